@@ -4,10 +4,12 @@ that has the most room. 2^33 voxels a side; a pool of fixed size holds what a pi
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 import tyro
+from rich.progress import track
 
 import gvtorch as gv
 
@@ -49,42 +51,48 @@ def plan(shape: gv.Mandelbulb) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def look(place: torch.Tensor, ways: torch.Tensor, level: float, width: int, height: int):
-    """The camera 2^-level of the box away from the place, and a stone in its sun."""
+    """The camera 2^-level of the box away from the place, and how its sun shines."""
     way = torch.lerp(ways[int(level)], ways[int(level) + 1], level % 1)
     eye, up = place + BOX * 0.5**level * way / way.norm(), torch.tensor([0.0, 0.0, 1.0]).double()
     sun = -way - 0.9 * torch.nn.functional.normalize(torch.linalg.cross(way, up), dim=0) - 0.5 * up
-    light = gv.DirectionalLight(tuple(sun.tolist()), (1.5, 1.25, 0.9), angle=4)
+    return gv.Camera.look_at(eye, place, fov=60, width=width, height=height), sun.float()
+
+
+def stone(sun: torch.Tensor) -> gv.Shader:
+    """The surface, which is where the opacity is a half, in its own colours."""
+    light = gv.DirectionalLight(sun, (1.5, 1.25, 0.9), angle=4)
     painted = {"color_channel": "rgba", "premultiplied": True, "light": light, "ambient": 0.35}
-    stone = gv.Isosurface(0.5, None, **painted)
-    stone.channel, stone.component = "rgba", 3  # where the opacity is a half
-    size = {"fov": 60, "width": width, "height": height}
-    return gv.Camera.look_at(tuple(eye.tolist()), tuple(place.tolist()), **size), stone
+    shader = gv.Isosurface(0.5, None, **painted)
+    shader.channel, shader.component = "rgba", 3
+    return shader
 
 
 def opened(shape: gv.Mandelbulb, settings: Settings) -> gv.Engine:
-    """An engine for it, with a pool of fixed size. Each iteration adds details an eighth as large:
-    those that are finer than pixels would be noise.
-    """
+    """An engine for it, with a pool of fixed size, in which no place is without a brick."""
     solid, box = gv.Solid(shape, normals=False), ((-BOX / 2,) * 3, (BOX / 2,) * 3)
-    producer = gv.FieldProducer(solid, 2**33, box=box)
-    limits = {"brick_pool": "512 MB", "load_budget": settings.budget}
-    return gv.Engine(producer, device=settings.device, **limits)
+    producer, device = gv.FieldProducer(solid, 2**33, box=box), settings.device
+    limits = {"brick_pool": "512 MB", "load_budget": settings.budget, "loading": "levels"}
+    return gv.Engine(producer, device=device, **limits)
 
 
 def fly(engine: gv.Engine, route: tuple[torch.Tensor, torch.Tensor], settings: Settings) -> None:
-    """Films the way from 2^-4 to 2^-30 of the box, and tells how long each frame took."""
-    height, width, took = settings.size, settings.size * 16 // 9 // 2 * 2, []
-    options = {"cone_scale": settings.cone_scale}
-    engine.render(*look(*route, 4.0, width, height), **options)  # where it begins
-    with gv.Video(settings.film, width, height, fps=30) as film:
-        for level in torch.linspace(4, 30, settings.frames).tolist():
-            camera, stone = look(*route, level, width, height)
+    """Films the way from 2^-4 to 2^-30 of the box; on a GPU it is flown live."""
+    size, took = (settings.size * 16 // 9 // 2 * 2, settings.size), []
+    options, (camera, way) = {"cone_scale": settings.cone_scale}, look(*route, 4.0, *size)
+    shader = stone(sun := way.to(engine.device))
+    engine.render(camera, shader, **options)  # where it begins
+    draw = partial(engine.frame, shader=shader, **options)
+    if engine.device.type == "cuda":
+        draw = engine.capture(camera, shader, batch=settings.budget, **options).replay
+    with gv.Video(settings.film, *size, fps=30) as film:
+        for level in track(torch.linspace(4, 30, settings.frames).tolist()):
+            camera, way = look(*route, level, *size)
             began = time.perf_counter()
-            picture, stats = engine.frame(camera, stone, **options)
-            misses = stats.misses  # waits for the device
+            sun.copy_(way)
+            picture, stats = draw(camera)
+            stats.settle()  # waits for the device
             took.append(1e3 * (time.perf_counter() - began))
             film.add(picture)
-            print(f"2^-{level:.2f} of the box: {took[-1]:.1f} ms, {misses} nodes missed")
     late, middle = sum(one > 1e3 / 30 for one in took), sorted(took)[len(took) // 2]
     print(f"{len(took)} frames: {middle:.1f} ms, at most {max(took):.1f}; {late} over 1/30 s")
 
@@ -94,23 +102,23 @@ def main(settings: Settings) -> None:
     finest = gv.Mandelbulb(8, iterations=20, colors=COLORS)
     route, options = plan(finest), {"cone_scale": settings.cone_scale}
     if settings.frames:
-        with opened(finest, settings) as engine:
-            fly(engine, route, settings)
+        fly(opened(finest, settings), route, settings)
     pictures, size = [], (settings.size * 16 // 27 + 1, settings.size // 2)
-    for level in PLACES:
+    for level in track(PLACES):
+        # Each iteration adds details an eighth as large; those finer than pixels would be noise.
         shape = gv.Mandelbulb(8, iterations=4 + int(level / 2), colors=COLORS)
-        camera, stone = look(*route, level, *size)
+        camera, sun = look(*route, level, *size)
+        shader = stone(sun.to(settings.device))
         with opened(shape, settings) as engine:
-            found = engine.render(camera, stone, **options)  # without light: less is traced again
-            print(f"2^-{level:g} of the box: {found.stats}", flush=True)
+            engine.render(camera, shader, **options)  # without light: less is traced again
             light = gv.Lighting(shadows=0, occlusion=1.0, reach=0.1 * BOX * 0.5**level)
-            lit = engine.render(camera, stone, lighting=light, **options).to("cpu")
+            lit = engine.render(camera, shader, lighting=light, **options).to("cpu")
         clear = lit.alpha * torch.exp(-0.15 * lit.depth / (BOX * 0.5**level))
         pictures.append(replace(lit, color=1.15 * clear * lit.color + (1 - clear) * HAZE))
     both = {}
     for name in ("color", "alpha"):
-        tiles = [getattr(one, name) for one in pictures]
-        both[name] = torch.cat([torch.cat(tiles[row : row + 3], 1) for row in (0, 3)])
+        six = [getattr(one, name) for one in pictures]
+        both[name] = torch.cat([torch.cat(six[row : row + 3], 1) for row in (0, 3)])
     replace(pictures[0], **both).save(settings.output)
     print(settings.output)
 

@@ -202,6 +202,7 @@ class Watched(Checked):
     def __init__(self, *args, **options):
         super().__init__(*args, **options)
         self.rounds = self.evicted = 0
+        self.unwatched, self.serving.serve = self.serving.serve, self.serve
 
     def frame(self, *args, **options):
         nodes, bricks = self.cache.nodes, self.cache.bricks
@@ -219,7 +220,7 @@ class Watched(Checked):
             )
         ]
         evicted = sum(stats.evicted.values())
-        super().serve(listed, counts, stats)
+        self.unwatched(listed, counts, stats)
         for now, old, keep in zip((bricks.owner_b, nodes.parent_t), before, kept, strict=True):
             assert torch.equal(now[keep], old[keep])
         if self.round:

@@ -1,4 +1,4 @@
-"""The ops `orbits` and `orbit_bounds`: twin, C++ and CUDA in every bit, gradients, hostile input."""
+"""`orbits` and `orbit_bounds`: twin, C++ and CUDA in every bit, gradients, hostile input."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ def some_points(count: int, dtype: torch.dtype, size: float) -> torch.Tensor:
 
 
 def bits(values: torch.Tensor) -> torch.Tensor:
-    values = torch.where(values.isnan(), 0.0, values.cpu())  # a NaN has many
+    values = values.cpu()
+    values = torch.where(values.isnan(), 0.0, values)  # a NaN has many
     return values.view(torch.int32 if values.dtype == torch.float32 else torch.int64)
 
 

@@ -15,10 +15,12 @@ import torch
 from helpers import DEVICES
 from helpers.recorded import Frames
 from helpers.waits import nobody_waits
+from torch import Tensor
 
 import gvtorch as gv
+from gvtorch.base.branches import side_by_side
 from gvtorch.base.constants import REQUEST_PENDING_SHIFT
-from gvtorch.cache.requests import DEEPER
+from gvtorch.cache.requests import DEEPER, levels_wanted
 from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
 from gvtorch.io.stores.conversion import convert
@@ -435,6 +437,22 @@ def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
         assert deepest > 3 and reached <= 2 < deepest and made < 3 * seen
 
 
+@pytest.mark.parametrize("backend", COMPILED)
+def test_a_frame_deepens_by_no_more_than_its_most(backend):
+    """Whatever rays ahead of the camera ask for, of which a frame may want far more than itself."""
+    assert int(levels_wanted(torch.tensor([16 * 64] * 3 + [-1] * 500), 2)) == DEEPER
+    assert int(levels_wanted(torch.tensor([0, 16, 32, -1]), 2)) == 0
+    assert int(levels_wanted(torch.tensor([-1, -1]), 2)) == 0
+    with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
+        frames, deeper = Frames(engine, view(64, 0), LOOK, 256, 8), []
+        for turn in range(20):
+            frames.look_from(view(64, 3.0 * turn))
+            frames.frame()
+            engine.readbacks.catch_up(wait=True)
+            deeper.append(engine.readbacks.deeper)
+    assert 0 < max(deeper) <= DEEPER
+
+
 class Unsaid(Ball):
     """The same, but not said to answer on the device."""
 
@@ -518,3 +536,28 @@ def test_a_node_that_fails_in_a_replay_is_named_by_the_host():
         assert len(engine.failures) > 0 and "NaN" in engine.failures[0].message
         assert torch.isfinite(picture.color).all()
         engine.validate()
+
+
+def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
+    """Recorded, they are branches of the graph: each replay sees what came before all of them."""
+    device = torch.device(DEVICES[compiled])
+    many, few = torch.zeros(1 << 20, device=device), torch.zeros(3, device=device)
+
+    def step() -> Tensor:
+        many.add_(1)
+        total, least = side_by_side(lambda: many.double().sum().view(1), lambda: few + 1)
+        few.copy_(least)
+        return torch.cat((total, few.double()))
+
+    found, replay = step(), None
+    if device.type == "cuda":
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            found = step()
+        replay = graph.replay
+    for turn in range(2, 40):
+        if replay is None:
+            found = step()
+        else:
+            replay()
+        assert found.tolist() == [turn * (1 << 20), turn, turn, turn]

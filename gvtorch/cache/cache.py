@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
+from ..base.branches import side_by_side
 from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
 from ..ops import lru_partition
 from ..pool import BrickPool, NodePool
@@ -37,7 +40,7 @@ class LRU:
         held = self.order[self.fresh :]
         order, unused = lru_partition(held, stamp, frame)
         held.copy_(order)
-        return unused + self.fresh
+        return unused + self.fresh if self.fresh else unused
 
     def free(self) -> Tensor:
         """(1,) int64 `unused` on the device."""
@@ -126,14 +129,17 @@ class Cache:
             (5,) int64 tiles unused and used, bricks unused and used, and how many of the unused
             are coarse; `make_room` is told the unused ones, once the host knows them.
         """
-        counts, frame, stamps = [], self.frame_1, (self.nodes.stamp_t, self.bricks.stamp_b)
+        frame, stamps = self.frame_1, (self.nodes.stamp_t, self.bricks.stamp_b)
         self.aliases.keep(frame)
-        for group, stamp in zip(self.lru.values(), stamps, strict=True):
+
+        def sort(group: list[LRU], stamp: Tensor) -> list[Tensor]:
             unused, size = [lru.sort(stamp, frame) for lru in group], sum(map(len, group))
             locked = (stamp[: len(stamp) - size] == frame).sum()
             whole = unused[0] + unused[1] if len(group) > 1 else unused[0]
-            counts += [whole, locked + size - whole]
-        return torch.cat((*counts, unused[1] if len(unused) > 1 else self._no_coarse))
+            return [whole, locked + size - whole, *unused[1:]]
+
+        tiles, bricks = side_by_side(*map(partial, (sort, sort), self.lru.values(), stamps))
+        return torch.cat((*tiles, *bricks, self._no_coarse)[:5])
 
     def used(self) -> Tensor:
         """(2,) int64 tiles and bricks used in the last picture; the host does not wait."""

@@ -65,11 +65,12 @@ class Requests:
 
 
 def levels_wanted(priority: Tensor, branching: int) -> Tensor:
-    """() int64 levels that subdivisions of these priorities want below the first, summed, as far as
-    a frame makes them.
+    """() int64 levels that subdivisions of priorities (k,) want below the first in the mean,
+    rounded, as far as a frame makes them. Rows of -1 do not count.
     """
     widths = [_PIXEL * branching**level for level in range(1, DEEPER + 1)]
-    return torch.stack([(priority >= width).sum() for width in widths]).sum()
+    total, count = sum((priority >= width).sum() for width in widths), (priority >= 0).sum()
+    return (2 * total + count) // (2 * count).clamp(min=1)
 
 
 def below(
@@ -100,7 +101,7 @@ class RequestList:
 
     node: Tensor  # (capacity,) int32 node indices, -1 behind the last
     word: Tensor  # (capacity,) int32 kinds and priority, 0 behind the last
-    count: Tensor  # (5,) int64: see `compact_requests`, then requests of each kind
+    count: Tensor  # (5,) int64: see `compact_requests`
 
     @classmethod
     def collect(cls, cache: Cache, capacity: int) -> RequestList:
@@ -108,8 +109,7 @@ class RequestList:
         cleared, their pending bits excepted; the host does not wait.
         """
         node, word, count = compact_requests(cache.requests(), capacity)
-        kinds = [(word & kind).ne(0).sum().view(1) for kind in KINDS.values()]
-        return cls(node=node, word=word, count=torch.cat((count, *kinds)))
+        return cls(node=node, word=word, count=count)
 
     def by_kind(self, cache: Cache, counts: Mapping[str, int]) -> dict[int, Requests]:
         """Returns the requests of each kind, those of aliases at their targets. `counts` are the

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ..base.branches import side_by_side
 from ..base.constants import CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from ..cache import Cache, Scheduler
 from ..cache.requests import below, levels_wanted
@@ -22,6 +24,14 @@ from .parents import once, parent_bricks, ready
 from .recorded import RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, children_of
 from .stats import FrameStats, Readbacks
+
+
+class Answer(NamedTuple):
+    """What a producer gave for a batch, not checked yet."""
+
+    node: Tensor  # (batch,) int64 nodes that were asked for, -1 for none
+    batch: RequestBatch
+    given: Any
 
 
 class DeviceFrame(RecordedFrame):
@@ -53,16 +63,23 @@ class DeviceFrame(RecordedFrame):
         return not steady
 
     def serve(self) -> None:
-        """Answers the most wanted requests of the last frame."""
+        """Answers the most wanted requests of the last frame. Producers make bricks and classify
+        at the same time; what they answer is written after that.
+        """
         loads, subdivisions = self.choose()
-        self._load(loads.node)
-        self._subdivide(*subdivisions)
+        bricks, regions = side_by_side(
+            partial(self._answers, REQUEST_LOAD, loads.node),
+            partial(self._answers, REQUEST_SUBDIVIDE, subdivisions.node),
+        )
+        self._load(bricks)
+        self._subdivide(regions, *subdivisions)
 
     def deepen(self) -> None:
         """Subdivides those nodes that `serve`, or `deepen` before, has just made and that rays will
         want finer, as the priority of the node above tells, so that no ray has to ask for it.
         """
-        self._subdivide(*self._below.unbind(1))
+        chosen, priority = self._below.unbind(1)
+        self._subdivide(self._answers(REQUEST_SUBDIVIDE, chosen), chosen, priority)
 
     def deeper(self, readbacks: Readbacks) -> int:
         """Returns what subdivisions wanted in the mean when the host last knew; 0 where each level
@@ -70,35 +87,43 @@ class DeviceFrame(RecordedFrame):
         """
         return 0 if self._by_level else readbacks.deeper
 
-    def _levels(self) -> Tensor:
+    def _deeper(self) -> Tensor:
         word = self._requests[:, 1].flatten()
-        wide = torch.where((word & REQUEST_SUBDIVIDE) != 0, word & REQUEST_PRIORITY, 0)
+        wide = torch.where((word & REQUEST_SUBDIVIDE) != 0, word & REQUEST_PRIORITY, -1)
         branching = max(source.layout.branching for source in self.trees)
         return levels_wanted(wide, branching).view(1)
 
-    def _load(self, chosen: Tensor) -> None:
-        """Loads nodes (batch,)."""
-        number, free = self.tree_of(chosen), self._unused[1:]
+    def _answers(self, kind: int, chosen: Tensor) -> list[Answer]:
+        """What each tree's producer answers for its own of nodes (batch,)."""
+        number, answers = self.tree_of(chosen), []
         for source in self.trees:
             node = torch.where(number == source.tree.number, chosen, -1)
-            if source.producer.needs_parent:
+            if kind == REQUEST_LOAD and source.producer.needs_parent:
                 node = once(ready(self.cache, node, source.layout.depth))
-            put, bare, failed = self._fill(source, node, free)
+            batch = self._asked(source, kind, node)
+            answers.append(Answer(node, batch, batch.ask()))
+        return answers
+
+    def _load(self, answers: Sequence[Answer]) -> None:
+        """Writes bricks."""
+        free = self._unused[1:]
+        for answer in answers:
+            put, bare, failed = self._fill(answer, free)
             free -= put[1:2]
             self._made[1:2] += put[1:2]
             self._made[2:3] += bare
             self._made[4:5] += put[2:]
             self._made[5:] += failed
 
-    def _subdivide(self, chosen: Tensor, priority: Tensor) -> None:
+    def _subdivide(self, answers: Sequence[Answer], chosen: Tensor, priority: Tensor) -> None:
         """Subdivides nodes (batch,), and notes which of their children are to be subdivided, too,
         those of the first nodes first.
         """
-        number, free = self.tree_of(chosen), self._unused[:1]
+        free = self._unused[:1]
         slot, wide = torch.full_like(chosen, -1), torch.zeros_like(chosen)
-        for source in self.trees:
-            mine = (number == source.tree.number) & (chosen >= 0)
-            put, failed = self._classify(source, torch.where(mine, chosen, -1), free)
+        for answer in answers:
+            mine, source = answer.node >= 0, answer.batch.source
+            put, failed = self._classify(answer, free)
             free -= put.counts[1:2]
             self._made[:1] += put.counts[1:2]
             self._made[3:4] += put.counts[2:]
@@ -112,12 +137,10 @@ class DeviceFrame(RecordedFrame):
         taken = split.flatten() & (rank <= self.batch)
         put_rows_of(self._below, torch.where(taken, rank - 1, -1), rows)
 
-    def _fill(
-        self, source: ProducedTree, node: Tensor, free: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _fill(self, answer: Answer, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Loads nodes (k,): (3,) counts of `Put`, how many need none (1,), how many failed (1,)."""
-        batch = self._asked(source, REQUEST_LOAD, node)
-        bricks = checked_bricks(batch.ask(), batch.nodes, source.producer, look=False)
+        node, batch, given = answer
+        bricks = checked_bricks(given, batch.nodes, batch.source.producer, look=False)
         good = _finite([bricks.data, bricks.constants], len(node), node.device)
         data, constant = good, torch.zeros_like(node[:1])
         if bricks.kind is not None:
@@ -130,10 +153,10 @@ class DeviceFrame(RecordedFrame):
         put = put_bricks(self.cache, _only(batch.targets, node, data), bricks.data, free)
         return put.counts, constant, ((node >= 0) & ~good).sum().view(1)
 
-    def _classify(self, source: ProducedTree, node: Tensor, free: Tensor) -> tuple[Put, Tensor]:
+    def _classify(self, answer: Answer, free: Tensor) -> tuple[Put, Tensor]:
         """Subdivides nodes (k,): what became of them, and how many failed (1,)."""
-        batch = self._asked(source, REQUEST_SUBDIVIDE, node)
-        regions = checked_regions(batch.ask(), batch.nodes, source.producer, look=False)
+        node, batch, given = answer
+        regions = checked_regions(given, batch.nodes, batch.source.producer, look=False)
         count = len(regions.kind)
         good = _finite([regions.constants, regions.ranges], count, node.device)
         good = good & (regions.kind >= Region.EMPTY) & (regions.kind <= Region.DATA_MAX_DEPTH)

@@ -18,12 +18,10 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.constants import REQUEST_SUBDIVIDE
 from ..base.explicit import explicit
 from ..base.records import Hits, Rays, add
 from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from ..cache import Cache, RequestList, Scheduler
-from ..cache.requests import Requests, coarser_requests, levels_wanted, requests_below
 from ..cameras import Camera
 from ..cameras.custom import as_camera
 from ..io.http import ask_again
@@ -47,6 +45,7 @@ from .host_frame import HostFrame
 from .production import Failure, Production
 from .ray_subsets import RaySubsets, scouts
 from .request_batch import ProducedTree
+from .serving import Serving
 from .setup import (
     EngineOptions,
     EngineSettings,
@@ -92,6 +91,7 @@ class Engine:
         cache: Pools, order of use and requests.
         scheduler: Which requests are served.
         production: What is on its way, and what failed.
+        serving: Chooses among the requests of a frame, and asks for these nodes.
         readbacks: The frames whose counts are on their way to the host.
         frames: Number of the last picture.
     """
@@ -129,11 +129,14 @@ class Engine:
         self.production = Production(
             self.cache, self.scheduler, self.options.patience, self.options.strict
         )
+        self.trees: dict[str, ProducedTree] = {}
+        self.serving = Serving(
+            self.cache, self.scheduler, self.production, self.trees, self._by_level
+        )
         self.readbacks = Readbacks()
         self.frames, self._closed = 0, False
         self._missed: Tensor | None = None  # (r,) bool, of the last picture's rays
         self._last: deque[FrameStats] = deque(maxlen=_KEPT)  # for the report
-        self.trees: dict[str, ProducedTree] = {}
         self._versions: dict[str, int] = {}  # of what they hold
         self.recorded: list[HostFrame] = []  # what producers on the host serve, without this frame
         try:
@@ -261,7 +264,7 @@ class Engine:
             return
         if last is not None:  # nothing was written since it was traced: its nodes are still there
             self.scheduler.begin()
-            self.serve(last.requests, last.wait(), stats)
+            self.serving.serve(last.requests, last.wait(), stats)
         with stage("write"):
             self.production.write(self.production.late(), stats)
 
@@ -286,50 +289,6 @@ class Engine:
             if one is not but:
                 one.release()
 
-    def serve(self, listed: RequestList, counts: Counts, stats: FrameStats) -> None:
-        """Lets slots be taken again, chooses requests, asks the producers, and writes the answers
-        that are here at once.
-        """
-        self.cache.make_room(counts.tiles_unused, counts.bricks_unused, counts.coarse_unused)
-        if not counts.listed:
-            return
-        with stage("schedule"):
-            requests = listed.by_kind(self.cache, counts.by_kind())
-            room = self.production.room()
-            nodes, deferred, exceeded = self.scheduler.choose(requests, room)
-            if exceeded:
-                coarser = coarser_requests(self.cache, requests, room)
-                nodes, deferred, _ = self.scheduler.choose(coarser, room)
-            stats.deferred += deferred
-            stats.capacity_exceeded |= exceeded
-        self.produce(nodes, stats)
-        if counts.subdivide and not (exceeded or self._by_level):
-            self.deepen(requests[REQUEST_SUBDIVIDE], stats)
-
-    def produce(self, nodes: Mapping[int, Tensor], stats: FrameStats) -> None:
-        """Asks the producers for the chosen nodes of each kind, and writes the answers that are
-        here at once.
-        """
-        with stage("produce"):
-            answers = self.production.ask([*self.trees.values()], nodes)
-        with stage("write"):
-            self.production.write(answers, stats)
-
-    def deepen(self, asked: Requests, stats: FrameStats) -> None:
-        """Subdivides what has come of subdivisions, too, where rays will want it, before they ask:
-        by as many levels as the subdivisions want in the mean.
-        """
-        branching = max(source.layout.branching for source in self.trees.values())
-        levels = int(levels_wanted(asked.priority, branching)) / max(1, len(asked))
-        for _ in range(round(levels)):
-            with stage("schedule"):
-                requests = requests_below(self.cache, asked, branching)
-                asked = requests[REQUEST_SUBDIVIDE]
-                nodes = self.scheduler.choose(requests, self.production.room()).nodes
-            if not any(map(len, nodes.values())):
-                break
-            self.produce(nodes, stats)
-
     def scout(self, view: View, stats: FrameStats) -> None:
         """Sends rays ahead of the picture: while answers are written at once, some of those that
         missed something are traced again, and what they miss next is served within this frame.
@@ -350,7 +309,7 @@ class Engine:
             collected = self.collect_requests_and_use(hits.samples[:0])
             counts = Counts(*collected.numbers.tolist())  # what misses something waits anyway
             add(stats.requests, counts.by_kind())
-            self.serve(collected.requests, counts, stats)
+            self.serving.serve(collected.requests, counts, stats)
 
     def trace(
         self, view: View, progress: Progress = no_progress, again: Again | None = None

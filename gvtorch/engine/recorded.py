@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..base.branches import side_by_side
 from ..base.constants import (
     REQUEST_KINDS,
     REQUEST_PENDING_SHIFT,
@@ -81,7 +82,7 @@ class RecordedFrame:
     def _list(self, which: int) -> RequestList:
         """Lists what is asked for by the picture (0) or by the next ones (1)."""
         listed = RequestList.collect(self.cache, self._most)
-        self._requests[which].copy_(torch.stack((listed.node, listed.word)))
+        torch.stack((listed.node, listed.word), out=self._requests[which])
         return listed
 
     def deeper(self, readbacks: Readbacks) -> int:
@@ -92,19 +93,21 @@ class RecordedFrame:
         """Brings slots into the order of use and counts; what the picture used is counted apart
         from what `look` used.
         """
-        use, ahead = self.cache.sort_by_use(), self._none
+        use, samples = side_by_side(
+            self.cache.sort_by_use, lambda: hits.samples.sum(dtype=torch.int64).view(1)
+        )
+        ahead = self._none
         self._unused.copy_(use[0:4:2])
         if self._ahead:
             use[1:4:2] = self._used
             ahead = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
-        samples = hits.samples.sum(dtype=torch.int64).view(1)
-        numbers = torch.cat((self._seen.count, use, samples, self._made, ahead, self._levels()))
+        numbers = torch.cat((self._seen.count, use, samples, self._made, ahead, self._deeper()))
         self._made.zero_()
         return Collected(self._seen, numbers)
 
-    def _levels(self) -> Tensor:
-        """(1,) int64 levels that are wanted below the first by what is to be subdivided, summed; 0
-        where no frame deepens a tree by several.
+    def _deeper(self) -> Tensor:
+        """(1,) int64 levels that are wanted below the first, in the mean of what is to be
+        subdivided; 0 where no frame deepens a tree by several.
         """
         return self._none
 

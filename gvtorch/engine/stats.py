@@ -147,7 +147,7 @@ class Counts(NamedTuple):
     bricks_evicted: int = 0
     failed: int = 0
     ahead: int = 0  # nodes that the picture did not miss, but will
-    levels: int = 0  # that all that is to be subdivided wants below the first
+    deeper: int = 0  # levels below the first that what is to be subdivided wants in the mean
 
     def by_kind(self) -> dict[str, int]:
         """Returns the number of requests by the name of their kind."""
@@ -222,7 +222,7 @@ class Readbacks(deque[Readback]):
     _steady = False
     # Of the newest frame read back, on the device:
     failed = False  # whether a node failed
-    deeper = 0  # how many levels below the first a subdivision wants in the mean
+    deeper = 0  # see `Counts`
 
     def catch_up(self, wait: bool) -> Readback | None:
         """Takes all frames whose counts are here. Waits for those of the others if `wait` is true,
@@ -263,7 +263,7 @@ class Readbacks(deque[Readback]):
         self._steady = readback.converged()
         counts = readback.wait()
         self.failed = counts.failed > 0
-        self.deeper = round(counts.levels / max(1, counts.subdivide))
+        self.deeper = counts.deeper
         readback.stats.settle()
         return readback
 

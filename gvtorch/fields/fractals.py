@@ -11,13 +11,14 @@ around it that holds the orbits of all points of the box (`Iteration.ranges` bou
 stretches there). That bounds where and when they escape, and so the very number that `forward`
 gives, whatever it means.
 
-Sources: ops/reference/orbits.py, which follows the orbits; Pickover, "Computers, pattern, chaos, and
-    beauty", 1990 (orbit traps).
+Sources: those of ops/reference/orbits.py, which follows the orbits; Pickover, "Computers, pattern,
+    chaos, and beauty", 1990 (orbit traps).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -153,24 +154,32 @@ class Fractal(Distance):
         """(3, ...) distances, and how near the orbits came to the origin and to a plane of two
         axes.
         """
-        point, step = points.reshape(-1, 3).contiguous(), _compiled_step(self.iteration)
-        constant, bailout = self._numbers(point)
-        if step is None:
-            found = plain.orbits(
-                point,
-                constant if self.julia else None,
-                bailout,
-                self.iteration,
-                self.iterations,
-                self.iteration.logarithmic,
-            )
+        point = points.reshape(-1, 3).contiguous()
+        known = self._known(point)
+        if known is None:
+            found = plain.orbits(point, self._way(point))
         else:
-            found = ops.orbits(point, constant, bailout, *step, self.iterations, self.julia)
+            found = ops.orbits(point, *known)
         return found.view(3, *points.shape[:-1])
 
-    def _numbers(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """(3,) constant and (1,) bailout, in the dtype of `like`."""
-        return self.constant.to(like), self.bailout.to(like).view(1)
+    def _known(self, like: Tensor) -> tuple[Any, ...] | None:
+        """What the ops take, in the dtype of `like`; None for a step of one's own."""
+        step = _compiled_step(self.iteration)
+        if step is None:
+            return None
+        constant, bailout = self.constant.to(like), self.bailout.to(like).view(1)
+        return constant, bailout, *step, self.iterations, self.julia
+
+    def _way(self, like: Tensor) -> plain.Way:
+        """The same for any step."""
+        return plain.Way(
+            self.iteration,
+            self.iteration.ranges,
+            self.constant.to(like) if self.julia else None,
+            self.bailout.to(like),
+            self.iterations,
+            self.iteration.logarithmic,
+        )
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
         """Not known: the value jumps where an orbit takes one more step."""
@@ -179,22 +188,11 @@ class Fractal(Distance):
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Follows the orbits of whole boxes, in parts; see the head of the file."""
         middle, part = parts_of(center, half, _PARTS)
-        step, (constant, bailout) = _compiled_step(self.iteration), self._numbers(middle)
-        if step is None:
-            found = plain.orbit_bounds(
-                middle,
-                length(part),
-                constant if self.julia else None,
-                bailout,
-                self.iteration,
-                self.iteration.ranges,
-                self.iterations,
-                self.iteration.logarithmic,
-            )
+        known, reach = self._known(middle), length(part)
+        if known is None:
+            low, high = plain.orbit_bounds(middle, reach, self._way(middle))
         else:
-            numbers = (constant, bailout, *step, self.iterations, self.julia)
-            found = ops.orbit_bounds(middle, length(part), *numbers)
-        low, high = found
+            low, high = ops.orbit_bounds(middle, reach, *known)
         return joined((low, high), _PARTS)
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:

@@ -45,8 +45,8 @@ def compact_requests(
 
     Returns:
         node_k (capacity,) node indices, rising, -1 behind them; word_k (capacity,) kinds and
-        priority; count_3 (3,) int64: nodes listed, nodes that could be listed, requested nodes,
-        pending or not.
+        priority; count_5 (5,) int64: nodes listed, nodes that could be listed, requested nodes,
+        pending or not; of those listed loads, and subdivisions.
     """
     words = request_tn.view(-1)
     requested = int((words & REQUEST_KINDS).count_nonzero())
@@ -58,7 +58,9 @@ def compact_requests(
     node_k[: len(kept)] = kept.to(torch.int32)
     word_k[: len(kept)] = open_kinds[kept] | (words[kept] & REQUEST_PRIORITY)
     words &= REQUEST_KINDS << REQUEST_PENDING_SHIFT
-    return node_k, word_k, torch.tensor([len(kept), len(node), requested], device=words.device)
+    kinds = [int((word_k & kind).count_nonzero()) for kind in (REQUEST_LOAD, REQUEST_SUBDIVIDE)]
+    counts = [len(kept), len(node), requested, *kinds]
+    return node_k, word_k, torch.tensor(counts, device=words.device)
 
 
 @op()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -48,16 +47,14 @@ def orbits(
     Raises:
         ValueError: A tensor of the wrong shape or dtype, or a number out of its range.
     """
-    _check("orbits", [("point_p3", point_p3, "p3")], constant_3, bailout_1, kind, amount, iterations)
+    fields = [("point_p3", point_p3, "p3")]
+    _check("orbits", fields, constant_3, bailout_1, kind, amount, iterations)
     given = (point_p3, constant_3, bailout_1)
     learns = torch.is_grad_enabled() and any(one.requires_grad for one in given)
     if _chosen(backend, point_p3) == "reference" or (learns and backend == "auto"):
-        step, _ = _steps(kind, amount)
-        own = constant_3 if julia else None
-        return twin.orbits(point_p3, own, bailout_1, step, iterations, kind == "power")
-    return torch.ops.gvtorch.orbits(
-        point_p3, constant_3, bailout_1, KINDS.index(kind), float(amount), iterations, julia
-    )
+        return twin.orbits(point_p3, _way(constant_3, bailout_1, kind, amount, iterations, julia))
+    numbers = (KINDS.index(kind), float(amount), iterations, julia)
+    return torch.ops.gvtorch.orbits(*given, *numbers)
 
 
 def orbit_bounds(
@@ -83,11 +80,8 @@ def orbit_bounds(
     fields = [("center_k3", center_k3, "k3"), ("reach_k", reach_k, "k")]
     _check("orbit_bounds", fields, constant_3, bailout_1, kind, amount, iterations)
     if _chosen(backend, center_k3) == "reference":
-        own = constant_3 if julia else None
-        ways = _steps(kind, amount)
-        return twin.orbit_bounds(
-            center_k3, reach_k, own, bailout_1, *ways, iterations, kind == "power"
-        )
+        way = _way(constant_3, bailout_1, kind, amount, iterations, julia)
+        return twin.orbit_bounds(center_k3, reach_k, way)
     numbers = (KINDS.index(kind), float(amount), iterations, julia)
     return torch.ops.gvtorch.orbit_bounds(center_k3, reach_k, constant_3, bailout_1, *numbers)
 
@@ -121,9 +115,20 @@ def _chosen(backend: str, like: Tensor) -> str:
     return choose_backend.__wrapped__(backend, like.device)  # torch.compile warns of caches
 
 
-def _steps(kind: str, amount: float) -> Any:
-    """A step and its ranges."""
+def _way(
+    constant_3: Tensor,
+    bailout_1: Tensor,
+    kind: str,
+    amount: float,
+    iterations: int,
+    julia: bool,
+) -> twin.Way:
+    """What the twin takes."""
     if kind == "power":
-        n = int(amount)
-        return partial(twin.power, n=n), partial(twin.power_ranges, n=n)
-    return partial(twin.fold, scale=amount), partial(twin.fold_ranges, scale=amount)
+        step: twin.Step = partial(twin.power, n=int(amount))
+        ranges: twin.Ranges = partial(twin.power_ranges, n=int(amount))
+    else:
+        step = partial(twin.fold, scale=amount)
+        ranges = partial(twin.fold_ranges, scale=amount)
+    constant = constant_3 if julia else None
+    return twin.Way(step, ranges, constant, bailout_1, iterations, kind == "power")

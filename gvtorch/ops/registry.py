@@ -204,7 +204,7 @@ FAKES: dict[str, Callable[..., Any]] = {
     "compact_requests": lambda *, request_tn, capacity: (
         request_tn.new_empty((capacity,), dtype=torch.int32),
         request_tn.new_empty((capacity,), dtype=torch.int32),
-        request_tn.new_empty((3,), dtype=torch.int64),
+        request_tn.new_empty((5,), dtype=torch.int64),
     ),
     "choose_requests": lambda *, asked_l2k, batch, **_: (
         asked_l2k.new_empty((2, batch), dtype=torch.int64),

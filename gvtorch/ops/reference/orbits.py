@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -78,63 +79,60 @@ def fold_ranges(z: Tensor, reach: Tensor, scale: float) -> tuple[Tensor, Tensor,
     return high, divide(abs(scale), far * far, reach), high
 
 
-def orbits(
-    point_p3: Tensor,
-    constant_3: Tensor | None,
-    bailout: Tensor,
-    step: Step,
-    iterations: int,
-    logarithmic: bool,
-) -> Tensor:
-    """Follows points until they escape; see `ops.orbits`. No constant: each point's own place."""
-    z = point_p3.mT
-    constant, add = (z, 1.0) if constant_3 is None else (constant_3[:, None], 0.0)
+class Way(NamedTuple):
+    """How orbits go on, and when they end."""
+
+    step: Step
+    ranges: Ranges
+    constant_3: Tensor | None  # what each step adds; None: each point's own place
+    bailout_1: Tensor  # beyond this distance from the origin they have escaped
+    iterations: int  # most steps
+    logarithmic: bool  # |z| grows as a power; else by a factor
+
+
+def orbits(point_p3: Tensor, way: Way) -> Tensor:
+    """Follows points until they escape; see `ops.orbits`."""
+    z, bailout = point_p3.mT, way.bailout_1
+    constant, add = (z, 1.0) if way.constant_3 is None else (way.constant_3[:, None], 0.0)
     radius = sqrt_exact(_squared(z))
     apart, near, plane = torch.ones_like(radius), radius, _from_planes(z)
-    for _ in range(iterations):
+    for _ in range(way.iterations):
         alive = radius <= bailout
-        after, grown = step(z)
+        after, grown = way.step(z)
         z = torch.where(alive, after + constant, z)
         apart = torch.where(alive, grown * apart + add, apart)
         radius = sqrt_exact(_squared(z))
         near, plane = smaller(near, radius), smaller(plane, _from_planes(z))
-    value = torch.where(radius <= bailout, -INSIDE, _estimate(radius, apart, logarithmic))
+    value = torch.where(radius <= bailout, -INSIDE, _estimate(radius, apart, way))
     return torch.stack((value, near, plane))
 
 
-def orbit_bounds(
-    center_k3: Tensor,
-    reach_k: Tensor,
-    constant_3: Tensor | None,
-    bailout: Tensor,
-    step: Step,
-    ranges: Ranges,
-    iterations: int,
-    logarithmic: bool,
-) -> Tensor:
+def orbit_bounds(center_k3: Tensor, reach_k: Tensor, way: Way) -> Tensor:
     """Follows the middle of balls, and a radius that holds the orbits of all of their points; see
     `ops.orbit_bounds`.
     """
-    z, reach = center_k3.mT, reach_k
-    constant, push, add = (z, reach, 1.0) if constant_3 is None else (constant_3[:, None], 0.0, 0.0)
+    z, reach, bailout = center_k3.mT, reach_k, way.bailout_1
+    constant, push, add = z, reach, 1.0
+    if way.constant_3 is not None:
+        constant, push, add = way.constant_3[:, None], torch.zeros_like(reach), 0.0
     low_apart = high_apart = torch.ones_like(reach)
     low, high = torch.full_like(reach, math.inf), torch.full_like(reach, -math.inf)
     inside = torch.ones_like(reach, dtype=torch.bool)  # whether any point may be, still
     lost = ~inside
-    for turn in range(iterations + 1):
+    for turn in range(way.iterations + 1):
         radius = sqrt_exact(_squared(z))
         least, most = _at_least(radius - reach, 0.0), radius + reach
         escaping = inside & (most > bailout)
-        first = _estimate(larger(least, bailout), high_apart, logarithmic)
-        last = _estimate(most, low_apart, logarithmic)
+        first = _estimate(larger(least, bailout), high_apart, way)
+        last = _estimate(most, low_apart, way)
         low = torch.where(escaping, smaller(low, first), low)
         high = torch.where(escaping, larger(high, last), high)
         lost = lost | (inside & ~(reach < FAR))
         inside = inside & (least <= bailout) & ~lost
-        if turn == iterations:
+        if turn == way.iterations:
             break
-        stretch, slow, fast = ranges(z, reach)
-        after, _ = step(z)
+        stretch, slow, fast = way.ranges(z, reach)
+        after, _ = way.step(z)
         z = torch.where(inside, after + constant, z)
         reach = torch.where(inside, stretch * reach + push, reach)
         low_apart = torch.where(inside, slow * low_apart + add, low_apart)
@@ -145,9 +143,9 @@ def orbit_bounds(
     return torch.stack((torch.where(lost, deep, low), torch.where(lost, math.inf, high)))
 
 
-def _estimate(radius: Tensor, apart: Tensor, logarithmic: bool) -> Tensor:
+def _estimate(radius: Tensor, apart: Tensor, way: Way) -> Tensor:
     """A distance, of orbits that have got to a radius while neighbours came apart."""
-    return 0.5 * radius * log_exact(radius) / apart if logarithmic else radius / apart
+    return 0.5 * radius * log_exact(radius) / apart if way.logarithmic else radius / apart
 
 
 def _squared(z: Tensor) -> Tensor:

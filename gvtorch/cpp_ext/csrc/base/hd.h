@@ -98,7 +98,11 @@ GV_HD void store_byte(uint8_t* byte, uint8_t value) {
 template <class T>
 GV_HD void add_to(T* sum, T value) {
 #ifdef __CUDA_ARCH__
-  atomicAdd(sum, value);
+  if constexpr (sizeof(T) == 8 && static_cast<T>(0.5) == 0) {
+    atomicAdd(reinterpret_cast<unsigned long long*>(sum), static_cast<unsigned long long>(value));
+  } else {
+    atomicAdd(sum, value);
+  }
 #else
   T seen = *sum;
   T next = seen + value;

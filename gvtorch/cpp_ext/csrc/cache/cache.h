@@ -50,7 +50,7 @@ GV_HD int32_t open_kinds(int32_t word) { return word & kKinds & ~(word >> kPendi
 struct ListRequests {
   GV_COMPACT_REQUESTS(GV_VIEW)
   int32_t *node_k, *word_k;
-  int64_t* count_3;  // kept, found, requested
+  int64_t* count_5;  // kept, found, requested; of those kept loads, and subdivisions
 
   GV_HD int32_t flags(int64_t node) const {
     const int32_t word = request_tn[node];
@@ -62,6 +62,8 @@ struct ListRequests {
       const int32_t word = request_tn[node];
       node_k[rank] = static_cast<int32_t>(node);
       word_k[rank] = open_kinds(word) | (word & kPriorityMask);
+      if ((word_k[rank] & kLoad) != 0) add_to<int64_t>(&count_5[3], 1);
+      if ((word_k[rank] & kSubdivide) != 0) add_to<int64_t>(&count_5[4], 1);
     }
     request_tn[node] &= kPending;
   }
@@ -71,9 +73,9 @@ struct ListRequests {
     word_k[rank] = 0;
   }
   GV_HD void total(int64_t listed, int64_t seen) const {
-    count_3[0] = smaller<int64_t>(listed, capacity);
-    count_3[1] = listed;
-    count_3[2] = seen;
+    count_5[0] = smaller<int64_t>(listed, capacity);
+    count_5[1] = listed;
+    count_5[2] = seen;
   }
 };
 
@@ -86,18 +88,17 @@ struct ListRequests {
   X(Int, batch, kAny)                     \
   X(Bool, coarse_first, kAny)
 
-constexpr int64_t kUnranked = INT64_MAX;  // no request of a node of the pool
-constexpr int64_t kComparedAtOnce = 256;
+constexpr int64_t kNoKey = INT64_MAX;  // no request of a node of the pool
+constexpr int64_t kComparers = 16;  // threads that share what a request is compared with
 
 struct ChooseArgs {
   GV_CHOOSE_REQUESTS(GV_VIEW)
   int64_t lists, listed, tiles;
-  int64_t* rank_lk;             // the lower, the more wanted
+  int64_t* key_lk;              // the lower, the more wanted; the last two bits are kinds
   int32_t *end_l, *before_2lk;  // behind a list's last request; how many loads, and subdivisions, are wanted more
   int64_t* node_2b;             // loads, then subdivisions
   int32_t* priority_2b;
 
-  GV_HD int64_t parts() const { return (listed + kComparedAtOnce - 1) / kComparedAtOnce; }  // of a list
   GV_HD int64_t node_at(int64_t index) const { return asked_l2k[index + index / listed * listed]; }
   GV_HD int32_t word_at(int64_t index) const { return asked_l2k[index + (index / listed + 1) * listed]; }
 };
@@ -112,29 +113,33 @@ struct RankRequests : ChooseArgs {
     if (index >= lists * listed) return;
     const int64_t node = node_at(index), list = index / listed;
     const int32_t word = word_at(index);
-    rank_lk[index] = kUnranked;
+    key_lk[index] = kNoKey;
     if (node < 0 || node >= tiles * per_tile || (word & kKinds) == 0) return;
-    const int64_t depth = loc_t4[4 * (node / per_tile) + 3];
+    const int64_t depth = loc_t4[4 * (node / per_tile) + 3], place = index % listed;
     const int32_t small = kPriorityMask - (word & kPriorityMask);
-    rank_lk[index] = (list << 20) + (coarse_first ? depth : -depth) * (kPriorityMask + 1) + small;
-    raise_to(&end_l[list], static_cast<int32_t>(index % listed + 1));
+    const int64_t rank = (list << 20) + (coarse_first ? depth : -depth) * (kPriorityMask + 1) + small;
+    key_lk[index] = (rank * (int64_t{1} << 31) + place) * 4 + (word & kKinds) / kLoad;
+    raise_to(&end_l[list], static_cast<int32_t>(place + 1));
   }
 };
 
-// Compares a request with those of a part of a list. Most frames have some hundred of them: to compare each with each
-// costs less than to sort the places of as many as there may be.
+// Compares a request with every kComparers-th of all lists. Most frames have some hundred of them: to compare each with
+// each costs less than to sort the places of as many as there may be.
 struct CompareRequests : ChooseArgs {
   GV_HD void operator()(int64_t number) const {
-    const int64_t index = number % (lists * listed), part = number / (lists * listed), list = part / parts();
-    const int64_t rank = rank_lk[index], first = part % parts() * kComparedAtOnce;
-    const int64_t end = smaller<int64_t>(end_l[list], first + kComparedAtOnce);
-    if (rank == kUnranked) return;
+    const int64_t index = number % (lists * listed), first = number / (lists * listed);
+    const int64_t own = key_lk[index];
+    if (own == kNoKey) return;
     int32_t loads = 0, subdivisions = 0;
-    for (int64_t other = list * listed + first; other < list * listed + end; ++other) {
-      if (rank_lk[other] > rank || (rank_lk[other] == rank && other >= index)) continue;
-      const int32_t kinds = word_at(other);
-      loads += (kinds & kLoad) != 0;
-      subdivisions += (kinds & kSubdivide) != 0;
+    for (int64_t list = 0; list < lists; ++list) {
+      const int64_t* const key_k = key_lk + list * listed;
+      const int32_t end = end_l[list];
+      for (auto other = static_cast<int32_t>(first); other < end; other += kComparers) {
+        const int64_t key = key_k[other];
+        if (key >= own) continue;
+        loads += static_cast<int32_t>(key & 1);
+        subdivisions += static_cast<int32_t>(key >> 1 & 1);
+      }
     }
     if (loads > 0) add_to(&before_2lk[index], loads);
     if (subdivisions > 0) add_to(&before_2lk[lists * listed + index], subdivisions);
@@ -143,7 +148,7 @@ struct CompareRequests : ChooseArgs {
 
 struct ServeRequests : ChooseArgs {
   GV_HD void operator()(int64_t index) const {
-    if (rank_lk[index] == kUnranked) return;
+    if (key_lk[index] == kNoKey) return;
     const int32_t word = word_at(index);
     for (int64_t which = 0; which < 2; ++which) {
       const int64_t place = before_2lk[which * lists * listed + index], room = room_2[1 - which];  // tiles, bricks
@@ -234,12 +239,17 @@ struct TakeFromOwner : UnlinkArgs {
   }
 };
 
-// An index is a word. Only shared slots have pointers beside their owner's.
+// An index is kTogether words. Only shared slots have pointers beside their owner's.
 struct ClearShared : UnlinkArgs {
+  static constexpr int64_t kTogether = 16;
+
   GV_HD void operator()(int64_t index) const {
     if (*any_shared == 0) return;
-    const int32_t word = pointer_tn[index];
-    if (word >= 0 && word < slots && leaving_s[word] != 0) pointer_tn[index] = kAbsent;
+    const int64_t end = smaller(nodes, (index + 1) * kTogether);
+    for (int64_t node = index * kTogether; node < end; ++node) {
+      const int32_t word = pointer_tn[node];
+      if (word >= 0 && word < slots && leaving_s[word] != 0) pointer_tn[node] = kAbsent;
+    }
   }
 };
 

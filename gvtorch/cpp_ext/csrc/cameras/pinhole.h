@@ -17,20 +17,24 @@ struct PinholeRays {
   GV_PINHOLE_RAYS(GV_VIEW)
   int64_t planes, width, columns;
   double *origin_r3, *direction_r3, *cone_r2, *range_r2;
+#ifdef __CUDACC__
+  static constexpr int64_t kThreads = 3;  // a ray, so that neighbouring threads write side by side
+#else
+  static constexpr int64_t kThreads = 1;
+#endif
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t row = index / width, plane = planes == 1 ? 0 : row;
-    const double x = x_kw[plane * width + (index - row * width)], y = y_h[row];
+    const int64_t ray = index / kThreads, row = ray / width, plane = planes == 1 ? 0 : row;
+    const double x = x_kw[plane * width + (ray - row * width)], y = y_h[row];
     const double* const camera = camera_kc + plane * columns;
     const double length = square_root(x * x + (y * y + 1));
-    for (int axis = 0; axis < 3; ++axis) {
-      origin_r3[3 * index + axis] = camera[9 + axis];
+    for (int64_t axis = index % kThreads; axis < 3; axis += kThreads) {
       const double down = y * camera[3 + axis] + camera[6 + axis];
-      direction_r3[3 * index + axis] = (x * camera[axis] + down) / length;
-    }
-    for (int end = 0; end < 2; ++end) {
-      cone_r2[2 * index + end] = camera[16 + end];
-      range_r2[2 * index + end] = camera[18 + end];
+      origin_r3[3 * ray + axis] = camera[9 + axis];
+      direction_r3[3 * ray + axis] = (x * camera[axis] + down) / length;
+      if (axis == 2) break;
+      cone_r2[2 * ray + axis] = camera[16 + axis];
+      range_r2[2 * ray + axis] = camera[18 + axis];
     }
   }
 };

@@ -14,7 +14,7 @@ struct alignas(16) Wide {  // as much as a thread moves at once
 template <class List>
 void compact(const Tensor& like, int64_t count, const List& list);
 
-GV_OP(CompactRequestsOp, "compact_requests", GV_COMPACT_REQUESTS, "(Tensor node_k, Tensor word_k, Tensor count_3)");
+GV_OP(CompactRequestsOp, "compact_requests", GV_COMPACT_REQUESTS, "(Tensor node_k, Tensor word_k, Tensor count_5)");
 
 inline auto run(const CompactRequestsOp& a) {
   const Like like{a.request_tn};
@@ -23,9 +23,10 @@ inline auto run(const CompactRequestsOp& a) {
   STD_TORCH_CHECK(a.capacity >= 1 && a.request_tn.numel() <= INT32_MAX, "gvtorch: no capacity, or too many nodes");
   Tensor node_k = give(args.node_k, a.request_tn, {a.capacity});
   Tensor word_k = give(args.word_k, a.request_tn, {a.capacity});
-  Tensor count_3 = give(args.count_3, a.request_tn, {3});
+  Tensor count_5 = torch::stable::new_zeros(a.request_tn, {5}, ScalarType::Long);
+  args.count_5 = lay(count_5);
   compact(a.request_tn, a.request_tn.numel(), args);
-  return std::make_tuple(node_k, word_k, count_3);
+  return std::make_tuple(node_k, word_k, count_5);
 }
 
 GV_OP(ChooseRequestsOp, "choose_requests", GV_CHOOSE_REQUESTS, "(Tensor node_2b, Tensor priority_2b)");
@@ -41,14 +42,14 @@ inline auto run(const ChooseRequestsOp& a) {
   args.listed = listed;
   args.tiles = tiles;
   const int64_t requests = lists * listed;
-  const Tensor rank_lk = give(args.rank_lk, a.asked_l2k, {requests});
+  const Tensor key_lk = give(args.key_lk, a.asked_l2k, {requests});
   const Tensor counts = torch::stable::new_zeros(a.asked_l2k, {2 * requests + lists});
   args.before_2lk = lay(counts);
   args.end_l = args.before_2lk + 2 * requests;
   Tensor node_2b = give(args.node_2b, a.asked_l2k, {2, a.batch});
   Tensor priority_2b = give(args.priority_2b, a.asked_l2k, {2, a.batch});
   for_each(a.asked_l2k, std::max(requests, 2 * a.batch), RankRequests{args});
-  for_each(a.asked_l2k, requests * lists * args.parts(), CompareRequests{args});
+  for_each(a.asked_l2k, requests * kComparers, CompareRequests{args});
   for_each(a.asked_l2k, requests, ServeRequests{args});
   return std::make_tuple(node_2b, priority_2b);
 }
@@ -93,7 +94,8 @@ inline void run(const UnlinkOp& a) {
 #ifndef __CUDACC__
   if (*args.any_shared == 0) return;
 #endif
-  for_each(a.pointer_tn, args.nodes, ClearShared{args});
+  constexpr int64_t kTogether = ClearShared::kTogether;
+  for_each(a.pointer_tn, (args.nodes + kTogether - 1) / kTogether, ClearShared{args});
 }
 
 GV_OP(OrphanOp, "orphan", GV_ORPHAN, "()");

@@ -23,7 +23,7 @@ inline auto run(const PinholeRaysOp& a) {
   const int64_t rays = rows * width;
   Tensor origin_r3 = give(args.origin_r3, a.x_kw, {rays, 3}), direction_r3 = give(args.direction_r3, a.x_kw, {rays, 3});
   Tensor cone_r2 = give(args.cone_r2, a.x_kw, {rays, 2}), range_r2 = give(args.range_r2, a.x_kw, {rays, 2});
-  for_each(a.x_kw, rays, args);
+  for_each(a.x_kw, PinholeRays::kThreads * rays, args);
   return std::make_tuple(origin_r3, direction_r3, cone_r2, range_r2);
 }
 
