@@ -20,7 +20,7 @@ from torch import Tensor
 import gvtorch as gv
 from gvtorch.base.branches import side_by_side
 from gvtorch.base.constants import REQUEST_PENDING_SHIFT
-from gvtorch.cache.requests import DEEPER, levels_wanted
+from gvtorch.cache.requests import DEEPER, deeper, levels_wanted
 from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
 from gvtorch.io.stores.conversion import convert
@@ -440,17 +440,16 @@ def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
 @pytest.mark.parametrize("backend", COMPILED)
 def test_a_frame_deepens_by_no_more_than_its_most(backend):
     """Whatever rays ahead of the camera ask for, of which a frame may want far more than itself."""
-    assert int(levels_wanted(torch.tensor([16 * 64] * 3 + [-1] * 500), 2)) == DEEPER
-    assert int(levels_wanted(torch.tensor([0, 16, 32, -1]), 2)) == 0
-    assert int(levels_wanted(torch.tensor([-1, -1]), 2)) == 0
+    for priority, most in (([1024] * 3 + [-1] * 500, DEEPER), ([0, 16, 32, -1], 0), ([-1], 0)):
+        assert deeper(levels_wanted(torch.tensor(priority), 2).tolist()) == most
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
-        frames, deeper = Frames(engine, view(64, 0), LOOK, 256, 8), []
+        frames, levels = Frames(engine, view(64, 0), LOOK, 256, 8), []
         for turn in range(20):
             frames.look_from(view(64, 3.0 * turn))
             frames.frame()
             engine.readbacks.catch_up(wait=True)
-            deeper.append(engine.readbacks.deeper)
-    assert 0 < max(deeper) <= DEEPER
+            levels.append(engine.readbacks.deeper)
+    assert 0 < max(levels) <= DEEPER
 
 
 class Unsaid(Ball):

@@ -54,12 +54,12 @@ class LRU:
         Returns:
             (k,) int64 slots; -1 where a row gets none.
         """
-        if not len(self):
+        if not (len(self) and len(wanted)):
             return torch.full_like(wanted, -1, dtype=torch.int64)
         rank = wanted.cumsum(0)
         given = wanted & (rank <= most)
         slot = self.order[(rank - 1).clamp(0, len(self) - 1)].to(torch.int64)
-        self._roll(given.sum())
+        self._roll(torch.minimum(rank[-1:], most).clamp(min=0))
         return torch.where(given, slot, -1)
 
     def _roll(self, count: Tensor) -> None:

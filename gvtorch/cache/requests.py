@@ -65,12 +65,19 @@ class Requests:
 
 
 def levels_wanted(priority: Tensor, branching: int) -> Tensor:
-    """() int64 levels that subdivisions of priorities (k,) want below the first in the mean,
-    rounded, as far as a frame makes them. Rows of -1 do not count.
+    """(DEEPER + 1,) int64 how many subdivisions there are, of priorities (k,), rows of -1 left out,
+    and how many of them want a level more, and two; see `deeper`.
     """
-    widths = [_PIXEL * branching**level for level in range(1, DEEPER + 1)]
-    total, count = sum((priority >= width).sum() for width in widths), (priority >= 0).sum()
-    return (2 * total + count) // (2 * count).clamp(min=1)
+    widths = [0, *(_PIXEL * branching**level for level in range(1, DEEPER + 1))]
+    return torch.stack([priority >= width for width in widths]).sum(1)
+
+
+def deeper(wanted: Sequence[int]) -> int:
+    """By how many levels below the first a frame deepens a tree, as the subdivisions want in the
+    mean; `wanted` as `levels_wanted` tells.
+    """
+    count, *more = wanted
+    return round(sum(more) / max(1, count))
 
 
 def below(

@@ -106,7 +106,7 @@ class Put(NamedTuple):
         """Counts; `owner` (s,) tells which slots held something."""
         given = slot >= 0
         held = given & (owner[slot.clamp(min=0)] >= 0)
-        return cls(wanted, slot, torch.stack([rows.sum() for rows in (wanted, given, held)]))
+        return cls(wanted, slot, torch.stack((wanted, given, held)).sum(1))
 
 
 def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) -> Put:

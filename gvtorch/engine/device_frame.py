@@ -87,11 +87,11 @@ class DeviceFrame(RecordedFrame):
         """
         return 0 if self._by_level else readbacks.deeper
 
-    def _deeper(self) -> Tensor:
+    def _levels(self) -> Tensor:
         word = self._requests[:, 1].flatten()
         wide = torch.where((word & REQUEST_SUBDIVIDE) != 0, word & REQUEST_PRIORITY, -1)
         branching = max(source.layout.branching for source in self.trees)
-        return levels_wanted(wide, branching).view(1)
+        return levels_wanted(wide, branching)
 
     def _answers(self, kind: int, chosen: Tensor) -> list[Answer]:
         """What each tree's producer answers for its own of nodes (batch,)."""

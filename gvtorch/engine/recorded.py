@@ -18,6 +18,7 @@ from ..base.constants import (
 )
 from ..base.records import Hits
 from ..cache import Cache, RequestList, Scheduler
+from ..cache.requests import DEEPER
 from ..cache.write import put_rows_of
 from ..ops import choose_requests
 from .request_batch import ProducedTree
@@ -101,15 +102,13 @@ class RecordedFrame:
         if self._ahead:
             use[1:4:2] = self._used
             ahead = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
-        numbers = torch.cat((self._seen.count, use, samples, self._made, ahead, self._deeper()))
+        numbers = torch.cat((self._seen.count, use, samples, self._made, ahead, self._levels()))
         self._made.zero_()
         return Collected(self._seen, numbers)
 
-    def _deeper(self) -> Tensor:
-        """(1,) int64 levels that are wanted below the first, in the mean of what is to be
-        subdivided; 0 where no frame deepens a tree by several.
-        """
-        return self._none
+    def _levels(self) -> Tensor:
+        """What `levels_wanted` tells; 0 where no frame deepens a tree by several."""
+        return self._none.expand(1 + DEEPER)
 
     def choose(self) -> tuple[Chosen, Chosen]:
         """Returns which loads, and which subdivisions, are served first of the lists, as

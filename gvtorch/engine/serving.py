@@ -9,7 +9,13 @@ from torch import Tensor
 from ..base.constants import REQUEST_SUBDIVIDE
 from ..base.stage import stage
 from ..cache import Cache, RequestList, Scheduler
-from ..cache.requests import Requests, coarser_requests, levels_wanted, requests_below
+from ..cache.requests import (
+    Requests,
+    coarser_requests,
+    deeper,
+    levels_wanted,
+    requests_below,
+)
 from .production import Production
 from .request_batch import ProducedTree
 from .stats import Counts, FrameStats
@@ -67,7 +73,7 @@ class Serving:
         by as many levels as the subdivisions want in the mean.
         """
         branching = max(source.layout.branching for source in self._trees.values())
-        for _ in range(int(levels_wanted(asked.priority, branching))):
+        for _ in range(deeper(levels_wanted(asked.priority, branching).tolist())):
             with stage("schedule"):
                 requests = requests_below(self._cache, asked, branching)
                 asked = requests[REQUEST_SUBDIVIDE]

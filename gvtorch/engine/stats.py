@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..base.records import RenderStats, add
 from ..cache import KINDS, RequestList
+from ..cache.requests import deeper
 
 _AHEAD = 3  # most frames that the host may be ahead of the device
 #: Fields of `FrameStats` that are known when the device has finished the frame.
@@ -147,7 +148,9 @@ class Counts(NamedTuple):
     bricks_evicted: int = 0
     failed: int = 0
     ahead: int = 0  # nodes that the picture did not miss, but will
-    deeper: int = 0  # levels below the first that what is to be subdivided wants in the mean
+    subdivisions: int = 0  # of the picture and of those ahead, if a frame deepens by several levels
+    one_deeper: int = 0  # of these, what wants a level more
+    two_deeper: int = 0
 
     def by_kind(self) -> dict[str, int]:
         """Returns the number of requests by the name of their kind."""
@@ -158,7 +161,7 @@ class Collected(NamedTuple):
     """What a traced frame leaves on the device."""
 
     requests: RequestList
-    numbers: Tensor  # (11,) or (19,) int64 `Counts`, and behind these what `ask` takes
+    numbers: Tensor  # (11,) or (21,) int64 `Counts`, and behind these what `ask` takes
     ask: Callable[[Tensor], int] | None = None  # told on the host; how many nodes were asked for
 
 
@@ -222,7 +225,7 @@ class Readbacks(deque[Readback]):
     _steady = False
     # Of the newest frame read back, on the device:
     failed = False  # whether a node failed
-    deeper = 0  # see `Counts`
+    deeper = 0  # by how many levels below the first the next frame deepens the trees
 
     def catch_up(self, wait: bool) -> Readback | None:
         """Takes all frames whose counts are here. Waits for those of the others if `wait` is true,
@@ -263,7 +266,7 @@ class Readbacks(deque[Readback]):
         self._steady = readback.converged()
         counts = readback.wait()
         self.failed = counts.failed > 0
-        self.deeper = counts.deeper
+        self.deeper = deeper((counts.subdivisions, counts.one_deeper, counts.two_deeper))
         readback.stats.settle()
         return readback
 
