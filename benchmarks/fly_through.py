@@ -58,6 +58,8 @@ class Settings:
     """on CUDA: most bricks that a frame makes"""
     look_ahead: float = 0
     """on CUDA: how many frames ahead of the camera rays ask for bricks"""
+    fit: bool = False
+    """on CUDA: views that the pool can't hold are drawn at levels that fit"""
     compiled: bool = False
     """torch.compile makes bricks and classifies nodes, in batches that are full"""
     graph: bool = True
@@ -194,7 +196,7 @@ def fly_resident(store: Path, settings: Settings, console: Console) -> list[str]
     times = [picture.stats.milliseconds for picture in pictures]
     used = sum(picture.stats.bricks_used for picture in pictures)
     rate = f"{1e3 * len(times) / sum(times):,.0f}"
-    return ["resident", "", "", "", f"{used / len(times):,.0f}", *quantiles(times), rate, ""]
+    return ["resident", "", "", "", f"{used / len(times):,.0f}", *quantiles(times), rate, "", ""]
 
 
 def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) -> list[str]:
@@ -206,8 +208,8 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
     with gv.Engine(producer, device=settings.device, **options) as engine:
         engine.render(cameras[0], shader)  # the flight begins with what its first view needs
         if engine.device.type == "cuda" and settings.graph:
-            ahead = {"batch": settings.batch, "look_ahead": settings.look_ahead}
-            draw = engine.capture(cameras[0], shader, **ahead).replay
+            how = {"batch": settings.batch, "look_ahead": settings.look_ahead, "fit": settings.fit}
+            draw = engine.capture(cameras[0], shader, **how).replay
         else:
             draw = partial(engine.frame, shader=shader)
         start = time.perf_counter()
@@ -226,6 +228,7 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
         f"{used / settings.frames:,.0f}",
         *quantiles(times),
         *(f"{settings.frames / seconds:,.0f}", f"{made / seconds:,.0f}"),
+        f"{sum(stats.coarser for stats in all_stats) / len(all_stats):.2f}",
     ]
 
 
@@ -245,7 +248,7 @@ def main(settings: Settings) -> None:
         table = Table(title=f"{settings.frames} frames of {width}x{height}, {settings.loading}")
         for column in ("brick pool", "miss rate", "fitting", "unserved", "bricks used a frame"):
             table.add_column(column, justify="right")
-        for column in ("median ms", "p99 ms", "frames / s", "bricks / s"):
+        for column in ("median ms", "p99 ms", "frames / s", "bricks / s", "coarser"):
             table.add_column(column, justify="right")
         for pool in settings.pools:
             producer = source(settings, store)

@@ -560,3 +560,38 @@ def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
         else:
             replay()
         assert found.tolist() == [turn * (1 << 20), turn, turn, turn]
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_views_that_the_pools_cannot_hold_are_drawn_at_levels_that_fit(backend):
+    device, wide, look = DEVICES[backend], view(64, 0), gv.Isosurface(0.5)
+    small = {"brick_pool": "0.6 MB", "node_pool": "2 MB", "device": device}
+    found = []
+    for fit in (True, False):
+        with gv.Engine(Ball(1024), **small) as engine:
+            frames = Frames(engine, wide, look, 512, 0, fit)
+            for _ in range(25):
+                _, stats = frames.frame()
+            found.append(stats)
+            engine.validate()
+    fitting, apart = found
+    assert apart.misses > 50 and apart.coarser == 1
+    assert fitting.misses == 0 and fitting.converged and 1 < fitting.coarser < 3
+    with gv.Engine(Ball(1024), brick_pool="64 MB", device=device) as engine:
+        whole, stats = Frames(engine, wide, look, 512, 0, True).whole()
+        assert stats.coarser == 1, "where all fits, nothing is coarser"
+        assert torch.equal(whole.color, Frames(engine, wide, look, 512).whole()[0].color)
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_views_that_fit_again_are_as_asked_for(backend):
+    small = {"brick_pool": "1.2 MB", "node_pool": "2 MB", "device": DEVICES[backend]}
+    with gv.Engine(Ball(1024), **small) as engine:
+        frames = Frames(engine, view(64, 0), LOOK, 512, 0, True)
+        for _ in range(12):
+            _, stats = frames.frame()
+        assert stats.coarser > 1
+        frames.look_from(gv.Camera.orbit(0, 20, 6.0, None, 64, 64))
+        for _ in range(80):
+            _, stats = frames.frame()
+        assert stats.coarser == 1 and stats.converged

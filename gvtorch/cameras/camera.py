@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 Numbers = float | Sequence[float] | Tensor
 Up = str | Sequence[float] | Tensor  # a name of `DIRECTIONS` such as "+z", or (3,) world
+CONE = slice(16, 18)  # of `Camera.numbers`
 _NARROWEST = 1e-12  # degrees of a field of view
 _FILLED = 0.98  # of half the picture's width or height, which a box that fits takes
 
@@ -403,7 +404,7 @@ class Camera:
         turned = torch.bmm(torch.from_numpy(translation[:, None]), torch.from_numpy(rotation))
         position = -turned.numpy()[:, 0]  # -R^T t
         pixel, zero = 1 / focal.min(1, keepdims=True), np.zeros((len(self), 1))
-        cone = (pixel, zero) if MODELS[self.model].parallel else (zero, pixel)
+        cone = (pixel, zero) if MODELS[self.model].parallel else (zero, pixel)  # at CONE
         range_ = (zero, zero + math.inf)
         bend = (self.radial_coeffs.numpy(), self.max_angle.numpy()[:, None])
         parts = (rotation.reshape(-1, 9), position, focal, centre, *cone, *range_, *bend)

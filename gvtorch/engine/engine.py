@@ -460,6 +460,7 @@ class Engine:
         *,
         batch: int = 512,
         look_ahead: float = 0,
+        fit: bool = False,
         **options: Unpack[RenderSettings],
     ) -> FrameGraph:
         """Records a frame as a CUDA graph, for cameras of this number and size.
@@ -476,6 +477,10 @@ class Engine:
             look_ahead: While the camera moves, a replay also asks for what its picture so many
                 frames on will miss, as far as the motion tells, by a sixteenth of the picture's
                 rays. This is served behind what the picture itself missed. 0: only what is missed.
+            fit: While the pools can't hold what a view uses and asks for, pixels count as wider, so
+                that it is drawn at levels that fit (`FrameStats.coarser` tells how much); else what
+                finds no slot is asked for again in every frame, and drawn from far above. For
+                replays that serve.
             **options: Fields of `RenderOptions`.
 
         Raises:
@@ -499,11 +504,12 @@ class Engine:
             view.options.layer.check_device("capture", self.device)
         check.whole("capture", "batch", batch, low=1, high=1 << 16)
         check.number("capture", "look_ahead", look_ahead, low=0, high=1000)
+        check.instance("capture", "fit", fit, bool)
         again = partial(self.frame, shader=shader, **options)
         again(camera)  # loads what is loaded at first use
         trees = [*self.trees.values()]
         served = make_recorded_frame(
-            self.cache, trees, self.scheduler, batch, self.production, self._by_level
+            self.cache, trees, self.scheduler, batch, self.production, self._by_level, fit
         )
         if isinstance(served, HostFrame):
             self.recorded.append(served)

@@ -84,7 +84,7 @@ class FrameGraph:
                 served.deepen()
         with _recorded(self._draw, engine.device):
             ahead = self._ahead is not None
-            self._hits = view.hits() if served is None else served.draw(view.hits, ahead)
+            self._hits = view.hits() if served is None else served.draw(view, ahead)
             self._picture = view.picture(self._hits, FrameStats())
             if self._ahead is None:
                 self._collected = self._collect()

@@ -20,11 +20,16 @@ from ..base.records import Hits
 from ..cache import Cache, RequestList, Scheduler
 from ..cache.requests import DEEPER
 from ..cache.write import put_rows_of
+from ..cameras.camera import CONE
 from ..ops import choose_requests
+from ..tracing.pixels import View
 from .request_batch import ProducedTree
-from .stats import Collected, Readbacks
+from .stats import COARSER_UNIT, Collected, Readbacks
 
 _MOST_LISTED = 1 << 14  # nodes whose requests are sorted
+_WIDEN, _NARROW = 1.2, 0.97  # by which cones change from frame to frame at most
+_WIDEST = 64.0
+_ROOMY = 0.85  # of a pool: if less is taken, cones become narrower
 
 
 class Chosen(NamedTuple):
@@ -45,9 +50,14 @@ class RecordedFrame:
     host_needed = False
 
     def __init__(
-        self, cache: Cache, trees: Sequence[ProducedTree], scheduler: Scheduler, batch: int
+        self,
+        cache: Cache,
+        trees: Sequence[ProducedTree],
+        scheduler: Scheduler,
+        batch: int,
+        fits: bool,
     ) -> None:
-        """Takes the memory of what a frame leaves to the next one."""
+        """Takes the memory of what a frame leaves to the next one. `fits`: see `Engine.capture`."""
         self.cache, self.trees, self.batch = cache, trees, batch
         self._coarse_first = scheduler.order == "coarse"
         self._most = min(_MOST_LISTED, cache.nodes.request_tn.numel())
@@ -59,11 +69,17 @@ class RecordedFrame:
         # bricks that were replaced, nodes that failed.
         self._made = self._unused.new_zeros(6)
         self._none = self._unused.new_zeros(1)
+        self._fits = fits
+        self._coarser = torch.ones(
+            1, dtype=torch.float64, device=device
+        )  # cones of frames that fit
 
-    def draw(self, trace: Callable[[], Hits], ahead: bool = False) -> Hits:
+    def draw(self, view: View, ahead: bool = False) -> Hits:
         """Traces the picture, and lists what it asks for. `ahead`: `look` may follow."""
         self.cache.frame_1.add_(1)
-        hits = trace()
+        if self._fits:  # what a camera's numbers hold of its cones
+            view.numbers[:, CONE].mul_(self._coarser)
+        hits = view.hits()
         self._seen, self._ahead = self._list(0), ahead
         if ahead:
             self._requests[1].zero_()
@@ -102,9 +118,23 @@ class RecordedFrame:
         if self._ahead:
             use[1:4:2] = self._used
             ahead = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
-        numbers = torch.cat((self._seen.count, use, samples, self._made, ahead, self._levels()))
+        told = (self._seen.count, use, samples, self._made, ahead, self._levels())
+        numbers = torch.cat((*told, (self._coarser * COARSER_UNIT).to(torch.int64)))
+        if self._fits:
+            self._fit(use, self._seen.count)
         self._made.zero_()
         return Collected(self._seen, numbers)
+
+    def _fit(self, use: Tensor, count: Tensor) -> None:
+        """Makes the next frame's cones wider where the pools can't hold all that this one used and
+        asked for, and narrower again where there is room. Of surfaces, which are most of what is
+        seen, bricks are as many as pixels that are as wide as cones.
+        """
+        nodes, bricks = self.cache.nodes.capacity, self.cache.bricks.capacity
+        taken = torch.stack(((use[3] + count[1]) / bricks, (use[1] + count[4]) / nodes)).amax()
+        wider = self._coarser * torch.where(taken > 1, taken.sqrt().clamp(max=_WIDEN), 1.0)
+        narrower = torch.where(taken < _ROOMY, self._coarser * _NARROW, wider)
+        self._coarser.copy_(narrower.clamp(1.0, _WIDEST))
 
     def _levels(self) -> Tensor:
         """What `levels_wanted` tells; 0 where no frame deepens a tree by several."""

@@ -22,7 +22,8 @@ from ..cache.requests import deeper
 _AHEAD = 3  # most frames that the host may be ahead of the device
 #: Fields of `FrameStats` that are known when the device has finished the frame.
 _LATE = {"milliseconds", "stages", "samples", "tiles_used", "bricks_used"}
-_LATE |= {"requests", "misses", "overflow", "converged", "ahead"}
+_LATE |= {"requests", "misses", "overflow", "converged", "ahead", "coarser"}
+COARSER_UNIT = 1 << 20  # of `Counts.coarser`
 _settling = threading.RLock()  # one thread completes statistics, others wait for it
 
 
@@ -42,6 +43,7 @@ class FrameStats(RenderStats):
     overflow: int = 0  # nodes with a request that the list had no place for
     converged: bool = False  # nothing that could be served was missing
     ahead: int = 0  # nodes that the next pictures will miss; see `Engine.capture`
+    coarser: float = 1.0  # how much wider pixels counted, so that the view fits the pools
 
     frame: int = 0  # number of the frame, from 1
     frames: int = 1  # frames that this picture took
@@ -151,6 +153,7 @@ class Counts(NamedTuple):
     subdivisions: int = 0  # of the picture and of those ahead, if a frame deepens by several levels
     one_deeper: int = 0  # of these, what wants a level more
     two_deeper: int = 0
+    coarser: int = COARSER_UNIT  # how much wider cones were than the camera's
 
     def by_kind(self) -> dict[str, int]:
         """Returns the number of requests by the name of their kind."""
@@ -161,7 +164,7 @@ class Collected(NamedTuple):
     """What a traced frame leaves on the device."""
 
     requests: RequestList
-    numbers: Tensor  # (11,) or (21,) int64 `Counts`, and behind these what `ask` takes
+    numbers: Tensor  # (11,) or (22,) int64 `Counts`, and behind these what `ask` takes
     ask: Callable[[Tensor], int] | None = None  # told on the host; how many nodes were asked for
 
 
@@ -217,6 +220,7 @@ class Readback:
             stats.evicted[name] += getattr(counts, f"{name}_evicted")
         for name in ("misses", "tiles_used", "bricks_used", "samples", "ahead"):
             setattr(stats, name, getattr(counts, name))
+        stats.coarser = counts.coarser / COARSER_UNIT
 
 
 class Readbacks(deque[Readback]):

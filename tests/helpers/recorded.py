@@ -21,6 +21,7 @@ class Frames:
         look: gv.Shader,
         batch: int,
         look_ahead: float = 0,
+        fit: bool = False,
     ) -> None:
         self.engine, self.batch = engine, batch
         self.view = engine.view("test", camera, look, {})
@@ -29,7 +30,7 @@ class Frames:
         trees = [*engine.trees.values()]
         by_level = engine.options.loading == "levels"
         made = make_recorded_frame(
-            engine.cache, trees, engine.scheduler, batch, engine.production, by_level
+            engine.cache, trees, engine.scheduler, batch, engine.production, by_level, fit
         )
         assert made is not None
         self.served, self.number = made, -1
@@ -64,7 +65,7 @@ class Frames:
             if ahead is not None:
                 ahead.follow(self.camera, numbers, stale)
             self.view.numbers.copy_(numbers)
-            hits = self.served.draw(self.view.hits, ahead is not None)
+            hits = self.served.draw(self.view, ahead is not None)
             if ahead is not None and ahead.due:
                 self.served.look(ahead.hits)
             collected = self.served.finish(hits)
