@@ -595,3 +595,21 @@ def test_views_that_fit_again_are_as_asked_for(backend):
         for _ in range(80):
             _, stats = frames.frame()
         assert stats.coarser == 1 and stats.converged
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_views_fit_where_producers_answer_from_the_host(backend):
+    """There what is on its way counts as well, which is not asked for again."""
+    axis = torch.linspace(-1, 1, 96)
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    waves = 0.5 + 0.5 * torch.sin(9 * x) * torch.sin(8 * y) * torch.sin(7 * z)
+    for fit in (False, True):
+        options = {"brick_pool": "60 kB", "node_pool": "2 MB", "device": DEVICES[backend]}
+        with gv.Engine(gv.VolumeProducer(gv.Volume(waves)), **options) as engine:
+            frames = Frames(engine, view(64, 0), LOOK, 512, 0, fit)
+            assert isinstance(frames.served, host_frame.HostFrame)
+            for _ in range(60):
+                _, stats = frames.frame()
+                time.sleep(0.02)
+            engine.validate()
+        assert stats.converged == fit and (stats.coarser > 1) == fit

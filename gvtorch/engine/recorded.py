@@ -131,7 +131,7 @@ class RecordedFrame:
         seen, bricks are as many as pixels that are as wide as cones.
         """
         nodes, bricks = self.cache.nodes.capacity, self.cache.bricks.capacity
-        taken = torch.stack(((use[3] + count[1]) / bricks, (use[1] + count[4]) / nodes)).amax()
+        taken = torch.stack(((use[3] + count[2]) / bricks, (use[1] + count[4]) / nodes)).amax()
         wider = self._coarser * torch.where(taken > 1, taken.sqrt().clamp(max=_WIDEN), 1.0)
         narrower = torch.where(taken < _ROOMY, self._coarser * _NARROW, wider)
         self._coarser.copy_(narrower.clamp(1.0, _WIDEST))
