@@ -1,5 +1,5 @@
-// Tracing, voxelizing, noise and orbits on the CPU, compiled once for each instruction set (build.py), GV_NAMESPACE its name.
-// Nothing of torch or of the standard library's templates may stand here: see hd.h.
+// Tracing, voxelizing, noise and orbits on the CPU, compiled once for each instruction set (build.py), GV_NAMESPACE its
+// name. Nothing of torch or of the standard library's templates may stand here: see hd.h.
 #include "fields/orbits.h"
 #include "mesh/voxelize.h"
 #include "noise/noise.h"

@@ -89,7 +89,7 @@ struct ListRequests {
   X(Bool, coarse_first, kAny)
 
 constexpr int64_t kNoKey = INT64_MAX;  // no request of a node of the pool
-constexpr int64_t kComparers = 16;  // threads that share what a request is compared with
+constexpr int64_t kComparers = 16;     // threads that share what a request is compared with
 
 struct ChooseArgs {
   GV_CHOOSE_REQUESTS(GV_VIEW)

@@ -13,16 +13,14 @@ void follow_points(const Tensor& like, const OrbitArgs& args);  // in cpu.cpp an
 
 template <class T>
 void follow_each_point(const Tensor& like, const OrbitArgs& args) {
-  with_step<T>(args.kind, [&](auto* step) {
-    for_each(like, args.points, FollowPoints<T, std::decay_t<decltype(*step)>>{args});
-  });
+  with_step<T>(args.kind,
+               [&](auto* step) { for_each(like, args.points, FollowPoints<T, std::decay_t<decltype(*step)>>{args}); });
 }
 
 template <class T>
 void follow_balls(const Tensor& like, const OrbitBoundsArgs& args) {
-  with_step<T>(args.kind, [&](auto* step) {
-    for_each(like, args.balls, FollowBalls<T, std::decay_t<decltype(*step)>>{args});
-  });
+  with_step<T>(args.kind,
+               [&](auto* step) { for_each(like, args.balls, FollowBalls<T, std::decay_t<decltype(*step)>>{args}); });
 }
 
 inline auto run(const OrbitsOp& a) {

@@ -11,16 +11,16 @@ enum class StepKind : int32_t { kPower, kFold, kCount };
 
 // What orbits go by. `amount`: n of z^n, or the Mandelbox's scale; `julia`: constant_3 is added, else each point's own
 // place.
-#define GV_ORBIT(X)                                  \
-  X(Reals, constant_3, 3)                            \
-  X(Reals, bailout_1, 1)                             \
+#define GV_ORBIT(X)                                    \
+  X(Reals, constant_3, 3)                              \
+  X(Reals, bailout_1, 1)                               \
   X(Int, kind, static_cast<int64_t>(StepKind::kCount)) \
-  X(Float, amount, kAny)                             \
-  X(Int, iterations, kAny)                           \
+  X(Float, amount, kAny)                               \
+  X(Int, iterations, kAny)                             \
   X(Bool, julia, kAny)
 
 // points
-#define GV_ORBITS(X)            \
+#define GV_ORBITS(X)             \
   X(Reals, point_p3, 3 * points) \
   GV_ORBIT(X)
 
