@@ -9,7 +9,7 @@ import torch
 from helpers import DEVICES
 
 import gvtorch as gv
-from gvtorch.ops import orbit_bounds, orbits
+from gvtorch.ops import Orbit, orbit_bounds, orbits
 from gvtorch.ops.reference.exact import log_exact
 
 CONSTANT, BAILOUT = (-0.55, 0.3, -0.25), 2.0
@@ -30,10 +30,10 @@ def wide(form: str) -> float:
     return 12.0 if form.startswith("box") else 3.0
 
 
-def given(form: str, dtype: torch.dtype, device: str) -> tuple:
+def given(form: str, dtype: torch.dtype, device: str) -> Orbit:
     kind, amount, iterations, julia, bailout = FORMS[form]
     constant, limit = (torch.tensor(n, dtype=dtype, device=device) for n in (CONSTANT, [bailout]))
-    return constant, limit, kind, amount, iterations, julia
+    return Orbit(constant, limit, kind, amount, iterations, julia)
 
 
 def some_points(count: int, dtype: torch.dtype, size: float) -> torch.Tensor:
@@ -62,13 +62,13 @@ def bits(values: torch.Tensor) -> torch.Tensor:
 def test_compiled_is_the_twin_in_every_bit(compiled, form, dtype):
     device = DEVICES[compiled]
     points = some_points(5003, dtype, wide(form))
-    expected = orbits(points, *given(form, dtype, "cpu"), backend="reference")
-    found = orbits(points.to(device), *given(form, dtype, device), backend=compiled)
+    expected = orbits(points, given(form, dtype, "cpu"), backend="reference")
+    found = orbits(points.to(device), given(form, dtype, device), backend=compiled)
     assert torch.equal(bits(found), bits(expected)) and torch.equal(
         found.isnan().cpu(), expected.isnan()
     )
     assert found.isnan().sum() == 9 and (expected[0] == -1).any() and (expected[0] > 0).any()
-    assert torch.equal(bits(orbits(points.to(device), *given(form, dtype, device))), bits(expected))
+    assert torch.equal(bits(orbits(points.to(device), given(form, dtype, device))), bits(expected))
 
 
 @forms
@@ -80,15 +80,15 @@ def test_bounds_are_the_twin_s_and_hold_what_points_give(compiled, form, dtype):
     reach = 0.3 * torch.rand(4001, generator=random, dtype=torch.float64) ** 4
     center, reach = center.to(dtype), reach.to(dtype)
     reach[:3] = torch.tensor((0.0, math.inf, math.nan))
-    expected = orbit_bounds(center, reach, *given(form, dtype, "cpu"), backend="reference")
+    expected = orbit_bounds(center, reach, given(form, dtype, "cpu"), backend="reference")
     own = given(form, dtype, device)
-    found = orbit_bounds(center.to(device), reach.to(device), *own, backend=compiled)
+    found = orbit_bounds(center.to(device), reach.to(device), own, backend=compiled)
     assert torch.equal(bits(found), bits(expected))
     assert expected[:, 1:3].T.tolist() == [[-1, math.inf]] * 2, "nothing is proven"
     way = torch.nn.functional.normalize(torch.randn((4001, 40, 3), generator=random), dim=-1)
     far = reach[:, None, None] * torch.rand((4001, 40, 1), generator=random).to(dtype)
     inside = (center[:, None] + way.to(dtype) * far)[3:]
-    value = orbits(inside.flatten(0, 1), *given(form, dtype, "cpu"))[0].view(-1, 40)
+    value = orbits(inside.flatten(0, 1), given(form, dtype, "cpu"))[0].view(-1, 40)
     low, high = expected[:, 3:, None] if dtype == torch.float64 else expected[:, 3:, None].double()
     slack = 1e-3 if dtype == torch.float32 else 1e-12
     assert (value >= low - slack * low.abs()).all() and (value <= high + slack * high.abs()).all()
@@ -111,14 +111,14 @@ def test_logarithm(dtype):
 def test_gradients_are_those_of_small_steps(form):
     points = some_points(3000, torch.float64, wide(form))[500:]
     own = given(form, torch.float64, "cpu")
-    value = orbits(points, *own)[0]
+    value = orbits(points, own)[0]
     points = points[(value > 0.01) & (value < 0.5)][:50].requires_grad_()
-    (slope,) = torch.autograd.grad(orbits(points, *own)[0].sum(), points)
+    (slope,) = torch.autograd.grad(orbits(points, own)[0].sum(), points)
     for axis in range(3):
         step = torch.zeros(3, dtype=torch.float64)
         step[axis] = 1e-7
         with torch.no_grad():
-            ends = [orbits(points + sign * step, *own)[0] for sign in (1, -1)]
+            ends = [orbits(points + sign * step, own)[0] for sign in (1, -1)]
         difference = (ends[0] - ends[1]) / 2e-7
         near = torch.isclose(slope[:, axis], difference, rtol=1e-3, atol=1e-4)
         assert near.float().mean() > 0.9, "but where an orbit takes one more step"
@@ -127,8 +127,7 @@ def test_gradients_are_those_of_small_steps(form):
 def test_opcheck(compiled):
     device = DEVICES[compiled]
     points = some_points(20, torch.float32, 3.0).to(device)
-    constant, limit, _, amount, *rest = given("julia", torch.float32, device)
-    numbers = (constant, limit, 0, float(amount), *rest)
+    numbers = given("julia", torch.float32, device).arguments()
     torch.library.opcheck(torch.ops.gvtorch.orbits.default, (points, *numbers))
     balls = (points, torch.rand(20, device=device))
     torch.library.opcheck(torch.ops.gvtorch.orbit_bounds.default, (*balls, *numbers))
@@ -150,11 +149,12 @@ def test_opcheck(compiled):
     ],
 )
 def test_what_is_wrong_is_named(changed, message):
-    numbers = {"constant_3": torch.zeros(3), "bailout_1": torch.full((1,), 2.0)}
-    fine = {"point_p3": torch.zeros(4, 3), **numbers, "kind": "power", "amount": 8, "iterations": 3}
-    assert orbits(**fine).shape == (3, 4)
+    points, fine = torch.zeros(4, 3), Orbit(torch.zeros(3), torch.full((1,), 2.0), "power", 8, 3)
+    assert orbits(points, fine).shape == (3, 4)
+    points = changed.get("point_p3", points)
+    changed = {name: value for name, value in changed.items() if name != "point_p3"}
     with pytest.raises(ValueError, match=f"orbits: {message}"):
-        orbits(**{**fine, **changed})
+        orbits(points, fine._replace(**changed))
 
 
 def test_compiled_and_exported_fields_hold_the_op():

@@ -18,7 +18,6 @@ Sources: those of ops/reference/orbits.py, which follows the orbits; Pickover, "
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -92,13 +91,6 @@ class Fold(Iteration):
         return plain.fold_ranges(z, reach, self.scale)
 
 
-def _compiled_step(iteration: Iteration) -> tuple[str, float] | None:
-    """A step that the ops know, by its kind and number; None for a step of one's own."""
-    if type(iteration) is Power:
-        return "power", iteration.power
-    return ("fold", iteration.scale) if type(iteration) is Fold else None
-
-
 class Fractal(Distance):
     """What does not escape; see the head of the file. Outside the value is the estimate, inside -1:
     there is none.
@@ -155,20 +147,21 @@ class Fractal(Distance):
         axes.
         """
         point = points.reshape(-1, 3).contiguous()
-        known = self._known(point)
-        if known is None:
+        orbit = self._orbit(point)
+        if orbit is None:
             found = plain.orbits(point, self._way(point))
         else:
-            found = ops.orbits(point, *known)
+            found = ops.orbits(point, orbit)
         return found.view(3, *points.shape[:-1])
 
-    def _known(self, like: Tensor) -> tuple[Any, ...] | None:
+    def _orbit(self, like: Tensor) -> ops.Orbit | None:
         """What the ops take, in the dtype of `like`; None for a step of one's own."""
-        step = _compiled_step(self.iteration)
-        if step is None:
-            return None
-        constant, bailout = self.constant.to(like), self.bailout.to(like).view(1)
-        return constant, bailout, *step, self.iterations, self.julia
+        step, numbers = self.iteration, (self.constant.to(like), self.bailout.to(like).view(1))
+        if type(step) is Power:
+            return ops.Orbit(*numbers, "power", step.power, self.iterations, self.julia)
+        if type(step) is Fold:
+            return ops.Orbit(*numbers, "fold", step.scale, self.iterations, self.julia)
+        return None
 
     def _way(self, like: Tensor) -> plain.Way:
         """The same for any step."""
@@ -188,11 +181,11 @@ class Fractal(Distance):
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Follows the orbits of whole boxes, in parts; see the head of the file."""
         middle, part = parts_of(center, half, _PARTS)
-        known, reach = self._known(middle), length(part)
-        if known is None:
+        orbit, reach = self._orbit(middle), length(part)
+        if orbit is None:
             low, high = plain.orbit_bounds(middle, reach, self._way(middle))
         else:
-            low, high = ops.orbit_bounds(middle, reach, *known)
+            low, high = ops.orbit_bounds(middle, reach, orbit)
         return joined((low, high), _PARTS)
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:

@@ -18,7 +18,7 @@ from .cache import (
 )
 from .cameras import pinhole_rays
 from .noise import noise
-from .orbits import orbit_bounds, orbits
+from .orbits import Orbit, orbit_bounds, orbits
 from .registry import available
 from .trace import (
     composite,
@@ -31,6 +31,7 @@ from .trace import (
 from .voxelize import voxelize
 
 __all__ = [
+    "Orbit",
     "RayArguments",
     "Samples",
     "Segments",
