@@ -102,7 +102,8 @@ def main(settings: Settings) -> None:
     finest = gv.Mandelbulb(8, iterations=20, colors=COLORS)
     route, options = plan(finest), {"cone_scale": settings.cone_scale}
     if settings.frames:
-        fly(opened(finest, settings), route, settings)
+        with opened(finest, settings) as engine:
+            fly(engine, route, settings)
     pictures, size = [], (settings.size * 16 // 27 + 1, settings.size // 2)
     for level in track(PLACES):
         # Each iteration adds details an eighth as large; those finer than pixels would be noise.

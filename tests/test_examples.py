@@ -33,7 +33,7 @@ def test_example_writes_a_picture(example, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [str(example), "--size", "48", "--output", str(out)])
     runpy.run_path(str(example), run_name="__main__")
     assert out.read_bytes().startswith(b"\x89PNG") and str(out) in capsys.readouterr().out
-    most = 127 if example.stem == "mandelbulb_zoom" else 80
+    most = 128 if example.stem == "mandelbulb_zoom" else 80
     assert 20 <= len(example.read_text().splitlines()) <= most
 
 

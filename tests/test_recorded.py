@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.recorded import Frames
+from helpers.recorded import COMPILED, LOOK, Ball, Frames, view
 from helpers.waits import nobody_waits
 from torch import Tensor
 
@@ -25,45 +25,6 @@ from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
 from gvtorch.io.stores.conversion import convert
 from gvtorch.pool import mapped
-
-COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
-LOOK = gv.TransferFunction.from_points(
-    [(0, 0), (0.4, 0.9)], [(0.4, 0.1, 0.2, 0.7), (1, 1, 0.8, 0.4)], reference=0.1
-)
-
-
-class Ball(gv.Producer):
-    """A ball with bands; what lies outside is EMPTY, with `kinds` only once it is filled."""
-
-    on_device = True
-
-    def __init__(self, extent: int = 256, branching: int = 2, kinds: bool = False) -> None:
-        super().__init__(extent, box=((-1, -1, -1), (1, 1, 1)), branching=branching)
-        self.kinds, self.asked = kinds, []
-        self.register_buffer("bands", torch.tensor([6.0, 28.0, 4.0]))
-        self.register_buffer("spoiled", torch.zeros(()))  # above 0: bricks near here hold NaN
-
-    def classify(self, nodes):
-        self.asked.append(len(nodes))
-        if self.kinds:
-            return torch.full_like(nodes.depth, gv.Region.DATA)
-        outside = nodes.center.norm(dim=1) - nodes.radius > 0.9
-        return torch.where(outside, gv.Region.EMPTY, gv.Region.DATA)
-
-    def fill(self, nodes):
-        gap = 0.9 - nodes.positions.norm(dim=-1, keepdim=True)
-        inside = (0.5 + gap / nodes.voxel_size.float()[:, None, None, None, :1]).clamp(0, 1)
-        value = inside * (0.7 + 0.3 * (nodes.positions * self.bands).sum(-1, keepdim=True).sin())
-        near = (nodes.center[:, 0] > 0.3) & (nodes.depth > 2) & (self.spoiled > 0)
-        value = torch.where(near[:, None, None, None, None], torch.nan, value)
-        if not self.kinds:
-            return {"value": value}
-        kind = torch.where((value == 0).flatten(1).all(1), gv.Region.EMPTY, gv.Region.DATA)
-        return gv.Bricks(data={"value": value}, kind=kind)
-
-
-def view(size: int = 48, angle: float = 30) -> gv.Camera:
-    return gv.Camera.orbit(angle, 20, 0.9, None, size, size)
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -560,56 +521,3 @@ def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
         else:
             replay()
         assert found.tolist() == [turn * (1 << 20), turn, turn, turn]
-
-
-@pytest.mark.parametrize("backend", COMPILED)
-def test_views_that_the_pools_cannot_hold_are_drawn_at_levels_that_fit(backend):
-    device, wide, look = DEVICES[backend], view(64, 0), gv.Isosurface(0.5)
-    small = {"brick_pool": "0.6 MB", "node_pool": "2 MB", "device": device}
-    found = []
-    for fit in (True, False):
-        with gv.Engine(Ball(1024), **small) as engine:
-            frames = Frames(engine, wide, look, 512, 0, fit)
-            for _ in range(25):
-                _, stats = frames.frame()
-            found.append(stats)
-            engine.validate()
-    fitting, apart = found
-    assert apart.misses > 50 and apart.coarser == 1
-    assert fitting.misses == 0 and fitting.converged and 1 < fitting.coarser < 3
-    with gv.Engine(Ball(1024), brick_pool="64 MB", device=device) as engine:
-        whole, stats = Frames(engine, wide, look, 512, 0, True).whole()
-        assert stats.coarser == 1, "where all fits, nothing is coarser"
-        assert torch.equal(whole.color, Frames(engine, wide, look, 512).whole()[0].color)
-
-
-@pytest.mark.parametrize("backend", COMPILED)
-def test_views_that_fit_again_are_as_asked_for(backend):
-    small = {"brick_pool": "1.2 MB", "node_pool": "2 MB", "device": DEVICES[backend]}
-    with gv.Engine(Ball(1024), **small) as engine:
-        frames = Frames(engine, view(64, 0), LOOK, 512, 0, True)
-        for _ in range(12):
-            _, stats = frames.frame()
-        assert stats.coarser > 1
-        frames.look_from(gv.Camera.orbit(0, 20, 6.0, None, 64, 64))
-        for _ in range(80):
-            _, stats = frames.frame()
-        assert stats.coarser == 1 and stats.converged
-
-
-@pytest.mark.parametrize("backend", COMPILED)
-def test_views_fit_where_producers_answer_from_the_host(backend):
-    """There what is on its way counts as well, which is not asked for again."""
-    axis = torch.linspace(-1, 1, 96)
-    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-    waves = 0.5 + 0.5 * torch.sin(9 * x) * torch.sin(8 * y) * torch.sin(7 * z)
-    for fit in (False, True):
-        options = {"brick_pool": "60 kB", "node_pool": "2 MB", "device": DEVICES[backend]}
-        with gv.Engine(gv.VolumeProducer(gv.Volume(waves)), **options) as engine:
-            frames = Frames(engine, view(64, 0), LOOK, 512, 0, fit)
-            assert isinstance(frames.served, host_frame.HostFrame)
-            for _ in range(60):
-                _, stats = frames.frame()
-                time.sleep(0.02)
-            engine.validate()
-        assert stats.converged == fit and (stats.coarser > 1) == fit

@@ -43,11 +43,11 @@ class DeviceFrame(RecordedFrame):
         trees: Sequence[ProducedTree],
         scheduler: Scheduler,
         batch: int,
-        fits: bool,
+        fit: bool,
         by_level: bool,
     ) -> None:
         """See `RecordedFrame`. `by_level`: levels are loaded one by one."""
-        super().__init__(cache, trees, scheduler, batch, fits)
+        super().__init__(cache, trees, scheduler, batch, fit)
         self._by_level = by_level
         # What was made last and is to be subdivided in turn: nodes and their priorities.
         self._below = self._unused.new_zeros((batch, 2)) - 1

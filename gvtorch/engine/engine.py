@@ -479,13 +479,12 @@ class Engine:
                 rays. This is served behind what the picture itself missed. 0: only what is missed.
             fit: While the pools can't hold what a view uses and asks for, pixels count as wider, so
                 that it is drawn at levels that fit (`FrameStats.coarser` tells how much); else what
-                finds no slot is asked for again in every frame, and drawn from far above. For
-                replays that serve.
+                finds no slot is asked for again in every frame, and drawn from far above.
             **options: Fields of `RenderOptions`.
 
         Raises:
             ValueError: The engine is on no CUDA device, the layer is on another, a shader is a
-                module, or see `frame`.
+                module, replays do not serve but should `fit`, or see `frame`.
             ProductionError: See `frame`.
         """
         shaders = shader.values() if isinstance(shader, Mapping) else (shader,)
@@ -511,6 +510,11 @@ class Engine:
         served = make_recorded_frame(
             self.cache, trees, self.scheduler, batch, self.production, self._by_level, fit
         )
+        if fit and served is None:
+            raise ValueError(
+                "Engine.capture: fit needs replays that serve: all producers on_device, or all "
+                "on_host, without coarse channels"
+            )
         if isinstance(served, HostFrame):
             self.recorded.append(served)
         return FrameGraph(self, view, served, again, look_ahead)

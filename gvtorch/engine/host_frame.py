@@ -51,11 +51,11 @@ class HostFrame(RecordedFrame):
         trees: Sequence[ProducedTree],
         scheduler: Scheduler,
         batch: int,
-        fits: bool,
+        fit: bool,
         production: Production,
     ) -> None:
         """See `RecordedFrame`; `production` knows what failed."""
-        super().__init__(cache, trees, scheduler, batch, fits)
+        super().__init__(cache, trees, scheduler, batch, fit)
         self._production = production
         device = self._unused.device
         self._mail = [Mail(_boxes(cache, one), batch, device) for one in trees]

@@ -55,9 +55,9 @@ class RecordedFrame:
         trees: Sequence[ProducedTree],
         scheduler: Scheduler,
         batch: int,
-        fits: bool,
+        fit: bool,
     ) -> None:
-        """Takes the memory of what a frame leaves to the next one. `fits`: see `Engine.capture`."""
+        """Takes the memory of what a frame leaves to the next one. `fit`: see `Engine.capture`."""
         self.cache, self.trees, self.batch = cache, trees, batch
         self._coarse_first = scheduler.order == "coarse"
         self._most = min(_MOST_LISTED, cache.nodes.request_tn.numel())
@@ -69,15 +69,14 @@ class RecordedFrame:
         # bricks that were replaced, nodes that failed.
         self._made = self._unused.new_zeros(6)
         self._none = self._unused.new_zeros(1)
-        self._fits = fits
-        self._coarser = torch.ones(
-            1, dtype=torch.float64, device=device
-        )  # cones of frames that fit
+        self._fit = fit
+        # By how much cones are wider than the camera's, so that a view fits the pools.
+        self._coarser = torch.ones(1, dtype=torch.float64, device=device)
 
     def draw(self, view: View, ahead: bool = False) -> Hits:
         """Traces the picture, and lists what it asks for. `ahead`: `look` may follow."""
         self.cache.frame_1.add_(1)
-        if self._fits:  # what a camera's numbers hold of its cones
+        if self._fit:
             view.numbers[:, CONE].mul_(self._coarser)
         hits = view.hits()
         self._seen, self._ahead = self._list(0), ahead
@@ -120,15 +119,19 @@ class RecordedFrame:
             ahead = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
         told = (self._seen.count, use, samples, self._made, ahead, self._levels())
         numbers = torch.cat((*told, (self._coarser * COARSER_UNIT).to(torch.int64)))
-        if self._fits:
-            self._fit(use, self._seen.count)
+        if self._fit:
+            self._widen_cones(use, self._seen.count)
         self._made.zero_()
         return Collected(self._seen, numbers)
 
-    def _fit(self, use: Tensor, count: Tensor) -> None:
-        """Makes the next frame's cones wider where the pools can't hold all that this one used and
-        asked for, and narrower again where there is room. Of surfaces, which are most of what is
-        seen, bricks are as many as pixels that are as wide as cones.
+    def _widen_cones(self, use: Tensor, count: Tensor) -> None:
+        """Makes the next frame's cones wider if the pools can't hold what this one used and asked
+        for, and narrower again, down to the camera's, if there is room. A surface takes bricks as
+        the inverse square of the cones' width.
+
+        Args:
+            use: (5,) int64 as `Cache.sort_by_use` tells.
+            count: (5,) int64 as `compact_requests` tells: what is pending counts as asked for.
         """
         nodes, bricks = self.cache.nodes.capacity, self.cache.bricks.capacity
         taken = torch.stack(((use[3] + count[2]) / bricks, (use[1] + count[4]) / nodes)).amax()

@@ -304,7 +304,7 @@ def make_recorded_frame(
     batch: int,
     production: Production,
     by_level: bool = False,
-    fits: bool = False,
+    fit: bool = False,
 ) -> DeviceFrame | HostFrame | None:
     """Returns what serves a captured frame; None where producers answer neither all on the device
     nor all from the host, have coarse channels, or need from the host what their parents hold.
@@ -313,7 +313,7 @@ def make_recorded_frame(
     if any(channel.coarse for one in producers for channel in one.channels.values()):
         return None
     if all(one.on_device for one in producers):
-        return DeviceFrame(cache, trees, scheduler, batch, fits, by_level)
+        return DeviceFrame(cache, trees, scheduler, batch, fit, by_level)
     if all(one.on_host and not one.needs_parent for one in producers):
-        return HostFrame(cache, trees, scheduler, batch, fits, production)
+        return HostFrame(cache, trees, scheduler, batch, fit, production)
     return None

@@ -23,7 +23,7 @@ _AHEAD = 3  # most frames that the host may be ahead of the device
 #: Fields of `FrameStats` that are known when the device has finished the frame.
 _LATE = {"milliseconds", "stages", "samples", "tiles_used", "bricks_used"}
 _LATE |= {"requests", "misses", "overflow", "converged", "ahead", "coarser"}
-COARSER_UNIT = 1 << 20  # of `Counts.coarser`
+COARSER_UNIT = 1 << 20  # what stands for 1 in `Counts.coarser`, a whole number
 _settling = threading.RLock()  # one thread completes statistics, others wait for it
 
 

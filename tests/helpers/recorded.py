@@ -1,14 +1,56 @@
-"""Frames that serve themselves, as `Engine.capture` records them."""
+"""Frames that serve themselves, as `Engine.capture` records them, and a ball to look at."""
 
 from __future__ import annotations
 
 import time
 from functools import partial
 
+import pytest
+import torch
+
 import gvtorch as gv
 from gvtorch.engine.host_frame import HostFrame
 from gvtorch.engine.look_ahead import LookAhead
 from gvtorch.engine.setup import make_recorded_frame
+
+COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
+LOOK = gv.TransferFunction.from_points(
+    [(0, 0), (0.4, 0.9)], [(0.4, 0.1, 0.2, 0.7), (1, 1, 0.8, 0.4)], reference=0.1
+)
+
+
+class Ball(gv.Producer):
+    """A ball with bands; what lies outside is EMPTY, with `kinds` only once it is filled."""
+
+    on_device = True
+
+    def __init__(self, extent: int = 256, branching: int = 2, kinds: bool = False) -> None:
+        super().__init__(extent, box=((-1, -1, -1), (1, 1, 1)), branching=branching)
+        self.kinds, self.asked = kinds, []
+        self.register_buffer("bands", torch.tensor([6.0, 28.0, 4.0]))
+        self.register_buffer("spoiled", torch.zeros(()))  # above 0: bricks near here hold NaN
+
+    def classify(self, nodes):
+        self.asked.append(len(nodes))
+        if self.kinds:
+            return torch.full_like(nodes.depth, gv.Region.DATA)
+        outside = nodes.center.norm(dim=1) - nodes.radius > 0.9
+        return torch.where(outside, gv.Region.EMPTY, gv.Region.DATA)
+
+    def fill(self, nodes):
+        gap = 0.9 - nodes.positions.norm(dim=-1, keepdim=True)
+        inside = (0.5 + gap / nodes.voxel_size.float()[:, None, None, None, :1]).clamp(0, 1)
+        value = inside * (0.7 + 0.3 * (nodes.positions * self.bands).sum(-1, keepdim=True).sin())
+        near = (nodes.center[:, 0] > 0.3) & (nodes.depth > 2) & (self.spoiled > 0)
+        value = torch.where(near[:, None, None, None, None], torch.nan, value)
+        if not self.kinds:
+            return {"value": value}
+        kind = torch.where((value == 0).flatten(1).all(1), gv.Region.EMPTY, gv.Region.DATA)
+        return gv.Bricks(data={"value": value}, kind=kind)
+
+
+def view(size: int = 48, angle: float = 30) -> gv.Camera:
+    return gv.Camera.orbit(angle, 20, 0.9, None, size, size)
 
 
 class Frames:

@@ -223,7 +223,7 @@ GV_HD T exp2_exact(T value) {
 
 GV_HD double log2_exact(double value) { return ::log2(value); }
 
-// What float and double keep below 1: a positive, normal number as fraction * 2^power, the fraction from a half up.
+// Takes a positive, normal number apart: it is the returned fraction, in [1/2, 1), times 2^power.
 template <class T>
 GV_HD T fraction_of(T value, IntOf<T>& power) {
   const auto bits = bit_cast<IntOf<T>>(value);

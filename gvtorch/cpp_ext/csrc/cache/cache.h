@@ -94,7 +94,7 @@ constexpr int64_t kComparers = 16;     // threads that share what a request is c
 struct ChooseArgs {
   GV_CHOOSE_REQUESTS(GV_VIEW)
   int64_t lists, listed, tiles;
-  int64_t* key_lk;              // the lower, the more wanted; the last two bits are kinds
+  int64_t* key_lk;              // rank, place in the list, and two bits of kinds: the lower, the more wanted
   int32_t *end_l, *before_2lk;  // behind a list's last request; how many loads, and subdivisions, are wanted more
   int64_t* node_2b;             // loads, then subdivisions
   int32_t* priority_2b;
@@ -123,8 +123,9 @@ struct RankRequests : ChooseArgs {
   }
 };
 
-// Compares a request with every kComparers-th of all lists. Most frames have some hundred of them: to compare each with
-// each costs less than to sort the places of as many as there may be.
+// Counts the requests that are wanted more than one; an index is one of kComparers threads that share this, each for
+// every kComparers-th of the others. Most frames have some hundred requests: to compare each with each costs less than
+// to sort the places of as many as there may be.
 struct CompareRequests : ChooseArgs {
   GV_HD void operator()(int64_t number) const {
     const int64_t index = number % (lists * listed), first = number / (lists * listed);

@@ -37,7 +37,8 @@ inline auto run(const ChooseRequestsOp& a) {
   const int64_t lists = a.asked_l2k.size(0), listed = a.asked_l2k.size(2), tiles = a.loc_t4.numel() / 4;
   ChooseArgs args{};
   GV_CHOOSE_REQUESTS(GV_TAKE)
-  STD_TORCH_CHECK(a.batch >= 1 && a.per_tile >= 1 && lists < 512, "gvtorch: no batch, no nodes, or too many lists");
+  STD_TORCH_CHECK(a.batch >= 1 && a.per_tile >= 1 && lists < 512 && listed <= INT32_MAX,
+                  "gvtorch: no batch, no nodes, or too many");
   args.lists = lists;
   args.listed = listed;
   args.tiles = tiles;

@@ -1,0 +1,83 @@
+"""Views that the pools can't hold, in frames that serve themselves; on CUDA also as one graph."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+import torch
+from helpers import DEVICES
+from helpers.recorded import COMPILED, LOOK, Ball, Frames, view
+
+import gvtorch as gv
+from gvtorch.engine import host_frame
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_views_that_the_pools_cannot_hold_are_drawn_at_levels_that_fit(backend):
+    device, wide, look = DEVICES[backend], view(64, 0), gv.Isosurface(0.5)
+    small = {"brick_pool": "0.6 MB", "node_pool": "2 MB", "device": device}
+    found = []
+    for fit in (True, False):
+        with gv.Engine(Ball(1024), **small) as engine:
+            frames = Frames(engine, wide, look, 512, 0, fit)
+            for _ in range(25):
+                _, stats = frames.frame()
+            found.append(stats)
+            engine.validate()
+    fitting, apart = found
+    assert apart.misses > 50 and apart.coarser == 1
+    assert fitting.misses == 0 and fitting.converged and 1 < fitting.coarser < 3
+    with gv.Engine(Ball(1024), brick_pool="64 MB", device=device) as engine:
+        whole, stats = Frames(engine, wide, look, 512, 0, True).whole()
+        assert stats.coarser == 1, "where all fits, nothing is coarser"
+        assert torch.equal(whole.color, Frames(engine, wide, look, 512).whole()[0].color)
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_views_that_fit_again_are_as_asked_for(backend):
+    small = {"brick_pool": "1.2 MB", "node_pool": "2 MB", "device": DEVICES[backend]}
+    with gv.Engine(Ball(1024), **small) as engine:
+        frames = Frames(engine, view(64, 0), LOOK, 512, 0, True)
+        for _ in range(12):
+            _, stats = frames.frame()
+        assert stats.coarser > 1
+        frames.look_from(gv.Camera.orbit(0, 20, 6.0, None, 64, 64))
+        for _ in range(80):
+            _, stats = frames.frame()
+        assert stats.coarser == 1 and stats.converged
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_views_fit_where_producers_answer_from_the_host(backend):
+    """There what is on its way counts as well, which is not asked for again."""
+    axis = torch.linspace(-1, 1, 96)
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    waves = 0.5 + 0.5 * torch.sin(9 * x) * torch.sin(8 * y) * torch.sin(7 * z)
+    for fit in (False, True):
+        options = {"brick_pool": "60 kB", "node_pool": "2 MB", "device": DEVICES[backend]}
+        with gv.Engine(gv.VolumeProducer(gv.Volume(waves)), **options) as engine:
+            frames = Frames(engine, view(64, 0), LOOK, 512, 0, fit)
+            assert isinstance(frames.served, host_frame.HostFrame)
+            for _ in range(60):
+                _, stats = frames.frame()
+                time.sleep(0.02)
+            engine.validate()
+        assert stats.converged == fit and (stats.coarser > 1) == fit
+
+
+@pytest.mark.backend("cuda")
+def test_a_graph_fits_as_well():
+    small = {"brick_pool": "1.2 MB", "node_pool": "2 MB", "device": "cuda"}
+    with gv.Engine(Ball(1024), **small) as engine:
+        graph = engine.capture(view(64, 0), LOOK, fit=True)
+        for _ in range(40):
+            _, stats = graph.replay(view(64, 0))
+        assert stats.converged and 1 < stats.coarser < 3
+        engine.validate()
+
+    class Unsaid(Ball):
+        on_device = False
+
+    with gv.Engine(Unsaid(), device="cuda") as engine, pytest.raises(ValueError, match="fit needs"):
+        engine.capture(view(64, 0), LOOK, fit=True)
