@@ -83,7 +83,7 @@ def fly(engine: gv.Engine, route: tuple[torch.Tensor, torch.Tensor], settings: S
     engine.render(camera, shader, **options)  # where it begins
     draw = partial(engine.frame, shader=shader, **options)
     if engine.device.type == "cuda":
-        draw = engine.capture(camera, shader, batch=settings.budget, **options).replay
+        draw = engine.capture(camera, shader, batch=settings.budget, fit=True, **options).replay
     with gv.Video(settings.film, *size, fps=30) as film:
         for level in track(torch.linspace(4, 30, settings.frames).tolist()):
             camera, way = look(*route, level, *size)
