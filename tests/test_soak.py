@@ -89,7 +89,7 @@ def flight(
         view = random_view(pick)
         batch, recorded = pick.choice([5, 64]), None
         if source.producer.on_host:
-            recorded = Frames(engine, view, LOOK, batch, 0, pick.random() < 0.3)
+            recorded = Frames(engine, view, LOOK, batch, fit=pick.random() < 0.3)
         for number in range(pick.randrange(5, 80)):
             if isinstance(source.producer, Faulty) and pick.random() < 0.1:
                 source.producer.fault = pick.choice(["", *FAULTS])
