@@ -11,7 +11,7 @@ namespace gvtorch {
 // behind a voxel, but never behind the pool: its last brick is read by single rays.
 inline bool packs(const TraceArgs& args) {
   constexpr int64_t kMostNodes = INT32_MAX / sizeof(int32_t);
-  return digit_bits_of(args) > 0 && args.nodes <= kMostNodes && args.bricks >= 2 &&
+  return !is_deep(args) && args.nodes <= kMostNodes && args.bricks >= 2 &&
          brick_bytes(args.voxel, args.side, args.channels) < 1 << 24;
 }
 

@@ -51,13 +51,14 @@ void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
     const ShaderType<StoredColor<T>, false> colors;
     if (is(ShaderKind::kStoredColor) && args.voxel == VoxelType::kUInt8) return typed(colors, uint8_t{});
     if (is(ShaderKind::kStoredColor) && args.voxel == VoxelType::kHalf) return typed(colors, Half{});
-    if (digit_bits_of(args) > 0) {
+    const ShaderType<Isosurface<T>, false> surface;
+    if (is(ShaderKind::kIsosurface) && args.voxel == VoxelType::kHalf) return typed(surface, Half{});
+    if (!is_deep(args)) {
       const auto shallow = [&](auto shader, auto voxel) {
         using Shader = typename decltype(shader)::Shader;
         each(ShadeRay<T, Shader, BitDigits, false, decltype(voxel)>(args));
       };
       const ShaderType<Lit<T>, false> lit;
-      const ShaderType<Isosurface<T>, false> surface;
       const bool is_lit = is(ShaderKind::kLit);
       if (is_lit && args.voxel == VoxelType::kUInt8) return shallow(lit, uint8_t{});
       if (is_lit && args.voxel == VoxelType::kInt16) return shallow(lit, int16_t{});

@@ -68,7 +68,7 @@ struct TreeView {
   int32_t branching;  // N
   int32_t nodes_per_tile;
   int32_t max_depth;
-  int32_t digit_bits;  // of a tree that is not deep: N is 2 to the power of it; else 0
+  int32_t digit_bits;  // N is 2 to the power of it; 0: it is no such power
   int32_t tiles, bricks;
 
   // Words of a node. One that names what the pool has not counts as absent, so that no word, whoever wrote it, leads
@@ -81,11 +81,15 @@ struct TreeView {
   GV_HD static int32_t within(int32_t word, int32_t count) { return word < count ? word : kAbsent; }
 };
 
-inline int32_t digit_bits_of(const TraceArgs& args) {
-  const int32_t bits = args.branching == 2 ? 1 : args.branching == 4 ? 2 : args.branching == 8 ? 3 : 4;
+inline int32_t digit_bits_of(int64_t branching) {
+  int32_t bits = 1;
+  while (int64_t{1} << bits < branching) ++bits;
+  return int64_t{1} << bits == branching ? bits : 0;
+}
+inline bool is_deep(const TraceArgs& args) {
   double voxels = args.side - 2 * args.border;
   for (int32_t depth = 0; depth < args.max_depth; ++depth) voxels *= args.branching;
-  return (args.branching == 1 << bits) && voxels <= kMostShallow ? bits : 0;
+  return digit_bits_of(args.branching) == 0 || voxels > kMostShallow;
 }
 
 // A node whose brick answers for a place. node < 0: nobody answers.
@@ -118,40 +122,40 @@ struct Digits {
   static constexpr bool kDeep = true;  // as RayView tells
   const Levels<T>& levels;
   Vec3<double> origin;
-  Vec3<double> cell;            // number of the node at the finest level
-  Vec3<double> upper{0, 0, 0};  // and of the one above the next child
-  int32_t branching, max_depth;
+  Vec3<int64_t> cell;            // number of the node at the finest level, below 2^51
+  Vec3<int64_t> upper{0, 0, 0};  // and of the one above the next child
+  int32_t branching, bits, max_depth;
 
   GV_HD Digits(const TreeView& tree, const Levels<T>& levels, const RayView& rays, const Ray<T>& ray, T t)
-      : levels(levels), branching(tree.branching), max_depth(tree.max_depth) {
+      : levels(levels), branching(tree.branching), bits(tree.digit_bits), max_depth(tree.max_depth) {
     const Vec3<double> place = ray.along(t, rays.deep);
     for (int axis = 0; axis < 3; ++axis) {
       const double high = rays.deep ? rays.high(axis) * (1 - 8.8817841970012523e-16)  // 2^-50
                                     : static_cast<double>(ray.inner[axis]);
       origin[axis] = ray.place(axis);
-      cell[axis] = whole(clamp(place[axis], 0.0, high) * levels.count[max_depth]);
+      cell[axis] = static_cast<int64_t>(clamp(place[axis], 0.0, high) * levels.count[max_depth]);
     }
   }
   GV_HD int32_t child(int32_t level) {
     Vec3<int32_t> digit;
     for (int axis = 0; axis < 3; ++axis) {
-      const double here = cell_of(axis, level);
-      digit[axis] = static_cast<int32_t>(here - upper[axis] * branching);
+      const int64_t here = cell_of(axis, level);
+      digit[axis] = static_cast<int32_t>(bits > 0 ? here & ((1 << bits) - 1) : here - upper[axis] * branching);
       upper[axis] = here;
     }
     return (digit.z * branching + digit.y) * branching + digit.x;
   }
   GV_HD T face(int axis, int32_t level, bool upper) const {
-    return static_cast<T>((cell_of(axis, level) + upper) * levels.exact_size[level] - origin[axis]);
+    return static_cast<T>(static_cast<double>(cell_of(axis, level) + upper) * levels.exact_size[level] - origin[axis]);
   }
 
  private:
-  GV_HD static double whole(double value) { return static_cast<double>(static_cast<int64_t>(value)); }
-  // Divided by a product that may be off by one: all numbers are whole and below 2^51.
-  GV_HD double cell_of(int axis, int32_t level) const {
-    const double below = levels.count[max_depth - level];
-    const double found = whole(cell[axis] * levels.exact_size[max_depth - level]);
-    const double left = cell[axis] - found * below;
+  // Divided by a power of N; where that is no shift, by a product that may be off by one.
+  GV_HD int64_t cell_of(int axis, int32_t level) const {
+    if (bits > 0) return cell[axis] >> (max_depth - level) * bits;
+    const auto below = static_cast<int64_t>(levels.count[max_depth - level]);
+    const auto found = static_cast<int64_t>(static_cast<double>(cell[axis]) * levels.exact_size[max_depth - level]);
+    const int64_t left = cell[axis] - found * below;
     return left < 0 ? found - 1 : left < below ? found : found + 1;
   }
 };
@@ -185,7 +189,7 @@ struct BitDigits {
 template <class T, class Body>
 void with_digits(const TraceArgs& args, const Body& body) {
   if constexpr (std::is_same_v<T, float>) {
-    if (digit_bits_of(args) > 0) return body(static_cast<BitDigits*>(nullptr));
+    if (!is_deep(args)) return body(static_cast<BitDigits*>(nullptr));
   }
   body(static_cast<Digits<T>*>(nullptr));
 }

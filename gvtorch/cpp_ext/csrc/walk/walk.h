@@ -74,8 +74,8 @@ struct Walk {
   T stop_clear, hit_clear;  // transmittance at which a ray ends, and at which its depth is taken
 
   explicit Walk(const TraceArgs& args)
-      : rays{args.origin_r3,  args.direction_r3,        args.cone_r2, args.range_r2, args.place_33,
-             args.cone_scale, digit_bits_of(args) == 0, args.clear_r},
+      : rays{args.origin_r3, args.direction_r3, args.cone_r2,  args.range_r2,
+             args.place_33,  args.cone_scale,   is_deep(args), args.clear_r},
         order{args.rays, args.width},
         tree{args.child_tn,
              args.brick_tn,
@@ -86,7 +86,7 @@ struct Walk {
              args.branching,
              args.nodes_per_tile,
              args.max_depth,
-             digit_bits_of(args),
+             digit_bits_of(args.branching),
              static_cast<int32_t>(args.nodes / args.nodes_per_tile),
              static_cast<int32_t>(args.bricks)},
         levels(args.root_voxel, args.side - 2 * args.border, args.branching),
