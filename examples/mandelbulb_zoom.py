@@ -67,16 +67,15 @@ def stone(sun: torch.Tensor) -> gv.Shader:
     return shader
 
 
-def opened(shape: gv.Mandelbulb, settings: Settings) -> gv.Engine:
-    """An engine for it, with a pool of fixed size, in which no place is without a brick."""
+def opened(shape: gv.Mandelbulb, settings: Settings, **options) -> gv.Engine:
+    """An engine for it, with a pool of fixed size."""
     solid, box = gv.Solid(shape, normals=False), ((-BOX / 2,) * 3, (BOX / 2,) * 3)
-    producer, device = gv.FieldProducer(solid, 2**33, box=box), settings.device
-    limits = {"brick_pool": "512 MB", "load_budget": settings.budget, "loading": "levels"}
-    return gv.Engine(producer, device=device, **limits)
+    producer = gv.FieldProducer(solid, 2**33, box=box)
+    return gv.Engine(producer, device=settings.device, load_budget=settings.budget, **options)
 
 
 def fly(engine: gv.Engine, route: tuple[torch.Tensor, torch.Tensor], settings: Settings) -> None:
-    """Films the way from 2^-4 to 2^-30 of the box; on a GPU it is flown live."""
+    """Films 2^-4 to 2^-30 of the box, loaded level by level; on a GPU it is flown live."""
     size, took = (settings.size * 16 // 9 // 2 * 2, settings.size), []
     options, (camera, way) = {"cone_scale": settings.cone_scale}, look(*route, 4.0, *size)
     shader = stone(sun := way.to(engine.device))
@@ -100,20 +99,21 @@ def fly(engine: gv.Engine, route: tuple[torch.Tensor, torch.Tensor], settings: S
 def main(settings: Settings) -> None:
     """Flies there, then renders the six places."""
     finest = gv.Mandelbulb(8, iterations=20, colors=COLORS)
-    route, options = plan(finest), {"cone_scale": settings.cone_scale}
+    route, scale = plan(finest), settings.cone_scale
     if settings.frames:
-        with opened(finest, settings) as engine:
+        with opened(finest, settings, brick_pool="512 MB", loading="levels") as engine:
             fly(engine, route, settings)
     pictures, size = [], (settings.size * 16 // 27 + 1, settings.size // 2)
     for level in track(PLACES):
         # Each iteration adds details an eighth as large; those finer than pixels would be noise.
         shape = gv.Mandelbulb(8, iterations=4 + int(level / 2), colors=COLORS)
         camera, sun = look(*route, level, *size)
+        small, _ = look(*route, level, size[0] // 4, size[1] // 4)
         shader = stone(sun.to(settings.device))
         with opened(shape, settings) as engine:
-            engine.render(camera, shader, **options)  # without light: less is traced again
+            engine.render(small, shader, cone_scale=scale / 4)  # loads most of what is seen
             light = gv.Lighting(shadows=0, occlusion=1.0, reach=0.1 * BOX * 0.5**level)
-            lit = engine.render(camera, shader, lighting=light, **options).to("cpu")
+            lit = engine.render(camera, shader, lighting=light, cone_scale=scale).to("cpu")
         clear = lit.alpha * torch.exp(-0.15 * lit.depth / (BOX * 0.5**level))
         pictures.append(replace(lit, color=1.15 * clear * lit.color + (1 - clear) * HAZE))
     both = {}

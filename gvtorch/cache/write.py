@@ -237,7 +237,7 @@ def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, 
             voxels = data[name].flatten(1, 3)
             if voxels.dtype == torch.uint16:  # which torch can't compare
                 voxels = voxels.to(torch.int32)
-            ends = torch.stack((voxels.amin(1), voxels.amax(1)), 1)
+            ends = torch.stack(torch.aminmax(voxels, dim=1), 1)
             put_rows_of(words.flatten(0, 1), index, ends)
 
 

@@ -318,7 +318,7 @@ class _ChannelLevels:
         for part in (slot >= 0).nonzero()[:, 0].split(_BATCH):
             bricks = movable(held)[slot[part]].view(held.dtype)
             voxels = bricks[:, inner, inner, inner].to(torch.float32).flatten(1, 3)
-            low[part], high[part] = voxels.amin(1), voxels.amax(1)
+            low[part], high[part] = torch.aminmax(voxels, dim=1)
         smallest, largest = (ends.view(*grid, -1).cpu().numpy() for ends in (low, high))
         return smallest, largest
 

@@ -40,7 +40,6 @@ void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
 }
 
 void follow_points(const Tensor& like, const OrbitArgs& args) {
-  if (is_wide(like)) return follow_each_point<double>(like, args);
   in_chunks(like, processor().chunks.orbits, args, args.points, 1 << 9);
 }
 

@@ -31,8 +31,13 @@ void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
   is_wide(like) ? noise_each<double>(like, args, points) : noise_each<float>(like, args, points);
 }
 
+template <class T>
+void follow_each_point(const Tensor& like, const OrbitArgs& args) {
+  with_step<T>(args.kind,
+               [&](auto* step) { for_each(like, args.points, FollowPoints<T, std::decay_t<decltype(*step)>>{args}); });
+}
 void follow_points(const Tensor& like, const OrbitArgs& args) {
-  is_wide(like) ? follow_each_point<double>(like, args) : follow_each_point<float>(like, args);
+  args.wide ? follow_each_point<double>(like, args) : follow_each_point<float>(like, args);
 }
 
 // `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks take their

@@ -39,8 +39,12 @@ void noise_chunk(const NoiseArgs& args, int64_t begin, int64_t end) {
   with_noise(args, [&](auto kind, auto axes) { noise_in_lanes<kind.value, axes.value>(args, begin, end); });
 }
 
+void orbits_chunk(const OrbitArgs& args, int64_t begin, int64_t end) {
+  args.wide ? orbits_in_lanes<Doubles>(args, begin, end) : orbits_in_lanes<Floats>(args, begin, end);
+}
+
 extern const Chunks chunks;
-const Chunks chunks = {shade_chunk, voxelize_chunk, noise_chunk, orbits_in_lanes};
+const Chunks chunks = {shade_chunk, voxelize_chunk, noise_chunk, orbits_chunk};
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

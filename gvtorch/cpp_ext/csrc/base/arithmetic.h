@@ -120,6 +120,15 @@ struct LanesOf<Floats> {
   static GV_HD Ints all() { return Ints{} == 0; }
 };
 
+template <>
+struct LanesOf<Doubles> {
+  using Real = double;
+  using Int = Longs;
+  using Mask = Longs;
+};
+
+GV_HD Doubles select(Longs which, Doubles a, Doubles b) { return which ? a : b; }
+GV_HD Longs select(Longs which, Longs a, Longs b) { return which ? a : b; }
 GV_HD Floats select(Mask which, Floats a, Floats b) { return which ? a : b; }
 GV_HD Ints select(Mask which, Ints a, Ints b) { return which ? a : b; }
 GV_HD float lane_of(Floats value, int lane) { return value[lane]; }
@@ -143,12 +152,20 @@ GV_HD Floats splat<Floats, float>(float value) {
   return value - Floats{};
 }
 template <>
+GV_HD Doubles splat<Doubles, double>(double value) {
+  return value - Doubles{};
+}
+template <>
 GV_HD Ints splat<Ints, int32_t>(int32_t value) {
   return value - Ints{};
 }
 template <class T>
 GV_HD T to_real(Ints value) {
   return to_floats(value);
+}
+template <class T>
+GV_HD T to_real(Longs value) {
+  return __builtin_convertvector(value, T);
 }
 GV_HD Floats clamp(Floats value, float low, float high) {
   return clamp(value, splat<Floats>(low), splat<Floats>(high));
@@ -230,11 +247,21 @@ GV_HD T fraction_of(T value, IntOf<T>& power) {
   power = (bits >> 23) - 126;
   return bit_cast<T>((bits & 0x007fffff) | 0x3f000000);
 }
-GV_HD double fraction_of(double value, int32_t& power) {
-  const auto bits = bit_cast<int64_t>(value);
-  power = static_cast<int32_t>(bits >> 52) - 1022;
-  return bit_cast<double>((bits & 0x000fffffffffffff) | 0x3fe0000000000000);
+template <class T, class Bits>
+GV_HD T wide_fraction_of(T value, Bits& power) {
+  const auto bits = bit_cast<Bits>(value);
+  power = (bits >> 52) - 1022;
+  return bit_cast<T>((bits & 0x000fffffffffffff) | 0x3fe0000000000000);
 }
+GV_HD double fraction_of(double value, int32_t& power) {
+  int64_t whole;
+  const double fraction = wide_fraction_of(value, whole);
+  power = static_cast<int32_t>(whole);
+  return fraction;
+}
+#ifndef __CUDACC__
+GV_HD Doubles fraction_of(Doubles value, Longs& power) { return wide_fraction_of(value, power); }
+#endif
 
 // Natural logarithm of a positive, normal number, in both precisions; of what is infinite or no number, itself.
 template <class T>

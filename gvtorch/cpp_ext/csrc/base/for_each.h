@@ -66,10 +66,16 @@ void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& f
 
 #else
 
+// Functors whose indices take long say how few make it worth to wake another thread.
+template <class Functor, class = void>
+constexpr int64_t kShare = 256;
+template <class Functor>
+constexpr int64_t kShare<Functor, std::void_t<decltype(Functor::kShare)>> = Functor::kShare;
+
 // Threads draw `share` neighbouring indices at a time from a counter: long rays do not leave a thread idle. Nothing
 // that a functor writes depends on which thread ran it.
 template <class On = Device, class Functor>
-void for_each(const torch::stable::Tensor&, int64_t count, const Functor& functor, int64_t share = 256) {
+void for_each(const torch::stable::Tensor&, int64_t count, const Functor& functor, int64_t share = kShare<Functor>) {
   const int64_t chunks = (count + share - 1) / share;
   const int64_t workers = std::min<int64_t>(torch::stable::get_num_threads(), chunks);
   std::atomic<int64_t> next{0};

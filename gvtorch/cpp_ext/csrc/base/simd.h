@@ -33,6 +33,8 @@ typedef float Floats __attribute__((vector_size(kLanes * 4)));
 typedef int32_t Ints __attribute__((vector_size(kLanes * 4)));
 typedef uint32_t Words __attribute__((vector_size(kLanes * 4)));  // sums and products wrap
 using Mask = Ints;                                                // -1 or 0 in each lane
+typedef double Doubles __attribute__((vector_size(kLanes * 4)));  // half as many
+typedef int64_t Longs __attribute__((vector_size(kLanes * 4)));
 
 GV_HD Floats to_floats(Ints value) { return __builtin_convertvector(value, Floats); }
 GV_HD Ints truncated(Floats value) { return __builtin_convertvector(value, Ints); }
@@ -48,13 +50,17 @@ GV_HD Ints lane_numbers() {
 GV_HD Floats smaller(Floats a, Floats b) { return (Floats)GV_MM(min_ps)((Native)b, (Native)a); }
 GV_HD Floats larger(Floats a, Floats b) { return (Floats)GV_MM(max_ps)((Native)b, (Native)a); }
 GV_HD Floats square_root(Floats value) { return (Floats)GV_MM(sqrt_ps)((Native)value); }
+GV_HD Doubles square_root(Doubles value) { return (Doubles)GV_MM(sqrt_pd)((decltype(GV_MM(setzero_pd)()))value); }
 #else
 GV_HD Floats smaller(Floats a, Floats b) { return b < a ? b : a; }
 GV_HD Floats larger(Floats a, Floats b) { return b > a ? b : a; }
-GV_HD Floats square_root(Floats value) {
-  for (int i = 0; i < kLanes; ++i) value[i] = sqrt(value[i]);
+template <class T>
+GV_HD T root_of_each(T value) {
+  for (size_t i = 0; i < sizeof(value) / sizeof(value[0]); ++i) value[i] = sqrt(value[i]);
   return value;
 }
+GV_HD Floats square_root(Floats value) { return root_of_each(value); }
+GV_HD Doubles square_root(Doubles value) { return root_of_each(value); }
 #endif
 GV_HD Ints smaller(Ints a, Ints b) { return b < a ? b : a; }
 GV_HD Ints larger(Ints a, Ints b) { return b > a ? b : a; }
@@ -75,6 +81,7 @@ GV_HD uint32_t bits(Mask mask) {
 #endif
 }
 GV_HD bool any(Mask mask) { return bits(mask) != 0; }
+GV_HD bool any(Longs mask) { return any((Mask)mask); }
 GV_HD int32_t count(Mask mask) { return __builtin_popcount(bits(mask)); }
 
 // body(lane) for each lane that is set.

@@ -12,24 +12,18 @@ GV_OP(OrbitBoundsOp, "orbit_bounds", GV_ORBIT_BOUNDS, "Tensor");
 void follow_points(const Tensor& like, const OrbitArgs& args);  // in cpu.cpp and in cuda.cu
 
 template <class T>
-void follow_each_point(const Tensor& like, const OrbitArgs& args) {
-  with_step<T>(args.kind,
-               [&](auto* step) { for_each(like, args.points, FollowPoints<T, std::decay_t<decltype(*step)>>{args}); });
-}
-
-template <class T>
 void follow_balls(const Tensor& like, const OrbitBoundsArgs& args) {
   with_step<T>(args.kind,
                [&](auto* step) { for_each(like, args.balls, FollowBalls<T, std::decay_t<decltype(*step)>>{args}); });
 }
 
 inline auto run(const OrbitsOp& a) {
-  is_wide(a.point_p3);  // or refuses
   const Like like{a.point_p3, a.point_p3.scalar_type()};
   const int64_t points = a.point_p3.numel() / 3;
   OrbitArgs args{};
   GV_ORBITS(GV_TAKE)
   args.points = points;
+  args.wide = is_wide(a.point_p3);  // or refuses
   Tensor found_3p = torch::stable::new_empty(a.point_p3, {3, points}, like.real);
   args.found_3p = lay(found_3p);
   follow_points(a.point_p3, args);

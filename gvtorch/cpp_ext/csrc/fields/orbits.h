@@ -33,6 +33,7 @@ enum class StepKind : int32_t { kPower, kFold, kCount };
 struct OrbitArgs {
   GV_ORBITS(GV_VIEW)
   int64_t points;
+  bool wide;       // float64
   void* found_3p;  // distance, least distance from the origin and from a plane of two axes
 };
 
@@ -252,22 +253,25 @@ void with_step(int32_t kind, const Body& body) {
 }
 
 #ifndef __CUDACC__
-// Points begin to end of float32, a vector of them at a time.
-inline void orbits_in_lanes(const OrbitArgs& args, int64_t begin, int64_t end) {
-  with_step<Floats>(args.kind, [&](auto* step) {
-    const FollowPoints<Floats, std::decay_t<decltype(*step)>> points{args};
-    for (int64_t index = begin; index < end; index += kLanes) {
-      const int64_t some = end - index < kLanes ? end - index : kLanes;
-      float last[3 * kLanes] = {};
-      memcpy(last, static_cast<const float*>(args.point_p3) + 3 * index, static_cast<size_t>(3 * some) * sizeof(float));
-      Floats found[3];
-      const Ints each = 3 * lane_numbers();
-      points.follow({pick(last, each), pick(last + 1, each), pick(last + 2, each)}, found);
+// Points begin to end, a vector of them at a time.
+template <class T>
+void orbits_in_lanes(const OrbitArgs& args, int64_t begin, int64_t end) {
+  using Real = RealOf<T>;
+  constexpr int64_t kMost = sizeof(T) / sizeof(Real);
+  with_step<T>(args.kind, [&](auto* step) {
+    const FollowPoints<T, std::decay_t<decltype(*step)>> points{args};
+    for (int64_t index = begin; index < end; index += kMost) {
+      const int64_t some = end - index < kMost ? end - index : kMost;
+      const Real* point = static_cast<const Real*>(args.point_p3) + 3 * index;
+      Vec3<T> place{};
+      for (int64_t lane = 0; lane < some; ++lane) {
+        for (int axis = 0; axis < 3; ++axis) place[axis][lane] = point[3 * lane + axis];
+      }
+      T found[3];
+      points.follow(place, found);
       for (int which = 0; which < 3; ++which) {
-        float value[kLanes];
-        memcpy(value, &found[which], sizeof(value));
-        memcpy(static_cast<float*>(args.found_3p) + which * args.points + index, value,
-               static_cast<size_t>(some) * sizeof(float));
+        memcpy(static_cast<Real*>(args.found_3p) + which * args.points + index, &found[which],
+               static_cast<size_t>(some) * sizeof(Real));
       }
     }
   });

@@ -384,7 +384,7 @@ struct TypedProbe : Probe<T> {
     return slope;
   }
   template <class Body>
-  GV_HD int32_t with_value(T begin, T end, const Body& body) const {
+  GV_HD int32_t with_value([[maybe_unused]] T begin, [[maybe_unused]] T end, const Body& body) const {
 #ifdef __CUDA_ARCH__
     // The usual bricks, 8 and 16 voxels wide with a border of 1: eight addresses are one and seven constants.
     const int32_t side = this->channels.side;

@@ -73,6 +73,8 @@ struct Walk {
   int32_t* stamp_b;
   T stop_clear, hit_clear;  // transmittance at which a ray ends, and at which its depth is taken
 
+  static constexpr int64_t kShare = 16;  // see for_each.h
+
   explicit Walk(const TraceArgs& args)
       : rays{args.origin_r3, args.direction_r3, args.cone_r2,  args.range_r2,
              args.place_33,  args.cone_scale,   is_deep(args), args.clear_r},
