@@ -52,8 +52,8 @@ class Settings:
     brick_size: int = 8
     """voxels along a side of a brick"""
     loading: str = "straight"
-    workers: int = 2
-    """threads that read the store: on one's own disk more of them only wait for one another"""
+    workers: int = 1
+    """threads that read the store"""
     batch: int = 512
     """on CUDA: most bricks that a frame makes"""
     look_ahead: float = 0

@@ -366,6 +366,12 @@ def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
             engine.validate()
 
 
+def test_one_thread_reads_a_folder_and_four_a_url(whole, served):
+    links = (whole, f"file://{whole}", f"{served}/cloud.zarr")
+    assert [gv.StoredProducer(link).workers for link in links] == [1, 1, 4]
+    assert gv.StoredProducer(whole, workers=3).workers == 3
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -110,7 +110,7 @@ class StoredChannels(JoinedProducer):
         *,
         host_cache: int | str = "512 MB",
         timeout: float = 30.0,
-        workers: int = 4,
+        workers: int | None = None,
     ) -> None:
         """Opens the store.
 
@@ -119,7 +119,7 @@ class StoredChannels(JoinedProducer):
             channels: Which of them; None takes all.
             host_cache: Most bytes of decoded blocks kept in host memory, of all together.
             timeout: As of `StoredProducer`.
-            workers: Number of threads that read a channel.
+            workers: Number of threads that read a channel, as of `StoredProducer`.
 
         Raises:
             ValueError: It has no such channel, or is no store of several; or see `StoredProducer`.

@@ -155,7 +155,7 @@ class StoredProducer(Producer):
         *,
         host_cache: int | str = "512 MB",
         timeout: float = 30.0,
-        workers: int = 4,
+        workers: int | None = None,
         image: str | None = None,
         time: int = 0,
         channels: Sequence[int] | None = None,
@@ -168,7 +168,9 @@ class StoredProducer(Producer):
             host_cache: Most bytes of decoded blocks and cells kept in host memory; each thread that
                 reads holds up to 64 MB more.
             timeout: Seconds after which a read counts as failed.
-            workers: Number of threads that read.
+            workers: Number of threads that read; left out, one of a folder and 4 of a URL. One
+                reads many chunks at once; more of them wait for one another's Python, and hold up
+                the frames.
             image: Which image, see `Store.open`.
             time: Which time point.
             channels: Which channels, as components of "value"; None takes all.
@@ -181,7 +183,8 @@ class StoredProducer(Producer):
             OSError: The store can't be read.
         """
         limit = check.nbytes("StoredProducer", "host_cache", host_cache)
-        check.whole("StoredProducer", "workers", workers, low=1, high=64)
+        if workers is not None:
+            check.whole("StoredProducer", "workers", workers, low=1, high=64)
         seconds = check.number("StoredProducer", "timeout", timeout, low=0, open_low=True)
         if not isinstance(store, Store):
             store = Store.open(store, image=image, time=time, channels=channels)
@@ -205,13 +208,13 @@ class StoredProducer(Producer):
         )
         self.store, self.timeout = store, seconds
         self.made_of = {name: store.coarse[name].made_of for name in coarse}
-        self.host_bytes, self._workers = limit, workers
+        self.host_bytes, self.workers = limit, workers or (4 if store.is_remote else 1)
         self._begin()
 
     def _begin(self) -> None:
         """Makes what a process has for itself: its cache and its threads."""
         self._cache, self._closed = HostCache(self.host_bytes), threading.Event()
-        self._threads = ThreadPoolExecutor(self._workers, thread_name_prefix="gvtorch-store")
+        self._threads = ThreadPoolExecutor(self.workers, thread_name_prefix="gvtorch-store")
         self._process = os.getpid()
 
     def _submit(self, work: Callable[[Nodes], Any], nodes: Nodes) -> Future:

@@ -296,6 +296,11 @@ class Store:
         return data
 
     @property
+    def is_remote(self) -> bool:
+        """Whether it is read over a network."""
+        return isinstance(self.root, str)
+
+    @property
     def stored(self) -> str:
         """NumPy dtype of what `read_stored` gives: that of the array, before it is narrowed."""
         return "int64" if self.label_values is not None else self._levels.stored.str
