@@ -289,7 +289,10 @@ def test_octaves_are_made_without_a_look_at_values(total):
     def made(loc):
         return producer.fill(Nodes(loc, layout, parents=parents))
 
-    found = torch.compile(made, fullgraph=True, backend="eager")(loc)
+    compiled = torch.compile(made, fullgraph=True, backend="eager")
+    found = compiled(loc)
+    with torch._dynamo.config.patch(error_on_recompile=True):
+        compiled(loc)
     for rows in ([0], [1, 2, 3, 4]):
         given = {name: own[rows] for name, own in parents.items()} if rows[0] else None
         expected = producer.fill(Nodes(loc[rows], layout, parents=given))

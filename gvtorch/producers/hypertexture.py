@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from ..base import check
 from ..fields import Distance, noise
 from ..fields.noise.fractal import Octave, octaves_of
+from ..fields.noise.tally import Tally
 from ..pool import Channel
 from .field import alike, cubic_extent, dtype_of_places
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth
@@ -35,7 +36,7 @@ class Level(NamedTuple):
     side: float  # of a voxel, world units
 
 
-class Hypertexture(Producer):
+class Hypertexture(Tally, Producer):
     """Density around a shape's surface:
 
         density = smoothstep(1/2 - softness, 1/2 + softness)(s),
@@ -117,7 +118,6 @@ class Hypertexture(Producer):
         self.octaves = [
             Octave(amplitude * one.amplitude, frequency * one.frequency, one.seed) for one in series
         ]
-        self.wanted = self.made = 0
         self.dtype = dtype_of_places(box, self.spacing)
         self._levels: list[Level] = []
         self._worn = torch.empty(0)
@@ -201,7 +201,7 @@ class Hypertexture(Producer):
         total = distance * (-1 / self.thickness)
         active = torch.arange(len(nodes), device=total.device)
         values = total.clone()
-        self.wanted += total.numel() * len(level.octaves)
+        self._count(wanted=total.numel() * len(level.octaves))
         for number, one in enumerate(level.octaves):
             if self.skip:
                 away = (values - 0.5).abs().flatten(1).amin(1)
@@ -211,7 +211,7 @@ class Hypertexture(Producer):
                     active, values, points = active[needed], values[needed], points[needed]
             if not len(active):
                 break
-            self.made += values.numel()
+            self._count(made=values.numel())
             values = values + one.amplitude * noise.perlin(points * one.frequency, seed=one.seed)
         total[active] = values
         return self._channels(total, distance, level.soft)

@@ -31,6 +31,7 @@ from ...base import check
 from .basis import perlin
 from .fractal import Octave, octaves_of
 from .lattice import as_points
+from .tally import Tally
 
 #: Interpolated from so many voxels along each axis.
 POINTS = 6
@@ -74,7 +75,7 @@ def inherit(
     return found.view(-1, side, side, side).permute(0, 3, 1, 2)
 
 
-class OctaveSum:
+class OctaveSum(Tally):
     """The sum of `fbm` in bricks of any level, of those octaves that its voxels can hold.
 
     Attributes:
@@ -113,7 +114,6 @@ class OctaveSum:
         self.settled = settled
         series = octaves_of(where, octaves, lacunarity, gain, seed)
         self.octaves = [one._replace(frequency=one.frequency * frequency) for one in series]
-        self.made = self.wanted = 0
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can hold."""
@@ -144,7 +144,7 @@ class OctaveSum:
         calm = self._wide(side, self.settled)
         held = self.held(side)
         size = axes[0].shape[0] * axes[0].shape[1] * axes[1].shape[1] * axes[2].shape[1]
-        self.wanted += size * len(held)
+        self._count(wanted=size * len(held))
         if parents is None or child is None or not above:
             settled = self._evaluated(axes, calm)
         else:
@@ -164,8 +164,7 @@ class OctaveSum:
         places = as_points("noise.OctaveSum", axes)
         for one in octaves:
             total += one.amplitude * perlin(places * one.frequency, seed=one.seed)
-            if not torch.compiler.is_compiling():  # each count would be compiled anew
-                self.made += total.numel()
+            self._count(made=total.numel())
         return total
 
 

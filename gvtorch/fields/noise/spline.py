@@ -30,11 +30,12 @@ from torch import Tensor
 from ...base import check
 from ...ops.reference import noise as twin
 from .fractal import Octave, octaves_of
+from .tally import Tally
 
 _APART = 1e-6  # relative, by which a level's voxels may differ from an octave's cells
 
 
-class SplineSum:
+class SplineSum(Tally):
     """A sum of octaves in bricks of any level: each is added in the level whose voxels are its
     cells, in float32. Levels halve their voxels (N = 2).
 
@@ -62,7 +63,6 @@ class SplineSum:
         check.number(where, "frequency", frequency, low=0, open_low=True)
         series = octaves_of(where, octaves, 2.0, gain, seed)
         self.octaves = [one._replace(frequency=one.frequency * frequency) for one in series]
-        self.made = self.wanted = 0
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can hold."""
@@ -101,7 +101,7 @@ class SplineSum:
             inner = size - 2 * border
             above = [(one + border) // inner // 2 * inner - border for one in low]
             found = self._added(_finer(parents, above, low, size), low, side)
-        self.wanted += len(found) * self._numbers(size, side)
+        self._count(wanted=len(found) * self._numbers(size, side))
         return found, found
 
     def _alone(self, low: Sequence[Tensor], size: int, side: float) -> Tensor:
@@ -125,8 +125,7 @@ class SplineSum:
                 bits = twin.join(x[:, None], y[:, :, None])
                 bits = twin.join(bits[:, None], z[:, :, None, None])
                 values = values + bits.to(values.dtype) * (one.amplitude * 2.0**-31)
-                if not torch.compiler.is_compiling():  # each count would be compiled anew
-                    self.made += values.numel()
+                self._count(made=values.numel())
         return values
 
     def _numbers(self, size: int, side: float) -> int:
