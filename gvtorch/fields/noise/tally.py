@@ -1,15 +1,17 @@
-"""How many random numbers were made, and how many would have been."""
+"""How much noise was evaluated, and how much a plain sum would have taken."""
 
 import torch
 
 
 class Tally:
-    """Counts while nothing is compiled: a count that a compiled function changes would be taken for
-    a new constant at each call, and the function compiled anew.
+    """Counts what was evaluated; what a unit is, its user says.
+
+    Nothing is counted while torch compiles: it takes an attribute for a constant, and a function
+    that changes one would be compiled anew at each call.
 
     Attributes:
-        made: Numbers made.
-        wanted: Numbers that are made where nothing is left out or taken over.
+        made: Units that were evaluated so far.
+        wanted: Those that were asked for, whether they had to be evaluated or not.
     """
 
     made = wanted = 0
