@@ -43,13 +43,20 @@ SHADERS = {
 }
 
 
+#: By shader and N; where N is 3 a tree is deep.
+CASES = [(name, 2) for name in SHADERS]
+CASES += [
+    (name, 3) for name in ("plain", "lit by a lamp", "stored colour", "isosurface", "maximum")
+]
+
+
 def all_shaded() -> dict[str, list[Tensor]]:
-    return {name: shaded(shader, "cpp") for name, shader in SHADERS.items()}
+    return {f"{name} {number}": shaded(SHADERS[name], "cpp", number) for name, number in CASES}
 
 
 @cache
-def expected(name: str) -> list[Tensor]:
-    return shaded(SHADERS[name], "reference")
+def expected(name: str, branching: int) -> list[Tensor]:
+    return shaded(SHADERS[name], "reference", branching)
 
 
 @pytest.fixture(scope="module")
@@ -60,11 +67,11 @@ def of_instructions(tmp_path_factory) -> dict[str, dict[str, list[Tensor]]]:
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("name", SHADERS)
+@pytest.mark.parametrize(("name", "branching"), CASES)
 @pytest.mark.parametrize("instructions", INSTRUCTIONS)
-def test_every_bit_is_the_reference_s(of_instructions, instructions, name):
-    found = of_instructions[instructions][name]
-    for one, other in zip(found, expected(name), strict=True):
+def test_every_bit_is_the_reference_s(of_instructions, instructions, name, branching):
+    found = of_instructions[instructions][f"{name} {branching}"]
+    for one, other in zip(found, expected(name, branching), strict=True):
         assert torch.equal(one.nan_to_num(7), other.nan_to_num(7))
     assert sum(len(one.unique()) for one in found) > 1000, "the test must see something"
 

@@ -51,7 +51,7 @@ def shader(name: str, folder: Path | None = None) -> gv.CompiledShader:
 
 
 def given(name: str, folder: Path | None = None) -> list[Tensor]:
-    """All that its traces write; where N is 3, and with one brick, no packet goes."""
+    """All that its traces write; where N is 3 trees are deep, and with one brick no packet goes."""
     own, found = shader(name, folder), []
     for branching in (2, 4, 3):
         found += shaded(own, "cpp", branching)

@@ -71,7 +71,7 @@ struct OneShader {
         trace_packets<CalledShader<UserShaderOf, float>, AnyValues>(args, begin, end);
       });
     }
-    each(ShadeRay<float, CalledShader<UserShaderOf, float>, Digits<float>>(args));  // what is left is mostly deep
+    each(ShadeRay<float, CalledShader<UserShaderOf, float>, Digits<float>>(args));  // what packets refuse
 #else
     with_digits<float>(args, [&](auto* digits) {
       each(ShadeRay<float, CalledShader<UserShaderOf, float>, std::decay_t<decltype(*digits)>>(args));

@@ -1,5 +1,5 @@
 // kLanes rays at once through the tree with any shader of shaders.h, each lane in a node and an interval of its own,
-// for float32 and a tree that is not deep. Each lane does what its ray does alone, so every bit is the same.
+// in float32. Each lane does what its ray does alone, so every bit is the same.
 //
 // A second walk beside that of walk.h, for two reasons. Lanes keep the path of their last descent and go on from where
 // the next one parts from it; a GPU's threads would have to keep it in local memory, which takes twice as long as to
@@ -8,6 +8,7 @@
 // functions of a single ray.
 #pragma once
 
+#include "packets/deep_lanes.h"
 #include "packets/packet_brick.h"
 #include "shaders/shade_rays.h"
 
@@ -76,6 +77,7 @@ struct PacketWalk {
 
   // The last descent: a node of each level, below 0 (bit 31) where it is hidden.
   Vec3<Ints> cell{};
+  DeepLanes deep_lanes;  // in place of `cell` where the tree is deep
   Ints path_depth = Ints{} - 1;
   Ints path_node[kMostLevels], path_brick[kMostLevels], path_tile[kMostLevels];
 
@@ -101,7 +103,8 @@ struct PacketWalk {
         hidden_tn(args.hidden_tn),
         bricks(args.bricks),
         stop_clear(kernel.stop_clear),
-        frame(*kernel.frame_1) {}
+        frame(*kernel.frame_1),
+        deep_lanes(walk.rays, walk.tree, walk.levels) {}
 
   // Traces the rays at places begin to end of the order, at most kLanes.
   GV_HD void trace(int64_t begin, int64_t end) {
@@ -200,6 +203,7 @@ struct PacketWalk {
       if (numbers[lane] < 0) continue;
       const Ray<float> one(walk.rays, numbers[lane]);
       put_lane(ray, lane, one);
+      if (walk.rays.deep) deep_lanes.begin(lane, one);
       put_lane(sight, lane, Sight<float>(walk.rays, numbers[lane], one.moved));
       at.near[lane] = one.cone_near;
       at.growth[lane] = one.cone_growth;
@@ -219,7 +223,12 @@ struct PacketWalk {
     if constexpr (Shader::kSurface) {
       if (one.depth < INFINITY) {
         const Ray<float> own(walk.rays, numbers[lane]);
-        kernel.surface(own, take_lane<Sight<float>>(sight, lane), one);
+        const Sight<float> own_sight = take_lane<Sight<float>>(sight, lane);
+        if (walk.rays.deep) {
+          kernel.template surface<Digits<float>>(own, own_sight, one);
+        } else {
+          kernel.template surface<BitDigits>(own, own_sight, one);
+        }
       }
     }
     kernel.finish(numbers[lane], ray.moved[lane], samples[lane], one);
@@ -267,10 +276,7 @@ struct PacketWalk {
     Ints reach, node, brick, tile;
     descend(which, middle, reach, node, brick, tile);
     const Mask hides = node < 0;
-    const Ints shift = tree.digit_bits * (tree.max_depth - reach);
-    const Floats size = pick(levels.size, reach);
-    const Floats exit = ray.leave(
-        [&](int axis, Mask upper) { return to_floats((cell[axis] >> shift) - upper) * size - ray.origin[axis]; });
+    const Floats exit = ray.leave([&](int axis, Mask upper) { return face(which, axis, reach, upper); });
     extent.exit = which ? exit : extent.exit;
 
     // The nodes whose bricks answer.
@@ -340,20 +346,7 @@ struct PacketWalk {
   // As `descend` in tree.h, level by level for all lanes: those whose known part of the path ends deeper wait.
   GV_HD void descend(Mask which, Floats middle, Ints& reach, Ints& node, Ints& brick, Ints& tile) {
     const TreeView& tree = walk.tree;
-    const int32_t top = tree.digit_bits * tree.max_depth;
-    const float cells = static_cast<float>(1 << top);
-    Ints parted{};
-    const Vec3<Floats> place = ray.at(middle);
-    for (int axis = 0; axis < 3; ++axis) {
-      const Ints here = which ? truncated(place[axis] * cells) : cell[axis];
-      parted = parted | (cell[axis] ^ here);
-      cell[axis] = here;
-    }
-    // The exponent of a number tells its highest bit; rounded up to a power of two it tells one level too few.
-    const Ints high = ((Ints)to_floats(parted) >> 23) - 126;
-    const Ints equal = truncated(to_floats(top - high) / static_cast<float>(tree.digit_bits));
-    Ints known = parted == 0 ? path_depth : smaller(path_depth, equal);
-    known = kKeepsPath ? smaller(known, wanted) : Ints{} - 1;
+    const Ints known = go(which, middle, kKeepsPath ? smaller(path_depth, wanted) : Ints{} - 1);
     const Ints from = larger(known, Ints{});
     node = own_lane(path_node, from);
     brick = own_lane(path_brick, from);
@@ -366,10 +359,8 @@ struct PacketWalk {
       const Mask here = going & (reach == level - 1);
       Ints next = Ints{} + tree.root, home = Ints{} + tree.root_tile;
       if (level > 0) {
-        const int32_t shift = top - level * tree.digit_bits, mask = (1 << tree.digit_bits) - 1;
-        const Ints x = (cell.x >> shift) & mask, y = (cell.y >> shift) & mask, z = (cell.z >> shift) & mask;
         home = here ? tile : Ints{};
-        next = home * tree.nodes_per_tile + ((z << (2 * tree.digit_bits)) | (y << tree.digit_bits) | x);
+        next = home * tree.nodes_per_tile + child(here, level);
       }
       next = here ? next : Ints{};
       stamp(tree.stamp_t, here, home);
@@ -387,6 +378,39 @@ struct PacketWalk {
       going = going & ~(here & ((level == wanted) | (tile < 0) | hides));
     }
     path_depth = which ? reach : path_depth;
+  }
+
+  // Goes to the places at distance t; returns the deepest level, at most `known`, of which a lane is in the same node
+  // as it was. Then which child of the node above a lane is in, and how far a face of its node of a level is from its
+  // ray's origin. As Digits and BitDigits.
+  GV_HD Ints go(Mask which, Floats t, Ints known) {
+    if (walk.rays.deep) return deep_lanes.go(which, ray.direction, t, known);
+    const TreeView& tree = walk.tree;
+    const int32_t top = tree.digit_bits * tree.max_depth;
+    const float cells = static_cast<float>(1 << top);
+    Ints parted{};
+    const Vec3<Floats> place = ray.at(t);
+    for (int axis = 0; axis < 3; ++axis) {
+      const Ints here = which ? truncated(place[axis] * cells) : cell[axis];
+      parted = parted | (cell[axis] ^ here);
+      cell[axis] = here;
+    }
+    // The exponent of a number tells its highest bit; rounded up to a power of two it tells one level too few.
+    const Ints high = ((Ints)to_floats(parted) >> 23) - 126;
+    const Ints equal = truncated(to_floats(top - high) / static_cast<float>(tree.digit_bits));
+    return parted == 0 ? known : smaller(known, equal);
+  }
+  GV_HD Ints child(Mask which, int32_t level) const {
+    if (walk.rays.deep) return deep_lanes.child(which, level);
+    const int32_t bits = walk.tree.digit_bits, mask = (1 << bits) - 1;
+    const int32_t shift = bits * (walk.tree.max_depth - level);
+    const Ints x = (cell.x >> shift) & mask, y = (cell.y >> shift) & mask, z = (cell.z >> shift) & mask;
+    return (z << (2 * bits)) | (y << bits) | x;
+  }
+  GV_HD Floats face(Mask which, int axis, Ints level, Mask upper) const {
+    if (walk.rays.deep) return deep_lanes.face(which, axis, level, upper);
+    const Ints shift = walk.tree.digit_bits * (walk.tree.max_depth - level);
+    return to_floats((cell[axis] >> shift) - upper) * pick(walk.levels.size, level) - ray.origin[axis];
   }
 
   GV_HD Mask hidden(Mask here, Ints node) {
@@ -416,13 +440,6 @@ struct PacketWalk {
     return pick(reinterpret_cast<const int32_t*>(path), level * kLanes + lane_numbers());
   }
 
-  // Low corners of the nodes of these depths that the lanes are in.
-  GV_HD Vec3<Floats> corner(Ints depth) const {
-    const Ints shift = walk.tree.digit_bits * (walk.tree.max_depth - depth);
-    const Floats size = pick(walk.levels.size, depth);
-    return {to_floats(cell.x >> shift) * size, to_floats(cell.y >> shift) * size, to_floats(cell.z >> shift) * size};
-  }
-
   GV_HD void leave(Mask which) {
     at.leave(which, extent);
     number = which ? at.count : number;
@@ -431,10 +448,9 @@ struct PacketWalk {
   GV_HD void aim(Mask which, Ints holder_depth, Ints brick, PacketBrick& to) {
     const Mask stored = brick >= 0;
     const Floats scale = pick(walk.levels.scale, holder_depth);
-    const Vec3<Floats> low = corner(holder_depth);
     const float first = static_cast<float>(kernel.channels.border) - 0.5f;
     for (int axis = 0; axis < 3; ++axis) {
-      const Floats offset = (ray.origin[axis] - low[axis]) * scale + first;
+      const Floats offset = -face(which, axis, holder_depth, Mask{}) * scale + first;
       const Floats slope = ray.direction[axis] * scale;
       to.offset[axis] = which ? (stored ? offset : Floats{}) : to.offset[axis];
       to.slope[axis] = which ? (stored ? slope : Floats{}) : to.slope[axis];

@@ -11,8 +11,7 @@ namespace gvtorch {
 // behind a voxel, but never behind the pool: its last brick is read by single rays.
 inline bool packs(const TraceArgs& args) {
   constexpr int64_t kMostNodes = INT32_MAX / sizeof(int32_t);
-  return !is_deep(args) && args.nodes <= kMostNodes && args.bricks >= 2 &&
-         brick_bytes(args.voxel, args.side, args.channels) < 1 << 24;
+  return args.nodes <= kMostNodes && args.bricks >= 2 && brick_bytes(args.voxel, args.side, args.channels) < 1 << 24;
 }
 
 // Whether packets take a fused shader's rays.

@@ -89,7 +89,7 @@ struct ShadeRay : Walk<T> {
     this->template follow<Digits>(ray, at, visitor);
     if constexpr (Shader::kSurface) {
       if (sum.depth < static_cast<T>(INFINITY)) {
-        surface(ray, sight, sum);
+        surface<Digits>(ray, sight, sum);
       }
     }
     finish(number, ray.moved, visitor.samples, sum);
@@ -139,8 +139,9 @@ struct ShadeRay : Walk<T> {
   }
 
   // The place where depth was set may lie half an interval beside the node that found it.
+  template <class Number>
   GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, Sum& sum) const {
-    Digits digits(tree, this->levels, this->rays, ray, sum.depth);
+    Number digits(tree, this->levels, this->rays, ray, sum.depth);
     int32_t wanted = 0;
     const auto words = [&](int32_t node) { return tree.words_of(node, false); };
     const T cone = ray.cone_near + ray.cone_growth * sum.depth;

@@ -130,11 +130,35 @@ struct Digits {
       : levels(levels), branching(tree.branching), bits(tree.digit_bits), max_depth(tree.max_depth) {
     const Vec3<double> place = ray.along(t, rays.deep);
     for (int axis = 0; axis < 3; ++axis) {
-      const double high = rays.deep ? rays.high(axis) * (1 - 8.8817841970012523e-16)  // 2^-50
-                                    : static_cast<double>(ray.inner[axis]);
+      const double high = rays.deep ? inner_of(rays, axis) : static_cast<double>(ray.inner[axis]);
       origin[axis] = ray.place(axis);
-      cell[axis] = static_cast<int64_t>(clamp(place[axis], 0.0, high) * levels.count[max_depth]);
+      cell[axis] = cell_at(levels, max_depth, place[axis], high);
     }
+  }
+  GV_HD Digits(const TreeView& tree, const Levels<T>& levels, Vec3<double> origin, Vec3<int64_t> cell)
+      : levels(levels),
+        origin(origin),
+        cell(cell),
+        branching(tree.branching),
+        bits(tree.digit_bits),
+        max_depth(tree.max_depth) {}
+
+  // The last place of the scene, where the tree is deep.
+  GV_HD static double inner_of(const RayView& rays, int axis) {
+    return rays.high(axis) * (1 - 8.8817841970012523e-16);  // 2^-50
+  }
+  GV_HD static int64_t cell_at(const Levels<T>& levels, int32_t max_depth, double place, double high) {
+    return static_cast<int64_t>(clamp(place, 0.0, high) * levels.count[max_depth]);
+  }
+  // Whether another place lies in the same node of a level.
+  GV_HD bool shares(const Digits& other, int32_t level) const {
+    bool same = true;
+    for (int axis = 0; axis < 3; ++axis) same = same && cell_of(axis, level) == other.cell_of(axis, level);
+    return same;
+  }
+  // The next child is one of the node of this level.
+  GV_HD void start_below(int32_t level) {
+    for (int axis = 0; axis < 3; ++axis) upper[axis] = cell_of(axis, level);
   }
   GV_HD int32_t child(int32_t level) {
     Vec3<int32_t> digit;
