@@ -47,7 +47,8 @@ class Steps(Protocol):
 
 
 class FrameGraph:
-    """A frame as CUDA graphs, one that serves and one that draws, which cost the host a call each.
+    """A frame as CUDA graphs, which cost the host a call each: one serves, one makes what lies below
+    what was made, one draws, and two look ahead of the camera and finish.
     `Engine.capture` makes it. Replays take turns with the other frames of the engine; the picture
     is one buffer, so one thread should replay a graph.
 
