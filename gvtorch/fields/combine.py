@@ -2,7 +2,7 @@
 
 What an interval of the parts tells of the whole is worked out by interval arithmetic (Moore,
 "Interval analysis", 1966). Any of the parts may have numbers that change with time: see
-`FieldProducer.changed`.
+`Producer.time`.
 """
 
 from __future__ import annotations

@@ -169,26 +169,6 @@ class FieldProducer(Producer):
         """
         return _by_channel(type(self).__name__, self.field(points), points)
 
-    @property
-    def time(self) -> float:
-        """The time of the parts of the field that have one, a buffer `time`; setting it makes them
-        anew (`changed`). AttributeError if none has.
-        """
-        return float(self._clocks()[0])
-
-    @time.setter
-    def time(self, value: float) -> None:
-        time = check.number(type(self).__name__, "time", value)
-        for clock in self._clocks():
-            clock.fill_(time)
-        self.changed()
-
-    def _clocks(self) -> list[Tensor]:
-        clocks = [one for n, one in self.field.named_buffers() if n.rpartition(".")[2] == "time"]
-        if not clocks:
-            raise AttributeError(f"{type(self).__name__}: no part of the field has a time")
-        return clocks
-
     def _made(self, nodes: Nodes, field: nn.Module) -> dict[str, Tensor]:
         """Values of the voxels of some bricks, (k, z, y, x, c) by channel."""
         where = type(self).__name__

@@ -73,6 +73,16 @@ class JoinedProducer(Producer):
     def _each(self) -> dict[str, Producer]:
         return {name: one for name, one in self.producers.items() if isinstance(one, Producer)}
 
+    @property
+    def version(self) -> int:  # type: ignore[override]
+        """Rises with that of each."""
+        return sum(one.version for one in self._each().values())
+
+    def changed(self) -> None:
+        """See `Producer.changed`; all have changed."""
+        for one in self._each().values():
+            one.changed()
+
     def prepare(self, layout: Layout) -> None:
         """Prepares all."""
         for one in self._each().values():
