@@ -28,8 +28,8 @@ class Finest(gv.VolumeProducer):
     later = False
 
     def __init__(self, volume, branching=2, **options):
-        super().__init__(volume, **options)
-        self.branching, self.filled = branching, []
+        super().__init__(volume, branching=branching, **options)
+        self.filled: list[tuple[int, ...]] = []
 
     def fill(self, nodes):
         assert (nodes.depth == nodes.layout.depth).all()
@@ -68,8 +68,7 @@ def test_coarse_levels_are_the_means_of_what_lies_below(shape, branching, dtypes
     """In every bit those of levels that are made of the whole volume."""
     volumes = {str(n): gv.Volume(noise(shape, dtype, n)) for n, dtype in enumerate(dtypes)}
     fine = Finest(volumes, branching, threshold=threshold)
-    whole = gv.VolumeProducer(volumes, threshold=threshold)
-    whole.branching = branching
+    whole = gv.VolumeProducer(volumes, threshold=threshold, branching=branching)
     producer = gv.FromChildren(fine)
     layout = Layout.of(producer, 4, 1, torch.device("cpu"))
     for one in (producer, whole):

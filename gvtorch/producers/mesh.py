@@ -39,6 +39,7 @@ class MeshProducer(Producer):
         band: float = 4.0,
         thickness: float = 1.0,
         solid: Solid = "auto",
+        branching: int = 2,
     ) -> None:
         """Takes a mesh.
 
@@ -50,6 +51,7 @@ class MeshProducer(Producer):
             thickness: Finest voxels, of what bounds no solid.
             solid: auto: what is closed is a solid; always: holes are filled before; never: all is a
                 sheet.
+            branching: N.
 
         Raises:
             ValueError: A number is out of its range, a channel unknown, or see `read_mesh`.
@@ -71,6 +73,7 @@ class MeshProducer(Producer):
             channels={name: Channel(*CHANNELS[name]) for name in grid.channels},
             spacing=grid.spacing,
             origin=grid.origin,
+            branching=branching,
             value_range={name: one for name, one in ranges.items() if name in grid.channels},
             labels={"material": None} if "material" in grid.channels else None,
         )
