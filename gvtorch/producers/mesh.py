@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..base import check
 from ..io.mesh_file import read_mesh
 from ..meshes.holes import Solid, told_of_holes
 from ..meshes.mesh import Mesh
@@ -54,8 +55,10 @@ class MeshProducer(Producer):
             branching: N.
 
         Raises:
-            ValueError: A number is out of its range, a channel unknown, or see `read_mesh`.
+            ValueError: It is none of these, a number is out of its range, a channel unknown, or see
+                `read_mesh`.
         """
+        check.instance("MeshProducer", "mesh", mesh, Mesh, str, Path)
         mesh = mesh if isinstance(mesh, Mesh) else read_mesh(mesh)
         if solid == "auto" and (told := told_of_holes(mesh)):
             warnings.warn(told, stacklevel=2)
