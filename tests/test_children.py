@@ -7,6 +7,7 @@ from concurrent.futures import Future
 import pytest
 import torch
 from helpers import DEVICES
+from helpers.producers import Sponge
 
 import gvtorch as gv
 from gvtorch.producers.producer import Layout, Nodes
@@ -150,6 +151,14 @@ def test_a_mixed_batch_is_as_its_parts():
         assert torch.equal(both[row : row + 1], alone)
 
 
+def root_of(producer):
+    """Regions and brick of a root and its first child."""
+    layout = Layout.of(producer, 4, 1, torch.device("cpu"))
+    producer.prepare(layout)
+    nodes = Nodes(torch.tensor([[0, 0, 0, 0], [0, 0, 0, 1]]), layout)
+    return producer.classify(nodes), producer.fill(nodes)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -169,6 +178,11 @@ def test_a_mixed_batch_is_as_its_parts():
             lambda: gv.Engine(gv.FromChildren(gv.Producer(1024))),
             "the root of a tree 7 levels deep is made of 2097152 finest bricks; the most is "
             "levels=5",
+        ),
+        (lambda: root_of(gv.FromChildren(Sponge(2))), "Sponge must answer without alias"),
+        (
+            lambda: root_of(gv.JoinedProducer({"a": Sponge(2)})),
+            "JoinedProducer: producers must answer without alias",
         ),
     ],
 )

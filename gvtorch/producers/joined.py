@@ -25,7 +25,8 @@ from .stored import StoredProducer
 class JoinedProducer(Producer):
     """Asks several producers for the same nodes; each gives one channel, under a name of its own.
 
-    A node is EMPTY where all say so, and CONSTANT where none has voxels for it.
+    A node is EMPTY where all say so, and CONSTANT where none has voxels for it. Answers with
+    aliases are refused.
 
     Attributes:
         producers: By the name of its channel.
