@@ -152,6 +152,26 @@ def test_only_the_tree_that_changed_is_made_anew():
         assert engine.render(view, GRAY).stats.converged
 
 
+@pytest.mark.parametrize(
+    ("make", "where"),
+    [
+        (lambda p: gv.stack(a=Ramp(), b=p), "Stack: b"),
+        (lambda p: gv.blend(p, Ramp(), Ramp()), "Blend: first"),
+        (lambda p: gv.blend(Ramp(), p, Ramp()), "Blend: second"),
+        (lambda p: gv.blend(Ramp(), Ramp(), p), "Blend: mask"),
+        (lambda p: gv.mask(Ramp(), p), "Mask: mask"),
+        (lambda p: gv.warp(p, Sway(), most=0.2), "Warp: field"),
+        (lambda p: gv.warp(Ramp(), p, most=0.2), "Warp: way"),
+        (lambda p: gv.Painted(gv.sdf.Sphere(), p), "Painted: colors"),
+        (lambda p: gv.FieldProducer(p, 32, box=BOX), "FieldProducer: field"),
+    ],
+)
+def test_a_producer_is_no_field(make, where):
+    with pytest.raises(ValueError, match=f"^{where} must be a field, got FieldProducer") as error:
+        make(gv.FieldProducer(Ramp(), 32, box=BOX))
+    assert "gv.JoinedProducer" in str(error.value) and "\n" not in str(error.value)
+
+
 class Growing(gv.sdf.Sphere):
     """A ball whose radius is the time."""
 
