@@ -159,6 +159,7 @@ def test_only_the_tree_that_changed_is_made_anew():
         (lambda p: gv.blend(p, Ramp(), Ramp()), "Blend: first"),
         (lambda p: gv.blend(Ramp(), p, Ramp()), "Blend: second"),
         (lambda p: gv.blend(Ramp(), Ramp(), p), "Blend: mask"),
+        (lambda p: gv.mask(p, Ramp()), "Mask: field"),
         (lambda p: gv.mask(Ramp(), p), "Mask: mask"),
         (lambda p: gv.warp(p, Sway(), most=0.2), "Warp: field"),
         (lambda p: gv.warp(Ramp(), p, most=0.2), "Warp: way"),

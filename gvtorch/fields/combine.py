@@ -178,6 +178,7 @@ class Mask(Blend):
 
     def __init__(self, field: nn.Module, mask: nn.Module) -> None:
         """Takes the field and a mask of one value; see `Blend`."""
+        checked_field("Mask", "field", field)
         super().__init__(field, field, mask)
         if isinstance(field, Field):
             self.dtypes = field.dtypes
