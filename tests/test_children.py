@@ -7,6 +7,7 @@ from concurrent.futures import Future
 import pytest
 import torch
 from helpers import DEVICES
+from helpers.producers import Sponge
 
 import gvtorch as gv
 from gvtorch.producers.producer import Layout, Nodes
@@ -28,8 +29,8 @@ class Finest(gv.VolumeProducer):
     later = False
 
     def __init__(self, volume, branching=2, **options):
-        super().__init__(volume, **options)
-        self.branching, self.filled = branching, []
+        super().__init__(volume, branching=branching, **options)
+        self.filled: list[tuple[int, ...]] = []
 
     def fill(self, nodes):
         assert (nodes.depth == nodes.layout.depth).all()
@@ -68,8 +69,7 @@ def test_coarse_levels_are_the_means_of_what_lies_below(shape, branching, dtypes
     """In every bit those of levels that are made of the whole volume."""
     volumes = {str(n): gv.Volume(noise(shape, dtype, n)) for n, dtype in enumerate(dtypes)}
     fine = Finest(volumes, branching, threshold=threshold)
-    whole = gv.VolumeProducer(volumes, threshold=threshold)
-    whole.branching = branching
+    whole = gv.VolumeProducer(volumes, threshold=threshold, branching=branching)
     producer = gv.FromChildren(fine)
     layout = Layout.of(producer, 4, 1, torch.device("cpu"))
     for one in (producer, whole):
@@ -151,6 +151,14 @@ def test_a_mixed_batch_is_as_its_parts():
         assert torch.equal(both[row : row + 1], alone)
 
 
+def root_of(producer):
+    """Regions and brick of a root and its first child."""
+    layout = Layout.of(producer, 4, 1, torch.device("cpu"))
+    producer.prepare(layout)
+    nodes = Nodes(torch.tensor([[0, 0, 0, 0], [0, 0, 0, 1]]), layout)
+    return producer.classify(nodes), producer.fill(nodes)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -170,6 +178,11 @@ def test_a_mixed_batch_is_as_its_parts():
             lambda: gv.Engine(gv.FromChildren(gv.Producer(1024))),
             "the root of a tree 7 levels deep is made of 2097152 finest bricks; the most is "
             "levels=5",
+        ),
+        (lambda: root_of(gv.FromChildren(Sponge(2))), "Sponge must answer without alias"),
+        (
+            lambda: root_of(gv.JoinedProducer({"a": Sponge(2)})),
+            "JoinedProducer: producers must answer without alias",
         ),
     ],
 )

@@ -152,9 +152,104 @@ def test_only_the_tree_that_changed_is_made_anew():
         assert engine.render(view, GRAY).stats.converged
 
 
-def test_a_field_without_a_time_says_so():
-    with pytest.raises(AttributeError, match="no part of the field has a time"):
-        gv.FieldProducer(Ramp(), 32, box=BOX).time = 1.0
+@pytest.mark.parametrize(
+    ("make", "where"),
+    [
+        (lambda p: gv.stack(a=Ramp(), b=p), "Stack: b"),
+        (lambda p: gv.blend(p, Ramp(), Ramp()), "Blend: first"),
+        (lambda p: gv.blend(Ramp(), p, Ramp()), "Blend: second"),
+        (lambda p: gv.blend(Ramp(), Ramp(), p), "Blend: mask"),
+        (lambda p: gv.mask(p, Ramp()), "Mask: field"),
+        (lambda p: gv.mask(Ramp(), p), "Mask: mask"),
+        (lambda p: gv.warp(p, Sway(), most=0.2), "Warp: field"),
+        (lambda p: gv.warp(Ramp(), p, most=0.2), "Warp: way"),
+        (lambda p: gv.Painted(gv.sdf.Sphere(), p), "Painted: colors"),
+        (lambda p: gv.FieldProducer(p, 32, box=BOX), "FieldProducer: field"),
+    ],
+)
+def test_a_producer_is_no_field(make, where):
+    with pytest.raises(ValueError, match=f"^{where} must be a field, got FieldProducer") as error:
+        make(gv.FieldProducer(Ramp(), 32, box=BOX))
+    assert "gv.JoinedProducer" in str(error.value) and "\n" not in str(error.value)
+
+
+class Growing(gv.sdf.Sphere):
+    """A ball whose radius is the time."""
+
+    def __init__(self):
+        super().__init__(0.5)
+        self.number("time", 0.5)
+
+    def forward(self, points):
+        return points.norm(dim=-1) - self.time
+
+
+def pulse():
+    return gv.FieldProducer(Pulse(), 32, box=BOX, threshold=0.0)
+
+
+CLOCKS = {
+    "joined": lambda: gv.JoinedProducer({"value": pulse()}),
+    "from children": lambda: gv.FromChildren(pulse()),
+    "of joined": lambda: gv.FromChildren(gv.JoinedProducer({"value": pulse()})),
+    "hypertexture": lambda: gv.Hypertexture(Growing(), 32, thickness=0.2, box=BOX),
+}
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("name", CLOCKS)
+def test_time_is_that_of_the_parts(name):
+    view, seen = camera(32, distance=1.6), []
+    with gv.Engine(producer := CLOCKS[name](), brick_size=4) as engine:
+        for time in (0.5, 0.9):
+            producer.time = time
+            seen.append(engine.render(view, GRAY).color)
+            engine.validate()
+        assert producer.time == 0.9 and not engine.changed
+    late = CLOCKS[name]()
+    late.time = 0.9
+    with gv.Engine(late, brick_size=4) as engine:
+        assert torch.equal(engine.render(view, GRAY).color, seen[1])
+    assert not torch.equal(*seen)
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("how", ["time", "changed"])
+def test_a_picture_of_joined_producers_follows_each_of_them(how):
+    view, one = camera(32, distance=1.6), pulse()
+    still = gv.FieldProducer(Ramp(), 32, box=BOX)
+    with gv.Engine(gv.JoinedProducer({"moving": one, "still": still}), brick_size=4) as engine:
+        first = engine.render(view, GRAY).color
+        if how == "time":
+            one.time = 0.9
+        else:
+            one.field.time.fill_(0.9)
+            one.changed()
+        assert engine.changed
+        assert not torch.equal(engine.render(view, GRAY).color, first)
+        still.changed()
+        assert engine.changed
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: gv.FieldProducer(Ramp(), 32, box=BOX),
+        lambda: gv.JoinedProducer({"a": gv.FieldProducer(Ramp(), 32, box=BOX)}),
+        lambda: gv.FromChildren(gv.FieldProducer(Ramp(), 32, box=BOX)),
+        lambda: gv.Hypertexture(gv.sdf.Sphere(), 32, thickness=0.2),
+        lambda: gv.PointProducer(torch.rand(9, 3)),
+    ],
+)
+def test_a_producer_without_a_time_says_so(make):
+    producer = make()
+    kind = type(producer).__name__
+    with pytest.raises(AttributeError, match=f"^{kind}: no part of it has a time$"):
+        producer.time = 1.0
+    assert not hasattr(producer, "time") and producer.version == 0
+
+
+def test_a_time_is_a_number():
     with pytest.raises(ValueError, match="time must be finite"):
         gv.FieldProducer(Pulse(), 32, box=BOX).time = float("nan")
 

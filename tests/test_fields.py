@@ -116,6 +116,14 @@ BOX = ((0, 0, 0), (1, 1, 1))
         (lambda: sdf.Repeat(ball(), (2, 0, 0), (2, 1, 1)), "Repeat: count must be odd"),
         (lambda: sdf.Repeat(ball(), (0, 0, 0)), "Repeat: period must be >= 0"),
         (lambda: gv.FieldProducer(3), "FieldProducer: field must be a Module, got int"),
+        (
+            lambda: gv.FieldProducer(torch.nn.ModuleList()),
+            "FieldProducer: field must be a field, got ModuleList, which has no forward",
+        ),
+        (
+            lambda: gv.cache_field(torch.nn.Linear(2, 1), box=BOX),
+            "FieldProducer: field Linear failed: RuntimeError: mat1 and mat2 shapes cannot be mult",
+        ),
         (lambda: gv.FieldProducer(Waves()), "box must be given: the field does not tell"),
         (
             lambda: gv.FieldProducer(Waves(), box=((0, 0, 0), (1, 1, math.inf))),
@@ -140,6 +148,45 @@ def test_bad_fields_are_named(call, message):
     with pytest.raises(ValueError) as caught:
         call()
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+class Torn(gv.Field):
+    """Fails from a place on, or in what it tells of boxes, with two lines."""
+
+    def __init__(self, end, bounded=False):
+        super().__init__()
+        self.end, self.bounded = end, bounded
+
+    def forward(self, points):
+        if (points[..., 0] > self.end).any():
+            raise RuntimeError("torn\nin two")
+        return points[..., 0]
+
+    def bounds(self, center, half):
+        if self.bounded:
+            raise RuntimeError("torn\nin two")
+
+
+TORN = "FieldProducer: field Torn failed: RuntimeError: torn in two"
+
+
+@pytest.mark.parametrize("torn", [Torn(0.3), Torn(9, bounded=True)])
+def test_a_root_that_a_field_can_not_make_is_one_line(torn):
+    with pytest.raises(gv.ProductionError) as caught:
+        gv.Engine(gv.FieldProducer(torn, 64, box=BOX))
+    assert str(caught.value) == f"Engine: the root of tree 'scene' can't be made: {TORN}"
+    assert isinstance(caught.value.__cause__.__cause__, RuntimeError)
+
+
+@pytest.mark.backend("cpp")
+def test_a_brick_that_a_field_can_not_make_is_one_line():
+    producer = gv.FieldProducer(Torn(9), 64, box=BOX)
+    with gv.Engine(producer, strict=True) as engine:
+        producer.field.end = 0.9
+        with pytest.raises(gv.ProductionError) as caught:
+            engine.render(camera(24), GRAY)
+        assert str(caught.value).endswith(TORN) and str(engine.failures[0]).endswith(TORN)
+    assert isinstance(caught.value.__cause__.__cause__, RuntimeError)
 
 
 @pytest.mark.backend("cpp")

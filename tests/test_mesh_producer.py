@@ -230,3 +230,8 @@ def test_a_file_is_read(tmp_path):
     assert producer.extent == (32, 32, 5)
     with pytest.raises(ValueError, match="channels must be some of"):
         gv.MeshProducer(tmp_path / "a.obj", channels=("value",))
+
+
+def test_what_is_no_mesh_is_told():
+    with pytest.raises(ValueError, match="MeshProducer: mesh must be a Mesh or str or Path, got i"):
+        gv.MeshProducer(3)

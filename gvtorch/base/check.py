@@ -277,6 +277,12 @@ def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsiz
     return plain
 
 
+def halves(where: str, branching: Any, what: str) -> None:
+    """Raises ValueError unless N is 2, for `what`, whose levels halve their voxels."""
+    if branching != 2:
+        raise ValueError(f"{where}: branching must be 2 for {what}, got {given(branching)}")
+
+
 def triple(
     where: str, name: str, value: Any, *, positive: bool = False
 ) -> tuple[float, float, float]:

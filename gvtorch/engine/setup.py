@@ -10,6 +10,7 @@ import torch
 
 from ..base import check
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
+from ..base.messages import one_line
 from ..base.volume import movable
 from ..cache import Cache, Scheduler
 from ..cache.write import write_slots
@@ -233,9 +234,8 @@ def make_tree(
         _fill_root(cache, made, options.patience)
     except Exception as error:
         producer.close()
-        reason = str(error) or type(error).__name__
         raise ProductionError(
-            f"Engine: the root of tree {name!r} can't be made: {reason}"
+            f"Engine: the root of tree {name!r} can't be made: {one_line(error)}"
         ) from error
     producer.layout = layout  # it serves this engine now
     return made

@@ -2,7 +2,7 @@
 
 What an interval of the parts tells of the whole is worked out by interval arithmetic (Moore,
 "Interval analysis", 1966). Any of the parts may have numbers that change with time: see
-`FieldProducer.changed`.
+`Producer.time`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from ..base import check
 from .distance import Distance
-from .field import Bounds, Field, Interval, Values
+from .field import Bounds, Field, Interval, Values, checked_field
 
 
 class Painted(Distance):
@@ -25,7 +25,7 @@ class Painted(Distance):
         """Takes the shape and what gives (..., 3) colours at points (..., 3)."""
         super().__init__()
         self.shape = check.instance("Painted", "shape", shape, Distance)
-        self.paint = check.instance("Painted", "colors", colors, nn.Module)
+        self.paint = checked_field("Painted", "colors", colors)
         self.exact, self.smooth = shape.exact, shape.smooth
 
     def forward(self, points: Tensor) -> Tensor:
@@ -68,8 +68,8 @@ class Warp(Field):
                 proven of a box that is so much wider holds.
         """
         super().__init__()
-        self.field = check.instance("Warp", "field", field, nn.Module)
-        self.way = check.instance("Warp", "way", way, nn.Module)
+        self.field = checked_field("Warp", "field", field)
+        self.way = checked_field("Warp", "way", way)
         self.number("most", most, low=0)
         if isinstance(field, Field) and not field.prefiltered:
             self.threshold, self.dtypes = field.threshold, field.dtypes
@@ -99,7 +99,7 @@ class Stack(Field):
         if not fields:
             raise ValueError("Stack: needs a field by name")
         self.fields = nn.ModuleDict(
-            {name: check.instance("Stack", name, one, nn.Module) for name, one in fields.items()}
+            {name: checked_field("Stack", name, one) for name, one in fields.items()}
         )
 
         self.prefiltered = _prefiltered("Stack", fields.values())
@@ -130,9 +130,9 @@ class Blend(Field):
         """
         super().__init__()
         where = type(self).__name__
-        self.first = check.instance(where, "first", first, nn.Module)
-        self.second = check.instance(where, "second", second, nn.Module)
-        self.mask = check.instance(where, "mask", mask, nn.Module)
+        self.first = checked_field(where, "first", first)
+        self.second = checked_field(where, "second", second)
+        self.mask = checked_field(where, "mask", mask)
 
         self.prefiltered = _prefiltered(where, (first, second, mask))
 
@@ -178,6 +178,7 @@ class Mask(Blend):
 
     def __init__(self, field: nn.Module, mask: nn.Module) -> None:
         """Takes the field and a mask of one value; see `Blend`."""
+        checked_field("Mask", "field", field)
         super().__init__(field, field, mask)
         if isinstance(field, Field):
             self.dtypes = field.dtypes

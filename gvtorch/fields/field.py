@@ -131,6 +131,19 @@ class Field(nn.Module):
         return f"{type(self).__name__}({parts})"
 
 
+def checked_field(where: str, name: str, value: Any) -> nn.Module:
+    """Returns a field, or a module that stands for one; ValueError unless it has a forward, which
+    producers, too, have not.
+    """
+    field = check.instance(where, name, value, nn.Module)
+    if getattr(field.forward, "__func__", None) is not nn.Module.forward:
+        return field
+    kind, more = type(field).__name__, ", which has no forward"
+    if hasattr(field, "classify"):
+        more = ", a producer: give its field, or put producers side by side by gv.JoinedProducer"
+    raise ValueError(f"{where}: {name} must be a field, got {kind}{more}")
+
+
 def length(vectors: Tensor) -> Tensor:
     """Returns (...,) lengths of vectors (..., c), whose gradient at 0 is 0, not NaN."""
     return torch.linalg.vector_norm(vectors, dim=-1)

@@ -51,7 +51,7 @@ class FromChildren(Producer):
 
         Raises:
             ValueError: It makes labels, whose means say nothing, or coarse channels, or it needs
-                its parents' bricks.
+                its parents' bricks. Answers with aliases are refused when they come.
         """
         where = type(self).__name__
         check.instance(where, "producer", producer, Producer)
@@ -131,9 +131,14 @@ class FromChildren(Producer):
     def _asked(self, nodes: Nodes) -> Bricks:
         """The producer's answer, checked."""
         found = checked_bricks(arrived(self.producer.fill(nodes)), nodes, self.producer)
-        if found.kind is not None and bool((found.kind == Region.ALIAS).any()):
-            raise ValueError(f"{type(self).__name__}: bricks may be no aliases here")
+        if found.kind is not None:
+            self._refuse_alias(found.kind)
         return found
+
+    def _refuse_alias(self, kind: Tensor) -> None:
+        if bool((kind == Region.ALIAS).any()):
+            who = type(self.producer).__name__
+            raise ValueError(f"{type(self).__name__}: {who} must answer without alias")
 
     def _coarse(self, nodes: Nodes) -> dict[str, Tensor]:
         """(k, z, y, x, c) bricks of coarse nodes, borders included."""
@@ -186,8 +191,7 @@ class FromChildren(Producer):
         regions = checked_regions(arrived(self.producer.classify(nodes)), nodes, self.producer)
         _raise_first(regions.errors)
         kind = regions.kind.cpu()
-        if bool((kind == Region.ALIAS).any()):
-            raise ValueError(f"{type(self).__name__}: regions may be no aliases here")
+        self._refuse_alias(kind)
         found = _uniform(self, regions.constants, len(loc), layout.brick_size)
         rest = ((kind != Region.EMPTY) & (kind != Region.CONSTANT)).nonzero()[:, 0]
         if len(rest):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -11,7 +11,9 @@ from torch import Tensor, nn
 
 from ..base import check
 from ..base.constants import DEEP_VOXELS
+from ..base.messages import one_line
 from ..fields import Distance, Field, Interval, Solid
+from ..fields.field import checked_field
 from ..pool import Channel
 from .producer import Bricks, Nodes, Producer, Region, Regions
 
@@ -69,11 +71,11 @@ class FieldProducer(Producer):
             value_range: For each channel its smallest and largest value, where they are known.
 
         Raises:
-            ValueError: The field gives no values of the shapes above, a channel differs from what
-                it gives, its box is unknown or infinite, or a number is out of its range.
+            ValueError: The field fails or gives no values of the shapes above, a channel differs
+                from what it gives, its box is unknown or infinite, or a number is out of its range.
         """
         where = type(self).__name__
-        check.instance(where, "field", field, nn.Module)
+        checked_field(where, "field", field)
         field = Solid(field) if isinstance(field, Distance) else field
         known = field if isinstance(field, Field) else None
         if box is None:
@@ -167,27 +169,8 @@ class FieldProducer(Producer):
         """Returns the values at points (..., 3), for each channel (..., c), without an engine: of
         the field itself, in the dtype of the points, not filtered and not rounded.
         """
-        return _by_channel(type(self).__name__, self.field(points), points)
-
-    @property
-    def time(self) -> float:
-        """The time of the parts of the field that have one, a buffer `time`; setting it makes them
-        anew (`changed`). AttributeError if none has.
-        """
-        return float(self._clocks()[0])
-
-    @time.setter
-    def time(self, value: float) -> None:
-        time = check.number(type(self).__name__, "time", value)
-        for clock in self._clocks():
-            clock.fill_(time)
-        self.changed()
-
-    def _clocks(self) -> list[Tensor]:
-        clocks = [one for n, one in self.field.named_buffers() if n.rpartition(".")[2] == "time"]
-        if not clocks:
-            raise AttributeError(f"{type(self).__name__}: no part of the field has a time")
-        return clocks
+        where = type(self).__name__
+        return _by_channel(where, _asked(where, self.field, self.field, points), points)
 
     def _made(self, nodes: Nodes, field: nn.Module) -> dict[str, Tensor]:
         """Values of the voxels of some bricks, (k, z, y, x, c) by channel."""
@@ -195,16 +178,19 @@ class FieldProducer(Producer):
         size = nodes.voxel_size.to(self.dtype)[:, None, None, None]
         if isinstance(field, Field) and field.prefiltered:
             points = nodes.wider(field.margin).points(self.dtype)
-            found = _by_channel(where, field.filtered(points, size), points)
+            values = _asked(where, field, field.filtered, points, size)
+            found = _by_channel(where, values, points)
             if field.margin == 0:
                 return found
             side = nodes.layout.side
             like = points[:, :side, :side, :side]
-            return _by_channel(where, field.finish(found, size[:, 0, 0, 0]), like)
+            values = _asked(where, field, field.finish, found, size[:, 0, 0, 0])
+            return _by_channel(where, values, like)
         points = nodes.points(self.dtype)
         total: dict[str, Any] = {}
         for offset in self.offsets.to(size).unbind(0):
-            values = _by_channel(where, field(points + size * offset), points)
+            asked = _asked(where, field, field, points + size * offset)
+            values = _by_channel(where, asked, points)
             total = {name: total.get(name, 0) + value for name, value in values.items()}
         return {name: value / len(self.offsets) for name, value in total.items()}
 
@@ -212,7 +198,8 @@ class FieldProducer(Producer):
         """For each channel of which anything is known, its interval, (k, c) each."""
         if not isinstance(self.field, Field):
             return {}
-        found = self.field.filtered_bounds(center, half, size)
+        ask = self.field.filtered_bounds
+        found = _asked(type(self).__name__, self.field, ask, center, half, size)
         if found is None:
             return {}
         by_channel = found if isinstance(found, Mapping) else {"value": found}
@@ -282,6 +269,15 @@ def alike(
         yield from ((rows, near) for rows in group.split(count))
 
 
+def _asked(where: str, field: nn.Module, method: Callable[..., Any], *given: Any) -> Any:
+    """What a method of a field gives; ValueError in one line that names the field if it fails."""
+    try:
+        return method(*given)
+    except Exception as error:
+        said = f"{type(error).__name__}: {one_line(error)}"
+        raise ValueError(f"{where}: field {type(field).__name__} failed: {said}") from error
+
+
 def _by_channel(where: str, values: Any, points: Tensor) -> dict[str, Tensor]:
     """Values of a field at points (..., 3) as (..., c) by channel; ValueError if they are not."""
     if isinstance(values, Tensor):
@@ -314,9 +310,9 @@ def _channels_of(where: str, field: nn.Module) -> dict[str, int]:
     points = torch.full((2, 5, 3), 0.25, device=device)
     with torch.no_grad():
         if isinstance(field, Field) and field.prefiltered:
-            values = field.filtered(points, points)
+            values = _asked(where, field, field.filtered, points, points)
         else:
-            values = field(points)
+            values = _asked(where, field, field, points)
     return {n: value.shape[-1] for n, value in _by_channel(where, values, points).items()}
 
 

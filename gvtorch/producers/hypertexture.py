@@ -78,6 +78,7 @@ class Hypertexture(Tally, Producer):
         skip: bool = True,
         box: Sequence[Sequence[float]] | None = None,
         dtype: torch.dtype = torch.float16,
+        branching: int = 2,
     ) -> None:
         """Takes the shape, and how rough it is.
 
@@ -93,6 +94,7 @@ class Hypertexture(Tally, Producer):
             skip: Whether octaves that can't matter are left out.
             box: World corners; left out: around the shape and what noise adds to it.
             dtype: Of the channels: float16, bfloat16 or float32.
+            branching: N.
 
         Raises:
             ValueError: A number is out of its range, the dtype another, or there is no box.
@@ -112,7 +114,13 @@ class Hypertexture(Tally, Producer):
         channels = {"density": Channel(dtype)}
         if distances:
             channels["distance"] = Channel(dtype)
-        super().__init__(extent, channels=channels, box=box, value_range={"density": (0.0, 1.0)})
+        super().__init__(
+            extent,
+            channels=channels,
+            box=box,
+            branching=branching,
+            value_range={"density": (0.0, 1.0)},
+        )
         self.shape, self.skip = shape, skip
         self.thickness, self.softness = thickness, softness
         self.octaves = [

@@ -25,7 +25,8 @@ from .stored import StoredProducer
 class JoinedProducer(Producer):
     """Asks several producers for the same nodes; each gives one channel, under a name of its own.
 
-    A node is EMPTY where all say so, and CONSTANT where none has voxels for it.
+    A node is EMPTY where all say so, and CONSTANT where none has voxels for it. Answers with
+    aliases are refused.
 
     Attributes:
         producers: By the name of its channel.
@@ -73,6 +74,16 @@ class JoinedProducer(Producer):
     def _each(self) -> dict[str, Producer]:
         return {name: one for name, one in self.producers.items() if isinstance(one, Producer)}
 
+    @property
+    def version(self) -> int:  # type: ignore[override]
+        """Rises with that of each."""
+        return sum(one.version for one in self._each().values())
+
+    def changed(self) -> None:
+        """See `Producer.changed`; all have changed."""
+        for one in self._each().values():
+            one.changed()
+
     def prepare(self, layout: Layout) -> None:
         """Prepares all."""
         for one in self._each().values():
@@ -111,6 +122,7 @@ class StoredChannels(JoinedProducer):
         host_cache: int | str = "512 MB",
         timeout: float = 30.0,
         workers: int | None = None,
+        branching: int = 2,
     ) -> None:
         """Opens the store.
 
@@ -120,11 +132,13 @@ class StoredChannels(JoinedProducer):
             host_cache: Most bytes of decoded blocks kept in host memory, of all together.
             timeout: As of `StoredProducer`.
             workers: Number of threads that read a channel, as of `StoredProducer`.
+            branching: N, which is 2, as of `StoredProducer`.
 
         Raises:
             ValueError: It has no such channel, or is no store of several; or see `StoredProducer`.
             OSError: It can't be read.
         """
+        check.halves("StoredChannels", branching, "levels of a store")
         known = channel_names(store)
         if not known:
             raise ValueError(f"{store}: is no store of several channels: take StoredProducer")

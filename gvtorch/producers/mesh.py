@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..base import check
 from ..io.mesh_file import read_mesh
 from ..meshes.holes import Solid, told_of_holes
 from ..meshes.mesh import Mesh
@@ -39,6 +40,7 @@ class MeshProducer(Producer):
         band: float = 4.0,
         thickness: float = 1.0,
         solid: Solid = "auto",
+        branching: int = 2,
     ) -> None:
         """Takes a mesh.
 
@@ -50,10 +52,13 @@ class MeshProducer(Producer):
             thickness: Finest voxels, of what bounds no solid.
             solid: auto: what is closed is a solid; always: holes are filled before; never: all is a
                 sheet.
+            branching: N.
 
         Raises:
-            ValueError: A number is out of its range, a channel unknown, or see `read_mesh`.
+            ValueError: It is none of these, a number is out of its range, a channel unknown, or see
+                `read_mesh`.
         """
+        check.instance("MeshProducer", "mesh", mesh, Mesh, str, Path)
         mesh = mesh if isinstance(mesh, Mesh) else read_mesh(mesh)
         if solid == "auto" and (told := told_of_holes(mesh)):
             warnings.warn(told, stacklevel=2)
@@ -71,6 +76,7 @@ class MeshProducer(Producer):
             channels={name: Channel(*CHANNELS[name]) for name in grid.channels},
             spacing=grid.spacing,
             origin=grid.origin,
+            branching=branching,
             value_range={name: one for name, one in ranges.items() if name in grid.channels},
             labels={"material": None} if "material" in grid.channels else None,
         )

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from ..base import check
 from ..base.constants import DEEP_VOXELS
 from ..fields.noise import OctaveSum, SplineSum
 from ..pool import Channel
@@ -36,6 +37,7 @@ class OctaveProducer(Producer):
         *,
         box: Sequence[Sequence[float]] | None = None,
         values: Callable[[Tensor, Nodes], Tensor] | None = None,
+        branching: int = 2,
         value_range: tuple[float, float] | None = None,
     ) -> None:
         """Takes the sum and where to cut voxels out of it.
@@ -46,15 +48,18 @@ class OctaveProducer(Producer):
             box: World corners ((x, y, z), (x, y, z)), of voxels that are cubes.
             values: A function of the sum (k, z, y, x) in some nodes, and of these nodes, such as a
                 density: of the same shape. On CUDA it is recorded: it may not wait for the host.
+            branching: N; 2 of a `SplineSum`, whose levels halve their voxels.
             value_range: Smallest and largest value, where they are known.
 
         Raises:
-            ValueError: Voxels are no cubes, or see `Producer`.
+            ValueError: Voxels are no cubes, N is not 2 of a `SplineSum`, or see `Producer`.
         """
         where = type(self).__name__
         if not isinstance(total, (OctaveSum, SplineSum)):
             kind = type(total).__name__
             raise ValueError(f"{where}: total must be a SplineSum or an OctaveSum, got {kind}")
+        if isinstance(total, SplineSum):
+            check.halves(where, branching, "a SplineSum")
         self._names = ["value"]
         if isinstance(total, OctaveSum) or values is not None:
             self._names.append("inherited")
@@ -62,6 +67,7 @@ class OctaveProducer(Producer):
             extent,
             channels={name: Channel() for name in self._names},
             box=box,
+            branching=branching,
             value_range=None if value_range is None else {"value": value_range},
         )
         if max(self.spacing) > min(self.spacing) * (1 + 1e-9):

@@ -517,6 +517,27 @@ class Producer(torch.nn.Module):
         """
         self.version += 1
 
+    @property
+    def time(self) -> float:
+        """The time of the parts that have one, such as a field or another producer: a buffer `time`
+        (`Field.number`). Setting it makes all anew (`changed`). AttributeError if none has.
+        """
+        return float(self._clocks()[0])
+
+    @time.setter
+    def time(self, value: float) -> None:
+        clocks = self._clocks()
+        time = check.number(type(self).__name__, "time", value)
+        for clock in clocks:
+            clock.fill_(time)
+        self.changed()
+
+    def _clocks(self) -> list[Tensor]:
+        clocks = [one for n, one in self.named_buffers() if n.rpartition(".")[2] == "time"]
+        if not clocks:
+            raise AttributeError(f"{type(self).__name__}: no part of it has a time")
+        return clocks
+
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the values at world points (..., 3), for each channel (..., c) float32, as
         renderers read them: between the eight nearest voxels of the finest level. Needs no engine;

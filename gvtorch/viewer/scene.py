@@ -182,7 +182,7 @@ class Scene:
         return values[np.isfinite(values)]
 
     def _clocks(self) -> list[Any]:
-        """Producers that have a time of their own (`FieldProducer.time`)."""
+        """Producers that have a time of their own (`Producer.time`)."""
         trees = () if self.engine is None else self.engine.trees.values()
         return [one.producer for one in trees if hasattr(one.producer, "time")]
 

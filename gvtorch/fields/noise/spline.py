@@ -86,7 +86,7 @@ class SplineSum(Tally):
             ValueError: No octave's cells are as wide as the level's voxels, or N is not 2.
         """
         where = "noise.SplineSum"
-        check.whole(where, "branching", branching, low=2, high=2)
+        check.halves(where, branching, "sums of splines")
         steps = math.log2(side * self.octaves[0].frequency)
         if abs(steps - round(steps)) > _APART:
             raise ValueError(
