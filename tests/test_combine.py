@@ -244,7 +244,7 @@ def test_a_picture_of_joined_producers_follows_each_of_them(how):
 def test_a_producer_without_a_time_says_so(make):
     producer = make()
     kind = type(producer).__name__
-    with pytest.raises(AttributeError, match=f"^{kind}: no part of it has a time$"):
+    with pytest.raises(AttributeError, match=f"^{kind}: no part of it keeps a number 'time'$"):
         producer.time = 1.0
     assert not hasattr(producer, "time") and producer.version == 0
 

@@ -47,10 +47,10 @@ class Steps(Protocol):
 
 
 class FrameGraph:
-    """A frame as CUDA graphs, which cost the host a call each: one serves, one makes what lies below
-    what was made, one draws, and two look ahead of the camera and finish.
-    `Engine.capture` makes it. Replays take turns with the other frames of the engine; the picture
-    is one buffer, so one thread should replay a graph.
+    """A frame as CUDA graphs, which cost the host a call each: one serves, one makes what lies
+    below what was made, one draws, and two look ahead of the camera and finish. `Engine.capture`
+    makes it. Replays take turns with the other frames of the engine; the picture is one buffer, so
+    one thread should replay a graph.
 
     A replay is the frame that `Engine.frame` would render. Where all producers are `on_device`, it
     also makes what the replay before it missed; where all are `on_host`, these get the list of what

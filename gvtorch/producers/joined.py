@@ -122,7 +122,6 @@ class StoredChannels(JoinedProducer):
         host_cache: int | str = "512 MB",
         timeout: float = 30.0,
         workers: int | None = None,
-        branching: int = 2,
     ) -> None:
         """Opens the store.
 
@@ -132,13 +131,11 @@ class StoredChannels(JoinedProducer):
             host_cache: Most bytes of decoded blocks kept in host memory, of all together.
             timeout: As of `StoredProducer`.
             workers: Number of threads that read a channel, as of `StoredProducer`.
-            branching: N, which is 2, as of `StoredProducer`.
 
         Raises:
             ValueError: It has no such channel, or is no store of several; or see `StoredProducer`.
             OSError: It can't be read.
         """
-        check.halves("StoredChannels", branching, "levels of a store")
         known = channel_names(store)
         if not known:
             raise ValueError(f"{store}: is no store of several channels: take StoredProducer")

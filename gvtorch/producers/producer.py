@@ -535,7 +535,7 @@ class Producer(torch.nn.Module):
     def _clocks(self) -> list[Tensor]:
         clocks = [one for n, one in self.named_buffers() if n.rpartition(".")[2] == "time"]
         if not clocks:
-            raise AttributeError(f"{type(self).__name__}: no part of it has a time")
+            raise AttributeError(f"{type(self).__name__}: no part of it keeps a number 'time'")
         return clocks
 
     def at(self, points: Tensor) -> dict[str, Tensor]:

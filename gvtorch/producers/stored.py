@@ -160,7 +160,6 @@ class StoredProducer(Producer):
         time: int = 0,
         channels: Sequence[int] | None = None,
         filtered: CoarseColors | None = None,
-        branching: int = 2,
     ) -> None:
         """Opens the store and starts the threads.
 
@@ -177,7 +176,6 @@ class StoredProducer(Producer):
             channels: Which channels, as components of "value"; None takes all.
             filtered: A `Filtered` shader whose colours the store holds (`Filtered.stored`): coarse
                 bricks bring them along, to be rendered with this shader.
-            branching: N, which is 2: the levels of a store halve their voxels.
 
         Raises:
             ValueError: A number is out of its range, the store has no such colours, or see
@@ -185,7 +183,6 @@ class StoredProducer(Producer):
             OSError: The store can't be read.
         """
         limit = check.nbytes("StoredProducer", "host_cache", host_cache)
-        check.halves("StoredProducer", branching, "levels of a store")
         if workers is not None:
             check.whole("StoredProducer", "workers", workers, low=1, high=64)
         seconds = check.number("StoredProducer", "timeout", timeout, low=0, open_low=True)

@@ -52,11 +52,12 @@ class VolumeProducer(Producer):
         Args:
             volume: One volume, or one by channel name, all of one extent, spacing and origin.
             threshold: Regions with no value above it are EMPTY; None keeps every value.
-            hold: What is held in memory, if N is 2. "voxels": all levels, 8 / 7 of the volume.
-                "bricks": all bricks of all levels, with their borders, as well (2.2 times the
-                volume for 8^3 and a border of 1); answers then come many times as fast. "mapped": a
-                copy of all levels, in host memory that the engine's CUDA device reads in place: it
-                cuts bricks by itself, the host has no part in it, and `Engine.capture` records it.
+            hold: What is held in memory (sizes: where N is 2). "voxels": all levels, 8 / 7 of the
+                volume. "bricks": all bricks of all levels, with their borders, as well (2.2 times
+                the volume for 8^3 and a border of 1); answers then come many times as fast.
+                "mapped": a copy of all levels, in host memory that the engine's CUDA device reads
+                in place: it cuts bricks by itself, the host has no part in it, and
+                `Engine.capture` records it.
             filtered: A `Filtered` shader: coarse bricks hold colours for it as well, made of the
                 first channel; to be rendered with this shader.
             branching: N.
