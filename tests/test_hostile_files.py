@@ -110,6 +110,30 @@ def test_a_budget_ends_the_work_of_its_thread_alone(tmp_path, monkeypatch):
         sum(range(1000))
 
 
+PROFILED = """
+import cProfile, sys
+from gvtorch.io import budget
+
+budget.SECONDS = 0.2
+with cProfile.Profile():
+    for refused in (False, True, False):
+        try:
+            with budget.header_budget(sys.argv[0]):
+                while refused:
+                    sum(range(1000))
+            print("read")
+        except ValueError:
+            print("refused")
+"""
+
+
+def test_a_budget_ends_under_a_profiler():
+    run = subprocess.run(
+        [sys.executable, "-c", PROFILED], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert run.stdout.split() == ["read", "refused", "read"], run.stderr[-2000:]
+
+
 def test_what_is_larger_than_memory_is_told_before(tmp_path, monkeypatch):
     np.savez_compressed(tmp_path / "a.npz", np.zeros((100, 100, 100), np.uint8))
     np.save(tmp_path / "b.npy", np.zeros((100, 100, 100), np.uint8))

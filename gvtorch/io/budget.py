@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .resources import amount
@@ -91,7 +91,8 @@ class _Watch:
         self._reader = threading.get_ident()
         self._clock = time.pthread_getcpuclockid(self._reader)
         self._begin, self._memory = time.clock_gettime(self._clock), _resident()
-        self._over, self._lock, self._ended = threading.Event(), threading.Lock(), False
+        self._over, self._lock = threading.Event(), threading.Lock()
+        self._sent = self._ended = False
 
     def __enter__(self) -> None:
         threading.Thread(target=self._look, daemon=True, name="gvtorch-budget").start()
@@ -99,9 +100,19 @@ class _Watch:
     def __exit__(self, *_error: object) -> None:
         with self._lock:
             self._ended = True  # no exception is sent from here on
-            # One that was sent and is not raised yet is withdrawn.
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._reader), None)
         self._over.set()
+        if self._sent:
+            # One may be on its way still. It can't be withdrawn: Python 3.11 would then look for it
+            # for ever, and hang under a profiler. So one more takes its place, and is met here.
+            with suppress(_TooMuch):
+                self._send()
+                while True:
+                    time.sleep(0)
+
+    def _send(self) -> None:
+        """Has `_TooMuch` raised in the thread that reads."""
+        reader, error = ctypes.c_ulong(self._reader), ctypes.py_object(_TooMuch)
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(reader, error)
 
     def _look(self) -> None:
         while not self._over.wait(_LOOK):
@@ -111,8 +122,8 @@ class _Watch:
                 spent = time.clock_gettime(self._clock) - self._begin
                 greedy = spent > _PATIENCE and _resident() - self._memory > self._most
                 if spent > self._seconds or greedy:
-                    error = ctypes.py_object(_TooMuch)
-                    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._reader), error)
+                    self._sent = True
+                    self._send()
 
 
 def _resident() -> int:
