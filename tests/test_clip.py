@@ -52,7 +52,9 @@ def test_pieces_hold_what_is_kept_and_nothing_else(boxes, cuts, seed):
     kept, cut, plane = some(boxes, 1.0), some(cuts, 0.6), (0.3, -0.4, 0.5, 0.6)
     clip = gv.Clip(planes=[plane], boxes=kept, without=cut)
     rays = rays_through(200, seed)
-    pieces = Clipped(lambda _: None, clip, UNIT, step=0.1, depth_alpha=0.1).pieces(rays)
+    pieces = (
+        Clipped(lambda _: None, clip, UNIT, step=0.1, depth_alpha=0.1).meet(rays).pieces(rays.range)
+    )
     assert len(pieces) == max(1, boxes) + cuts
     spans = torch.stack(pieces).numpy()  # (k, r, 2)
     assert (spans[..., 0] <= spans[..., 1]).all()
@@ -75,7 +77,9 @@ def test_boxes_that_touch_are_one_piece():
     box = torch.tensor([[3.0, 4, 5], [3.7, 5.3, 5.9]], dtype=torch.float64)
     rays = rays_through(100, 1)
     rays = dataclasses.replace(rays, origin=rays.origin + torch.tensor([3.3, 4.6, 5.4]))
-    first, second = Clipped(lambda _: None, clip, box, step=0.1, depth_alpha=0.1).pieces(rays)
+    first, second = (
+        Clipped(lambda _: None, clip, box, step=0.1, depth_alpha=0.1).meet(rays).pieces(rays.range)
+    )
     assert (first[:, 0] < first[:, 1]).sum() > 50
     assert torch.equal(second[:, 0], second[:, 1])
 
@@ -324,10 +328,11 @@ def test_the_face_that_is_shaded_is_the_one_that_was_crossed():
     direction = torch.nn.functional.normalize(to - origin)
     limits = torch.tensor([0.0, torch.inf], dtype=torch.float64).expand(64, 2)
     rays = gv.Rays(origin=origin, direction=direction, cone=limits, range=limits)
-    entry = clipped.pieces(rays)[0][:, 0]
+    met = clipped.meet(rays)
+    entry = met.pieces(rays.range)[0][:, 0]
     torch.testing.assert_close(entry, (to - origin).norm(dim=1))
     axis = torch.tensor([0] * 22 + [1] * 22 + [2] * 20)
-    facing, normal = clipped._facing(rays, entry)
+    facing, normal = met.facing(entry)
     torch.testing.assert_close(normal, torch.eye(3, dtype=torch.float64)[axis])
     torch.testing.assert_close(facing, direction.gather(1, axis[:, None]).abs()[:, 0])
 

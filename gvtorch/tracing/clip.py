@@ -91,45 +91,43 @@ class Faces(NamedTuple):
     without: list[list[Face]]
 
 
-@dataclass(frozen=True, eq=False)
-class Clipped:
-    """Traces the kept pieces of rays, and the caps in front of them, in one frame."""
+class _Met(NamedTuple):
+    """A face, and rays. float64; numbers of faces stay on the host, so nothing waits for it."""
 
-    trace: Trace  # traces a piece
-    clip: Clip
-    box: Tensor  # (2, 3) world corners of the scene
-    step: float  # world length of the shortest interval: one behind a cut gives its cap the colour
-    depth_alpha: float  # depth is where alpha passes this
-    slab: Trace | None = None  # traces the intervals that give caps their colour; None: `trace`
-    unlit: bool = False  # caps are not lit here, because `Lighting` lights them later
-    #: Traces all pieces of each ray; None: each piece is composited over those behind it.
-    together: Callable[[Iterable[Rays]], Hits] | None = None
+    normal: Sequence[float]
+    height: Tensor  # (r,) how far each ray's origin lies inside of it
+    rate: Tensor  # (r,) by how much that grows per unit distance
 
-    @cached_property
-    def _faces(self) -> Faces:
-        return self.clip.faces(self.box)
 
-    def __call__(self, rays: Rays) -> Hits:
-        """Traces rays in world units."""
-        rays = replace(rays, range=rays.range.to(torch.float64))
-        pieces = [replace(rays, range=kept) for kept in self.pieces(rays)]
-        if self.together is not None and not self.clip.caps:
-            return self.together(pieces)
-        cap = partial(self._cap, rays.range[:, 0]) if self.clip.caps else None
-        return trace_pieces(self.trace, pieces, cap=cap)
+class _MetFaces(NamedTuple):
+    """`Faces`, and where rays meet them: worked out once for all pieces and caps."""
 
-    def pieces(self, rays: Rays) -> list[Tensor]:
-        """Returns the kept (r, 2) ranges of rays, nearest first, as many as a ray can have; a range
-        that a ray does not need ends where it begins.
+    planes: list[_Met]
+    boxes: list[list[_Met]]
+    without: list[list[_Met]]
+
+    @staticmethod
+    def of(faces: Faces, rays: Rays) -> _MetFaces:
+        """Where rays meet the faces."""
+        origin, direction = (
+            one.to(torch.float64).mT.contiguous() for one in (rays.origin, rays.direction)
+        )
+
+        def meet(some: list[Face]) -> list[_Met]:
+            return [_Met(n, _dot(n, [*origin]) + d, _dot(n, [*direction])) for *n, d in some]
+
+        return _MetFaces(meet(faces.planes), [*map(meet, faces.boxes)], [*map(meet, faces.without)])
+
+    def pieces(self, limits: Tensor) -> list[Tensor]:
+        """Returns the kept (r, 2) parts of the (r, 2) limits, nearest first, as many as a ray can
+        have; one that a ray does not need ends where it begins.
         """
-        first, last = _convex_span(self._faces.planes, rays, *rays.range.unbind(1))
+        first, last = _convex_span(self.planes, *limits.unbind(1))
         last = torch.maximum(first, last)
-        if not (self._faces.boxes or self._faces.without):
+        if not (self.boxes or self.without):
             return [torch.stack((first, last), 1)]
         everything = torch.full_like(first, -torch.inf), torch.full_like(first, torch.inf)
-        boxes, without = (
-            [_convex_span(faces, rays, *everything) for faces in sets] for sets in self._faces[1:]
-        )
+        boxes, without = ([_convex_span(faces, *everything) for faces in sets] for sets in self[1:])
         all_ends = [end.clamp(first, last) for span in boxes + without for end in span]
         ends = torch.stack([first, last, *all_ends], 1).sort(1).values
         low, high = ends[:, :-1], ends[:, 1:]
@@ -151,7 +149,59 @@ class Clipped:
             pieces.append(torch.where((a < b)[:, None], span, first[:, None]))
         return pieces
 
-    def _cap(self, begin: Tensor, piece: Rays) -> Hits:
+    def facing(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns (r,) cosines between each ray and the normal of the face that it crosses at
+        distances t (r,), and (r, 3) that normal, towards the eye. Of the faces through which the
+        ray enters the kept region, it is the nearest to that place.
+        """
+        nearest, cosine = torch.full_like(t, torch.inf), torch.ones_like(t)
+        normal = [torch.zeros_like(t)] * 3
+        planes, boxes, without = self
+        kept = [(1, face) for faces in (planes, *boxes) for face in faces]
+        cut = [(-1, face) for faces in without for face in faces]
+        for side, (own, height, rate) in kept + cut:
+            away = torch.where(side * rate > 0, (height + t * rate).abs(), torch.inf)
+            nearer = away < nearest
+            cosine = torch.where(nearer, rate.abs(), cosine)
+            sides = zip(own, normal, strict=True)
+            normal = [torch.where(nearer, -side * n, known) for n, known in sides]
+            nearest = torch.minimum(away, nearest)
+        return cosine, torch.stack(normal, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Clipped:
+    """Traces the kept pieces of rays, and the caps in front of them, in one frame."""
+
+    trace: Trace  # traces a piece
+    clip: Clip
+    box: Tensor  # (2, 3) world corners of the scene
+    step: float  # world length of the shortest interval: one behind a cut gives its cap the colour
+    depth_alpha: float  # depth is where alpha passes this
+    slab: Trace | None = None  # traces the intervals that give caps their colour; None: `trace`
+    unlit: bool = False  # caps are not lit here, because `Lighting` lights them later
+    #: Traces all pieces of each ray; None: each piece is composited over those behind it.
+    together: Callable[[Iterable[Rays]], Hits] | None = None
+
+    @cached_property
+    def _faces(self) -> Faces:
+        return self.clip.faces(self.box)
+
+    def __call__(self, rays: Rays) -> Hits:
+        """Traces rays in world units."""
+        rays = replace(rays, range=rays.range.to(torch.float64))
+        met = self.meet(rays)
+        pieces = [replace(rays, range=kept) for kept in met.pieces(rays.range)]
+        if self.together is not None and not self.clip.caps:
+            return self.together(pieces)
+        cap = partial(self._cap, met, rays.range[:, 0]) if self.clip.caps else None
+        return trace_pieces(self.trace, pieces, cap=cap)
+
+    def meet(self, rays: Rays) -> _MetFaces:
+        """Where rays in world units meet the faces."""
+        return _MetFaces.of(self._faces, rays)
+
+    def _cap(self, met: _MetFaces, begin: Tensor, piece: Rays) -> Hits:
         """The caps of pieces that begin at a cut, not at `begin` (r,). One interval behind the cut
         gives the colour, the features, and whether there is matter at all.
         """
@@ -161,7 +211,7 @@ class Clipped:
         before = piece.light()[:, 0].to(slab.color)  # transmittance before the cap
         taken = before - (1 - slab.alpha[:, 0])  # by the slab, of the light
         alpha = torch.where(taken > _SEEN * before, self.clip.cap_opacity, 0.0).to(before)
-        facing, normal = self._facing(piece, first)
+        facing, normal = met.facing(first)
         light = 1 - (0.0 if self.unlit else self.clip.cap_light) * (1 - facing)
         taken = torch.where(alpha > 0, taken, 1.0)
         part = before * alpha / taken
@@ -179,25 +229,6 @@ class Clipped:
             features=None if slab.features is None else slab.features * part[:, None],
             label=None if slab.label is None else torch.where(hit[:, None], slab.label, -1),
         )
-
-    def _facing(self, rays: Rays, t: Tensor) -> tuple[Tensor, Tensor]:
-        """(r,) cosine between each ray and the normal of the face that it crosses at distances t
-        (r,), and (r, 3) that normal, towards the eye. Of the faces through which the ray enters
-        the kept region, it is the nearest to that place.
-        """
-        nearest, cosine = torch.full_like(t, torch.inf), torch.ones_like(t)
-        normal = [torch.zeros_like(t)] * 3
-        planes, boxes, without = self._faces
-        kept = [(1, face) for faces in (planes, *boxes) for face in faces]
-        cut = [(-1, face) for faces in without for face in faces]
-        for side, face in kept + cut:
-            height, rate = _height_over(face, rays)
-            away = torch.where(side * rate > 0, (height + t * rate).abs(), torch.inf)
-            cosine = torch.where(away < nearest, rate.abs(), cosine)
-            sides = zip(face, normal, strict=False)
-            normal = [torch.where(away < nearest, -side * n, known) for n, known in sides]
-            nearest = torch.minimum(away, nearest)
-        return cosine, torch.stack(normal, 1)
 
 
 def _face(name: str, numbers: Any) -> Face:
@@ -237,28 +268,16 @@ def _box(name: str, numbers: Any) -> list[Face]:
     return faces
 
 
-def _convex_span(
-    faces: Sequence[Face], rays: Rays, first: Tensor, last: Tensor
-) -> tuple[Tensor, Tensor]:
+def _convex_span(faces: Sequence[_Met], first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
     """(r,) distances between which rays lie inside all faces, cut out of [first, last];
-    last < first where they pass by. float64; numbers stay on the host, so nothing waits for it.
+    last < first where they pass by.
     """
-    for face in faces:
-        height, rate = _height_over(face, rays)
+    for _, height, rate in faces:
         t = -height / rate
         first = torch.where(rate > 0, torch.maximum(first, t), first)
         last = torch.where(rate < 0, torch.minimum(last, t), last)
         last = torch.where((rate == 0) & (height < 0), -torch.inf, last)
     return first, last
-
-
-def _height_over(face: Face, rays: Rays) -> tuple[Tensor, Tensor]:
-    """(r,) how far each ray's origin lies inside of a face, and by how much that grows per
-    unit distance.
-    """
-    *normal, offset = face
-    height = _dot(normal, rays.origin.to(torch.float64).unbind(1)) + offset
-    return height, _dot(normal, rays.direction.to(torch.float64).unbind(1))
 
 
 def _dot(normal: Sequence[float], vector: Sequence[Any]) -> Any:
