@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from helpers import resident_bytes
 
 import gvtorch as gv
 
@@ -71,22 +72,23 @@ def first_below(rays: gv.Rays, share: float, cone: np.ndarray, end: float) -> np
 @pytest.fixture(scope="module")
 def bulb():
     """An engine of a fixed pool, and the place on the surface."""
-    solid = gv.Solid(gv.Mandelbulb(8, iterations=STEPS), colors=False)
-    producer = gv.FieldProducer(solid, 2**33, box=((-BOX / 2,) * 3, (BOX / 2,) * 3))
-    assert producer.dtype == torch.float64
-    with gv.Engine(producer, brick_pool="24 MB", node_pool="8 MB") as engine:
+    with opened("24 MB") as engine:
         yield engine, surface_place()
 
 
-@pytest.mark.backend("cpp")
-@pytest.mark.parametrize("level", [4, 20, 26, 30])
-def test_a_picture_from_near_is_that_of_the_formula(bulb, level):
-    """Where estimates fall from a cone's width to a fiftieth of it lies what is drawn: nothing
-    before, and no hole behind.
+def opened(bricks: str) -> gv.Engine:
+    """An engine of a fixed pool."""
+    solid = gv.Solid(gv.Mandelbulb(8, iterations=STEPS), colors=False)
+    producer = gv.FieldProducer(solid, 2**33, box=((-BOX / 2,) * 3, (BOX / 2,) * 3))
+    assert producer.dtype == torch.float64
+    return gv.Engine(producer, brick_pool=bricks, node_pool="8 MB")
+
+
+def seen_from_near(engine: gv.Engine, place: np.ndarray, level: int, size: int) -> gv.Picture:
+    """A picture. Where estimates fall from a cone's width to a fiftieth of it lies what is drawn:
+    nothing before, and no hole behind.
     """
-    engine, place = bulb
-    size, scale = 16, 2.0
-    view = camera(place, level, size)
+    scale, view = 2.0, camera(place, level, size)
     picture = engine.render(view, gv.Isosurface(0.25), cone_scale=scale)
     engine.validate()
     assert picture.stats.converged and not picture.stats.failed
@@ -104,6 +106,33 @@ def test_a_picture_from_near_is_that_of_the_formula(bulb, level):
     print(
         f"2^-{level}: {seen.mean():.2f} seen, {np.quantile(beside, (0, 0.5, 0.97, 1))} cones beside"
     )
+    return picture
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("level", [4, 20, 26, 30])
+def test_a_picture_from_near_is_that_of_the_formula(bulb, level):
+    seen_from_near(*bulb, level, 16)
+
+
+@pytest.mark.backend("cpp")
+def test_a_flight_through_all_levels_is_that_of_the_formula():
+    """From 2^-4 to 2^-30 of the box with a pool that holds a part of what is seen on the way, in
+    memory that stays as it is; back at the beginning, the picture has the bits that it had.
+    """
+    place, made = surface_place(), 0
+    with opened("2 MB") as engine:
+        for level in range(4, 31):
+            picture = seen_from_near(engine, place, level, 20)
+            made += picture.stats.produced["bricks"]
+            if level == 4:
+                first, memory = picture, engine.memory()
+            if level == 10:
+                resident = resident_bytes()
+        assert made > 2 * engine.cache.bricks.capacity, "the pool was filled anew"
+        assert engine.memory() == memory and resident_bytes() - resident < 20e6
+        back = seen_from_near(engine, place, 4, 20)
+        assert torch.equal(back.depth, first.depth) and torch.equal(back.color, first.color)
 
 
 @pytest.mark.backend("cpp")

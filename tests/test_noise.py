@@ -102,16 +102,25 @@ def test_sums_repeat_with_the_period_of_their_first_octave(n):
     torch.testing.assert_close(noise.warp(points, period=5), moved, atol=1e-13, rtol=0)
 
 
-def test_fractal_sum_is_that_of_plain_numpy():
-    points = random_points(50, 3)
-    options = {"octaves": 5, "lacunarity": 1.9, "gain": 0.6, "seed": 3}
-    expected = [numpy_noise.fbm(point, **options) for point in points.tolist()]
-    torch.testing.assert_close(
-        noise.fbm(points, **options),
-        torch.tensor(expected, dtype=torch.float64),
-        atol=1e-11,
-        rtol=0,
-    )
+@pytest.mark.parametrize(
+    ("name", "own"),
+    [
+        ("fbm", {}),
+        ("turbulence", {}),
+        ("ridged", {}),
+        ("ridged", {"sharpness": 0.7}),
+        ("warp", {"amplitude": 0.3}),
+    ],
+)
+def test_fractal_sums_are_those_of_plain_numpy(name, own):
+    """At 10^3 points; weights of ridges are cut to 1 by the one sharpness, hardly by the other."""
+    points = random_points(1000, 3)
+    options = {"octaves": 3, "lacunarity": 1.9, "gain": 0.6, "seed": 3, **own}
+    expected = [getattr(numpy_noise, name)(point, **options) for point in points.tolist()]
+    found = getattr(noise, name)(points, **options)
+    right = torch.tensor(expected, dtype=torch.float64)
+    torch.testing.assert_close(found, right, atol=1e-11, rtol=0)
+    assert right.std() > 0.1
 
 
 @named

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
+from helpers.points import share_below
 
 import gvtorch as gv
 from gvtorch.points.points import Points
@@ -58,15 +57,6 @@ def dense(
         z, y, x = (part[some] for part, some in zip(parts, held, strict=True))
         out[held] += z[:, None, None, None] * y[:, None, None] * x[:, None] * weight
     return out
-
-
-def share_below(edges: np.ndarray, center: float, reach: float) -> np.ndarray:
-    """The share of a point below places along an axis."""
-    if reach == 0:
-        return (edges > center).astype(float)
-    x = np.clip(2 * (edges - center) / reach + 2, 0, 4)
-    terms = [(-1) ** k * math.comb(4, k) * np.maximum(x - k, 0) ** 4 for k in range(5)]
-    return np.sum(terms, 0) / 24
 
 
 def prepared(

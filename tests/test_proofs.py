@@ -1,13 +1,15 @@
-"""What all producers of formulas promise: what is proven empty or full is so in every voxel, values
-lie in their ranges, and a level is the mean of the one below it.
+"""What all producers of formulas, meshes and points promise: what is proven empty or full is so in
+every voxel, values lie in their ranges, and a level is the mean of the one below it.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 
 import pytest
 import torch
+from helpers import meshes
 from helpers.shapes import ALL, BOXES, ball, block, inside, nodes_of, random_boxes
 
 import gvtorch as gv
@@ -40,6 +42,15 @@ class Sway(torch.nn.Module):
         return 0.05 * (7 * points.roll(1, -1)).sin()
 
 
+def scattered():
+    """Points of all sizes, from none to many voxels, in clumps."""
+    random = torch.Generator().manual_seed(3)
+    place = 0.25 * torch.randn((500, 3), generator=random).double().clamp(-3, 3)
+    sizes = torch.tensor([0.0, 0.005, 0.02, 0.1], dtype=torch.float64)
+    radius = sizes[torch.randint(0, 4, (500,), generator=random)]
+    return gv.PointProducer(place, 0.1 + radius, 128, radius=radius, box=BOX)
+
+
 def of_field(field, **options):
     return lambda: gv.FieldProducer(field(), 128, **{"box": BOX, **options})
 
@@ -70,6 +81,13 @@ PRODUCERS = {
     "stacked": of_field(
         lambda: gv.stack(a=gv.Solid(ball()), b=gv.Solid(block(), colors=False)), threshold=0.0
     ),
+    "mesh": lambda: gv.MeshProducer(meshes.torus(1.0, 0.4, (48, 24)), resolution=128),
+    "distances to a mesh": lambda: gv.MeshProducer(
+        meshes.joined(meshes.torus(1.0, 0.4, (48, 24)), meshes.sheet(3, 1.3)),
+        resolution=128,
+        channels=("coverage", "distance"),
+    ),
+    "points": scattered,
     "julia": lambda: gv.FieldProducer(gv.Julia((-0.2, 0.5, 0.3), 2, iterations=9), 128),
     **{
         name: of_field(make, **({"box": ((-7.0,) * 3, (7.0,) * 3)} if name == "mandelbox" else {}))
@@ -88,42 +106,134 @@ def voxels(producer, nodes):
     return answer.data if isinstance(answer, gv.Bricks) else answer
 
 
+def shown_by(producer) -> dict[str, float]:
+    """By channel that is seen, the value up to which it shows nothing."""
+    if isinstance(producer, gv.FieldProducer):
+        return producer.threshold or {}
+    return {name: 0.0 for name in ("density", "coverage", "value") if name in producer.channels}
+
+
+def check_proofs(producer, regions, ends) -> None:
+    """What regions tell of nodes against the least and the largest voxel in their reach, two (k, c)
+    by channel.
+    """
+    kind, shown = regions.kind, shown_by(producer)
+    assert shown or not (kind == gv.Region.EMPTY).any()
+    for channel, (least, most) in ends.items():
+        if channel in shown:
+            assert (most <= shown[channel])[kind == gv.Region.EMPTY].all(), channel
+        if channel in regions.constants:
+            same = (least == regions.constants[channel]) & (most == regions.constants[channel])
+            assert same[kind == gv.Region.CONSTANT].all(), channel
+        else:
+            assert not (kind == gv.Region.CONSTANT).any()
+        if channel in regions.ranges:
+            low, high = regions.ranges[channel].unbind(1)
+            assert (least >= low).all() and (most <= high).all(), channel
+
+
+def halved(cells: torch.Tensor, of: Callable, reach: bool) -> torch.Tensor:
+    """The least or the largest of 2^3 cells (z, y, x, c), or of the 4^3 in reach of a brick of two
+    cells and a border of 1; beyond the level there are none.
+    """
+    for axis in range(3):
+        first, last = cells.narrow(axis, 0, 1), cells.narrow(axis, -1, 1)
+        every = [slice(None)] * axis
+        pair = of(cells[(*every, slice(0, None, 2))], cells[(*every, slice(1, None, 2))])
+        if reach:
+            before, after = torch.cat((first, cells), axis), torch.cat((cells, last), axis)
+            pair = of(pair, before[(*every, slice(0, -1, 2))])
+            pair = of(pair, after[(*every, slice(2, None, 2))])
+        cells = pair
+    return cells
+
+
+def each(ends, reach: bool):
+    """The least of the least cells, the largest of the largest."""
+    return halved(ends[0], torch.minimum, reach), halved(ends[1], torch.maximum, reach)
+
+
+def whole_level(producer, depth: int, brick_size: int) -> dict[str, torch.Tensor]:
+    """For each channel (z, y, x, c) all voxels of a level, made in bricks of a size."""
+    producer.prepare(Layout.of(producer, brick_size, 1, torch.device("cpu")))
+    nodes, n = nodes_of(producer, depth, brick_size=brick_size), 2**depth
+    found = {}
+    for channel, bricks in voxels(producer, nodes).items():
+        own = bricks[:, 1:-1, 1:-1, 1:-1].unflatten(0, (n, n, n))
+        found[channel] = own.permute(0, 3, 1, 4, 2, 5, 6).reshape(*(n * brick_size,) * 3, -1)
+    return found
+
+
 def test_no_voxel_is_dropped(name):
-    """All nodes of depth 3 and a twentieth of those of depth 6, in bricks of 2^3; all of them with
-    GVTORCH_SOAK=1. What is called EMPTY or CONSTANT is, in every voxel, and every value is in its
-    range.
+    """Brute force: all nodes of all depths to 6, in bricks of 2^3, against all voxels of the finest
+    level in their reach. What is called EMPTY or CONSTANT is, in every voxel, and every value is in
+    its range.
     """
     producer = PRODUCERS[name]()
+    levels, told = whole_level(producer, 3, 16), dict.fromkeys(gv.Region, 0)
+    cells = {channel: (level, level) for channel, level in levels.items()}
     producer.prepare(Layout.of(producer, 2, 1, torch.device("cpu")))
-    shown = getattr(producer, "threshold", None) or {"density": 0.0}
-    told, random = dict.fromkeys(gv.Region, 0), torch.Generator().manual_seed(6)
-    share = 1 if os.environ.get("GVTORCH_SOAK") else 20
-    for depth, most in ((3, 1 << 9), (6, (1 << 18) // share)):
+    for depth in range(6, -1, -1):
+        regions = producer.classify(nodes_of(producer, depth, brick_size=2))
+        ends = {n: each(one, reach=True) for n, one in cells.items()}
+        check_proofs(
+            producer, regions, {n: (a.flatten(0, 2), b.flatten(0, 2)) for n, (a, b) in ends.items()}
+        )
+        cells = {n: each(one, reach=False) for n, one in cells.items()}
+        for region in gv.Region:
+            told[region] += int((regions.kind == region).sum())
+    least = 0.001 if name == "mandelbox" else 0.1
+    proven = told[gv.Region.CONSTANT if name == "distances to a mesh" else gv.Region.EMPTY]
+    assert proven > least * sum(told.values())
+
+
+def test_no_brick_is_dropped(name):
+    """As above, against the nodes' own bricks, which are coarser at depth 3: all of this depth and
+    4096 of depth 6; all of them with GVTORCH_SOAK=1.
+    """
+    producer, random = PRODUCERS[name](), torch.Generator().manual_seed(6)
+    producer.prepare(Layout.of(producer, 2, 1, torch.device("cpu")))
+    for depth, most in ((3, 1 << 9), (6, 1 << (18 if os.environ.get("GVTORCH_SOAK") else 12))):
         nodes = nodes_of(producer, depth, brick_size=2)
         nodes = nodes[torch.randperm(len(nodes), generator=random)[:most].sort().values]
-        regions = producer.classify(nodes)
-        for at in torch.arange(len(nodes)).split(50_000):
-            kind = regions.kind[at]
-            data = voxels(producer, nodes[at])
-            for channel, bricks in data.items():
-                rows = bricks.flatten(1, 3)
-                if channel in shown:
-                    assert (rows <= shown[channel])[kind == gv.Region.EMPTY].all(), channel
-                if channel in regions.constants:
-                    constant = regions.constants[channel][at][:, None]
-                    assert (rows == constant)[kind == gv.Region.CONSTANT].all(), channel
-                else:
-                    assert not (kind == gv.Region.CONSTANT).any()
-                if channel in regions.ranges:
-                    low, high = regions.ranges[channel][at].unbind(1)
-                    assert (rows >= low[:, None]).all() and (rows <= high[:, None]).all(), channel
-            for region in gv.Region:
-                told[region] += int((kind == region).sum())
-    least = 0.001 if name == "mandelbox" else 0.1
-    assert told[gv.Region.EMPTY] > least * sum(told.values())
+        for rows in torch.arange(len(nodes)).split(50_000):
+            made = voxels(producer, nodes[rows]).items()
+            ends = {channel: bricks.flatten(1, 3).aminmax(dim=1) for channel, bricks in made}
+            check_proofs(producer, producer.classify(nodes[rows]), ends)
 
 
-@pytest.mark.parametrize("name", [name for name in PRODUCERS if name not in ALL])
+@pytest.mark.parametrize("octaves", [1, 4])
+def test_noise_passes_no_proof_in_random_boxes(octaves):
+    """10^5 nodes of all levels, two thirds of them about where the proof of EMPTY or CONSTANT
+    begins to hold: 32 values of each by the formula.
+    """
+    rough = {**ROUGH, "frequency": 60.0, "octaves": octaves, "dtype": torch.float32}
+    producer, random = gv.Hypertexture(ball(), 2**12, **rough), torch.Generator().manual_seed(9)
+    layout = Layout.of(producer, 8, 1, torch.device("cpu"))
+    producer.prepare(layout)
+    finest = producer.level_of(layout.depth)
+    worn = finest.left[0] + finest.soft
+    begins = [0.7 + producer.thickness * one for one in (worn - 0.5, -worn - 0.5)]
+    depth = torch.randint(2, layout.depth + 1, (BOXES, 1), generator=random)
+    side = layout.spacing[0] * 8 * 2.0 ** (layout.depth - depth)
+    away = 1.2 * torch.rand((BOXES, 1), generator=random).double()
+    for third, begin in enumerate(begins):
+        away[third::3] = begin + 2 * side[third::3] * (away[third::3] - 0.6)
+    way = torch.nn.functional.normalize(torch.randn((BOXES, 3), generator=random).double(), dim=1)
+    place = ((way * away - layout.origin_3) / side).floor().long().clamp(min=0)
+    nodes = gv.Nodes(torch.cat((place.minimum(2**depth - 1), depth), 1), layout)
+    kind = producer.classify(nodes).kind
+    half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border - 0.5)
+    for region, value in ((gv.Region.EMPTY, 0.0), (gv.Region.CONSTANT, 1.0)):
+        rows = (kind == region).nonzero()[:, 0]
+        points = inside(nodes.center[rows], half[rows], 32)
+        assert (producer.at(points)["density"] == value).all() and len(rows) > BOXES / 20
+
+
+NOT_FIELDS = {*ALL, "mesh", "distances to a mesh", "points"}
+
+
+@pytest.mark.parametrize("name", [name for name in PRODUCERS if name not in NOT_FIELDS])
 def test_intervals_of_fields_hold_in_random_boxes(name):
     """10^5 boxes, 12 values of each; of prefiltered fields for voxels of any size."""
     producer = PRODUCERS[name]()

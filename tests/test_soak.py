@@ -9,11 +9,10 @@ from __future__ import annotations
 import os
 import random
 from concurrent.futures import Future
-from pathlib import Path
 
 import pytest
 import torch
-from helpers import DEVICES
+from helpers import DEVICES, resident_bytes
 from helpers.producers import Late
 from helpers.recorded import Frames
 
@@ -116,10 +115,6 @@ def flight(
             assert torch.equal(picture.color, expected.color), seed
             assert torch.equal(picture.depth, expected.depth), seed
         return engine.frames, whole
-
-
-def resident_bytes() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.mark.parametrize("backend", COMPILED)

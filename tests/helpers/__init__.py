@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import subprocess
 import warnings
 from pathlib import Path
@@ -28,6 +29,11 @@ def shared(path: str) -> Path:
     if not file.exists():
         pytest.skip(ABSENT + path)
     return file
+
+
+def resident_bytes() -> int:
+    """Memory that this process holds."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def gvtorch(*args: object, cwd: str | Path = ".") -> subprocess.CompletedProcess[str]:

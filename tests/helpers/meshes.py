@@ -82,3 +82,15 @@ def volume(mesh: gv.Mesh) -> float:
 def area(mesh: gv.Mesh) -> float:
     a, b, c = mesh.corners.transpose(1, 0, 2)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def parts(mesh: gv.Mesh) -> list[gv.Mesh]:
+    """Those that hang together by corners at one place."""
+    _, corner = np.unique(mesh.corners.reshape(-1, 3), axis=0, return_inverse=True)
+    corner = corner.reshape(-1, 3)
+    label, before = np.arange(corner.max() + 1), None
+    while not np.array_equal(label, before):
+        before = label.copy()
+        np.minimum.at(label, corner, label[corner].min(1, keepdims=True))
+    found = label[corner[:, 0]]
+    return [mesh.only(np.flatnonzero(found == one)) for one in np.unique(found)]

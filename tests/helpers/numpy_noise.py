@@ -130,9 +130,39 @@ def cellular(point, feature="F1", jitter=1.0, reach=1, seed=0, period=None) -> f
     return {"F1": first, "F2": second, "F2-F1": second - first}[feature]
 
 
-def fbm(point, octaves=6, lacunarity=2.0, gain=0.5, seed=0) -> float:
-    total = 0.0
+NEXT_OCTAVE, NEXT_AXIS = 0x10001, 0x3000007
+
+
+def layers(point, octaves, lacunarity, gain, seed) -> list[tuple[float, float]]:
+    """Amplitude and noise of each octave."""
+    found = []
     for octave in range(octaves):
         place = [one * lacunarity**octave for one in point]
-        total += gain**octave * perlin(place, seed + octave * 0x10001)
+        found.append((gain**octave, perlin(place, seed + octave * NEXT_OCTAVE)))
+    return found
+
+
+def fbm(point, octaves=6, lacunarity=2.0, gain=0.5, seed=0) -> float:
+    return sum(a * one for a, one in layers(point, octaves, lacunarity, gain, seed))
+
+
+def turbulence(point, octaves=6, lacunarity=2.0, gain=0.5, seed=0) -> float:
+    return sum(a * abs(one) for a, one in layers(point, octaves, lacunarity, gain, seed))
+
+
+def ridged(point, octaves=6, lacunarity=2.0, gain=0.5, sharpness=2.0, seed=0) -> float:
+    """Musgrave's: a signal's weight is the one before, as sharp as told and cut to 0 to 1."""
+    total, weight = 0.0, 1.0
+    for amplitude, one in layers(point, octaves, lacunarity, gain, seed):
+        signal = weight * (1 - abs(one)) ** 2
+        weight = min(max(sharpness * signal, 0.0), 1.0)
+        total += amplitude * signal
     return total
+
+
+def warp(point, amplitude=1.0, octaves=1, lacunarity=2.0, gain=0.5, seed=0) -> list[float]:
+    moved = []
+    for axis, one in enumerate(point):
+        own = layers(point, octaves, lacunarity, gain, seed + (axis + 1) * NEXT_AXIS)
+        moved.append(one + amplitude * sum(a * noise for a, noise in own))
+    return moved
