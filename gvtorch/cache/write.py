@@ -120,9 +120,10 @@ def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) 
     # given away have to wait.
     front = lru.order[: len(node)].to(torch.int64)
     most = torch.minimum(wanted.sum(), free)
-    leaving = torch.zeros(pool.capacity, dtype=torch.bool, device=node.device)
-    leaving[front] = torch.arange(len(front), device=node.device) < most
-    staying = wanted & ~leaving[node.clamp(min=0) // per_tile]
+    taken = torch.arange(len(front), device=node.device) < most
+    leaving, tile = torch.where(taken, front, -1).sort().values, node.clamp(min=0) // per_tile
+    before, after = (torch.searchsorted(leaving, tile, right=right) for right in (False, True))
+    staying = wanted & (before == after)  # how often the node's own tile is among them: never
     slot = lru.give(staying, most)
     put = Put.of(wanted, slot, pool.parent_t)
     tile_k = slot.to(torch.int32)
