@@ -9,8 +9,9 @@ from __future__ import annotations
 import gc
 import os
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -126,22 +127,31 @@ def random_view(pick: random.Random) -> gv.Camera:
 Resident = Callable[[gv.Producer, gv.Camera], gv.Picture]
 
 
-def resident(blobs: gv.Volume, device: torch.device) -> Resident:
-    """Returns what shows all that a producer makes: a volume's tree, or of a field an engine that
-    has room for it.
+@contextmanager
+def resident(blobs: gv.Volume, store: Path, device: torch.device) -> Iterator[Resident]:
+    """What shows all that a producer makes: the tree of a volume, and else an engine that
+    has room for it. A store's cells are wider than bricks here, so it has other CONSTANT regions.
     """
     size: dict[str, Any] = {"device": device, "brick_size": 4}
     trees = {n: gv.N3Tree.from_volume(blobs, branching=n, **size) for n in (2, 3)}
-    engines = {n: gv.Engine(Spotted(n), brick_pool="16 MB", **size) for n in (2, 3)}
+    others = [Spotted(2), Spotted(3), gv.StoredProducer(store)]
+    kinds = [(type(one), one.branching) for one in others]
+    engines = [gv.Engine(one, brick_pool="16 MB", **size) for one in others]
+    roomy = dict(zip(kinds, engines, strict=True))
 
     def show(producer: gv.Producer, view: gv.Camera) -> gv.Picture:
-        if isinstance(producer, Spotted):
-            picture = engines[producer.branching].render(view, LOOK, max_frames=300)
-            assert picture.stats.converged
-            return picture
-        return gv.render(trees[producer.branching], view, LOOK)
+        engine = roomy.get((type(producer), producer.branching))
+        if engine is None:
+            return gv.render(trees[producer.branching], view, LOOK)
+        picture = engine.render(view, LOOK, max_frames=300)
+        assert picture.stats.converged
+        return picture
 
-    return show
+    try:
+        yield show
+    finally:
+        for engine in engines:
+            engine.close()
 
 
 def flight(
@@ -197,20 +207,22 @@ def memory(device: torch.device) -> tuple[int, int]:
 def test_random_flights_end_in_the_resident_picture(blobs, tmp_path, backend, monkeypatch):
     monkeypatch.setattr(mapped, "_SMALL", 0)  # bytes: all that is mapped is read in place
     device = torch.device(DEVICES[backend])
-    store, show = convert(blobs, tmp_path / "store"), resident(blobs, device)
+    store = tmp_path / "store"
+    convert(blobs, store)
     begin = random.randrange(10**9) if FRAMES > 10_000 else 0  # long runs side by side differ
     frames = flights = compared = 0
     after_a_fifth: tuple[int, int] | None = None
-    while frames < FRAMES:
-        flown, whole = flight(begin + flights, blobs, store, show, device)
-        frames, flights, compared = frames + flown, flights + 1, compared + whole
-        if after_a_fifth is None and frames > FRAMES // 5:
-            after_a_fifth = memory(device)
-        if FRAMES > 10_000 and flights % 50 == 0:
-            megabytes = memory(device)[0] / 1e6
-            print(f"{frames:,} frames, {flights:,} flights, {megabytes:,.0f} MB", flush=True)
-    assert after_a_fifth is not None
-    grown, on_device = (b - a for a, b in zip(after_a_fifth, memory(device), strict=True))
+    with resident(blobs, store, device) as show:
+        while frames < FRAMES:
+            flown, whole = flight(begin + flights, blobs, store, show, device)
+            frames, flights, compared = frames + flown, flights + 1, compared + whole
+            if after_a_fifth is None and frames > FRAMES // 5:
+                after_a_fifth = memory(device)
+            if FRAMES > 10_000 and flights % 50 == 0:
+                megabytes = memory(device)[0] / 1e6
+                print(f"{frames:,} frames, {flights:,} flights, {megabytes:,.0f} MB", flush=True)
+        assert after_a_fifth is not None
+        grown, on_device = (b - a for a, b in zip(after_a_fifth, memory(device), strict=True))
     assert FRAMES < 10_000 or grown < 50e6, f"{grown / 1e6:.0f} MB more"
     assert on_device < 3e6, f"{on_device / 1e6:.1f} MB more on the device"
     assert compared > 0.4 * flights
