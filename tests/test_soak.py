@@ -148,6 +148,8 @@ def resident(blobs: gv.Volume, store: Path, device: torch.device) -> Iterator[Re
         return picture
 
     try:
+        for one in others:
+            show(one, gv.Camera.orbit(30, 20, 0.8, None, 12, 10))  # takes all memory that it needs
         yield show
     finally:
         for engine in engines:
