@@ -19,7 +19,7 @@ class LRU:
 
     Attributes:
         order: (k,) int32 slots without the locked ones; on CUDA changed in place, for graphs read
-            it, and on the CPU a part of longer memory, in which it moves on by what is given away.
+            it, and on the CPU a part of memory a little longer, where it moves on by what is given.
         unused: How many at the front the last picture did not use; these may be taken.
         fresh: How many of these, the first, never held anything, so that a frame need not look at
             them; 0 on CUDA, where the host does not know.
@@ -28,7 +28,7 @@ class LRU:
     def __init__(self, capacity: int, locked: int, device: torch.device) -> None:
         """Starts with slots `locked` to `capacity`, all free."""
         size, on_host = capacity - locked, device.type == "cpu"
-        self._memory = torch.empty(size + size // 4 * on_host, dtype=torch.int32, device=device)
+        self._memory = torch.empty(size + size // 512 * on_host, dtype=torch.int32, device=device)
         self.order = torch.arange(locked, capacity, out=self._memory[:size])
         self.unused = size
         self.fresh = size if on_host else 0
