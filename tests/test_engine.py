@@ -347,7 +347,7 @@ def test_pools_are_honoured_to_the_byte():
         assert memory["bookkeeping"] <= 0.031 * managed
         lru = [one for group in engine.cache.lru.values() for one in group]
         fields = [*engine.cache.nodes.fields.values(), *engine.cache.bricks.fields.values()]
-        total = sum(field.nbytes for field in fields) + sum(one.order.nbytes for one in lru)
+        total = sum(field.nbytes for field in fields) + sum(one.nbytes for one in lru)
         assert total == sum(memory.values())
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.recorded import COMPILED, LOOK, Ball, Frames, view
+from helpers.recorded import COMPILED, LOOK, Ball, Frames, recorded, view
 from helpers.waits import nobody_waits
 from torch import Tensor
 
@@ -443,24 +443,42 @@ def flown(
 PATH = [view(96, 1.5 * number) for number in range(61)]
 
 
-@pytest.mark.backend("cuda")
-@pytest.mark.parametrize("look_ahead", [0, 12])
-def test_a_flight_through_a_store_does_not_wait(blobs, tmp_path, look_ahead):
-    options = {"brick_size": 4, "brick_pool": "4 MB", "device": "cuda"}
-    with gv.Engine(on_the_host(blobs, tmp_path / "one", "store"), **options) as engine:
-        _, picture, _, _ = flown(engine, PATH, 64, look_ahead)
-        assert torch.equal(engine.render(PATH[-1], LOOK).color, picture.color)
+def winding(number: int) -> gv.Camera:
+    """A view of a long flight that comes to new places all the time."""
+    height, distance = 50 * math.sin(number / 40), 0.85 + 0.3 * math.cos(number / 90)
+    return gv.Camera.orbit(1.7 * number, height, distance, None, 96, 96)
 
 
-@pytest.mark.backend("cuda")
-def test_a_flight_through_a_volume_read_in_place_does_not_wait(monkeypatch):
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize(
+    "scene, look_ahead", [("store", 0), ("store", 12), ("mapped", 0), ("formula", 6)]
+)
+def test_a_long_flight_does_not_wait(blobs, tmp_path, scene, look_ahead, backend, monkeypatch):
     monkeypatch.setattr(mapped, "_SMALL", 100_000)  # bytes: the voxels are more
-    values = torch.rand((128,) * 3, generator=torch.Generator().manual_seed(2))
-    options = {"brick_pool": "20 MB", "device": "cuda"}
-    with gv.Engine(gv.VolumeProducer(gv.Volume(values), hold="mapped"), **options) as engine:
-        _, picture, _, missed = flown(engine, PATH, 64)
-        assert missed > 100
-        assert torch.equal(engine.render(PATH[-1], LOOK).color, picture.color)
+    device, options = DEVICES[backend], {"brick_pool": "12 MB"}
+    if scene == "store":
+        producer = on_the_host(blobs, tmp_path / "store", "store")
+        options = {"brick_pool": "150 kB", "brick_size": 4}
+    elif scene == "mapped":
+        values = torch.rand((128,) * 3, generator=torch.Generator().manual_seed(2))
+        producer = gv.VolumeProducer(gv.Volume(values), hold="mapped")
+    else:
+        producer = Ball(1024)
+    path = [winding(number) for number in range(1000 if device == "cuda" else 30)]
+    with gv.Engine(producer, device=device, **options) as engine:
+        replay = recorded(engine, path[0], LOOK, batch=64, look_ahead=look_ahead)
+        with nobody_waits(device=device):
+            flight = [replay(camera)[1] for camera in path]
+        for _ in range(600):
+            color, stats = replay(path[-1])
+            time.sleep(0.002)
+            if stats.settle().converged:
+                break
+        assert stats.converged and sum(stats.misses > 0 for stats in flight) > 0.2 * len(path)
+        assert any(stats.ahead for stats in flight) == (look_ahead > 0)
+        engine.validate()
+        shown = color.clone()
+        assert torch.equal(engine.render(path[-1], LOOK).color.reshape(-1, 3), shown)
 
 
 @pytest.mark.backend("cuda")

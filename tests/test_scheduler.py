@@ -37,6 +37,18 @@ def test_slots_that_never_held_anything_stay_in_front_unread():
     assert lru.fresh == 0 and lru.order.tolist() == [2, 4, 5, 3]
 
 
+def test_the_order_is_that_of_a_queue_however_often_slots_are_given():
+    lru, queue = LRU(3000, 3, torch.device("cpu")), list(range(3, 3000))
+    for turn in range(200):
+        wanted, most = turn * 7 % 10 * (turn % 5 != 4), torch.tensor([turn * 11 % 14])
+        given = min(wanted, int(most))
+        slot = lru.give(torch.ones(wanted, dtype=torch.bool), most)
+        assert slot.tolist() == queue[:given] + [-1] * (wanted - given)
+        queue = queue[given:] + queue[:given]
+        assert lru.order.tolist() == queue
+    assert lru.order.nbytes < lru.nbytes < 1.01 * lru.order.nbytes
+
+
 def requests(depth, priority, coarse=None) -> dict[int, Requests]:
     none = torch.zeros(0, dtype=torch.int64)
     loads = Requests(

@@ -6,17 +6,24 @@ memory stays flat, and once all is well again the picture is the resident one, i
 
 from __future__ import annotations
 
+import gc
 import os
 import random
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from helpers import DEVICES, resident_bytes
 from helpers.producers import Late
-from helpers.recorded import Frames
+from helpers.recorded import recorded, stepped
 
 import gvtorch as gv
+from gvtorch.io.stores.conversion import convert
+from gvtorch.pool import mapped
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
 FRAMES = int(os.environ.get("GVTORCH_SOAK", "2000"))
@@ -49,19 +56,60 @@ class Faulty(gv.VolumeProducer):
         return {n: torch.full(r.shape, torch.nan, dtype=r.dtype) for n, r in answer.data.items()}
 
 
-def random_engine(pick: random.Random, blobs: gv.Volume, device: torch.device) -> gv.Engine:
-    kind = pick.choice(["voxels", "bricks", "late"])
+class Spots(torch.nn.Module):
+    """A ball with spots, with NaN in it while `spoiled` is not 0."""
+
+    spoiled: torch.Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("spoiled", torch.zeros(()))
+
+    def forward(self, position):
+        ball = (3 - 4 * position.norm(dim=-1, keepdim=True)).clamp(0, 1)
+        value = ball * (0.6 + 0.4 * (9 * position[..., :1]).sin())
+        return torch.where((position[..., 1:2] > 0.2) & (self.spoiled > 0), torch.nan, value)
+
+
+class Spotted(gv.FieldProducer):
+    """Made on the device; gives NaN while there is a `fault`."""
+
+    def __init__(self, branching: int) -> None:
+        super().__init__(Spots(), 40, box=((-1, -1, -1), (1, 1, 1)), branching=branching)
+
+    @property
+    def fault(self) -> str:
+        return "nan" if self.field.spoiled else ""
+
+    @fault.setter
+    def fault(self, fault: str) -> None:
+        self.field.spoiled.fill_(fault != "")
+
+
+def random_producer(pick: random.Random, blobs: gv.Volume, store: Path) -> gv.Producer:
+    kind = pick.choice(["voxels", "bricks", "late", "mapped", "store", "field"])
+    seed, branching = pick.randrange(1000), pick.choice([2, 3])
+    if kind == "store":
+        return gv.StoredProducer(store)
+    if kind == "field":
+        return Spotted(branching)
     if kind == "late":
-        producer: gv.VolumeProducer = Late(blobs, pick.randrange(1000), most=0.001)
+        producer: gv.VolumeProducer = Late(blobs, seed, most=0.001)
+    elif kind == "mapped":
+        producer = gv.VolumeProducer(blobs, hold="mapped")
     else:
         producer = Faulty(blobs, pick, kind)
-    producer.branching = branching = pick.choice([2, 3])
+    producer.branching = branching
+    return producer
+
+
+def random_engine(pick: random.Random, producer: gv.Producer, device: torch.device) -> gv.Engine:
     return gv.Engine(
         producer,
         device=device,
         brick_size=4,
         brick_pool=pick.choice([3, 20, 80, 300, 3000]) * 6**3 * 4,
-        node_pool=pick.choice([8, 30, 100, 1000]) * branching**3 * 20,
+        node_pool=pick.choice([8, 30, 100, 1000]) * producer.branching**3 * 20,
         load_budget=pick.choice([1, 7, 50, 4096]),
         subdivide_budget=pick.choice([1, 7, 50, 4096]),
         order=pick.choice(["coarse", "fine"]),
@@ -76,61 +124,106 @@ def random_view(pick: random.Random) -> gv.Camera:
     return gv.Camera.orbit(pick.uniform(-180, 180), pick.uniform(-80, 80), distance, None, 12, 10)
 
 
+Resident = Callable[[gv.Producer, gv.Camera], gv.Picture]
+
+
+@contextmanager
+def resident(blobs: gv.Volume, store: Path, device: torch.device) -> Iterator[Resident]:
+    """What shows all that a producer makes: the tree of a volume, and else an engine that
+    has room for it. A store's cells are wider than bricks here, so it has other CONSTANT regions.
+    """
+    size: dict[str, Any] = {"device": device, "brick_size": 4}
+    trees = {n: gv.N3Tree.from_volume(blobs, branching=n, **size) for n in (2, 3)}
+    others = [Spotted(2), Spotted(3), gv.StoredProducer(store)]
+    kinds = [(type(one), one.branching) for one in others]
+    engines = [gv.Engine(one, brick_pool="16 MB", **size) for one in others]
+    roomy = dict(zip(kinds, engines, strict=True))
+
+    def show(producer: gv.Producer, view: gv.Camera) -> gv.Picture:
+        engine = roomy.get((type(producer), producer.branching))
+        if engine is None:
+            return gv.render(trees[producer.branching], view, LOOK)
+        picture = engine.render(view, LOOK, max_frames=300)
+        assert picture.stats.converged
+        return picture
+
+    try:
+        for one in others:
+            show(one, gv.Camera.orbit(30, 20, 0.8, None, 12, 10))  # takes all memory that it needs
+        yield show
+    finally:
+        for engine in engines:
+            engine.close()
+
+
 def flight(
-    seed: int, blobs: gv.Volume, trees: dict[int, gv.N3Tree], device: torch.device
+    seed: int, blobs: gv.Volume, store: Path, show: Resident, device: torch.device
 ) -> tuple[int, bool]:
     """Flies once with an engine of its own; returns its number of frames, and whether its last
     picture was whole: then it is the resident one.
     """
     pick = random.Random(seed)
-    with random_engine(pick, blobs, device) as engine:
-        (source,) = engine.trees.values()
-        view = random_view(pick)
-        batch, recorded = pick.choice([5, 64]), None
-        if source.producer.on_host:
-            recorded = Frames(engine, view, LOOK, batch, fit=pick.random() < 0.3)
+    producer = random_producer(pick, blobs, store)
+    with random_engine(pick, producer, device) as engine:
+        view, replay = random_view(pick), None
+        if producer.on_host or producer.on_device:
+            record = pick.choice([recorded, stepped])
+            options = {"batch": pick.choice([5, 64]), "look_ahead": pick.choice([0, 0, 5])}
+            replay = record(engine, view, LOOK, fit=pick.random() < 0.3, **options)
         for number in range(pick.randrange(5, 80)):
-            if isinstance(source.producer, Faulty) and pick.random() < 0.1:
-                source.producer.fault = pick.choice(["", *FAULTS])
+            if isinstance(producer, Faulty | Spotted) and pick.random() < 0.1:
+                producer.fault = pick.choice(["", *FAULTS])
             if pick.random() < 0.3:
                 view = random_view(pick)
-            if recorded is not None and pick.random() < 0.5:
-                recorded.look_from(view)
-                recorded.frame()
+            if replay is not None and pick.random() < 0.5:
+                replay(view)
             elif pick.random() < 0.1:
                 engine.render(view, LOOK, max_frames=5)
             else:
                 engine.frame(view, LOOK, lod=pick.choice(["auto", "finest"]))
             if number % 4 == 0:
                 engine.validate()
-        if isinstance(source.producer, Faulty):
-            source.producer.fault = ""
+        if isinstance(producer, Faulty | Spotted):
+            producer.fault = ""
         engine.production.wait(0.1)
         engine.forget_failures()
         picture = engine.render(view, LOOK, max_frames=300)
         engine.validate()
         whole = picture.stats.converged and not picture.stats.failed
         if whole:
-            expected = gv.render(trees[source.producer.branching], view, LOOK)
+            expected = show(producer, view)
             assert torch.equal(picture.color, expected.color), seed
             assert torch.equal(picture.depth, expected.depth), seed
         return engine.frames, whole
 
 
+def memory(device: torch.device) -> tuple[int, int]:
+    """Bytes of the process, and of tensors on a CUDA device."""
+    gc.collect()
+    on_device = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
+    return resident_bytes(), on_device
+
+
 @pytest.mark.parametrize("backend", COMPILED)
-def test_random_flights_end_in_the_resident_picture(blobs, backend):
-    device = DEVICES[backend]
-    trees = {n: gv.N3Tree.from_volume(blobs, 4, branching=n, device=device) for n in (2, 3)}
+def test_random_flights_end_in_the_resident_picture(blobs, tmp_path, backend, monkeypatch):
+    monkeypatch.setattr(mapped, "_SMALL", 0)  # bytes: all that is mapped is read in place
+    device = torch.device(DEVICES[backend])
+    store = tmp_path / "store"
+    convert(blobs, store)
     begin = random.randrange(10**9) if FRAMES > 10_000 else 0  # long runs side by side differ
-    frames = flights = compared = after_a_fifth = 0
-    while frames < FRAMES:
-        flown, whole = flight(begin + flights, blobs, trees, device)
-        frames, flights, compared = frames + flown, flights + 1, compared + whole
-        if not after_a_fifth and frames > FRAMES // 5:
-            after_a_fifth = resident_bytes()
-        if FRAMES > 10_000 and flights % 50 == 0:
-            megabytes = resident_bytes() / 1e6
-            print(f"{frames:,} frames, {flights:,} flights, {megabytes:,.0f} MB", flush=True)
-    grown = resident_bytes() - after_a_fifth
+    frames = flights = compared = 0
+    after_a_fifth: tuple[int, int] | None = None
+    with resident(blobs, store, device) as show:
+        while frames < FRAMES:
+            flown, whole = flight(begin + flights, blobs, store, show, device)
+            frames, flights, compared = frames + flown, flights + 1, compared + whole
+            if after_a_fifth is None and frames > FRAMES // 5:
+                after_a_fifth = memory(device)
+            if FRAMES > 10_000 and flights % 50 == 0:
+                megabytes = memory(device)[0] / 1e6
+                print(f"{frames:,} frames, {flights:,} flights, {megabytes:,.0f} MB", flush=True)
+        assert after_a_fifth is not None
+        grown, on_device = (b - a for a, b in zip(after_a_fifth, memory(device), strict=True))
     assert FRAMES < 10_000 or grown < 50e6, f"{grown / 1e6:.0f} MB more"
+    assert on_device < 3e6, f"{on_device / 1e6:.1f} MB more on the device"
     assert compared > 0.4 * flights

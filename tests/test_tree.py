@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 import gvtorch as gv
 from gvtorch.base import constants as config
+from gvtorch.pool import pyramid
 from gvtorch.pool.pyramid import volume_levels
 
 SIZES = {"branching": 2, "brick_size": 4, "border": 1}
@@ -33,6 +34,25 @@ def coarse_by_hand(data: np.ndarray, n: int) -> np.ndarray:
         ]
         out[index] = data[np.ix_(*picks)].mean()
     return out
+
+
+@pytest.mark.parametrize("how", ["mean", "majority"])
+def test_each_level_is_made_once(how, monkeypatch):
+    """Of the level below: values by the volume's filter, and the ends of ranges."""
+    made: dict[str, list[tuple[int, ...]]] = {}
+    for name in ("coarser", "pool_min", "pool_max"):
+        pool = getattr(pyramid, name)
+
+        def noted(values, *given, name=name, pool=pool, **named):
+            made.setdefault(name, []).append(values.shape)
+            return pool(values, *given, **named)
+
+        monkeypatch.setattr(pyramid, name, noted)
+    volume = random_volume((40, 24, 30), torch.uint8)
+    volumes = {"a": gv.Volume(volume.data, labels=how == "majority"), "b": volume}
+    gv.N3Tree.from_volume(volumes, 4)
+    levels = [(30, 24, 40, 1), (15, 12, 20, 1), (8, 6, 10, 1), (4, 3, 5, 1)]
+    assert made == dict.fromkeys(("coarser", "pool_min", "pool_max"), 2 * levels)
 
 
 @pytest.mark.parametrize("branching", [2, 3])

@@ -18,7 +18,8 @@ class LRU:
     """The order in which slots of a pool are given away: least recently used first.
 
     Attributes:
-        order: (k,) int32 slots without the locked ones, changed in place: CUDA graphs read it.
+        order: (k,) int32 slots without the locked ones; on CUDA changed in place, for graphs read
+            it, and on the CPU a part of memory a little longer, where it moves on by what is given.
         unused: How many at the front the last picture did not use; these may be taken.
         fresh: How many of these, the first, never held anything, so that a frame need not look at
             them; 0 on CUDA, where the host does not know.
@@ -26,9 +27,11 @@ class LRU:
 
     def __init__(self, capacity: int, locked: int, device: torch.device) -> None:
         """Starts with slots `locked` to `capacity`, all free."""
-        self.order = torch.arange(locked, capacity, dtype=torch.int32, device=device)
-        self.unused = len(self)
-        self.fresh = len(self) if device.type == "cpu" else 0
+        size, on_host = capacity - locked, device.type == "cpu"
+        self._memory = torch.empty(size + size // 512 * on_host, dtype=torch.int32, device=device)
+        self.order = torch.arange(locked, capacity, out=self._memory[:size])
+        self.unused = size
+        self.fresh = size if on_host else 0
 
     def sort(self, stamp: Tensor, frame: Tensor) -> Tensor:
         """Moves the slots that `frame` (1,) int32 did not use to the front, each part in its old
@@ -63,13 +66,23 @@ class LRU:
         return torch.where(given, slot, -1)
 
     def _roll(self, count: Tensor) -> None:
-        if count.device.type == "cpu":
-            given = int(count)
-            self.fresh = max(0, self.fresh - given)
-            self.order.copy_(self.order.roll(-given))
+        if count.device.type != "cpu":
+            place = torch.arange(len(self), device=count.device) + count
+            self.order.copy_(self.order[place % len(self)])
             return
-        place = torch.arange(len(self), device=count.device) + count
-        self.order.copy_(self.order[place % len(self)])
+        given, start, memory = int(count), self.order.storage_offset(), self._memory
+        self.fresh = max(0, self.fresh - given)
+        end = start + given + len(self)
+        if end <= len(memory):
+            memory[end - given : end] = self.order[:given]
+            self.order = memory[start + given : end]
+        else:  # back to the beginning
+            self.order = memory[: len(self)].copy_(self.order.roll(-given))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it takes."""
+        return self._memory.nbytes
 
     def __len__(self) -> int:
         """Number of slots."""
@@ -118,7 +131,7 @@ class Cache:
         content = (*nodes.constants.values(), *nodes.ranges.values())
         node_bytes = sum(words.nbytes for words in (nodes.child_tn, nodes.brick_tn, *content))
         brick_bytes = sum(tensor.nbytes for tensor in bricks.bricks.values())
-        order = sum(lru.order.nbytes for group in self.lru.values() for lru in group)
+        order = sum(lru.nbytes for group in self.lru.values() for lru in group)
         rest = nodes.nbytes + bricks.nbytes - node_bytes - brick_bytes + order
         return {"node_pool": node_bytes, "brick_pool": brick_bytes, "bookkeeping": rest}
 

@@ -123,9 +123,9 @@ class RequestList:
         numbers of requests by the name of their kind, on the host already, which so waits only if
         there are aliases.
         """
-        asked = {}
+        asked, listed = {}, self.word[: sum(counts.values())]  # or less: a node may ask for both
         for name, kind in KINDS.items():
-            row = torch.nonzero_static((self.word & kind).ne(0), size=counts[name])[:, 0]
+            row = torch.nonzero_static((listed & kind).ne(0), size=counts[name])[:, 0]
             node, priority = self.node[row].to(torch.int64), self.word[row] & REQUEST_PRIORITY
             asked[kind] = node, priority
         return _at_targets(cache, asked)

@@ -341,12 +341,13 @@ class Camera:
         """Returns the camera in world units, given the (2, 3) box of the scene."""
         if self.frame is Frame.WORLD:
             return self
-        centre, side = (box[0] + box[1]) / 2, (box[1] - box[0]).max()
+        low, high = box.numpy()  # see `numbers`
+        centre, side = torch.from_numpy((low + high) / 2), float((high - low).max())
         view, Ks = self.viewmats.clone(), self.Ks
         rotation = view[:, :3, :3]
-        scale = side.expand(len(self), 1)
         if self.fitted is None:
             view[:, :3, 3] = view[:, :3, 3] * side - rotation @ centre
+            scale = view.new_full((len(self), 1), side)
         else:
             corners = torch.stack([box[at, (0, 1, 2)] for at in _CORNERS]) - centre
             halves = [_FILLED * half for half in self.fitted]
@@ -433,7 +434,7 @@ class Camera:
         row = torch.arange(*rows, device=numbers.device)  # (y,)
         if len(numbers) > 1:
             numbers, row = numbers[row // self.height], row % self.height  # one for each row
-        (fx, fy), (cx, cy) = numbers[:, 12:14].unbind(1), numbers[:, 14:16].unbind(1)
+        fx, fy, cx, cy = numbers[:, 12:16].unbind(1)
         column = torch.arange(self.width, dtype=torch.float64, device=numbers.device)
         x, y = (column - cx[:, None]) / fx[:, None], (row - cy) / fy
         return MODELS[self.model].rays(Plane(x, y, numbers, self.distorted))

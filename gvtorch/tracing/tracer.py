@@ -7,6 +7,7 @@ waits for the number of samples of each part.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -192,7 +193,7 @@ def _check_step(tree: N3Tree, step: float, options: RenderOptions) -> None:
     """Raises ValueError where the ends of intervals can't be told apart. Those of cones can: an
     interval is about as long as its cone is wide, and a distance is known far better than that.
     """
-    length = float((tree.box[1] - tree.box[0]).norm())
+    length = math.dist(*tree.box.tolist())
     most, hint = 2**46, "take a longer step"
     if options.lod == "finest":
         most, hint = 2**50, "lod='auto' takes longer ones where voxels are small"

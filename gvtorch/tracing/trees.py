@@ -95,8 +95,11 @@ def tree_traces(
 def box_around(where: str, trees: Mapping[str, N3Tree], poses: Any = None) -> Tensor:
     """Returns (2, 3) float64 world corners around all trees, given `RenderOptions.pose`."""
     placed = poses_of(where, trees, poses)
-    boxes = torch.stack([world_box(tree.box, placed[name]) for name, tree in trees.items()])
-    return torch.stack((boxes[:, 0].amin(0), boxes[:, 1].amax(0)))
+    boxes = [world_box(tree.box, placed[name]) for name, tree in trees.items()]
+    if len(boxes) == 1:
+        return boxes[0]
+    low, high = torch.stack(boxes).unbind(1)
+    return torch.stack((low.amin(0), high.amax(0)))
 
 
 def trace_trees(trees: Sequence[TreeTrace], rays: Rays) -> Hits:

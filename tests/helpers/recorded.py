@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 import gvtorch as gv
 from gvtorch.engine.host_frame import HostFrame
@@ -116,3 +119,31 @@ class Frames:
             self.engine.read_back(stats, hits, collected)
         self.engine.readbacks.hold_back()
         return hits, stats.settle()
+
+
+Replay = Callable[[gv.Camera], tuple[Tensor, gv.FrameStats]]
+
+
+def stepped(engine: gv.Engine, camera: gv.Camera, look: gv.Shader, **options: Any) -> Replay:
+    """Returns what gives the colour (r, 3) of a frame by `Frames`, and its statistics."""
+    frames = Frames(engine, camera, look, **options)
+
+    def step(camera: gv.Camera) -> tuple[Tensor, gv.FrameStats]:
+        frames.look_from(camera)
+        hits, stats = frames.frame()
+        return hits.color, stats
+
+    return step
+
+
+def recorded(engine: gv.Engine, camera: gv.Camera, look: gv.Shader, **options: Any) -> Replay:
+    """The same, on CUDA of a graph, whose replays overwrite the colour."""
+    if engine.device.type != "cuda":
+        return stepped(engine, camera, look, **options)
+    graph = engine.capture(camera, look, **options)
+
+    def replay(camera: gv.Camera) -> tuple[Tensor, gv.FrameStats]:
+        picture, stats = graph.replay(camera)
+        return picture.color.reshape(-1, 3), stats
+
+    return replay
