@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.compiler import is_compiling
 
 TINY = 1.1754944e-38  # smallest normal float32: what lets less through is opaque
 
@@ -31,10 +33,14 @@ def larger(a: Tensor, b: Tensor) -> Tensor:
 
 
 def sqrt_exact(value: Tensor) -> Tensor:
-    """Square root, rounded once: torch's own may be an ulp beside it on the CPU. In float64 that is
-    mended by the remainder, whose product is exact in halves (Dekker, "A floating-point technique
-    for extending the available precision", 1971).
+    """Square root, rounded once: torch's own may be an ulp beside it on the CPU, NumPy's is not.
+    Where NumPy's can't be had, that is mended in float64 by the remainder, whose product is exact
+    in halves (Dekker, "A floating-point technique for extending the available precision", 1971).
     """
+    plain = value.device.type == "cpu" and not value.requires_grad and type(value) is Tensor
+    if plain and value.dtype in (torch.float32, torch.float64) and not is_compiling():
+        with np.errstate(invalid="ignore"):
+            return torch.from_numpy(np.sqrt(value.numpy()))
     root = torch.sqrt(value.to(torch.float64))
     if value.dtype != torch.float64:
         return root.to(value.dtype)
@@ -128,12 +134,14 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 def unit(v: Tensor) -> Tensor:
     """(r, 3) vectors of length 1, or 0 where there is no direction."""
-    x, y, z = larger(v, -v).unbind(1)
+    columns = v.mT.contiguous()  # (3, r): passes over numbers side by side are several times faster
+    x, y, z = columns.abs()
     most = larger(larger(x, y), z)
     known = (most > 0) & (most < torch.inf)
-    scaled = v / torch.where(known, most, 1.0)[:, None]
-    length = sqrt_exact(dot(scaled, scaled))
-    return torch.where(known[:, None], scaled / length[:, None], 0.0)
+    scaled = columns / torch.where(known, most, 1.0)
+    x, y, z = scaled * scaled
+    length = sqrt_exact(x + y + z)
+    return torch.where(known, scaled / length, 0.0).mT.contiguous()
 
 
 def power(x: Tensor, exponent: float | Tensor) -> Tensor:
