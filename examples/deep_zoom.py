@@ -36,7 +36,7 @@ def solid(x, y, z, digits):
     """Whether cells of a grid of 3^digits a side are the sponge's: nowhere are two digits 1."""
     side = 3**digits
     found = (torch.minimum(torch.minimum(x, y), z) >= 0) & (x < side) & (y < side) & (z < side)
-    for _ in range(21):
+    for _ in range(int(digits.max())):
         found = found & ((x % 3 == 1).int() + (y % 3 == 1).int() + (z % 3 == 1).int() < 2)
         x, y, z = x // 3, y // 3, z // 3
     return found
