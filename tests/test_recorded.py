@@ -23,6 +23,7 @@ from gvtorch.base.constants import REQUEST_PENDING_SHIFT
 from gvtorch.cache.requests import DEEPER, deeper, levels_wanted
 from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
+from gvtorch.engine.stats import Collected, Counts, Readback
 from gvtorch.io.stores.conversion import convert
 from gvtorch.pool import mapped
 
@@ -539,3 +540,23 @@ def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
         else:
             replay()
         assert found.tolist() == [turn * (1 << 20), turn, turn, turn]
+
+
+@pytest.mark.parametrize("chosen", [0, 2])
+def test_what_the_frame_before_asks_for_is_on_its_way(chosen):
+    """Its rays marked nodes as pending, so the next frame does not find them; and it may be settled
+    before the host has asked for any.
+    """
+    asked = []
+
+    def ask(numbers: Tensor) -> int:
+        asked.append(numbers.tolist())
+        return chosen
+
+    counts = torch.zeros(len(Counts._fields) + 3, dtype=torch.int64)
+    stats = [gv.FrameStats() for _ in range(3)]
+    before = Readback(stats[0], Collected(None, counts, ask))
+    after = Readback(stats[1], Collected(None, counts), (before,))
+    Readback(stats[2], Collected(None, counts), (before, after))
+    assert stats[2].settle().converged == stats[1].settle().converged == (chosen == 0)
+    assert before.ask() == chosen and asked == [[0, 0, 0]], "it asks once"

@@ -348,7 +348,7 @@ class Engine:
         stats.rays, stats.bytes = len(hits.missed), nodes.nbytes + bricks.nbytes
         self._missed = hits.missed
         self.cache.make_room(0, 0)
-        self.readbacks.append(Readback(stats, collected))
+        self.readbacks.append(Readback(stats, collected, self.readbacks))
 
     @explicit(RenderOptions)
     @_alone

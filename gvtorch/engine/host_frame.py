@@ -170,17 +170,17 @@ class HostFrame(RecordedFrame):
 
     def ask(self, turn: int, asked: Tensor) -> int:
         """Lets a thread ask producers for the nodes that a frame chose: (2 * batch * 6,) int64 on
-        the host, of each kind rows of node, tree and place. Returns how many they are.
+        the host, of each kind rows of node, tree and place. Returns how many they are, dropped
+        ones included.
         """
         rows = asked.view(len(KINDS), -1, 6)
         count = (rows.numpy()[..., 0] >= 0).sum(1).tolist()
         with self._lock:
-            if turn != self.turn:
-                return 0
-            self._asked += sum(count)
-            for kind, listed, k in zip(KINDS.values(), rows, count, strict=True):
-                if k:
-                    self._chosen[kind].append(listed[:k])
+            if turn == self.turn:
+                self._asked += sum(count)
+                for kind, listed, k in zip(KINDS.values(), rows, count, strict=True):
+                    if k:
+                        self._chosen[kind].append(listed[:k])
         self._go_on()
         return sum(count)
 

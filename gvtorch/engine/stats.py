@@ -8,7 +8,7 @@ from __future__ import annotations
 import statistics
 import threading
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -171,9 +171,13 @@ class Collected(NamedTuple):
 class Readback:
     """A frame whose counts are on their way to the host; completes its statistics."""
 
-    def __init__(self, stats: FrameStats, collected: Collected) -> None:
-        """Starts the copy."""
+    def __init__(
+        self, stats: FrameStats, collected: Collected, earlier: Iterable[Readback] = ()
+    ) -> None:
+        """Starts the copy. `earlier`: those of frames before, which may not have asked yet."""
         self.stats, (self.requests, numbers, self._ask) = stats, collected
+        self._earlier = tuple(earlier)
+        self._asked: int | None = None
         self.pending = stats.pending > 0  # answers were on their way while it was traced
         self._numbers, self._event = numbers, None
         self._counts: Counts | None = None
@@ -201,13 +205,19 @@ class Readback:
         return self._counts
 
     def ask(self) -> int:
-        """Asks for what the device chose, once; returns for how many nodes."""
-        ask, self._ask = self._ask, None
-        self.wait()
-        return 0 if ask is None else ask(self._numbers[len(Counts._fields) :])
+        """Asks for what the device chose, once; returns for how many nodes. Waits."""
+        with _settling:  # of threads that render and threads that settle one asks
+            if self._asked is None:
+                self.wait()
+                ask, numbers = self._ask, self._numbers[len(Counts._fields) :]
+                self._asked = 0 if ask is None else ask(numbers)
+        return self._asked
 
     def converged(self) -> bool:
         """Whether nothing that could be served was missing; waits until the counts are here."""
+        for one in self._earlier:  # what they ask for is marked as pending, and not found again
+            self.pending |= one.ask() > 0
+        self._earlier = ()
         return not (self.wait().found or self.pending)
 
     def _complete(self) -> None:
@@ -264,9 +274,7 @@ class Readbacks(deque[Readback]):
 
     def _take(self) -> Readback:
         readback = self.popleft()
-        if readback.ask():
-            for later in self:
-                later.pending = True
+        readback.ask()
         self._steady = readback.converged()
         counts = readback.wait()
         self.failed = counts.failed > 0
