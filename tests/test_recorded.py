@@ -4,9 +4,11 @@ CUDA as one graph, which the host never waits for.
 
 from __future__ import annotations
 
+import gc
 import math
 import threading
 import time
+import weakref
 from concurrent.futures import Future
 from typing import Any
 
@@ -20,6 +22,7 @@ from torch import Tensor
 import gvtorch as gv
 from gvtorch.base.branches import side_by_side
 from gvtorch.base.constants import REQUEST_PENDING_SHIFT
+from gvtorch.cache import Cache
 from gvtorch.cache.requests import DEEPER, deeper, levels_wanted
 from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
@@ -540,6 +543,35 @@ def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
         else:
             replay()
         assert found.tolist() == [turn * (1 << 20), turn, turn, turn]
+
+
+@pytest.mark.backend("cuda")
+def test_garbage_of_other_engines_does_not_end_a_recording(blobs, monkeypatch):
+    """Locked memory that only garbage holds is given back by whatever thread collects garbage."""
+    monkeypatch.setattr(mapped, "_SMALL", 0)
+    garbage: list[Any] = [mapped.mapped(torch.zeros(1 << 20), torch.device("cuda"))]
+    garbage.append(garbage)
+    held, sort, thresholds = [garbage], Cache.sort_by_use, gc.get_threshold()
+    given_back = weakref.ref(garbage[0])
+    del garbage
+
+    def collecting(cache: Cache) -> Tensor:
+        if torch.cuda.is_current_stream_capturing():
+            held.clear()
+            gc.set_threshold(1, 1, 1)
+            assert [[] for _ in range(1000)]
+        return sort(cache)
+
+    monkeypatch.setattr(Cache, "sort_by_use", collecting)
+    with gv.Engine(gv.VolumeProducer(blobs), device="cuda") as engine:
+        try:
+            graph = engine.capture(view(24), LOOK)
+        finally:
+            gc.set_threshold(*thresholds)
+        assert not held and gc.isenabled()
+        gc.collect()
+        assert given_back() is None
+        assert graph.replay(view(24))[1].settle().samples > 0
 
 
 @pytest.mark.parametrize("chosen", [0, 2])

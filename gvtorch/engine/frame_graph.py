@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
@@ -174,6 +175,14 @@ class FrameGraph:
 
 @contextmanager
 def _recorded(graph: torch.cuda.CUDAGraph, device: torch.device) -> Iterator[None]:
-    """Records what the block does on the device."""
-    with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
-        yield
+    """Records what the block does on the device. Meanwhile Python collects no garbage: to give
+    back what an old engine held, such as locked host memory, would break the recording off.
+    """
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            yield
+    finally:
+        if collects:
+            gc.enable()
