@@ -1,6 +1,6 @@
 """A spiral galaxy of points: a bulge, an old disc, young arms, nebulae, and dust that hides them.
 
-Its light spans more than 10^6 and is tone-mapped.
+Its light spans some 10^6 (from voxel to voxel) and is tone-mapped.
 """
 
 from dataclasses import dataclass
