@@ -194,11 +194,11 @@ def test_rays_through_edges_and_corners_count_once():
 
 @pytest.fixture(scope="module")
 def searched() -> tuple[gv.Mesh, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A mesh, (16, 3) corners of cubes of 8^3 places, these (p, 3), and their (p,) distances to the
+    """A mesh, (40, 3) corners of cubes of 8^3 places, these (p, 3), and their (p,) distances to the
     nearest triangle, found by force.
     """
     mesh = meshes.joined(meshes.torus(1.0, 0.4, (24, 12)), meshes.sheet(3, 2.0))
-    low = torch.from_numpy(places(mesh, 16, 3))
+    low = torch.from_numpy(places(mesh, 40, 3))
     z, y, x = torch.meshgrid(*[torch.arange(8) * 0.1 + 0.05] * 3, indexing="ij")
     place = (low[:, None] + torch.stack((x, y, z), -1).view(-1, 3)).view(-1, 3)
     corner = Geometry(mesh).corner
@@ -213,7 +213,7 @@ def test_the_search_misses_no_triangle(searched, reach, detail):
     mesh, low, place, exact = searched
     geometry = Geometry(mesh)
     geometry.detail = detail
-    size = torch.tensor([0.1, 0.1, reach], dtype=torch.float64).expand(40, 3).contiguous()
+    size = torch.tensor([0.1, 0.1, reach], dtype=torch.float64).expand(len(low), 3).contiguous()
     found = geometry.cubes(low, size, 8, 0.0, shares=False, weights=True, wide=False)
     near = exact < reach * (1 - 1e-5)
     distance, face = found.distance.view(-1), found.face.view(-1).long()

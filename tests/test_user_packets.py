@@ -98,10 +98,10 @@ def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch, quick)
     """The library that users have holds the packet, the one of this file's other header does not;
     float64 is the same in both.
     """
-    own = shader("lit")
+    own = shader("ink")
     assert b"PacketWalk" in own.libraries[0].read_bytes()
     monkeypatch.setenv("CXX", quick)
-    alone = shader("lit", tmp_path)
+    alone = shader("ink", tmp_path)
     assert b"PacketWalk" not in alone.libraries[0].read_bytes()
     tree = scene()
     rays = cut(camera_rays(tree, 11, distance=1.5))
