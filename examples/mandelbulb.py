@@ -5,6 +5,7 @@ Regions whose orbits are proven to escape in time are empty, and never evaluated
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -20,8 +21,8 @@ class Settings:
     """Renders a fractal: the bulb, a Julia set or the Mandelbox."""
 
     output: Path = Path("mandelbulb.png")
-    fractal: str = "bulb"
-    size: int = 480
+    fractal: Literal["bulb", "julia", "box"] = "bulb"
+    size: int = 720
     extent: int = 512
     device: str = "cpu"
 
