@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from helpers import DEVICES
+from torch.autograd import forward_ad
+from torch.fx.experimental.proxy_tensor import make_fx
 
 import gvtorch as gv
 from gvtorch.ops import Orbit, orbit_bounds, orbits
-from gvtorch.ops.reference.exact import log_exact
+from gvtorch.ops.reference.exact import log_exact, sqrt_exact
 
 CONSTANT, BAILOUT = (-0.55, 0.3, -0.25), 2.0
 FORMS = {  # kind, amount, iterations, julia, bailout
@@ -105,6 +108,31 @@ def test_logarithm(dtype):
     one = torch.tensor(3.0, dtype=dtype, requires_grad=True)
     log_exact(one).backward()
     assert one.grad.item() == pytest.approx(1 / 3)
+
+
+@dtypes
+def test_square_roots_are_rounded_once_whoever_follows(dtype):
+    """NumPy's where nothing follows them; what records or derives sees operations of torch."""
+    value = torch.rand((500, 3), dtype=dtype, generator=torch.Generator().manual_seed(3)) + 0.01
+    expected = torch.from_numpy(np.sqrt(value.numpy()))
+    slope = 0.5 / expected
+    leaf = value.clone().requires_grad_()
+    found = {
+        "plain": sqrt_exact(value),
+        "of a leaf": sqrt_exact(leaf).detach(),
+        "by rows": torch.vmap(sqrt_exact)(value),
+        "traced": torch.jit.trace(sqrt_exact, (value[:9] * 2,))(value),
+        "of functions": make_fx(sqrt_exact)(value * 2)(value),
+        "compiled": torch.compile(sqrt_exact, backend="eager", fullgraph=True)(value),
+    }
+    for how, root in found.items():
+        assert torch.equal(root, expected), how
+    sqrt_exact(leaf).sum().backward()
+    torch.testing.assert_close(leaf.grad, slope)
+    torch.testing.assert_close(torch.func.grad(lambda v: sqrt_exact(v).sum())(value), slope)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(value, torch.ones_like(value))
+        torch.testing.assert_close(forward_ad.unpack_dual(sqrt_exact(dual)).tangent, slope)
 
 
 @forms

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 from torch.compiler import is_compiling
+from torch.jit import is_tracing
+from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 TINY = 1.1754944e-38  # smallest normal float32: what lets less through is opaque
 
@@ -32,15 +35,30 @@ def larger(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(b > a, b, a)
 
 
+def _seen_by_numpy(value: Tensor) -> np.ndarray | None:
+    """Floats on the CPU as an array, where nothing follows what becomes of them: no gradient of
+    either mode, no compiler, no recording, no transform of `torch.func`.
+    """
+    if value.device.type != "cpu" or type(value) is not Tensor or value.requires_grad:
+        return None
+    followed = is_compiling() or is_tracing() or is_in_torch_dispatch_mode()
+    if followed or value.dtype not in (torch.float32, torch.float64):
+        return None
+    try:
+        return value.numpy() if unpack_dual(value).tangent is None else None
+    except RuntimeError:  # of `torch.func`: there is no memory
+        return None
+
+
 def sqrt_exact(value: Tensor) -> Tensor:
     """Square root, rounded once: torch's own may be an ulp beside it on the CPU, NumPy's is not.
     Where NumPy's can't be had, that is mended in float64 by the remainder, whose product is exact
     in halves (Dekker, "A floating-point technique for extending the available precision", 1971).
     """
-    plain = value.device.type == "cpu" and not value.requires_grad and type(value) is Tensor
-    if plain and value.dtype in (torch.float32, torch.float64) and not is_compiling():
+    seen = _seen_by_numpy(value)
+    if seen is not None:
         with np.errstate(invalid="ignore"):
-            return torch.from_numpy(np.sqrt(value.numpy()))
+            return torch.from_numpy(np.sqrt(seen))
     root = torch.sqrt(value.to(torch.float64))
     if value.dtype != torch.float64:
         return root.to(value.dtype)
