@@ -132,8 +132,8 @@ class Field(nn.Module):
 
 
 def checked_field(where: str, name: str, value: Any) -> nn.Module:
-    """Returns a field, or a module that stands for one; ValueError unless it has a forward, which
-    producers, too, have not.
+    """Returns a field, or a module that stands for one. ValueError where it has no forward, as
+    producers have none.
     """
     field = check.instance(where, name, value, nn.Module)
     if getattr(field.forward, "__func__", None) is not nn.Module.forward:

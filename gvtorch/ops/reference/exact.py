@@ -58,7 +58,7 @@ def sqrt_exact(value: Tensor) -> Tensor:
     seen = _seen_by_numpy(value)
     if seen is not None:
         with np.errstate(invalid="ignore"):
-            return torch.from_numpy(np.sqrt(seen))
+            return torch.from_numpy(np.sqrt(seen, out=np.empty_like(seen)))  # of 0 axes, too
     root = torch.sqrt(value.to(torch.float64))
     if value.dtype != torch.float64:
         return root.to(value.dtype)
