@@ -343,16 +343,17 @@ def test_kernels_equal_twins_on_a_large_pool(compiled):
     actual = ops.lacking(*there, 1, 0, 2, backend=compiled)
     assert torch.equal(actual.cpu(), expected) and 0 < int(expected.sum()) < len(node)
 
-    asked = torch.randint(0, tiles * per_tile, (2, 2, 3000), generator=generator).to(torch.int32)
-    asked[:, 1] &= LOAD | SUBDIVIDE | 15  # of few sizes
-    asked[0, 0, 2000:] = -1
-    given = asked, pool[1], torch.tensor([900, 5000])
-    for order_ in (True, False):
-        expected = ops.choose_requests(*given, per_tile, 1024, order_, backend="reference")
-        there = [one.to(device) for one in given]
-        actual = ops.choose_requests(*there, per_tile, 1024, order_, backend=compiled)
-        assert all(torch.equal(a.cpu(), e) for a, e in zip(actual, expected, strict=True))
-        assert (expected[0] >= 0).sum(1).tolist() == [1024, 900]
+    for listed in (3000, 30_000):  # which are compared, which are sorted
+        asked = torch.randint(0, tiles * per_tile, (2, 2, listed), generator=generator).int()
+        asked[:, 1] &= LOAD | SUBDIVIDE | 15  # of few sizes
+        asked[0, 0, 2000:] = -1
+        given = asked, pool[1], torch.tensor([900, 5000])
+        for order_ in (True, False):
+            expected = ops.choose_requests(*given, per_tile, 1024, order_, backend="reference")
+            there = [one.to(device) for one in given]
+            actual = ops.choose_requests(*there, per_tile, 1024, order_, backend=compiled)
+            assert all(torch.equal(a.cpu(), e) for a, e in zip(actual, expected, strict=True))
+            assert (expected[0] >= 0).sum(1).tolist() == [1024, 900]
 
 
 def test_cache_ops_pass_opcheck(compiled):

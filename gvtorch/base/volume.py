@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -57,7 +58,7 @@ class Volume:
     none changes.
 
     Attributes:
-        data: (z, y, x, c) tensor on the CPU, one of `CHANNEL_DTYPES`.
+        data: (z, y, x, c) tensor, one of `CHANNEL_DTYPES`, on the device where it was given.
         spacing, origin, name, info: See the constructor.
         filter: How coarse levels are made: the mean; of labels the most frequent; or what is seen
             along six directions, see `directional`.
@@ -82,9 +83,9 @@ class Volume:
         """Checks and takes over a grid.
 
         Args:
-            data: (z, y, x) or (z, y, x, c). Any byte order. bool becomes uint8; 32 and 64 bit
-                integers and float64 become float32. Labels are whole numbers of any dtype, below
-                2^63; those of more than 16 bits are counted off, see `label_values`.
+            data: (z, y, x) or (z, y, x, c). Any device, any byte order. bool becomes uint8; 32 and
+                64 bit integers and float64 become float32. Labels are whole numbers of any dtype,
+                below 2^63; those of more than 16 bits are counted off, see `label_values`.
             spacing: (x, y, z) world units, distance of neighbouring voxel centres.
             origin: (x, y, z) world units, centre of voxel 0.
             name: Where it came from, for messages.
@@ -146,6 +147,12 @@ class Volume:
         unordered = self.data.dtype == torch.uint16  # torch does not compare them
         low, high = torch.aminmax(self.data.to(torch.int32) if unordered else self.data)
         return (float(low), float(high))
+
+    def to(self, device: torch.device | str) -> Volume:
+        """Returns the volume with its data on a device; what lies there already is shared."""
+        other = copy.copy(self)
+        other.data = self.data.to(device)
+        return other
 
     def directional(
         self, *, premultiplied: bool = False, dtype: torch.dtype = torch.float16
@@ -234,7 +241,7 @@ class Volume:
 
 def to_numpy(values: Tensor) -> np.ndarray:
     """Returns voxels as an array. NumPy has no bfloat16: float32 holds its values."""
-    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
+    return (values.float() if values.dtype == torch.bfloat16 else values).cpu().numpy()
 
 
 def movable(tensor: Tensor) -> Tensor:
@@ -249,7 +256,7 @@ def _as_labels(
 ) -> tuple[Tensor | np.ndarray, Tensor | None]:
     """Labels as bricks hold them, and what they stand for."""
     if isinstance(data, Tensor):
-        data = to_numpy(data.detach().cpu())
+        data = to_numpy(data.detach())
     if not isinstance(data, np.ndarray) or data.ndim not in (3, 4) or not data.size:
         return data, None  # `_as_tensor` and `Volume` tell what is wrong
     if data.dtype.kind == "f" and nan is not None:
@@ -260,7 +267,7 @@ def _as_labels(
 
 def _as_tensor(where: str, data: Tensor | np.ndarray) -> Tensor:
     if isinstance(data, Tensor):
-        tensor = data.detach().cpu()
+        tensor = data.detach()
     elif isinstance(data, np.ndarray):
         if data.dtype.kind not in "biuf":
             raise ValueError(f"{where}: data must hold numbers, got dtype {data.dtype}")
@@ -276,7 +283,7 @@ def _as_tensor(where: str, data: Tensor | np.ndarray) -> Tensor:
         return tensor
     if tensor.is_complex():
         raise ValueError(f"{where}: data must hold real numbers, got {check.describe(tensor)}")
-    check_narrowed(where, tensor.numpy())
+    check_narrowed(where, tensor.cpu().numpy())
     return tensor.to(torch.float32)
 
 
@@ -295,4 +302,4 @@ def _finite(where: str, tensor: Tensor, nan: float | None) -> Tensor:
             f"{where}: data holds {bad} values that are NaN or infinite (of {tensor.numel()}); "
             "pass nan=VALUE (--nan VALUE) to replace them"
         )
-    return torch.where(torch.isfinite(tensor), tensor, torch.tensor(nan, dtype=tensor.dtype))
+    return torch.where(torch.isfinite(tensor), tensor, tensor.new_tensor(nan))

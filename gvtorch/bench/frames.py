@@ -15,6 +15,7 @@ import torch
 from ..cameras import Camera
 from ..engine import Engine, FrameStats
 from ..pool import Channel, N3Tree
+from ..pool.mapped import mapped
 from ..producers import Bricks, Nodes, Producer, VolumeProducer
 from ..shaders import TransferFunction
 from ..tracing import render
@@ -212,12 +213,24 @@ class Ready(Producer):
         return Bricks(data={"value": self.bricks[: len(nodes)]})
 
 
-_ROWS = 1 << 16
+_ROWS, _REPLAYED = 1 << 16, 1 << 18
+
+
+class ReadyThere(Ready):
+    """The same, in host memory that the device reads in place, as it records."""
+
+    on_device = True
+
+    def __init__(self, side: int, device: torch.device) -> None:
+        """Locks the rows' memory, as many as a replay may ask for."""
+        super().__init__(side, pinned=False)
+        self.bricks = mapped(self.bricks.repeat(_REPLAYED // _ROWS, 1, 1, 1, 1), device)
 
 
 def stream(record: Record) -> None:
     """All bricks of a scene, which its producer has ready, into an engine's pool; time is that of
-    the stages produce and write. Beside it, one large copy from the same kind of memory.
+    the stages produce and write, of recorded frames all that serves. Beside it, one large copy from
+    the same kind of memory.
     """
     settings = record.settings
     side = 64 if settings.quick else 512
@@ -235,10 +248,16 @@ def stream(record: Record) -> None:
             poured.append(_pour(side, pinned, device))
             if len(poured) > 1 and time.perf_counter() - began > settings.seconds:
                 break
-        for who, part in (("gvtorch", 0), ("gvtorch, frames without tiles", 1)):
-            moved = poured[-1][part][1]
+        whole, rest = ([one[part] for one in poured[1:]] for part in (0, 1))
+        ways = {"gvtorch": whole, "gvtorch, frames without tiles": rest}
+        if pinned:
+            there = ReadyThere(side, device)
+            repeats = range(len(poured))
+            ways["gvtorch, recorded frames"] = [_replay(there, device) for _ in repeats][1:]
+        for who, spent in ways.items():
+            moved = spent[-1][1]
             if moved:
-                timing: Timing = spread([one[part][0] for one in poured[1:]])
+                timing: Timing = spread([one[0] for one in spent])
                 rate = 1e3 * moved / timing.median
                 told = {"moved_bytes": moved, "bytes_per_second": rate}
                 record.add(case, who, timing, **told, copy_share=rate / copied[1])
@@ -249,8 +268,21 @@ def stream(record: Record) -> None:
         )
     record.note(
         "ms: stages produce and write of the frames of a cold start that moved bricks, monitored; "
-        "of all, and of those that made no tiles besides; copy share: of the copy's rate"
+        "of all, and of those that made no tiles besides; of recorded frames the stage serve, in "
+        "which requests are chosen, too; copy share: of the copy's rate"
     )
+
+
+_POURED = (
+    Camera.orbit(30, 20, 2.0, 35, 256, 256),
+    TransferFunction.from_points([(0, 0), (255, 1e-4)]),
+)
+
+
+def _pouring(side: int) -> dict[str, Any]:
+    """Options of an engine that takes all bricks of a scene."""
+    pools = _POOLS if side > 64 else _QUICK
+    return {"load_budget": _ROWS, "subdivide_budget": _ROWS, **pools}
 
 
 def _copy_rate(record: Record, pinned: bool) -> tuple[Timing, float, int]:
@@ -267,14 +299,10 @@ def _pour(side: int, pinned: bool, device: torch.device) -> list[tuple[float, in
     """Returns milliseconds of producing and writing, and bytes moved, until all is there: of the
     frames that moved any, and of those that made no tiles besides.
     """
-    shader = TransferFunction.from_points([(0, 0), (255, 1e-4)])
-    camera = Camera.orbit(30, 20, 2.0, 35, 256, 256)
-    pools = _POOLS if side > 64 else _QUICK
-    options: dict[str, Any] = {"load_budget": _ROWS, "subdivide_budget": _ROWS, **pools}
     milliseconds, moved = [0.0, 0.0], [0, 0]
-    with Engine(Ready(side, pinned), device=device, **options) as engine:
+    with Engine(Ready(side, pinned), device=device, **_pouring(side)) as engine:
         for _ in range(_MOST):
-            _, stats = engine.frame(camera, shader, lod="finest", step=2.0)
+            _, stats = engine.frame(*_POURED, lod="finest", step=2.0)
             cost = sum(stats.stages.get(name, 0.0) for name in ("produce", "write"))
             for part in (0, 1) if not stats.produced["tiles"] else (0,):
                 if stats.bytes_uploaded:
@@ -283,3 +311,20 @@ def _pour(side: int, pinned: bool, device: torch.device) -> list[tuple[float, in
             if stats.converged:
                 return [*zip(milliseconds, moved, strict=True)]
     raise ValueError(f"bench: nothing converged within {_MOST} frames")
+
+
+def _replay(there: ReadyThere, device: torch.device) -> tuple[float, int]:
+    """Returns milliseconds of serving and bytes moved, as `_pour`, by recorded frames: of those
+    that moved any.
+    """
+    with Engine(there, device=device, **_pouring(there.extent[0])) as engine:
+        graph = engine.capture(*_POURED, batch=_REPLAYED, lod="finest", step=2.0)
+        frames: list[FrameStats] = []
+        while len(frames) < 4 or not engine.steady:
+            frames.append(graph.replay(_POURED[0])[1])
+            if len(frames) > _MOST:
+                raise ValueError(f"bench: nothing converged within {_MOST} frames")
+        moving = [one for one in frames if one.produced["bricks"]]
+        brick = sum(bricks[0].nbytes for bricks in engine.cache.bricks.bricks.values())
+        moved = brick * sum(one.produced["bricks"] for one in moving)
+        return sum(one.stages["serve"] for one in moving), moved

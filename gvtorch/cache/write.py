@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_SUBDIVIDE, TERMINAL
+from ..base.volume import movable
 from ..ops import lacking, link, link_bricks, link_tiles, orphan, put_rows, unlink
 from ..pool import N3Tree
 from ..pool.staging import Chunk, Voxels, on_device, row_bytes
@@ -227,14 +228,19 @@ def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> None:
 
 def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, Tensor]) -> None:
     """Gives nodes (k,) that have no finer level the ranges of their voxels, borders included: what
-    `classify` told may have been a bound.
+    `classify` told may have been a bound. They are read where they were written: `data` may lie
+    beyond a bus.
     """
     nodes = cache.nodes
     finest = nodes.child_tn.view(-1)[node.clamp(min=0)] == TERMINAL
     index = torch.where(finest & (slot >= 0), node, -1)
     for name, words in nodes.ranges.items():
         if name in data and not cache.bricks.channels[name].coarse:
-            voxels = data[name].flatten(1, 3)
+            held = cache.bricks.bricks[name].detach()
+            rows = movable(held).flatten(1)
+            words_of = torch.int64 if row_bytes(held) % 8 == 0 else rows.dtype  # fewer to gather
+            found = rows.view(words_of)[slot.clamp(min=0)]
+            voxels = found.view(held.dtype).view(len(slot), -1, held.shape[-1])
             if voxels.dtype == torch.uint16:  # which torch can't compare
                 voxels = voxels.to(torch.int32)
             ends = torch.stack(torch.aminmax(voxels, dim=1), 1)

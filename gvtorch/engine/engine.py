@@ -501,7 +501,7 @@ class Engine:
             )
         if view.options.layer is not None:
             view.options.layer.check_device("capture", self.device)
-        check.whole("capture", "batch", batch, low=1, high=1 << 16)
+        check.whole("capture", "batch", batch, low=1, high=1 << 18)
         check.number("capture", "look_ahead", look_ahead, low=0, high=1000)
         check.instance("capture", "fit", fit, bool)
         again = partial(self.frame, shader=shader, **options)

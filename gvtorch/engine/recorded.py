@@ -26,7 +26,7 @@ from ..tracing.pixels import View
 from .request_batch import ProducedTree
 from .stats import COARSER_UNIT, Collected, Readbacks
 
-_MOST_LISTED = 1 << 14  # nodes whose requests are sorted
+_MOST_LISTED = 1 << 14  # nodes whose requests are listed, or as many as a batch holds
 _WIDEN, _NARROW = 1.2, 0.97  # by which cones change from frame to frame at most
 _WIDEST = 64.0
 _ROOMY = 0.85  # of a pool: if less is taken, cones become narrower
@@ -60,7 +60,7 @@ class RecordedFrame:
         """Takes the memory of what a frame leaves to the next one. `fit`: see `Engine.capture`."""
         self.cache, self.trees, self.batch = cache, trees, batch
         self._coarse_first = scheduler.order == "coarse"
-        self._most = min(_MOST_LISTED, cache.nodes.request_tn.numel())
+        self._most = min(max(_MOST_LISTED, batch), cache.nodes.request_tn.numel())
         device = cache.frame_1.device
         # What the last picture asked for, and what the next ones will: nodes and their words.
         self._requests = torch.zeros((2, 2, self._most), dtype=torch.int32, device=device)

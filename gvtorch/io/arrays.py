@@ -28,7 +28,7 @@ def as_source(where: str, given: Any, axes: str | None = None) -> VolumeSource:
     """Returns a volume or an array as a source; see `ArrayLike.of` for arguments and errors."""
     if isinstance(given, Volume):
         place: dict[str, Any] = {"spacing": given.spacing, "origin": given.origin}
-        return MemorySource.of(given.data.numpy(), path=given.name, info=given.info, **place)
+        return MemorySource.of(given.data.cpu().numpy(), path=given.name, info=given.info, **place)
     if not hasattr(given, "shape") or not hasattr(given, "dtype") or hasattr(given, "device"):
         if not isinstance(given, np.ndarray):
             return as_source(where, as_volume(given, axes=axes, where=where))

@@ -1,9 +1,10 @@
-"""Reductions of voxels in NumPy, of which coarse levels and summaries of nodes are made.
+"""Reductions of voxels, of which coarse levels and summaries of nodes are made: of arrays on the
+host, and, with the same bits, of tensors on a device.
 
 `pool_mean` is the filter of a level (docs/design.md, section 2, tells why), `pool_majority` that of
 labels, `pool_directional` that of volumes with six directions, see `Volume.directional`.
 
-All functions take (z, y, x, c) arrays. Each gives the same bits on any part of an array whose
+All functions take (z, y, x, c) grids. Each gives the same bits on any part of an array whose
 corner is a multiple of the factor as on the whole, so volumes are also converted part by part.
 Source: Crassin et al., "GigaVoxels", I3D 2009, section 3 (mip-mapped bricks); Williams, "Pyramidal
     parametrics", 1983; Crassin et al., "Interactive indirect illumination using voxel cone
@@ -16,15 +17,36 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from ..base.volume import DIRECTIONS
+from ..base.volume import DIRECTIONS, to_numpy
 
 Factors = Sequence[int]  # z y x
+Reduction = Literal["min", "max", "mean"]
+#: Arrays; or tensors of a dtype that torch compares and adds up, so not uint16, nor bfloat16.
+Grid = TypeVar("Grid", np.ndarray, Tensor)
 
-_COMBINE = {"min": np.minimum, "max": np.maximum, "mean": np.add}
+_ARRAYS = {"min": np.minimum, "max": np.maximum, "mean": np.add}
+_TENSORS = {"min": torch.minimum, "max": torch.maximum, "mean": torch.add}
 _SLAB = 1 << 22  # voxels reduced at a time, so that intermediate arrays stay in a core's cache
+_DEVICE_SLAB = 1 << 27  # likewise, so that these take less memory than the voxels
+
+
+def as_grid(values: Tensor) -> Any:
+    """Returns voxels as a `Grid`: an array of those on the host, a tensor of others."""
+    if values.device.type == "cpu":
+        return to_numpy(values)
+    wider = {torch.uint16: torch.int32, torch.bfloat16: torch.float32}
+    return values.to(wider.get(values.dtype, values.dtype))
+
+
+def from_grid(values: np.ndarray | Tensor, dtype: torch.dtype) -> Tensor:
+    """Returns what `as_grid` took, in its dtype again."""
+    return torch.as_tensor(values).to(dtype)
 
 
 def round_array(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
@@ -32,7 +54,7 @@ def round_array(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return values.astype(dtype) if dtype.kind == "f" else np.rint(values).astype(dtype)
 
 
-def pool_mean(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
+def pool_mean(values: Grid, factor: int | Sequence[int]) -> Grid:
     """Averages blocks of voxels, (z, y, x, c) integers of at most 16 bits, float16 or float32.
 
     Sums are exact for integers and float64 for float32, always in the same order. `factor` is the
@@ -43,20 +65,20 @@ def pool_mean(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
         (ceil(z / factor), ..., c) of the same dtype, rounded to nearest, ties to even.
     """
 
-    def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:
-        return _narrow(_reduced(part, factors, np.add), math.prod(factors), values.dtype)
+    def reduce(part: Grid, factors: Factors) -> Grid:
+        return _narrow(_reduced(part, factors, "mean"), math.prod(factors), _name(values))
 
     return _pool(values, factor, reduce)
 
 
-def pool_min(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
+def pool_min(values: Grid, factor: int | Sequence[int]) -> Grid:
     """Returns the minimum of each block; arguments as for `pool_mean`."""
-    return _pool(values, factor, partial(_reduced, combine=np.minimum))
+    return _pool(values, factor, partial(_reduced, how="min"))
 
 
-def pool_max(values: np.ndarray, factor: int | Sequence[int]) -> np.ndarray:
+def pool_max(values: Grid, factor: int | Sequence[int]) -> Grid:
     """Returns the maximum of each block; arguments as for `pool_mean`."""
-    return _pool(values, factor, partial(_reduced, combine=np.maximum))
+    return _pool(values, factor, partial(_reduced, how="max"))
 
 
 def pool_majority(
@@ -67,7 +89,7 @@ def pool_majority(
     """
 
     def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:
-        low, high = (_reduced(part, factors, one) for one in (np.minimum, np.maximum))
+        low, high = _reduced(part, factors, "min"), _reduced(part, factors, "max")
         mixed = (low != high).nonzero()
         if len(mixed[0]):
             z, y, x = (n // f for n, f in zip(part.shape, factors, strict=False))
@@ -121,7 +143,7 @@ def pool_directional(
             for k in columns[1:]:
                 total = total + (1 - total[..., 3:]) * _every(rgba, axis, k, factor)
             across = [1 if a == axis else f for a, f in enumerate(factors)]
-            mean = _reduced(total, across, np.add) / factor**2
+            mean = _reduced(total, across, "mean") / factor**2
             seen.append(_of_length(mean, 1 / (factor * sides_zyx[axis])))
         return np.concatenate(seen, -1)
 
@@ -137,7 +159,7 @@ def _of_length(rgba: np.ndarray, lengths: float) -> np.ndarray:
     return np.concatenate((rgba[..., :3] * scale, changed), -1)
 
 
-def window(values: np.ndarray, how: str, *, size: int, step: int) -> np.ndarray:
+def window(values: Grid, how: Reduction, *, size: int, step: int) -> Grid:
     """Reduces windows of size^3 voxels, `step` apart, by "min", "max" or "mean"; the first lies at
     the corner of the array (z, y, x, c).
 
@@ -146,19 +168,21 @@ def window(values: np.ndarray, how: str, *, size: int, step: int) -> np.ndarray:
         mean.
     """
     for axis in range(3):
-        values = _along(values, axis, _COMBINE[how], size, step)
-    return (values / size**3).astype(np.float32) if how == "mean" else values
+        values = _along(values, axis, how, size, step)
+    return _as(_mean(values, size**3), "float32") if how == "mean" else values
 
 
-def extend(values: np.ndarray, axis: int, before: int, after: int) -> np.ndarray:
+def extend(values: Grid, axis: int, before: int, after: int) -> Grid:
     """Repeats the outermost voxels along an axis, `before` and `after` times."""
     if before == after == 0:
         return values
     index = np.arange(-before, values.shape[axis] + after).clip(0, values.shape[axis] - 1)
+    if isinstance(values, Tensor):
+        return values.index_select(axis, torch.from_numpy(index).to(values.device))
     return values.take(index, axis)
 
 
-def by_node(values: np.ndarray, how: str, brick_size: int, border: int) -> np.ndarray:
+def by_node(values: Grid, how: Reduction, brick_size: int, border: int) -> Grid:
     """Reduces the voxels (z, y, x, c) of a level by "min", "max" or "mean": those of each node's
     brick and `border` voxels around, repeated at the level's faces.
 
@@ -170,41 +194,36 @@ def by_node(values: np.ndarray, how: str, brick_size: int, border: int) -> np.nd
         count = -(-values.shape[axis] // brick_size)
         extra = count * brick_size - values.shape[axis]
         values = extend(values, axis, border, extra + border)
-        values = _along(values, axis, _COMBINE[how], size, brick_size)
-    return (values / size**3 if how == "mean" else values).astype(np.float32)
+        values = _along(values, axis, how, size, brick_size)
+    return _as(_mean(values, size**3) if how == "mean" else values, "float32")
 
 
 def _along(
-    values: np.ndarray,
-    axis: int,
-    combine: np.ufunc,
-    size: int,
-    step: int,
-    wide: np.dtype | None = None,
-) -> np.ndarray:
+    values: Grid, axis: int, how: Reduction, size: int, step: int, wide: str | None = None
+) -> Grid:
     """Reduces windows of `size` voxels, `step` apart, along one axis, in order; sums are of the
     dtype `wide`, or one that holds them.
     """
-    if combine is np.add and wide is None:
-        wide = _wide(values.dtype, size)
+    if how == "mean" and wide is None:
+        wide = _wide(_name(values), size)
     count = (values.shape[axis] - size) // step + 1
-    found = _every(values, axis, 0, step, count)
-    found = found.copy() if wide is None else found.astype(wide)
+    found = _as(_every(values, axis, 0, step, count), wide or _name(values), copy=True)
+    combine: Any = (_TENSORS if isinstance(values, Tensor) else _ARRAYS)[how]
     for k in range(1, size):
         combine(found, _every(values, axis, k, step, count), out=found)
     return found
 
 
 def _pool(
-    values: np.ndarray,
-    factor: int | Sequence[int],
-    reduce: Callable[[np.ndarray, Factors], np.ndarray],
-) -> np.ndarray:
-    """Runs `reduce`, which takes whole blocks to one voxel each, over slabs of an array."""
+    values: Grid, factor: int | Sequence[int], reduce: Callable[[Grid, Factors], Grid]
+) -> Grid:
+    """Runs `reduce`, which takes whole blocks to one voxel each, over slabs of a grid."""
     factors = [factor] * 3 if isinstance(factor, int) else list(factor)
     shape = [-(-n // f) for n, f in zip(values.shape[:3], factors, strict=True)]
-    out = np.empty((*shape, values.shape[3]), values.dtype)
-    rows = max(1, _SLAB // max(1, int(np.prod(values.shape[1:])) * factors[0]))
+    shape.append(values.shape[3])
+    out = _empty(values, shape)
+    slab = _DEVICE_SLAB if isinstance(values, Tensor) else _SLAB
+    rows = max(1, slab // max(1, math.prod(values.shape[1:]) * factors[0]))
     for start in range(0, shape[0], rows):
         part = values[start * factors[0] : (start + rows) * factors[0]]
         for axis in range(3):
@@ -213,47 +232,75 @@ def _pool(
     return out
 
 
-def _reduced(part: np.ndarray, factors: Factors, combine: np.ufunc) -> np.ndarray:
+def _reduced(part: Grid, factors: Factors, how: Reduction) -> Grid:
     """Reduces whole blocks to one voxel each, axis after axis."""
-    wide = _wide(part.dtype, math.prod(factors)) if combine is np.add else None
+    wide = _wide(_name(part), math.prod(factors)) if how == "mean" else None
     for axis, factor in enumerate(factors):
-        part = _along(part, axis, combine, factor, factor, wide)
-    return part if wide is None else part.astype(wide, copy=False)
+        part = _along(part, axis, how, factor, factor, wide)
+    return part
 
 
-def _every(
-    values: np.ndarray, axis: int, first: int, step: int, count: int | None = None
-) -> np.ndarray:
+def _every(values: Grid, axis: int, first: int, step: int, count: int | None = None) -> Grid:
     """Returns every `step`-th slice along an axis, `count` of them."""
     stop = None if count is None else first + step * (count - 1) + 1
     return values[(slice(None),) * axis + (slice(first, stop, step),)]
 
 
-def _wide(dtype: np.dtype, terms: int) -> np.dtype:
-    """Returns a dtype that holds the sum of so many terms."""
+def _empty(values: Grid, shape: Sequence[int]) -> Grid:
+    """Returns a grid of a shape, of the kind, dtype and device of another."""
+    if isinstance(values, Tensor):
+        return values.new_empty(shape)
+    return np.empty(shape, values.dtype)
+
+
+def _name(values: Grid) -> str:
+    """Returns the name of a grid's dtype, which NumPy and torch share."""
+    return str(values.dtype).removeprefix("torch.")
+
+
+def _as(values: Grid, name: str, *, copy: bool = False) -> Grid:
+    """Returns a grid in the dtype of a name."""
+    if isinstance(values, Tensor):
+        return values.to(getattr(torch, name), copy=copy)
+    return values.astype(name, copy=copy)
+
+
+def _mean(total: Grid, count: int) -> Grid:
+    """Divides sums, integers as float64: by no reciprocal, which torch takes of plain numbers."""
+    if "int" in _name(total):
+        total = _as(total, "float64")
+    if isinstance(total, Tensor):
+        return total / torch.full((), count, dtype=total.dtype, device=total.device)
+    return total / total.dtype.type(count)
+
+
+def _wide(name: str, terms: int) -> str:
+    """Returns the dtype that holds the sum of so many terms of a dtype."""
+    dtype = np.dtype(name)
     if dtype.kind == "f":
-        return np.dtype(np.float32 if dtype.itemsize == 2 else np.float64)
+        return "float32" if dtype.itemsize == 2 else "float64"
     if dtype.itemsize > 4:
-        return np.dtype(np.int64)
+        return "int64"
     info = np.iinfo(dtype)
     most = max(-int(info.min), int(info.max)) * terms
-    return next(np.dtype(f"int{bits}") for bits in (16, 32, 64) if most < 2 ** (bits - 1))
+    return next(f"int{bits}" for bits in (16, 32, 64) if most < 2 ** (bits - 1))
 
 
-def _narrow(total: np.ndarray, voxels: int, dtype: np.dtype) -> np.ndarray:
+def _narrow(total: Grid, voxels: int, name: str) -> Grid:
     """Divides sums by the number of voxels; integers are rounded to nearest, ties to even."""
-    if dtype.kind == "f":
-        return (total / total.dtype.type(voxels)).astype(dtype)
+    if voxels == 1:
+        return _as(total, name)
+    if "float" in name:
+        return _as(_mean(total, voxels), name)
     if voxels & (voxels - 1) == 0:  # a shift: floor, plus one above a half or at an odd half
-        if voxels == 1:
-            return total.astype(dtype)
         shift = voxels.bit_length() - 1
         odd = total >> shift
         odd &= 1
         odd += total
         odd += voxels // 2 - 1
         odd >>= shift
-        return odd.astype(dtype)
-    whole, rest = np.divmod(total, voxels)
+        return _as(odd, name)
+    whole = total // voxels
+    rest = total - whole * voxels
     up = (2 * rest > voxels) | ((2 * rest == voxels) & (whole & 1 == 1))
-    return (whole + up).astype(dtype)
+    return _as(whole + up, name)

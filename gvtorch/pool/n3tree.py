@@ -28,7 +28,7 @@ from .pools import (
     labels_by_channel,
     volumes_by_channel,
 )
-from .pyramid import TreePlan, levels_by_depth, tree_depth
+from .pyramid import TreePlan, levels_by_depth, maker_of, tree_depth
 from .refresh import BrickLevels
 
 _numbering = threading.Lock()
@@ -245,7 +245,8 @@ class N3Tree:
             branching: N >= 2.
             threshold: Regions with no value above it are EMPTY: they are never drawn, whatever the
                 transfer function. None keeps every value. Not of labels alone.
-            device: Device of the pools.
+            device: Device of the pools. On a CUDA device with room for it the levels are made
+                there, too, with the same bits; but for labels and directional volumes.
             progress: Called with what is made, how many levels of it are done, and of how many.
 
         Raises:
@@ -254,7 +255,9 @@ class N3Tree:
 
         Source: Crassin et al., "GigaVoxels", I3D 2009, section 3; docs/design.md, section 2.
         """
-        volumes = volumes_by_channel("from_volume", volume)
+        given = volumes_by_channel("from_volume", volume)
+        maker = maker_of(given.values(), torch.device(device))
+        volumes = {name: one.to(maker) for name, one in given.items()}
         first = next(iter(volumes.values()))
         check.whole("from_volume", "branching", branching, low=2, high=16)
         threshold = checked_threshold("from_volume", threshold, volumes)

@@ -7,21 +7,23 @@ be made part by part, out of core, with the same bits; see downsample.py for the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..base.constants import CONSTANT, EMPTY, TERMINAL
 from ..base.labels import background
 from ..base.stage import Progress, no_progress
-from ..base.volume import Volume, movable, to_numpy
+from ..base.volume import Volume, movable
 from ..ops import cut_bricks
 from .downsample import (
+    Grid,
+    as_grid,
     by_node,
+    from_grid,
     pool_directional,
     pool_majority,
     pool_max,
@@ -30,7 +32,8 @@ from .downsample import (
 )
 from .pools import BrickPool, NodePool
 
-_BATCH = 4096  # bricks cut from a level at a time
+_BATCH = {"cpu": 4096, "cuda": 1 << 15}  # bricks cut from a level at a time
+_PEAK = 8  # times a volume's bytes: itself, its levels, what they are made by, and all bricks
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ def volume_levels(
     dtype = volume.data.dtype
     known = volume.label_values
     empty = background(None if known is None else known.numpy())
-    values = low = high = to_numpy(volume.data)
+    values = low = high = as_grid(volume.data)
     for level in range(count):
         if level > 0:
             values = coarser(
@@ -96,11 +99,11 @@ def volume_levels(
             )
             low, high = pool_min(low, branching), pool_max(high, branching)
         summary = NodeSummary(
-            low=torch.from_numpy(by_node(low, "min", brick_size, border)),
-            high=torch.from_numpy(by_node(high, "max", brick_size, border)),
-            mean=torch.from_numpy(by_node(values, middle_of(volume.filter), brick_size, 0)),
+            low=torch.as_tensor(by_node(low, "min", brick_size, border)),
+            high=torch.as_tensor(by_node(high, "max", brick_size, border)),
+            mean=torch.as_tensor(by_node(values, middle_of(volume.filter), brick_size, 0)),
         )
-        stored = volume.data if level == 0 else from_numpy(values, dtype)
+        stored = volume.data if level == 0 else from_grid(values, dtype)
         yield Level(values=stored, nodes=summary)
 
 
@@ -110,7 +113,7 @@ def middle_of(how: str) -> Literal["mean", "min"]:
 
 
 def coarser(
-    values: np.ndarray,
+    values: Grid,
     how: str,
     branching: int,
     dtype: torch.dtype,
@@ -118,11 +121,12 @@ def coarser(
     level: int,
     *,
     empty: float | None = None,
-) -> np.ndarray:
+) -> Grid:
     """Returns a level made of the one before.
 
     Args:
-        values: That level, (z, y, x, c), or a part of it that begins at a multiple of `branching`.
+        values: That level, (z, y, x, c), or a part of it that begins at a multiple of `branching`;
+            an array where the filter is not the mean.
         how: The volume's filter.
         branching: N.
         dtype: Of the channel.
@@ -130,20 +134,16 @@ def coarser(
         level: Number of the level that is made, from 1.
         empty: Of labels, the value of the background.
     """
-    if how == "directional":
+    made: Any = values
+    if how == "mean":
+        made = pool_mean(made, branching)
+    elif how == "majority":
+        made = pool_majority(made, branching, empty)
+    else:
         scale = branching ** (level - 1)
         x, y, z = (side / min(spacing) * scale for side in spacing)
-        values = pool_directional(values, branching, (z, y, x))
-    elif how == "majority":
-        values = pool_majority(values, branching, empty)
-    else:
-        values = pool_mean(values, branching)
-    return to_numpy(from_numpy(values, dtype)) if dtype == torch.bfloat16 else values
-
-
-def from_numpy(values: np.ndarray, dtype: torch.dtype) -> Tensor:
-    """Returns what `to_numpy` took, in its dtype again."""
-    return torch.from_numpy(values).to(dtype)
+        made = pool_directional(made, branching, (z, y, x))
+    return as_grid(from_grid(made, dtype)) if dtype == torch.bfloat16 else made
 
 
 def levels_by_depth(
@@ -162,6 +162,18 @@ def levels_by_depth(
             result[name].insert(0, level)
             progress("levels", len(result[name]), depth + 1)
     return result
+
+
+def maker_of(volumes: Iterable[Volume], device: torch.device) -> torch.device:
+    """Returns the device on which the levels of volumes are made for pools on a device."""
+    host, size = torch.device("cpu"), 0
+    for volume in volumes:
+        if volume.filter != "mean":
+            return host
+        size += volume.data.nbytes
+    if device.type != "cuda" or _PEAK * size > torch.cuda.mem_get_info(device)[0]:
+        return host
+    return device
 
 
 def tree_depth(extent: tuple[int, int, int], brick_size: int, branching: int) -> int:
@@ -210,10 +222,10 @@ class TreePlan:
             empty = torch.stack([node.is_empty(threshold) for node in nodes]).all(0)
             exists = torch.ones_like(empty)
             if depth > 0:
-                parent = (torch.arange(size) // branching for size in exists.shape)
+                parent = (torch.arange(n, device=empty.device) // branching for n in empty.shape)
                 exists = (self.child[-1] >= 0)[torch.meshgrid(*parent, indexing="ij")]
             data = exists & ~(constant | empty)
-            rank = torch.arange(int(data.sum()), dtype=torch.int32)
+            rank = torch.arange(int(data.sum()), dtype=torch.int32, device=empty.device)
             brick = torch.where(empty, EMPTY, CONSTANT).to(torch.int32)
             brick[data] = self.bricks + rank
             child = torch.full_like(brick, TERMINAL)
@@ -256,7 +268,8 @@ class TreePlan:
         has_brick = self.brick[depth] >= 0
         place, slots = has_brick.nonzero(), self.brick[depth][has_brick]
         values = self.levels[channel][depth].values
-        for part, slot in zip(place.split(_BATCH), slots[::_BATCH].tolist(), strict=False):
+        batch = _BATCH[values.device.type]
+        for part, slot in zip(place.split(batch), slots[::batch].tolist(), strict=False):
             cut = cut_bricks(values, part, pool.brick_size, pool.border)
             pool.bricks[channel][slot : slot + len(part)] = cut
 
@@ -264,7 +277,7 @@ class TreePlan:
         """Returns (k,) int64 node indices of places (k, 3) z, y, x at a depth."""
         n = self.branching
         if depth == 0:
-            return torch.zeros(len(zyx), dtype=torch.int64)
+            return zyx.new_zeros(len(zyx))
         tile = self.child[depth - 1][tuple((zyx // n).T)].to(torch.int64)
         z, y, x = (zyx % n).unbind(1)
         return tile * nodes_per_tile + (z * n + y) * n + x

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.volume import movable, to_numpy
-from .downsample import by_node, extend, pool_max, pool_min, window
+from .downsample import by_node, extend, from_grid, pool_max, pool_min, window
 from .pools import BrickPool, NodePool
-from .pyramid import NodeSummary, coarser, from_numpy, middle_of
+from .pyramid import NodeSummary, coarser, middle_of
 
 _BATCH = 4096  # bricks read or written at a time
 Place = tuple[int, ...]  # voxels or nodes of a level, z y x
@@ -265,9 +265,10 @@ class _ChannelLevels:
         else:
             cut = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
             wide = border * n**level // size
+            smallest, largest = self._own_ranges
             ranges = [
-                by_node(grid, how, n**level, wide)[cut]
-                for grid, how in zip(self._own_ranges, ("min", "max"), strict=True)
+                by_node(smallest, "min", n**level, wide)[cut],
+                by_node(largest, "max", n**level, wide)[cut],
             ]
         flat = [torch.from_numpy(part.astype(np.float32)).flatten(0, 2) for part in (*ranges, mean)]
         return NodeSummary(*flat)
@@ -328,7 +329,7 @@ class _ChannelLevels:
         held = self.tree.bricks.bricks[self.name].detach()
         slot = torch.where(exact, self.tree.slot_n[node], -1)
         side = size + 2 * border
-        level = movable(from_numpy(padded, held.dtype))
+        level = movable(from_grid(padded, held.dtype))
         windows = level.unfold(0, side, size).unfold(1, side, size).unfold(2, side, size)
         grid = windows.shape[:3]
         for part in (slot >= 0).nonzero()[:, 0].split(_BATCH):

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ..base import check
 from ..base.volume import to_numpy
-from ..pool.pyramid import coarser, from_numpy
+from ..pool.downsample import from_grid
+from ..pool.pyramid import coarser
 from ..pool.staging import on_device
 from .answer import checked_bricks, checked_regions
 from .producer import (
@@ -120,11 +121,11 @@ class FromChildren(Producer):
         order = torch.cat((fine, coarse)).argsort().cpu()
         for name, rows in above.items():
             both = [to_numpy(on_device(own.data[name], rows.device)), to_numpy(rows)]
-            data[name] = from_numpy(np.concatenate(both)[order.numpy()], rows.dtype)
+            data[name] = from_grid(np.concatenate(both)[order.numpy()], rows.dtype)
             if name in own.constants:
                 one = to_numpy(own.constants[name].cpu())
                 none = np.zeros((len(coarse), *one.shape[1:]), one.dtype)
-                constants[name] = from_numpy(np.concatenate((one, none))[order.numpy()], rows.dtype)
+                constants[name] = from_grid(np.concatenate((one, none))[order.numpy()], rows.dtype)
         errors = {int(fine[index]): message for index, message in own.errors.items()}
         return Bricks(data=data, kind=kind, constants=constants, errors=errors)
 
@@ -150,7 +151,7 @@ class FromChildren(Producer):
                 low = loc[rows, :3] * layout.brick_size - layout.border
                 for name, values in self._region(layout, depth, low, layout.side).items():
                     found[name][rows.numpy()] = values
-        return {n: from_numpy(found[n], c.dtype) for n, c in self.channels.items()}
+        return {n: from_grid(found[n], c.dtype) for n, c in self.channels.items()}
 
     def _region(self, layout: Layout, depth: int, low: Tensor, size: int) -> Blocks:
         """size^3 voxels of a level from voxels `low` (k, 3) x y z on; beyond the level's faces the

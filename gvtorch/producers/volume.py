@@ -50,7 +50,8 @@ class VolumeProducer(Producer):
         """Takes a volume, which becomes channel "value", or one for each channel.
 
         Args:
-            volume: One volume, or one by channel name, all of one extent, spacing and origin.
+            volume: One volume, or one by channel name, all of one extent, spacing and origin; held
+                in host memory.
             threshold: Regions with no value above it are EMPTY; None keeps every value.
             hold: What is held in memory (sizes: where N is 2). "voxels": all levels, 8 / 7 of the
                 volume. "bricks": all bricks of all levels, with their borders, as well (2.2 times
@@ -68,7 +69,8 @@ class VolumeProducer(Producer):
         if hold not in ("voxels", "bricks", "mapped"):
             known = "'voxels', 'bricks' or 'mapped'"
             raise ValueError(f"VolumeProducer: hold must be {known}, got {hold!r}")
-        volumes = volumes_by_channel("VolumeProducer", volume)
+        given = volumes_by_channel("VolumeProducer", volume)
+        volumes = {name: one.to("cpu") for name, one in given.items()}
         first = next(iter(volumes.values()))
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
         if filtered is not None:

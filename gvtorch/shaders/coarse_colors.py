@@ -43,7 +43,7 @@ class VolumeField:
     across = 256
 
     def __init__(self, volume: Volume, component: int) -> None:
-        self._values = volume.data[..., component]
+        self._values = volume.data[..., component].cpu()
         z, y, x = self._values.shape
         self.shape = (z, y, x)
 

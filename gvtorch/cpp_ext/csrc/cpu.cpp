@@ -75,6 +75,8 @@ void compact(const Tensor& like, int64_t count, const List& list) {
   list.total(all.listed, all.seen);
 }
 
+void sort_keys(const Tensor&, int64_t* keys, int64_t count) { std::sort(keys, keys + count); }
+
 }  // namespace gvtorch
 
 STABLE_TORCH_LIBRARY(gvtorch, library) {

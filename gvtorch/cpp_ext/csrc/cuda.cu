@@ -2,6 +2,7 @@
 
 #include <cub/block/block_reduce.cuh>
 #include <cub/block/block_scan.cuh>
+#include <cub/device/device_radix_sort.cuh>
 
 #include "entry/entry_cache.h"
 #include "entry/entry_camera.h"
@@ -114,6 +115,23 @@ void compact(const Tensor& like, int64_t count, const List& list) {
   launch(count_chunks<List>, chunks, kThreads, list, count, chunk_c);
   launch(add_chunks, 1, kScanThreads, chunk_c, chunks);
   launch(take_chunks<List>, chunks, kThreads, list, count, chunk_c);
+}
+
+void sort_keys(const Tensor& like, int64_t* keys, int64_t count) {
+  const Launcher launch(like);
+  const Tensor other = torch::stable::new_empty(like, {count}, ScalarType::Long);
+  cub::DoubleBuffer<int64_t> buffers(keys, static_cast<int64_t*>(other.mutable_data_ptr()));
+  size_t bytes = 0;
+  const auto sort = [&](void* scratch) {
+    const cudaError_t status = cub::DeviceRadixSort::SortKeys(scratch, bytes, buffers, count, 0, 64, launch.stream());
+    STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: sorting failed: ", cudaGetErrorString(status));
+  };
+  sort(nullptr);  // asks for the scratch memory
+  const Tensor scratch = torch::stable::new_empty(like, {static_cast<int64_t>(bytes)}, ScalarType::Byte);
+  sort(scratch.mutable_data_ptr());
+  if (buffers.Current() != keys) {
+    cudaMemcpyAsync(keys, buffers.Current(), count * sizeof(int64_t), cudaMemcpyDeviceToDevice, launch.stream());
+  }
 }
 
 }  // namespace gvtorch

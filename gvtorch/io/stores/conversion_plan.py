@@ -116,7 +116,9 @@ def source_of(
             raise ValueError(f"{source.name}: {source.data.dtype} has no place in a store")
         told = {"path": source.name, "info": source.info}
         told |= {"spacing": source.spacing, "origin": source.origin}
-        found = placed("convert", MemorySource.of(source.data.numpy(), **told), spacing, origin)
+        found = placed(
+            "convert", MemorySource.of(source.data.cpu().numpy(), **told), spacing, origin
+        )
         if source.label_values is None:
             return found
         # They are counted off already.

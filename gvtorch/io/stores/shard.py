@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ...pool.downsample import pool_max, pool_mean, pool_min, round_array, window
+from ...pool.downsample import Reduction, pool_max, pool_mean, pool_min, round_array, window
 from .. import boxes
 from ..source import VolumeSource
 from .checksums import Files, shard_files
@@ -79,7 +79,7 @@ def write_shard(conversion: Conversion, level: int, place: Place) -> ShardResult
     writes = [write(conversion.root, layout.plain(level), low, plain, time)]
     for spec, bound in zip(layout.bounds(level), (least, most), strict=False):
         writes.append(write(conversion.root, spec, low, _plain(bound[inner], axes), time))
-    middle = "min" if conversion.source.info.labels else "mean"  # a label that is there
+    middle: Reduction = "min" if conversion.source.info.labels else "mean"  # a label that is there
     cells = _cells(values, least, most, [-(-n // CELL) for n in size], middle)
     first = [a // CELL for a in low]
     writes.append(write(conversion.root, layout.cells(level), first, cells, time))
@@ -115,7 +115,7 @@ def _from_below(
     """Makes a box of a level, voxels around it included, from the level below: means (labels: the
     most frequent), smallest and largest finest values.
     """
-    pools = (conversion.pool, pool_min, pool_max)
+    pools: tuple[Pool, ...] = (conversion.pool, pool_min, pool_max)
     layout, deadline = conversion.layout, Deadline(_TIMEOUT)
     arrays = []
     # The finest values are their own smallest and largest.
@@ -143,7 +143,7 @@ def _plain(values: np.ndarray, axes: str) -> np.ndarray:
 
 
 def _cells(
-    values: np.ndarray, least: np.ndarray, most: np.ndarray, count: list[int], middle: str
+    values: np.ndarray, least: np.ndarray, most: np.ndarray, count: list[int], middle: Reduction
 ) -> np.ndarray:
     """(gz, gy, gx, 3, c) low, high, mean of the cells of a cube with its border."""
     reach = tuple(slice(0, n * CELL + 2 * BORDER) for n in count)

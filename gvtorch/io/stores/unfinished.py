@@ -236,7 +236,7 @@ def fingerprint(source: str | Path | Volume) -> list[Any]:
     """Sizes and modification times of a source, or a checksum: equal while it is unchanged."""
     if isinstance(source, Volume):
         data = movable(source.data)
-        return [list(data.shape), str(source.data.dtype), zlib.crc32(data.numpy().tobytes())]
+        return [list(data.shape), str(source.data.dtype), zlib.crc32(data.cpu().numpy().tobytes())]
     text = str(source)
     if "://" in text:
         return [text]

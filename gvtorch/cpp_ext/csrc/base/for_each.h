@@ -26,20 +26,21 @@ struct Device {};  // of this library
 class Launcher {
  public:
   explicit Launcher(const torch::stable::Tensor& like) : guard(like.get_device_index()) {
-    void* current = nullptr;
-    TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &current));
-    stream = static_cast<cudaStream_t>(current);
+    void* stream = nullptr;
+    TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &stream));
+    current = static_cast<cudaStream_t>(stream);
   }
   template <class... Parameter, class... Argument>
   void operator()(void (*kernel)(Parameter...), int64_t blocks, int threads, const Argument&... arguments) const {
-    kernel<<<static_cast<unsigned>(blocks), threads, 0, stream>>>(arguments...);
+    kernel<<<static_cast<unsigned>(blocks), threads, 0, current>>>(arguments...);
     const cudaError_t status = cudaGetLastError();
     STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: kernel launch failed: ", cudaGetErrorString(status));
   }
+  cudaStream_t stream() const { return current; }
 
  private:
   const torch::stable::accelerator::DeviceGuard guard;
-  cudaStream_t stream;
+  cudaStream_t current;
 };
 
 // That many blocks on a multiprocessor leave 64 registers to a thread: waiting for memory is what tracing must hide.

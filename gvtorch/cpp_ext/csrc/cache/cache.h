@@ -8,6 +8,7 @@
 //                                                             rank: those listed before it; listed: all
 //                      list.blank(rank)                       for every place left over of list.places()
 //                      list.total(listed, seen)               once
+//   sort_keys(keys, n) brings n numbers into rising order
 // Method: Crassin et al., "GigaVoxels", I3D 2009, section 5 (usage stamps, LRU by compaction, request lists).
 #pragma once
 
@@ -88,19 +89,28 @@ struct ListRequests {
   X(Int, batch, kAny)                     \
   X(Bool, coarse_first, kAny)
 
-constexpr int64_t kNoKey = INT64_MAX;  // no request of a node of the pool
-constexpr int64_t kComparers = 16;     // threads that share what a request is compared with
+constexpr int64_t kNoKey = INT64_MAX;                              // no request of a node of the pool
+constexpr int64_t kComparers = 16;                                 // threads that share what a request is compared with
+constexpr int64_t kMostCompared = 1 << 15, kManyServed = 1 << 12;  // longer lists, and larger batches, are sorted for
+constexpr int64_t kIndices = int64_t{1} << 31;
 
 struct ChooseArgs {
   GV_CHOOSE_REQUESTS(GV_VIEW)
   int64_t lists, listed, tiles;
-  int64_t* key_lk;              // rank, place in the list, and two bits of kinds: the lower, the more wanted
+  int64_t* key_lk;              // rank, index in the lists, and two bits of kinds: the lower, the more wanted
   int32_t *end_l, *before_2lk;  // behind a list's last request; how many loads, and subdivisions, are wanted more
   int64_t* node_2b;             // loads, then subdivisions
   int32_t* priority_2b;
 
   GV_HD int64_t node_at(int64_t index) const { return asked_l2k[index + index / listed * listed]; }
   GV_HD int32_t word_at(int64_t index) const { return asked_l2k[index + (index / listed + 1) * listed]; }
+  // Serves a request as a load (0) or a subdivision (1), of which so many are wanted more.
+  GV_HD void serve(int64_t which, int64_t place, int64_t index) const {
+    const int64_t room = room_2[1 - which];  // tiles, bricks
+    if (place >= smaller<int64_t>(batch, room)) return;
+    node_2b[which * batch + place] = node_at(index);
+    priority_2b[which * batch + place] = word_at(index) & kPriorityMask;
+  }
 };
 
 // Ranks requests, and empties what is given.
@@ -115,11 +125,11 @@ struct RankRequests : ChooseArgs {
     const int32_t word = word_at(index);
     key_lk[index] = kNoKey;
     if (node < 0 || node >= tiles * per_tile || (word & kKinds) == 0) return;
-    const int64_t depth = loc_t4[4 * (node / per_tile) + 3], place = index % listed;
+    const int64_t depth = loc_t4[4 * (node / per_tile) + 3];
     const int32_t small = kPriorityMask - (word & kPriorityMask);
     const int64_t rank = (list << 20) + (coarse_first ? depth : -depth) * (kPriorityMask + 1) + small;
-    key_lk[index] = (rank * (int64_t{1} << 31) + place) * 4 + (word & kKinds) / kLoad;
-    raise_to(&end_l[list], static_cast<int32_t>(place + 1));
+    key_lk[index] = (rank * kIndices + index) * 4 + (word & kKinds) / kLoad;
+    raise_to(&end_l[list], static_cast<int32_t>(index % listed + 1));
   }
 };
 
@@ -150,14 +160,26 @@ struct CompareRequests : ChooseArgs {
 struct ServeRequests : ChooseArgs {
   GV_HD void operator()(int64_t index) const {
     if (key_lk[index] == kNoKey) return;
-    const int32_t word = word_at(index);
     for (int64_t which = 0; which < 2; ++which) {
-      const int64_t place = before_2lk[which * lists * listed + index], room = room_2[1 - which];  // tiles, bricks
-      if ((word & (which == 0 ? kLoad : kSubdivide)) == 0 || place >= smaller<int64_t>(batch, room)) continue;
-      node_2b[which * batch + place] = node_at(index);
-      priority_2b[which * batch + place] = word & kPriorityMask;
+      if ((key_lk[index] >> which & 1) != 0) serve(which, before_2lk[which * lists * listed + index], index);
     }
   }
+};
+
+// The same for keys in order, of loads or of subdivisions; see `compact`.
+struct ServeSorted : ChooseArgs {
+  int64_t which;
+
+  GV_HD int32_t flags(int64_t place) const {
+    const int64_t key = key_lk[place];
+    return key != kNoKey && (key >> which & 1) != 0 ? kListed | kTouched : 0;
+  }
+  GV_HD void take(int64_t place, int32_t, int64_t rank, int64_t) const {
+    serve(which, rank, (key_lk[place] >> 2) & (kIndices - 1));
+  }
+  GV_HD int64_t places() const { return 0; }
+  GV_HD void blank(int64_t) const {}
+  GV_HD void total(int64_t, int64_t) const {}
 };
 
 // --- The order of use

@@ -1,5 +1,5 @@
 // The ops of cache and pools: from tensors to the functors of cache.h. Included once by cpu.cpp and once by cuda.cu,
-// each of which brings its own `compact`. How lists become ops: entry.h.
+// each of which brings its own `compact` and `sort_keys`. How lists become ops: entry.h.
 #pragma once
 
 #include "cache/cache.h"
@@ -13,6 +13,7 @@ struct alignas(16) Wide {  // as much as a thread moves at once
 
 template <class List>
 void compact(const Tensor& like, int64_t count, const List& list);
+void sort_keys(const Tensor& like, int64_t* keys, int64_t count);
 
 GV_OP(CompactRequestsOp, "compact_requests", GV_COMPACT_REQUESTS, "(Tensor node_k, Tensor word_k, Tensor count_5)");
 
@@ -37,7 +38,7 @@ inline auto run(const ChooseRequestsOp& a) {
   const int64_t lists = a.asked_l2k.size(0), listed = a.asked_l2k.size(2), tiles = a.loc_t4.numel() / 4;
   ChooseArgs args{};
   GV_CHOOSE_REQUESTS(GV_TAKE)
-  STD_TORCH_CHECK(a.batch >= 1 && a.per_tile >= 1 && lists < 512 && listed <= INT32_MAX,
+  STD_TORCH_CHECK(a.batch >= 1 && a.per_tile >= 1 && lists < 512 && lists * listed <= INT32_MAX,
                   "gvtorch: no batch, no nodes, or too many");
   args.lists = lists;
   args.listed = listed;
@@ -50,8 +51,13 @@ inline auto run(const ChooseRequestsOp& a) {
   Tensor node_2b = give(args.node_2b, a.asked_l2k, {2, a.batch});
   Tensor priority_2b = give(args.priority_2b, a.asked_l2k, {2, a.batch});
   for_each(a.asked_l2k, std::max(requests, 2 * a.batch), RankRequests{args});
-  for_each(a.asked_l2k, requests * kComparers, CompareRequests{args});
-  for_each(a.asked_l2k, requests, ServeRequests{args});
+  if (requests <= kMostCompared && a.batch < kManyServed) {
+    for_each(a.asked_l2k, requests * kComparers, CompareRequests{args});
+    for_each(a.asked_l2k, requests, ServeRequests{args});
+  } else {
+    sort_keys(a.asked_l2k, args.key_lk, requests);
+    for (int64_t which = 0; which < 2; ++which) compact(a.asked_l2k, requests, ServeSorted{{args}, which});
+  }
   return std::make_tuple(node_2b, priority_2b);
 }
 
