@@ -164,7 +164,8 @@ def _in_cubes(
     row, own = cells.listed()
     cube = cells.cube[own]
     voxel = cells.voxels(points.codes, codes[row], own) - cubes.low_k3[cube]
-    keep = ((voxel >= 0) & (voxel < cubes.side)).all(1)
+    x, y, z = ((voxel >= 0) & (voxel < cubes.side)).T
+    keep = x & y & z
     return _Found(row[keep], cube[keep])
 
 
@@ -218,17 +219,20 @@ def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, Cubes]]:
 def _reaching(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, _Found]]:
     """Yields for levels above the cubes' the points that reach into them, or very nearly."""
     grid = points.grid
-    size = grid.spacing_3 * grid.branching**cubes.level
+    half = 0.5 * cubes.side * grid.spacing_3 * grid.branching**cubes.level
+    middle = grid.low + (2 / cubes.side * cubes.low_k3 + 1) * half
     for level, around in _wide(points, cubes):
         rows = points.points[level].rows
-        row, cube = _in_cubes(points, rows["code"], 0, around, least=1)
-        place = rows["position"][row].astype(np.float64)
-        radius = _NEARLY * rows["radius"][row].astype(np.float64)[:, None]
-        corner = grid.low + cubes.low_k3[cube] * size
-        near = (place + radius > corner) & (place - radius < corner + cubes.side * size)
-        keep = near.all(1)
-        if keep.any():
-            yield level, _Found(row[keep], cube[keep])
+        cells = _cells(points, rows["code"], 0, around, least=1)
+        row, own = cells.listed()
+        cube = cells.cube[own]
+        for axis in range(3):
+            away = np.abs(rows["position"][row, axis] - middle[cube, axis])
+            radius = rows["radius"][row].astype(np.float64)
+            near = away < _NEARLY * radius + half[axis]
+            row, cube = row[near], cube[near]
+        if len(row):
+            yield level, _Found(row, cube)
 
 
 def _narrow_lists(
