@@ -20,6 +20,7 @@ from .cameras import pinhole_rays
 from .noise import noise
 from .orbits import Orbit, orbit_bounds, orbits
 from .registry import available
+from .splat import splat
 from .trace import (
     composite,
     list_samples,
@@ -57,6 +58,7 @@ __all__ = [
     "put_rows",
     "sample_bricks",
     "shade_rays",
+    "splat",
     "trace_rays",
     "trace_segments",
     "unlink",

@@ -192,6 +192,11 @@ def _voxelize(
     return real, whole, torch.empty_like(whole), share, weight
 
 
+def _splat(*, edge_k3e: Tensor, value_nc: Tensor, **_: Any) -> Tensor:
+    side = edge_k3e.shape[2] - 1
+    return edge_k3e.new_empty((edge_k3e.shape[0], side, side, side, value_nc.shape[1]))
+
+
 FAKES: dict[str, Callable[..., Any]] = {
     "trace_rays": _trace_rays,
     "shade_rays": _shade_rays,
@@ -219,6 +224,7 @@ FAKES: dict[str, Callable[..., Any]] = {
     "cut_bricks": _cut_bricks,
     "pinhole_rays": _pinhole_rays,
     "voxelize": _voxelize,
+    "splat": _splat,
     "orbits": lambda *, point_p3, **_: point_p3.new_empty((3, point_p3.shape[0])),
     "orbit_bounds": lambda *, center_k3, **_: center_k3.new_empty((2, center_k3.shape[0])),
     "noise": lambda *, point_pn, **_: point_pn.new_empty((point_pn.shape[0],)),
@@ -301,6 +307,7 @@ if not _reasons["cpp"]:
     _refuse_gradients(torch.ops.gvtorch.trace_rays)
     _refuse_gradients(torch.ops.gvtorch.shade_rays)
     _refuse_gradients(torch.ops.gvtorch.noise)
+    _refuse_gradients(torch.ops.gvtorch.splat)
     _refuse_gradients(torch.ops.gvtorch.orbits)
     _refuse_gradients(torch.ops.gvtorch.orbit_bounds)
     torch.library.register_autograd(

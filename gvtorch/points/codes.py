@@ -1,10 +1,13 @@
 """`Codes`: numbers of voxels along a curve that fills a node before it leaves it, and the kernel by
-which a point that is wider than a voxel is shared among several.
+which a point that is wider than a voxel is shared among several, as arrays.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import torch
+
+from ..ops.reference import splat as twin
 
 _MOST = 2**62  # codes of an int64
 
@@ -56,20 +59,10 @@ class Codes:
 
 def shares(edge: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Returns what each interval between edges (k, m + 1), rising, holds of points at (k,) that
-    reach as far as (k,), > 0: (k, m), which adds up to 1 where the edges enclose the point.
-
-    A point's density is a product of cubic splines along x, y and z, and its share of a box the
-    product of these integrals. So the shares of the boxes in a box add up to that box's share.
-    Source: the M4 kernel of Monaghan, Lattanzio, "A refined particle method for astrophysical
-    problems", 1985, along each axis, and integrated.
+    reach as far as (k,): (k, m), float64. See the twin.
     """
-    away = 2 * np.clip((edge - center[:, None]) / radius[:, None], -1, 1)  # knots at integers
-    far = np.abs(away)
-    rest = 2 - far
-    inner = 0.5 - far * (2 / 3 - far * far * (1 / 3 - far / 8))
-    tail = np.where(far > 1, rest * rest * rest * rest / 24, inner)  # beyond it
-    below = np.where(away < 0, tail, 1 - tail)
-    return below[:, 1:] - below[:, :-1]
+    given = (torch.from_numpy(np.asarray(one, np.float64)) for one in (edge, center, radius))
+    return twin.shares(*given).numpy()
 
 
 def peak(radius: np.ndarray, size_3: np.ndarray) -> np.ndarray:

@@ -8,13 +8,15 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
-from .codes import peak, shares
+from ..ops.splat import splat
+from .codes import Codes, peak
 from .sorted import SortedPoints
 from .table import Rows
 
 _CELL = 4  # voxels along a side of what is looked up at least
-_SHARES = 1 << 21  # numbers of wide points that are worked on together
+_NEARLY = 1.001  # of how far a point reaches: more than rounding makes of it
 
 
 class Cubes(NamedTuple):
@@ -25,13 +27,44 @@ class Cubes(NamedTuple):
     level: int
 
 
+class _Cells(NamedTuple):
+    """Cells of cubes that hold rows of a table; those of a cube stand together."""
+
+    cube: np.ndarray  # (s,) rising
+    first_s3: np.ndarray  # voxel x, y, z, of the cubes' level
+    code: np.ndarray  # (s,) of the first voxel, as the table has it
+    start: np.ndarray  # (s,) row in the table
+    rows: np.ndarray  # (s,) how many
+    size: int  # voxels along a side
+    below: int  # codes of the table in a voxel
+
+    def once(self) -> tuple[_Cells, np.ndarray]:
+        """Returns each cell once, and (s,) which of these they are."""
+        _, one, same = np.unique(self.code, return_index=True, return_inverse=True)
+        return self._replace(**{n: getattr(self, n)[one] for n in self._fields[:5]}), same
+
+    def ahead(self) -> np.ndarray:
+        """Returns (s,) how many rows the cells before each have."""
+        return np.cumsum(self.rows) - self.rows
+
+    def listed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns (m,) the rows of all cells, and of which cell each is."""
+        own = np.repeat(np.arange(len(self.rows)), self.rows)
+        return (self.start - self.ahead())[own] + np.arange(len(own)), own
+
+    def voxels(self, curve: Codes, code: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """Returns (m, 3) the voxels of codes in cells."""
+        within = code - self.code[own]
+        if self.below > 1:
+            within //= self.below
+        return self.first_s3[own] + curve.places(self.size)[within]
+
+
 class _Found(NamedTuple):
-    """Rows of a table in cubes: those of a cube stand together."""
+    """Rows of a table in cubes: those of a cube stand together, and those of equal codes in it."""
 
     row: np.ndarray  # (m,) in the table
     cube: np.ndarray  # (m,) rising
-    cell: np.ndarray  # (m,) number of the cell, by which rows of equal codes stand together
-    voxel_m3: np.ndarray  # of the cubes' level, from the cube's first on
 
 
 def values(points: SortedPoints, cubes: Cubes, *, narrow: bool = True) -> np.ndarray:
@@ -42,20 +75,13 @@ def values(points: SortedPoints, cubes: Cubes, *, narrow: bool = True) -> np.nda
         cubes: The voxels.
         narrow: Whether points count that are narrower than a finest voxel.
     """
-    k, side, width = len(cubes.low_k3), cubes.side, points.width
-    total = np.zeros((k * side**3, width))
-    if narrow and (table := _finer(points, cubes.level)) is not None:
-        rows, level = table
-        found = _in_cubes(points, rows["code"], level, cubes)
-        x, y, z = found.voxel_m3.T
-        at = ((found.cube * side + z) * side + y) * side + x
-        value = rows["value"][found.row]
-        for number in range(width):
-            total[:, number] = np.bincount(at, value[:, number], len(total))
-    total /= points.grid.branching ** (3 * cubes.level)
-    out = total.reshape(k, side, side, side, width)
-    _add_wide(points, cubes, out)
-    return out
+    table = _finer(points, cubes.level) if narrow else None
+    edge = np.stack(points.grid.edges(cubes.low_k3, cubes.side, cubes.level), 1)
+    low = np.ascontiguousarray(cubes.low_k3, np.int64)
+    lists = (*_narrow_lists(points, cubes, table), *_wide_lists(points, cubes))
+    held = splat(*(torch.from_numpy(one) for one in (edge, low, *lists)))
+    scale = points.grid.branching ** (3 * cubes.level)
+    return held.div_(scale).numpy() if scale > 1 else held.numpy()
 
 
 def ranges(
@@ -72,7 +98,7 @@ def ranges(
         found = _in_cubes(points, rows["code"], level, cubes)
         if len(found.row):
             _widen(rows, found, some, low, high)
-    for level, cube, row in _wide(points, cubes):
+    for level, (row, cube) in _reaching(points, cubes):
         rows = points.points[level].rows
         most = peak(rows["radius"][row].astype(np.float64), points.grid.spacing_3)
         value = most[:, None] * rows["value"][row]
@@ -132,7 +158,22 @@ def _in_cubes(
     points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes, *, least: int = _CELL
 ) -> _Found:
     """The rows of a table, of codes of voxels of a level not above the cubes', that lie in them;
-    looked up by cells of at least so many voxels along a side.
+    see `_cells`.
+    """
+    cells = _cells(points, codes, level, cubes, least=least)
+    row, own = cells.listed()
+    cube = cells.cube[own]
+    voxel = cells.voxels(points.codes, codes[row], own) - cubes.low_k3[cube]
+    x, y, z = ((voxel >= 0) & (voxel < cubes.side)).T
+    keep = x & y & z
+    return _Found(row[keep], cube[keep])
+
+
+def _cells(
+    points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes, *, least: int = _CELL
+) -> _Cells:
+    """Where the rows of a table are, of codes of voxels of a level not above the cubes', in cells
+    of at least so many voxels along a side that together hold the cubes.
     """
     grid, curve = points.grid, points.codes
     n = grid.branching
@@ -150,68 +191,99 @@ def _in_cubes(
     # Codes that a cell covers, among those of the table.
     below = n ** (3 * (cubes.level - level))
     covers = min(size**3 * below, n ** (3 * max(0, curve.digits - level)))
-    begin = curve.of(cell[cube, which]) * (size**3 * below)
-    start = np.searchsorted(codes, begin)
-    count = np.searchsorted(codes, begin + covers) - start
+    code = curve.of(cell[cube, which]) * (size**3 * below)
+    start = np.searchsorted(codes, code)
+    count = np.searchsorted(codes, code + covers) - start
     some = np.flatnonzero(count)
-    cube, which, start, count, begin = (one[some] for one in (cube, which, start, count, begin))
-    ahead = np.cumsum(count) - count
-    row = np.repeat(start - ahead, count) + np.arange(int(count.sum()))
-    own = np.repeat(np.arange(len(some)), count)
-    within = (codes[row] - begin[own]) // below
-    corner = first[cube, which] - cubes.low_k3[cube]
-    voxel = corner[own] + curve.places(size)[within]
-    keep = ((voxel >= 0) & (voxel < cubes.side)).all(1)
-    return _Found(row[keep], cube[own][keep], own[keep], voxel[keep])
+    cube, which, code, start, count = (one[some] for one in (cube, which, code, start, count))
+    return _Cells(cube, first[cube, which], code, start, count, size, below)
 
 
-def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Yields the levels above the cubes' whose points reach into them, (m,) which cubes, rising,
-    and which points.
+def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, Cubes]]:
+    """Yields the levels above the cubes' that have points, and the voxels of these levels in which
+    all points lie that may reach into the cubes.
     """
     grid = points.grid
-    scale = grid.branching**cubes.level
-    size = grid.spacing_3 * scale
     for level, table in points.points.items():
         if level <= cubes.level or "radius" not in table.rows:
             continue
         # Their centres are at most a voxel of their level away, of the widest as far as they reach.
-        rows, up = table.rows, grid.branching ** (level - cubes.level)
+        up = grid.branching ** (level - cubes.level)
         reach = 1
         if level == grid.levels - 1:
             reach = int(max(grid.extent)) // grid.branching**level + 1
         low = cubes.low_k3 // up - reach
-        side = (cubes.side + up - 2) // up + 1 + 2 * reach
-        found = _in_cubes(points, rows["code"], 0, Cubes(low, side, level), least=1)
-        place = rows["position"][found.row].astype(np.float64)
-        radius = rows["radius"][found.row].astype(np.float64)[:, None]
-        corner = grid.low + cubes.low_k3[found.cube] * size
-        near = (place + radius > corner) & (place - radius < corner + cubes.side * size)
-        keep = near.all(1)
-        if keep.any():
-            yield level, found.cube[keep], found.row[keep]
+        yield level, Cubes(low, (cubes.side + up - 2) // up + 1 + 2 * reach, level)
 
 
-def _add_wide(points: SortedPoints, cubes: Cubes, out: np.ndarray) -> None:
-    """Adds the points that are wider than the cubes' voxels: for each cube the product of what its
-    planes and its lines hold of them.
-    """
-    scale = points.grid.branching ** (3 * cubes.level)
-    step = max(1, _SHARES // cubes.side**2)
-    for level, cube, row in _wide(points, cubes):
+def _reaching(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, _Found]]:
+    """Yields for levels above the cubes' the points that reach into them, or very nearly."""
+    grid = points.grid
+    half = 0.5 * cubes.side * grid.spacing_3 * grid.branching**cubes.level
+    middle = grid.low + (2 / cubes.side * cubes.low_k3 + 1) * half
+    for level, around in _wide(points, cubes):
         rows = points.points[level].rows
-        for begin in range(0, len(row), step):
-            here, own = row[begin : begin + step], cube[begin : begin + step]
-            place = rows["position"][here].astype(np.float64)
-            radius = rows["radius"][here].astype(np.float64)
-            edges = points.grid.edges(cubes.low_k3[own], cubes.side, cubes.level)
-            x, y, z = (shares(edge, place[:, axis], radius) for axis, edge in enumerate(edges))
-            value = rows["value"][here].astype(np.float64) / scale
-            plane = (z[:, :, None] * y[:, None, :]).reshape(len(here), -1)
-            line = (x[:, :, None] * value[:, None, :]).reshape(len(here), -1)
-            for start, stop in itertools.pairwise([*_begins(own).tolist(), len(own)]):
-                held = plane[start:stop].T @ line[start:stop]
-                out[own[start]] += held.reshape(out.shape[1:])
+        cells = _cells(points, rows["code"], 0, around, least=1)
+        row, own = cells.listed()
+        cube = cells.cube[own]
+        for axis in range(3):
+            away = np.abs(rows["position"][row, axis] - middle[cube, axis])
+            radius = rows["radius"][row].astype(np.float64)
+            near = away < _NEARLY * radius + half[axis]
+            row, cube = row[near], cube[near]
+        if len(row):
+            yield level, _Found(row, cube)
+
+
+def _narrow_lists(
+    points: SortedPoints, cubes: Cubes, table: tuple[Rows, int] | None
+) -> tuple[np.ndarray, ...]:
+    """What `ops.splat` takes of rows that lie wholly in a voxel: lists of cubes, voxels, values."""
+    if table is None:
+        none = (np.empty((0, 3), np.int64), np.empty((0, points.width)))
+        return (*_lists(cubes, np.empty(0, np.int64), np.empty((0, 2), np.int64)), *none)
+    rows, level = table
+    cells = _cells(points, rows["code"], level, cubes)
+    once, same = cells.once()
+    row, own = once.listed()
+    voxel = once.voxels(points.codes, rows["code"][row], own)
+    value = rows["value"][row].astype(np.float64, copy=False)
+    return (*_lists(cubes, cells.cube, _runs(once, same)), voxel, value)
+
+
+def _wide_lists(points: SortedPoints, cubes: Cubes) -> tuple[np.ndarray, ...]:
+    """What `ops.splat` takes of points that are wider than the cubes' voxels, those of finer levels
+    first: lists of cubes, positions, radii, values.
+    """
+    cube, run = [np.empty(0, np.int64)], [np.empty((0, 2), np.int64)]
+    parts = [(np.empty((0, 3)), np.empty(0), np.empty((0, points.width)))]
+    ahead = 0
+    for level, around in _wide(points, cubes):
+        rows = points.points[level].rows
+        cells = _cells(points, rows["code"], 0, around, least=1)
+        once, same = cells.once()
+        row, _ = once.listed()
+        place, radius, value = (
+            rows[name][row].astype(np.float64) for name in ("position", "radius", "value")
+        )
+        cube.append(cells.cube)
+        run.append(ahead + _runs(once, same))
+        parts.append((place, radius, value))
+        ahead += len(row)
+    columns = (np.concatenate(one) for one in zip(*parts, strict=True))
+    return (*_lists(cubes, np.concatenate(cube), np.concatenate(run)), *columns)
+
+
+def _runs(once: _Cells, same: np.ndarray) -> np.ndarray:
+    """(s, 2) where the rows of cells begin and end, of a table of the rows of each cell once."""
+    begin = once.ahead()
+    return np.stack((begin, begin + once.rows), 1)[same]
+
+
+def _lists(cubes: Cubes, cube_s: np.ndarray, run_s2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the runs of each cube begin, and all runs by cubes."""
+    order = np.argsort(cube_s, kind="stable")
+    return np.searchsorted(cube_s[order], np.arange(len(cubes.low_k3) + 1)), run_s2[order]
 
 
 def narrow_near(points: SortedPoints, center: np.ndarray, reach: float) -> np.ndarray:

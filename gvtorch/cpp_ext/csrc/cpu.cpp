@@ -10,6 +10,7 @@
 #include "entry/entry_fields.h"
 #include "entry/entry_mesh.h"
 #include "entry/entry_noise.h"
+#include "entry/entry_points.h"
 #include "packets/processor.h"
 
 namespace gvtorch {
@@ -41,6 +42,11 @@ void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
 
 void follow_points(const Tensor& like, const OrbitArgs& args) {
   in_chunks(like, processor().chunks.orbits, args, args.points, 1 << 9);
+}
+
+void splat_points(const Tensor& like, const SplatArgs& args) {
+  const auto part = [&](int64_t number) { processor().chunks.splat(args, number, number + 1); };
+  for_each(like, SplatPart{args}.parts(), part, 1);
 }
 
 // See cache.h. Threads count chunks, then take them: ranks do not depend on the number of threads.
@@ -86,6 +92,7 @@ STABLE_TORCH_LIBRARY(gvtorch, library) {
   gvtorch::define(library, gvtorch::MeshOps{});
   gvtorch::define(library, gvtorch::CameraOps{});
   gvtorch::define(library, gvtorch::NoiseOps{});
+  gvtorch::define(library, gvtorch::PointOps{});
   gvtorch::define(library, gvtorch::FieldOps{});
 }
 
@@ -94,5 +101,6 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
   gvtorch::implement(library, gvtorch::MeshOps{});
   gvtorch::implement(library, gvtorch::CameraOps{});
   gvtorch::implement(library, gvtorch::NoiseOps{});
+  gvtorch::implement(library, gvtorch::PointOps{});
   gvtorch::implement(library, gvtorch::FieldOps{});
 }

@@ -9,6 +9,7 @@
 #include "entry/entry_fields.h"
 #include "entry/entry_mesh.h"
 #include "entry/entry_noise.h"
+#include "entry/entry_points.h"
 #include "entry/entry_segments.h"
 
 namespace gvtorch {
@@ -30,6 +31,10 @@ void voxelize(const Tensor& like, const VoxelizeArgs& args) {
 
 void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
   is_wide(like) ? noise_each<double>(like, args, points) : noise_each<float>(like, args, points);
+}
+
+void splat_points(const Tensor& like, const SplatArgs& args) {
+  for_each(like, args.cubes * args.side * args.side * args.side, SplatVoxel{args});
 }
 
 template <class T>
@@ -143,5 +148,6 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
   gvtorch::implement(library, gvtorch::MeshOps{});
   gvtorch::implement(library, gvtorch::CameraOps{});
   gvtorch::implement(library, gvtorch::NoiseOps{});
+  gvtorch::implement(library, gvtorch::PointOps{});
   gvtorch::implement(library, gvtorch::FieldOps{});
 }

@@ -1,10 +1,11 @@
-// Tracing, voxelizing, noise and orbits on the CPU, compiled once for each instruction set (build.py), GV_NAMESPACE its
-// name. Nothing of torch or of the standard library's templates may stand here: see hd.h.
+// Tracing, voxelizing, noise, orbits and points on the CPU, compiled once for each instruction set (build.py),
+// GV_NAMESPACE its name. Nothing of torch or of the standard library's templates may stand here: see hd.h.
 #include "fields/orbits.h"
 #include "mesh/voxelize.h"
 #include "noise/noise.h"
 #include "packets/chunks.h"
 #include "packets/packet_walk.h"
+#include "points/splat.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
@@ -43,8 +44,13 @@ void orbits_chunk(const OrbitArgs& args, int64_t begin, int64_t end) {
   args.wide ? orbits_in_lanes<Doubles>(args, begin, end) : orbits_in_lanes<Floats>(args, begin, end);
 }
 
+void splat_chunk(const SplatArgs& args, int64_t begin, int64_t end) {
+  const SplatPart part{args};
+  for (int64_t index = begin; index < end; ++index) part(index);
+}
+
 extern const Chunks chunks;
-const Chunks chunks = {shade_chunk, voxelize_chunk, noise_chunk, orbits_chunk};
+const Chunks chunks = {shade_chunk, voxelize_chunk, noise_chunk, orbits_chunk, splat_chunk};
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

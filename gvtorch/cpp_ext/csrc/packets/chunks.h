@@ -9,12 +9,14 @@ struct ShadeArgs;
 struct VoxelizeArgs;
 struct NoiseArgs;
 struct OrbitArgs;
+struct SplatArgs;
 
 struct Chunks {
   void (*shade)(const ShadeArgs& args, int64_t begin, int64_t end);        // rays
   void (*voxelize)(const VoxelizeArgs& args, int64_t begin, int64_t end);  // rows of voxels
   void (*noise)(const NoiseArgs& args, int64_t begin, int64_t end);        // points, in float32
   void (*orbits)(const OrbitArgs& args, int64_t begin, int64_t end);       // the same
+  void (*splat)(const SplatArgs& args, int64_t begin, int64_t end);        // parts of cubes
 };
 
 }  // namespace gvtorch

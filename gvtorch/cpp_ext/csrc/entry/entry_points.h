@@ -1,0 +1,38 @@
+// The op on points: from tensors to the functors of points/. See entry.h.
+#pragma once
+
+#include "entry/entry.h"
+#include "points/splat.h"
+
+namespace gvtorch {
+
+GV_OP(SplatOp, "splat", GV_SPLAT, "Tensor");
+
+void splat_points(const Tensor& like, const SplatArgs& args);  // in cpu.cpp and in cuda.cu
+
+inline auto run(const SplatOp& a) {
+  STD_TORCH_CHECK(a.edge_k3e.dim() == 3 && a.edge_k3e.size(2) >= 2 && a.edge_k3e.size(2) <= kMostSplatted,
+                  "gvtorch: edge_k3e must be (k, 3, e), e >= 2");
+  STD_TORCH_CHECK(a.value_nc.dim() == 2 && a.value_nc.size(1) >= 1 && a.value_nc.size(1) <= INT32_MAX,
+                  "gvtorch: value_nc must be (n, c)");
+  const Like like{a.edge_k3e};
+  const int64_t cubes = a.edge_k3e.size(0), side = a.edge_k3e.size(2) - 1;
+  const int64_t width = a.value_nc.size(1), narrow = a.value_nc.size(0), wide = a.radius_m.numel();
+  const int64_t narrow_runs = a.narrow_s2.numel() / 2, wide_runs = a.wide_t2.numel() / 2;
+  SplatArgs args{};
+  GV_SPLAT(GV_TAKE)
+  args.cubes = cubes;
+  args.side = side;
+  args.width = width;
+  args.narrow = narrow;
+  args.narrow_runs = narrow_runs;
+  args.wide = wide;
+  args.wide_runs = wide_runs;
+  Tensor sum_kzyxc = give(args.sum_kzyxc, a.edge_k3e, {cubes, side, side, side, width});
+  splat_points(a.edge_k3e, args);
+  return sum_kzyxc;
+}
+
+using PointOps = Types<SplatOp>;
+
+}  // namespace gvtorch
