@@ -15,7 +15,7 @@ from ..base.messages import one_line
 from ..fields import Distance, Field, Interval, Solid
 from ..fields.field import checked_field
 from ..pool import Channel
-from .producer import Bricks, Nodes, Producer, Region, Regions
+from .producer import Bricks, Nodes, Producer, Region, Regions, clocks_of
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
 _FEW = 12  # bricks: smaller groups cost more than they save by leaving out parts of a field
@@ -150,9 +150,8 @@ class FieldProducer(Producer):
         if nodes.loc.device.type != "cpu" or torch.compiler.is_compiling():
             data = self._made(nodes, self.field)
         else:
-            beyond = getattr(self.field, "margin", 0) + _MARGIN
             order, parts = [], []
-            for rows, field in alike(self.field, nodes, beyond, _BATCH):
+            for rows, field in alike(self.field, nodes, self._beyond, _BATCH):
                 order.append(rows)
                 parts.append(self._made(nodes[rows], field))
             back = torch.cat(order).argsort()
@@ -164,6 +163,15 @@ class FieldProducer(Producer):
         finite = torch.stack([data[name].isfinite().flatten(1).all(1) for name in whole]).all(0)
         # Integers can't hold NaN: such bricks fail by a kind that there is none of.
         return Bricks(data=stored, kind=torch.where(finite, int(Region.DATA), -1))
+
+    def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
+        """Where a part of the field that keeps a time matters at either (`Field.near`)."""
+        return moving(self, self.field, nodes, self._beyond, (before, after))
+
+    @property
+    def _beyond(self) -> float:
+        """Voxels behind a brick's border that the field is asked for."""
+        return getattr(self.field, "margin", 0) + _MARGIN
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the values at points (..., 3), for each channel (..., c), without an engine: of
@@ -267,6 +275,20 @@ def alike(
     for group in groups:
         near = field.near(center[group], half[group])
         yield from ((rows, near) for rows in group.split(count))
+
+
+def moving(
+    producer: Producer, field: nn.Module, nodes: Nodes, beyond: float, times: Sequence[float]
+) -> Tensor:
+    """Returns (k,) bool, in which nodes a part of a producer's field that keeps a time matters at
+    any of some times; for `beyond` see `alike`.
+    """
+    found = torch.zeros_like(nodes.depth, dtype=torch.bool)
+    for time in times:
+        with producer.at_time(time):
+            for rows, near in alike(field, nodes, beyond, max(1, len(nodes))):
+                found[rows] |= bool(clocks_of(near))
+    return found
 
 
 def _asked(where: str, field: nn.Module, method: Callable[..., Any], *given: Any) -> Any:

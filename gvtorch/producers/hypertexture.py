@@ -19,7 +19,7 @@ from ..fields import Distance, noise
 from ..fields.noise.fractal import Octave, octaves_of
 from ..fields.noise.tally import Tally
 from ..pool import Channel
-from .field import alike, cubic_extent, dtype_of_places
+from .field import alike, cubic_extent, dtype_of_places, moving
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
@@ -184,6 +184,10 @@ class Hypertexture(Tally, Producer):
         kind = torch.where(-low / self.thickness + worn <= 0.5, Region.EMPTY, kind)
         is_full = (kind == Region.CONSTANT)[:, None].to(self.channels["density"].dtype)
         return Regions(kind=kind, constants={"density": is_full})
+
+    def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
+        """Where a part of the shape that keeps a time matters at either."""
+        return moving(self, self.shape, nodes, 0, (before, after))
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
         """Makes the bricks, level by level, in batches in which the same of the shape matters."""
