@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import gvtorch
+import tyro
+from helpers import ROOT, gvtorch
 
 import gvtorch as gv
+from gvtorch.tools import cli
 
 
 def keys_file(folder: Path, text: str) -> Path:
@@ -213,3 +217,16 @@ def test_values_may_begin_with_a_minus(small, tmp_path):
     for flags in (("--at", "-0.5mm"), ("--up", "-y"), ("--up", "+y")):
         run = gvtorch("slice", small, "-o", tmp_path / "a.png", *flags)
         assert run.returncode == 0, run.stderr
+
+
+def test_commands_in_the_docs_are_commands():
+    """Each line of a listing is parsed, and nothing runs."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    listed = re.compile(rf"^gvtorch (?:{'|'.join(cli._COMMANDS)}) .*", re.M)
+    lines = [line for page in pages for line in listed.findall(page.read_text())]
+    commands = [shlex.split(line, comments=True)[1:] for line in lines]
+    assert len(commands) > 30 and {words[0] for words in commands} == {*cli._COMMANDS}
+    for words in commands:
+        if "--help" not in words:
+            config = (tyro.conf.CascadeSubcommandArgs,)
+            tyro.extras.subcommand_cli_from_dict(cli._COMMANDS, args=words, config=config)

@@ -150,6 +150,49 @@ def test_bad_fields_are_named(call, message):
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
+class Odd(sdf.Distance):
+    """Tells nonsense in one of its methods, as it is told itself."""
+
+    def __init__(self, method, answer):
+        super().__init__()
+        self.__dict__[method] = answer
+
+    def forward(self, points):
+        return points.norm(dim=-1) - 0.5
+
+
+@pytest.mark.parametrize(
+    ("method", "answer", "message"),
+    [
+        ("alike", lambda c, h: c[:1, 0], "Odd.alike: must give (8,) int64 numbers, got (1,) float"),
+        ("alike", lambda c, h: 0, "Odd.alike: must give (8,) int64 numbers, got int"),
+        ("near", lambda c, h: 3, "Odd.near: answer must be a Field, got int"),
+        ("bounds", lambda c, h: c[0], "Odd.bounds: 'value' must be two tensors, low and high"),
+        ("bounds", lambda c, h: (c, c), "'value' must be (8,) or (8, 1) each, got (8, 3) float64"),
+        ("forward", lambda p: p, "shape Odd must give (8, 10, 10, 10) distances at (8, 10, 10, 10"),
+    ],
+)
+def test_what_a_shape_tells_wrongly_is_named(method, answer, message):
+    odd = Odd(method, answer)
+    rough = gv.Hypertexture(odd, 16, thickness=0.1, box=BOX)
+    layout = Layout.of(rough, 8, 1, torch.device("cpu"))
+    rough.prepare(layout)
+    place = torch.cartesian_prod(*(torch.arange(2),) * 3)
+    nodes = gv.Nodes(torch.cat((place, torch.ones_like(place[:, :1])), 1), layout)
+    with pytest.raises(ValueError) as caught:
+        (rough.classify if method == "bounds" else rough.fill)(nodes)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("error", [MemoryError, torch.OutOfMemoryError])
+def test_memory_that_is_short_is_no_fault_of_a_field(error):
+    def forward(points):
+        raise error("no more")
+
+    with pytest.raises(error, match="no more"):
+        gv.FieldProducer(Given(forward), box=BOX)
+
+
 class Torn(gv.Field):
     """Fails from a place on, or in what it tells of boxes, with two lines."""
 

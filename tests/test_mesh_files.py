@@ -163,6 +163,21 @@ def test_bad_files_are_told_in_a_line(tmp_path, name, content, said):
     assert not (tmp_path / "a.zarr").exists()
 
 
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: gv.read_mesh(3), "read_mesh: path must be a str or PathLike"),
+        (lambda: gv.read_mesh("a.obj", texture=3), "read_mesh: texture must be a str or PathLike"),
+        (lambda: gv.voxelize(3, "a"), "voxelize: mesh must be a Mesh or str or PathLike"),
+        (lambda: gv.SampledDistance.of_mesh(3), "SampledDistance: mesh must be a Mesh"),
+    ],
+)
+def test_what_is_no_mesh_is_told(call, message):
+    with pytest.raises(ValueError) as caught:
+        call()
+    assert str(caught.value) == f"{message}, got int"
+
+
 def test_missing_files_and_far_ones_are_told(tmp_path):
     with pytest.raises(FileNotFoundError, match="file not found"):
         gv.read_mesh(tmp_path / "none.obj")

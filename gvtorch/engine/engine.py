@@ -44,6 +44,7 @@ from .frame_graph import FrameGraph
 from .host_frame import HostFrame
 from .production import Failure, Production
 from .ray_subsets import RaySubsets, scouts
+from .renewal import renew_tree
 from .request_batch import ProducedTree
 from .serving import Serving
 from .setup import (
@@ -53,7 +54,6 @@ from .setup import (
     make_pools,
     make_recorded_frame,
     make_tree,
-    renew_tree,
 )
 from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
 
@@ -269,8 +269,9 @@ class Engine:
             self.production.write(self.production.late(), stats)
 
     def renew(self) -> None:
-        """Drops what trees hold whose producers tell of another content (`Producer.changed`), and
-        makes their roots anew; the host waits for that. The next frames make the rest again.
+        """Drops what trees hold whose producers tell of another content (`Producer.changed`), where
+        it is another, and makes their roots anew; the host waits for that. The next frames make the
+        rest again.
         """
         changed = [s for n, s in self.trees.items() if s.producer.version != self._versions[n]]
         if not changed:
@@ -279,8 +280,9 @@ class Engine:
         self.readbacks.catch_up(wait=True)  # what they list is no longer asked for
         for source in changed:
             self.production.forget(source)
-            renew_tree(self.cache, source, self.options.patience)
-            self._versions[source.name] = source.producer.version
+            since, producer = self._versions[source.name], source.producer
+            renew_tree(self.cache, source, self.options.patience, producer.changes(since))
+            self._versions[source.name] = producer.version
         self._missed = None
 
     def release(self, but: HostFrame | None = None) -> None:

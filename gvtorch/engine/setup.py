@@ -15,7 +15,6 @@ from ..base.volume import movable
 from ..cache import Cache, Scheduler
 from ..cache.write import write_slots
 from ..io.resources import amount, memory_free
-from ..ops import unlink
 from ..pool import BrickPool, Channel, N3Tree, NodePool
 from ..producers import Layout, Nodes, Producer, Region
 from ..producers.answer import checked_bricks, checked_regions
@@ -231,7 +230,7 @@ def make_tree(
         cache.finest[number] = layout.depth
     made = ProducedTree(name, tree, producer, layout)
     try:
-        _fill_root(cache, made, options.patience)
+        fill_root(cache, made, options.patience)
     except Exception as error:
         producer.close()
         raise ProductionError(
@@ -241,36 +240,19 @@ def make_tree(
     return made
 
 
-def renew_tree(cache: Cache, made: ProducedTree, patience: float) -> None:
-    """Drops all that a tree holds and makes its root anew: its producer's content has changed."""
-    nodes, bricks, per_tile = cache.nodes, cache.bricks, cache.nodes.nodes_per_tile
-    number = made.tree.number
-    cache.aliases.clear(number)
-    own = nodes.tree_t == number
-    tile = (own & (nodes.parent_t >= 0)).nonzero()[:, 0]
-    slot = ((bricks.owner_b >= 0) & own[bricks.owner_b.clamp(min=0) // per_tile]).nonzero()[:, 0]
-    unlink(nodes.child_tn, nodes.parent_t, nodes.shared_t, tile.to(torch.int32))
-    unlink(nodes.brick_tn, bricks.owner_b, bricks.shared_b, slot.to(torch.int32))
-    nodes.child_tn[tile], nodes.brick_tn[tile], nodes.request_tn[tile] = ABSENT, ABSENT, 0
-    nodes.stamp_t[tile], nodes.shared_t[tile] = -1, False
-    bricks.stamp_b[slot], bricks.shared_b[slot] = -1, False
-    nodes.child_tn[number], nodes.brick_tn[number], nodes.request_tn[number] = TERMINAL, EMPTY, 0
-    _fill_root(cache, made, patience)
-
-
-def _fill_root(cache: Cache, made: ProducedTree, patience: float) -> None:
+def fill_root(cache: Cache, made: ProducedTree, patience: float) -> None:
     """Writes the root's content into the first slots, which are the roots'."""
     nodes, index, producer = cache.nodes, made.tree.root, made.producer
     number = index // nodes.nodes_per_tile
     loc = torch.zeros((1, 4), dtype=torch.int64, device=nodes.child_tn.device)
     root = Nodes(loc, made.layout, coarse=bool(cache.finest[number] > 0))
-    regions = checked_regions(_now(producer.classify(root), patience), root, producer)
+    regions = checked_regions(arrived_within(producer.classify(root), patience), root, producer)
     _raise_first(regions.errors)
     for channel, tensor in regions.ranges.items():
         movable(nodes.ranges[channel])[number, 0] = movable(tensor)[0]
     kind, constants = Region(int(regions.kind[0])), regions.constants
     if kind in (Region.DATA, Region.DATA_MAX_DEPTH):
-        bricks = checked_bricks(_now(producer.fill(root), patience), root, producer)
+        bricks = checked_bricks(arrived_within(producer.fill(root), patience), root, producer)
         _raise_first(bricks.errors)
         found = kind if bricks.kind is None else Region(int(bricks.kind[0]))
         if found not in (Region.DATA, Region.DATA_MAX_DEPTH):
@@ -293,7 +275,8 @@ def _raise_first(errors: Mapping[int, str]) -> None:
         raise ValueError(message)
 
 
-def _now(answer: Any, patience: float) -> Any:
+def arrived_within(answer: Any, patience: float) -> Any:
+    """Returns a producer's answer; waits for one that comes later, so many seconds."""
     return answer.result(patience) if hasattr(answer, "result") else answer
 
 

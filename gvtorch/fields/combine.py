@@ -8,13 +8,13 @@ What an interval of the parts tells of the whole is worked out by interval arith
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
 from ..base import check
-from .distance import Distance
+from .distance import HASH, Distance
 from .field import Bounds, Field, Interval, Values, checked_field
 
 
@@ -83,6 +83,12 @@ class Warp(Field):
         wide = half + self.most
         return self.field.bounds(center, wide) if isinstance(self.field, Field) else None
 
+    def near(self, center: Tensor, half: Tensor) -> Self:
+        return self.replaced(field=_near(self.field, center, half + self.most))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return _alike((self.field,), center, half + self.most)
+
     def box(self) -> Tensor | None:
         box = self.field.box() if isinstance(self.field, Field) else None
         return None if box is None else torch.stack((box[0] - self.most, box[1] + self.most))
@@ -119,6 +125,13 @@ class Stack(Field):
     ) -> Mapping[str, Interval]:
         known = {n: _known(field, center, half, size) for n, field in self.fields.items()}
         return _flat({name: found for name, found in known.items() if found is not None})
+
+    def near(self, center: Tensor, half: Tensor) -> Self:
+        near = {name: _near(field, center, half) for name, field in self.fields.items()}
+        return self.replaced(fields=nn.ModuleDict(near))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return _alike(self.fields.values(), center, half)
 
 
 class Blend(Field):
@@ -171,6 +184,13 @@ class Blend(Field):
         if isinstance(found[0], Mapping) or isinstance(found[1], Mapping):
             return None
         return _between(found[0], found[1], low, high)
+
+    def near(self, center: Tensor, half: Tensor) -> Self:
+        parts = {"first": self.first, "second": self.second, "mask": self.mask}
+        return self.replaced(**{n: _near(part, center, half) for n, part in parts.items()})
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return _alike(self.children(), center, half)
 
 
 class Mask(Blend):
@@ -238,6 +258,19 @@ def _known(part: nn.Module, center: Tensor, half: Tensor, size: Tensor | None) -
     if size is None or not part.prefiltered:
         return part.bounds(center, half)
     return part.filtered_bounds(center, half, size)
+
+
+def _near(part: nn.Module, center: Tensor, half: Tensor) -> nn.Module:
+    """A part without what does not matter in boxes; see `Field.near`."""
+    return part.near(center, half) if isinstance(part, Field) else part
+
+
+def _alike(parts: Iterable[nn.Module], center: Tensor, half: Tensor) -> Tensor:
+    """(k,) numbers, equal where the same of all parts matters; see `Field.alike`."""
+    found = torch.zeros_like(center[:, 0], dtype=torch.int64)
+    for part in parts:
+        found = found * HASH + (part.alike(center, half) if isinstance(part, Field) else 0)
+    return found
 
 
 def _single(values: Values) -> Tensor:

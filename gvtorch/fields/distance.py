@@ -22,7 +22,7 @@ from .field import Field, Interval, length
 
 Color = Sequence[float]  # linear red, green, blue, 0 to 1
 WHITE = (0.8, 0.8, 0.8)
-_HASH = 0x9E3779B1
+HASH = 0x9E3779B1
 _ROUNDED = 2.0**-16  # of the size of places: values differ by less where float32 rounds them
 
 
@@ -167,7 +167,7 @@ class Pair(Distance):
         own = torch.where(most == 0, 0, torch.where(least == 1, 1, 2))
         first = torch.where(own == 1, 0, self.first.alike(center, half))
         second = torch.where(own == 0, 0, self.second.alike(center, half))
-        return (first * _HASH + second) * 3 + own
+        return (first * HASH + second) * 3 + own
 
     def box(self) -> Tensor | None:
         return around(self.first.box(), self.second.box())

@@ -71,6 +71,7 @@ class SampledDistance(Distance):
         Raises:
             ValueError: A number is out of its range.
         """
+        check.instance("SampledDistance", "mesh", mesh, Mesh)
         reach = check.number("SampledDistance", "reach", reach, low=0, high=4)
         grid = Voxelizer(mesh, resolution=resolution, channels=("distance",), band=_BAND)
         more = math.ceil(reach * resolution)

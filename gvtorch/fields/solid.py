@@ -47,6 +47,7 @@ class Solid(Field):
         super().__init__()
         self.shape = check.instance("Solid", "shape", shape, Distance)
         self.colors, self.normals = colors, colors if normals is None else normals
+        self.exact = shape.exact  # also of what is `near` by: so that bits stay
         rough = not shape.smooth if differences is None else differences
         self.margin = int(self.normals and rough)
         self.threshold = {"rgba" if colors else "density": 0.0}
@@ -65,13 +66,13 @@ class Solid(Field):
     def _voxels(self, points: Tensor, side: Tensor, differences: bool) -> dict[str, Tensor]:
         """The channels of voxels with sides (...,); for `differences` see `filtered`."""
         shape, found = self.shape, {}
-        if differences or (shape.exact and not self.normals):
+        if differences or (self.exact and not self.normals):
             value, color = shape.surface(points) if self.colors else (shape(points), None)
             near = value.clamp(-2 * side, 2 * side)[..., None].expand_as(points)
         else:
             value, color, gradient = shape.surface_and_gradient(points)
             steep = length(gradient).clamp(min=1e-6)
-            value = value if shape.exact else value / steep
+            value = value if self.exact else value / steep
             deep = (value.abs() >= _DEEP * side)[..., None]
             near = torch.where(deep, 0.0, gradient / steep[..., None])
         alpha = share(value, side)[..., None]
@@ -106,7 +107,7 @@ class Solid(Field):
         """
         low, high = self.shape.bounds(center, half)
         side = size.amax(-1)
-        if not self.shape.exact:
+        if not self.exact:
             steep = self.shape.slope(center, half)
             side = side * steep.clamp(min=1e-6)
         most = torch.where(low > 0, share(low, side), 1.0)

@@ -10,11 +10,13 @@ import json
 import math
 import zlib
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..base import check
 from ..base.messages import need_library, one_line
 from ..base.srgb import from_srgb
 from ..meshes.mesh import MOST_FACES, Material, Mesh
@@ -44,9 +46,11 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
     Raises:
         FileNotFoundError: It is not there.
         ValueError: It is none of these, is damaged, has no triangles, places that are NaN, indices
-            out of range, or names a texture or a buffer that is not there.
+            out of range, or names a texture or a buffer that is not there; or is no path.
         ImportError: trimesh is not installed.
     """
+    check.instance("read_mesh", "path", path, str, PathLike)
+    check.instance("read_mesh", "texture", texture or "", str, PathLike)
     path = Path(path)
     ending, packed = _ending(path)
     if not path.is_file():

@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,7 @@ class MeshSource(VolumeSource):
         texture: str | Path | None = None,
     ) -> dict[str, MeshSource]:
         """Reads the mesh, and lays a grid around it: a source for each channel; see `voxelize`."""
+        check.instance("voxelize", "mesh", given, Mesh, str, PathLike)
         check_solid("voxelize", solid)
         names = check_channels("voxelize", channels)
         if isinstance(given, Mesh):

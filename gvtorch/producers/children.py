@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Future
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,9 +23,11 @@ from .producer import (
     Producer,
     Region,
     Regions,
+    Where,
     arrived,
     by_depth,
     grid_of,
+    touched,
 )
 
 _AT_ONCE = 64  # blocks of a level that are made together, out of N^3 times as many below
@@ -74,9 +77,17 @@ class FromChildren(Producer):
         """That of the producer."""
         return self.producer.version
 
-    def changed(self) -> None:
+    def changed(self, where: Any = None) -> None:
         """See `Producer.changed`."""
-        self.producer.changed()
+        self.producer.changed(where)
+
+    def changes(self, since: int) -> list[Where] | None:
+        """Where the producer has changed."""
+        return self.producer.changes(since)
+
+    def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
+        """Where the producer differs."""
+        return self.producer.differs(nodes, before, after)
 
     def prepare(self, layout: Layout) -> None:
         """Refuses trees that are too deep."""
@@ -104,11 +115,21 @@ class FromChildren(Producer):
         if bool(finest.all()):
             return self.producer.fill(nodes)
         if self._known != self.producer.version:
-            self._known = self.producer.version
-            self._kept.clear()
+            self._forget(nodes.layout)
         if bool(finest.any()):
             return self._mixed(nodes, finest)
         return Bricks(data=self._coarse(nodes))
+
+    def _forget(self, layout: Layout) -> None:
+        """Drops the blocks that the producer would make otherwise by now."""
+        changes, places = self.producer.changes(self._known), [*self._kept]
+        self._known = self.producer.version
+        if changes is None or not places:
+            self._kept.clear()
+            return
+        stale = touched(changes, Nodes(torch.tensor(places, device=layout.device), layout))
+        for row in stale.nonzero()[:, 0].tolist():
+            del self._kept[places[row]]
 
     def _mixed(self, nodes: Nodes, finest: Tensor) -> Bricks:
         """Bricks of nodes some of which are of the finest level."""

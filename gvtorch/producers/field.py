@@ -15,7 +15,7 @@ from ..base.messages import one_line
 from ..fields import Distance, Field, Interval, Solid
 from ..fields.field import checked_field
 from ..pool import Channel
-from .producer import Bricks, Nodes, Producer, Region, Regions
+from .producer import Bricks, Nodes, Producer, Region, Regions, clocks_of
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
 _FEW = 12  # bricks: smaller groups cost more than they save by leaving out parts of a field
@@ -150,9 +150,8 @@ class FieldProducer(Producer):
         if nodes.loc.device.type != "cpu" or torch.compiler.is_compiling():
             data = self._made(nodes, self.field)
         else:
-            beyond = getattr(self.field, "margin", 0) + _MARGIN
             order, parts = [], []
-            for rows, field in alike(self.field, nodes, beyond, _BATCH):
+            for rows, field in alike(self.field, nodes, self._beyond, _BATCH):
                 order.append(rows)
                 parts.append(self._made(nodes[rows], field))
             back = torch.cat(order).argsort()
@@ -164,6 +163,15 @@ class FieldProducer(Producer):
         finite = torch.stack([data[name].isfinite().flatten(1).all(1) for name in whole]).all(0)
         # Integers can't hold NaN: such bricks fail by a kind that there is none of.
         return Bricks(data=stored, kind=torch.where(finite, int(Region.DATA), -1))
+
+    def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
+        """Where a part of the field that keeps a time matters at either (`Field.near`)."""
+        return moving(self, self.field, nodes, self._beyond, (before, after))
+
+    @property
+    def _beyond(self) -> float:
+        """Voxels behind a brick's border that the field is asked for."""
+        return getattr(self.field, "margin", 0) + _MARGIN
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the values at points (..., 3), for each channel (..., c), without an engine: of
@@ -204,28 +212,10 @@ class FieldProducer(Producer):
             return {}
         by_channel = found if isinstance(found, Mapping) else {"value": found}
         return {
-            name: self._interval(name, ends, len(center))
+            name: interval_of(self.field, name, ends, len(center), self.channels[name].width)
             for name, ends in by_channel.items()
             if name in self.channels
         }
-
-    def _interval(self, name: str, ends: Any, count: int) -> Interval:
-        """What a field told of a channel, (k, c) each; ValueError if it is no interval."""
-        where, width = f"{type(self.field).__name__}.bounds", self.channels[name].width
-        if not isinstance(ends, tuple) or [isinstance(e, Tensor) for e in ends] != [True, True]:
-            got = f"{len(ends)} items" if isinstance(ends, tuple) else type(ends).__name__
-            raise ValueError(f"{where}: {name!r} must be two tensors, low and high, got {got}")
-        if any(tuple(e.shape) not in ((count,), (count, width)) for e in ends):
-            low, high = (check.describe(e) for e in ends)
-            raise ValueError(
-                f"{where}: {name!r} must be ({count},) or ({count}, {width}) each, "
-                f"got {low} and {high}"
-            )
-        low, high = (e[:, None].expand(-1, width) if e.dim() == 1 else e for e in ends)
-        looks = low.device.type == "cpu" and not torch.compiler.is_compiling()
-        if looks and not bool((low <= high).all()):
-            raise ValueError(f"{where}: {name!r} must be low <= high everywhere, and not NaN")
-        return low, high
 
     def _stored(self, name: str, values: Tensor) -> Tensor:
         """Values in a channel's dtype."""
@@ -245,6 +235,39 @@ def cache_field(
     return FieldProducer(field, extent, **options)
 
 
+def interval_of(field: nn.Module, name: str, ends: Any, count: int, width: int) -> Interval:
+    """Returns what the `bounds` of a field told of `width` numbers under a name, (k, width) each;
+    ValueError if it is no interval.
+    """
+    where = f"{type(field).__name__}.bounds"
+    if not isinstance(ends, tuple) or [isinstance(e, Tensor) for e in ends] != [True, True]:
+        got = f"{len(ends)} items" if isinstance(ends, tuple) else type(ends).__name__
+        raise ValueError(f"{where}: {name!r} must be two tensors, low and high, got {got}")
+    if any(tuple(e.shape) not in ((count,), (count, width)) for e in ends):
+        low, high = (check.describe(e) for e in ends)
+        raise ValueError(
+            f"{where}: {name!r} must be ({count},) or ({count}, {width}) each, got {low} and {high}"
+        )
+    low, high = (e[:, None].expand(-1, width) if e.dim() == 1 else e for e in ends)
+    looks = low.device.type == "cpu" and not torch.compiler.is_compiling()
+    if looks and not bool((low <= high).all()):
+        raise ValueError(f"{where}: {name!r} must be low <= high everywhere, and not NaN")
+    return low, high
+
+
+def distances_of(where: str, shape: nn.Module, points: Tensor) -> Tensor:
+    """Returns the distances (...,) of a shape at points (..., 3); ValueError if it gives others."""
+    found = _asked(where, shape, shape, points)
+    lead = points.shape[:-1]
+    if not isinstance(found, Tensor) or found.shape != lead or not found.dtype.is_floating_point:
+        sizes = ", ".join(str(size) for size in lead)
+        raise ValueError(
+            f"{where}: shape {type(shape).__name__} must give ({sizes}) distances "
+            f"at ({sizes}, 3) points, got {check.describe(found)}"
+        )
+    return found
+
+
 def alike(
     field: nn.Module, nodes: Nodes, beyond: float, count: int
 ) -> Iterator[tuple[Tensor, nn.Module]]:
@@ -257,7 +280,11 @@ def alike(
         return
     center, layout = nodes.center, nodes.layout
     half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border + beyond)
-    _, kind = field.alike(center, half).unique(return_inverse=True)
+    name, numbers = type(field).__name__, field.alike(center, half)
+    if check.shown(numbers) != f"({len(nodes)},) int64":
+        came = check.describe(numbers)
+        raise ValueError(f"{name}.alike: must give ({len(nodes)},) int64 numbers, got {came}")
+    _, kind = numbers.unique(return_inverse=True)
     groups: list[Tensor] = []
     for group in kind.argsort(stable=True).split(kind.bincount().tolist()):
         if groups and len(groups[-1]) < _FEW:
@@ -265,14 +292,32 @@ def alike(
         else:
             groups.append(group)
     for group in groups:
-        near = field.near(center[group], half[group])
+        near = check.instance(
+            f"{name}.near", "answer", field.near(center[group], half[group]), Field
+        )
         yield from ((rows, near) for rows in group.split(count))
+
+
+def moving(
+    producer: Producer, field: nn.Module, nodes: Nodes, beyond: float, times: Sequence[float]
+) -> Tensor:
+    """Returns (k,) bool, in which nodes a part of a producer's field that keeps a time matters at
+    any of some times; for `beyond` see `alike`.
+    """
+    found = torch.zeros_like(nodes.depth, dtype=torch.bool)
+    for time in times:
+        with producer.at_time(time):
+            for rows, near in alike(field, nodes, beyond, max(1, len(nodes))):
+                found[rows] |= bool(clocks_of(near))
+    return found
 
 
 def _asked(where: str, field: nn.Module, method: Callable[..., Any], *given: Any) -> Any:
     """What a method of a field gives; ValueError in one line that names the field if it fails."""
     try:
         return method(*given)
+    except (MemoryError, torch.OutOfMemoryError):
+        raise  # no fault of the field
     except Exception as error:
         said = f"{type(error).__name__}: {one_line(error)}"
         raise ValueError(f"{where}: field {type(field).__name__} failed: {said}") from error

@@ -19,7 +19,14 @@ from ..fields import Distance, noise
 from ..fields.noise.fractal import Octave, octaves_of
 from ..fields.noise.tally import Tally
 from ..pool import Channel
-from .field import alike, cubic_extent, dtype_of_places
+from .field import (
+    alike,
+    cubic_extent,
+    distances_of,
+    dtype_of_places,
+    interval_of,
+    moving,
+)
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
@@ -165,7 +172,7 @@ class Hypertexture(Tally, Producer):
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the channels (..., 1) at points (..., 3), of the points' dtype, not filtered."""
-        distance = self.shape(points)
+        distance = distances_of(type(self).__name__, self.shape, points)
         total = distance * (-1 / self.thickness)
         for one in self.octaves:
             total = total + one.amplitude * noise.perlin(points * one.frequency, seed=one.seed)
@@ -175,7 +182,8 @@ class Hypertexture(Tally, Producer):
         """EMPTY and CONSTANT where the distance proves density 0 or 1 whatever the noise is."""
         layout = nodes.layout
         half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border)
-        low, high = self.shape.bounds(nodes.center, half)
+        ends = self.shape.bounds(nodes.center, half)
+        low, high = (end[:, 0] for end in interval_of(self.shape, "value", ends, len(half), 1))
         worn = self._worn.to(low.device)[nodes.depth]
         kind = torch.full_like(nodes.depth, Region.DATA)
         if "distance" not in self.channels:
@@ -184,6 +192,10 @@ class Hypertexture(Tally, Producer):
         kind = torch.where(-low / self.thickness + worn <= 0.5, Region.EMPTY, kind)
         is_full = (kind == Region.CONSTANT)[:, None].to(self.channels["density"].dtype)
         return Regions(kind=kind, constants={"density": is_full})
+
+    def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
+        """Where a part of the shape that keeps a time matters at either."""
+        return moving(self, self.shape, nodes, 0, (before, after))
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
         """Makes the bricks, level by level, in batches in which the same of the shape matters."""
@@ -205,7 +217,7 @@ class Hypertexture(Tally, Producer):
     def _made(self, nodes: Nodes, level: Level, shape: nn.Module) -> dict[str, Tensor]:
         """Channels (k, z, y, x, 1) of nodes of a level, of what of the shape matters there."""
         points = nodes.points(self.dtype)
-        distance = shape(points)
+        distance = distances_of(type(self).__name__, shape, points)
         total = distance * (-1 / self.thickness)
         active = torch.arange(len(nodes), device=total.device)
         values = total.clone()

@@ -18,7 +18,17 @@ from torch import Tensor
 from ..base import check
 from ..io.stores.channels import channel_names
 from ..io.stores.store import Store
-from .producer import Bricks, Layout, Nodes, Producer, Region, Regions, arrived, grid_of
+from .producer import (
+    Bricks,
+    Layout,
+    Nodes,
+    Producer,
+    Region,
+    Regions,
+    Where,
+    arrived,
+    grid_of,
+)
 from .stored import StoredProducer
 
 
@@ -77,12 +87,25 @@ class JoinedProducer(Producer):
     @property
     def version(self) -> int:  # type: ignore[override]
         """Rises with that of each."""
-        return sum(one.version for one in self._each().values())
+        return max(one.version for one in self._each().values())
 
-    def changed(self) -> None:
+    def changed(self, where: Any = None) -> None:
         """See `Producer.changed`; all have changed."""
         for one in self._each().values():
-            one.changed()
+            one.changed(where)
+
+    def changes(self, since: int) -> list[Where] | None:
+        """Wherever any has changed."""
+        new = [one.changes(since) for one in self._each().values() if one.version > since]
+        known = [changes for changes in new if changes is not None]
+        if len(known) < len(new):
+            return None
+        return [*dict.fromkeys(where for changes in known for where in changes)]  # each once
+
+    def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
+        """Where any differs."""
+        timed = [one for one in self._each().values() if hasattr(one, "time")]
+        return torch.stack([one.differs(nodes, before, after) for one in timed]).any(0)
 
     def prepare(self, layout: Layout) -> None:
         """Prepares all."""

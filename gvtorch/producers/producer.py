@@ -7,12 +7,14 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2
 
 from __future__ import annotations
 
-import functools
 import itertools
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import partial
 from typing import Any, Protocol, Self, TypedDict, runtime_checkable
 
 import torch
@@ -20,11 +22,15 @@ from torch import Tensor
 
 from ..base import check
 from ..base.volume import Volume, movable
-from ..fields.noise import inherit
 from ..pool import Channel
 from ..pool.pools import phrase
-from ..pool.pyramid import tree_depth
 from ..pool.staging import TableRows, Voxels, on_device
+from .nodes import Layout, Nodes
+
+#: Tells which of k nodes hold another content, they or what lies below them: (k,) bool.
+Where = Callable[[Nodes], Tensor]
+_numbers = itertools.count(1)  # of changes of all producers: a later one has a larger number
+_REMEMBERED = 64  # changes; before these, everything may have changed
 
 
 class Region(IntEnum):
@@ -37,263 +43,12 @@ class Region(IntEnum):
     ALIAS = 4  # the same as another node, the alias target, with all below it
 
 
-@dataclass(frozen=True, kw_only=True)
-class Layout:
-    """How an engine cuts a producer's world into nodes and bricks."""
-
-    depth: int  # of the finest level; the root's is 0
-    branching: int  # N: a node has N^3 children
-    brick_size: int  # voxels along a side of a brick, without the border
-    border: int  # voxels around a brick
-    extent: tuple[int, int, int]  # finest voxels along x, y, z
-    spacing: tuple[float, float, float]  # world size of a finest voxel
-    origin: tuple[float, float, float]  # world place of the centre of voxel 0
-    device: torch.device  # of the pools
-    scene: Mapping[str, Layout] = field(default_factory=dict, repr=False, compare=False)  # trees
-
-    @classmethod
-    def of(cls, producer: Producer, brick_size: int, border: int, device: torch.device) -> Layout:
-        """Returns the layout of a producer's world in bricks of a size."""
-        return cls(
-            depth=tree_depth(producer.extent, brick_size, producer.branching),
-            branching=producer.branching,
-            brick_size=brick_size,
-            border=border,
-            extent=producer.extent,
-            spacing=producer.spacing,
-            origin=producer.origin,
-            device=device,
-        )
-
-    def wider(self, by: int) -> Layout:
-        """Returns the layout of bricks with a border that is wider by so many voxels; kept."""
-        if by not in self._wider:
-            self._wider[by] = replace(self, border=self.border + by)
-        return self._wider[by]
-
-    @functools.cached_property
-    def _wider(self) -> dict[int, Layout]:
-        return {}
-
-    @property
-    def side(self) -> int:
-        """s = brick_size + 2 * border, voxels along a side of a brick with its border."""
-        return self.brick_size + 2 * self.border
-
-    @functools.cached_property
-    def spacing_3(self) -> Tensor:
-        """(3,) float64 `spacing` on the device."""
-        return torch.tensor(self.spacing, dtype=torch.float64, device=self.device)
-
-    @functools.cached_property
-    def origin_3(self) -> Tensor:
-        """(3,) float64 `origin` on the device."""
-        return torch.tensor(self.origin, dtype=torch.float64, device=self.device)
-
-    @functools.cached_property
-    def extent_3(self) -> Tensor:
-        """(3,) float64 `extent` on the device."""
-        return torch.tensor(self.extent, dtype=torch.float64, device=self.device)
-
-    @functools.cached_property
-    def reach(self) -> Tensor:
-        """(s,) int64 voxels along a side of a brick, -border to brick_size + border - 1."""
-        return torch.arange(-self.border, self.brick_size + self.border, device=self.device)
-
-    @functools.cached_property
-    def grid(self) -> Tensor:
-        """(s * s * s * 3,) int64: for each x, y, z of each voxel of a brick, its index among the
-        3 * s coordinates along the axes.
-        """
-        at = torch.arange(len(self.reach), device=self.device)
-        z, y, x = torch.meshgrid(at, at, at, indexing="ij")
-        return torch.stack((x, y + len(at), z + 2 * len(at)), -1).flatten()
-
-
-class Nodes:
-    """A batch of k nodes of one tree, by place: what a producer is asked about.
-
-    Attributes:
-        loc: (k, 4) int64 x, y, z, depth: node x of its level covers voxels x * brick_size to
-            (x + 1) * brick_size of that level.
-        layout: How the tree's world is cut: brick size, border, spacing and the like.
-        coarse: Whether their bricks hold coarse channels as well: then all are above the finest
-            level; where a producer has such channels and this is False, all are of the finest.
-        parents: For each channel (k, z, y, x, c) the bricks of their parents, with borders, as they
-            are stored; None unless `Producer.needs_parent`, and of the root, which has none.
-    """
-
-    def __init__(
-        self,
-        loc: Tensor,
-        layout: Layout,
-        *,
-        coarse: bool = False,
-        parents: Mapping[str, Tensor] | None = None,
-    ) -> None:
-        """Holds the places."""
-        self.loc, self.layout, self.coarse, self.parents = loc, layout, coarse, parents
-        self._known: dict[str, Tensor] = {}  # a cache of properties that torch.compile can trace
-
-    def __len__(self) -> int:
-        return self.loc.shape[0]
-
-    def __getitem__(self, index: slice | Tensor) -> Nodes:
-        """Returns some of the nodes."""
-        parents = self.parents
-        if parents is not None:
-            parents = {name: rows[index] for name, rows in parents.items()}
-        return Nodes(self.loc[index], self.layout, coarse=self.coarse, parents=parents)
-
-    def wider(self, by: int) -> Nodes:
-        """Returns the same nodes with a border that is wider by so many voxels: what a producer
-        evaluates where voxels are made of their neighbours.
-        """
-        return Nodes(self.loc, self.layout.wider(by), coarse=self.coarse) if by else self
-
-    @property
-    def child(self) -> Tensor:
-        """(k, 3) int64 which child of its parent each is, x y z, 0 to N - 1."""
-        return self.loc[:, :3] % self.layout.branching
-
-    def inherited(self, points: int = 2) -> dict[str, Tensor]:
-        """Returns for each channel (k, z, y, x, c) float32 what `parents` hold where these nodes
-        have their voxels, border included: interpolated from `points` voxels along each axis, see
-        `gv.noise.inherit`; 2 is what renderers read.
-
-        Raises:
-            ValueError: There are no parents, or bricks have no border.
-        """
-        if self.parents is None:
-            raise ValueError("Nodes.inherited: the producer must have needs_parent, and no root")
-        layout, found = self.layout, {}
-        cut = {"border": layout.border, "branching": layout.branching, "points": points}
-        for name, bricks in self.parents.items():
-            width = bricks.shape[-1]
-            flat = bricks.movedim(-1, 1).flatten(0, 1).to(torch.float32)
-            rows = inherit(flat, self.child.repeat_interleave(width, 0), **cut)
-            found[name] = rows.unflatten(0, (-1, width)).movedim(1, -1)
-        return found
-
-    @property
-    def depth(self) -> Tensor:
-        """(k,) int64, 0 for the root."""
-        return self.loc[:, 3]
-
-    @property
-    def scale(self) -> Tensor:
-        """(k,) float64, finest voxels along a side of one of the node's voxels."""
-        if "scale" not in self._known:
-            base = torch.full_like(self.loc[:, 3], self.layout.branching, dtype=torch.float64)
-            self._known["scale"] = base ** (self.layout.depth - self.loc[:, 3])
-        return self._known["scale"]
-
-    @property
-    def voxel_size(self) -> Tensor:
-        """(k, 3) float64 world size of one of the node's voxels."""
-        return self.scale[:, None] * self.layout.spacing_3.to(self.loc.device)
-
-    @property
-    def box(self) -> Tensor:
-        """(k, 2, 3) float64 world corners, x y z, without the border."""
-        low = self.loc[:, :3] * self.layout.brick_size
-        faces = torch.stack((low, low + self.layout.brick_size), 1) * self.scale[:, None, None]
-        return self._world(faces - 0.5)
-
-    @property
-    def center(self) -> Tensor:
-        """(k, 3) float64 world centre."""
-        return self.box.mean(1)
-
-    @property
-    def radius(self) -> Tensor:
-        """(k,) float64 world distance from the centre to the farthest voxel centre of the brick,
-        border included.
-        """
-        return (self.voxel_size * (0.5 * (self.layout.side - 1))).norm(dim=1)
-
-    @property
-    def axes(self) -> tuple[Tensor, Tensor, Tensor]:
-        """float32 world coordinates of the voxel centres along x (k, 1, 1, s), y (k, 1, s, 1) and
-        z (k, s, 1, 1), border included. A function of them broadcasts to (k, z, y, x) and reads a
-        hundredth of the memory that `positions` take. In worlds of more than about 2^20 voxels a
-        side float32 can't tell neighbours apart: see `local_axes`.
-        """
-        return _broadcast(self._places)
-
-    @property
-    def local_axes(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The same from the brick's `center` on: exact at any depth. `center` is float64, so that
-        `nodes.center[:, 0, None, None, None] + x` gives world coordinates in float64.
-        """
-        return _broadcast(self._local)
-
-    @property
-    def positions(self) -> Tensor:
-        """(k, z, y, x, 3) float32 world positions of the voxel centres, border included."""
-        return self._grid("positions", self._places)
-
-    @property
-    def local_positions(self) -> Tensor:
-        """(k, z, y, x, 3) float32, the same from the brick's `center` on: see `local_axes`."""
-        return self._grid("local_positions", self._local)
-
-    def points(self, dtype: torch.dtype) -> Tensor:
-        """Returns `positions`, in float32 or, exact at any depth, in float64."""
-        if dtype == torch.float64:
-            return self.center[:, None, None, None] + self.local_positions
-        return self.positions
-
-    def _grid(self, name: str, places: Tensor) -> Tensor:
-        """(k, z, y, x, 3) of (k, 3, s) coordinates along each axis, kept under a name."""
-        if name not in self._known:
-            side, grid = self.layout.side, self.layout.grid.to(places.device)
-            flat = places.flatten(1).index_select(1, grid)
-            self._known[name] = flat.view(-1, side, side, side, 3)
-        return self._known[name]
-
-    @property
-    def _local(self) -> Tensor:
-        """(k, 3, s) float32 coordinates along each axis of the voxel centres from `center` on."""
-        middle = 0.5 * (self.layout.brick_size - 1)
-        reach = self.layout.reach.to(self.loc.device) - middle
-        return (self.voxel_size[:, :, None] * reach).to(torch.float32)
-
-    @property
-    def _places(self) -> Tensor:
-        """(k, 3, s) float32 world coordinates of the voxel centres along each axis."""
-        if "places" not in self._known:
-            reach = self.layout.reach.to(self.loc.device)
-            voxel = self.loc[:, :3, None] * self.layout.brick_size + reach
-            finest = (voxel + 0.5) * self.scale[:, None, None] - 0.5
-            self._known["places"] = self._world(finest.mT).mT.to(torch.float32).contiguous()
-        return self._known["places"]
-
-    def _world(self, finest: Tensor) -> Tensor:
-        """Brings places (..., 3) from finest voxels to the world."""
-        layout = self.layout
-        return finest * layout.spacing_3.to(finest.device) + layout.origin_3.to(finest.device)
-
-    def __repr__(self) -> str:
-        layout = self.layout
-        return (
-            f"Nodes({len(self)} on {self.loc.device}, "
-            f"bricks of {layout.brick_size}^3+{layout.border}, tree depth {layout.depth})"
-        )
-
-
 def by_depth(loc: Tensor) -> Iterator[tuple[int, Tensor]]:
     """Yields each depth of nodes at places (k, 4), and which of them it has, (m,); waits for the
     device.
     """
     for depth in loc[:, 3].unique().tolist():
         yield depth, (loc[:, 3] == depth).nonzero()[:, 0]
-
-
-def _broadcast(places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(k, 3, s) coordinates along each axis, so that they broadcast to (k, z, y, x)."""
-    x, y, z = places.unbind(1)
-    return x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
 
 
 def _between(bricks: Tensor, row: Tensor, place: Tensor) -> Tensor:
@@ -417,7 +172,7 @@ class Producer(torch.nn.Module):
             CUDA record this where the producer is `on_device`.
         host_bytes: Host memory that it may fill while it is used.
         made_of: For coarse channels, what they are made of: shaders compare it with what they need.
-        version: Number of the content, see `changed`.
+        version: Number of the content, which rises: see `changed`.
         extent, spacing, origin, branching, channels, value_range, labels: See `__init__`.
     """
 
@@ -485,6 +240,7 @@ class Producer(torch.nn.Module):
                 raise ValueError(f"{where}: channels[{name!r}] must be a Channel, got {channel!r}")
         self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
         self.made_of: dict[str, Any] = {}
+        self._changes: deque[tuple[int, Where | None]] = deque(maxlen=_REMEMBERED)
 
     def prepare(self, layout: Layout) -> None:
         """Is called once by the engine, before anything else, with how it cuts the world."""
@@ -511,16 +267,45 @@ class Producer(torch.nn.Module):
         """
         raise NotImplementedError(f"{type(self).__name__}: fill is not written")
 
-    def changed(self) -> None:
+    def changed(self, where: Where | Tensor | Sequence[Any] | None = None) -> None:
         """Tells that the content is another one from now on, such as at another time: the engine
-        drops what it holds and asks again, from its next frame on.
+        drops what it holds of it and asks again, from its next frame on.
+
+        Args:
+            where: World corners (2, 3) or (m, 2, 3) of boxes, beyond which all voxels stay, those
+                of coarse levels too where they lie beyond; or a function that tells of `Nodes`
+                which (k,) bool have changed, they or what lies below. Left out: everything.
+
+        Raises:
+            ValueError: Corners are not finite, or of another shape.
         """
-        self.version += 1
+        if where is not None and not callable(where):
+            boxes = check.reals(f"{type(self).__name__}.changed", "where", where)
+            if boxes.dim() not in (2, 3) or boxes.shape[-2:] != (2, 3):
+                raise ValueError(
+                    f"{type(self).__name__}.changed: where must be (2, 3) or (m, 2, 3) corners, "
+                    f"got {check.shown(boxes)}"
+                )
+            where = partial(Nodes.touch, boxes=boxes.view(-1, 2, 3))
+        self.version = next(_numbers)
+        self._changes.append((self.version, where))
+
+    def changes(self, since: int) -> list[Where] | None:
+        """Returns where the content is another one than at a version; None: maybe everywhere."""
+        new = [where for number, where in self._changes if number > since]
+        known = [where for where in new if where is not None]
+        return known if 0 < len(known) == len(new) < _REMEMBERED else None
+
+    def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
+        """Returns (k,) bool which nodes, borders included, or what lies below them, are others at
+        one time than at another; unless overridden all, if any part has a time.
+        """
+        return torch.full_like(nodes.depth, hasattr(self, "time"), dtype=torch.bool)
 
     @property
     def time(self) -> float:
         """The time of the parts that have one, such as a field or another producer: a buffer `time`
-        (`Field.number`). Setting it makes all anew (`changed`). AttributeError if none has.
+        (`Field.number`). Setting it makes anew what `differs`. AttributeError if none has.
         """
         return float(self._clocks()[0])
 
@@ -528,13 +313,27 @@ class Producer(torch.nn.Module):
     def time(self, value: float) -> None:
         clocks = self._clocks()
         time = check.number(type(self).__name__, "time", value)
+        before = {float(clock) for clock in clocks}
         for clock in clocks:
             clock.fill_(time)
-        self.changed()
+        alike = len(before) == 1
+        self.changed(partial(self.differs, before=before.pop(), after=time) if alike else None)
+
+    @contextmanager
+    def at_time(self, time: float) -> Iterator[None]:
+        """Lets the block look at another time, which is no change."""
+        clocks = self._clocks()
+        own = [float(clock) for clock in clocks]
+        try:
+            for clock in clocks:
+                clock.fill_(time)
+            yield
+        finally:
+            for clock, value in zip(clocks, own, strict=True):
+                clock.fill_(value)
 
     def _clocks(self) -> list[Tensor]:
-        clocks = [one for n, one in self.named_buffers() if n.rpartition(".")[2] == "time"]
-        if not clocks:
+        if not (clocks := clocks_of(self)):
             raise AttributeError(f"{type(self).__name__}: no part of it keeps a number 'time'")
         return clocks
 
@@ -587,6 +386,16 @@ class Producer(torch.nn.Module):
         extent = "x".join(str(n) for n in self.extent)
         channels = phrase(self.channels)
         return f"{type(self).__name__}({extent} (x, y, z), N={self.branching}, {channels})"
+
+
+def clocks_of(module: torch.nn.Module) -> list[Tensor]:
+    """Returns the numbers `time` of all parts that have one."""
+    return [one for name, one in module.named_buffers() if name.rpartition(".")[2] == "time"]
+
+
+def touched(changes: Sequence[Where], nodes: Nodes) -> Tensor:
+    """Returns (k,) bool, which nodes any of some changes concerns."""
+    return torch.stack([where(nodes) for where in changes]).any(0)
 
 
 def arrived(answer: Any) -> Any:
