@@ -89,9 +89,9 @@ struct ListRequests {
   X(Int, batch, kAny)                     \
   X(Bool, coarse_first, kAny)
 
-constexpr int64_t kNoKey = INT64_MAX;                              // no request of a node of the pool
-constexpr int64_t kComparers = 16;                                 // threads that share what a request is compared with
-constexpr int64_t kMostCompared = 1 << 15, kManyServed = 1 << 12;  // longer lists, and larger batches, are sorted for
+constexpr int64_t kNoKey = INT64_MAX;       // no request of a node of the pool
+constexpr int64_t kComparers = 16;          // threads that share what a request is compared with
+constexpr int64_t kMostCompared = 1 << 15;  // longer lists are sorted
 constexpr int64_t kIndices = int64_t{1} << 31;
 
 struct ChooseArgs {

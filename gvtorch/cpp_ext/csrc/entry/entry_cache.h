@@ -51,7 +51,7 @@ inline auto run(const ChooseRequestsOp& a) {
   Tensor node_2b = give(args.node_2b, a.asked_l2k, {2, a.batch});
   Tensor priority_2b = give(args.priority_2b, a.asked_l2k, {2, a.batch});
   for_each(a.asked_l2k, std::max(requests, 2 * a.batch), RankRequests{args});
-  if (requests <= kMostCompared && a.batch < kManyServed) {
+  if (requests <= kMostCompared) {
     for_each(a.asked_l2k, requests * kComparers, CompareRequests{args});
     for_each(a.asked_l2k, requests, ServeRequests{args});
   } else {
