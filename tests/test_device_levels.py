@@ -52,6 +52,20 @@ def test_tensors_are_reduced_to_the_bits_of_arrays(dtype, factor, device):
         )
 
 
+@pytest.mark.parametrize("device", ["nonsense", "cuda:99", 5.5])
+def test_a_device_that_is_not_there_is_told(device):
+    volume = gv.Volume(random_data("uint8", (8, 8, 8, 1)))
+    tree = gv.N3Tree.from_volume(volume)
+    calls = {
+        "from_volume": lambda: gv.N3Tree.from_volume(volume, device=device),
+        "N3Tree.to": lambda: tree.to(device),
+        "Volume.to": lambda: volume.to(device),
+    }
+    for where, call in calls.items():
+        with pytest.raises(ValueError, match=f"^{where}: device "):
+            call()
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_grids_come_back_as_they_went(dtype):
     data = random_data(dtype, (5, 4, 3, 1))

@@ -151,7 +151,7 @@ class Volume:
     def to(self, device: torch.device | str) -> Volume:
         """Returns the volume with its data on a device; what lies there already is shared."""
         other = copy.copy(self)
-        other.data = self.data.to(device)
+        other.data = self.data.to(check.device("Volume.to", device))
         return other
 
     def directional(

@@ -256,7 +256,8 @@ class N3Tree:
         Source: Crassin et al., "GigaVoxels", I3D 2009, section 3; docs/design.md, section 2.
         """
         given = volumes_by_channel("from_volume", volume)
-        maker = maker_of(given.values(), torch.device(device))
+        device = check.device("from_volume", device)
+        maker = maker_of(given.values(), device)
         volumes = {name: one.to(maker) for name, one in given.items()}
         first = next(iter(volumes.values()))
         check.whole("from_volume", "branching", branching, low=2, high=16)
@@ -289,7 +290,7 @@ class N3Tree:
 
     def to(self, device: torch.device | str) -> N3Tree:
         """Returns the tree with its pools on a device; what lies there already is shared."""
-        other = copy.copy(self)
+        device, other = check.device("N3Tree.to", device), copy.copy(self)
         other.nodes, other.bricks = self.nodes.to(device), self.bricks.to(device)
         return other
 
