@@ -1,5 +1,6 @@
 """Fields of fields: a gyroid that blends into noise along a ramp, masked by a ball, and warped."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,9 +19,14 @@ VIEW = (-0.9, -3.3, 1.1), (0, 0, 0), (0, 0, 1), 35
 
 
 class Of(torch.nn.Module):
-    def __init__(self, function: object) -> None:
+    """A function of points and of modules, which go along to the engine's device."""
+
+    def __init__(self, function: Callable[..., torch.Tensor], *parts: torch.nn.Module) -> None:
         super().__init__()
-        self.forward = function  # type: ignore[method-assign]
+        self.function, self.parts = function, torch.nn.ModuleList(parts)
+
+    def forward(self, points: torch.Tensor) -> torch.Tensor:
+        return self.function(points, *self.parts)
 
 
 @dataclass
@@ -36,7 +42,7 @@ class Settings:
 def world() -> torch.nn.Module:
     """Channels: "shape", whose surface is at 1/2, and "side", which colours it."""
     cells = gv.sdf.Shell(gv.sdf.Gyroid(0.55), 0.06)
-    gyroid = Of(lambda p: (0.5 - 12 * cells(p)).clamp(0, 1))
+    gyroid = Of(lambda p, shape: (0.5 - 12 * shape(p)).clamp(0, 1), cells)
     stone = Of(lambda p: (0.6 + 2 * gv.noise.fbm(1.8 * p, octaves=5, seed=3)).clamp(0, 1))
     ramp = Of(lambda p: (0.5 + 0.9 * p[..., 0] + 0.2 * p[..., 2]).clamp(0, 1))
     ball = Of(lambda p: (0.5 + 12 * (1 - p.norm(dim=-1))).clamp(0, 1))

@@ -228,8 +228,8 @@ def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> None:
 
 def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, Tensor]) -> None:
     """Gives nodes (k,) that have no finer level the ranges of their voxels, borders included: what
-    `classify` told may have been a bound. They are read where they were written: `data` may lie
-    beyond a bus.
+    `classify` told may have been a bound. They are read from the pool: `data` may lie in host
+    memory, behind the bus.
     """
     nodes = cache.nodes
     finest = nodes.child_tn.view(-1)[node.clamp(min=0)] == TERMINAL
@@ -238,8 +238,8 @@ def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, 
         if name in data and not cache.bricks.channels[name].coarse:
             held = cache.bricks.bricks[name].detach()
             rows = movable(held).flatten(1)
-            words_of = torch.int64 if row_bytes(held) % 8 == 0 else rows.dtype  # fewer to gather
-            found = rows.view(words_of)[slot.clamp(min=0)]
+            word = torch.int64 if row_bytes(held) % 8 == 0 else rows.dtype  # fewer to gather
+            found = rows.view(word)[slot.clamp(min=0)]
             voxels = found.view(held.dtype).view(len(slot), -1, held.shape[-1])
             if voxels.dtype == torch.uint16:  # which torch can't compare
                 voxels = voxels.to(torch.int32)

@@ -269,9 +269,8 @@ class Engine:
             self.production.write(self.production.late(), stats)
 
     def renew(self) -> None:
-        """Drops what trees hold whose producers tell of another content (`Producer.changed`), where
-        it is another, and makes their roots anew; the host waits for that. The next frames make the
-        rest again.
+        """Drops the nodes and bricks that producers say have changed (`Producer.changed`), and
+        makes the roots of their trees anew; the host waits for that. The next frames make the rest.
         """
         changed = [s for n, s in self.trees.items() if s.producer.version != self._versions[n]]
         if not changed:

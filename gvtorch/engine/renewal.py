@@ -1,4 +1,4 @@
-"""`renew_tree`: what a tree holds is dropped where its producer tells of another content."""
+"""`renew_tree`: drops the bricks and subtrees of a tree that its producer says have changed."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from .setup import arrived_within, fill_root
 def renew_tree(
     cache: Cache, made: ProducedTree, patience: float, changes: Sequence[Where] | None
 ) -> None:
-    """Makes a tree's root anew, and drops what it holds: bricks of nodes that `changes` concern,
-    which are classified anew, and all below those that turn out to have no children. Everything
-    goes where changes are not known (None), where bricks are made of their parents', where there
-    are aliases, and where a node can't be classified.
+    """Makes a tree's root anew. Nodes for which one of `changes` is true are classified again and
+    lose their bricks; those that have no children any more lose the subtree below them. All of the
+    tree is dropped if `changes` is None (not known), if bricks are made of their parents' bricks,
+    if there are aliases, or if the producer can't classify one of these nodes.
     """
     nodes, root = cache.nodes, made.tree.number
     whole = changes is None or made.producer.needs_parent or len(cache.aliases) > 0
@@ -47,8 +47,8 @@ def renew_tree(
 def _renew_parts(
     cache: Cache, made: ProducedTree, patience: float, changes: Sequence[Where]
 ) -> bool:
-    """Classifies the nodes anew that changes concern, all but the root, and drops their bricks;
-    False, and nothing is done, if their producer can't tell.
+    """Classifies the changed nodes again, all but the root, and drops their bricks. Returns False,
+    with the tree as it was but for its requests, if the producer fails to classify one.
     """
     nodes, n = cache.nodes, made.layout.branching**3
     tile = ((nodes.tree_t == made.tree.number) & (nodes.parent_t >= 0)).nonzero()[:, 0]
@@ -65,7 +65,7 @@ def _renew_parts(
     try:
         answer = arrived_within(batch.ask(), patience)
         regions = checked_regions(answer, batch.nodes, made.producer)
-    except Exception:  # asked again node by node, those that fail are named
+    except Exception:  # all is dropped and asked for again, where a failure is told by node
         return False
     if regions.errors or regions.alias is not None:
         return False

@@ -33,7 +33,7 @@ Grid = TypeVar("Grid", np.ndarray, Tensor)
 _ARRAYS = {"min": np.minimum, "max": np.maximum, "mean": np.add}
 _TENSORS = {"min": torch.minimum, "max": torch.maximum, "mean": torch.add}
 _SLAB = 1 << 22  # voxels reduced at a time, so that intermediate arrays stay in a core's cache
-_DEVICE_SLAB = 1 << 27  # likewise, so that these take less memory than the voxels
+_DEVICE_SLAB = 1 << 27  # likewise on a device: more would take more memory and no less time
 
 
 def as_grid(values: Tensor) -> Any:
@@ -266,7 +266,9 @@ def _as(values: Grid, name: str, *, copy: bool = False) -> Grid:
 
 
 def _mean(total: Grid, count: int) -> Grid:
-    """Divides sums, integers as float64: by no reciprocal, which torch takes of plain numbers."""
+    """Divides sums by a count, integers in float64. For tensors the divisor is a tensor, too: by a
+    plain number torch multiplies with the reciprocal, which rounds otherwise.
+    """
     if "int" in _name(total):
         total = _as(total, "float64")
     if isinstance(total, Tensor):

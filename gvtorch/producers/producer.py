@@ -27,7 +27,7 @@ from ..pool.pools import phrase
 from ..pool.staging import TableRows, Voxels, on_device
 from .nodes import Layout, Nodes
 
-#: Tells which of k nodes hold another content, they or what lies below them: (k,) bool.
+#: Tells which of k nodes have changed, in their own voxels or in those below them: (k,) bool.
 Where = Callable[[Nodes], Tensor]
 _numbers = itertools.count(1)  # of changes of all producers: a later one has a larger number
 _REMEMBERED = 64  # changes; before these, everything may have changed
@@ -291,14 +291,14 @@ class Producer(torch.nn.Module):
         self._changes.append((self.version, where))
 
     def changes(self, since: int) -> list[Where] | None:
-        """Returns where the content is another one than at a version; None: maybe everywhere."""
+        """Returns what tells the nodes that have changed since a version; None: any may have."""
         new = [where for number, where in self._changes if number > since]
         known = [where for where in new if where is not None]
         return known if 0 < len(known) == len(new) < _REMEMBERED else None
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
-        """Returns (k,) bool which nodes, borders included, or what lies below them, are others at
-        one time than at another; unless overridden all, if any part has a time.
+        """Returns (k,) bool, which nodes differ between two times: in a voxel of their own, borders
+        included, or in one below them. Unless overridden all do, if any part has a time.
         """
         return torch.full_like(nodes.depth, hasattr(self, "time"), dtype=torch.bool)
 
