@@ -4,6 +4,8 @@ picture is that of 256 rays a pixel.
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from helpers.afar import assert_same_bits, compare, filtered, matter, picture, rays, walls
@@ -79,6 +81,21 @@ def test_from_afar_it_shows_what_many_fine_rays_show(look, way, pixel):
     means, before = compare(picture(tree, transfer, way, pixel), truth)
     print(look, way, pixel, f"{light:.3f} {psnr:.1f} dB, means {means:.3f} {before:.1f} dB")
     assert psnr > before + 5
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("way", [(0.0, 0.0, 1.0), (0.37, 0.23, 1.0)])
+def test_a_solid_ball_covers_a_disc_from_afar(way):
+    """Its rim does not grow: what is hidden behind it takes on what is seen beside it."""
+    radius, place = 36.0, torch.arange(96) - 47.5
+    z, y, x = torch.meshgrid(place, place, place, indexing="ij")
+    inside = radius - (x * x + y * y + z * z).sqrt()
+    volume = gv.Volume((0.5 + inside / 2).clamp(0, 1))
+    tree = gv.N3Tree.from_volume(volume, 8)
+    shader = gv.Filtered.of(tree, volume, gv.TransferFunction([(0.49, 0), (0.51, 0.999)]))
+    for pixel, grown in ((4.0, 0.05), (8.0, 0.07), (16.0, 0.07)):
+        covered = picture(tree, shader, way, pixel)[..., 3].sum()
+        assert abs(float(covered) / (math.pi * (radius / pixel) ** 2) - 1) < grown, pixel
 
 
 @pytest.mark.backend("cpp")

@@ -506,7 +506,7 @@ def test_another_shader_leaves_out_what_it_does_not_take(tab, viewer):
     tab.until(lambda: viewer.state.options.lighting is None)
     assert "lighting needs normals" in tab.page.locator(".gv-note.gv-shown").inner_text()
     for name in ("lighting", "lens"):
-        assert tab.page.locator(f"label.gv-row:has-text('{name}') select").is_disabled()
+        tab.until(tab.page.locator(f"label.gv-row:has-text('{name}') select").is_disabled)
     tab.page.get_by_label("Undo").click()
     tab.until(lambda: viewer.state.options.lighting is not None)
     tab.page.get_by_label("Redo").click()

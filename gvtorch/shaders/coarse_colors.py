@@ -20,6 +20,7 @@ from .shader import ColorTable
 
 _TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # whose columns are worked out at a time
 _LEAST = 0.001  # weight of a column that no light comes to
+_HIDDEN = 0.5  # of the light beside it: a voxel to which less comes is hidden
 _FAINT = 32  # over which the moments of its normals count; as in csrc/shaders/light.h
 _DIRECTIONS = 6
 #: Numbers of a voxel as seen along a direction: premultiplied colour and alpha; then, of lit
@@ -74,26 +75,35 @@ def write_colors(
             works.
         spacing: Size of a voxel along x, y, z.
         branching: N.
-        out: For each coarse level, the finest of them first, (z, y, x, 6 * n) float16: n numbers,
-            PLAIN or LIT, of its voxels as seen along +x -x +y -y +z -z, for a length of the
-            smallest spacing.
+        out: For each coarse level, the finest of them first, (z, y, x, 6 * (n + 1)) float16: n
+            numbers, PLAIN or LIT, of its voxels as seen along +x -x +y -y +z -z, for a length of
+            the smallest spacing; and which share of the light came through the voxel before.
         progress: Told ("filtered", voxels done, voxels in all).
     """
     done, total = 0, 3 * math.prod(field.shape)
-    width = 2 * out[0].shape[-1] // _DIRECTIONS if out else 0
+    numbers = out[0].shape[-1] // _DIRECTIONS if out else 0
     for axis, table in enumerate(tables):
         along, share = 2 - axis, min(spacing) / spacing[axis]
         sizes = [spacing[2 - a] for a in (along, *(a for a in range(3) if a != along))]
-        painter = _Painter(table, sizes if width == 2 * LIT else None, along)
+        painter = _Painter(table, sizes if numbers == LIT + 1 else None, along)
+        mine = [
+            level.unflatten(-1, (_DIRECTIONS, -1))[..., 2 * axis : 2 * axis + 2, :]
+            .movedim(along, 0)
+            .movedim(3, 0)
+            for level in out
+        ]  # (2, n, a, b, numbers)
         for level, a, b, sums in _see_along(field, along, painter, branching, len(out)):
-            means = (sums[:, :-1] / sums[:, -1:]).flatten(0, 1).movedim(0, 3)
-            colors = _of_length(means, share).to(torch.float16)
-            _, high, wide, _ = colors.shape
-            columns = out[level].movedim(along, 0)[..., width * axis : width * (axis + 1)]
-            columns[:, a : a + high, b : b + wide] = colors
+            light = sums[:, -1:]
+            means = _of_length(sums[:, :-1] / light, share)
+            part = light / (2 * branching ** (level + 1)) ** 2
+            seen = torch.cat((means, part), 1).movedim(1, 4).to(torch.float16)
+            high, wide = seen.shape[2:4]
+            mine[level][:, :, a : a + high, b : b + wide] = seen
             if level == 0:
                 done += field.shape[along] * high * wide * branching**2
                 progress("filtered", min(done, total), total)
+        for level in mine:
+            _fill_hidden(level, table.table_lm4.device)
 
 
 def _see_along(
@@ -144,6 +154,46 @@ def _see_along(
                 yield level, a // block, b // block, seen
     for level, sums in coarse.items():
         yield level, 0, 0, _pooled(sums, whole[level] // tile)
+
+
+def _fill_hidden(seen: Tensor, device: torch.device) -> None:
+    """Gives voxels to which hardly any light comes what is seen beside them: (2, n, a, b, c + 1),
+    the last number is the light.
+
+    Only rays that pass between them and others see them, and read half of each: along the rim of a
+    solid half of what is within, interval after interval, so that from afar solids would grow.
+    """
+    most, (high, wide) = _TILE_VOXELS[device.type], seen.shape[2:4]
+    rows = min(high, max(1, most // wide))
+    for slab in seen.split(max(1, most // (rows * wide)), 1):
+        before = torch.zeros_like(slab[:, :, :1], dtype=torch.float32, device=device)
+        for first in range(0, high, rows):
+            part = slab[:, :, first : first + rows]
+            known = slab[:, :, first : first + rows + 1].to(device, torch.float32)
+            sums = known[..., :-1] * known[..., -1:]
+            sums = torch.cat((sums, known[..., -1:]), -1)
+            count = part.shape[2]
+            missing = count + 1 - known.shape[2]  # behind the last row there is nothing
+            near = _beside(torch.cat((before, _padded(sums, 2, 0, missing)), 2), 2)
+            near = _beside(_padded(near, 3, 1, 1), 3)
+            before, sums = sums[:, :, count - 1 : count], sums[:, :, :count]
+            light, around = sums[..., -1:], near[..., -1:]
+            lack = (1 - light / (_HIDDEN * around)).clamp(min=0)
+            total = sums + lack * lack * near
+            part[..., :-1] = (total[..., :-1] / total[..., -1:]).to(part)
+
+
+def _padded(values: Tensor, axis: int, before: int, behind: int) -> Tensor:
+    """Puts zeros before and behind along an axis."""
+    sides = [0, 0] * (values.dim() - axis - 1) + [before, behind]
+    return torch.nn.functional.pad(values, sides)
+
+
+def _beside(values: Tensor, axis: int) -> Tensor:
+    """Returns means of three neighbours each along an axis, the middle one counts twice."""
+    count = values.shape[axis] - 2
+    first, middle, last = (values.narrow(axis, at, count) for at in range(3))
+    return 0.25 * first + 0.5 * middle + 0.25 * last
 
 
 def _parts(field: Field, along: int, tile: int) -> Iterator[tuple[int, int, Tensor]]:
@@ -315,6 +365,11 @@ def _pooled(values: Tensor, block: int) -> Tensor:
     return pooled[:, 0].unflatten(0, values.shape[:-2])
 
 
+def without_light(colors: Tensor) -> Tensor:
+    """Returns (..., 6 * n) of the (..., 6 * (n + 1)) that `write_colors` writes."""
+    return colors.unflatten(-1, (_DIRECTIONS, -1))[..., :-1].flatten(-2)
+
+
 def mean_of_directions(colors: Tensor) -> Tensor:
     """Returns (..., n) of (..., 6 * n), of the same dtype. Their moments are over _FAINT: light
     comes to all of such matter, and the trace then tells which share of it has a normal.
@@ -329,11 +384,10 @@ def mean_of_directions(colors: Tensor) -> Tensor:
 
 
 def _of_length(colors: Tensor, lengths: float) -> Tensor:
-    """Returns numbers (..., 2 * n) of homogeneous matter over other lengths."""
+    """Returns numbers (2, c, ...) of homogeneous matter over other lengths."""
     if lengths == 1:
         return colors
-    pairs = colors.unflatten(-1, (2, -1))
-    alpha = pairs[..., 3:4]
+    alpha = colors[:, 3:4]
     changed = 1 - (1 - alpha).clamp(min=1e-30) ** lengths
     scale = changed / torch.where(alpha > 0, alpha, 1.0)
-    return torch.cat((pairs[..., :3] * scale, changed, pairs[..., 4:] * scale), -1).flatten(-2)
+    return torch.cat((colors[:, :3] * scale, changed, colors[:, 4:] * scale), 1)

@@ -3,15 +3,16 @@
 The function of a mean is not the mean of the function, and a mean forgets what stands behind what.
 So each voxel of a coarse level holds what the function makes of the finest voxels below it, seen
 along the axes: for each column of them its colour and alpha, and of the columns the mean, weighted
-with the light that came through the voxel before. Cracks stay open, and walls closed. Where matter
-is lit, so are the second moments of its normals: they have no sign, as light has none that falls on
-both sides of a surface, and they tell how rough a surface is. Light and material stay free.
+with the light that came through the voxel before. Cracks stay open, and walls closed; hidden voxels
+take on what is seen beside them, so that solids hardly grow. Where matter is lit, so are the second
+moments of its normals: they have no sign, as light has none that falls on both sides of a surface,
+and they tell how rough a surface is. Light and material stay free.
 
 Source: Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011
 (voxels by direction); Younesy, Möller, Carr, "Improving the quality of multi-resolution volume
 rendering", EuroVis 2006 (why); Olano, Baker, "LEAN mapping", I3D 2010, and Heitz, Dupuy, Crassin,
-Dachsbacher, "The SGGX microflake distribution", SIGGRAPH 2015 (moments of normals). The weight and
-the sums over moments are ours; docs/picture.md measures what they give.
+Dachsbacher, "The SGGX microflake distribution", SIGGRAPH 2015 (moments of normals). The weight,
+what hidden voxels hold and the sums over moments are ours; docs/picture.md measures them.
 """
 
 from __future__ import annotations
@@ -36,10 +37,21 @@ from ..ops import ShadeArguments, cut_bricks
 from ..ops.shading import FilteredNumbers, ShadeParameters, shader_number
 from ..pool import Channel, N3Tree
 from .built_in import Lit
-from .coarse_colors import LIT, PLAIN, Field, VolumeField, mean_of_directions, write_colors
+from .coarse_colors import (
+    LIT,
+    PLAIN,
+    Field,
+    VolumeField,
+    mean_of_directions,
+    without_light,
+    write_colors,
+)
 from .shader import Sampling, Shader
 from .transfer_function import TransferFunction
 
+#: Times by which levels are finer; the sharper what the finest voxels show, which are not filtered,
+#: the later they should come in.
+_FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
 _OPAQUE = 0.2  # alpha of a finest voxel from which on directions matter
 _TIMEOUT = 3600.0  # seconds for one read of local data
 _BATCH = 4096  # bricks cut at a time
@@ -67,13 +79,13 @@ class Filtered(Shader):
     Or the transfer function as `Lit` shows it: then coarse bricks tell of the normals, too, and
     highlights widen. Light and material may be edited at any time.
 
-    Levels are chosen 1.6 times as fine as for other shaders, whose wide cones have to filter.
+    Levels are chosen twice as fine as for other shaders, whose wide cones have to filter; 1.75
+    times of lit matter, 1.6 where colours differ by direction.
     """
 
     kind = "Filtered"
     lit_kind = "FilteredLit"  # of a `Lit`
     reads_coarse = True
-    finer = 1.6  # a fine voxel is at least five eighths of an interval
     transfer: TransferFunction | Lit
     checks: ClassVar[Mapping[str, Check]] = {"transfer": _to_filter, "component": whole(0)}
 
@@ -114,7 +126,7 @@ class Filtered(Shader):
         it: (b, z, y, x, n or 6 * n) float16 for its first b bricks, those above the finest level.
         n is 4: premultiplied linear colour, and the alpha of a voxel; of lit matter 10: also the
         moments of its normals. What a tree's threshold made EMPTY counts here as it is. Working
-        takes 14 to 25 bytes a finest voxel on the device, the channel included; lit, twice that.
+        takes 16 to 27 bytes a finest voxel on the device, the channel included; lit, twice that.
 
         Args:
             tree: What `N3Tree.from_volume` made of the volume.
@@ -169,7 +181,7 @@ class Filtered(Shader):
     ) -> Self:
         """Works the colours out for a store, out of core, and writes them into it as a coarse
         channel, which `StoredProducer(store, filtered=shader)` streams. The store's own voxels are
-        read and stay as they are. While they are made, files of 7 bytes a finest voxel (lit, 17)
+        read and stay as they are. While they are made, files of 9 bytes a finest voxel (lit, 19)
         lie in the store's folder; the colours themselves compress well.
 
         Args:
@@ -189,7 +201,7 @@ class Filtered(Shader):
         shader = cls(transfer, channel, component, directions=directions)
         place = check.device("Filtered", device)
         kind, made_of = shader.colors(opened.spacing), shader.made_of
-        wide = 6 * shader.numbers
+        wide = 6 * (shader.numbers + 1)
 
         def fill(levels: Sequence[np.ndarray]) -> None:
             out = [torch.from_numpy(level) for level in levels]
@@ -197,9 +209,7 @@ class Filtered(Shader):
             shader.write(field, opened.spacing, 2, out, place, progress)
 
         def keep(colors: np.ndarray) -> np.ndarray:
-            if kind.width == wide:
-                return colors
-            return mean_of_directions(torch.from_numpy(colors)).numpy()
+            return shader.kept(torch.from_numpy(colors), kind.width).numpy()
 
         told = CoarseChannel(width=kind.width, made_of=made_of)
         make_channel(opened, channel, told, wide, fill, keep, progress)
@@ -281,11 +291,16 @@ class Filtered(Shader):
         field = VolumeField(volume, self.component or 0)
         sides = [branching ** (level + 1) for level in range(depth)]
         shapes = [[-(-n // side) for n in field.shape] for side in sides]
-        wide = 6 * self.numbers
+        wide = 6 * (self.numbers + 1)
         out = [torch.empty((*n, wide), dtype=torch.float16, device=device) for n in shapes]
         self.write(field, volume.spacing, branching, out, device, progress)
         for colors in out:
-            yield (colors if width == wide else mean_of_directions(colors)).cpu()
+            yield self.kept(colors, width).cpu()
+
+    def kept(self, colors: Tensor, width: int) -> Tensor:
+        """Returns what a channel of a width holds of what `write` wrote."""
+        seen = without_light(colors)
+        return seen if seen.shape[-1] == width else mean_of_directions(seen)
 
     def write(
         self,
@@ -302,6 +317,12 @@ class Filtered(Shader):
         smallest = min(spacing)
         tables = [self.transfer.table(_sampling(smallest, side / 2, device)) for side in spacing]
         write_colors(field, tables, spacing, branching, out, progress)
+
+    def finer(self, tree: N3Tree) -> float:
+        known = tree.bricks.channels.get(str(self.other))
+        if known is not None and known.width > self.numbers:
+            return _FINER_BY_DIRECTION
+        return _FINER if self.numbers == PLAIN else _FINER_LIT
 
     def own_numbers(self, tree: N3Tree) -> FilteredNumbers:
         return FilteredNumbers(min(tree.spacing) * tree.side)

@@ -89,7 +89,6 @@ class Shader(Checked):
         other: Name of a second channel that it reads, or None.
         other_component: Which number of it colours a surface.
         reads_coarse: The second channel may be a coarse one, which only coarse bricks have.
-        finer: Levels are chosen as if voxels were so many times as large as they are.
         reads_labels: It reads a channel of labels; others would blend them.
         whole_ray: It must see a ray in one go: what cuts rays into pieces refuses it.
         uses_torch: Its colours are made in torch, outside of the kernel. The host waits for the
@@ -106,7 +105,6 @@ class Shader(Checked):
     other_component: int = 0
     reads_coarse: bool = False
     reads_labels: bool = False
-    finer: float = 1.0
     whole_ray: bool = False
     uses_torch: bool = False
     checks: ClassVar[Mapping[str, Check]] = {
@@ -147,6 +145,10 @@ class Shader(Checked):
         return tuple(n for n in (self.channel, self.normals, self.other) if n is not None)
 
     # What `shade_rays` is told.
+
+    def finer(self, tree: N3Tree) -> float:
+        """Returns how many times as large as they are voxels count when levels are chosen."""
+        return 1.0
 
     def own_numbers(self, tree: N3Tree) -> Sequence[Number]:
         """Returns the shader's own numbers, a record of `ops.shading`; most have none."""

@@ -75,7 +75,7 @@ class Tracer:
             branching=tree.branching,
             max_depth=tree.depth,
             border=tree.bricks.border,
-            root_voxel=tree.root_voxel * shader.finer,
+            root_voxel=tree.root_voxel * shader.finer(tree),
             cone_scale=scale,
             step=step,
             bricks_bzyxc=tree.bricks.bricks[channel],
