@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -68,7 +68,6 @@ class Recorder(Protocol):
         """Notes that it ends."""
 
 
-_NOTHING = nullcontext()
 _timings: ContextVar[Timings | None] = ContextVar("gvtorch_timings", default=None)
 _recorders: list[Recorder] = []
 #: Nsight Systems and Compute name their library in the first; the second asks for ranges by hand.
@@ -77,29 +76,43 @@ _RANGES = torch.version.cuda is not None and bool(
 )
 
 
-@contextmanager
-def stage(name: str) -> Iterator[None]:
+class stage:  # a class costs a third of a generator, several times a frame
     """Names the step that the block does, for the open `collect_timings()`, torch's profiler and
     whoever else listens; costs next to nothing where nobody does.
     """
-    timings, recorders = _timings.get(), tuple(_recorders)
-    profiled = torch.autograd._profiler_enabled()
-    with (
-        torch.profiler.record_function(f"gvtorch.{name}") if profiled else _NOTHING,
-        torch.cuda.nvtx.range(f"gvtorch.{name}") if _RANGES else _NOTHING,
-    ):
-        if timings is None and not recorders:
-            yield
-            return
-        began = [(one, one.begin()) for one in recorders]
-        start = None if timings is None else mark(timings.device)
-        try:
-            yield
-        finally:
-            if timings is not None and start is not None:
-                timings.spans.append((name, start, mark(timings.device)))
-            for one, what in began:
-                one.end(name, what)
+
+    __slots__ = ("_began", "_name", "_ranges", "_start", "_timings")
+
+    def __init__(self, name: str) -> None:
+        """Takes the step's name."""
+        self._name = name
+
+    def __enter__(self) -> None:
+        self._ranges = None
+        if _RANGES or torch.autograd._profiler_enabled():
+            self._ranges = _open_ranges(f"gvtorch.{self._name}")
+        self._began = [(one, one.begin()) for one in _recorders]
+        self._timings = timings = _timings.get()
+        self._start = None if timings is None else mark(timings.device)
+
+    def __exit__(self, *error: object) -> None:
+        timings, start = self._timings, self._start
+        if timings is not None and start is not None:
+            timings.spans.append((self._name, start, mark(timings.device)))
+        for one, what in self._began:
+            one.end(self._name, what)
+        if self._ranges is not None:
+            self._ranges.close()
+
+
+def _open_ranges(name: str) -> ExitStack:
+    """Opens a range of torch's profiler and of NVIDIA's tools, where they listen."""
+    with ExitStack() as ranges:
+        if torch.autograd._profiler_enabled():
+            ranges.enter_context(torch.profiler.record_function(name))
+        if _RANGES:
+            ranges.enter_context(torch.cuda.nvtx.range(name))
+        return ranges.pop_all()
 
 
 @contextmanager

@@ -7,7 +7,6 @@ centres at integers, and `from_kornia` and `to_kornia` shift the principal point
 
 from __future__ import annotations
 
-import copy
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -320,8 +319,8 @@ class Camera:
         return self._changed(**parts, batched=False)
 
     def _changed(self, **parts: Any) -> Camera:
-        other = copy.copy(self)
-        vars(other).update(parts)
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), **parts)
         return other
 
     @property
@@ -341,24 +340,31 @@ class Camera:
         """Returns the camera in world units, given the (2, 3) box of the scene."""
         if self.frame is Frame.WORLD:
             return self
-        low, high = box.numpy()  # see `numbers`
-        centre, side = torch.from_numpy((low + high) / 2), float((high - low).max())
-        view, Ks = self.viewmats.clone(), self.Ks
-        rotation = view[:, :3, :3]
+        # NumPy, here and in `numbers`: calls of torch take longer, and let go of the interpreter,
+        # for which the frame would queue again and again behind the threads that read a store.
+        low, high = box.numpy()
+        centre, side, Ks = (low + high) / 2, (high - low).max(), self.Ks
+        view = self.viewmats.numpy().copy()
+        rotation, place = view[:, :3, :3], view[:, :3, 3]
+        turned = _sum_of_three(rotation.swapaxes(0, 2), centre).T
         if self.fitted is None:
-            view[:, :3, 3] = view[:, :3, 3] * side - rotation @ centre
-            scale = view.new_full((len(self), 1), side)
+            place[:] = place * side - turned
+            scale: Any = side
         else:
-            corners = torch.stack([box[at, (0, 1, 2)] for at in _CORNERS]) - centre
+            corners = torch.stack([box[at, (0, 1, 2)] for at in _CORNERS]) - torch.from_numpy(
+                centre
+            )
             halves = [_FILLED * half for half in self.fitted]
-            away, scale = MODELS[self.model].fit(corners @ rotation.mT, *halves)  # (n,) each
-            view[:, :3, 3] = -(rotation @ centre)
-            view[:, 2, 3] += away
+            seen = corners @ torch.from_numpy(rotation).mT
+            away, scale = MODELS[self.model].fit(seen, *halves)  # (n,) each
+            place[:] = -turned
+            place[:, 2] += away.numpy()
             scale = scale[:, None]
         if MODELS[self.model].parallel:
             Ks = Ks.clone()
             Ks[:, (0, 1), (0, 1)] /= scale
-        return self._changed(viewmats=view, Ks=Ks, frame=Frame.WORLD, fitted=None)
+        parts = {"viewmats": torch.from_numpy(view), "Ks": Ks}
+        return self._changed(**parts, frame=Frame.WORLD, fitted=None)
 
     def pixel_width(self, distance: float) -> float:
         """Returns the world units that a pixel is wide: of a pinhole at a distance along its axis,
@@ -397,13 +403,10 @@ class Camera:
         """
         if self.frame is not Frame.WORLD:
             raise ValueError("Camera.rays: an orbit camera has no place yet, call placed(tree.box)")
-        # Mostly NumPy: each call of torch lets go of the interpreter, and the frame would queue for
-        # it again and again behind the threads that read a store.
         view, intrinsics = self.viewmats.numpy(), self.Ks.numpy()
         rotation, translation = view[:, :3, :3], view[:, :3, 3]
         focal, centre = intrinsics[:, (0, 1), (0, 1)], intrinsics[:, :2, 2] - 0.5
-        turned = torch.bmm(torch.from_numpy(translation[:, None]), torch.from_numpy(rotation))
-        position = -turned.numpy()[:, 0]  # -R^T t
+        position = -_sum_of_three(rotation.swapaxes(0, 1), translation.T[..., None])  # -R^T t
         pixel, zero = 1 / focal.min(1, keepdims=True), np.zeros((len(self), 1))
         cone = (pixel, zero) if MODELS[self.model].parallel else (zero, pixel)  # at CONE
         range_ = (zero, zero + math.inf)
@@ -458,8 +461,8 @@ class Camera:
 
     def image(self, column: Tensor) -> Tensor:
         """Returns numbers (r,) or (r, c) of all pixels as a picture (h, w, c), or (n, h, w, c)."""
-        image = column.reshape(len(self), self.height, self.width, -1)
-        return image if self.batched else image[0]
+        one = (self.height, self.width, -1)
+        return column.reshape(len(self), *one) if self.batched else column.reshape(one)
 
     def rays(self, device: torch.device | str = "cpu", rows: tuple[int, int] | None = None) -> Rays:
         """Returns the rays through pixel centres, camera by camera, row by row, in float64; of all
@@ -474,6 +477,11 @@ class Camera:
 
 _ROWS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # a row a camera
 _CORNERS = list(itertools.product((0, 1), repeat=3))
+
+
+def _sum_of_three(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Sums three values times three weights, in order."""
+    return values[0] * weights[0] + values[1] * weights[1] + values[2] * weights[2]
 
 
 def upward(where: str, up: Up) -> Tensor:

@@ -134,4 +134,6 @@ def render_options(
         return options
     if isinstance(options.background, Background):
         options.background.check(where, camera)
-    return replace(options, layer=options.layer and options.layer.cut(where, camera))
+    if options.layer is None:
+        return options
+    return replace(options, layer=options.layer.cut(where, camera))

@@ -86,10 +86,7 @@ def render(
         view = View(placed, placed.numbers(device), traced, chosen, box)
         hits = view.hits(progress)
         with stage("picture"):
-            stats = tree_stats(trees, chosen, hits.samples)
-            for one, number in zip(trees, numbers, strict=True):
-                stats.tiles_used += int((one.nodes.stamp_t >= number).sum())
-                stats.bricks_used += int((one.bricks.stamp_b >= number).sum())
+            stats = tree_stats(trees, chosen, hits.samples, numbers)
             picture = view.picture(hits, stats)
     stats.stages = timings.as_dict()
     stats.milliseconds = 1e3 * (time.perf_counter() - start)
@@ -178,12 +175,26 @@ def _traced(
     return partial(trace_trees, tree_traces(where, named, shaders, options, box)), box
 
 
-def tree_stats(trees: Sequence[N3Tree], options: RenderOptions, samples: Tensor) -> RenderStats:
-    """Returns the statistics of a picture, given the samples (r,) of its rays."""
+def tree_stats(
+    trees: Sequence[N3Tree],
+    options: RenderOptions,
+    samples: Tensor,
+    frames: Sequence[int] = (),
+) -> RenderStats:
+    """Returns the statistics of a picture, given the samples (r,) of its rays; what each tree used
+    since a frame, if they are told. Waits for the device once.
+    """
+    sums = [samples.sum(dtype=torch.int64)]
+    for tree, frame in zip(trees, frames, strict=False):
+        stamps = (tree.nodes.stamp_t, tree.bricks.stamp_b)
+        sums += [torch.count_nonzero(stamp >= frame) for stamp in stamps]
+    total, *used = torch.stack(sums).tolist()
     return RenderStats(
         backend=choose_backend(options.backend, trees[0].device),
         rays=samples.numel(),
-        samples=int(samples.sum(dtype=torch.int64)),
+        samples=total,
+        tiles_used=sum(used[::2]),
+        bricks_used=sum(used[1::2]),
         nodes=sum(tree.nodes.child_tn.numel() for tree in trees),
         bricks=sum(tree.bricks.capacity for tree in trees),
         bytes=sum(tree.nbytes for tree in trees),
