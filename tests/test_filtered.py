@@ -14,6 +14,7 @@ from helpers.rays import camera_rays
 from helpers.traces import SHADER, run
 
 import gvtorch as gv
+from gvtorch.shaders import coarse_colors
 
 MISTY = gv.TransferFunction(
     [(0.2, 0), (0.5, 0.02), (0.9, 0.08)], [(0.2, 1, 0.3, 0.1), (1, 1, 1, 1)]
@@ -96,6 +97,18 @@ def test_a_solid_ball_covers_a_disc_from_afar(way):
     for pixel, grown in ((4.0, 0.05), (8.0, 0.07), (16.0, 0.07)):
         covered = picture(tree, shader, way, pixel)[..., 3].sum()
         assert abs(float(covered) / (math.pi * (radius / pixel) ** 2) - 1) < grown, pixel
+
+
+@pytest.mark.parametrize("most", [1, 40, 300])
+def test_colours_are_the_same_whatever_is_worked_out_at_a_time(monkeypatch, most):
+    def colors() -> torch.Tensor:
+        tree, shader = filtered(SHADER, directions=True)
+        return tree.bricks.bricks[shader.other]
+
+    whole = colors()
+    monkeypatch.setitem(coarse_colors._TILE_VOXELS, "cpu", most)
+    torch.testing.assert_close(colors(), whole, rtol=0, atol=1e-3)
+    assert whole.unique().numel() > 1000, "the test must see something"
 
 
 @pytest.mark.backend("cpp")

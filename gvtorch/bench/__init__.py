@@ -15,12 +15,14 @@ if TYPE_CHECKING:
 WORKLOADS = {
     "march": "rays through resident trees: fog, shell, clouds and a scan, beside peers",
     "first_hit": "the first opaque voxel of a thin shell, 1920x1080, beside peers",
+    "calls": "what a call costs beside its rays: small pictures, one by one and 1,000 at once",
     "bricks": "marching with brick sizes 4 to 32 and borders 0 to 2, and their memory",
     "shaders": "each shader beside the plain transfer function, resident and in the engine",
     "lens": "the engine through lenses: more blur, coarser levels, fewer bricks",
     "opengl": "pictures out of OpenGL and into it, in shared buffers and through the host",
     "view": "a page of the viewer: pictures a second, from the hand to the picture; beside peers",
     "frame": "the engine: a steady frame and the cache's share of it, a cold start",
+    "deep": "steady frames of a surface in a tree of 13 levels, and of its patch in one of 9",
     "lru": "1 M slots ordered by use, beside torch.sort",
     "compact": "requests listed out of 8 M nodes, beside torch.nonzero",
     "produce": "10^3-voxel bricks made by the producers of the library, eager and compiled",
@@ -46,7 +48,8 @@ PEERS = {
     "trame": "trame-vtk",
 }
 _HOME = {
-    **{"march": "march", "first_hit": "march", "bricks": "march", "frame": "frames"},
+    **dict.fromkeys(("march", "first_hit", "calls", "bricks"), "march"),
+    **{"frame": "frames", "deep": "frames"},
     **{"shaders": "shaders", "lens": "lens", "opengl": "exchange"},
     **{"stream": "frames", "lru": "cache", "compact": "cache", "produce": "produce"},
     **{"noise": "noise", "voxelize": "voxelize", "view": "view"},

@@ -1,5 +1,5 @@
 """Rays through resident trees, beside peers that render the same picture: `march`, `first_hit`,
-and `bricks`, the sweep of brick sizes.
+`calls` of little work, and `bricks`, the sweep of brick sizes.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -19,7 +20,7 @@ from ..cameras import Camera
 from ..io.resources import memory_free
 from ..pictures import Picture
 from ..pool import N3Tree
-from ..tracing import trace
+from ..tracing import render, trace
 from .peers import Peer, Task, find
 from .record import Record, Settings, Timing, clock, once
 from .scenes import SCENES, Scene, shell_sparse
@@ -63,6 +64,45 @@ def first_hit(record: Record) -> None:
     if record.wants(_case(scene.name, size)):
         tree = N3Tree.from_volume(scene.volume, device=record.settings.device)
         _compare(record, scene, tree, size, peers, ("finest",))
+
+
+def calls(record: Record) -> None:
+    """Pictures of a thin shell that are so small that the call itself shows."""
+    settings = record.settings
+    count, sizes = (3, (1, 8)) if settings.quick else (1000, (1, 64))
+    scene = shell_sparse(32 if settings.quick else 64)
+    tree = N3Tree.from_volume(scene.volume, device=settings.device)
+    for size in sizes:
+        case = f"one picture, {size}x{size}"
+        if not record.wants(case):
+            continue
+        camera = scene.camera(size, size)
+        rays = camera.rays(settings.device)
+        for who, run in (
+            ("render", partial(render, tree, camera, scene.shader)),
+            ("trace", partial(trace, tree, rays, scene.shader)),
+        ):
+            settings.tell(f"{case}: {who}")
+            timing = clock(run, settings, calls=1 if settings.quick else 100)
+            record.add(case, who, timing, op_ms=op_milliseconds(run, settings))
+    case = f"{count:,} pictures, {size}x{size}"
+    if not record.wants(case):
+        return
+    settings.tell(case)
+    around = torch.linspace(0, 360, count + 1, dtype=torch.float64)[:-1]
+    cameras = Camera.orbit(around, 20, 2.0, 30, size, size).placed(scene.box)
+    alone = [cameras[n] for n in range(count)]
+    at_once = partial(render, tree, cameras, scene.shader)
+
+    def one_by_one() -> list[Picture]:
+        return [render(tree, camera, scene.shader) for camera in alone]
+
+    singles = torch.stack([picture.color for picture in one_by_one()])
+    same = bool(torch.equal(at_once().color, singles))
+    timings = {"one by one": clock(one_by_one, settings), "one batch": clock(at_once, settings)}
+    for who, timing in timings.items():
+        times = timing.median / timings["one by one"].median
+        record.add(case, who, timing, times=times, same=same)
 
 
 def bricks(record: Record) -> None:
