@@ -76,7 +76,7 @@ _RANGES = torch.version.cuda is not None and bool(
 )
 
 
-class stage:  # a class costs a third of a generator, several times a frame
+class stage:  # no generator, which takes longer: a frame has several
     """Names the step that the block does, for the open `collect_timings()`, torch's profiler and
     whoever else listens; costs next to nothing where nobody does.
     """

@@ -69,10 +69,10 @@ def first_hit(record: Record) -> None:
 def calls(record: Record) -> None:
     """Pictures of a thin shell that are so small that the call itself shows."""
     settings = record.settings
-    count, sizes = (3, (1, 8)) if settings.quick else (1000, (1, 64))
+    count, small = (3, 8) if settings.quick else (1000, 64)
     scene = shell_sparse(32 if settings.quick else 64)
     tree = N3Tree.from_volume(scene.volume, device=settings.device)
-    for size in sizes:
+    for size in (1, small):
         case = f"one picture, {size}x{size}"
         if not record.wants(case):
             continue
@@ -85,12 +85,12 @@ def calls(record: Record) -> None:
             settings.tell(f"{case}: {who}")
             timing = clock(run, settings, calls=1 if settings.quick else 100)
             record.add(case, who, timing, op_ms=op_milliseconds(run, settings))
-    case = f"{count:,} pictures, {size}x{size}"
+    case = f"{count:,} pictures, {small}x{small}"
     if not record.wants(case):
         return
     settings.tell(case)
     around = torch.linspace(0, 360, count + 1, dtype=torch.float64)[:-1]
-    cameras = Camera.orbit(around, 20, 2.0, 30, size, size).placed(scene.box)
+    cameras = Camera.orbit(around, 20, 2.0, 30, small, small).placed(scene.box)
     alone = [cameras[n] for n in range(count)]
     at_once = partial(render, tree, cameras, scene.shader)
 

@@ -351,11 +351,9 @@ class Camera:
             place[:] = place * side - turned
             scale: Any = side
         else:
-            corners = torch.stack([box[at, (0, 1, 2)] for at in _CORNERS]) - torch.from_numpy(
-                centre
-            )
+            corners = torch.stack([box[at, (0, 1, 2)] for at in _CORNERS])
+            seen = (corners - torch.from_numpy(centre)) @ torch.from_numpy(rotation).mT
             halves = [_FILLED * half for half in self.fitted]
-            seen = corners @ torch.from_numpy(rotation).mT
             away, scale = MODELS[self.model].fit(seen, *halves)  # (n,) each
             place[:] = -turned
             place[:, 2] += away.numpy()
@@ -480,7 +478,7 @@ _CORNERS = list(itertools.product((0, 1), repeat=3))
 
 
 def _sum_of_three(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Sums three values times three weights, in order."""
+    """Sums values (3, ...) times weights (3, ...) over the three, in order."""
     return values[0] * weights[0] + values[1] * weights[1] + values[2] * weights[2]
 
 

@@ -49,8 +49,8 @@ from .coarse_colors import (
 from .shader import Sampling, Shader
 from .transfer_function import TransferFunction
 
-#: Times by which levels are finer; the sharper what the finest voxels show, which are not filtered,
-#: the later they should come in.
+#: What `finer` gives. The finest voxels are not filtered: the sharper what they show, the larger
+#: should pixels be that still take coarse ones, so the smaller is this.
 _FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
 _OPAQUE = 0.2  # alpha of a finest voxel from which on directions matter
 _TIMEOUT = 3600.0  # seconds for one read of local data

@@ -144,11 +144,13 @@ class Shader(Checked):
         """Names of the channels that it names itself."""
         return tuple(n for n in (self.channel, self.normals, self.other) if n is not None)
 
-    # What `shade_rays` is told.
-
     def finer(self, tree: N3Tree) -> float:
-        """Returns how many times as large as they are voxels count when levels are chosen."""
+        """Returns by what factor levels are finer than the pixel cone asks for: their voxels count
+        as so many times as large.
+        """
         return 1.0
+
+    # What `shade_rays` is told.
 
     def own_numbers(self, tree: N3Tree) -> Sequence[Number]:
         """Returns the shader's own numbers, a record of `ops.shading`; most have none."""
