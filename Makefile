@@ -64,13 +64,13 @@ asan: $(VENV)/ready
 tsan: $(VENV)/ready
 	$(BIN)/python tests/fuzz/sanitized.py thread tests/test_threads.py $(ARGS)
 
-lint: $(VENV)/ready
+lint: $(VENV)/packages
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/clang-format --dry-run --Werror $(SOURCES) $(wildcard gvtorch/bench/*.h tests/cpp/* examples/*.h)
 
-format: $(VENV)/ready
+format: $(VENV)/packages
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $(SOURCES) $(wildcard gvtorch/bench/*.h tests/cpp/* examples/*.h)
@@ -97,8 +97,16 @@ $(VENV)/torch: pyproject.toml .ci/constraints.txt
 	$(PIP) setuptools wheel "$(TORCH)"
 	@touch $@
 
-$(VENV)/ready: $(VENV)/torch $(SOURCES) gvtorch/cpp_ext/build.py gvtorch/cpp_ext/compilers.py
-	$(PIP) --no-build-isolation -e ".[dev]"
+# Installed without what is compiled, so that make -j2 does both side by side.
+$(VENV)/packages: $(VENV)/torch
+	GVTORCH_COMPILE=0 $(PIP) --no-build-isolation -e ".[dev]"
+	@touch $@
+
+$(VENV)/libraries: $(VENV)/torch $(SOURCES) gvtorch/cpp_ext/build.py gvtorch/cpp_ext/compilers.py
+	$(BIN)/python gvtorch/cpp_ext/build.py
+	@touch $@
+
+$(VENV)/ready: $(VENV)/packages $(VENV)/libraries
 	@touch $@
 
 $(VENV)/bench: $(VENV)/ready

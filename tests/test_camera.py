@@ -288,36 +288,39 @@ def test_a_thinned_camera_looks_through_the_middle_of_its_pixels_ahead_of_the_mo
 
 @pytest.mark.parametrize("cameras", [1, 3])
 def test_pinhole_rays_are_the_twin_s(compiled, cameras):
-    """In every bit, for one camera and for a batch, whose rows have a camera each."""
+    """In every bit, for one camera and for a batch, of all rows and of some."""
     camera = gv.Camera.orbit([0, 40, 80][:cameras], 10, [2.0, 1.0, 3.0][:cameras], 30, 41, 23)
-    camera, device = camera.placed(BOX), DEVICES[compiled]
-    numbers = camera.numbers(device)
-    numbers = numbers if cameras == 1 else numbers.repeat_interleave(23, 0)
-    generator = torch.Generator().manual_seed(1)
-    x = torch.randn((len(numbers), 41), dtype=torch.float64, generator=generator).to(device)
-    y = torch.randn(cameras * 23, dtype=torch.float64, generator=generator).to(device)
-    made = ops.pinhole_rays(x, y, numbers, backend=compiled)
-    twins = ops.pinhole_rays(x.cpu(), y.cpu(), numbers.cpu(), backend="reference")
-    for one, twin in zip(made, twins, strict=True):
-        assert torch.equal(one.cpu(), twin) and len(twin) == cameras * 23 * 41
-    assert torch.allclose(twins[1].norm(dim=1), torch.ones(1, dtype=torch.float64))
-    assert torch.equal(twins[0][-1], numbers[-1, 9:12].cpu())
-    torch.library.opcheck(torch.ops.gvtorch.pinhole_rays.default, (x, y, numbers))
+    camera = camera.placed(BOX).shifted(0.3, -4.7)
+    numbers = camera.numbers(DEVICES[compiled])
+    for first, rows in ((0, 23 * cameras), (5, 23 * cameras - 7), (22, 1), (3, 0)):
+        given_ = (first, rows, 41, 23)
+        made = ops.pinhole_rays(numbers, *given_, backend=compiled)
+        twins = ops.pinhole_rays(numbers.cpu(), *given_, backend="reference")
+        for one, twin in zip(made, twins, strict=True):
+            assert torch.equal(one.cpu(), twin) and len(twin) == rows * 41
+        assert torch.allclose(twins[1].norm(dim=1), torch.ones(1, dtype=torch.float64))
+        assert not rows or torch.equal(twins[0][-1], numbers[(first + rows - 1) // 23, 9:12].cpu())
+    torch.library.opcheck(torch.ops.gvtorch.pinhole_rays.default, (numbers, 5, 9, 41, 23))
 
 
 @pytest.mark.parametrize(
-    ("x", "y", "camera", "message"),
+    ("camera", "given_", "message"),
     [
-        ((2, 5), (3,), (2, 26), "x_kw must have a row, or 3, got 2"),
-        ((1, 5), (3,), (1, 19), "camera_kc must have 20 columns or more, got 19"),
-        ((1, 5), (3,), (3, 26), "camera_kc must be (1, c) float64"),
+        ((1, 19), (0, 3, 4, 3), "camera_nc must have 20 columns or more, got 19"),
+        ((2, 26), (1, 6, 4, 3), "no rows 1 to 7 in 2 cameras of 3 rows"),
+        ((1, 26), (0, 0, 4, 0), "no rows 0 to 0 in 1 cameras of 0 rows"),
+        ((1, 26), (-1, 1, 4, 3), "first must be an int >= 0"),
+        ((1, 26), (0, 2**31, 4, 3), "rows must be an int"),
+        ((26,), (0, 3, 4, 3), "camera_nc must be (n, c) float64"),
     ],
 )
-def test_pinhole_rays_name_what_is_wrong(x, y, camera, message):
-    given_ = [torch.zeros(shape, dtype=torch.float64) for shape in (x, y, camera)]
+def test_pinhole_rays_name_what_is_wrong(camera, given_, message):
+    numbers = torch.zeros(camera, dtype=torch.float64)
     with pytest.raises(ValueError, match="pinhole_rays: ") as caught:
-        ops.pinhole_rays(*given_)
+        ops.pinhole_rays(numbers, *given_)
     assert message in str(caught.value)
+    with pytest.raises((ValueError, RuntimeError)):
+        torch.ops.gvtorch.pinhole_rays(numbers, *given_)
 
 
 def test_rows_are_counted_through_the_batch():

@@ -20,6 +20,7 @@ import google_crc32c
 import numpy as np
 import pytest
 import torch
+from helpers.servers import WebServer
 from helpers.stores import noise, write_foreign
 
 import gvtorch as gv
@@ -32,10 +33,8 @@ MEMORY = 300 << 20  # bytes that reading may take
 VIEW = gv.Camera.orbit(width=128, height=48)
 
 
-class Server(servers.ThreadingHTTPServer):
+class Server(WebServer):
     """Serves a folder, with byte ranges if `parts`; files whose paths match `bad` as `how` says."""
-
-    daemon_threads = True
 
     def __init__(self, folder: Path) -> None:
         super().__init__(("127.0.0.1", 0), Handler)

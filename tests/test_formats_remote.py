@@ -7,11 +7,12 @@ import http.server
 import threading
 import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.servers import WebServer
 from helpers.stores import noise
 
 import gvtorch as gv
@@ -20,7 +21,7 @@ from gvtorch.io.stores.conversion import convert
 from gvtorch.io.stores.store import Store
 
 
-class Server(ThreadingHTTPServer):
+class Server(WebServer):
     """Serves a few files, without byte ranges, and counts what it sent."""
 
     files: dict[str, bytes]
@@ -230,7 +231,7 @@ class Endless(http.server.BaseHTTPRequestHandler):
 
 @pytest.mark.parametrize("pause", [0.0, 0.05])
 def test_a_server_without_an_end_is_given_up(pause, monkeypatch):
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Endless)
+    server = WebServer(("127.0.0.1", 0), Endless)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     monkeypatch.setattr(Endless, "pause", pause)
     monkeypatch.setattr("gvtorch.io.stores.store._OPEN_TIMEOUT", 1.0)

@@ -226,4 +226,5 @@ def test_random_flights_end_in_the_resident_picture(blobs, tmp_path, backend, mo
         grown, on_device = (b - a for a, b in zip(after_a_fifth, memory(device), strict=True))
     assert FRAMES < 10_000 or grown < 50e6, f"{grown / 1e6:.0f} MB more"
     assert on_device < 3e6, f"{on_device / 1e6:.1f} MB more on the device"
-    assert compared > 0.4 * flights
+    # A flight whose pools are too small takes 300 frames more, so few flights tell little.
+    assert compared > (0.4 if FRAMES > 10_000 else 0.2) * flights

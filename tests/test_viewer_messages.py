@@ -12,7 +12,6 @@ import threading
 import types
 from collections import Counter
 from functools import partial
-from http.server import ThreadingHTTPServer
 from inspect import Parameter
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -20,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.pictures import GRAY
+from helpers.servers import WebServer
 from helpers.stores import Handler, noise
 from helpers.viewer import SOON, Page, turned
 
@@ -248,8 +248,7 @@ def test_a_server_that_stops_in_a_chunk_is_told_and_asked_again(stored, monkeypa
         "gvtorch.io.http.REFUSED", 1e6
     )  # so it would never be asked again by itself
     monkeypatch.setattr(Stalling, "over", threading.Event())
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Stalling, directory=str(stored.parent)))
-    server.daemon_threads = True
+    server = WebServer(("127.0.0.1", 0), partial(Stalling, directory=str(stored.parent)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     url = f"http://127.0.0.1:{server.server_port}/a.zarr"
     producer = gv.StoredProducer(url, timeout=5.0 if refused else 1.2)

@@ -432,13 +432,8 @@ class Camera:
         """Returns the rays through the pixel centres of whole rows, the first one and the one after
         the last counted through the batch, from what `numbers` gave.
         """
-        row = torch.arange(*rows, device=numbers.device)  # (y,)
-        if len(numbers) > 1:
-            numbers, row = numbers[row // self.height], row % self.height  # one for each row
-        fx, fy, cx, cy = numbers[:, 12:16].unbind(1)
-        column = torch.arange(self.width, dtype=torch.float64, device=numbers.device)
-        x, y = (column - cx[:, None]) / fx[:, None], (row - cy) / fy
-        return MODELS[self.model].rays(Plane(x, y, numbers, self.distorted))
+        plane = Plane(numbers, rows, self.width, self.height, self.distorted)
+        return MODELS[self.model].rays(plane)
 
     def pixel_samples(self, numbers: Tensor, rows: tuple[int, int]) -> Tensor:
         """Returns `Rays.sample` of whole rows, counted as for `pixel_rays`."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import torch
@@ -26,10 +27,32 @@ _CLEAR = 1.02  # of the distance of a parallel camera's eye from the nearest cor
 class Plane:
     """Rows of pixels on the image planes of cameras: y rows of w pixels, r = y * w in all."""
 
-    x: Tensor  # (k, w) float64; k is 1 where all rows are one camera's, else y
-    y: Tensor  # (y,)
-    numbers: Tensor  # (k, 26), see `Camera.numbers`
+    cameras: Tensor  # (n, 26) float64, see `Camera.numbers`
+    rows: tuple[int, int]  # the first one and the one after the last, counted through the batch
+    width: int
+    height: int  # of a camera
     distorted: bool  # the coefficients of a fisheye are used
+
+    @cached_property
+    def row(self) -> Tensor:
+        """(y,) int64, counted through the batch."""
+        return torch.arange(*self.rows, device=self.cameras.device)
+
+    @cached_property
+    def numbers(self) -> Tensor:
+        """(k, 26) float64: k is 1 where all rows are one camera's, else y."""
+        return self.cameras if len(self.cameras) == 1 else self.cameras[self.row // self.height]
+
+    @cached_property
+    def x(self) -> Tensor:
+        """(k, w) float64."""
+        column = torch.arange(self.width, dtype=torch.float64, device=self.cameras.device)
+        return (column - self.numbers[:, 14, None]) / self.numbers[:, 12, None]
+
+    @cached_property
+    def y(self) -> Tensor:
+        """(y,) float64."""
+        return (self.row % self.height - self.numbers[:, 15]) / self.numbers[:, 13]
 
     @property
     def rotation(self) -> Tensor:
@@ -43,10 +66,10 @@ class Plane:
 
     def spread(self, values: Tensor) -> Tensor:
         """(r, c) of (k, c): one camera's is not copied."""
-        rows, width = len(self.y), self.x.shape[1]
+        rays = (self.rows[1] - self.rows[0]) * self.width
         if len(values) == 1:
-            return values.expand(rows * width, -1)
-        return values[:, None].expand(-1, width, -1).reshape(rows * width, -1)
+            return values.expand(rays, -1)
+        return values[:, None].expand(-1, self.width, -1).reshape(rays, -1)
 
     def turned(self, local: Tensor) -> Tensor:
         """(y, w, 3) world directions of those in camera axes."""
@@ -75,7 +98,7 @@ class Plane:
             direction=direction.reshape(-1, 3),
             cone=cone,
             range=limits,
-            width=self.x.shape[1],
+            width=self.width,
         )
 
 
@@ -126,9 +149,10 @@ class Pinhole(Model):
     """The direction is (x, y, 1)."""
 
     def rays(self, plane: Plane) -> Rays:
-        columns = pinhole_rays(plane.x, plane.y, plane.numbers.contiguous())
+        (first, end), sizes = plane.rows, (plane.width, plane.height)
+        columns = pinhole_rays(plane.cameras.contiguous(), first, end - first, *sizes)
         named = dict(zip(("origin", "direction", "cone", "range"), columns, strict=True))
-        return Rays(**named, width=plane.x.shape[1])
+        return Rays(**named, width=plane.width)
 
 
 class Ortho(Model):

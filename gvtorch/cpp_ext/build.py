@@ -5,7 +5,10 @@ nothing of gvtorch and runs compilers.py by its path. Both libraries use the Lib
 no Python C API: one wheel serves every Python >= 3.11 and every torch >= 2.11. The CUDA library is
 built where nvcc stands and is loaded only where torch has CUDA.
 
+As a program it compiles them in the source tree.
+
 Environment:
+    GVTORCH_COMPILE     0: an installation compiles nothing (the program does)
     GVTORCH_CUDA        auto (default: build when nvcc is found), 0 (never), 1 (fail without nvcc)
     GVTORCH_CUDA_ARCHS  compute capabilities, as in "80;90"; the last one is also shipped as PTX
     CXX, NVCC           the compilers
@@ -100,7 +103,8 @@ def compile_libraries(output: Path) -> list[Path]:
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
     output.mkdir(parents=True, exist_ok=True)
     calls = commands(output)
-    with ThreadPoolExecutor(os.cpu_count()) as pool, ThreadPoolExecutor(len(calls)) as linkers:
+    workers = max(1, (os.cpu_count() or 1) - (len(calls) - 1))  # nvcc, which takes longest, has one
+    with ThreadPoolExecutor(workers) as pool, ThreadPoolExecutor(len(calls)) as linkers:
 
         def make(library: Path) -> None:
             stamp = library.with_suffix(".stamp")
@@ -125,6 +129,8 @@ class BuildExt(build_ext):
 
     def run(self) -> None:
         """Compiles in the source tree, where the next build finds them, and copies from there."""
+        if os.environ.get("GVTORCH_COMPILE") == "0":
+            return
         libraries = compile_libraries(FOLDER / "lib")
         if not (self.inplace or self.editable_mode):
             for library in libraries:
@@ -148,3 +154,7 @@ class BdistWheel(bdist_wheel):
     def get_tag(self) -> tuple[str, str, str]:
         """Returns (py3, none, platform)."""
         return ("py3", "none", super().get_tag()[2])
+
+
+if __name__ == "__main__":
+    compile_libraries(FOLDER / "lib")

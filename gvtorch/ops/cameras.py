@@ -2,44 +2,55 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+import torch
 from torch import Tensor
 
 from .reference.exact import sqrt_exact
 from .registry import Backend, Doubles, op
 
+Count = Annotated[int, range(2**31)]
 
-def _check_planes(*, x_kw: Tensor, y_h: Tensor, camera_kc: Tensor) -> None:
-    planes, rows, columns = len(x_kw), len(y_h), camera_kc.shape[1]
-    if planes not in (1, rows):
-        raise ValueError(f"pinhole_rays: x_kw must have a row, or {rows}, got {planes}")
+
+def _check_rows(*, camera_nc: Tensor, first: int, rows: int, height: int, **_: int) -> None:
+    cameras, columns = camera_nc.shape
     if columns < 20:
-        raise ValueError(f"pinhole_rays: camera_kc must have 20 columns or more, got {columns}")
+        raise ValueError(f"pinhole_rays: camera_nc must have 20 columns or more, got {columns}")
+    if height < 1 or first + rows > cameras * height:
+        have = f"{cameras} cameras of {height} rows"
+        raise ValueError(f"pinhole_rays: no rows {first} to {first + rows} in {have}")
 
 
-@op(_check_planes)
+@op(_check_rows)
 def pinhole_rays(
-    x_kw: Doubles,  # places of columns on the image plane; k is 1 where all rows are one camera's
-    y_h: Doubles,  # and of rows
-    camera_kc: Doubles,  # from column 0: rotation (3, 3), world to camera; 9: position; 16: cone,
-    # 18: range
+    camera_nc: Doubles,  # from column 0: rotation (3, 3), world to camera; 9: position; 12: focal
+    # lengths; 14: principal point, pixel centres at integers; 16: cone; 18: range
+    first: Count,  # row, counted through the batch
+    rows: Count,
+    width: Count,  # pixels of a row
+    height: Count,  # rows of a camera
     *,
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Makes the rays of all pixels, row by row: their directions are (x, y, 1), turned into the
-    world, of unit length.
+    """Makes the rays through the pixels of whole rows: their directions are (x, y, 1), turned into
+    the world, of unit length, where x = (column - cx) / fx and y = (row - cy) / fy.
 
     Returns:
-        origin_r3, direction_r3, cone_r2 and range_r2, float64, as `Rays` has them; r = h * w.
+        origin_r3, direction_r3, cone_r2 and range_r2, float64, as `Rays` has them; r = rows * width.
     """
-    rows, width = len(y_h), x_kw.shape[1]
-    rotation = camera_kc[:, :9].unflatten(1, (3, 3))
-    length = sqrt_exact(x_kw * x_kw + (y_h * y_h + 1)[:, None])
-    across = x_kw[..., None] * rotation[:, None, 0]
-    down = y_h[:, None] * rotation[:, 1] + rotation[:, 2]
+    row = torch.arange(first, first + rows, device=camera_nc.device)
+    column = torch.arange(width, dtype=torch.float64, device=camera_nc.device)
+    camera = camera_nc[row // height]  # of each row
+    fx, fy, cx, cy = (one[:, None] for one in camera[:, 12:16].unbind(1))
+    x, y = (column - cx) / fx, ((row % height)[:, None] - cy) / fy
+    rotation = camera[:, :9].unflatten(1, (3, 3))
+    length = sqrt_exact(x * x + (y * y + 1))
+    across, down = x[..., None] * rotation[:, None, 0], y * rotation[:, 1] + rotation[:, 2]
     direction = (across + down[:, None]) / length[..., None]
 
-    def spread(first: int, count: int) -> Tensor:
-        part = camera_kc[:, None, first : first + count]
-        return part.expand(rows, width, count).reshape(-1, count).contiguous()
+    def spread(at: int, count: int) -> Tensor:
+        part = camera[:, None, at : at + count]
+        return part.expand(rows, width, count).reshape(-1, count)
 
     return spread(9, 3), direction.view(-1, 3), spread(16, 2), spread(18, 2)

@@ -176,9 +176,8 @@ def _cut_bricks(*, values_zyxc: Tensor, place_k3: Tensor, brick_size: int, borde
     return values_zyxc.new_empty((place_k3.shape[0], side, side, side, values_zyxc.shape[3]))
 
 
-def _pinhole_rays(*, x_kw: Tensor, y_h: Tensor, **_: Any) -> tuple[Tensor, ...]:
-    rays = y_h.shape[0] * x_kw.shape[1]
-    return tuple(x_kw.new_empty((rays, width)) for width in (3, 3, 2, 2))
+def _pinhole_rays(*, camera_nc: Tensor, rows: int, width: int, **_: Any) -> tuple[Tensor, ...]:
+    return tuple(camera_nc.new_empty((rows * width, numbers)) for numbers in (3, 3, 2, 2))
 
 
 def _voxelize(

@@ -18,6 +18,8 @@ import gvtorch as gv
 from gvtorch.io.stores.store import Store
 from gvtorch.pool.pyramid import round_to, volume_levels
 
+from .servers import WebServer
+
 
 def read(path: Path, **options) -> tuple[gv.Volume, list[str]]:
     """A volume, and the lines that reading it told."""
@@ -133,7 +135,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 def serving(folder: Path) -> Iterator[str]:
     """The URL of a folder, for a while."""
     handler = functools.partial(Handler, directory=str(folder))
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    server = WebServer(("127.0.0.1", 0), handler)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     yield f"http://127.0.0.1:{server.server_port}"

@@ -7,15 +7,17 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// planes, width, rows, columns
-#define GV_PINHOLE_RAYS(X)      \
-  X(World, x_kw, planes* width) \
-  X(World, y_h, rows)           \
-  X(World, camera_kc, planes* columns)
+// Rows are counted through the batch: `rows` of them from `first`, `height` a camera. cameras, columns
+#define GV_PINHOLE_RAYS(X)                \
+  X(World, camera_nc, cameras* columns) \
+  X(Count, first, kAny)                 \
+  X(Count, rows, kAny)                  \
+  X(Count, width, kAny)                 \
+  X(Count, height, kAny)
 
 struct PinholeRays {
   GV_PINHOLE_RAYS(GV_VIEW)
-  int64_t planes, width, columns;
+  int64_t columns;
   double *origin_r3, *direction_r3, *cone_r2, *range_r2;
 #ifdef __CUDACC__
   static constexpr int64_t kThreads = 3;  // a ray, so that neighbouring threads write side by side
@@ -24,14 +26,15 @@ struct PinholeRays {
 #endif
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t ray = index / kThreads, row = ray / width, plane = planes == 1 ? 0 : row;
-    const double x = x_kw[plane * width + (ray - row * width)], y = y_h[row];
-    const double* const camera = camera_kc + plane * columns;
+    const int64_t ray = index / kThreads, down = ray / width, row = first + down;
+    const double* const camera = camera_nc + row / height * columns;
+    const double x = (static_cast<double>(ray - down * width) - camera[14]) / camera[12];
+    const double y = (static_cast<double>(row % height) - camera[15]) / camera[13];
     const double length = square_root(x * x + (y * y + 1));
     for (int64_t axis = index % kThreads; axis < 3; axis += kThreads) {
-      const double down = y * camera[3 + axis] + camera[6 + axis];
+      const double ahead = y * camera[3 + axis] + camera[6 + axis];
       origin_r3[3 * ray + axis] = camera[9 + axis];
-      direction_r3[3 * ray + axis] = (x * camera[axis] + down) / length;
+      direction_r3[3 * ray + axis] = (x * camera[axis] + ahead) / length;
       if (axis == 2) break;
       cone_r2[2 * ray + axis] = camera[16 + axis];
       range_r2[2 * ray + axis] = camera[18 + axis];

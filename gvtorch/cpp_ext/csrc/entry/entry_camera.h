@@ -10,20 +10,20 @@ GV_OP(PinholeRaysOp, "pinhole_rays", GV_PINHOLE_RAYS,
       "(Tensor origin_r3, Tensor direction_r3, Tensor cone_r2, Tensor range_r2)");
 
 inline auto run(const PinholeRaysOp& a) {
-  const Like like{a.x_kw};
-  STD_TORCH_CHECK(a.x_kw.dim() == 2 && a.camera_kc.dim() == 2 && a.camera_kc.size(1) >= 20,
-                  "gvtorch: x_kw must be (k, w), and camera_kc (k, c) with c >= 20");
-  const int64_t planes = a.x_kw.size(0), width = a.x_kw.size(1), rows = a.y_h.numel(), columns = a.camera_kc.size(1);
-  STD_TORCH_CHECK(planes == 1 || planes == rows, "gvtorch: x_kw must be of one row, or of a row each");
+  const Like like{a.camera_nc};
+  STD_TORCH_CHECK(a.camera_nc.dim() == 2 && a.camera_nc.size(1) >= 20, "gvtorch: camera_nc must be (n, c) with c >= 20");
+  const int64_t cameras = a.camera_nc.size(0), columns = a.camera_nc.size(1);
+  for (const int64_t size : {a.first, a.rows, a.width, a.height})
+    STD_TORCH_CHECK(size >= 0 && size <= INT32_MAX, "gvtorch: rows and pixels must be numbers of 31 bits");
+  STD_TORCH_CHECK(a.height >= 1 && a.first + a.rows <= cameras * a.height, "gvtorch: there are fewer rows");
   PinholeRays args{};
   GV_PINHOLE_RAYS(GV_TAKE)
-  args.planes = planes;
-  args.width = width;
   args.columns = columns;
-  const int64_t rays = rows * width;
-  Tensor origin_r3 = give(args.origin_r3, a.x_kw, {rays, 3}), direction_r3 = give(args.direction_r3, a.x_kw, {rays, 3});
-  Tensor cone_r2 = give(args.cone_r2, a.x_kw, {rays, 2}), range_r2 = give(args.range_r2, a.x_kw, {rays, 2});
-  for_each(a.x_kw, PinholeRays::kThreads * rays, args);
+  const int64_t rays = a.rows * a.width;
+  Tensor origin_r3 = give(args.origin_r3, a.camera_nc, {rays, 3});
+  Tensor direction_r3 = give(args.direction_r3, a.camera_nc, {rays, 3});
+  Tensor cone_r2 = give(args.cone_r2, a.camera_nc, {rays, 2}), range_r2 = give(args.range_r2, a.camera_nc, {rays, 2});
+  for_each(a.camera_nc, PinholeRays::kThreads * rays, args);
   return std::make_tuple(origin_r3, direction_r3, cone_r2, range_r2);
 }
 
