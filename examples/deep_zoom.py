@@ -11,7 +11,7 @@ import gvtorch as gv
 
 LEVELS = (1.0, 6.5, 12.25, 17.3)
 SUN = gv.DirectionalLight((-0.5, 0.35, -1), color=(1.5, 1.15, 0.75), angle=2)
-SHADE = {"shadows": 0.85, "occlusion": 1.0, "ambient": (0.8, 0.9, 1.1), "cones": 12}
+SHADE = {"shadows": 0.85, "occlusion": 1.0, "ambient": (0.8, 0.9, 1.1), "cones": 8}
 STONE = gv.Isosurface(0.5, color=(0.95, 0.72, 0.45), ambient=0.45, diffuse=0.9, specular=0.1)
 HAZE = torch.tensor([0.78, 0.85, 0.92])
 

@@ -1,7 +1,5 @@
-"""A ball of cells, cut open: labels of 64 bits, each in a colour of its own, and one picked.
-
-Cells are the neighbourhoods of their nuclei, with a gap between them; a nucleus is a label, too.
-The numbers are far beyond what float32 keeps apart.
+"""A ball of cells, cut open: labels of 64 bits, each in a colour of its own, and one picked. Cells
+are what is nearest to their nuclei, with a gap between; a nucleus is a label, too.
 """
 
 from dataclasses import dataclass
@@ -14,10 +12,11 @@ import tyro
 import gvtorch as gv
 
 FIRST, NUCLEUS = 720_575_940_000_000_000, 1_000_000  # labels: of cells, and so much more of nuclei
-CELLS, GAP, RADIUS, CORE = 360, 0.012, 0.47, 0.42  # of a box of side 1; CORE of a cell's own size
-SKY = gv.Gradient((0.030, 0.036, 0.052), (0.004, 0.005, 0.008))
+CELLS, REACH = 360, 0.2  # no voxel of a cell is so far from its nucleus, in sides of the box
+GAP, RADIUS, CORE = 0.012, 0.47, 0.42  # in sides of the box; CORE of a cell's own size
+BONE, SKY = (0.86, 0.80, 0.66), gv.Gradient((0.030, 0.036, 0.052), (0.004, 0.005, 0.008))
 SUN = gv.DirectionalLight((0.55, -1.0, -0.75), (1.25, 1.16, 1.0), angle=7)
-LIGHT = gv.Lighting(ambient=(0.62, 0.72, 0.95), occlusion=0.9, reach=0.12, cones=12, frame="box")
+LIGHT = gv.Lighting(ambient=(0.62, 0.72, 0.95), occlusion=0.9, reach=0.12, cones=6, frame="box")
 CUT = gv.Clip(without=[((0.0, 0.0, 0.0), (0.6, 0.6, 0.6))], frame="box", caps=True, cap_light=0.0)
 
 
@@ -26,16 +25,15 @@ class Settings:
     """Renders a ball of cells."""
 
     output: Path = Path("labels.png")
-    size: int = 360
-    samples: int = 4
-    side: int = 144
+    size: int = 720
+    samples: int = 2
+    side: int = 224
     device: str = "cpu"
 
 
 def tissue(side: int) -> gv.Volume:
     """Cells in a ball whose places were spread evenly, (side)^3 labels in int64."""
-    random = torch.Generator().manual_seed(4)
-    places = torch.rand((40 * CELLS, 3), generator=random) - 0.5
+    places = torch.rand((40 * CELLS, 3), generator=torch.Generator().manual_seed(4)) - 0.5
     places = places[places.norm(dim=1) < RADIUS]
     centre = places[:CELLS]
     for _ in range(12):  # Lloyd: each centre goes to the middle of its neighbourhood
@@ -43,32 +41,35 @@ def tissue(side: int) -> gv.Volume:
         middle = torch.zeros_like(centre).index_add(0, nearest, places)
         centre = middle / nearest.bincount(minlength=len(centre)).clamp(min=1)[:, None]
     size = torch.cdist(centre, centre).fill_diagonal_(torch.inf).min(1).values / 2  # of each cell
+    near, far = torch.full((2, side, side, side), torch.inf)  # squares: of the nearest two centres
+    cell, other = torch.zeros((2, side, side, side), dtype=torch.int64)
     axis = (torch.arange(side) + 0.5) / side - 0.5
-    label = torch.zeros((side, side, side), dtype=torch.int64)
-    for plane, z in zip(label, axis, strict=True):
-        y, x = torch.meshgrid(axis, axis, indexing="ij")
-        place = torch.stack((x, y, z.expand_as(x)), -1).flatten(0, 1)
-        apart = torch.cdist(place, centre)
-        near, cell = apart.min(1)
-        far, other = apart.scatter_(1, cell[:, None], torch.inf).min(1)
-        wall = (far**2 - near**2) / 2 / (centre[cell] - centre[other]).norm(dim=1)  # how far it is
-        inside = (wall > GAP / 2) & (place.norm(dim=1) < RADIUS + 0.3 * wall.clamp(max=0.08))
-        number = FIRST + cell + torch.where(near < CORE * size[cell], NUCLEUS, 0)
-        plane[:] = torch.where(inside, number, 0).view(side, side)
-    return gv.Volume(label, labels=True)
+    for number, middle in enumerate(centre):
+        low, high = (((middle.flip(0) + 0.5 + r) * side).int().clamp(0) for r in (-REACH, REACH))
+        part = tuple(map(slice, low, high))  # of z, y, x
+        z, y, x = ((axis[one] - at) ** 2 for one, at in zip(part, middle.flip(0), strict=True))
+        apart, a, b = z[:, None, None] + y[:, None] + x, near[part], far[part]
+        other[part] = torch.where(apart < a, cell[part], other[part].where(apart >= b, number))
+        far[part] = torch.where(apart < a, a, torch.minimum(apart, b))
+        cell[part], near[part] = torch.where(apart < a, number, cell[part]), apart.minimum(a)
+    wall = (far - near) / 2 / (centre[cell] - centre[other]).norm(dim=-1)  # how far it is
+    depth = RADIUS - sum(one**2 for one in torch.meshgrid(axis, axis, axis, indexing="ij")).sqrt()
+    inside = (wall > GAP / 2) & (depth > -0.3 * wall.clamp(max=0.08))
+    number = FIRST + cell + NUCLEUS * (near.sqrt() < CORE * size[cell])
+    return gv.Volume(torch.where(inside, number, 0), labels=True)
 
 
 def main(settings: Settings) -> None:
     """Renders the cells, and tells which one lies in the middle of the picture."""
     volume = tissue(settings.side)
     tree = gv.N3Tree.from_volume(volume, 10, border=3, device=settings.device)
-    nuclei = volume.label_values[volume.label_values >= FIRST + NUCLEUS]
-    colors = dict.fromkeys(nuclei.tolist(), (0.86, 0.80, 0.66))
-    shader = gv.Labels(colors, light=SUN, ambient=0.55, diffuse=0.75, specular=0.12)
+    nuclei = [label for label in volume.label_values.tolist() if label >= FIRST + NUCLEUS]
+    shader = gv.Labels(
+        dict.fromkeys(nuclei, BONE), light=SUN, ambient=0.55, diffuse=0.75, specular=0.12
+    )
     camera = gv.Camera.orbit(38, 30, 1.95, 30, settings.size * 16 // 9, settings.size)
     options = {"shader": shader, "lighting": LIGHT, "clip": CUT, "background": SKY}
-    show = gv.Progressive(partial(gv.render, tree, **options))
-    picture = show.refine(camera, settings.samples)
+    picture = gv.Progressive(partial(gv.render, tree, **options)).refine(camera, settings.samples)
     middle = picture.label[settings.size // 2, settings.size * 8 // 9, 0]
     print(f"{len(volume.label_values) - 1} labels; in the middle: {middle}")
     picture.tone_map("aces", exposure=0.15).save(settings.output)

@@ -62,7 +62,7 @@ def main(settings: Settings) -> None:
     front = gv.Camera.look_at((48, 58, 250), (48, 38, 48), (0, 1, 0), 23, *size)
     soft, lamp = gv.Lighting(ambient=SKY), gv.Lighting(ambient=(0, 0, 0))
     near = gv.Lighting(ambient=SKY, occlusion=0.85, reach=0.1, frame="box", cones=6)
-    dim = gv.Lighting(ambient=(0.3, 0.3, 0.3), occlusion=0.9, cones=10)
+    dim = gv.Lighting(ambient=(0.3, 0.3, 0.3), occlusion=0.9, cones=7)
     bounce = replace(dim, ambient=(0.1, 0.1, 0.1), indirect=1.0, reach=SIDE)
     images = []
     both = (vessels, orbit, VESSELS, (None, soft, near)), (box, front, PAINT, (lamp, dim, bounce))

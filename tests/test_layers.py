@@ -138,13 +138,16 @@ def test_kernel_headers_include_only_downward():
 
 def test_import_loads_torch_and_nothing_heavier():
     code = (
-        "import sys, gvtorch as gv; gv.render, gv.N3Tree, gv.Camera, gv.read_volume;"
+        "import sys, torch, gvtorch as gv; gv.read_volume; gray = gv.TransferFunction;"
+        "tree = gv.N3Tree.from_volume(gv.Volume(torch.zeros(4, 4, 4)));"
+        "gv.render(tree, gv.Camera.orbit(30, width=4, height=4), gray.preset('gray', 0, 1));"
         "print(*sys.modules)"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = set(run.stdout.split())
     assert "torch" in loaded
-    assert not loaded & {"kornia", "nibabel", "astropy", "tifffile", "nrrd", "tyro", "rich", "PIL"}
+    heavy = {"kornia", "nibabel", "astropy", "tifffile", "nrrd", "tyro", "rich", "PIL", "sympy"}
+    assert not loaded & heavy
 
 
 def test_test_files_import_helpers_and_no_test_file():

@@ -518,8 +518,8 @@ def _batch(where: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:
         found.append((numbers, shape))
         sizes.append(numbers.shape[:batch])
     try:
-        size = torch.broadcast_shapes(*sizes)
-    except RuntimeError:
+        size = np.broadcast_shapes(*sizes)  # torch's imports sympy: half a second
+    except ValueError:
         raise ValueError(
             f"{where}: {', '.join(values)} do not match, they have different lengths"
         ) from None

@@ -37,7 +37,7 @@ def pinhole_rays(
     the world, of unit length, where x = (column - cx) / fx and y = (row - cy) / fy.
 
     Returns:
-        origin_r3, direction_r3, cone_r2 and range_r2, float64, as `Rays` has them; r = rows * width.
+        origin_r3, direction_r3, cone_r2 and range_r2, float64, as in `Rays`; r = rows * width.
     """
     row = torch.arange(first, first + rows, device=camera_nc.device)
     column = torch.arange(width, dtype=torch.float64, device=camera_nc.device)

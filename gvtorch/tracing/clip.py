@@ -16,7 +16,7 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
-from .composite import Trace, trace_pieces
+from .composite import Trace, among, if_few, trace_pieces
 
 Face = tuple[float, ...]  # unit normal and offset (a, b, c, d): inside, a x + b y + c z + d >= 0
 Numbers = Sequence[Sequence[float]] | Tensor
@@ -118,6 +118,14 @@ class _MetFaces(NamedTuple):
 
         return _MetFaces(meet(faces.planes), [*map(meet, faces.boxes)], [*map(meet, faces.without)])
 
+    def of_some(self, which: Tensor) -> _MetFaces:
+        """The same for some of the rays."""
+
+        def some(met: list[_Met]) -> list[_Met]:
+            return [_Met(one.normal, one.height[which], one.rate[which]) for one in met]
+
+        return _MetFaces(some(self.planes), [*map(some, self.boxes)], [*map(some, self.without)])
+
     def pieces(self, limits: Tensor) -> list[Tensor]:
         """Returns the kept (r, 2) parts of the (r, 2) limits, nearest first, as many as a ray can
         have; one that a ray does not need ends where it begins.
@@ -207,6 +215,9 @@ class Clipped:
         """
         first, last = piece.range.unbind(1)
         end = torch.where(first > begin, torch.minimum(first + self.step, last), first)
+        which = if_few(first < end)
+        if which is not None:
+            return among(piece, which, self._cap(met.of_some(which), begin[which], piece[which]))
         slab = (self.slab or self.trace)(replace(piece, range=torch.stack((first, end), 1)))
         before = piece.light()[:, 0].to(slab.color)  # transmittance before the cap
         taken = before - (1 - slab.alpha[:, 0])  # by the slab, of the light

@@ -62,12 +62,42 @@ def behind(rays: Rays, front: Hits) -> Rays:
     return replace(rays, transmittance=1 - front.alpha[:, 0].to(torch.float64))
 
 
+def if_few(some: Tensor) -> Tensor | None:
+    """Returns which of `some` (r,) bool are true, on the CPU and if they are less than half; else
+    None: more are as quickly done with the others, and on the GPU the host would wait.
+    """
+    if some.device.type != "cpu":
+        return None
+    which = some.nonzero()[:, 0]
+    return which if 2 * len(which) < len(some) else None
+
+
+def among(rays: Rays, which: Tensor, hits: Hits) -> Hits:
+    """Puts the hits of some rays among those of the others, which have empty ranges."""
+    empty = {"depth": torch.inf, "label": -1}
+    columns: dict[str, Tensor | None] = {}
+    for name, found in vars(hits).items():
+        columns[name] = None
+        if found is not None:
+            shape = (len(rays.origin), *found.shape[1:])
+            nothing = found.new_full(shape, empty.get(name, 0))
+            if name == "alpha":
+                nothing = 1 - rays.light().to(found)
+            columns[name] = nothing.index_put((which,), found)
+    return Hits(**columns)  # type: ignore[arg-type]
+
+
 def trace_pieces(trace: Trace, pieces: Iterable[Rays], *, cap: Trace | None = None) -> Hits:
     """Traces pieces of the same rays, nearest first, as if each ray were traced in one go: one that
     has ended takes no more samples, and its depth is found in whichever piece it lies. `cap` traces
     what lies in front of each piece.
     """
-    steps = ((one, piece) for piece in pieces for one in (cap, trace) if one is not None)
+
+    def trace_open(rays: Rays) -> Hits:
+        which = if_few(rays.range[:, 0] < rays.range[:, 1])
+        return trace(rays) if which is None else among(rays, which, trace(rays[which]))
+
+    steps = ((one, piece) for piece in pieces for one in (cap, trace_open) if one is not None)
     first, piece = next(steps)
     front = first(piece)
     for one, piece in steps:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Unpack, get_args
+from typing import Literal, Unpack, get_args
 
 import torch
 from torch import Tensor
@@ -128,7 +128,9 @@ def cost(
     box = box_around("cost", {"": tree}, chosen.pose)
     placed = camera.placed(box)
     counter = _Counter(tree, transfer, chosen)
-    view = View(placed, placed.numbers(tree.device), around(counter, chosen, box), chosen, box)
+    traced = around(counter, chosen, box)
+    numbers = placed.numbers(tree.device)
+    view = View(placed, numbers, lambda rays: traced(counter.begin(rays)), chosen, box)
     with using("cost", [tree]):
         columns = [
             (hits.samples, counter.take_nodes(), *_means(hits))
@@ -162,11 +164,19 @@ class _Counter(Tracer):
         self.component = self.arguments.component
         self.module = TransferModule(shader, min(tree.spacing)).to(tree.device)
         self.fill_b = torch.full_like(tree.bricks.born_b, -1, dtype=torch.float32)
-        self._nodes: Any = 0
+        self._nodes: Tensor | None = None
 
-    def take_nodes(self) -> Any:
-        """Returns (r,) int32 nodes that rays visited since the last call."""
-        nodes, self._nodes = self._nodes, 0
+    def begin(self, rays: Rays) -> Rays:
+        """Returns the rays of a block with their numbers, since some may be traced alone."""
+        count, device = len(rays.origin), rays.origin.device
+        if self._nodes is None:
+            self._nodes = torch.zeros(count, dtype=torch.int32, device=device)
+        return replace(rays, sample=torch.arange(count, device=device))
+
+    def take_nodes(self) -> Tensor:
+        """Returns (r,) int32 nodes that the rays of a block visited."""
+        nodes, self._nodes = self._nodes, None
+        assert nodes is not None
         return nodes
 
     def __call__(self, rays: Rays) -> Hits:
@@ -174,7 +184,9 @@ class _Counter(Tracer):
         alpha: of 1, the node's depth, whether it has a brick, the brick's age and its fill.
         """
         sums, hits, nodes = march(self, self.inside(rays), self.shade, 5, limit=1, by_node=False)
-        self._nodes = self._nodes + nodes
+        assert self._nodes is not None
+        assert rays.sample is not None
+        self._nodes.index_add_(0, rays.sample, nodes)
         return replace(hits, features=sums)
 
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:

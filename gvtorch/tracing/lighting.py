@@ -35,7 +35,7 @@ from ..shaders.lights import (
     check_light,
     check_triple,
 )
-from .composite import Trace, behind, over
+from .composite import Trace, behind, if_few, over
 from .thin_lens import ThinLens
 
 #: Where cones begin, in voxels. Cones to lights are lifted `_OFF` above the surface. Hemisphere
@@ -110,17 +110,28 @@ class _Points:
     row: int  # pixels of a row, see `Rays.width`
     tally: _Tally  # of all rays of the pixels
 
+    def of_some(self, which: Tensor) -> _Points:
+        """Some of the points, with a tally of their own."""
+        columns = {name: one[which] for name, one in vars(self).items() if isinstance(one, Tensor)}
+        return replace(self, **columns, row=0, tally=_Tally(len(which), self.seen.device))
+
 
 class _Tally:
     """Samples and misses of all rays of a pixel."""
 
-    def __init__(self, hits: Hits) -> None:
-        self.samples, self.missed = hits.samples, hits.missed
+    def __init__(self, pixels: int, device: torch.device) -> None:
+        self.samples = torch.zeros(pixels, dtype=torch.int32, device=device)
+        self.missed = torch.zeros(pixels, dtype=torch.bool, device=device)
 
     def __call__(self, hits: Hits) -> Hits:
         """Adds those of some hits, which it returns."""
         self.samples, self.missed = self.samples + hits.samples, self.missed | hits.missed
         return hits
+
+    def add_some(self, which: Tensor, other: _Tally) -> None:
+        """Adds those of some pixels."""
+        self.samples = self.samples.index_add(0, which, other.samples)
+        self.missed = self.missed.index_put((which,), self.missed[which] | other.missed)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -143,7 +154,8 @@ class Lighted:
         color, m = hits.color, self.material
         look = (self.lighting.ambient, m.ambient, m.diffuse, m.specular)
         sky, (ambient, diffuse, specular) = pack(look, color.dtype, color.device).split(3)
-        tally = _Tally(hits)
+        tally = _Tally(len(color), color.device)
+        tally(hits)
         points = self._points(rays, hits, tally)
         direct, highlight = self._direct(points, self.lighting.shadow_cones)
         unblocked, bounced = self._hemisphere(points, rays)
@@ -208,6 +220,12 @@ class Lighted:
         at_eye = isinstance(light, Headlight) and points.headlight is None
         if not self.lighting.shadows or at_eye:
             return torch.ones_like(points.width)
+        which = if_few(facing & points.seen)
+        if which is not None:
+            some = points.of_some(which)
+            part = self._visible(light, cones, some, beam[which], facing[which])
+            points.tally.add_some(which, some.tally)
+            return torch.ones_like(points.width).index_put((which,), part)
         points = self._lifted(points, _OFF, beam)
         beam, distance, size = _towards(light, points)
         growth = 2 * CONE_OF_DISC / math.sqrt(cones) * size
@@ -232,16 +250,23 @@ class Lighted:
         if not (lighting.occlusion or lighting.indirect):
             return unblocked, bounced
         assert reach is not None
+        if rays.sample is None:
+            rays = replace(rays, sample=torch.arange(len(unblocked), device=unblocked.device))
+        which = if_few(points.seen)
+        if which is not None:
+            some = points.of_some(which)
+            share, light = self._hemisphere(some, rays[which])
+            points.tally.add_some(which, some.tally)
+            return unblocked.index_put((which,), share), bounced.index_put((which,), light)
         trace = self.blocker if self.matter is None else self.matter
-        some = points.seen.to(torch.float64)
-        start = _WAY * some * points.width.clamp(min=self.voxel)
-        end = torch.maximum(start, reach * some)
-        middle = torch.maximum(start, reach / 2 * some)
+        seen = points.seen.to(torch.float64)
+        start = _WAY * seen * points.width.clamp(min=self.voxel)
+        end = torch.maximum(start, reach * seen)
+        middle = torch.maximum(start, reach / 2 * seen)
         lifted = self._lifted(points, _CLOSE)
-        eye, weight, sample = rays.origin.to(torch.float64), 1 / lighting.cones, rays.sample
-        if sample is None:
-            sample = torch.arange(len(eye), device=eye.device)
-        for direction in _cones_over(points.normal, sample, lighting.cones):
+        eye, weight = rays.origin.to(torch.float64), 1 / lighting.cones
+        assert rays.sample is not None
+        for direction in _cones_over(points.normal, rays.sample, lighting.cones):
             growth = dot(direction, points.normal).clamp(0, _WIDE)  # none dips into a floor
             first, second = (
                 self._cone(lifted, direction, growth, *span)
