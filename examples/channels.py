@@ -24,7 +24,7 @@ class Settings:
     """Makes the cells and renders them."""
 
     output: Path = Path("channels.png")
-    size: int = 300
+    size: int = 720
     device: str = "cpu"
 
 

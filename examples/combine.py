@@ -34,7 +34,7 @@ class Settings:
     """Renders the ball."""
 
     output: Path = Path("combine.png")
-    size: int = 360  # height of the picture
+    size: int = 720  # height of the picture
     extent: int = 192
     device: str = "cpu"
 

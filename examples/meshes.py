@@ -10,7 +10,7 @@ import gvtorch as gv
 
 FOLDER = Path(__file__).parent / "data" / "meshes"
 SUN = gv.DirectionalLight((-0.8, -1.0, -0.55), (1.35, 1.2, 0.98), angle=4)
-LIGHT = gv.Lighting(ambient=(0.5, 0.58, 0.72), occlusion=0.9, cones=8, reach=0.12, frame="box")
+LIGHT = gv.Lighting(ambient=(0.5, 0.58, 0.72), occlusion=0.9, cones=6, reach=0.12, frame="box")
 AROUND = {"lighting": LIGHT, "background": gv.Gradient((0.13, 0.23, 0.40), (0.52, 0.55, 0.55))}
 VIEW, GRASS = ((0.5, 1.15, 3.3), (0, 0.45, 0), (0, 1, 0), 30), (0.2, 0.34, 0.09, 1)
 #: File, texture, height, degrees around y, place x and z.
@@ -27,7 +27,7 @@ class Settings:
     """Renders meshes by their voxels."""
 
     output: Path = Path("meshes.png")
-    size: int = 360  # height of the picture
+    size: int = 720  # height of the picture
     resolution: int = 384
     device: str = "cpu"
 
