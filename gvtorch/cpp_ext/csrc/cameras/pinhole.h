@@ -8,7 +8,7 @@ namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
 // Rows are counted through the batch: `rows` of them from `first`, `height` a camera. cameras, columns
-#define GV_PINHOLE_RAYS(X)                \
+#define GV_PINHOLE_RAYS(X)              \
   X(World, camera_nc, cameras* columns) \
   X(Count, first, kAny)                 \
   X(Count, rows, kAny)                  \

@@ -11,7 +11,8 @@ GV_OP(PinholeRaysOp, "pinhole_rays", GV_PINHOLE_RAYS,
 
 inline auto run(const PinholeRaysOp& a) {
   const Like like{a.camera_nc};
-  STD_TORCH_CHECK(a.camera_nc.dim() == 2 && a.camera_nc.size(1) >= 20, "gvtorch: camera_nc must be (n, c) with c >= 20");
+  STD_TORCH_CHECK(a.camera_nc.dim() == 2 && a.camera_nc.size(1) >= 20,
+                  "gvtorch: camera_nc must be (n, c) with c >= 20");
   const int64_t cameras = a.camera_nc.size(0), columns = a.camera_nc.size(1);
   for (const int64_t size : {a.first, a.rows, a.width, a.height})
     STD_TORCH_CHECK(size >= 0 && size <= INT32_MAX, "gvtorch: rows and pixels must be numbers of 31 bits");
