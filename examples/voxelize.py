@@ -71,7 +71,7 @@ def main(settings: Settings) -> None:
     camera = gv.Camera.orbit(38, 24, 1.18, 34, settings.size * 16 // 9, settings.size)
     look = gv.StoredColor("color", **fine, **light)
     engine = gv.Engine(producer, device=settings.device)
-    picture = engine.render(camera, look, lighting=LIGHT, background=BACKGROUND)
+    picture = engine.render(camera, look, step=1.0, lighting=LIGHT, background=BACKGROUND)
     picture.save(settings.output)
     print(f"{settings.output}: {len(mesh.faces)} triangles, {picture.stats.bricks_used} bricks")
 
