@@ -19,6 +19,7 @@ from helpers.trees import forget
 from helpers.waits import nobody_waits
 
 import gvtorch as gv
+from gvtorch.tracing import clip, composite, lighting
 from gvtorch.tracing.composite import trace_pieces
 from gvtorch.tracing.tracer import Tracer
 from gvtorch.tracing.trees import TreeTrace, trace_trees
@@ -271,3 +272,38 @@ def test_normals_of_three_trees_are_the_mean_by_the_light_that_each_takes():
         torch.testing.assert_close(found.normal[ray], taken / taken.norm())
         torch.testing.assert_close(found.color[ray], color)
         assert abs(float(found.alpha[ray]) - sum(shares)) < 1e-6
+
+
+LEFT_OUT = {
+    "isosurface": gv.Isosurface(0.5, light=gv.DirectionalLight((1, 1, 2), angle=5)),
+    "stored colour": gv.StoredColor("rgba", light=gv.PointLight((0, 0, 60), radius=2), diffuse=1),
+    "features": gv.Features(gv.TransferFunction.preset("gray", 0, 1), "rgba"),
+    "labels": gv.Labels(channel="label"),
+}
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("name", LEFT_OUT)
+def test_rays_that_the_cpu_leaves_out_change_no_bit(channels, monkeypatch, name):
+    """Those without a second piece, that begin at no cut, or whose pixels show nothing."""
+    tree, pictures, left_out = gv.N3Tree.from_volume(channels), [], []
+    light = gv.Lighting(occlusion=0.8, indirect=0.5, cones=3, reach=0.2, frame="box")
+    cut = gv.Clip(without=[((0, 0, 0), (0.6, 0.6, 0.6))], frame="box", caps=True)
+    options = {"clip": cut, "lighting": None if name == "features" else light}
+    few = composite.if_few
+
+    def noted(some):
+        which = few(some)
+        left_out.append(which is not None)
+        return which
+
+    for chosen in (noted, lambda some: None):
+        for room in (clip, composite, lighting):
+            monkeypatch.setattr(room, "if_few", chosen)
+        view = gv.Camera.orbit(30, 20, 1.6, 30, 40, 28)
+        pictures.append(gv.render(tree, view, LEFT_OUT[name], **options))
+    one, other = map(vars, pictures)
+    for field, values in one.items():
+        if isinstance(values, torch.Tensor):
+            assert torch.equal(values, other[field]), field
+    assert any(left_out) and one["alpha"].max() > 0.5 and one["samples"].max() > 3
