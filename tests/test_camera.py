@@ -311,6 +311,7 @@ def test_pinhole_rays_are_the_twin_s(compiled, cameras):
         ((1, 26), (0, 0, 4, 0), "no rows 0 to 0 in 1 cameras of 0 rows"),
         ((1, 26), (-1, 1, 4, 3), "first must be an int >= 0"),
         ((1, 26), (0, 2**31, 4, 3), "rows must be an int"),
+        ((1, 26), (0, 2, 2**30, 3), "2 rows of 1073741824 are too many at once"),
         ((26,), (0, 3, 4, 3), "camera_nc must be (n, c) float64"),
     ],
 )

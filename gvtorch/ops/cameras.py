@@ -13,13 +13,15 @@ from .registry import Backend, Doubles, op
 Count = Annotated[int, range(2**31)]
 
 
-def _check_rows(*, camera_nc: Tensor, first: int, rows: int, height: int, **_: int) -> None:
+def _check_rows(*, camera_nc: Tensor, first: int, rows: int, width: int, height: int) -> None:
     cameras, columns = camera_nc.shape
     if columns < 20:
         raise ValueError(f"pinhole_rays: camera_nc must have 20 columns or more, got {columns}")
     if height < 1 or first + rows > cameras * height:
         have = f"{cameras} cameras of {height} rows"
         raise ValueError(f"pinhole_rays: no rows {first} to {first + rows} in {have}")
+    if max(first + rows, rows * width) not in Count.__metadata__[0]:
+        raise ValueError(f"pinhole_rays: {rows} rows of {width} are too many at once")
 
 
 @op(_check_rows)

@@ -10,10 +10,10 @@ inline namespace GV_NAMESPACE {
 // Rows are counted through the batch: `rows` of them from `first`, `height` a camera. cameras, columns
 #define GV_PINHOLE_RAYS(X)              \
   X(World, camera_nc, cameras* columns) \
-  X(Count, first, kAny)                 \
-  X(Count, rows, kAny)                  \
-  X(Count, width, kAny)                 \
-  X(Count, height, kAny)
+  X(Int, first, kAny)                   \
+  X(Int, rows, kAny)                    \
+  X(Int, width, kAny)                   \
+  X(Int, height, kAny)
 
 struct PinholeRays {
   GV_PINHOLE_RAYS(GV_VIEW)
@@ -26,9 +26,11 @@ struct PinholeRays {
 #endif
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t ray = index / kThreads, down = ray / width, row = first + down;
+    const int64_t ray = index / kThreads;
+    const int32_t narrow = static_cast<int32_t>(ray);  // of 31 bits: a GPU takes long to divide wider numbers
+    const int32_t down = narrow / width, row = first + down;
     const double* const camera = camera_nc + row / height * columns;
-    const double x = (static_cast<double>(ray - down * width) - camera[14]) / camera[12];
+    const double x = (static_cast<double>(narrow - down * width) - camera[14]) / camera[12];
     const double y = (static_cast<double>(row % height) - camera[15]) / camera[13];
     const double length = square_root(x * x + (y * y + 1));
     for (int64_t axis = index % kThreads; axis < 3; axis += kThreads) {

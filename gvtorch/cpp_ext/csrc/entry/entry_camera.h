@@ -14,11 +14,10 @@ inline auto run(const PinholeRaysOp& a) {
   STD_TORCH_CHECK(a.camera_nc.dim() == 2 && a.camera_nc.size(1) >= 20,
                   "gvtorch: camera_nc must be (n, c) with c >= 20");
   const int64_t cameras = a.camera_nc.size(0), columns = a.camera_nc.size(1);
-  for (const int64_t size : {a.first, a.rows, a.width, a.height})
-    STD_TORCH_CHECK(size >= 0 && size <= INT32_MAX, "gvtorch: rows and pixels must be numbers of 31 bits");
-  STD_TORCH_CHECK(a.height >= 1 && a.first + a.rows <= cameras * a.height, "gvtorch: there are fewer rows");
   PinholeRays args{};
   GV_PINHOLE_RAYS(GV_TAKE)
+  STD_TORCH_CHECK(a.height >= 1 && a.first + a.rows <= cameras * a.height, "gvtorch: there are fewer rows");
+  STD_TORCH_CHECK(a.first + a.rows <= INT32_MAX && a.rows * a.width <= INT32_MAX, "gvtorch: these are too many rays");
   args.columns = columns;
   const int64_t rays = a.rows * a.width;
   Tensor origin_r3 = give(args.origin_r3, a.camera_nc, {rays, 3});
