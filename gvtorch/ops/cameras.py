@@ -10,7 +10,8 @@ from torch import Tensor
 from .reference.exact import sqrt_exact
 from .registry import Backend, Doubles, op
 
-Count = Annotated[int, range(2**31)]
+_END = 2**31
+Count = Annotated[int, range(_END)]
 
 
 def _check_rows(*, camera_nc: Tensor, first: int, rows: int, width: int, height: int) -> None:
@@ -20,7 +21,7 @@ def _check_rows(*, camera_nc: Tensor, first: int, rows: int, width: int, height:
     if height < 1 or first + rows > cameras * height:
         have = f"{cameras} cameras of {height} rows"
         raise ValueError(f"pinhole_rays: no rows {first} to {first + rows} in {have}")
-    if max(first + rows, rows * width) not in Count.__metadata__[0]:
+    if max(first + rows, rows * width) >= _END:
         raise ValueError(f"pinhole_rays: {rows} rows of {width} are too many at once")
 
 
