@@ -16,7 +16,7 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
-from .composite import Trace, among, if_few, trace_pieces
+from .composite import Trace, if_few, scatter_hits, trace_pieces
 
 Face = tuple[float, ...]  # unit normal and offset (a, b, c, d): inside, a x + b y + c z + d >= 0
 Numbers = Sequence[Sequence[float]] | Tensor
@@ -217,7 +217,8 @@ class Clipped:
         end = torch.where(first > begin, torch.minimum(first + self.step, last), first)
         which = if_few(first < end)
         if which is not None:
-            return among(piece, which, self._cap(met.of_some(which), begin[which], piece[which]))
+            caps = self._cap(met.of_some(which), begin[which], piece[which])
+            return scatter_hits(piece, which, caps)
         slab = (self.slab or self.trace)(replace(piece, range=torch.stack((first, end), 1)))
         before = piece.light()[:, 0].to(slab.color)  # transmittance before the cap
         taken = before - (1 - slab.alpha[:, 0])  # by the slab, of the light

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -72,10 +73,12 @@ def if_few(some: Tensor) -> Tensor | None:
     return which if 2 * len(which) < len(some) else None
 
 
-def among(rays: Rays, which: Tensor, hits: Hits) -> Hits:
-    """Puts the hits of some rays among those of the others, which have empty ranges."""
+def scatter_hits(rays: Rays, which: Tensor, hits: Hits) -> Hits:
+    """Returns the hits of all rays (r), given those of the rays `which` (k,): the others have empty
+    ranges, so they hit nothing and keep the light that they had.
+    """
     empty = {"depth": torch.inf, "label": -1}
-    columns: dict[str, Tensor | None] = {}
+    columns: dict[str, Any] = {}
     for name, found in vars(hits).items():
         columns[name] = None
         if found is not None:
@@ -84,7 +87,7 @@ def among(rays: Rays, which: Tensor, hits: Hits) -> Hits:
             if name == "alpha":
                 nothing = 1 - rays.light().to(found)
             columns[name] = nothing.index_put((which,), found)
-    return Hits(**columns)  # type: ignore[arg-type]
+    return Hits(**columns)
 
 
 def trace_pieces(trace: Trace, pieces: Iterable[Rays], *, cap: Trace | None = None) -> Hits:
@@ -95,7 +98,7 @@ def trace_pieces(trace: Trace, pieces: Iterable[Rays], *, cap: Trace | None = No
 
     def trace_open(rays: Rays) -> Hits:
         which = if_few(rays.range[:, 0] < rays.range[:, 1])
-        return trace(rays) if which is None else among(rays, which, trace(rays[which]))
+        return trace(rays) if which is None else scatter_hits(rays, which, trace(rays[which]))
 
     steps = ((one, piece) for piece in pieces for one in (cap, trace_open) if one is not None)
     first, piece = next(steps)

@@ -113,15 +113,16 @@ class _Points:
     def of_some(self, which: Tensor) -> _Points:
         """Some of the points, with a tally of their own."""
         columns = {name: one[which] for name, one in vars(self).items() if isinstance(one, Tensor)}
-        return replace(self, **columns, row=0, tally=_Tally(len(which), self.seen.device))
+        counts = (self.tally.samples, self.tally.missed)
+        tally = _Tally(*(count.new_zeros(len(which)) for count in counts))
+        return replace(self, **columns, row=0, tally=tally)
 
 
 class _Tally:
     """Samples and misses of all rays of a pixel."""
 
-    def __init__(self, pixels: int, device: torch.device) -> None:
-        self.samples = torch.zeros(pixels, dtype=torch.int32, device=device)
-        self.missed = torch.zeros(pixels, dtype=torch.bool, device=device)
+    def __init__(self, samples: Tensor, missed: Tensor) -> None:
+        self.samples, self.missed = samples, missed
 
     def __call__(self, hits: Hits) -> Hits:
         """Adds those of some hits, which it returns."""
@@ -154,8 +155,7 @@ class Lighted:
         color, m = hits.color, self.material
         look = (self.lighting.ambient, m.ambient, m.diffuse, m.specular)
         sky, (ambient, diffuse, specular) = pack(look, color.dtype, color.device).split(3)
-        tally = _Tally(len(color), color.device)
-        tally(hits)
+        tally = _Tally(hits.samples, hits.missed)
         points = self._points(rays, hits, tally)
         direct, highlight = self._direct(points, self.lighting.shadow_cones)
         unblocked, bounced = self._hemisphere(points, rays)
