@@ -9,7 +9,7 @@ import tyro
 import gvtorch as gv
 
 SUN = gv.DirectionalLight((-0.9, -1.0, -0.25), (1.25, 1.12, 0.95), angle=5)
-LIGHT = gv.Lighting(ambient=(0.5, 0.58, 0.72), occlusion=0.9, cones=6, reach=0.15, frame="box")
+LIGHT = gv.Lighting(ambient=(0.5, 0.58, 0.72), occlusion=0.9, cones=4, reach=0.1, frame="box")
 BACKGROUND = gv.Gradient((0.10, 0.13, 0.18), (0.42, 0.42, 0.42))
 ALONG, AROUND, PLATE = 640, 48, np.array((0.42, 0.41, 0.40))
 

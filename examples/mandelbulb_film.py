@@ -1,0 +1,61 @@
+"""A flight to the Mandelbulb's surface, from 2^-4 to 2^-30 of the box away from it, as a film: on a
+GPU it is flown live, one graph a frame, in a pool of fixed size.
+"""
+
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+import tyro
+from mandelbulb_zoom import bulb, look, ways
+from rich.progress import track
+
+import gvtorch as gv
+
+
+@dataclass
+class Settings:
+    """Films the flight, and keeps its last picture."""
+
+    output: Path = Path("mandelbulb_film.png")
+    film: Path = Path("mandelbulb_film.mp4")
+    size: int = 360
+    frames: int = 600
+    cone_scale: float = 2.0  # pixels that a voxel is wide
+    budget: int = 4096  # most bricks a frame
+    device: str = "cpu"
+
+
+def main(settings: Settings) -> None:
+    """Loads what is seen level by level, so that every place has a brick, then flies."""
+    route, took = ways(), []
+    size = settings.size * 16 // 9 // 2 * 2, settings.size
+    pools = {"brick_pool": "512 MB", "load_budget": settings.budget, "loading": "levels"}
+    with (
+        bulb(20, settings.device, **pools) as engine,
+        gv.Video(settings.film, *size, fps=30) as film,
+    ):
+        camera, shader = look(route, 4.0, *size, engine.device)
+        options = {"cone_scale": settings.cone_scale}
+        engine.render(camera, shader, **options)  # where it begins
+        draw = partial(engine.frame, shader=shader, **options)
+        if engine.device.type == "cuda":
+            draw = engine.capture(camera, shader, batch=settings.budget, fit=True, **options).replay
+        for level in track(torch.linspace(4, 30, settings.frames).tolist()):
+            camera, lit = look(route, level, *size, engine.device)
+            began = time.perf_counter()
+            shader.light.direction.copy_(lit.light.direction)
+            picture, stats = draw(camera)
+            stats.settle()  # waits for the device
+            took.append(1e3 * (time.perf_counter() - began))
+            film.add(picture)
+        picture.save(settings.output)
+    late, middle = sum(one > 1e3 / 30 for one in took), sorted(took)[len(took) // 2]
+    print(f"{len(took)} frames: {middle:.1f} ms, at most {max(took):.1f}; {late} over 1/30 s")
+    print(f"{settings.film}, {settings.output}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings))
