@@ -18,6 +18,7 @@ from gvtorch import ops
 from gvtorch.base.volume import DIRECTIONS
 from gvtorch.cameras.custom import CustomCamera
 from gvtorch.tracing import pixels
+from gvtorch.tracing.tracer import Tracer
 
 BOX = torch.tensor([[1.0, 2.0, 3.0], [5.0, 4.0, 4.0]], dtype=torch.float64)
 
@@ -347,9 +348,15 @@ def test_small_cameras_share_calls(monkeypatch):
     one_call = gv.render(tree, cameras, shader, progress=told)
     assert calls == [320] and one_call.alpha.max() > 0.3
     calls.clear()
-    monkeypatch.setitem(pixels._RAYS_A_BLOCK, "cpu", 1000)  # 62 rows, in the middle of a camera
+    monkeypatch.setattr(pixels, "_WATCHED", 1000)  # 62 rows, in the middle of a camera
     parts = gv.render(tree, cameras, shader, progress=told)
     assert calls == [62, 124, 186, 248, 310, 320]
+    traced, march = [], Tracer.__call__
+    monkeypatch.setattr(
+        Tracer, "__call__", lambda own, rays: traced.append(rays) or march(own, rays)
+    )
+    gv.render(tree, cameras, shader)
+    assert len(traced) == 1, "nobody watches: one trace"
     for index in range(20):
         alone = gv.render(tree, cameras[index], shader)
         for name in ("color", "alpha", "depth", "samples"):

@@ -38,7 +38,8 @@ Scene = N3Tree | Mapping[str, N3Tree]
 Pixels = slice | Tensor  # some of the pixels of all pictures of a camera, row by row
 #: Hits of an earlier pass, which are overwritten, and which (r,) bool of their rays to trace again.
 Again = tuple[Hits, Tensor]
-_RAYS_A_BLOCK = {"cpu": 1 << 16, "cuda": 1 << 22}  # small on the CPU, so that progress shows
+_RAYS_A_BLOCK = 1 << 22
+_WATCHED = 1 << 16  # of these on a CPU, where progress shows and Ctrl-C ends a picture
 
 
 @explicit(RenderOptions)
@@ -224,7 +225,10 @@ class View:
             ValueError: The picture is larger than the device's memory.
         """
         device = self.numbers.device
-        block = _RAYS_A_BLOCK[device.type]
+        at_once = device.type == "cuda" or (
+            len(self.camera) > 1 and progress is no_progress and isinstance(self.trace_rays, Tracer)
+        )
+        block = _RAYS_A_BLOCK if at_once else _WATCHED
         size = self.rays * (8 * self.options.dtype.itemsize + 5)  # the colour twice
         check.memory("render", f"a picture of {self.rays} pixels", size, device)
         hits, where = again or (None, None)
