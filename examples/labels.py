@@ -16,7 +16,7 @@ CELLS, REACH = 360, 0.2  # no voxel of a cell is so far from its nucleus, in sid
 GAP, RADIUS, CORE = 0.012, 0.47, 0.42  # in sides of the box; CORE of a cell's own size
 BONE, SKY = (0.86, 0.80, 0.66), gv.Gradient((0.030, 0.036, 0.052), (0.004, 0.005, 0.008))
 SUN = gv.DirectionalLight((0.55, -1.0, -0.75), (1.25, 1.16, 1.0), angle=7)
-LIGHT = gv.Lighting(ambient=(0.62, 0.72, 0.95), occlusion=0.9, reach=0.12, cones=6, frame="box")
+LIGHT = gv.Lighting(ambient=(0.62, 0.72, 0.95), occlusion=0.9, reach=0.12, cones=5, frame="box")
 CUT = gv.Clip(without=[((0.0, 0.0, 0.0), (0.6, 0.6, 0.6))], frame="box", caps=True, cap_light=0.0)
 
 

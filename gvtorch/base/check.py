@@ -5,6 +5,7 @@ came.
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 import math
 import operator
@@ -101,18 +102,20 @@ def tensors(
     """
     known = {**_DIGITS, **(sizes or {})}
     for name, value, shape, dtype in fields:
-        expected = [known.get(letter, letter) for letter in shape]
+        before = len(known)
         fits = isinstance(value, Tensor) and value.dtype == dtype and value.device == device
-        if not fits or value.dim() != len(shape):
-            tensor(where, name, value, expected, dtype, device)  # raises
-        for letter, size in zip(shape, value.shape, strict=True):
-            if known.setdefault(letter, size) != size:
-                tensor(where, name, value, expected, dtype, device)  # raises, unless it is new
-                raise ValueError(
-                    f"{where}: {name} must be ({', '.join(shape)}), got {describe(value)}"
-                )
-        if not value.is_contiguous():
-            raise ValueError(f"{where}: {name} must be contiguous")
+        if fits and value.dim() == len(shape):
+            for letter, size in zip(shape, value.shape, strict=True):
+                if known.setdefault(letter, size) != size:
+                    break
+            else:
+                if value.is_contiguous():
+                    continue
+                raise ValueError(f"{where}: {name} must be contiguous")
+        told = dict(itertools.islice(known.items(), before))  # by the fields before this one
+        expected = [told.get(letter, letter) for letter in shape]
+        tensor(where, name, value, expected, dtype, device)  # raises, unless a letter differs in it
+        raise ValueError(f"{where}: {name} must be ({', '.join(shape)}), got {describe(value)}")
     return known
 
 

@@ -247,9 +247,9 @@ def _refuse_gradients(op: Any) -> None:
 
     def kernel(keys: Any, *given: Any) -> Any:
         if torch.is_grad_enabled():
-            for name, value in zip(names, given, strict=False):
-                if isinstance(value, Tensor):  # few arguments are
-                    check.no_gradient(where, name, value)
+            for at, value in enumerate(given):
+                if isinstance(value, Tensor) and value.requires_grad:
+                    raise check.lost_gradient(where, names[at])
         return op.default.redispatch(keys & torch._C._after_autograd_keyset, *given)
 
     _libraries[namespace].impl(where, kernel, "Autograd", with_keyset=True)
