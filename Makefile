@@ -40,7 +40,7 @@ demo: $(VENV)/ready
 	@echo "The picture: $(CURDIR)/out/demo.png"
 
 gallery: $(VENV)/ready
-	for name in $(basename $(notdir $(wildcard examples/*.py))); do \
+	for name in $(filter-out mandelbulb_film,$(basename $(notdir $(wildcard examples/*.py)))); do \
 	  $(BIN)/python examples/$$name.py --output docs/images/$$name.png || exit; \
 	done
 

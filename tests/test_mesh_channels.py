@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import torch
 from helpers import gvtorch, meshes
+from helpers.stores import stopped_at
 
 import gvtorch as gv
-from gvtorch.io.stores import shard
 from gvtorch.io.stores.channels import channel_names
 from gvtorch.io.stores.store_layout import WORK
 from gvtorch.meshes.voxelizer import Voxelizer
@@ -137,24 +137,14 @@ def test_colours_are_drawn_lit_in_one_line(store, tmp_path):
 
 
 def test_a_broken_off_store_goes_on_and_is_the_same(tmp_path, mesh, monkeypatch):
-    original, ran = shard.write_shard, []
-
-    def stop(job, level, place):
-        if "memory" not in job.root["driver"]:
-            ran.append(place)
-            if len(ran) == 9:
-                raise KeyboardInterrupt
-        return original(job, level, place)
-
     told = {"resolution": 150, "channels": NAMES, "workers": 1}
     whole = tmp_path / "whole" / "a.zarr"
     whole.parent.mkdir()
     gv.voxelize(mesh, whole, **told)
     target = tmp_path / "a.zarr"
-    with monkeypatch.context() as patch:
-        patch.setattr(shard, "write_shard", stop)
-        with pytest.raises(KeyboardInterrupt, match=r"--channels coverage,color,normal .*--resume"):
-            gv.voxelize(mesh, target, **told)
+    how = r"--channels coverage,color,normal .*--resume"
+    with stopped_at(monkeypatch, 9), pytest.raises(KeyboardInterrupt, match=how):
+        gv.voxelize(mesh, target, **told)
     assert (target / "coverage" / "zarr.json").exists() and not (target / "zarr.json").exists()
     with pytest.raises(FileExistsError, match="half-written"):
         gv.voxelize(mesh, target, **told)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 from helpers import gvtorch, meshes, shared
+from helpers.stores import stopped_at
 
 import gvtorch as gv
 from gvtorch.io.mesh_source import MeshSource
-from gvtorch.io.stores import shard
 from gvtorch.io.stores.store_layout import WORK
 from gvtorch.meshes.voxelizer import Voxelizer
 
@@ -254,19 +254,9 @@ def test_a_mesh_in_memory_goes_to_worker_processes(tmp_path):
 
 
 def test_a_broken_off_voxelization_goes_on(tmp_path, torus_file, monkeypatch):
-    original, ran = shard.write_shard, []
-
-    def stop(job, level, place):
-        if "memory" not in job.root["driver"]:
-            ran.append(place)
-            if len(ran) == 3:
-                raise KeyboardInterrupt
-        return original(job, level, place)
-
     store = tmp_path / "a.zarr"
     words = ("voxelize", torus_file, "-o", store, "--resolution", 300, "--workers", 1)
-    with monkeypatch.context() as patch:
-        patch.setattr(shard, "write_shard", stop)
+    with stopped_at(monkeypatch, 3):
         run = gvtorch(*words)
     assert run.returncode == 130 and "2 of" in run.stderr
     assert f"gvtorch voxelize {torus_file} -o {store}" in run.stderr and "--resume" in run.stderr

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers import gvtorch, shared
 from helpers.damage import break_file
+from helpers.stores import stopped_at
 
 import gvtorch as gv
-from gvtorch.io.stores import shard
 from gvtorch.io.stores.store_layout import WORK
 from gvtorch.points.splat import region
 
@@ -204,18 +204,8 @@ def test_light_has_colours_and_the_producer_s_voxels(tmp_path):
 
 def test_a_broken_off_splat_goes_on(tmp_path, monkeypatch):
     path, store = write_npz(tmp_path / "a.npz"), tmp_path / "a.zarr"
-    original, ran = shard.write_shard, []
-
-    def stop(job, level, place):
-        if "memory" not in job.root["driver"]:
-            ran.append(place)
-            if len(ran) == 3:
-                raise KeyboardInterrupt
-        return original(job, level, place)
-
     given = {"extent": 300, "workers": 1}
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt, match="gvtorch splat"):
-        patch.setattr(shard, "write_shard", stop)
+    with stopped_at(monkeypatch, 3), pytest.raises(KeyboardInterrupt, match="gvtorch splat"):
         gv.splat(path, store, **given)
     assert (store / WORK / "points" / "points.json").exists()
     with pytest.raises(ValueError, match="begun with other points or settings"):

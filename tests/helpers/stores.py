@@ -13,8 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import gvtorch as gv
+from gvtorch.io.stores import shard
 from gvtorch.io.stores.store import Store
 from gvtorch.pool.pyramid import round_to, volume_levels
 
@@ -27,6 +29,23 @@ def read(path: Path, **options) -> tuple[gv.Volume, list[str]]:
         warnings.simplefilter("always")
         volume = gv.read_volume(path, **options)
     return volume, [str(one.message) for one in told]
+
+
+@contextmanager
+def stopped_at(monkeypatch: pytest.MonkeyPatch, number: int) -> Iterator[None]:
+    """Lets the block's conversions on disk stop at the shard of a number, as by Ctrl-C."""
+    original, places = shard.write_shard, []
+
+    def stop(job, level, place):
+        if "memory" not in job.root["driver"]:
+            places.append(place)
+            if len(places) == number:
+                raise KeyboardInterrupt
+        return original(job, level, place)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shard, "write_shard", stop)
+        yield
 
 
 def noise(shape: tuple[int, ...], dtype: str = "uint8", seed: int = 0) -> np.ndarray:
