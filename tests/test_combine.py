@@ -105,6 +105,8 @@ def test_a_mask_hides_what_it_hides():
     inside = (0.5 - (nodes.positions.norm(dim=-1) - 0.7) * 32).clamp(0, 1)[..., None]
     assert torch.allclose(data, network(nodes.positions) * inside, atol=1e-5)
     assert not data[kind == gv.Region.EMPTY].any() and (kind == gv.Region.EMPTY).sum() > 200
+    shape = gv.FieldProducer(gv.mask(network, gv.sdf.Sphere(0.7)), 64, box=BOX, threshold=0)
+    assert torch.equal(shape.fill(nodes).data["value"], data), "a distance stands for its solid"
     with pytest.raises(ValueError, match="takes no field with a margin"):
         gv.mask(network, gv.Solid(gv.Mandelbulb()))
     with pytest.raises(ValueError, match="needs one channel, got rgba, normal"):

@@ -75,3 +75,11 @@ def test_bad_arguments_are_named(call, message):
     with pytest.raises(ValueError) as caught:
         call(level((4, 4, 4, 1), torch.uint8), torch.zeros((1, 3), dtype=torch.int64))
     assert message in str(caught.value)
+
+
+def test_bricks_beyond_any_level_are_its_edge(backend):
+    values = level((3, 4, 5, 2), torch.uint8).to(DEVICES[backend])
+    far = torch.tensor([[2**63 - 1, 0, -(2**63)], [0, 2**62, 1]], device=values.device)
+    near = far.clamp(-9, 9)
+    found = ops.cut_bricks(values, far, 2, 1, backend=backend)
+    assert torch.equal(found, ops.cut_bricks(values, near, 2, 1, backend=backend))

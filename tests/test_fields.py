@@ -96,6 +96,16 @@ class Given(torch.nn.Module):
 BOX = ((0, 0, 0), (1, 1, 1))
 
 
+def test_infinite_values_fail_and_halves_do_not():
+    view, shader = gv.Camera.orbit(width=4, height=4), gv.TransferFunction.preset("gray", 0, 1)
+    inner = gv.FieldProducer(Given(lambda p: p[..., 0].half()), 16, box=BOX)
+    outer = gv.FieldProducer(Given(lambda p: p[..., 0] / 0), 16, box=BOX)
+    with gv.Engine(inner) as engine:
+        assert engine.render(view, shader).alpha.any()
+    with pytest.raises(gv.ProductionError, match="channel 'value' holds NaN or infinite values"):
+        gv.Engine(outer)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -141,6 +141,34 @@ def test_solid_tells_what_is_filled():
         Voxelizer(ball, solid="yes")
 
 
+def test_a_pole_that_is_computed_again_is_the_same_place():
+    """sin(pi) is 1e-16: the usual ball of latitudes is closed all the same."""
+    rings = 24
+    polar, around = np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    polar, around = polar[:, None], around[None]
+    part = (
+        np.sin(polar) * np.cos(around),
+        np.sin(polar) * np.sin(around),
+        np.cos(polar + 0 * around),
+    )
+    a = np.arange(rings * 48).reshape(rings, 48)
+    b = np.roll(a, -1, 1)
+    faces = np.stack(((a, a + 48, b), (b, a + 48, b + 48))).transpose(0, 2, 3, 1).reshape(-1, 3)
+    ball = gv.Mesh(vertices=np.stack(part, -1).reshape(-1, 3), faces=faces)
+    flat = gv.Mesh(vertices=ball.vertices.round(12), faces=faces)
+    ends = [gv.MeshProducer(one, resolution=32).voxelizer for one in (ball, flat)]
+    made, expected = (one.region((0, 0, 0), one.extent)["coverage"].double().sum() for one in ends)
+    assert float(made) == pytest.approx(float(expected), rel=1e-6) and float(made) > 5000 * 255
+
+
+def test_a_field_of_a_mesh_tells_of_its_holes():
+    ball = without(meshes.sphere(4), 7, 8)
+    with pytest.warns(UserWarning, match='2 holes of 6 edges leave 1 parts open.*solid="always"'):
+        gv.SampledDistance.of_mesh(ball, resolution=16)
+    filled_up = gv.SampledDistance.of_mesh(ball, resolution=16, solid="always")
+    assert float(filled_up(torch.zeros(1, 3))) < -0.5
+
+
 def test_few_holes_are_told_in_a_line(tmp_path):
     trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
     ball = without(meshes.sphere(4), 7, 8)

@@ -84,6 +84,22 @@ def test_all_instruction_sets_give_the_same_bits(instructions):
 
 
 @dtypes
+def test_coordinates_that_32_bits_cannot_count_are_0(backend, dtype):
+    """So a sum's octaves, of whatever frequency, stay within their bounds."""
+    points = some_points(500, 3, dtype).to(DEVICES[backend])
+    far = points.clone()
+    far[::2, 0] = torch.tensor([2.0**29, -(2.0**40), 1e30, torch.inf, -torch.inf]).repeat(50)
+    for kind in twin.KINDS:
+        expected = noise(torch.where(far.abs() >= 2**29, 0.0, far), kind, backend=backend)
+        found = noise(far, kind, backend=backend)
+        assert torch.equal(found, expected) and bool(found.isfinite().all())
+    whole = gv.noise.fbm(points, octaves=64)
+    bounds = gv.noise.fbm_bounds(octaves=64)
+    assert bounds.low <= float(whole.min()) and float(whole.max()) <= bounds.high
+    assert float((whole - gv.noise.fbm(points, octaves=28)).abs().max()) < 2.0**-27
+
+
+@dtypes
 def test_opcheck(compiled, dtype):
     points = some_points(50, 3, dtype).to(DEVICES[compiled])
     given = (points, 0, 1, 2, 3, 0, 0, 5, 1.0, 1)

@@ -200,6 +200,18 @@ def test_the_box_is_around_all_points_unless_given():
     assert one.extent == (1024, 1024, 1024) and len(one.points) == 1
 
 
+def test_sums_that_halves_cannot_hold_are_told_once():
+    place, value = torch.rand(50, 3), torch.full((50,), 1e6)
+    view, shader = gv.Camera.orbit(width=8, height=8), gv.TransferFunction.preset("gray", 0, 1e5)
+    with gv.Engine(gv.PointProducer(place, value, 32)) as engine:
+        engine.render(view, shader, lod="finest")
+    half = gv.PointProducer(place, value, 32, dtype=torch.float16)
+    with pytest.warns(UserWarning, match=r"a voxel's sum, .*float16 holds, 65504") as told:
+        with gv.Engine(half) as engine:
+            engine.render(view, shader, lod="finest")
+    assert len(told) == 1
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

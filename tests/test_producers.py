@@ -127,12 +127,51 @@ def test_eviction_clears_every_pointer_to_a_shared_tile():
         (lambda: gv.Producer(4, box=((0, 0, 0), (1, 1, -1))), "spacing must be positive"),
         (lambda: gv.Producer(4, box=((0, 0, 0),)), "box must be two corners"),
         (lambda: gv.Producer(4, branching=1), "branching must be an int >= 2"),
+        (lambda: gv.Producer(4.5), "extent must be an int >= 1"),
+        (lambda: gv.Producer(4, value_range={"a": (0, 1)}), "value_range has channel 'a'; there"),
+        (lambda: gv.Producer(4, value_range={"value": (1, 0)}), "must be (smallest, largest)"),
+        (lambda: gv.Producer(4, labels={"a": None}), "labels has channel 'a'; there are value"),
     ],
 )
 def test_bad_producers_are_named(call, message):
     with pytest.raises(ValueError) as caught:
         call()
     assert message in str(caught.value)
+
+
+class Gray(Ball):
+    """Answers with the voxels of its only channel, and counts what is outside."""
+
+    def fill(self, nodes):
+        return super().fill(nodes)["value"]
+
+
+def test_the_voxels_of_one_channel_need_no_name(blobs):
+    view = camera(24)
+    with gv.Engine(Ball(64), **SIZE) as engine, gv.Engine(Gray(64), **SIZE) as other:
+        expected, found = engine.render(view, GRAY), other.render(view, GRAY)
+    assert torch.equal(found.color, expected.color) and found.alpha.max() > 0.5
+
+
+def test_a_mask_is_no_kind_of_region():
+    class Outside(Ball):
+        def classify(self, nodes):
+            return nodes.center.norm(dim=1) > 3
+
+    with pytest.raises(gv.ProductionError, match=r"kind must be \(1,\) of Region, got \(1,\) bool"):
+        gv.Engine(Outside(64), **SIZE)
+
+
+def test_nodes_that_fail_are_told_with_the_picture():
+    class Torn(Ball):
+        def fill(self, nodes):
+            if int(nodes.depth.max()) > 0:
+                raise OSError("torn")
+            return super().fill(nodes)
+
+    with gv.Engine(Torn(64), **SIZE) as engine:
+        stats = engine.render(camera(24), GRAY).stats
+        assert stats.failed > 0 and f"{stats.failed} nodes failed: Engine.failures" in repr(stats)
 
 
 def test_validate_finds_a_tile_in_the_wrong_place(blobs):

@@ -56,6 +56,14 @@ def test_compiled_equals_reference(tree, compiled, name, lod):
             assert found["alpha"].max() > 0.3, "the test must see something"
 
 
+@pytest.mark.parametrize("name", SHADERS)
+def test_compiled_equals_reference_in_every_bit_of_float64(tree, compiled, name):
+    rays = camera_rays(tree, 6, distance=1.3)
+    found, _, actual = assert_equal(tree, compiled, rays, SHADERS[name], dtype=torch.float64)
+    for field in ("color", "alpha", "depth", "normal", "features"):
+        assert torch.equal(actual[field].cpu(), found[field].cpu()), field
+
+
 @pytest.mark.parametrize(
     ("dtype", "branching", "step"),  # each pair of values
     [

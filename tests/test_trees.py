@@ -8,6 +8,7 @@ import torch
 from helpers import DEVICES
 
 import gvtorch as gv
+from gvtorch.tracing import pixels
 
 WARM = gv.TransferFunction([(0, 0), (0.1, 0), (1, 0.5)], [(0, 0.2, 0, 0), (1, 1, 0.8, 0.3)])
 COLD = gv.TransferFunction([(0, 0), (0.2, 0), (1, 0.4)], [(0, 0, 0.1, 0.4), (1, 0.4, 0.9, 1)])
@@ -290,6 +291,35 @@ def test_mistakes_are_told_in_a_line(volumes, make, told):
 
 
 @pytest.mark.backend("cpp")
+def test_what_some_blocks_of_rays_lack_is_nothing(volumes, monkeypatch):
+    """Features of rays that meet nothing are 0, in a block of their own, too."""
+    monkeypatch.setattr(pixels, "_WATCHED", 32)
+    trees = {
+        name: gv.N3Tree.from_volume(
+            {"value": one, "more": gv.Volume(one.data + 1, one.spacing, one.origin)}
+        )
+        for name, one in volumes.items()
+    }
+    shader = gv.Features(WARM, "more")
+    shown = [view(16), gv.Camera.look_at((200, 0, 0), (300, 0, 0), (0, 0, 1), 38, 16, 16)]
+    both = gv.Camera(
+        torch.cat([one.viewmats for one in shown]), torch.cat([one.Ks for one in shown]), 16, 16
+    )
+    picture = gv.render(trees, both, shader, progress=lambda *_: None)
+    assert float(picture.features[0].max()) > 0 and not picture.features[1].any()
+    for at, camera in enumerate(shown):
+        alone = gv.render(trees, camera, shader)
+        assert torch.equal(picture.features[at], alone.features)
+
+
+def test_pre_integrated_media_overlap_as_others_do(volumes):
+    trees = {name: gv.N3Tree.from_volume(one) for name, one in volumes.items()}
+    fine = gv.render(trees, view(), {"ct": WARM, "pet": COLD}, step=0.1, lod="finest")
+    shaders = {"ct": gv.PreIntegrated(WARM), "pet": gv.PreIntegrated(COLD)}
+    found = gv.render(trees, view(), shaders, step=0.5, lod="finest")
+    assert float((found.color - fine.color).abs().max()) < 0.01 < float(fine.color.max())
+
+
 def test_labels_are_told_among_media(volumes):
     """A segmentation of the smooth ball in another volume: its labels, as without the other."""
     values = volumes["ct"].data[..., 0]

@@ -233,9 +233,10 @@ def make_tree(
         fill_root(cache, made, options.patience)
     except Exception as error:
         producer.close()
-        raise ProductionError(
-            f"Engine: the root of tree {name!r} can't be made: {one_line(error)}"
-        ) from error
+        said = one_line(error)
+        if not isinstance(error, (ValueError, ProductionError)):
+            said = f"{type(error).__name__}: {said}"  # "division by zero" alone tells little
+        raise ProductionError(f"Engine: the root of tree {name!r} can't be made: {said}") from error
     producer.layout = layout  # it serves this engine now
     return made
 

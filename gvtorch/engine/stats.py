@@ -122,7 +122,8 @@ class FrameStats(RenderStats):
     def __repr__(self) -> str:
         made = ", ".join(f"{number} {name}" for name, number in self.produced.items())
         known = "not read back" if self._unread else "converged" * self.converged or "misses some"
-        return f"FrameStats(frame {self.frame}: produced {made}; {known})"
+        lost = f"; {self.failed} nodes failed: Engine.failures" if self.failed else ""
+        return f"FrameStats(frame {self.frame}: produced {made}; {known}{lost})"
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self.settle())

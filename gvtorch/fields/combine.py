@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from ..base import check
 from .distance import HASH, Distance
 from .field import Bounds, Field, Interval, Values, checked_field
+from .solid import Solid
 
 
 class Painted(Distance):
@@ -139,14 +140,14 @@ class Blend(Field):
 
     def __init__(self, first: nn.Module, second: nn.Module, mask: nn.Module) -> None:
         """Takes two fields of the same channels, and a mask of one value, such as the density of a
-        `Solid`.
+        `Solid`; a `Distance` stands for that of its own.
         """
         super().__init__()
         where = type(self).__name__
         self.first = checked_field(where, "first", first)
         self.second = checked_field(where, "second", second)
+        mask = Solid(mask, colors=False) if isinstance(mask, Distance) else mask
         self.mask = checked_field(where, "mask", mask)
-
         self.prefiltered = _prefiltered(where, (first, second, mask))
 
     def forward(self, points: Tensor) -> Values:

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from ..base.volume import Volume
+from ..meshes.holes import Solid, told_of_holes
 from ..meshes.mesh import Mesh
 from ..meshes.voxelizer import Voxelizer
 from .distance import WHITE, Color, Distance
@@ -57,7 +60,13 @@ class SampledDistance(Distance):
 
     @classmethod
     def of_mesh(
-        cls, mesh: Mesh, *, resolution: int = 96, reach: float = 0.25, color: Color = WHITE
+        cls,
+        mesh: Mesh,
+        *,
+        resolution: int = 96,
+        reach: float = 0.25,
+        solid: Solid = "auto",
+        color: Color = WHITE,
     ) -> SampledDistance:
         """Returns the distances to a mesh's surface, negative inside of closed parts: exact within
         3 voxels of it, and beyond that to about a tenth of a voxel.
@@ -66,14 +75,19 @@ class SampledDistance(Distance):
             mesh: As `read_mesh` gives it.
             resolution: Voxels along its longest side.
             reach: How far the volume goes on around it, as a share of that side.
+            solid: Which parts are solids: "auto", closed ones (others are sheets, and a warning
+                tells where a few edges are missing), "always", whose holes are filled, or "never".
             color: The surface's.
 
         Raises:
             ValueError: A number is out of its range.
         """
         check.instance("SampledDistance", "mesh", mesh, Mesh)
+        if solid == "auto" and (told := told_of_holes(mesh)):
+            warnings.warn(told, stacklevel=2)
         reach = check.number("SampledDistance", "reach", reach, low=0, high=4)
-        grid = Voxelizer(mesh, resolution=resolution, channels=("distance",), band=_BAND)
+        given: dict[str, Any] = {"channels": ("distance",), "band": _BAND, "solid": solid}
+        grid = Voxelizer(mesh, resolution=resolution, **given)
         more = math.ceil(reach * resolution)
         ends = [n + more for n in grid.extent[::-1]]
         near = grid.region((-more,) * 3, ends)["distance"][..., 0]

@@ -17,6 +17,7 @@ from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
+from ..base import check
 from ..base.messages import need_library
 from ..base.srgb import from_srgb
 from ..points.points import Points
@@ -65,6 +66,7 @@ class PointFile:
 
     def __init__(self, path: str | Path, **names: Unpack[ColumnNames]) -> None:
         """Opens the file, see `read_points`."""
+        check.known("read_points", names, ColumnNames)
         self.path = Path(path)
         self.columns = _columns(self.path)
         radius = names.get("radius")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 _LEAST = 1e-30  # world units that a mesh may span; 1 / _LEAST at most: their squares are numbers
+_WELDED = 2.0**40  # steps along a mesh's longest side: places that round to the same one are one
 MOST_FACES = 2**28  # triangles of a mesh: they and their hierarchy would take 100 GB
 
 
@@ -48,6 +49,8 @@ class Mesh:
             value = getattr(self, field_name)
             if value is None:
                 continue
+            if dtype == np.int64 and (np.asarray(value) != np.trunc(value)).any():
+                raise ValueError(f"{self.name}: {field_name} must be whole numbers")
             value = np.ascontiguousarray(value, dtype)
             fits = value.ndim == len(shape) and all(
                 n is None or n == m for n, m in zip(shape, value.shape, strict=True)
@@ -161,8 +164,13 @@ def _evenness(faces: np.ndarray) -> np.ndarray:
 
 
 def welded(mesh: Mesh) -> np.ndarray:
-    """(f, 3) int64 vertices, those at the same place being one."""
-    return _different(mesh.vertices)[1][mesh.faces]
+    """(f, 3) int64 vertices, those at the same place being one: to 10^-12 of the mesh's size, for
+    whoever computes a pole or a seam twice gets two places.
+    """
+    low, high = mesh.bounds
+    size = float((high - low).max())
+    places = mesh.vertices if size == 0 else np.round((mesh.vertices - low) / size * _WELDED)
+    return _different(places)[1][mesh.faces]
 
 
 def _different(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

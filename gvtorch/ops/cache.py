@@ -356,6 +356,9 @@ def cut_bricks(
     """
     where = "cut_bricks"
     shape = ("z", "y", "x", "c")
+    check.instance(where, "values_zyxc", values_zyxc, Tensor)
+    check.instance(where, "place_k3", place_k3, Tensor)
+    check.no_gradient(where, "values_zyxc", values_zyxc)
     check.tensor(where, "values_zyxc", values_zyxc, shape, values_zyxc.dtype, place_k3.device)
     check.tensor(where, "place_k3", place_k3, ("k", 3), torch.int64, place_k3.device)
     check.whole(where, "brick_size", brick_size, low=1, high=2**10)
@@ -370,7 +373,8 @@ def cut_bricks(
 
 def _cut_twin(values_zyxc: Tensor, place_k3: Tensor, brick_size: int, border: int) -> Tensor:
     reach = torch.arange(-border, brick_size + border, device=place_k3.device)
-    corner = place_k3[:, :, None] * brick_size + reach  # (k, 3, s)
+    place = place_k3.clamp(-(2**50), 2**50)  # beyond any level
+    corner = place[:, :, None] * brick_size + reach  # (k, 3, s)
     z, y, x = (corner[:, axis].clamp(0, values_zyxc.shape[axis] - 1) for axis in range(3))
     index = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
     return movable(values_zyxc)[index].view(values_zyxc.dtype)

@@ -30,8 +30,8 @@ def noise(
     the twin is evaluated, which torch can differentiate.
 
     Args:
-        point_pn: (p, n) float32 or float64, in cells. Beyond 2^31 nothing is defined; NaN gives
-            NaN.
+        point_pn: (p, n) float32 or float64, in cells. Coordinates beyond 2^29 count as 0; NaN
+            gives NaN.
         kind: perlin, value, simplex; F1, F2 or F2-F1 of cellular noise.
         seed: Another noise for each.
         period: After how many cells the noise repeats along x, y, z; 0: never.

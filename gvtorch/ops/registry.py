@@ -84,12 +84,15 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
                 bound = signature.bind(*given, **named)
                 bound.apply_defaults()
                 given = tuple(bound.arguments.values())[: len(names)]
-            device = given[0].device
+            device = check.instance(where, names[0], given[0], Tensor).device
             fields = [
-                (name, given[place], shape or "abcd"[: given[place].dim()], dtype)
+                (name, given[place], shape or _any_shape(where, name, given[place]), dtype)
                 for place, name, shape, dtype in tensors
             ]
             check.tensors(where, device, fields)
+            for place, name, _, dtype in tensors:
+                if dtype == torch.float64:
+                    check.no_gradient(where, name, given[place])
             for name, inside in ranges.items():
                 check.whole(where, name, given[places[name]], low=inside[0], high=inside[-1])
             if also is not None:
@@ -101,6 +104,10 @@ def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
         return cast("_Twin", run)
 
     return made_of
+
+
+def _any_shape(where: str, name: str, value: Any) -> str:
+    return "abcd"[: check.instance(where, name, value, Tensor).dim()]
 
 
 def _names(op: Any) -> tuple[str, ...]:

@@ -346,8 +346,11 @@ def composite(
         Sums (r, c), light that is left (r,), and the light that reached each sample (k,), 0 behind
         the end of a ray; the last one has no gradient.
     """
-    where, device, real = "composite", alpha_k.device, alpha_k.dtype
+    where = "composite"
+    alpha_k = check.instance(where, "alpha_k", alpha_k, Tensor)
+    device, real = alpha_k.device, alpha_k.dtype
     check_real(where, "alpha_k", alpha_k, "(k,)")
+    check.tensor(where, "offset_r", offset_r, ("o",), torch.int64, device)
     rays = check.whole(where, "offset_r's length", offset_r.shape[0], low=1) - 1
     clear = alpha_k.new_ones(rays) if clear_r is None else clear_r
     fields = (

@@ -71,8 +71,10 @@ def voxelize(
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
-    where, device, world = "voxelize", corner_f33.device, torch.float64
-    if not len(corner_f33):
+    where, world = "voxelize", torch.float64
+    device = check.instance(where, "corner_f33", corner_f33, Tensor).device
+    check.no_gradient(where, "corner_f33", corner_f33)
+    if not corner_f33.numel():
         raise ValueError(f"{where}: corner_f33 must hold at least one triangle")
     check.tensors(
         where,

@@ -35,9 +35,8 @@ def checked_bricks(answer: Any, nodes: Nodes, producer: Producer, *, look: bool 
     some channels lie on the host and others on the device: then all go to the device. For `look`
     see `checked_regions`.
     """
-    if isinstance(answer, Mapping):
-        answer = Bricks(data=answer)
-    bricks = _checked("fill", answer, Bricks, "a dict of tensors", nodes, producer, look)
+    given = producer.as_bricks(answer)
+    bricks = _checked("fill", given, Bricks, "a dict of tensors", nodes, producer, look)
     if len({on_host({name: rows}) for name, rows in bricks.data.items()}) == 1:
         return bricks
     device = nodes.layout.device
@@ -85,7 +84,8 @@ def _checked(
     if any(not 0 <= index < count for index in errors):
         raise ValueError(f"{where}: errors names an item that is not in the batch of {count}")
     if kind is not None or isinstance(answer, Regions):
-        if not isinstance(kind, Tensor) or kind.shape != (count,) or kind.is_floating_point():
+        whole = isinstance(kind, Tensor) and not kind.is_floating_point()
+        if not whole or kind.shape != (count,) or kind.dtype == torch.bool:
             came = check.describe(kind)
             raise ValueError(f"{where}: kind must be ({count},) of Region, got {came}")
         kind = kind.to(torch.int64)

@@ -109,7 +109,7 @@ class FromChildren(Producer):
         """As the producer does."""
         return self.producer.classify(nodes)
 
-    def fill(self, nodes: Nodes) -> Bricks | Mapping[str, Tensor] | Future:
+    def fill(self, nodes: Nodes) -> Bricks | Mapping[str, Tensor] | Tensor | Future:
         """The producer's bricks of the finest level, and means of what lies below of others."""
         finest = nodes.depth == nodes.layout.depth
         if bool(finest.all()):

@@ -156,7 +156,9 @@ class FieldProducer(Producer):
                 parts.append(self._made(nodes[rows], field))
             back = torch.cat(order).argsort()
             data = {name: torch.cat([part[name] for part in parts])[back] for name in self.channels}
-        stored = {name: self._stored(name, rows) for name, rows in data.items()}
+        # What is infinite fails like NaN, and is not stored as the largest number.
+        known = {name: rows.masked_fill(rows.isinf(), math.nan) for name, rows in data.items()}
+        stored = {name: self._stored(name, rows) for name, rows in known.items()}
         whole = [n for n, channel in self.channels.items() if not channel.dtype.is_floating_point]
         if not whole:
             return Bricks(data=stored)
@@ -221,6 +223,7 @@ class FieldProducer(Producer):
         """Values in a channel's dtype."""
         channel = self.channels[name]
         least, most = channel.limits
+        values = values.float() if values.dtype.itemsize < 4 else values  # halves have less range
         if channel.dtype.is_floating_point:
             return values.clamp(least, most).to(channel.dtype)
         return (values * most).round().clamp(least, most).to(channel.dtype)

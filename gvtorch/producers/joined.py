@@ -238,7 +238,7 @@ def _joined_bricks(
 ) -> Bricks:
     data, constants, given = dict[str, Any](), dict[str, Tensor](), dict[str, Bricks]()
     for name, one in answers.items():
-        given[name] = one if isinstance(one, Bricks) else Bricks(data=one)
+        given[name] = producers[name].as_bricks(one)
         (own,) = producers[name].channels
         data[name] = given[name].data[own]
         constants |= {name: given[name].constants[own]} if own in given[name].constants else {}

@@ -8,6 +8,7 @@ nearest grid point for points without a radius).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,7 @@ class PointProducer(Producer):
             branching=grid.branching,
         )
         self.points, self.drawn = found, drawn
+        self._told = False  # of sums that the channel can't hold
 
     def prepare(self, layout: Layout) -> None:
         """Does nothing: the points are sorted for any layout."""
@@ -117,8 +119,22 @@ class PointProducer(Producer):
         out = torch.empty(shape, dtype=channel.dtype)
         for rows, cubes in _by_level(nodes):
             made = torch.from_numpy(values(self.points, cubes, narrow=self._narrow(cubes)))
+            self._warn_of(made)
             out[rows] = made.clamp(*channel.limits).to(channel.dtype)
         return {"value": out}
+
+    def _warn_of(self, sums: Tensor) -> None:
+        """Tells once where sums are larger than the channel can hold."""
+        (low, high), dtype = self.channels["value"].limits, self.channels["value"].dtype
+        least, most = (float(end) for end in torch.aminmax(sums)) if sums.numel() else (0.0, 0.0)
+        if not self._told and (least < low or most > high):
+            self._told = True
+            end, name = max(-least, most), str(dtype).removeprefix("torch.")
+            warnings.warn(
+                f"{type(self).__name__}: a voxel's sum, {end:.3g}, is more than {name} holds, "
+                f"{high:.5g}, which is stored: take float32, or scale the values",
+                stacklevel=2,
+            )
 
     def _narrow(self, cubes: Cubes) -> bool:
         return not (self.drawn and cubes.level == 0)

@@ -8,6 +8,7 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -216,7 +217,7 @@ class Producer(torch.nn.Module):
         """
         super().__init__()
         where = type(self).__name__
-        sizes = (extent,) * 3 if isinstance(extent, int) else tuple(extent)
+        sizes = tuple(extent) if isinstance(extent, Sequence) else (extent,) * 3
         if len(sizes) != 3:
             raise ValueError(f"{where}: extent must be a number or (x, y, z), got {extent!r}")
         x, y, z = (check.whole(where, "extent", size, low=1, high=2**40) for size in sizes)
@@ -239,6 +240,15 @@ class Producer(torch.nn.Module):
             if not isinstance(channel, Channel):
                 raise ValueError(f"{where}: channels[{name!r}] must be a Channel, got {channel!r}")
         self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
+        for what, given in (("value_range", self.value_range), ("labels", self.labels)):
+            if unknown := sorted(map(str, {*given} - {*self.channels})):
+                known = ", ".join(self.channels)
+                raise ValueError(f"{where}: {what} has channel {unknown[0]!r}; there are {known}")
+        for name, ends in self.value_range.items():
+            if len(ends) != 2 or not -math.inf < ends[0] <= ends[1] < math.inf:
+                raise ValueError(
+                    f"{where}: value_range[{name!r}] must be (smallest, largest), got {ends!r}"
+                )
         self.made_of: dict[str, Any] = {}
         self._changes: deque[tuple[int, Where | None]] = deque(maxlen=_REMEMBERED)
 
@@ -256,14 +266,15 @@ class Producer(torch.nn.Module):
         """
         return torch.full((len(nodes),), Region.DATA, device=nodes.loc.device)
 
-    def fill(self, nodes: Nodes) -> Bricks | Mapping[str, Tensor] | Future:
+    def fill(self, nodes: Nodes) -> Bricks | Mapping[str, Tensor] | Tensor | Future:
         """Makes the voxels of k bricks, borders included.
 
         Coarse levels must be pre-filtered: a voxel is the mean over the space that it covers.
 
         Returns:
-            `Bricks`, or their voxels {channel: (k, z, y, x, c)} alone, now or as a future. Coarse
-            channels (`Channel.coarse`) are there if `nodes.coarse` is true, and only then.
+            `Bricks`, or their voxels {channel: (k, z, y, x, c)} alone, or those of the only channel
+            there is, now or as a future. Coarse channels (`Channel.coarse`) are there if
+            `nodes.coarse` is true, and only then.
         """
         raise NotImplementedError(f"{type(self).__name__}: fill is not written")
 
@@ -373,11 +384,17 @@ class Producer(torch.nn.Module):
             made = self.bricks_at(above, layout)
             parents = {name: bricks[row] for name, bricks in made.items()}
         answer = arrived(self.fill(Nodes(loc, layout, parents=parents)))
-        answer = answer if isinstance(answer, Bricks) else Bricks(data=answer)
+        answer = self.as_bricks(answer)
         for message in answer.errors.values():
             raise ValueError(f"{type(self).__name__}.at: {message}")
         shape = (len(loc), *(layout.side,) * 3, -1)
         return {name: on_device(rows, loc.device).view(shape) for name, rows in answer.data.items()}
+
+    def as_bricks(self, answer: Any) -> Any:
+        """Returns what `fill` gave as `Bricks`; what is none of its answers stays what it is."""
+        if isinstance(answer, Tensor) and len(self.channels) == 1:
+            answer = dict.fromkeys(self.channels, answer)
+        return Bricks(data=answer) if isinstance(answer, Mapping) else answer
 
     def close(self) -> None:
         """Closes files and ends threads; does nothing unless overridden."""

@@ -58,6 +58,12 @@ def _nearer_label(front: Hits, back: Hits) -> Tensor | None:
     return torch.where(front.depth <= back.depth, near, far)
 
 
+def nothing_like(field: Tensor, rays: int) -> Tensor:
+    """The field (r, ...) of rays that met nothing that gives it: zeros, of labels -1."""
+    shape = (rays, *field.shape[1:])
+    return field.new_full(shape, -1 if field.dtype == torch.int64 else 0)
+
+
 def behind(rays: Rays, front: Hits) -> Rays:
     """The rays with the light that `front` lets through."""
     return replace(rays, transmittance=1 - front.alpha[:, 0].to(torch.float64))

@@ -28,7 +28,7 @@ from ..pictures.background import Background
 from ..pictures.picture import Picture
 from ..pool import N3Tree
 from .around import around
-from .composite import Trace
+from .composite import Trace, nothing_like
 from .options import RenderOptions, RenderSettings, render_options
 from .tracer import Tracer
 from .trees import Shaders, box_around, trace_trees, tree_traces
@@ -301,13 +301,14 @@ class View:
 
 
 def _write(hits: Hits, pixels: Pixels, part: Hits, count: int) -> None:
-    """Puts the hits of some pixels among those of all."""
+    """Puts the hits of some pixels among those of all; what some have others have none of."""
     for name, field in vars(part).items():
-        if field is None:
-            continue
         if vars(hits)[name] is None:
-            vars(hits)[name] = field.new_empty((count, *field.shape[1:]))
-        vars(hits)[name][pixels] = field
+            if field is None:
+                continue
+            vars(hits)[name] = nothing_like(field, count)
+        whole = vars(hits)[name]
+        whole[pixels] = nothing_like(whole, len(part.alpha)) if field is None else field
 
 
 def empty_hits(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:

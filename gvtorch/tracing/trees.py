@@ -29,7 +29,7 @@ from ..shaders.filtered import Filtered
 from ..shaders.shader import Shader, check_shader
 from ..shaders.transfer_function import TransferFunction
 from .around import around
-from .composite import Trace, box_span, over
+from .composite import Trace, box_span, nothing_like, over
 from .options import RenderOptions
 from .pose import poses_of, world_box
 from .tracer import Batch, Tracer
@@ -192,7 +192,7 @@ def _filled(fields: Sequence[Tensor | None]) -> list[Tensor] | None:
         return None
     if len({field.shape[1:] for field in given}) > 1:
         raise ValueError("render: trees must give as many features each")
-    nothing = _nothing_like(given[0], len(given[0]))
+    nothing = nothing_like(given[0], len(given[0]))
     return [nothing if field is None else field for field in fields]
 
 
@@ -218,7 +218,7 @@ def _block(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     back = reduce(_nearer, [one.trace(replace(rays, transmittance=None)) for one in surfaces])
     depth = back.depth.to(rays.range.dtype)
     front_range = torch.cat((rays.range[:, :1], torch.minimum(rays.range[:, 1:], depth)), 1)
-    front = _nothing(rays, trees[0].tracer.dtype, normals=False)
+    front = _nothing(rays, trees[0].tracer.dtype)
     if media:
         front = _media(media, replace(rays, range=front_range))
     hit_clear = 1 - trees[0].tracer.arguments.depth_alpha
@@ -242,8 +242,7 @@ def _media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Goes along rays from box to box: where a ray is in one of them its tree is traced as ever."""
     span = _spans(trees, rays)
     ends = span.transpose(0, 1).flatten(1).sort(1).values  # (r, 2m)
-    normals = any(one.tracer.shading is not None for one in trees)
-    hits = _nothing(rays, trees[0].tracer.dtype, normals)
+    hits = _nothing(rays, trees[0].tracer.dtype, trees)
     stop = trees[0].tracer.arguments.stop_alpha
     for near, far in pairwise(ends.unbind(1)):
         middle = (near + far) / 2
@@ -284,7 +283,7 @@ def _further(
             continue
         known = fields[name]
         if known is None:
-            known = _nothing_like(more, len(which))
+            known = nothing_like(more, len(which))
         fields[name] = known.index_copy(0, at, join.get(name, torch.add)(known[at], more))
     return Hits(**fields)
 
@@ -416,7 +415,10 @@ def _cut(trees: Sequence[TreeTrace], rays: Rays) -> tuple[_Pieces, Tensor]:
     for number, one in enumerate(trees):
         tracer = one.tracer
         given = ops.RayArguments.of(tracer.inside(replace(rays, transmittance=None)))
-        segments = ops.trace_segments(given, tracer.arguments, by_node=True, backend=tracer.backend)
+        known, table = tracer.arguments, tracer.arguments.table_lm4
+        if table.dim() == 4:  # by two values, (l, m, m, 4): of intervals without a change
+            known = known._replace(table_lm4=table.diagonal(dim1=1, dim2=2).mT.contiguous())
+        segments = ops.trace_segments(given, known, by_node=True, backend=tracer.backend)
         missed |= segments.missed
         batch = Batch(tracer, given, segments, ops.list_samples(segments))
         first = batch.moved[batch.ray] + batch.starts
@@ -473,13 +475,19 @@ def _spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
     return torch.stack(spans)
 
 
-def _nothing(rays: Rays, dtype: torch.dtype, normals: bool) -> Hits:
-    """Hits of rays before they have met anything."""
+def _nothing(rays: Rays, dtype: torch.dtype, trees: Sequence[TreeTrace] = ()) -> Hits:
+    """Hits of rays before they have met anything, with the fields that any of the trees gives."""
     column = torch.zeros(len(rays.origin), 1, dtype=dtype, device=rays.origin.device)
     color = column.expand(-1, 3).contiguous()
+    shaded = [one.tracer for one in trees if one.tracer.shading is not None]
+    # Labels come as a feature, which the tracer turns into names.
+    widths = [0 if one.names is not None else one.shading.features for one in shaded]  # type: ignore[union-attr]
+    labeled = any(one.names is not None for one in shaded)
     return Hits(
         color=color,
-        normal=color if normals else None,
+        normal=color if shaded else None,
+        features=column.expand(-1, max(widths)).contiguous() if shaded else None,
+        label=torch.full_like(column, -1, dtype=torch.int64) if labeled else None,
         alpha=1 - rays.light().to(dtype),
         depth=torch.full_like(column, torch.inf),
         samples=torch.zeros_like(column[:, 0], dtype=torch.int32),
@@ -498,17 +506,11 @@ def _scattered(found: Sequence[Hits], places: Sequence[Tensor]) -> Hits:
         like = next((field for field in filled if field is not None), None)
         if like is not None:
             parts = [
-                _nothing_like(like, len(one.alpha)) if field is None else field
+                nothing_like(like, len(one.alpha)) if field is None else field
                 for one, field in zip(found, filled, strict=True)
             ]
             fields[name] = torch.cat(parts)[at]
     return Hits(**fields)
-
-
-def _nothing_like(field: Tensor, rays: int) -> Tensor:
-    """The field (r, ...) of rays that met nothing that gives it: zeros, of labels -1."""
-    shape = (rays, *field.shape[1:])
-    return field.new_full(shape, -1 if field.dtype == torch.int64 else 0)
 
 
 def _unit(vectors: Tensor) -> Tensor:

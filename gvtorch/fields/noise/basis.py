@@ -19,7 +19,7 @@ def perlin(points: Points, *, seed: int = 0, period: Period = None) -> Tensor:
 
     Args:
         points: (..., 2) or (..., 3) float32 or float64, or 2 or 3 tensors x, y (, z) that
-            broadcast. Beyond 2^31 nothing is defined; float32 has no fractions beyond 2^23.
+            broadcast. Coordinates beyond 2^29 count as 0; float32 has no fractions beyond 2^23.
         seed: Another noise for each.
         period: After how many cells the noise repeats, one for all axes or one for each.
 

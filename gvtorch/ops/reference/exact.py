@@ -1,4 +1,4 @@
-"""Numbers that every backend rounds alike, as csrc/base/hd.h in every bit of float32."""
+"""Numbers that every backend rounds alike, as csrc/base/arithmetic.h in every bit."""
 
 from __future__ import annotations
 
@@ -78,12 +78,13 @@ def _polynomial(x: Tensor, highest: float, *coefficients: float) -> Tensor:
 
 
 def log2_exact(value: Tensor) -> Tensor:
-    """Base-2 logarithm of positive normal floats, from + - * / alone (float64: torch.log2).
+    """Base-2 logarithm of positive normal numbers, from + - * / alone.
 
     Source: Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964, 4.1.27.
     """
     if value.dtype == torch.float64:
-        return torch.log2(value)
+        exponent, s, series = _log_series(value)
+        return exponent + series * s * 1.4426950408889634
     bits = value.contiguous().view(torch.int32)
     exponent = ((bits >> 23) - 127).to(torch.float32)
     mantissa = ((bits & 0x007FFFFF) | 0x3F800000).view(torch.float32)
@@ -101,35 +102,55 @@ def log_exact(value: Tensor) -> Tensor:
     is infinite or no number, itself. Source: as `log2_exact`.
     """
     known = value.detach()
-    fraction, power = torch.frexp(known)
-    large = fraction > 0.70710678
-    mantissa = torch.where(large, fraction, fraction + fraction)
-    exponent = torch.where(large, power, power - 1).to(value.dtype)
-    s = (mantissa - 1) / (mantissa + 1)
-    series = _polynomial(s * s, *(2 / odd for odd in range(19, 0, -2)))
+    exponent, s, series = _log_series(known)
     found = torch.where(known < torch.inf, exponent * 0.6931471805599453 + s * series, known)
     return found + (value - known) / known if value.requires_grad else found
 
 
+def _log_series(value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The power of two next to numbers, and two factors of the natural logarithm of what is left:
+    s = (m - 1) / (m + 1), and 2 + 2/3 s^2 + 2/5 s^4 ...
+    """
+    fraction, power = torch.frexp(value)
+    large = fraction > 0.70710678
+    mantissa = torch.where(large, fraction, fraction + fraction)
+    s = (mantissa - 1) / (mantissa + 1)
+    series = _polynomial(s * s, *(2 / odd for odd in range(19, 0, -2)))
+    return torch.where(large, power, power - 1).to(value.dtype), s, series
+
+
+#: ln(2)^k / k! for k from 14 to 1.
+_SLOPE = (
+    *(6.778726354822545e-14, 1.3691488853904128e-12, 2.5678435993488206e-11),
+    *(4.4455382718708116e-10, 7.054911620801123e-09, 1.01780860092397e-07),
+    *(1.321548679014431e-06, 1.5252733804059841e-05, 0.0001540353039338161),
+    *(0.0013333558146428443, 0.009618129107628477, 0.05550410866482158),
+    *(0.24022650695910072, 0.6931471805599453),
+)
+
+
 def _exp2_slope(f: Tensor) -> Tensor:
     """(2^f - 1) / f for f in [-0.5, 0.5]."""
+    if f.dtype == torch.float64:
+        return _polynomial(f, *_SLOPE)
     low = (1.52527338e-5, 1.54035304e-4, 1.33335581e-3, 9.61812911e-3)
     return _polynomial(f, *low, 5.55041087e-2, 2.40226507e-1, 6.93147181e-1)
 
 
 def exp2_exact(value: Tensor) -> Tensor:
-    """2 to the power of a float below 127, from + - * alone; 0 below -126 (float64: torch.exp2).
+    """2 to the power of a number, from + - * alone: 0 where it is at most -126, and the largest
+    power 2^126; in float64 -1022 and 2^1022.
 
     Source: Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964, 4.2.1.
     """
-    if value.dtype == torch.float64:
-        return torch.exp2(value)
-    tiny = ~(value > -126)
-    x = torch.where(tiny, 0.0, smaller(value, torch.full_like(value, 126.0)))
+    wide = value.dtype == torch.float64
+    most, bias, digits = (1022, 1023, 52) if wide else (126, 127, 23)
+    tiny = ~(value > -most)
+    x = torch.where(tiny, 0.0, smaller(value, torch.full_like(value, float(most))))
     whole = torch.floor(x + 0.5)
     f = x - whole
     series = _exp2_slope(f) * f + 1.0
-    power = ((whole.to(torch.int32) + 127) << 23).view(torch.float32)
+    power = ((whole.to(torch.int64 if wide else torch.int32) + bias) << digits).view(value.dtype)
     return torch.where(tiny, 0.0, series * power)
 
 
@@ -137,8 +158,6 @@ def taken_by(halvings: Tensor) -> Tensor:
     """What is taken from light that is halved so often: 1 - 2^-halvings, as exact where that is
     little.
     """
-    if halvings.dtype == torch.float64:
-        return -torch.expm1(halvings * -0.69314718055994531)
     thin = halvings < 0.5
     near = torch.where(thin, halvings, 0.0)
     return torch.where(thin, _exp2_slope(-near) * near, 1 - exp2_exact(-halvings))

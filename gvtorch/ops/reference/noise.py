@@ -25,6 +25,8 @@ from .exact import sqrt_exact
 
 #: Points evaluated together on the CPU: their temporaries then stay in its caches.
 CHUNK = 1 << 16
+#: Coordinates from here on count as 0: 32 bits count cells, skewed ones of simplices too.
+_MOST = 2.0**29
 #: In the order of `NoiseKind` in csrc/noise/noise.h.
 KINDS = ("perlin", "value", "simplex", "F1", "F2", "F2-F1")
 
@@ -76,7 +78,8 @@ def noise(
     def evaluate(*axes: Tensor) -> Tensor:
         return make(axes, given) if kind < 3 else make(axes, given, KINDS[kind])
 
-    return in_chunks(evaluate, point_pn.unbind(1))
+    counted = torch.where(point_pn.detach().abs() >= _MOST, 0.0, point_pn)
+    return in_chunks(evaluate, counted.unbind(1))
 
 
 def _perlin(axes: Sequence[Tensor], given: Given) -> Tensor:

@@ -238,8 +238,6 @@ GV_HD T exp2_exact(T value) {
   return select(normal, series * bit_cast<T>((bit_cast<WordOf<T>>(whole) + 127u) << 23), T{});
 }
 
-GV_HD double log2_exact(double value) { return ::log2(value); }
-
 // Takes a positive, normal number apart: it is the returned fraction, in [1/2, 1), times 2^power.
 template <class T>
 GV_HD T fraction_of(T value, IntOf<T>& power) {
@@ -279,15 +277,42 @@ GV_HD T log_exact(T value) {
   const T found = exponent * static_cast<Real>(0.6931471805599453) + s * series;
   return select(value < static_cast<Real>(INFINITY), found, value);
 }
-GV_HD double exp2_exact(double value) { return ::exp2(value); }
+
+// The same in float64, by longer series.
+GV_HD double log2_exact(double value) {
+  int32_t power;
+  const double fraction = fraction_of(value, power);
+  const bool large = fraction > 0.70710678;
+  const double mantissa = large ? fraction : fraction + fraction, exponent = large ? power : power - 1;
+  const double s = (mantissa - 1) / (mantissa + 1), z = s * s;
+  double series = 2.0 / 19;
+  for (int32_t odd = 17; odd > 0; odd -= 2) series = series * z + 2.0 / odd;
+  return exponent + series * s * 1.4426950408889634;
+}
+GV_HD double exp2_slope(double f) {
+  constexpr double kSeries[] = {6.778726354822545e-14,  1.3691488853904128e-12, 2.5678435993488206e-11,
+                                4.4455382718708116e-10, 7.054911620801123e-09,  1.01780860092397e-07,
+                                1.321548679014431e-06,  1.5252733804059841e-05, 0.0001540353039338161,
+                                0.0013333558146428443,  0.009618129107628477,   0.05550410866482158,
+                                0.24022650695910072,    0.6931471805599453};
+  double series = kSeries[0];
+  for (int term = 1; term < 14; ++term) series = series * f + kSeries[term];
+  return series;
+}
+GV_HD double exp2_exact(double value) {
+  if (!(value > -1022.0)) return 0;
+  const double x = smaller(value, 1022.0);
+  const int32_t whole = floor_int(x + 0.5);
+  const double f = x - whole;
+  return (exp2_slope(f) * f + 1.0) * bit_cast<double>(static_cast<int64_t>(whole + 1023) << 52);
+}
 
 // What is taken from light that is halved so often: 1 - 2^-halvings, as exact where that is little.
 template <class T>
 GV_HD T taken_by(T halvings) {
-  const auto thin = halvings < 0.5f;
+  const auto thin = halvings < static_cast<RealOf<T>>(0.5);
   return select(thin, exp2_slope(-halvings) * halvings, 1 - exp2_exact(-halvings));
 }
-GV_HD double taken_by(double halvings) { return -::expm1(halvings * -0.69314718055994531); }
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

@@ -496,7 +496,8 @@ struct CutBricks {
 
   GV_HD int32_t side() const { return brick_size + 2 * border; }
   GV_HD int64_t low(int64_t plane, int32_t axis) const {
-    return place_k3[3 * (plane / side()) + axis] * brick_size - border;
+    const int64_t place = place_k3[3 * (plane / side()) + axis], far = int64_t{1} << 50;  // beyond any level
+    return larger(-far, smaller(place, far)) * brick_size - border;
   }
   GV_HD int64_t inside(int64_t at, int32_t axis) const {
     return larger<int64_t>(0, smaller<int64_t>(at, size_3[axis] - 1));

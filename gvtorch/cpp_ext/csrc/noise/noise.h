@@ -125,6 +125,13 @@ struct NoiseAt {
 
   // --- Kinds
 
+  // A coordinate; those beyond what 32 bits can count, skewed too, count as 0.
+  static GV_HD T counted(T place) {
+    constexpr auto kMost = static_cast<Real>(0x1p29);
+    const T none{};
+    return select(place >= kMost, none, select(place <= -kMost, none, place));
+  }
+
   // What `corner(bits, away)` gives at the 2^N corners of the point's cell, interpolated.
   template <class Corner>
   GV_HD T between(const T* place, const Corner& corner) const {
@@ -295,7 +302,7 @@ struct MakeNoise {
   GV_HD void operator()(int64_t index) const {
     const T* point = static_cast<const T*>(args.point_pn) + N * index;
     T place[N];
-    for (int axis = 0; axis < N; ++axis) place[axis] = point[axis];
+    for (int axis = 0; axis < N; ++axis) place[axis] = NoiseAt<T, N>::counted(point[axis]);
     static_cast<T*>(args.value_p)[index] = NoiseAt<T, N>(args).template make<kKind>(place);
   }
 };
@@ -314,7 +321,7 @@ void noise_in_lanes(const NoiseArgs& args, int64_t begin, int64_t end) {
       point = last;
     }
     Floats at[N];
-    for (int axis = 0; axis < N; ++axis) at[axis] = pick(point + axis, N * lane_numbers());
+    for (int axis = 0; axis < N; ++axis) at[axis] = noise.counted(pick(point + axis, N * lane_numbers()));
     const Floats found = noise.template make<kKind>(at);
     memcpy(value, &found, sizeof(value));
     memcpy(static_cast<float*>(args.value_p) + index, value, static_cast<size_t>(some) * sizeof(float));
