@@ -405,6 +405,13 @@ def test_cache_ops_pass_opcheck(compiled):
         torch.library.opcheck(op.default, arguments)
 
 
+def test_slots_that_do_not_exist_were_not_used(backend):
+    device = DEVICES[backend]
+    order, stamp = int32([0, -1, 5, 1], device), int32([3, 3], device)
+    found, unused = ops.lru_partition(order, stamp, int32([3], device), backend=backend)
+    assert found.tolist() == [-1, 5, 0, 1] and int(unused) == 2
+
+
 def test_nothing_to_do(backend):
     device = DEVICES[backend]
     none, frame = int32([], device), int32([1], device)

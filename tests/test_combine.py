@@ -285,6 +285,31 @@ def test_producers_of_any_kind_tell_values_at_points(blobs):
         assert engine.trees
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: gv.PointProducer(torch.rand(9, 3), extent=16),
+        lambda: gv.FieldProducer(gv.sdf.Sphere(), 16),
+        lambda: gv.Hypertexture(gv.sdf.Sphere(), 16, thickness=0.1),
+    ],
+)
+def test_points_to_look_at_are_checked(make):
+    producer = make()
+    one = producer.at(torch.zeros(3))
+    many = producer.at(torch.zeros(2, 3))
+    for name, values in one.items():
+        assert values.dim() == 1 and torch.equal(values, many[name][1])
+        assert values.dtype == many[name].dtype
+    for points, told in (
+        ([0.0, 0.0, 0.0], "points must be a Tensor, got list"),
+        (torch.zeros(6), r"points must be (..., 3), got (6,)"),
+        (torch.full((2, 3), torch.nan), "points must be finite"),
+    ):
+        with pytest.raises(ValueError) as caught:
+            producer.at(points)
+        assert told in str(caught.value)
+
+
 def test_wider_nodes_are_the_same_voxels_and_more():
     producer = gv.FieldProducer(Ramp(), 32, box=BOX)
     layout = Layout.of(producer, 4, 1, torch.device("cpu"))

@@ -420,8 +420,11 @@ def test_samples_that_name_nothing_are_zero(walk):
         {"brick": torch.full_like(segments.brick, 10**6)},
         {"depth": torch.full_like(segments.depth, 60)},
     ):
-        values = sample_bricks(*changed(walk, change))
+        given = changed(walk, change)
+        values = sample_bricks(*given)
         assert (values[:2] == 0).all()
+        if "segment" in change or "ray_index" in change:
+            assert torch.equal(values, sample_bricks(*given, backend="reference"))
 
 
 @pytest.mark.backend("cpp")

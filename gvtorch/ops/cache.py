@@ -115,7 +115,9 @@ def lru_partition(
     Returns:
         order_k (k,), unused_1 (1,) int64: how many this frame did not use.
     """
-    used = stamp_s[order_k.to(torch.int64)] == frame_1
+    order = order_k.to(torch.int64)
+    known = (order >= 0) & (order < len(stamp_s))  # others count as unused
+    used = known & (stamp_s[torch.where(known, order, 0)] == frame_1)
     return torch.cat((order_k[~used], order_k[used])), (~used).sum().view(1)
 
 

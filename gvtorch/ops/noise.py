@@ -55,6 +55,8 @@ def noise(
     check.whole(where, "seed", seed, low=-(2**63))
     check.number(where, "jitter", jitter, low=0, high=1)
     check.whole(where, "reach", reach, low=1, high=2)
+    if not isinstance(period, Sequence):
+        raise ValueError(f"{where}: period must be numbers of cells, one an axis, got {period!r}")
     each = (*period, 0, 0, 0)[:3]
     for one in each:
         check.whole(where, "period", one, low=0, high=2**28)

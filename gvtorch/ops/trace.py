@@ -350,8 +350,8 @@ def composite(
     alpha_k = check.instance(where, "alpha_k", alpha_k, Tensor)
     device, real = alpha_k.device, alpha_k.dtype
     check_real(where, "alpha_k", alpha_k, "(k,)")
-    check.tensor(where, "offset_r", offset_r, ("o",), torch.int64, device)
-    rays = check.whole(where, "offset_r's length", offset_r.shape[0], low=1) - 1
+    length = len(offset_r) if check.instance(where, "offset_r", offset_r, Tensor).dim() else 0
+    rays = check.whole(where, "offset_r's length", length, low=1) - 1
     clear = alpha_k.new_ones(rays) if clear_r is None else clear_r
     fields = (
         ("alpha_k", alpha_k, "k", real),

@@ -108,7 +108,7 @@ def _checked(
     if not look:
         _refuse_late(where, answer, [*fields.values()], layout.device)
         return form(kind=kind, **fields)
-    counts = _refuse_bad(kind, [*fields.values()], errors)
+    counts = _refuse_bad(form, kind, [*fields.values()], errors)
     missing = sorted(fine - {*fields["constants"]})
     if missing and counts[Region.CONSTANT]:
         raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
@@ -201,7 +201,10 @@ def _alias(
 
 
 def _refuse_bad(
-    kind: Tensor | None, fields: Sequence[Mapping[str, Tensor | TableRows]], errors: dict[int, str]
+    form: type[Form],
+    kind: Tensor | None,
+    fields: Sequence[Mapping[str, Tensor | TableRows]],
+    errors: dict[int, str],
 ) -> list[int]:
     """Adds items of an unknown kind, and those that hold NaN or infinite values, to the errors.
     Rows of a table are not looked at: `BrickTable` has checked them. Returns how many items are of
@@ -224,7 +227,8 @@ def _refuse_bad(
     if kind is not None and sum(counts) < len(kind):
         for index in ((kind < Region.EMPTY) | (kind > Region.ALIAS)).nonzero()[:, 0].tolist():
             made = int(kind[index])
-            errors[index] = "the values are not finite" if made == -1 else f"{made} is no Region"
+            late = made == -1 and form is Bricks  # see `Bricks.kind`
+            errors[index] = "the values are not finite" if late else f"{made} is no Region"
     for (channel, values), whole in zip(floats, finite, strict=True):
         if whole:
             continue

@@ -15,7 +15,7 @@ from ..base.messages import one_line
 from ..fields import Distance, Field, Interval, Solid
 from ..fields.field import checked_field
 from ..pool import Channel
-from .producer import Bricks, Nodes, Producer, Region, Regions, clocks_of
+from .producer import Bricks, Nodes, Producer, Region, Regions, check_points, clocks_of
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
 _FEW = 12  # bricks: smaller groups cost more than they save by leaving out parts of a field
@@ -180,6 +180,9 @@ class FieldProducer(Producer):
         the field itself, in the dtype of the points, not filtered and not rounded.
         """
         where = type(self).__name__
+        check_points(f"{where}.at", points)
+        if points.dim() == 1:  # numbers of no axis would be promoted
+            return {name: values[0] for name, values in self.at(points[None]).items()}
         return _by_channel(where, _asked(where, self.field, self.field, points), points)
 
     def _made(self, nodes: Nodes, field: nn.Module) -> dict[str, Tensor]:

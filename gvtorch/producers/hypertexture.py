@@ -27,7 +27,7 @@ from .field import (
     interval_of,
     moving,
 )
-from .producer import Layout, Nodes, Producer, Region, Regions, by_depth
+from .producer import Layout, Nodes, Producer, Region, Regions, by_depth, check_points
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
 _COARSEST = 1.5  # cells a voxel, from which on the mean tells nothing of the noise
@@ -116,7 +116,7 @@ class Hypertexture(Tally, Producer):
         most = amplitude * sum(one.amplitude for one in series) * noise.bounds(noise.perlin).high
         reach = thickness * max(most + softness - 0.5, 0.0)
         extent, box = _cut_out(where, shape, reach, extent, box)
-        if not dtype.is_floating_point:
+        if not check.instance(where, "dtype", dtype, torch.dtype).is_floating_point:
             raise ValueError(f"{where}: dtype must be one of floats, got {dtype}")
         channels = {"density": Channel(dtype)}
         if distances:
@@ -172,6 +172,9 @@ class Hypertexture(Tally, Producer):
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the channels (..., 1) at points (..., 3), of the points' dtype, not filtered."""
+        check_points(f"{type(self).__name__}.at", points)
+        if points.dim() == 1:  # numbers of no axis would be promoted
+            return {name: values[0] for name, values in self.at(points[None]).items()}
         distance = distances_of(type(self).__name__, self.shape, points)
         total = distance * (-1 / self.thickness)
         for one in self.octaves:

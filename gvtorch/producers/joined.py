@@ -52,6 +52,9 @@ class JoinedProducer(Producer):
             ValueError: One has several channels, or they differ in extent, place or branching.
         """
         where = type(self).__name__
+        if not isinstance(producers, Mapping):
+            got = type(producers).__name__
+            raise ValueError(f"{where}: producers must be producers by name, got a {got}")
         if not producers:
             raise ValueError(f"{where}: producers must hold at least one")
         channels, ranges, labels = dict[str, Any](), dict[str, Any](), dict[str, Any]()

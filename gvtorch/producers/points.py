@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..base import check
 from ..points.points import Points
 from ..points.sorted import SortedPoints, sort_points
 from ..points.splat import Cubes, ranges, values
@@ -71,7 +72,7 @@ class PointProducer(Producer):
                 box, or a number is out of its range.
         """
         where = type(self).__name__
-        if not dtype.is_floating_point:
+        if not check.instance(where, "dtype", dtype, torch.dtype).is_floating_point:
             raise ValueError(f"{where}: dtype must be one of floats, got {dtype}")
         if isinstance(positions, (str, Path)):
             positions = SortedPoints.open(positions)

@@ -354,8 +354,9 @@ class Producer(torch.nn.Module):
         without one, this prepares the producer for bricks of 8^3.
 
         Raises:
-            ValueError: A brick can't be made.
+            ValueError: Points are not that, or a brick can't be made.
         """
+        check_points(f"{type(self).__name__}.at", points)
         if self.layout is None:
             layout = Layout.of(self, 8, 1, points.device)
             self.prepare(layout)
@@ -403,6 +404,14 @@ class Producer(torch.nn.Module):
         extent = "x".join(str(n) for n in self.extent)
         channels = phrase(self.channels)
         return f"{type(self).__name__}({extent} (x, y, z), N={self.branching}, {channels})"
+
+
+def check_points(where: str, points: Any) -> None:
+    """Raises ValueError unless points are (..., 3) and finite."""
+    if check.instance(where, "points", points, Tensor).shape[-1:] != (3,):
+        raise ValueError(f"{where}: points must be (..., 3), got {check.describe(points)}")
+    if not bool(torch.isfinite(points).all()):
+        raise ValueError(f"{where}: points must be finite")
 
 
 def clocks_of(module: torch.nn.Module) -> list[Tensor]:

@@ -216,6 +216,8 @@ def _layers(
 ) -> Iterator[tuple[float, Tensor]]:
     """Yields amplitude and noise of each octave."""
     place = as_points(where, points)
+    if not callable(basis):
+        raise ValueError(f"{where}: basis must be a function such as noise.perlin, got {basis!r}")
     every = periods(where, period, place.shape[-1])
     if period is not None and lacunarity != int(lacunarity):
         raise ValueError(f"{where}: with a period lacunarity must be whole, got {lacunarity!r}")

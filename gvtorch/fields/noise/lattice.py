@@ -45,7 +45,7 @@ def periods(where: str, period: Period, n: int, multiple: int = 1) -> tuple[int,
     """
     if period is None:
         return (0,) * n
-    each = (period,) * n if isinstance(period, int) else tuple(period)
+    each = tuple(period) if isinstance(period, Sequence) else (period,) * n
     if len(each) != n:
         raise ValueError(f"{where}: period must be an int or {n} of them, got {period!r}")
     for one in each:

@@ -104,7 +104,14 @@ def sample_bricks(
 ) -> Tensor:
     """Twin of `torch.ops.gvtorch.sample_bricks`: (k, c). Bricks may be float64 here."""
     a, real, segment = arguments, segments.distance.dtype, samples.segment.to(torch.int64)
-    beam = Beam.enter(rays, a, real)[segments.ray_index.to(torch.int64)[segment]]
+    count, rays_there = len(segments.distance), len(rays.origin_r3)
+    if not count or not rays_there:
+        return segments.distance.new_zeros((len(segment), a.bricks_bzyxc.shape[-1]))
+    ray = segments.ray_index.to(torch.int64)
+    known = (segment >= 0) & (segment < count)
+    segment = torch.where(known, segment, 0)
+    known = known & (ray[segment] >= 0) & (ray[segment] < rays_there)
+    beam = Beam.enter(rays, a, real)[torch.where(known, ray[segment], 0)]
     base, end, seen = segments.distance[segment].unbind(1)
     first, _, level = segments.interval[segment].unbind(1)
     length = torch.tensor(a.step, dtype=real).to(base) * 2.0 ** level.clamp(min=0).to(real)
@@ -121,7 +128,8 @@ def sample_bricks(
     channel = Bricks.of(a)
     probe = Probe(beam, Answer(fine, coarse, *levels.voxels(depths[2])), channel)
     components = channel.components(a.bricks_bzyxc, a.constant_tnc)
-    return torch.stack([probe.number(component, t) for component in components], 1)
+    found = torch.stack([probe.number(component, t) for component in components], 1)
+    return torch.where(known[:, None], found, 0.0)
 
 
 def composite(
