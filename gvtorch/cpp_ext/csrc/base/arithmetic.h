@@ -8,7 +8,7 @@
 //
 // Masks are joined by && || and !. A single ray is one lane: its mask is a bool, for which && and || stop early.
 //
-// log2 and exp2 in float32 are written with + - * / and bit moves alone, always in the same order, so that the torch
+// log2 and exp2 are written with + - * / and bit moves alone, always in the same order, so that the torch
 // twin (ops/reference/exact.py), the CPU and the GPU agree to the last bit. Series: Abramowitz and Stegun, "Handbook of
 // Mathematical Functions", 1964, 4.1.27 (logarithm by atanh) and 4.2.1 (exponential).
 #pragma once
