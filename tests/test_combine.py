@@ -251,6 +251,11 @@ def test_a_producer_without_a_time_says_so(make):
     assert not hasattr(producer, "time") and producer.version == 0
 
 
+def test_producers_are_joined_by_name():
+    with pytest.raises(ValueError, match="producers must be producers by name, got a list"):
+        gv.JoinedProducer([pulse()])
+
+
 def test_a_time_is_a_number():
     with pytest.raises(ValueError, match="time must be finite"):
         gv.FieldProducer(Pulse(), 32, box=BOX).time = float("nan")

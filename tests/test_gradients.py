@@ -148,3 +148,23 @@ def test_a_compiled_shader_raises_too(tree, monkeypatch, quick):
     rays = rays_of(tree)
     with pytest.raises(RuntimeError, match=lost("cone_r2")):
         gv.trace(tree, replace(rays, cone=rays.cone.clone().requires_grad_()), shader)
+
+
+def test_ops_that_make_floats_refuse_what_they_would_lose(backend):
+    device = DEVICES[backend]
+    camera_nc = torch.rand(1, 26, dtype=torch.float64, device=device, requires_grad=True)
+    with pytest.raises(RuntimeError, match="pinhole_rays: gradients by camera_nc would be lost"):
+        gv.ops.pinhole_rays(camera_nc, 0, 2, 2, 2, backend=backend)
+    values = torch.rand(4, 4, 4, 1, device=device, requires_grad=True)
+    place = torch.zeros(1, 3, dtype=torch.int64, device=device)
+    with pytest.raises(RuntimeError, match="cut_bricks: gradients by values_zyxc would be lost"):
+        gv.ops.cut_bricks(values, place, 2, 1, backend=backend)
+    with torch.no_grad():
+        assert not gv.ops.cut_bricks(values, place, 2, 1, backend=backend).requires_grad
+
+
+def test_the_voxelizer_refuses_gradients_of_triangles():
+    corner = torch.rand(1, 3, 3, dtype=torch.float64, requires_grad=True)
+    none = torch.zeros(1, 3, dtype=torch.float64)
+    with pytest.raises(RuntimeError, match="voxelize: gradients by corner_f33 would be lost"):
+        gv.ops.voxelize(corner, torch.ones(1).bool(), torch.zeros(1, 6), none, none, 4, 0.0)

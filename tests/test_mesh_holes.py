@@ -157,6 +157,8 @@ def test_a_pole_that_is_computed_again_is_the_same_place():
     ball = gv.Mesh(vertices=np.stack(part, -1).reshape(-1, 3), faces=faces)
     flat = gv.Mesh(vertices=ball.vertices.round(12), faces=faces)
     ends = [gv.MeshProducer(one, resolution=32).voxelizer for one in (ball, flat)]
+    with pytest.raises(ValueError, match="faces must be whole numbers"):
+        gv.Mesh(vertices=ball.vertices, faces=faces + 0.5)
     made, expected = (one.region((0, 0, 0), one.extent)["coverage"].double().sum() for one in ends)
     assert float(made) == pytest.approx(float(expected), rel=1e-6) and float(made) > 5000 * 255
 

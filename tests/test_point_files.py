@@ -118,6 +118,8 @@ def test_what_may_be_meant_is_asked_for(tmp_path):
     assert (points.positions == MASS[:, None]).all() and (points.radius == 0.5).all()
     with pytest.raises(ValueError, match="has no column 'q'; it has place, mass"):
         gv.read_points(path, positions="q")
+    with pytest.raises(ValueError, match=r"read_points: unknown option 'radii'; known: .*radius"):
+        gv.read_points(path, radii=0.5)
     with pytest.raises(ValueError, match="positions must be 3 numbers, the columns are 1"):
         gv.read_points(path, positions="u", values="u")
 
