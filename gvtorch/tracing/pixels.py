@@ -38,8 +38,8 @@ Scene = N3Tree | Mapping[str, N3Tree]
 Pixels = slice | Tensor  # some of the pixels of all pictures of a camera, row by row
 #: Hits of an earlier pass, which are overwritten, and which (r,) bool of their rays to trace again.
 Again = tuple[Hits, Tensor]
-_RAYS_A_BLOCK = 1 << 22
-_WATCHED = 1 << 16  # of these on a CPU, where progress shows and Ctrl-C ends a picture
+_RAYS_A_BLOCK = 1 << 22  # rays that are traced at once
+_WATCHED = 1 << 16  # the same on a CPU, where progress is to show and Ctrl-C waits for a block
 
 
 @explicit(RenderOptions)

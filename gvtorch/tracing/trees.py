@@ -479,10 +479,12 @@ def _nothing(rays: Rays, dtype: torch.dtype, trees: Sequence[TreeTrace] = ()) ->
     """Hits of rays before they have met anything, with the fields that any of the trees gives."""
     column = torch.zeros(len(rays.origin), 1, dtype=dtype, device=rays.origin.device)
     color = column.expand(-1, 3).contiguous()
-    shaded = [one.tracer for one in trees if one.tracer.shading is not None]
-    # Labels come as a feature, which the tracer turns into names.
-    widths = [0 if one.names is not None else one.shading.features for one in shaded]  # type: ignore[union-attr]
-    labeled = any(one.names is not None for one in shaded)
+    shaded = [
+        (one.tracer.names, shading) for one in trees if (shading := one.tracer.shading) is not None
+    ]
+    # A label is the kernel's only feature, which the tracer turns into a name: none is left.
+    widths = [shading.features if names is None else 0 for names, shading in shaded]
+    labeled = any(names is not None for names, _ in shaded)
     return Hits(
         color=color,
         normal=color if shaded else None,
