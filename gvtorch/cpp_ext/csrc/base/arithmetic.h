@@ -261,9 +261,14 @@ GV_HD double fraction_of(double value, int32_t& power) {
 GV_HD Doubles fraction_of(Doubles value, Longs& power) { return wide_fraction_of(value, power); }
 #endif
 
-// Natural logarithm of a positive, normal number, in both precisions; of what is infinite or no number, itself.
+// Of a positive, normal number: the exponent of the power of two next to it, and what is left: s * series is its
+// natural logarithm.
 template <class T>
-GV_HD T log_exact(T value) {
+struct LogParts {
+  T exponent, s, series;
+};
+template <class T>
+GV_HD LogParts<T> log_parts(T value) {
   using Real = RealOf<T>;
   IntOf<T> power;
   const T fraction = fraction_of(value, power);
@@ -274,20 +279,22 @@ GV_HD T log_exact(T value) {
   const T z = s * s;
   T series = splat<T>(static_cast<Real>(2.0 / 19));
   for (int32_t odd = 17; odd > 0; odd -= 2) series = series * z + static_cast<Real>(2.0 / odd);
-  const T found = exponent * static_cast<Real>(0.6931471805599453) + s * series;
+  return {exponent, s, series};
+}
+
+// Natural logarithm of a positive, normal number, in both precisions; of what is infinite or no number, itself.
+template <class T>
+GV_HD T log_exact(T value) {
+  using Real = RealOf<T>;
+  const LogParts<T> parts = log_parts(value);
+  const T found = parts.exponent * static_cast<Real>(0.6931471805599453) + parts.s * parts.series;
   return select(value < static_cast<Real>(INFINITY), found, value);
 }
 
-// The same in float64, by longer series.
+// The base-2 logarithm, and powers of two, in float64, by longer series.
 GV_HD double log2_exact(double value) {
-  int32_t power;
-  const double fraction = fraction_of(value, power);
-  const bool large = fraction > 0.70710678;
-  const double mantissa = large ? fraction : fraction + fraction, exponent = large ? power : power - 1;
-  const double s = (mantissa - 1) / (mantissa + 1), z = s * s;
-  double series = 2.0 / 19;
-  for (int32_t odd = 17; odd > 0; odd -= 2) series = series * z + 2.0 / odd;
-  return exponent + series * s * 1.4426950408889634;
+  const LogParts<double> parts = log_parts(value);
+  return parts.exponent + parts.series * parts.s * 1.4426950408889634;
 }
 GV_HD double exp2_slope(double f) {
   constexpr double kSeries[] = {6.778726354822545e-14,  1.3691488853904128e-12, 2.5678435993488206e-11,
