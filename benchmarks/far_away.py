@@ -35,7 +35,8 @@ SCANS = {
     "brain": ("mni_icbm152_t1_197x233x189_uint8.nii.gz", (40, 255, 0.05), (185, 195)),
 }
 SUN = gv.DirectionalLight((-0.6, 0.7, 1.0))  # shines from above, right of the eye
-PARTS = 16  # rays a pixel, along each side
+PARTS = 16  # rays a pixel of the truth, along each side
+STILL = 4  # and of a still picture
 SCALE = 5  # pixels of the file for one of a picture
 
 
@@ -69,7 +70,7 @@ def functions(scan: str) -> dict[str, gv.TransferFunction]:
 
 
 def parallel(tree: gv.N3Tree, pixel: float, parts: int) -> gv.Rays:
-    """Rays through the whole tree, parts^2 a pixel; one alone is as wide as the pixel."""
+    """Rays through the whole tree, parts^2 a pixel, each as wide as its part."""
     real = {"dtype": torch.float64}
     way = torch.nn.functional.normalize(torch.tensor([0.37, 0.23, 1.0], **real), dim=0)
     across = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], **real), way)
@@ -81,7 +82,7 @@ def parallel(tree: gv.N3Tree, pixel: float, parts: int) -> gv.Rays:
     at = ((torch.arange(side * parts, **real) + 0.5) / parts - side / 2 + 0.37) * pixel
     y, x = torch.meshgrid(at, at, indexing="ij")
     origin = tree.box.mean(0) + x.reshape(-1, 1) * across + y.reshape(-1, 1) * up - 2 * reach * way
-    wide = torch.tensor([pixel if parts == 1 else 0.0, 0.0], **real)
+    wide = torch.tensor([pixel / parts, 0.0], **real)
     columns = (way, wide, torch.tensor([0.0, 1e9], **real))
     direction, cone, limits = (one.expand(len(origin), -1).contiguous() for one in columns)
     rays = gv.Rays(origin=origin, direction=direction, cone=cone, range=limits)
@@ -113,8 +114,8 @@ def compare(found: Tensor, truth: Tensor) -> str:
 def main(settings: Settings) -> None:
     """Measures all and prints the table."""
     rows: list[Tensor] = []
-    print("| scan | function | voxels a pixel | one ray | means | filtered | samples |")
-    print("|---|---|---|---|---|---|---|")
+    print("| scan | function | voxels a pixel | one ray | means | filtered | samples | 16 rays |")
+    print("|---|---|---|---|---|---|---|---|")
     for scan in SCANS:
         if not any(one in scan for one in settings.only.split(",")):
             continue
@@ -132,9 +133,10 @@ def main(settings: Settings) -> None:
                 one, _ = draw(tree, look, pixel, 1, "finest")
                 means, before = draw(tree, look, pixel)
                 found, after = draw(tree, shader, pixel)
+                still, _ = draw(tree, shader, pixel, STILL)
                 scores = " | ".join(compare(each, truth) for each in (one, means, found))
-                ratio = after / before
-                print(f"| {scan} | {name} | {pixel:g} | {scores} | {ratio:.2f} |", flush=True)
+                last = f"{after / before:.2f} | {compare(still, truth)}"
+                print(f"| {scan} | {name} | {pixel:g} | {scores} | {last} |", flush=True)
                 if pixel == settings.pixels[min(1, len(settings.pixels) - 1)]:
                     rows.append(torch.stack((truth, found, means, one)))
     if settings.picture is not None:

@@ -66,6 +66,8 @@ def write_colors(
     branching: int,
     out: Sequence[Tensor],
     progress: Progress,
+    *,
+    all_light: bool,
 ) -> None:
     """Writes the colours of the coarse levels.
 
@@ -77,8 +79,12 @@ def write_colors(
         branching: N.
         out: For each coarse level, the finest of them first, (z, y, x, 6 * (n + 1)) float16: n
             numbers, PLAIN or LIT, of its voxels as seen along +x -x +y -y +z -z, for a length of
-            the smallest spacing; and which share of the light came through the voxel before.
+            the smallest spacing; and which share of the light came to them.
         progress: Told ("filtered", voxels done, voxels in all).
+        all_light: Columns count by all the light that comes to them from outside, so that a row of
+            voxels lets through what its columns do together. For translucent matter, of which a ray
+            that goes obliquely sees much the same. In opaque matter it may see what no light comes
+            to along an axis: if False, light is lost in the voxel before only.
     """
     done, total = 0, 3 * math.prod(field.shape)
     numbers = out[0].shape[-1] // _DIRECTIONS if out else 0
@@ -92,7 +98,7 @@ def write_colors(
             .movedim(3, 0)
             for level in out
         ]  # (2, n, a, b, numbers)
-        for level, a, b, sums in _see_along(field, along, painter, branching, len(out)):
+        for level, a, b, sums in _see_along(field, along, painter, branching, len(out), all_light):
             light = sums[:, -1:]
             means = _of_length(sums[:, :-1] / light, share)
             part = light / (2 * branching ** (level + 1)) ** 2
@@ -112,6 +118,7 @@ def _see_along(
     painter: _Painter,
     branching: int,
     levels: int,
+    all_light: bool,
 ) -> Iterator[tuple[int, int, int, Tensor]]:
     """Yields what is seen along an axis of the field: a coarse level, two places across, and of the
     voxels that begin there the weighted sums (2, c + 1, n, a, b), forwards and backwards: c numbers
@@ -145,7 +152,7 @@ def _see_along(
         for level, side in enumerate(whole):
             if not empty or level == 0:
                 columns = columns.joined(branching)
-                weighted = columns.weighted()
+                weighted = columns.weighted(all_light)
             block = min(side, tile)
             seen = _pooled(weighted, 2 * block)
             if level in coarse:
@@ -276,13 +283,16 @@ class _Columns:
             passes = passes * clear[k]
         return _Columns(ahead, behind, passes)
 
-    def weighted(self) -> Tensor:
+    def weighted(self, all_light: bool) -> Tensor:
         """Returns (2, c + 2, n, a, b) colour, alpha, moments and 1, from both sides, times the
-        light that the interval before lets through.
+        light that comes to each interval; see `write_colors`.
         """
         whole = torch.ones_like(self.clear[:1])
-        before = torch.cat((whole, self.clear[:-1])) + _LEAST
-        behind = torch.cat((self.clear[1:], whole)) + _LEAST
+        before = torch.cat((whole, self.clear[:-1]))
+        behind = torch.cat((self.clear[1:], whole))
+        if all_light:
+            before, behind = before.cumprod(0), behind.flip(0).cumprod(0).flip(0)
+        before, behind = before + _LEAST, behind + _LEAST
         alpha = 1 - self.clear
         sides = [
             [color[:3] * light, (alpha * light)[None], light[None]]

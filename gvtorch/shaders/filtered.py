@@ -316,7 +316,8 @@ class Filtered(Shader):
         """
         smallest = min(spacing)
         tables = [self.transfer.table(_sampling(smallest, side / 2, device)) for side in spacing]
-        write_colors(field, tables, spacing, branching, out, progress)
+        one_mean = self.colors(spacing).width == self.numbers
+        write_colors(field, tables, spacing, branching, out, progress, all_light=one_mean)
 
     def finer(self, tree: N3Tree) -> float:
         known = tree.bricks.channels.get(str(self.other))

@@ -71,63 +71,46 @@ struct Lit : Plain<T> {
   }
 };
 
-// The lit transfer function, right from afar too: as Filtered, whose numbers are followed by the mean products xx xy xz
-// yy yz zz of the components of the normals below a voxel, times its alpha.
+// What a lit node shows of an interval.
+template <class V>
+struct LitRow {
+  Row<V> row{};      // premultiplied colour in the light, and alpha
+  Vec3<V> normal{};  // times alpha
+};
+template <class V, class F>
+GV_HD LitRow<V> combined(const LitRow<V>& a, const LitRow<V>& b, const F& f) {
+  const auto& n = a.normal;
+  const auto& m = b.normal;
+  return {combined(a.row, b.row, f), {f(n.x, m.x), f(n.y, m.y), f(n.z, m.z)}};
+}
+
+// The lit transfer function from afar: Filtered's numbers are followed by the mean products xx xy xz yy yz zz of the
+// components of the normals below a voxel, times its alpha.
 template <class T>
-struct FilteredLit : Lit<T> {
+struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
   static constexpr int32_t kFiltered = 10;
-  template <class V>
-  using SumOf = ShadeSum<V>;
   using Own = typename Filtered<T>::Own;
-  int32_t bricks;  // that the second channel has
+  using FromAfar<T, Lit<T>, FilteredLit<T>>::FromAfar;
 
-  explicit FilteredLit(const ShadeArgs& args) : Lit<T>(args), bricks(args.other_bricks) {}
-
-  GV_HD const Lit<T>& plain() const { return *this; }
-  template <class Eye>
-  GV_HD auto stored(const Eye& probe) const {
-    return any_stored(probe, bricks);
+  template <class V>
+  GV_HD void take(MaskOf<V> which, const LitRow<V>& found, const Piece<V>& piece, ShadeSum<V>& sum) const {
+    sum.add_normal(found.normal, sum.clear, which && found.row.alpha > 0);
+    sum.add_light(found.row, sum.clear, which);
+    sum.absorb(found.row.alpha, piece.start, piece.length, sum.hit_clear, which);
   }
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
-    const MaskOf<V> seen = which && stored(probe), others = which && !seen;
-    if (any(others)) Lit<T>::add(others, piece, probe, sum);
-    if (!any(seen)) return;
-    Look<V> found = look(seen, piece, probe, probe.fine);
-    const MaskOf<V> mixed = seen && probe.mixed;
-    if (any(mixed)) {
-      const Look<V> coarse = look(mixed, piece, probe, probe.coarse);
-      const V weight = probe.weight(piece.middle);
-      found.join(coarse, [&](V a, V b) { return select(mixed, a + weight * (b - a), a); });
-    }
-    sum.add_normal(found.normal, sum.clear, seen && found.row.alpha > 0);
-    sum.add_light(found.row, sum.clear, seen);
-    sum.absorb(found.row.alpha, piece.start, piece.length, sum.hit_clear, seen);
+  // What one of the nodes shows; nothing in other lanes.
+  template <class V, class Eye, class Node>
+  GV_HD LitRow<V> look(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+    const MaskOf<V> colored = which && node.among(this->bricks), others = which && !colored;
+    LitRow<V> found;
+    if (any(others)) found = near(others, piece, probe, node);
+    if (!any(colored)) return found;
+    return combined(found, far(colored, piece, probe, node), [&](V a, V b) { return select(colored, b, a); });
   }
 
  private:
-  template <class V>
-  struct Look {
-    Row<V> row{};      // premultiplied colour in the light, and alpha
-    Vec3<V> normal{};  // times alpha
-
-    template <class F>
-    GV_HD void join(const Look& other, const F& f) {
-      row = combined(row, other.row, f);
-      for (int axis = 0; axis < 3; ++axis) normal[axis] = f(normal[axis], other.normal[axis]);
-    }
-  };
-  // What one of the nodes shows; nothing in other lanes.
   template <class V, class Eye, class Node>
-  GV_HD Look<V> look(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
-    const MaskOf<V> colored = which && node.among(bricks), others = which && !colored;
-    Look<V> found;
-    if (any(others)) found = near(others, piece, probe, node);
-    if (any(colored)) found.join(far(colored, piece, probe, node), [&](V a, V b) { return select(colored, b, a); });
-    return found;
-  }
-  template <class V, class Eye, class Node>
-  GV_HD Look<V> near(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+  GV_HD LitRow<V> near(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
     const V t = piece.middle;
     const Row<V> row = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, which);
     const MaskOf<V> shown = which && row.alpha > 0;
@@ -137,7 +120,7 @@ struct FilteredLit : Lit<T> {
     return times_alpha(shown, this->light.shade(row, n, probe, t), n);
   }
   template <class V, class Eye, class Node>
-  GV_HD Look<V> far(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+  GV_HD LitRow<V> far(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
     const V t = piece.middle;
     probe.narrow(which);
     const auto& colors = probe.channels.other;
@@ -192,7 +175,7 @@ struct FilteredLit : Lit<T> {
     return sum;
   }
   template <class V>
-  GV_HD static Look<V> times_alpha(MaskOf<V> which, const Row<V>& row, const Vec3<V>& n) {
+  GV_HD static LitRow<V> times_alpha(MaskOf<V> which, const Row<V>& row, const Vec3<V>& n) {
     const V a = select(which, row.alpha, V{});
     const auto of = [&](V number) { return select(which, number * a, V{}); };
     return {{of(row.red), of(row.green), of(row.blue), a}, {of(n.x), of(n.y), of(n.z)}};

@@ -120,57 +120,65 @@ struct StoredColor : ShaderFacts {
   GV_HD void done(Sum&) const {}
 };
 
-// A node that answers is one of the pool's first bricks.
-template <class Eye>
-GV_HD auto any_stored(const Eye& probe, int32_t bricks) {
-  return probe.fine.among(bricks) || (probe.mixed && probe.coarse.among(bricks));
-}
-
-// The transfer function, right from afar too: a second channel, which the first bricks of the pool have, holds what the
-// function makes of the finest voxels below each of theirs: premultiplied colour and alpha of an interval as long as
-// the voxel, once or by direction, as StoredColor reads them. Other bricks, and nodes without one, are seen through the
-// function as ever; where two levels blend, their colours do.
-template <class T>
-struct Filtered : Plain<T> {
-  static constexpr int32_t kFiltered = 4;
+// A transfer function, `Base`, right from afar too: a second channel, which the first bricks of the pool have, holds
+// what the function makes of the finest voxels below each of theirs. Other bricks, and nodes without one, are seen
+// through the function as ever; where two levels blend, what is seen of them does. `Shader` stands on this and has
+//
+//   look(which, piece, probe, node)   what one of the nodes shows of an interval, which `combined` can mix
+//   take(which, found, piece, sum)    adds it to what the ray has met
+template <class T, class Base, class Shader>
+struct FromAfar : Base {
   template <class V>
   using SumOf = ShadeSum<V>;
-  struct Own {
-    T side;  // of the root cube, world
-  };
-  const Parameters<T>* parameters;
   int32_t bricks;  // that the second channel has
 
-  explicit Filtered(const ShadeArgs& args)
-      : Plain<T>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)), bricks(args.other_bricks) {}
+  explicit FromAfar(const ShadeArgs& args) : Base(args), bricks(args.other_bricks) {}
 
-  GV_HD const Plain<T>& plain() const { return *this; }
+  GV_HD const Base& plain() const { return *this; }
   template <class Eye>
   GV_HD auto stored(const Eye& probe) const {
-    return any_stored(probe, bricks);
+    return probe.fine.among(bricks) || (probe.mixed && probe.coarse.among(bricks));
   }
   template <class V, class Eye>
   GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
     const MaskOf<V> seen = which && stored(probe), others = which && !seen;
-    if (any(others)) Plain<T>::add(others, piece, probe, sum);
+    if (any(others)) Base::add(others, piece, probe, sum);
     if (!any(seen)) return;
-    Row<V> row = look(seen, piece, probe, probe.fine);
+    const Shader& shader = static_cast<const Shader&>(*this);
+    auto found = shader.look(seen, piece, probe, probe.fine);
     const MaskOf<V> mixed = seen && probe.mixed;
     if (any(mixed)) {
-      const Row<V> coarse = look(mixed, piece, probe, probe.coarse);
+      const auto coarse = shader.look(mixed, piece, probe, probe.coarse);
       const V weight = probe.weight(piece.middle);
-      const auto mix = [&](V a, V b) { return select(mixed, a + weight * (b - a), a); };
-      row = {mix(row.red, coarse.red), mix(row.green, coarse.green), mix(row.blue, coarse.blue),
-             mix(row.alpha, coarse.alpha)};
+      found = combined(found, coarse, [&](V a, V b) { return select(mixed, a + weight * (b - a), a); });
     }
-    sum.add_light(row, sum.clear, seen);
-    sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, seen);
+    shader.take(seen, found, piece, sum);
+  }
+};
+
+// The plain transfer function from afar: the second channel holds premultiplied colour and alpha of an interval as long
+// as the voxel, once or by direction, as StoredColor reads them.
+template <class T>
+struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
+  static constexpr int32_t kFiltered = 4;
+  struct Own {
+    T side;  // of the root cube, world
+  };
+  const Parameters<T>* parameters;
+
+  explicit Filtered(const ShadeArgs& args)
+      : FromAfar<T, Plain<T>, Filtered<T>>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
+
+  template <class V>
+  GV_HD void take(MaskOf<V> which, const Row<V>& found, const Piece<V>& piece, ShadeSum<V>& sum) const {
+    sum.add_light(found, sum.clear, which);
+    sum.absorb(found.alpha, piece.start, piece.length, sum.hit_clear, which);
   }
   // Premultiplied colour and alpha of an interval, as one of the nodes shows them.
   template <class V, class Eye, class Node>
   GV_HD Row<V> look(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
     const V t = piece.middle;
-    const MaskOf<V> colored = which && node.among(bricks), others = which && !colored;
+    const MaskOf<V> colored = which && node.among(this->bricks), others = which && !colored;
     Row<V> row{};
     if (any(others)) {
       const Row<V> plain = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, others);
