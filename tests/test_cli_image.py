@@ -66,9 +66,9 @@ def test_backgrounds_tone_and_samples(small, tmp_path):
         np.testing.assert_allclose(np.load(tmp_path / "a.npz")["color"], expected.color, atol=1e-6)
     run(
         *(small, "-o", tmp_path / "a.png", "--bits", "16", "--background", tmp_path / "sky.npy"),
-        *("--samples", "5", "--tone", "aces", "--exposure", "0.5"),
+        *("--samples", "5", "--cone-scale", "0.6", "--tone", "aces", "--exposure", "0.5"),
     )
-    render = partial(picture, small, background=sky)
+    render = partial(picture, small, background=sky, cone_scale=0.6)
     expected = gv.Progressive(render).refine(camera, 5).tone_map("aces", exposure=0.5)
     torch.testing.assert_close(gv.read_image(tmp_path / "a.png"), expected.color, atol=1e-4, rtol=0)
 
@@ -92,6 +92,7 @@ def test_files_of_every_kind(small, tmp_path, name, bits):
         (["-o", "a.png", "--bits", "7"], ".png has 8 or 16 bits, got 7"),
         (["-o", "a.tif", "--npz", "a.npz"], "--npz holds a whole picture: not with .tif"),
         (["-o", "a.png", "--samples", "0"], "--samples must be an int >= 1, got 0"),
+        (["-o", "a.png", "--cone-scale", "0"], "cone_scale must be finite and > 0, got 0"),
         (["-o", "a.png", "--exposure", "nan"], "exposure must be finite"),
         (["-o", "a.png", "--background", "sky.exr"], "image not found: sky.exr"),
         (["-o", "a.png", "--background", "1,1,1/0"], "--background must be 3 numbers"),

@@ -77,11 +77,40 @@ def test_from_afar_it_shows_what_many_fine_rays_show(look, way, pixel):
     tree = gv.N3Tree.from_volume(volume, 8)
     shader = gv.Filtered.of(tree, volume, transfer)
     assert tree.bricks.channels["filtered"].width == (4 if look == "misty" else 24)
-    truth = picture(tree, transfer, way, pixel, 16)
+    truth = picture(tree, transfer, way, pixel, 16, "finest")
     light, psnr = compare(picture(tree, shader, way, pixel), truth)
     means, before = compare(picture(tree, transfer, way, pixel), truth)
     print(look, way, pixel, f"{light:.3f} {psnr:.1f} dB, means {means:.3f} {before:.1f} dB")
     assert psnr > before + 5
+    _, still = compare(picture(tree, shader, way, pixel, 4), truth)
+    assert still > psnr
+
+
+def test_a_row_of_voxels_lets_through_what_its_columns_do_together():
+    """Of translucent matter, along each axis; of opaque matter columns count by the voxel before,
+    and as if they were independent of what is further away a row hides too much.
+    """
+    generator = torch.Generator().manual_seed(5)
+    plane = torch.rand((16, 16), generator=generator)  # columns along z, some denser than others
+    values = (plane + 0.2 * torch.rand((32, 16, 16), generator=generator)).clamp(0, 1)
+    shader = gv.Filtered(MISTY)
+    volume = gv.Volume(values)
+    field = coarse_colors.VolumeField(volume, 0)
+    through = {}
+    for directions in (False, True):
+        shader._directions = directions
+        out = [torch.empty((32 >> n, 16 >> n, 16 >> n, 30), dtype=torch.float16) for n in (1, 2, 3)]
+        shader.write(field, (1.0, 1.0, 1.0), 2, out, torch.device("cpu"))
+        rows = [one.unflatten(-1, (6, 5))[..., 3].float() for one in out]
+        through[directions] = [
+            torch.stack([(1 - one[..., k]).prod(2 - k // 2).mean() for k in range(6)])
+            for one in rows
+        ]
+    finest = through[False][0]
+    assert not torch.allclose(finest[:2], finest[4:], rtol=0.05)  # an axis is unlike another
+    for all_light, before in zip(through[False][1:], through[True][1:], strict=True):
+        torch.testing.assert_close(all_light, finest, rtol=0.02, atol=0)
+        assert (before[4:] < 0.97 * finest[4:]).all()
 
 
 @pytest.mark.backend("cpp")
@@ -106,10 +135,11 @@ def test_a_solid_ball_covers_a_disc_from_afar(way, most):
         assert abs(float(covered) / (math.pi * (radius / pixel) ** 2) - 1) < grown, pixel
 
 
+@pytest.mark.parametrize("directions", [True, False])
 @pytest.mark.parametrize("most", [1, 40, 300])
-def test_colours_are_the_same_whatever_is_worked_out_at_a_time(monkeypatch, most):
+def test_colours_are_the_same_whatever_is_worked_out_at_a_time(monkeypatch, most, directions):
     def colors() -> torch.Tensor:
-        tree, shader = filtered(SHADER, directions=True)
+        tree, shader = filtered(SHADER, directions=directions)
         return tree.bricks.bricks[shader.other]
 
     whole = colors()

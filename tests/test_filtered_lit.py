@@ -76,7 +76,7 @@ def test_from_afar_it_shows_what_many_fine_rays_show(scan, look, pixel, light, l
     tree = gv.N3Tree.from_volume(volume)
     shader = gv.Filtered.of(tree, volume, lit)
     way = (0.37, 0.23, 1.0)
-    truth = picture(tree, lit, way, pixel, 12)
+    truth = picture(tree, lit, way, pixel, 12, "finest")
     share, psnr = compare(picture(tree, shader, way, pixel), truth)
     means, before = compare(picture(tree, lit, way, pixel), truth)
     one, alone = compare(picture(tree, lit, way, pixel, 1, "finest"), truth)
@@ -102,7 +102,7 @@ def test_highlights_of_rough_matter_widen():
     look = gv.Lit(gv.TransferFunction([(0.4, 0), (0.5, 0.95)]), **shine)
     tree = gv.N3Tree.from_volume(volume)
     shader = gv.Filtered.of(tree, volume, look)
-    truth = picture(tree, look, (0.37, 0.23, 1.0), 8.0, 16)[..., 0]
+    truth = picture(tree, look, (0.37, 0.23, 1.0), 8.0, 16, "finest")[..., 0]
     smooth = picture(tree, look, (0.37, 0.23, 1.0), 8.0)[..., 0]
     found = picture(tree, shader, (0.37, 0.23, 1.0), 8.0)[..., 0]
     assert 0.6 < float(found.sum() / truth.sum()) < 1.6

@@ -59,6 +59,9 @@ def _renderer(where: str, render: Callable[[Camera], Any]) -> Callable[[Camera],
 class Progressive:
     """The running mean of jittered frames; does not wait for the device. For one thread at a time.
 
+    Each ray's cone is as wide as `render` makes it: for a still of n samples give it a `cone_scale`
+    of 4 / 3 / sqrt(n), so that what lies within a pixel is seen by several narrow rays.
+
     A pixel's mean begins with its first frame without a miss, and leaves out later frames with one.
     Until then the pixel shows the newest frame.
 

@@ -3,10 +3,10 @@
 The function of a mean is not the mean of the function, and a mean forgets what stands behind what.
 So each voxel of a coarse level holds what the function makes of the finest voxels below it, seen
 along the axes: for each column of them its colour and alpha, and of the columns the mean, weighted
-with the light that came through the voxel before. Cracks stay open, and walls closed; hidden voxels
-take on what is seen beside them, so that solids hardly grow. Where matter is lit, so are the second
-moments of its normals: they have no sign, as light has none that falls on both sides of a surface,
-and they tell how rough a surface is. Light and material stay free.
+with the light that comes to them. Cracks stay open, and walls closed; hidden voxels take on what is
+seen beside them, so that solids hardly grow. Where matter is lit, so are the second moments of its
+normals: they have no sign, as light has none that falls on both sides of a surface, and they tell
+how rough a surface is. Light and material stay free.
 
 Source: Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011
 (voxels by direction); Younesy, Möller, Carr, "Improving the quality of multi-resolution volume

@@ -67,9 +67,7 @@ def rays(origin: torch.Tensor, direction: torch.Tensor, cone: torch.Tensor) -> g
 
 
 def parallel(tree: gv.N3Tree, way: tuple[float, float, float], pixel: float, parts: int) -> gv.Rays:
-    """Rays of an orthographic picture through a whole tree, parts^2 a pixel, wide ones if it is
-    one.
-    """
+    """Rays of an orthographic picture through a whole tree, parts^2 a pixel, as wide as a part."""
     forward = torch.nn.functional.normalize(torch.tensor(way, dtype=torch.float64), dim=0)
     right = torch.nn.functional.normalize(
         torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]).double(), forward), dim=0
@@ -81,9 +79,7 @@ def parallel(tree: gv.N3Tree, way: tuple[float, float, float], pixel: float, par
     y, x = torch.meshgrid(at + 0.37, at + 0.61, indexing="ij")
     origin = tree.box.mean(0) + x.reshape(-1, 1) * right + y.reshape(-1, 1) * up
     origin = origin - 2 * reach * forward
-    cone = torch.zeros(len(origin), 2, dtype=torch.float64)
-    if parts == 1:
-        cone[:, 0] = pixel
+    cone = torch.tensor([pixel / parts, 0.0], dtype=torch.float64).repeat(len(origin), 1)
     return rays(origin, forward.expand(len(origin), 3), cone)
 
 
@@ -95,9 +91,9 @@ def picture(
     parts: int = 1,
     lod: str = "auto",
 ) -> torch.Tensor:
-    """(h, w, 4) means over the rays of each pixel; several rays are finest ones."""
+    """(h, w, 4) means over the parts^2 rays of each pixel."""
     given = parallel(tree, way, pixel, parts)
-    hits = gv.trace(tree, given, shader, lod="finest" if parts > 1 else lod)
+    hits = gv.trace(tree, given, shader, lod=lod)
     side = math.isqrt(len(given.origin)) // parts
     colors = torch.cat((hits.color, hits.alpha), 1).double()
     return colors.reshape(side, parts, side, parts, 4).mean((1, 3))
