@@ -156,6 +156,16 @@ def test_damaged_and_unknown_files_are_one_line(tmp_path):
     (tmp_path / "cameras.txt").write_text("1 OPENCV 640 480 500 500 320 240 0.1 0 0 0\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 5 1 a.jpg\n\n")
     (tmp_path / "a.json").write_text('{"frames": [{"transform_matrix": [[1]]}]}')
+    (tmp_path / "g.json").write_text(
+        json.dumps(
+            {
+                "w": 9,
+                "h": 9,
+                "fl_x": 9,
+                "frames": [{"file_path": "a", "transform_matrix": np.eye(4).tolist()}] * 2,
+            }
+        )
+    )
     (tmp_path / "b.json").write_text('{"frames": []}')
     (tmp_path / "c.pvcc").write_text("<a><Property name='CameraPosition'></Property></a>")
     (tmp_path / "d.pvcc").write_text("<a>")
@@ -166,6 +176,7 @@ def test_damaged_and_unknown_files_are_one_line(tmp_path):
         (".", "a lens of model OPENCV with distortion is not read"),
         ("a.json", "frame 0: pose must be (4, 4) numbers"),
         ("b.json", "has no cameras"),
+        ("g.json", "frame 1: there is one of 'a' already"),
         ("c.pvcc", "c.pvcc: "),
         ("d.pvcc", "can't be read as cameras"),
         ("e.txt", "must end in .pvcc or .json or be a folder"),

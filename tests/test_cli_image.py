@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import gvtorch
+from PIL import Image
 
 import gvtorch as gv
 
@@ -103,3 +104,52 @@ def test_a_mistake_gets_one_line(small, tmp_path, args, message):
     done = gvtorch("render", small, *args, cwd=tmp_path)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
     assert message in done.stderr and not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def others(small, tmp_path):
+    """A volume, what says how it was shown, and a folder of pictures that is a volume."""
+    np.save(tmp_path / "v.npy", gv.read_volume(small).data[..., 0].numpy())
+    (tmp_path / "s.json").write_text('{"component": 0, "camera": {"eye": [9, 9, 9]}}')
+    (tmp_path / "stack").mkdir()
+    for number in range(3):
+        gray = np.full((8, 8), 80 * number, np.uint8)
+        Image.fromarray(gray).save(tmp_path / "stack" / f"{number:04d}.png")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ("render v.npy -o v.npy", "--output v.npy would be written over what PATH reads"),
+        ("render v.npy -o ./v.npy", "--output v.npy would be written over what PATH reads"),
+        ("render v.npy -o a.png --stats v.npy", "--stats v.npy would be written over"),
+        ("render v.npy -o a.npz --npz a.npz", "--npz and --output are one file: a.npz"),
+        ("render v.npy -o a.png --stats a.png", "--stats and --output are one file: a.png"),
+        ("render v.npy -o a.png --state s.json --stats s.json", "what --state reads"),
+        ("render stack -o stack/0003.png", "would be written over what PATH reads"),
+        ("slice v.npy -o v.npy", "--output v.npy would be written over what PATH reads"),
+        ("fly stack -o stack --frames 2", "--output stack would be written over what PATH reads"),
+        ("fly v.npy -o f --stats v.npy --frames 2", "--stats v.npy would be written over"),
+        ("fly v.npy -o f --poses s.json --trace s.json", "are one file: s.json"),
+        ("render v.npy -o a.png --state s.json --component 1", "--state tells what --component"),
+        ("render v.npy -o a.png --state s.json --up +z", "--state tells what --up does"),
+        ("fly v.npy -o f --state s.json --component 1", "--state tells what --component does"),
+        ("view v.npy --state s.json --shader lit", "--state tells what --shader does"),
+        ("view v.npy --state s.json --camera orbit:0,0", "--state tells what --camera does"),
+        ("view a.py --threshold 3", "--threshold is for files: the script tells"),
+        ("view v.npy --port 99999 --no-browser", "port must be an int >= 0 and <= 65535"),
+        ("render v.npy -o a.png --camera file:c.pvcc --camera-model fisheye", "--camera-model"),
+        ("render v.npy -o a.png --clip=", "--clip must hold plane:"),
+        ("render v.npy -o a.png --camera=", "--camera must be orbit:"),
+        ("convert v.npy stack --dry-run", "exists and is no store"),
+        ("convert v.npy a.zarr --dry-run --spacing 0,2,2", "spacing"),
+        ("convert v.npy a.zarr --dry-run --memory much", "--memory"),
+    ],
+)
+def test_nothing_is_overwritten_and_no_flag_is_without_effect(others, args, message):
+    before = {file: file.read_bytes() for file in others.rglob("*") if file.is_file()}
+    done = gvtorch(*args.split(), cwd=others)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+    assert message in done.stderr
+    assert before == {file: file.read_bytes() for file in others.rglob("*") if file.is_file()}

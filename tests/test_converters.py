@@ -105,6 +105,17 @@ def test_resume_of_a_finished_store_says_so(tmp_path, raw, data):
     assert listed(target) == before
     run = gvtorch("convert", raw, target)
     assert run.returncode == 2 and "there is a store already" in run.stderr
+    np.save(tmp_path / "other.npy", np.zeros((5, 5, 5), np.int16))
+    for flags, message in (
+        ((raw, target, "--block", "64"), "with block 32, now it is 64"),
+        ((raw, target, "--threshold", "9"), "with threshold None, now it is 9.0"),
+        ((tmp_path / "other.npy", target), "is finished, with extent"),
+    ):
+        run = gvtorch("convert", *flags, "--resume")
+        assert run.returncode == 2 and message in run.stderr, run.stderr
+    assert listed(target) == before
+    raw.unlink()
+    assert gvtorch("convert", raw, target, "--resume").returncode == 0
 
 
 # --- the journal

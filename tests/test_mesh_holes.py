@@ -159,6 +159,9 @@ def test_a_pole_that_is_computed_again_is_the_same_place():
     ends = [gv.MeshProducer(one, resolution=32).voxelizer for one in (ball, flat)]
     with pytest.raises(ValueError, match="faces must be whole numbers"):
         gv.Mesh(vertices=ball.vertices, faces=faces + 0.5)
+    tensors = gv.Mesh(vertices=torch.from_numpy(ball.vertices), faces=torch.from_numpy(faces))
+    assert np.array_equal(tensors.vertices, ball.vertices)
+    assert np.array_equal(tensors.faces, faces)
     made, expected = (one.region((0, 0, 0), one.extent)["coverage"].double().sum() for one in ends)
     assert float(made) == pytest.approx(float(expected), rel=1e-6) and float(made) > 5000 * 255
 

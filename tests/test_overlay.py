@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 
 import numpy as np
 import pytest
@@ -192,3 +193,17 @@ def test_nothing_seen_is_told_of_strips_too(small, tmp_path):
     )
     assert run.returncode == 0 and "nothing is seen: values range from" in run.stderr
     assert pixels((tmp_path / "a.png").read_bytes()).shape == (720, 1024, 3)
+
+
+def test_a_small_picture_has_room_or_says_so():
+    """Also where places of ticks are no sums of powers of two."""
+    fits = 0
+    for width, height in itertools.product(range(8, 80, 9), range(6, 60, 3)):
+        for low, high in ((0.0, 255.0), (0.0, 1.0), (-1e-3, 3.7)):
+            bar = gv.ColorBar(colors=lambda v: np.zeros((len(v), 4)), low=low, high=high)
+            try:
+                gv.Overlay(width, height, bar=bar)
+                fits += 1
+            except ValueError as error:
+                assert "has no room" in str(error), (width, height, low, high)
+    assert fits > 50

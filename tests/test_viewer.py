@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import time
 import weakref
 from dataclasses import dataclass, field
 
@@ -381,3 +382,51 @@ def test_a_surface_is_handed_over_as_a_file(session, monkeypatch, tmp_path):
     assert "gvtorch surface" in page.next("refused", 1)["text"]
     assert [*page.files] == ["surface.ply"]
     page.final()
+
+
+def test_who_follows_one_that_follows_moves_too(session):
+    first, second, third = (Page(session) for _ in range(3))
+    second.send("follow", client=first.client.number)
+    third.send("follow", client=second.client.number)
+    first.send("follow", client=third.client.number)  # in a circle
+    circle = {"1": 3, "2": 1, "3": 2}
+    third.until(lambda: [one["clients"] for one in third.of("clients")][-1:] == [circle])
+    there = turned(first.camera, 0.5)
+    first.moved(there)
+    for page in (second, third):
+        page.until(lambda p=page: np.allclose(p.pictures[-1][0]["camera"]["eye"], there["eye"]))
+
+
+def test_others_go_on_while_a_still_is_taken_and_it_ends_with_its_page(session):
+    one, other = Page(session), Page(session)
+    one.final()
+    other.final()
+    one.send("change", state={"develop": {"samples": 4096}}, rest=True)
+    one.send("still", width=200, height=200)
+    one.send("still", width=64, height=48)
+    assert "one is being made already" in one.next("refused", 0)["text"]
+    other.send("pick", x=0.5, y=0.5)
+    other.next("picked", 0)
+    assert not one.files and session.ask(lambda: len(session._stills)) == 1
+    session.leave(one.client)
+    other.until(lambda: not session._stills)
+    other.send("still", width=200, height=200)
+    session.ask(lambda: None)
+    begin = time.monotonic()
+    session.close()
+    assert time.monotonic() - begin < 10 and not session._thread.is_alive()
+
+
+def test_whole_states_with_what_json_can_not_tell_are_taken():
+    module = gv.ModuleShader(gv.TransferModule(FUNCTION, 1.0))
+    session = new_session(bright_ball(), module)
+    try:
+        page = Page(session)
+        page.until(lambda: page.of("welcome"))
+        state = page.of("welcome")[0]["state"]
+        assert set(state["shader"]) == {"kept"}
+        page.send("change", state={**state, "develop": {"exposure": 1.0}}, rest=True)
+        page.until(lambda: session.state.develop.exposure == 1.0)
+        assert session.state.shader is module and not page.of("refused")
+    finally:
+        session.close()

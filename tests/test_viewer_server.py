@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import gc
 import json
+import socket
 import sys
 import threading
 import weakref
@@ -84,6 +85,13 @@ def test_a_page_over_http_and_a_websocket(server):
     for name, content in page_files().items():
         status, headers, body = get(server, f"/{name}")
         assert status == 200 and body == content and headers["X-Content-Type-Options"] == "nosniff"
+
+
+def test_what_is_no_http_is_answered_and_not_told(server, capfd, caplog):
+    with socket.create_connection(("127.0.0.1", server.port)) as one:
+        one.sendall(b"GET /ws?token=\xff HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert b" 400 " in one.recv(200).split(b"\r\n")[0]
+    assert not caplog.records and not any(capfd.readouterr())
 
 
 def test_nothing_but_the_page_is_read(server):

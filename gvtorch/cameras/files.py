@@ -247,6 +247,8 @@ def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[
             told.get("file_path", f"{number:04d}.png"),
             told.get("camera_model", "PINHOLE"),
         )
+        if str(name) in cameras:
+            raise ValueError(f"frame {number}: there is one of {str(name)!r} already")
         cameras[str(name)] = _made(model, view, (fx, fy, cx, cy), told, (x, y))
     return cameras
 

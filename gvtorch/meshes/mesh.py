@@ -49,7 +49,8 @@ class Mesh:
             value = getattr(self, field_name)
             if value is None:
                 continue
-            if dtype == np.int64 and (np.asarray(value) != np.trunc(value)).any():
+            value = np.asarray(value)
+            if dtype == np.int64 and (value != np.trunc(value)).any():
                 raise ValueError(f"{self.name}: {field_name} must be whole numbers")
             value = np.ascontiguousarray(value, dtype)
             fits = value.ndim == len(shape) and all(

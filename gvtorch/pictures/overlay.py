@@ -102,8 +102,11 @@ class Overlay:
         """Takes sRGB with straight alpha, (h, w, 4) uint8."""
         height, width = image.shape[:2]
         if top < 0 or left < 0 or top + height > self._size[1] or left + width > self._size[0]:
-            have, need = "x".join(map(str, self._size)), f"{left + width}x{top + height}"
-            raise ValueError(f"Overlay: a picture of {have} has no room for it, {need} would do")
+            have = "x".join(map(str, self._size))
+            raise ValueError(
+                f"Overlay: a picture of {have} has no room for what is drawn over it, which takes "
+                f"{width}x{height} and some beside it"
+            )
         parts = torch.from_numpy(image.astype(np.float32) / 255)
         self._stamps.append(_Stamp(top, left, from_srgb(parts[..., :3]), parts[..., 3:]))
 
@@ -199,8 +202,9 @@ class _Pen:
         for color, more in (((0, 0, 0, 200), 2 * self._rim), ((255, 255, 255, 255), 0)):
             wide = self._line + more
             for (ax, ay), (bx, by) in lines:
-                half = wide / 2
-                draw.rectangle((ax - half, ay - half, bx + half - 1, by + half - 1), fill=color)
+                left, top = ax - wide / 2, ay - wide / 2
+                right, bottom = bx + wide / 2 - 1, by + wide / 2 - 1
+                draw.rectangle((left, top, max(left, right), max(top, bottom)), fill=color)
 
     def bar(self, bar: ColorBar, high: int) -> np.ndarray:
         """A colour bar, its numbers to the left of it, and its title above."""

@@ -110,7 +110,12 @@ class Convert:
         self.making.check()
         common: dict[str, Any] = {**self.source.options(), "threshold": self.threshold}
         if self.dry_run:
-            del common["spacing"]
+            from ..base import check
+            from ..io.stores.unfinished import is_begun
+
+            is_begun(self.store, resume=self.making.resume)  # raises where it would
+            if self.memory is not None:
+                check.nbytes("convert", "--memory", self.memory)
             common |= {"block": self.making.block, "workers": self.making.workers}
             _print_table(_readable(estimate(self.path, self.store, **common).as_dict()))
             return

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -143,6 +145,30 @@ def open_data(path: str, source: ReadOptions, *, image: str | None, level: int) 
         if value:
             raise ValueError(f"--{flag} is for stores; make one: gvtorch convert {path} STORE.zarr")
     return source.read(path)
+
+
+def check_files(read: Mapping[str, Any], written: Mapping[str, Path | None]) -> None:
+    """Checks that a command overwrites nothing that it reads, and no file of its own; each by the
+    flag that names it.
+
+    Raises:
+        ValueError: It would.
+    """
+    whole: dict[Path, str] = {}  # folders count with all that is in them
+    for flag, name in read.items():
+        if name is not None and os.path.exists(name):
+            whole[Path(os.path.realpath(name))] = flag
+    taken: dict[Path, str] = {}
+    for flag, path in written.items():
+        if path is None:
+            continue
+        place = Path(os.path.realpath(path))
+        source = whole.get(place) or (whole.get(place.parent) if place.parent in whole else None)
+        if source is not None:
+            raise ValueError(f"{flag} {path} would be written over what {source} reads")
+        if place in taken:
+            raise ValueError(f"{flag} and {taken[place]} are one file: {path}")
+        taken[place] = flag
 
 
 def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:

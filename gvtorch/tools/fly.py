@@ -19,7 +19,7 @@ from ..base.digits import whole_number
 from ..base.messages import printable
 from ..base.whole_file import write_whole
 from ..io.stores.ngff import is_zarr
-from .common import Bar, given, size, volume_formats
+from .common import Bar, check_files, given, size, volume_formats
 from .drawn import Drawn
 from .look import first_orbit, parse_camera, parse_orbit, stance
 from .scene import Scene, SceneFlags
@@ -129,6 +129,16 @@ class Fly:
             raise ValueError(
                 f"--output must be a folder or end in {kinds}, got {str(self.output)!r}"
             )
+        flight = self.flight if self.flight != "orbit" else None
+        check_files(
+            {"PATH": self.path, "--state": self.state, "--keys": self.keys, "--path": flight},
+            {
+                "--output": self.output,
+                "--stats": self.stats,
+                "--poses": self.poses,
+                "--trace": self.trace,
+            },
+        )
         if is_film and options["background"] is None:
             raise ValueError(f"--background transparent is for pictures, not {self.output.suffix}")
 
@@ -312,6 +322,7 @@ class Fly:
                 first = check.json_file("state", self.keys.parent / first)
         flags = [name for name, value in paths.items() if value]
         told = {"shader": _OF_SHADER, "camera": ("camera_model", "fov", "up")}
+        told["component"] = ("component",)
         names = {name for part, those in told.items() if part in first for name in those}
         names |= set(first.get("options", ()))
         if self.times is not None and any(state.time != 0 for _, state in self._flight().keys):

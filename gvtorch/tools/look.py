@@ -113,9 +113,9 @@ class Look:
             **({} if self.cone_scale is None else {"cone_scale": self.cone_scale}),
             "background": parse_background(self.background),
             "stop_alpha": self.stop_alpha,
-            "clip": parse_clip(self.clip) if self.clip else None,
-            "lens": parse_lens(self.lens) if self.lens else None,
-            "lighting": parse_lighting(self.lighting) if self.lighting else None,
+            "clip": None if self.clip is None else parse_clip(self.clip),
+            "lens": None if self.lens is None else parse_lens(self.lens),
+            "lighting": None if self.lighting is None else parse_lighting(self.lighting),
             "component": self.component,
             "backend": self.backend,
         }
@@ -263,7 +263,8 @@ def parse_camera(
 
     up = look.upward() or stance(space)[0]
     shape = (look.fov, width, height, look.camera_model)
-    kind, _, rest = (text or f"orbit:{first_orbit(space)}").partition(":")
+    text = f"orbit:{first_orbit(space)}" if text is None else text
+    kind, _, rest = text.partition(":")
     if kind == "orbit":
         azimuth, elevation, distance = parse_orbit("--camera orbit", rest)
         fit = distance is None
@@ -283,7 +284,8 @@ def _camera_of_file(text: str, look: Look, width: int, height: int) -> Camera:
     """The camera of PATH, or the one of PATH,NAME."""
     from ..cameras import read_cameras
 
-    for flag, value in (("--fov", look.fov), ("--up", look.up)):
+    model = None if look.camera_model == "pinhole" else look.camera_model
+    for flag, value in (("--fov", look.fov), ("--up", look.up), ("--camera-model", model)):
         if value is not None:
             raise ValueError(f"--camera file: tells what {flag} does: leave one out")
     path, comma, name = text.rpartition(",")

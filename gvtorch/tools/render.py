@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 
 from ..base.messages import printable
 from ..base.whole_file import write_whole
-from .common import Bar, given, size, volume_formats
+from .common import Bar, check_files, given, size, volume_formats
 from .drawn import Drawn
 from .image import KINDS, STRIPS, Develop, in_strips
 from .look import parse_camera
@@ -138,9 +138,12 @@ class Render:
         """Raises ValueError where a flag tells what a saved state does."""
         if self.state is None:
             return
-        if not self.state.is_file():
-            raise FileNotFoundError(f"state not found: {self.state}")
-        free = ("--size", "--backend", "--brick-size", "--border", "--component", "--up")
+        from ..base import check
+
+        content = check.json_file("state", self.state)
+        free = {"--size", "--backend", "--brick-size", "--border"}
+        free |= {"--component"} - {f"--{name}" for name in content}
+        free |= set() if "camera" in content else {"--up"}
         flags = [one for one in given(self.scene.look) if one not in free] + self.develop.given()
         flags += ["--camera"] * (self.camera is not None) + ["--show"] * (self.show != "picture")
         if flags:
@@ -160,6 +163,10 @@ class Render:
             if file is not None and not file.parent.is_dir():
                 raise FileNotFoundError(f"folder not found: {file.parent}")
         checked_path("--output", self.output, self.bits, KINDS)
+        check_files(
+            {"PATH": self.path, "--state": self.state},
+            {"--output": self.output, "--npz": self.npz, "--stats": self.stats},
+        )
         if self.show != "picture":
             flags = (self.develop.given() if self.npz is None else []) + self.drawn.given()
             if flags:

@@ -59,8 +59,7 @@ class View:
         aiohttp_web()
         if self.scene.look.size != type(self.scene.look)().size:
             raise ValueError("--size is for pictures: a page has its own")
-        if self.state is not None and not self.state.is_file():
-            raise FileNotFoundError(f"state not found: {self.state}")
+        self._check_state()
         what, shader, camera, options = self._opened()
         view(
             *(what, shader, camera),
@@ -72,6 +71,18 @@ class View:
             wait=True,
             **options,
         )
+
+    def _check_state(self) -> None:
+        """Raises ValueError where a flag tells what a saved state does."""
+        if self.state is None:
+            return
+        if not self.state.is_file():
+            raise FileNotFoundError(f"state not found: {self.state}")
+        free = ("--backend", "--brick-size", "--border", "--component", "--up")
+        flags = [one for one in given(self.scene.look) if one not in free]
+        flags += ["--camera"] * (self.camera is not None)
+        if flags:
+            raise ValueError(f"--state tells what {flags[0]} does: leave one out")
 
     def _opened(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
         """What is looked at, its shader, its camera, and fields of `RenderOptions`."""
@@ -130,8 +141,10 @@ class View:
             for group in ("look", "streaming", "source")
             for one in given(getattr(self.scene, group))
         ]
-        if flags or self.camera:
-            raise ValueError(f"{(flags or ['--camera'])[0]} is for files: the script tells")
+        flags += ["--camera"] * (self.camera is not None)
+        flags += ["--threshold"] * (self.scene.threshold is not None)
+        if flags:
+            raise ValueError(f"{flags[0]} is for files: the script tells")
         if not Path(self.path).is_file():
             raise FileNotFoundError(f"script not found: {self.path}")
         sys.path.insert(0, str(Path(self.path).resolve().parent))
@@ -139,4 +152,6 @@ class View:
         if "scene" not in found:
             raise ValueError(f"{self.path}: must set scene, as in scene = gv.FieldProducer(...)")
         what, shader, camera, options = (found.get(name) for name in _NAMES)
+        if not isinstance(options or {}, dict):
+            raise ValueError(f"{self.path}: options must be a dict, got {type(options).__name__}")
         return what, shader, camera, dict(options or {})

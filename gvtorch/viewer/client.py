@@ -46,6 +46,7 @@ class Client:
         picture: The last one.
         monitor: Whether it is told the figures of each frame.
         nodes: Whether it is told the boxes of the nodes of each frame.
+        gone: Whether it has left.
     """
 
     def __init__(self, number: int, send: Send, eye: Eye) -> None:
@@ -53,7 +54,7 @@ class Client:
         self.number, self._send = number, send
         self.eye, self.size, self.rate = eye, (0, 0), 25.0
         self.follows: int | None = None
-        self.monitor = self.nodes = False
+        self.monitor = self.nodes = self.gone = False
         self._moving, self._moved, self._sent = False, 0.0, 0.0
         self._drawn: tuple[Any, ...] | None = None  # what the last picture showed
         self._progressive: Progressive | None = None
@@ -73,7 +74,7 @@ class Client:
 
     def end(self) -> None:
         """Lets go of the page and of the scene: whoever kept one would keep the other."""
-        self._send, self._progressive = _nobody, None
+        self._send, self._progressive, self.gone = _nobody, None, True
 
     # The network's side.
 

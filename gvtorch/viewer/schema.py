@@ -178,9 +178,10 @@ def decode(where: str, hint: Any, content: Any, now: Any = None, depth: int = 0)
     if depth > MOST_DEPTH:
         raise ValueError(f"{where}: objects in objects in objects, more than {MOST_DEPTH}")
     if isinstance(content, dict) and set(content) == {"kept"}:
-        if now is None:
+        if now is not None:
+            return now
+        if hint is not Any:  # which is JSON as it is
             raise ValueError(f"{where}: JSON can't tell what was here: {content['kept']!r:.200}")
-        return now
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     problems = []
     for choice in sorted(choices, key=lambda one: not _fits(one, content)):
@@ -246,9 +247,12 @@ def _number(content: Any) -> float:
     if isinstance(content, bool) or not isinstance(content, (int, float)):
         raise _Other("a number")
     try:
-        return float(content)
+        number = float(content)
     except OverflowError:
-        raise _Other("a number") from None
+        number = math.inf
+    if not math.isfinite(number):  # as of 1e999
+        raise _Other("a finite number")
+    return number
 
 
 def _of_type(kind: type, words: str) -> Any:

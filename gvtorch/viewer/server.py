@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import ipaddress
+import logging
 import secrets
 import socket
 import threading
@@ -57,6 +58,18 @@ def aiohttp_web() -> Any:
     return need_library("view", "aiohttp.web", "aiohttp", "view")
 
 
+def _is_ours(record: logging.LogRecord) -> bool:
+    """Whether a line of the server's library is worth a word: not that a request was no HTTP."""
+    error = record.exc_info[1] if record.exc_info else None
+    return type(error).__module__ != "aiohttp.http_exceptions"
+
+
+def _logger() -> logging.Logger:
+    logger = logging.getLogger("gvtorch.view")
+    logger.addFilter(_is_ours)
+    return logger
+
+
 class Server:
     """A session's page.
 
@@ -85,6 +98,7 @@ class Server:
             allow: Further names under which pages may reach this machine.
 
         Raises:
+            ValueError: The host needs a token.
             OSError: The port is taken, or the host is not this machine's.
             ImportError: aiohttp is missing.
         """
@@ -135,7 +149,8 @@ class Server:
     async def _serve(self, started: list[BaseException | None], ready: threading.Event) -> None:
         web = aiohttp_web()
         self._stop = asyncio.Event()
-        runner = web.AppRunner(self.application(), access_log=None, shutdown_timeout=1.0)
+        quiet = {"access_log": None, "logger": _logger()}
+        runner = web.AppRunner(self.application(), shutdown_timeout=1.0, **quiet)
         await runner.setup()
         try:
             site = web.TCPSite(runner, self._host, self.port)

@@ -9,14 +9,13 @@ import io
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import torch
 
 from ..base.messages import one_line
-from ..base.stage import no_progress
 from ..base.volume import Volume
 from ..cameras import Camera
 from ..cameras.camera import Up, upward
@@ -26,7 +25,7 @@ from ..pictures import Picture, Progressive
 from ..shaders import TransferFunction
 from ..shaders.presets import CT_PRESETS, PRESETS
 from . import protocol
-from .client import Client, Send
+from .client import Client, Interrupted, Send
 from .export import SurfaceExport
 from .files import read_function
 from .fitting import trimmed, unfit
@@ -73,6 +72,7 @@ class Session:
         self._good = state  # the last state of which there was a picture
         self._count, self._turn = 0, 0
         self._tasks: deque[Callable[[], None]] = deque()
+        self._stills: deque[tuple[Client, Generator[None, None, Picture]]] = deque()
         self._wake = threading.Condition()
         self._closed = False
         self._failed: tuple[str, ...] = ()
@@ -98,6 +98,7 @@ class Session:
 
     def leave(self, client: Client) -> None:
         """Forgets a page."""
+        client.gone = True  # what is being made for it ends
         self.post(lambda: self._goodbye(client))
 
     def receive(self, client: Client, text: str | bytes) -> None:
@@ -165,12 +166,13 @@ class Session:
             client.end()
         self.clients.clear()
         self._tasks.clear()
+        self._stills.clear()
         self.scene.close()
 
     def _step(self) -> bool:
         """Does what was asked for, and draws one picture; False: the session is closed."""
         with self._wake:
-            while not (self._closed or self._tasks or self._someone()):
+            while not (self._closed or self._tasks or self._stills or self._someone()):
                 waits = any(one.waits() for one in self.clients.values())
                 self._wake.wait(_TICK if waits else None)
             if self._closed:
@@ -184,6 +186,8 @@ class Session:
         client = self._someone()
         if client is not None:
             self._draw(client)
+        if self._stills:
+            self._go_on()
         return True
 
     def _someone(self) -> Client | None:
@@ -329,11 +333,18 @@ class Session:
         self._place(client, message.camera, message.moving, message.sent)
 
     def _place(self, client: Client, eye: Eye, moving: bool, sent: float = 0.0) -> None:
+        """Moves a page's camera, and those of pages that follow it, or one that does."""
         client.move(eye, moving, sent)
-        for other in self.clients.values():
-            if other.follows == client.number and other is not client:
-                other.move(eye, moving, 0.0)
-                other.tell("camera", camera=encode(eye))
+        moved = {client.number}
+        waiting = deque(moved)
+        while waiting:
+            first = waiting.popleft()
+            for other in self.clients.values():
+                if other.follows == first and other.number not in moved:
+                    moved.add(other.number)
+                    waiting.append(other.number)
+                    other.move(eye, moving, 0.0)
+                    other.tell("camera", camera=encode(eye))
 
     def _change(self, client: Client, message: protocol.Change) -> None:
         content = message.state
@@ -488,8 +499,24 @@ class Session:
             client.tell("figures", **self._figures(client.picture))
 
     def _still(self, client: Client, message: protocol.Still) -> None:
-        picture = self.still(client.eye, message.width, message.height)
-        client.send_file("picture.png", png(picture))
+        if any(one is client for one, _ in self._stills):
+            raise ValueError("still: one is being made already")
+        size = message.width, message.height
+        self._stills.append((client, self._still_frames(client.eye, *size, lambda: client.gone)))
+
+    def _go_on(self) -> None:
+        """Renders one more frame of the still that waits longest."""
+        client, frames = self._stills.popleft()
+        try:
+            next(frames)
+        except StopIteration as end:
+            client.send_file("picture.png", png(end.value))
+        except Interrupted:
+            pass
+        except Exception as error:  # whatever it was, the view goes on
+            client.tell("refused", text=f"still: {one_line(error)}")
+        else:
+            self._stills.append((client, frames))
 
     def _surface(self, client: Client, message: protocol.Surface) -> None:
         if self._export is not None and self._export.busy:
@@ -510,18 +537,40 @@ class Session:
 
     def still(self, eye: Eye, width: int, height: int) -> Picture:
         """Renders a whole picture: all that can be had, all samples."""
+        frames = self._still_frames(eye, width, height, lambda: False)
+        while True:
+            try:
+                next(frames)
+            except StopIteration as end:
+                return end.value
+
+    def _still_frames(
+        self, eye: Eye, width: int, height: int, unwanted: Callable[[], bool]
+    ) -> Generator[None, None, Picture]:
+        """Renders a whole picture, and lets others have their turn after each sample.
+
+        Raises:
+            Interrupted: The session was closed, or nobody wants it any more.
+        """
         state, scene, whole = self.state, self.scene, (width, height)
+
+        def check(_what: str, _done: int, _total: int) -> None:
+            if self._closed or unwanted():
+                raise Interrupted("the view was closed")
+
         if state.slices is not None:
             width, height = panes(*whole)["view"][2:]
         camera = eye.camera(width, height, scene.box)
-        if scene.engine is not None:
-            scene.engine.render(camera, state.shader, **state.settings())  # until all is there
-        made = Progressive(lambda one: scene.frame(one, state)).refine(
-            camera, state.develop.samples
-        )
+        if scene.engine is not None:  # until all is there
+            scene.engine.render(camera, state.shader, progress=check, **state.settings())
+        mean = Progressive(lambda one: scene.frame(one, state, check))
+        made = mean.frame(camera)
+        while mean.count < state.develop.samples:
+            yield
+            made = mean.frame(camera)
         shown = state.develop.develop(made)
         if state.show != "picture":
-            shown = blended(shown, scene.cost(camera, state, no_progress), state.blend)
+            shown = blended(shown, scene.cost(camera, state, check), state.blend)
         if self._planes is None or state.slices is None:
             return shown
         return self._planes.composed(shown, state, *whole, wait=True).picture

@@ -29,6 +29,7 @@ from ..tracing import RenderOptions, render
 from .schema import decode, encode
 
 Triple = tuple[float, float, float]
+_FAR = 1e30  # from where a ray can still be told in numbers
 Show = Literal["picture", "samples", "nodes", "lod", "age", "fill"]
 
 
@@ -56,6 +57,8 @@ class Eye:
             object.__setattr__(self, name, check.triple("Eye", name, getattr(self, name)))
         widest = model_of("Eye", self.model).widest
         check.number("Eye", "fov", self.fov, low=0, high=widest, open_low=True)
+        if max(abs(one) for one in (*self.eye, *self.target, *self.up)) > _FAR:
+            raise ValueError(f"Eye: eye, target and up must be at most {_FAR:g}")
         if self.eye == self.target or not any(self.up):
             raise ValueError("Eye: eye and target must differ, and up must not be zero")
 

@@ -119,6 +119,7 @@ def view(
         ImportError: `gvtorch[view]` is not installed.
     """
     aiohttp_web()
+    check.whole("view", "port", port, low=0, high=65535)
     session = new_session(what, shader, camera, up=up, state=state, engine=engine, **options)
     if _in_notebook() and wait is None and browser is None:
         from .notebook import widget
@@ -178,7 +179,10 @@ def new_session(
         elif state is not None:
             chosen = chosen.read(Path(state))
         if chosen.camera is None:
-            eye = fitted(scene, None, _SIZE, up) if camera is None else Eye.of(camera, scene.box)
+            if camera is None:
+                eye = fitted(scene, None, _SIZE, up)
+            else:
+                eye = Eye.of(check.instance("view", "camera", camera, Camera), scene.box)
             chosen = replace(chosen, camera=eye)
         scene.check_time(chosen.time)
         if chosen.time != scene.time and scene.reopen is not None:

@@ -21,7 +21,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -47,7 +47,7 @@ from .conversion_plan import (
     within,
 )
 from .store import Store
-from .store_layout import WORK, Deadline, opened
+from .store_layout import WORK, Deadline, StoreLayout, opened
 from .unfinished import Done
 
 _AHEAD = 64  # tasks handed to an executor that does not tell how many workers it has
@@ -95,7 +95,8 @@ def convert(
             be the same for all of its workers. A pool of processes if left out.
         workers: Number of processes of that pool; left out, one a core, as far as memory goes.
         memory: Most bytes of all processes, as in "2 GB": fewer workers then. Left out, all free.
-        resume: Go on with a half-written store; a finished one is given as it is.
+        resume: Go on with a half-written store; a finished one is given as it is, if it is of
+            such a source and settings.
         progress: Told ("converting", bytes done, bytes in all).
         **options: shape, dtype, key and axes, as of `read_volume`.
 
@@ -111,7 +112,11 @@ def convert(
         KeyboardInterrupt: It was interrupted; `resume` goes on, as the message says.
     """
     target = Path(store)
-    if resume and unfinished.is_finished(target) and (whole := Store.open(target)).has_blocks:
+    whole = Store.open(target) if resume and unfinished.is_finished(target) else None
+    if whole is not None and whole.has_blocks:
+        with suppress(FileNotFoundError):  # it may be gone when all is done
+            found = source_of(source, spacing, origin, time, oblique, labels, options)
+            _check_finished(target, whole.layout, found, block, threshold)
         return whole
     begun = unfinished.is_begun(target, resume=resume)
     found = source_of(source, spacing, origin, time, oblique, labels, options)
@@ -125,12 +130,32 @@ def convert(
     return Store.open(target)
 
 
+def _check_finished(
+    target: Path, layout: StoreLayout, source: VolumeSource, block: int, threshold: float | None
+) -> None:
+    """Raises ValueError where a finished store is not the one that would be made."""
+    kept = layout.dtype if source.info.labels else source.dtype  # labels may be counted off
+    for name, before, now in (
+        ("extent", tuple(layout.extent), tuple(source.extent)),
+        ("channels", layout.width, source.width),
+        ("dtype", layout.dtype, kept),
+        ("block", layout.block, block),
+        ("threshold", layout.threshold, threshold),
+    ):
+        if before != now:
+            raise ValueError(
+                f"{target}: is finished, with {name} {before!r}, now it is {now!r}; remove the "
+                "store to make it anew"
+            )
+
+
 def estimate(
     source: str | Path | Volume | Any,
     store: str | Path,
     *,
     block: int = 32,
     threshold: float | None = None,
+    spacing: Sequence[float] | None = None,
     nan: float | None = None,
     time: int | None = None,
     oblique: Oblique | None = None,
@@ -143,7 +168,7 @@ def estimate(
 
     Args, Raises: as `convert`.
     """
-    opened_source = source_of(source, None, None, time, oblique, labels, options)
+    opened_source = source_of(source, spacing, None, time, oblique, labels, options)
     target = Path(store)
     opened_source = counted(opened_source, target, time, workers, no_progress)
     return estimate_of(plan_of(source, opened_source, target, block, threshold, nan, time, workers))
