@@ -82,6 +82,44 @@ def test_files_that_eat_a_machine_are_refused(tmp_path):
         assert max(seconds, more) < SECONDS, (path.name, seconds, more)
 
 
+class _Slow:
+    """A lock that is long in coming, once its watcher has had its turn."""
+
+    def __init__(self, lock: threading.Lock) -> None:
+        self._lock, self._reader = lock, threading.get_ident()
+
+    def __enter__(self) -> None:
+        if threading.get_ident() == self._reader:
+            end = time.monotonic() + 0.4  # an exception that comes meanwhile is raised here
+            while time.monotonic() < end:
+                pass
+        self._lock.acquire()
+
+    def __exit__(self, *_error: object) -> None:
+        self._lock.release()
+
+
+def test_nothing_is_raised_behind_a_budget(tmp_path, monkeypatch):
+    """Also where a second exception comes while the first is on its way out."""
+    monkeypatch.setattr(budget, "SECONDS", 0.1)
+    (tmp_path / "a.npy").write_bytes(b"")
+    made = budget._Watch.__init__
+
+    def slow(self, *args) -> None:
+        made(self, *args)
+        self._lock = _Slow(self._lock)
+
+    monkeypatch.setattr(budget._Watch, "__init__", slow)
+    with pytest.raises(ValueError, match="takes more than"):
+        with budget.header_budget(str(tmp_path / "a.npy")):
+            while True:
+                pass
+    end = time.monotonic() + 1.0
+    while time.monotonic() < end:
+        pass
+    assert not [one for one in threading.enumerate() if one.name == "gvtorch-budget"]
+
+
 def test_a_budget_ends_the_work_of_its_thread_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(budget, "SECONDS", 0.2)
     (tmp_path / "a.npy").touch()

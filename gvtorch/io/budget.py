@@ -98,8 +98,10 @@ class _Watch:
         threading.Thread(target=self._look, daemon=True, name="gvtorch-budget").start()
 
     def __exit__(self, *_error: object) -> None:
-        with self._lock:
-            self._ended = True  # no exception is sent from here on
+        while not self._ended:
+            with suppress(_TooMuch):  # one more, that came before the lock was held
+                with self._lock:
+                    self._ended = True  # no exception is sent from here on
         self._over.set()
         if self._sent:
             # One may be on its way still. It can't be withdrawn: Python 3.11 would then look for it
@@ -115,7 +117,8 @@ class _Watch:
         ctypes.pythonapi.PyThreadState_SetAsyncExc(reader, error)
 
     def _look(self) -> None:
-        while not self._over.wait(_LOOK):
+        pause = _LOOK
+        while not self._over.wait(pause):
             with self._lock:
                 if self._ended:
                     return
@@ -124,6 +127,7 @@ class _Watch:
                 if spent > self._seconds or greedy:
                     self._sent = True
                     self._send()
+                    pause *= 2  # it may be swallowed; or be met already, and on its way out
 
 
 def _resident() -> int:
