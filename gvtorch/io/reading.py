@@ -55,12 +55,10 @@ def read_volume(
 ) -> Volume:
     """Reads a volume, with what the file tells of it: `Volume.info`.
 
-    Formats: RAW (`.raw`, `.raw.gz`; x fastest), `.npy`, `.npy.gz`, `.npy.bz2`, `.npz`, NIfTI
-    (`.nii`, `.nii.gz`), NRRD (`.nrrd`, `.nhdr`), TIFF (`.tif`, `.tiff`, or a folder of them), FITS
-    (`.fits`, `.fits.gz`), OME-Zarr (a folder or a URL). NumPy arrays are (z, y, x), or
-    (z, y, x, c) with at most 4 channels; others are asked about (`axes`). NIfTI and NRRD with axes
-    along the world's are turned to x, y, z; oblique ones are resampled along them. What is done so,
-    and what of the file is not kept, is told in a warning.
+    `gvtorch info` and docs/formats.md list the formats. RAW is x fastest. NumPy arrays are
+    (z, y, x), or (z, y, x, c) with at most 4 channels; others are asked about (`axes`). NIfTI and
+    NRRD with axes along the world's are turned to x, y, z; oblique ones are resampled along them.
+    What is done so, and what of the file is not kept, is told in a warning.
 
     Args:
         path: The file, a folder of slices, `file.h5:/dataset`, a URL (a file is downloaded, see
