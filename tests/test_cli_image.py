@@ -11,6 +11,7 @@ from helpers import gvtorch
 from PIL import Image
 
 import gvtorch as gv
+from gvtorch.viewer.state import ViewState
 
 LOOK = ("--size", "24x16", "--tf", "hot", "--camera", "orbit:20,10,0.8")
 
@@ -111,6 +112,9 @@ def others(small, tmp_path):
     """A volume, what says how it was shown, and a folder of pictures that is a volume."""
     np.save(tmp_path / "v.npy", gv.read_volume(small).data[..., 0].numpy())
     (tmp_path / "s.json").write_text('{"component": 0, "camera": {"eye": [9, 9, 9]}}')
+    ViewState(shader=gv.TransferFunction.preset("hot", 0, 200)).save(tmp_path / "t.json")
+    (tmp_path / "list.json").write_text("[]")
+    (tmp_path / "sky.exr").touch()
     (tmp_path / "stack").mkdir()
     for number in range(3):
         gray = np.full((8, 8), 80 * number, np.uint8)
@@ -135,7 +139,14 @@ def others(small, tmp_path):
         ("render v.npy -o a.png --state s.json --component 1", "--state tells what --component"),
         ("render v.npy -o a.png --state s.json --up +z", "--state tells what --up does"),
         ("fly v.npy -o f --state s.json --component 1", "--state tells what --component does"),
-        ("view v.npy --state s.json --shader lit", "--state tells what --shader does"),
+        ("render v.npy -o a.png --state t.json --shader lit", "--state tells what --shader does"),
+        ("view v.npy --state t.json --tf hot", "--state tells what --tf does"),
+        ("view v.npy --state t.json --step 1", "--state tells what --step does"),
+        ("view v.npy --state s.json --component 1", "--state tells what --component does"),
+        ("render v.npy -o a.png --state list.json", "list.json: not a state"),
+        ("fly v.npy -o f --state list.json", "list.json: not a state"),
+        ("view v.npy --state list.json", "list.json: not a state"),
+        ("render v.npy -o sky.exr --background sky.exr", "written over what --background reads"),
         ("view v.npy --state s.json --camera orbit:0,0", "--state tells what --camera does"),
         ("view a.py --threshold 3", "--threshold is for files: the script tells"),
         ("view v.npy --port 99999 --no-browser", "port must be an int >= 0 and <= 65535"),
@@ -153,3 +164,14 @@ def test_nothing_is_overwritten_and_no_flag_is_without_effect(others, args, mess
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
     assert message in done.stderr
     assert before == {file: file.read_bytes() for file in others.rglob("*") if file.is_file()}
+
+
+def test_a_state_leaves_the_flags_be_that_it_does_not_tell(others):
+    (others / "part.json").write_text('{"develop": {"samples": 1}}')
+    lit = ["--shader", "lit", "--step", "0.25"]
+    pictures = []
+    for flags in (["--state", "part.json", *lit], lit, []):
+        done = gvtorch("render", "v.npy", "-o", "a.png", "--size", "48x32", *flags, cwd=others)
+        assert done.returncode == 0, done.stderr
+        pictures.append(np.asarray(Image.open(others / "a.png")))
+    assert np.array_equal(*pictures[:2]) and not np.array_equal(*pictures[1:])

@@ -109,6 +109,8 @@ def test_resume_of_a_finished_store_says_so(tmp_path, raw, data):
     for flags, message in (
         ((raw, target, "--block", "64"), "with block 32, now it is 64"),
         ((raw, target, "--threshold", "9"), "with threshold None, now it is 9.0"),
+        ((raw, target, "--spacing", "1,1,9"), "with spacing (1.0, 1.0, 1.0), now it is"),
+        ((raw, target, "--labels"), "with labels False, now it is True"),
         ((tmp_path / "other.npy", target), "is finished, with extent"),
     ):
         run = gvtorch("convert", *flags, "--resume")

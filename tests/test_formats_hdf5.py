@@ -114,6 +114,21 @@ def test_packed_values_and_missing_ones(tmp_path, grid):
     assert np.array_equal(volume.data[..., 0].numpy(), expected.astype("f4"))
 
 
+def test_wide_labels_with_a_value_for_none_stay_apart(tmp_path):
+    """float32 would merge them; where they are no labels that is told."""
+    labels = np.random.default_rng(3).integers(0, 50, (9, 8, 7)).astype("i4") + 2**25
+    labels[0, 0, :2] = -1
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("d", data=labels).attrs["_FillValue"] = np.int32(-1)
+    volume = gv.read_volume(tmp_path / "a.h5", axes="zyx", labels=True)
+    assert np.array_equal(volume.label_values.numpy()[volume.data[..., 0].int().numpy()], labels)
+    gv.convert(tmp_path / "a.h5", tmp_path / "a.zarr", labels=True, axes="zyx", workers=1)
+    kept = gv.Store.open(tmp_path / "a.zarr").label_values
+    assert np.array_equal(kept.numpy(), np.unique(labels))
+    with pytest.raises(ValueError, match="int32 values reach 33554"):
+        gv.read_volume(tmp_path / "a.h5", axes="zyx", nan=0)
+
+
 def test_times_of_netcdf(tmp_path):
     data = noise((4, 3, 5, 6), "float32")
     cube = xarray.DataArray(data, dims=("time", "z", "lat", "lon"), name="v")

@@ -393,8 +393,13 @@ def test_who_follows_one_that_follows_moves_too(session):
     third.until(lambda: [one["clients"] for one in third.of("clients")][-1:] == [circle])
     there = turned(first.camera, 0.5)
     first.moved(there)
+
+    def seen(page: Page) -> bool:
+        return np.allclose(page.pictures[-1][0]["camera"]["eye"], there["eye"])
+
     for page in (second, third):
-        page.until(lambda p=page: np.allclose(p.pictures[-1][0]["camera"]["eye"], there["eye"]))
+        page.until(lambda p=page: seen(p))
+        assert seen(page)
 
 
 def test_others_go_on_while_a_still_is_taken_and_it_ends_with_its_page(session):

@@ -135,7 +135,7 @@ def open_source(
             source = opener(**given)
         check_files(source)
         if labels:
-            source = dataclasses.replace(source, info=dataclasses.replace(source.info, labels=True))
+            source = source.as_labels()
         check_extent(text, (*source.extent, source.width), most=most)
         check_extent(text, source.extent, most=MOST_VOXELS)
         if not 1 <= source.times <= MOST_TIMES or min(source.shape) < 1:

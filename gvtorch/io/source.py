@@ -98,6 +98,10 @@ class VolumeSource(ABC):
         """Returns the source of another time point."""
         return self if time == self.time else dataclasses.replace(self, time=time)
 
+    def as_labels(self) -> Self:
+        """Returns the source of labels: its values are numbers of things, kept exactly."""
+        return dataclasses.replace(self, info=dataclasses.replace(self.info, labels=True))
+
     def staged(self, folder: Path) -> VolumeSource:
         """Returns a source that other processes can read: what lies in memory goes to a folder."""
         return self

@@ -148,22 +148,27 @@ def open_data(path: str, source: ReadOptions, *, image: str | None, level: int) 
 
 
 def check_files(read: Mapping[str, Any], written: Mapping[str, Path | None]) -> None:
-    """Checks that a command overwrites nothing that it reads, and no file of its own; each by the
-    flag that names it.
+    """Checks that a command writes over nothing that it reads, and each of its files once. Of a
+    folder that is read, all files in it count.
+
+    Args:
+        read: By flag, what is read: a path, FILE:NAME, or a text that is none.
+        written: By flag, the files or folders to write.
 
     Raises:
         ValueError: It would.
     """
-    whole: dict[Path, str] = {}  # folders count with all that is in them
-    for flag, name in read.items():
-        if name is not None and os.path.exists(name):
-            whole[Path(os.path.realpath(name))] = flag
+    sources: dict[Path, str] = {}
+    for flag, text in read.items():
+        for name in (str(text), str(text).rpartition(":")[0]) if text is not None else ():
+            if os.path.exists(name):
+                sources[Path(os.path.realpath(name))] = flag
     taken: dict[Path, str] = {}
     for flag, path in written.items():
         if path is None:
             continue
         place = Path(os.path.realpath(path))
-        source = whole.get(place) or (whole.get(place.parent) if place.parent in whole else None)
+        source = sources.get(place, sources.get(place.parent))
         if source is not None:
             raise ValueError(f"{flag} {path} would be written over what {source} reads")
         if place in taken:

@@ -19,7 +19,7 @@ from ..base.digits import whole_number
 from ..base.messages import printable
 from ..base.whole_file import write_whole
 from ..io.stores.ngff import is_zarr
-from .common import Bar, check_files, given, size, volume_formats
+from .common import Bar, check_files, size, volume_formats
 from .drawn import Drawn
 from .look import first_orbit, parse_camera, parse_orbit, stance
 from .scene import Scene, SceneFlags
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from ..viewer.state import ViewState
 
 _FILMS = tuple(declared_names("pictures.video", "FILMS"))
-_OF_SHADER = ("tf", "window", "shader", "channel", "value")  # flags
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +130,13 @@ class Fly:
             )
         flight = self.flight if self.flight != "orbit" else None
         check_files(
-            {"PATH": self.path, "--state": self.state, "--keys": self.keys, "--path": flight},
+            {
+                "PATH": self.path,
+                "--state": self.state,
+                "--keys": self.keys,
+                "--path": flight,
+                **self.scene.look.files(),
+            },
             {
                 "--output": self.output,
                 "--stats": self.stats,
@@ -308,26 +313,23 @@ class Fly:
     def _check_saved(self) -> None:
         """Raises ValueError where a flag tells what the states do."""
         from ..base import check
+        from ..viewer.state import saved_state
 
         self._flight()  # what is wrong with it
         path = self.flight if self.flight != "orbit" else None
         paths: dict[str, Any] = {"--path": path, "--orbit": self.orbit}
         if self.keys is None:
             assert self.state is not None
-            first = check.json_file("state", self.state)
+            first = saved_state(self.state)
         else:
             paths |= {"--turntable": self.turntable, "--state": self.state}
             first = check.json_file("key frames", self.keys)[0]["state"]
             if isinstance(first, str):
-                first = check.json_file("state", self.keys.parent / first)
+                first = saved_state(self.keys.parent / first)
         flags = [name for name, value in paths.items() if value]
-        told = {"shader": _OF_SHADER, "camera": ("camera_model", "fov", "up")}
-        told["component"] = ("component",)
-        names = {name for part, those in told.items() if part in first for name in those}
-        names |= set(first.get("options", ()))
         if self.times is not None and any(state.time != 0 for _, state in self._flight().keys):
             flags.append("--times")
-        flags += [f for f in given(self.scene.look) if f[2:].replace("-", "_") in names]
+        flags += self.scene.look.told_by(first)
         if flags:
             raise ValueError(f"{self._flag} tells what {flags[0]} does: leave one out")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,7 +12,7 @@ from tyro.conf import arg
 
 from ..base.declared import declared_names
 from .colors import check_component, chosen_transfer
-from .common import numbers
+from .common import given, numbers
 from .image import parse_background
 from .light import parse_lighting
 
@@ -36,6 +37,11 @@ else:
         )
     ]
 
+_OF_STATE = {  # fields that a part of a saved state tells
+    "shader": ("tf", "window", "shader", "channel", "value"),
+    "camera": ("camera_model", "fov", "up"),
+    "component": ("component",),
+}
 _WHOLE = ("isosurface", "maximum", "minimum", "mean")  # see one value, or a whole ray
 
 
@@ -119,6 +125,18 @@ class Look:
             "component": self.component,
             "backend": self.backend,
         }
+
+    def files(self) -> dict[str, str | None]:
+        """What is read beside the volume, by flag."""
+        return {"--tf": self.tf, "--background": self.background}
+
+    def told_by(self, state: Mapping[str, Any]) -> list[str]:
+        """Flags that were given and that a saved state tells as well, so that they would do
+        nothing.
+        """
+        names = {one for part, those in _OF_STATE.items() if part in state for one in those}
+        names |= set(state.get("options", ()))
+        return [flag for flag in given(self) if flag[2:].replace("-", "_") in names]
 
     def device(self) -> torch.device:
         """CUDA where the backend runs there."""

@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 
 from ..base.messages import printable
 from ..base.whole_file import write_whole
-from .common import Bar, check_files, given, size, volume_formats
+from .common import Bar, check_files, size, volume_formats
 from .drawn import Drawn
 from .image import KINDS, STRIPS, Develop, in_strips
 from .look import parse_camera
@@ -138,13 +138,10 @@ class Render:
         """Raises ValueError where a flag tells what a saved state does."""
         if self.state is None:
             return
-        from ..base import check
+        from ..viewer.state import saved_state
 
-        content = check.json_file("state", self.state)
-        free = {"--size", "--backend", "--brick-size", "--border"}
-        free |= {"--component"} - {f"--{name}" for name in content}
-        free |= set() if "camera" in content else {"--up"}
-        flags = [one for one in given(self.scene.look) if one not in free] + self.develop.given()
+        state = saved_state(self.state)
+        flags = self.scene.look.told_by(state) + self.develop.given()
         flags += ["--camera"] * (self.camera is not None) + ["--show"] * (self.show != "picture")
         if flags:
             raise ValueError(f"--state tells what {flags[0]} does: leave one out")
@@ -164,7 +161,7 @@ class Render:
                 raise FileNotFoundError(f"folder not found: {file.parent}")
         checked_path("--output", self.output, self.bits, KINDS)
         check_files(
-            {"PATH": self.path, "--state": self.state},
+            {"PATH": self.path, "--state": self.state, **self.scene.look.files()},
             {"--output": self.output, "--npz": self.npz, "--stats": self.stats},
         )
         if self.show != "picture":

@@ -57,7 +57,7 @@ class Slice:
         from ..tracing.slices import radiological_views
 
         checked_path("--output", self.output, self.bits, KINDS)
-        check_files({"PATH": self.path}, {"--output": self.output})
+        check_files({"PATH": self.path, "--tf": self.tf}, {"--output": self.output})
         places: Any = tuple(self.at.split(","))
         if len(places) not in ((1, 3) if self.axis == "all" else (1,)):
             raise ValueError(f"--at must be one place, or three for --axis all, got {self.at!r}")

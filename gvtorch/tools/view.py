@@ -76,11 +76,11 @@ class View:
         """Raises ValueError where a flag tells what a saved state does."""
         if self.state is None:
             return
-        if not self.state.is_file():
-            raise FileNotFoundError(f"state not found: {self.state}")
-        free = ("--backend", "--brick-size", "--border", "--component", "--up")
-        flags = [one for one in given(self.scene.look) if one not in free]
-        flags += ["--camera"] * (self.camera is not None)
+        from ..viewer.state import saved_state
+
+        state = saved_state(self.state)
+        flags = self.scene.look.told_by(state)
+        flags += ["--camera"] * (self.camera is not None and "camera" in state)
         if flags:
             raise ValueError(f"--state tells what {flags[0]} does: leave one out")
 

@@ -14,7 +14,8 @@ from typing import Any
 from ..base.messages import need_library
 from .client import Client
 from .server import page_files
-from .session import Session, png
+from .session import Session
+from .still import png
 
 _FIRST = "app.js"
 _IMPORT = re.compile(r'from "\./([a-z]+\.js)"')

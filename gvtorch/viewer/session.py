@@ -5,11 +5,10 @@ between frames. It waits for no page: see `Client`.
 
 from __future__ import annotations
 
-import io
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -21,11 +20,11 @@ from ..cameras import Camera
 from ..cameras.camera import Up, upward
 from ..engine import EngineOptions
 from ..io.stores.store import Store
-from ..pictures import Picture, Progressive
+from ..pictures import Picture
 from ..shaders import TransferFunction
 from ..shaders.presets import CT_PRESETS, PRESETS
 from . import protocol
-from .client import Client, Interrupted, Send
+from .client import Client, Send
 from .export import SurfaceExport
 from .files import read_function
 from .fitting import trimmed, unfit
@@ -34,8 +33,9 @@ from .parameters import Parameters
 from .protocol import parse
 from .scene import Scene
 from .schema import KINDS, decode, describe_kind, encode
-from .slices import Planes, panes
-from .state import Development, Eye, Slices, ViewState, blended, transfer_of
+from .slices import Planes
+from .state import Development, Eye, Slices, ViewState, transfer_of
+from .still import Steps, Stills, finish, still_steps
 
 _TICK = 0.02  # seconds between looks at whether a camera has come to rest
 _FIGURES = 0.25  # seconds between figures for monitors
@@ -72,7 +72,7 @@ class Session:
         self._good = state  # the last state of which there was a picture
         self._count, self._turn = 0, 0
         self._tasks: deque[Callable[[], None]] = deque()
-        self._stills: deque[tuple[Client, Generator[None, None, Picture]]] = deque()
+        self._stills = Stills()
         self._wake = threading.Condition()
         self._closed = False
         self._failed: tuple[str, ...] = ()
@@ -187,7 +187,7 @@ class Session:
         if client is not None:
             self._draw(client)
         if self._stills:
-            self._go_on()
+            self._stills.go_on()
         return True
 
     def _someone(self) -> Client | None:
@@ -499,24 +499,8 @@ class Session:
             client.tell("figures", **self._figures(client.picture))
 
     def _still(self, client: Client, message: protocol.Still) -> None:
-        if any(one is client for one, _ in self._stills):
-            raise ValueError("still: one is being made already")
         size = message.width, message.height
-        self._stills.append((client, self._still_frames(client.eye, *size, lambda: client.gone)))
-
-    def _go_on(self) -> None:
-        """Renders one more frame of the still that waits longest."""
-        client, frames = self._stills.popleft()
-        try:
-            next(frames)
-        except StopIteration as end:
-            client.send_file("picture.png", png(end.value))
-        except Interrupted:
-            pass
-        except Exception as error:  # whatever it was, the view goes on
-            client.tell("refused", text=f"still: {one_line(error)}")
-        else:
-            self._stills.append((client, frames))
+        self._stills.add(client, self._steps(client.eye, size, lambda: client.gone))
 
     def _surface(self, client: Client, message: protocol.Surface) -> None:
         if self._export is not None and self._export.busy:
@@ -537,43 +521,13 @@ class Session:
 
     def still(self, eye: Eye, width: int, height: int) -> Picture:
         """Renders a whole picture: all that can be had, all samples."""
-        frames = self._still_frames(eye, width, height, lambda: False)
-        while True:
-            try:
-                next(frames)
-            except StopIteration as end:
-                return end.value
+        return finish(self._steps(eye, (width, height), lambda: False))
 
-    def _still_frames(
-        self, eye: Eye, width: int, height: int, unwanted: Callable[[], bool]
-    ) -> Generator[None, None, Picture]:
-        """Renders a whole picture, and lets others have their turn after each sample.
-
-        Raises:
-            Interrupted: The session was closed, or nobody wants it any more.
-        """
-        state, scene, whole = self.state, self.scene, (width, height)
-
-        def check(_what: str, _done: int, _total: int) -> None:
-            if self._closed or unwanted():
-                raise Interrupted("the view was closed")
-
-        if state.slices is not None:
-            width, height = panes(*whole)["view"][2:]
-        camera = eye.camera(width, height, scene.box)
-        if scene.engine is not None:  # until all is there
-            scene.engine.render(camera, state.shader, progress=check, **state.settings())
-        mean = Progressive(lambda one: scene.frame(one, state, check))
-        made = mean.frame(camera)
-        while mean.count < state.develop.samples:
-            yield
-            made = mean.frame(camera)
-        shown = state.develop.develop(made)
-        if state.show != "picture":
-            shown = blended(shown, scene.cost(camera, state, check), state.blend)
-        if self._planes is None or state.slices is None:
-            return shown
-        return self._planes.composed(shown, state, *whole, wait=True).picture
+    def _steps(self, eye: Eye, size: tuple[int, int], gone: Callable[[], bool]) -> Steps:
+        return still_steps(
+            *(self.scene, lambda: self._planes, self.state, eye, size),
+            unwanted=lambda: self._closed or gone(),
+        )
 
 
 _TAKES: Mapping[type, Callable[[Session, Client, Any], None]] = {
@@ -622,12 +576,3 @@ def schema() -> dict[str, Any]:
         name: one for name, one in told["EngineOptions"]["fields"].items() if name in _ENGINE
     }
     return told
-
-
-def png(picture: Picture) -> bytes:
-    """Returns a picture as a PNG file."""
-    from PIL import Image
-
-    out = io.BytesIO()
-    Image.fromarray(picture.to_srgb8().numpy()).save(out, "PNG")
-    return out.getvalue()

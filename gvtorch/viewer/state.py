@@ -248,7 +248,7 @@ class ViewState:
             FileNotFoundError: There is no such file.
             ValueError: It holds something else; the message names it.
         """
-        content = check.json_file("state", path)
+        content = saved_state(path)
         try:
             return self.changed(content)
         except ValueError as error:
@@ -270,6 +270,19 @@ def costed(shader: Shader) -> TransferFunction:
     return check.instance("cost", "shader", transfer_of(shader) or shader, TransferFunction)
 
 
+def saved_state(path: str | Path) -> dict[str, Any]:
+    """Returns what a .json file of a state tells, unchecked: its fields, some of them or all.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It holds something else.
+    """
+    content = check.json_file("state", path)
+    if not isinstance(content, dict) or not isinstance(content.get("options", {}), dict):
+        raise ValueError(f"{path}: not a state: it must be an object with the state's fields")
+    return content
+
+
 def saved_time(path: str | Path) -> float:
     """Returns the time that a .json file of a state tells, 0 where it tells none.
 
@@ -277,9 +290,7 @@ def saved_time(path: str | Path) -> float:
         FileNotFoundError: There is no such file.
         ValueError: It holds something else.
     """
-    content = check.json_file("state", path)
-    told = content.get("time", 0.0) if isinstance(content, dict) else None
-    return check.number(f"{path}: state", "time", told)
+    return check.number(f"{path}: state", "time", saved_state(path).get("time", 0.0))
 
 
 def blended(picture: Picture, cost: Picture, share: float) -> Picture:

@@ -12,11 +12,12 @@ import math
 import os
 import re
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
+from ...base.labels import check_narrowed
 from ...base.named_axes import ask_axes, even_steps, letter_of, named_axes, place_named
 from ...base.units import spacing_of
 from ..budget import check_beside
@@ -35,8 +36,14 @@ class Hdf5Source(VolumeSource):
     """A data set."""
 
     name: str
+    packed: str  # dtype of the values in the file
     scale: tuple[float, float] | None = None  # factor and offset of packed values
     missing: tuple[float, ...] = ()  # stored values that stand for none
+
+    def as_labels(self) -> Self:
+        """See `VolumeSource`; a value that stands for none is a label like others."""
+        found = super().as_labels()
+        return found if self.scale else replace(found, missing=(), stored=self.packed)
 
     def read_stored(self, index: Index) -> np.ndarray:
         """Reads a part; packed values are unpacked, missing ones become NaN."""
@@ -47,9 +54,13 @@ class Hdf5Source(VolumeSource):
         if self.scale is None and not self.missing:
             return data
         found = data * np.float64(self.scale[0]) + self.scale[1] if self.scale else data
-        found = np.asarray(found).astype(self.stored)
+        gaps = np.zeros(data.shape, bool)
         for value in self.missing:
-            found[data == value] = np.nan
+            gaps |= data == value
+        if not self.scale:
+            check_narrowed(self.path, data[~gaps])
+        found = np.asarray(found).astype(self.stored)
+        found[gaps] = np.nan
         return found
 
 
@@ -71,6 +82,7 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         shape = tuple(int(n) for n in data.shape)
         letters, steps, units, lost = _axes(f"{path}:/{name.strip('/')}", data, shape, axes)
         info, scale, missing, stored = _values(data, letters, shape)
+        data_type = data.dtype.str
         place, moments = place_named(letters, shape, steps, units)
         sizes = np.ravel(data.attrs.get("element_size_um", ())).tolist()
         if moments["unit"] is None and len(sizes) == 3:
@@ -82,6 +94,7 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         axes=letters,
         stored=stored,
         name=name,
+        packed=data_type,
         scale=scale,
         missing=missing,
         info=info,

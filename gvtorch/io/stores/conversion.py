@@ -22,6 +22,7 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -47,7 +48,7 @@ from .conversion_plan import (
     within,
 )
 from .store import Store
-from .store_layout import WORK, Deadline, StoreLayout, opened
+from .store_layout import WORK, Deadline, opened
 from .unfinished import Done
 
 _AHEAD = 64  # tasks handed to an executor that does not tell how many workers it has
@@ -95,8 +96,8 @@ def convert(
             be the same for all of its workers. A pool of processes if left out.
         workers: Number of processes of that pool; left out, one a core, as far as memory goes.
         memory: Most bytes of all processes, as in "2 GB": fewer workers then. Left out, all free.
-        resume: Go on with a half-written store; a finished one is given as it is, if it is of
-            such a source and settings.
+        resume: Go on with a half-written store. A finished one is given as it is, if its grid,
+            dtype, block and threshold are those asked for; its voxels are not compared.
         progress: Told ("converting", bytes done, bytes in all).
         **options: shape, dtype, key and axes, as of `read_volume`.
 
@@ -112,15 +113,13 @@ def convert(
         KeyboardInterrupt: It was interrupted; `resume` goes on, as the message says.
     """
     target = Path(store)
-    whole = Store.open(target) if resume and unfinished.is_finished(target) else None
-    if whole is not None and whole.has_blocks:
+    make_source = partial(source_of, source, spacing, origin, time, oblique, labels, options)
+    if resume and unfinished.is_finished(target) and (whole := Store.open(target)).has_blocks:
         with suppress(FileNotFoundError):  # it may be gone when all is done
-            found = source_of(source, spacing, origin, time, oblique, labels, options)
-            _check_finished(target, whole.layout, found, block, threshold)
+            _check_finished(whole, make_source(read=False), block, threshold)
         return whole
     begun = unfinished.is_begun(target, resume=resume)
-    found = source_of(source, spacing, origin, time, oblique, labels, options)
-    found = counted(found, target, time, workers, progress)
+    found = counted(make_source(), target, time, workers, progress)
     plan = plan_of(source, found, target, block, threshold, nan, time, workers)
     if executor is None and (memory is not None or workers is None):
         plan = within(plan, memory)
@@ -131,21 +130,24 @@ def convert(
 
 
 def _check_finished(
-    target: Path, layout: StoreLayout, source: VolumeSource, block: int, threshold: float | None
+    store: Store, source: VolumeSource, block: int, threshold: float | None
 ) -> None:
-    """Raises ValueError where a finished store is not the one that would be made."""
-    kept = layout.dtype if source.info.labels else source.dtype  # labels may be counted off
+    """Raises ValueError where a finished store can't be the one that would be made."""
+    is_labels = source.info.labels
     for name, before, now in (
-        ("extent", tuple(layout.extent), tuple(source.extent)),
-        ("channels", layout.width, source.width),
-        ("dtype", layout.dtype, kept),
-        ("block", layout.block, block),
-        ("threshold", layout.threshold, threshold),
+        ("extent", store.layout.extent, source.extent),
+        ("spacing", store.spacing, source.spacing),
+        ("origin", store.origin, source.origin),
+        ("channels", store.layout.width, source.width),
+        ("labels", store.info.labels, is_labels),
+        ("dtype", None if is_labels else store.layout.dtype, None if is_labels else source.dtype),
+        ("block", store.block, block),
+        ("threshold", store.threshold, threshold),
     ):
         if before != now:
             raise ValueError(
-                f"{target}: is finished, with {name} {before!r}, now it is {now!r}; remove the "
-                "store to make it anew"
+                f"{store.location}: is finished, with {name} {before!r}, now it is {now!r}; remove "
+                "the store to make it anew"
             )
 
 

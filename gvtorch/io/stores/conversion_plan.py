@@ -95,9 +95,11 @@ def source_of(
     oblique: Oblique | None,
     labels: bool,
     options: FormatSettings,
+    *,
+    read: bool = True,
 ) -> VolumeSource:
-    """Opens the source; one that can only be read whole is read, once. Its time points are those
-    that are written.
+    """Opens the source; one that can only be read whole is read, once, unless `read` is False. Its
+    time points are those that are written.
     """
     check.known("convert", options, FormatSettings)
     if isinstance(source, VolumeSource):
@@ -125,7 +127,7 @@ def source_of(
         return IndexSource.of(found, source.label_values.numpy(), indexed=True)
     placement: dict[str, Any] = {"spacing": spacing, "origin": origin, "oblique": oblique}
     found = open_source(source, time=time, labels=labels, **placement, **options)
-    if not found.whole:
+    if not (found.whole and read):
         return found
     first, times = (0, found.times) if time is None else (time, 1)
     free, needed = resources.memory_free(), found.peak_bytes + (times - 1) * found.nbytes

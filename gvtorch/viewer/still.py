@@ -1,0 +1,117 @@
+"""Stills: whole pictures that pages ask for, in any size. They are rendered by the thread of the
+session, a step at a time between the frames of pages.
+"""
+
+from __future__ import annotations
+
+import io
+from collections import deque
+from collections.abc import Callable, Generator
+
+from ..base.messages import one_line
+from ..pictures import Picture, Progressive
+from .client import Client, Interrupted
+from .scene import Scene
+from .slices import Planes, panes
+from .state import Eye, ViewState, blended
+
+Steps = Generator[None, None, Picture]
+
+
+def still_steps(
+    scene: Scene,
+    planes: Callable[[], Planes | None],
+    state: ViewState,
+    eye: Eye,
+    size: tuple[int, int],
+    unwanted: Callable[[], bool],
+) -> Steps:
+    """Renders a whole picture, all that can be had, all samples; others have their turn after each
+    step.
+
+    Args:
+        scene: Of what.
+        planes: Tells the slices beside it, if there are any, when all else is there.
+        state: How it is shown.
+        eye: From where.
+        size: Width and height in pixels, with the slices.
+        unwanted: Asked between parts of the picture, whether nobody waits for it any more.
+
+    Raises:
+        Interrupted: Nobody waits for it any more.
+    """
+
+    def check(_what: str, _done: int, _total: int) -> None:
+        if unwanted():
+            raise Interrupted("nobody waits for this still any more")
+
+    width, height = size if state.slices is None else panes(*size)["view"][2:]
+    camera = eye.camera(width, height, scene.box)
+    if scene.engine is not None:  # until all is there
+        scene.engine.render(camera, state.shader, progress=check, **state.settings())
+        yield
+    mean = Progressive(lambda one: scene.frame(one, state, check))
+    made = mean.frame(camera)
+    while mean.count < state.develop.samples:
+        yield
+        made = mean.frame(camera)
+    shown = state.develop.develop(made)
+    if state.show != "picture":
+        shown = blended(shown, scene.cost(camera, state, check), state.blend)
+    beside = planes()
+    if beside is None or state.slices is None:
+        return shown
+    return beside.composed(shown, state, *size, wait=True).picture
+
+
+def finish(steps: Steps) -> Picture:
+    """Returns the picture, without a turn for others."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value
+
+
+class Stills:
+    """Those that pages wait for, which take turns."""
+
+    def __init__(self) -> None:
+        """Starts with none."""
+        self._waiting: deque[tuple[Client, Steps]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def add(self, client: Client, steps: Steps) -> None:
+        """Begins one for a page; raises ValueError if it waits for one already."""
+        if any(one is client for one, _ in self._waiting):
+            raise ValueError("still: one is being made already")
+        self._waiting.append((client, steps))
+
+    def clear(self) -> None:
+        """Gives all up."""
+        self._waiting.clear()
+
+    def go_on(self) -> None:
+        """Takes the next step of the one that waits longest, and sends it if that was the last."""
+        client, steps = self._waiting.popleft()
+        try:
+            next(steps)
+        except StopIteration as end:
+            client.send_file("picture.png", png(end.value))
+        except Interrupted:
+            pass
+        except Exception as error:  # whatever it was, the view goes on
+            client.tell("refused", text=f"still: {one_line(error)}")
+        else:
+            self._waiting.append((client, steps))
+
+
+def png(picture: Picture) -> bytes:
+    """Returns a picture as a PNG file."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(picture.to_srgb8().numpy()).save(out, "PNG")
+    return out.getvalue()
