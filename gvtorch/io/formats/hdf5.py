@@ -36,25 +36,31 @@ class Hdf5Source(VolumeSource):
     """A data set."""
 
     name: str
-    packed: str  # dtype of the values in the file
+    packed: str  # dtype of the values in the file, as its attributes tell
     scale: tuple[float, float] | None = None  # factor and offset of packed values
-    missing: tuple[float, ...] = ()  # stored values that stand for none
+    missing: tuple[float, ...] = ()  # packed values that stand for none
+    valid: tuple[float, float] = (-math.inf, math.inf)  # packed values beyond stand for none
 
     def as_labels(self) -> Self:
         """See `VolumeSource`; a value that stands for none is a label like others."""
         found = super().as_labels()
-        return found if self.scale else replace(found, missing=(), stored=self.packed)
+        if self.scale:
+            return found
+        return replace(found, missing=(), valid=(-math.inf, math.inf), stored=self.packed)
 
     def read_stored(self, index: Index) -> np.ndarray:
         """Reads a part; packed values are unpacked, missing ones become NaN."""
         import h5py
 
         with h5py.File(self.path, "r") as file:
-            data = file[self.name][index]
-        if self.scale is None and not self.missing:
+            data = np.asarray(file[self.name][index])
+        if data.dtype.kind in "iu":
+            data = data.view(self.packed)
+        low, high = self.valid
+        if self.scale is None and not self.missing and (low, high) == (-math.inf, math.inf):
             return data
         found = data * np.float64(self.scale[0]) + self.scale[1] if self.scale else data
-        gaps = np.zeros(data.shape, bool)
+        gaps = (data < low) | (data > high)
         for value in self.missing:
             gaps |= data == value
         if not self.scale:
@@ -81,8 +87,7 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         _check(path, name, data)
         shape = tuple(int(n) for n in data.shape)
         letters, steps, units, lost = _axes(f"{path}:/{name.strip('/')}", data, shape, axes)
-        info, scale, missing, stored = _values(data, letters, shape)
-        data_type = data.dtype.str
+        info, values = _values(data, letters, shape)
         place, moments = place_named(letters, shape, steps, units)
         sizes = np.ravel(data.attrs.get("element_size_um", ())).tolist()
         if moments["unit"] is None and len(sizes) == 3:
@@ -92,11 +97,8 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         path=path,
         shape=shape,
         axes=letters,
-        stored=stored,
         name=name,
-        packed=data_type,
-        scale=scale,
-        missing=missing,
+        **values,
         info=info,
         lost=tuple(lost),
         **place,
@@ -252,17 +254,41 @@ def _tags(data: Any) -> list[Any]:
     return tags if isinstance(tags, list) and all(isinstance(tag, dict) for tag in tags) else []
 
 
-def _values(
-    data: Any, letters: str, shape: tuple[int, ...]
-) -> tuple[ImageInfo, tuple[float, float] | None, tuple[float, ...], str]:
-    """What the attributes tell of values: info, scale, missing ones, and the dtype they become."""
+def _values(data: Any, letters: str, shape: tuple[int, ...]) -> tuple[ImageInfo, dict[str, Any]]:
+    """What the attributes tell of values: info, and the fields `packed`, `scale`, `missing`,
+    `valid` and `stored` of a source.
+
+    Source: CF Conventions 1.11, sections 2.5.1 and 8.1; `_Unsigned` is of the NetCDF Users' Guide,
+        appendix A.
+    """
     attrs = data.attrs
-    factor, offset = (_number(attrs.get(name)) for name in ("scale_factor", "add_offset"))
+    packed, told = data.dtype, _text(attrs.get("_Unsigned")).lower()
+    if packed.kind in "iu" and told in ("true", "false"):
+        packed = np.dtype(packed.str.replace(packed.kind, "u" if told == "true" else "i"))
+
+    def numbers(name: str) -> list[float]:
+        found = np.ravel(attrs.get(name, ()))
+        if packed.kind in "iu" and found.dtype.kind in "iu" and told in ("true", "false"):
+            found = found.astype(packed)
+        return found.tolist() if found.dtype.kind in "iuf" else []
+
+    def number(name: str, other: float) -> float:
+        return float((numbers(name) or [other])[0])
+
     scale = None
-    if factor is not None or offset is not None:
-        scale = (1.0 if factor is None else factor, 0.0 if offset is None else offset)
-    missing = {_number(attrs.get(name)) for name in ("_FillValue", "missing_value")}
-    gaps = tuple(sorted(v for v in missing if v is not None and not math.isnan(v)))
+    if numbers("scale_factor") or numbers("add_offset"):
+        scale = (number("scale_factor", 1.0), number("add_offset", 0.0))
+    gaps = {*numbers("_FillValue")[:1], *numbers("missing_value")}
+    missing = tuple(sorted(v for v in gaps if not math.isnan(v)))
+    valid = tuple(numbers("valid_range"))
+    if len(valid) != 2:
+        valid = (number("valid_min", -math.inf), number("valid_max", math.inf))
+    if packed.kind in "iu":  # bounds that no value lies beyond
+        least, most = np.iinfo(packed).min, np.iinfo(packed).max
+        valid = (
+            -math.inf if valid[0] <= least else valid[0],
+            math.inf if valid[1] >= most else valid[1],
+        )
     quantity = _text(attrs.get("units"))
     name = _text(attrs.get("long_name"))
     width = shape[letters.index("c")] if "c" in letters else 1
@@ -270,16 +296,11 @@ def _values(
     channels = tuple(ChannelInfo(name=_text(n)) for n in names) if len(names) == width else ()
     if not channels and width == 1 and name:
         channels = (ChannelInfo(name=name),)
-    stored = data.dtype.str
-    if scale or gaps:
-        wide = data.dtype.kind == "f" and data.dtype.itemsize > 4
-        stored = "float64" if wide else "float32"
-    return ImageInfo(quantity=quantity or None, channels=channels), scale, gaps, stored
-
-
-def _number(value: Any) -> float | None:
-    found = np.ravel(value) if value is not None else np.zeros(0)
-    return float(found[0]) if found.size == 1 and found.dtype.kind in "iuf" else None
+    stored = packed.str
+    if scale or missing or valid != (-math.inf, math.inf):
+        stored = "float64" if packed.kind == "f" and packed.itemsize > 4 else "float32"
+    values = {"packed": packed.str, "scale": scale, "missing": missing, "valid": valid}
+    return ImageInfo(quantity=quantity or None, channels=channels), {**values, "stored": stored}
 
 
 def _text(value: Any) -> str:
