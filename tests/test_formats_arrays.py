@@ -178,4 +178,4 @@ def test_masked_values_are_not_there():
     with pytest.raises(ValueError, match="int64 values reach 100000059"):
         gv.as_volume(np.ma.MaskedArray(data + 10**8, gaps), nan=0)
     with pytest.raises(ValueError, match="masked arrays: fill them before"):
-        gv.as_volume(dask.array.from_array(masked, chunks=2), axes="zyx")
+        gv.as_volume(dask.from_array(masked, chunks=2), axes="zyx")

@@ -272,10 +272,13 @@ def image_info(header: Any, samples: int, times: Times) -> tuple[ImageInfo, list
         lost.append("the palette: values are its numbers")
     if kind == "MONOCHROME1":
         lost.append("that high values are meant to be dark (MONOCHROME1)")
+    table = header.get("ModalityLUTSequence") and header.get("RescaleSlope") is None
+    if table:
+        lost.append("the modality's table: values are those that it looks up")
     quantity = str(
         header.get("RescaleType") or header.get("Units") or header.get("DoseUnits") or ""
     )
-    if header.get("Modality") == "CT" and quantity in ("", "US"):
+    if header.get("Modality") == "CT" and quantity in ("", "US") and not table:
         quantity = "HU"
     shared = _first(header.get("SharedFunctionalGroupsSequence"))
     voi = _first(shared.get("FrameVOILUTSequence")) if shared is not None else None
