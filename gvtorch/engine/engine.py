@@ -117,6 +117,8 @@ class Engine:
         )
         self.device = check.device("Engine", self.options.device)
         producers = dict(scene) if isinstance(scene, Mapping) else {"scene": scene}
+        for name in producers:
+            check.instance("Engine", "name of a tree", name, str)
         nodes, bricks = make_pools(producers, self.options, self.device)
         self.cache = Cache(nodes, bricks, len(producers))
         most_loads = max(1, _MOST_PRODUCED // brick_bytes(bricks.channels, self.options))

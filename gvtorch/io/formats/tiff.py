@@ -189,6 +189,11 @@ def _told(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) 
     if series.kind == "imagej":
         info, spacing, more = imagej_info(file.imagej_metadata, _resolution(file), width)
         return replace(info, channels=channels) if colors else info, spacing, [*more, *lost]
+    tags = series.keyframe.tags
+    if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are of printers
+        lost.append("the size of a pixel in centimeters: how far pages are apart is not told")
+    if tags.valueof("Orientation", 1) != 1:
+        lost.append("that its pages are to be shown turned or mirrored")
     return ImageInfo(channels=channels), (1.0, 1.0, 1.0), lost
 
 
