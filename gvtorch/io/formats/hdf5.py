@@ -87,7 +87,7 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         _check(path, name, data)
         shape = tuple(int(n) for n in data.shape)
         letters, steps, units, lost = _axes(f"{path}:/{name.strip('/')}", data, shape, axes)
-        info, values = _values(data, letters, shape)
+        info, values = _info(data, letters, shape), _values(data)
         place, moments = place_named(letters, shape, steps, units)
         sizes = np.ravel(data.attrs.get("element_size_um", ())).tolist()
         if moments["unit"] is None and len(sizes) == 3:
@@ -254,53 +254,57 @@ def _tags(data: Any) -> list[Any]:
     return tags if isinstance(tags, list) and all(isinstance(tag, dict) for tag in tags) else []
 
 
-def _values(data: Any, letters: str, shape: tuple[int, ...]) -> tuple[ImageInfo, dict[str, Any]]:
-    """What the attributes tell of values: info, and the fields `packed`, `scale`, `missing`,
-    `valid` and `stored` of a source.
+def _info(data: Any, letters: str, shape: tuple[int, ...]) -> ImageInfo:
+    """What the attributes tell of the image."""
+    quantity, name = (_text(data.attrs.get(key)) for key in ("units", "long_name"))
+    width = shape[letters.index("c")] if "c" in letters else 1
+    names = np.ravel(data.attrs.get("channel_names", ())).tolist()
+    channels = tuple(ChannelInfo(name=_text(n)) for n in names) if len(names) == width else ()
+    if not channels and width == 1 and name:
+        channels = (ChannelInfo(name=name),)
+    return ImageInfo(quantity=quantity or None, channels=channels)
+
+
+def _values(data: Any) -> dict[str, Any]:
+    """What the attributes tell of the values: the fields `packed`, `scale`, `missing`, `valid` and
+    `stored` of a source.
 
     Source: CF Conventions 1.11, sections 2.5.1 and 8.1; `_Unsigned` is of the NetCDF Users' Guide,
         appendix A.
     """
-    attrs = data.attrs
-    packed, told = data.dtype, _text(attrs.get("_Unsigned")).lower()
-    if packed.kind in "iu" and told in ("true", "false"):
+    packed, told = data.dtype, _text(data.attrs.get("_Unsigned")).lower()
+    whole, other_sign = data.dtype.kind in "iu", told in ("true", "false")
+    if whole and other_sign:
         packed = np.dtype(packed.str.replace(packed.kind, "u" if told == "true" else "i"))
 
-    def numbers(name: str) -> list[float]:
-        found = np.ravel(attrs.get(name, ()))
-        if packed.kind in "iu" and found.dtype.kind in "iu" and told in ("true", "false"):
+    def numbers(name: str, *others: float) -> list[float]:
+        found = np.ravel(data.attrs.get(name, ()))
+        if whole and other_sign and found.dtype.kind in "iu":
             found = found.astype(packed)
-        return found.tolist() if found.dtype.kind in "iuf" else []
-
-    def number(name: str, other: float) -> float:
-        return float((numbers(name) or [other])[0])
+        return (found.tolist() if found.dtype.kind in "iuf" else []) or list(others)
 
     scale = None
     if numbers("scale_factor") or numbers("add_offset"):
-        scale = (number("scale_factor", 1.0), number("add_offset", 0.0))
+        scale = (numbers("scale_factor", 1.0)[0], numbers("add_offset", 0.0)[0])
     gaps = {*numbers("_FillValue")[:1], *numbers("missing_value")}
     missing = tuple(sorted(v for v in gaps if not math.isnan(v)))
-    valid = tuple(numbers("valid_range"))
+    valid = numbers("valid_range")
     if len(valid) != 2:
-        valid = (number("valid_min", -math.inf), number("valid_max", math.inf))
-    if packed.kind in "iu":  # bounds that no value lies beyond
-        least, most = np.iinfo(packed).min, np.iinfo(packed).max
-        valid = (
-            -math.inf if valid[0] <= least else valid[0],
-            math.inf if valid[1] >= most else valid[1],
-        )
-    quantity = _text(attrs.get("units"))
-    name = _text(attrs.get("long_name"))
-    width = shape[letters.index("c")] if "c" in letters else 1
-    names = np.ravel(attrs.get("channel_names", ())).tolist()
-    channels = tuple(ChannelInfo(name=_text(n)) for n in names) if len(names) == width else ()
-    if not channels and width == 1 and name:
-        channels = (ChannelInfo(name=name),)
+        valid = [numbers("valid_min", -math.inf)[0], numbers("valid_max", math.inf)[0]]
+    if whole and valid[0] <= np.iinfo(packed).min:  # no value lies beyond
+        valid[0] = -math.inf
+    if whole and valid[1] >= np.iinfo(packed).max:
+        valid[1] = math.inf
     stored = packed.str
-    if scale or missing or valid != (-math.inf, math.inf):
+    if scale or missing or valid != [-math.inf, math.inf]:
         stored = "float64" if packed.kind == "f" and packed.itemsize > 4 else "float32"
-    values = {"packed": packed.str, "scale": scale, "missing": missing, "valid": valid}
-    return ImageInfo(quantity=quantity or None, channels=channels), {**values, "stored": stored}
+    return {
+        "packed": packed.str,
+        "scale": scale,
+        "missing": missing,
+        "valid": tuple(valid),
+        "stored": stored,
+    }
 
 
 def _text(value: Any) -> str:
