@@ -277,20 +277,25 @@ def _values(data: Any) -> dict[str, Any]:
     if whole and other_sign:
         packed = np.dtype(packed.str.replace(packed.kind, "u" if told == "true" else "i"))
 
-    def numbers(name: str, *others: float) -> list[float]:
+    def numbers(name: str) -> list[float]:
         found = np.ravel(data.attrs.get(name, ()))
         if whole and other_sign and found.dtype.kind in "iu":
             found = found.astype(packed)
-        return (found.tolist() if found.dtype.kind in "iuf" else []) or list(others)
+        return found.tolist() if found.dtype.kind in "iuf" else []
 
+    def number(name: str, other: float) -> float:
+        found = numbers(name)
+        return found[0] if len(found) == 1 else other
+
+    factor, offset = number("scale_factor", math.nan), number("add_offset", math.nan)
     scale = None
-    if numbers("scale_factor") or numbers("add_offset"):
-        scale = (numbers("scale_factor", 1.0)[0], numbers("add_offset", 0.0)[0])
-    gaps = {*numbers("_FillValue")[:1], *numbers("missing_value")}
+    if not math.isnan(factor) or not math.isnan(offset):
+        scale = (1.0 if math.isnan(factor) else factor, 0.0 if math.isnan(offset) else offset)
+    gaps = {number("_FillValue", math.nan), *numbers("missing_value")}
     missing = tuple(sorted(v for v in gaps if not math.isnan(v)))
     valid = numbers("valid_range")
     if len(valid) != 2:
-        valid = [numbers("valid_min", -math.inf)[0], numbers("valid_max", math.inf)[0]]
+        valid = [number("valid_min", -math.inf), number("valid_max", math.inf)]
     if whole and valid[0] <= np.iinfo(packed).min:  # no value lies beyond
         valid[0] = -math.inf
     if whole and valid[1] >= np.iinfo(packed).max:
