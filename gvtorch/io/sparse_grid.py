@@ -21,10 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from ..base.digits import whole_number
 from ..base.image_info import ChannelInfo, ImageInfo
 from ..base.messages import need_library
 from ..base.volume import check_extent
-from .source import Index, VolumeSource, choose, place_axes
+from .source import Index, VolumeSource, place_axes
 
 SIDES = (4096, 128, 8)  # voxels along a side of an upper node, a lower node and a leaf
 COUNTS = (32, 16, 8)  # entries along a side of each
@@ -241,11 +242,24 @@ def describe(
     }
 
 
-def choose_grid(path: str, names: Sequence[str], key: str | None) -> tuple[int, list[str]]:
-    """As `choose`; the first is "density" if there is one, and names may be as in f.vdb:/name."""
-    first = names.index("density") if "density" in names else 0
-    key = None if key is None else key.removeprefix("/")
-    return choose(path, "grid", names, key, first=first)
+def choose(path: str, names: Sequence[str], key: str | None) -> tuple[int, tuple[str, ...]]:
+    """Which grid is meant: `key` names it or its number; the only one, "density", or the first, if
+    left out. And what to say of the others.
+    """
+    if not names:
+        raise ValueError(f"{path}: holds no grid")
+    listed = ", ".join(names[:20])
+    if key is None:
+        at = names.index("density") if "density" in names else 0
+        others = f"{len(names) - 1} other grids; key (--key) chooses among {listed}"
+        return at, (others,) if len(names) > 1 else ()
+    key = key.removeprefix("/")  # of file.vdb:/density
+    if key in names:
+        return names.index(key), ()
+    number = whole_number(key)
+    if number is not None and number < len(names):
+        return number, ()
+    raise ValueError(f"{path}: has no grid {key!r}; it holds {listed}")
 
 
 def bits(data: Any, at: int, count: int) -> np.ndarray:

@@ -12,9 +12,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ...base.digits import whole_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import NO_DEPTH, spacing_of
-from ..source import Index, VolumeSource, choose
+from ..source import Index, VolumeSource
 from ..tiff_info import finite_number
 from .format import Format
 
@@ -69,10 +70,7 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
         scenes = file.scenes_bounding_rectangle
         kinds = sorted(set(file.pixel_types.values()))
         xml = file.raw_metadata
-        numbers, scene, left = sorted(scenes), None, []
-        if numbers or key is not None:
-            at, left = choose(path, "scene", [str(one) for one in numbers], key)
-            scene = numbers[at]
+        scene = _choose(path, sorted(scenes), key)
         whole = file.total_bounding_rectangle if scene is None else scenes[scene]
     others = {n: b - a for n, (a, b) in box.items() if n not in "TCZXY" and b - a > 1}
     others.pop("S", None)
@@ -88,7 +86,8 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
     if counts[1] > 1 and colors > 1:
         raise ValueError(f"{path}: {counts[1]} channels of colours; expected one")
     info, spacing, lost = _told(xml, counts[1], colors, stored)
-    lost += left
+    if key is None and len(scenes) > 1:
+        lost.append(f"{len(scenes) - 1} other scenes; key (--key) chooses among 0 to {max(scenes)}")
     return CziSource(
         path=path,
         shape=(*counts, whole.h, whole.w, colors),
@@ -101,6 +100,14 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
         corner=(whole.x, whole.y),
         starts=starts,
     )
+
+
+def _choose(path: str, scenes: list[int], key: str | None) -> int | None:
+    scene = whole_number(key)
+    if key is not None and scene not in scenes:
+        listed = ", ".join(map(str, scenes)) or "none"
+        raise ValueError(f"{path}: has no scene {key!r}; it holds {listed}")
+    return scene if key is not None else scenes[0] if scenes else None
 
 
 def _told(

@@ -27,7 +27,7 @@ from ..sparse_grid import (
     bits,
     blosc_begin,
     check_roots,
-    choose_grid,
+    choose,
     describe,
     unpack,
 )
@@ -102,9 +102,9 @@ class NanoSource(SparseSource):
 
 @Format("NanoVDB", ".nvdb", options=("key",))
 def open_nanovdb(path: str, key: str | None = None) -> NanoSource:
-    """Opens a grid; see `choose_grid`."""
+    """Opens a grid; see `choose`."""
     heads = _heads(path)
-    number, lost = choose_grid(path, [head.name for head in heads], key)
+    number, lost = choose(path, [head.name for head in heads], key)
     head = heads[number]
     if head.kind not in _TYPES:
         kind = _REFUSED.get(head.kind, f"type {head.kind}")
@@ -115,7 +115,7 @@ def open_nanovdb(path: str, key: str | None = None) -> NanoSource:
     affine, low, high = _place(_content(path, head, _ROOT + 24), head)
     kind = _CLASSES.get(head.grid_class, "")
     told = describe(path, head.name, kind, np.dtype(dtype), width, low, high, affine)
-    return NanoSource(number=number, lost=tuple(lost), **told)
+    return NanoSource(number=number, lost=lost, **told)
 
 
 def _heads(path: str) -> list[Head]:

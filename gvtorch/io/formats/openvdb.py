@@ -27,7 +27,7 @@ from ..sparse_grid import (
     SparseSource,
     bits,
     check_roots,
-    choose_grid,
+    choose,
     describe,
     unpack,
 )
@@ -158,10 +158,10 @@ class VdbSource(SparseSource):
 
 @Format("OpenVDB", ".vdb", options=("key",))
 def open_openvdb(path: str, key: str | None = None) -> VdbSource:
-    """Opens a grid; see `choose_grid`."""
+    """Opens a grid; see `choose`."""
     with _mapped(path) as data:
         version, entries = _entries(data)
-        at, lost = choose_grid(path, [entry.name for entry in entries], key)
+        at, lost = choose(path, [entry.name for entry in entries], key)
         entry = entries[at]
         number = at
         if entry.parent:
@@ -183,7 +183,7 @@ def open_openvdb(path: str, key: str | None = None) -> VdbSource:
         low, high = VdbGrid.read(path, number).box()
     grid_class = str(entry.told.get("class", ""))
     given = describe(path, entry.name, grid_class, np.dtype(dtype), width, low, high, entry.affine)
-    return VdbSource(number=number, lost=tuple(lost), **given)
+    return VdbSource(number=number, lost=lost, **given)
 
 
 @functools.lru_cache(maxsize=2)

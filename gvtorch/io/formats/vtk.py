@@ -25,7 +25,7 @@ import numpy as np
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.volume import check_extent
 from ..packed import PackedSource, text_numbers
-from ..source import ArraySource, Index, VolumeSource, choose, place_axes
+from ..source import ArraySource, Index, VolumeSource, place_axes
 from .format import Format
 
 _LEGACY = {
@@ -141,12 +141,20 @@ def open_vtk(path: str, key: str | None = None) -> VolumeSource:
     return _open_legacy(path, key) if path.lower().endswith(".vtk") else _open_xml(path, key)
 
 
+def _choose(path: str, names: Sequence[str], key: str | None) -> int:
+    if not names:
+        raise ValueError(f"{path}: holds no array of numbers")
+    if key is not None and key not in names:
+        raise ValueError(f"{path}: has no array {key!r}; it holds {', '.join(names)}")
+    return 0 if key is None else names.index(key)
+
+
 def _told(
     path: str,
     points: Sequence[int],
     affine: np.ndarray,
     array: dict[str, Any],
-    lost: Sequence[str],
+    others: Sequence[str],
 ) -> dict[str, Any]:
     """Fields of a source of (z, y, x) or (z, y, x, c) values at points, or in cells."""
     size = [max(n - 1, 1) for n in points] if array["cells"] else list(points)
@@ -158,6 +166,7 @@ def _told(
     width = array["width"]
     place = place_axes(path, affine, size)
     place["axes"] = place["axes"][::-1] + "c" * (width > 1)
+    lost = [f"other arrays; key (--key) chooses among {', '.join(others)}"] if others[1:] else []
     return {
         "path": path,
         "shape": (*size[::-1], *((width,) if width > 1 else ())),
@@ -192,8 +201,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     low, high = extent[::2], extent[1::2]
     arrays = _xml_arrays(root, piece)
     names = [array["name"] for array in arrays]
-    at, lost = choose(path, "array", names, key)
-    array = arrays[at]
+    array = arrays[_choose(path, names, key)]
     if array["kind"] not in _XML:
         raise ValueError(f"{path}: {array['name']} is of {array['kind']}; expected numbers")
     numbers = {
@@ -205,8 +213,8 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     affine = np.eye(4)
     affine[:3, :3] = numbers["Direction"].reshape(3, 3) * numbers["Spacing"]
     affine[:3, 3] = numbers["Origin"] + affine[:3, :3] @ low
-    points = [b - a + 1 for a, b in zip(low, high, strict=True)]
-    told = _told(path, points, affine, array, lost)
+    told = _told(path, [b - a + 1 for a, b in zip(low, high, strict=True)], affine, array,
+                 names if key is None else names[:1])  # fmt: skip
     order = {"LittleEndian": "<", "BigEndian": ">"}[root.get("byte_order", "LittleEndian")]
     header = order + {"UInt32": "u4", "UInt64": "u8"}[root.get("header_type", "UInt32")]
     packer = {"": "", "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma",
@@ -337,9 +345,8 @@ def _open_mapped(path: str, content: mmap.mmap, key: str | None) -> VolumeSource
         path, content, sum(len(line) + 1 for line in lines[:4]), binary
     )
     names = [array["name"] for array in arrays]
-    at, lost = choose(path, "array", names, key)
-    found = arrays[at]
-    told = _told(path, points, affine, found, lost)
+    found = arrays[_choose(path, names, key)]
+    told = _told(path, points, affine, found, names if key is None else names[:1])
     told |= {"file": path, "offset": found["offset"], "stored": found["stored"]}
     if binary:
         return ArraySource(**told)
