@@ -1,5 +1,6 @@
-"""`PackedSource`: an array that is packed as a whole (zlib, gzip, bzip2, text), unpacked no further
-than its header tells: what would unpack to more is damaged.
+"""`PackedSource`: an array that is packed as a whole (zlib, gzip, bzip2, text); `unpack` unpacks a
+stretch of a file, `unpack_block` bytes. None goes further than its header tells: what would unpack
+to more is damaged.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import IO, Any, Literal
 
 import numpy as np
 
+from ..base.messages import need_library
 from .source import Index, VolumeSource
 
 _READ = 1 << 20  # bytes
@@ -96,6 +98,27 @@ def _words(stream: IO[bytes]) -> Iterator[list[bytes]]:
         if len(rest) > _READ:
             raise ValueError(f"a word of more than {_READ} bytes is no number")
         yield words
+
+
+def unpack_block(codec: str, packed: Any, need: int) -> bytes:
+    """Unpacks "zlib", "lzma", "lz4" or "blosc" data in memory, which must be of `need` bytes."""
+    if not need:
+        return b""
+    if codec == "zlib":
+        found = zlib.decompressobj().decompress(packed, need + 1)
+    elif codec == "lzma":
+        import lzma
+
+        found = lzma.LZMADecompressor().decompress(packed, need + 1)
+    else:
+        told = int.from_bytes(packed[4:8], "little"), int.from_bytes(packed[12:16], "little")
+        if codec == "blosc" and (len(packed) < 16 or told != (need, len(packed))):
+            raise ValueError(f"a block of {need} bytes expected, its head tells of {told[0]}")
+        codecs = need_library(f"what is packed by {codec}", "imagecodecs")
+        found = bytes(getattr(codecs, f"{codec}_decode")(bytes(packed), out=need))
+    if len(found) != need:
+        raise ValueError(f"a block of {need} bytes expected, {len(found)} found")
+    return found
 
 
 def unpack(file: str, offset: int, need: int, codec: str) -> bytes:

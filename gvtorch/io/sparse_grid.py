@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 import struct
 import threading
-import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,10 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from ..base.digits import whole_number
 from ..base.image_info import ChannelInfo, ImageInfo
-from ..base.messages import need_library
 from ..base.volume import check_extent
+from .packed import unpack_block
 from .source import Index, VolumeSource, place_axes
 
 SIDES = (4096, 128, 8)  # voxels along a side of an upper node, a lower node and a leaf
@@ -242,48 +240,9 @@ def describe(
     }
 
 
-def choose(path: str, names: Sequence[str], key: str | None) -> tuple[int, tuple[str, ...]]:
-    """Which grid is meant: `key` names it or its number; the only one, "density", or the first, if
-    left out. And what to say of the others.
-    """
-    if not names:
-        raise ValueError(f"{path}: holds no grid")
-    listed = ", ".join(names[:20])
-    if key is None:
-        at = names.index("density") if "density" in names else 0
-        others = f"{len(names) - 1} other grids; key (--key) chooses among {listed}"
-        return at, (others,) if len(names) > 1 else ()
-    key = key.removeprefix("/")  # of file.vdb:/density
-    if key in names:
-        return names.index(key), ()
-    number = whole_number(key)
-    if number is not None and number < len(names):
-        return number, ()
-    raise ValueError(f"{path}: has no grid {key!r}; it holds {listed}")
-
-
 def bits(data: Any, at: int, count: int) -> np.ndarray:
     """Reads (count,) bool, bits of a mask from a byte on, the lowest of each byte first."""
     return np.unpackbits(np.frombuffer(data, "u1", count // 8, at), bitorder="little").view(bool)
-
-
-def unpack(codec: str, packed: Any, need: int, most: int | None = None) -> bytes:
-    """Unpacks a part that must be of `need` bytes, and of no more than `most`: "zip" (zlib) or
-    "blosc".
-    """
-    if not need:
-        return b""
-    if codec == "zip":
-        found = zlib.decompressobj().decompress(packed, need + 1)
-    else:
-        told = int.from_bytes(packed[4:8], "little"), int.from_bytes(packed[12:16], "little")
-        if len(packed) < 16 or told != (need, len(packed)) or need > (most or need):
-            raise ValueError(f"a packed part of {need} bytes expected, its head tells of {told[0]}")
-        imagecodecs = need_library("what is packed by Blosc", "imagecodecs")
-        found = bytes(imagecodecs.blosc_decode(bytes(packed), out=need))
-    if len(found) != need:
-        raise ValueError(f"a part of {need} bytes expected, {len(found)} found")
-    return found
 
 
 def blosc_begin(packed: bytes, most: int) -> bytes:
@@ -302,4 +261,4 @@ def blosc_begin(packed: bytes, most: int) -> bytes:
             f"to {_MOST_BLOCK} bytes, within {len(packed)}"
         )
     head = struct.pack("<3I", block, block, 20 + len(packed) - start)
-    return unpack("blosc", packed[:4] + head + struct.pack("<I", 20) + packed[start:], block)
+    return unpack_block("blosc", packed[:4] + head + struct.pack("<I", 20) + packed[start:], block)

@@ -15,11 +15,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...base.digits import whole_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb
 from ...base.units import NO_DEPTH, spacing_of
 from ..source import Index, VolumeSource
-from .format import Format
+from .format import Format, choose
 
 _MOST_HEADER = 1 << 28  # characters
 _MOST_BLOCKS = 1 << 20
@@ -61,15 +60,9 @@ def open_lif(path: str, key: str | None = None) -> LifSource:
         blocks = _blocks(file, size)
     found = [e for e in root.iter("Element") if e.find("./Data/Image") is not None]
     found = [e for e in found if _block(e, blocks) is not None]
-    if not found:
-        raise ValueError(f"{path}: holds no image")
     names = [str(element.get("Name", "")) for element in found]
-    at = names.index(key) if key in names else 0 if key is None else whole_number(key)
-    listed = ", ".join(f"{number} {name!r}" for number, name in enumerate(names))
-    if at is None or at >= len(found):
-        raise ValueError(f"{path}: has no image {key!r}; it holds {listed}")
-    others = [f"{len(found) - 1} other images; key (--key) chooses among {listed}"]
-    return _image(path, found[at], blocks, others if key is None and len(found) > 1 else [])
+    at, others = choose(path, "image", names, key)
+    return _image(path, found[at], blocks, [*others])
 
 
 def _image(
