@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ..packed import unpack_block
 from ..sparse_grid import (
     COUNTS,
     SIDES,
@@ -29,7 +30,6 @@ from ..sparse_grid import (
     check_roots,
     choose_grid,
     describe,
-    unpack,
 )
 from .format import Format
 
@@ -329,8 +329,8 @@ class _Packing:
             length = cursor.number("<q")
             content = cursor.take(abs(length))
             if length > 0:
-                codec = "blosc" if self.compression & _BLOSC else "zip"
-                content = unpack(codec, content, size)
+                codec = "blosc" if self.compression & _BLOSC else "zlib"
+                content = unpack_block(codec, content, size)
         else:
             content = cursor.take(size)
         if len(content) != size:

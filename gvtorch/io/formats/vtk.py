@@ -12,7 +12,6 @@ import io
 import math
 import mmap
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +23,7 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.volume import check_extent
-from ..packed import PackedSource, text_numbers
+from ..packed import PackedSource, text_numbers, unpack_block
 from ..source import ArraySource, Index, VolumeSource, choose, place_axes
 from .format import Format
 
@@ -106,7 +105,7 @@ class VtkSource(VolumeSource):
         begin = heads if self.encoding == "raw" else -(-heads // 3) * 4
         data, parts, at = _bytes(content[begin:], self.encoding, sum(packed)), [], 0
         for here, unpacked in zip(packed, sizes, strict=True):
-            parts.append(_unpack(self.compressor, data[at : at + here], unpacked))
+            parts.append(unpack_block(self.compressor, data[at : at + here], unpacked))
             at += here
         return b"".join(parts)
 
@@ -116,23 +115,6 @@ def _bytes(content: bytes, encoding: str, count: int) -> bytes:
     if encoding == "raw":
         return content[:count]
     return base64.b64decode(content[: -(-count // 3) * 4])[:count]
-
-
-def _unpack(compressor: str, packed: bytes, need: int) -> bytes:
-    """Unpacks a block that must be of `need` bytes."""
-    if compressor == "zlib":
-        found = zlib.decompressobj().decompress(packed, need + 1)
-    elif compressor == "lzma":
-        import lzma
-
-        found = lzma.LZMADecompressor().decompress(packed, need + 1)
-    else:
-        import imagecodecs
-
-        found = bytes(imagecodecs.lz4_decode(packed, out=need))
-    if len(found) != need:
-        raise ValueError(f"a block of {need} bytes expected, {len(found)} found")
-    return found
 
 
 @Format("VTK", ".vti", ".vtk", options=("key",))
