@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from . import check
+from . import boxes, check
 from .image_info import ChannelInfo, ImageInfo
 from .labels import check_narrowed
 from .named_axes import ask_axes, even_steps, named_axes, place_named
@@ -48,11 +48,8 @@ class ArrayLike:
                 for axis, n in zip(self.axes, self.shape, strict=True)
             )
         )
-        data = data.squeeze(tuple(at for at, axis in enumerate(self.axes) if axis in "-t"))
-        axes = self.axes.replace("-", "").replace("t", "")
-        missing = "".join(axis for axis in "zyxc" if axis not in axes)
-        order = [(missing + axes).index(axis) for axis in "zyxc"]
-        data = data[(None,) * len(missing)].transpose(order)
+        data = data.squeeze(tuple(at for at, axis in enumerate(self.axes) if axis == "-"))
+        data = boxes.to_zyxc(data, self.axes.replace("-", ""), "tzyxc")[0]
         return np.flip(data, tuple("zyx".index(axis) for axis in self.flips))
 
     def read(self, index: tuple[slice, ...]) -> np.ndarray:

@@ -17,10 +17,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..base import check
+from ..base import boxes, check
 from ..base.image_info import Rows
 from ..pool.downsample import round_array
-from . import boxes
 from .source import Index, VolumeSource
 
 Oblique = Literal["resample", "keep"]

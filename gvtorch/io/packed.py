@@ -1,12 +1,12 @@
-"""`PackedSource`: an array that is packed as a whole (zlib, gzip, bzip2, text); `unpack` unpacks a
-stretch of a file, `unpack_block` bytes. None goes further than its header tells: what would unpack
-to more is damaged.
+"""What files pack, unpacked no further than their headers tell: what would unpack to more is
+damaged. `PackedSource` is an array that is packed as a whole (zlib, gzip, bzip2, text).
 """
 
 from __future__ import annotations
 
 import math
 import os
+import struct
 import zlib
 from bz2 import BZ2Decompressor
 from collections.abc import Iterator
@@ -19,6 +19,8 @@ from ..base.messages import need_library
 from .source import Index, VolumeSource
 
 _READ = 1 << 20  # bytes
+_MOST_BLOCK = 1 << 26  # bytes of a block of Blosc; writers of VDB make them of 256 KB
+_STORED = 2  # Blosc's flag of a part that is not packed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,3 +159,22 @@ def _unpacked(stream: IO[bytes], codec: str, need: int) -> Iterator[bytes]:
         part = engine.decompress(packed, need + 1 - size)
         size += len(part)
         yield part
+
+
+def blosc_begin(packed: bytes, most: int) -> bytes:
+    """The first bytes, at least `most` if there are so many, of what Blosc packed: only its first
+    block is unpacked, as a part of its own. (Layout: README_CHUNK_FORMAT of c-blosc 1.)
+    """
+    size, block = struct.unpack_from("<2I", packed, 4)
+    most = min(most, size)
+    if packed[2] & _STORED:
+        return packed[16 : 16 + most]
+    block = min(block, size)
+    (start,) = struct.unpack_from("<I", packed, 16)
+    if not most <= block <= _MOST_BLOCK or not 20 <= start < len(packed):
+        raise ValueError(
+            f"a packed part begins with a block of {block} bytes at byte {start}; expected {most} "
+            f"to {_MOST_BLOCK} bytes, within {len(packed)}"
+        )
+    head = struct.pack("<3I", block, block, 20 + len(packed) - start)
+    return unpack_block("blosc", packed[:4] + head + struct.pack("<I", 20) + packed[start:], block)

@@ -24,10 +24,10 @@ from typing import IO, Any, Self
 
 import numpy as np
 
+from ..base import boxes
 from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
-from . import boxes
 from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]

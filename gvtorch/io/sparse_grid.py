@@ -11,7 +11,6 @@ Source: Museth, "VDB: High-resolution sparse volumes with dynamic topology", ACM
 from __future__ import annotations
 
 import math
-import struct
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -22,7 +21,6 @@ import numpy as np
 
 from ..base.image_info import ChannelInfo, ImageInfo
 from ..base.volume import check_extent
-from .packed import unpack_block
 from .source import Index, VolumeSource, place_axes
 
 SIDES = (4096, 128, 8)  # voxels along a side of an upper node, a lower node and a leaf
@@ -32,8 +30,6 @@ MOST_INDEX = 2**31
 MOST_ROOTS = 1 << 20  # entries of a root
 _BATCH = 4096  # leaves
 _WHOLE = 1 << 22  # voxels of whole leaves around a box that is thinner than these
-_MOST_BLOCK = 1 << 26  # bytes of a block of Blosc; writers of VDB make them of 256 KB
-_STORED = 2  # Blosc's flag of a part that is not packed
 _LOCK = threading.Lock()
 _QUANTITIES = {"level set": "signed distance", "fog volume": "density"}
 
@@ -243,22 +239,3 @@ def describe(
 def bits(data: Any, at: int, count: int) -> np.ndarray:
     """Reads (count,) bool, bits of a mask from a byte on, the lowest of each byte first."""
     return np.unpackbits(np.frombuffer(data, "u1", count // 8, at), bitorder="little").view(bool)
-
-
-def blosc_begin(packed: bytes, most: int) -> bytes:
-    """The first bytes, at least `most` if there are so many, of what Blosc packed: only its first
-    block is unpacked, as a part of its own. (Layout: README_CHUNK_FORMAT of c-blosc 1.)
-    """
-    size, block = struct.unpack_from("<2I", packed, 4)
-    most = min(most, size)
-    if packed[2] & _STORED:
-        return packed[16 : 16 + most]
-    block = min(block, size)
-    (start,) = struct.unpack_from("<I", packed, 16)
-    if not most <= block <= _MOST_BLOCK or not 20 <= start < len(packed):
-        raise ValueError(
-            f"a packed part begins with a block of {block} bytes at byte {start}; expected {most} "
-            f"to {_MOST_BLOCK} bytes, within {len(packed)}"
-        )
-    head = struct.pack("<3I", block, block, 20 + len(packed) - start)
-    return unpack_block("blosc", packed[:4] + head + struct.pack("<I", 20) + packed[start:], block)

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from ..base import check
+from ..base.boxes import extent_in
 from ..fields import Distance, noise
 from ..fields.noise.fractal import Octave, octaves_of
 from ..fields.noise.tally import Tally
 from ..pool import Channel
 from .field import (
     alike,
-    cubic_extent,
     distances_of,
     dtype_of_places,
     interval_of,
@@ -259,4 +259,4 @@ def _cut_out(
         if own is None or not bool(own.isfinite().all()):
             raise ValueError(f"{where}: box must be given: the shape does not tell where it ends")
         box = [(own[0] - reach).tolist(), (own[1] + reach).tolist()]
-    return cubic_extent(where, extent, box) if isinstance(extent, int) else extent, box
+    return extent_in(where, extent, box), box

@@ -19,8 +19,8 @@ import torch
 from numpy.lib.stride_tricks import as_strided
 
 from ..base import check
+from ..base.boxes import grouped
 from ..base.stage import stage
-from ..io.boxes import grouped
 from ..io.stores.store import Store
 from ..pool import Channel
 from ..pool.pyramid import NodeSummary

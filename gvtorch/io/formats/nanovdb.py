@@ -19,14 +19,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..packed import unpack_block
+from ..packed import blosc_begin, unpack_block
 from ..sparse_grid import (
     COUNTS,
     VOXELS,
     SparseGrid,
     SparseSource,
     bits,
-    blosc_begin,
     check_roots,
     describe,
 )

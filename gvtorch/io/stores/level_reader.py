@@ -17,11 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from ...base import check
+from ...base import boxes, check
+from ...base.boxes import Zyx
 from ...base.labels import check_narrowed
 from ...pool.downsample import pool_mean
-from .. import boxes
-from ..boxes import Zyx
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
 from .store_layout import MOST_VOXELS, Deadline, StoreError, StoreLayout, child, opened, short
