@@ -127,6 +127,11 @@ def check_solid(where: str, solid: str) -> None:
         raise ValueError(f"{where}: solid must be one of {', '.join(known)}, got {solid!r}")
 
 
+def once_filled(solid: Solid) -> Solid:
+    """Returns `solid` for a mesh whose holes are filled already."""
+    return "auto" if solid == "always" else solid
+
+
 def prepared(mesh: Mesh, solid: Solid) -> Mesh:
     """Returns what is made into voxels."""
     return filled(mesh) if solid == "always" else mesh

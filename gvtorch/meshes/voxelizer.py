@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
@@ -31,6 +31,15 @@ _CUBE, _PARTS = 8, 4  # voxels along a side of the cubes of a region; of so many
 _BATCH = 1 << 20  # voxels that are made together
 _FINER = 2  # places along a side that a coarse voxel is the mean of
 _DIAGONAL = 0.5 * math.sqrt(3)  # from a voxel's centre to its corner
+
+
+class GridSettings(TypedDict, total=False):
+    """Settings of a `Voxelizer`, whatever its channels."""
+
+    resolution: int
+    band: float
+    thickness: float
+    solid: Solid
 
 
 def check_channels(where: str, channels: str | Sequence[str]) -> tuple[str, ...]:
