@@ -115,7 +115,9 @@ class HostFrame(RecordedFrame):
             self._write(source, mail)
 
     def finish(self, hits: Hits) -> Collected:
-        """And chooses what the host is asked for, which is marked as pending."""
+        """Ends a frame as `RecordedFrame.finish` does, then chooses the nodes that producers are
+        asked for, marks them as pending, and lets the host read them with the frame's numbers.
+        """
         collected = super().finish(hits)
         words, chosen = self.cache.nodes.request_tn.view(-1), self.choose()
         for kind, (node, _) in zip(KINDS.values(), chosen, strict=True):

@@ -127,7 +127,7 @@ class _Waiting:
 
 
 def _outcome(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
-    """Returns what a call to a producer gave, and what it raised instead."""
+    """Calls a producer; returns its answer and None, or None and the error that it raised."""
     try:
         return call(), None
     except Exception as error:

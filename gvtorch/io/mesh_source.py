@@ -24,7 +24,7 @@ import torch
 from ..base import check
 from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
-from ..meshes.holes import Solid, check_solid, once_filled, told_of_holes
+from ..meshes.holes import SolidParts, check_solid, once_filled, told_of_holes
 from ..meshes.mesh import Material, Mesh
 from ..meshes.voxelizer import CHANNELS, GridSettings, Voxelizer, check_channels
 from .mesh_file import read_mesh
@@ -45,7 +45,7 @@ class MeshSource(VolumeSource):
     resolution: int
     band: float
     thickness: float
-    solid: Solid
+    solid: SolidParts
     marks: tuple[Any, ...]  # identify mesh and settings: equal while these are unchanged
     words: tuple[str, ...] = ()  # of the command line beside these
     several: bool = False  # whether its store holds other channels, too
@@ -61,7 +61,7 @@ class MeshSource(VolumeSource):
         resolution: int = 1024,
         band: float = 4.0,
         thickness: float = 1.0,
-        solid: Solid = "auto",
+        solid: SolidParts = "auto",
         texture: str | Path | None = None,
     ) -> dict[str, MeshSource]:
         """Reads the mesh, and lays a grid around it: a source for each channel; see `voxelize`."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..base import check
 from .geometry import Cubes, Geometry
-from .holes import Solid, check_solid, prepared
+from .holes import SolidParts, check_solid, prepared
 from .mesh import Mesh
 from .paint import Paint
 
@@ -39,7 +39,7 @@ class GridSettings(TypedDict, total=False):
     resolution: int
     band: float
     thickness: float
-    solid: Solid
+    solid: SolidParts
 
 
 def check_channels(where: str, channels: str | Sequence[str]) -> tuple[str, ...]:
@@ -82,7 +82,7 @@ class Voxelizer:
         channels: Sequence[str] = ("coverage",),
         band: float = 4.0,
         thickness: float = 1.0,
-        solid: Solid = "auto",
+        solid: SolidParts = "auto",
         device: torch.device | str = "cpu",
     ) -> None:
         """Lays the grid around the mesh.

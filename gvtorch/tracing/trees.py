@@ -29,7 +29,7 @@ from ..shaders.filtered import Filtered
 from ..shaders.shader import Shader, check_shader
 from ..shaders.transfer_function import TransferFunction
 from .around import around
-from .composite import Trace, box_span, nothing_like, over
+from .composite import TraceRays, box_span, nothing_like, over
 from .options import RenderOptions
 from .pose import poses_of, world_box
 from .tracer import Batch, Tracer
@@ -49,7 +49,7 @@ class TreeTrace:
     """What traces rays through one of several trees."""
 
     box: Tensor  # (2, 3) float64 world corners around it
-    trace: Trace  # with whatever the options put around
+    trace: TraceRays  # with whatever the options put around
     tracer: Tracer  # the tree alone
 
 
@@ -264,7 +264,12 @@ def _media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
 
 
 def _further(
-    hits: Hits, rays: Rays, which: Tensor, span: tuple[Tensor, Tensor], stop: float, trace: Trace
+    hits: Hits,
+    rays: Rays,
+    which: Tensor,
+    span: tuple[Tensor, Tensor],
+    stop: float,
+    trace: TraceRays,
 ) -> Hits:
     """Traces a stretch of the rays `which` (r,) bool that have not ended, behind their `hits`,
     whose normals are sums by light.
