@@ -503,7 +503,7 @@ class Engine:
                 "Engine.capture: trees that overlap can't be recorded: the host waits for them"
             )
         if view.options.layer is not None:
-            view.options.layer.check_device("capture", self.device)
+            view.options.layer.check_device(self.device)
         check.whole("capture", "batch", batch, low=1, high=1 << 18)
         check.number("capture", "look_ahead", look_ahead, low=0, high=1000)
         check.instance("capture", "fit", fit, bool)
