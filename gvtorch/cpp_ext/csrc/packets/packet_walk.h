@@ -514,7 +514,7 @@ struct PacketWalk {
     if constexpr (kEnds) {
       piece.front = back;
       piece.back = back = value(piece.end);
-    } else if constexpr (!ReadsAll<Shader>::value) {
+    } else if constexpr (!Shader::kReadsAll) {
       piece.value = value(piece.middle);
     }
     const Mask seeing = which & (sum.clear > stop_clear);

@@ -44,18 +44,9 @@ template <class T>
 GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> at) {
   Row<T> row{};
   with_voxel(type, [&](auto voxel) {
-    const Eight<T> eight(at, side);
-    const int32_t step_y = width * side, step_z = step_y * side;
-    const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
-                         (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * width);
-    const auto blend = [&](int32_t which) {
-      return eight.blend([&](int y, int z, T& left, T& right) {
-        const auto* pair = corner + (z * step_z + y * step_y) + which;
-        left = number<T>(pair[0]);
-        right = number<T>(pair[width]);
-      });
-    };
-    row = {blend(0), blend(1), blend(2), blend(3)};
+    using Voxel = decltype(voxel);
+    const EightVoxels<T, Voxel> eight(static_cast<const Voxel*>(voxels) + first, Eight<T>(at, side), side, width);
+    row = {eight.value(0), eight.value(1), eight.value(2), eight.value(3)};
   });
   return row;
 }
@@ -76,30 +67,17 @@ template <class T>
 GV_CALL void read_numbers(const void* voxels, VoxelType type, Components<T> components, int32_t count, int64_t first,
                           int32_t side, Vec3<T> at, T* out) {
   with_voxel(type, [&](auto voxel) {
-    const Eight<T> eight(at, side);
-    const int32_t width = components.width, step_y = width * side, step_z = step_y * side;
-    const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
-                         (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * width);
-    for (int32_t i = 0; i < count; ++i) {
-      const int32_t component = components[i];
-      out[i] = eight.blend([&](int y, int z, T& left, T& right) {
-        const auto* pair = corner + (z * step_z + y * step_y) + component;
-        left = number<T>(pair[0]);
-        right = number<T>(pair[width]);
-      });
-    }
+    using Voxel = decltype(voxel);
+    const Voxel* brick = static_cast<const Voxel*>(voxels) + first;
+    const EightVoxels<T, Voxel> eight(brick, Eight<T>(at, side), side, components.width);
+    for (int32_t i = 0; i < count; ++i) out[i] = eight.value(components[i]);
   });
-}
-
-template <class T>
-GV_HD T dot(Vec3<T> a, Vec3<T> b) {
-  return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
 // A vector of length 1, or 0 where there is no direction.
 template <class T>
 GV_HD Vec3<T> unit(Vec3<T> v) {
-  const T most = larger(larger(larger(v.x, -v.x), larger(v.y, -v.y)), larger(v.z, -v.z));
+  const T most = larger(larger(absolute(v.x), absolute(v.y)), absolute(v.z));
   const MaskOf<T> some = most > 0 && most < static_cast<RealOf<T>>(INFINITY);
   Vec3<T> scaled{};
   if (!any(some)) return scaled;
@@ -218,12 +196,7 @@ struct Probe {
 
   // Four numbers of a channel at distance t, from one on: the voxels around it are found once.
   GV_HD Row<T> four_at(const ChannelView& channel, int32_t first, T t) const {
-    const Row<T> row = four_in(channel, first, fine, t);
-    if (!mixed) return row;
-    const Row<T> other = four_in(channel, first, coarse, t);
-    const T part = weight(t);
-    return {row.red + part * (other.red - row.red), row.green + part * (other.green - row.green),
-            row.blue + part * (other.blue - row.blue), row.alpha + part * (other.alpha - row.alpha)};
+    return blended(t, [&](const Spot<T>& spot) { return four_in(channel, first, spot, t); });
   }
 
   // Several numbers of a channel at distance t, at most kMostNumbers.
@@ -245,7 +218,7 @@ struct Probe {
       if (known->at == t) return known->gradient;
     }
 #endif
-    return blended_slope(t, [&](const Spot<T>& spot) { return differences(spot, t); });
+    return blended(t, [&](const Spot<T>& spot) { return differences(spot, t); });
   }
 
   // What one of the two nodes, fine or coarse, says of the value and of its gradient, and its brick of four numbers of
@@ -295,22 +268,14 @@ struct Probe {
     const T low = read(below), high = read(above);
     return (high - low) * (spot.scale / cube[axis]);
   }
-  // A gradient that both levels have, told by slope_in(spot).
-  template <class Slope>
-  GV_HD Vec3<T> blended_slope(T t, const Slope& slope_in) const {
-    Vec3<T> slope = slope_in(fine);
-    if (!mixed) return slope;
-    const Vec3<T> other = slope_in(coarse);
-    const T part = weight(t);
-    for (int axis = 0; axis < 3; ++axis) slope[axis] = slope[axis] + part * (other[axis] - slope[axis]);
-    return slope;
-  }
-  // A number that both levels have, told by read(spot).
+  // What both levels have, a number or several, told by read(spot).
   template <class Read>
-  GV_HD T blended(T t, const Read& read) const {
-    const T number = read(fine);
-    if (!mixed) return number;
-    return number + weight(t) * (read(coarse) - number);
+  GV_HD auto blended(T t, const Read& read) const {
+    const auto found = read(fine);
+    if (!mixed) return found;
+    const auto other = read(coarse);
+    const T part = weight(t);
+    return combined(found, other, [&](T a, T b) { return a + part * (b - a); });
   }
   GV_HD int64_t first_of(const ChannelView& channel, int32_t component, const Spot<T>& spot) const {
     const int32_t numbers = channels.side * channels.side * channels.side * channel.width;  // they fit: check_bricks
@@ -371,7 +336,7 @@ struct TypedProbe : Probe<T> {
     return number<T>(constants[static_cast<int64_t>(spot.node) * channel.width + this->channels.component]);
   }
   GV_HD Vec3<T> gradient(T t) const {
-    return this->blended_slope(t, [&](const Spot<T>& spot) { return differences(spot, t); });
+    return this->blended(t, [&](const Spot<T>& spot) { return differences(spot, t); });
   }
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
     Vec3<T> slope{0, 0, 0};
