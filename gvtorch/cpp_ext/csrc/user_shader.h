@@ -48,7 +48,7 @@ struct UserShader : ShaderFacts {
 
   explicit UserShader(const ShadeArgs& args)
       : transfer(args),
-        light{static_cast<const Parameters<T>*>(args.parameter_54)},
+        light(args),
         uniform_k(static_cast<const T*>(args.parameter_54) + kParameters),
         uniforms(args.parameters - kParameters),
         other_component(args.other_component),

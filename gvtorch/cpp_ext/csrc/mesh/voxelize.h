@@ -54,17 +54,12 @@ using Together = std::conditional_t<std::is_same_v<T, float>, Floats, T>;
 template <class T>
 constexpr int32_t kTogether = static_cast<int32_t>(sizeof(Together<T>) / sizeof(T));
 
-// A place may be of one number an axis, or of a vector of them (F) where the triangle's are numbers (T).
-template <class F, class T>
-GV_HD Vec3<F> minus(Vec3<F> a, Vec3<T> b) {
-  return {a.x - b.x, a.y - b.y, a.z - b.z};
-}
 template <class T>
 GV_HD Vec3<T> outer(Vec3<T> a, Vec3<T> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
-// What of a triangle is the same for all places.
+// What of a triangle is the same for all places. A place may be of one number an axis, or of a vector of them (F).
 template <class T>
 struct Triangle {
   Vec3<T> corner[3], edge[3], beside[3], normal;

@@ -27,10 +27,7 @@ struct Labels : ShaderFacts {
   int32_t component;
 
   explicit Labels(const ShadeArgs& args)
-      : transfer(args),
-        step(static_cast<T>(args.step)),
-        light{static_cast<const Parameters<T>*>(args.parameter_54)},
-        component(args.component) {}
+      : transfer(args), step(static_cast<T>(args.step)), light(args), component(args.component) {}
 
   struct Own {
     T lit;  // 1 or 0

@@ -13,6 +13,13 @@ inline namespace GV_NAMESPACE {
 
 constexpr int32_t kMostNumbers = 16;  // that are read at once
 
+template <class T>
+GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {
+  T out = 0;
+  with_voxel(type, [&](auto voxel) { out = number<T>(static_cast<const decltype(voxel)*>(numbers)[index]); });
+  return out;
+}
+
 struct ChannelView {
   const void* bricks_bzyxc;  // null where there is no brick
   const void* constant_tnc;  // null: there is no such channel
@@ -20,14 +27,12 @@ struct ChannelView {
   int32_t width;  // numbers a voxel
 
   GV_HD bool given() const { return constant_tnc != nullptr; }
+  // A number of a node without a brick.
+  template <class T>
+  GV_HD T constant(int32_t node, int32_t component) const {
+    return read_number<T>(constant_tnc, type, static_cast<int64_t>(node) * width + component);
+  }
 };
-
-template <class T>
-GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {
-  T out = 0;
-  with_voxel(type, [&](auto voxel) { out = number<T>(static_cast<const decltype(voxel)*>(numbers)[index]); });
-  return out;
-}
 
 // A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes. Its arguments are
 // values, for an address would put the whole kernel's arguments on the stack.
@@ -285,15 +290,11 @@ struct Probe {
  private:
   GV_HD Row<T> four_in(const ChannelView& channel, int32_t first, const Spot<T>& spot, T t) const {
     if (spot.brick >= 0) return four_of(true, channel, first, spot, t);
-    const int64_t row = static_cast<int64_t>(spot.node) * channel.width + first;
-    const auto read = [&](int32_t which) { return read_number<T>(channel.constant_tnc, channel.type, row + which); };
+    const auto read = [&](int32_t which) { return channel.constant<T>(spot.node, first + which); };
     return {read(0), read(1), read(2), read(3)};
   }
   GV_HD T read(const ChannelView& channel, int32_t component, const Spot<T>& spot, Vec3<T> at) const {
-    if (spot.brick < 0) {
-      return read_number<T>(channel.constant_tnc, channel.type,
-                            static_cast<int64_t>(spot.node) * channel.width + component);
-    }
+    if (spot.brick < 0) return channel.constant<T>(spot.node, component);
     const int64_t first = first_of(channel, component, spot);
     return read_brick(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at);
   }
@@ -303,19 +304,12 @@ struct Probe {
       const int64_t first = first_of(channel, 0, spot);
       return read_numbers(channel.bricks_bzyxc, channel.type, components, count, first, channels.side, spot.at(t), out);
     }
-    const int64_t row = static_cast<int64_t>(spot.node) * channel.width;
-    for (int32_t i = 0; i < count; ++i) {
-      out[i] = read_number<T>(channel.constant_tnc, channel.type, row + components[i]);
-    }
+    for (int32_t i = 0; i < count; ++i) out[i] = channel.constant<T>(spot.node, components[i]);
   }
   GV_HD bool same(const ChannelView& channel) const {
     if (!channel.given()) return true;
     for (int32_t component = 0; component < channel.width; ++component) {
-      const int64_t a = static_cast<int64_t>(fine.node) * channel.width + component;
-      const int64_t b = static_cast<int64_t>(coarse.node) * channel.width + component;
-      if (read_number<T>(channel.constant_tnc, channel.type, a) !=
-          read_number<T>(channel.constant_tnc, channel.type, b))
-        return false;
+      if (channel.constant<T>(fine.node, component) != channel.constant<T>(coarse.node, component)) return false;
     }
     return true;
   }

@@ -46,7 +46,7 @@ struct ShadeRay : Walk<T> {
                  args.side,
                  args.border,
                  args.component},
-        light{static_cast<const Parameters<T>*>(args.parameter_54)},
+        light(args),
         range_tn2c(args.range_tn2c),
         hidden_tn(args.hidden_tn),
         lengths(args.levels),

@@ -54,7 +54,7 @@ struct Lit : Plain<T> {
   using Plain<T>::step;
   Light<T> light;
 
-  explicit Lit(const ShadeArgs& args) : Plain<T>(args), light{static_cast<const Parameters<T>*>(args.parameter_54)} {}
+  explicit Lit(const ShadeArgs& args) : Plain<T>(args), light(args) {}
 
   GV_HD T alpha(const Piece<T>& piece, const Probe<T>&) const {
     return look_up(Transfer<T>(transfer), piece.value, piece, step).alpha;
@@ -289,10 +289,7 @@ struct Isosurface : ShaderFacts {
   Light<T> light;
   int32_t color_component;
 
-  explicit Isosurface(const ShadeArgs& args)
-      : transfer(args),
-        light{static_cast<const Parameters<T>*>(args.parameter_54)},
-        color_component(args.other_component) {}
+  explicit Isosurface(const ShadeArgs& args) : transfer(args), light(args), color_component(args.other_component) {}
 
   struct Own {
     T level;

@@ -47,7 +47,7 @@ struct StoredColor : ShaderFacts {
   using Sum = SumOf<T>;
   Light<T> light;
 
-  explicit StoredColor(const ShadeArgs& args) : light{static_cast<const Parameters<T>*>(args.parameter_54)} {}
+  explicit StoredColor(const ShadeArgs& args) : light(args) {}
 
   template <class Any>
   GV_HD bool hides(T, T high, const Any&) const {
