@@ -13,9 +13,7 @@ inline namespace GV_NAMESPACE {
 
 template <class T>
 struct TraceOptions {
-  T step;  // world length of the shortest interval
-  T stop_alpha;
-  T depth_alpha;
+  T step;         // world length of the shortest interval
   bool by_level;  // a node's brick is asked for before its children
 };
 
@@ -92,14 +90,13 @@ struct Walk {
              static_cast<int32_t>(args.nodes / args.nodes_per_tile),
              static_cast<int32_t>(args.bricks)},
         levels(args.root_voxel, args.side - 2 * args.border, args.branching),
-        options{static_cast<T>(args.step), static_cast<T>(args.stop_alpha), static_cast<T>(args.depth_alpha),
-                args.by_level},
+        options{static_cast<T>(args.step), args.by_level},
         hits{static_cast<T*>(args.color_r3), static_cast<T*>(args.alpha_r1), static_cast<T*>(args.depth_r1),
              args.samples_r, args.missed_r},
         frame_1(args.frame_1),
         stamp_b(args.stamp_b),
-        stop_clear(1 - options.stop_alpha),
-        hit_clear(1 - options.depth_alpha) {}
+        stop_clear(1 - static_cast<T>(args.stop_alpha)),
+        hit_clear(1 - static_cast<T>(args.depth_alpha)) {}
 
   // Goes along a ray to its end, or until the visitor has enough. Digits: see `with_digits`. A visitor has:
   //
