@@ -95,7 +95,9 @@ class HostFrame(RecordedFrame):
             return
         self.active = False
         self._waiting.clear()
-        with self._lock:  # what a thread works on now is posted before, and dropped, or not at all
+        # An answer in the making is either posted before the lock is held, and dropped below, or
+        # comes after, and is refused because its turn is an old one.
+        with self._lock:
             self.turn += 1
             for chosen in self._chosen.values():
                 chosen.clear()

@@ -162,11 +162,11 @@ struct Walk {
   }
 
   // Finds the node in which an interval's middle lies; marks what is used and what is missing. `wanted` is the depth
-  // that the visit before wanted.
+  // that the visit before wanted. Level of detail: the first depth whose voxel fits into the cone (packet_walk.h
+  // decides likewise for many rays; Levels.wanted in the twin).
   template <class Digits, class Words>
   GV_HD Visit<T> find(const Ray<T>& ray, Digits& digits, T cone, const Words& words, int32_t& wanted,
                       bool& missed) const {
-    // Level of detail: the first depth whose voxel fits into the cone.
     const T infinity = static_cast<T>(INFINITY);
     while (wanted < tree.max_depth && levels.voxel[wanted] > cone) ++wanted;
     while (wanted > 0 && !(levels.voxel[wanted - 1] > cone)) --wanted;
@@ -194,7 +194,7 @@ struct Walk {
   }
 
   // Asks for what is not there, and tells whether it did. Straight to the wanted level, or level by level: then a
-  // brick is there before its node is subdivided.
+  // brick is there before its node is subdivided. A node that is absent or too coarse always leads to a request.
   GV_HD bool mark_missing(const Place& place, int32_t wanted, bool blend, T cone) const {
     const bool absent = place.brick == kAbsent;
     const bool deeper = place.depth < wanted && place.tile == kAbsent;
