@@ -44,7 +44,7 @@ def open_mrc(path: str) -> ArraySource:
         raise ValueError(f"{path}: an extended header of {int(found['nsymbt'])} bytes")
     axes = [int(found[name]) for name in ("maps", "mapr", "mapc")]
     letters = "zyx" if sorted(axes) != [1, 2, 3] else "".join("xyz"[axis - 1] for axis in axes)
-    spacing, origin, unit = _place(found, dict(zip(letters, sizes, strict=True)))
+    spacing, origin, unit = _place(found)
     stack = int(found["ispg"]) > 400 and int(found["mz"]) > 0
     if stack:
         each = int(found["mz"])
@@ -68,7 +68,7 @@ def open_mrc(path: str) -> ArraySource:
 
 
 def _place(
-    header: Any, sizes: dict[str, int]
+    header: Any,
 ) -> tuple[tuple[float, float, float], tuple[float, float, float], str | None]:
     """Voxel size and place of the first voxel, angstroms, x y z."""
     steps, starts = [], []
