@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ..base.digits import finite_number
 from ..base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ..base.units import NO_DEPTH, spacing_of, time_unit
 from .budget import check_beside
@@ -250,12 +251,3 @@ def _color(table: Any) -> Rgb | None:
 
 def _tag(element: Any) -> str:
     return str(element.tag).rpartition("}")[2]
-
-
-def finite_number(text: Any) -> float | None:
-    """Returns the number that a text tells; None if it is none, or not finite."""
-    try:
-        value = float(text)
-    except (TypeError, ValueError):
-        return None
-    return value if math.isfinite(value) else None

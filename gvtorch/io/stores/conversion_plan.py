@@ -24,9 +24,9 @@ from .. import resources
 from ..label_source import IndexSource, counted_source
 from ..oblique import Oblique
 from ..reading import FormatSettings, open_source, placed, read_whole
-from ..source import MemorySource, VolumeSource
+from ..source import MemorySource, VolumeSource, no_time
 from . import shard, unfinished
-from .level_reader import Pool, no_time
+from .level_reader import Pool
 from .store_layout import BLOCKS, DTYPES, WORK, StoreLayout, context, kvstore
 
 _FEW = 4  # tasks of level 0 up to which processes are not worth their start
