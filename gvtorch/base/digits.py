@@ -18,6 +18,6 @@ def finite_number(text: Any) -> float | None:
     """Returns the number that a text tells; None if it is none, or not finite."""
     try:
         value = float(text)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     return value if math.isfinite(value) else None

@@ -269,7 +269,7 @@ def image_info(header: Any, samples: int, times: Times) -> tuple[ImageInfo, list
     lost = []
     kind = str(header.get("PhotometricInterpretation", ""))
     if kind == "PALETTE COLOR":
-        lost.append("the palette: values are its numbers")
+        lost.append("the colours of its palette: values are numbers of its entries")
     if kind == "MONOCHROME1":
         lost.append("that high values are meant to be dark (MONOCHROME1)")
     table = header.get("ModalityLUTSequence") and header.get("RescaleSlope") is None

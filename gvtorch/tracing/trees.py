@@ -191,7 +191,7 @@ def _filled(fields: Sequence[Tensor | None]) -> list[Tensor] | None:
     if not given:
         return None
     if len({field.shape[1:] for field in given}) > 1:
-        raise ValueError("render: trees must give as many features each")
+        raise ValueError("render: all trees must give the same number of features")
     nothing = nothing_like(given[0], len(given[0]))
     return [nothing if field is None else field for field in fields]
 
@@ -358,7 +358,7 @@ class _Shown:
             shape = (len(self.extinction), field.shape[1])
             known = self.sums.setdefault(name, self.extinction.new_zeros(shape))
             if known.shape != shape:
-                raise ValueError("render: trees must give as many features each")
+                raise ValueError("render: all trees must give the same number of features")
             known.index_add_(0, at, share * field)
 
     def alpha(self) -> Tensor:

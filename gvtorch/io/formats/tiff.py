@@ -15,9 +15,9 @@ from ..source import ArraySource, Index, VolumeSource, choose
 from ..tiff_info import JPEG, Told, check_pictures, imagej_info, ome_info, opened
 from .format import Format
 
-_LOST = {  # by kind of photometric interpretation
+_LOST = {  # by the tag PhotometricInterpretation
     0: "that high values are meant to be dark (MinIsWhite)",
-    3: "its palette: values are its numbers",
+    3: "the colours of its palette: values are numbers of its entries",
 }
 
 
