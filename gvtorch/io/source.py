@@ -300,6 +300,12 @@ def open_unpacked(file: str, member: str = "") -> IO[bytes]:
     return bz2.open(file, "rb") if file.lower().endswith(".bz2") else open(file, "rb")
 
 
+def no_time(where: str, time: object, times: int) -> str:
+    """The message about a time point that is not there."""
+    one = "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
+    return f"{where}: has no time {time!r}; it has {one}"
+
+
 @contextmanager
 def told_as(
     kind: type[Exception], path: str, what: str, *through: type[Exception]

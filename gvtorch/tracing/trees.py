@@ -192,7 +192,7 @@ def _filled(hits: Sequence[Hits], name: str) -> list[Tensor] | None:
     if not given:
         return None
     if len({field.shape[1:] for field in given}) > 1:
-        raise ValueError("render: trees must give as many features each")
+        raise ValueError("render: all trees must give the same number of features")
     return [
         nothing_like(given[0], len(one.alpha)) if field is None else field
         for one, field in zip(hits, fields, strict=True)
@@ -366,7 +366,7 @@ class _Shown:
             shape = (len(self.extinction), field.shape[1])
             known = self.sums.setdefault(name, self.extinction.new_zeros(shape))
             if known.shape != shape:
-                raise ValueError("render: trees must give as many features each")
+                raise ValueError("render: all trees must give the same number of features")
             known.index_add_(0, at, share * field)
 
     def alpha(self) -> Tensor:

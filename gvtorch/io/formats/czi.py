@@ -12,10 +12,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ...base.digits import finite_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import NO_DEPTH, spacing_of
 from ..source import Index, VolumeSource
-from ..tiff_info import finite_number
 from .format import Format, choose
 
 _DTYPES = {

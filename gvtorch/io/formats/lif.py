@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...base.image_info import ChannelInfo, ImageInfo, Rgb
+from ...base.image_info import COLORS, ChannelInfo, ImageInfo
 from ...base.units import NO_DEPTH, spacing_of
 from ..source import Index, VolumeSource
 from .format import Format, choose
@@ -24,16 +24,6 @@ _MOST_HEADER = 1 << 28  # characters
 _MOST_BLOCKS = 1 << 20
 _LETTERS = {1: "x", 2: "y", 3: "z", 4: "t"}
 _NAMES = {5: "wavelengths", 9: "excitation wavelengths", 10: "tiles"}
-_COLORS: dict[str, Rgb] = {
-    "red": (1.0, 0.0, 0.0),
-    "green": (0.0, 1.0, 0.0),
-    "blue": (0.0, 0.0, 1.0),
-    "cyan": (0.0, 1.0, 1.0),
-    "magenta": (1.0, 0.0, 1.0),
-    "yellow": (1.0, 1.0, 0.0),
-    "gray": (1.0, 1.0, 1.0),
-    "grey": (1.0, 1.0, 1.0),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +126,7 @@ def _channel(element: Any) -> ChannelInfo:
         for item in element.iter("ChannelProperty")
         if item.findtext("Key") in ("DyeName", "Name")
     ]
-    return ChannelInfo(name=next(filter(None, names), table), color=_COLORS.get(table.lower()))
+    return ChannelInfo(name=next(filter(None, names), table), color=COLORS.get(table.lower()))
 
 
 def _block(element: Any, blocks: dict[str, tuple[int, int]]) -> tuple[int, int] | None:

@@ -12,13 +12,12 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ..source import ArraySource, Index, VolumeSource
-from ..tiff_info import Told, check_pictures, imagej_info, ome_info, opened
+from ..tiff_info import JPEG, Told, check_pictures, imagej_info, ome_info, opened
 from .format import Format, choose
 
-_JPEG = (6, 7, 34892, 33007)
-_LOST = {  # by kind of photometric interpretation
+_LOST = {  # by the tag PhotometricInterpretation
     0: "that high values are meant to be dark (MinIsWhite)",
-    3: "its palette: values are its numbers",
+    3: "the colours of its palette: values are numbers of its entries",
 }
 
 
@@ -93,7 +92,7 @@ def _unpacked(page: Any, keyframe: Any, number: int) -> np.ndarray | None:
     if len(packed) != size:
         raise ValueError(f"{file.path}: ends before its tile {number}")
     more = {}
-    if keyframe.compression in _JPEG:
+    if keyframe.compression in JPEG:
         more = {"jpegtables": page.jpegtables, "jpegheader": keyframe.jpegheader}
     found = keyframe.decode(packed, number, **more)[0]
     return None if found is None else found[0]

@@ -211,7 +211,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
             )
     else:
         encoding = "ascii" if array["format"] == "ascii" else "base64"
-        offset, length = _inline(path, content, array["number"])
+        offset, length = _inline(content, array["number"])
     return VtkSource(
         stored=stored,
         encoding=encoding,
@@ -269,7 +269,7 @@ def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
     return sorted(found, key=lambda array: not array["first"])
 
 
-def _inline(path: str, content: bytes, number: int) -> tuple[int, int]:
+def _inline(content: bytes, number: int) -> tuple[int, int]:
     """Where the content of a DataArray begins, by its number in the file, and its length."""
     found: list[list[int]] = []
     parser = expat.ParserCreate()

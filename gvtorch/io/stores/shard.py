@@ -209,7 +209,7 @@ def create_arrays(conversion: Conversion, level: int) -> None:
 
 
 def write_labels(conversion: Conversion, labels: np.ndarray) -> None:
-    """Writes the array of labels that were counted off."""
+    """Writes the array of labels that are indexed."""
     root, spec = conversion.root, conversion.layout.labels()
     _create(root, spec)
     finish(write(root, spec, [0], labels), root.get("path", "store"))

@@ -549,7 +549,7 @@ class Store:
 
 
 def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline) -> np.ndarray:
-    """(k,) int64 labels that were counted off."""
+    """(k,) int64 labels that are indexed."""
     spec = layout.labels()
     name = f"{where}/{spec['path']}"
     array = deadline.wait(opened(root, spec), name)
