@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import torch
 from torch import Tensor
@@ -32,43 +32,49 @@ class Octave(NamedTuple):
     seed: int
 
 
+class SumSettings(TypedDict, total=False):
+    """Settings of a sum of octaves; see `fbm`."""
+
+    octaves: int
+    lacunarity: float
+    gain: float
+    basis: Basis
+    seed: int
+    period: Period
+
+
 def octaves_of(
-    where: str, octaves: int, lacunarity: float, gain: float, seed: int
+    where: str, octaves: int, lacunarity: float, gain: float, seed: int, frequency: float = 1
 ) -> Iterator[Octave]:
-    """Yields the octaves of a sum: amplitudes 1, gain, gain^2, ..., frequencies 1, lacunarity, ...
+    """Yields the octaves of a sum: amplitudes 1, gain, gain^2, ..., frequencies of `frequency`
+    times 1, lacunarity, ...
 
     Raises:
         ValueError: There are none, more than 64, or a number is not positive.
     """
+    check.number(where, "frequency", frequency, low=0, open_low=True)
     check.whole(where, "octaves", octaves, low=1, high=64)
     check.number(where, "lacunarity", lacunarity, low=0, open_low=True)
     check.number(where, "gain", gain, low=0, open_low=True)
     check.whole(where, "seed", seed, low=-(2**62), high=2**62)
     for number in range(octaves):
-        yield Octave(gain**number, lacunarity**number, seed + number * _NEXT_OCTAVE)
+        yield Octave(gain**number, lacunarity**number * frequency, seed + number * _NEXT_OCTAVE)
 
 
-def fbm(
-    points: Points,
-    *,
-    octaves: int = 6,
-    lacunarity: float = 2.0,
-    gain: float = 0.5,
-    basis: Basis = perlin,
-    seed: int = 0,
-    period: Period = None,
-) -> Tensor:
+def fbm(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
     """Fractal sum (fractional Brownian motion): octaves of a noise, each `lacunarity` times as fine
     as the one before and `gain` times as strong.
 
     Args:
         points: As in `perlin`.
-        octaves: How many, 1 to 64.
-        lacunarity, gain: Of an octave to the one before.
+        octaves: How many, 1 to 64. Default: 6.
+        lacunarity, gain: Frequency and amplitude of an octave, by those of the one before.
+            Default: 2 and 0.5.
         basis: The noise that is summed: `perlin`, `value`, `simplex`, `cellular`, or your own
-            function of points, `seed` and `period`.
-        seed: Of the first octave; each has its own.
+            function of points, `seed` and `period`. Default: `perlin`.
+        seed: Of the first octave; each has its own. Default: 0.
         period: Of the first octave, in its cells; the lacunarity must then be a whole number.
+            Default: None, it does not repeat.
 
     Returns:
         (...) of the points' dtype, within `fbm_bounds`.
@@ -76,45 +82,24 @@ def fbm(
     Raises:
         ValueError: An argument is not that.
     """
-    where = "noise.fbm"
-    layers = _layers(where, points, octaves, lacunarity, gain, basis, seed, period)
-    return _sum(where, (amplitude * noise for amplitude, noise in layers))
+    layers = _layers("noise.fbm", points, **settings)
+    return _sum("noise.fbm", (amplitude * noise for amplitude, noise in layers))
 
 
-def turbulence(
-    points: Points,
-    *,
-    octaves: int = 6,
-    lacunarity: float = 2.0,
-    gain: float = 0.5,
-    basis: Basis = perlin,
-    seed: int = 0,
-    period: Period = None,
-) -> Tensor:
+def turbulence(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
     """The sum of the absolute values of octaves: creases where they pass 0, as in flames and
     marble. Arguments, result and errors are those of `fbm`.
     """
-    where = "noise.turbulence"
-    layers = _layers(where, points, octaves, lacunarity, gain, basis, seed, period)
-    return _sum(where, (amplitude * noise.abs() for amplitude, noise in layers))
+    layers = _layers("noise.turbulence", points, **settings)
+    return _sum("noise.turbulence", (amplitude * noise.abs() for amplitude, noise in layers))
 
 
-def ridged(
-    points: Points,
-    *,
-    octaves: int = 6,
-    lacunarity: float = 2.0,
-    gain: float = 0.5,
-    sharpness: float = 2.0,
-    basis: Basis = perlin,
-    seed: int = 0,
-    period: Period = None,
-) -> Tensor:
+def ridged(points: Points, *, sharpness: float = 2.0, **settings: Unpack[SumSettings]) -> Tensor:
     """Ridges: octaves of (1 - |noise|)^2, each weighted by the one before, so that valleys stay
     smooth and detail gathers on the crests.
 
     Args:
-        points, octaves, lacunarity, gain, basis, seed, period: As in `fbm`; noises lie in -1 to 1.
+        points, settings: As in `fbm`; noises lie in -1 to 1.
         sharpness: An octave's weight is the one before times this, at most 1.
 
     Returns:
@@ -128,8 +113,7 @@ def ridged(
 
     def crests() -> Iterator[Tensor]:
         weight: Tensor | None = None
-        layers = _layers(where, points, octaves, lacunarity, gain, basis, seed, period)
-        for amplitude, noise in layers:
+        for amplitude, noise in _layers(where, points, **settings):
             crest = (1 - noise.abs()) * (1 - noise.abs())
             crest = crest if weight is None else crest * weight
             weight = (crest * sharpness).clamp(0, 1)
@@ -138,21 +122,11 @@ def ridged(
     return _sum(where, crests())
 
 
-def warp(
-    points: Points,
-    *,
-    amplitude: float = 1.0,
-    octaves: int = 1,
-    lacunarity: float = 2.0,
-    gain: float = 0.5,
-    basis: Basis = perlin,
-    seed: int = 0,
-    period: Period = None,
-) -> Tensor:
+def warp(points: Points, *, amplitude: float = 1.0, **settings: Unpack[SumSettings]) -> Tensor:
     """Domain warp: points moved by a vector of noise, to be handed to another function of place.
 
     Args:
-        points, octaves, lacunarity, gain, basis, seed, period: As in `fbm`.
+        points, settings: As in `fbm`, but one octave by default.
         amplitude: The noises, one for each axis, are multiplied by this.
 
     Returns:
@@ -164,18 +138,11 @@ def warp(
     """
     place = as_points("noise.warp", points)
     check.number("noise.warp", "amplitude", amplitude)
-    shifts = [
-        fbm(
-            place,
-            octaves=octaves,
-            lacunarity=lacunarity,
-            gain=gain,
-            basis=basis,
-            seed=seed + (axis + 1) * _NEXT_AXIS,
-            period=period,
-        )
-        for axis in range(place.shape[-1])
-    ]
+    first = settings.get("seed", 0)
+    shifts = []
+    for axis in range(place.shape[-1]):
+        own: SumSettings = {"octaves": 1, **settings, "seed": first + (axis + 1) * _NEXT_AXIS}
+        shifts.append(fbm(place, **own))
     return place + amplitude * torch.stack(shifts, -1)
 
 
@@ -207,12 +174,13 @@ def _sum(where: str, parts: Iterable[Tensor]) -> Tensor:
 def _layers(
     where: str,
     points: Points,
-    octaves: int,
-    lacunarity: float,
-    gain: float,
-    basis: Basis,
-    seed: int,
-    period: Period,
+    *,
+    octaves: int = 6,
+    lacunarity: float = 2.0,
+    gain: float = 0.5,
+    basis: Basis = perlin,
+    seed: int = 0,
+    period: Period = None,
 ) -> Iterator[tuple[float, Tensor]]:
     """Yields amplitude and noise of each octave."""
     place = as_points(where, points)

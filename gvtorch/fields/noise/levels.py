@@ -107,13 +107,11 @@ class OctaveSum(Tally):
             ValueError: A number is out of its range.
         """
         where = "noise.OctaveSum"
-        check.number(where, "frequency", frequency, low=0, open_low=True)
+        self.octaves = [*octaves_of(where, octaves, lacunarity, gain, seed, frequency)]
         self.hold = check.number(where, "hold", hold, low=0, open_low=True)
         if not settled >= self.hold:
             raise ValueError(f"{where}: settled must be >= hold, {hold:g}, got {settled!r}")
         self.settled = settled
-        series = octaves_of(where, octaves, lacunarity, gain, seed)
-        self.octaves = [one._replace(frequency=one.frequency * frequency) for one in series]
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can hold."""

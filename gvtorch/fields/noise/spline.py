@@ -59,10 +59,7 @@ class SplineSum(Tally):
         Raises:
             ValueError: A number is out of its range.
         """
-        where = "noise.SplineSum"
-        check.number(where, "frequency", frequency, low=0, open_low=True)
-        series = octaves_of(where, octaves, 2.0, gain, seed)
-        self.octaves = [one._replace(frequency=one.frequency * frequency) for one in series]
+        self.octaves = [*octaves_of("noise.SplineSum", octaves, 2.0, gain, seed, frequency)]
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can hold."""
