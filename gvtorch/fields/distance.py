@@ -210,14 +210,36 @@ class SmoothUnion(Pair):
         return None if found is None else grown(found, self.width / 4)
 
 
-class Negative(Distance):
-    """What lies outside of a shape."""
+class OfShape(Distance):
+    """Base of what is made of one shape, which is asked in boxes `over`."""
 
     def __init__(self, shape: Distance) -> None:
         """Takes the shape, with its colour."""
         super().__init__()
-        self.shape = check.instance("Negative", "shape", shape, Distance)
+        self.shape = check.instance(type(self).__name__, "shape", shape, Distance)
         self.exact, self.smooth = shape.exact, shape.smooth
+
+    def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns boxes (k, 3) that hold the places at which the shape is asked for all points of
+        boxes; the same boxes unless overridden.
+        """
+        return center, half
+
+    def slope(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.slope(*self.over(center, half))
+
+    def near(self, center: Tensor, half: Tensor) -> Distance:
+        return self.replaced(shape=self.shape.near(*self.over(center, half)))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(*self.over(center, half))
+
+    def colors(self, center: Tensor, half: Tensor) -> Interval:
+        return self.shape.colors(*self.over(center, half))
+
+
+class Negative(OfShape):
+    """What lies outside of a shape."""
 
     def forward(self, points: Tensor) -> Tensor:
         return -self.shape(points)
@@ -226,21 +248,9 @@ class Negative(Distance):
         value, color = self.shape.surface(points)
         return -value, color
 
-    def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.slope(center, half)
-
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         low, high = self.shape.bounds(center, half)
         return -high, -low
-
-    def near(self, center: Tensor, half: Tensor) -> Distance:
-        return self.replaced(shape=self.shape.near(center, half))
-
-    def alike(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.alike(center, half)
-
-    def colors(self, center: Tensor, half: Tensor) -> Interval:
-        return self.shape.colors(center, half)
 
 
 class Difference(Intersection):
