@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Camera
-from .composite import Trace, over
+from .composite import TraceRays, over
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ class LayerPixels:
         alpha = None if self.alpha is None else self.alpha[which]
         return LayerPixels(self.color[which], self.distance[which], alpha)
 
-    def trace(self, trace_rays: Trace, rays: Rays, stop_alpha: float) -> Hits:
+    def trace(self, trace_rays: TraceRays, rays: Rays, stop_alpha: float) -> Hits:
         """Traces the rays of these pixels and composites voxels and layer. Depth, normal and
         features are those of the voxels alone, the normal by the light that the voxels in front of
         the layer and behind it take. A ray that has reached `stop_alpha` with the layer goes no
