@@ -81,6 +81,21 @@ class RequestBatch:
             parents = {name: rows[index] for name, rows in parents.items()}
         return replace(self, targets=self.targets[index], parents=parents)
 
+    def halves(self) -> tuple[RequestBatch, RequestBatch]:
+        """Two batches to ask for after a producer raised, so that one bad node does not take the
+        others with it.
+        """
+        half = len(self) // 2
+        return self[:half], self[half:]
+
+    def failed_nodes(self, errors: Mapping[int, str]) -> dict[int, str]:
+        """By node of the batch, in order, the first message of the items that failed."""
+        per_node = len(self.loc) // len(self)
+        failed: dict[int, str] = {}
+        for item in sorted(errors):
+            failed.setdefault(item // per_node, errors[item])
+        return failed
+
     @property
     def nodes(self) -> Nodes:
         """What the producer is asked about; made anew, for `Nodes` keep positions once computed."""
