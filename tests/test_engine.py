@@ -398,6 +398,7 @@ def test_report_tells_stages_rates_and_occupancy(blobs):
     ("call", "message"),
     [
         (gv.Engine, "must be a Producer, got Volume"),
+        (lambda v: gv.Engine({1: v}), "name of a tree must be a str, got int"),
         (lambda v: gv.Engine({}), "at least one producer"),
         (lambda v: engine(v, brick_pool="lots"), 'brick_pool must be bytes, as in "256 MB"'),
         (lambda v: engine(v, brick_pool=0), "brick_pool must be an int >= 1"),

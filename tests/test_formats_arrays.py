@@ -162,3 +162,20 @@ def test_arrays_are_rendered(grid):
         "a",
         "b",
     }
+
+
+def test_masked_values_are_not_there():
+    data = np.arange(60).reshape(3, 4, 5)
+    gaps = data % 7 == 0
+    for dtype in ("u1", "f4", "f8", ">i2"):
+        masked = np.ma.MaskedArray(data.astype(dtype), gaps)
+        volume = gv.as_volume(masked, nan=-1)
+        assert np.array_equal(volume.data[..., 0].numpy(), np.where(gaps, -1, data))
+        with pytest.raises(ValueError, match="9 values that are NaN"):
+            gv.as_volume(masked)
+    nothing = gv.as_volume(np.ma.MaskedArray(data.astype("u1"), np.zeros_like(gaps)))
+    assert nothing.data.numpy().dtype == np.uint8
+    with pytest.raises(ValueError, match="int64 values reach 100000059"):
+        gv.as_volume(np.ma.MaskedArray(data + 10**8, gaps), nan=0)
+    with pytest.raises(ValueError, match="masked arrays: fill them before"):
+        gv.as_volume(dask.from_array(masked, chunks=2), axes="zyx")

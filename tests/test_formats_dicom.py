@@ -259,6 +259,20 @@ def test_color_and_images_without_a_place(tmp_path):
     assert [channel.name for channel in volume.info.channels] == ["red", "green", "blue"]
 
 
+def test_a_modality_s_table_is_told(tmp_path, data):
+    """It is not looked up, so that the values are no Hounsfield units."""
+    table = pydicom.Dataset()
+    table.LUTDescriptor, table.ModalityLUTType, table.LUTData = [3, 0, 16], "HU", bytes(6)
+    found = dataset(Rows=data.shape[1], Columns=data.shape[2], Modality="CT")
+    image = np.abs(data[0]).astype("<u2")
+    found.ModalityLUTSequence, found.PixelData = [table], image.tobytes()
+    found.save_as(tmp_path / "a.dcm", enforce_file_format=True)
+    with pytest.warns(UserWarning, match="the modality's table: values are those that it looks"):
+        volume = gv.read_volume(tmp_path / "a.dcm")
+    assert volume.info.quantity is None
+    assert np.array_equal(volume.data[0, ..., 0].numpy(), image[::-1, ::-1])
+
+
 @pytest.mark.parametrize("codec", ["jpeg", "ljpeg"])
 def test_frames_through_imagecodecs(tmp_path, codec):
     import imagecodecs

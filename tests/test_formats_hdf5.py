@@ -114,6 +114,49 @@ def test_packed_values_and_missing_ones(tmp_path, grid):
     assert np.array_equal(volume.data[..., 0].numpy(), expected.astype("f4"))
 
 
+@pytest.mark.parametrize(
+    ("attributes", "gaps"),
+    [
+        ({"missing_value": np.array([3, 250], "u1")}, (3, 250)),
+        ({"valid_range": np.array([10, 240], "u1")}, (*range(10), *range(241, 256))),
+        ({"valid_min": np.uint8(0), "valid_max": np.uint8(200)}, range(201, 256)),
+        ({"valid_max": np.uint8(200), "_FillValue": np.uint8(7)}, (7, *range(201, 256))),
+        ({"valid_range": np.array([0, 255], "u1")}, ()),
+    ],
+)
+def test_what_is_valid(tmp_path, attributes, gaps):
+    data = np.arange(256, dtype="u1").reshape(4, 8, 8)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("d", data=data).attrs.update(attributes)
+    volume = gv.read_volume(tmp_path / "a.h5", axes="zyx", nan=-1)
+    expected = np.where(np.isin(data, list(gaps)), -1.0, data)
+    assert np.array_equal(volume.data[..., 0].numpy(), expected)
+    assert volume.data.numpy().dtype == (np.float32 if len(gaps) else np.uint8)
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_bytes_that_are_told_to_have_no_sign(tmp_path, grid, scaled):
+    """As xarray reads them."""
+    data = np.arange(-128, 128, dtype="i1").reshape(4, 8, 8)
+    told = {"scale_factor": 0.5, "_FillValue": np.int8(-1)} if scaled else {}
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        file.create_dataset("d", data=data).attrs.update({"_Unsigned": "true", **told})
+    volume = gv.read_volume(tmp_path / "a.nc", axes="zyx", nan=-9)
+    packed = xarray.Variable(tuple("zyx"), data, {"_Unsigned": "true", **told})
+    peer = xarray.conventions.decode_cf_variable("d", packed)
+    assert np.array_equal(volume.data[..., 0].numpy(), peer.fillna(-9).values)
+    assert volume.data.max() == (127 if scaled else 255)
+
+
+def test_a_data_set_that_is_handed_over_tells_that_its_values_are_packed(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        made = file.create_dataset("d", data=np.zeros((4, 5, 6), "i2"))
+        made.attrs.update({"scale_factor": 2.0, "_FillValue": np.int16(0)})
+        told = r"not kept: scale_factor, _FillValue: values are taken as they are stored"
+        with pytest.warns(UserWarning, match=told):
+            gv.as_volume(made, axes="zyx")
+
+
 def test_wide_labels_with_a_value_for_none_stay_apart(tmp_path):
     """float32 would merge them; where they are no labels that is told."""
     labels = np.random.default_rng(3).integers(0, 50, (9, 8, 7)).astype("i4") + 2**25

@@ -179,7 +179,7 @@ def test_vti(tmp_path, grid, mode, packer, dtype):
     other = gv.read_volume(file, key="other")
     assert np.array_equal(other.data.float(), (volume.data + 1).float())
     assert open_source(file).whole == ((mode, packer) != ("Appended", "None"))
-    with pytest.raises(ValueError, match="has no array 'x'; it holds density, other"):
+    with pytest.raises(ValueError, match="has no array 'x'; it holds 0 'density', 1 'other'"):
         gv.read_volume(file, key="x")
 
 
@@ -252,7 +252,7 @@ def test_points_come_before_cells_in_legacy_vtk(tmp_path, grid, kind):
     array.SetName("cells")
     image.GetCellData().AddArray(array)
     file = write_legacy(tmp_path / "a.vtk", image, kind)
-    with pytest.warns(UserWarning, match=r"other arrays; key .*, cells"):
+    with pytest.warns(UserWarning, match=r"other arrays; key .*, 2 'cells'"):
         volume = gv.read_volume(file)
     assert np.array_equal(volume.data[..., 0].numpy(), grid)
     volume = gv.read_volume(file, key="cells")

@@ -64,7 +64,7 @@ def test_czi(tmp_path, five, packed):
 
 def test_scenes_of_czi(tmp_path, five):
     file = write_czi(tmp_path / "a.czi", five[:1, :1], scenes=2)
-    with pytest.warns(UserWarning, match="1 other scenes; key .* among 0 to 1"):
+    with pytest.warns(UserWarning, match="1 other scenes; key .* among 0, 1"):
         volume = gv.read_volume(file)
     assert np.array_equal(volume.data[..., 0].numpy(), five[0, 0])
     other = gv.read_volume(file, key="1")
@@ -201,7 +201,7 @@ def test_nd2_through_a_stand_in(tmp_path, monkeypatch):
         assert hasattr(nd2.ND2File, name), f"nd2 has no {name} any more"
     monkeypatch.setattr(nd2, "ND2File", StandIn)
     (tmp_path / "a.nd2").write_bytes(b"")
-    with pytest.warns(UserWarning, match="1 other positions; key .* chooses, 0 to 1"):
+    with pytest.warns(UserWarning, match="1 other positions; key .* among 0, 1"):
         source = open_source(tmp_path / "a.nd2", time=1)
     whole = np.moveaxis(StandIn.data[:, 0], 2, -1)
     assert np.array_equal(source.read_times(0, 2), whole)
@@ -212,7 +212,7 @@ def test_nd2_through_a_stand_in(tmp_path, monkeypatch):
     assert source.info.channels[0] == gv.ChannelInfo(name="DAPI", color=(1, 0, 0.2))
     other = open_source(tmp_path / "a.nd2", key="1")
     assert np.array_equal(other.read_times(0, 1)[0], np.moveaxis(StandIn.data[0, 1], 1, -1))
-    with pytest.raises(ValueError, match="has no position '2'; it holds 0 to 1"):
+    with pytest.raises(ValueError, match="has no position '2'; it holds 0, 1"):
         open_source(tmp_path / "a.nd2", key="2")
 
 

@@ -154,6 +154,15 @@ def test_values_that_are_shown_otherwise_are_told(tmp_path, kind, told):
     assert np.array_equal(volume.data[..., 0].numpy(), data)
 
 
+def test_turned_pages_and_centimeters_are_told(tmp_path):
+    file = tmp_path / "a.tif"
+    options = {"resolution": (2000, 2000), "resolutionunit": "CENTIMETER"}
+    tifffile.imwrite(file, noise((3, 8, 9)), extratags=[(274, "H", 1, 6, False)], **options)
+    told = "size of a pixel in centimeters: .*; that its pages are to be shown turned"
+    with pytest.warns(UserWarning, match=told):
+        gv.read_volume(file)
+
+
 def test_a_file_that_ends_before_its_tiles(tmp_path):
     file = ome(tmp_path / "a.tif", noise((1, 1, 4, 40, 50), "uint16"), compression="zlib")
     with tifffile.TiffFile(file) as tiff:

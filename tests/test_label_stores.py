@@ -1,4 +1,4 @@
-"""Labels in files and stores: counted off, converted, resumed, streamed; on the command line."""
+"""Labels in files and stores: indexed, converted, resumed, streamed; on the command line."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_the_command_line_shows_labels(tmp_path):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("dtype", ["uint32", "uint8"])
 def test_label_images_that_another_library_wrote(tmp_path, dtype):
-    """By zarr, with one level: coarser ones are made by majority; wide ones are counted off."""
+    """By zarr, with one level: coarser ones are made by majority; wide ones are indexed."""
     zarr = pytest.importorskip("zarr")
     data = (cells((40, 36, 44), 12) * (2**28 - 1 if dtype == "uint32" else 21)).astype(dtype)
     group = zarr.open_group(tmp_path / "cells.zarr", mode="w", zarr_format=3)
@@ -175,7 +175,7 @@ def test_label_images_that_another_library_wrote(tmp_path, dtype):
     if dtype == "uint8":
         same_as_resident(store, volume)
     else:
-        with pytest.raises(ValueError, match=r"labels of <u4 must be counted off first: gvtorch"):
+        with pytest.raises(ValueError, match=r"labels of <u4 must be indexed first: gvtorch"):
             gv.StoredProducer(store)
     made = gv.convert(tmp_path / "cells.zarr", tmp_path / "own.zarr")
     assert made.info.labels and made.spacing == SPACING

@@ -98,6 +98,51 @@ def test_textures_and_materials_of_an_obj(tmp_path):
     assert mesh.uv is not None and np.array_equal(mesh.uv, mesh.corners[..., :2].astype(np.float32))
 
 
+@pytest.mark.parametrize(("told", "opacity"), [("d 0.25", 0.25), ("Tr 0.25", 0.75), ("d x", 1)])
+def test_an_obj_s_material_may_let_light_through(tmp_path, told, opacity):
+    (tmp_path / "a.mtl").write_text(f"newmtl glass\nKd 1 0 0\n{told}\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + CUBE.replace("f ", "usemtl glass\nf ", 1))
+    assert gv.read_mesh(tmp_path / "a.obj").materials[0].color == (1, 0, 0, opacity)
+
+
+def star(count: int, seed: int) -> np.ndarray:
+    """(n, 2) corners around the middle, counter-clockwise, at any distance from it."""
+    angle = 2 * np.pi * np.arange(count) / count
+    far = np.random.default_rng(seed).uniform(0.1, 1, count)
+    return np.stack((far * np.cos(angle), far * np.sin(angle)), -1)
+
+
+@pytest.mark.parametrize("count", [4, 5, 9, 60])
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_polygons_that_are_not_convex_are_cut_within_themselves(tmp_path, count, clockwise):
+    """Their triangles have the polygon's area, and face its way: those of a fan overlap."""
+    flat = star(count, 3)[::-1] if clockwise else star(count, 3)
+    tilt = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
+    tilt *= np.sign(np.linalg.det(tilt))
+    places = np.concatenate((flat, np.zeros((count, 1))), 1) @ tilt.T
+    lines = [f"v {x:.17g} {y:.17g} {z:.17g}" for x, y, z in places.tolist()]
+    corners = [f"{n + 1 if n % 2 else n - count}//1" for n in range(count)]
+    lines += ["vn 0 0 1", "f " + " ".join(corners), "f 1//1 2//1 3//1"]
+    (tmp_path / "a.obj").write_text("\r\n".join(lines) + "\r\n")
+    mesh = gv.read_mesh(tmp_path / "a.obj")
+    a, b, c = mesh.corners.transpose(1, 0, 2) @ tilt
+    area = 0.5 * np.cross((b - a)[:, :2], (c - a)[:, :2])
+    after = np.roll(flat, -1, 0)
+    whole = 0.5 * (flat[:, 0] * after[:, 1] - flat[:, 1] * after[:, 0]).sum()
+    assert len(area) == count - 1 and (area[:-1] * np.sign(whole) > 0).all()
+    assert area[:-1].sum() == pytest.approx(whole)
+
+
+def test_what_crosses_itself_is_a_fan_and_huge_polygons_are_refused(tmp_path):
+    text = "v 0 0 0\nv 2 2 0\nv 2 0 0\nv 0 1 0\nf 1 2 3 4\n"
+    (tmp_path / "a.obj").write_text(text)
+    assert len(gv.read_mesh(tmp_path / "a.obj").faces) == 2
+    places = "".join(f"v {x} {y} 0\n" for x, y in star(1001, 0).tolist())
+    (tmp_path / "b.obj").write_text(places + "f " + " ".join(map(str, range(1, 1002))))
+    with pytest.raises(ValueError, match="a polygon of 1001 corners is not convex, at most 1000"):
+        gv.read_mesh(tmp_path / "b.obj")
+
+
 def test_a_texture_is_laid_on(tmp_path):
     file = write_textured(tmp_path)
     (tmp_path / "a.mtl").unlink()

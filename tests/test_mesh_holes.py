@@ -11,7 +11,7 @@ from helpers import gvtorch, meshes, shared
 
 import gvtorch as gv
 from gvtorch.meshes.holes import filled, rims, told_of_holes
-from gvtorch.meshes.mesh import solids
+from gvtorch.meshes.mesh import facing_away, solids
 from gvtorch.meshes.voxelizer import Voxelizer
 from gvtorch.meshes.winding import winding_number
 
@@ -81,6 +81,30 @@ def test_a_plane_hole_is_filled_by_its_plane():
         new = closed.corners[len(one.faces) :]
         assert solids(closed)[1].all() and np.abs(new[..., 2]).max() < 2e-3
         assert abs(meshes.volume(closed)) == pytest.approx(meshes.volume(ball) / 2, rel=2e-3)
+
+
+def test_triangles_that_face_the_other_way_are_turned():
+    """Also where most of a part was listed after them, and apart from it in another part."""
+    ball = meshes.sphere(3)
+    for away in ([5], [0, 1, 2, 77], np.arange(0, 512, 7)):
+        wrong = ball.turned(np.array(away))
+        assert not solids(wrong)[1].any() and np.array_equal(facing_away(wrong), away)
+        mended = filled(wrong)
+        assert np.array_equal(mended.faces, ball.faces) and solids(mended)[1].all()
+    opened = without(ball.turned(np.array([500])), 0, 300)
+    assert len(rims(filled(opened))[0]) == 0 and solids(filled(opened))[1].all()
+
+
+def test_a_strip_of_one_side_stays_as_it_is():
+    turn = np.linspace(0, 2 * np.pi, 41)[:-1]
+    side = np.array([-0.3, 0.3])[:, None]
+    wide = 1 + side * np.cos(turn / 2)
+    place = np.stack((wide * np.cos(turn), wide * np.sin(turn), side * np.sin(turn / 2)), -1)
+    low, high = np.arange(40), np.arange(40, 80)
+    next_low, next_high = np.append(low[1:], 40), np.append(high[1:], 0)
+    faces = np.stack((low, next_low, high, high, next_low, next_high), -1).reshape(-1, 3)
+    strip = gv.Mesh(vertices=place.reshape(-1, 3), faces=faces)
+    assert not len(facing_away(strip))
 
 
 def test_what_encloses_nothing_stays_a_sheet():

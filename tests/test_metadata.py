@@ -100,6 +100,19 @@ def test_colours_of_nifti(tmp_path):
 # --- NRRD
 
 
+@pytest.mark.parametrize(
+    ("centers", "spacing", "origin"),
+    [("cell", (0.5, 1, 2), (1.25, 2.5, 4)), ("node", (2 / 3, 1.2, 2.4), (1, 2, 3))],
+)
+def test_ends_of_axes_of_nrrd(tmp_path, centers, spacing, origin):
+    """Of cells they are their outer sides, of nodes the places of the first and the last one."""
+    told = f"axis mins: 1 2 3\naxis maxs: 3 8 15\ncenters: {centers} {centers} {centers}\n"
+    head = f"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 4 6 6\nencoding: raw\n{told}\n"
+    (tmp_path / "a.nrrd").write_bytes(head.encode() + bytes(144))
+    volume, _ = read(tmp_path / "a.nrrd")
+    assert volume.spacing == pytest.approx(spacing) and volume.origin == pytest.approx(origin)
+
+
 def test_kinds_units_and_space_of_nrrd(tmp_path):
     nrrd = pytest.importorskip("nrrd")
     data = np.arange(2 * 4 * 5 * 6, dtype=np.int16).reshape(2, 4, 5, 6)  # fastest first

@@ -158,6 +158,13 @@ def test_a_strange_ply_is_named(tmp_path, head, message):
     assert str(path) in str(caught.value) and message in str(caught.value)
 
 
+def test_columns_of_another_length_are_told(tmp_path):
+    places = np.random.default_rng(0).random((9, 3))
+    np.savez(tmp_path / "a.npz", positions=places, values=np.ones(9), radius=np.ones(8))
+    with pytest.warns(UserWarning, match=r"not read, since others have 9 rows: radius \(8\)"):
+        assert gv.read_points(tmp_path / "a.npz").radius is None
+
+
 def test_no_pickle_is_loaded_and_nan_is_told(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, position=PLACE, value=np.array([{}] * COUNT))

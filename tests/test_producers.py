@@ -124,7 +124,7 @@ def test_eviction_clears_every_pointer_to_a_shared_tile():
         (lambda: gv.Producer(0), "extent must be an int >= 1"),
         (lambda: gv.Producer((4, 4)), "extent must be a number or (x, y, z)"),
         (lambda: gv.Producer(4, spacing=0), "spacing must be positive"),
-        (lambda: gv.Producer(4, box=((0, 0, 0), (1, 1, -1))), "spacing must be positive"),
+        (lambda: gv.Producer(4, box=((0, 0, 0), (1, 1, -1))), "sides of the box must be positive"),
         (lambda: gv.Producer(4, box=((0, 0, 0),)), "box must be two corners"),
         (lambda: gv.Producer(4, branching=1), "branching must be an int >= 2"),
         (lambda: gv.Producer(4.5), "extent must be an int >= 1"),

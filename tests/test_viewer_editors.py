@@ -170,7 +170,7 @@ def test_slices_of_a_store_read_no_finer_than_pixels(scan_store, monkeypatch):
 
 
 def test_slices_of_labels_have_their_colours():
-    data = cells((12, 13, 14), 9, seed=3) * 1000003  # counted off: wider than 16 bits
+    data = cells((12, 13, 14), 9, seed=3) * 1000003  # indexed: wider than 16 bits
     volume = gv.Volume(data, labels=True)
     session = new_session(volume, gv.Labels({1000003: (1.0, 0.0, 0.0)}, visible=[1000003]))
     try:

@@ -12,12 +12,15 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from . import check
+from . import boxes, check
 from .image_info import ChannelInfo, ImageInfo
+from .labels import check_narrowed
 from .named_axes import ask_axes, even_steps, named_axes, place_named
 from .units import spacing_of
 from .volume import Volume, check_extent
 
+#: Attributes by which files of NetCDF and HDF5 tell what their numbers stand for.
+_PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned", "valid_range")
 _OFFERS = ("__array__", "__array_interface__", "__dlpack__")
 
 
@@ -45,11 +48,8 @@ class ArrayLike:
                 for axis, n in zip(self.axes, self.shape, strict=True)
             )
         )
-        data = data.squeeze(tuple(at for at, axis in enumerate(self.axes) if axis in "-t"))
-        axes = self.axes.replace("-", "").replace("t", "")
-        missing = "".join(axis for axis in "zyxc" if axis not in axes)
-        order = [(missing + axes).index(axis) for axis in "zyxc"]
-        data = data[(None,) * len(missing)].transpose(order)
+        data = data.squeeze(tuple(at for at, axis in enumerate(self.axes) if axis == "-"))
+        data = boxes.to_zyxc(data, self.axes.replace("-", ""), "tzyxc")[0]
         return np.flip(data, tuple("zyx".index(axis) for axis in self.flips))
 
     def read(self, index: tuple[slice, ...]) -> np.ndarray:
@@ -74,6 +74,10 @@ class ArrayLike:
             raise ValueError(f"{where}: is a set of arrays, take one of them: {held}")
         if not hasattr(given, "shape") or not hasattr(given, "dtype"):
             given = _plain(where, given)
+        if isinstance(given, np.ma.MaskedArray):
+            given = _filled(where, given)
+        elif isinstance(getattr(given, "_meta", None), np.ma.MaskedArray):
+            raise ValueError(f"{where}: its parts are masked arrays: fill them before")
         shape = tuple(int(n) for n in given.shape)
         dtype = np.dtype(str(given.dtype)) if not isinstance(given.dtype, np.dtype) else given.dtype
         if dtype.kind not in "biuf":
@@ -83,6 +87,9 @@ class ArrayLike:
         letters = letters or ask_axes(where, shape, axes)
         place, moments = place_named(letters, shape, steps, units)
         attrs = _attributes(given)
+        packed = [n for n in _PACKED if n in attrs and np.any(attrs[n] == attrs[n])]  # no NaN
+        if packed:
+            lost = [*lost, f"{', '.join(packed)}: values are taken as they are stored"]
         sizes = np.ravel(attrs.get("spacing", attrs.get("element_size_um", ()))).tolist()
         if not any(steps) and len(sizes) >= 3 and all(isinstance(n, (int, float)) for n in sizes):
             unit = "um" if "element_size_um" in attrs else str(attrs.get("unit", ""))
@@ -171,6 +178,17 @@ def _plain(where: str, given: Any) -> np.ndarray:
         return np.asarray(given)
     except Exception as error:
         raise ValueError(f"{where}: gives no array: {error}") from None
+
+
+def _filled(where: str, given: np.ma.MaskedArray) -> np.ndarray:
+    """The array with NaN for what is masked; whole numbers become float32 then."""
+    data, gaps = np.asarray(given.data), np.ma.getmaskarray(given)
+    if not gaps.any() or data.dtype.kind not in "biuf":
+        return data
+    if data.dtype.kind != "f":
+        check_narrowed(where, data[~gaps])
+        data = data.astype(np.float32)
+    return np.where(gaps, data.dtype.type(np.nan), data)
 
 
 def _is_lazy(given: Any) -> bool:

@@ -307,6 +307,18 @@ def triple(
     return (x, y, z)
 
 
+def box(where: str, value: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Returns two corners, (x, y, z) each; raises ValueError unless the second lies beyond the
+    first along all axes.
+    """
+    if len(value) != 2:
+        raise ValueError(f"{where}: box must be two corners, got {value!r}")
+    low, high = (triple(where, "box", corner) for corner in value)
+    sides = [b - a for a, b in zip(low, high, strict=True)]
+    triple(where, "sides of the box", sides, positive=True)
+    return low, high
+
+
 def placed(
     where: str, spacing: Any, origin: Any, extent: Sequence[int]
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

@@ -31,14 +31,20 @@ class ChannelInfo:
         return ", ".join(words + ["not shown at first"] * (not self.active)) or "nothing told"
 
 
-_RGB = {"red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0)}
+#: Colours of microscopists' usual lookup tables.
+COLORS: dict[str, Rgb] = {
+    **{"blue": (0.0, 0.0, 1.0), "green": (0.0, 1.0, 0.0), "red": (1.0, 0.0, 0.0)},
+    **{"magenta": (1.0, 0.0, 1.0), "cyan": (0.0, 1.0, 1.0), "yellow": (1.0, 1.0, 0.0)},
+    **{"orange": (1.0, 128 / 255, 0.0)},
+    **dict.fromkeys(("white", "gray", "grey"), (1.0, 1.0, 1.0)),
+}
 #: Of light that is added up: premultiplied colour, and what it hides.
 PREMULTIPLIED = tuple(ChannelInfo(name=name) for name in ("red", "green", "blue", "opacity"))
 
 
 def color_channels(count: int = 3) -> tuple[ChannelInfo, ...]:
     """Returns the channels of colours: red, green, blue, and whatever follows is alpha."""
-    colors = [ChannelInfo(name=name, color=color) for name, color in _RGB.items()]
+    colors = [ChannelInfo(name=name, color=COLORS[name]) for name in ("red", "green", "blue")]
     return (*colors, *[ChannelInfo(name="alpha")] * (count - 3))
 
 

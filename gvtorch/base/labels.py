@@ -1,7 +1,7 @@
 """Numbers of things: whole numbers of any width that must stay apart, in the dtypes of bricks.
 
-Numbers of 16 bits at most are kept as they are. Wider ones are counted off: voxels hold the index
-of their label among all that there are, and a table holds the labels.
+Numbers of 16 bits at most are kept as they are. Wider ones are indexed: voxels hold the index of
+their label in a table of all labels.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def indices(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return np.searchsorted(labels, values.astype(np.int64, copy=False)).astype(dtype)
 
 
-def counted_off(where: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def indexed(where: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Returns labels as bricks hold them, and (k,) int64 what each of their numbers stands for;
     None where they are kept as they are. Raises ValueError as `as_whole` and `distinct`.
     """

@@ -15,7 +15,7 @@ from torch import Tensor
 from . import check
 from . import constants as config
 from .image_info import ImageInfo
-from .labels import check_narrowed, counted_off
+from .labels import check_narrowed, indexed
 
 #: The dtypes that a brick channel can have. Wider ones are narrowed on the way in, see `Volume`.
 CHANNEL_DTYPES = (
@@ -63,7 +63,7 @@ class Volume:
         filter: How coarse levels are made: the mean; of labels the most frequent; or what is seen
             along six directions, see `directional`.
         label_values: (k,) int64, sorted: the label that each value of the data stands for, where
-            labels were counted off; None: values stand for themselves.
+            labels are indexed; None: values stand for themselves.
     """
 
     filter: Literal["mean", "majority", "directional"] = "mean"
@@ -85,7 +85,7 @@ class Volume:
         Args:
             data: (z, y, x) or (z, y, x, c). Any device, any byte order. bool becomes uint8; 32 and
                 64 bit integers and float64 become float32. Labels are whole numbers of any dtype,
-                below 2^63; those of more than 16 bits are counted off, see `label_values`.
+                below 2^63; those of more than 16 bits are indexed, see `label_values`.
             spacing: (x, y, z) world units, distance of neighbouring voxel centres.
             origin: (x, y, z) world units, centre of voxel 0.
             name: Where it came from, for messages.
@@ -261,7 +261,7 @@ def _as_labels(
         return data, None  # `_as_tensor` and `Volume` tell what is wrong
     if data.dtype.kind == "f" and nan is not None:
         data = np.where(np.isfinite(data), data, nan)
-    values, labels = counted_off(where, data)
+    values, labels = indexed(where, data)
     return _as_tensor(where, values), None if labels is None else torch.from_numpy(labels)
 
 

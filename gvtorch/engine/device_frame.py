@@ -27,7 +27,7 @@ from .stats import FrameStats, Readbacks
 
 
 class Unchecked(NamedTuple):
-    """What a producer answered to a batch; not checked yet."""
+    """What a producer gave for a batch, not checked yet."""
 
     node: Tensor  # (batch,) int64 nodes that were asked for, -1 for none
     batch: RequestBatch

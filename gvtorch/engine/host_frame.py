@@ -95,7 +95,9 @@ class HostFrame(RecordedFrame):
             return
         self.active = False
         self._waiting.clear()
-        with self._lock:  # what a thread works on now is posted before, and dropped, or not at all
+        # An answer in the making is either posted before the lock is held, and dropped below, or
+        # comes after, and is refused because its turn is an old one.
+        with self._lock:
             self.turn += 1
             for chosen in self._chosen.values():
                 chosen.clear()
@@ -115,8 +117,8 @@ class HostFrame(RecordedFrame):
             self._write(source, mail)
 
     def finish(self, hits: Hits) -> Collected:
-        """Ends a frame as `RecordedFrame.finish` does. Also chooses the nodes that producers on the
-        host are asked for, marks them as pending and sends the list along with the frame's counts.
+        """Ends a frame as `RecordedFrame.finish` does, then chooses the nodes that producers are
+        asked for, marks them as pending, and lets the host read them with the frame's numbers.
         """
         collected = super().finish(hits)
         words, chosen = self.cache.nodes.request_tn.view(-1), self.choose()
@@ -227,8 +229,7 @@ class HostFrame(RecordedFrame):
             self._split(turn, batch, error)
             return
         if isinstance(answer, Future):
-            until = time.monotonic() + self._production.patience_of(batch)
-            self._waiting[answer] = until, batch
+            self._waiting[answer] = time.monotonic() + self._production.patience_of(batch), batch
             answer.add_done_callback(arrived)
         else:
             self._settle(turn, batch, lambda: answer)
@@ -272,7 +273,7 @@ class HostFrame(RecordedFrame):
     def _name_errors(self, turn: int, batch: RequestBatch, answer: Regions | Bricks) -> Tensor:
         """(k,) bool, which nodes of a batch have an item that failed; names them."""
         bad = torch.zeros(len(batch), dtype=torch.bool)
-        for node, message in batch.failed_nodes(answer.errors).items():
+        for node, message in batch.failed(answer).items():
             bad[node] = True
             self._fail(turn, batch[node : node + 1], message)
         return bad

@@ -127,7 +127,7 @@ class _Waiting:
 
 
 def _outcome(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
-    """Calls a producer. Returns its answer and None, or None and the exception that it raised."""
+    """Calls a producer; returns its answer and None, or None and the error that it raised."""
     try:
         return call(), None
     except Exception as error:
@@ -168,11 +168,6 @@ class Production:
         batches = self._under_way()
         return {kind: sum(len(b) for b in batches if b.kind == kind) for kind in KINDS.values()}
 
-    def patience_of(self, batch: RequestBatch) -> float:
-        """Seconds until an answer is given up: the producer's own number, if it has one."""
-        own = batch.source.producer.patience
-        return self.patience if own is None else own
-
     def room(self) -> dict[int, list[int]]:
         """For each kind, how many slots may be taken that no answer on its way needs; see
         `Cache.room`.
@@ -183,6 +178,11 @@ class Production:
                 known = (b for b in batches if b.kind == kind and b.coarse == number)
                 free[number] = max(0, free[number] - sum(map(len, known)))
         return room
+
+    def patience_of(self, batch: RequestBatch) -> float:
+        """Seconds after which a batch is given up: the producer's own, if it has any."""
+        own = batch.source.producer.patience
+        return self.patience if own is None else own
 
     def ask(self, trees: Sequence[ProducedTree], chosen: Mapping[int, Tensor]) -> list[Answered]:
         """Asks for the chosen (k,) nodes of each kind; returns answers that are here at once."""
@@ -326,7 +326,7 @@ class Production:
 
     def _wait_for(self, batch: RequestBatch, asked: Future) -> None:
         self._mark(batch)
-        patience, future = self.patience_of(batch), self._sent_ahead(batch, asked)
+        future, patience = self._sent_ahead(batch, asked), self.patience_of(batch)
         self._waiting.append(_Waiting(batch, asked, future, patience, time.monotonic()))
 
     def _sent_ahead(self, batch: RequestBatch, asked: Future) -> Future:
@@ -348,9 +348,7 @@ class Production:
         return ahead
 
     def _settle(self, batch: RequestBatch, answer: Any, raised: Exception | None) -> list[Answered]:
-        """Checks an answer, or deals with an error: a producer that raised is asked again for each
-        half of the batch.
-        """
+        """Checks an answer; where the producer raised, asks it again for each half of the batch."""
         if raised is not None:
             self._raised += 1
             if len(batch) == 1 or self._raised > _MOST_RAISES:
@@ -365,12 +363,12 @@ class Production:
             self._fail(batch, str(error), error)
             return []
         if checked.errors:
-            failed = batch.failed_nodes(checked.errors)
+            failed = batch.failed(checked)
             for node, message in failed.items():
                 self._fail(batch[node : node + 1], message)
             keep = torch.ones(len(batch), dtype=torch.bool)
             keep[list(failed)] = False
-            rows = keep.repeat_interleave(len(batch.loc) // len(batch)).nonzero()[:, 0]
+            rows = keep.repeat_interleave(batch.per_node).nonzero()[:, 0]
             batch, checked = batch[keep.nonzero()[:, 0]], checked.rows(rows)
         return [Answered(batch, shipped(batch, checked, self.staging))] if len(batch) else []
 

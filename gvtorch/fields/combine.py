@@ -13,12 +13,12 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from .distance import HASH, Distance, OfShape
+from .distance import HASH, Changed, Distance
 from .field import Bounds, Field, Interval, Values, checked_field
 from .solid import Solid
 
 
-class Painted(OfShape):
+class Painted(Changed):
     """A shape coloured by a field of linear red, green and blue, 0 to 1."""
 
     def __init__(self, shape: Distance, colors: nn.Module) -> None:
@@ -26,14 +26,8 @@ class Painted(OfShape):
         super().__init__(shape)
         self.paint = checked_field("Painted", "colors", colors)
 
-    def forward(self, points: Tensor) -> Tensor:
-        return self.shape(points)
-
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
         return self.shape(points), self.paint(points).clamp(0, 1)
-
-    def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        return self.shape.bounds(center, half)
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return torch.zeros_like(center), torch.ones_like(center)

@@ -15,17 +15,17 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .distance import Distance, OfShape, grown
+from .distance import Changed, Distance, grown
 from .field import Interval, length, tighter
 
 Matrix = Sequence[Sequence[float]]
 
 
-class Space(OfShape):
+class Space(Changed):
     """Base of shapes that are asked somewhere else: at `place` of a point, in boxes `over`."""
 
     def place(self, points: Tensor) -> Tensor:
-        """Returns the points (..., 3) at which the shape is asked; the same unless overridden."""
+        """Returns the points (..., 3) at which the shape is asked; itself unless overridden."""
         return points
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
@@ -48,9 +48,9 @@ class Space(OfShape):
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """What the shape tells of the place of a box, and the slope."""
-        low, high = self.shape.bounds(*self.over(center, half))
+        low, high = super().bounds(center, half)
         known = self.value(low, center), self.value(high, center)
-        return tighter(known, super().bounds(center, half))
+        return tighter(known, Distance.bounds(self, center, half))
 
 
 class Transform(Space):
@@ -93,9 +93,6 @@ class Transform(Space):
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
         return value * self.scale
-
-    def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.slope(*self.over(center, half))
 
     def box(self) -> Tensor | None:
         box = self.shape.box()

@@ -149,7 +149,7 @@ def order_frames(
     affine[:3, 1], affine[:3, 2] = columns * first.spacing[0], rows * first.spacing[1]
     if any(frame.position is None for frame in frames):
         return _without_place(frames, affine, np.cross(rows, columns))
-    slices = _by_place(where, frames, np.cross(rows, columns))
+    slices = _by_place(frames, np.cross(rows, columns))
     count, apart = _times(where, slices)
     ordered = [one[t] for t in range(count) for one in slices]
     places = np.array([one[0].position for one in slices])
@@ -188,7 +188,7 @@ def _without_place(
     return ordered, affine, lost if len(ordered) > 1 else [], Times()
 
 
-def _by_place(where: str, frames: Sequence[Frame], normal: np.ndarray) -> list[list[Frame]]:
+def _by_place(frames: Sequence[Frame], normal: np.ndarray) -> list[list[Frame]]:
     """Groups frames whose places are the same, along the normal of their plane."""
     depths = np.array([frame.position for frame in frames]) @ normal
     order = np.argsort(depths, kind="stable")
@@ -269,13 +269,16 @@ def image_info(header: Any, samples: int, times: Times) -> tuple[ImageInfo, list
     lost = []
     kind = str(header.get("PhotometricInterpretation", ""))
     if kind == "PALETTE COLOR":
-        lost.append("the palette: values are its numbers")
+        lost.append("the colours of its palette: values are numbers of its entries")
     if kind == "MONOCHROME1":
         lost.append("that high values are meant to be dark (MONOCHROME1)")
+    table = header.get("ModalityLUTSequence") and header.get("RescaleSlope") is None
+    if table:
+        lost.append("the modality's table: values are those that it looks up")
     quantity = str(
         header.get("RescaleType") or header.get("Units") or header.get("DoseUnits") or ""
     )
-    if header.get("Modality") == "CT" and quantity in ("", "US"):
+    if header.get("Modality") == "CT" and quantity in ("", "US") and not table:
         quantity = "HU"
     shared = _first(header.get("SharedFunctionalGroupsSequence"))
     voi = _first(shared.get("FrameVOILUTSequence")) if shared is not None else None

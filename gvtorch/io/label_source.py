@@ -1,5 +1,5 @@
-"""Labels on their way into a store: which there are, region by region, and sources that count them
-off.
+"""Labels on their way into a store: which there are, found region by region, and sources of their
+indices.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class IndexSource(VolumeSource):
 
     @classmethod
     def of(cls, inner: VolumeSource, labels: np.ndarray, *, indexed: bool = False) -> IndexSource:
-        """Counts the labels of a source off."""
+        """Indexes the labels of a source."""
         x, y, z = inner.extent
         told = ("path", "spacing", "origin", "info", "time")
         return cls(
@@ -72,7 +72,7 @@ def _loaded(file: str) -> np.ndarray:
     return np.load(file)
 
 
-def counted_source(
+def indexed_source(
     source: VolumeSource,
     times: tuple[int, int],
     workers: int,

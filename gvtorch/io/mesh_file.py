@@ -20,6 +20,7 @@ from ..base import check
 from ..base.messages import need_library, one_line
 from ..base.srgb import from_srgb
 from ..meshes.mesh import MOST_FACES, Material, Mesh
+from .polygons import cut_polygons
 from .resources import amount, memory_free
 from .source import told_as
 
@@ -60,6 +61,7 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
     _check_claims(path, ending, content)
     resolver: Any = _Beside(path)
     try:
+        content = cut_polygons(content) if ending == "obj" else content
         loaded = trimesh.load(
             io.BytesIO(content),
             file_type=ending,
@@ -304,6 +306,17 @@ def _colors(part: Any, faces: np.ndarray, ending: str) -> np.ndarray | None:
     return value
 
 
+def _opacity(material: Any) -> float:
+    """What an MTL file tells: d, or 1 - Tr."""
+    told = material.kwargs
+    name = "d" if "d" in told else "tr"
+    try:
+        value = float(told[name][-1])  # behind -halo
+    except (KeyError, IndexError, ValueError):
+        return 1.0
+    return min(max(value if name == "d" else 1 - value, 0.0), 1.0)
+
+
 def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
     """Turns trimesh's material into ours; white if there is none."""
     if material is None:
@@ -318,6 +331,8 @@ def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
         color = color / 255
     if image is not None and not gltf:
         color = np.ones(4)  # its texture is all
+    if ending == "obj":
+        color[3] *= _opacity(material)
     if not gltf:
         color[:3] = from_srgb(color[:3])
     texture = None

@@ -17,10 +17,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..base import check
+from ..base import boxes, check
 from ..base.image_info import Rows
 from ..pool.downsample import round_array
-from . import boxes
 from .source import Index, VolumeSource
 
 Oblique = Literal["resample", "keep"]
@@ -118,20 +117,18 @@ class StraightSource(VolumeSource):
 def straighten(
     source: VolumeSource,
     oblique: Oblique | None = None,
-    fill: float | None = None,
     place: Sequence[float] | None = None,
 ) -> VolumeSource:
     """Returns a source whose axes lie along the world's, and tells in a line what it did.
 
     A step along an axis of the world is as long as the voxels are in that direction, so as many
-    voxels come out as there were, and the whole turned box lies inside.
+    voxels come out as there were, and the whole turned box lies inside. What lies beside the
+    source's box is 0 for labels, else the smallest value of the time point that is read first.
 
     Args:
         source: Returned as it is, if its axes lie along the world's.
         oblique: "resample" (the default), or "keep": the voxels stay as they are, and their axes
             are taken for the world's; `info.pose` tells how to turn them (`RenderOptions.pose`).
-        fill: The value beside the source's box; the smallest one (of the time point that is read
-            first), 0 of labels, if left out.
         place: World place of the first voxel, if it is not what the file tells.
 
     Raises:
@@ -154,8 +151,7 @@ def straighten(
         info = dataclasses.replace(source.info, pose=pose)
         return dataclasses.replace(source, oblique=None, info=info)
     extent, spacing, origin, to_inner = _grid(affine, source.extent)
-    if fill is None:
-        fill = 0.0 if source.info.labels else _smallest(source)
+    fill = 0.0 if source.info.labels else _smallest(source)
     x, y, z = extent.tolist()
     warnings.warn(
         f"{name}: resampled along the world's axes, {x}x{y}x{z} voxels of "

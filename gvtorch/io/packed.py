@@ -1,11 +1,12 @@
-"""`PackedSource`: an array that is packed as a whole (zlib, gzip, bzip2, text), unpacked no further
-than its header tells: what would unpack to more is damaged.
+"""What files pack, unpacked no further than their headers tell: what would unpack to more is
+damaged. `PackedSource` is an array that is packed as a whole (zlib, gzip, bzip2, text).
 """
 
 from __future__ import annotations
 
 import math
 import os
+import struct
 import zlib
 from bz2 import BZ2Decompressor
 from collections.abc import Iterator
@@ -14,9 +15,12 @@ from typing import IO, Any, Literal
 
 import numpy as np
 
+from ..base.messages import need_library
 from .source import Index, VolumeSource
 
 _READ = 1 << 20  # bytes
+_MOST_BLOCK = 1 << 26  # bytes of a block of Blosc; writers of VDB make them of 256 KB
+_STORED = 2  # Blosc's flag of a part that is not packed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +102,27 @@ def _words(stream: IO[bytes]) -> Iterator[list[bytes]]:
         yield words
 
 
+def unpack_block(codec: str, packed: Any, need: int) -> bytes:
+    """Unpacks "zlib", "lzma", "lz4" or "blosc" data in memory, which must be of `need` bytes."""
+    if not need:
+        return b""
+    if codec == "zlib":
+        found = zlib.decompressobj().decompress(packed, need + 1)
+    elif codec == "lzma":
+        import lzma
+
+        found = lzma.LZMADecompressor().decompress(packed, need + 1)
+    else:
+        told = int.from_bytes(packed[4:8], "little"), int.from_bytes(packed[12:16], "little")
+        if codec == "blosc" and (len(packed) < 16 or told != (need, len(packed))):
+            raise ValueError(f"a block of {need} bytes expected, its head tells of {told[0]}")
+        codecs = need_library(f"what is packed by {codec}", "imagecodecs")
+        found = bytes(getattr(codecs, f"{codec}_decode")(bytes(packed), out=need))
+    if len(found) != need:
+        raise ValueError(f"a block of {need} bytes expected, {len(found)} found")
+    return found
+
+
 def unpack(file: str, offset: int, need: int, codec: str) -> bytes:
     """Unpacks "zlib" (or gzip) or "bz2" data of a file, which must be of `need` bytes, and no
     further than these.
@@ -134,3 +159,22 @@ def _unpacked(stream: IO[bytes], codec: str, need: int) -> Iterator[bytes]:
         part = engine.decompress(packed, need + 1 - size)
         size += len(part)
         yield part
+
+
+def blosc_begin(packed: bytes, most: int) -> bytes:
+    """The first bytes, at least `most` if there are so many, of what Blosc packed: only its first
+    block is unpacked, as a part of its own. (Layout: README_CHUNK_FORMAT of c-blosc 1.)
+    """
+    size, block = struct.unpack_from("<2I", packed, 4)
+    most = min(most, size)
+    if packed[2] & _STORED:
+        return packed[16 : 16 + most]
+    block = min(block, size)
+    (start,) = struct.unpack_from("<I", packed, 16)
+    if not most <= block <= _MOST_BLOCK or not 20 <= start < len(packed):
+        raise ValueError(
+            f"a packed part begins with a block of {block} bytes at byte {start}; expected {most} "
+            f"to {_MOST_BLOCK} bytes, within {len(packed)}"
+        )
+    head = struct.pack("<3I", block, block, 20 + len(packed) - start)
+    return unpack_block("blosc", packed[:4] + head + struct.pack("<I", 20) + packed[start:], block)

@@ -131,6 +131,15 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     count = max(sizes, key=sizes.count) if sizes else 0  # of most columns
     if not count:
         raise ValueError(f"{path}: holds no columns of numbers")
+    meant = _PLACES + _COLORS + _VALUES + _RADII  # others may be of anything
+    others = [
+        f"{name} ({len(one)})"
+        for name, one in found.items()
+        if len(one) != count and name.lower().startswith(meant)
+    ]
+    if others:
+        told = f"{path}: not read, since others have {count} rows: {', '.join(others)}"
+        warnings.warn(told, stacklevel=4)
     return {n: one for n, one in found.items() if len(one) == count and one.ndim <= 2}
 
 

@@ -24,8 +24,7 @@ from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten
 from .remote import fetch, is_file_url, split_url
 from .resources import amount, memory_free
-from .source import ArraySource, MemorySource, VolumeSource, told_as
-from .stores.level_reader import no_time
+from .source import ArraySource, MemorySource, VolumeSource, no_time, told_as
 from .stores.ngff import is_zarr
 from .stores.store_layout import DTYPES, MOST_TIMES, MOST_VOXELS, StoreError
 

@@ -24,10 +24,10 @@ from typing import IO, Any, Self
 
 import numpy as np
 
+from ..base import boxes
 from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
-from . import boxes
 from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
@@ -298,6 +298,12 @@ def open_unpacked(file: str, member: str = "") -> IO[bytes]:
     if file.lower().endswith(".gz"):
         return gzip.open(file, "rb")  # type: ignore[return-value]
     return bz2.open(file, "rb") if file.lower().endswith(".bz2") else open(file, "rb")
+
+
+def no_time(where: str, time: object, times: int) -> str:
+    """The message about a time point that is not there."""
+    one = "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
+    return f"{where}: has no time {time!r}; it has {one}"
 
 
 @contextmanager

@@ -11,9 +11,7 @@ Source: Museth, "VDB: High-resolution sparse volumes with dynamic topology", ACM
 from __future__ import annotations
 
 import math
-import struct
 import threading
-import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,9 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.digits import whole_number
 from ..base.image_info import ChannelInfo, ImageInfo
-from ..base.messages import need_library
 from ..base.volume import check_extent
 from .source import Index, VolumeSource, place_axes
 
@@ -34,8 +30,6 @@ MOST_INDEX = 2**31
 MOST_ROOTS = 1 << 20  # entries of a root
 _BATCH = 4096  # leaves
 _WHOLE = 1 << 22  # voxels of whole leaves around a box that is thinner than these
-_MOST_BLOCK = 1 << 26  # bytes of a block of Blosc; writers of VDB make them of 256 KB
-_STORED = 2  # Blosc's flag of a part that is not packed
 _LOCK = threading.Lock()
 _QUANTITIES = {"level set": "signed distance", "fog volume": "density"}
 
@@ -242,64 +236,6 @@ def describe(
     }
 
 
-def choose(path: str, names: Sequence[str], key: str | None) -> tuple[int, tuple[str, ...]]:
-    """Which grid is meant: `key` names it or its number; the only one, "density", or the first, if
-    left out. And what to say of the others.
-    """
-    if not names:
-        raise ValueError(f"{path}: holds no grid")
-    listed = ", ".join(names[:20])
-    if key is None:
-        at = names.index("density") if "density" in names else 0
-        others = f"{len(names) - 1} other grids; key (--key) chooses among {listed}"
-        return at, (others,) if len(names) > 1 else ()
-    key = key.removeprefix("/")  # of file.vdb:/density
-    if key in names:
-        return names.index(key), ()
-    number = whole_number(key)
-    if number is not None and number < len(names):
-        return number, ()
-    raise ValueError(f"{path}: has no grid {key!r}; it holds {listed}")
-
-
 def bits(data: Any, at: int, count: int) -> np.ndarray:
     """Reads (count,) bool, bits of a mask from a byte on, the lowest of each byte first."""
     return np.unpackbits(np.frombuffer(data, "u1", count // 8, at), bitorder="little").view(bool)
-
-
-def unpack(codec: str, packed: Any, need: int, most: int | None = None) -> bytes:
-    """Unpacks a part that must be of `need` bytes, and of no more than `most`: "zip" (zlib) or
-    "blosc".
-    """
-    if not need:
-        return b""
-    if codec == "zip":
-        found = zlib.decompressobj().decompress(packed, need + 1)
-    else:
-        told = int.from_bytes(packed[4:8], "little"), int.from_bytes(packed[12:16], "little")
-        if len(packed) < 16 or told != (need, len(packed)) or need > (most or need):
-            raise ValueError(f"a packed part of {need} bytes expected, its head tells of {told[0]}")
-        imagecodecs = need_library("what is packed by Blosc", "imagecodecs")
-        found = bytes(imagecodecs.blosc_decode(bytes(packed), out=need))
-    if len(found) != need:
-        raise ValueError(f"a part of {need} bytes expected, {len(found)} found")
-    return found
-
-
-def blosc_begin(packed: bytes, most: int) -> bytes:
-    """The first bytes, at least `most` if there are so many, of what Blosc packed: only its first
-    block is unpacked, as a part of its own. (Layout: README_CHUNK_FORMAT of c-blosc 1.)
-    """
-    size, block = struct.unpack_from("<2I", packed, 4)
-    most = min(most, size)
-    if packed[2] & _STORED:
-        return packed[16 : 16 + most]
-    block = min(block, size)
-    (start,) = struct.unpack_from("<I", packed, 16)
-    if not most <= block <= _MOST_BLOCK or not 20 <= start < len(packed):
-        raise ValueError(
-            f"a packed part begins with a block of {block} bytes at byte {start}; expected {most} "
-            f"to {_MOST_BLOCK} bytes, within {len(packed)}"
-        )
-    head = struct.pack("<3I", block, block, 20 + len(packed) - start)
-    return unpack("blosc", packed[:4] + head + struct.pack("<I", 20) + packed[start:], block)

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from ..base import check
+from ..base.boxes import clamp, repeat_edges
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume, to_numpy
 from ..meshes.contour import contour, edge_of
 from ..meshes.mesh import Mesh
 from ..pool import N3Tree
-from .boxes import clamp, repeat_edges
 from .stores.store import CELL, Store
 from .surface_file import SurfaceFile, check_surface_path
 

@@ -17,15 +17,16 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ..base.digits import finite_number
 from ..base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ..base.units import NO_DEPTH, spacing_of, time_unit
 from .budget import check_beside
 from .picture_size import picture_size
 
 Told = tuple[ImageInfo, tuple[float, float, float], list[str]]  # info, spacing, what is not kept
-_JPEG = (6, 7, 34892, 33007)
+JPEG = (6, 7, 34892, 33007)
 _LERC = 34887
-_PICTURES = (*_JPEG, _LERC, 22610, 33003, 33004, 33005, 34712, 34933, 34934, 50001, 50002, 52546)
+_PICTURES = (*JPEG, _LERC, 22610, 33003, 33004, 33005, 34712, 34933, 34934, 50001, 50002, 52546)
 _MOST_XML = 1 << 28  # characters
 _MOST_PLANES = 1 << 16
 _MOST_LISTED = 1 << 22  # planes that a file may tell of
@@ -101,7 +102,7 @@ def check_pictures(pages: Iterable[Any]) -> None:
 
 def _checked(frame: Any, decode: Callable[..., Any]) -> Callable[..., Any]:
     """Wraps what unpacks the pictures of a page; raises ValueError for one that does not fit."""
-    is_jpeg = frame.compression in _JPEG
+    is_jpeg = frame.compression in JPEG
     wide, tall = frame.tilewidth, frame.tilelength
     if not frame.is_tiled:
         wide, tall = frame.imagewidth, frame.imagelength
@@ -159,8 +160,8 @@ def ome_info(xml: str, number: int, name: str, width: int) -> Told:
     images = [child for child in root.iter() if _tag(child) == "Image"]
     named = [image for image in images if image.get("Name") == name]
     image = named[0] if len(named) == 1 else images[number] if number < len(images) else None
-    pixels = None if image is None else _child(image, "Pixels")
-    if image is None or pixels is None:
+    pixels = next((one for one in (() if image is None else image) if _tag(one) == "Pixels"), None)
+    if pixels is None:
         return ImageInfo(), (1.0, 1.0, 1.0), ["OME-XML, which tells nothing of this image"]
     sizes = [finite_number(pixels.get(f"PhysicalSize{axis}")) for axis in "XYZ"]
     units = [pixels.get(f"PhysicalSize{axis}Unit", "\u00b5m") for axis in "XYZ"]
@@ -250,16 +251,3 @@ def _color(table: Any) -> Rgb | None:
 
 def _tag(element: Any) -> str:
     return str(element.tag).rpartition("}")[2]
-
-
-def _child(element: Any, tag: str) -> Any:
-    return next((child for child in element if _tag(child) == tag), None)
-
-
-def finite_number(text: Any) -> float | None:
-    """Returns the number that a text tells; None if it is none, or not finite."""
-    try:
-        value = float(text)
-    except (TypeError, ValueError):
-        return None
-    return value if math.isfinite(value) else None

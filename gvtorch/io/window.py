@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..base import check
+from ..base.boxes import Zyx
 from ..base.volume import Volume, to_numpy
 from ..pool.downsample import pool_mean
-from .boxes import Zyx
 from .stores.store import Store
 
 _MOST = 2**22  # voxels that are looked at

@@ -13,10 +13,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
-from .mesh import Mesh, edges_of, parts_of, solids, welded
+from .mesh import Mesh, edges_of, facing_away, parts_of, solids, welded
 from .winding import WindingNumber
 
-Solid = Literal["auto", "always", "never"]  # which parts are solids: closed ones, filled ones, none
+#: Which parts are solids: closed ones, filled ones, none.
+SolidParts = Literal["auto", "always", "never"]
 
 _RINGS = 4  # of triangles between a hole's rim and its middle
 _STEPS = 12  # of the bisection
@@ -97,37 +98,52 @@ def told_of_holes(mesh: Mesh) -> str:
     kept, solid = solids(mesh)
     if solid.all():
         return ""
-    found, part = rims(mesh)
+    away = facing_away(mesh)
+    found, part = rims(mesh.turned(away))
     count = np.bincount(part[kept], minlength=len(mesh.faces))
     edges = np.bincount(
         [one.part for one in found], [len(one.face) for one in found], len(mesh.faces)
     )
     nearly = np.flatnonzero((edges > 0) & (edges <= _FEW * count))
     holes = sum(one.part in nearly for one in found)
-    if not holes:
+    why = []
+    if holes:
+        why.append(
+            f"{holes} holes of {int(edges[nearly].sum())} edges leave {len(nearly)} parts open"
+        )
+    if len(away) and len(away) <= _FEW * len(kept):
+        why.append(f"{len(away)} triangles face the other way than those around them")
+    if not why:
         return ""
     return (
-        f"{mesh.name}: {holes} holes of {int(edges[nearly].sum())} edges leave {len(nearly)} parts "
-        'open: they become sheets; solid="always" (--solid always) fills them'
+        f"{mesh.name}: {', '.join(why)}: they become sheets; "
+        'solid="always" (--solid always) mends them'
     )
 
 
 def check_solid(where: str, solid: str) -> None:
-    """Raises ValueError unless it is a `Solid`."""
-    known = get_args(Solid)
+    """Raises ValueError unless it is a `SolidParts`."""
+    known = get_args(SolidParts)
     if solid not in known:
         raise ValueError(f"{where}: solid must be one of {', '.join(known)}, got {solid!r}")
 
 
-def prepared(mesh: Mesh, solid: Solid) -> Mesh:
+def once_filled(solid: SolidParts) -> SolidParts:
+    """Returns `solid` for a mesh whose holes are filled already."""
+    return "auto" if solid == "always" else solid
+
+
+def prepared(mesh: Mesh, solid: SolidParts) -> Mesh:
     """Returns what is made into voxels."""
     return filled(mesh) if solid == "always" else mesh
 
 
 def filled(mesh: Mesh) -> Mesh:
-    """Returns the mesh with its holes closed. What encloses nothing even then, such as a leaf,
-    stays as it is.
+    """Returns the mesh with its holes closed, and single triangles that face the other way turned.
+    What encloses nothing even then, such as a leaf, stays as it is.
     """
+    away = facing_away(mesh)
+    mesh = mesh.turned(away) if len(away) else mesh
     found, part = rims(mesh)
     if not found:
         return mesh

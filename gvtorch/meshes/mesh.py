@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -49,15 +49,20 @@ class Mesh:
             value = getattr(self, field_name)
             if value is None:
                 continue
-            value = np.asarray(value)
-            if dtype == np.int64 and (value != np.trunc(value)).any():
+            wanted = ", ".join("n" if n is None else str(n) for n in shape)
+            try:
+                given = np.asarray(value)
+                whole = dtype != np.int64 or (given == np.trunc(given)).all()
+                with np.errstate(invalid="ignore"):
+                    value = np.ascontiguousarray(given, dtype)
+            except (TypeError, ValueError):  # rows of different lengths, texts
+                raise ValueError(f"{self.name}: {field_name} must be ({wanted}) numbers") from None
+            if not whole:
                 raise ValueError(f"{self.name}: {field_name} must be whole numbers")
-            value = np.ascontiguousarray(value, dtype)
             fits = value.ndim == len(shape) and all(
                 n is None or n == m for n, m in zip(shape, value.shape, strict=True)
             )
             if not fits:
-                wanted = ", ".join("n" if n is None else str(n) for n in shape)
                 raise ValueError(f"{self.name}: {field_name} must be ({wanted}), got {value.shape}")
             object.__setattr__(self, field_name, value)
         if self.material is None:
@@ -107,16 +112,16 @@ class Mesh:
 
     def only(self, kept: np.ndarray) -> Mesh:
         """Returns the mesh with some of its triangles, (m,) int64."""
-        assert self.material is not None
-        return Mesh(
-            vertices=self.vertices,
-            faces=self.faces[kept],
-            color=None if self.color is None else self.color[kept],
-            uv=None if self.uv is None else self.uv[kept],
-            material=self.material[kept],
-            materials=self.materials,
-            name=self.name,
-        )
+        told = {name: getattr(self, name) for name in ("faces", "color", "uv", "material")}
+        return replace(self, **{n: one[kept] for n, one in told.items() if one is not None})
+
+    def turned(self, which: np.ndarray) -> Mesh:
+        """Returns the mesh with some of its triangles, (m,) int64, facing the other way."""
+        corner = np.tile(np.arange(3), (len(self.faces), 1))
+        corner[which] = (0, 2, 1)
+        row = np.arange(len(self.faces))[:, None]
+        told = {name: getattr(self, name) for name in ("faces", "color", "uv")}
+        return replace(self, **{n: one[row, corner] for n, one in told.items() if one is not None})
 
     def __repr__(self) -> str:
         """Tells counts and bounds."""
@@ -199,6 +204,36 @@ def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     return edge, begin, end, balance
 
 
+def facing_away(mesh: Mesh) -> np.ndarray:
+    """Finds triangles that face the other way than most of their part. Two triangles that alone
+    share an edge face the same way if they run along it in opposite directions; in each part that
+    hangs together by such edges, the side of less area is returned. A part that can't face one way
+    altogether, such as a Moebius strip, is left as it is.
+
+    Returns:
+        (m,) int64 triangles.
+    """
+    kept, _ = solids(mesh)
+    faces = welded(mesh)[kept]
+    edge, begin, end, _ = edges_of(faces)
+    order = np.argsort(edge, kind="stable")
+    first = np.searchsorted(edge[order], np.flatnonzero(np.bincount(edge) == 2))
+    ahead = (begin < end).astype(np.int64)
+    # Each triangle stands twice, as it is and turned, and hangs together with the neighbours that
+    # then go along their edge the other way.
+    state = np.arange(2)[:, None]
+    hooks = [2 * np.arange(len(first)) + (ahead[order[first + at]] ^ state ^ at) for at in range(2)]
+    nodes = [order[first + at] // 3 + state * len(faces) for at in range(2)]
+    part = parts_of(np.ravel(nodes), np.ravel(hooks), 2 * len(faces), 2 * len(first))
+    part = part.reshape(2, len(faces))
+    own = part.min(0)
+    unlike_first = part[0] > own  # they face the other way than the first one of their part
+    a, b, c = mesh.corners[kept].transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    excess = np.bincount(own, np.where(unlike_first, area, -area), len(faces))[own]
+    return kept[(part[0] != part[1]) & (unlike_first == (excess <= 0))]
+
+
 def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """(f,) bool whether a triangle's part, among those that are counted, is closed."""
     closed = np.zeros(len(faces), bool)
@@ -215,7 +250,7 @@ def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
 
 
 def parts_of(face: np.ndarray, edge: np.ndarray, faces: int, edges: int) -> np.ndarray:
-    """(faces,) the smallest triangle of each part; pairs (face, edge) hang together."""
+    """(faces,) the lowest triangle number of each part; pairs (face, edge) hang together."""
     label = np.arange(faces)
     while True:
         least = np.full(edges, faces)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base import check
+from ..base.boxes import extent_in
 from .points import Points
 
 
@@ -32,16 +33,8 @@ class Grid:
     ) -> Grid:
         """Returns the grid of a user's extent and box, around all points if there is none."""
         check.whole(where, "branching", branching, low=2, high=16)
-        if box is None:
-            box = _bounds(blocks)
-        if len(box) != 2:
-            raise ValueError(f"{where}: box must be two corners, got {box!r}")
-        low, high = (check.triple(where, "box", corner) for corner in box)
-        sides = [b - a for a, b in zip(low, high, strict=True)]
-        check.triple(where, "sides of the box", sides, positive=True)
-        if isinstance(extent, int):
-            check.whole(where, "extent", extent, low=1, high=2**40)
-            extent = [max(1, round(extent * side / max(sides))) for side in sides]
+        low, high = check.box(where, _bounds(blocks) if box is None else box)
+        extent = extent_in(where, extent, (low, high))
         if len(extent) != 3:
             raise ValueError(f"{where}: extent must be a number or (x, y, z), got {extent!r}")
         x, y, z = (check.whole(where, "extent", size, low=1, high=2**40) for size in extent)

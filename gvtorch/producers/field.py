@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ..base import check
+from ..base.boxes import extent_in
 from ..base.constants import DEEP_VOXELS
 from ..base.messages import one_line
 from ..fields import Distance, Field, Interval, Solid
@@ -80,8 +81,8 @@ class FieldProducer(Producer):
         known = field if isinstance(field, Field) else None
         if box is None:
             extent, box = _cut_out(where, known, extent)
-        elif isinstance(extent, int):
-            extent = cubic_extent(where, extent, box)
+        else:
+            extent = extent_in(where, extent, box)
         given = _channels_of(where, field)
         dtypes: Mapping[str, torch.dtype] = getattr(field, "dtypes", {})
         own = {n: Channel(dtypes.get(n, torch.float32), width) for n, width in given.items()}
@@ -387,16 +388,3 @@ def dtype_of_places(box: Sequence[Sequence[float]], spacing: Sequence[float]) ->
     """Returns float32 where it tells the finest voxels of a box apart, else float64."""
     reach = max(abs(float(end)) for corner in box for end in corner)
     return torch.float32 if reach <= 0.5 * DEEP_VOXELS * min(spacing) else torch.float64
-
-
-def cubic_extent(where: str, extent: int, box: Sequence[Sequence[float]]) -> list[int]:
-    """Returns the extent along x, y, z of a box whose longest side has `extent` voxels, so that
-    these are cubes or nearly so.
-    """
-    if len(box) != 2:
-        raise ValueError(f"{where}: box must be two corners, got {box!r}")
-    low, high = (check.triple(where, "box", corner) for corner in box)
-    sides = [b - a for a, b in zip(low, high, strict=True)]
-    check.whole(where, "extent", extent, low=1, high=2**40)
-    check.triple(where, "sides of the box", sides, positive=True)
-    return [max(1, round(extent * side / max(sides))) for side in sides]

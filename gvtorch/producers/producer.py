@@ -223,9 +223,7 @@ class Producer(torch.nn.Module):
         x, y, z = (check.whole(where, "extent", size, low=1, high=2**40) for size in sizes)
         self.extent = (x, y, z)
         if box is not None:
-            if len(box) != 2:
-                raise ValueError(f"{where}: box must be two corners, got {box!r}")
-            low, high = (check.triple(where, "box", corner) for corner in box)
+            low, high = check.box(where, box)
             spacing = [(b - a) / n for a, b, n in zip(low, high, self.extent, strict=True)]
             origin = [a + 0.5 * s for a, s in zip(low, spacing, strict=True)]
         if isinstance(spacing, (int, float)):

@@ -19,8 +19,8 @@ import torch
 from numpy.lib.stride_tricks import as_strided
 
 from ..base import check
+from ..base.boxes import grouped
 from ..base.stage import stage
-from ..io.boxes import grouped
 from ..io.stores.store import Store
 from ..pool import Channel
 from ..pool.pyramid import NodeSummary
@@ -190,7 +190,7 @@ class StoredProducer(Producer):
             store = Store.open(store, image=image, time=time, channels=channels)
         if store.info.labels and store.dtype.is_floating_point and not store.has_blocks:
             raise ValueError(
-                f"{store.location}: labels of {store.stored} must be counted off first: "
+                f"{store.location}: labels of {store.stored} must be indexed first: "
                 f"gvtorch convert {store.location} STORE.zarr"
             )
         value_range = {}

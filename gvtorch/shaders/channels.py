@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..base import check
-from ..base.image_info import ChannelInfo
+from ..base.image_info import COLORS, ChannelInfo, to_hex
 from ..base.srgb import from_srgb
 from ..base.volume import Volume
 from ..io.stores.store import Store
@@ -23,12 +23,6 @@ from .transfer_function import TransferFunction
 
 Mode = Literal["additive", "opacity"]
 
-#: Colours of microscopists' usual lookup tables, as sRGB.
-NAMED = {
-    **{"blue": "#0000ff", "green": "#00ff00", "red": "#ff0000", "magenta": "#ff00ff"},
-    **{"cyan": "#00ffff", "yellow": "#ffff00", "orange": "#ff8000", "white": "#ffffff"},
-    **{"gray": "#ffffff", "grey": "#ffffff"},
-}
 #: Of channels whose colour is not told, by their place; the first is blue, and light enough to see.
 DISTINCT = (
     *("#2850ff", "#00ff00", "#ff0000", "#ff00ff", "#00ffff", "#ffff00", "#ff8000", "#ffffff"),
@@ -292,4 +286,5 @@ def linear_color(where: str, color: Triple | str) -> Triple:
     """Returns a colour as linear RGB, as `colors.linear_color`, of which names are those of lookup
     tables.
     """
-    return named_color(where, color, NAMED)
+    named = {name: f"#{to_hex(one)}" for name, one in COLORS.items()}
+    return named_color(where, color, named)

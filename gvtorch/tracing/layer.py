@@ -86,12 +86,12 @@ class Layer:
             object.__setattr__(strip, name, part[..., top : top + camera.height, :, :])
         return strip
 
-    def check_device(self, where: str, device: torch.device) -> None:
+    def check_device(self, device: torch.device) -> None:
         """Raises ValueError unless all tensors lie on the device."""
         for _, part in self._parts():
             if part.device != device:
                 raise ValueError(
-                    f"{where}: layer must lie on {device}, where the graph reads it, "
+                    f"capture: layer must lie on {device}, where the graph reads it, "
                     f"got {part.device}"
                 )
 

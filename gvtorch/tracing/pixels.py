@@ -207,7 +207,7 @@ class View:
     """A camera in the world, what traces its rays, and how the picture is made."""
 
     camera: Camera
-    numbers: Tensor  # of the camera, on the device that traces
+    numbers: Tensor  # of the camera, on the device that traces; a graph's replays write others
     trace_rays: TraceRays  # through all trees
     options: RenderOptions
     box: Tensor  # (2, 3) world corners of the scene

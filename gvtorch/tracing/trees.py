@@ -173,7 +173,7 @@ def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
 
 
 def _ranked(hits: Sequence[Hits], name: str, order: Tensor) -> Sequence[Any]:
-    """A field (r, ...) of the hits of m trees, in the order (m, r) of the trees along each ray."""
+    """A field (r, ...) of m trees, in the order (m, r) of the trees along each ray."""
     filled = _filled(hits, name)
     if filled is None:
         return [None] * len(hits)
@@ -184,15 +184,15 @@ def _ranked(hits: Sequence[Hits], name: str, order: Tensor) -> Sequence[Any]:
 
 
 def _filled(hits: Sequence[Hits], name: str) -> list[Tensor] | None:
-    """A field (r, ...) of several hits; zeros, of labels -1, stand for those that do not give it.
-    None if none does.
+    """A field (r, ...) of each of several hits; zeros, of labels -1, stand for those that do not
+    give it. None if none does.
     """
     fields = [getattr(one, name) for one in hits]
     given = [field for field in fields if field is not None]
     if not given:
         return None
     if len({field.shape[1:] for field in given}) > 1:
-        raise ValueError("render: trees must give as many features each")
+        raise ValueError("render: all trees must give the same number of features")
     return [
         nothing_like(given[0], len(one.alpha)) if field is None else field
         for one, field in zip(hits, fields, strict=True)
@@ -366,7 +366,7 @@ class _Shown:
             shape = (len(self.extinction), field.shape[1])
             known = self.sums.setdefault(name, self.extinction.new_zeros(shape))
             if known.shape != shape:
-                raise ValueError("render: trees must give as many features each")
+                raise ValueError("render: all trees must give the same number of features")
             known.index_add_(0, at, share * field)
 
     def alpha(self) -> Tensor:
@@ -510,9 +510,11 @@ def _scattered(found: Sequence[Hits], places: Sequence[Tensor]) -> Hits:
     if len(found) == 1:
         return found[0]
     at = torch.cat(list(places)).argsort()
-    filled = {name: _filled(found, name) for name in vars(found[0])}
-    parts = {name: fields for name, fields in filled.items() if fields is not None}
-    return Hits(**{name: torch.cat(fields)[at] for name, fields in parts.items()})
+    fields = {}
+    for name in vars(found[0]):
+        if (parts := _filled(found, name)) is not None:
+            fields[name] = torch.cat(parts)[at]
+    return Hits(**fields)
 
 
 def _unit(vectors: Tensor) -> Tensor:

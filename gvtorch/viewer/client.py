@@ -150,7 +150,7 @@ class Client:
         """Whether it will want something without being told."""
         return bool(self.size[0]) and (self._renew or not self._done)
 
-    def rest(self) -> None:
+    def pause(self) -> None:
         """Draws nothing for a second, after a picture failed."""
         self._not_before = time.monotonic() + 1.0
 

@@ -24,14 +24,6 @@ from .lattice import Period, Points, as_points, periods
 _NEXT_OCTAVE, _NEXT_AXIS = 0x10001, 0x3000007
 
 
-class Octave(NamedTuple):
-    """One octave of a sum."""
-
-    amplitude: float
-    frequency: float
-    seed: int
-
-
 class SumSettings(TypedDict, total=False):
     """Settings of a sum of octaves; see `fbm`."""
 
@@ -43,22 +35,39 @@ class SumSettings(TypedDict, total=False):
     period: Period
 
 
+class Octave(NamedTuple):
+    """One octave of a sum."""
+
+    amplitude: float
+    frequency: float
+    seed: int
+
+
 def octaves_of(
-    where: str, octaves: int, lacunarity: float, gain: float, seed: int, frequency: float = 1
+    where: str, octaves: int, lacunarity: float, gain: float, seed: int
 ) -> Iterator[Octave]:
-    """Yields the octaves of a sum: amplitudes 1, gain, gain^2, ..., frequencies of `frequency`
-    times 1, lacunarity, ...
+    """Yields the octaves of a sum: amplitudes 1, gain, gain^2, ..., frequencies 1, lacunarity, ...
 
     Raises:
         ValueError: There are none, more than 64, or a number is not positive.
     """
-    check.number(where, "frequency", frequency, low=0, open_low=True)
     check.whole(where, "octaves", octaves, low=1, high=64)
     check.number(where, "lacunarity", lacunarity, low=0, open_low=True)
     check.number(where, "gain", gain, low=0, open_low=True)
     check.whole(where, "seed", seed, low=-(2**62), high=2**62)
     for number in range(octaves):
-        yield Octave(gain**number, lacunarity**number * frequency, seed + number * _NEXT_OCTAVE)
+        yield Octave(gain**number, lacunarity**number, seed + number * _NEXT_OCTAVE)
+
+
+def octaves_from(
+    where: str, frequency: float, octaves: int, lacunarity: float, gain: float, seed: int
+) -> list[Octave]:
+    """Returns the octaves of a sum whose first has `frequency` cells a world unit; ValueError as of
+    `octaves_of`.
+    """
+    check.number(where, "frequency", frequency, low=0, open_low=True)
+    series = octaves_of(where, octaves, lacunarity, gain, seed)
+    return [one._replace(frequency=one.frequency * frequency) for one in series]
 
 
 def fbm(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
@@ -67,14 +76,11 @@ def fbm(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
 
     Args:
         points: As in `perlin`.
-        octaves: How many, 1 to 64. Default: 6.
-        lacunarity, gain: Frequency and amplitude of an octave, by those of the one before.
-            Default: 2 and 0.5.
-        basis: The noise that is summed: `perlin`, `value`, `simplex`, `cellular`, or your own
-            function of points, `seed` and `period`. Default: `perlin`.
-        seed: Of the first octave; each has its own. Default: 0.
-        period: Of the first octave, in its cells; the lacunarity must then be a whole number.
-            Default: None, it does not repeat.
+        **settings: octaves: how many, 1 to 64; 6 if left out. lacunarity, 2, and gain, 0.5: of an
+            octave to the one before. basis: the noise that is summed: `perlin`, the default,
+            `value`, `simplex`, `cellular`, or your own function of points, `seed` and `period`.
+            seed: of the first octave, 0; each has its own. period: of the first octave, in its
+            cells; the lacunarity must then be a whole number.
 
     Returns:
         (...) of the points' dtype, within `fbm_bounds`.
@@ -82,16 +88,18 @@ def fbm(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
     Raises:
         ValueError: An argument is not that.
     """
-    layers = _layers("noise.fbm", points, **settings)
-    return _sum("noise.fbm", (amplitude * noise for amplitude, noise in layers))
+    where = "noise.fbm"
+    layers = _layers(where, points, **settings)
+    return _sum(where, (amplitude * noise for amplitude, noise in layers))
 
 
 def turbulence(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
     """The sum of the absolute values of octaves: creases where they pass 0, as in flames and
     marble. Arguments, result and errors are those of `fbm`.
     """
-    layers = _layers("noise.turbulence", points, **settings)
-    return _sum("noise.turbulence", (amplitude * noise.abs() for amplitude, noise in layers))
+    where = "noise.turbulence"
+    layers = _layers(where, points, **settings)
+    return _sum(where, (amplitude * noise.abs() for amplitude, noise in layers))
 
 
 def ridged(points: Points, *, sharpness: float = 2.0, **settings: Unpack[SumSettings]) -> Tensor:
@@ -99,8 +107,9 @@ def ridged(points: Points, *, sharpness: float = 2.0, **settings: Unpack[SumSett
     smooth and detail gathers on the crests.
 
     Args:
-        points, settings: As in `fbm`; noises lie in -1 to 1.
+        points: As in `perlin`.
         sharpness: An octave's weight is the one before times this, at most 1.
+        **settings: As in `fbm`; noises lie in -1 to 1.
 
     Returns:
         (...) of the points' dtype, from 0 to the sum of the amplitudes.
@@ -126,8 +135,9 @@ def warp(points: Points, *, amplitude: float = 1.0, **settings: Unpack[SumSettin
     """Domain warp: points moved by a vector of noise, to be handed to another function of place.
 
     Args:
-        points, settings: As in `fbm`, but one octave by default.
+        points: As in `perlin`.
         amplitude: The noises, one for each axis, are multiplied by this.
+        **settings: As in `fbm`, but for 1 octave if left out.
 
     Returns:
         (..., n) points. A function of slope s has a slope of at most
@@ -138,10 +148,9 @@ def warp(points: Points, *, amplitude: float = 1.0, **settings: Unpack[SumSettin
     """
     place = as_points("noise.warp", points)
     check.number("noise.warp", "amplitude", amplitude)
-    first = settings.get("seed", 0)
-    shifts = []
+    seed, shifts = settings.get("seed", 0), []
     for axis in range(place.shape[-1]):
-        own: SumSettings = {"octaves": 1, **settings, "seed": first + (axis + 1) * _NEXT_AXIS}
+        own: SumSettings = {"octaves": 1, **settings, "seed": seed + (axis + 1) * _NEXT_AXIS}
         shifts.append(fbm(place, **own))
     return place + amplitude * torch.stack(shifts, -1)
 

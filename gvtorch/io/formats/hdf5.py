@@ -22,11 +22,12 @@ from ...base.named_axes import ask_axes, even_steps, letter_of, named_axes, plac
 from ...base.units import spacing_of
 from ..budget import check_beside
 from ..source import Index, VolumeSource
-from .format import Format
+from .format import Format, not_chosen
 
 _ENDINGS = (".h5", ".hdf5", ".hdf", ".he5", ".h5ad", ".ilp", ".nc", ".nc4", ".cdf")
 _MOST_CHUNK = 1 << 31  # bytes
 _MOST_SETS = 100_000
+_KIND = " of three or more axes"  # the data sets that messages list
 _MOST_LINKS = 16  # that lead one to another
 _MOST_PLACES = 1 << 24  # along an axis
 
@@ -36,25 +37,31 @@ class Hdf5Source(VolumeSource):
     """A data set."""
 
     name: str
-    packed: str  # dtype of the values in the file
+    packed: str  # dtype of the values in the file, as its attributes tell
     scale: tuple[float, float] | None = None  # factor and offset of packed values
-    missing: tuple[float, ...] = ()  # stored values that stand for none
+    missing: tuple[float, ...] = ()  # packed values that stand for none
+    valid: tuple[float, float] = (-math.inf, math.inf)  # packed values beyond stand for none
 
     def as_labels(self) -> Self:
         """See `VolumeSource`; a value that stands for none is a label like others."""
         found = super().as_labels()
-        return found if self.scale else replace(found, missing=(), stored=self.packed)
+        if self.scale:
+            return found
+        return replace(found, missing=(), valid=(-math.inf, math.inf), stored=self.packed)
 
     def read_stored(self, index: Index) -> np.ndarray:
         """Reads a part; packed values are unpacked, missing ones become NaN."""
         import h5py
 
         with h5py.File(self.path, "r") as file:
-            data = file[self.name][index]
-        if self.scale is None and not self.missing:
+            data = np.asarray(file[self.name][index])
+        if data.dtype.kind in "iu":
+            data = data.view(self.packed)
+        low, high = self.valid
+        if self.scale is None and not self.missing and (low, high) == (-math.inf, math.inf):
             return data
         found = data * np.float64(self.scale[0]) + self.scale[1] if self.scale else data
-        gaps = np.zeros(data.shape, bool)
+        gaps = (data < low) | (data > high)
         for value in self.missing:
             gaps |= data == value
         if not self.scale:
@@ -81,8 +88,7 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         _check(path, name, data)
         shape = tuple(int(n) for n in data.shape)
         letters, steps, units, lost = _axes(f"{path}:/{name.strip('/')}", data, shape, axes)
-        info, scale, missing, stored = _values(data, letters, shape)
-        data_type = data.dtype.str
+        info, values = _info(data, letters, shape), _values(data)
         place, moments = place_named(letters, shape, steps, units)
         sizes = np.ravel(data.attrs.get("element_size_um", ())).tolist()
         if moments["unit"] is None and len(sizes) == 3:
@@ -92,11 +98,8 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         path=path,
         shape=shape,
         axes=letters,
-        stored=stored,
         name=name,
-        packed=data_type,
-        scale=scale,
-        missing=missing,
+        **values,
         info=info,
         lost=tuple(lost),
         **place,
@@ -161,17 +164,14 @@ def _choose(path: str, file: Any, key: str | None) -> str:
         if isinstance(file.get(key), h5py.Dataset):
             return key
         if not isinstance(file.get(key), h5py.Group):
-            held = ", ".join(_volumes(file)) or "none of three or more axes"
-            raise ValueError(f"{path}: has no data set {key!r}; it holds {held}")
+            raise not_chosen(path, "data set", [*_volumes(file)], key, _KIND)
         names = {f"{key.rstrip('/')}/{name}": text for name, text in _volumes(file[key]).items()}
     else:
         names = _volumes(file)
     if len(names) == 1:
         return next(iter(names))
-    if not names:
-        raise ValueError(f"{path}: holds no data set of three or more axes")
-    listed = ", ".join(f"{path}:/{name.strip('/')} {text}" for name, text in names.items())
-    raise ValueError(f"{path}: holds {len(names)} data sets, choose one with key (--key): {listed}")
+    listed = [f"{path}:/{name.strip('/')} {text}" for name, text in names.items()]
+    raise not_chosen(path, "data set", listed, None, _KIND)
 
 
 def _volumes(group: Any) -> dict[str, str]:
@@ -252,34 +252,62 @@ def _tags(data: Any) -> list[Any]:
     return tags if isinstance(tags, list) and all(isinstance(tag, dict) for tag in tags) else []
 
 
-def _values(
-    data: Any, letters: str, shape: tuple[int, ...]
-) -> tuple[ImageInfo, tuple[float, float] | None, tuple[float, ...], str]:
-    """What the attributes tell of values: info, scale, missing ones, and the dtype they become."""
-    attrs = data.attrs
-    factor, offset = (_number(attrs.get(name)) for name in ("scale_factor", "add_offset"))
-    scale = None
-    if factor is not None or offset is not None:
-        scale = (1.0 if factor is None else factor, 0.0 if offset is None else offset)
-    missing = {_number(attrs.get(name)) for name in ("_FillValue", "missing_value")}
-    gaps = tuple(sorted(v for v in missing if v is not None and not math.isnan(v)))
-    quantity = _text(attrs.get("units"))
-    name = _text(attrs.get("long_name"))
+def _info(data: Any, letters: str, shape: tuple[int, ...]) -> ImageInfo:
+    """What the attributes tell of the image."""
+    quantity, name = (_text(data.attrs.get(key)) for key in ("units", "long_name"))
     width = shape[letters.index("c")] if "c" in letters else 1
-    names = np.ravel(attrs.get("channel_names", ())).tolist()
+    names = np.ravel(data.attrs.get("channel_names", ())).tolist()
     channels = tuple(ChannelInfo(name=_text(n)) for n in names) if len(names) == width else ()
     if not channels and width == 1 and name:
         channels = (ChannelInfo(name=name),)
-    stored = data.dtype.str
-    if scale or gaps:
-        wide = data.dtype.kind == "f" and data.dtype.itemsize > 4
-        stored = "float64" if wide else "float32"
-    return ImageInfo(quantity=quantity or None, channels=channels), scale, gaps, stored
+    return ImageInfo(quantity=quantity or None, channels=channels)
 
 
-def _number(value: Any) -> float | None:
-    found = np.ravel(value) if value is not None else np.zeros(0)
-    return float(found[0]) if found.size == 1 and found.dtype.kind in "iuf" else None
+def _values(data: Any) -> dict[str, Any]:
+    """What the attributes tell of the values: the fields `packed`, `scale`, `missing`, `valid` and
+    `stored` of a source.
+
+    Source: CF Conventions 1.11, sections 2.5.1 and 8.1; `_Unsigned` is of the NetCDF Users' Guide,
+        appendix A.
+    """
+    packed, told = data.dtype, _text(data.attrs.get("_Unsigned")).lower()
+    whole, other_sign = data.dtype.kind in "iu", told in ("true", "false")
+    if whole and other_sign:
+        packed = np.dtype(packed.str.replace(packed.kind, "u" if told == "true" else "i"))
+
+    def numbers(name: str) -> list[float]:
+        found = np.ravel(data.attrs.get(name, ()))
+        if whole and other_sign and found.dtype.kind in "iu":
+            found = found.astype(packed)
+        return found.tolist() if found.dtype.kind in "iuf" else []
+
+    def number(name: str, other: float) -> float:
+        found = numbers(name)
+        return found[0] if len(found) == 1 else other
+
+    factor, offset = number("scale_factor", math.nan), number("add_offset", math.nan)
+    scale = None
+    if not math.isnan(factor) or not math.isnan(offset):
+        scale = (1.0 if math.isnan(factor) else factor, 0.0 if math.isnan(offset) else offset)
+    gaps = {number("_FillValue", math.nan), *numbers("missing_value")}
+    missing = tuple(sorted(v for v in gaps if not math.isnan(v)))
+    valid = numbers("valid_range")
+    if len(valid) != 2:
+        valid = [number("valid_min", -math.inf), number("valid_max", math.inf)]
+    if whole and valid[0] <= np.iinfo(packed).min:  # no value lies beyond
+        valid[0] = -math.inf
+    if whole and valid[1] >= np.iinfo(packed).max:
+        valid[1] = math.inf
+    stored = packed.str
+    if scale or missing or valid != [-math.inf, math.inf]:
+        stored = "float64" if packed.kind == "f" and packed.itemsize > 4 else "float32"
+    return {
+        "packed": packed.str,
+        "scale": scale,
+        "missing": missing,
+        "valid": tuple(valid),
+        "stored": stored,
+    }
 
 
 def _text(value: Any) -> str:

@@ -15,26 +15,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...base.digits import whole_number
-from ...base.image_info import ChannelInfo, ImageInfo, Rgb
+from ...base.image_info import COLORS, ChannelInfo, ImageInfo
 from ...base.units import NO_DEPTH, spacing_of
 from ..source import Index, VolumeSource
-from .format import Format
+from .format import Format, choose
 
 _MOST_HEADER = 1 << 28  # characters
 _MOST_BLOCKS = 1 << 20
 _LETTERS = {1: "x", 2: "y", 3: "z", 4: "t"}
 _NAMES = {5: "wavelengths", 9: "excitation wavelengths", 10: "tiles"}
-_COLORS: dict[str, Rgb] = {
-    "red": (1.0, 0.0, 0.0),
-    "green": (0.0, 1.0, 0.0),
-    "blue": (0.0, 0.0, 1.0),
-    "cyan": (0.0, 1.0, 1.0),
-    "magenta": (1.0, 0.0, 1.0),
-    "yellow": (1.0, 1.0, 0.0),
-    "gray": (1.0, 1.0, 1.0),
-    "grey": (1.0, 1.0, 1.0),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,15 +50,9 @@ def open_lif(path: str, key: str | None = None) -> LifSource:
         blocks = _blocks(file, size)
     found = [e for e in root.iter("Element") if e.find("./Data/Image") is not None]
     found = [e for e in found if _block(e, blocks) is not None]
-    if not found:
-        raise ValueError(f"{path}: holds no image")
     names = [str(element.get("Name", "")) for element in found]
-    at = names.index(key) if key in names else 0 if key is None else whole_number(key)
-    listed = ", ".join(f"{number} {name!r}" for number, name in enumerate(names))
-    if at is None or at >= len(found):
-        raise ValueError(f"{path}: has no image {key!r}; it holds {listed}")
-    others = [f"{len(found) - 1} other images; key (--key) chooses among {listed}"]
-    return _image(path, found[at], blocks, others if key is None and len(found) > 1 else [])
+    at, others = choose(path, "image", names, key)
+    return _image(path, found[at], blocks, [*others])
 
 
 def _image(
@@ -143,7 +126,7 @@ def _channel(element: Any) -> ChannelInfo:
         for item in element.iter("ChannelProperty")
         if item.findtext("Key") in ("DyeName", "Name")
     ]
-    return ChannelInfo(name=next(filter(None, names), table), color=_COLORS.get(table.lower()))
+    return ChannelInfo(name=next(filter(None, names), table), color=COLORS.get(table.lower()))
 
 
 def _block(element: Any, blocks: dict[str, tuple[int, int]]) -> tuple[int, int] | None:

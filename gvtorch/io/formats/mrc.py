@@ -22,7 +22,7 @@ _DTYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
 @Format("MRC", ".mrc", ".map", ".rec", ".ccp4", ".mrcs", ".st", ".mrc.gz", ".map.gz", ".mrc.bz2",
         ".map.bz2", library="mrcfile")  # fmt: skip
 def open_mrc(path: str) -> ArraySource:
-    """Opens a map, in angstroms. A stack of maps is taken for times."""
+    """Opens a map, in angstroms. The maps of a stack are taken for times."""
     import mrcfile
 
     with warnings.catch_warnings(record=True) as heard:
@@ -44,14 +44,14 @@ def open_mrc(path: str) -> ArraySource:
         raise ValueError(f"{path}: an extended header of {int(found['nsymbt'])} bytes")
     axes = [int(found[name]) for name in ("maps", "mapr", "mapc")]
     letters = "zyx" if sorted(axes) != [1, 2, 3] else "".join("xyz"[axis - 1] for axis in axes)
-    spacing, origin, unit = _place(found, dict(zip(letters, sizes, strict=True)))
+    spacing, origin, unit = _place(found)
     stack = int(found["ispg"]) > 400 and int(found["mz"]) > 0
     if stack:
         each = int(found["mz"])
         if sizes[0] % each:
             raise ValueError(f"{path}: a stack of {sizes[0]} slices is no whole number of maps")
         sizes, letters = [sizes[0] // each, each, *sizes[1:]], "t" + letters
-        lost.append(f"that its {sizes[0]} maps are no times")
+        lost.append(f"that its {sizes[0]} maps are separate: they are taken for times")
     return ArraySource(
         path=path,
         file=path,
@@ -68,7 +68,7 @@ def open_mrc(path: str) -> ArraySource:
 
 
 def _place(
-    header: Any, sizes: dict[str, int]
+    header: Any,
 ) -> tuple[tuple[float, float, float], tuple[float, float, float], str | None]:
     """Voxel size and place of the first voxel, angstroms, x y z."""
     steps, starts = [], []

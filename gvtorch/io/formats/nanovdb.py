@@ -19,24 +19,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..packed import blosc_begin, unpack_block
 from ..sparse_grid import (
     COUNTS,
     VOXELS,
     SparseGrid,
     SparseSource,
     bits,
-    blosc_begin,
     check_roots,
-    choose,
     describe,
-    unpack,
 )
-from .format import Format
+from .format import Format, choose
 
 _FILES = (b"NanoVDB0", b"NanoVDB2")
 _GRIDS = (b"NanoVDB0", b"NanoVDB1")
 _VERSION = 32
-_CODECS = {0: "none", 1: "zip", 2: "blosc"}
+_CODECS = {0: "none", 1: "zlib", 2: "blosc"}
 _CLASSES = {1: "level set", 2: "fog volume", 3: "staggered"}
 _TYPE, _TREE, _ROOT = 636, 672, 736  # bytes before its type, before the tree and its root
 _COUNTS = _TREE + 32  # before the numbers of leaves, lower and upper nodes
@@ -102,9 +100,9 @@ class NanoSource(SparseSource):
 
 @Format("NanoVDB", ".nvdb", options=("key",))
 def open_nanovdb(path: str, key: str | None = None) -> NanoSource:
-    """Opens a grid; see `choose`."""
+    """Opens the grid `key` (its name or number); "density" or the first, if left out."""
     heads = _heads(path)
-    number, lost = choose(path, [head.name for head in heads], key)
+    number, lost = choose(path, "grid", [head.name for head in heads], key, preferred="density")
     head = heads[number]
     if head.kind not in _TYPES:
         kind = _REFUSED.get(head.kind, f"type {head.kind}")
@@ -160,7 +158,7 @@ def _packed(file: Any, head: Head, end: int) -> int:
     count, size = 0, 0
     while size < head.size:
         (length,) = struct.unpack("<Q", file.read(8))
-        if head.codec == "zip":
+        if head.codec == "zlib":
             return 8 + length
         part = file.read(16)
         if not 16 <= length <= end or (told := int.from_bytes(part[4:8], "little")) < 1:
@@ -183,15 +181,15 @@ def _content(path: str, head: Head, most: int = 0) -> Any:
         while size < (most or head.size):
             (length,) = struct.unpack("<Q", file.read(8))
             part = file.read(length)
-            if head.codec == "zip":
+            if head.codec == "zlib":
                 if most:
                     return zlib.decompressobj().decompress(part, most)
-                return unpack("zip", part, head.size)
+                return unpack_block("zlib", part, head.size)
             if most:
                 parts.append(blosc_begin(part, most - size))
             else:
                 told = int.from_bytes(part[4:8], "little")
-                parts.append(unpack("blosc", part, told, head.size - size))
+                parts.append(unpack_block("blosc", part, min(told, head.size - size)))
             size += len(parts[-1])
         return b"".join(parts)
 

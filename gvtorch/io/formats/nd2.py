@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ...base.digits import whole_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import spacing_of
 from ..source import Index, VolumeSource
-from .format import Format
+from .format import Format, choose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,17 +49,12 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
 
     with nd2.ND2File(path) as file:
         sizes: Mapping[str, int] = dict(file.sizes)
-        others = {n: size for n, size in sizes.items() if n not in "TPZCYXS" and size > 1}
-        if others:
-            raise ValueError(f"{path}: has axes beside T, P, Z, C, Y, X: {others}")
-        positions = int(sizes.get("P", 1))
-        position = 0 if key is None else whole_number(key)
-        if position is None or position >= positions:
-            raise ValueError(f"{path}: has no position {key!r}; it holds 0 to {positions - 1}")
+        more = {n: size for n, size in sizes.items() if n not in "TPZCYXS" and size > 1}
+        if more:
+            raise ValueError(f"{path}: has axes beside T, P, Z, C, Y, X: {more}")
+        position, others = choose(path, "position", range(sizes.get("P", 1)), key)
         dtype = np.dtype(file.dtype).str
         info, spacing, lost = _told(file, sizes)
-    if key is None and positions > 1:
-        lost.append(f"{positions - 1} other positions; key (--key) chooses, 0 to {positions - 1}")
     width, colors = int(sizes.get("C", 1)), int(sizes.get("S", 1))
     if width > 1 and colors > 1:
         raise ValueError(f"{path}: {width} channels of colours; expected one")
@@ -72,7 +66,7 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
         stored=dtype,
         spacing=spacing,
         info=info,
-        lost=tuple(lost),
+        lost=(*lost, *others),
         position=position,
     )
 

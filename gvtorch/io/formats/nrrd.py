@@ -181,17 +181,44 @@ def _directions(header: dict[str, Any], rank: int) -> np.ndarray:
     return told if fits else np.full((rank, 3), np.nan)
 
 
+def _numbers(header: dict[str, Any], rank: int, *names: str) -> np.ndarray:
+    """(axes,) what the first field of these names that is there tells of each axis; NaN for
+    nothing.
+    """
+    field = next((header[name] for name in names if name in header), np.zeros(0))
+    told = np.asarray(field, dtype=np.float64)
+    return told if told.shape == (rank,) else np.full(rank, np.nan)
+
+
 def _spacings(header: dict[str, Any], rank: int) -> np.ndarray:
     """(axes,) widths of a step along each axis; NaN for none."""
-    told = np.asarray(header.get("spacings", np.zeros(0)), dtype=np.float64)
-    return told if told.shape == (rank,) else np.full(rank, np.nan)
+    return _steps(header, rank)[0]
+
+
+def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
+    """(axes,) widths of a step along each axis and (axes,) places of the first values; NaN for
+    none.
+
+    Source: NRRD format, sections "axis mins" and "centers"; values whose centering is not told are
+        those of cells, as Teem takes them.
+    """
+    low = _numbers(header, rank, "axis mins", "axismins")
+    high = _numbers(header, rank, "axis maxs", "axismaxs")
+    told = header.get("centers", header.get("centerings", ""))
+    told = (told if isinstance(told, str) else " ".join(map(str, told))).lower().split()
+    told = told if len(told) == rank else ["cell"] * rank
+    in_cells = np.array([one != "node" for one in told])
+    count = np.asarray(header["sizes"]) - ~in_cells
+    step = _numbers(header, rank, "spacings")
+    step = np.where(np.isnan(step), (high - low) / np.maximum(count, 1), step)
+    return step, low + np.where(in_cells, 0.5 * step, 0)
 
 
 def _affine(header: dict[str, Any], letters: str) -> np.ndarray:
     """(4, 4) place of the three axes of space."""
     spatial = [axis for axis, letter in enumerate(letters) if letter == "s"]
     directions = _directions(header, len(letters))[spatial, :3]
-    spacings = _spacings(header, len(letters))[spatial]
+    spacings, first = (one[spatial] for one in _steps(header, len(letters)))
     affine = np.eye(4)
     if not np.isnan(directions).all():
         affine[:3, :3] = directions.T
@@ -200,6 +227,8 @@ def _affine(header: dict[str, Any], letters: str) -> np.ndarray:
     origin = np.asarray(header.get("space origin", np.zeros(3)), dtype=np.float64)
     if origin.shape in ((3,), (4,)) and not np.isnan(origin[:3]).all():
         affine[:3, 3] = origin[:3]
+    if "space origin" not in header and np.isfinite(first).all():
+        affine[:3, 3] = first
     return affine  # what is told and no number is refused by `place_axes`
 
 

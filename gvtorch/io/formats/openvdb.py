@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ..packed import unpack_block
 from ..sparse_grid import (
     COUNTS,
     SIDES,
@@ -27,11 +28,9 @@ from ..sparse_grid import (
     SparseSource,
     bits,
     check_roots,
-    choose,
     describe,
-    unpack,
 )
-from .format import Format
+from .format import Format, choose
 
 _MAGIC = 0x56444220
 _VERSIONS = range(220, 225)
@@ -158,10 +157,11 @@ class VdbSource(SparseSource):
 
 @Format("OpenVDB", ".vdb", options=("key",))
 def open_openvdb(path: str, key: str | None = None) -> VdbSource:
-    """Opens a grid; see `choose`."""
+    """Opens the grid `key` (its name or number); "density" or the first, if left out."""
     with _mapped(path) as data:
         version, entries = _entries(data)
-        at, lost = choose(path, [entry.name for entry in entries], key)
+        names = [entry.name for entry in entries]
+        at, lost = choose(path, "grid", names, key, preferred="density")
         entry = entries[at]
         number = at
         if entry.parent:
@@ -329,8 +329,8 @@ class _Packing:
             length = cursor.number("<q")
             content = cursor.take(abs(length))
             if length > 0:
-                codec = "blosc" if self.compression & _BLOSC else "zip"
-                content = unpack(codec, content, size)
+                codec = "blosc" if self.compression & _BLOSC else "zlib"
+                content = unpack_block(codec, content, size)
         else:
             content = cursor.take(size)
         if len(content) != size:

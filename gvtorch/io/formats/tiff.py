@@ -10,16 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ...base.digits import whole_number
 from ...base.image_info import ImageInfo, color_channels
 from ..source import ArraySource, Index, VolumeSource
-from ..tiff_info import Told, check_pictures, imagej_info, ome_info, opened
-from .format import Format
+from ..tiff_info import JPEG, Told, check_pictures, imagej_info, ome_info, opened
+from .format import Format, choose
 
-_JPEG = (6, 7, 34892, 33007)
-_LOST = {  # by kind of photometric interpretation
+_LOST = {  # by the tag PhotometricInterpretation
     0: "that high values are meant to be dark (MinIsWhite)",
-    3: "its palette: values are its numbers",
+    3: "the colours of its palette: values are numbers of its entries",
 }
 
 
@@ -94,7 +92,7 @@ def _unpacked(page: Any, keyframe: Any, number: int) -> np.ndarray | None:
     if len(packed) != size:
         raise ValueError(f"{file.path}: ends before its tile {number}")
     more = {}
-    if keyframe.compression in _JPEG:
+    if keyframe.compression in JPEG:
         more = {"jpegtables": page.jpegtables, "jpegheader": keyframe.jpegheader}
     found = keyframe.decode(packed, number, **more)[0]
     return None if found is None else found[0]
@@ -110,14 +108,14 @@ def _page_shape(series: Any) -> tuple[int, ...]:
 def open_tiff(path: str, key: str | None = None) -> VolumeSource:
     """Opens a stack: the series `key` (its number or name) of a file, the first if left out."""
     with opened(path) as (file, warned):
-        number = _choose(path, file.series, key)
+        if not file.series:
+            raise ValueError("it holds no images")
+        number, others = choose(path, "series", [one.name for one in file.series], key)
         series = file.series[number]
         shape = tuple(int(n) for n in series.shape)
         axes = _axes(path, shape, series.axes)
         info, spacing, lost = _told(file, series, number, axes, shape)
-        if key is None and len(file.series) > 1:
-            names = ", ".join(f"{at} {one.name!r}" for at, one in enumerate(file.series))
-            lost.append(f"{len(file.series) - 1} other series; key (--key) chooses among {names}")
+        lost += others
         lost += [f"what tifffile warns of ({text})" for text in dict.fromkeys(warned)]
         told: dict[str, Any] = {
             "path": path,
@@ -143,21 +141,6 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
     return TiffSource(
         stored=series.dtype.str, whole=not by_page, series=number, lost=tuple(lost), **told
     )
-
-
-def _choose(path: str, series: Sequence[Any], key: str | None) -> int:
-    if not series:
-        raise ValueError("it holds no images")
-    if key is None:
-        return 0
-    found = [at for at, one in enumerate(series) if key == one.name]
-    number = whole_number(key)
-    if not found and number is not None and number < len(series):
-        found = [number]
-    if not found:
-        names = ", ".join(f"{at} {one.name!r}" for at, one in enumerate(series))
-        raise ValueError(f"{path}: has no series {key!r}; it holds {names}")
-    return found[0]
 
 
 def _axes(path: str, shape: Sequence[int], axes: str) -> str:
@@ -189,6 +172,11 @@ def _told(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) 
     if series.kind == "imagej":
         info, spacing, more = imagej_info(file.imagej_metadata, _resolution(file), width)
         return replace(info, channels=channels) if colors else info, spacing, [*more, *lost]
+    tags = series.keyframe.tags
+    if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are of printers
+        lost.append("the size of a pixel in centimeters: how far pages are apart is not told")
+    if tags.valueof("Orientation", 1) != 1:
+        lost.append("that its pages are to be shown turned or mirrored")
     return ImageInfo(channels=channels), (1.0, 1.0, 1.0), lost
 
 

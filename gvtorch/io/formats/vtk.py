@@ -12,7 +12,6 @@ import io
 import math
 import mmap
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,9 +23,9 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.volume import check_extent
-from ..packed import PackedSource, text_numbers
+from ..packed import PackedSource, text_numbers, unpack_block
 from ..source import ArraySource, Index, VolumeSource, place_axes
-from .format import Format
+from .format import Format, choose
 
 _LEGACY = {
     "unsigned_char": "u1",
@@ -106,7 +105,7 @@ class VtkSource(VolumeSource):
         begin = heads if self.encoding == "raw" else -(-heads // 3) * 4
         data, parts, at = _bytes(content[begin:], self.encoding, sum(packed)), [], 0
         for here, unpacked in zip(packed, sizes, strict=True):
-            parts.append(_unpack(self.compressor, data[at : at + here], unpacked))
+            parts.append(unpack_block(self.compressor, data[at : at + here], unpacked))
             at += here
         return b"".join(parts)
 
@@ -118,35 +117,10 @@ def _bytes(content: bytes, encoding: str, count: int) -> bytes:
     return base64.b64decode(content[: -(-count // 3) * 4])[:count]
 
 
-def _unpack(compressor: str, packed: bytes, need: int) -> bytes:
-    """Unpacks a block that must be of `need` bytes."""
-    if compressor == "zlib":
-        found = zlib.decompressobj().decompress(packed, need + 1)
-    elif compressor == "lzma":
-        import lzma
-
-        found = lzma.LZMADecompressor().decompress(packed, need + 1)
-    else:
-        import imagecodecs
-
-        found = bytes(imagecodecs.lz4_decode(packed, out=need))
-    if len(found) != need:
-        raise ValueError(f"a block of {need} bytes expected, {len(found)} found")
-    return found
-
-
 @Format("VTK", ".vti", ".vtk", options=("key",))
 def open_vtk(path: str, key: str | None = None) -> VolumeSource:
-    """Opens an image; `key` is the name of an array, the first if left out."""
+    """Opens an image; `key` is the name or number of an array, the first if left out."""
     return _open_legacy(path, key) if path.lower().endswith(".vtk") else _open_xml(path, key)
-
-
-def _choose(path: str, names: Sequence[str], key: str | None) -> int:
-    if not names:
-        raise ValueError(f"{path}: holds no array of numbers")
-    if key is not None and key not in names:
-        raise ValueError(f"{path}: has no array {key!r}; it holds {', '.join(names)}")
-    return 0 if key is None else names.index(key)
 
 
 def _told(
@@ -154,7 +128,7 @@ def _told(
     points: Sequence[int],
     affine: np.ndarray,
     array: dict[str, Any],
-    others: Sequence[str],
+    lost: tuple[str, ...],
 ) -> dict[str, Any]:
     """Fields of a source of (z, y, x) or (z, y, x, c) values at points, or in cells."""
     size = [max(n - 1, 1) for n in points] if array["cells"] else list(points)
@@ -166,12 +140,11 @@ def _told(
     width = array["width"]
     place = place_axes(path, affine, size)
     place["axes"] = place["axes"][::-1] + "c" * (width > 1)
-    lost = [f"other arrays; key (--key) chooses among {', '.join(others)}"] if others[1:] else []
     return {
         "path": path,
         "shape": (*size[::-1], *((width,) if width > 1 else ())),
         "info": ImageInfo(channels=(ChannelInfo(name=array["name"]),) if width == 1 else ()),
-        "lost": tuple(lost),
+        "lost": lost,
         **place,
     }
 
@@ -200,8 +173,8 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
         raise ValueError(f"{path}: has no extent")
     low, high = extent[::2], extent[1::2]
     arrays = _xml_arrays(root, piece)
-    names = [array["name"] for array in arrays]
-    array = arrays[_choose(path, names, key)]
+    chosen, lost = choose(path, "array", [array["name"] for array in arrays], key)
+    array = arrays[chosen]
     if array["kind"] not in _XML:
         raise ValueError(f"{path}: {array['name']} is of {array['kind']}; expected numbers")
     numbers = {
@@ -213,8 +186,8 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     affine = np.eye(4)
     affine[:3, :3] = numbers["Direction"].reshape(3, 3) * numbers["Spacing"]
     affine[:3, 3] = numbers["Origin"] + affine[:3, :3] @ low
-    told = _told(path, [b - a + 1 for a, b in zip(low, high, strict=True)], affine, array,
-                 names if key is None else names[:1])  # fmt: skip
+    points = [b - a + 1 for a, b in zip(low, high, strict=True)]
+    told = _told(path, points, affine, array, lost)
     order = {"LittleEndian": "<", "BigEndian": ">"}[root.get("byte_order", "LittleEndian")]
     header = order + {"UInt32": "u4", "UInt64": "u8"}[root.get("header_type", "UInt32")]
     packer = {"": "", "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma",
@@ -238,7 +211,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
             )
     else:
         encoding = "ascii" if array["format"] == "ascii" else "base64"
-        offset, length = _inline(path, content, array["number"])
+        offset, length = _inline(content, array["number"])
     return VtkSource(
         stored=stored,
         encoding=encoding,
@@ -296,7 +269,7 @@ def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
     return sorted(found, key=lambda array: not array["first"])
 
 
-def _inline(path: str, content: bytes, number: int) -> tuple[int, int]:
+def _inline(content: bytes, number: int) -> tuple[int, int]:
     """Where the content of a DataArray begins, by its number in the file, and its length."""
     found: list[list[int]] = []
     parser = expat.ParserCreate()
@@ -344,9 +317,9 @@ def _open_mapped(path: str, content: mmap.mmap, key: str | None) -> VolumeSource
     affine, points, arrays = _legacy_parts(
         path, content, sum(len(line) + 1 for line in lines[:4]), binary
     )
-    names = [array["name"] for array in arrays]
-    found = arrays[_choose(path, names, key)]
-    told = _told(path, points, affine, found, names if key is None else names[:1])
+    chosen, lost = choose(path, "array", [array["name"] for array in arrays], key)
+    found = arrays[chosen]
+    told = _told(path, points, affine, found, lost)
     told |= {"file": path, "offset": found["offset"], "stored": found["stored"]}
     if binary:
         return ArraySource(**told)

@@ -24,6 +24,7 @@ from .store import Store
 from .store_layout import WORK, Deadline, is_name, kvstore
 
 _TIMEOUT = 20.0  # seconds
+_MANIFEST = "channels.json"
 
 
 def channel_names(location: str | Path) -> tuple[str, ...]:
@@ -71,10 +72,10 @@ def convert_channels(
     """
     target = Path(store)
     _check(sources)
-    begun = _begun(target, resume)
+    begun = unfinished.is_begun(target, resume=resume, manifest=_MANIFEST)
     target.mkdir(exist_ok=True)
     (target / WORK).mkdir(exist_ok=True)
-    manifest = target / WORK / "channels.json"
+    manifest = target / WORK / _MANIFEST
     marks = json.loads(json.dumps({name: one.fingerprint() for name, one in sources.items()}))
     if begun and read_json_file(manifest) != {"sources": marks}:
         raise ValueError(
@@ -84,7 +85,7 @@ def convert_channels(
     unfinished.write_json(manifest, {"sources": marks})
     total, before = sum(one.nbytes for one in sources.values()), 0
     for name, source in sources.items():
-        if not (target / name / "zarr.json").exists():
+        if not unfinished.is_finished(target / name):
             half = (target / name / WORK / "manifest.json").exists()
             if not half:
                 shutil.rmtree(target / name, ignore_errors=True)
@@ -117,16 +118,3 @@ def _check(sources: Mapping[str, VolumeSource]) -> None:
     for name in sources:
         if not is_name(name):
             raise ValueError(f"a channel's name is made of letters, digits, - and _, got {name!r}")
-
-
-def _begun(target: Path, resume: bool) -> bool:
-    """Returns whether there is a half-written store to go on with; raises as `is_begun`."""
-    if not (target / WORK / "channels.json").exists():
-        return unfinished.is_begun(target, resume=False)
-    if (target / "zarr.json").exists():
-        raise FileExistsError(f"{target}: there is a store already; remove it or choose a new name")
-    if not resume:
-        raise FileExistsError(
-            f"{target}: half-written; --resume (resume=True) goes on with it, or remove it"
-        )
-    return True

@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ...base import boxes
 from ...base.stage import Progress, no_progress
 from ...base.whole_file import told_of
-from .. import boxes
 from ..resources import amount
 from .ngff import read_json_file
 from .shard import bordered, finish, write

@@ -91,7 +91,7 @@ def convert(
         time: The one time point to write; all if left out.
         oblique: As of `read_volume`.
         labels: Values are numbers of things, kept exactly; also where the file says so. Those wider
-            than 16 bits are counted off: all is read once before, to find which there are.
+            than 16 bits are indexed: all is read once before, to find which there are.
         executor: Runs the tasks, such as a dask client's `get_executor()`; the store's folder must
             be the same for all of its workers. A pool of processes if left out.
         workers: Number of processes of that pool; left out, one a core, as far as memory goes.

@@ -21,12 +21,12 @@ from ...base.stage import Progress
 from ...base.volume import Volume
 from ...pool.downsample import pool_majority, pool_mean
 from .. import resources
-from ..label_source import IndexSource, counted_source
+from ..label_source import IndexSource, indexed_source
 from ..oblique import Oblique
 from ..reading import FormatSettings, open_source, placed, read_whole
-from ..source import MemorySource, VolumeSource
+from ..source import MemorySource, VolumeSource, no_time
 from . import shard, unfinished
-from .level_reader import Pool, no_time
+from .level_reader import Pool
 from .store_layout import BLOCKS, DTYPES, WORK, StoreLayout, context, kvstore
 
 _FEW = 4  # tasks of level 0 up to which processes are not worth their start
@@ -80,7 +80,7 @@ class Plan:
 
     @property
     def labels(self) -> np.ndarray | None:
-        """(k,) int64 labels that are counted off."""
+        """(k,) int64 labels that are indexed."""
         source = self.task.source
         if not isinstance(source, IndexSource) or isinstance(source.labels, str):
             return None
@@ -123,7 +123,7 @@ def source_of(
         )
         if source.label_values is None:
             return found
-        # They are counted off already.
+        # They are indexed already.
         return IndexSource.of(found, source.label_values.numpy(), indexed=True)
     placement: dict[str, Any] = {"spacing": spacing, "origin": origin, "oblique": oblique}
     found = open_source(source, time=time, labels=labels, **placement, **options)
@@ -152,7 +152,7 @@ def counted(
         return source
     times = (0, source.times) if time is None else (source.time, source.time + 1)
     threads = min(8, resources.cores() if workers is None else workers)
-    return counted_source(source, times, threads, target / WORK / LABELS, progress)
+    return indexed_source(source, times, threads, target / WORK / LABELS, progress)
 
 
 def plan_of(

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from ...base import check
+from ...base import boxes, check
+from ...base.boxes import Zyx
 from ...base.labels import check_narrowed
 from ...pool.downsample import pool_mean
-from .. import boxes
-from ..boxes import Zyx
+from ..source import no_time
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
 from .store_layout import MOST_VOXELS, Deadline, StoreError, StoreLayout, child, opened, short
@@ -132,12 +132,6 @@ def _choose(
     if not picked or not all(isinstance(c, int) and 0 <= c < width for c in picked):
         raise ValueError(f"{where}: has no channels {picked!r}; it has {width}, from 0")
     return picked if "c" in axes else slice(None)
-
-
-def no_time(where: str, time: object, times: int) -> str:
-    """The message about a time point that is not there."""
-    one = "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
-    return f"{where}: has no time {time!r}; it has {one}"
 
 
 def _factors(

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from ...base import boxes
 from ...pool.downsample import Reduction, pool_max, pool_mean, pool_min, round_array, window
-from .. import boxes
 from ..source import VolumeSource
 from .checksums import Files, shard_files
 from .chunk_files import files_of
@@ -209,7 +209,7 @@ def create_arrays(conversion: Conversion, level: int) -> None:
 
 
 def write_labels(conversion: Conversion, labels: np.ndarray) -> None:
-    """Writes the array of labels that were counted off."""
+    """Writes the array of labels that are indexed."""
     root, spec = conversion.root, conversion.layout.labels()
     _create(root, spec)
     finish(write(root, spec, [0], labels), root.get("path", "store"))

@@ -19,11 +19,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...base import check
+from ...base import boxes, check
+from ...base.boxes import Zyx, grouped
 from ...base.labels import background
 from ...pool.downsample import pool_majority, pool_mean
-from .. import boxes
-from ..boxes import Zyx, grouped
 from .checksums import Checksums, file_of, sum_of
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .level_reader import LevelReader, Pool, fitted, open_arrays
@@ -550,7 +549,7 @@ class Store:
 
 
 def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline) -> np.ndarray:
-    """(k,) int64 labels that were counted off."""
+    """(k,) int64 labels that are indexed."""
     spec = layout.labels()
     name = f"{where}/{spec['path']}"
     array = deadline.wait(opened(root, spec), name)

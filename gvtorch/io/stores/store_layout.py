@@ -8,8 +8,8 @@
                                      its border the true neighbours, repeated at the volume's faces;
                                      blocks of CONSTANT and EMPTY cells only are not written
     STORE.zarr/gvtorch/cells/0 ...   (gz, gy, gx, 3, c) low, high, mean of every cell of 8^3 voxels
-    STORE.zarr/gvtorch/labels        (k,) int64, rising: of labels that were counted off, since they
-                                     are wider than 16 bits, the label that each value stands for
+    STORE.zarr/gvtorch/labels        (k,) int64, rising: of labels that are indexed, since they are
+                                     wider than 16 bits, the label that each value stands for
     STORE.zarr/gvtorch/coarse/ ...   what coarse voxels hold beside means; see coarse.py
     STORE.zarr/.gvtorch-work         only while it is made: manifest, journal, low and high pyramids
 
@@ -81,7 +81,7 @@ class StoreLayout:
     threshold: float | None = None  # what EMPTY was decided by
     value_range: Sequence[Sequence[float]] | None = None  # [low, high] of each channel
     times: int = 1  # time points
-    label_count: int | None = None  # of labels that were counted off
+    label_count: int | None = None  # of labels that are indexed
     files_sum: int | None = None  # checksum of the list of checksums, see checksums.py
 
     @property
@@ -189,7 +189,7 @@ class StoreLayout:
         )
 
     def labels(self) -> dict[str, Any]:
-        """Spec of the array of labels that were counted off."""
+        """Spec of the array of labels that are indexed."""
         count = self.label_count or 0
         shard = -(-count // _LABEL_CHUNK) * _LABEL_CHUNK
         return dataclasses.replace(self, dtype="int64")._array(

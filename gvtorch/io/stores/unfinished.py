@@ -70,8 +70,8 @@ def is_finished(target: Path) -> bool:
     return (target / "zarr.json").exists()
 
 
-def is_begun(target: Path, *, resume: bool) -> bool:
-    """Returns whether there is a half-written store to go on with.
+def is_begun(target: Path, *, resume: bool, manifest: str = _MANIFEST) -> bool:
+    """Returns whether there is a half-written store to go on with, begun with a file of this name.
 
     Raises:
         FileExistsError: There is a whole store, a half-written one without `resume`, or something
@@ -80,14 +80,15 @@ def is_begun(target: Path, *, resume: bool) -> bool:
     """
     if is_finished(target):
         raise FileExistsError(f"{target}: there is a store already; remove it or choose a new name")
-    manifest = target / WORK / _MANIFEST
-    if manifest.exists():
+    folder = target / WORK
+    if (folder / manifest).exists():
         if not resume:
             raise FileExistsError(
                 f"{target}: half-written; --resume (resume=True) goes on with it, or remove it"
             )
         return True
-    if target.is_dir() and {entry.name for entry in target.iterdir()} <= {WORK}:
+    empty = target.is_dir() and {entry.name for entry in target.iterdir()} <= {WORK}
+    if empty and not any(folder.glob("*.json")):
         return False
     if target.exists():
         raise FileExistsError(f"{target}: exists and is no store; choose a new name")

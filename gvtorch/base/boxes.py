@@ -1,4 +1,6 @@
-"""Boxes of voxels, `low` to `high` in z, y, x: their index, and what lies beyond a grid."""
+"""Boxes of voxels, `low` to `high` in z, y, x: their index, and what lies beyond a grid; how many
+voxels a box of the world has.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+
+from . import check
 
 Zyx = Sequence[int]
 
@@ -47,3 +51,17 @@ def grouped(places: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     others = np.flatnonzero((places[1:] != places[:-1]).any(1)) + 1
     first = np.append(0, others)[: len(order)]
     return places[first], np.split(order, others)[: len(order)]
+
+
+def extent_in(
+    where: str, extent: int | Sequence[int], box: Sequence[Sequence[float]]
+) -> Sequence[int]:
+    """Returns an extent along x, y, z as it is; a number is that of the box's longest side, and
+    voxels are cubes then, or nearly so.
+    """
+    if not isinstance(extent, int):
+        return extent
+    low, high = check.box(where, box)
+    check.whole(where, "extent", extent, low=1, high=2**40)
+    sides = [b - a for a, b in zip(low, high, strict=True)]
+    return [max(1, round(extent * side / max(sides))) for side in sides]
