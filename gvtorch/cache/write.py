@@ -1,8 +1,8 @@
 """Writes what was produced into the pools.
 
-Slots change hands in one order, always: slots are taken from those that the last picture did not
-use, every pointer to them is cleared, the new content is written, the nodes are linked to it. So no
-pointer ever leads to a slot that holds something else.
+Slots change hands (eviction) in one order, always: slots are taken from those that the last picture
+did not use, every pointer to them is cleared, the new content is written, the nodes are linked to
+it. So no pointer ever leads to a slot that holds something else.
 Source: Crassin et al., "GigaVoxels", I3D 2009, section 5.
 """
 

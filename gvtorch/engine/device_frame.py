@@ -26,7 +26,7 @@ from .request_batch import ProducedTree, RequestBatch, children_of
 from .stats import FrameStats, Readbacks
 
 
-class Answer(NamedTuple):
+class Unchecked(NamedTuple):
     """What a producer gave for a batch, not checked yet."""
 
     node: Tensor  # (batch,) int64 nodes that were asked for, -1 for none
@@ -94,7 +94,7 @@ class DeviceFrame(RecordedFrame):
         branching = max(source.layout.branching for source in self.trees)
         return levels_wanted(wide, branching)
 
-    def _answers(self, kind: int, chosen: Tensor) -> list[Answer]:
+    def _answers(self, kind: int, chosen: Tensor) -> list[Unchecked]:
         """What each tree's producer answers for its own of nodes (batch,)."""
         number, answers = self.tree_of(chosen), []
         for source in self.trees:
@@ -102,10 +102,10 @@ class DeviceFrame(RecordedFrame):
             if kind == REQUEST_LOAD and source.producer.needs_parent:
                 node = once(ready(self.cache, node, source.layout.depth))
             batch = self._asked(source, kind, node)
-            answers.append(Answer(node, batch, batch.ask()))
+            answers.append(Unchecked(node, batch, batch.ask()))
         return answers
 
-    def _load(self, answers: Sequence[Answer]) -> None:
+    def _load(self, answers: Sequence[Unchecked]) -> None:
         """Writes bricks."""
         free = self._unused[1:]
         for answer in answers:
@@ -116,7 +116,7 @@ class DeviceFrame(RecordedFrame):
             self._made[4:5] += put[2:]
             self._made[5:] += failed
 
-    def _subdivide(self, answers: Sequence[Answer], chosen: Tensor, priority: Tensor) -> None:
+    def _subdivide(self, answers: Sequence[Unchecked], chosen: Tensor, priority: Tensor) -> None:
         """Subdivides nodes (batch,), and notes which of their children are to be subdivided, too,
         those of the first nodes first.
         """
@@ -138,7 +138,7 @@ class DeviceFrame(RecordedFrame):
         taken = split.flatten() & (rank <= self.batch)
         put_rows_of(self._below, torch.where(taken, rank - 1, -1), rows)
 
-    def _fill(self, answer: Answer, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _fill(self, answer: Unchecked, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Loads nodes (k,): (3,) counts of `Put`, how many need none (1,), how many failed (1,)."""
         node, batch, given = answer
         bricks = checked_bricks(given, batch.nodes, batch.source.producer, look=False)
@@ -154,7 +154,7 @@ class DeviceFrame(RecordedFrame):
         put = put_bricks(self.cache, _only(batch.targets, node, data), bricks.data, free)
         return put.counts, constant, ((node >= 0) & ~good).sum().view(1)
 
-    def _classify(self, answer: Answer, free: Tensor) -> tuple[Put, Tensor]:
+    def _classify(self, answer: Unchecked, free: Tensor) -> tuple[Put, Tensor]:
         """Subdivides nodes (k,): what became of them, and how many failed (1,)."""
         node, batch, given = answer
         regions = checked_regions(given, batch.nodes, batch.source.producer, look=False)

@@ -170,7 +170,7 @@ class Engine:
             camera: One camera or a batch; an orbit camera stands around the scene's box. Or rays in
                 world units; see `gvtorch.render`.
             shader: The transfer function or another shader, or one for each tree by name.
-            progress: Told how many rays are done.
+            progress: Told how many rows of pixels are done.
             **options: Fields of `RenderOptions`.
 
         Returns:
@@ -255,9 +255,9 @@ class Engine:
     def serve_last_frame(self, stats: FrameStats, wait: bool = False) -> None:
         """Serves the requests of the last frame and writes answers that came late.
 
-        Where the last frame's counts are not here, this frame does without: it makes the same
-        requests again. The host waits for them only if an earlier frame is known to have requests,
-        if an answer is due, if the host is too far ahead, or if `wait` is true.
+        If the last frame's counts have not arrived, nothing is served now: rays ask again for what
+        they still miss. The host waits for the counts only if an earlier frame is known to have
+        requests, if an answer is due, if the host is too far ahead, or if `wait` is true.
         """
         self.renew()
         self.release()
@@ -296,8 +296,9 @@ class Engine:
         """Sends rays ahead of the picture: while answers are written at once, some of those that
         missed something are traced again, and what they miss next is served within this frame.
 
-        They count as rays of the last picture: what any of these used, and what was written since,
-        stays. What is too much for budgets or pools is left to the whole picture.
+        They have the frame number of the last picture: no slot is given away that it or they used,
+        or that was written since. What is too much for budgets or pools is left to the whole
+        picture.
         """
         written, hits = 0, None
         for _ in range(self.options.scout_rounds):
@@ -503,7 +504,7 @@ class Engine:
                 "Engine.capture: trees that overlap can't be recorded: the host waits for them"
             )
         if view.options.layer is not None:
-            view.options.layer.check_device("capture", self.device)
+            view.options.layer.check_device(self.device)
         check.whole("capture", "batch", batch, low=1, high=1 << 18)
         check.number("capture", "look_ahead", look_ahead, low=0, high=1000)
         check.instance("capture", "fit", fit, bool)

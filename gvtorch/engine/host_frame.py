@@ -95,7 +95,9 @@ class HostFrame(RecordedFrame):
             return
         self.active = False
         self._waiting.clear()
-        with self._lock:  # what a thread works on now is posted before, and dropped, or not at all
+        # An answer in the making is either posted before the lock is held, and dropped below, or
+        # comes after, and is refused because its turn is an old one.
+        with self._lock:
             self.turn += 1
             for chosen in self._chosen.values():
                 chosen.clear()
@@ -115,7 +117,9 @@ class HostFrame(RecordedFrame):
             self._write(source, mail)
 
     def finish(self, hits: Hits) -> Collected:
-        """And chooses what the host is asked for, which is marked as pending."""
+        """Ends a frame as `RecordedFrame.finish` does, then chooses the nodes that producers are
+        asked for, marks them as pending, and lets the host read them with the frame's numbers.
+        """
         collected = super().finish(hits)
         words, chosen = self.cache.nodes.request_tn.view(-1), self.choose()
         for kind, (node, _) in zip(KINDS.values(), chosen, strict=True):
@@ -225,14 +229,10 @@ class HostFrame(RecordedFrame):
             self._split(turn, batch, error)
             return
         if isinstance(answer, Future):
-            self._waiting[answer] = time.monotonic() + self._patience(batch), batch
+            self._waiting[answer] = time.monotonic() + self._production.patience_of(batch), batch
             answer.add_done_callback(arrived)
         else:
             self._settle(turn, batch, lambda: answer)
-
-    def _patience(self, batch: RequestBatch) -> float:
-        own = batch.source.producer.patience
-        return self._production.patience if own is None else own
 
     def _give_up(self) -> None:
         """Counts answers as failed that have not come in time."""
@@ -240,15 +240,15 @@ class HostFrame(RecordedFrame):
         for future, (until, batch) in list(self._waiting.items()):
             if until < now and self._waiting.pop(future, None) is not None:
                 future.cancel()
-                self._fail(self.turn, batch, f"no answer within {self._patience(batch):g} s")
+                patience = self._production.patience_of(batch)
+                self._fail(self.turn, batch, f"no answer within {patience:g} s")
 
     def _split(self, turn: int, batch: RequestBatch, error: Exception) -> None:
         if len(batch) == 1:
             self._fail(turn, batch, f"{type(error).__name__}: {error}", error)
             return
-        half = len(batch) // 2
-        self._submit(turn, batch[:half])
-        self._submit(turn, batch[half:])
+        for half in batch.halves():
+            self._submit(turn, half)
 
     def _settle(self, turn: int, batch: RequestBatch, answer: Callable[[], Any]) -> None:
         """Checks an answer and posts it, in whatever thread brings it."""
@@ -273,12 +273,9 @@ class HostFrame(RecordedFrame):
     def _name_errors(self, turn: int, batch: RequestBatch, answer: Regions | Bricks) -> Tensor:
         """(k,) bool, which nodes of a batch have an item that failed; names them."""
         bad = torch.zeros(len(batch), dtype=torch.bool)
-        per_node = len(batch.loc) // len(batch)
-        for index in sorted(answer.errors):
-            node = index // per_node
-            if not bad[node]:
-                bad[node] = True
-                self._fail(turn, batch[node : node + 1], answer.errors[index])
+        for node, message in batch.failed(answer).items():
+            bad[node] = True
+            self._fail(turn, batch[node : node + 1], message)
         return bad
 
     def _fail(

@@ -127,7 +127,7 @@ class _Waiting:
 
 
 def _outcome(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
-    """Returns what a call to a producer gave, and what it raised instead."""
+    """Calls a producer; returns its answer and None, or None and the error that it raised."""
     try:
         return call(), None
     except Exception as error:
@@ -178,6 +178,11 @@ class Production:
                 known = (b for b in batches if b.kind == kind and b.coarse == number)
                 free[number] = max(0, free[number] - sum(map(len, known)))
         return room
+
+    def patience_of(self, batch: RequestBatch) -> float:
+        """Seconds after which a batch is given up: the producer's own, if it has any."""
+        own = batch.source.producer.patience
+        return self.patience if own is None else own
 
     def ask(self, trees: Sequence[ProducedTree], chosen: Mapping[int, Tensor]) -> list[Answered]:
         """Asks for the chosen (k,) nodes of each kind; returns answers that are here at once."""
@@ -321,9 +326,7 @@ class Production:
 
     def _wait_for(self, batch: RequestBatch, asked: Future) -> None:
         self._mark(batch)
-        own = batch.source.producer.patience
-        patience = self.patience if own is None else own
-        future = self._sent_ahead(batch, asked)
+        future, patience = self._sent_ahead(batch, asked), self.patience_of(batch)
         self._waiting.append(_Waiting(batch, asked, future, patience, time.monotonic()))
 
     def _sent_ahead(self, batch: RequestBatch, asked: Future) -> Future:
@@ -345,16 +348,13 @@ class Production:
         return ahead
 
     def _settle(self, batch: RequestBatch, answer: Any, raised: Exception | None) -> list[Answered]:
-        """Checks an answer, or deals with an error. A producer that raised is asked again for each
-        half of the batch, so that one bad node does not take the others with it.
-        """
+        """Checks an answer; where the producer raised, asks it again for each half of the batch."""
         if raised is not None:
             self._raised += 1
             if len(batch) == 1 or self._raised > _MOST_RAISES:
                 self._fail(batch, f"{type(raised).__name__}: {raised}", raised)
                 return []
-            half = len(batch) // 2
-            return [*self._submit(batch[:half]), *self._submit(batch[half:])]
+            return [one for half in batch.halves() for one in self._submit(half)]
         if isinstance(answer, Shipment):
             return [Answered(batch, answer)]
         try:
@@ -363,15 +363,12 @@ class Production:
             self._fail(batch, str(error), error)
             return []
         if checked.errors:
-            per_node = len(batch.loc) // len(batch)
-            named: dict[int, str] = {}
-            for index in sorted(checked.errors):
-                named.setdefault(index // per_node, checked.errors[index])
-            for node, message in named.items():
+            failed = batch.failed(checked)
+            for node, message in failed.items():
                 self._fail(batch[node : node + 1], message)
             keep = torch.ones(len(batch), dtype=torch.bool)
-            keep[list(named)] = False
-            rows = keep.repeat_interleave(per_node).nonzero()[:, 0]
+            keep[list(failed)] = False
+            rows = keep.repeat_interleave(batch.per_node).nonzero()[:, 0]
             batch, checked = batch[keep.nonzero()[:, 0]], checked.rows(rows)
         return [Answered(batch, shipped(batch, checked, self.staging))] if len(batch) else []
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from .stats import FrameStats
 
 _STRIDES = (16, 4)  # pixels from scout to scout
-_FEW = 16  # one of so many rays is not waited for: it goes on with the next ones
+_FEW = 16  # if no more than one ray of so many misses something, the next ones are not kept waiting
 
 
 class RaySubsets:
@@ -89,8 +89,8 @@ class RaySubsets:
         self.over = self.done == self.count
 
     def _choose(self, group: Tensor, in_grids: Sequence[int]) -> None:
-        """Lets a group's scouts be traced next, of which each grid has as many; all of the group
-        where these are few.
+        """Lets a group's scouts be traced next, all of the group where they are few; `in_grids`
+        tells how many of the group lie on each grid.
         """
         for grid, size, here in zip(self._grids, self._sizes, in_grids, strict=True):
             if here * _FEW > size:

@@ -73,6 +73,13 @@ class RequestBatch:
                 parts.append(replace(part, coarse=mask is coarse))
         return parts
 
+    def halves(self) -> tuple[RequestBatch, RequestBatch]:
+        """The first half, and the rest: a producer that raised is asked again for each, so that one
+        bad node does not take the others with it.
+        """
+        half = len(self) // 2
+        return self[:half], self[half:]
+
     def __getitem__(self, index: slice | Tensor) -> RequestBatch:
         if isinstance(index, Tensor):
             index = upload(index, self.targets.node.device)
@@ -97,6 +104,18 @@ class RequestBatch:
         digits = torch.stack((child % n, child // n % n, child // n**2, torch.ones_like(child)), 1)
         low = torch.cat((loc[:, :3] * n, loc[:, 3:]), 1)
         return (low[:, None] + digits).flatten(0, 1)
+
+    @property
+    def per_node(self) -> int:
+        """How many items an answer has for each node of the batch."""
+        return len(self.loc) // len(self)
+
+    def failed(self, answer: Regions | Bricks) -> dict[int, str]:
+        """Why nodes failed, by their place in the batch: the first error among a node's items."""
+        found: dict[int, str] = {}
+        for index in sorted(answer.errors):
+            found.setdefault(index // self.per_node, answer.errors[index])
+        return found
 
     def alias_tree(self, answer: Regions | Bricks) -> int:
         """Number of the tree in which the alias targets of an answer lie."""

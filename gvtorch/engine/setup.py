@@ -159,15 +159,15 @@ def _check_memory(
             raise ValueError(f"Engine: {told} take {total}, {place} has {amount(free)} free")
 
 
-def _slots(name: str, given: int | str, slot: int, least: int, beside: int = 0) -> int:
-    """Returns how many slots a pool's bytes hold; `beside` of them are for coarse channels."""
+def _slots(name: str, given: int | str, slot: int, least: int, coarse: int = 0) -> int:
+    """Returns how many slots fit into a pool's bytes, less those set aside for coarse channels."""
     size = check.nbytes("Engine", name, given)
-    count = max(0, size - beside) // slot
+    count = max(0, size - coarse) // slot
     if count < least:
-        kinds = f" beside {beside} for coarse channels" if beside else ""
+        kinds = f" beside {coarse} bytes for coarse channels" if coarse else ""
         raise ValueError(
             f"Engine: {name} of {size} bytes holds {count} slots of {slot} bytes{kinds}, "
-            f"at least {least} are needed ({least * slot + beside} bytes)"
+            f"at least {least} are needed ({least * slot + coarse} bytes)"
         )
     return count
 

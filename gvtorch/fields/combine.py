@@ -13,39 +13,21 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from ..base import check
-from .distance import HASH, Distance
+from .distance import HASH, Changed, Distance
 from .field import Bounds, Field, Interval, Values, checked_field
 from .solid import Solid
 
 
-class Painted(Distance):
+class Painted(Changed):
     """A shape coloured by a field of linear red, green and blue, 0 to 1."""
 
     def __init__(self, shape: Distance, colors: nn.Module) -> None:
         """Takes the shape and what gives (..., 3) colours at points (..., 3)."""
-        super().__init__()
-        self.shape = check.instance("Painted", "shape", shape, Distance)
+        super().__init__(shape)
         self.paint = checked_field("Painted", "colors", colors)
-        self.exact, self.smooth = shape.exact, shape.smooth
-
-    def forward(self, points: Tensor) -> Tensor:
-        return self.shape(points)
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
         return self.shape(points), self.paint(points).clamp(0, 1)
-
-    def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.slope(center, half)
-
-    def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        return self.shape.bounds(center, half)
-
-    def near(self, center: Tensor, half: Tensor) -> Distance:
-        return self.replaced(shape=self.shape.near(center, half))
-
-    def alike(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.alike(center, half)
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         return torch.zeros_like(center), torch.ones_like(center)

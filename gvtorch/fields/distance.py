@@ -13,6 +13,7 @@ Sources: Hart, "Sphere tracing: a geometric method for the antialiased ray traci
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -210,14 +211,50 @@ class SmoothUnion(Pair):
         return None if found is None else grown(found, self.width / 4)
 
 
-class Negative(Distance):
-    """What lies outside of a shape."""
+class OfShape(Field):
+    """Base of fields made of one shape, which is asked in boxes `over` those that they are asked
+    in: the same of it matters.
+    """
+
+    shape: Distance
+
+    def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns boxes (k, 3) that hold all points at which the shape is asked in boxes; the boxes
+        themselves unless overridden.
+        """
+        return center, half
+
+    def near(self, center: Tensor, half: Tensor) -> Self:
+        return self.replaced(shape=self.shape.near(*self.over(center, half)))
+
+    def alike(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.alike(*self.over(center, half))
+
+
+class Changed(OfShape, Distance):
+    """Base of shapes made of one: with its values, slope and colours, unless overridden."""
 
     def __init__(self, shape: Distance) -> None:
         """Takes the shape, with its colour."""
         super().__init__()
-        self.shape = check.instance("Negative", "shape", shape, Distance)
+        self.shape = check.instance(type(self).__name__, "shape", shape, Distance)
         self.exact, self.smooth = shape.exact, shape.smooth
+
+    def forward(self, points: Tensor) -> Tensor:
+        return self.shape(points)
+
+    def slope(self, center: Tensor, half: Tensor) -> Tensor:
+        return self.shape.slope(*self.over(center, half))
+
+    def bounds(self, center: Tensor, half: Tensor) -> Interval:
+        return self.shape.bounds(*self.over(center, half))
+
+    def colors(self, center: Tensor, half: Tensor) -> Interval:
+        return self.shape.colors(*self.over(center, half))
+
+
+class Negative(Changed):
+    """What lies outside of a shape."""
 
     def forward(self, points: Tensor) -> Tensor:
         return -self.shape(points)
@@ -226,21 +263,9 @@ class Negative(Distance):
         value, color = self.shape.surface(points)
         return -value, color
 
-    def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.slope(center, half)
-
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         low, high = self.shape.bounds(center, half)
         return -high, -low
-
-    def near(self, center: Tensor, half: Tensor) -> Distance:
-        return self.replaced(shape=self.shape.near(center, half))
-
-    def alike(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.alike(center, half)
-
-    def colors(self, center: Tensor, half: Tensor) -> Interval:
-        return self.shape.colors(center, half)
 
 
 class Difference(Intersection):

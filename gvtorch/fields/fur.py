@@ -7,22 +7,21 @@ Source: Perlin, Hoffert, "Hypertexture", SIGGRAPH 1989 (fur as noise around a su
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Self
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from . import noise
-from .distance import Distance, grown
-from .field import Field, Interval, length
+from .distance import Distance, OfShape, grown
+from .field import Interval, length
 
 _SKIN = 0.1  # value of skin and roots
 _HALF, _SPREAD = 0.45, 0.7  # height at which hairs end, in lengths: half + spread * noise
 _SHARP = 5.0  # how fast a hair ends, by lengths
 
 
-class Fur(Field):
+class Fur(OfShape):
     """Value 0 between hairs, and from 0.1 at their roots to 1 at tips one length high. A point
     belongs to a hair where the noise at its root, the nearest point of the shape, is above its
     height.
@@ -84,12 +83,6 @@ class Fur(Field):
         skin = high < (_HALF - reach - 1 / _SHARP) * self.length
         least = _SKIN * skin.to(low)
         return {"value": (least, torch.where(skin, least, (~above).to(low)))}
-
-    def near(self, center: Tensor, half: Tensor) -> Self:
-        return self.replaced(shape=self.shape.near(center, half))
-
-    def alike(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.alike(center, half)
 
     def box(self) -> Tensor | None:
         """Around the shape and its hairs."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.volume import Volume
-from ..meshes.holes import Solid, told_of_holes
+from ..meshes.holes import SolidParts, told_of_holes
 from ..meshes.mesh import Mesh
 from ..meshes.voxelizer import Voxelizer
 from .distance import WHITE, Color, Distance
@@ -65,7 +65,7 @@ class SampledDistance(Distance):
         *,
         resolution: int = 96,
         reach: float = 0.25,
-        solid: Solid = "auto",
+        solid: SolidParts = "auto",
         color: Color = WHITE,
     ) -> SampledDistance:
         """Returns the distances to a mesh's surface, negative inside of closed parts: exact within

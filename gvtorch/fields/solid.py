@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Self
 
 import torch
 from torch import Tensor
 
 from ..base import check
-from .distance import Distance
-from .field import Field, Interval, length
+from .distance import Distance, OfShape
+from .field import Interval, length
 
 _POINT = 1e-30  # side of voxels of no size
 _DEEP = 4.0  # voxels below the surface from which on nothing but its colour is told
 
 
-class Solid(Field):
+class Solid(OfShape):
     """The inside of a shape. A voxel holds the share of it that lies inside, as if the surface were
     a plane across it: clamp(1/2 - distance / side), the exact share where the plane faces an axis,
     and right to 0.09 in every direction. So all levels are antialiased, at one evaluation a voxel.
@@ -123,12 +122,6 @@ class Solid(Field):
             turned = torch.where(deep, 0.0, 1.0).to(low)[:, None].expand(-1, 3)
             known["normal"] = (-turned, turned)
         return known
-
-    def near(self, center: Tensor, half: Tensor) -> Self:
-        return self.replaced(shape=self.shape.near(center, half))
-
-    def alike(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.alike(center, half)
 
     def box(self) -> Tensor | None:
         return self.shape.box()

@@ -15,28 +15,18 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .distance import Distance, grown
+from .distance import Changed, Distance, grown
 from .field import Interval, length, tighter
 
 Matrix = Sequence[Sequence[float]]
 
 
-class Space(Distance):
+class Space(Changed):
     """Base of shapes that are asked somewhere else: at `place` of a point, in boxes `over`."""
 
-    def __init__(self, shape: Distance) -> None:
-        """Takes the shape, with its colour."""
-        super().__init__()
-        self.shape = check.instance(type(self).__name__, "shape", shape, Distance)
-        self.exact, self.smooth = shape.exact, shape.smooth
-
     def place(self, points: Tensor) -> Tensor:
-        """Returns the points (..., 3) at which the shape is asked."""
-        raise NotImplementedError
-
-    def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns boxes (k, 3) that hold `place` of all points of boxes."""
-        raise NotImplementedError
+        """Returns the points (..., 3) at which the shape is asked; itself unless overridden."""
+        return points
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
         """Returns the value at points, given the shape's; it never falls where that rises."""
@@ -54,22 +44,13 @@ class Space(Distance):
         return self.value(value, points), color
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.slope(*self.over(center, half)) * self.stretch(center, half)
+        return super().slope(center, half) * self.stretch(center, half)
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """What the shape tells of the place of a box, and the slope."""
-        low, high = self.shape.bounds(*self.over(center, half))
+        low, high = super().bounds(center, half)
         known = self.value(low, center), self.value(high, center)
-        return tighter(known, super().bounds(center, half))
-
-    def near(self, center: Tensor, half: Tensor) -> Distance:
-        return self.replaced(shape=self.shape.near(*self.over(center, half)))
-
-    def alike(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.alike(*self.over(center, half))
-
-    def colors(self, center: Tensor, half: Tensor) -> Interval:
-        return self.shape.colors(*self.over(center, half))
+        return tighter(known, Distance.bounds(self, center, half))
 
 
 class Transform(Space):
@@ -112,9 +93,6 @@ class Transform(Space):
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
         return value * self.scale
-
-    def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        return self.shape.slope(*self.over(center, half))
 
     def box(self) -> Tensor | None:
         box = self.shape.box()
@@ -255,12 +233,6 @@ class Offset(Space):
         """Takes the shape, and how far its surface moves outwards."""
         super().__init__(shape)
         self.number("by", by)
-
-    def place(self, points: Tensor) -> Tensor:
-        return points
-
-    def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-        return center, half
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
         return value - self.by

@@ -16,7 +16,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -24,9 +24,9 @@ import torch
 from ..base import check
 from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
-from ..meshes.holes import Solid, check_solid, prepared, told_of_holes
+from ..meshes.holes import SolidParts, check_solid, once_filled, told_of_holes
 from ..meshes.mesh import Material, Mesh
-from ..meshes.voxelizer import CHANNELS, Voxelizer, check_channels
+from ..meshes.voxelizer import CHANNELS, GridSettings, Voxelizer, check_channels
 from .mesh_file import read_mesh
 from .source import VolumeSource
 from .stores.channels import convert_channels
@@ -45,7 +45,7 @@ class MeshSource(VolumeSource):
     resolution: int
     band: float
     thickness: float
-    solid: Solid
+    solid: SolidParts
     marks: tuple[Any, ...]  # identify mesh and settings: equal while these are unchanged
     words: tuple[str, ...] = ()  # of the command line beside these
     several: bool = False  # whether its store holds other channels, too
@@ -58,13 +58,14 @@ class MeshSource(VolumeSource):
         given: str | Path | Mesh,
         channels: str | Sequence[str] = "coverage",
         *,
-        resolution: int,
+        resolution: int = 1024,
         band: float = 4.0,
         thickness: float = 1.0,
-        solid: Solid = "auto",
+        solid: SolidParts = "auto",
         texture: str | Path | None = None,
     ) -> dict[str, MeshSource]:
         """Reads the mesh, and lays a grid around it: a source for each channel; see `voxelize`."""
+        check.whole("voxelize", "resolution", resolution, low=8, high=2**20)
         check.instance("voxelize", "mesh", given, Mesh, str, PathLike)
         check_solid("voxelize", solid)
         names = check_channels("voxelize", channels)
@@ -77,9 +78,8 @@ class MeshSource(VolumeSource):
         if solid == "auto" and (told := told_of_holes(mesh)):
             warnings.warn(told, stacklevel=3)
         marks.insert(0, _checksum(mesh))
-        mesh = prepared(mesh, solid)
         grid: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
-        made = Voxelizer(mesh, channels=names, **grid, solid=_as_it_is(solid))
+        made = Voxelizer(mesh, channels=names, **grid, solid=solid)
         told_words = [word for key, n in grid.items() for word in (f"--{key}", f"{n:g}")]
         words = ("--channels", ",".join(names), *told_words, "--solid", solid)
         found = {}
@@ -103,7 +103,7 @@ class MeshSource(VolumeSource):
                 marks=tuple(marks),
                 words=words if texture is None else (*words, "--texture", str(texture)),
                 several=len(names) > 1,
-                mesh=mesh,
+                mesh=made.mesh,
             )
         return found
 
@@ -149,30 +149,22 @@ def _voxelizer(source: MeshSource) -> Voxelizer:
         channels=(source.channel,),
         band=source.band,
         thickness=source.thickness,
-        solid=_as_it_is(source.solid),
+        solid=once_filled(source.solid),
     )
-
-
-def _as_it_is(solid: Solid) -> Solid:
-    """`solid` for a mesh whose holes are filled already."""
-    return "auto" if solid == "always" else solid
 
 
 def voxelize(
     mesh: str | Path | Mesh,
     store: str | Path,
     *,
-    resolution: int = 1024,
     channels: str | Sequence[str] = "coverage",
-    band: float = 4.0,
-    thickness: float = 1.0,
-    solid: Solid = "auto",
     texture: str | Path | None = None,
     block: int = 32,
     executor: Executor | None = None,
     workers: int | None = None,
     resume: bool = False,
     progress: Progress = no_progress,
+    **settings: Unpack[GridSettings],
 ) -> Store:
     """Writes a mesh into a store, out of core: what is in memory is the mesh and a few cubes of
     voxels.
@@ -183,15 +175,11 @@ def voxelize(
     Args:
         mesh: A `Mesh`, or a file that `read_mesh` knows.
         store: The folder to make.
-        resolution: Finest voxels along the longest side.
         channels: One or several of coverage, distance, color, normal and material; see `Voxelizer`.
             Several lie side by side in the folder, for `StoredChannels`.
-        band: Finest voxels up to which the nearest place of the surface counts.
-        thickness: Finest voxels, of what bounds no solid.
-        solid: auto: what is closed is a solid; always: holes are filled before; never: all is a
-            sheet.
         texture: As of `read_mesh`, of files.
         block, executor, workers, resume, progress: As of `convert`.
+        **settings: resolution, band, thickness and solid, as of `gv.MeshProducer`.
 
     Returns:
         The store, open; of several channels that of the first. Its coarse levels are means of those
@@ -200,9 +188,8 @@ def voxelize(
     Raises:
         ValueError, OSError, KeyboardInterrupt: As of `read_mesh` and `convert`.
     """
-    check.whole("voxelize", "resolution", resolution, low=8, high=2**20)
-    grid: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
-    sources = MeshSource.of(mesh, channels, **grid, solid=solid, texture=texture)
+    check.known("voxelize", settings, GridSettings)
+    sources = MeshSource.of(mesh, channels, **settings, texture=texture)
     told: dict[str, Any] = {"block": block, "executor": executor, "workers": workers}
     told |= {"resume": resume, "progress": progress}
     if len(sources) > 1:

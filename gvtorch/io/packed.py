@@ -102,6 +102,27 @@ def _words(stream: IO[bytes]) -> Iterator[list[bytes]]:
         yield words
 
 
+def unpack_block(codec: str, packed: Any, need: int) -> bytes:
+    """Unpacks "zlib", "lzma", "lz4" or "blosc" data in memory, which must be of `need` bytes."""
+    if not need:
+        return b""
+    if codec == "zlib":
+        found = zlib.decompressobj().decompress(packed, need + 1)
+    elif codec == "lzma":
+        import lzma
+
+        found = lzma.LZMADecompressor().decompress(packed, need + 1)
+    else:
+        told = int.from_bytes(packed[4:8], "little"), int.from_bytes(packed[12:16], "little")
+        if codec == "blosc" and (len(packed) < 16 or told != (need, len(packed))):
+            raise ValueError(f"a block of {need} bytes expected, its head tells of {told[0]}")
+        codecs = need_library(f"what is packed by {codec}", "imagecodecs")
+        found = bytes(getattr(codecs, f"{codec}_decode")(bytes(packed), out=need))
+    if len(found) != need:
+        raise ValueError(f"a block of {need} bytes expected, {len(found)} found")
+    return found
+
+
 def unpack(file: str, offset: int, need: int, codec: str) -> bytes:
     """Unpacks "zlib" (or gzip) or "bz2" data of a file, which must be of `need` bytes, and no
     further than these.
@@ -138,30 +159,6 @@ def _unpacked(stream: IO[bytes], codec: str, need: int) -> Iterator[bytes]:
         part = engine.decompress(packed, need + 1 - size)
         size += len(part)
         yield part
-
-
-def unpack_block(codec: str, packed: bytes, need: int) -> bytes:
-    """Unpacks "zlib", "lzma", "lz4" or "blosc" data, which must be of `need` bytes."""
-    if not need:
-        return b""
-    if codec == "zlib":
-        found = zlib.decompressobj().decompress(packed, need + 1)
-    elif codec == "lzma":
-        import lzma
-
-        found = lzma.LZMADecompressor().decompress(packed, need + 1)
-    elif codec == "lz4":
-        imagecodecs = need_library("what is packed by LZ4", "imagecodecs")
-        found = bytes(imagecodecs.lz4_decode(packed, out=need))
-    else:
-        told = int.from_bytes(packed[4:8], "little"), int.from_bytes(packed[12:16], "little")
-        if len(packed) < 16 or told != (need, len(packed)):
-            raise ValueError(f"a packed part of {need} bytes expected, its head tells of {told[0]}")
-        imagecodecs = need_library("what is packed by Blosc", "imagecodecs")
-        found = bytes(imagecodecs.blosc_decode(packed, out=need))
-    if len(found) != need:
-        raise ValueError(f"a part of {need} bytes expected, {len(found)} found")
-    return found
 
 
 def blosc_begin(packed: bytes, most: int) -> bytes:

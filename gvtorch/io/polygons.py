@@ -11,7 +11,7 @@ import numpy as np
 
 _FACE = re.compile(rb"^[ \t]*f((?:[ \t]+[-\d/]+){4,})[ \t]*(?=\r?$)", re.MULTILINE)
 _VERTEX = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
-_MOST = 1000  # corners of a polygon to cut: it takes the square of them
+_MOST = 1000  # corners of a polygon to cut: the worst take the cube of them
 _ROUND = 1e-9  # of the polygon's area, below which a corner counts as straight
 
 
@@ -82,9 +82,9 @@ def _turns(flat: np.ndarray) -> np.ndarray:
 
 
 def ears(flat: np.ndarray) -> list[list[int]]:
-    """Cuts a polygon (n, 2), counter-clockwise, into n - 2 triangles of its corners: one corner
-    after another that is convex, and no other one lies in its triangle. What crosses itself and
-    has no such corner is cut as a fan.
+    """Cuts a polygon (n, 2), counter-clockwise, into n - 2 triangles of its corners: cuts off, one
+    by one, a convex corner whose triangle holds no other corner (an ear). A polygon that crosses
+    itself and has no ear left is cut as a fan.
 
     Source: Meisters, "Polygons have ears", American Mathematical Monthly 82, 1975.
     """
@@ -93,8 +93,8 @@ def ears(flat: np.ndarray) -> list[list[int]]:
     while len(left) > 3:
         own = flat[left]
         turn = _turns(own)
-        dents = own[turn <= _ROUND]
-        at = next((n for n in np.argsort(-turn) if _is_ear(own, int(n), turn[n], dents)), None)
+        not_convex = own[turn <= _ROUND]
+        at = next((n for n in np.argsort(-turn) if _is_ear(own, int(n), turn[n], not_convex)), None)
         if at is None:
             break
         n = int(at)
@@ -103,12 +103,12 @@ def ears(flat: np.ndarray) -> list[list[int]]:
     return found + [[left[0], left[n], left[n + 1]] for n in range(1, len(left) - 1)]
 
 
-def _is_ear(polygon: np.ndarray, at: int, turn: float, dents: np.ndarray) -> bool:
+def _is_ear(polygon: np.ndarray, at: int, turn: float, not_convex: np.ndarray) -> bool:
     if turn <= 0:
         return False
     a, b, c = polygon[at - 1], polygon[at], polygon[(at + 1) % len(polygon)]
-    inside = np.ones(len(dents), bool)
+    inside = np.ones(len(not_convex), bool)
     for begin, end in ((a, b), (b, c), (c, a)):
-        inside &= _cross(end - begin, dents - begin) >= 0
-        inside &= (dents != begin).any(1)
+        inside &= _cross(end - begin, not_convex - begin) >= 0
+        inside &= (not_convex != begin).any(1)
     return not inside.any()

@@ -25,14 +25,12 @@ from typing import IO, Any, Self
 import numpy as np
 
 from ..base import boxes
-from ..base.digits import whole_number
 from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
 from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
-_LISTED = 20  # names that a message lists
 _PART = 1 << 20  # bytes that are unpacked at a time
 #: (4, 4) of world axes that run left and posterior, to right and anterior ones.
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -305,39 +303,6 @@ def no_time(where: str, time: object, times: int) -> str:
     """The message about a time point that is not there."""
     one = "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
     return f"{where}: has no time {time!r}; it has {one}"
-
-
-def choose(
-    path: str, what: str, names: Sequence[str], key: str | None, *, first: int = 0
-) -> tuple[int, list[str]]:
-    """Which of several images, grids or arrays of a file is meant.
-
-    Args:
-        path: The file, for messages.
-        what: What they are, in one word.
-        names: What each is called; texts of numbers where they have numbers alone.
-        key: One of the names, or a number from 0; None: the `first`.
-
-    Returns:
-        Its number, and what to say of the others.
-
-    Raises:
-        ValueError: There is none, or none of this name or number.
-    """
-    if not names:
-        raise ValueError(f"{path}: holds no {what}")
-    numbered = all(whole_number(name) is not None for name in names)
-    told = [one if numbered else f"{n} {one!r}" for n, one in enumerate(names[:_LISTED])]
-    listed = ", ".join(told) + ", ..." * (len(names) > _LISTED)
-    if key is None:
-        others = f"{len(names) - 1} other {what.removesuffix('s')}s"
-        return first, [f"{others}; key (--key) chooses among {listed}"] if names[1:] else []
-    if key in names:
-        return names.index(key), []
-    number = None if numbered else whole_number(key)
-    if number is None or number >= len(names):
-        raise ValueError(f"{path}: has no {what} {key!r}; it holds {listed}")
-    return number, []
 
 
 @contextmanager

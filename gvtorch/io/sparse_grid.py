@@ -21,7 +21,7 @@ import numpy as np
 
 from ..base.image_info import ChannelInfo, ImageInfo
 from ..base.volume import check_extent
-from .source import Index, VolumeSource, choose, place_axes
+from .source import Index, VolumeSource, place_axes
 
 SIDES = (4096, 128, 8)  # voxels along a side of an upper node, a lower node and a leaf
 COUNTS = (32, 16, 8)  # entries along a side of each
@@ -234,13 +234,6 @@ def describe(
         ),
         **place_axes(path, shifted, shape, component=3 if width > 1 else None),
     }
-
-
-def choose_grid(path: str, names: Sequence[str], key: str | None) -> tuple[int, list[str]]:
-    """As `choose`; the first is "density" if there is one, and names may be as in f.vdb:/name."""
-    first = names.index("density") if "density" in names else 0
-    key = None if key is None else key.removeprefix("/")
-    return choose(path, "grid", names, key, first=first)
 
 
 def bits(data: Any, at: int, count: int) -> np.ndarray:

@@ -16,7 +16,8 @@ import torch
 from .mesh import Mesh, edges_of, facing_away, parts_of, solids, welded
 from .winding import WindingNumber
 
-Solid = Literal["auto", "always", "never"]  # which parts are solids: closed ones, filled ones, none
+#: Which parts are solids: closed ones, filled ones, none.
+SolidParts = Literal["auto", "always", "never"]
 
 _RINGS = 4  # of triangles between a hole's rim and its middle
 _STEPS = 12  # of the bisection
@@ -121,13 +122,18 @@ def told_of_holes(mesh: Mesh) -> str:
 
 
 def check_solid(where: str, solid: str) -> None:
-    """Raises ValueError unless it is a `Solid`."""
-    known = get_args(Solid)
+    """Raises ValueError unless it is a `SolidParts`."""
+    known = get_args(SolidParts)
     if solid not in known:
         raise ValueError(f"{where}: solid must be one of {', '.join(known)}, got {solid!r}")
 
 
-def prepared(mesh: Mesh, solid: Solid) -> Mesh:
+def once_filled(solid: SolidParts) -> SolidParts:
+    """Returns `solid` for a mesh whose holes are filled already."""
+    return "auto" if solid == "always" else solid
+
+
+def prepared(mesh: Mesh, solid: SolidParts) -> Mesh:
     """Returns what is made into voxels."""
     return filled(mesh) if solid == "always" else mesh
 

@@ -205,12 +205,13 @@ def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 
 def facing_away(mesh: Mesh) -> np.ndarray:
-    """Finds triangles that face the other way than most of their part, by area: those that share an
-    edge, and no third one has it, should go along it in opposite ways. What can't face one way
+    """Finds triangles that face the other way than most of their part. Two triangles that alone
+    share an edge face the same way if they run along it in opposite directions; in each part that
+    hangs together by such edges, the side of less area is returned. A part that can't face one way
     altogether, such as a Moebius strip, is left as it is.
 
     Returns:
-        (t,) int64 triangles.
+        (m,) int64 triangles.
     """
     kept, _ = solids(mesh)
     faces = welded(mesh)[kept]
@@ -226,11 +227,11 @@ def facing_away(mesh: Mesh) -> np.ndarray:
     part = parts_of(np.ravel(nodes), np.ravel(hooks), 2 * len(faces), 2 * len(first))
     part = part.reshape(2, len(faces))
     own = part.min(0)
-    others = part[0] > own  # they face the other way than the first one of their part
+    unlike_first = part[0] > own  # they face the other way than the first one of their part
     a, b, c = mesh.corners[kept].transpose(1, 0, 2)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    less = np.bincount(own, np.where(others, area, -area), len(faces))[own]
-    return kept[np.where(part[0] == part[1], False, others == (less <= 0))]
+    excess = np.bincount(own, np.where(unlike_first, area, -area), len(faces))[own]
+    return kept[(part[0] != part[1]) & (unlike_first == (excess <= 0))]
 
 
 def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
@@ -249,7 +250,7 @@ def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
 
 
 def parts_of(face: np.ndarray, edge: np.ndarray, faces: int, edges: int) -> np.ndarray:
-    """(faces,) the smallest triangle of each part; pairs (face, edge) hang together."""
+    """(faces,) the lowest triangle number of each part; pairs (face, edge) hang together."""
     label = np.arange(faces)
     while True:
         least = np.full(edges, faces)

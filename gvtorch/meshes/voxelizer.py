@@ -7,14 +7,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from .geometry import Cubes, Geometry
-from .holes import Solid, check_solid, prepared
+from .holes import SolidParts, check_solid, prepared
 from .mesh import Mesh
 from .paint import Paint
 
@@ -31,6 +31,15 @@ _CUBE, _PARTS = 8, 4  # voxels along a side of the cubes of a region; of so many
 _BATCH = 1 << 20  # voxels that are made together
 _FINER = 2  # places along a side that a coarse voxel is the mean of
 _DIAGONAL = 0.5 * math.sqrt(3)  # from a voxel's centre to its corner
+
+
+class GridSettings(TypedDict, total=False):
+    """Settings of a `Voxelizer`, whatever its channels."""
+
+    resolution: int
+    band: float
+    thickness: float
+    solid: SolidParts
 
 
 def check_channels(where: str, channels: str | Sequence[str]) -> tuple[str, ...]:
@@ -73,7 +82,7 @@ class Voxelizer:
         channels: Sequence[str] = ("coverage",),
         band: float = 4.0,
         thickness: float = 1.0,
-        solid: Solid = "auto",
+        solid: SolidParts = "auto",
         device: torch.device | str = "cpu",
     ) -> None:
         """Lays the grid around the mesh.

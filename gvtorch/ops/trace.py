@@ -107,7 +107,6 @@ def check_trace(
 
 
 def check_shade(
-    where: str,
     rays: RayArguments,
     arguments: TraceArguments,
     shading: ShadeArguments,
@@ -115,6 +114,7 @@ def check_shade(
     own: bool,
 ) -> None:
     """Checks all that a shader reads; `own`: it is a user's."""
+    where = "shade_rays"
     known = ("",) if own else SHADER_KINDS
     kind = known[check.whole(where, "shader", shading.shader, low=0, high=len(known) - 1)]
     sizes = check_trace(where, rays, arguments, "lmm4" if kind == "PreIntegrated" else "lm4")
@@ -210,7 +210,7 @@ def shade_rays(
 
     Source: Blinn, SIGGRAPH 1977; Engel, Kraus, Ertl, Graphics Hardware 2001.
     """
-    check_shade("shade_rays", rays, arguments, shading, parameter_54, own=op is not None)
+    check_shade(rays, arguments, shading, parameter_54, own=op is not None)
     if choose_backend(backend, rays.origin_r3.device) != "reference":
         return op_of(op)(*rays, *arguments, *shading, parameter_54)
     if op is not None:

@@ -154,13 +154,11 @@ def _widen(rows: Rows, found: _Found, some: np.ndarray, low: np.ndarray, high: n
     high[here] = np.maximum.reduceat(most, first)
 
 
-def _in_cubes(
-    points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes, *, least: int = _CELL
-) -> _Found:
+def _in_cubes(points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes) -> _Found:
     """The rows of a table, of codes of voxels of a level not above the cubes', that lie in them;
     see `_cells`.
     """
-    cells = _cells(points, codes, level, cubes, least=least)
+    cells = _cells(points, codes, level, cubes)
     row, own = cells.listed()
     cube = cells.cube[own]
     voxel = cells.voxels(points.codes, codes[row], own) - cubes.low_k3[cube]

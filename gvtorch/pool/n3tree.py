@@ -386,14 +386,14 @@ class N3Tree:
             number=self.number,
         )
 
-    def warn_if_edited(self, where: str, *, learned: bool = False) -> None:
+    def warn_if_edited(self, *, learned: bool = False) -> None:
         """Warns, once for each edit, if bricks were edited and not refreshed since. `learned`: who
         asks reads bricks that require gradients as they are being trained.
         """
         edited = self.bricks.new_edits(learned)
         if edited:
             warnings.warn(
-                f"{where}: bricks of {', '.join(edited)} were edited, and ranges and coarse levels "
+                f"render: bricks of {', '.join(edited)} were edited, and ranges and coarse levels "
                 "were made before: call tree.refresh()",
                 stacklevel=4,
             )

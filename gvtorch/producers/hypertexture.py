@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from ..base import check
 from ..base.boxes import extent_in
 from ..fields import Distance, noise
-from ..fields.noise.fractal import Octave, octaves_of
+from ..fields.noise.fractal import Octave, octaves_from
 from ..fields.noise.tally import Tally
 from ..pool import Channel
 from .field import (
@@ -110,9 +110,8 @@ class Hypertexture(Tally, Producer):
         check.instance(where, "shape", shape, Distance)
         thickness = check.number(where, "thickness", thickness, low=0, open_low=True)
         amplitude = check.number(where, "amplitude", amplitude, low=0)
-        frequency = check.number(where, "frequency", frequency, low=0, open_low=True)
         softness = check.number(where, "softness", softness, low=0, open_low=True)
-        series = [*octaves_of(where, octaves, lacunarity, gain, seed)]
+        series = octaves_from(where, frequency, octaves, lacunarity, gain, seed)
         most = amplitude * sum(one.amplitude for one in series) * noise.bounds(noise.perlin).high
         reach = thickness * max(most + softness - 0.5, 0.0)
         extent, box = _cut_out(where, shape, reach, extent, box)
@@ -130,9 +129,7 @@ class Hypertexture(Tally, Producer):
         )
         self.shape, self.skip = shape, skip
         self.thickness, self.softness = thickness, softness
-        self.octaves = [
-            Octave(amplitude * one.amplitude, frequency * one.frequency, one.seed) for one in series
-        ]
+        self.octaves = [one._replace(amplitude=amplitude * one.amplitude) for one in series]
         self.dtype = dtype_of_places(box, self.spacing)
         self._levels: list[Level] = []
         self._worn = torch.empty(0)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from ..io.mesh_file import read_mesh
-from ..meshes.holes import Solid, told_of_holes
+from ..meshes.holes import once_filled, told_of_holes
 from ..meshes.mesh import Mesh
-from ..meshes.voxelizer import CHANNELS, Voxelizer
+from ..meshes.voxelizer import CHANNELS, GridSettings, Voxelizer
 from ..pool import Channel
 from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
@@ -35,24 +35,20 @@ class MeshProducer(Producer):
         self,
         mesh: Mesh | str | Path,
         *,
-        resolution: int = 1024,
         channels: Sequence[str] = ("coverage",),
-        band: float = 4.0,
-        thickness: float = 1.0,
-        solid: Solid = "auto",
         branching: int = 2,
+        **settings: Unpack[GridSettings],
     ) -> None:
         """Takes a mesh.
 
         Args:
             mesh: A `Mesh`, or a file that `read_mesh` knows.
-            resolution: Finest voxels along its longest side.
             channels: coverage, distance, color, normal, material; see `Voxelizer`.
-            band: Finest voxels up to which the nearest place of the surface counts.
-            thickness: Finest voxels, of what bounds no solid.
-            solid: auto: what is closed is a solid; always: holes are filled before; never: all is a
-                sheet.
             branching: N.
+            **settings: resolution: finest voxels along its longest side, 1024 if left out. band:
+                finest voxels up to which the nearest place of the surface counts, 4. thickness:
+                finest voxels, of what bounds no solid, 1. solid: "auto", the default: what is
+                closed is a solid; "always": holes are filled before; "never": all is a sheet.
 
         Raises:
             ValueError: It is none of these, a number is out of its range, a channel unknown, or see
@@ -60,16 +56,12 @@ class MeshProducer(Producer):
         """
         check.instance("MeshProducer", "mesh", mesh, Mesh, str, Path)
         mesh = mesh if isinstance(mesh, Mesh) else read_mesh(mesh)
+        check.known("MeshProducer", settings, GridSettings)
+        solid = settings.get("solid", "auto")
         if solid == "auto" and (told := told_of_holes(mesh)):
             warnings.warn(told, stacklevel=2)
-        self._told: dict[str, Any] = {
-            "resolution": resolution,
-            "channels": channels,
-            "band": band,
-            "thickness": thickness,
-        }
-        grid = Voxelizer(mesh, **self._told, solid=solid)
-        self._told["solid"] = "auto" if solid == "always" else solid  # the holes are filled now
+        grid = Voxelizer(mesh, channels=channels, **settings)
+        self._settings: GridSettings = {**settings, "solid": once_filled(solid)}
         ranges = {"coverage": (0.0, 255.0), "distance": (-grid.band, grid.band)}
         super().__init__(
             grid.extent,
@@ -85,7 +77,8 @@ class MeshProducer(Producer):
     def prepare(self, layout: Layout) -> None:
         """Moves the triangles to where they are worked on."""
         if layout.device != self.voxelizer.device:
-            self.voxelizer = Voxelizer(self.voxelizer.mesh, **self._told, device=layout.device)
+            told: dict[str, Any] = {"channels": self.voxelizer.channels, "device": layout.device}
+            self.voxelizer = Voxelizer(self.voxelizer.mesh, **told, **self._settings)
 
     def classify(self, nodes: Nodes) -> Regions:
         """EMPTY outside and CONSTANT inside, where no triangle comes near any voxel in reach."""

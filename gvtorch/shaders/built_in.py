@@ -1,8 +1,8 @@
 """The built-in shaders: what each reads, and what it tells the kernel.
 
-A shader stands in three files, once in each: its struct in cpp_ext/csrc/shaders, listed in
+A shader stands in four files, once in each: its struct in cpp_ext/csrc/shaders, listed in
 shaders.h, which tells what it does with an interval; its torch twin in ops/reference/shaders.py;
-and its class here. Numbers of its own are a record in ops/shading.py.
+its kind, and the record of numbers of its own, in ops/shading.py; and its class here.
 """
 
 from __future__ import annotations

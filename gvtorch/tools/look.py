@@ -82,8 +82,8 @@ class Look:
     lod: Literal["auto", "finest"] = "auto"
     """auto: voxels as wide as a pixel's cone; finest: the data as it is"""
     cone_scale: Annotated[float | None, arg(metavar="FACTOR")] = None
-    """how much wider than a pixel its cone is; 4/3 if left out. With --samples 16 a quarter of
-    that, 0.33, shows most"""
+    """how much wider than a pixel its cone is; 4/3 if left out. With --samples 16, 0.33 (a quarter
+    of it) shows the finest detail"""
     background: Annotated[str, arg(metavar="R,G,B|FILE")] = "0,0,0"
     """linear, 0 to 1; R,G,B/R,G,B from top to bottom; transparent; or an environment map, PNG, EXR,
     TIFF or NPY"""
@@ -139,13 +139,15 @@ class Look:
         return [flag for flag in given(self) if flag[2:].replace("-", "_") in names]
 
     def device(self) -> torch.device:
-        """CUDA where the backend runs there."""
+        """The device that the backend needs; for auto, CUDA if it can be used."""
         import torch
 
         from ..ops import available
         from ..ops.trace import choose_backend
 
-        wants_cuda = self.backend == "cuda" or (self.backend == "auto" and not available()["cuda"])
+        wants_cuda = self.backend == "cuda" or (
+            self.backend == "auto" and available()["cuda"] == ""
+        )
         device = torch.device("cuda" if wants_cuda else "cpu")
         choose_backend(self.backend, device)
         return device

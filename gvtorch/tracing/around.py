@@ -15,14 +15,14 @@ from ..shaders.filtered import Filtered
 from ..shaders.lights import LitShader
 from ..shaders.shader import CutSurface, Shader
 from .clip import Clipped
-from .composite import Trace, tree_span
+from .composite import TraceRays, tree_span
 from .lighting import Lighted
 from .options import RenderOptions
 from .thin_lens import ThinLens, ThroughLens
 from .tracer import Tracer
 
 
-def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> Trace:
+def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRays:
     """Wraps a tree's tracer in what the options ask for. Each ray goes through lighting, then the
     clip, then the lens, then the tree; cones to the lights go through clip and tree alone.
 
@@ -83,12 +83,12 @@ def check_fits(shader: Shader, options: RenderOptions) -> None:
 
 def _clipped(
     tracer: Tracer, options: RenderOptions, box: Tensor, lens: ThinLens | None = None
-) -> Trace:
+) -> TraceRays:
     """A tracer with the lens (in world units) and the options' clip."""
     opened = tracer.shader if options.clip is None else tracer.shader.opened()
     if opened is not tracer.shader:
         tracer = tracer.seeing(opened, options)
-    trace: Trace = tracer
+    trace: TraceRays = tracer
     if lens is not None:
         trace = ThroughLens(trace, lens, options.cone_scale)
     if options.clip is None:
@@ -110,8 +110,8 @@ def _clipped(
 
 
 def _slab(
-    surface: CutSurface | None, tracer: Tracer, options: RenderOptions, trace: Trace
-) -> Trace | None:
+    surface: CutSurface | None, tracer: Tracer, options: RenderOptions, trace: TraceRays
+) -> TraceRays | None:
     """What traces the intervals behind cuts; None: what traces all else."""
     if surface is not None:
         return _surface_slab(surface, tracer, options)
@@ -126,7 +126,7 @@ def _slab(
     return slab
 
 
-def _surface_slab(surface: CutSurface, tracer: Tracer, options: RenderOptions) -> Trace:
+def _surface_slab(surface: CutSurface, tracer: Tracer, options: RenderOptions) -> TraceRays:
     """What traces the intervals behind cuts through isosurfaces: opaque where the first value lies
     inside the surface, in its own colour, unlit. The isosurface itself is hollow under a clip.
     """

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
-from .composite import Trace, if_few, scatter_hits, trace_pieces
+from .composite import TraceRays, if_few, scatter_hits, trace_pieces
 
 Face = tuple[float, ...]  # unit normal and offset (a, b, c, d): inside, a x + b y + c z + d >= 0
 Numbers = Sequence[Sequence[float]] | Tensor
@@ -181,12 +181,12 @@ class _MetFaces(NamedTuple):
 class Clipped:
     """Traces the kept pieces of rays, and the caps in front of them, in one frame."""
 
-    trace: Trace  # traces a piece
+    trace: TraceRays  # traces a piece
     clip: Clip
     box: Tensor  # (2, 3) world corners of the scene
     step: float  # world length of the shortest interval: one behind a cut gives its cap the colour
     depth_alpha: float  # depth is where alpha passes this
-    slab: Trace | None = None  # traces the intervals that give caps their colour; None: `trace`
+    slab: TraceRays | None = None  # traces the intervals that give caps their colour; None: `trace`
     unlit: bool = False  # caps are not lit here, because `Lighting` lights them later
     #: Traces all pieces of each ray; None: each piece is composited over those behind it.
     together: Callable[[Iterable[Rays]], Hits] | None = None

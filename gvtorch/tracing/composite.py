@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 
 from ..base.records import Hits, Rays
 
-Trace = Callable[[Rays], Hits]  # with whatever the options put around
+TraceRays = Callable[[Rays], Hits]  # with whatever the options put around
 
 
 def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
@@ -96,7 +96,7 @@ def scatter_hits(rays: Rays, which: Tensor, hits: Hits) -> Hits:
     return Hits(**columns)
 
 
-def trace_pieces(trace: Trace, pieces: Iterable[Rays], *, cap: Trace | None = None) -> Hits:
+def trace_pieces(trace: TraceRays, pieces: Iterable[Rays], *, cap: TraceRays | None = None) -> Hits:
     """Traces pieces of the same rays, nearest first, as if each ray were traced in one go: one that
     has ended takes no more samples, and its depth is found in whichever piece it lies. `cap` traces
     what lies in front of each piece.

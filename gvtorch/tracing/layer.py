@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Camera
-from .composite import Trace, over
+from .composite import TraceRays, over
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +86,12 @@ class Layer:
             object.__setattr__(strip, name, part[..., top : top + camera.height, :, :])
         return strip
 
-    def check_device(self, where: str, device: torch.device) -> None:
+    def check_device(self, device: torch.device) -> None:
         """Raises ValueError unless all tensors lie on the device."""
         for _, part in self._parts():
             if part.device != device:
                 raise ValueError(
-                    f"{where}: layer must lie on {device}, where the graph reads it, "
+                    f"capture: layer must lie on {device}, where the graph reads it, "
                     f"got {part.device}"
                 )
 
@@ -128,7 +128,7 @@ class LayerPixels:
         alpha = None if self.alpha is None else self.alpha[which]
         return LayerPixels(self.color[which], self.distance[which], alpha)
 
-    def trace(self, trace_rays: Trace, rays: Rays, stop_alpha: float) -> Hits:
+    def trace(self, trace_rays: TraceRays, rays: Rays, stop_alpha: float) -> Hits:
         """Traces the rays of these pixels and composites voxels and layer. Depth, normal and
         features are those of the voxels alone, the normal by the light that the voxels in front of
         the layer and behind it take. A ray that has reached `stop_alpha` with the layer goes no

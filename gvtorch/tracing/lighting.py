@@ -35,7 +35,7 @@ from ..shaders.lights import (
     check_light,
     check_triple,
 )
-from .composite import Trace, behind, if_few, over
+from .composite import TraceRays, behind, if_few, over
 from .thin_lens import ThinLens
 
 #: Where cones begin, in voxels. Cones to lights are lifted `_OFF` above the surface. Hemisphere
@@ -139,9 +139,9 @@ class _Tally:
 class Lighted:
     """Traces rays of one frame, then cones from the points that they met, and lights these."""
 
-    trace: Trace  # traces the eye's rays: unlit colours and normals
-    blocker: Trace  # traces cones of which only alpha is used
-    matter: Trace | None  # traces cones to what reflects light: unlit colours and normals; None: no
+    trace: TraceRays  # traces the eye's rays: unlit colours and normals
+    blocker: TraceRays  # traces cones of which only alpha is used
+    matter: TraceRays | None  # the same as `trace`, of cones to what reflects light; None: no
     lighting: Lighting  # in world units
     lights: Sequence[Light]  # in world units
     material: ShadeParameters  # how matter reflects light

@@ -28,7 +28,7 @@ from ..pictures.background import Background
 from ..pictures.picture import Picture
 from ..pool import N3Tree
 from .around import around
-from .composite import Trace, nothing_like
+from .composite import TraceRays, nothing_like
 from .options import RenderOptions, RenderSettings, render_options
 from .tracer import Tracer
 from .trees import Shaders, box_around, trace_trees, tree_traces
@@ -159,7 +159,7 @@ def using(where: str, trees: Sequence[N3Tree]) -> ExitStack:
 
 def _traced(
     where: str, scene: Scene, shaders: Shaders, options: RenderOptions
-) -> tuple[Trace, Tensor]:
+) -> tuple[TraceRays, Tensor]:
     """Begins a frame: what traces rays through a scene, and its box."""
     trees = _trees(where, scene)
     for tree in trees:
@@ -207,8 +207,8 @@ class View:
     """A camera in the world, what traces its rays, and how the picture is made."""
 
     camera: Camera
-    numbers: Tensor  # of the camera, on the device that traces
-    trace_rays: Trace  # through all trees
+    numbers: Tensor  # of the camera, on the device that traces; a graph's replays write others
+    trace_rays: TraceRays  # through all trees
     options: RenderOptions
     box: Tensor  # (2, 3) world corners of the scene
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
-from .composite import Trace, trace_pieces
+from .composite import TraceRays, trace_pieces
 
 #: Width of the cone over the diameter of the circle of confusion. Voxels half as wide as the
 #: circle, read trilinearly, blur as much as it does (variance v^2 / 4; the circle's is 1 / 16).
@@ -64,7 +64,7 @@ class ThinLens:
 class ThroughLens:
     """Traces rays whose cones are widened by a lens."""
 
-    trace: Trace
+    trace: TraceRays
     lens: ThinLens  # in world units
     cone_scale: float  # the tracer's factor on cones, which shall not widen the lens's
 

@@ -54,7 +54,7 @@ class Tracer:
         channel = _channel_of(tree, shader, options)
         step = options.step * min(tree.spacing)
         _check_step(tree, step, options)
-        tree.warn_if_edited("render", learned=isinstance(shader, ModuleShader))
+        tree.warn_if_edited(learned=isinstance(shader, ModuleShader))
         self.tree, self.shader, self.channel = tree, shader, channel
         self.pose = options.pose if isinstance(options.pose, Pose) else None
         if frame_1 is None:

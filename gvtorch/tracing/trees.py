@@ -29,7 +29,7 @@ from ..shaders.filtered import Filtered
 from ..shaders.shader import Shader, check_shader
 from ..shaders.transfer_function import TransferFunction
 from .around import around
-from .composite import Trace, box_span, nothing_like, over
+from .composite import TraceRays, box_span, nothing_like, over
 from .options import RenderOptions
 from .pose import poses_of, world_box
 from .tracer import Batch, Tracer
@@ -49,7 +49,7 @@ class TreeTrace:
     """What traces rays through one of several trees."""
 
     box: Tensor  # (2, 3) float64 world corners around it
-    trace: Trace  # with whatever the options put around
+    trace: TraceRays  # with whatever the options put around
     tracer: Tracer  # the tree alone
 
 
@@ -154,8 +154,8 @@ def _in_order(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Composites trees in the order in which rays enter their boxes."""
     first, last = _spans(trees, rays).unbind(2)
     order = torch.where(first <= last, first, torch.inf).argsort(dim=0, stable=True)  # (m, r)
-    hits = [vars(one.trace(rays)) for one in trees]
-    fields = {name: _ranked([one[name] for one in hits], order) for name in hits[0]}
+    hits = [one.trace(rays) for one in trees]
+    fields = {name: _ranked(hits, name, order) for name in vars(hits[0])}
     ranked = [Hits(**{name: f[rank] for name, f in fields.items()}) for rank in range(len(trees))]
     return replace(reduce(over, ranked), normal=_mean_normal(ranked))
 
@@ -172,28 +172,31 @@ def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
     return normalize(total, dim=1)
 
 
-def _ranked(fields: list[Tensor | None], order: Tensor) -> Sequence[Any]:
-    """The same field (r, ...) of m trees, in the order (m, r) of the trees along each ray; zeros,
-    of labels -1, stand for a tree that does not give it.
-    """
-    filled = _filled(fields)
+def _ranked(hits: Sequence[Hits], name: str, order: Tensor) -> Sequence[Any]:
+    """A field (r, ...) of m trees, in the order (m, r) of the trees along each ray."""
+    filled = _filled(hits, name)
     if filled is None:
-        return fields
+        return [None] * len(hits)
     stacked = torch.stack(filled)
     if stacked.dim() == 3:
         order = order[:, :, None].expand_as(stacked)
     return stacked.gather(0, order).unbind(0)
 
 
-def _filled(fields: Sequence[Tensor | None]) -> list[Tensor] | None:
-    """The same field (r, ...) of several hits; zeros stand for those that do not give it."""
+def _filled(hits: Sequence[Hits], name: str) -> list[Tensor] | None:
+    """A field (r, ...) of each of several hits; zeros, of labels -1, stand for those that do not
+    give it. None if none does.
+    """
+    fields = [getattr(one, name) for one in hits]
     given = [field for field in fields if field is not None]
     if not given:
         return None
     if len({field.shape[1:] for field in given}) > 1:
         raise ValueError("render: all trees must give the same number of features")
-    nothing = nothing_like(given[0], len(given[0]))
-    return [nothing if field is None else field for field in fields]
+    return [
+        nothing_like(given[0], len(one.alpha)) if field is None else field
+        for one, field in zip(hits, fields, strict=True)
+    ]
 
 
 # --- several trees in the same space
@@ -230,7 +233,7 @@ def _nearer(one: Hits, two: Hits) -> Hits:
     """Of two hits of each ray the nearer one."""
     first, fields = (one.depth <= two.depth)[:, 0], {}
     for name in vars(one):
-        pair = _filled([getattr(one, name), getattr(two, name)])
+        pair = _filled((one, two), name)
         if pair is not None:
             a, b = pair
             fields[name] = torch.where(first if a.dim() == 1 else first[:, None], a, b)
@@ -261,7 +264,12 @@ def _media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
 
 
 def _further(
-    hits: Hits, rays: Rays, which: Tensor, span: tuple[Tensor, Tensor], stop: float, trace: Trace
+    hits: Hits,
+    rays: Rays,
+    which: Tensor,
+    span: tuple[Tensor, Tensor],
+    stop: float,
+    trace: TraceRays,
 ) -> Hits:
     """Traces a stretch of the rays `which` (r,) bool that have not ended, behind their `hits`,
     whose normals are sums by light.
@@ -504,13 +512,7 @@ def _scattered(found: Sequence[Hits], places: Sequence[Tensor]) -> Hits:
     at = torch.cat(list(places)).argsort()
     fields = {}
     for name in vars(found[0]):
-        filled = [getattr(one, name) for one in found]
-        like = next((field for field in filled if field is not None), None)
-        if like is not None:
-            parts = [
-                nothing_like(like, len(one.alpha)) if field is None else field
-                for one, field in zip(found, filled, strict=True)
-            ]
+        if (parts := _filled(found, name)) is not None:
             fields[name] = torch.cat(parts)[at]
     return Hits(**fields)
 

@@ -150,9 +150,9 @@ class Client:
         """Whether it will want something without being told."""
         return bool(self.size[0]) and (self._renew or not self._done)
 
-    def rest_for(self, seconds: float) -> None:
-        """Draws nothing for a while, after a picture failed."""
-        self._not_before = time.monotonic() + seconds
+    def pause(self) -> None:
+        """Draws nothing for a second, after a picture failed."""
+        self._not_before = time.monotonic() + 1.0
 
     def draw(
         self, scene: Scene, state: ViewState, newer: Callable[[], bool], planes: Planes | None

@@ -226,7 +226,7 @@ class Session:
             self._tell_state(None)
             self._stir()
         else:
-            client.rest_for(1.0)
+            client.pause()
 
     def _tell_all(self, kind: str, **content: Any) -> None:
         for one in self.clients.values():

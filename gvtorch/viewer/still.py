@@ -26,14 +26,14 @@ def still_steps(
     size: tuple[int, int],
     unwanted: Callable[[], bool],
 ) -> Steps:
-    """Renders a whole picture, all that can be had, all samples; others have their turn after each
-    step.
+    """Renders a finished picture: nothing missing, every sample taken. A generator that yields
+    between its steps, so that others get their frames.
 
     Args:
-        scene: Of what.
-        planes: Tells the slices beside it, if there are any, when all else is there.
+        scene: What is shown.
+        planes: Gives the slices to draw beside it; called last.
         state: How it is shown.
-        eye: From where.
+        eye: Where the camera stands.
         size: Width and height in pixels, with the slices.
         unwanted: Asked between parts of the picture, whether nobody waits for it any more.
 

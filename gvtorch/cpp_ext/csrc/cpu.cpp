@@ -5,12 +5,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "entry/entry_cache.h"
-#include "entry/entry_camera.h"
-#include "entry/entry_fields.h"
-#include "entry/entry_mesh.h"
-#include "entry/entry_noise.h"
-#include "entry/entry_points.h"
+#include "entry/entry_all.h"
 #include "packets/processor.h"
 
 namespace gvtorch {
@@ -18,65 +13,54 @@ namespace gvtorch {
 // A user's shader is compiled for the same (cpp_ext/user.py).
 extern "C" __attribute__((visibility("default"))) const char* gvtorch_instructions() { return processor().name; }
 
-void voxelize(const Tensor& like, const VoxelizeArgs& args) {
-  constexpr int64_t kRows = 16;  // at a time
-  const int64_t rows = args.cubes * args.side * args.side;
-  const auto chunk = [&](int64_t number) {
-    processor().chunks.voxelize(args, number * kRows, std::min(rows, (number + 1) * kRows));
-  };
-  for_each(like, (rows + kRows - 1) / kRows, chunk, 1);
+// Calls run(args, begin, end), one of `processor().chunks`, for all items of an op, `share` at a time.
+template <class Args>
+void in_chunks(void (*run)(const Args&, int64_t, int64_t), const Args& args, int64_t count, int64_t share) {
+  for_shares(count, share, [&](int64_t begin, int64_t end) { run(args, begin, end); });
 }
 
-// Points of float32, a chunk at a time.
-template <class Args>
-void in_chunks(const Tensor& like, void (*run)(const Args&, int64_t, int64_t), const Args& args, int64_t points,
-               int64_t chunk) {
-  const auto some = [&](int64_t number) { run(args, number * chunk, std::min(points, (number + 1) * chunk)); };
-  for_each(like, (points + chunk - 1) / chunk, some, 1);
+void voxelize(const Tensor&, const VoxelizeArgs& args) {
+  in_chunks(processor().chunks.voxelize, args, args.cubes * args.side * args.side, 16);
 }
 
 void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
   if (is_wide(like)) return noise_each<double>(like, args, points);
-  in_chunks(like, processor().chunks.noise, args, points, 1 << 11);
+  in_chunks(processor().chunks.noise, args, points, 1 << 11);
 }
 
-void follow_points(const Tensor& like, const OrbitArgs& args) {
-  in_chunks(like, processor().chunks.orbits, args, args.points, 1 << 9);
+void follow_points(const Tensor&, const OrbitArgs& args) {
+  in_chunks(processor().chunks.orbits, args, args.points, 1 << 9);
 }
 
-void splat_points(const Tensor& like, const SplatArgs& args) {
-  const auto part = [&](int64_t number) { processor().chunks.splat(args, number, number + 1); };
-  for_each(like, SplatPart{args}.parts(), part, 1);
+void splat_points(const Tensor&, const SplatArgs& args) {
+  in_chunks(processor().chunks.splat, args, SplatPart{args}.parts(), 1);
 }
 
 // See cache.h. Threads count chunks, then take them: ranks do not depend on the number of threads.
 template <class List>
-void compact(const Tensor& like, int64_t count, const List& list) {
+void compact(const Tensor&, int64_t count, const List& list) {
   constexpr int64_t kChunk = 1 << 11;
   const int64_t chunks = (count + kChunk - 1) / kChunk;
   std::vector<Counts> before(static_cast<size_t>(chunks) + 1);  // each chunk; all stand behind the last
-  const auto count_chunk = [&](int64_t chunk) {
-    const int64_t end = std::min(count, (chunk + 1) * kChunk);
+  for_shares(count, kChunk, [&](int64_t begin, int64_t end) {
     Counts own{};
-    for (int64_t index = chunk * kChunk; index < end; ++index) own.add(list.flags(index));
-    before[chunk + 1] = own;
-  };
-  for_each(like, chunks, count_chunk, 1);
+    for (int64_t index = begin; index < end; ++index) own.add(list.flags(index));
+    before[begin / kChunk + 1] = own;
+  });
   for (int64_t chunk = 0; chunk < chunks; ++chunk) before[chunk + 1] = before[chunk] + before[chunk + 1];
   const Counts all = before.back();
-  const auto take_chunk = [&](int64_t chunk) {
-    if (before[chunk].any == before[chunk + 1].any) return;
-    const int64_t end = std::min(count, (chunk + 1) * kChunk);
+  for_shares(count, kChunk, [&](int64_t begin, int64_t end) {
+    const Counts &here = before[begin / kChunk], &behind = before[begin / kChunk + 1];
+    if (here.any == behind.any) return;
     const List own = list;  // which nothing written can alias
-    int64_t rank = before[chunk].listed;
-    for (int64_t index = chunk * kChunk; index < end; ++index) {
+    int64_t rank = here.listed;
+    for (int64_t index = begin; index < end; ++index) {
       const int32_t flags = own.flags(index);
       if ((flags & kTouched) == 0) continue;
       own.take(index, flags, rank, all.listed);
       rank += flags & kListed;
     }
-  };
-  for_each(like, chunks, take_chunk, 1);
+  });
   for (int64_t rank = all.listed; rank < list.places(); ++rank) list.blank(rank);
   list.total(all.listed, all.seen);
 }
@@ -85,22 +69,6 @@ void sort_keys(const Tensor&, int64_t* keys, int64_t count) { std::sort(keys, ke
 
 }  // namespace gvtorch
 
-STABLE_TORCH_LIBRARY(gvtorch, library) {
-  gvtorch::define(library, gvtorch::RayOps{});
-  gvtorch::define(library, gvtorch::SegmentOps{});
-  gvtorch::define(library, gvtorch::CacheOps{});
-  gvtorch::define(library, gvtorch::MeshOps{});
-  gvtorch::define(library, gvtorch::CameraOps{});
-  gvtorch::define(library, gvtorch::NoiseOps{});
-  gvtorch::define(library, gvtorch::PointOps{});
-  gvtorch::define(library, gvtorch::FieldOps{});
-}
+STABLE_TORCH_LIBRARY(gvtorch, library) { gvtorch::define(library, gvtorch::AllOps{}); }
 
-STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) {
-  gvtorch::implement(library, gvtorch::CacheOps{});
-  gvtorch::implement(library, gvtorch::MeshOps{});
-  gvtorch::implement(library, gvtorch::CameraOps{});
-  gvtorch::implement(library, gvtorch::NoiseOps{});
-  gvtorch::implement(library, gvtorch::PointOps{});
-  gvtorch::implement(library, gvtorch::FieldOps{});
-}
+STABLE_TORCH_LIBRARY_IMPL(gvtorch, CPU, library) { gvtorch::implement(library, gvtorch::OtherOps{}); }

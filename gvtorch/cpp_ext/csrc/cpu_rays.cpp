@@ -10,7 +10,7 @@ namespace gvtorch {
 void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
   if (wide) return shade_fused<double>(like, args);
   if (!(args.shader == kPlainShader ? packs(args) : shades(args))) return shade_fused<float>(like, args);
-  trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) { processor().chunks.shade(args, begin, end); });
+  trace_chunks(like, args, [&](int64_t begin, int64_t end) { processor().chunks.shade(args, begin, end); });
 }
 
 }  // namespace gvtorch

@@ -4,13 +4,7 @@
 #include <cub/block/block_scan.cuh>
 #include <cub/device/device_radix_sort.cuh>
 
-#include "entry/entry_cache.h"
-#include "entry/entry_camera.h"
-#include "entry/entry_fields.h"
-#include "entry/entry_mesh.h"
-#include "entry/entry_noise.h"
-#include "entry/entry_points.h"
-#include "entry/entry_segments.h"
+#include "entry/entry_all.h"
 
 namespace gvtorch {
 
@@ -141,13 +135,4 @@ void sort_keys(const Tensor& like, int64_t* keys, int64_t count) {
 
 }  // namespace gvtorch
 
-STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) {
-  gvtorch::implement(library, gvtorch::RayOps{});
-  gvtorch::implement(library, gvtorch::SegmentOps{});
-  gvtorch::implement(library, gvtorch::CacheOps{});
-  gvtorch::implement(library, gvtorch::MeshOps{});
-  gvtorch::implement(library, gvtorch::CameraOps{});
-  gvtorch::implement(library, gvtorch::NoiseOps{});
-  gvtorch::implement(library, gvtorch::PointOps{});
-  gvtorch::implement(library, gvtorch::FieldOps{});
-}
+STABLE_TORCH_LIBRARY_IMPL(gvtorch, CUDA, library) { gvtorch::implement(library, gvtorch::AllOps{}); }

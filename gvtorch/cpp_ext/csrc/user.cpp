@@ -63,11 +63,11 @@ struct OneShader {
                     "gvtorch: parameter_54 holds the wrong number of uniforms: ", own);
   }
   static void run(const Tensor& like, ShadeArgs args, bool wide) {
-    const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
+    const auto each = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };
     if (wide) return each(ShadeRay<double, CalledShader<UserShaderOf, double>, Digits<double>>(args));
 #ifdef GV_PACKETS
     if (packs(args)) {
-      return trace_chunks<Device>(like, args, [&](int64_t begin, int64_t end) {
+      return trace_chunks(like, args, [&](int64_t begin, int64_t end) {
         trace_packets<CalledShader<UserShaderOf, float>, AnyValues>(args, begin, end);
       });
     }

@@ -32,11 +32,9 @@ inline namespace GV_NAMESPACE {
   static constexpr const char* kUniformNames = #__VA_ARGS__
 
 template <class T>
-struct UserShader {
-  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false;
+struct UserShader : ShaderFacts {
+  static constexpr bool kHidesAlike = false;
   static constexpr bool kWhole = false;     // a ray must not be traced in pieces, each with a Sum of its own
-  static constexpr int32_t kFeatures = 0;   // numbers of sum.feature_c, which begin with 0
-  static constexpr int32_t kAsOther = -1;   // for kFeatures: as many as the second channel holds
   static constexpr int32_t kUniforms = -1;  // without GV_UNIFORMS: any number of them
   static constexpr const char* kUniformNames = "";
   using Sum = ShadeSum<T>;
@@ -50,7 +48,7 @@ struct UserShader {
 
   explicit UserShader(const ShadeArgs& args)
       : transfer(args),
-        light{static_cast<const Parameters<T>*>(args.parameter_54)},
+        light(args),
         uniform_k(static_cast<const T*>(args.parameter_54) + kParameters),
         uniforms(args.parameters - kParameters),
         other_component(args.other_component),
@@ -119,7 +117,7 @@ struct CalledShader : Kind<T> {
   using Base = Kind<T>;
   using Base::Base;
   using Sum = typename Base::Sum;
-  static constexpr bool kHidesAlike = kHidesByTransfer<Base> || HidesAlike<Base>::value;
+  static constexpr bool kHidesAlike = kHidesByTransfer<Base> || Base::kHidesAlike;
 
   GV_HD void add(bool, const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const { Base::add(piece, probe, sum); }
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import torch
 from torch import Tensor
@@ -22,6 +22,17 @@ from .lattice import Period, Points, as_points, periods
 
 #: Seeds of the octaves of a sum, and of the components of a warp, are so far apart.
 _NEXT_OCTAVE, _NEXT_AXIS = 0x10001, 0x3000007
+
+
+class SumSettings(TypedDict, total=False):
+    """Settings of a sum of octaves; see `fbm`."""
+
+    octaves: int
+    lacunarity: float
+    gain: float
+    basis: Basis
+    seed: int
+    period: Period
 
 
 class Octave(NamedTuple):
@@ -48,27 +59,28 @@ def octaves_of(
         yield Octave(gain**number, lacunarity**number, seed + number * _NEXT_OCTAVE)
 
 
-def fbm(
-    points: Points,
-    *,
-    octaves: int = 6,
-    lacunarity: float = 2.0,
-    gain: float = 0.5,
-    basis: Basis = perlin,
-    seed: int = 0,
-    period: Period = None,
-) -> Tensor:
+def octaves_from(
+    where: str, frequency: float, octaves: int, lacunarity: float, gain: float, seed: int
+) -> list[Octave]:
+    """Returns the octaves of a sum whose first has `frequency` cells a world unit; ValueError as of
+    `octaves_of`.
+    """
+    check.number(where, "frequency", frequency, low=0, open_low=True)
+    series = octaves_of(where, octaves, lacunarity, gain, seed)
+    return [one._replace(frequency=one.frequency * frequency) for one in series]
+
+
+def fbm(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
     """Fractal sum (fractional Brownian motion): octaves of a noise, each `lacunarity` times as fine
     as the one before and `gain` times as strong.
 
     Args:
         points: As in `perlin`.
-        octaves: How many, 1 to 64.
-        lacunarity, gain: Of an octave to the one before.
-        basis: The noise that is summed: `perlin`, `value`, `simplex`, `cellular`, or your own
-            function of points, `seed` and `period`.
-        seed: Of the first octave; each has its own.
-        period: Of the first octave, in its cells; the lacunarity must then be a whole number.
+        **settings: octaves: how many, 1 to 64; 6 if left out. lacunarity, 2, and gain, 0.5: of an
+            octave to the one before. basis: the noise that is summed: `perlin`, the default,
+            `value`, `simplex`, `cellular`, or your own function of points, `seed` and `period`.
+            seed: of the first octave, 0; each has its own. period: of the first octave, in its
+            cells; the lacunarity must then be a whole number.
 
     Returns:
         (...) of the points' dtype, within `fbm_bounds`.
@@ -77,45 +89,27 @@ def fbm(
         ValueError: An argument is not that.
     """
     where = "noise.fbm"
-    layers = _layers(where, points, octaves, lacunarity, gain, basis, seed, period)
+    layers = _layers(where, points, **settings)
     return _sum(where, (amplitude * noise for amplitude, noise in layers))
 
 
-def turbulence(
-    points: Points,
-    *,
-    octaves: int = 6,
-    lacunarity: float = 2.0,
-    gain: float = 0.5,
-    basis: Basis = perlin,
-    seed: int = 0,
-    period: Period = None,
-) -> Tensor:
+def turbulence(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
     """The sum of the absolute values of octaves: creases where they pass 0, as in flames and
     marble. Arguments, result and errors are those of `fbm`.
     """
     where = "noise.turbulence"
-    layers = _layers(where, points, octaves, lacunarity, gain, basis, seed, period)
+    layers = _layers(where, points, **settings)
     return _sum(where, (amplitude * noise.abs() for amplitude, noise in layers))
 
 
-def ridged(
-    points: Points,
-    *,
-    octaves: int = 6,
-    lacunarity: float = 2.0,
-    gain: float = 0.5,
-    sharpness: float = 2.0,
-    basis: Basis = perlin,
-    seed: int = 0,
-    period: Period = None,
-) -> Tensor:
+def ridged(points: Points, *, sharpness: float = 2.0, **settings: Unpack[SumSettings]) -> Tensor:
     """Ridges: octaves of (1 - |noise|)^2, each weighted by the one before, so that valleys stay
     smooth and detail gathers on the crests.
 
     Args:
-        points, octaves, lacunarity, gain, basis, seed, period: As in `fbm`; noises lie in -1 to 1.
+        points: As in `perlin`.
         sharpness: An octave's weight is the one before times this, at most 1.
+        **settings: As in `fbm`; noises lie in -1 to 1.
 
     Returns:
         (...) of the points' dtype, from 0 to the sum of the amplitudes.
@@ -128,8 +122,7 @@ def ridged(
 
     def crests() -> Iterator[Tensor]:
         weight: Tensor | None = None
-        layers = _layers(where, points, octaves, lacunarity, gain, basis, seed, period)
-        for amplitude, noise in layers:
+        for amplitude, noise in _layers(where, points, **settings):
             crest = (1 - noise.abs()) * (1 - noise.abs())
             crest = crest if weight is None else crest * weight
             weight = (crest * sharpness).clamp(0, 1)
@@ -138,22 +131,13 @@ def ridged(
     return _sum(where, crests())
 
 
-def warp(
-    points: Points,
-    *,
-    amplitude: float = 1.0,
-    octaves: int = 1,
-    lacunarity: float = 2.0,
-    gain: float = 0.5,
-    basis: Basis = perlin,
-    seed: int = 0,
-    period: Period = None,
-) -> Tensor:
+def warp(points: Points, *, amplitude: float = 1.0, **settings: Unpack[SumSettings]) -> Tensor:
     """Domain warp: points moved by a vector of noise, to be handed to another function of place.
 
     Args:
-        points, octaves, lacunarity, gain, basis, seed, period: As in `fbm`.
+        points: As in `perlin`.
         amplitude: The noises, one for each axis, are multiplied by this.
+        **settings: As in `fbm`, but for 1 octave if left out.
 
     Returns:
         (..., n) points. A function of slope s has a slope of at most
@@ -164,18 +148,10 @@ def warp(
     """
     place = as_points("noise.warp", points)
     check.number("noise.warp", "amplitude", amplitude)
-    shifts = [
-        fbm(
-            place,
-            octaves=octaves,
-            lacunarity=lacunarity,
-            gain=gain,
-            basis=basis,
-            seed=seed + (axis + 1) * _NEXT_AXIS,
-            period=period,
-        )
-        for axis in range(place.shape[-1])
-    ]
+    seed, shifts = settings.get("seed", 0), []
+    for axis in range(place.shape[-1]):
+        own: SumSettings = {"octaves": 1, **settings, "seed": seed + (axis + 1) * _NEXT_AXIS}
+        shifts.append(fbm(place, **own))
     return place + amplitude * torch.stack(shifts, -1)
 
 
@@ -207,12 +183,13 @@ def _sum(where: str, parts: Iterable[Tensor]) -> Tensor:
 def _layers(
     where: str,
     points: Points,
-    octaves: int,
-    lacunarity: float,
-    gain: float,
-    basis: Basis,
-    seed: int,
-    period: Period,
+    *,
+    octaves: int = 6,
+    lacunarity: float = 2.0,
+    gain: float = 0.5,
+    basis: Basis = perlin,
+    seed: int = 0,
+    period: Period = None,
 ) -> Iterator[tuple[float, Tensor]]:
     """Yields amplitude and noise of each octave."""
     place = as_points(where, points)

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from ...base import check
 from .basis import perlin
-from .fractal import Octave, octaves_of
+from .fractal import Octave, octaves_from
 from .lattice import as_points
 from .tally import Tally
 
@@ -107,13 +107,11 @@ class OctaveSum(Tally):
             ValueError: A number is out of its range.
         """
         where = "noise.OctaveSum"
-        check.number(where, "frequency", frequency, low=0, open_low=True)
         self.hold = check.number(where, "hold", hold, low=0, open_low=True)
         if not settled >= self.hold:
             raise ValueError(f"{where}: settled must be >= hold, {hold:g}, got {settled!r}")
         self.settled = settled
-        series = octaves_of(where, octaves, lacunarity, gain, seed)
-        self.octaves = [one._replace(frequency=one.frequency * frequency) for one in series]
+        self.octaves = octaves_from(where, frequency, octaves, lacunarity, gain, seed)
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can hold."""

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from ...base import check
 from ...ops.reference import noise as twin
-from .fractal import Octave, octaves_of
+from .fractal import Octave, octaves_from
 from .tally import Tally
 
 _APART = 1e-6  # relative, by which a level's voxels may differ from an octave's cells
@@ -60,9 +60,7 @@ class SplineSum(Tally):
             ValueError: A number is out of its range.
         """
         where = "noise.SplineSum"
-        check.number(where, "frequency", frequency, low=0, open_low=True)
-        series = octaves_of(where, octaves, 2.0, gain, seed)
-        self.octaves = [one._replace(frequency=one.frequency * frequency) for one in series]
+        self.octaves = octaves_from(where, frequency, octaves, 2.0, gain, seed)
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can hold."""

@@ -23,7 +23,7 @@ from ..source import Index, VolumeSource
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
 from ..stores.ngff import read_json_file
 from ..stores.store_layout import Deadline, is_number, kvstore, opened_at
-from .format import Format
+from .format import Format, not_chosen
 
 _TIMEOUT = 600.0  # seconds for one read
 _OPEN_TIMEOUT = 20.0
@@ -172,9 +172,7 @@ def _choose(path: str, key: str | None) -> str:
     names = _arrays(path)
     if key is None and len(names) == 1:
         return str(Path(path) / names[0])
-    what = f"holds {len(names)} arrays" if key is None else f"has no array {key!r}"
-    listed = ", ".join(names[:50]) or "none of three or more axes"
-    raise ValueError(f"{path}: {what}, choose one with key (--key): {listed}")
+    raise not_chosen(path, "array", names, key, " of three or more axes")
 
 
 def _source(path: str, driver: str, folder: str) -> tuple[ChunkedSource, tuple[int, ...]]:

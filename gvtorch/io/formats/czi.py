@@ -15,8 +15,8 @@ import numpy as np
 from ...base.digits import finite_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import NO_DEPTH, spacing_of
-from ..source import Index, VolumeSource, choose
-from .format import Format
+from ..source import Index, VolumeSource
+from .format import Format, choose
 
 _DTYPES = {
     "Gray8": ("u1", 1),
@@ -69,16 +69,15 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
         scenes = file.scenes_bounding_rectangle
         kinds = sorted(set(file.pixel_types.values()))
         xml = file.raw_metadata
-        numbers, scene, left = sorted(scenes), None, []
-        if numbers or key is not None:
-            at, left = choose(path, "scene", [str(one) for one in numbers], key)
-            scene = numbers[at]
-        whole = file.total_bounding_rectangle if scene is None else scenes[scene]
-    others = {n: b - a for n, (a, b) in box.items() if n not in "TCZXY" and b - a > 1}
-    others.pop("S", None)
-    others.pop("M", None)
-    if others:
-        told = ", ".join(f"{name} {size}" for name, size in others.items())
+        scene, whole = None, file.total_bounding_rectangle
+        others: tuple[str, ...] = ()
+        if scenes or key is not None:
+            at, others = choose(path, "scene", sorted(scenes), key)
+            scene = sorted(scenes)[at]
+            whole = scenes[scene]
+    more = {n: b - a for n, (a, b) in box.items() if n not in "TCZXYSM" and b - a > 1}
+    if more:
+        told = ", ".join(f"{name} {size}" for name, size in more.items())
         raise ValueError(f"{path}: has axes beside T, C, Z, Y, X: {told}")
     if len(kinds) != 1 or kinds[0] not in _DTYPES:
         raise ValueError(f"{path}: pixels are {', '.join(map(str, kinds))}; expected one kind")
@@ -88,7 +87,6 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
     if counts[1] > 1 and colors > 1:
         raise ValueError(f"{path}: {counts[1]} channels of colours; expected one")
     info, spacing, lost = _told(xml, counts[1], colors, stored)
-    lost += left
     return CziSource(
         path=path,
         shape=(*counts, whole.h, whole.w, colors),
@@ -96,7 +94,7 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
         stored=stored,
         spacing=spacing,
         info=info,
-        lost=tuple(lost),
+        lost=(*lost, *others),
         scene=scene,
         corner=(whole.x, whole.y),
         starts=starts,

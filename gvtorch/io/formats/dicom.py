@@ -26,7 +26,7 @@ from ..dicom_codecs import plugin_of
 from ..dicom_frames import Frame, frames_of, image_info, order_frames
 from ..source import LPS_TO_RAS, Index, VolumeSource, place_axes
 from ..stores.ngff import is_zarr
-from .format import Format
+from .format import Format, not_chosen
 
 _MOST_FILES = 200_000
 _MOST_UNPACKED = 1 << 32  # bytes
@@ -182,13 +182,12 @@ def _choose(path: str, series: dict[str, list[Any]], key: str | None) -> list[An
     if len(found) == 1:
         return series[found[0]]
     numbers = [words[0] for words in names.values()]
-    listed = ", ".join(
+    listed = [
         f"{words[0] if numbers.count(words[0]) == 1 else uid} ({words[1] or 'without a name'}, "
         f"{len(series[uid])} files)"
         for uid, words in names.items()
-    )
-    what = f"holds {len(series)} series" if key is None else f"has no series {key!r}"
-    raise ValueError(f"{path}: {what}, choose one with key (--key): {listed}")
+    ]
+    raise not_chosen(path, "series", listed, key)
 
 
 def _names(uid: str, header: Any) -> list[str]:

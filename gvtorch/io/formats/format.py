@@ -1,11 +1,12 @@
-"""`Format`: an entry of the registry of file formats."""
+"""`Format`: an entry of the registry of file formats; `choose`: one of several things in a file."""
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+from ...base.digits import whole_number
 from ...base.messages import need_library
 from ..source import VolumeSource
 
@@ -13,6 +14,7 @@ Opener = TypeVar("Opener", bound=Callable[..., VolumeSource])
 
 #: Every format, in the order in which they are tried.
 FORMATS: list[Format] = []
+_MOST_LISTED = 50  # names in a message
 
 
 class Format:
@@ -70,3 +72,63 @@ class Format:
         need_library(
             f"{path}: reading this format", self.library or __name__, self.package, self.extra
         )
+
+
+def choose(
+    path: str, what: str, names: Sequence[str | int], key: str | None, preferred: str = ""
+) -> tuple[int, tuple[str, ...]]:
+    """Finds which of several things in a file is meant.
+
+    Args:
+        path: For messages.
+        what: What they are: "image".
+        names: Of all of them; or their numbers, where they have no names.
+        key: A name or a number (of those that have names: from 0), also behind a slash, as in
+            `file.vdb:/density`.
+        preferred: The name that is meant if `key` is left out. Where it is not there, the first is.
+
+    Returns:
+        Its index among `names`, and what `VolumeSource.lost` tells of the others if `key` is left
+        out.
+
+    Raises:
+        ValueError: There is none, or none that `key` means.
+    """
+    numbers = [at if isinstance(name, str) else name for at, name in enumerate(names)]
+    listed = [
+        f"{number} {name!r}" if isinstance(name, str) else str(number)
+        for number, name in zip(numbers, names, strict=True)
+    ]
+    if key is None and names:
+        others = f"{len(names) - 1} other {_plural(what)}; key (--key) chooses among"
+        lost = (f"{others} {_list(listed)}",) if len(names) > 1 else ()
+        return names.index(preferred) if preferred in names else 0, lost
+    bare = (key or "").removeprefix("/")
+    for wanted, found in ((key, names), (bare, names), (whole_number(bare), numbers)):
+        if wanted in found:
+            return found.index(wanted), ()
+    raise not_chosen(path, what, listed, key)
+
+
+def not_chosen(
+    path: str, what: str, names: Sequence[str], key: str | None, kind: str = ""
+) -> ValueError:
+    """Returns the error where `key` means none of several things, or is left out and one must be
+    chosen. `kind` tells which ones are listed: " of three or more axes".
+    """
+    if key is not None:
+        told = f"has no {what} {key!r}; it holds {_list(names) or f'none{kind}'}"
+    elif names:
+        told = f"holds {len(names)} {_plural(what)}, choose one with key (--key): {_list(names)}"
+    else:
+        told = f"holds no {what}{kind}"
+    return ValueError(f"{path}: {told}")
+
+
+def _plural(what: str) -> str:
+    return what if what.endswith("s") else f"{what}s"
+
+
+def _list(names: Sequence[str]) -> str:
+    more = ["..."] if len(names) > _MOST_LISTED else []
+    return ", ".join([*names[:_MOST_LISTED], *more])

@@ -22,11 +22,12 @@ from ...base.named_axes import ask_axes, even_steps, letter_of, named_axes, plac
 from ...base.units import spacing_of
 from ..budget import check_beside
 from ..source import Index, VolumeSource
-from .format import Format
+from .format import Format, not_chosen
 
 _ENDINGS = (".h5", ".hdf5", ".hdf", ".he5", ".h5ad", ".ilp", ".nc", ".nc4", ".cdf")
 _MOST_CHUNK = 1 << 31  # bytes
 _MOST_SETS = 100_000
+_KIND = " of three or more axes"  # the data sets that messages list
 _MOST_LINKS = 16  # that lead one to another
 _MOST_PLACES = 1 << 24  # along an axis
 
@@ -163,17 +164,14 @@ def _choose(path: str, file: Any, key: str | None) -> str:
         if isinstance(file.get(key), h5py.Dataset):
             return key
         if not isinstance(file.get(key), h5py.Group):
-            held = ", ".join(_volumes(file)) or "none of three or more axes"
-            raise ValueError(f"{path}: has no data set {key!r}; it holds {held}")
+            raise not_chosen(path, "data set", [*_volumes(file)], key, _KIND)
         names = {f"{key.rstrip('/')}/{name}": text for name, text in _volumes(file[key]).items()}
     else:
         names = _volumes(file)
     if len(names) == 1:
         return next(iter(names))
-    if not names:
-        raise ValueError(f"{path}: holds no data set of three or more axes")
-    listed = ", ".join(f"{path}:/{name.strip('/')} {text}" for name, text in names.items())
-    raise ValueError(f"{path}: holds {len(names)} data sets, choose one with key (--key): {listed}")
+    listed = [f"{path}:/{name.strip('/')} {text}" for name, text in names.items()]
+    raise not_chosen(path, "data set", listed, None, _KIND)
 
 
 def _volumes(group: Any) -> dict[str, str]:

@@ -17,8 +17,8 @@ import numpy as np
 
 from ...base.image_info import COLORS, ChannelInfo, ImageInfo
 from ...base.units import NO_DEPTH, spacing_of
-from ..source import Index, VolumeSource, choose
-from .format import Format
+from ..source import Index, VolumeSource
+from .format import Format, choose
 
 _MOST_HEADER = 1 << 28  # characters
 _MOST_BLOCKS = 1 << 20
@@ -51,8 +51,8 @@ def open_lif(path: str, key: str | None = None) -> LifSource:
     found = [e for e in root.iter("Element") if e.find("./Data/Image") is not None]
     found = [e for e in found if _block(e, blocks) is not None]
     names = [str(element.get("Name", "")) for element in found]
-    at, lost = choose(path, "image", names, key)
-    return _image(path, found[at], blocks, lost)
+    at, others = choose(path, "image", names, key)
+    return _image(path, found[at], blocks, [*others])
 
 
 def _image(

@@ -27,10 +27,9 @@ from ..sparse_grid import (
     SparseSource,
     bits,
     check_roots,
-    choose_grid,
     describe,
 )
-from .format import Format
+from .format import Format, choose
 
 _FILES = (b"NanoVDB0", b"NanoVDB2")
 _GRIDS = (b"NanoVDB0", b"NanoVDB1")
@@ -101,9 +100,9 @@ class NanoSource(SparseSource):
 
 @Format("NanoVDB", ".nvdb", options=("key",))
 def open_nanovdb(path: str, key: str | None = None) -> NanoSource:
-    """Opens a grid; see `choose_grid`."""
+    """Opens the grid `key` (its name or number); "density" or the first, if left out."""
     heads = _heads(path)
-    number, lost = choose_grid(path, [head.name for head in heads], key)
+    number, lost = choose(path, "grid", [head.name for head in heads], key, preferred="density")
     head = heads[number]
     if head.kind not in _TYPES:
         kind = _REFUSED.get(head.kind, f"type {head.kind}")
@@ -114,7 +113,7 @@ def open_nanovdb(path: str, key: str | None = None) -> NanoSource:
     affine, low, high = _place(_content(path, head, _ROOT + 24), head)
     kind = _CLASSES.get(head.grid_class, "")
     told = describe(path, head.name, kind, np.dtype(dtype), width, low, high, affine)
-    return NanoSource(number=number, lost=tuple(lost), **told)
+    return NanoSource(number=number, lost=lost, **told)
 
 
 def _heads(path: str) -> list[Head]:

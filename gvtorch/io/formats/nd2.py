@@ -11,8 +11,8 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import spacing_of
-from ..source import Index, VolumeSource, choose
-from .format import Format
+from ..source import Index, VolumeSource
+from .format import Format, choose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,14 +49,12 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
 
     with nd2.ND2File(path) as file:
         sizes: Mapping[str, int] = dict(file.sizes)
-        unknown = {n: size for n, size in sizes.items() if n not in "TPZCYXS" and size > 1}
-        if unknown:
-            raise ValueError(f"{path}: has axes beside T, P, Z, C, Y, X: {unknown}")
-        positions = int(sizes.get("P", 1))
-        position, others = choose(path, "position", [str(n) for n in range(positions)], key)
+        more = {n: size for n, size in sizes.items() if n not in "TPZCYXS" and size > 1}
+        if more:
+            raise ValueError(f"{path}: has axes beside T, P, Z, C, Y, X: {more}")
+        position, others = choose(path, "position", range(sizes.get("P", 1)), key)
         dtype = np.dtype(file.dtype).str
         info, spacing, lost = _told(file, sizes)
-    lost += others
     width, colors = int(sizes.get("C", 1)), int(sizes.get("S", 1))
     if width > 1 and colors > 1:
         raise ValueError(f"{path}: {width} channels of colours; expected one")
@@ -68,7 +66,7 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
         stored=dtype,
         spacing=spacing,
         info=info,
-        lost=tuple(lost),
+        lost=(*lost, *others),
         position=position,
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...base.named_axes import ask_axes
 from ..source import ArraySource, open_unpacked
-from .format import Format
+from .format import Format, choose, not_chosen
 
 
 @Format("NPY", ".npy", ".npy.gz", ".npy.bz2", options=("axes",))
@@ -44,11 +44,7 @@ def open_npz(path: str, key: str | None = None, axes: str | None = None) -> Arra
     """Opens the array `key` of an archive; without it, the only one. `axes` as of `ask_axes`."""
     with zipfile.ZipFile(path) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-    if key is None and len(names) != 1:
-        raise ValueError(
-            f"{path}: holds {len(names)} arrays, choose one with key (--key): {', '.join(names)}"
-        )
-    chosen = names[0] if key is None else key
-    if chosen not in names:
-        raise ValueError(f"{path}: has no array {chosen!r}; it holds {', '.join(names)}")
-    return open_npy(path, axes, f"{chosen}.npy")
+    if key is None and len(names) > 1:
+        raise not_chosen(path, "array", names, key)
+    at, _ = choose(path, "array", names, key)
+    return open_npy(path, axes, f"{names[at]}.npy")

@@ -28,10 +28,9 @@ from ..sparse_grid import (
     SparseSource,
     bits,
     check_roots,
-    choose_grid,
     describe,
 )
-from .format import Format
+from .format import Format, choose
 
 _MAGIC = 0x56444220
 _VERSIONS = range(220, 225)
@@ -158,10 +157,11 @@ class VdbSource(SparseSource):
 
 @Format("OpenVDB", ".vdb", options=("key",))
 def open_openvdb(path: str, key: str | None = None) -> VdbSource:
-    """Opens a grid; see `choose_grid`."""
+    """Opens the grid `key` (its name or number); "density" or the first, if left out."""
     with _mapped(path) as data:
         version, entries = _entries(data)
-        at, lost = choose_grid(path, [entry.name for entry in entries], key)
+        names = [entry.name for entry in entries]
+        at, lost = choose(path, "grid", names, key, preferred="density")
         entry = entries[at]
         number = at
         if entry.parent:
@@ -183,7 +183,7 @@ def open_openvdb(path: str, key: str | None = None) -> VdbSource:
         low, high = VdbGrid.read(path, number).box()
     grid_class = str(entry.told.get("class", ""))
     given = describe(path, entry.name, grid_class, np.dtype(dtype), width, low, high, entry.affine)
-    return VdbSource(number=number, lost=tuple(lost), **given)
+    return VdbSource(number=number, lost=lost, **given)
 
 
 @functools.lru_cache(maxsize=2)

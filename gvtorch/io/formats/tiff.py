@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
-from ..source import ArraySource, Index, VolumeSource, choose
+from ..source import ArraySource, Index, VolumeSource
 from ..tiff_info import JPEG, Told, check_pictures, imagej_info, ome_info, opened
-from .format import Format
+from .format import Format, choose
 
 _LOST = {  # by the tag PhotometricInterpretation
     0: "that high values are meant to be dark (MinIsWhite)",
@@ -110,7 +110,7 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
     with opened(path) as (file, warned):
         if not file.series:
             raise ValueError("it holds no images")
-        number, others = choose(path, "series", [str(one.name) for one in file.series], key)
+        number, others = choose(path, "series", [one.name for one in file.series], key)
         series = file.series[number]
         shape = tuple(int(n) for n in series.shape)
         axes = _axes(path, shape, series.axes)

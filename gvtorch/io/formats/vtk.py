@@ -24,8 +24,8 @@ import numpy as np
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.volume import check_extent
 from ..packed import PackedSource, text_numbers, unpack_block
-from ..source import ArraySource, Index, VolumeSource, choose, place_axes
-from .format import Format
+from ..source import ArraySource, Index, VolumeSource, place_axes
+from .format import Format, choose
 
 _LEGACY = {
     "unsigned_char": "u1",
@@ -119,7 +119,7 @@ def _bytes(content: bytes, encoding: str, count: int) -> bytes:
 
 @Format("VTK", ".vti", ".vtk", options=("key",))
 def open_vtk(path: str, key: str | None = None) -> VolumeSource:
-    """Opens an image; `key` is the name of an array, the first if left out."""
+    """Opens an image; `key` is the name or number of an array, the first if left out."""
     return _open_legacy(path, key) if path.lower().endswith(".vtk") else _open_xml(path, key)
 
 
@@ -128,7 +128,7 @@ def _told(
     points: Sequence[int],
     affine: np.ndarray,
     array: dict[str, Any],
-    lost: Sequence[str],
+    lost: tuple[str, ...],
 ) -> dict[str, Any]:
     """Fields of a source of (z, y, x) or (z, y, x, c) values at points, or in cells."""
     size = [max(n - 1, 1) for n in points] if array["cells"] else list(points)
@@ -144,7 +144,7 @@ def _told(
         "path": path,
         "shape": (*size[::-1], *((width,) if width > 1 else ())),
         "info": ImageInfo(channels=(ChannelInfo(name=array["name"]),) if width == 1 else ()),
-        "lost": tuple(lost),
+        "lost": lost,
         **place,
     }
 
@@ -173,9 +173,8 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
         raise ValueError(f"{path}: has no extent")
     low, high = extent[::2], extent[1::2]
     arrays = _xml_arrays(root, piece)
-    names = [array["name"] for array in arrays]
-    at, lost = choose(path, "array", names, key)
-    array = arrays[at]
+    chosen, lost = choose(path, "array", [array["name"] for array in arrays], key)
+    array = arrays[chosen]
     if array["kind"] not in _XML:
         raise ValueError(f"{path}: {array['name']} is of {array['kind']}; expected numbers")
     numbers = {
@@ -318,9 +317,8 @@ def _open_mapped(path: str, content: mmap.mmap, key: str | None) -> VolumeSource
     affine, points, arrays = _legacy_parts(
         path, content, sum(len(line) + 1 for line in lines[:4]), binary
     )
-    names = [array["name"] for array in arrays]
-    at, lost = choose(path, "array", names, key)
-    found = arrays[at]
+    chosen, lost = choose(path, "array", [array["name"] for array in arrays], key)
+    found = arrays[chosen]
     told = _told(path, points, affine, found, lost)
     told |= {"file": path, "offset": found["offset"], "stored": found["stored"]}
     if binary:

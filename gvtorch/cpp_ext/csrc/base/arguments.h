@@ -7,7 +7,7 @@
 // int stays below (it is never negative); kAny where that is told elsewhere. It is an expression of the sizes that the
 // function knows in which the list is taken. An X makes one thing of each line:
 //
-//   GV_VIEW    a member of the struct that kernels read, here and in cache.h
+//   GV_VIEW    a member of the struct that kernels read
 //   GV_FIELD   a member of the struct that torch fills (entry.h, as the others)
 //   GV_WORD    its words in the schema
 //   GV_TYPE    its type, in the order of the schema

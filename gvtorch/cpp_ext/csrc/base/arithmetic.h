@@ -187,6 +187,11 @@ GV_HD MaskOf<T> all_lanes() {
 template <class T>
 constexpr bool kPacket = LanesOf<T>::kPacket;
 
+template <class T>
+GV_HD T absolute(T value) {
+  return larger(value, -value);
+}
+
 // floor of a value that fits an int32; lanes that are not asked for may hold any. Without SSE4.1 (the baseline of
 // x86-64) std::floor is a call.
 template <class T>

@@ -18,8 +18,6 @@
 
 namespace gvtorch {
 
-struct Device {};  // of this library
-
 #ifdef __CUDACC__
 
 // Starts kernels on the device of `like`, in torch's current stream.
@@ -58,7 +56,7 @@ __global__ void __launch_bounds__(kBlock, kBlocksAtOnce<Functor>) run_functor(Fu
   }
 }
 
-template <class On = Device, class Functor>
+template <class Functor>
 void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& functor) {
   if (count == 0) return;
   const int64_t blocks = std::min<int64_t>((count + kBlock - 1) / kBlock, INT32_MAX);
@@ -73,18 +71,24 @@ constexpr int64_t kShare = 256;
 template <class Functor>
 constexpr int64_t kShare<Functor, std::void_t<decltype(Functor::kShare)>> = Functor::kShare;
 
-// Threads draw `share` neighbouring indices at a time from a counter: long rays do not leave a thread idle. Nothing
-// that a functor writes depends on which thread ran it.
-template <class On = Device, class Functor>
-void for_each(const torch::stable::Tensor&, int64_t count, const Functor& functor, int64_t share = kShare<Functor>) {
+// Calls body(begin, end) for all indices, `share` neighbours at a time, which threads draw from a counter: long rays do
+// not leave a thread idle. Nothing that a body writes depends on which thread ran it.
+template <class Body>
+void for_shares(int64_t count, int64_t share, const Body& body) {
   const int64_t chunks = (count + share - 1) / share;
   const int64_t workers = std::min<int64_t>(torch::stable::get_num_threads(), chunks);
   std::atomic<int64_t> next{0};
   torch::stable::parallel_for(0, workers, 1, [&](int64_t, int64_t) {
     for (int64_t chunk = next++; chunk < chunks; chunk = next++) {
-      const int64_t end = std::min(count, (chunk + 1) * share);
-      for (int64_t index = chunk * share; index < end; ++index) functor(index);
+      body(chunk * share, std::min(count, (chunk + 1) * share));
     }
+  });
+}
+
+template <class Functor>
+void for_each(const torch::stable::Tensor&, int64_t count, const Functor& functor) {
+  for_shares(count, kShare<Functor>, [&](int64_t begin, int64_t end) {
+    for (int64_t index = begin; index < end; ++index) functor(index);
   });
 }
 

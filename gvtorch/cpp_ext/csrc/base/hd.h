@@ -33,6 +33,16 @@ struct Vec3 {
   GV_HD T operator[](int axis) const { return axis == 0 ? x : (axis == 1 ? y : z); }
 };
 
+// Also of vectors of lanes (A) and of numbers (B).
+template <class A, class B>
+GV_HD Vec3<A> minus(Vec3<A> a, Vec3<B> b) {
+  return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+template <class A, class B>
+GV_HD auto dot(Vec3<A> a, Vec3<B> b) {
+  return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
 // 16-bit floats as they are stored; every one of them is a float.
 struct Half {
   uint16_t bits;

@@ -119,6 +119,18 @@ GV_HD Ints pick_shared(const int32_t* table, Ints index) {
 }
 GV_HD Floats pick(const float* table, Ints index) { return (Floats)gather(table, index << 2); }
 
+#ifdef GV_MM
+// Rows of four numbers, of the lanes i, i + 4, i + 8, ... in own[i]: each of the four numbers of all lanes.
+GV_HD void transpose(const Native own[4], Floats number[4]) {
+  const Native a = GV_MM(unpacklo_ps)(own[0], own[1]), b = GV_MM(unpacklo_ps)(own[2], own[3]);
+  const Native c = GV_MM(unpackhi_ps)(own[0], own[1]), d = GV_MM(unpackhi_ps)(own[2], own[3]);
+  number[0] = (Floats)GV_MM(shuffle_ps)(a, b, 0x44);
+  number[1] = (Floats)GV_MM(shuffle_ps)(a, b, 0xee);
+  number[2] = (Floats)GV_MM(shuffle_ps)(c, d, 0x44);
+  number[3] = (Floats)GV_MM(shuffle_ps)(c, d, 0xee);
+}
+#endif
+
 // Four floats at each address base + offset (a multiple of 16 bytes), the first of all lanes in row[0], and so on: a
 // load for each lane and a transposition, where four gathers would load each number alone.
 GV_HD void load_rows(const void* base, Ints offset, Floats row[4]) {
@@ -128,7 +140,7 @@ GV_HD void load_rows(const void* base, Ints offset, Floats row[4]) {
   const auto four = [&](int i) {
     return _mm_loadu_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
   };
-  Native own[4];  // own[i]: the lanes i, i + 4, i + 8, ...
+  Native own[4];
   for (int i = 0; i < 4; ++i) {
 #if defined(__AVX512F__)
     own[i] = _mm512_castps128_ps512(four(i));
@@ -141,12 +153,7 @@ GV_HD void load_rows(const void* base, Ints offset, Floats row[4]) {
     own[i] = four(i);
 #endif
   }
-  const Native a = GV_MM(unpacklo_ps)(own[0], own[1]), b = GV_MM(unpacklo_ps)(own[2], own[3]);
-  const Native c = GV_MM(unpackhi_ps)(own[0], own[1]), d = GV_MM(unpackhi_ps)(own[2], own[3]);
-  row[0] = (Floats)GV_MM(shuffle_ps)(a, b, 0x44);
-  row[1] = (Floats)GV_MM(shuffle_ps)(a, b, 0xee);
-  row[2] = (Floats)GV_MM(shuffle_ps)(c, d, 0x44);
-  row[3] = (Floats)GV_MM(shuffle_ps)(c, d, 0xee);
+  transpose(own, row);
 #else
   for (int i = 0; i < 4; ++i) row[i] = (Floats)gather(static_cast<const float*>(base) + i, offset);
 #endif
@@ -160,7 +167,7 @@ GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats
   const auto eight = [&](int i) {
     return _mm256_loadu_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
   };
-  Native half[2][4];  // of four or eight lanes, each number of the first row, then of the second, by turns
+  Floats half[2][4];  // of four or eight lanes, each number of the first row, then of the second, by turns
   for (int h = 0; h < 2; ++h) {
     Native own[4];
     for (int i = 0; i < 4; ++i) {
@@ -170,20 +177,16 @@ GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats
       own[i] = eight(4 * h + i);
 #endif
     }
-    const Native a = GV_MM(unpacklo_ps)(own[0], own[1]), b = GV_MM(unpacklo_ps)(own[2], own[3]);
-    const Native c = GV_MM(unpackhi_ps)(own[0], own[1]), d = GV_MM(unpackhi_ps)(own[2], own[3]);
-    half[h][0] = GV_MM(shuffle_ps)(a, b, 0x44);
-    half[h][1] = GV_MM(shuffle_ps)(a, b, 0xee);
-    half[h][2] = GV_MM(shuffle_ps)(c, d, 0x44);
-    half[h][3] = GV_MM(shuffle_ps)(c, d, 0xee);
+    transpose(own, half[h]);
   }
   for (int i = 0; i < 4; ++i) {
+    const auto low = (Native)half[0][i], high = (Native)half[1][i];
 #if defined(__AVX512F__)
-    first[i] = (Floats)_mm512_shuffle_f32x4(half[0][i], half[1][i], 0x88);
-    second[i] = (Floats)_mm512_shuffle_f32x4(half[0][i], half[1][i], 0xdd);
+    first[i] = (Floats)_mm512_shuffle_f32x4(low, high, 0x88);
+    second[i] = (Floats)_mm512_shuffle_f32x4(low, high, 0xdd);
 #else
-    first[i] = (Floats)_mm256_permute2f128_ps(half[0][i], half[1][i], 0x20);
-    second[i] = (Floats)_mm256_permute2f128_ps(half[0][i], half[1][i], 0x31);
+    first[i] = (Floats)_mm256_permute2f128_ps(low, high, 0x20);
+    second[i] = (Floats)_mm256_permute2f128_ps(low, high, 0x31);
 #endif
   }
 #else

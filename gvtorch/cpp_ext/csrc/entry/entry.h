@@ -1,6 +1,6 @@
-// Where torch meets the kernels: how the lists of arguments.h become ops, and the ops that trace rays. Included once by
-// cpu.cpp and once by cuda.cu, and by every user's shader (user.cpp). The cache's ops and those of segments:
-// entry_cache.h, entry_segments.h.
+// Where torch meets the kernels: how the lists of arguments.h become ops, and the ops that trace rays. Included by the
+// two libraries (cpu*.cpp, cuda.cu) and by every user's shader (user.cpp). The other ops stand in the other headers of
+// this folder; entry_all.h lists them all.
 //
 // An op is a struct of its arguments (GV_OP), and a function `run` of it, which checks them and runs kernels.
 //
@@ -62,6 +62,8 @@ inline std::string schema_of(const char* name, std::initializer_list<std::string
 struct Begin {};  // the first of a list's types, for each of the others has a comma before it
 template <class...>
 struct Types {};
+template <class... One, class... Other>
+Types<One..., Other...> operator+(Types<One...>, Types<Other...>);  // both lists as one
 
 #define GV_FIELD(kind, name, limit) Handed<kinds::kind>::Type name;
 #define GV_TYPE(kind, name, limit) , Handed<kinds::kind>::Type

@@ -24,8 +24,7 @@ inline auto run(const OrbitsOp& a) {
   GV_ORBITS(GV_TAKE)
   args.points = points;
   args.wide = is_wide(a.point_p3);  // or refuses
-  Tensor found_3p = torch::stable::new_empty(a.point_p3, {3, points}, like.real);
-  args.found_3p = lay(found_3p);
+  Tensor found_3p = give(args.found_3p, a.point_p3, {3, points});
   follow_points(a.point_p3, args);
   return found_3p;
 }
@@ -37,8 +36,7 @@ inline auto run(const OrbitBoundsOp& a) {
   OrbitBoundsArgs args{};
   GV_ORBIT_BOUNDS(GV_TAKE)
   args.balls = balls;
-  Tensor ends_2k = torch::stable::new_empty(a.center_k3, {2, balls}, like.real);
-  args.ends_2k = lay(ends_2k);
+  Tensor ends_2k = give(args.ends_2k, a.center_k3, {2, balls});
   wide ? follow_balls<double>(a.center_k3, args) : follow_balls<float>(a.center_k3, args);
   return ends_2k;
 }

@@ -1,7 +1,7 @@
 // The ops on triangles: from tensors to the functors of mesh/. See entry.h.
 #pragma once
 
-#include "entry/entry_segments.h"
+#include "entry/entry.h"
 #include "mesh/voxelize.h"
 
 namespace gvtorch {

@@ -1,7 +1,7 @@
 // The op of noise: from tensors to the functors of noise/. See entry.h.
 #pragma once
 
-#include "entry/entry_segments.h"
+#include "entry/entry.h"
 #include "noise/noise.h"
 
 namespace gvtorch {
@@ -24,8 +24,7 @@ inline auto run(const NoiseOp& a) {
   NoiseArgs args{};
   GV_NOISE(GV_TAKE)
   args.axes = static_cast<int32_t>(axes);
-  Tensor value_p = torch::stable::new_empty(a.point_pn, {points}, like.real);
-  args.value_p = lay(value_p);
+  Tensor value_p = give(args.value_p, a.point_pn, {points});
   make_noise(a.point_pn, args, points);
   return value_p;
 }

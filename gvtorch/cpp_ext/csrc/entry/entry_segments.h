@@ -44,7 +44,7 @@ void walk_rays(const Op& a, const Make& make) {
       using Digits = std::decay_t<decltype(*digits)>;
       WalkRay<T, Digits> args{ShadeRay<T, Plain<T>, Digits>(walked), nullptr, 0, false};
       GV_PART(GV_TAKE)
-      const Tensor places = hide_nodes<Device>(a.origin_r3, walked.nodes, args.kernel);
+      const Tensor places = hide_nodes(a.origin_r3, walked.nodes, args.kernel);
       for_each(a.origin_r3, args.kernel.order.count(), make(args, real));
     });
   });

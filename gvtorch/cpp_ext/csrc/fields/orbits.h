@@ -49,11 +49,7 @@ constexpr double kDeepInside = 1, kLostBeyond = 1e3;  // INSIDE and FAR of the t
 
 template <class T>
 GV_HD T squared(const Vec3<T>& z) {
-  return z.x * z.x + z.y * z.y + z.z * z.z;
-}
-template <class T>
-GV_HD T absolute(T value) {
-  return larger(value, -value);
+  return dot(z, z);
 }
 template <class T>
 GV_HD T from_planes(const Vec3<T>& z) {

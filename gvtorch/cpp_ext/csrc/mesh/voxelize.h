@@ -31,11 +31,9 @@ constexpr double kCoarse = 2;     // triangles along a side of a voxel from whic
   X(Bool, weights, kAny)              \
   X(Bool, wide, kAny)
 
-#define GV_VIEW_MESH(kind, name, limit) kinds::kind::View name;
-
 // What the kernels get: boxes of floor i begin at first[i], the lowest are those of the triangles.
 struct VoxelizeArgs {
-  GV_VOXELIZE(GV_VIEW_MESH)
+  GV_VOXELIZE(GV_VIEW)
   int64_t triangles, cubes;
   int32_t first[kMostFloors + 1], floors;
 
@@ -56,78 +54,80 @@ using Together = std::conditional_t<std::is_same_v<T, float>, Floats, T>;
 template <class T>
 constexpr int32_t kTogether = static_cast<int32_t>(sizeof(Together<T>) / sizeof(T));
 
-// A place may be of one number an axis, or of a vector of them (F) where the triangle's are numbers (T).
-template <class F, class T>
-GV_HD Vec3<F> minus(Vec3<F> a, Vec3<T> b) {
-  return {a.x - b.x, a.y - b.y, a.z - b.z};
-}
-template <class F, class T>
-GV_HD auto inner(Vec3<F> a, Vec3<T> b) {
-  return a.x * b.x + a.y * b.y + a.z * b.z;
-}
 template <class T>
 GV_HD Vec3<T> outer(Vec3<T> a, Vec3<T> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
-// What of a triangle is the same for all places.
+// What of a triangle is the same for all places. A place may be of one number an axis, or of a vector of them (F).
 template <class T>
 struct Triangle {
   Vec3<T> corner[3], edge[3], beside[3], normal;
   T inverse2[3], length2, most;  // most: what `beside` may give inside; less where there is no area
 
-  GV_HD explicit Triangle(const T* at) {
-    for (int i = 0; i < 3; ++i) corner[i] = {at[3 * i], at[3 * i + 1], at[3 * i + 2]};
+  GV_HD explicit Triangle(const Vec3<T>* corner_3) {
+    for (int i = 0; i < 3; ++i) corner[i] = corner_3[i];
     for (int i = 0; i < 3; ++i) edge[i] = minus(corner[(i + 1) % 3], corner[i]);
     normal = outer(edge[0], minus(corner[2], corner[0]));
-    const T squared = inner(normal, normal);
+    const T squared = dot(normal, normal);
     length2 = squared > 0 ? squared : static_cast<T>(1);
     most = static_cast<T>(squared > 0 ? 0 : -1);
     for (int i = 0; i < 3; ++i) {
       beside[i] = outer(edge[i], normal);
-      const T edge2 = inner(edge[i], edge[i]);
+      const T edge2 = dot(edge[i], edge[i]);
       inverse2[i] = 1 / (edge2 > 0 ? edge2 : static_cast<T>(1));
     }
   }
 
+  // Where on an edge its nearest place lies: 0 at its first corner, 1 at its second.
+  template <class F>
+  GV_HD F along_edge(int i, Vec3<F> place) const {
+    return clamp(dot(minus(place, corner[i]), edge[i]) * inverse2[i], F{}, F{} + 1);
+  }
+  // The way from there to the place.
   template <class F>
   GV_HD Vec3<F> from_edge(int i, Vec3<F> place) const {
     const Vec3<F> from = minus(place, corner[i]);
-    const F t = clamp(inner(from, edge[i]) * inverse2[i], F{}, F{} + 1);
+    const F t = along_edge(i, place);
     return {from.x - t * edge[i].x, from.y - t * edge[i].y, from.z - t * edge[i].z};
   }
   // Whether the nearest place of the triangle's plane lies in the triangle.
   template <class F>
   GV_HD auto over(Vec3<F> place) const {
-    const F first = inner(minus(place, corner[0]), beside[0]), second = inner(minus(place, corner[1]), beside[1]),
-            third = inner(minus(place, corner[2]), beside[2]);
+    const F first = dot(minus(place, corner[0]), beside[0]), second = dot(minus(place, corner[1]), beside[1]),
+            third = dot(minus(place, corner[2]), beside[2]);
     return larger(larger(first, second), third) <= most + F{};
   }
   template <class F>
   GV_HD F gap2(Vec3<F> place) const {
     const Vec3<F> from0 = from_edge(0, place), from1 = from_edge(1, place), from2 = from_edge(2, place);
-    const F best = smaller(smaller(inner(from0, from0), inner(from1, from1)), inner(from2, from2));
-    const F height = inner(minus(place, corner[0]), normal);
+    const F best = smaller(smaller(dot(from0, from0), dot(from1, from1)), dot(from2, from2));
+    const F height = dot(minus(place, corner[0]), normal);
     return select(over(place), height * height / length2, best);
+  }
+  // Of equally near edges the first.
+  GV_HD int nearest_edge(Vec3<T> place) const {
+    int nearest = 0;
+    T best{};
+    for (int i = 0; i < 3; ++i) {
+      const Vec3<T> from = from_edge(i, place);
+      const T own = dot(from, from);
+      if (i == 0 || own < best) {
+        nearest = i;
+        best = own;
+      }
+    }
+    return nearest;
   }
   // Weights of the corners at the nearest place.
   GV_HD Vec3<T> weight(Vec3<T> place) const {
     Vec3<T> found{};
     if (over(place)) {
-      for (int i = 0; i < 3; ++i) found[(i + 2) % 3] = -inner(minus(place, corner[i]), beside[i]) / length2;
+      for (int i = 0; i < 3; ++i) found[(i + 2) % 3] = -dot(minus(place, corner[i]), beside[i]) / length2;
       return found;
     }
-    int at = 0;
-    T best{};
-    for (int i = 0; i < 3; ++i) {
-      const Vec3<T> from = from_edge(i, place);
-      const T own = inner(from, from);
-      if (i == 0 || own < best) {
-        at = i;
-        best = own;
-      }
-    }
-    const T t = clamp(inner(minus(place, corner[at]), edge[at]) * inverse2[at], T{}, T{} + 1);
+    const int at = nearest_edge(place);
+    const T t = along_edge(at, place);
     found[at] = 1 - t;
     found[(at + 1) % 3] = t;
     return found;
@@ -135,17 +135,7 @@ struct Triangle {
   // A vector along which the nearest place lies, of any length and sign.
   GV_HD Vec3<T> away(Vec3<T> place, T gap2) const {
     if (over(place) || gap2 < static_cast<T>(kTouch)) return normal;
-    Vec3<T> toward{};
-    T best{};
-    for (int i = 0; i < 3; ++i) {
-      const Vec3<T> from = from_edge(i, place);
-      const T own = inner(from, from);
-      if (i == 0 || own < best) {
-        toward = from;
-        best = own;
-      }
-    }
-    return toward;
+    return from_edge(nearest_edge(place), place);
   }
 };
 
@@ -227,9 +217,8 @@ struct Polygon {
 // The share of a voxel below a plane. Scardovelli and Zaleski 2000.
 template <class T>
 GV_HD T box_share(Vec3<T> normal, T offset) {
-  const T length = square_root(inner(normal, normal));
-  const T x0 = normal.x < 0 ? -normal.x : normal.x, y0 = normal.y < 0 ? -normal.y : normal.y,
-          z0 = normal.z < 0 ? -normal.z : normal.z;
+  const T length = square_root(dot(normal, normal));
+  const T x0 = absolute(normal.x), y0 = absolute(normal.y), z0 = absolute(normal.z);
   const T least = static_cast<T>(kFlat) * (x0 + y0 + z0);
   const T x = larger(x0, least), y = larger(y0, least), z = larger(z0, least);
   const T low = smaller(x, y), high = larger(x, y), rest = smaller(high, z);
@@ -323,10 +312,14 @@ struct VoxelizePack {
   static GV_HD T infinite() { return static_cast<T>(bit_cast<float>(0x7f800000)); }
   static GV_HD T place(const Cube& cube, int64_t i) { return static_cast<T>(i) * cube.step + static_cast<T>(0.5); }
 
+  // The three corners of a triangle, in voxels of the cube.
+  GV_HD void read_corners(const Cube& cube, int64_t number, Vec3<T>* corner) const {
+    for (int i = 0; i < 9; ++i) corner[i / 3][i % 3] = cube.local(a.corner_f33[9 * number + i], i % 3);
+  }
   GV_HD Triangle<T> triangle(const Cube& cube, int64_t number) const {
-    T at[9];
-    for (int i = 0; i < 9; ++i) at[i] = cube.local(a.corner_f33[9 * number + i], i % 3);
-    return Triangle<T>(at);
+    Vec3<T> corner[3];
+    read_corners(cube, number, corner);
+    return Triangle<T>(corner);
   }
   // How far a box is from what lies between two places along an axis; world units, 0 in it.
   GV_HD double beside(int64_t box, int axis, double low, double high) const {
@@ -402,7 +395,7 @@ struct VoxelizePack {
     for (int32_t i = 0; i < a.side; ++i) winding[i] = 0;
     ahead(x, y0, y1, z0, z1, [&](int64_t number) {
       Vec3<T> corner[3];
-      for (int i = 0; i < 9; ++i) corner[i / 3][i % 3] = cube.local(a.corner_f33[9 * number + i], i % 3);
+      read_corners(cube, number, corner);
       const Pierced<T> along = pierced(y, z, corner);
       if (along.way == 0) return;
       for (int32_t i = 0; i < a.side; ++i) winding[i] += along.way * (along.at > place(cube, i));
@@ -428,10 +421,8 @@ struct VoxelizePack {
     int64_t parts[kPack] = {};
     ahead(x, y0, y1, z0, z1, [&](int64_t number) {
       Polygon<T> whole;
-      for (int i = 0; i < 3; ++i) {
-        const double* at = a.corner_f33 + 9 * number + 3 * i;
-        whole.push({cube.local(at[0], 0), cube.local(at[1], 1), cube.local(at[2], 2)});
-      }
+      read_corners(cube, number, whole.at);
+      whole.count = 3;
       const Polygon<T> column = in_column(whole, low);
       if (column.count == 0) return;
       for (int32_t i = begin; i < end; ++i) {

@@ -34,20 +34,6 @@ struct NoiseArgs {
 
 inline namespace GV_NAMESPACE {
 
-// 32 bits in each lane, which wrap.
-template <class T>
-struct WordsOf {
-  using Words = uint32_t;
-  using Signed = int32_t;
-};
-#ifndef __CUDACC__
-template <>
-struct WordsOf<Floats> {
-  typedef uint32_t Words __attribute__((vector_size(kLanes * 4)));
-  using Signed = Ints;
-};
-#endif
-
 constexpr uint32_t kFirstFactor = 0x2C1B3C6D, kSecondFactor = 0x297A2D39;
 constexpr uint32_t kThird = 2796203;  // 2^23 / 3
 constexpr uint32_t kTopBit = 0x80000000, kOneBits = 0x3F800000;
@@ -55,8 +41,8 @@ constexpr uint32_t kTopBit = 0x80000000, kOneBits = 0x3F800000;
 // The noise of points of N coordinates.
 template <class T, int N>
 struct NoiseAt {
-  using Words = typename WordsOf<T>::Words;
-  using Signed = typename WordsOf<T>::Signed;
+  using Words = WordOf<T>;
+  using Signed = IntOf<T>;
   using Real = RealOf<T>;
 
   uint32_t salt[3];

@@ -186,9 +186,6 @@ struct PacketChannel : ChannelView {
   GV_HD Vec3<Floats> rise(int32_t component, Ints brick, const Vec3<Floats>& at) const {
     return rise_reader(pool, component * bytes, brick, at.x, at.y, at.z);
   }
-  GV_HD float constant(int32_t component, int32_t node) const {
-    return read_number<float>(constant_tnc, type, static_cast<int64_t>(node) * width + component);
-  }
 };
 
 // The values that a packet walks on: of a dtype known to the compiler, or only at run time.

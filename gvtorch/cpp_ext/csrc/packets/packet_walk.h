@@ -143,14 +143,11 @@ struct PacketWalk {
     for (int32_t i = 0; i < count; ++i) out[i] = mixed ? out[i] + part * (other[i] - out[i]) : out[i];
   }
   GV_HD Vec3<Floats> gradient(Floats t) const {
-    Vec3<Floats> slope = differences(fine, fine_depth, t);
+    const Vec3<Floats> slope = differences(fine, fine_depth, t);
     if (!any(mixed & marching)) return slope;
     const Vec3<Floats> other = differences(coarse, coarse_depth, t);
     const Floats part = weight(t);
-    for (int axis = 0; axis < 3; ++axis) {
-      slope[axis] = mixed ? slope[axis] + part * (other[axis] - slope[axis]) : slope[axis];
-    }
-    return slope;
+    return combined(slope, other, [&](Floats a, Floats b) { return mixed ? a + part * (b - a) : a; });
   }
 
   GV_HD Floats value_of(const PacketBrick& brick, Floats t) const { return value_in(brick, t); }
@@ -460,7 +457,7 @@ struct PacketWalk {
     for_lanes(which & ~stored, [&](int lane) { to.constant[lane] = constant_of(lane, holder_depth); });
   }
   GV_HD float constant_of(int lane, Ints depth) const {
-    return channels.value.constant(kernel.channels.component, node_of(lane, depth));
+    return channels.value.constant<float>(node_of(lane, depth), kernel.channels.component);
   }
   GV_HD Ints depth_of(const PacketBrick& brick) const { return &brick == &fine ? fine_depth : coarse_depth; }
   GV_HD int32_t node_of(int lane, Ints depth) const { return path_node[depth[lane]][lane] & INT32_MAX; }
@@ -514,7 +511,7 @@ struct PacketWalk {
     if constexpr (kEnds) {
       piece.front = back;
       piece.back = back = value(piece.end);
-    } else if constexpr (!ReadsAll<Shader>::value) {
+    } else if constexpr (!Shader::kReadsAll) {
       piece.value = value(piece.middle);
     }
     const Mask seeing = which & (sum.clear > stop_clear);
@@ -545,14 +542,14 @@ struct PacketWalk {
                          Floats t) const {
     Floats number = channel.read(component, brick.brick, brick.at(t));
     for_lanes(marching & ~brick.stored,
-              [&](int lane) { number[lane] = channel.constant(component, node_of(lane, depth)); });
+              [&](int lane) { number[lane] = channel.constant<float>(node_of(lane, depth), component); });
     return number;
   }
   GV_HD void numbers_in(const PacketChannel& channel, Components<float> components, int32_t count,
                         const PacketBrick& brick, Ints depth, Floats t, Floats* out) const {
     channel.numbers(components, count, brick.brick, brick.at(t), out);
     for_lanes(marching & ~brick.stored, [&](int lane) {
-      for (int32_t i = 0; i < count; ++i) out[i][lane] = channel.constant(components[i], node_of(lane, depth));
+      for (int32_t i = 0; i < count; ++i) out[i][lane] = channel.constant<float>(node_of(lane, depth), components[i]);
     });
   }
   GV_HD Vec3<Floats> differences(const PacketBrick& brick, Ints depth, Floats t) const {

@@ -25,15 +25,13 @@ inline bool shades(const ShadeArgs& args) {
 }
 
 // body(begin, end) for chunks of the rays; first an empty byte for each node, in which it is kept what is hidden.
-template <class Device, class Body>
+template <class Body>
 void trace_chunks(const torch::stable::Tensor& like, TraceArgs& args, const Body& body) {
   constexpr int64_t kChunk = 256;
   torch::stable::Tensor hidden_tn =
       torch::stable::new_zeros(like, {args.nodes + 3}, torch::headeronly::ScalarType::Byte);
   args.hidden_tn = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
-  const int64_t count = RayOrder{args.rays, args.width}.count();
-  const auto chunk = [&](int64_t number) { body(number * kChunk, std::min(count, (number + 1) * kChunk)); };
-  for_each<Device>(like, (count + kChunk - 1) / kChunk, chunk, 1);
+  for_shares(RayOrder{args.rays, args.width}.count(), kChunk, body);
 }
 
 }  // namespace gvtorch

@@ -79,7 +79,7 @@ struct Spread {
   // What lies below an edge.
   template <class T>
   static GV_HD T below(T away) {
-    const T none{}, one = none + 1.0, far = larger(away, -away), rest = 2.0 - far, square = rest * rest;
+    const T none{}, one = none + 1.0, far = absolute(away), rest = 2.0 - far, square = rest * rest;
     const T inner = 0.5 - far * (2.0 / 3 - far * far * (1.0 / 3 - far * 0.125));
     const T tail = select(far > one, square * square * (1.0 / 24), inner);
     return select(away < none, tail, 1.0 - tail);

@@ -1,19 +1,22 @@
-// Several numbers of a voxel, each with a transfer function of its own, composited together at each sample.
+// ChannelMix: voxels hold several numbers, called channels here, each with a transfer function of its own. At each
+// sample all channels are mixed into one colour and one alpha.
 //
-// An interval of length l through values v_i: channel i has the colour c_i and the opacity a_i of its reference length
-// r_i, so it halves the light h_i = -log2(1 - a_i) l / r_i times. Together they halve it
+// For an interval of length l, the function of channel i gives a colour c_i, and the opacity a_i of its reference
+// length r_i. Alone, channel i halves the light h_i = -log2(1 - a_i) l / r_i times. All channels together halve it
+// H times; the mode of the shader says how H is made:
 //
-//   opacity:   H = h_1 + h_2 + ...        what each takes from the light multiplies
-//   additive:  H = max(h_1, h_2, ...)     they hide no more than the densest of them does alone
+//   opacity:   H = h_1 + h_2 + ...        each channel dims what the others let through
+//   additive:  H = max(h_1, h_2, ...)     together they hide only as much as the densest one
 //
-// times, so alpha = 1 - 2^-H, and the light that comes out is alpha (h_1 c_1 + h_2 c_2 + ...) / H, premultiplied. Both
-// solve emission and absorption for matter of one kind (each channel glows h_i c_i), so an interval in two halves shows
-// what it shows in one. A channel alone is what its function shows in either way; channels of equal h have the mean of
-// their colours by opacity, and the sum, which may be above 1, if they are added.
+// Then alpha = 1 - 2^-H, and the premultiplied colour is alpha (h_1 c_1 + h_2 c_2 + ...) / H. Both modes solve emission
+// and absorption exactly for an even mixture in which channel i emits h_i c_i, so an interval that is cut in two shows
+// the same. One channel alone shows what its function shows, in either mode. Channels of equal h show the mean of their
+// colours in the mode opacity, and the sum of their colours, which may be above 1, in the mode additive.
 //
-// The table holds, before the rows, a head: (channels, 1 if they are added, 0, 0), and for each channel (component,
-// value of the first row, rows a unit of the value, rows). Then come their rows, one channel after the other: colour,
-// and h of an interval of step * 2^l.
+// The table has four numbers a row. It begins with a head: one row (how many channels, 1 if additive, 0, 0), and a row
+// for each channel (which number of a voxel, value of its function's first row, rows per unit of the value, how many
+// rows). Then follow the rows of the functions, one channel after the other: red, green, blue, and h of an interval
+// of length step * 2^level.
 //
 // Equal to ops/reference/shaders.py. Source: Max, "Optical models for direct volume rendering", IEEE TVCG 1995.
 #pragma once
@@ -33,23 +36,12 @@ GV_HD int32_t whole_up_to(T number, int32_t most) {
 template <class T>
 struct ChannelRows : Transfer<T> {
   int32_t component;
-  int32_t stride;  // rows of the whole table
 
   ChannelRows() = default;
   GV_HD ChannelRows(const TransferView<T>& all, const Row<T>& head, int32_t first, int32_t width)
       : Transfer<T>(all.table_lm + first, all.opaque_m + first, head.green, head.blue,
                     whole_up_to(head.alpha, all.rows - first)),
-        component(whole_up_to(head.red, width - 1)),
-        stride(all.rows) {}
-
-  // Colour, and how often an interval halves the light. Lanes that are not asked for may get anything.
-  template <class V>
-  GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which) const {
-    const Cell<V> cell = this->find(value);
-    const auto index = static_cast<typename LanesOf<V>::Index>(level) * stride + cell.row;
-    const RowPair<V> pair = this->rows_at(index);
-    return make_row<V>(which, [&](int column) { return pair.at(cell.weight, column); });
-  }
+        component(whole_up_to(head.red, width - 1)) {}
 };
 
 template <class T>
@@ -97,7 +89,7 @@ struct ChannelMix : ShaderFacts {
     V red{}, green{}, blue{}, total{};
     const bool added = view.table_lm[0].green > 0;
     each([&](int32_t i, const ChannelRows<T>& rows) {
-      const Row<V> row = rows.look_up(values[i], piece.level, which);
+      const Row<V> row = rows.look_up(values[i], piece.level, which, view.rows);  // its alpha: halvings
       red = red + row.alpha * row.red;
       green = green + row.alpha * row.green;
       blue = blue + row.alpha * row.blue;

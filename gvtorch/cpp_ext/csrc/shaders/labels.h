@@ -27,10 +27,7 @@ struct Labels : ShaderFacts {
   int32_t component;
 
   explicit Labels(const ShadeArgs& args)
-      : transfer(args),
-        step(static_cast<T>(args.step)),
-        light{static_cast<const Parameters<T>*>(args.parameter_54)},
-        component(args.component) {}
+      : transfer(args), step(static_cast<T>(args.step)), light(args), component(args.component) {}
 
   struct Own {
     T lit;  // 1 or 0
@@ -93,9 +90,8 @@ struct Labels : ShaderFacts {
       const T weight = probe.weight(t);
       const auto mix = [&](T a, T b) { return a + weight * (b - a); };
       if (!(look.row.alpha > 0)) look.label = one.label;
-      look.row = {mix(look.row.red, one.row.red), mix(look.row.green, one.row.green), mix(look.row.blue, one.row.blue),
-                  mix(look.row.alpha, one.row.alpha)};
-      for (int axis = 0; axis < 3; ++axis) look.normal[axis] = mix(look.normal[axis], one.normal[axis]);
+      look.row = combined(look.row, one.row, mix);
+      look.normal = combined(look.normal, one.normal, mix);
     }
     return look;
   }
@@ -141,7 +137,7 @@ struct Labels : ShaderFacts {
     for (int axis = 0; axis < 3; ++axis) {
       for (int k = -reach; k <= reach; ++k) {
         const T offset = static_cast<T>(k) - from[axis];
-        const T left = static_cast<T>(reach) + static_cast<T>(0.5) - larger(offset, -offset);
+        const T left = static_cast<T>(reach) + static_cast<T>(0.5) - absolute(offset);
         share[axis][k + reach] = larger(left, static_cast<T>(0));
         way[axis][k + reach] = share[axis][k + reach] * offset;
       }
@@ -173,10 +169,7 @@ struct Labels : ShaderFacts {
       n.z = n.z + way[2][k] * plane;
     }
     for (int axis = 0; axis < 3; ++axis) n[axis] = n[axis] * (spot.scale / probe.cube[axis]);
-    n = unit(n);
-    const bool away = dot(n, probe.sight.direction) > 0;
-    for (int axis = 0; axis < 3; ++axis) n[axis] = away ? -n[axis] : n[axis];
-    return n;
+    return light.to_eye(n, probe.sight.direction);
   }
 };
 

@@ -101,6 +101,8 @@ template <class T>
 struct Light {
   const Parameters<T>* parameters;
 
+  explicit Light(const ShadeArgs& args) : parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
+
   // A medium, whose places have no normal.
   GV_HD bool scatters() const { return parameters->octaves > 0; }
 
@@ -165,7 +167,7 @@ struct Light {
     const MaskOf<V> turned = dot(n, n) > 0;
     if (any(turned)) {
       facing = select(turned, larger(V{}, dot(n, to_light)), facing);
-      const Vec3<V> half = unit(Vec3<V>{to_light.x - d.x, to_light.y - d.y, to_light.z - d.z});
+      const Vec3<V> half = unit(minus(to_light, d));
       const MaskOf<V> faces = turned && facing > 0;
       if (any(faces)) highlight = select(faces, power_of(larger(V{}, dot(n, half)), own.shininess), highlight);
     }
@@ -220,7 +222,7 @@ struct Light {
     const V above = clamp(mean + wide, V{}, two * wide);
     const V facing = above * above / select(wide > 0, two * two * wide, unity) + larger(V{}, mean - wide);
 
-    const Vec3<V> half = unit(Vec3<V>{to_light.x - d.x, to_light.y - d.y, to_light.z - d.z});
+    const Vec3<V> half = unit(minus(to_light, d));
     const V even = square_root(clamp(static_cast<T>(1.5) * square - static_cast<T>(0.5), zero, one));
     const V spread = (one - even) / three;
     const V little = static_cast<T>(0.9) * (spread * spread);

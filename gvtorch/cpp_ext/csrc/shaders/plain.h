@@ -1,4 +1,5 @@
-// The plain transfer function, and what shaders say of themselves; the head of shaders.h tells what a shader is.
+// The facts that every shader tells of itself, and the simplest shader: the plain transfer function. The head of
+// shaders.h explains what a shader is.
 #pragma once
 
 #include "shaders/light.h"
@@ -6,17 +7,18 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// What a shader says of itself, where it does not say otherwise; see the head of this file.
+// Facts about a shader that the compiler must know: the walks and the checks of arguments read them. A shader inherits
+// these defaults and declares anew what differs. The first line and kReadsAll are explained in the head of shaders.h.
 struct ShaderFacts {
   static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
+  static constexpr bool kReadsAll = false;
   static constexpr bool kIntegrates = false;  // its table is (l, m, m, 4)
   static constexpr bool kColored = false;     // its channel holds red, green, blue and opacity, once or by direction
-  static constexpr int32_t kFiltered = 0;     // above 0: so many numbers, or six times so many, of its second channel
-                                              // tell of the pool's first bricks
-  static constexpr bool kReadsAll = false;    // it reads what it needs, and a piece has no value
-  static constexpr int32_t kFeatures = 0;     // numbers of sum.feature_c
+  static constexpr int32_t kFiltered = 0;     // above 0: its second channel holds so many numbers a voxel, or six times
+                                              // so many, in the pool's first bricks
+  static constexpr int32_t kFeatures = 0;     // how many numbers it writes to sum.feature_c; they begin as 0
   static constexpr int32_t kAsOther = -1;     // for kFeatures: as many as the second channel holds
-  static bool packs(const ShadeArgs&) { return true; }  // packets may take its rays
+  static bool packs(const ShadeArgs&) { return true; }  // whether packets can trace its rays
 };
 
 // The plain transfer function. Table: TransferTable or Transfer.

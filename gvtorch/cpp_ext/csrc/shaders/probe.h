@@ -13,6 +13,13 @@ inline namespace GV_NAMESPACE {
 
 constexpr int32_t kMostNumbers = 16;  // that are read at once
 
+template <class T>
+GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {
+  T out = 0;
+  with_voxel(type, [&](auto voxel) { out = number<T>(static_cast<const decltype(voxel)*>(numbers)[index]); });
+  return out;
+}
+
 struct ChannelView {
   const void* bricks_bzyxc;  // null where there is no brick
   const void* constant_tnc;  // null: there is no such channel
@@ -20,14 +27,12 @@ struct ChannelView {
   int32_t width;  // numbers a voxel
 
   GV_HD bool given() const { return constant_tnc != nullptr; }
+  // A number of a node without a brick.
+  template <class T>
+  GV_HD T constant(int32_t node, int32_t component) const {
+    return read_number<T>(constant_tnc, type, static_cast<int64_t>(node) * width + component);
+  }
 };
-
-template <class T>
-GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {
-  T out = 0;
-  with_voxel(type, [&](auto voxel) { out = number<T>(static_cast<const decltype(voxel)*>(numbers)[index]); });
-  return out;
-}
 
 // A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes. Its arguments are
 // values, for an address would put the whole kernel's arguments on the stack.
@@ -44,18 +49,9 @@ template <class T>
 GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> at) {
   Row<T> row{};
   with_voxel(type, [&](auto voxel) {
-    const Eight<T> eight(at, side);
-    const int32_t step_y = width * side, step_z = step_y * side;
-    const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
-                         (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * width);
-    const auto blend = [&](int32_t which) {
-      return eight.blend([&](int y, int z, T& left, T& right) {
-        const auto* pair = corner + (z * step_z + y * step_y) + which;
-        left = number<T>(pair[0]);
-        right = number<T>(pair[width]);
-      });
-    };
-    row = {blend(0), blend(1), blend(2), blend(3)};
+    using Voxel = decltype(voxel);
+    const EightVoxels<T, Voxel> eight(static_cast<const Voxel*>(voxels) + first, Eight<T>(at, side), side, width);
+    row = {eight.value(0), eight.value(1), eight.value(2), eight.value(3)};
   });
   return row;
 }
@@ -76,30 +72,17 @@ template <class T>
 GV_CALL void read_numbers(const void* voxels, VoxelType type, Components<T> components, int32_t count, int64_t first,
                           int32_t side, Vec3<T> at, T* out) {
   with_voxel(type, [&](auto voxel) {
-    const Eight<T> eight(at, side);
-    const int32_t width = components.width, step_y = width * side, step_z = step_y * side;
-    const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
-                         (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * width);
-    for (int32_t i = 0; i < count; ++i) {
-      const int32_t component = components[i];
-      out[i] = eight.blend([&](int y, int z, T& left, T& right) {
-        const auto* pair = corner + (z * step_z + y * step_y) + component;
-        left = number<T>(pair[0]);
-        right = number<T>(pair[width]);
-      });
-    }
+    using Voxel = decltype(voxel);
+    const Voxel* brick = static_cast<const Voxel*>(voxels) + first;
+    const EightVoxels<T, Voxel> eight(brick, Eight<T>(at, side), side, components.width);
+    for (int32_t i = 0; i < count; ++i) out[i] = eight.value(components[i]);
   });
-}
-
-template <class T>
-GV_HD T dot(Vec3<T> a, Vec3<T> b) {
-  return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
 // A vector of length 1, or 0 where there is no direction.
 template <class T>
 GV_HD Vec3<T> unit(Vec3<T> v) {
-  const T most = larger(larger(larger(v.x, -v.x), larger(v.y, -v.y)), larger(v.z, -v.z));
+  const T most = larger(larger(absolute(v.x), absolute(v.y)), absolute(v.z));
   const MaskOf<T> some = most > 0 && most < static_cast<RealOf<T>>(INFINITY);
   Vec3<T> scaled{};
   if (!any(some)) return scaled;
@@ -218,12 +201,7 @@ struct Probe {
 
   // Four numbers of a channel at distance t, from one on: the voxels around it are found once.
   GV_HD Row<T> four_at(const ChannelView& channel, int32_t first, T t) const {
-    const Row<T> row = four_in(channel, first, fine, t);
-    if (!mixed) return row;
-    const Row<T> other = four_in(channel, first, coarse, t);
-    const T part = weight(t);
-    return {row.red + part * (other.red - row.red), row.green + part * (other.green - row.green),
-            row.blue + part * (other.blue - row.blue), row.alpha + part * (other.alpha - row.alpha)};
+    return blended(t, [&](const Spot<T>& spot) { return four_in(channel, first, spot, t); });
   }
 
   // Several numbers of a channel at distance t, at most kMostNumbers.
@@ -245,7 +223,7 @@ struct Probe {
       if (known->at == t) return known->gradient;
     }
 #endif
-    return blended_slope(t, [&](const Spot<T>& spot) { return differences(spot, t); });
+    return blended(t, [&](const Spot<T>& spot) { return differences(spot, t); });
   }
 
   // What one of the two nodes, fine or coarse, says of the value and of its gradient, and its brick of four numbers of
@@ -295,22 +273,14 @@ struct Probe {
     const T low = read(below), high = read(above);
     return (high - low) * (spot.scale / cube[axis]);
   }
-  // A gradient that both levels have, told by slope_in(spot).
-  template <class Slope>
-  GV_HD Vec3<T> blended_slope(T t, const Slope& slope_in) const {
-    Vec3<T> slope = slope_in(fine);
-    if (!mixed) return slope;
-    const Vec3<T> other = slope_in(coarse);
-    const T part = weight(t);
-    for (int axis = 0; axis < 3; ++axis) slope[axis] = slope[axis] + part * (other[axis] - slope[axis]);
-    return slope;
-  }
-  // A number that both levels have, told by read(spot).
+  // What both levels have, a number or several, told by read(spot).
   template <class Read>
-  GV_HD T blended(T t, const Read& read) const {
-    const T number = read(fine);
-    if (!mixed) return number;
-    return number + weight(t) * (read(coarse) - number);
+  GV_HD auto blended(T t, const Read& read) const {
+    const auto found = read(fine);
+    if (!mixed) return found;
+    const auto other = read(coarse);
+    const T part = weight(t);
+    return combined(found, other, [&](T a, T b) { return a + part * (b - a); });
   }
   GV_HD int64_t first_of(const ChannelView& channel, int32_t component, const Spot<T>& spot) const {
     const int32_t numbers = channels.side * channels.side * channels.side * channel.width;  // they fit: check_bricks
@@ -320,15 +290,11 @@ struct Probe {
  private:
   GV_HD Row<T> four_in(const ChannelView& channel, int32_t first, const Spot<T>& spot, T t) const {
     if (spot.brick >= 0) return four_of(true, channel, first, spot, t);
-    const int64_t row = static_cast<int64_t>(spot.node) * channel.width + first;
-    const auto read = [&](int32_t which) { return read_number<T>(channel.constant_tnc, channel.type, row + which); };
+    const auto read = [&](int32_t which) { return channel.constant<T>(spot.node, first + which); };
     return {read(0), read(1), read(2), read(3)};
   }
   GV_HD T read(const ChannelView& channel, int32_t component, const Spot<T>& spot, Vec3<T> at) const {
-    if (spot.brick < 0) {
-      return read_number<T>(channel.constant_tnc, channel.type,
-                            static_cast<int64_t>(spot.node) * channel.width + component);
-    }
+    if (spot.brick < 0) return channel.constant<T>(spot.node, component);
     const int64_t first = first_of(channel, component, spot);
     return read_brick(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at);
   }
@@ -338,19 +304,12 @@ struct Probe {
       const int64_t first = first_of(channel, 0, spot);
       return read_numbers(channel.bricks_bzyxc, channel.type, components, count, first, channels.side, spot.at(t), out);
     }
-    const int64_t row = static_cast<int64_t>(spot.node) * channel.width;
-    for (int32_t i = 0; i < count; ++i) {
-      out[i] = read_number<T>(channel.constant_tnc, channel.type, row + components[i]);
-    }
+    for (int32_t i = 0; i < count; ++i) out[i] = channel.constant<T>(spot.node, components[i]);
   }
   GV_HD bool same(const ChannelView& channel) const {
     if (!channel.given()) return true;
     for (int32_t component = 0; component < channel.width; ++component) {
-      const int64_t a = static_cast<int64_t>(fine.node) * channel.width + component;
-      const int64_t b = static_cast<int64_t>(coarse.node) * channel.width + component;
-      if (read_number<T>(channel.constant_tnc, channel.type, a) !=
-          read_number<T>(channel.constant_tnc, channel.type, b))
-        return false;
+      if (channel.constant<T>(fine.node, component) != channel.constant<T>(coarse.node, component)) return false;
     }
     return true;
   }
@@ -371,7 +330,7 @@ struct TypedProbe : Probe<T> {
     return number<T>(constants[static_cast<int64_t>(spot.node) * channel.width + this->channels.component]);
   }
   GV_HD Vec3<T> gradient(T t) const {
-    return this->blended_slope(t, [&](const Spot<T>& spot) { return differences(spot, t); });
+    return this->blended(t, [&](const Spot<T>& spot) { return differences(spot, t); });
   }
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
     Vec3<T> slope{0, 0, 0};

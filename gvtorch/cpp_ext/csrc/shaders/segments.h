@@ -144,9 +144,7 @@ struct WalkRay {
   }
 
   GV_HD T constant(const Holder& holder) const {
-    const ChannelView& channel = kernel.channels.value;
-    return read_number<T>(channel.constant_tnc, channel.type,
-                          static_cast<int64_t>(holder.node) * channel.width + kernel.channels.component);
+    return kernel.channels.value.template constant<T>(holder.node, kernel.channels.component);
   }
 };
 

@@ -8,14 +8,14 @@ namespace gvtorch {
 
 // Gives a ShadeRay a place for each node, in which it is kept what is hidden from all rays: see kUnknown in walk.h.
 // They live as long as what is returned.
-template <class Device, class Kernel>
+template <class Kernel>
 torch::stable::Tensor hide_nodes(const torch::stable::Tensor& like, int64_t nodes, Kernel& kernel) {
   torch::stable::Tensor places;
   if constexpr (Kernel::kHidesAlike) {
 #ifdef __CUDACC__
     places = torch::stable::new_empty(like, {nodes}, torch::headeronly::ScalarType::Long);
     kernel.words_tn = static_cast<NodeWords*>(places.mutable_data_ptr());
-    for_each<Device>(like, nodes, HideShaded<Kernel>{kernel});
+    for_each(like, nodes, HideShaded<Kernel>{kernel});
 #else
     places = torch::stable::new_zeros(like, {nodes}, torch::headeronly::ScalarType::Byte);
     kernel.hidden_tn = static_cast<uint8_t*>(places.mutable_data_ptr());
@@ -24,10 +24,10 @@ torch::stable::Tensor hide_nodes(const torch::stable::Tensor& like, int64_t node
   return places;
 }
 
-template <class Device, class Kernel>
+template <class Kernel>
 void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel) {
-  const torch::stable::Tensor places = hide_nodes<Device>(like, nodes, kernel);
-  for_each<Device>(like, kernel.order.count(), kernel);
+  const torch::stable::Tensor places = hide_nodes(like, nodes, kernel);
+  for_each(like, kernel.order.count(), kernel);
 }
 
 // Rays with a fused shader. On CUDA the voxels' dtype is compiled in for the plain function, filtered or not, and where
@@ -35,7 +35,7 @@ void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel)
 // plain function in float32 alone.
 template <class T>
 void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
-  const auto each = [&](const auto& kernel) { shade_each<Device>(like, args.nodes, kernel); };
+  const auto each = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };
   const auto typed = [&](auto shader, auto voxel) {
     using Shader = typename decltype(shader)::Shader;
     with_digits<T>(args, [&](auto* digits) {

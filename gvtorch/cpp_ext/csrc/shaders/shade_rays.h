@@ -14,26 +14,6 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-template <class Shader, class = void>
-struct IsFiltered : std::false_type {};
-template <class Shader>
-struct IsFiltered<Shader, std::void_t<decltype(Shader::kFiltered)>> : std::bool_constant<(Shader::kFiltered > 0)> {};
-
-template <class Shader, class = void>
-struct IsColored : std::false_type {};
-template <class Shader>
-struct IsColored<Shader, std::void_t<decltype(Shader::kColored)>> : std::bool_constant<Shader::kColored> {};
-
-template <class Shader, class = void>
-struct ReadsAll : std::false_type {};
-template <class Shader>
-struct ReadsAll<Shader, std::void_t<decltype(Shader::kReadsAll)>> : std::bool_constant<Shader::kReadsAll> {};
-
-template <class Shader, class = void>
-struct HidesAlike : std::false_type {};
-template <class Shader>
-struct HidesAlike<Shader, std::void_t<decltype(Shader::kHidesAlike)>> : std::bool_constant<Shader::kHidesAlike> {};
-
 // Digits: see `with_digits`. Voxel: of the shader's value; void: told at run time.
 template <class T, class Shader, class Digits, bool kShadows = false, class Voxel = void>
 struct ShadeRay : Walk<T> {
@@ -45,8 +25,8 @@ struct ShadeRay : Walk<T> {
   // once: 128 or 64 registers a thread.
   static constexpr bool kShort =
       !std::is_void_v<Voxel> && std::is_base_of_v<Plain<T>, Shader> && !std::is_base_of_v<Lit<T>, Shader>;
-  static constexpr int kBlocksAtOnce = kShort && !IsFiltered<Shader>::value ? 8 : 4;
-  static constexpr bool kHidesAlike = HidesAlike<Shader>::value;
+  static constexpr int kBlocksAtOnce = kShort && Shader::kFiltered == 0 ? 8 : 4;
+  static constexpr bool kHidesAlike = Shader::kHidesAlike;
   Shader shader;
   Channels channels;
   Light<T> light;
@@ -66,7 +46,7 @@ struct ShadeRay : Walk<T> {
                  args.side,
                  args.border,
                  args.component},
-        light{static_cast<const Parameters<T>*>(args.parameter_54)},
+        light(args),
         range_tn2c(args.range_tn2c),
         hidden_tn(args.hidden_tn),
         lengths(args.levels),
@@ -113,7 +93,7 @@ struct ShadeRay : Walk<T> {
   // Nothing between the ends of the node's range changes the sum.
   template <class Any>
   GV_HD bool hides(const Any& shader, int32_t node, const typename Any::Sum& sum) const {
-    if constexpr (ReadsAll<Any>::value) {
+    if constexpr (Any::kReadsAll) {
       return shader.hides_ranges([&](int32_t component) { return range_of(node, component); });
     } else {
       const Range range = range_of(node);
@@ -183,7 +163,7 @@ struct ShadeRay : Walk<T> {
     template <class Node>
     GV_HD void finish(const Node&) const {}
     GV_HD NodeWords words(int32_t node) const {
-      if constexpr (HidesAlike<Any>::value) return kernel.words(node);
+      if constexpr (Any::kHidesAlike) return kernel.words(node);
       return kernel.tree.words_of(node, kernel.hides(shader, node, sum));
     }
     GV_HD Eye enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
@@ -203,11 +183,10 @@ struct ShadeRay : Walk<T> {
       ++samples;
     }
     GV_HD int32_t take(const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
-      if constexpr (IsFiltered<Any>::value) {  // it reads colours by itself; a visit without any is the plain
-                                               // function's
+      if constexpr (Any::kFiltered > 0) {  // it reads colours by itself; a visit without any is the plain function's
         if (shader.stored(probe)) return take_by(shader, [](T) { return T{}; }, probe, at, alike, last);
         return take(ready_for_ray(shader.plain()), probe, at, alike, last);
-      } else if constexpr (ReadsAll<Any>::value) {
+      } else if constexpr (Any::kReadsAll) {
         return take_by(shader, [](T) { return T{}; }, probe, at, alike, last);
       } else {
         return take(shader, probe, at, alike, last);
@@ -283,7 +262,7 @@ struct ShadeRay : Walk<T> {
     const Sight<T> sight(probe.sight.at(t), way);
     Intervals<T> at(beam, options.step, lengths);
     at.go(true, at.count + 1);
-    const Veil<T, Shader> veil{shader};
+    const Veil<T, Shader> veil{{}, shader};
     typename Veil<T, Shader>::Sum sum;
     sum.stop_clear = light.faintest(this->stop_clear);
     Visitor<Veil<T, Shader>> visitor{*this, veil, &beam, &sight, sum};

@@ -10,9 +10,10 @@
 //   hides(low, high, sum)                         true: no value in [low, high] changes the sum. The node is left out;
 //                                                 without kHidesAlike, of V as `add`
 //   kHidesAlike                                   it does not look at the sum: nodes are hidden from all rays alike
-//   kReadsAll, hides_ranges(range_of)             it reads the voxels' numbers by itself, and no value comes with a
-//   piece;
-//                                                 range_of(component) tells the ends of any of them
+//   kReadsAll, hides_ranges(range_of)             `add` reads all numbers through its probe, and pieces come without a
+//                                                 value. hides_ranges then stands in the place of `hides`:
+//                                                 range_of(component) has the smallest and the largest value (low,
+//                                                 high) that one of a voxel's numbers has in the node
 //   add(which, piece, probe, sum)                 adds an interval; `probe` reads any channel at any distance
 //   kSurface, surface(probe, sum)                 where depth was set: `probe` then stands in the node of that place
 //   done(sum)                                     after the last interval
@@ -53,7 +54,7 @@ struct Lit : Plain<T> {
   using Plain<T>::step;
   Light<T> light;
 
-  explicit Lit(const ShadeArgs& args) : Plain<T>(args), light{static_cast<const Parameters<T>*>(args.parameter_54)} {}
+  explicit Lit(const ShadeArgs& args) : Plain<T>(args), light(args) {}
 
   GV_HD T alpha(const Piece<T>& piece, const Probe<T>&) const {
     return look_up(Transfer<T>(transfer), piece.value, piece, step).alpha;
@@ -79,9 +80,7 @@ struct LitRow {
 };
 template <class V, class F>
 GV_HD LitRow<V> combined(const LitRow<V>& a, const LitRow<V>& b, const F& f) {
-  const auto& n = a.normal;
-  const auto& m = b.normal;
-  return {combined(a.row, b.row, f), {f(n.x, m.x), f(n.y, m.y), f(n.z, m.z)}};
+  return {combined(a.row, b.row, f), combined(a.normal, b.normal, f)};
 }
 
 // The lit transfer function from afar: Filtered's numbers are followed by the mean products xx xy xz yy yz zz of the
@@ -105,7 +104,7 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
     LitRow<V> found;
     if (any(others)) found = near(others, piece, probe, node);
     if (!any(colored)) return found;
-    return combined(found, far(colored, piece, probe, node), [&](V a, V b) { return select(colored, b, a); });
+    return choose(colored, far(colored, piece, probe, node), found);
   }
 
  private:
@@ -157,10 +156,7 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
       const MaskOf<V> back = which && d[axis] < 0, ahead = which && !back;
       const int32_t first = 2 * kFiltered * axis;
       Moments<V> m = any(ahead) ? moments(ahead, read, first) : moments(back, read, first + kFiltered);
-      if (any(ahead) && any(back)) {
-        const Moments<V> there = moments(back, read, first + kFiltered);
-        m = combined(there, m, [&](V a, V b) { return select(back, a, b); });
-      }
+      if (any(ahead) && any(back)) m = choose(back, moments(back, read, first + kFiltered), m);
       const Vec3<V> column = axis == 0   ? Vec3<V>{m.xx, m.xy, m.xz}
                              : axis == 1 ? Vec3<V>{m.xy, m.yy, m.yz}
                                          : Vec3<V>{m.xz, m.yz, m.zz};
@@ -184,8 +180,8 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
 
 // What a shader takes from the light that goes through: the shader of rays that go to a light.
 template <class T, class Shader>
-struct Veil {
-  static constexpr bool kEnds = false, kSeesEmpty = false, kHidesAlike = Shader::kHidesAlike;
+struct Veil : ShaderFacts {
+  static constexpr bool kHidesAlike = Shader::kHidesAlike;
   struct Sum {
     T clear = 1;     // transmittance
     T stop_clear{};  // at which the way ends
@@ -229,10 +225,10 @@ struct PreIntegrated : ShaderFacts {
     if (!any(beyond)) {
       row = part(row, lengths);
     } else {
-      const V share = lengths / size_of(piece.back - piece.front);
-      const Row<V> before = part(pair(front, front), share * size_of(front - piece.front));
-      const Row<V> behind = part(pair(back, back), share * size_of(piece.back - back));
-      const Row<V> parts = over(over(before, part(row, share * size_of(back - front))), behind);
+      const V share = lengths / absolute(piece.back - piece.front);
+      const Row<V> before = part(pair(front, front), share * absolute(front - piece.front));
+      const Row<V> behind = part(pair(back, back), share * absolute(piece.back - back));
+      const Row<V> parts = over(over(before, part(row, share * absolute(back - front))), behind);
       row = choose(beyond, parts, part(row, lengths));
     }
     if (unseen(which, row.alpha)) return;
@@ -261,18 +257,9 @@ struct PreIntegrated : ShaderFacts {
     return choose(changes, {row.red * scale, row.green * scale, row.blue * scale, alpha}, row);
   }
   template <class V>
-  GV_HD static Row<V> choose(MaskOf<V> which, const Row<V>& a, const Row<V>& b) {
-    return {select(which, a.red, b.red), select(which, a.green, b.green), select(which, a.blue, b.blue),
-            select(which, a.alpha, b.alpha)};
-  }
-  template <class V>
   GV_HD static Row<V> over(const Row<V>& a, const Row<V>& b) {
     const V kept = 1 - a.alpha;
     return {a.red + kept * b.red, a.green + kept * b.green, a.blue + kept * b.blue, a.alpha + kept * b.alpha};
-  }
-  template <class V>
-  GV_HD static V size_of(V value) {
-    return larger(value, -value);
   }
   GV_HD void done(Sum&) const {}
 };
@@ -302,10 +289,7 @@ struct Isosurface : ShaderFacts {
   Light<T> light;
   int32_t color_component;
 
-  explicit Isosurface(const ShadeArgs& args)
-      : transfer(args),
-        light{static_cast<const Parameters<T>*>(args.parameter_54)},
-        color_component(args.other_component) {}
+  explicit Isosurface(const ShadeArgs& args) : transfer(args), light(args), color_component(args.other_component) {}
 
   struct Own {
     T level;

@@ -8,16 +8,6 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// f(a, b) of numbers, or of each of rows.
-template <class V, class F>
-GV_HD V combined(V a, V b, const F& f) {
-  return f(a, b);
-}
-template <class V, class F>
-GV_HD Row<V> combined(const Row<V>& a, const Row<V>& b, const F& f) {
-  return {f(a.red, b.red), f(a.green, b.green), f(a.blue, b.blue), f(a.alpha, b.alpha)};
-}
-
 // A voxel's number, or four of them, as seen along direction d; read(which, k) gives lanes the number k places behind
 // the first, or the four that begin there. A channel may hold `one` numbers for each of six directions (Crassin et al.,
 // "Interactive indirect illumination using voxel cone tracing", CGF 2011): then the three that d goes along are read,
@@ -31,7 +21,7 @@ GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const 
     if (!any(back)) return read(ahead, first);
     if (!any(ahead)) return read(back, first + one);
     const auto there = read(back, first + one), here = read(ahead, first);
-    return combined(there, here, [&](V a, V b) { return select(back, a, b); });
+    return choose(back, there, here);
   };
   const auto z = side(2);
   auto seen = z;
@@ -45,7 +35,9 @@ GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const 
   return seen;
 }
 
-// Colour and opacity of each voxel, once or by direction, which no packet reads; the value is the opacity.
+// Voxels that hold a colour themselves: red, green, blue and opacity, or these four for each of six directions (see
+// by_direction). The opacity is the value by which nodes are hidden. Packets read four numbers a voxel; rays through
+// colours by direction are traced one by one.
 template <class T>
 struct StoredColor : ShaderFacts {
   static constexpr bool kColored = true;
@@ -55,7 +47,7 @@ struct StoredColor : ShaderFacts {
   using Sum = SumOf<T>;
   Light<T> light;
 
-  explicit StoredColor(const ShadeArgs& args) : light{static_cast<const Parameters<T>*>(args.parameter_54)} {}
+  explicit StoredColor(const ShadeArgs& args) : light(args) {}
 
   template <class Any>
   GV_HD bool hides(T, T high, const Any&) const {

@@ -16,6 +16,25 @@ struct alignas(16) alignas(T) Row {
 };
 constexpr int kAlpha = 3;
 
+// f(a, b) of two numbers, or of each number of two rows or vectors; other structs have an overload beside them.
+template <class V, class F>
+GV_HD V combined(V a, V b, const F& f) {
+  return f(a, b);
+}
+template <class V, class F>
+GV_HD Row<V> combined(const Row<V>& a, const Row<V>& b, const F& f) {
+  return {f(a.red, b.red), f(a.green, b.green), f(a.blue, b.blue), f(a.alpha, b.alpha)};
+}
+template <class V, class F>
+GV_HD Vec3<V> combined(const Vec3<V>& a, const Vec3<V>& b, const F& f) {
+  return {f(a.x, b.x), f(a.y, b.y), f(a.z, b.z)};
+}
+// `select` of all that `combined` takes.
+template <class Mask, class Some>
+GV_HD Some choose(Mask which, const Some& a, const Some& b) {
+  return combined(a, b, [&](auto one, auto other) { return select(which, one, other); });
+}
+
 // A packet of which nothing is seen is done with an interval; to a single ray the question costs more than it spares.
 template <class T>
 GV_HD bool unseen(MaskOf<T> which, T alpha) {
@@ -64,11 +83,11 @@ struct Cell {
 // Values a little apart: interpolation may round beyond the ends of a range.
 template <class T>
 GV_HD T a_little_below(T value) {
-  return value - larger(value, -value) * static_cast<RealOf<T>>(9.5367431640625e-7);  // 2^-20
+  return value - absolute(value) * static_cast<RealOf<T>>(9.5367431640625e-7);  // 2^-20
 }
 template <class T>
 GV_HD T a_little_above(T value) {
-  return value + larger(value, -value) * static_cast<RealOf<T>>(9.5367431640625e-7);
+  return value + absolute(value) * static_cast<RealOf<T>>(9.5367431640625e-7);
 }
 
 // The table as a kernel carries it: what lies on a GPU is not read before a ray is traced.
@@ -144,8 +163,13 @@ struct Transfer {
   // Colour and alpha of a value, for a level of intervals. Lanes that are not asked for may get anything.
   template <class V>
   GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which = all_lanes<V>()) const {
+    return look_up(value, level, which, rows);
+  }
+  // The same in a table of several functions, so many rows a level.
+  template <class V>
+  GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which, int32_t level_rows) const {
     const Cell<V> cell = find(value);
-    const auto index = static_cast<typename LanesOf<V>::Index>(level) * rows + cell.row;
+    const auto index = static_cast<typename LanesOf<V>::Index>(level) * level_rows + cell.row;
     const RowPair<V> pair = rows_at(index);
     return make_row<V>(which, [&](int column) { return pair.at(cell.weight, column); });
   }

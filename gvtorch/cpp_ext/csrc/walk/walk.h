@@ -13,9 +13,7 @@ inline namespace GV_NAMESPACE {
 
 template <class T>
 struct TraceOptions {
-  T step;  // world length of the shortest interval
-  T stop_alpha;
-  T depth_alpha;
+  T step;         // world length of the shortest interval
   bool by_level;  // a node's brick is asked for before its children
 };
 
@@ -92,14 +90,13 @@ struct Walk {
              static_cast<int32_t>(args.nodes / args.nodes_per_tile),
              static_cast<int32_t>(args.bricks)},
         levels(args.root_voxel, args.side - 2 * args.border, args.branching),
-        options{static_cast<T>(args.step), static_cast<T>(args.stop_alpha), static_cast<T>(args.depth_alpha),
-                args.by_level},
+        options{static_cast<T>(args.step), args.by_level},
         hits{static_cast<T*>(args.color_r3), static_cast<T*>(args.alpha_r1), static_cast<T*>(args.depth_r1),
              args.samples_r, args.missed_r},
         frame_1(args.frame_1),
         stamp_b(args.stamp_b),
-        stop_clear(1 - options.stop_alpha),
-        hit_clear(1 - options.depth_alpha) {}
+        stop_clear(1 - static_cast<T>(args.stop_alpha)),
+        hit_clear(1 - static_cast<T>(args.depth_alpha)) {}
 
   // Goes along a ray to its end, or until the visitor has enough. Digits: see `with_digits`. A visitor has:
   //
@@ -165,11 +162,11 @@ struct Walk {
   }
 
   // Finds the node in which an interval's middle lies; marks what is used and what is missing. `wanted` is the depth
-  // that the visit before wanted.
+  // that the visit before wanted. Level of detail: the first depth whose voxel fits into the cone (packet_walk.h
+  // decides likewise for many rays; Levels.wanted in the twin).
   template <class Digits, class Words>
   GV_HD Visit<T> find(const Ray<T>& ray, Digits& digits, T cone, const Words& words, int32_t& wanted,
                       bool& missed) const {
-    // Level of detail: the first depth whose voxel fits into the cone.
     const T infinity = static_cast<T>(INFINITY);
     while (wanted < tree.max_depth && levels.voxel[wanted] > cone) ++wanted;
     while (wanted > 0 && !(levels.voxel[wanted - 1] > cone)) --wanted;
@@ -197,7 +194,7 @@ struct Walk {
   }
 
   // Asks for what is not there, and tells whether it did. Straight to the wanted level, or level by level: then a
-  // brick is there before its node is subdivided.
+  // brick is there before its node is subdivided. A node that is absent or too coarse always leads to a request.
   GV_HD bool mark_missing(const Place& place, int32_t wanted, bool blend, T cone) const {
     const bool absent = place.brick == kAbsent;
     const bool deeper = place.depth < wanted && place.tile == kAbsent;
