@@ -156,6 +156,20 @@ def test_a_broken_off_store_goes_on_and_is_the_same(tmp_path, mesh, monkeypatch)
         gv.voxelize(mesh, target, **told)
 
 
+@pytest.mark.parametrize(
+    ("manifest", "channels"), [("manifest.json", NAMES), ("channels.json", NAMES[0])]
+)
+def test_what_another_converter_has_begun_stays(tmp_path, mesh, manifest, channels):
+    target = tmp_path / "a.zarr"
+    begun = target / ".gvtorch-work" / manifest
+    begun.parent.mkdir(parents=True)
+    begun.write_text("{}")
+    for resume in (False, True):
+        with pytest.raises(FileExistsError, match="exists and is no store"):
+            gv.voxelize(mesh, target, resolution=20, channels=channels, resume=resume)
+    assert begun.read_text() == "{}"
+
+
 @pytest.mark.skipif(os.name != "posix", reason="kills a process")
 def test_a_killed_voxelization_goes_on_and_is_the_same(tmp_path):
     trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")

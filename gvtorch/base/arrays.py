@@ -48,8 +48,7 @@ class ArrayLike:
                 for axis, n in zip(self.axes, self.shape, strict=True)
             )
         )
-        data = data.squeeze(tuple(at for at, axis in enumerate(self.axes) if axis == "-"))
-        data = boxes.to_zyxc(data, self.axes.replace("-", ""), "tzyxc")[0]
+        data = boxes.to_zyxc(data, self.axes, "tzyxc")[0]
         return np.flip(data, tuple("zyx".index(axis) for axis in self.flips))
 
     def read(self, index: tuple[slice, ...]) -> np.ndarray:

@@ -37,8 +37,10 @@ def repeat_edges(data: np.ndarray, start: Zyx, low: Zyx, high: Zyx) -> np.ndarra
 
 def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
     """Returns an array whose axes are `axes` as (z, y, x, c), or as another order of the same and
-    more; those that it lacks have size 1.
+    more; those that it lacks have size 1. Axes -, of size 1, are dropped.
     """
+    data = data.squeeze(tuple(at for at, axis in enumerate(axes) if axis == "-"))
+    axes = axes.replace("-", "")
     missing = "".join(axis for axis in order if axis not in axes)
     letters = missing + axes
     return data[(None,) * len(missing)].transpose([letters.index(axis) for axis in order])

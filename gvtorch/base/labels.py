@@ -7,6 +7,7 @@ their label in a table of all labels.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
@@ -94,6 +95,14 @@ def indexed(where: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | No
         return values, None
     labels = distinct(where, values)  # plane by plane
     return indices(values, labels), labels
+
+
+def counted(labels: Any) -> str:
+    """Returns how many of labels (k,) there are, without the background 0, and from where to where:
+    "12, 1 to 40".
+    """
+    found = labels[labels != 0]
+    return f"{len(found)}, {int(found.min())} to {int(found.max())}" if len(found) else "0"
 
 
 def background(labels: np.ndarray | None) -> int | None:

@@ -15,7 +15,7 @@ from torch import Tensor
 from . import check
 from . import constants as config
 from .image_info import ImageInfo
-from .labels import check_narrowed, indexed
+from .labels import check_narrowed, counted, indexed
 
 #: The dtypes that a brick channel can have. Wider ones are narrowed on the way in, see `Volume`.
 CHANNEL_DTYPES = (
@@ -225,10 +225,8 @@ class Volume:
             return {}
         known = self.label_values
         names = movable(self.data).unique().to(torch.int64) if known is None else known
-        names = names[names != 0]
-        ends = f", {int(names.min())} to {int(names.max())}" if len(names) else ""
-        counted = "" if known is None else "; the other numbers are places in their list"
-        return {"labels": f"{len(names)}{ends}{counted}"}
+        others = "" if known is None else "; the other numbers are places in their list"
+        return {"labels": f"{counted(names)}{others}"}
 
     def __repr__(self) -> str:
         dtype = str(self.data.dtype).removeprefix("torch.")

@@ -14,12 +14,14 @@ from .text_path import text_path
 
 
 @contextmanager
-def told_of(path: Path) -> Iterator[None]:
-    """Gives an OSError of writing that names no file, as of a full disk, the name of this one."""
+def told_of(path: Path, *drafts: str) -> Iterator[None]:
+    """Gives an OSError of writing that names no file, as of a full disk, or one of its drafts, the
+    name of this file.
+    """
     try:
         yield
     except OSError as error:
-        if error.filename is not None:
+        if error.filename not in (None, *drafts):
             raise
         text = f"can't be written: {error.strerror or error}"
         raise OSError(error.errno or errno.EIO, text, str(path)) from None
@@ -28,23 +30,15 @@ def told_of(path: Path) -> Iterator[None]:
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A place to write to, which takes the file's name once the block ends well."""
-    part = ""
     try:
         handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from None
     try:
-        try:
+        part = os.path.join(text_path(os.path.abspath(path.parent)), os.path.basename(name))
+        with told_of(path, name, part):  # what stands there already stays
             os.close(handle)
-            part = os.path.join(text_path(os.path.abspath(path.parent)), os.path.basename(name))
             yield Path(part)
-        except OSError as error:  # what stands there already stays
-            if error.filename not in (None, name, part):
-                raise
-            text = error.strerror or str(error)
-            raise OSError(
-                error.errno or errno.EIO, f"can't be written: {text}", str(path)
-            ) from None
         mask = os.umask(0)
         os.umask(mask)
         os.chmod(name, 0o666 & ~mask)

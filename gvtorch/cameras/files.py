@@ -27,7 +27,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.messages import one_line
-from ..base.whole_file import whole_file
+from ..base.whole_file import write_whole
 from .camera import Camera, Frame
 from .rotations import quaternion_of, rotation_of
 
@@ -135,21 +135,16 @@ def write_cameras(
         raise FileNotFoundError(f"{where}: folder not found: {path.parent}")
     if path.suffix == ".pvcc":
         far = check.number(where, "distance", distance or 1.0, low=0, open_low=True)
-        _write(path, _pvcc(cameras, far))
+        write_whole(path, _pvcc(cameras, far))
     elif path.suffix == ".json":
-        _write(path, json.dumps(_transforms(cameras), indent=1) + "\n")
+        write_whole(path, json.dumps(_transforms(cameras), indent=1) + "\n")
     elif path.suffix == "" and (path.is_dir() or not path.exists()):
         texts = _colmap(cameras)
         path.mkdir(exist_ok=True)
         for name, text in texts.items():
-            _write(path / name, text)
+            write_whole(path / name, text)
     else:
         raise ValueError(f"{where}: path must end in .pvcc or .json or be a folder, got {path}")
-
-
-def _write(path: Path, text: str) -> None:
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
 
 
 def _scaled(camera: Camera, width: int, height: int) -> Camera:

@@ -13,7 +13,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from .distance import HASH, Changed, Distance
+from .distance import HASH, Changed, Distance, grown
 from .field import Bounds, Field, Interval, Values, checked_field
 from .solid import Solid
 
@@ -73,8 +73,7 @@ class Warp(Field):
         return _alike((self.field,), center, half + self.most)
 
     def box(self) -> Tensor | None:
-        box = self.field.box() if isinstance(self.field, Field) else None
-        return None if box is None else torch.stack((box[0] - self.most, box[1] + self.most))
+        return grown(self.field.box() if isinstance(self.field, Field) else None, self.most)
 
 
 class Stack(Field):
@@ -155,18 +154,22 @@ class Blend(Field):
         found = [_known(part, center, half, size) for part in (self.first, self.second)]
         if found[0] is None or found[1] is None:
             return None
-        share = _known(self.mask, center, half, size)
-        none = torch.zeros_like(center[:, 0])
-        if isinstance(share, Mapping):
-            share = next(iter(share.values())) if len(share) == 1 else None
-        low, high = (none, none + 1) if share is None else share
-        low, high = low.reshape(len(none)), high.reshape(len(none))
+        low, high = self._shares(center, half, size)
         if isinstance(found[0], Mapping) and isinstance(found[1], Mapping):
             both = {*found[0]} & {*found[1]}
             return {n: _between(found[0][n], found[1][n], low, high) for n in both}
         if isinstance(found[0], Mapping) or isinstance(found[1], Mapping):
             return None
         return _between(found[0], found[1], low, high)
+
+    def _shares(self, center: Tensor, half: Tensor, size: Tensor | None) -> Interval:
+        """(k,) what the mask is known to be in boxes; 0 to 1 where nothing is."""
+        known = _known(self.mask, center, half, size)
+        if isinstance(known, Mapping):
+            known = next(iter(known.values())) if len(known) == 1 else None
+        none = torch.zeros_like(center[:, 0])
+        low, high = (none, none + 1) if known is None else known
+        return low.reshape(len(none)), high.reshape(len(none))
 
     def near(self, center: Tensor, half: Tensor) -> Self:
         parts = {"first": self.first, "second": self.second, "mask": self.mask}
@@ -200,15 +203,10 @@ class Mask(Blend):
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
         """0 where the mask is; else between 0 and the field."""
-        share = _known(self.mask, center, half, size)
-        if isinstance(share, Mapping):
-            share = next(iter(share.values())) if len(share) == 1 else None
-        none = torch.zeros_like(center[:, 0])
-        low, high = (none, none + 1) if share is None else share
-        low, high = low.reshape(len(none)), high.reshape(len(none))
+        low, high = self._shares(center, half, size)
         found = _known(self.first, center, half, size)
         if found is None:  # of a field of one number, what is hidden is known all the same
-            wild = torch.full_like(none, torch.inf)
+            wild = torch.full_like(center[:, 0], torch.inf)
             found = (-wild, wild)
         if isinstance(found, Mapping):
             return {n: _between(_zero(one), one, low, high) for n, one in found.items()}

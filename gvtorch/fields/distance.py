@@ -207,8 +207,7 @@ class SmoothUnion(Pair):
         return torch.lerp(first, second, share) - self.width * share * (1 - share), share
 
     def box(self) -> Tensor | None:
-        found = super().box()
-        return None if found is None else grown(found, self.width / 4)
+        return grown(super().box(), self.width / 4)
 
 
 class OfShape(Field):
@@ -315,6 +314,6 @@ def common(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     return torch.stack((torch.maximum(first[0], second[0]), torch.minimum(first[1], second[1])))
 
 
-def grown(box: Tensor, by: Tensor | float) -> Tensor:
-    """Returns a (2, 3) box whose faces lie further out by a length."""
-    return torch.stack((box[0] - by, box[1] + by))
+def grown(box: Tensor | None, by: Tensor | float) -> Tensor | None:
+    """Returns a (2, 3) box whose faces lie further out by a length; None if it is unknown."""
+    return None if box is None else torch.stack((box[0] - by, box[1] + by))

@@ -86,6 +86,5 @@ class Fur(OfShape):
 
     def box(self) -> Tensor | None:
         """Around the shape and its hairs."""
-        box = self.shape.box()
         reach = _HALF + _SPREAD * noise.bounds(noise.perlin).high
-        return None if box is None else grown(box, reach * self.length)
+        return grown(self.shape.box(), reach * self.length)

@@ -219,9 +219,8 @@ class Repeat(Space):
         return (low + high) / 2, (high - low) / 2
 
     def box(self) -> Tensor | None:
-        box, most = self.shape.box(), torch.tensor(self._most, dtype=torch.float64)
-        way = torch.where(self.period > 0, self.period * most, 0.0)
-        return None if box is None else torch.stack((box[0] - way, box[1] + way))
+        most = torch.tensor(self._most, dtype=torch.float64)
+        return grown(self.shape.box(), torch.where(self.period > 0, self.period * most, 0.0))
 
 
 class Offset(Space):
@@ -238,8 +237,7 @@ class Offset(Space):
         return value - self.by
 
     def box(self) -> Tensor | None:
-        box = self.shape.box()
-        return None if box is None else grown(box, self.by.clamp(min=0))
+        return grown(self.shape.box(), self.by.clamp(min=0))
 
 
 class Shell(Offset):

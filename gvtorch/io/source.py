@@ -158,8 +158,7 @@ class VolumeSource(ABC):
             index.append(slice(size - stop, size - start) if backwards else slice(start, stop))
         with np.errstate(all="ignore"):  # what is no number is told, or replaced, as such
             data = self.read_stored(tuple(index))
-        data = data.squeeze(tuple(i for i, axis in enumerate(self.axes) if axis == "-"))
-        data = boxes.to_zyxc(data, self.axes.replace("-", ""), "tzyxc")
+        data = boxes.to_zyxc(data, self.axes, "tzyxc")
         data = np.flip(data, tuple("tzyx".index(axis) for axis in self.flips))
         if not self.info.labels:
             check_narrowed(self.path, data)

@@ -141,7 +141,7 @@ class Lighted:
 
     trace: TraceRays  # traces the eye's rays: unlit colours and normals
     blocker: TraceRays  # traces cones of which only alpha is used
-    matter: TraceRays | None  # the same as `trace`, of cones to what reflects light; None: no
+    matter: TraceRays | None  # traces cones to what reflects light, as `trace` does; None: no
     lighting: Lighting  # in world units
     lights: Sequence[Light]  # in world units
     material: ShadeParameters  # how matter reflects light

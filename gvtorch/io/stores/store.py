@@ -21,7 +21,7 @@ import torch
 
 from ...base import boxes, check
 from ...base.boxes import Zyx, grouped
-from ...base.labels import background
+from ...base.labels import background, counted
 from ...pool.downsample import pool_majority, pool_mean
 from .checksums import Checksums, file_of, sum_of
 from .chunk_files import ChunkFiles, begin_read, files_of
@@ -75,8 +75,8 @@ class Store:
         threshold: What EMPTY was decided by, or None.
         all_channels: Whether it was opened with all of its channels, as they are.
         coarse: Its coarse channels by name; see coarse.py.
-        label_values: (k,) int64 the label that each value stands for, where labels were counted
-            off; None: values stand for themselves.
+        label_values: (k,) int64 the label that each value stands for, where labels are indexed;
+            None: values stand for themselves.
         pool: Makes coarser voxels: their mean, or the most frequent label.
         layout: What lies where on disk.
         root: tensorstore's spec of its folder.
@@ -228,7 +228,7 @@ class Store:
             "unit": None,
             **self.info.describe(),
             **times,
-            **self._labels_told(),
+            **({} if self.label_values is None else {"labels": counted(self.label_values)}),
             "levels": self.levels,
             "level extents": [list(self.level_extent(level)) for level in range(self.levels)],
             "blocks": f"{self.block}^3+{self.border}" if self.has_blocks else "none",
@@ -238,14 +238,6 @@ class Store:
             "disk bytes": sum(file.stat().st_size for file in files),
             **({"not kept": list(self.lost)} if self.lost else {}),
         }
-
-    def _labels_told(self) -> dict[str, Any]:
-        """How many labels there are, without the background 0, and which, where it is known."""
-        if self.label_values is None:
-            return {}
-        names = self.label_values[self.label_values != 0]
-        ends = f", {int(names.min())} to {int(names.max())}" if len(names) else ""
-        return {"labels": f"{len(names)}{ends}"}
 
     def level_extent(self, level: int) -> tuple[int, int, int]:
         """(x, y, z) voxels of a level, 0 the finest."""
@@ -300,8 +292,8 @@ class Store:
         return "int64" if self.label_values is not None else self._levels.stored.str
 
     def read_stored(self, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
-        """Reads a box of finest voxels, (z, y, x, c), as they are stored; labels that were counted
-        off are given as labels. Box and errors as of `read_region`; it lies inside the volume.
+        """Reads a box of finest voxels, (z, y, x, c), as they are stored; of labels that are
+        indexed, the labels. Box and errors as of `read_region`; it lies inside the volume.
         """
         if not self.has_blocks:
             return self._levels.read_stored(low, high, Deadline(timeout))
