@@ -176,8 +176,9 @@ def test_vti(tmp_path, grid, mode, packer, dtype):
     assert np.array_equal(volume.data[..., 0].float().numpy(), values.astype("f4"))
     assert volume.spacing == (0.5, 2, 3) and volume.origin == (11, 20, 30)
     assert volume.info.channels[0].name == "density"
-    other = gv.read_volume(file, key="other")
-    assert np.array_equal(other.data.float(), (volume.data + 1).float())
+    for key in ("other", "1"):
+        other = gv.read_volume(file, key=key)
+        assert np.array_equal(other.data.float(), (volume.data + 1).float())
     assert open_source(file).whole == ((mode, packer) != ("Appended", "None"))
     with pytest.raises(ValueError, match="has no array 'x'; it holds 0 'density', 1 'other'"):
         gv.read_volume(file, key="x")

@@ -86,7 +86,7 @@ def test_several_series_and_pyramids(tmp_path):
     with pytest.warns(UserWarning, match=r"1 other series; key .* among 0 'fine', 1 'other'"):
         volume = gv.read_volume(file)
     assert np.array_equal(volume.data[..., 0].numpy(), fine)
-    for key in ("1", "other"):
+    for key in ("1", "other", "/other"):
         volume = gv.read_volume(file, key=key)
         assert np.array_equal(volume.data[..., 0].numpy(), other) and volume.spacing[0] == 7
     with pytest.raises(ValueError, match="has no series '2'; it holds 0 'fine', 1 'other'"):

@@ -47,7 +47,7 @@ def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
 
 
 def grouped(places: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns the different ones (m, 3) of places (k, 3), in order, and the rows of each."""
+    """Returns the different ones (m, n) of places (k, n), in order, and the rows of each."""
     order = np.lexsort(places.T[::-1])
     places = places[order]
     others = np.flatnonzero((places[1:] != places[:-1]).any(1)) + 1

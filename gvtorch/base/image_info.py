@@ -53,6 +53,12 @@ def to_hex(color: Rgb) -> str:
     return "".join(f"{round(255 * min(max(part, 0.0), 1.0)):02x}" for part in color)
 
 
+def from_hex(text: str) -> Rgb:
+    """Returns the colour that RRGGBB tells; raises ValueError of anything else."""
+    red, green, blue = (part / 255 for part in bytes.fromhex(text))
+    return (red, green, blue)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ImageInfo:
     """What is known of an image's numbers; what a file does not tell is left out."""

@@ -1,4 +1,4 @@
-"""`whole_file`, `write_whole`: files that appear when they are whole."""
+"""`whole_file`, `write_whole`, `durable_file`: files that appear when they are whole."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from .text_path import text_path
 
@@ -50,3 +51,26 @@ def write_whole(path: Path, text: str) -> None:
     """Writes text; on a full disk what stands there already stays."""
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def durable_file(path: Path) -> Iterator[IO[bytes]]:
+    """Opens a file that takes its name once the block ends well, and is on disk then: a power cut
+    leaves the whole file or none.
+    """
+    draft = path.with_name(f".{path.name}.draft")
+    with told_of(path), draft.open("wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+    rename(draft, path)
+
+
+def rename(draft: Path, path: Path) -> None:
+    """Gives a file its name; on disk when this returns."""
+    draft.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

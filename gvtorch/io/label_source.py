@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ import numpy as np
 from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
 from ..base.npy_file import write_npy
 from ..base.stage import Progress, no_progress
-from ..base.whole_file import told_of
+from ..base.whole_file import durable_file
 from .source import Index, MemorySource, VolumeSource
 
 _CUBE = 128  # voxels along a side of what is read at once
@@ -129,9 +128,5 @@ def _labels_of(
 
 def write_labels(file: Path, labels: np.ndarray) -> None:
     """Writes labels to a .npy file that is either there as a whole or not at all."""
-    draft = file.with_name(f".{file.name}")
-    with told_of(file), draft.open("wb") as out:
+    with durable_file(file) as out:
         write_npy(out, labels)
-        out.flush()
-        os.fsync(out.fileno())
-    draft.replace(file)

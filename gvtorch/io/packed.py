@@ -123,6 +123,17 @@ def unpack_block(codec: str, packed: Any, need: int) -> bytes:
     return found
 
 
+def is_packed_fits(path: str) -> bool:
+    """Whether a FITS file is packed by gzip, whatever its name says; raises ValueError where it is
+    neither that nor plain. (astropy unpacks others, ZIP archives into a file, without a bound.)
+    """
+    with open(path, "rb") as file:
+        begin = file.read(6)
+    if begin != b"SIMPLE" and not begin.startswith(b"\x1f\x8b"):
+        raise ValueError(f"{path}: is no FITS file")
+    return begin != b"SIMPLE"
+
+
 def unpack(file: str, offset: int, need: int, codec: str) -> bytes:
     """Unpacks "zlib" (or gzip) or "bz2" data of a file, which must be of `need` bytes, and no
     further than these.

@@ -22,7 +22,7 @@ from ..base.messages import need_library
 from ..base.srgb import from_srgb
 from ..points.points import Points
 from .budget import MOST_PACKED, header_budget
-from .formats.fits import is_packed
+from .packed import is_packed_fits
 from .resources import amount, memory_free
 from .source import told_as
 
@@ -155,7 +155,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 def _read_fits(path: Path) -> dict[str, np.ndarray]:
     """Columns of numbers of the first table that has rows; those of lists are left out."""
     fits = need_library(f"{path}: FITS", "astropy.io.fits", "astropy")
-    packed = is_packed(str(path))
+    packed = is_packed_fits(str(path))
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*truncated.*")
         with ExitStack() as stack:

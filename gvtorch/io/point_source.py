@@ -27,7 +27,7 @@ from .source import VolumeSource
 from .stores.conversion import convert
 from .stores.store import Store
 from .stores.store_layout import WORK
-from .stores.unfinished import fingerprint, is_begun, write_json
+from .stores.unfinished import as_json, fingerprint, is_begun, write_json
 
 CHANNELS = ("value", "color")
 _MADE_OF = "made_of.json"
@@ -168,7 +168,7 @@ def splat(
 def _sort(source: PointSource, folder: Path, marks: list[Any], begun: bool, **options: Any) -> None:
     """Sorts the points into a folder, unless it holds them already."""
     made_of = folder / _MADE_OF
-    told = json.loads(json.dumps(marks))
+    told = as_json(marks)
     if made_of.exists() and json.loads(made_of.read_text(encoding="utf-8")) == told:
         return
     if begun:

@@ -26,6 +26,7 @@ from urllib.parse import unquote, urlsplit
 
 from ..base.digits import whole_number
 from ..base.messages import need_library, one_line
+from ..base.whole_file import write_whole
 from .resources import amount
 
 _TIMEOUT = 30.0  # seconds without a byte
@@ -106,9 +107,7 @@ def fetch(url: str) -> Path:
     except OSError:  # it is there already, by another process
         shutil.rmtree(file.parent, ignore_errors=True)
     about = {"url": url, "name": file.name, "place": place.name, "version": version}
-    draft = folder / f".about-{os.getpid()}"
-    draft.write_text(json.dumps(about), encoding="utf-8")
-    draft.replace(folder / "about.json")
+    write_whole(folder / "about.json", json.dumps(about))
     _evict(place)
     return place / file.name
 

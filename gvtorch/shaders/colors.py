@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base import check
+from ..base.image_info import from_hex
 from ..base.srgb import from_srgb
 
 #: Colours by name, as sRGB.
@@ -41,8 +42,7 @@ def linear_color(
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
         names = ", ".join(named)
         raise ValueError(f"{where}: {value!r} is no colour; known: #RRGGBB, {names}")
-    red, green, blue = (int(text[at : at + 2], 16) / 255 for at in (1, 3, 5))
-    red, green, blue = from_srgb(np.array((red, green, blue))).tolist()
+    red, green, blue = from_srgb(np.array(from_hex(text[1:]))).tolist()
     return (red, green, blue)
 
 

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ...base.digits import finite_number
-from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
+from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels, from_hex
 from ...base.units import NO_DEPTH, spacing_of
 from ..source import Index, VolumeSource
 from .format import Format, choose
@@ -138,10 +138,7 @@ def _channel(item: Any, shown: Any, stored: str) -> ChannelInfo:
     text = (None if shown is None else shown.findtext("Color")) or item.findtext("Color") or ""
     color: Rgb | None = None
     if len(text) in (7, 9) and text.startswith("#"):
-        red, green, blue = (
-            int(text[at : at + 2], 16) / 255 for at in range(len(text) - 6, len(text), 2)
-        )
-        color = (red, green, blue)
+        color = from_hex(text[-6:])
     window = None
     ends = [
         finite_number(None if shown is None else shown.findtext(name)) for name in ("Low", "High")

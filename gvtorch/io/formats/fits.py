@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..packed import is_packed_fits
 from ..source import ArraySource, Index, VolumeSource
 from .format import Format
 
@@ -38,7 +39,7 @@ def open_fits(path: str) -> VolumeSource:
     """Opens a cube; its first voxel tells the dtype after scaling."""
     from astropy.io import fits
 
-    packed = is_packed(path)
+    packed = is_packed_fits(path)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*truncated.*")
         with fits.open(path, memmap=False) as units:
@@ -53,17 +54,6 @@ def open_fits(path: str) -> VolumeSource:
         stored = first.newbyteorder(">").str
         return ArraySource(file=path, stored=stored, offset=offset, **told)
     return FitsSource(stored=first.str, whole=packed, **told)
-
-
-def is_packed(path: str) -> bool:
-    """Whether a file is packed by gzip, whatever its name says; raises ValueError where it is
-    neither that nor plain. (astropy unpacks others, ZIP archives into a file, without a bound.)
-    """
-    with open(path, "rb") as file:
-        begin = file.read(6)
-    if begin != b"SIMPLE" and not begin.startswith(b"\x1f\x8b"):
-        raise ValueError(f"{path}: is no FITS file")
-    return begin != b"SIMPLE"
 
 
 def _cube(path: str, units: Any) -> Any:

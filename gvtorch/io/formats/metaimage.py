@@ -7,6 +7,7 @@ Source: "MetaIO documentation" (Insight Software Consortium), tags of images; IT
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from pathlib import Path
@@ -16,7 +17,6 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ...base.units import length_unit
-from ..budget import check_regular
 from ..packed import PackedSource
 from ..source import LPS_TO_RAS, ArraySource, VolumeSource, place_axes
 from .format import Format
@@ -76,20 +76,16 @@ def open_metaimage(path: str) -> VolumeSource:
     is_here = file.upper() == "LOCAL"
     data = path if is_here else str(Path(path).parent / file)
     offset = end if is_here else int(header.get("HeaderSize", 0))
-    if not is_here and os.path.exists(data):
-        check_regular(data)
     if header.get("BinaryData", "True").lower() != "true":
         return PackedSource(file=data, offset=offset, codec="text", fortran=True, **told)
     if header.get("CompressedData", "False").lower() == "true":
         return PackedSource(file=data, offset=max(offset, 0), codec="zlib", fortran=True, **told)
-    source = ArraySource(file=data, offset=max(offset, 0), fortran=True, **told)
     if offset < 0:  # the numbers are the last of the file
-        need = int(np.prod(source.shape)) * np.dtype(source.stored).itemsize
-        told_end = os.stat(data).st_size - need
-        if told_end < 0:
-            raise ValueError(f"{path}: takes {need} bytes, the file has {need + told_end}")
-        source = ArraySource(file=data, offset=told_end, fortran=True, **told)
-    return source
+        need, size = math.prod(told["shape"]) * np.dtype(kind).itemsize, os.stat(data).st_size
+        if need > size:
+            raise ValueError(f"{path}: takes {need} bytes, the file has {size}")
+        offset = size - need
+    return ArraySource(file=data, offset=offset, fortran=True, **told)
 
 
 def _header(path: str) -> tuple[dict[str, str], int]:

@@ -17,7 +17,6 @@ import numpy as np
 from ...base.image_info import ChannelInfo, ImageInfo, color_channels
 from ...base.named_axes import ask_axes
 from ...base.units import length_unit, time_unit
-from ..budget import check_regular
 from ..packed import PackedSource, unpack
 from ..source import ArraySource, Index, VolumeSource, place_axes
 from .format import Format
@@ -140,8 +139,6 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     if skip < -1 or lines < 0 or (skip == -1 and encoding != "raw"):
         raise ValueError(f"{path}: byte skip {skip}, line skip {lines}")
     file_path, first = (path, offset) if data is None else (str(Path(path).parent / data), 0)
-    if os.path.exists(file_path):
-        check_regular(file_path)
     size = os.stat(file_path).st_size
     if max(skip, lines) > size and encoding in ("raw", "text"):
         raise ValueError(f"{path}: skips {max(skip, lines)} bytes or lines of {size} bytes")

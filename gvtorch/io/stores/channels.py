@@ -9,7 +9,6 @@ folder, as OME-Zarr lays several images (`bioformats2raw.layout`).
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -76,7 +75,7 @@ def convert_channels(
     target.mkdir(exist_ok=True)
     (target / WORK).mkdir(exist_ok=True)
     manifest = target / WORK / _MANIFEST
-    marks = json.loads(json.dumps({name: one.fingerprint() for name, one in sources.items()}))
+    marks = unfinished.as_json({name: one.fingerprint() for name, one in sources.items()})
     if begun and read_json_file(manifest) != {"sources": marks}:
         raise ValueError(
             f"{target}: was begun with another source, other channels or other settings; remove "

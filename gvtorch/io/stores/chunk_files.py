@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ...base.boxes import grouped
 from ..http import SMALL, Endless
 
 HEADS = ("zarr.json", ".zarray", "attributes.json")  # files of an array that are no chunks
@@ -374,7 +375,6 @@ def _by_row(rows: np.ndarray, numbers: np.ndarray) -> Iterator[tuple[list[int], 
         if len(rows):
             yield rows[0].tolist(), numbers
         return
-    order = np.lexsort(rows.T)
-    rows, numbers = rows[order], numbers[order]
-    cuts = np.flatnonzero((rows[1:] != rows[:-1]).any(1)) + 1
-    yield from zip(rows[[0, *cuts]].tolist(), np.split(numbers, cuts), strict=True)
+    different, members = grouped(rows)
+    for row, at in zip(different.tolist(), members, strict=True):
+        yield row, numbers[at]

@@ -8,9 +8,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from reprlib import repr as brief
 from typing import Any
 
-from ...base.image_info import ChannelInfo, Rgb, to_hex
+from ...base.image_info import ChannelInfo, Rgb, from_hex, to_hex
 from .store_layout import is_number
 
 #: For viewers: of channels without a colour. A single one is white.
@@ -29,7 +30,7 @@ def read_channels(omero: Any) -> tuple[tuple[ChannelInfo, ...], list[str]]:
         color, window = _color(channel.get("color")), _window(channel.get("window"))
         for name, value in (("color", color), ("window", window)):
             if value is None and channel.get(name) is not None:
-                lost.append(f"{name} {_short(channel[name])} of channel {number}")
+                lost.append(f"{name} {brief(channel[name])} of channel {number}")
         if channel.get("inverted") is True:
             lost.append(f"channel {number} is shown inverted")
         label, active = channel.get("label"), channel.get("active")
@@ -79,10 +80,7 @@ def forget_assumed(channels: Sequence[ChannelInfo], assumed: Any) -> tuple[Chann
 def _color(text: Any) -> Rgb | None:
     plain = text if isinstance(text, str) else ""
     found = re.fullmatch(r"#?([0-9a-fA-F]{6})([0-9a-fA-F]{2})?", plain)
-    if found is None:
-        return None
-    red, green, blue = (value / 255 for value in bytes.fromhex(found[1]))
-    return (red, green, blue)
+    return None if found is None else from_hex(found[1])
 
 
 def _window(told: Any) -> tuple[float, float] | None:
@@ -92,8 +90,3 @@ def _window(told: Any) -> tuple[float, float] | None:
     if not all(map(is_number, ends)) or ends[0] > ends[1]:
         return None
     return (float(ends[0]), float(ends[1]))
-
-
-def _short(value: Any) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 40 else f"{text[:37]}..."

@@ -192,12 +192,7 @@ class Store:
         kinds = (self.layout.blocks, self._blocks), (self.layout.cells, self._cells)
         specs = [(spec(at), arrays) for spec, arrays in kinds for at in range(self.levels)]
         for spec, arrays, future in [(*pair, opened(self.root, pair[0])) for pair in specs]:
-            where = f"{self.location}/{spec['path']}"
-            array = deadline.wait(future, where)
-            wanted = spec["metadata"]
-            if list(array.shape) != wanted["shape"] or array.dtype.name != wanted["data_type"]:
-                raise ValueError(f"{where}: damaged: {array.shape} {array.dtype.name}")
-            files = files_of(where, array)
+            array, files = _as_told(self.location, spec, future, deadline)
             arrays.append((self.layout.at_time(array, self.time), files))
         folder = child(self.root, self.coarse_folder)
         told = read_json(self.location, folder, "zarr.json", deadline)
@@ -395,13 +390,9 @@ class Store:
         deadline = Deadline(timeout)
         place = f"{self.coarse_folder}/{channel.folder(name)}"
         spec = self.layout.coarse(level, place, channel.width)
-        where = f"{self.location}/{spec['path']}"
-        array = deadline.wait(opened(self.root, spec), where)
-        if list(array.shape) != spec["metadata"]["shape"] or array.dtype.name != "float16":
-            raise ValueError(f"{where}: damaged: {array.shape} {array.dtype.name}")
-        out = np.empty((len(zyx), *array.shape[3:]), np.float16)
+        chunked = _as_told(self.location, spec, opened(self.root, spec), deadline)
+        out = np.empty((len(zyx), *chunked[0].shape[3:]), np.float16)
         order = np.lexsort(zyx.T[::-1])
-        chunked = (array, files_of(where, array))
         errors = self._read_stored(chunked, level, zyx, order, out, deadline)
         for row in _blank(out):  # also zeros are written
             try:
@@ -540,14 +531,21 @@ class Store:
         return check.whole(self.location, "level", level, low=0, high=self.levels - 1)
 
 
+def _as_told(where: str, spec: dict[str, Any], future: Any, deadline: Deadline) -> Chunked:
+    """Waits for an array of ours; raises ValueError if its shape or dtype is not its spec's."""
+    name, wanted = f"{where}/{spec['path']}", spec["metadata"]
+    array = deadline.wait(future, name)
+    if list(array.shape) != wanted["shape"] or array.dtype.name != wanted["data_type"]:
+        raise ValueError(f"{name}: damaged: {array.shape} {array.dtype.name}")
+    return array, files_of(name, array)
+
+
 def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline) -> np.ndarray:
     """(k,) int64 labels that are indexed."""
     spec = layout.labels()
     name = f"{where}/{spec['path']}"
-    array = deadline.wait(opened(root, spec), name)
-    if list(array.shape) != [layout.label_count] or array.dtype.name != "int64":
-        raise ValueError(f"{name}: damaged: {array.shape} {array.dtype.name}")
-    labels: np.ndarray = deadline.wait(begin_read(array, files_of(name, array)), name)
+    chunked = _as_told(where, spec, opened(root, spec), deadline)
+    labels: np.ndarray = deadline.wait(begin_read(*chunked), name)
     if not (labels[1:] > labels[:-1]).all():
         raise ValueError(f"{name}: damaged: labels must rise")
     return labels

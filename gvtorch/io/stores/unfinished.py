@@ -16,7 +16,7 @@ from typing import IO, Any, NamedTuple
 
 from ...base.image_info import ImageInfo
 from ...base.volume import Volume, movable
-from ...base.whole_file import told_of
+from ...base.whole_file import durable_file, rename, told_of
 from .checksums import LIST, Files, sum_of
 from .ngff import image_metadata, read_json_file
 from .store_layout import GROUPS, WORK, StoreLayout
@@ -44,9 +44,7 @@ class UnfinishedStore:
         """Writes down that tasks are done; on disk when this returns."""
         self.done |= done
         with told_of(self._target / WORK / _JOURNAL):
-            self._journal.writelines(_line(*item) for item in done.items())
-            self._journal.flush()
-            os.fsync(self._journal.fileno())
+            _write_lines(self._journal, done)
 
     def finish(self, layout: StoreLayout, info: ImageInfo, settings: Mapping[str, Any]) -> None:
         """Writes the metadata, the root's last of all, and removes the hidden folder."""
@@ -59,7 +57,7 @@ class UnfinishedStore:
         image, beside = image_metadata(name, layout, info, **place)
         own = layout.attributes(place) | ({"info": beside} if beside else {})
         own["files_sum"] = sum_of(files)
-        own["checksum"] = sum_of(json.loads(json.dumps(own)))
+        own["checksum"] = sum_of(as_json(own))
         attributes = {"ome": image, "gvtorch": own}
         write_json(self._target / "zarr.json", group(attributes))
         shutil.rmtree(self._target / WORK, ignore_errors=True)
@@ -119,9 +117,7 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
         draft = folder / f".{_JOURNAL}.draft"
         with draft.open("w", encoding="utf-8") as journal:
             with told_of(draft):
-                journal.writelines(_line(*item) for item in done.items())
-                journal.flush()
-                os.fsync(journal.fileno())
+                _write_lines(journal, done)
             rename(draft, folder / _JOURNAL)
             yield UnfinishedStore(target, journal, done)
 
@@ -168,7 +164,7 @@ def locked(file: Path, other: str) -> Iterator[IO[str]]:
 def _compare(target: Path, settings: dict[str, Any]) -> None:
     manifest = target / WORK / _MANIFEST
     before = read_json_file(manifest)
-    plain = json.loads(json.dumps(settings))
+    plain = as_json(settings)
     if before.get("fingerprint") != plain["fingerprint"]:
         raise ValueError(
             f"{target}: the source is not the one that it was begun with ({before.get('source')}): "
@@ -188,10 +184,13 @@ def count_done(target: Path) -> int:
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
 
-def _line(task: Task, done: Done) -> str:
-    """A line of the journal, with its checksum."""
-    entry = {"task": list(task), "voxels": done.voxels, "files": done.files}
-    return json.dumps(entry | {"checksum": sum_of(entry)}) + "\n"
+def _write_lines(journal: IO[str], done: Mapping[Task, Done]) -> None:
+    """Writes a line with a checksum for each task; on disk when this returns."""
+    for task, one in done.items():
+        entry = {"task": list(task), "voxels": one.voxels, "files": one.files}
+        journal.write(json.dumps(entry | {"checksum": sum_of(entry)}) + "\n")
+    journal.flush()
+    os.fsync(journal.fileno())
 
 
 def _read_journal(path: Path) -> dict[Task, Done]:
@@ -208,6 +207,11 @@ def _read_journal(path: Path) -> dict[Task, Done]:
     return done
 
 
+def as_json(value: Any) -> Any:
+    """Returns a value as it comes back from a JSON file: tuples are lists."""
+    return json.loads(json.dumps(value))
+
+
 def group(attributes: dict[str, Any]) -> dict[str, Any]:
     """Returns the metadata of a Zarr group."""
     return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
@@ -215,22 +219,8 @@ def group(attributes: dict[str, Any]) -> dict[str, Any]:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes a file that is either there as a whole or not at all."""
-    draft = path.with_name(f".{path.name}.draft")
-    with told_of(path), draft.open("w", encoding="utf-8") as file:
-        json.dump(content, file, indent=1, allow_nan=False)
-        file.flush()
-        os.fsync(file.fileno())
-    rename(draft, path)
-
-
-def rename(draft: Path, path: Path) -> None:
-    """Gives a file its name; on disk when this returns."""
-    draft.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    with durable_file(path) as file:
+        file.write(json.dumps(content, indent=1, allow_nan=False).encode())
 
 
 def fingerprint(source: str | Path | Volume) -> list[Any]:
