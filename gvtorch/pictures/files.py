@@ -66,7 +66,7 @@ def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | No
 
 
 @contextmanager
-def _told() -> Iterator[None]:
+def _as_os_errors() -> Iterator[None]:
     """Raises OSError for whatever a library raises when it can't write."""
     try:
         yield
@@ -121,7 +121,7 @@ def write_png(path: Path, layers: Layers, *, transparent: bool, bits: int = 8) -
 
     image = np.ascontiguousarray(tiff_pixels(side_by_side(layers), transparent, bits))
     write = write_image_png_u8 if bits == 8 else write_image_png_u16
-    with _told():
+    with _as_os_errors():
         write(str(path), image, "rgba" if transparent else "rgb")
     with path.open("rb") as file:  # of the last bytes that find no place on disk it tells nothing
         file.seek(-min(len(_PNG_END), path.stat().st_size), os.SEEK_END)
@@ -198,5 +198,5 @@ def _write_exr(path: Path, layers: Layers, bits: int) -> None:
     channels["Z"] = np.ascontiguousarray(layers["depth"][..., 0])
     channels["samples"] = layers["samples"][..., 0].astype(np.uint32, "C")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with _told():
+    with _as_os_errors():
         OpenEXR.File(header, channels).write(str(path))

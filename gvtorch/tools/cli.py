@@ -255,7 +255,7 @@ _COMMANDS: dict[str, Any] = {
 }
 
 
-def _told(said: str) -> str:
+def _unboxed(said: str) -> str:
     """The parser's box on a mistake as one line; what an unknown flag may mean goes in brackets."""
     box = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", said)  # and its title
     words = " ".join(box.split())
@@ -349,7 +349,7 @@ def _run(args: list[str] | None) -> None:
             )
     except SystemExit as end:
         if end.code:
-            print(f"gvtorch: error: {_told(said.getvalue())}", file=sys.stderr)
+            print(f"gvtorch: error: {_unboxed(said.getvalue())}", file=sys.stderr)
         raise
     warnings.showwarning = lambda message, *_rest, **_more: print(
         f"gvtorch: {one_line(message)}", file=sys.stderr
