@@ -155,6 +155,22 @@ def test_a_root_that_cannot_be_made_is_an_error_at_once(how):
         gv.Engine(Rootless(how), patience=0.1, **SIZE)
 
 
+@pytest.mark.parametrize("patience", [20.0, float("inf")])
+def test_the_root_is_waited_for_as_long_as_the_producer_says(patience):
+    pool = ThreadPoolExecutor(1)
+
+    class Late(Ball):
+        def classify(self, nodes):
+            found = super().classify(nodes)
+            return pool.submit(lambda: (time.sleep(0.3), found)[1]) if len(nodes) == 1 else found
+
+    producer = Late()
+    producer.patience = patience
+    with gv.Engine(producer, patience=0.05, **SIZE) as engine:
+        assert engine.trees["scene"].patience == patience
+    pool.shutdown()
+
+
 @pytest.mark.backend("cpp")
 def test_an_answer_for_a_node_that_is_gone_is_dropped():
     """Futures that come after their tile was evicted do no harm."""

@@ -128,9 +128,7 @@ class Engine:
             subdivisions=self.options.subdivide_budget,
             milliseconds=self.options.time_budget,
         )
-        self.production = Production(
-            self.cache, self.scheduler, self.options.patience, self.options.strict
-        )
+        self.production = Production(self.cache, self.scheduler, self.options.strict)
         self.trees: dict[str, ProducedTree] = {}
         self.serving = Serving(
             self.cache, self.scheduler, self.production, self.trees, self._by_level
@@ -282,7 +280,7 @@ class Engine:
         for source in changed:
             self.production.forget(source)
             since, producer = self._versions[source.name], source.producer
-            renew_tree(self.cache, source, self.options.patience, producer.changes(since))
+            renew_tree(self.cache, source, producer.changes(since))
             self._versions[source.name] = producer.version
         self._missed = None
 

@@ -229,7 +229,7 @@ class HostFrame(RecordedFrame):
             self._split(turn, batch, error)
             return
         if isinstance(answer, Future):
-            self._waiting[answer] = time.monotonic() + self._production.patience_of(batch), batch
+            self._waiting[answer] = time.monotonic() + batch.source.patience, batch
             answer.add_done_callback(arrived)
         else:
             self._settle(turn, batch, lambda: answer)
@@ -240,8 +240,7 @@ class HostFrame(RecordedFrame):
         for future, (until, batch) in list(self._waiting.items()):
             if until < now and self._waiting.pop(future, None) is not None:
                 future.cancel()
-                patience = self._production.patience_of(batch)
-                self._fail(self.turn, batch, f"no answer within {patience:g} s")
+                self._fail(self.turn, batch, f"no answer within {batch.source.patience:g} s")
 
     def _split(self, turn: int, batch: RequestBatch, error: Exception) -> None:
         if len(batch) == 1:

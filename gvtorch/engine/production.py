@@ -142,8 +142,8 @@ class Production:
         staging: The way of bricks from the host to a CUDA device; None where they are there.
     """
 
-    def __init__(self, cache: Cache, scheduler: Scheduler, patience: float, strict: bool) -> None:
-        self.cache, self.scheduler, self.patience = cache, scheduler, patience
+    def __init__(self, cache: Cache, scheduler: Scheduler, strict: bool) -> None:
+        self.cache, self.scheduler = cache, scheduler
         self.failures = Failures(strict)
         self._raised = self._skipped = 0
         self._waiting: list[_Waiting] = []
@@ -178,11 +178,6 @@ class Production:
                 known = (b for b in batches if b.kind == kind and b.coarse == number)
                 free[number] = max(0, free[number] - sum(map(len, known)))
         return room
-
-    def patience_of(self, batch: RequestBatch) -> float:
-        """Seconds after which a batch is given up: the producer's own, if it has any."""
-        own = batch.source.producer.patience
-        return self.patience if own is None else own
 
     def ask(self, trees: Sequence[ProducedTree], chosen: Mapping[int, Tensor]) -> list[Answered]:
         """Asks for the chosen (k,) nodes of each kind; returns answers that are here at once."""
@@ -326,7 +321,7 @@ class Production:
 
     def _wait_for(self, batch: RequestBatch, asked: Future) -> None:
         self._mark(batch)
-        future, patience = self._sent_ahead(batch, asked), self.patience_of(batch)
+        future, patience = self._sent_ahead(batch, asked), batch.source.patience
         self._waiting.append(_Waiting(batch, asked, future, patience, time.monotonic()))
 
     def _sent_ahead(self, batch: RequestBatch, asked: Future) -> Future:

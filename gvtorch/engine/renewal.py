@@ -16,12 +16,10 @@ from ..producers import Nodes
 from ..producers.answer import checked_regions
 from ..producers.producer import Where, touched
 from .request_batch import ProducedTree, RequestBatch, children_of
-from .setup import arrived_within, fill_root
+from .setup import fill_root
 
 
-def renew_tree(
-    cache: Cache, made: ProducedTree, patience: float, changes: Sequence[Where] | None
-) -> None:
+def renew_tree(cache: Cache, made: ProducedTree, changes: Sequence[Where] | None) -> None:
     """Makes a tree's root anew. Nodes for which one of `changes` is true are classified again and
     lose their bricks; those that have no children any more lose the subtree below them. All of the
     tree is dropped if `changes` is None (not known), if bricks are made of their parents' bricks,
@@ -29,13 +27,13 @@ def renew_tree(
     """
     nodes, root = cache.nodes, made.tree.number
     whole = changes is None or made.producer.needs_parent or len(cache.aliases) > 0
-    if whole or not _renew_parts(cache, made, patience, changes or []):
+    if whole or not _renew_parts(cache, made, changes or []):
         _drop_all(cache, root)
     below = nodes.child_tn[root, 0].clone()
     nodes.child_tn[root], nodes.brick_tn[root], nodes.request_tn[root] = TERMINAL, EMPTY, 0
     cache.bricks.owner_b[root] = ABSENT
     try:
-        fill_root(cache, made, patience)
+        fill_root(cache, made)
     finally:
         ends = bool(nodes.child_tn[root, 0] == TERMINAL)
         nodes.child_tn[root, 0] = below.clamp(min=ABSENT)
@@ -44,9 +42,7 @@ def renew_tree(
             nodes.child_tn[root, 0] = TERMINAL
 
 
-def _renew_parts(
-    cache: Cache, made: ProducedTree, patience: float, changes: Sequence[Where]
-) -> bool:
+def _renew_parts(cache: Cache, made: ProducedTree, changes: Sequence[Where]) -> bool:
     """Classifies the changed nodes again, all but the root, and drops their bricks. Returns False,
     with the tree as it was but for its requests, if the producer fails to classify one.
     """
@@ -63,7 +59,7 @@ def _renew_parts(
     targets = Targets(made.tree, parent, made.tree.loc(parent))
     batch = RequestBatch(made, REQUEST_SUBDIVIDE, targets)
     try:
-        answer = arrived_within(batch.ask(), patience)
+        answer = made.wait(batch.ask())
         regions = checked_regions(answer, batch.nodes, made.producer)
     except Exception:  # all is dropped and asked for again, where a failure is told by node
         return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -35,6 +36,19 @@ class ProducedTree:
     tree: N3Tree
     producer: Producer
     layout: Layout
+    engine_patience: float  # seconds, of a producer without its own
+
+    @property
+    def patience(self) -> float:
+        """Seconds after which an answer that has not come is given up."""
+        own = self.producer.patience
+        return self.engine_patience if own is None else own
+
+    def wait(self, answer: Any) -> Any:
+        """Returns the producer's answer; waits for one that comes later, as patience goes."""
+        if not hasattr(answer, "result"):
+            return answer
+        return answer.result(None if self.patience == math.inf else self.patience)
 
     @cached_property
     def host_layout(self) -> Layout:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypedDict
+from typing import Literal, TypedDict
 
 import torch
 
@@ -228,9 +228,9 @@ def make_tree(
     nodes.tree_t[number] = number
     if any(channel.coarse for channel in producer.channels.values()):
         cache.finest[number] = layout.depth
-    made = ProducedTree(name, tree, producer, layout)
+    made = ProducedTree(name, tree, producer, layout, options.patience)
     try:
-        fill_root(cache, made, options.patience)
+        fill_root(cache, made)
     except Exception as error:
         producer.close()
         said = one_line(error)
@@ -241,19 +241,19 @@ def make_tree(
     return made
 
 
-def fill_root(cache: Cache, made: ProducedTree, patience: float) -> None:
+def fill_root(cache: Cache, made: ProducedTree) -> None:
     """Writes the root's content into the first slots, which are the roots'."""
     nodes, index, producer = cache.nodes, made.tree.root, made.producer
     number = index // nodes.nodes_per_tile
     loc = torch.zeros((1, 4), dtype=torch.int64, device=nodes.child_tn.device)
     root = Nodes(loc, made.layout, coarse=bool(cache.finest[number] > 0))
-    regions = checked_regions(arrived_within(producer.classify(root), patience), root, producer)
+    regions = checked_regions(made.wait(producer.classify(root)), root, producer)
     _raise_first(regions.errors)
     for channel, tensor in regions.ranges.items():
         movable(nodes.ranges[channel])[number, 0] = movable(tensor)[0]
     kind, constants = Region(int(regions.kind[0])), regions.constants
     if kind in (Region.DATA, Region.DATA_MAX_DEPTH):
-        bricks = checked_bricks(arrived_within(producer.fill(root), patience), root, producer)
+        bricks = checked_bricks(made.wait(producer.fill(root)), root, producer)
         _raise_first(bricks.errors)
         found = kind if bricks.kind is None else Region(int(bricks.kind[0]))
         if found not in (Region.DATA, Region.DATA_MAX_DEPTH):
@@ -274,11 +274,6 @@ def fill_root(cache: Cache, made: ProducedTree, patience: float) -> None:
 def _raise_first(errors: Mapping[int, str]) -> None:
     for message in errors.values():
         raise ValueError(message)
-
-
-def arrived_within(answer: Any, patience: float) -> Any:
-    """Returns a producer's answer; waits for one that comes later, so many seconds."""
-    return answer.result(patience) if hasattr(answer, "result") else answer
 
 
 def make_recorded_frame(
