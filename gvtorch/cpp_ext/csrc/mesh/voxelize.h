@@ -105,8 +105,8 @@ struct Triangle {
     const F height = dot(minus(place, corner[0]), normal);
     return select(over(place), height * height / length2, best);
   }
-  // Of equally near edges the first.
-  GV_HD int nearest_edge(Vec3<T> place) const {
+  // Of equally near edges the first, and the way from its nearest place.
+  GV_HD int nearest_edge(Vec3<T> place, Vec3<T>& way) const {
     int nearest = 0;
     T best{};
     for (int i = 0; i < 3; ++i) {
@@ -115,6 +115,7 @@ struct Triangle {
       if (i == 0 || own < best) {
         nearest = i;
         best = own;
+        way = from;
       }
     }
     return nearest;
@@ -126,7 +127,8 @@ struct Triangle {
       for (int i = 0; i < 3; ++i) found[(i + 2) % 3] = -dot(minus(place, corner[i]), beside[i]) / length2;
       return found;
     }
-    const int at = nearest_edge(place);
+    Vec3<T> way;
+    const int at = nearest_edge(place, way);
     const T t = along_edge(at, place);
     found[at] = 1 - t;
     found[(at + 1) % 3] = t;
@@ -135,7 +137,9 @@ struct Triangle {
   // A vector along which the nearest place lies, of any length and sign.
   GV_HD Vec3<T> away(Vec3<T> place, T gap2) const {
     if (over(place) || gap2 < static_cast<T>(kTouch)) return normal;
-    return from_edge(nearest_edge(place), place);
+    Vec3<T> way;
+    nearest_edge(place, way);
+    return way;
   }
 };
 

@@ -49,9 +49,10 @@ template <class T>
 GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> at) {
   Row<T> row{};
   with_voxel(type, [&](auto voxel) {
-    using Voxel = decltype(voxel);
-    const EightVoxels<T, Voxel> eight(static_cast<const Voxel*>(voxels) + first, Eight<T>(at, side), side, width);
-    row = {eight.value(0), eight.value(1), eight.value(2), eight.value(3)};
+    const Eight<T> eight(at, side);
+    const auto* corner = corner_of(static_cast<const decltype(voxel)*>(voxels) + first, eight, side, width);
+    const auto read = [&](int32_t which) { return between(corner + which, eight, side, width); };
+    row = {read(0), read(1), read(2), read(3)};
   });
   return row;
 }
@@ -72,10 +73,10 @@ template <class T>
 GV_CALL void read_numbers(const void* voxels, VoxelType type, Components<T> components, int32_t count, int64_t first,
                           int32_t side, Vec3<T> at, T* out) {
   with_voxel(type, [&](auto voxel) {
-    using Voxel = decltype(voxel);
-    const Voxel* brick = static_cast<const Voxel*>(voxels) + first;
-    const EightVoxels<T, Voxel> eight(brick, Eight<T>(at, side), side, components.width);
-    for (int32_t i = 0; i < count; ++i) out[i] = eight.value(components[i]);
+    const Eight<T> eight(at, side);
+    const int32_t width = components.width;
+    const auto* corner = corner_of(static_cast<const decltype(voxel)*>(voxels) + first, eight, side, width);
+    for (int32_t i = 0; i < count; ++i) out[i] = between(corner + components[i], eight, side, width);
   });
 }
 
@@ -276,11 +277,13 @@ struct Probe {
   // What both levels have, a number or several, told by read(spot).
   template <class Read>
   GV_HD auto blended(T t, const Read& read) const {
-    const auto found = read(fine);
-    if (!mixed) return found;
-    const auto other = read(coarse);
-    const T part = weight(t);
-    return combined(found, other, [&](T a, T b) { return a + part * (b - a); });
+    auto found = read(fine);
+    if (mixed) {
+      const auto other = read(coarse);
+      const T part = weight(t);
+      found = combined(found, other, [part](T a, T b) { return a + part * (b - a); });
+    }
+    return found;
   }
   GV_HD int64_t first_of(const ChannelView& channel, int32_t component, const Spot<T>& spot) const {
     const int32_t numbers = channels.side * channels.side * channels.side * channel.width;  // they fit: check_bricks

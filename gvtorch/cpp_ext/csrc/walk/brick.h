@@ -125,30 +125,27 @@ struct Eight {
   }
 };
 
-// The same voxels in memory: what lies between them, of one of their numbers or of several.
+// The first of the eight voxels in memory.
 template <class T, class Voxel>
-struct EightVoxels {
-  Eight<T> eight;
-  int32_t step_x, step_y, step_z;  // from a voxel to the next one
-  const Voxel* corner;             // the lowest of the eight
-
-  GV_HD EightVoxels(const Voxel* voxels, const Eight<T>& eight, int32_t side, int32_t channels)
-      : eight(eight), step_x(channels), step_y(step_x * side), step_z(step_y * side) {
-    corner = voxels + static_cast<uint32_t>(eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * step_x);
-  }
-  GV_HD T value(int32_t component) const {
-    return eight.blend([&](int y, int z, T& left, T& right) {
-      const Voxel* first = corner + (z * step_z + y * step_y) + component;
-      left = number<T>(first[0]);
-      right = number<T>(first[step_x]);
-    });
-  }
-};
+GV_HD const Voxel* corner_of(const Voxel* voxels, const Eight<T>& eight, int32_t side, int32_t channels) {
+  const int32_t step_y = channels * side, step_z = step_y * side;
+  return voxels + static_cast<uint32_t>(eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * channels);
+}
+// Value between the eight voxels, of a number of theirs: `corner` is that of the first one.
+template <class T, class Voxel>
+GV_HD T between(const Voxel* corner, const Eight<T>& eight, int32_t side, int32_t channels) {
+  const int32_t step_y = channels * side, step_z = step_y * side;
+  return eight.blend([&](int y, int z, T& left, T& right) {
+    const Voxel* first = corner + (z * step_z + y * step_y);
+    left = number<T>(first[0]);
+    right = number<T>(first[channels]);
+  });
+}
 
 // Value at a place of a brick, between the voxels that are told.
 template <class T, class Voxel>
 GV_HD T trilinear(const Voxel* voxels, const Eight<T>& eight, int32_t side, int32_t channels) {
-  return EightVoxels<T, Voxel>(voxels, eight, side, channels).value(0);
+  return between(corner_of(voxels, eight, side, channels), eight, side, channels);
 }
 template <class T, class Voxel>
 GV_HD T trilinear(const Voxel* voxels, int32_t side, int32_t channels, Vec3<T> at) {
