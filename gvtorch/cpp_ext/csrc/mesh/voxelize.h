@@ -79,16 +79,10 @@ struct Triangle {
     }
   }
 
-  // Where on an edge its nearest place lies: 0 at its first corner, 1 at its second.
-  template <class F>
-  GV_HD F along_edge(int i, Vec3<F> place) const {
-    return clamp(dot(minus(place, corner[i]), edge[i]) * inverse2[i], F{}, F{} + 1);
-  }
-  // The way from there to the place.
   template <class F>
   GV_HD Vec3<F> from_edge(int i, Vec3<F> place) const {
     const Vec3<F> from = minus(place, corner[i]);
-    const F t = along_edge(i, place);
+    const F t = clamp(dot(from, edge[i]) * inverse2[i], F{}, F{} + 1);
     return {from.x - t * edge[i].x, from.y - t * edge[i].y, from.z - t * edge[i].z};
   }
   // Whether the nearest place of the triangle's plane lies in the triangle.
@@ -105,31 +99,25 @@ struct Triangle {
     const F height = dot(minus(place, corner[0]), normal);
     return select(over(place), height * height / length2, best);
   }
-  // Of equally near edges the first, and the way from its nearest place.
-  GV_HD int nearest_edge(Vec3<T> place, Vec3<T>& way) const {
-    int nearest = 0;
-    T best{};
-    for (int i = 0; i < 3; ++i) {
-      const Vec3<T> from = from_edge(i, place);
-      const T own = dot(from, from);
-      if (i == 0 || own < best) {
-        nearest = i;
-        best = own;
-        way = from;
-      }
-    }
-    return nearest;
-  }
-  // Weights of the corners at the nearest place.
+  // Weights of the corners at the nearest place. It and `away` each look for the nearest edge: one function for both
+  // costs 5 to 11 % of a mesh with distances.
   GV_HD Vec3<T> weight(Vec3<T> place) const {
     Vec3<T> found{};
     if (over(place)) {
       for (int i = 0; i < 3; ++i) found[(i + 2) % 3] = -dot(minus(place, corner[i]), beside[i]) / length2;
       return found;
     }
-    Vec3<T> way;
-    const int at = nearest_edge(place, way);
-    const T t = along_edge(at, place);
+    int at = 0;
+    T best{};
+    for (int i = 0; i < 3; ++i) {
+      const Vec3<T> from = from_edge(i, place);
+      const T own = dot(from, from);
+      if (i == 0 || own < best) {
+        at = i;
+        best = own;
+      }
+    }
+    const T t = clamp(dot(minus(place, corner[at]), edge[at]) * inverse2[at], T{}, T{} + 1);
     found[at] = 1 - t;
     found[(at + 1) % 3] = t;
     return found;
@@ -137,9 +125,17 @@ struct Triangle {
   // A vector along which the nearest place lies, of any length and sign.
   GV_HD Vec3<T> away(Vec3<T> place, T gap2) const {
     if (over(place) || gap2 < static_cast<T>(kTouch)) return normal;
-    Vec3<T> way;
-    nearest_edge(place, way);
-    return way;
+    Vec3<T> toward{};
+    T best{};
+    for (int i = 0; i < 3; ++i) {
+      const Vec3<T> from = from_edge(i, place);
+      const T own = dot(from, from);
+      if (i == 0 || own < best) {
+        toward = from;
+        best = own;
+      }
+    }
+    return toward;
   }
 };
 
@@ -318,7 +314,10 @@ struct VoxelizePack {
 
   // The three corners of a triangle, in voxels of the cube.
   GV_HD void read_corners(const Cube& cube, int64_t number, Vec3<T>* corner) const {
-    for (int i = 0; i < 9; ++i) corner[i / 3][i % 3] = cube.local(a.corner_f33[9 * number + i], i % 3);
+    for (int i = 0; i < 3; ++i) {
+      const double* at = a.corner_f33 + 9 * number + 3 * i;
+      corner[i] = {cube.local(at[0], 0), cube.local(at[1], 1), cube.local(at[2], 2)};
+    }
   }
   GV_HD Triangle<T> triangle(const Cube& cube, int64_t number) const {
     Vec3<T> corner[3];

@@ -277,13 +277,11 @@ struct Probe {
   // What both levels have, a number or several, told by read(spot).
   template <class Read>
   GV_HD auto blended(T t, const Read& read) const {
-    auto found = read(fine);
-    if (mixed) {
-      const auto other = read(coarse);
-      const T part = weight(t);
-      found = combined(found, other, [part](T a, T b) { return a + part * (b - a); });
-    }
-    return found;
+    const auto found = read(fine);
+    if (!mixed) return found;
+    const auto other = read(coarse);
+    const T part = weight(t);
+    return combined(found, other, [&](T a, T b) { return a + part * (b - a); });
   }
   GV_HD int64_t first_of(const ChannelView& channel, int32_t component, const Spot<T>& spot) const {
     const int32_t numbers = channels.side * channels.side * channels.side * channel.width;  // they fit: check_bricks
