@@ -50,9 +50,17 @@ GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int6
   Row<T> row{};
   with_voxel(type, [&](auto voxel) {
     const Eight<T> eight(at, side);
-    const auto* corner = corner_of(static_cast<const decltype(voxel)*>(voxels) + first, eight, side, width);
-    const auto read = [&](int32_t which) { return between(corner + which, eight, side, width); };
-    row = {read(0), read(1), read(2), read(3)};
+    const int32_t step_y = width * side, step_z = step_y * side;
+    const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
+                         (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * width);
+    const auto blend = [&](int32_t which) {
+      return eight.blend([&](int y, int z, T& left, T& right) {
+        const auto* pair = corner + (z * step_z + y * step_y) + which;
+        left = number<T>(pair[0]);
+        right = number<T>(pair[width]);
+      });
+    };
+    row = {blend(0), blend(1), blend(2), blend(3)};
   });
   return row;
 }
@@ -74,9 +82,17 @@ GV_CALL void read_numbers(const void* voxels, VoxelType type, Components<T> comp
                           int32_t side, Vec3<T> at, T* out) {
   with_voxel(type, [&](auto voxel) {
     const Eight<T> eight(at, side);
-    const int32_t width = components.width;
-    const auto* corner = corner_of(static_cast<const decltype(voxel)*>(voxels) + first, eight, side, width);
-    for (int32_t i = 0; i < count; ++i) out[i] = between(corner + components[i], eight, side, width);
+    const int32_t width = components.width, step_y = width * side, step_z = step_y * side;
+    const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
+                         (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * width);
+    for (int32_t i = 0; i < count; ++i) {
+      const int32_t component = components[i];
+      out[i] = eight.blend([&](int y, int z, T& left, T& right) {
+        const auto* pair = corner + (z * step_z + y * step_y) + component;
+        left = number<T>(pair[0]);
+        right = number<T>(pair[width]);
+      });
+    }
   });
 }
 
@@ -200,9 +216,15 @@ struct Probe {
     return blended(t, [&](const Spot<T>& spot) { return read(channel, component, spot, spot.at(t)); });
   }
 
-  // Four numbers of a channel at distance t, from one on: the voxels around it are found once.
+  // Four numbers of a channel at distance t, from one on: the voxels around it are found once. Not by `blended`, which
+  // costs 8 % in float64.
   GV_HD Row<T> four_at(const ChannelView& channel, int32_t first, T t) const {
-    return blended(t, [&](const Spot<T>& spot) { return four_in(channel, first, spot, t); });
+    const Row<T> row = four_in(channel, first, fine, t);
+    if (!mixed) return row;
+    const Row<T> other = four_in(channel, first, coarse, t);
+    const T part = weight(t);
+    return {row.red + part * (other.red - row.red), row.green + part * (other.green - row.green),
+            row.blue + part * (other.blue - row.blue), row.alpha + part * (other.alpha - row.alpha)};
   }
 
   // Several numbers of a channel at distance t, at most kMostNumbers.

@@ -125,27 +125,17 @@ struct Eight {
   }
 };
 
-// The first of the eight voxels in memory.
+// Value at a place of a brick, between the voxels that are told.
 template <class T, class Voxel>
-GV_HD const Voxel* corner_of(const Voxel* voxels, const Eight<T>& eight, int32_t side, int32_t channels) {
+GV_HD T trilinear(const Voxel* voxels, const Eight<T>& eight, int32_t side, int32_t channels) {
   const int32_t step_y = channels * side, step_z = step_y * side;
-  return voxels + static_cast<uint32_t>(eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * channels);
-}
-// Value between the eight voxels, of a number of theirs: `corner` is that of the first one.
-template <class T, class Voxel>
-GV_HD T between(const Voxel* corner, const Eight<T>& eight, int32_t side, int32_t channels) {
-  const int32_t step_y = channels * side, step_z = step_y * side;
+  const auto offset = static_cast<uint32_t>(eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * channels);
+  const Voxel* corner = voxels + offset;
   return eight.blend([&](int y, int z, T& left, T& right) {
     const Voxel* first = corner + (z * step_z + y * step_y);
     left = number<T>(first[0]);
     right = number<T>(first[channels]);
   });
-}
-
-// Value at a place of a brick, between the voxels that are told.
-template <class T, class Voxel>
-GV_HD T trilinear(const Voxel* voxels, const Eight<T>& eight, int32_t side, int32_t channels) {
-  return between(corner_of(voxels, eight, side, channels), eight, side, channels);
 }
 template <class T, class Voxel>
 GV_HD T trilinear(const Voxel* voxels, int32_t side, int32_t channels, Vec3<T> at) {
