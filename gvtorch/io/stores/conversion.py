@@ -85,8 +85,7 @@ def convert(
         store: The folder to make.
         block: Voxels along a side of a block, 32 or 64.
         threshold: Blocks with no value above it are not written; see `N3Tree.from_volume`.
-        spacing: (x, y, z) world units; overrides the file's.
-        origin: (x, y, z) world units; overrides the file's.
+        spacing, origin: (x, y, z) world units; override the file's.
         nan: Value for voxels that are NaN or infinite; they are refused if left out.
         time: The one time point to write; all if left out.
         oblique: As of `read_volume`.
@@ -108,8 +107,7 @@ def convert(
         FileExistsError: There is something at `store` already.
         ValueError: The source is damaged or holds NaN, an argument does not fit, or `resume` finds
             a store of other settings or of a source that has changed.
-        OSError: The disk is full, or source or store can't be read or written; `resume` goes on
-            from there.
+        OSError: The disk is full, or a file can't be read or written; `resume` goes on from there.
         KeyboardInterrupt: It was interrupted; `resume` goes on, as the message says.
     """
     target = Path(store)
