@@ -124,14 +124,11 @@ struct PacketWalk {
   // As those of Probe, for all lanes that march.
   GV_HD Floats value(Floats t) const {
     const Floats value = value_in(fine, t);
-    if (!any(mixed & marching)) return value;
-    return mixed ? value + weight(t) * (value_in(coarse, t) - value) : value;
+    return any(mixed & marching) ? between(value, value_in(coarse, t), t) : value;
   }
   GV_HD Floats number_at(const PacketChannel& channel, int32_t component, Floats t) const {
     const Floats number = number_in(channel, component, fine, fine_depth, t);
-    if (!any(mixed & marching)) return number;
-    const Floats other = number_in(channel, component, coarse, coarse_depth, t);
-    return mixed ? number + weight(t) * (other - number) : number;
+    return any(mixed & marching) ? between(number, number_in(channel, component, coarse, coarse_depth, t), t) : number;
   }
   GV_HD void numbers_at(const PacketChannel& channel, Components<float> components, int32_t count, Floats t,
                         Floats* out) const {
@@ -139,15 +136,11 @@ struct PacketWalk {
     if (!any(mixed & marching)) return;
     Floats other[kMostNumbers];
     numbers_in(channel, components, count, coarse, coarse_depth, t, other);
-    const Floats part = weight(t);
-    for (int32_t i = 0; i < count; ++i) out[i] = mixed ? out[i] + part * (other[i] - out[i]) : out[i];
+    for (int32_t i = 0; i < count; ++i) out[i] = between(out[i], other[i], t);
   }
   GV_HD Vec3<Floats> gradient(Floats t) const {
     const Vec3<Floats> slope = differences(fine, fine_depth, t);
-    if (!any(mixed & marching)) return slope;
-    const Vec3<Floats> other = differences(coarse, coarse_depth, t);
-    const Floats part = weight(t);
-    return combined(slope, other, [&](Floats a, Floats b) { return mixed ? a + part * (b - a) : a; });
+    return any(mixed & marching) ? between(slope, differences(coarse, coarse_depth, t), t) : slope;
   }
 
   GV_HD Floats value_of(const PacketBrick& brick, Floats t) const { return value_in(brick, t); }
@@ -160,6 +153,12 @@ struct PacketWalk {
     return differences(brick, depth_of(brick), t);
   }
   GV_HD Floats weight(Floats t) const { return clamp((at.cone(t) - voxel) * blend_scale, 0.0f, 1.0f); }
+
+  template <class Some>
+  GV_HD Some between(const Some& finer, const Some& coarser, Floats t) const {
+    const Floats part = weight(t);
+    return combined(finer, coarser, [&](Floats a, Floats b) { return mixed ? a + part * (b - a) : a; });
+  }
 
   GV_HD void narrow(Mask which) { marching = which; }
   // body(lane, probe) with each lane's own.

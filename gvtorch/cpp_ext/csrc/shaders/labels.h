@@ -87,11 +87,9 @@ struct Labels : ShaderFacts {
         look = one;
         continue;
       }
-      const T weight = probe.weight(t);
-      const auto mix = [&](T a, T b) { return a + weight * (b - a); };
       if (!(look.row.alpha > 0)) look.label = one.label;
-      look.row = combined(look.row, one.row, mix);
-      look.normal = combined(look.normal, one.normal, mix);
+      look.row = probe.between(look.row, one.row, t);
+      look.normal = probe.between(look.normal, one.normal, t);
     }
     return look;
   }

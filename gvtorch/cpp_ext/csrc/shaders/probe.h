@@ -213,18 +213,14 @@ struct Probe {
 
   // A number of a channel at distance t.
   GV_HD T number_at(const ChannelView& channel, int32_t component, T t) const {
-    return blended(t, [&](const Spot<T>& spot) { return read(channel, component, spot, spot.at(t)); });
+    const T number = read(channel, component, fine, fine.at(t));
+    return mixed ? between(number, read(channel, component, coarse, coarse.at(t)), t) : number;
   }
 
-  // Four numbers of a channel at distance t, from one on: the voxels around it are found once. Not by `blended`, which
-  // costs 8 % in float64.
+  // Four numbers of a channel at distance t, from one on: the voxels around it are found once.
   GV_HD Row<T> four_at(const ChannelView& channel, int32_t first, T t) const {
     const Row<T> row = four_in(channel, first, fine, t);
-    if (!mixed) return row;
-    const Row<T> other = four_in(channel, first, coarse, t);
-    const T part = weight(t);
-    return {row.red + part * (other.red - row.red), row.green + part * (other.green - row.green),
-            row.blue + part * (other.blue - row.blue), row.alpha + part * (other.alpha - row.alpha)};
+    return mixed ? between(row, four_in(channel, first, coarse, t), t) : row;
   }
 
   // Several numbers of a channel at distance t, at most kMostNumbers.
@@ -246,7 +242,8 @@ struct Probe {
       if (known->at == t) return known->gradient;
     }
 #endif
-    return blended(t, [&](const Spot<T>& spot) { return differences(spot, t); });
+    const Vec3<T> slope = differences(fine, t);
+    return mixed ? between(slope, differences(coarse, t), t) : slope;
   }
 
   // What one of the two nodes, fine or coarse, says of the value and of its gradient, and its brick of four numbers of
@@ -280,6 +277,13 @@ struct Probe {
   }
   GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }
 
+  // Between what the two say, a number or several.
+  template <class Some>
+  GV_HD Some between(const Some& finer, const Some& coarser, T t) const {
+    const T part = weight(t);
+    return combined(finer, coarser, [&](T a, T b) { return a + part * (b - a); });
+  }
+
   // No node that answers has a brick, and all numbers of both are equal: one value all over the visit.
   GV_HD bool uniform() const {
     if (fine.brick >= 0 || coarse.brick >= 0) return false;
@@ -295,15 +299,6 @@ struct Probe {
     above[axis] = above[axis] + static_cast<T>(0.5);
     const T low = read(below), high = read(above);
     return (high - low) * (spot.scale / cube[axis]);
-  }
-  // What both levels have, a number or several, told by read(spot).
-  template <class Read>
-  GV_HD auto blended(T t, const Read& read) const {
-    const auto found = read(fine);
-    if (!mixed) return found;
-    const auto other = read(coarse);
-    const T part = weight(t);
-    return combined(found, other, [&](T a, T b) { return a + part * (b - a); });
   }
   GV_HD int64_t first_of(const ChannelView& channel, int32_t component, const Spot<T>& spot) const {
     const int32_t numbers = channels.side * channels.side * channels.side * channel.width;  // they fit: check_bricks
@@ -344,7 +339,8 @@ struct TypedProbe : Probe<T> {
   using Probe<T>::Probe;
 
   GV_HD T value(T t) const {
-    return this->blended(t, [&](const Spot<T>& spot) { return value_of(spot, t); });
+    const T value = value_of(this->fine, t);
+    return this->mixed ? this->between(value, value_of(this->coarse, t), t) : value;
   }
   GV_HD T value_of(const Spot<T>& spot, T t) const {
     const ChannelView& channel = this->channels.value;
@@ -353,7 +349,8 @@ struct TypedProbe : Probe<T> {
     return number<T>(constants[static_cast<int64_t>(spot.node) * channel.width + this->channels.component]);
   }
   GV_HD Vec3<T> gradient(T t) const {
-    return this->blended(t, [&](const Spot<T>& spot) { return differences(spot, t); });
+    const Vec3<T> slope = differences(this->fine, t);
+    return this->mixed ? this->between(slope, differences(this->coarse, t), t) : slope;
   }
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
     Vec3<T> slope{0, 0, 0};
