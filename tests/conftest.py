@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import gvtorch as gv
-from gvtorch.ops import available
+from gvtorch.ops import unavailable
 from gvtorch.viewer.state import Development
 from gvtorch.viewer.view import new_session
 
@@ -47,7 +47,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(params=["reference", "cpp", "cuda"])
 def backend(request: pytest.FixtureRequest) -> str:
     """Every backend that can run here."""
-    reason = available()[request.param]
+    reason = unavailable()[request.param]
     if reason:
         pytest.skip(f"backend {request.param}: {reason}")
     return request.param
@@ -56,7 +56,7 @@ def backend(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(params=["cpp", "cuda"])
 def compiled(request: pytest.FixtureRequest) -> str:
     """Every compiled backend that can run here."""
-    reason = available()[request.param]
+    reason = unavailable()[request.param]
     if reason:
         pytest.skip(f"backend {request.param}: {reason}")
     return request.param
@@ -197,7 +197,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     }
     marked = {mark.args[0] for mark in item.iter_markers("backend")}
     item.user_properties += [("backend", name) for name in sorted(names | marked or {"no backend"})]
-    if "cuda" in marked and (reason := available()["cuda"]):
+    if "cuda" in marked and (reason := unavailable()["cuda"]):
         pytest.skip(f"backend cuda: {reason}")
 
 
@@ -213,7 +213,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     groups = ("reference", "cpp", "cuda", "opengl", "browser", "no backend")
     counts = ", ".join(f"{name} {_ran[name]}" for name in groups)
     terminalreporter.write_line(f"passed by backend: {counts}")
-    for name, reason in available().items():
+    for name, reason in unavailable().items():
         if reason:
             terminalreporter.write_line(f"backend {name} did not run: {reason}")
     if reason := browser.absent():

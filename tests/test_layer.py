@@ -18,7 +18,7 @@ from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.base import constants as config
-from gvtorch.ops import available
+from gvtorch.ops import unavailable
 from gvtorch.tracing import pixels
 
 HAZE = gv.TransferFunction.from_points([(0, 0.03)], [(0, 0.9, 0.5, 0.2)])
@@ -153,8 +153,8 @@ def behind_nodes(tree: gv.N3Tree, place: torch.Tensor, normal: torch.Tensor) -> 
 @pytest.mark.parametrize("backend_name", ["reference", "cpp"])
 @pytest.mark.parametrize("lod", ["finest", "auto"])
 def test_nothing_behind_an_opaque_layer_is_used_or_asked_for(blobs, backend_name, lod):
-    if available()[backend_name]:
-        pytest.skip(available()[backend_name])
+    if unavailable()[backend_name]:
+        pytest.skip(unavailable()[backend_name])
     whole = gv.N3Tree.from_volume(blobs, 4)
     bare = on(whole, "cpu")
     leaf = whole.nodes.loc_t4[:, 3:] == whole.depth

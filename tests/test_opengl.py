@@ -14,7 +14,7 @@ from helpers.opengl import no_vtk
 
 import gvtorch as gv
 from gvtorch.opengl import ClipDepth, matrices, ray_distance, window_depth
-from gvtorch.ops import available
+from gvtorch.ops import unavailable
 
 EYES = torch.tensor([[3.0, 2.0, 5.0], [-4.0, 1.0, 2.0]])
 
@@ -223,7 +223,7 @@ def test_vtk_draws_our_pixels_at_our_distances(vtk):
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 @pytest.mark.parametrize("tilt", [0.0, 25.0])
 def test_the_seam_of_vtks_triangles_and_a_ball_is_exact_to_a_pixel(vtk, tilt, device):
-    if device == "cuda" and (reason := available()["cuda"]):
+    if device == "cuda" and (reason := unavailable()["cuda"]):
         pytest.skip(f"backend cuda: {reason}")
     radius, height, far = 20.0, 12.0, 60
     angle = math.radians(tilt)

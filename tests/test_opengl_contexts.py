@@ -14,7 +14,7 @@ from helpers.opengl import opengl_context
 
 import gvtorch as gv
 from gvtorch.opengl import functions as gl
-from gvtorch.ops import available
+from gvtorch.ops import unavailable
 
 pytestmark = pytest.mark.backend("opengl")
 WIDTH, HEIGHT = 13, 7
@@ -52,7 +52,7 @@ def use(context: ctypes.c_void_p | None) -> None:
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.backend("cuda"))])
 def device(request):
-    if request.param == "cuda" and (reason := available()["cuda"]):
+    if request.param == "cuda" and (reason := unavailable()["cuda"]):
         pytest.skip(f"backend cuda: {reason}")
     opengl_context()  # and EGL's display, which others may have ended
     yield request.param

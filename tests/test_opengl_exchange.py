@@ -14,7 +14,7 @@ from helpers.opengl import opengl_context
 
 import gvtorch as gv
 from gvtorch.opengl import functions as gl
-from gvtorch.ops import available
+from gvtorch.ops import unavailable
 
 pytestmark = pytest.mark.backend("opengl")
 WIDTH, HEIGHT = 37, 23  # rows of odd lengths: 37 pixels of 3 or 1 bytes end between words
@@ -46,7 +46,7 @@ everywhere = pytest.mark.parametrize(("device", "shared"), [HOST, *CUDA])
 
 @pytest.fixture
 def exchange(context, device, shared):
-    if device == "cuda" and (reason := available()["cuda"]):
+    if device == "cuda" and (reason := unavailable()["cuda"]):
         pytest.skip(f"backend cuda: {reason}")
     with gv.opengl.Exchange(WIDTH, HEIGHT, device, share=None if shared else False) as made:
         if shared and not made.shared and "OpenGL draws on" in made.reason:

@@ -16,7 +16,7 @@ from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.base import constants as config
-from gvtorch.ops import available
+from gvtorch.ops import unavailable
 from gvtorch.pool import BrickTable, Staging, TableRows
 from gvtorch.pool.staging import wide_rows
 
@@ -38,7 +38,7 @@ def voxels(count, dtype=torch.uint8, width=1, side=10, seed=0) -> torch.Tensor:
 
 @pytest.fixture(params=["cpp", "cuda"])
 def device(request) -> torch.device:
-    reason = available()[request.param]
+    reason = unavailable()[request.param]
     if reason:
         pytest.skip(f"backend {request.param}: {reason}")
     return torch.device(DEVICES[request.param])
@@ -344,8 +344,8 @@ def test_a_producer_that_never_answers_stalls_no_frame(device):
 @pytest.mark.parametrize("hold", ["voxels", "bricks", "mapped"])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32])
 def test_bricks_cut_ahead_give_the_picture_of_the_volume(blobs, backend, hold, dtype):
-    if available()[backend]:
-        pytest.skip(f"backend {backend}: {available()[backend]}")
+    if unavailable()[backend]:
+        pytest.skip(f"backend {backend}: {unavailable()[backend]}")
     values = blobs.data * (1 if dtype == torch.float32 else 250)
     volume = gv.Volume(
         values.to(torch.int32).to(dtype) if dtype == torch.uint16 else values.to(dtype),

@@ -15,14 +15,14 @@ from helpers.waits import nobody_waits
 
 import gvtorch as gv
 from gvtorch.engine.stats import Readback
-from gvtorch.ops import available
+from gvtorch.ops import unavailable
 from gvtorch.tracing.pixels import View
 
 
 @pytest.fixture
 def cuda() -> str:
     """The device, where CUDA is."""
-    reason = available()["cuda"]
+    reason = unavailable()["cuda"]
     if reason:
         pytest.skip(f"backend cuda: {reason}")
     return "cuda"

@@ -19,7 +19,7 @@ from .cache import (
 from .cameras import pinhole_rays
 from .noise import noise
 from .orbits import Orbit, orbit_bounds, orbits
-from .registry import available
+from .registry import unavailable
 from .splat import splat
 from .trace import (
     composite,
@@ -38,7 +38,6 @@ __all__ = [
     "Segments",
     "ShadeArguments",
     "TraceArguments",
-    "available",
     "choose_requests",
     "compact_requests",
     "composite",
@@ -61,6 +60,7 @@ __all__ = [
     "splat",
     "trace_rays",
     "trace_segments",
+    "unavailable",
     "unlink",
     "voxelize",
 ]

@@ -27,8 +27,8 @@ _DTYPES = (torch.int32, torch.int64, torch.int16, torch.bool, torch.uint8, torch
 _Twin = TypeVar("_Twin", bound=Callable[..., Any])
 
 
-def available() -> dict[str, str]:
-    """Returns for each of reference, cpp, cuda an empty text, or why it can't be used."""
+def unavailable() -> dict[str, str]:
+    """Returns for each of reference, cpp, cuda why it can't be used here; an empty text: it can."""
     return {"reference": "", **_reasons}
 
 
@@ -43,8 +43,8 @@ def choose_backend(backend: str, device: torch.device) -> str:
         raise ValueError(f"backend must be auto, reference, cpp or cuda, got {backend!r}")
     compiled = {"cpu": "cpp", "cuda": "cuda"}.get(device.type)
     if backend == "auto":
-        return compiled if compiled and not available()[compiled] else "reference"
-    reason = available()[backend]
+        return compiled if compiled and not unavailable()[compiled] else "reference"
+    reason = unavailable()[backend]
     if reason:
         raise ValueError(f"backend {backend!r} can't be used here: {reason}")
     if backend not in ("reference", compiled):

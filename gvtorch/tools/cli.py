@@ -152,11 +152,11 @@ class Filter:
         """Adds the colours."""
         from ..io.resources import amount
         from ..io.stores.store import Store
-        from ..ops import available
+        from ..ops import unavailable
         from ..shaders import Filtered, Lit
         from .colors import chosen_transfer
 
-        on_cuda = self.backend == "cuda" or (self.backend is None and not available()["cuda"])
+        on_cuda = self.backend == "cuda" or (self.backend is None and not unavailable()["cuda"])
         start, store = time.perf_counter(), Store.open(self.store)
         before = store.describe()["disk bytes"]
         with Bar() as bar:
@@ -182,14 +182,14 @@ def installation() -> dict[str, Any]:
 
     from .. import __version__
     from ..io.formats import FORMATS
-    from ..ops import available
+    from ..ops import unavailable
 
     cards = range(torch.cuda.device_count()) if torch.cuda.is_available() else ()
     return {
         "gvtorch": __version__,
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "backends": {name: reason or "ready" for name, reason in available().items()},
+        "backends": {name: reason or "ready" for name, reason in unavailable().items()},
         "devices": [
             f"cpu ({torch.get_num_threads()} threads)",
             *(f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in cards),

@@ -142,11 +142,11 @@ class Look:
         """The device that the backend needs; for auto, CUDA if it can be used."""
         import torch
 
-        from ..ops import available
+        from ..ops import unavailable
         from ..ops.trace import choose_backend
 
         wants_cuda = self.backend == "cuda" or (
-            self.backend == "auto" and available()["cuda"] == ""
+            self.backend == "auto" and not unavailable()["cuda"]
         )
         device = torch.device("cuda" if wants_cuda else "cpu")
         choose_backend(self.backend, device)

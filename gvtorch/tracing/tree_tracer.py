@@ -17,7 +17,7 @@ from ..base import constants as config
 from ..base.records import Rays
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
-from ..ops import RayArguments, ShadeArguments, TraceArguments, available
+from ..ops import RayArguments, ShadeArguments, TraceArguments, unavailable
 from ..ops.trace import op_of
 from ..pool import N3Tree
 from ..shaders.shader import Shader, check_shader
@@ -59,8 +59,8 @@ class TreeTracer(torch.nn.Module):
             ValueError: The channel is unknown, or a number is out of its range.
         """
         super().__init__()
-        if available()["cpp"]:
-            raise RuntimeError(f"TreeTracer needs the compiled op: {available()['cpp']}")
+        if unavailable()["cpp"]:
+            raise RuntimeError(f"TreeTracer needs the compiled op: {unavailable()['cpp']}")
         check_shader("TreeTracer", "shader", shader)
         if shader.uses_torch:
             kind = type(shader).__name__

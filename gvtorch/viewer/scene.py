@@ -23,7 +23,7 @@ from ..io.reading import open_source, read_volume
 from ..io.stores.ngff import is_zarr
 from ..io.stores.store import Store
 from ..io.window import looked_at, window
-from ..ops import available
+from ..ops import unavailable
 from ..pictures import Picture
 from ..pool import N3Tree
 from ..producers import Producer, StoredProducer, VolumeProducer
@@ -297,7 +297,7 @@ def open_scene(what: Any, **options: Any) -> Scene:
             raise ValueError(f"view: {next(iter(options))} is set where the scene is made already")
         return Scene(repr(what), *((what, None) if isinstance(what, Engine) else (None, what)))
     options.setdefault("time_budget", _BUDGET)
-    if "device" not in options and not available()["cuda"]:
+    if "device" not in options and not unavailable()["cuda"]:
         options["device"] = "cuda"
     if isinstance(what, Mapping) and all(isinstance(one, Producer) for one in what.values()):
         return Scene(", ".join(what), Engine(what, **options), remake=lambda _: what)
