@@ -21,7 +21,7 @@ from ..base.volume import movable
 from ..ops import lacking, link, link_bricks, link_tiles, orphan, put_rows, unlink
 from ..pool import N3Tree
 from ..pool.staging import Chunk, Voxels, on_device, row_bytes
-from .cache import Cache
+from .cache import LRU, Cache
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -82,12 +82,9 @@ def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
     """Gives nodes their children; see `put_tiles`. The host waits for what came of it."""
     (lru,) = cache.lru[REQUEST_SUBDIVIDE]
     put = put_tiles(cache, targets, children, lru.free())
-    lasting, items, evicted = put.counts.tolist()
-    lru.unused -= items
-    done = Written(items=items, evicted=evicted, stale=len(targets) - lasting)
-    done.unplaced = max(0, lasting - items - lru.unused)
-    done.lost = put.wanted & (put.slot < 0) if items < lasting else None
-    if items and children.alias is not None:
+    done = _outcome(put, targets, lru)
+    done.unplaced = max(0, done.unplaced - lru.unused)
+    if done.items and children.alias is not None:
         row, child = (children.is_alias & (put.slot >= 0)[:, None]).nonzero().unbind(1)
         node, tree = put.slot[row] * cache.nodes.nodes_per_tile + child, targets.tree
         goal = children.alias[row, child]
@@ -108,6 +105,16 @@ class Put(NamedTuple):
         given = slot >= 0
         held = given & (owner[slot.clamp(min=0)] >= 0)
         return cls(wanted, slot, torch.stack((wanted, given, held)).sum(1))
+
+
+def _outcome(put: Put, targets: Targets, lru: LRU) -> Written:
+    """What became of the targets; the host waits for it."""
+    lasting, items, evicted = put.counts.tolist()
+    lru.unused -= items
+    unplaced = lasting - items
+    lost = put.wanted & (put.slot < 0) if unplaced else None
+    stale = len(targets) - lasting
+    return Written(items=items, evicted=evicted, stale=stale, unplaced=unplaced, lost=lost)
 
 
 def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) -> Put:
@@ -163,12 +170,8 @@ def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Wr
     coarse = any(cache.bricks.channels[name].coarse for name in first)
     lru = cache.lru[REQUEST_LOAD][coarse]
     put = put_bricks(cache, targets, data, lru.free(), coarse)
-    lasting, items, evicted = put.counts.tolist()
-    lru.unused -= items
-    done = Written(items=items, evicted=evicted, stale=len(targets) - lasting)
-    done.unplaced = lasting - items
-    done.lost = put.wanted & (put.slot < 0) if done.unplaced else None
-    done.nbytes = items * _brick_bytes(data)
+    done = _outcome(put, targets, lru)
+    done.nbytes = done.items * _brick_bytes(data)
     return done
 
 

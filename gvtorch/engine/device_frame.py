@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..base.branches import side_by_side
-from ..base.constants import CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
+from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from ..cache import Cache, Scheduler
 from ..cache.requests import below, levels_wanted
 from ..cache.write import Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
@@ -22,7 +22,7 @@ from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
 from .parents import once, parent_bricks, ready
 from .recorded import RecordedFrame
-from .request_batch import ProducedTree, RequestBatch, children_of
+from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
 from .stats import FrameStats, Readbacks
 
 
@@ -146,9 +146,9 @@ class DeviceFrame(RecordedFrame):
         data, constant = good, torch.zeros_like(node[:1])
         if bricks.kind is not None:
             data = (bricks.kind == Region.DATA) | (bricks.kind == Region.DATA_MAX_DEPTH)
-            bare = (bricks.kind == Region.EMPTY) | (bricks.kind == Region.CONSTANT)
+            word = brick_words(bricks.kind)
+            bare = word != ABSENT
             good, data, bare = good & (data | bare), good & data, good & bare
-            word = torch.where(bricks.kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
             targets = _only(batch.targets, node, bare)
             constant = put_uniform(self.cache, targets, word, bricks.constants).view(1)
         put = put_bricks(self.cache, _only(batch.targets, node, data), bricks.data, free)

@@ -13,13 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..base.constants import (
-    CONSTANT,
-    EMPTY,
-    REQUEST_LOAD,
-    REQUEST_PENDING_SHIFT,
-    REQUEST_SUBDIVIDE,
-)
+from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
 from ..base.records import Hits
 from ..base.volume import movable
 from ..cache import KINDS, Cache, Scheduler
@@ -29,7 +23,7 @@ from ..producers import Bricks, Region, Regions
 from .mail import Form, Mail
 from .production import Production
 from .recorded import RecordedFrame
-from .request_batch import ProducedTree, RequestBatch, children_of
+from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
 from .stats import Collected, FrameStats
 
 _SOON = 0.02  # seconds after which a producer that has not answered yet is asked again
@@ -307,9 +301,9 @@ class HostFrame(RecordedFrame):
         alias = kind[good] == Region.ALIAS
         if bool(alias.any()):
             self._leave_to_host(turn, batch[good[alias]])
-        bare = (kind[good] == Region.EMPTY) | (kind[good] == Region.CONSTANT)
+        word = brick_words(kind)
+        bare = word[good] != ABSENT
         self._post(turn, batch, "bricks", rows, fields, good[~bare & ~alias])
-        word = torch.where(kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
         known = {
             name: torch.zeros((len(kind), one.width), dtype=one.dtype)
             for name, one in batch.source.producer.channels.items()

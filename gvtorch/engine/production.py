@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..base.constants import CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_PENDING_SHIFT
+from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT
 from ..cache import KINDS, Cache, Scheduler, write
 from ..cache.write import Targets, Written
 from ..pool import Staging
@@ -27,6 +27,7 @@ from .request_batch import (
     Answered,
     ProducedTree,
     RequestBatch,
+    brick_words,
     by_kind,
     children_of,
     send_ahead,
@@ -378,9 +379,9 @@ class Production:
             return
         if kind is Region.EMPTY:
             device = batch.targets.node.device
-            word = torch.where(answer.kind == Region.CONSTANT, CONSTANT, EMPTY).to(torch.int32)
+            word = upload(brick_words(answer.kind), device)
             constants = {name: upload(rows, device) for name, rows in answer.constants.items()}
-            written = write.uniform(self.cache, batch.targets, upload(word, device), constants)
+            written = write.uniform(self.cache, batch.targets, word, constants)
             self._add_up(batch, written, stats)
             return
         sent = shipped(batch, answer, self.staging)

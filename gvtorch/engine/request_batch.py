@@ -155,17 +155,21 @@ class Answered(NamedTuple):
     answer: Regions | Bricks | Shipment
 
 
+def brick_words(kind: Tensor) -> Tensor:
+    """(k,) int32 the words of nodes that need no brick, EMPTY or CONSTANT; ABSENT of all others."""
+    word = torch.where(kind == Region.EMPTY, EMPTY, ABSENT)
+    return torch.where(kind == Region.CONSTANT, CONSTANT, word).to(torch.int32)
+
+
 def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
     """Turns a producer's regions into the words of tiles, where the regions lie."""
     nodes = batch.nodes
     layout = nodes.layout
     low = nodes.loc[:, :3] * (nodes.scale * layout.brick_size)[:, None]
     kind = torch.where((low >= layout.extent_3).any(1), Region.EMPTY, answer.kind)
-    leaf = (kind == Region.EMPTY) | (kind == Region.CONSTANT) | (kind == Region.DATA_MAX_DEPTH)
-    leaf |= nodes.depth >= layout.depth
+    brick = brick_words(kind)
+    leaf = (brick != ABSENT) | (kind == Region.DATA_MAX_DEPTH) | (nodes.depth >= layout.depth)
     child = torch.where(leaf, TERMINAL, ABSENT).to(torch.int32)
-    brick = torch.where(kind == Region.EMPTY, EMPTY, ABSENT)
-    brick = torch.where(kind == Region.CONSTANT, CONSTANT, brick).to(torch.int32)
     constants, ranges = dict(answer.constants), dict(answer.ranges)
     for name, words in cache.nodes.constants.items():  # also what another tree left in these tiles
         if name not in constants:
