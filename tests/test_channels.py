@@ -12,7 +12,7 @@ from helpers.traces import assert_equal, run
 
 import gvtorch as gv
 from gvtorch.base.image_info import COLORS
-from gvtorch.shaders.channels import DISTINCT, linear_color
+from gvtorch.shaders.channels import DISTINCT, channel_color
 
 SPACING, ORIGIN = (1.0, 0.8, 1.3), (3.0, -2.0, 5.0)
 MODES = ["additive", "opacity"]
@@ -354,8 +354,8 @@ def test_any_window_has_a_table():
     ],
 )
 def test_colors_by_name_number_and_value(color, linear):
-    assert linear_color("x", color) == pytest.approx(linear, abs=1e-5)
-    assert all(len(linear_color("x", name)) == 3 for name in COLORS)
+    assert channel_color("x", color) == pytest.approx(linear, abs=1e-5)
+    assert all(len(channel_color("x", name)) == 3 for name in COLORS)
 
 
 def shown(**look) -> list[gv.ChannelLook]:

@@ -123,7 +123,7 @@ def test_a_chunk_that_swells_costs_itself(stored, request, place, remote, tmp_pa
             with pytest.raises(Exception, match=r"Blosc|40[03]"):
                 read(view).result(timeout=30)
         if remote:
-            assert "Blosc would make 1073741824 bytes of a chunk" in relay.named(
+            assert "Blosc would make 1073741824 bytes of a chunk" in relay.with_urls(
                 f'Error opening "a": {relay.through(f"{root}/a/").spec["base_url"]}'
                 f"{file.relative_to(stored)}: "
             )

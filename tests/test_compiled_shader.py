@@ -591,6 +591,6 @@ def test_it_is_unpickled_in_another_process(tmp_path):
 
 @pytest.mark.backend("cpp")
 def test_cuda_gets_no_other_content_than_the_cpu_has(tmp_path):
-    edited = replace(user.load(HEADER, "mine::Plain"), header=write(tmp_path, ADD))
+    edited = replace(user.load_op(HEADER, "mine::Plain"), header=write(tmp_path, ADD))
     with pytest.raises(RuntimeError, match=r"own.h has changed: make the shader anew"):
         user.load_cuda(edited)

@@ -13,7 +13,7 @@ from gvtorch.pool.downsample import (
     pool_max,
     pool_mean,
     pool_min,
-    window,
+    reduce_windows,
 )
 
 DTYPES = [str(dtype).removeprefix("torch.") for dtype in CHANNEL_DTYPES]
@@ -47,8 +47,8 @@ def test_tensors_are_reduced_to_the_bits_of_arrays(dtype, factor, device):
         assert found.dtype == torch.float32
         np.testing.assert_array_equal(found.cpu().numpy(), by_node(array, how, 4, 1))
         np.testing.assert_array_equal(
-            window(tensor, how, size=3, step=2).cpu().numpy(),
-            window(array, how, size=3, step=2),
+            reduce_windows(tensor, how, size=3, step=2).cpu().numpy(),
+            reduce_windows(array, how, size=3, step=2),
         )
 
 

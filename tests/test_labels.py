@@ -18,7 +18,7 @@ from helpers.traces import run
 from helpers.trees import on
 
 import gvtorch as gv
-from gvtorch.base.srgb import from_srgb
+from gvtorch.base.srgb import array_from_srgb
 from gvtorch.shaders.colors import distinct_colors, linear_color
 
 ORIGIN = (2.0, -1.0, 0.5)
@@ -219,7 +219,7 @@ def test_colours_in_every_form():
         (None, own),
         ({1: RED, 2**40: "#0000ff", 77: "tan"}, [own[0], own[1], RED, own[3], own[4], BLUE]),
         ([RED, GREEN, "blue"], [own[0], RED, GREEN, linear_color("", "blue"), own[4], own[5]]),
-        (table, [own[0], *from_srgb(table / 255), own[4], own[5]]),
+        (table, [own[0], *array_from_srgb(table / 255), own[4], own[5]]),
         (torch.tensor([GREEN]), [own[0], GREEN, *own[2:]]),
     ):
         found = gv.Labels(colors)._look().colors_of(labels)

@@ -12,6 +12,9 @@ from pathlib import Path
 
 from helpers import ROOT
 
+from gvtorch.bench import WORKLOADS
+from gvtorch.viewer.protocol import MESSAGES
+
 PACKAGE = ROOT / "gvtorch"
 FLOORS = [
     {"base"},
@@ -134,6 +137,31 @@ def test_kernel_headers_include_only_downward():
         for other in re.findall(r'#include "(\w+)/', path.read_text()):
             below = number[other] < number[own] or other == own
             assert below, f"{path.relative_to(csrc)} includes {other}"
+
+
+def named_elsewhere(path: Path, name: str) -> bool:
+    """Whether a name is another thing's on purpose: of a twin or an op, that of what it serves; of
+    a command, a workload or a message, the word that users type; of a peer, what all peers have.
+    """
+    home = path.relative_to(PACKAGE).parts
+    return (
+        home[0] == "ops"
+        or (home[0] == "tools" and name.lower() == path.stem)
+        or (home == ("viewer", "protocol.py") and name.lower() in MESSAGES)
+        or (home[0] == "bench" and (name in WORKLOADS or "peers" in home))
+    )
+
+
+def test_no_two_things_share_a_name():
+    """Of classes, and of functions that other files may import."""
+    homes: dict[str, list[str]] = {}
+    for path in modules():
+        for node in ast.parse(path.read_text()).body:
+            shared = isinstance(node, ast.FunctionDef) and node.name[0] != "_"
+            if (shared or isinstance(node, ast.ClassDef)) and not named_elsewhere(path, node.name):
+                homes.setdefault(node.name, []).append(str(path.relative_to(PACKAGE)))
+    assert not {name: found for name, found in homes.items() if len(found) > 1}
+    assert len(homes) > 900, "the test must see something"
 
 
 def test_import_loads_torch_and_nothing_heavier():

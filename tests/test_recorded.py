@@ -20,7 +20,7 @@ from helpers.waits import nobody_waits
 from torch import Tensor
 
 import gvtorch as gv
-from gvtorch.base.branches import side_by_side
+from gvtorch.base.branches import in_branches
 from gvtorch.base.constants import REQUEST_PENDING_SHIFT
 from gvtorch.cache import Cache
 from gvtorch.cache.requests import DEEPER, deeper, levels_wanted
@@ -527,7 +527,7 @@ def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
 
     def step() -> Tensor:
         many.add_(1)
-        total, least = side_by_side(lambda: many.double().sum().view(1), lambda: few + 1)
+        total, least = in_branches(lambda: many.double().sum().view(1), lambda: few + 1)
         few.copy_(least)
         return torch.cat((total, few.double()))
 

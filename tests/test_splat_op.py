@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gvtorch.ops import splat
 from gvtorch.ops.reference import splat as twin
-from gvtorch.points.codes import shares
+from gvtorch.points.codes import point_shares
 from gvtorch.points.points import Points
 from gvtorch.points.sorted import sort_points
 from gvtorch.points.splat import Cubes, values
@@ -315,7 +315,7 @@ def test_points_in_numpy_have_the_shares_of_the_twin():
     edge, center = np.linspace(-1, 1, 12).repeat(3).reshape(12, 3).T.copy(), np.array([0, 0.1, 2])
     radius = np.array([0.5, 0.0, 3.0])
     expected = twin.shares(*map(torch.from_numpy, (edge, center, radius)))
-    found = shares(edge, center, radius)
+    found = point_shares(edge, center, radius)
     assert np.array_equal(found, expected.numpy())
     exact = [np.diff(share_below(edge[i], center[i], radius[i])) for i in range(3)]
     assert np.allclose(found, exact, rtol=0, atol=1e-15)

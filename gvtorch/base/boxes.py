@@ -19,7 +19,7 @@ def index(low: Any, high: Any) -> tuple[slice, ...]:
     return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
 
 
-def clamp(low: Zyx, high: Zyx, shape: Zyx) -> tuple[list[int], list[int]]:
+def clamped_box(low: Zyx, high: Zyx, shape: Zyx) -> tuple[list[int], list[int]]:
     """The part of a box that lies in a grid, or what is next to it: at least one voxel a side."""
     start = [min(max(a, 0), n - 1) for a, n in zip(low, shape, strict=True)]
     stop = [max(min(b, n), a + 1) for a, b, n in zip(start, high, shape, strict=True)]
@@ -46,7 +46,7 @@ def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
     return data[(None,) * len(missing)].transpose([letters.index(axis) for axis in order])
 
 
-def grouped(places: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+def rows_by_place(places: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns the different ones (m, n) of places (k, n), in order, and the rows of each."""
     order = np.lexsort(places.T[::-1])
     places = places[order]

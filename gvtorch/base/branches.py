@@ -1,4 +1,4 @@
-"""`side_by_side`: jobs of a recorded frame that do not wait for one another."""
+"""`in_branches`: jobs of a recorded frame that do not wait for one another."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 
-def side_by_side(*jobs: Callable[[], Any]) -> list[Any]:
+def in_branches(*jobs: Callable[[], Any]) -> list[Any]:
     """Returns what each job returns. While a CUDA graph is recorded, jobs become branches of it,
     which run at the same time and end before what comes next; else they run one after the other.
     No job may write what another reads.

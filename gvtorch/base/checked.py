@@ -55,19 +55,19 @@ def or_none(given: Check) -> Check:
     return lambda owner, name, value: None if value is None else given(owner, name, value)
 
 
-def above(low: float) -> Check:
+def number_above(low: float) -> Check:
     """A check for a finite number above `low`; keeps a float."""
     return lambda owner, name, value: check.number(
         kind_of(owner), name, value, low=low, open_low=True
     )
 
 
-def whole(low: int, high: int = sys.maxsize) -> Check:
+def whole_between(low: int, high: int = sys.maxsize) -> Check:
     """A check for a whole number from `low` to `high`."""
     return lambda owner, name, value: check.whole(kind_of(owner), name, value, low=low, high=high)
 
 
-def text(owner: Any, name: str, value: Any) -> str:
+def as_name(owner: Any, name: str, value: Any) -> str:
     """Checks that a value is a name."""
     if not isinstance(value, str):
         raise ValueError(f"{kind_of(owner)}: {name} must be a name, got {value!r}")

@@ -12,7 +12,9 @@ from torch import Tensor
 from . import check
 
 
-def moved(value: Any, device: torch.device | str | None, dtype: torch.dtype | None = None) -> Any:
+def to_device(
+    value: Any, device: torch.device | str | None, dtype: torch.dtype | None = None
+) -> Any:
     """Returns a tensor on a device, in another dtype if it holds floats; anything else as it is."""
     if not isinstance(value, Tensor):
         return value
@@ -41,7 +43,7 @@ class Rays:
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Rays:
         """The rays on a device, in float32 or float64; None leaves each as it is."""
-        return self._each(lambda column: moved(column, device, dtype), self.width)
+        return self._each(lambda column: to_device(column, device, dtype), self.width)
 
     def light(self) -> Tensor:
         """Returns (r, 1) float64 transmittance at the first distance."""
@@ -77,7 +79,9 @@ class Hits:
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Hits:
         """The hits on a device; its floats in another dtype. None leaves each as it is."""
-        return replace(self, **{name: moved(v, device, dtype) for name, v in vars(self).items()})
+        return replace(
+            self, **{name: to_device(v, device, dtype) for name, v in vars(self).items()}
+        )
 
     def __repr__(self) -> str:
         extra = [

@@ -8,6 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 
-def from_srgb(color: np.ndarray) -> np.ndarray:
+def array_from_srgb(color: np.ndarray) -> np.ndarray:
     """Returns sRGB in [0, 1] as linear light (IEC 61966-2-1)."""
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)

@@ -22,7 +22,7 @@ from ..producers import Bricks, FieldProducer, Nodes, Producer, VolumeProducer
 from ..shaders import TransferFunction
 from ..tracing import render
 from .record import Record, Settings, Timing, clock, spread, synchronize
-from .scenes import Scene, aneurism, fog_dense, worn
+from .scenes import BenchScene, aneurism, fog_dense, worn
 
 #: Stages of a frame that are the cache's: what a resident tree has no need of.
 CACHE = ("requests", "lru", "schedule", "produce", "write", "count")
@@ -94,7 +94,7 @@ def deep(record: Record) -> None:
     record.note("times: beside the small tree's frame")
 
 
-def _steady(record: Record, scene: Scene, size: tuple[int, int]) -> None:
+def _steady(record: Record, scene: BenchScene, size: tuple[int, int]) -> None:
     settings, camera = record.settings, scene.camera(*size)
     case = f"steady, {scene.name}, {size[0]}x{size[1]}"
     medians = {}
@@ -174,7 +174,7 @@ def _converge(engine: Engine, camera: Camera, shader: TransferFunction) -> torch
     raise ValueError(f"bench: nothing converged within {_MOST} frames")
 
 
-def _cold(record: Record, scene: Scene, size: tuple[int, int], budget: int) -> None:
+def _cold(record: Record, scene: BenchScene, size: tuple[int, int], budget: int) -> None:
     """From an engine that holds the root alone to a picture that misses nothing: frame after frame,
     each of them whole, and by `Engine.render`, which shows the last one alone; on CUDA by a graph
     as well, of a volume that the device reads in place.

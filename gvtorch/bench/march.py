@@ -23,7 +23,7 @@ from ..pool import N3Tree
 from ..tracing import render, trace
 from .peers import Peer, Task, find
 from .record import Record, Settings, Timing, clock, once
-from .scenes import SCENES, Scene, shell_sparse
+from .scenes import SCENES, BenchScene, shell_sparse
 
 _STOP = 0.99
 Size = tuple[int, int]
@@ -142,7 +142,7 @@ def _case(name: str, size: Size) -> str:
 
 def _compare(
     record: Record,
-    scene: Scene,
+    scene: BenchScene,
     tree: N3Tree,
     size: Size,
     peers: dict[str, type[Peer]],
@@ -180,7 +180,7 @@ def _compare(
 
 
 def _tracing(
-    tree: N3Tree, scene: Scene, camera: Camera, lod: str, device: torch.device
+    tree: N3Tree, scene: BenchScene, camera: Camera, lod: str, device: torch.device
 ) -> Callable[[], Hits]:
     """Returns the call that is timed; rays are made before."""
     rays = camera.rays(device)
@@ -215,7 +215,7 @@ def difference(picture: Tensor, other: Tensor) -> dict[str, float]:
 
 def op_milliseconds(run: Callable[[], object], settings: Settings) -> float | None:
     """Median milliseconds inside the op of a fused shader; None where none is called."""
-    with _Watch(settings.device) as watch:
+    with _OpTimer(settings.device) as watch:
         began = time.perf_counter()
         for _ in range(settings.repeats):
             run()
@@ -224,7 +224,7 @@ def op_milliseconds(run: Callable[[], object], settings: Settings) -> float | No
     return statistics.median(watch.times) if watch.times else None
 
 
-class _Watch(TorchDispatchMode):
+class _OpTimer(TorchDispatchMode):
     """Takes the time of a fused shader's op whenever it is called."""
 
     def __init__(self, device: torch.device) -> None:
@@ -247,7 +247,7 @@ class _Watch(TorchDispatchMode):
         return answer[0]
 
 
-def _tree_bytes(scene: Scene, brick_size: int, border: int) -> int:
+def _tree_bytes(scene: BenchScene, brick_size: int, border: int) -> int:
     """At most: all bricks of all levels, and the float32 pyramid that they are cut from."""
     x, y, z = scene.volume.extent
     brick = (brick_size + 2 * border) ** 3

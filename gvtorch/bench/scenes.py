@@ -21,7 +21,7 @@ SCAN = Path(__file__).parents[2] / "examples" / "data" / "aneurism_256x256x256_u
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class BenchScene:
     """A volume and how it is shown."""
 
     name: str
@@ -56,20 +56,20 @@ def _uint8(values: Tensor) -> Volume:
     return Volume(values.clamp(0, 255).to(torch.uint8))
 
 
-def fog_dense(side: int) -> Scene:
+def fog_dense(side: int) -> BenchScene:
     """Thin fog that fills the box: every brick exists and is sampled."""
     volume = _uint8(_waves(*_grid(side)))
-    return Scene(name="fog dense", volume=volume, shader=_FOG, surface=100.0)
+    return BenchScene(name="fog dense", volume=volume, shader=_FOG, surface=100.0)
 
 
-def fog_sparse(side: int) -> Scene:
+def fog_sparse(side: int) -> BenchScene:
     """Fog in five balls, a twentieth of the box: the rest is empty."""
     z, y, x = _grid(side)
     inside = torch.zeros_like(x, dtype=torch.bool)
     for cx, cy, cz in ((0, 0, 0), (0.5, 0.5, 0.5), (-0.5, 0.4, -0.3), (0.4, -0.6, -0.4)):
         inside |= (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2 < 0.28**2
     inside |= (x + 0.5) ** 2 + (y + 0.5) ** 2 + (z - 0.5) ** 2 < 0.28**2
-    return Scene(name="fog sparse", volume=_uint8(_waves(z, y, x) * inside), shader=_FOG)
+    return BenchScene(name="fog sparse", volume=_uint8(_waves(z, y, x) * inside), shader=_FOG)
 
 
 def _shell(side: int) -> Tensor:
@@ -79,21 +79,21 @@ def _shell(side: int) -> Tensor:
     return 255 * (1 - (radius - 0.8).abs() / width).clamp(0, 1)
 
 
-def shell_sparse(side: int) -> Scene:
+def shell_sparse(side: int) -> BenchScene:
     """A thin opaque sphere: most of the box is empty."""
-    return Scene(name="shell sparse", volume=_uint8(_shell(side)), shader=_SOLID)
+    return BenchScene(name="shell sparse", volume=_uint8(_shell(side)), shader=_SOLID)
 
 
-def shell_dense(side: int) -> Scene:
+def shell_dense(side: int) -> BenchScene:
     """The sphere in values that the transfer function does not show: every brick exists."""
     z, y, x = np.ogrid[0:side, 0:side, 0:side]
     faint = torch.from_numpy((7 * x + 13 * y + 29 * z) % 16 + 1)
-    return Scene(
+    return BenchScene(
         name="shell dense", volume=_uint8(torch.maximum(_shell(side), faint)), shader=_SOLID
     )
 
 
-def clouds(side: int) -> Scene:
+def clouds(side: int) -> BenchScene:
     """Clouds of which 68 % of the voxels are transparent, stepped by whole voxels: the setting of
     a figure that is known of VTK.
     """
@@ -109,10 +109,10 @@ def clouds(side: int) -> Scene:
     values = 128 + 127 * (field - edge) / float(field.max() - edge)
     opacity, color = [(128, 0), (255, 0.3)], [(128, 0.2, 0.4, 0.8), (255, 1, 0.9, 0.7)]
     shader = TransferFunction.from_points(opacity, color)
-    return Scene(name="clouds", volume=_uint8(values.floor()), shader=shader, step=1.0)
+    return BenchScene(name="clouds", volume=_uint8(values.floor()), shader=shader, step=1.0)
 
 
-def aneurism(side: int) -> Scene:
+def aneurism(side: int) -> BenchScene:
     """The bundled scan; of smaller sides every so many voxels of it.
 
     Raises:
@@ -122,7 +122,7 @@ def aneurism(side: int) -> Scene:
     every = max(1, data.shape[0] // side)
     volume = Volume(data[::every, ::every, ::every].contiguous())
     vessels = TransferFunction.preset("vessels", 0, 255)
-    return Scene(name="aneurism", volume=volume, shader=vessels, surface=76.0)
+    return BenchScene(name="aneurism", volume=volume, shader=vessels, surface=76.0)
 
 
 def worn_planes(side: int) -> Iterator[np.ndarray]:
@@ -142,20 +142,20 @@ def worn_planes(side: int) -> Iterator[np.ndarray]:
         yield np.clip(128 + 20 * side / 8 * inside, 0, 255).astype(np.uint8)
 
 
-def worn(side: int) -> Scene:
+def worn(side: int) -> BenchScene:
     """The worn sphere as a volume in memory."""
     shader = TransferFunction.from_points(
         [(100, 0), (140, 0.9)],
         [(100, 0.3, 0.1, 0.05), (160, 0.9, 0.6, 0.3), (255, 1, 0.95, 0.8)],
         reference=4.0,
     )
-    return Scene(name="worn", volume=Volume(np.stack([*worn_planes(side)])), shader=shader)
+    return BenchScene(name="worn", volume=Volume(np.stack([*worn_planes(side)])), shader=shader)
 
 
 _FOG = TransferFunction.from_points([(0, 0), (255, 0.004)], [(0, 1, 0.5, 0), (255, 0, 0.5, 1)])
 _SOLID = TransferFunction.from_points([(20, 0), (120, 1)])
 
-Maker = Callable[[int], Scene]
+Maker = Callable[[int], BenchScene]
 #: Scenes of `march`, by name.
 SCENES: dict[str, Maker] = {
     "fog dense": fog_dense,

@@ -36,7 +36,7 @@ from ..shaders.built_in import BY_NAME
 from ..tracing import Lighting, trace
 from .march import Size, difference, op_milliseconds, rates, rgba
 from .record import Record, Settings, Timing, clock
-from .scenes import Scene, aneurism, fog_dense, worn
+from .scenes import BenchScene, aneurism, fog_dense, worn
 
 _WIDE = 16  # numbers of the widest channel
 _OWN = Path(__file__).with_name("own_shader.h")
@@ -44,11 +44,11 @@ SUN = DirectionalLight((1.0, -2.0, -1.5), angle=4.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Look:
+class ShaderCase:
     """A shader with its options, and the look that its time is a ratio of."""
 
     name: str
-    shader: Callable[[Scene], Shader]
+    shader: Callable[[BenchScene], Shader]
     options: Mapping[str, Any] = field(default_factory=dict)  # of `RenderOptions`
     beside: str = "plain"
     twin: bool = False  # both must draw the same picture
@@ -56,22 +56,22 @@ class Look:
     compiles: bool = False  # left out where there is no compiler
 
 
-def _named(name: str, scene: Scene) -> Shader:
+def _named(name: str, scene: BenchScene) -> Shader:
     return BY_NAME[name](scene.shader, scene.surface)
 
 
-def _module(scene: Scene) -> Shader:
+def _module(scene: BenchScene) -> Shader:
     module = TransferModule(scene.shader, min(scene.volume.spacing))
     return ModuleShader(module, hidden_by=scene.shader)
 
 
-def _own(scene: Scene) -> Shader:
+def _own(scene: BenchScene) -> Shader:
     return CompiledShader(_OWN, "Own", transfer=scene.shader)
 
 
-def _cones(name: str, *, occlusion: float = 0.0, indirect: float = 0.0) -> Look:
+def _cones(name: str, *, occlusion: float = 0.0, indirect: float = 0.0) -> ShaderCase:
     light = Lighting(lights=(SUN,), occlusion=occlusion, indirect=indirect)
-    return Look(
+    return ShaderCase(
         name=f"isosurface, {name}",
         shader=lambda scene: Isosurface(scene.surface),
         options={"lighting": light},
@@ -82,25 +82,25 @@ def _cones(name: str, *, occlusion: float = 0.0, indirect: float = 0.0) -> Look:
 #: What is measured, each behind the look that it stands beside. Left out where a scene has not the
 #: channels that a shader names.
 LOOKS = (
-    *(Look(name=name, shader=partial(_named, name)) for name in BY_NAME),
+    *(ShaderCase(name=name, shader=partial(_named, name)) for name in BY_NAME),
     _cones("shadow"),
     _cones("shadow, occlusion", occlusion=1.0),
     _cones("shadow, occlusion, bounce", occlusion=1.0, indirect=1.0),
-    Look(name="lit by stored normals", shader=lambda s: Lit(s.shader, normals="normal")),
-    Look(name="stored colour", shader=lambda _: StoredColor("rgba")),
-    Look(name="stored colour, lit", shader=lambda _: StoredColor("rgba", lit=True)),
-    Look(
+    ShaderCase(name="lit by stored normals", shader=lambda s: Lit(s.shader, normals="normal")),
+    ShaderCase(name="stored colour", shader=lambda _: StoredColor("rgba")),
+    ShaderCase(name="stored colour, lit", shader=lambda _: StoredColor("rgba", lit=True)),
+    ShaderCase(
         name="lit, shadows per sample",
         shader=lambda s: Lit(s.shader, light=SUN, shadows=True),
         slow=True,
     ),
-    Look(name="distance field", shader=lambda s: DistanceField(offset=s.surface)),
-    Look(name="3 features", shader=lambda s: Features(s.shader, "normal")),
-    Look(name=f"{_WIDE} features", shader=lambda s: Features(s.shader, "numbers")),
-    Look(name="module", shader=_module, twin=True, slow=True),
-    Look(name="user's header", shader=_own, twin=True, slow=True, compiles=True),
-    Look(name="plain, step 1", shader=lambda s: s.shader, options={"step": 1.0}),
-    Look(
+    ShaderCase(name="distance field", shader=lambda s: DistanceField(offset=s.surface)),
+    ShaderCase(name="3 features", shader=lambda s: Features(s.shader, "normal")),
+    ShaderCase(name=f"{_WIDE} features", shader=lambda s: Features(s.shader, "numbers")),
+    ShaderCase(name="module", shader=_module, twin=True, slow=True),
+    ShaderCase(name="user's header", shader=_own, twin=True, slow=True, compiles=True),
+    ShaderCase(name="plain, step 1", shader=lambda s: s.shader, options={"step": 1.0}),
+    ShaderCase(
         name="pre-integrated, step 1",
         shader=lambda s: PreIntegrated(s.shader),
         options={"step": 1.0},
@@ -138,7 +138,7 @@ def shaders(record: Record) -> None:
 
 
 def _resident(
-    record: Record, scene: Scene, volumes: Mapping[str, Volume], size: Size
+    record: Record, scene: BenchScene, volumes: Mapping[str, Volume], size: Size
 ) -> dict[str, Tensor]:
     """Adds the rows of a resident tree; returns the pictures by look."""
     case = f"{scene.name}, resident, {size[0]}x{size[1]}"
@@ -156,7 +156,7 @@ def _resident(
 
 def _streamed(
     record: Record,
-    scene: Scene,
+    scene: BenchScene,
     volumes: Mapping[str, Volume],
     size: Size,
     resident: Mapping[str, Tensor],
@@ -189,7 +189,7 @@ def _streamed(
 def _measure(
     record: Record,
     case: str,
-    scene: Scene,
+    scene: BenchScene,
     channels: Collection[str],
     frame: Callable[..., Hits | Picture],
     others: Mapping[str, Tensor],
@@ -253,7 +253,7 @@ def _clock(run: Callable[[], Hits | Picture], settings: Settings) -> tuple[Timin
     return clock(call, settings), given[0]
 
 
-def _wanted(record: Record, case: str) -> list[Look]:
+def _wanted(record: Record, case: str) -> list[ShaderCase]:
     """The looks of a case that are asked for, and those that they stand beside."""
     names = {look.name for look in LOOKS if record.wants(f"{case}, {look.name}")}
     for look in reversed(LOOKS):
@@ -262,7 +262,7 @@ def _wanted(record: Record, case: str) -> list[Look]:
     return [look for look in LOOKS if look.name in names]
 
 
-def _channels(scene: Scene) -> dict[str, Volume]:
+def _channels(scene: BenchScene) -> dict[str, Volume]:
     """Normals, colours and numbers of a scene's voxels: all is even where its value is."""
     value = scene.volume.data[..., 0].float()
     normal = torch.nn.functional.normalize(torch.stack(torch.gradient(value)[::-1], -1), dim=-1)

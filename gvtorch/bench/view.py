@@ -17,7 +17,7 @@ import torch
 from . import PEERS, Unavailable, browser
 from .peers.pages import DIFFERS, NEEDS, PAGES, Site, served
 from .record import Record, spread
-from .scenes import Scene, aneurism, fog_dense
+from .scenes import BenchScene, aneurism, fog_dense
 
 _RATES = (25.0, 60.0)  # pictures a second that are wanted
 _HELD = 1 / 60  # seconds between camera messages, as of a hand that drags
@@ -51,7 +51,7 @@ def view(record: Record) -> None:
     _beside(record, scene, sizes)
 
 
-def _turn(record: Record, case: str, scene: Scene, size: tuple[int, int], rate: float) -> None:
+def _turn(record: Record, case: str, scene: BenchScene, size: tuple[int, int], rate: float) -> None:
     from ..viewer.server import Server
     from ..viewer.view import new_session
 
@@ -83,7 +83,7 @@ def _p95(times: list[float]) -> float:
     return sorted(times)[math.ceil(0.95 * len(times)) - 1]
 
 
-def _beside(record: Record, scene: Scene, sizes: tuple[tuple[int, int], ...]) -> None:
+def _beside(record: Record, scene: BenchScene, sizes: tuple[tuple[int, int], ...]) -> None:
     """The pages of peers and ours in a browser, turned by the same hand."""
     settings = record.settings
     why = browser.absent()

@@ -30,7 +30,7 @@ from ..pool import BrickPool, N3Tree, NodePool
 _LONGEST = 64  # aliases of aliases
 
 
-class Rows(NamedTuple):
+class AliasRows(NamedTuple):
     """The aliases that are alive, rising by node."""
 
     node: Tensor  # (a,) int64
@@ -40,9 +40,9 @@ class Rows(NamedTuple):
     target_place: Tensor  # (a, 5) its place, which is not the goal's below another alias
     exact: Tensor  # (a,) bool, whether it is the target
 
-    def some(self, index: Tensor) -> Rows:
+    def some(self, index: Tensor) -> AliasRows:
         """Some of them."""
-        return Rows(*(field[index] for field in self))
+        return AliasRows(*(field[index] for field in self))
 
 
 class Aliases:
@@ -53,7 +53,7 @@ class Aliases:
         rows: What is known of each.
     """
 
-    rows: Rows
+    rows: AliasRows
 
     def __init__(self, nodes: NodePool, bricks: BrickPool) -> None:
         """Starts without any."""
@@ -72,7 +72,7 @@ class Aliases:
         device = self.nodes.child_tn.device
         none = torch.zeros((0, 5), dtype=torch.int64, device=device)
         one = none[:, 0]
-        self.rows = Rows(one, none, none, one, none, one.bool())
+        self.rows = AliasRows(one, none, none, one, none, one.bool())
         self._kept = one, one
 
     def __len__(self) -> int:
@@ -88,10 +88,10 @@ class Aliases:
             torch.cat((torch.full_like(loc[:, :1], number), loc), 1)
             for number, loc in ((tree, place), (goal_tree, goal))
         )
-        new = Rows(node, own, other, node, own, torch.zeros_like(node, dtype=torch.bool))
+        new = AliasRows(node, own, other, node, own, torch.zeros_like(node, dtype=torch.bool))
         both = [torch.cat(pair) for pair in zip(self.rows.some(known), new, strict=True)]
         order = both[0].argsort()
-        self.rows = Rows(*(field[order] for field in both))
+        self.rows = AliasRows(*(field[order] for field in both))
 
     def update(self) -> None:
         """Finds targets that are not known any more, and gives all aliases the words of theirs."""
@@ -164,7 +164,7 @@ class Aliases:
         """(k,) bool, which nodes have no children."""
         return self.nodes.child_tn.view(-1)[node] == TERMINAL
 
-    def _followed(self, rows: Rows) -> Rows:
+    def _followed(self, rows: AliasRows) -> AliasRows:
         """The rows, with targets that are no aliases; those that lead back to themselves are left
         out, and asked for themselves.
         """
@@ -179,7 +179,7 @@ class Aliases:
             target = torch.where(known, rows.target[row], target)
         return self._followed(rows.some(~known))
 
-    def _copy(self, rows: Rows) -> None:
+    def _copy(self, rows: AliasRows) -> None:
         """Gives aliases the words of their targets."""
         nodes, bricks, node, target = self.nodes, self.bricks, rows.node, rows.target
         for pointer, owner, shared in (

@@ -7,7 +7,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ..base.branches import side_by_side
+from ..base.branches import in_branches
 from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
 from ..ops import lru_partition
 from ..pool import BrickPool, NodePool
@@ -151,7 +151,7 @@ class Cache:
             whole = unused[0] + unused[1] if len(group) > 1 else unused[0]
             return [whole, locked + size - whole, *unused[1:]]
 
-        tiles, bricks = side_by_side(*map(partial, (sort, sort), self.lru.values(), stamps))
+        tiles, bricks = in_branches(*map(partial, (sort, sort), self.lru.values(), stamps))
         return torch.cat((*tiles, *bricks, self._no_coarse)[:5])
 
     def used(self) -> Tensor:

@@ -22,7 +22,7 @@ from ..base.records import Rays
 from ..base.volume import DIRECTIONS
 from ..pool.staging import upload
 from .ahead import continued
-from .models import MODELS, CameraModel, Plane, last_rising_angle, model_of
+from .models import MODELS, CameraModel, PixelRows, last_rising_angle, model_of
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -432,7 +432,7 @@ class Camera:
         """Returns the rays through the pixel centres of whole rows, the first one and the one after
         the last counted through the batch, from what `numbers` gave.
         """
-        plane = Plane(numbers, rows, self.width, self.height, self.distorted)
+        plane = PixelRows(numbers, rows, self.width, self.height, self.distorted)
         return MODELS[self.model].rays(plane)
 
     def pixel_samples(self, numbers: Tensor, rows: tuple[int, int]) -> Tensor:

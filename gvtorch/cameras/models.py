@@ -24,7 +24,7 @@ _CLEAR = 1.02  # of the distance of a parallel camera's eye from the nearest cor
 
 
 @dataclass(frozen=True)
-class Plane:
+class PixelRows:
     """Rows of pixels on the image planes of cameras: y rows of w pixels, r = y * w in all."""
 
     cameras: Tensor  # (n, 26) float64, see `Camera.numbers`
@@ -141,14 +141,14 @@ class Model(ABC):
         return torch.maximum(x / half_x, y / half_y)
 
     @abstractmethod
-    def rays(self, plane: Plane) -> Rays:
+    def rays(self, plane: PixelRows) -> Rays:
         """Returns the rays through places of the image plane."""
 
 
 class Pinhole(Model):
     """The direction is (x, y, 1)."""
 
-    def rays(self, plane: Plane) -> Rays:
+    def rays(self, plane: PixelRows) -> Rays:
         (first, end), sizes = plane.rows, (plane.width, plane.height)
         columns = pinhole_rays(plane.cameras.contiguous(), first, end - first, *sizes)
         named = dict(zip(("origin", "direction", "cone", "range"), columns, strict=True))
@@ -165,7 +165,7 @@ class Ortho(Model):
         scale = self.reach(corners, half_x, half_y).amax(1)
         return torch.maximum(scale, _CLEAR * corners[..., 2].abs().amax(1)), scale
 
-    def rays(self, plane: Plane) -> Rays:
+    def rays(self, plane: PixelRows) -> Rays:
         rotation = plane.rotation
         across = plane.x[..., None] * rotation[:, None, 0]
         down = plane.y[:, None] * rotation[:, 1] + plane.position
@@ -190,7 +190,7 @@ class Fisheye(Model):
         """All within a cone: a straight edge between two places of it does not leave it."""
         return corners[..., :2].norm(dim=-1) / math.tan(min(half_x, half_y, _NEAREST))
 
-    def rays(self, plane: Plane) -> Rays:
+    def rays(self, plane: PixelRows) -> Rays:
         x, y = plane.x, plane.y[:, None]
         k, limit = plane.numbers[:, 20:24], plane.numbers[:, 24:25]
         radius = (x * x + (y * y)).sqrt()  # (y, w)
@@ -221,7 +221,7 @@ class Panorama(Model):
         slopes = (math.tan(min(half, _NEAREST)) for half in (half_x, half_y))
         return super().reach(corners, *slopes)
 
-    def rays(self, plane: Plane) -> Rays:
+    def rays(self, plane: PixelRows) -> Rays:
         latitude = plane.y[:, None].expand(-1, plane.x.shape[-1])
         longitude = plane.x.expand_as(latitude)
         ring = latitude.cos()

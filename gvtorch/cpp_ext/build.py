@@ -37,7 +37,7 @@ FOLDER = Path("gvtorch") / "cpp_ext"
 compilers = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("compilers.py"))))
 
 
-def find_nvcc() -> str | None:
+def chosen_nvcc() -> str | None:
     """Returns the path of nvcc, or None where there is none or GVTORCH_CUDA=0."""
     choice = os.environ.get("GVTORCH_CUDA", "auto")
     if choice not in ("auto", "0", "1"):
@@ -84,7 +84,7 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
             [*compilers.find_cxx(), *objects, "-Wl,--no-as-needed", *link, "-pthread"],
         ]
     }
-    nvcc = find_nvcc()
+    nvcc = chosen_nvcc()
     if nvcc is not None:
         archs = (os.environ.get("GVTORCH_CUDA_ARCHS") or ARCHS).split(";")
         codes = compilers.machine_codes(archs)

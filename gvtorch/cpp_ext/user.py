@@ -115,7 +115,7 @@ class UserShader(ShaderSource):
     uniforms: tuple[str, ...] | None  # their names; None: any number, without names
 
 
-def load(header: str | os.PathLike[str], name: str) -> UserShader:
+def load_op(header: str | os.PathLike[str], name: str) -> UserShader:
     """Loads the op of a header's struct for the CPU; compiles it unless the cache has it. Raises
     what `CompiledShader` does.
     """
@@ -163,7 +163,7 @@ def reload(shader: UserShader) -> UserShader:
     """Returns a shader that another process compiled (an unpickled one, say) as it is if its op is
     loaded here, else made anew from its header.
     """
-    return shader if (shader.op, "cpu") in _libraries else load(shader.header, shader.name)
+    return shader if (shader.op, "cpu") in _libraries else load_op(shader.header, shader.name)
 
 
 _libraries: dict[tuple[str, str], Path] = {}  # the loaded ones, by op and device type

@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..base.branches import side_by_side
+from ..base.branches import in_branches
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from ..cache import Cache, Scheduler
 from ..cache.requests import below, levels_wanted
 from ..cache.write import Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
 from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
-from .parents import once, parent_bricks, ready
+from .parents import first_ones, parent_bricks, ready
 from .recorded import RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
 from .stats import FrameStats, Readbacks
@@ -68,7 +68,7 @@ class DeviceFrame(RecordedFrame):
         at the same time; what they answer is written after that.
         """
         loads, subdivisions = self.choose()
-        bricks, regions = side_by_side(
+        bricks, regions = in_branches(
             partial(self._answers, REQUEST_LOAD, loads.node),
             partial(self._answers, REQUEST_SUBDIVIDE, subdivisions.node),
         )
@@ -100,7 +100,7 @@ class DeviceFrame(RecordedFrame):
         for source in self.trees:
             node = torch.where(number == source.tree.number, chosen, -1)
             if kind == REQUEST_LOAD and source.producer.needs_parent:
-                node = once(ready(self.cache, node, source.layout.depth))
+                node = first_ones(ready(self.cache, node, source.layout.depth))
             batch = self._asked(source, kind, node)
             answers.append(Unchecked(node, batch, batch.ask()))
         return answers

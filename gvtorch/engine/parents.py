@@ -26,7 +26,7 @@ def ready(cache: Cache, node: Tensor, depth: int) -> Tensor:
     return node
 
 
-def once(node: Tensor) -> Tensor:
+def first_ones(node: Tensor) -> Tensor:
     """Returns nodes (k,) with repeated ones replaced by -1, all but the first. The host does not
     wait.
     """

@@ -302,7 +302,7 @@ class Production:
             lost = (failed & (node != batch.targets.node)).nonzero()[:, 0]
             if len(lost):
                 self._fail(batch[lost], "the brick of its parent can't be made")
-        first = parents.once(torch.where(pending, -1, node))
+        first = parents.first_ones(torch.where(pending, -1, node))
         asked = above[(first >= 0).nonzero()[:, 0]]
         bricks = parents.parent_bricks(cache, source, asked.targets.node)
         return replace(asked, parents=bricks)

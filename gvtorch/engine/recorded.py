@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..base.branches import side_by_side
+from ..base.branches import in_branches
 from ..base.constants import (
     REQUEST_KINDS,
     REQUEST_PENDING_SHIFT,
@@ -109,7 +109,7 @@ class RecordedFrame:
         """Brings slots into the order of use and counts; what the picture used is counted apart
         from what `look` used.
         """
-        use, samples = side_by_side(
+        use, samples = in_branches(
             self.cache.sort_by_use, lambda: hits.samples.sum(dtype=torch.int64).view(1)
         )
         ahead = self._none

@@ -171,7 +171,7 @@ class Pair(Distance):
         return (first * HASH + second) * 3 + own
 
     def box(self) -> Tensor | None:
-        return around(self.first.box(), self.second.box())
+        return joint_box(self.first.box(), self.second.box())
 
 
 class Union(Pair):
@@ -300,7 +300,7 @@ class SmoothDifference(SmoothIntersection):
         super().__init__(first, Negative(second), width)
 
 
-def around(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+def joint_box(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     """Returns the (2, 3) box around two boxes; None if either is unknown."""
     if first is None or second is None:
         return None

@@ -57,7 +57,7 @@ class Power(Iteration):
         self.power = check.whole("Power", "power", power, low=2, high=64)
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        return plain.power(z, self.power)
+        return plain.spherical_power(z, self.power)
 
     def ranges(self, z: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return plain.power_ranges(z, reach, self.power)

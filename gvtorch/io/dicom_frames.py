@@ -34,7 +34,7 @@ _IN_TIME["AcquisitionTime"] = "second"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Frame:
+class DicomFrame:
     """An image of a file."""
 
     file: str
@@ -57,7 +57,7 @@ class Times:
     unit: str | None = None
 
 
-def frames_of(header: Any, count: int) -> list[Frame]:
+def frames_of(header: Any, count: int) -> list[DicomFrame]:
     """Returns the frames of a file, from its header without pixels."""
     shared = _first(header.get("SharedFunctionalGroupsSequence"))
     each = header.get("PerFrameFunctionalGroupsSequence") or ()
@@ -79,7 +79,7 @@ def frames_of(header: Any, count: int) -> list[Frame]:
     return found
 
 
-def _frame(header: Any, groups: list[Any], number: int) -> Frame:
+def _frame(header: Any, groups: list[Any], number: int) -> DicomFrame:
     def told(sequence: str, name: str) -> Any:
         for group in groups:
             item = _first(group.get(sequence))
@@ -108,7 +108,7 @@ def _frame(header: Any, groups: list[Any], number: int) -> Frame:
     numbers = [*spacing, *position, *orientation, *(v for v in (slope, intercept) if v is not None)]
     if not all(math.isfinite(v) for v in numbers) or len(spacing) != 2:
         raise ValueError(f"{header.filename}: place, spacing or rescaling is no number")
-    return Frame(
+    return DicomFrame(
         file=header.filename,
         number=number,
         slope=1.0 if slope is None else float(slope),
@@ -122,8 +122,8 @@ def _frame(header: Any, groups: list[Any], number: int) -> Frame:
 
 
 def order_frames(
-    where: str, frames: Sequence[Frame]
-) -> tuple[list[Frame], np.ndarray, list[str], Times]:
+    where: str, frames: Sequence[DicomFrame]
+) -> tuple[list[DicomFrame], np.ndarray, list[str], Times]:
     """Sorts frames by time and place.
 
     Returns:
@@ -165,7 +165,7 @@ def order_frames(
     return ordered, affine, lost, _moments(ordered, count, apart)
 
 
-def _directions(where: str, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+def _directions(where: str, frame: DicomFrame) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors along a row and along a column."""
     told = np.array(frame.orientation or (1, 0, 0, 0, 1, 0), dtype=np.float64)
     rows, columns = told[:3], told[3:]
@@ -176,8 +176,8 @@ def _directions(where: str, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _without_place(
-    frames: Sequence[Frame], affine: np.ndarray, normal: np.ndarray
-) -> tuple[list[Frame], np.ndarray, list[str], Times]:
+    frames: Sequence[DicomFrame], affine: np.ndarray, normal: np.ndarray
+) -> tuple[list[DicomFrame], np.ndarray, list[str], Times]:
     """Frames of one place, or of none that is told: in the order of their numbers."""
     ordered = sorted(frames, key=lambda f: (f.moments.get("InstanceNumber", 0), f.file, f.number))
     between = ordered[0].between
@@ -188,11 +188,11 @@ def _without_place(
     return ordered, affine, lost if len(ordered) > 1 else [], Times()
 
 
-def _by_place(frames: Sequence[Frame], normal: np.ndarray) -> list[list[Frame]]:
+def _by_place(frames: Sequence[DicomFrame], normal: np.ndarray) -> list[list[DicomFrame]]:
     """Groups frames whose places are the same, along the normal of their plane."""
     depths = np.array([frame.position for frame in frames]) @ normal
     order = np.argsort(depths, kind="stable")
-    slices: list[list[Frame]] = []
+    slices: list[list[DicomFrame]] = []
     last = -math.inf
     for at in order:
         if depths[at] - last > 1e-3:
@@ -202,7 +202,7 @@ def _by_place(frames: Sequence[Frame], normal: np.ndarray) -> list[list[Frame]]:
     return slices
 
 
-def _times(where: str, slices: list[list[Frame]]) -> tuple[int, str | None]:
+def _times(where: str, slices: list[list[DicomFrame]]) -> tuple[int, str | None]:
     """Sorts the frames of each slice by what tells them apart; returns how many they are and it."""
     counts = sorted({len(one) for one in slices})
     if counts == [1]:
@@ -224,7 +224,7 @@ def _times(where: str, slices: list[list[Frame]]) -> tuple[int, str | None]:
     return counts[0], name
 
 
-def _moments(ordered: Sequence[Frame], count: int, apart: str | None) -> Times:
+def _moments(ordered: Sequence[DicomFrame], count: int, apart: str | None) -> Times:
     if count == 1:
         return Times()
     name = (

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..base import check
 from ..base.messages import need_library, one_line
-from ..base.srgb import from_srgb
+from ..base.srgb import array_from_srgb
 from ..meshes.mesh import MOST_FACES, Material, Mesh
 from .polygons import cut_polygons
 from .resources import amount, memory_free
@@ -302,7 +302,7 @@ def _colors(part: Any, faces: np.ndarray, ending: str) -> np.ndarray | None:
         told = np.concatenate((told, np.full_like(told[..., :1], 255)), -1)
     value = told.astype(np.float32) / (255 if told.dtype == np.uint8 else 1)
     if ending not in ("gltf", "glb"):
-        value[..., :3] = from_srgb(value[..., :3])
+        value[..., :3] = array_from_srgb(value[..., :3])
     return value
 
 
@@ -334,7 +334,7 @@ def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
     if ending == "obj":
         color[3] *= _opacity(material)
     if not gltf:
-        color[:3] = from_srgb(color[:3])
+        color[:3] = array_from_srgb(color[:3])
     texture = None
     if image is not None and mapped:
         try:

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..base import check
 from ..base.messages import need_library
-from ..base.srgb import from_srgb
+from ..base.srgb import array_from_srgb
 from ..points.points import Points
 from .budget import MOST_PACKED, header_budget
 from .packed import is_packed_fits
@@ -297,4 +297,4 @@ def _linear(colors: np.ndarray, kinds: set[Any]) -> np.ndarray:
     """Linear light of whole numbers, which are sRGB; of others themselves."""
     if not all(kind.kind in "iu" for kind in kinds):
         return colors
-    return from_srgb(colors / max(np.iinfo(kind).max for kind in kinds))
+    return array_from_srgb(colors / max(np.iinfo(kind).max for kind in kinds))

@@ -156,7 +156,7 @@ def open_source(
     if source.lost:
         told = " ".join("; ".join(source.lost).split())  # in one line, whatever the file says
         warnings.warn(f"{text}: not kept: {told}", stacklevel=2)
-    return placed(text, source, spacing, origin)
+    return at_place(text, source, spacing, origin)
 
 
 def _find(path: Any, given: dict[str, Any]) -> tuple[str, str, Callable[..., VolumeSource]]:
@@ -188,7 +188,7 @@ def _find(path: Any, given: dict[str, Any]) -> tuple[str, str, Callable[..., Vol
     return text, kind, opener
 
 
-def placed(
+def at_place(
     where: str,
     source: VolumeSource,
     spacing: Sequence[float] | None,

@@ -259,7 +259,7 @@ def through(url: str, context: Any = None) -> Relayed:
         return _server().folder(url, context)
 
 
-def named(text: str) -> str:
+def with_urls(text: str) -> str:
     """Replaces the relay's addresses in a message by the URLs that they stand for; if a file was
     refused, tells why.
     """

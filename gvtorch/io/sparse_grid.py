@@ -194,7 +194,7 @@ class SparseSource(VolumeSource, ABC):
         return values[..., index[3]] if len(index) > 3 else values[..., 0]
 
 
-def describe(
+def source_fields(
     path: str,
     name: str,
     kind: str,

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from ..base import check
-from ..base.boxes import clamp, repeat_edges
+from ..base.boxes import clamped_box, repeat_edges
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume, to_numpy
 from ..meshes.contour import contour, edge_of
@@ -172,7 +172,7 @@ class _Grid:
     def read(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
         """Returns samples low to high, float64; outside they are -inf."""
         begin, end = ([n - self.more for n in corner] for corner in (low, high))
-        start, stop = clamp(begin, end, self.voxels)
+        start, stop = clamped_box(begin, end, self.voxels)
         values = self._voxels(start, stop)[..., self.component, None]
         values = repeat_edges(values, start, begin, end)[..., 0]
         same = values == self.label if self.label is not None else values
@@ -205,7 +205,7 @@ class _Grid:
         if not isinstance(store, Store) or not store.has_blocks:
             return True
         begin, end = ([n - self.more for n in corner] for corner in (low, high))
-        start, stop = clamp(begin, end, self.voxels)
+        start, stop = clamped_box(begin, end, self.voxels)
         cells = store.read_cells(
             self.level, [n // CELL for n in start], [-(-n // CELL) for n in stop]
         )[..., self.component]
@@ -237,7 +237,7 @@ def _parts(grid: _Grid, progress: Progress) -> Iterator[tuple[np.ndarray, np.nda
     """Yields new vertices, (v, 3) world x y z, and triangles of all vertices so far."""
     spans = [[(a, min(a + _BLOCK, n - 1)) for a in range(0, n - 1, _BLOCK)] for n in grid.samples]
     counts = [len(those) for those in spans]
-    total, shared, vertices = int(np.prod(counts)), _Shared(), 0
+    total, shared, vertices = int(np.prod(counts)), _FarVertices(), 0
     blocks = itertools.product(*(enumerate(those) for those in spans))
     for done, block in enumerate(blocks):
         at, low, high = (
@@ -258,7 +258,7 @@ def _parts(grid: _Grid, progress: Progress) -> Iterator[tuple[np.ndarray, np.nda
     yield np.zeros((0, 3)), np.zeros((0, 3), np.int64)
 
 
-class _Shared:
+class _FarVertices:
     """Vertices on the far faces of blocks, until the blocks behind them come; blocks come along x,
     then y, then z.
     """

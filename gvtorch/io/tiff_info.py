@@ -33,7 +33,7 @@ _MOST_LISTED = 1 << 22  # planes that a file may tell of
 
 
 @contextmanager
-def opened(path: str) -> Iterator[tuple[Any, list[str]]]:
+def opened_tiff(path: str) -> Iterator[tuple[Any, list[str]]]:
     """Opens a file through tifffile, which logs damage and reads on.
 
     Yields:
@@ -44,7 +44,7 @@ def opened(path: str) -> Iterator[tuple[Any, list[str]]]:
     """
     import tifffile
 
-    heard = _Heard()
+    heard = _TiffLog()
     log = logging.getLogger("tifffile")
     log.addHandler(heard)
     try:
@@ -138,7 +138,7 @@ def _lerc(packed: bytes, most: int) -> bytes:
     return zlib.decompressobj().decompress(packed, most) if packed[:1] == b"x" else packed
 
 
-class _Heard(logging.Handler):
+class _TiffLog(logging.Handler):
     """Keeps what tifffile logs in this thread."""
 
     def __init__(self) -> None:

@@ -19,7 +19,7 @@ _POINTS = 1 << 20  # places that are asked for together
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cubes:
+class MeshCubes:
     """What k cubes of side^3 voxels hold; see `ops.voxelize`."""
 
     distance: Tensor  # (k, z, y, x) float32 to the nearest place, world units; inf beyond the reach
@@ -126,7 +126,7 @@ class Geometry:
         shares: bool,
         weights: bool,
         wide: bool,
-    ) -> Cubes:
+    ) -> MeshCubes:
         """Looks at cubes of side^3 voxels.
 
         Args:
@@ -143,7 +143,7 @@ class Geometry:
             low_k3, size_k3, side, thickness, shares=shares, weights=weights, wide=wide
         )
         world = found.distance * size_k3[:, :1, None, None].to(found.distance.dtype)
-        return Cubes(
+        return MeshCubes(
             distance=torch.where(found.nearest >= 0, world, torch.inf).to(torch.float32),
             face=found.nearest,
             inside=found.winding != 0,

@@ -30,7 +30,7 @@ class Hierarchy:
         self.order = _morton(0.5 * (low + high)).argsort(stable=True)
         levels = [torch.cat((low[self.order], high[self.order]), 1)]
         while len(levels[-1]) > ARITY:
-            below = filled(levels[-1]).view(-1, ARITY, 6)
+            below = padded(levels[-1]).view(-1, ARITY, 6)
             levels.append(torch.cat((below[..., :3].amin(1), below[..., 3:].amax(1)), 1))
         self.box = torch.cat(levels)
         self.first = [0]
@@ -38,7 +38,7 @@ class Hierarchy:
             self.first.append(self.first[-1] + len(level))
 
 
-def filled(level: Tensor) -> Tensor:
+def padded(level: Tensor) -> Tensor:
     """Returns (n, ...) with its last row repeated, until boxes of the level above are full."""
     return torch.cat((level, level[-1:].expand(-len(level) % ARITY, *level.shape[1:])))
 

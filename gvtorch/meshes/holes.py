@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
-from .mesh import Mesh, edges_of, facing_away, parts_of, solids, welded
+from .mesh import Mesh, edges_of, facing_away, part_of_faces, solids, welded
 from .winding import WindingNumber
 
 #: Which parts are solids: closed ones, filled ones, none.
@@ -45,7 +45,7 @@ def rims(mesh: Mesh) -> tuple[list[Rim], np.ndarray]:
     edge, begin, end, balance = edges_of(faces)
     face = np.repeat(np.arange(len(faces)), 3)
     part = np.full(len(mesh.faces), -1)
-    own = parts_of(face, edge, len(faces), int(edge.max()) + 1)
+    own = part_of_faces(face, edge, len(faces), int(edge.max()) + 1)
     part[kept] = kept[own]
     # An edge that is gone along once too often is gone back along the rim; of several triangles
     # at one edge those are taken that came first.

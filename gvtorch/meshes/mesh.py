@@ -224,7 +224,7 @@ def facing_away(mesh: Mesh) -> np.ndarray:
     state = np.arange(2)[:, None]
     hooks = [2 * np.arange(len(first)) + (ahead[order[first + at]] ^ state ^ at) for at in range(2)]
     nodes = [order[first + at] // 3 + state * len(faces) for at in range(2)]
-    part = parts_of(np.ravel(nodes), np.ravel(hooks), 2 * len(faces), 2 * len(first))
+    part = part_of_faces(np.ravel(nodes), np.ravel(hooks), 2 * len(faces), 2 * len(first))
     part = part.reshape(2, len(faces))
     own = part.min(0)
     unlike_first = part[0] > own  # they face the other way than the first one of their part
@@ -244,12 +244,12 @@ def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
             closed[own] = True
             return closed
         face = np.repeat(np.arange(len(own)), 3)
-        part = parts_of(face, edge, len(own), len(balance))
+        part = part_of_faces(face, edge, len(own), len(balance))
         closed[own] = ~np.isin(part, np.unique(part[face[balance[edge] != 0]]))
     return closed
 
 
-def parts_of(face: np.ndarray, edge: np.ndarray, faces: int, edges: int) -> np.ndarray:
+def part_of_faces(face: np.ndarray, edge: np.ndarray, faces: int, edges: int) -> np.ndarray:
     """(faces,) the lowest triangle number of each part; pairs (face, edge) hang together."""
     label = np.arange(faces)
     while True:

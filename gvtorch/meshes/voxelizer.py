@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .geometry import Cubes, Geometry
+from .geometry import Geometry, MeshCubes
 from .holes import SolidParts, check_solid, prepared
 from .mesh import Mesh
 from .paint import Paint
@@ -180,7 +180,7 @@ class Voxelizer:
         """
         shape = (len(inside_k), 1, 1, 1)
         inside = inside_k.view(shape)
-        far = Cubes(
+        far = MeshCubes(
             distance=torch.full(shape, torch.inf, device=self.device),
             face=torch.full(shape, -1, dtype=torch.int32, device=self.device),
             inside=inside,
@@ -279,7 +279,7 @@ class Voxelizer:
         }
         return self._channels(self.geometry.cubes(low, size, side, self.thickness, **told))
 
-    def _channels(self, found: Cubes) -> dict[str, Tensor]:
+    def _channels(self, found: MeshCubes) -> dict[str, Tensor]:
         """By channel (k, z, y, x, c) float32 of what was found (materials int64)."""
         made: dict[str, Tensor] = {}
         if "coverage" in self.channels:

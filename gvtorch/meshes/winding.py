@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ..ops.voxelize import ARITY
-from .hierarchy import Hierarchy, filled
+from .hierarchy import Hierarchy, padded
 from .mesh import Mesh
 
 _FAR = 3.5  # radii from which on a box of triangles is a dipole: errors are then below 1e-3
@@ -40,7 +40,7 @@ class WindingNumber:
             area, middle, normal = levels[-1]
             spare = -len(area) % ARITY
             area = torch.cat((area, area.new_zeros(spare))).view(-1, ARITY, 1)
-            middle = filled(middle).view(-1, ARITY, 3)
+            middle = padded(middle).view(-1, ARITY, 3)
             weight = area.clamp(min=1e-300)  # of boxes without area: any place in them
             middle = (weight * middle).sum(1) / weight.sum(1)
             normal = torch.cat((normal, normal.new_zeros(spare, 3))).view(-1, ARITY, 3).sum(1)

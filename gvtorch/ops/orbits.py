@@ -50,7 +50,7 @@ class Orbit(NamedTuple):
     def way(self) -> twin.Way:
         """What the twin takes."""
         if self.kind == "power":
-            step: twin.Step = partial(twin.power, n=int(self.amount))
+            step: twin.Step = partial(twin.spherical_power, n=int(self.amount))
             ranges: twin.Ranges = partial(twin.power_ranges, n=int(self.amount))
         else:
             step = partial(twin.fold, scale=self.amount)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..base.records import RenderStats, moved
+from ..base.records import RenderStats, to_device
 from .files import display_pixels, write_image, write_png
 from .tone import ToneCurve, tone_map
 
@@ -82,7 +82,9 @@ class Picture:
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Picture:
         """Returns the picture on a device; its floats in another dtype. None leaves each as is."""
-        return replace(self, **{name: moved(v, device, dtype) for name, v in vars(self).items()})
+        return replace(
+            self, **{name: to_device(v, device, dtype) for name, v in vars(self).items()}
+        )
 
     def show(self) -> None:
         """Shows the picture: in a notebook below the cell, else as a PNG in the system's viewer.

@@ -25,7 +25,7 @@ from ..io.budget import MOST_PACKED, check_regular, header_budget
 from ..io.picture_size import picture_size
 from ..io.resources import amount, memory_free
 from ..io.source import told_as
-from ..io.tiff_info import check_pictures, opened
+from ..io.tiff_info import check_pictures, opened_tiff
 from .tone import from_srgb
 
 _EXR = b"\x76\x2f\x31\x01"
@@ -183,7 +183,7 @@ def _read_npy(path: Path) -> np.ndarray:
 
 def _read_tiff(path: Path) -> np.ndarray:
     need_library(".tif", "tifffile", extra="image")
-    with opened(str(path)) as (file, _):
+    with opened_tiff(str(path)) as (file, _):
         series = file.series[0]
         most = MOST_PACKED * path.stat().st_size
         _check_size(path, tuple(series.shape), series.dtype.itemsize, most)

@@ -57,7 +57,7 @@ class Codes:
         return self._places[side]
 
 
-def shares(edge: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def point_shares(edge: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Returns what each interval between edges (k, m + 1), rising, holds of points at (k,) that
     reach as far as (k,): (k, m), float64. See the twin.
     """

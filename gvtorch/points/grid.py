@@ -1,4 +1,4 @@
-"""`Grid`: the voxels that points are laid into."""
+"""`PointGrid`: the voxels that points are laid into."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .points import Points
 
 
 @dataclass(frozen=True)
-class Grid:
+class PointGrid:
     """A box of finest voxels; voxels of level l are N^l of them wide."""
 
     extent: tuple[int, int, int]  # finest voxels along x, y, z
@@ -30,7 +30,7 @@ class Grid:
         extent: int | Sequence[int],
         box: Sequence[Sequence[float]] | None,
         branching: int,
-    ) -> Grid:
+    ) -> PointGrid:
         """Returns the grid of a user's extent and box, around all points if there is none."""
         check.whole(where, "branching", branching, low=2, high=16)
         low, high = check.box(where, _bounds(blocks) if box is None else box)

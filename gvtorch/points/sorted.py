@@ -18,8 +18,8 @@ import numpy as np
 from ..base import check
 from ..base.stage import Progress, no_progress
 from ..base.whole_file import told_of
-from .codes import Codes, peak, shares
-from .grid import Grid
+from .codes import Codes, peak, point_shares
+from .grid import PointGrid
 from .points import Points
 from .table import Fold, Rows, Runs, Table, grouped
 
@@ -58,7 +58,7 @@ class SortedPoints:
 
     def __init__(
         self,
-        grid: Grid,
+        grid: PointGrid,
         width: int,
         points: dict[int, Table],
         sums: dict[int, Table],
@@ -83,7 +83,7 @@ class SortedPoints:
                 raise ValueError(f"version {meta['version']!r}, this reads {_VERSION}")
             told = meta["grid"]
             box = (told["low"], told["high"])
-            grid = Grid.around("grid", (), told["extent"], box, told["branching"])
+            grid = PointGrid.around("grid", (), told["extent"], box, told["branching"])
             tables = {
                 what: {
                     int(level): Table.mapped(
@@ -163,7 +163,7 @@ def sort_points(
     block = len(points)
     if target is not None:
         block = max(4096, check.nbytes(where, "memory", memory) // (_COPIES * row))
-    grid = Grid.around(where, points.blocks(block), extent, box, branching)
+    grid = PointGrid.around(where, points.blocks(block), extent, box, branching)
     draft = None if target is None else target.with_name(f".{target.name}.draft")
     if draft is not None:
         shutil.rmtree(draft, ignore_errors=True)
@@ -194,7 +194,7 @@ class _Maker:
     """The steps of `sort_points`, and where its tables lie."""
 
     def __init__(
-        self, grid: Grid, width: int, folder: Path | None, block: int, progress: Progress
+        self, grid: PointGrid, width: int, folder: Path | None, block: int, progress: Progress
     ) -> None:
         self.grid, self.width, self.folder, self.block = grid, width, folder, block
         self.codes = Codes(grid.branching, max(grid.extent))
@@ -306,7 +306,7 @@ class _Maker:
         narrow = radius == 0  # wholly in its voxel
         parts = []
         for axis, edge in enumerate(self.grid.edges(first, count, level)):
-            part = shares(edge, place[:, axis], np.where(narrow, 1.0, radius))
+            part = point_shares(edge, place[:, axis], np.where(narrow, 1.0, radius))
             parts.append(np.where(narrow[:, None], np.arange(count) == reach, part))
         x, y, z = parts
         share = (z[:, :, None, None] * y[:, None, :, None] * x[:, None, None, :]).reshape(-1)

@@ -159,7 +159,7 @@ def _of_length(rgba: np.ndarray, lengths: float) -> np.ndarray:
     return np.concatenate((rgba[..., :3] * scale, changed), -1)
 
 
-def window(values: Grid, how: Reduction, *, size: int, step: int) -> Grid:
+def reduce_windows(values: Grid, how: Reduction, *, size: int, step: int) -> Grid:
     """Reduces windows of size^3 voxels, `step` apart, by "min", "max" or "mean"; the first lies at
     the corner of the array (z, y, x, c).
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.volume import movable, to_numpy
-from .downsample import by_node, extend, from_grid, pool_max, pool_min, window
+from .downsample import by_node, extend, from_grid, pool_max, pool_min, reduce_windows
 from .pools import BrickPool, NodePool
 from .pyramid import NodeSummary, coarser, middle_of
 
@@ -258,10 +258,13 @@ class _ChannelLevels:
                 for one in self._pooled(level)
             )
         inner = padded[tuple(slice(border, s - border) for s in padded.shape[:3])]
-        mean = window(inner, middle_of(self.how), size=size, step=size)
+        mean = reduce_windows(inner, middle_of(self.how), size=size, step=size)
         if level < self._by_brick:
             both = {"size": size + 2 * border, "step": size}
-            ranges = [window(smallest, "min", **both), window(largest, "max", **both)]
+            ranges = [
+                reduce_windows(smallest, "min", **both),
+                reduce_windows(largest, "max", **both),
+            ]
         else:
             cut = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
             wide = border * n**level // size

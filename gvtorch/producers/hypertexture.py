@@ -34,7 +34,7 @@ _COARSEST = 1.5  # cells a voxel, from which on the mean tells nothing of the no
 _ROUNDED = 1e-4  # what rounding may add to a sum of octaves, in units of the amplitude
 
 
-class Level(NamedTuple):
+class LevelOctaves(NamedTuple):
     """What the voxels of a level are made with."""
 
     octaves: list[Octave]  # with amplitudes as the voxels see them
@@ -131,7 +131,7 @@ class Hypertexture(Tally, Producer):
         self.thickness, self.softness = thickness, softness
         self.octaves = [one._replace(amplitude=amplitude * one.amplitude) for one in series]
         self.dtype = dtype_of_places(box, self.spacing)
-        self._levels: list[Level] = []
+        self._levels: list[LevelOctaves] = []
         self._worn = torch.empty(0)
 
     @property
@@ -148,11 +148,11 @@ class Hypertexture(Tally, Producer):
         finer = [max(worn[depth:]) for depth in range(len(worn))]
         self._worn = torch.tensor(finer, dtype=torch.float64, device=layout.device)
 
-    def level_of(self, depth: int) -> Level:
+    def level_of(self, depth: int) -> LevelOctaves:
         """Returns what the voxels of a depth are made with; known once an engine uses this."""
         return self._levels[depth]
 
-    def _level(self, side: float) -> Level:
+    def _level(self, side: float) -> LevelOctaves:
         """Returns what voxels of a side, in world units, are made with."""
         kept, variance = [], self.softness**2 / 5 + (side / self.thickness) ** 2 / 12
         for one in self.octaves:
@@ -165,7 +165,7 @@ class Hypertexture(Tally, Producer):
         left = [high * sum(one.amplitude for one in kept[n:]) for n in range(len(kept) + 1)]
         margin = _ROUNDED * max(1.0, *left)
         left = [one + margin for one in left]
-        return Level(kept, left, math.sqrt(5 * variance), side)
+        return LevelOctaves(kept, left, math.sqrt(5 * variance), side)
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the channels (..., 1) at points (..., 3), of the points' dtype, not filtered."""
@@ -214,7 +214,7 @@ class Hypertexture(Tally, Producer):
                     data[name][here[rows]] = values.to(data[name].dtype)
         return data
 
-    def _made(self, nodes: Nodes, level: Level, shape: nn.Module) -> dict[str, Tensor]:
+    def _made(self, nodes: Nodes, level: LevelOctaves, shape: nn.Module) -> dict[str, Tensor]:
         """Channels (k, z, y, x, 1) of nodes of a level, of what of the shape matters there."""
         points = nodes.points(self.dtype)
         distance = distances_of(type(self).__name__, shape, points)

@@ -19,7 +19,7 @@ import torch
 from numpy.lib.stride_tricks import as_strided
 
 from ..base import check
-from ..base.boxes import grouped
+from ..base.boxes import rows_by_place
 from ..base.stage import stage
 from ..io.stores.store import Store
 from ..pool import Channel
@@ -300,7 +300,7 @@ class StoredProducer(Producer):
         store, grid = self.store, self.store.cell_grid(level)
         out = np.zeros((len(at), 3, store.width), np.float32)
         errors: dict[int, str] = {}
-        tiles, parts = grouped(at // _TILE)
+        tiles, parts = rows_by_place(at // _TILE)
         keys: list[Key] = [("cells", level, *tile) for tile in tiles.tolist()]
 
         def read(missing: list[Key]) -> dict[Key, Found]:
@@ -361,7 +361,7 @@ class StoredProducer(Producer):
         group of cubes after the other; returns errors by row. After a timeout no more are read.
         """
         cubes = _Cubes.of(self.store, layout)
-        places, parts = grouped(zyx // cubes.bricks)
+        places, parts = rows_by_place(zyx // cubes.bricks)
         corner = zyx % cubes.bricks * cubes.brick_size + cubes.border - layout.border
         errors: dict[int, str] = {}
         late = ""

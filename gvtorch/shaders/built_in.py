@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import torch
 
-from ..base.checked import Check, above, flag, instance_of, kind_of, or_none, text
+from ..base.checked import Check, as_name, flag, instance_of, kind_of, number_above, or_none
 from ..ops import ShadeArguments
 from ..ops.shading import (
     GradientMagnitudeNumbers,
@@ -46,8 +46,8 @@ _WHITE = TransferFunction.from_points([(0, 1)])
 _COLOR = a_triple(low=0, high=1)
 _PROJECTIONS = {name: name for name in ("maximum", "minimum", "mean")}
 _PROJECTIONS |= {"max": "maximum", "min": "minimum"}
-# Of a `Solid`: rows of its table; width of its ramp in intervals, at which penumbras agree best;
-# and of a distance field's ramp in voxels at most.
+# Of a `WideIsosurface`: rows of its table; width of its ramp in intervals, at which penumbras agree
+# best; and of a distance field's ramp in voxels at most.
 _ROWS, _RAMP, _WIDEST = 1025, 3.0, 16
 _OPAQUE = 1e-20  # a reference length by which the least opacity is whole
 
@@ -119,8 +119,8 @@ class StoredColor(LitShader):
     shadowed_kind = "ShadowedColor"
     component = 3
     checks: ClassVar[Mapping[str, Check]] = {
-        "channel": text,
-        "reference": or_none(above(0)),
+        "channel": as_name,
+        "reference": or_none(number_above(0)),
         "premultiplied": flag,
         "lit": flag,
     }
@@ -278,13 +278,13 @@ class Isosurface(LitShader):
         hollow.filled = False
         return hollow
 
-    def matter(self) -> Solid:
+    def matter(self) -> WideIsosurface:
         if self.color is None or isinstance(self.color, TransferFunction):
             raise ValueError("Isosurface: indirect light needs a surface of one colour")
-        return Solid(self, self.color)
+        return WideIsosurface(self, self.color)
 
-    def blocker(self) -> Solid:
-        return Solid(self, None)
+    def blocker(self) -> WideIsosurface:
+        return WideIsosurface(self, None)
 
     def cut_surface(self) -> CutSurface:
         value = Projection("maximum", _WHITE)
@@ -321,7 +321,7 @@ class DistanceField(Isosurface):
         super().__init__(offset, color, **look)
 
 
-class Solid(Shader):
+class WideIsosurface(Shader):
     """An isosurface as cones wider than a voxel see it. They read means, and a mean tells which
     share of the cone the surface fills: opacity is a ramp around the level, wider for longer
     intervals, so that shadows are soft.
@@ -414,7 +414,7 @@ class Features(Shader):
     kind = "Features"
     checks: ClassVar[Mapping[str, Check]] = {
         "transfer": _TRANSFER,
-        "other": lambda owner, _, value: text(owner, "channel", value),
+        "other": lambda owner, _, value: as_name(owner, "channel", value),
     }
 
     def __init__(self, transfer: TransferFunction, channel: str) -> None:

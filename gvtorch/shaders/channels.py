@@ -12,7 +12,7 @@ import torch
 
 from ..base import check
 from ..base.image_info import COLORS, ChannelInfo, to_hex
-from ..base.srgb import from_srgb
+from ..base.srgb import array_from_srgb
 from ..base.volume import Volume
 from ..io.stores.store import Store
 from ..io.window import windows
@@ -88,7 +88,7 @@ class ChannelLook:
             )
         low, high = window_of(where, self.window)
         default = DISTINCT[place] if count > 1 else "white"
-        color = linear_color(where, default if self.color is None else self.color)
+        color = channel_color(where, default if self.color is None else self.color)
         opacity = _OPACITY if self.opacity is None else self.opacity
         opacity = check.number(where, "opacity", opacity, low=0, high=1)
         parts = [part / _RAMP for part in range(_RAMP)]
@@ -191,7 +191,7 @@ class Channels(Shader):
             one = told.get(component, ChannelInfo())
             looks.append(
                 ChannelLook(
-                    color=one.color and tuple(from_srgb(np.array(one.color)).tolist()),
+                    color=one.color and tuple(array_from_srgb(np.array(one.color)).tolist()),
                     window=one.window or found[component],
                     component=component,
                     visible=active or one.active,
@@ -282,7 +282,7 @@ def window_of(where: str, window: Sequence[float]) -> tuple[float, float]:
     return low, high
 
 
-def linear_color(where: str, color: Triple | str) -> Triple:
+def channel_color(where: str, color: Triple | str) -> Triple:
     """Returns a colour as linear RGB, as `colors.linear_color`, of which names are those of lookup
     tables.
     """

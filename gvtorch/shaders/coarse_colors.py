@@ -28,7 +28,7 @@ _DIRECTIONS = 6
 PLAIN, LIT = 4, 10
 
 
-class Field(Protocol):
+class FinestVoxels(Protocol):
     """The finest voxels, which may be more than memory holds."""
 
     shape: tuple[int, int, int]  # z, y, x
@@ -49,7 +49,7 @@ class VolumeField:
         self.shape = (z, y, x)
 
     def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
-        """See `Field`."""
+        """See `FinestVoxels`."""
         found = movable(self._values)
         for axis, (first, end, size) in enumerate(zip(low, high, self.shape, strict=True)):
             if first >= 0 and end <= size:
@@ -60,7 +60,7 @@ class VolumeField:
 
 
 def write_colors(
-    field: Field,
+    field: FinestVoxels,
     tables: Sequence[ColorTable],
     spacing: tuple[float, float, float],
     branching: int,
@@ -113,7 +113,7 @@ def write_colors(
 
 
 def _see_along(
-    field: Field,
+    field: FinestVoxels,
     along: int,
     painter: _Painter,
     branching: int,
@@ -203,7 +203,7 @@ def _beside(values: Tensor, axis: int) -> Tensor:
     return 0.25 * first + 0.5 * middle + 0.25 * last
 
 
-def _parts(field: Field, along: int, tile: int) -> Iterator[tuple[int, int, Tensor]]:
+def _parts(field: FinestVoxels, along: int, tile: int) -> Iterator[tuple[int, int, Tensor]]:
     """Yields the field in columns along an axis, tile by tile: where a tile begins across, and its
     values (n, a + 2, b + 2) with a neighbour on each side. They are read in slabs of many tiles.
     """

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..base import check
 from ..base.image_info import from_hex
-from ..base.srgb import from_srgb
+from ..base.srgb import array_from_srgb
 
 #: Colours by name, as sRGB.
 NAMED = {
@@ -42,7 +42,7 @@ def linear_color(
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
         names = ", ".join(named)
         raise ValueError(f"{where}: {value!r} is no colour; known: #RRGGBB, {names}")
-    red, green, blue = from_srgb(np.array(from_hex(text[1:]))).tolist()
+    red, green, blue = array_from_srgb(np.array(from_hex(text[1:]))).tolist()
     return (red, green, blue)
 
 

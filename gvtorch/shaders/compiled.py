@@ -74,7 +74,7 @@ class CompiledShader(LitShader):
         """
         super().__init__(**light)
         self.name = name
-        self._take(user.load(header, name))
+        self._take(user.load_op(header, name))
         self.transfer, self.channel, self.component = transfer, channel, component
         self.other, self.other_component = other, other_component
         self.uniforms = {} if uniforms is None else uniforms

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, kind_of, whole
+from ..base.checked import Check, kind_of, whole_between
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from ..io.stores.coarse import make_channel
@@ -40,7 +40,7 @@ from .built_in import Lit
 from .coarse_colors import (
     LIT,
     PLAIN,
-    Field,
+    FinestVoxels,
     VolumeField,
     mean_of_directions,
     without_light,
@@ -87,7 +87,7 @@ class Filtered(Shader):
     lit_kind = "FilteredLit"  # of a `Lit`
     reads_coarse = True
     transfer: TransferFunction | Lit
-    checks: ClassVar[Mapping[str, Check]] = {"transfer": _to_filter, "component": whole(0)}
+    checks: ClassVar[Mapping[str, Check]] = {"transfer": _to_filter, "component": whole_between(0)}
 
     def __init__(
         self,
@@ -304,7 +304,7 @@ class Filtered(Shader):
 
     def write(
         self,
-        field: Field,
+        field: FinestVoxels,
         spacing: tuple[float, float, float],
         branching: int,
         out: Sequence[Tensor],
@@ -368,7 +368,7 @@ class _StoreField:
         self.shape = (z, y, x)
 
     def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
-        """See `Field`."""
+        """See `FinestVoxels`."""
         values = self._store.read_region(0, low, high, timeout=_TIMEOUT)[..., self._component]
         return torch.from_numpy(np.ascontiguousarray(values))
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.srgb import from_srgb
+from ..base.srgb import array_from_srgb
 from ..ops.shading import LabelNumbers
 from ..pool import N3Tree
 from .colors import distinct_colors, linear_color
@@ -278,7 +278,7 @@ def _in_order(where: str, colors: Any) -> np.ndarray:
         if colors.ndim != 2 or colors.shape[1] != 3:
             raise ValueError(f"{where}: colors must be (k, 3), got {check.shown(colors)}")
         found = colors.astype(np.float64)
-        found = from_srgb(found / 255) if colors.dtype == np.uint8 else found
+        found = array_from_srgb(found / 255) if colors.dtype == np.uint8 else found
         if not ((found >= 0) & (found <= 1)).all():
             raise ValueError(f"{where}: colors must lie in [0, 1]")
         return found

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, Checked, kind_of, whole
+from ..base.checked import Check, Checked, kind_of, whole_between
 from ..ops import ShadeArguments
 from ..ops.shading import LightKind, Number, ShadeParameters, Triple, shader_number
 from ..pool import N3Tree
@@ -133,7 +133,7 @@ class LitShader(Shader):
     checks: ClassVar[Mapping[str, Check]] = {
         "light": lambda owner, name, value: check_light(f"{kind_of(owner)}: {name}", value),
         **dict.fromkeys(_MATERIAL[:4], a_number(low=0)),
-        "octaves": whole(0, MOST_OCTAVES),
+        "octaves": whole_between(0, MOST_OCTAVES),
         "anisotropy": a_number(low=-0.95, high=0.95),
     }
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, instance_of, or_none, whole
+from ..base.checked import Check, instance_of, or_none, whole_between
 from .shader import ColorTable, Sampling, Shader
 from .transfer_function import TransferFunction
 
@@ -52,7 +52,7 @@ class ModuleShader(Shader, torch.nn.Module):
         "module": lambda owner, name, value: _callable(value),
         "channels": lambda owner, name, value: _names(value),
         "hidden_by": or_none(instance_of(TransferFunction)),
-        "samples": or_none(whole(PART_SAMPLES)),
+        "samples": or_none(whole_between(PART_SAMPLES)),
     }
 
     def __init__(

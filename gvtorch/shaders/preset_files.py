@@ -35,7 +35,7 @@ _APART = 0.33 * math.pi  # hues between which the way goes through white, as VTK
 
 
 @np.errstate(all="ignore")  # what is beyond numbers is refused
-def read_points(path: str | Path, name: str | None) -> tuple[Pair, float | None, bool]:
+def read_preset(path: str | Path, name: str | None) -> tuple[Pair, float | None, bool]:
     """Reads a preset of ParaView (.json) or 3D Slicer (.vp, .vp.json, or one by its name of an .xml
     such as its presets.xml).
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, Checked, flag, or_none, text, whole
+from ..base.checked import Check, Checked, as_name, flag, or_none, whole_between
 from ..ops import ShadeArguments
 from ..ops.shading import Number, ShadeParameters, Triple, pack, shader_number
 from ..pool import N3Tree
@@ -108,11 +108,11 @@ class Shader(Checked):
     whole_ray: bool = False
     uses_torch: bool = False
     checks: ClassVar[Mapping[str, Check]] = {
-        "channel": or_none(text),
-        "component": or_none(whole(0)),
-        "normals": or_none(text),
-        "other": or_none(text),
-        "other_component": whole(0),
+        "channel": or_none(as_name),
+        "component": or_none(whole_between(0)),
+        "normals": or_none(as_name),
+        "other": or_none(as_name),
+        "other_component": whole_between(0),
         "shadows": flag,
     }
 

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
-from ..base.checked import Check, above, kind_of, or_none
+from ..base.checked import Check, kind_of, number_above, or_none
 from ..base.messages import one_line
 from ..base.whole_file import write_whole
-from .preset_files import paraview_item, read_points
+from .preset_files import paraview_item, read_preset
 from .presets import CT_PRESETS, Points, named
 from .shader import ColorTable, Sampling, Shader
 
@@ -55,7 +55,7 @@ class TransferFunction(Shader):
     checks: ClassVar[Mapping[str, Check]] = {
         "opacity": lambda owner, name, points: _points(kind_of(owner), name, points, 2),
         "color": lambda owner, name, points: _points(kind_of(owner), name, points, 4),
-        "reference": or_none(above(0)),
+        "reference": or_none(number_above(0)),
     }
 
     def __init__(
@@ -124,7 +124,7 @@ class TransferFunction(Shader):
                 if name is not None:
                     raise ValueError(f"{path}: holds one function, without a name: leave it out")
                 return cls.from_json(path)
-        (opacity, color), reference, relative = read_points(path, name)
+        (opacity, color), reference, relative = read_preset(path, name)
         try:
             function = cls(opacity, color, reference)
         except ValueError as error:

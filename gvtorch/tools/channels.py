@@ -21,7 +21,7 @@ def parse_channels(text: str | None, image: Volume | Store) -> Channels:
         ValueError: An item is none, or of a channel that is not there.
     """
     from ..shaders import Channels
-    from ..shaders.channels import linear_color, window_of
+    from ..shaders.channels import channel_color, window_of
 
     if text is None:
         return Channels.of(image)
@@ -49,7 +49,7 @@ def parse_channels(text: str | None, image: Volume | Store) -> Channels:
         color, window = (*told, "auto", "auto")[:2]
         where = f"--channel {component}"
         if color not in ("", "auto"):
-            look.color = linear_color(where, color)
+            look.color = channel_color(where, color)
         if window not in ("", "auto"):
             low, high = numbers(f"{where}: window", window, 2, float)
             look.window = window_of(where, (low, high))

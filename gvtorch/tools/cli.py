@@ -29,7 +29,7 @@ from ..base.declared import did_you_mean
 from ..base.messages import one_line, printable
 from ..io.stores.ngff import is_zarr
 from .bench import Bench
-from .common import Bar, ReadOptions, given, refuse_for_store, volume_formats
+from .common import Bar, ReadOptions, flags_given, refuse_for_store, volume_formats
 from .fly import Fly
 from .making import Making, told_store
 from .render import Render
@@ -53,7 +53,7 @@ class Info:
     def run(self) -> None:
         """Prints the answer."""
         if self.path is None:
-            flags = given(self.source)
+            flags = flags_given(self.source)
             if flags:
                 raise ValueError(f"{flags[0]} is for volume files: name one")
             content = installation()

@@ -119,7 +119,7 @@ class Bar:
         self._progress.update(self._tasks[what], completed=done, total=total or None)
 
 
-def given(options: Any) -> list[str]:
+def flags_given(options: Any) -> list[str]:
     """Flags of a group of options that differ from what they are if left out."""
     plain = vars(type(options)())
     return [f"--{n.replace('_', '-')}" for n, v in vars(options).items() if v != plain[n]]
@@ -129,7 +129,7 @@ def refuse_for_store(source: ReadOptions, *known: str) -> None:
     """Raises ValueError where flags tell how to read a volume file, but a store was named; --time
     and those `known` are for stores too.
     """
-    flags = [flag for flag in given(source) if flag not in ("--time", *known)]
+    flags = [flag for flag in flags_given(source) if flag not in ("--time", *known)]
     if flags:
         raise ValueError(f"{flags[0]} is for volume files; a store tells it itself")
 
@@ -147,7 +147,7 @@ def open_data(path: str, source: ReadOptions, *, image: str | None, level: int) 
     return source.read(path)
 
 
-def check_files(read: Mapping[str, Any], written: Mapping[str, Path | None]) -> None:
+def check_outputs(read: Mapping[str, Any], written: Mapping[str, Path | None]) -> None:
     """Checks that a command writes over nothing that it reads, and each of its files once. Of a
     folder that is read, all files in it count.
 

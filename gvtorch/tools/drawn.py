@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from .common import given
+from .common import flags_given
 
 if TYPE_CHECKING:
     from ..base.image_info import ImageInfo
@@ -32,7 +32,7 @@ class Drawn:
 
     def given(self) -> list[str]:
         """Flags that are not left out."""
-        return given(self)
+        return flags_given(self)
 
     def overlay(
         self, shader: Shader, info: ImageInfo, component: int, camera: Camera, eye: Eye

@@ -19,10 +19,10 @@ from ..base.digits import whole_number
 from ..base.messages import printable
 from ..base.whole_file import write_whole
 from ..io.stores.ngff import is_zarr
-from .common import Bar, check_files, size, volume_formats
+from .common import Bar, check_outputs, size, volume_formats
 from .drawn import Drawn
 from .look import first_orbit, parse_camera, parse_orbit, stance
-from .scene import Scene, SceneFlags
+from .scene import RenderedScene, SceneFlags
 
 if TYPE_CHECKING:
     from ..cameras import Camera
@@ -129,7 +129,7 @@ class Fly:
                 f"--output must be a folder or end in {kinds}, got {str(self.output)!r}"
             )
         flight = self.flight if self.flight != "orbit" else None
-        check_files(
+        check_outputs(
             {
                 "PATH": self.path,
                 "--state": self.state,
@@ -162,7 +162,7 @@ class Fly:
         return self.times is not None and not moves
 
     def _taken(
-        self, scene: Scene, options: dict[str, Any], width: int, height: int
+        self, scene: RenderedScene, options: dict[str, Any], width: int, height: int
     ) -> Callable[[float], tuple[Camera, Picture]]:
         """What takes the picture at a place of the path, 0 to 1."""
         from ..viewer.state import Eye
@@ -343,7 +343,7 @@ class Fly:
         look = self.scene.look
         return CameraPath.from_json(self.flight, up=look.upward(), fov=look.fov)
 
-    def _path(self, scene: Scene, width: int, height: int) -> CameraPath:
+    def _path(self, scene: RenderedScene, width: int, height: int) -> CameraPath:
         from ..cameras.path import CameraPath
 
         if self.flight != "orbit":

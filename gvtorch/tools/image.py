@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from .common import given, numbers
+from .common import flags_given, numbers
 
 if TYPE_CHECKING:
     from ..cameras import Camera
@@ -41,7 +41,7 @@ class Develop:
 
     def given(self) -> list[str]:
         """Flags that differ from what they are if left out."""
-        return given(self)
+        return flags_given(self)
 
     def wrap(self, render: Callable[[Camera], Picture]) -> Callable[[Camera], Picture]:
         """Returns what renders a camera with all samples, tone-mapped."""

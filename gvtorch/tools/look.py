@@ -12,7 +12,7 @@ from tyro.conf import arg
 
 from ..base.declared import declared_names
 from .colors import check_component, chosen_transfer
-from .common import given, numbers
+from .common import flags_given, numbers
 from .image import parse_background
 from .light import parse_lighting
 
@@ -136,7 +136,7 @@ class Look:
         """
         names = {one for part, those in _OF_STATE.items() if part in state for one in those}
         names |= set(state.get("options", ()))
-        return [flag for flag in given(self) if flag[2:].replace("-", "_") in names]
+        return [flag for flag in flags_given(self) if flag[2:].replace("-", "_") in names]
 
     def device(self) -> torch.device:
         """The device that the backend needs; for auto, CUDA if it can be used."""

@@ -15,12 +15,12 @@ from tyro.conf import Positional, arg
 
 from ..base.messages import printable
 from ..base.whole_file import write_whole
-from .common import Bar, check_files, size, volume_formats
+from .common import Bar, check_outputs, size, volume_formats
 from .drawn import Drawn
 from .image import KINDS, STRIPS, Develop, in_strips
 from .look import parse_camera
-from .scene import Scene, SceneFlags
-from .streaming import told
+from .scene import RenderedScene, SceneFlags
+from .streaming import cost_in_words
 
 if TYPE_CHECKING:
     from ..base.records import RenderStats
@@ -75,7 +75,7 @@ class Render:
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": opened.extent}
             write_whole(self.stats, json.dumps(content, indent=2) + "\n")
-        print(f"{printable(self.output)}: {width}x{height}, {told(stats)}")
+        print(f"{printable(self.output)}: {width}x{height}, {cost_in_words(stats)}")
 
     def _at_saved_time(self) -> SceneFlags:
         """The flags of the scene, of the time point that a saved state tells."""
@@ -90,7 +90,7 @@ class Render:
         return replace(self.scene, source=replace(source, time=int(time))) if time else self.scene
 
     def _take_saved(
-        self, opened: Scene, now: ViewState, width: int, height: int, bar: Bar
+        self, opened: RenderedScene, now: ViewState, width: int, height: int, bar: Bar
     ) -> RenderStats:
         """Takes the picture of a saved state, as a page shows it."""
         own = {"shader": now.shader, **now.settings()}
@@ -102,14 +102,16 @@ class Render:
         camera = self._saved_camera(scene, now, width, height)
         return taking._take(scene, camera, taking._overlay(scene, camera, now.camera), bar)
 
-    def _saved_camera(self, scene: Scene, now: ViewState, width: int, height: int) -> Camera:
+    def _saved_camera(
+        self, scene: RenderedScene, now: ViewState, width: int, height: int
+    ) -> Camera:
         """The camera of a saved state, for a picture of this size."""
         if now.camera is None:
             return parse_camera(None, self.scene.look, width, height, scene.space)
         return now.camera.camera(width, height, scene.box)
 
     def _take_composed(
-        self, scene: Scene, now: ViewState, width: int, height: int, bar: Bar
+        self, scene: RenderedScene, now: ViewState, width: int, height: int, bar: Bar
     ) -> RenderStats:
         """Takes a picture with planes beside it or costs over it."""
         from ..viewer.slices import Planes, panes
@@ -160,7 +162,7 @@ class Render:
             if file is not None and not file.parent.is_dir():
                 raise FileNotFoundError(f"folder not found: {file.parent}")
         checked_path("--output", self.output, self.bits, KINDS)
-        check_files(
+        check_outputs(
             {"PATH": self.path, "--state": self.state, **self.scene.look.files()},
             {"--output": self.output, "--npz": self.npz, "--stats": self.stats},
         )
@@ -169,7 +171,7 @@ class Render:
             if flags:
                 raise ValueError(f"{flags[0]} is for pictures, not for --show {self.show}")
 
-    def _overlay(self, scene: Scene, camera: Camera, eye: Eye | None) -> Overlay | None:
+    def _overlay(self, scene: RenderedScene, camera: Camera, eye: Eye | None) -> Overlay | None:
         """What is drawn over the picture."""
         from ..viewer.state import Eye
 
@@ -177,7 +179,9 @@ class Render:
         eye = Eye.of(camera, scene.box) if eye is None else eye
         return self.drawn.overlay(scene.shader, scene.info, component, placed, eye)
 
-    def _take(self, scene: Scene, camera: Camera, overlay: Overlay | None, bar: Bar) -> RenderStats:
+    def _take(
+        self, scene: RenderedScene, camera: Camera, overlay: Overlay | None, bar: Bar
+    ) -> RenderStats:
         """Renders and writes the files, strip by strip where the kind of file lets it."""
         from ..pictures import render_tiles
 
@@ -213,7 +217,7 @@ class _Seen:
         self._any = self._any or bool(picture.alpha.any())
         return picture
 
-    def warn_of_nothing(self, scene: Scene) -> None:
+    def warn_of_nothing(self, scene: RenderedScene) -> None:
         """Warns where nothing was seen."""
         if not self._any:
             ends = scene.values

@@ -1,5 +1,5 @@
-"""`Scene`: what `gvtorch render` and `gvtorch fly` look at: a volume, built into a tree in memory,
-or a store, streamed.
+"""`RenderedScene`: what `gvtorch render` and `gvtorch fly` look at: a volume, built into a tree in
+memory, or a store, streamed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import tyro
 from tyro.conf import arg
 
 from ..io.stores.ngff import is_zarr
-from .common import Bar, ReadOptions, given, refuse_for_store
+from .common import Bar, ReadOptions, flags_given, refuse_for_store
 from .look import Look
 from .streaming import Streaming, tell_failures
 
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What is there."""
+class RenderedScene:
+    """A scene and what renders it."""
 
     render: Callable[..., Picture]  # of a camera
     shader: Shader
@@ -81,7 +81,7 @@ class SceneFlags:
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     @contextmanager
-    def open(self, path: str, options: dict[str, Any], bar: Bar) -> Iterator[Scene]:
+    def open(self, path: str, options: dict[str, Any], bar: Bar) -> Iterator[RenderedScene]:
         """Opens a volume or a store, to be rendered with these options.
 
         Raises:
@@ -92,14 +92,14 @@ class SceneFlags:
             with self._stream(path, options) as scene:
                 yield scene
             return
-        flags = given(self.streaming)
+        flags = flags_given(self.streaming)
         if flags:
             raise ValueError(
                 f"{flags[0]} is for stores; make one: gvtorch convert {path} STORE.zarr"
             )
         yield self._resident(path, options, bar)
 
-    def _resident(self, path: str, options: dict[str, Any], bar: Bar) -> Scene:
+    def _resident(self, path: str, options: dict[str, Any], bar: Bar) -> RenderedScene:
         """Builds the whole tree of a volume file."""
         from ..pool import N3Tree
         from ..shaders import Filtered
@@ -117,7 +117,7 @@ class SceneFlags:
             shader = Filtered.of(
                 tree, volume, shader.transfer, component=look.component, progress=bar
             )
-        return Scene(
+        return RenderedScene(
             partial(render, tree, shader=shader, **options),
             shader,
             partial(cost, tree, shader=shader, **options),
@@ -128,7 +128,7 @@ class SceneFlags:
         )
 
     @contextmanager
-    def _stream(self, path: str, options: dict[str, Any]) -> Iterator[Scene]:
+    def _stream(self, path: str, options: dict[str, Any]) -> Iterator[RenderedScene]:
         """Streams a store, and tells at last what failed."""
         from ..tracing import cost
 
@@ -140,7 +140,7 @@ class SceneFlags:
         with streaming.open(store, self.look) as (engine, shader):
             (tree,) = (source.tree for source in engine.trees.values())
             mode, most = streaming.mode or "converge", streaming.max_frames
-            yield Scene(
+            yield RenderedScene(
                 partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
                 shader,
                 partial(cost, tree, shader=shader, **options),

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from ..base.messages import printable
 from .colors import chosen_transfer, parse_window
-from .common import Bar, ReadOptions, check_files, open_data, volume_formats
+from .common import Bar, ReadOptions, check_outputs, open_data, volume_formats
 from .image import KINDS
 
 
@@ -57,7 +57,7 @@ class Slice:
         from ..tracing.slices import radiological_views
 
         checked_path("--output", self.output, self.bits, KINDS)
-        check_files({"PATH": self.path, "--tf": self.tf}, {"--output": self.output})
+        check_outputs({"PATH": self.path, "--tf": self.tf}, {"--output": self.output})
         places: Any = tuple(self.at.split(","))
         if len(places) not in ((1, 3) if self.axis == "all" else (1,)):
             raise ValueError(f"--at must be one place, or three for --axis all, got {self.at!r}")

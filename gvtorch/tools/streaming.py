@@ -124,7 +124,7 @@ class Streaming:
             yield engine, shader
 
 
-def told(stats: RenderStats) -> str:
+def cost_in_words(stats: RenderStats) -> str:
     """What a picture cost, in a few words."""
     from ..engine import FrameStats
 

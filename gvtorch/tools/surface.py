@@ -11,7 +11,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..base.messages import printable
-from .common import Bar, ReadOptions, check_files, open_data, volume_formats
+from .common import Bar, ReadOptions, check_outputs, open_data, volume_formats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class Surface:
         from ..io.surface_file import check_surface_path
 
         check_surface_path("--output", self.output)
-        check_files({"PATH": self.path}, {"--output": self.output})
+        check_outputs({"PATH": self.path}, {"--output": self.output})
         start = time.perf_counter()
         with Bar() as bar:
             bar("reading", 0, 0)

@@ -11,7 +11,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..io.stores.ngff import is_zarr
-from .common import Bar, given, refuse_for_store, volume_formats
+from .common import Bar, flags_given, refuse_for_store, volume_formats
 from .look import parse_camera
 from .scene import SceneFlags
 
@@ -139,7 +139,7 @@ class View:
         flags = [
             one
             for group in ("look", "streaming", "source")
-            for one in given(getattr(self.scene, group))
+            for one in flags_given(getattr(self.scene, group))
         ]
         flags += ["--camera"] * (self.camera is not None)
         flags += ["--threshold"] * (self.scene.threshold is not None)

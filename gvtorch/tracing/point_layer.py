@@ -13,7 +13,7 @@ import torch
 from ..base import check
 from ..base import constants as config
 from ..cameras.camera import Camera
-from ..points.codes import shares
+from ..points.codes import point_shares
 from ..points.splat import narrow_near
 from ..producers.points import PointProducer
 from .layer import Layer
@@ -118,7 +118,7 @@ def _draw(
     edge = np.arange(count + 1)
     reach = np.full(len(x), size)
     along, down = (
-        shares((start[:, None] + edge).astype(np.float64), one, reach)
+        point_shares((start[:, None] + edge).astype(np.float64), one, reach)
         for start, one in zip(first, (x, y), strict=True)
     )
     for dy in range(count):

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..cameras import Camera
 from ..pictures import Picture, Progressive
-from .protocol import told, with_picture
+from .protocol import message_text, with_picture
 from .scene import Scene
 from .slices import Planes, panes
 from .state import Eye, ViewState, blended
@@ -80,7 +80,7 @@ class Client:
 
     def tell(self, kind: str, **content: Any) -> None:
         """Sends a text."""
-        self._send(told(kind, **content))
+        self._send(message_text(kind, **content))
 
     def ack(self, number: int) -> None:
         """Notes that a picture was drawn, and sends the next one if it waits."""

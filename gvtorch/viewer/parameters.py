@@ -13,7 +13,7 @@ import torch
 
 from ..producers import Producer
 from .scene import Scene
-from .schema import decode, describe, encode
+from .schema import control_for, decode, encode
 
 _MOST = 16  # numbers of a parameter that gets controls
 
@@ -59,7 +59,7 @@ class Parameters:
         if self.record is not None:
             hints = get_type_hints(type(self.record))
             for field in fields(self.record):
-                one = describe(hints[field.name])
+                one = control_for(hints[field.name])
                 if "range" in field.metadata:
                     one["range"] = list(field.metadata["range"])
                 told[field.name] = {**one, "value": encode(getattr(self.record, field.name))}

@@ -209,7 +209,7 @@ def _no_number(name: str) -> float:
     raise ValueError(f"{name} is no number")
 
 
-def told(kind: str, **content: Any) -> str:
+def message_text(kind: str, **content: Any) -> str:
     """Returns a text for a page."""
     return json.dumps({"type": kind, **content})
 

@@ -341,7 +341,7 @@ def _object(where: str, hint: type, content: Any, now: Any, depth: int) -> Any:
         raise ValueError(f"{where}: {error}") from None
 
 
-def describe(hint: Any, owner: str = "", name: str = "") -> dict[str, Any]:
+def control_for(hint: Any, owner: str = "", name: str = "") -> dict[str, Any]:
     """Returns what the page needs to know of a type hint to make a control: its `type`, and by that
     `choices`, `items`, `fields` with their texts, or the `range` of a slider. What has no control
     is of type "kept".
@@ -375,7 +375,7 @@ def _described(hint: Any, owner: str, name: str) -> dict[str, Any] | None:
     elif origin is tuple and inner == (float, float):
         told = {"type": "pair"}
     elif origin in (list, tuple, Sequence) and inner:
-        told = {"type": "list", "items": describe(inner[0])}
+        told = {"type": "list", "items": control_for(inner[0])}
     else:
         told = _described_class(hint) if is_class else None
     return told
@@ -414,7 +414,7 @@ def describe_kind(kind: type) -> dict[str, Any]:
     declared = {one.name: one for one in fields(kind)} if is_dataclass(kind) else {}
     told = {}
     for name, (hint, default) in arguments(kind).items():
-        one = describe(hint, kind.__name__, name)
+        one = control_for(hint, kind.__name__, name)
         if default is not inspect.Parameter.empty and default is not None:
             made = getattr(declared.get(name), "default_factory", MISSING)
             one["default"] = encode(default if made is MISSING else made())

@@ -35,7 +35,7 @@ from .scene import Scene
 from .schema import KINDS, decode, describe_kind, encode
 from .slices import Planes
 from .state import Development, Eye, Slices, ViewState, transfer_of
-from .still import Steps, Stills, finish, still_steps
+from .still import Steps, Stills, finished_picture, still_steps
 
 _TICK = 0.02  # seconds between looks at whether a camera has come to rest
 _FIGURES = 0.25  # seconds between figures for monitors
@@ -521,7 +521,7 @@ class Session:
 
     def still(self, eye: Eye, width: int, height: int) -> Picture:
         """Renders a whole picture: all that can be had, all samples."""
-        return finish(self._steps(eye, (width, height), lambda: False))
+        return finished_picture(self._steps(eye, (width, height), lambda: False))
 
     def _steps(self, eye: Eye, size: tuple[int, int], gone: Callable[[], bool]) -> Steps:
         return still_steps(

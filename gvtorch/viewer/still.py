@@ -64,7 +64,7 @@ def still_steps(
     return beside.composed(shown, state, *size, wait=True).picture
 
 
-def finish(steps: Steps) -> Picture:
+def finished_picture(steps: Steps) -> Picture:
     """Returns the picture, without a turn for others."""
     while True:
         try:

@@ -167,7 +167,7 @@ def new_session(
         if parameters is None and scene.engine is not None and len(scene.engine.trees) == 1:
             (one,) = scene.engine.trees.values()
             parameters = Parameters(one.producer)
-        first = check_shader(scene, shader)
+        first = shader_or_first(scene, shader)
         chosen = ViewState(
             shader=first,
             options=render_options("view", options),
@@ -195,7 +195,7 @@ def new_session(
         raise
 
 
-def check_shader(scene: Scene, shader: Any) -> Shader:
+def shader_or_first(scene: Scene, shader: Any) -> Shader:
     """Returns a user's shader, or one that fits."""
     if shader is None:
         return scene.first_shader()

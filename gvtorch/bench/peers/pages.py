@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..scenes import Scene, aneurism, fog_dense
+from ..scenes import BenchScene, aneurism, fog_dense
 
 _STARTS = 120.0  # seconds in which a page must be there
 
@@ -43,7 +43,7 @@ class Site:
     threads: int
     rate: float = 25.0
 
-    def scene(self) -> Scene:
+    def scene(self) -> BenchScene:
         """Returns the scan, or fog where it is not here."""
         try:
             return aneurism(self.side)
@@ -66,7 +66,7 @@ def gvtorch_page(site: Site, ready: Connection) -> None:
     threading.Event().wait()
 
 
-def _viser(site: Site, ready: Connection) -> tuple[Any, Scene]:
+def _viser(site: Site, ready: Connection) -> tuple[Any, BenchScene]:
     """Starts viser's server with the scene's camera and nothing else in the picture."""
     import viser
 

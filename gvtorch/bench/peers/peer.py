@@ -12,14 +12,14 @@ from torch import Tensor
 from ...base.records import Rays
 from ...cameras import Camera
 from ...shaders import TransferFunction
-from ..scenes import Scene
+from ..scenes import BenchScene
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
     """A picture to render. The scene's voxels are cubes of 1 world unit, voxel 0 is at 0."""
 
-    scene: Scene
+    scene: BenchScene
     camera: Camera
     rays: Rays  # of the camera, on the device
     stop_alpha: float

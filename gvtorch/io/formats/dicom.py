@@ -23,7 +23,7 @@ import numpy as np
 
 from ...base.volume import check_extent
 from ..dicom_codecs import plugin_of
-from ..dicom_frames import Frame, frames_of, image_info, order_frames
+from ..dicom_frames import DicomFrame, frames_of, image_info, order_frames
 from ..source import LPS_TO_RAS, Index, VolumeSource, place_axes
 from ..stores.ngff import is_zarr
 from .format import Format, not_chosen
@@ -210,7 +210,7 @@ def _frame_count(header: Any) -> int:
 def _source(path: str, headers: list[Any]) -> DicomSource:
     first = headers[0]
     rows, columns, samples = _image_shape(first)
-    frames: list[Frame] = []
+    frames: list[DicomFrame] = []
     for header in headers:
         count = _frame_count(header)
         check_extent(header.filename, (count, rows, columns), most=1 << 40)
@@ -244,7 +244,7 @@ def _image_shape(header: Any) -> tuple[int, int, int]:
     return (int(header.get("Rows") or 0), int(header.get("Columns") or 0), samples)
 
 
-def _dtype(header: Any, frames: Sequence[Frame]) -> str:
+def _dtype(header: Any, frames: Sequence[DicomFrame]) -> str:
     """The smallest dtype that holds every value after rescaling."""
     for tag, kind in (("FloatPixelData", "float32"), ("DoubleFloatPixelData", "float64")):
         if tag in header:

@@ -22,7 +22,7 @@ from ..picture_size import jpeg_ends, picture_size
 from ..resources import amount, memory_free
 from ..source import Index, VolumeSource, told_as
 from ..stores.ngff import is_zarr
-from ..tiff_info import check_pictures, opened
+from ..tiff_info import check_pictures, opened_tiff
 from .format import Format
 
 _TIFF = (".tif", ".tiff")
@@ -109,7 +109,7 @@ def _image(file: str) -> np.ndarray:
     """Unpacks an image."""
     codec = _CODECS.get(Path(file).suffix.lower())
     if codec is None:
-        with opened(file) as (tiff, _):
+        with opened_tiff(file) as (tiff, _):
             check_pictures(tiff.series[0].pages)
             return tiff.asarray()
     import imagecodecs
@@ -125,7 +125,7 @@ def _image(file: str) -> np.ndarray:
 def _shape(file: str) -> tuple[Any, ...]:
     """What the header of an image tells: rows and columns first."""
     if Path(file).suffix.lower() in _TIFF:
-        with opened(file) as (tiff, _):
+        with opened_tiff(file) as (tiff, _):
             return tuple(tiff.series[0].shape)
     with open(file, "rb") as stream:
         head = stream.read(_HEAD)

@@ -27,7 +27,7 @@ from ..sparse_grid import (
     SparseSource,
     bits,
     check_roots,
-    describe,
+    source_fields,
 )
 from .format import Format, choose
 
@@ -112,7 +112,7 @@ def open_nanovdb(path: str, key: str | None = None) -> NanoSource:
     _, dtype, width = _TYPES[head.kind]
     affine, low, high = _place(_content(path, head, _ROOT + 24), head)
     kind = _CLASSES.get(head.grid_class, "")
-    told = describe(path, head.name, kind, np.dtype(dtype), width, low, high, affine)
+    told = source_fields(path, head.name, kind, np.dtype(dtype), width, low, high, affine)
     return NanoSource(number=number, lost=lost, **told)
 
 
@@ -218,7 +218,7 @@ def _grid(path: str, number: int, _opened: int) -> NanoGrid:
     return NanoGrid.of(_content(path, head), *_TYPES[head.kind])
 
 
-class Layout(NamedTuple):
+class NodeFormat(NamedTuple):
     """Where things lie in the nodes of a type."""
 
     tiles: int  # bytes before the root's tiles
@@ -230,7 +230,7 @@ class Layout(NamedTuple):
     leaf: int  # bytes of a leaf; of FpN: without its codes
 
     @classmethod
-    def of(cls, kind: str, dtype: str, width: int) -> Layout:
+    def of(cls, kind: str, dtype: str, width: int) -> NodeFormat:
         """As a compiler lays out the structs: a value, then smallest, largest, mean, deviation."""
         item = np.dtype(dtype).itemsize
         value = item * width
@@ -265,13 +265,13 @@ class NanoGrid(SparseGrid):
 
     data: Any  # the grid's bytes
     kind: str
-    layout: Layout
+    layout: NodeFormat
     places: tuple[np.ndarray, np.ndarray, np.ndarray]  # bytes before each node, as `origins`
 
     @classmethod
     def of(cls, data: Any, kind: str, dtype: str, width: int) -> NanoGrid:
         """Finds the nodes."""
-        layout = Layout.of(kind, dtype, width)
+        layout = NodeFormat.of(kind, dtype, width)
         (count,) = struct.unpack_from("<I", data, _ROOT + 24)
         check_roots(count)
         fields = {
@@ -356,7 +356,7 @@ def _codes(data: Any, at: int, bits: int) -> np.ndarray:
 
 
 def _children(
-    data: Any, layout: Layout, level: int, places: np.ndarray, origins: np.ndarray
+    data: Any, layout: NodeFormat, level: int, places: np.ndarray, origins: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """By node: bytes before each of its children, and their first voxels."""
     n, side = COUNTS[level], COUNTS[level + 1] * (8 if level == 0 else 1)

@@ -120,7 +120,7 @@ def _components(data: np.ndarray) -> np.ndarray:
     return parts[..., None, :] if parts.ndim == 4 else parts
 
 
-class _Heard(logging.Filter):
+class _HeaderLog(logging.Filter):
     """Keeps what nibabel tells of a header while one is read, which it would print."""
 
     def __init__(self) -> None:
@@ -135,7 +135,7 @@ class _Heard(logging.Filter):
         return lines is None
 
 
-_HEARD = _Heard()
+_HEARD = _HeaderLog()
 
 
 def _load(path: str) -> tuple[Any, list[str]]:

@@ -28,7 +28,7 @@ from ..sparse_grid import (
     SparseSource,
     bits,
     check_roots,
-    describe,
+    source_fields,
 )
 from .format import Format, choose
 
@@ -182,7 +182,9 @@ def open_openvdb(path: str, key: str | None = None) -> VdbSource:
     else:
         low, high = VdbGrid.read(path, number).box()
     grid_class = str(entry.told.get("class", ""))
-    given = describe(path, entry.name, grid_class, np.dtype(dtype), width, low, high, entry.affine)
+    given = source_fields(
+        path, entry.name, grid_class, np.dtype(dtype), width, low, high, entry.affine
+    )
     return VdbSource(number=number, lost=lost, **given)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ..source import ArraySource, Index, VolumeSource
-from ..tiff_info import JPEG, Told, check_pictures, imagej_info, ome_info, opened
+from ..tiff_info import JPEG, Told, check_pictures, imagej_info, ome_info, opened_tiff
 from .format import Format, choose
 
 _LOST = {  # by the tag PhotometricInterpretation
@@ -29,7 +29,7 @@ class TiffSource(VolumeSource):
 
     def read_stored(self, index: Index) -> np.ndarray:
         """Unpacks the pages of a part."""
-        with opened(self.path) as (file, _):
+        with opened_tiff(self.path) as (file, _):
             series = file.series[self.series]
             if self.whole:
                 check_pictures(series.pages)
@@ -107,7 +107,7 @@ def _page_shape(series: Any) -> tuple[int, ...]:
 )  # pyramids: a series is its finest level
 def open_tiff(path: str, key: str | None = None) -> VolumeSource:
     """Opens a stack: the series `key` (its number or name) of a file, the first if left out."""
-    with opened(path) as (file, warned):
+    with opened_tiff(path) as (file, warned):
         if not file.series:
             raise ValueError("it holds no images")
         number, others = choose(path, "series", [one.name for one in file.series], key)

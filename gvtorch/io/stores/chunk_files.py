@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ...base.boxes import grouped
+from ...base.boxes import rows_by_place
 from ..http import SMALL, Endless
 
 HEADS = ("zarr.json", ".zarray", "attributes.json")  # files of an array that are no chunks
@@ -375,6 +375,6 @@ def _by_row(rows: np.ndarray, numbers: np.ndarray) -> Iterator[tuple[list[int], 
         if len(rows):
             yield rows[0].tolist(), numbers
         return
-    different, members = grouped(rows)
+    different, members = rows_by_place(rows)
     for row, at in zip(different.tolist(), members, strict=True):
         yield row, numbers[at]

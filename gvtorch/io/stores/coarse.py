@@ -25,9 +25,9 @@ from ...base.stage import Progress, no_progress
 from ...base.whole_file import told_of
 from ..resources import amount
 from .ngff import read_json_file
-from .shard import bordered, finish, write
+from .shard import bordered, finish_write, write
 from .store import Store
-from .store_layout import BORDER, WORK, CoarseChannel, Deadline, StoreLayout, is_name, opened
+from .store_layout import BORDER, WORK, CoarseChannel, Deadline, StoreLayout, begin_open, is_name
 from .unfinished import group, locked, write_json
 
 _OPEN_TIMEOUT = 60.0  # seconds
@@ -142,12 +142,12 @@ def _write_blocks(
     done, total = 0, sum(_voxels(values.shape[:3]) for values in levels)
     for level, values in enumerate(levels, 1):
         spec = store.layout.coarse(level, f"{store.coarse_folder}/{folder}", width)
-        Deadline(_OPEN_TIMEOUT).wait(opened(store.root, spec, "create"), spec["path"])
+        Deadline(_OPEN_TIMEOUT).wait(begin_open(store.root, spec, "create"), spec["path"])
         for low in itertools.product(*(range(0, n, _CUBE) for n in values.shape[:3])):
             size = [min(_CUBE, n - a) for a, n in zip(low, values.shape, strict=False)]
             blocks = _blocks(store.layout, values, low, size, keep)
             at = [a // store.layout.block for a in low]
-            finish(write(store.root, spec, at, blocks), store.location, "make it anew")
+            finish_write(write(store.root, spec, at, blocks), store.location, "make it anew")
             done += _voxels(size)
             progress("writing", done, total)
     write_json(place / "zarr.json", group({}))
@@ -165,7 +165,7 @@ def _blocks(
     end = [
         a + -(-n // layout.block) * layout.block + BORDER for a, n in zip(low, size, strict=True)
     ]
-    start, stop = boxes.clamp(begin, end, values.shape[:3])
+    start, stop = boxes.clamped_box(begin, end, values.shape[:3])
     inside = boxes.repeat_edges(keep(values[boxes.index(start, stop)]), start, begin, end)
     return np.ascontiguousarray(bordered(layout, inside))
 

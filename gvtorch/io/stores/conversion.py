@@ -41,14 +41,14 @@ from .conversion_plan import (
     Estimate,
     Plan,
     check_room,
-    counted,
     estimate_of,
     plan_of,
     source_of,
+    with_counted_labels,
     within,
 )
 from .store import Store
-from .store_layout import WORK, Deadline, opened
+from .store_layout import WORK, Deadline, begin_open
 from .unfinished import Done
 
 _AHEAD = 64  # tasks handed to an executor that does not tell how many workers it has
@@ -117,7 +117,7 @@ def convert(
             _check_finished(whole, make_source(read=False), block, threshold)
         return whole
     begun = unfinished.is_begun(target, resume=resume)
-    found = counted(make_source(), target, time, workers, progress)
+    found = with_counted_labels(make_source(), target, time, workers, progress)
     plan = plan_of(source, found, target, block, threshold, nan, time, workers)
     if executor is None and (memory is not None or workers is None):
         plan = within(plan, memory)
@@ -170,7 +170,7 @@ def estimate(
     """
     opened_source = source_of(source, spacing, None, time, oblique, labels, options)
     target = Path(store)
-    opened_source = counted(opened_source, target, time, workers, no_progress)
+    opened_source = with_counted_labels(opened_source, target, time, workers, no_progress)
     return estimate_of(plan_of(source, opened_source, target, block, threshold, nan, time, workers))
 
 
@@ -183,7 +183,7 @@ def _write_store(plan: Plan, begun: bool, executor: Executor | None, progress: P
         with _executor(executor, plan) as pool:
             _write_levels(_staged(plan, pool), work, pool, progress)
         if plan.labels is not None:
-            shard.write_labels(task, plan.labels)
+            shard.write_label_array(task, plan.labels)
         layout = dataclasses.replace(task.layout, value_range=_value_range(task))
         work.finish(layout, task.source.info, settings)
 
@@ -297,7 +297,7 @@ def _value_range(task: shard.Conversion) -> list[list[float]]:
     """Smallest and largest value of each channel, of all times: of the last level's one cell."""
     deadline = Deadline(_OPEN_TIMEOUT)
     spec = task.layout.cells(task.layout.levels - 1)
-    cells = deadline.wait(deadline.wait(opened(task.root, spec), "cells").read(), "cells")
+    cells = deadline.wait(deadline.wait(begin_open(task.root, spec), "cells").read(), "cells")
     cells = cells.reshape(-1, 3, task.layout.width)
     lows, highs = cells[:, 0].min(0), cells[:, 1].max(0)
     return [[low.item(), high.item()] for low, high in zip(lows, highs, strict=True)]

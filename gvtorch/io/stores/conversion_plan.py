@@ -23,7 +23,7 @@ from ...pool.downsample import pool_majority, pool_mean
 from .. import resources
 from ..label_source import IndexSource, indexed_source
 from ..oblique import Oblique
-from ..reading import FormatSettings, open_source, placed, read_whole
+from ..reading import FormatSettings, at_place, open_source, read_whole
 from ..source import MemorySource, VolumeSource, no_time
 from . import shard, unfinished
 from .level_reader import Pool
@@ -118,7 +118,7 @@ def source_of(
             raise ValueError(f"{source.name}: {source.data.dtype} has no place in a store")
         told = {"path": source.name, "info": source.info}
         told |= {"spacing": source.spacing, "origin": source.origin}
-        found = placed(
+        found = at_place(
             "convert", MemorySource.of(source.data.cpu().numpy(), **told), spacing, origin
         )
         if source.label_values is None:
@@ -140,7 +140,7 @@ def source_of(
     return MemorySource.of(read_whole(found, first, times), **told)
 
 
-def counted(
+def with_counted_labels(
     source: VolumeSource,
     target: Path,
     time: int | None,

@@ -24,7 +24,7 @@ from ...pool.downsample import pool_mean
 from ..source import no_time
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
-from .store_layout import MOST_VOXELS, Deadline, StoreError, StoreLayout, child, opened, short
+from .store_layout import MOST_VOXELS, Deadline, StoreError, StoreLayout, begin_open, child, short
 
 Pool = Callable[[np.ndarray, int | Sequence[int]], np.ndarray]
 _TILE = 64  # voxels along a side of a tile that is made on demand
@@ -47,7 +47,7 @@ class StoredArray:
 
     def read(self, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         """Reads (z, y, x, c); voxels beyond the array repeat its outermost ones."""
-        start, stop = boxes.clamp(low, high, [self.size(axis) for axis in "zyx"])
+        start, stop = boxes.clamped_box(low, high, [self.size(axis) for axis in "zyx"])
         inside = dict(zip("zyx", boxes.index(start, stop), strict=True))
         place = tuple(inside.get(axis, slice(None)) for axis in self.axes)
         data = deadline.wait(begin_read(self.array[place], self.files), self.where)
@@ -70,7 +70,7 @@ def open_arrays(
     at = child(root, finest.path)
     is_v3 = read_json(f"{where}/{finest.path}", at, "zarr.json", deadline) is not None
     driver = "zarr3" if is_v3 else "zarr"
-    futures = [opened(root, {"driver": driver, "path": scale.path}) for scale in image.scales]
+    futures = [begin_open(root, {"driver": driver, "path": scale.path}) for scale in image.scales]
     stored: list[StoredArray] = []
     for scale, future in zip(image.scales, futures, strict=True):
         name = f"{where}/{scale.path}"
@@ -93,7 +93,7 @@ def open_arrays(
     return stored, chosen, sizes
 
 
-def fitted(
+def with_channels(
     image: MultiscaleImage, sizes: dict[str, int], chosen: slice | list[int]
 ) -> MultiscaleImage:
     """What the metadata tells of the channels that were chosen, if it fits the array."""
@@ -179,7 +179,7 @@ class LevelReader:
 
     def read(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         """Reads (z, y, x, c) voxels `low` to `high` of a level; beyond it the outermost repeat."""
-        start, stop = boxes.clamp(low, high, self._layout.shape(level))
+        start, stop = boxes.clamped_box(low, high, self._layout.shape(level))
         data = self._inside(level, start, stop, deadline)
         return np.ascontiguousarray(boxes.repeat_edges(data, start, low, high))
 

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ...base import boxes
-from ...pool.downsample import Reduction, pool_max, pool_mean, pool_min, round_array, window
+from ...pool.downsample import Reduction, pool_max, pool_mean, pool_min, reduce_windows, round_array
 from ..source import VolumeSource
 from .checksums import Files, shard_files
 from .chunk_files import files_of
 from .level_reader import Pool, StoredArray
 from .store import needed_cells
-from .store_layout import BORDER, CELL, Deadline, StoreError, StoreLayout, opened, short
+from .store_layout import BORDER, CELL, Deadline, StoreError, StoreLayout, begin_open, short
 
 _TIMEOUT = 3600.0  # seconds for one read of local data
 _OPEN_TIMEOUT = 60.0  # seconds
@@ -88,7 +88,7 @@ def write_shard(conversion: Conversion, level: int, place: Place) -> ShardResult
         at = [a // layout.block for a in low]
         writes.append(write(conversion.root, layout.blocks(level), at, blocks, time))
     for begun in writes:
-        finish(begun, conversion.root.get("path", "store"))
+        finish_write(begun, conversion.root.get("path", "store"))
     specs = (layout.plain(level), layout.cells(level), layout.blocks(level))
     files = shard_files(conversion.root, specs, place, Deadline(_TIMEOUT))
     return ShardResult(place, int(np.prod(size)), files=files)
@@ -98,7 +98,7 @@ def _from_source(
     conversion: Conversion, time: int, low: list[int], high: list[int], inner: tuple[slice, ...]
 ) -> tuple[np.ndarray, int]:
     """Reads a box; returns also how many of its `inner` values are not finite."""
-    start, stop = boxes.clamp(low, high, conversion.layout.shape(0))
+    start, stop = boxes.clamped_box(low, high, conversion.layout.shape(0))
     source = conversion.source.at_time(conversion.source.time + time)
     values, bad = source.read_region(start, stop), 0
     if values.dtype.kind == "f" and (wrong := ~np.isfinite(values)).any():
@@ -120,11 +120,11 @@ def _from_below(
     arrays = []
     # The finest values are their own smallest and largest.
     for spec in (layout.plain(level - 1), *layout.bounds(level - 1)):
-        array = deadline.wait(opened(conversion.root, spec), spec["path"])
+        array = deadline.wait(begin_open(conversion.root, spec), spec["path"])
         files = files_of(spec["path"], array)
         array = layout.at_time(array, time)
         arrays.append(StoredArray(array, files, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
-    start, stop = boxes.clamp(low, high, layout.shape(level))
+    start, stop = boxes.clamped_box(low, high, layout.shape(level))
     size = (*[b - a for a, b in zip(start, stop, strict=True)], layout.width)
     made = [np.empty(size, layout.dtype) for _ in pools]
     for z in (start[0], *range((start[0] // _SLAB + 1) * _SLAB, stop[0], _SLAB)):
@@ -149,9 +149,9 @@ def _cells(
     reach = tuple(slice(0, n * CELL + 2 * BORDER) for n in count)
     own = tuple(slice(BORDER, BORDER + n * CELL) for n in count)
     size = CELL + 2 * BORDER
-    low = window(least[reach], "min", size=size, step=CELL)
-    high = window(most[reach], "max", size=size, step=CELL)
-    mean = window(values[own], middle, size=CELL, step=CELL)
+    low = reduce_windows(least[reach], "min", size=size, step=CELL)
+    high = reduce_windows(most[reach], "max", size=size, step=CELL)
+    mean = reduce_windows(values[own], middle, size=CELL, step=CELL)
     return np.stack((low, high, round_array(mean, values.dtype)), axis=3)
 
 
@@ -182,14 +182,14 @@ def write(
     time: int | None = None,
 ) -> Any:
     """Begins to write a box into an array of the store, at a time if it has an axis for that."""
-    array = Deadline(_TIMEOUT).wait(opened(root, spec, "write"), spec["path"])
+    array = Deadline(_TIMEOUT).wait(begin_open(root, spec, "write"), spec["path"])
     array = array if time is None else array[time]
     low = [0, *low] if data.ndim == 4 else low  # (c, z, y, x)
     low = [*low, *[0] * (data.ndim - len(low))]
     return array[boxes.index(low, np.add(low, data.shape).tolist())].write(data)
 
 
-def finish(begun: Any, where: str, then: str = "--resume (resume=True) goes on") -> None:
+def finish_write(begun: Any, where: str, then: str = "--resume (resume=True) goes on") -> None:
     """Waits until it is written; `then` tells what helps after a full disk."""
     try:
         begun.result()
@@ -208,12 +208,12 @@ def create_arrays(conversion: Conversion, level: int) -> None:
         _create(conversion.root, spec)
 
 
-def write_labels(conversion: Conversion, labels: np.ndarray) -> None:
+def write_label_array(conversion: Conversion, labels: np.ndarray) -> None:
     """Writes the array of labels that are indexed."""
     root, spec = conversion.root, conversion.layout.labels()
     _create(root, spec)
-    finish(write(root, spec, [0], labels), root.get("path", "store"))
+    finish_write(write(root, spec, [0], labels), root.get("path", "store"))
 
 
 def _create(root: dict[str, Any], spec: dict[str, Any]) -> None:
-    Deadline(_OPEN_TIMEOUT).wait(opened(root, spec, "create"), f"{root['path']}{spec['path']}")
+    Deadline(_OPEN_TIMEOUT).wait(begin_open(root, spec, "create"), f"{root['path']}{spec['path']}")

@@ -20,12 +20,12 @@ import numpy as np
 import torch
 
 from ...base import boxes, check
-from ...base.boxes import Zyx, grouped
+from ...base.boxes import Zyx, rows_by_place
 from ...base.labels import background, counted
 from ...pool.downsample import pool_majority, pool_mean
 from .checksums import Checksums, file_of, sum_of
 from .chunk_files import ChunkFiles, begin_read, files_of
-from .level_reader import LevelReader, Pool, fitted, open_arrays
+from .level_reader import LevelReader, Pool, open_arrays, with_channels
 from .ngff import MultiscaleImage, find_image, read_json
 from .store_layout import (
     BORDER,
@@ -35,9 +35,9 @@ from .store_layout import (
     Deadline,
     StoreError,
     StoreLayout,
+    begin_open,
     child,
     kvstore,
-    opened,
     read_key,
     value_dtype,
 )
@@ -164,7 +164,7 @@ class Store:
         if found.info.labels:
             pool = partial(pool_majority, background=background(names))
         levels = LevelReader(stored, layout, pool)
-        found = fitted(found, sizes, chosen)
+        found = with_channels(found, sizes, chosen)
         self = cls(
             *(where, found, layout, levels, chosen),
             time=time,
@@ -191,7 +191,7 @@ class Store:
         """Opens blocks and cells of all levels, and compares them with what they must be."""
         kinds = (self.layout.blocks, self._blocks), (self.layout.cells, self._cells)
         specs = [(spec(at), arrays) for spec, arrays in kinds for at in range(self.levels)]
-        for spec, arrays, future in [(*pair, opened(self.root, pair[0])) for pair in specs]:
+        for spec, arrays, future in [(*pair, begin_open(self.root, pair[0])) for pair in specs]:
             array, files = _as_told(self.location, spec, future, deadline)
             arrays.append((self.layout.at_time(array, self.time), files))
         folder = child(self.root, self.coarse_folder)
@@ -275,7 +275,7 @@ class Store:
         deadline = Deadline(timeout)
         data = self._levels.read(self._checked(level), low, high, deadline)
         if self.has_blocks:
-            start, stop = boxes.clamp(low, high, self.layout.shape(level))
+            start, stop = boxes.clamped_box(low, high, self.layout.shape(level))
             self._sums.check_box(self.layout.plain(level), start, stop, deadline)
             inside = data[boxes.index(np.subtract(start, low).clip(0), data.shape[:3])]
             self._check_shards(self.layout.plain(level), inside, start, stop, deadline)
@@ -390,7 +390,7 @@ class Store:
         deadline = Deadline(timeout)
         place = f"{self.coarse_folder}/{channel.folder(name)}"
         spec = self.layout.coarse(level, place, channel.width)
-        chunked = _as_told(self.location, spec, opened(self.root, spec), deadline)
+        chunked = _as_told(self.location, spec, begin_open(self.root, spec), deadline)
         out = np.empty((len(zyx), *chunked[0].shape[3:]), np.float16)
         order = np.lexsort(zyx.T[::-1])
         errors = self._read_stored(chunked, level, zyx, order, out, deadline)
@@ -544,7 +544,7 @@ def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline)
     """(k,) int64 labels that are indexed."""
     spec = layout.labels()
     name = f"{where}/{spec['path']}"
-    chunked = _as_told(where, spec, opened(root, spec), deadline)
+    chunked = _as_told(where, spec, begin_open(root, spec), deadline)
     labels: np.ndarray = deadline.wait(begin_read(*chunked), name)
     if not (labels[1:] > labels[:-1]).all():
         raise ValueError(f"{name}: damaged: labels must rise")
@@ -570,7 +570,7 @@ def _blank(out: np.ndarray) -> list[int]:
 def _groups(zyx: np.ndarray, side: int) -> list[np.ndarray]:
     """Indices of blocks to be read together."""
     groups = []
-    for index in grouped(zyx // _GROUP)[1]:
+    for index in rows_by_place(zyx // _GROUP)[1]:
         span = (zyx[index].max(0) - zyx[index].min(0) + 1) * (side - 2 * BORDER) + 2 * BORDER
         if math.prod(span.tolist()) <= 2 * len(index) * side**3:
             groups.append(index)

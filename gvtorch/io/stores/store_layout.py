@@ -36,7 +36,7 @@ from urllib.parse import unquote, urlsplit
 
 from ...base.text_path import text_path
 from ..http import Endless, file_url, is_http, read_http
-from ..relay import named, read_within, through
+from ..relay import read_within, through, with_urls
 from ..resources import cores
 
 if TYPE_CHECKING:
@@ -409,7 +409,7 @@ class Deadline:
 def short(error: BaseException) -> str:
     """tensorstore's message in one line, without its annotations."""
     text = re.sub(r"\s*\[[a-z_]+(=| locations=).*", "", str(error), flags=re.DOTALL)
-    return named(" ".join(text.split()))[:400] or type(error).__name__
+    return with_urls(" ".join(text.split()))[:400] or type(error).__name__
 
 
 _users: set[int] = set()  # processes that use tensorstore: this one, one that it was forked from
@@ -507,7 +507,7 @@ def read_key(
         raise StoreError(f"{where}/{name}: {error}") from None
 
 
-def opened(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
+def begin_open(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
     """Begins to open an array of a store; returns tensorstore's future.
 
     `root` comes from `kvstore`, `spec` from `StoreLayout`; `mode` is "read", "write" or "create"

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from .exact import clamp, larger, taken_by
 from .march import Piece, Probe, Transfer
-from .tree import Bricks
+from .tree import ChannelBricks
 
 
-class AllNumbers(Bricks):
+class AllNumbers(ChannelBricks):
     """All numbers of a channel, whose smallest and largest values are (r, c)."""
 
     def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:

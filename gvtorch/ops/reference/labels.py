@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .exact import clamp, larger, smaller
 from .rays import INF, Beam
-from .tree import Bricks, Holder
+from .tree import ChannelBricks, Holder
 
 _MOST_REACH = 3  # voxels
 
@@ -25,7 +25,7 @@ class Nearest:
     place: Tensor  # (r, 3) from the voxel's centre, -0.5 to 0.5
 
 
-class LabelBricks(Bricks):
+class LabelBricks(ChannelBricks):
     """One component of a channel of labels."""
 
     def nearest(self, holder: Holder, beam: Beam, t: Tensor) -> Nearest:

@@ -18,7 +18,7 @@ from ..shading import LightKind, ShadeParameters
 from .exact import clamp, divide, dot, larger, power, smaller, sqrt_exact, unit
 from .march import Piece, Plain, Probe, Visitor, Walk
 from .rays import INF, Intervals, split
-from .tree import Bricks
+from .tree import ChannelBricks
 
 #: Each octave of scattering gives so much of the light of the one before it, and keeps so much of
 #: its direction: fitted to path traced clouds (benchmarks/cloud_light.py).
@@ -32,7 +32,7 @@ class Light:
     """A light, the material it falls on, and the eye that sees it. World units."""
 
     parameters: ShadeParameters
-    normals: tuple[Bricks, ...]  # three components, or none
+    normals: tuple[ChannelBricks, ...]  # three components, or none
     eye: Tensor  # (r, 3)
     along: Tensor  # (r, 3)
     moved: Tensor  # (r,) distance from the eye to where distances begin

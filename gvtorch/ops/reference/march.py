@@ -24,13 +24,13 @@ from ...base.constants import EMPTY
 from ..arguments import RayArguments, TraceArguments
 from .exact import TINY, clamp, divide, larger, log2_exact, smaller, stretch
 from .rays import INF, Beam, Intervals, Rows
-from .tree import Bricks, Holder, Tree
+from .tree import ChannelBricks, Holder, Tree
 
 _SLACK = 2.0**-20  # relative
 
 
 @dataclass
-class Answer(Rows):
+class NodePair(Rows):
     """The one or two nodes whose bricks tell a ray's values."""
 
     fine: Holder
@@ -40,7 +40,7 @@ class Answer(Rows):
 
 
 @dataclass
-class Visit(Answer):
+class Visit(NodePair):
     """The node each ray stands in: where the visit ends, and what the node shows."""
 
     seen: Tensor  # (r,) distance at which the node was looked up
@@ -73,14 +73,14 @@ class Probe:
     """What a visitor may ask of the tree at places of its rays."""
 
     beam: Beam
-    answer: Answer
-    channel: Bricks
+    answer: NodePair
+    channel: ChannelBricks
 
     def value(self, t: Tensor) -> Tensor:
         """(r,) values at distances t (r,)."""
         return self.number(self.channel, t)
 
-    def number(self, bricks: Bricks, t: Tensor) -> Tensor:
+    def number(self, bricks: ChannelBricks, t: Tensor) -> Tensor:
         """(r,) numbers of any channel at distances t (r,)."""
         return self.blend(t, lambda holder: bricks.sample(holder, self.beam, t))
 
@@ -201,8 +201,8 @@ class Transfer:
 
     def transparent(self, smallest: Tensor, largest: Tensor) -> Tensor:
         """Bool: no value between the two is seen."""
-        first = torch.floor(self.place(below(smallest))).to(torch.int64)
-        end = torch.ceil(self.place(above(largest))).to(torch.int64)
+        first = torch.floor(self.place(a_little_below(smallest))).to(torch.int64)
+        end = torch.ceil(self.place(a_little_above(largest))).to(torch.int64)
         before = torch.where(first > 0, self.opaque_m[(first - 1).clamp(min=0)], 0)
         return self.opaque_m[end] == before
 
@@ -212,12 +212,12 @@ def mix(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
     return a + weight[:, None] * (b - a)
 
 
-def above(value: Tensor) -> Tensor:
+def a_little_above(value: Tensor) -> Tensor:
     """A little more, since interpolation may round beyond its ends."""
     return value + larger(value, -value) * _SLACK
 
 
-def below(value: Tensor) -> Tensor:
+def a_little_below(value: Tensor) -> Tensor:
     """A little less."""
     return value - larger(value, -value) * _SLACK
 
@@ -227,7 +227,7 @@ class Visitor(ABC):
     """What rays do on their way: a shader, or a list of what one would sample."""
 
     transfer: Transfer
-    channel: Bricks
+    channel: ChannelBricks
     sees_empty = False  # whether EMPTY nodes are sampled, too
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -250,14 +250,16 @@ class Visitor(ABC):
 class Walk:
     """Rays on their way through a tree."""
 
-    def __init__(self, at: Intervals, tree: Tree, channel: Bricks) -> None:
+    def __init__(self, at: Intervals, tree: Tree, channel: ChannelBricks) -> None:
         self.at, self.tree, self.channel = at, tree, channel
         self.visit = Visit.none(at.start)
         self.samples = self.visits = torch.zeros_like(at.start, dtype=torch.int32)
         self.missed = torch.zeros_like(at.start, dtype=torch.bool)  # something that was seen
 
     @classmethod
-    def enter(cls, rays: RayArguments, a: TraceArguments, channel: type[Bricks] = Bricks) -> Walk:
+    def enter(
+        cls, rays: RayArguments, a: TraceArguments, channel: type[ChannelBricks] = ChannelBricks
+    ) -> Walk:
         """World rays where they enter the scene."""
         beam = Beam.enter(rays, a, a.table_lm4.dtype)
         return cls(Intervals(beam, a.step, len(a.table_lm4)), Tree(a), channel.of(a))

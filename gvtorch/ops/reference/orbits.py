@@ -28,7 +28,7 @@ INSIDE = 1.0  # world units that the fractal's inside is told to be deep: no est
 FAR = 1e3  # a ball's orbits that get so far apart tell nothing any more
 
 
-def power(z: Tensor, n: int) -> tuple[Tensor, Tensor]:
+def spherical_power(z: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """z^n in spherical coordinates: |z|^n, and both angles n times. Two complex powers: of z + i
     rho, whose angle is that from the axis, and of the direction (x + i y) / rho; rho is the
     distance from the axis.
@@ -43,10 +43,11 @@ def power(z: Tensor, n: int) -> tuple[Tensor, Tensor]:
 
 
 def power_ranges(z: Tensor, reach: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
-    """`Ranges` of `power`. Along radius and meridian n r^(n-1), along the circle of latitude that
-    times |sin(n angle) / sin(angle)|, which is at most n. The angle, which is that from the axis,
-    changes by at most asin(reach / r) in a ball; asin(s) <= s + (pi / 2 - 1) s^3, since all terms
-    of its series are positive and all beyond the first together pi / 2 - 1 at s = 1.
+    """`Ranges` of `spherical_power`. Along radius and meridian n r^(n-1), along the circle of
+    latitude that times |sin(n angle) / sin(angle)|, which is at most n. The angle, which is that
+    from the axis, changes by at most asin(reach / r) in a ball; asin(s) <= s + (pi / 2 - 1) s^3,
+    since all terms of its series are positive and all beyond the first together pi / 2 - 1 at
+    s = 1.
     """
     x, y, up = z.unbind(0)
     away, radius = sqrt_exact(x * x + y * y), sqrt_exact(_squared(z))

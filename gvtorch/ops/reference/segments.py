@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ..arguments import RayArguments, Samples, Segments, TraceArguments
-from .march import Answer, Piece, Probe, Transfer, Visitor, Walk
+from .march import NodePair, Piece, Probe, Transfer, Visitor, Walk
 from .rays import Beam
-from .tree import Bricks, Levels
+from .tree import ChannelBricks, Levels
 
 _PIECE = -1  # level of an interval of any length
 
@@ -125,8 +125,8 @@ def sample_bricks(
         levels.holder(node, brick, depth, place)
         for node, brick, depth in zip(nodes, bricks, depths[:2], strict=True)
     )
-    channel = Bricks.of(a)
-    probe = Probe(beam, Answer(fine, coarse, *levels.voxels(depths[2])), channel)
+    channel = ChannelBricks.of(a)
+    probe = Probe(beam, NodePair(fine, coarse, *levels.voxels(depths[2])), channel)
     components = channel.components(a.bricks_bzyxc, a.constant_tnc)
     found = torch.stack([probe.number(component, t) for component in components], 1)
     return torch.where(known[:, None], found, 0.0)

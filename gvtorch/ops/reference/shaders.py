@@ -30,9 +30,9 @@ from .channels import AllNumbers, ChannelTable
 from .exact import clamp, dot, larger, sqrt_exact, stretch, unit
 from .labels import LabelBricks
 from .light import Light, Shadows
-from .march import Piece, Plain, Probe, Walk, above, below, mix
+from .march import Piece, Plain, Probe, Walk, a_little_above, a_little_below, mix
 from .rays import INF
-from .tree import Bricks, Holder
+from .tree import ChannelBricks, Holder
 
 _BISECTIONS = 4
 LIT = 10  # numbers of filtered colours with moments of normals, seen along a direction
@@ -43,11 +43,11 @@ class Shade(Plain):
     """The transfer function, lit; and what all shaders share."""
 
     light: Light
-    others: tuple[Bricks, ...]  # components of the second channel, or none
+    others: tuple[ChannelBricks, ...]  # components of the second channel, or none
     other_component: int
     features: Tensor  # (r, c) sums
     shadows: Shadows | None
-    bricks: ClassVar[type[Bricks]] = Bricks  # what it reads of its channel
+    bricks: ClassVar[type[ChannelBricks]] = ChannelBricks  # what it reads of its channel
 
     def __post_init__(self) -> None:
         self.normal = torch.zeros_like(self.light.along)  # (r, 3) sum
@@ -91,7 +91,7 @@ class Shade(Plain):
         """After the last interval."""
 
 
-class Sided(Bricks):
+class Sided(ChannelBricks):
     """The opacity in a channel that holds red, green, blue and opacity for each of six directions,
     or once.
     """
@@ -111,7 +111,7 @@ class StoredColor(Shade):
         return self.light.parameters.own_as(StoredColorNumbers)
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        return ~(above(high) > 0)
+        return ~(a_little_above(high) > 0)
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         own = self.own
@@ -194,9 +194,9 @@ class Isosurface(Shade):
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
         level, filled, hides = self.level, self.filled, torch.zeros_like(self.found[which])
         if filled >= 0:
-            hides = hides | (above(high) < level)
+            hides = hides | (a_little_above(high) < level)
         if filled <= 0:
-            hides = hides | (below(low) >= level)
+            hides = hides | (a_little_below(low) >= level)
         return hides & ~self.found[which]
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
@@ -264,8 +264,8 @@ class Projection(Shade):
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
         kind, found = self.kind, self.found[which]
-        useless = ((kind == ProjectionKind.MAXIMUM) & (above(high) <= found)) | (
-            (kind == ProjectionKind.MINIMUM) & (below(low) >= found)
+        useless = ((kind == ProjectionKind.MAXIMUM) & (a_little_above(high) <= found)) | (
+            (kind == ProjectionKind.MINIMUM) & (a_little_below(low) >= found)
         )
         return useless & (self.length[which] > 0)
 

@@ -164,7 +164,7 @@ class Tree:
 
 
 @dataclass
-class Bricks:
+class ChannelBricks:
     """One component of one channel."""
 
     bricks_bzyxc: Tensor
