@@ -91,7 +91,9 @@ def find_image(
         asked = "no multiscale image" if image is None else f"no image {image!r}"
         plate = "; it is a plate: name a field of view, as in 'A/1/0'"
         of = plate if _member(attributes, "plate") is not None else ""
-        raise ValueError(f"{where}: has {asked} (NGFF multiscales){of}")
+        known = _image_names(attributes) if image is not None else []
+        held = f"; it holds {_few(known)}" if known else ""
+        raise ValueError(f"{where}: has {asked} (NGFF multiscales){held}{of}")
     if layout is not None and isinstance(own, dict):
         found = replace(found, info=_own_info(own.get("info"), found.info), own=own)
     else:
@@ -177,6 +179,19 @@ def _parse_image(
     return None
 
 
+def _image_names(attributes: dict[str, Any]) -> list[str]:
+    """By what `find_image` finds the images of a group, as far as it tells them."""
+    images, folders = _member(attributes, "multiscales"), attributes.get(SEVERAL)
+    scales, inner = (one if isinstance(one, list) else [] for one in (images, folders))
+    names = [str(one.get("name", n)) for n, one in enumerate(scales) if isinstance(one, dict)]
+    return [*names, *(one for one in inner if isinstance(one, str))]
+
+
+def _few(names: list[str]) -> str:
+    short = [one if len(one) < 50 else brief(one) for one in names[:5]]
+    return ", ".join(short) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
 def _as_labels(found: MultiscaleImage, told: Any) -> MultiscaleImage:
     """An image whose values are labels, if `image-label` says so."""
     if not isinstance(told, dict):
@@ -195,8 +210,7 @@ def _member(attributes: dict[str, Any], name: str) -> Any:
 def _told_beside(found: MultiscaleImage, others: list[str]) -> MultiscaleImage:
     if not others:
         return found
-    named = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
-    text = f"the images {named} beside {brief(found.name)} (key= or image= names one)"
+    text = f"the images {_few(others)} beside {brief(found.name)} (key= or image= names one)"
     return replace(found, lost=(*found.lost, text))
 
 
