@@ -61,7 +61,7 @@ def test_each_channel_is_a_store_of_its_own(store, mesh):
         assert one.has_blocks and one.extent == grid.extent
         found = one.read_region(0, *whole)
         assert np.array_equal(found, expected[name].numpy()), name
-    with pytest.raises(ValueError, match="has no image 'normals'.*; it holds .*coverage.*normal"):
+    with pytest.raises(ValueError, match=r"has no image 'normals'.*; it holds .*coverage.*normal"):
         gv.Store.open(store, image="normals")
 
 
