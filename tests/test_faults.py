@@ -83,7 +83,7 @@ class Operations(TorchDispatchMode):
 #: By which files of gvtorch's own are written: open, fsync, rename, remove.
 WRITES: Calls = [
     *((pathlib.Path, "open"), (pathlib.Path, "replace"), (os, "fsync"), (pathlib.Path, "mkdir")),
-    *((shard, "write"), (shard, "finish"), (shard, "shard_files")),
+    *((shard, "write"), (shard, "finish_write"), (shard, "shard_files")),
 ]
 
 
