@@ -12,6 +12,8 @@ from pathlib import Path
 
 from helpers import ROOT
 
+import gvtorch.ops
+import gvtorch.shaders
 from gvtorch.bench import WORKLOADS
 from gvtorch.viewer.protocol import MESSAGES
 
@@ -140,12 +142,14 @@ def test_kernel_headers_include_only_downward():
 
 
 def named_elsewhere(path: Path, name: str) -> bool:
-    """Whether a name is another thing's on purpose: of a twin or an op, that of what it serves; of
-    a command, a workload or a message, the word that users type; of a peer, what all peers have.
+    """Whether something may have the name of another thing: an op and its twin that of the function
+    which they serve, a shader's twin that of the shader; a command, a workload and a message are
+    named by what users and pages type; peers have one interface.
     """
     home = path.relative_to(PACKAGE).parts
     return (
-        home[0] == "ops"
+        (home[0] == "ops" and name in vars(gvtorch.ops))
+        or (home == ("ops", "reference", "shaders.py") and name in vars(gvtorch.shaders))
         or (home[0] == "tools" and name.lower() == path.stem)
         or (home == ("viewer", "protocol.py") and name.lower() in MESSAGES)
         or (home[0] == "bench" and (name in WORKLOADS or "peers" in home))

@@ -356,8 +356,12 @@ def test_images_by_name_and_folder(tmp_path):
     other = Store.open(tmp_path, image="b")
     assert other.read_region(0, (0, 0, 0), (1, 1, 1))[0, 0, 0, 0] == data[0, 0, 0, 0] + 1
     assert Store.open(tmp_path / "0", image="first").extent == (9, 9, 9)
-    with pytest.raises(ValueError, match=r"has no image '\.\./0'"):
+    with pytest.raises(ValueError, match=r"has no image '\.\./0'.*; it holds a$"):
         Store.open(tmp_path / "b", image="../0")
+    several = [{"name": name} for name in ("x" * 100, *"bcdefg")]
+    (tmp_path / ".zattrs").write_text(json.dumps({"multiscales": several}))
+    with pytest.raises(ValueError, match=r"; it holds 'x+\.\.\.x+', b, c, d, e and 2 more$"):
+        Store.open(tmp_path, image="none")
 
 
 def test_foreign_mistakes_are_one_line(tmp_path):

@@ -108,7 +108,9 @@ class Put(NamedTuple):
 
 
 def _outcome(put: Put, targets: Targets, lru: LRU) -> Written:
-    """What became of the targets; the host waits for it."""
+    """What became of the targets, after the slots that they took are counted off the unused ones.
+    The host waits for it.
+    """
     lasting, items, evicted = put.counts.tolist()
     lru.unused -= items
     unplaced = lasting - items

@@ -432,8 +432,8 @@ class Camera:
         """Returns the rays through the pixel centres of whole rows, the first one and the one after
         the last counted through the batch, from what `numbers` gave.
         """
-        plane = PixelRows(numbers, rows, self.width, self.height, self.distorted)
-        return MODELS[self.model].rays(plane)
+        pixels = PixelRows(numbers, rows, self.width, self.height, self.distorted)
+        return MODELS[self.model].rays(pixels)
 
     def pixel_samples(self, numbers: Tensor, rows: tuple[int, int]) -> Tensor:
         """Returns `Rays.sample` of whole rows, counted as for `pixel_rays`."""

@@ -141,18 +141,18 @@ class Model(ABC):
         return torch.maximum(x / half_x, y / half_y)
 
     @abstractmethod
-    def rays(self, plane: PixelRows) -> Rays:
-        """Returns the rays through places of the image plane."""
+    def rays(self, pixels: PixelRows) -> Rays:
+        """Returns the rays through the pixels' centres."""
 
 
 class Pinhole(Model):
     """The direction is (x, y, 1)."""
 
-    def rays(self, plane: PixelRows) -> Rays:
-        (first, end), sizes = plane.rows, (plane.width, plane.height)
-        columns = pinhole_rays(plane.cameras.contiguous(), first, end - first, *sizes)
+    def rays(self, pixels: PixelRows) -> Rays:
+        (first, end), sizes = pixels.rows, (pixels.width, pixels.height)
+        columns = pinhole_rays(pixels.cameras.contiguous(), first, end - first, *sizes)
         named = dict(zip(("origin", "direction", "cone", "range"), columns, strict=True))
-        return Rays(**named, width=plane.width)
+        return Rays(**named, width=pixels.width)
 
 
 class Ortho(Model):
@@ -165,11 +165,11 @@ class Ortho(Model):
         scale = self.reach(corners, half_x, half_y).amax(1)
         return torch.maximum(scale, _CLEAR * corners[..., 2].abs().amax(1)), scale
 
-    def rays(self, plane: PixelRows) -> Rays:
-        rotation = plane.rotation
-        across = plane.x[..., None] * rotation[:, None, 0]
-        down = plane.y[:, None] * rotation[:, 1] + plane.position
-        return plane.rays(plane.spread(rotation[:, 2]), origin=across + down[:, None])
+    def rays(self, pixels: PixelRows) -> Rays:
+        rotation = pixels.rotation
+        across = pixels.x[..., None] * rotation[:, None, 0]
+        down = pixels.y[:, None] * rotation[:, 1] + pixels.position
+        return pixels.rays(pixels.spread(rotation[:, 2]), origin=across + down[:, None])
 
 
 class Fisheye(Model):
@@ -190,21 +190,21 @@ class Fisheye(Model):
         """All within a cone: a straight edge between two places of it does not leave it."""
         return corners[..., :2].norm(dim=-1) / math.tan(min(half_x, half_y, _NEAREST))
 
-    def rays(self, plane: PixelRows) -> Rays:
-        x, y = plane.x, plane.y[:, None]
-        k, limit = plane.numbers[:, 20:24], plane.numbers[:, 24:25]
+    def rays(self, pixels: PixelRows) -> Rays:
+        x, y = pixels.x, pixels.y[:, None]
+        k, limit = pixels.numbers[:, 20:24], pixels.numbers[:, 24:25]
         radius = (x * x + (y * y)).sqrt()  # (y, w)
-        angle = undistort(radius, k, limit) if plane.distorted else radius
+        angle = undistort(radius, k, limit) if pixels.distorted else radius
         scale = torch.where(radius > 0, angle.sin() / radius, 1.0)
         across = torch.stack((x.expand_as(radius), y.expand_as(radius)), -1)
         local = torch.cat((scale[..., None] * across, angle.cos()[..., None]), -1)
         edge, widening = limit, None
-        if plane.distorted:
+        if pixels.distorted:
             edge = distort(limit, k)
             # Along the radius a pixel spans 1 / slope, across it sin(angle) / radius.
             widening = torch.maximum(1 / slope(angle, k), scale)
         inside = radius <= edge * _ROUNDING
-        return plane.rays(plane.turned(local), widening=widening, inside=inside)
+        return pixels.rays(pixels.turned(local), widening=widening, inside=inside)
 
 
 class Panorama(Model):
@@ -221,18 +221,18 @@ class Panorama(Model):
         slopes = (math.tan(min(half, _NEAREST)) for half in (half_x, half_y))
         return super().reach(corners, *slopes)
 
-    def rays(self, plane: PixelRows) -> Rays:
-        latitude = plane.y[:, None].expand(-1, plane.x.shape[-1])
-        longitude = plane.x.expand_as(latitude)
+    def rays(self, pixels: PixelRows) -> Rays:
+        latitude = pixels.y[:, None].expand(-1, pixels.x.shape[-1])
+        longitude = pixels.x.expand_as(latitude)
         ring = latitude.cos()
         parts = (longitude.sin() * ring, latitude.sin(), longitude.cos() * ring)
         below = latitude.abs() <= _ROUNDING * math.pi / 2
         inside = below & (longitude.abs() <= _ROUNDING * math.pi)
         # A pixel spans 1 / fy radians down, and along its circle of latitude cos / fx.
-        fx, fy = plane.numbers[:, 12:14].unbind(1)
-        span = torch.maximum(plane.y.cos() / fx, 1 / fy) * torch.minimum(fx, fy)
+        fx, fy = pixels.numbers[:, 12:14].unbind(1)
+        span = torch.maximum(pixels.y.cos() / fx, 1 / fy) * torch.minimum(fx, fy)
         widening = span[:, None].expand_as(latitude)
-        return plane.rays(plane.turned(torch.stack(parts, -1)), widening=widening, inside=inside)
+        return pixels.rays(pixels.turned(torch.stack(parts, -1)), widening=widening, inside=inside)
 
 
 #: Every camera model by its name.

@@ -156,7 +156,9 @@ class Answered(NamedTuple):
 
 
 def brick_words(kind: Tensor) -> Tensor:
-    """(k,) int32 the words of nodes that need no brick, EMPTY or CONSTANT; ABSENT of all others."""
+    """Returns brick words (k,) int32 of nodes whose kinds of `Region` are (k,): EMPTY or CONSTANT
+    where no brick is needed, else ABSENT.
+    """
     word = torch.where(kind == Region.EMPTY, EMPTY, ABSENT)
     return torch.where(kind == Region.CONSTANT, CONSTANT, word).to(torch.int32)
 

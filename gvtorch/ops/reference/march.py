@@ -73,7 +73,7 @@ class Probe:
     """What a visitor may ask of the tree at places of its rays."""
 
     beam: Beam
-    answer: NodePair
+    nodes: NodePair
     channel: ChannelBricks
 
     def value(self, t: Tensor) -> Tensor:
@@ -103,15 +103,15 @@ class Probe:
         """(r,) or (r, c): what the node says and what its parent says, whose weight grows from 0
         where the cone is as wide as the node's voxels to 1 where it is as wide as its parent's.
         """
-        answer = self.answer
-        two, value = answer.fine.node != answer.coarse.node, ask(answer.fine)
+        nodes = self.nodes
+        two, value = nodes.fine.node != nodes.coarse.node, ask(nodes.fine)
         if not two.any():
             return value
-        share = divide(1.0, answer.above - answer.voxel, answer.voxel)
-        weight = clamp((self.beam.cone(t) - answer.voxel) * share, 0, 1)
+        share = divide(1.0, nodes.above - nodes.voxel, nodes.voxel)
+        weight = clamp((self.beam.cone(t) - nodes.voxel) * share, 0, 1)
         if value.dim() == 2:
             weight, two = weight[:, None], two[:, None]
-        return torch.where(two, value + weight * (ask(answer.coarse) - value), value)
+        return torch.where(two, value + weight * (ask(nodes.coarse) - value), value)
 
 
 @dataclass

@@ -329,7 +329,7 @@ class Labels(Shade):
         return self.transfer.opaque_m[last] == torch.where(first > 0, before, 0)
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        fine, coarse = probe.answer.fine, probe.answer.coarse
+        fine, coarse = probe.nodes.fine, probe.nodes.coarse
         looks = probe.blend(piece.middle, partial(self.look, piece, probe))
         color, alpha, normal = looks.split((3, 1, 3), 1)
         hidden = ~(self.look(piece, probe, fine)[:, 3] > 0)
@@ -374,7 +374,7 @@ class Filtered(Shade):
     """The transfer function, and the colours that the pool's first bricks have."""
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        fine, coarse = probe.answer.fine, probe.answer.coarse
+        fine, coarse = probe.nodes.fine, probe.nodes.coarse
         stored = self.stored(fine) | self.stored(coarse)
         self.add_near(piece, probe, where & ~stored)
         if not (where & stored).any():

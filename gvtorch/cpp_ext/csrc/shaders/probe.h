@@ -277,7 +277,7 @@ struct Probe {
   }
   GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }
 
-  // Between what the two say, a number or several.
+  // What the two nodes say at distance t, a number or several, mixed: the coarse one counts by `weight`.
   template <class Some>
   GV_HD Some between(const Some& finer, const Some& coarser, T t) const {
     const T part = weight(t);
