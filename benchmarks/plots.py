@@ -1,5 +1,5 @@
 """Draws what `gvtorch bench NAME -o docs/performance` kept, and writes the tables between the
-markers of docs/performance.md. Records of quick sizes are left out.
+markers of docs/performance/tables.md. Records of quick sizes are left out.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Settings:
 
     records: Path = DOCS / "performance"
     """a folder of JSON files; pictures are written beside them"""
-    page: Path = DOCS / "performance.md"
+    page: Path = DOCS / "performance" / "tables.md"
     """a Markdown file with the markers"""
 
 
