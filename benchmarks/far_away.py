@@ -45,7 +45,7 @@ class Settings:
     """What to measure."""
 
     folder: Positional[Path]
-    """with the scans of docs/picture.md"""
+    """with the scans of docs/from_afar.md"""
     pixels: tuple[float, ...] = (2.0, 8.0, 32.0)
     """voxels a pixel"""
     only: str = ""

@@ -12,7 +12,7 @@ Source: Crassin et al., "Interactive indirect illumination using voxel cone trac
 (voxels by direction); Younesy, Möller, Carr, "Improving the quality of multi-resolution volume
 rendering", EuroVis 2006 (why); Olano, Baker, "LEAN mapping", I3D 2010, and Heitz, Dupuy, Crassin,
 Dachsbacher, "The SGGX microflake distribution", SIGGRAPH 2015 (moments of normals). The weight,
-what hidden voxels hold and the sums over moments are ours; docs/picture.md measures them.
+what hidden voxels hold and the sums over moments are ours; docs/from_afar.md measures them.
 """
 
 from __future__ import annotations
