@@ -153,10 +153,9 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
 #pragma unroll 1
 #endif
     for (int axis = 0; axis < 3; ++axis) {
-      const MaskOf<V> back = which && d[axis] < 0, ahead = which && !back;
-      const int32_t first = 2 * kFiltered * axis;
-      Moments<V> m = any(ahead) ? moments(ahead, read, first) : moments(back, read, first + kFiltered);
-      if (any(ahead) && any(back)) m = choose(back, moments(back, read, first + kFiltered), m);
+      const MaskOf<V> back = which && d[axis] < 0;
+      const auto six = [&](MaskOf<V> some, int32_t first) { return moments(some, read, first); };
+      const Moments<V> m = of_side<V>(which, back, 2 * kFiltered * axis, six, kFiltered);
       const Vec3<V> column = axis == 0   ? Vec3<V>{m.xx, m.xy, m.xz}
                              : axis == 1 ? Vec3<V>{m.xy, m.yy, m.yz}
                                          : Vec3<V>{m.xz, m.yz, m.zz};

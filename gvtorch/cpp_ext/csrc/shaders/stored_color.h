@@ -8,6 +8,20 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
+// What lanes read of one of a voxel's two sides on an axis: the numbers from `first` on where a ray goes ahead along
+// it, those `one` places behind where it goes back.
+template <class V, class Read>
+GV_HD auto of_side(MaskOf<V> which, MaskOf<V> back, int32_t first, const Read& read, int32_t one) {
+  if constexpr (kPacket<V>) {
+    const MaskOf<V> ahead = which && !back;
+    if (!any(back)) return read(ahead, first);
+    if (!any(ahead)) return read(back, first + one);
+    return choose(back, read(back, first + one), read(ahead, first));
+  } else {
+    return read(which, back ? first + one : first);
+  }
+}
+
 // A voxel's number, or four of them, as seen along direction d; read(which, k) gives lanes the number k places behind
 // the first, or the four that begin there. A channel may hold `one` numbers for each of six directions (Crassin et al.,
 // "Interactive indirect illumination using voxel cone tracing", CGF 2011): then the three that d goes along are read,
@@ -15,14 +29,7 @@ inline namespace GV_NAMESPACE {
 template <class V, class Read>
 GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const Read& read, int32_t one = 4) {
   if (width == one) return read(which, 0);
-  const auto side = [&](int axis) {
-    const MaskOf<V> back = which && d[axis] < 0, ahead = which && !back;
-    const int32_t first = 2 * one * axis;
-    if (!any(back)) return read(ahead, first);
-    if (!any(ahead)) return read(back, first + one);
-    const auto there = read(back, first + one), here = read(ahead, first);
-    return choose(back, there, here);
-  };
+  const auto side = [&](int axis) { return of_side<V>(which, which && d[axis] < 0, 2 * one * axis, read, one); };
   const auto z = side(2);
   auto seen = z;
 #ifdef __CUDA_ARCH__
