@@ -82,9 +82,11 @@ class Render:
         source = self.scene.source
         if self.state is None or source.time is not None:
             return self.scene
-        from ..viewer.state import saved_time
+        from ..base import check
+        from ..viewer.state import saved_state
 
-        time = saved_time(self.state)
+        told = saved_state(self.state).get("time", 0.0)
+        time = check.number(f"{self.state}: state", "time", told)
         if time != int(time):
             raise ValueError(f"{self.state}: time must be the number of a time point, got {time:g}")
         return replace(self.scene, source=replace(source, time=int(time))) if time else self.scene

@@ -98,7 +98,7 @@ class View:
 
     def _store(self) -> tuple[Scene, Shader]:
         from ..engine.engine import Engine
-        from ..viewer.scene import Scene, Series
+        from ..viewer.scene import Scene, series_of
 
         if self.scene.threshold is not None:
             raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
@@ -111,14 +111,14 @@ class View:
         def remake(data: Any) -> Producer:
             return streaming.content(data, look)[0]
 
-        series = vars(Series.of(store))
+        series = series_of(store)
         return Scene(store.name, engine, data=store, remake=remake, **series), shader
 
     def _volume(self) -> tuple[Scene, Shader]:
         from ..engine.engine import Engine
         from ..producers import VolumeProducer
         from ..shaders import Filtered
-        from ..viewer.scene import Scene, Series
+        from ..viewer.scene import Scene, series_of
 
         source = replace(self.scene.source, time=self.scene.source.time or 0)
         look, volume = self.scene.look, source.read(self.path)
@@ -129,7 +129,7 @@ class View:
             return VolumeProducer(data, threshold=self.scene.threshold, filtered=filtered)
 
         engine = Engine(make(volume), **self.scene.streaming.memory(look, volume))
-        series = vars(Series.of(self.path, **source.options()))
+        series = series_of(self.path, **source.options())
         return Scene(volume.name, engine, data=volume, remake=make, **series), shader
 
     def _run_script(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
