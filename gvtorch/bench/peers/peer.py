@@ -71,15 +71,8 @@ def spans(task: Task) -> Tensor:
 
 
 def bake(shader: TransferFunction, step: float, rows: int) -> np.ndarray:
-    """Samples a transfer function over [0, 255].
-
-    Args:
-        shader: The function; its reference length is 1 world unit if it names none.
-        step: World units that an opacity is for.
-        rows: How many rows; 255 k + 1 rows hit every value that is a multiple of 1 / k.
-
-    Returns:
-        (rows, 4) float64 colour, not premultiplied, and opacity of a step.
+    """Samples a transfer function over [0, 255]: (rows, 4) float64 colour, not premultiplied, and
+    opacity of a step in world units; 255 k + 1 rows hit every value that is a multiple of 1 / k.
     """
     table = shader(np.linspace(0, 255, rows))
     with np.errstate(divide="ignore"):
