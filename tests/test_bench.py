@@ -13,9 +13,10 @@ from helpers import DEVICES, ROOT, gvtorch
 
 import gvtorch as gv
 from gvtorch import bench
-from gvtorch.bench import browser, peers, scenes, tables
+from gvtorch.bench import browser, scenes, tables
 from gvtorch.bench import record as record_module
 from gvtorch.bench.peers import pages
+from gvtorch.bench.peers.peer import Task, find
 from gvtorch.bench.record import Record, Settings, clock
 from gvtorch.bench.shaders import LOOKS
 from gvtorch.tools.bench import Bench
@@ -115,11 +116,11 @@ def test_grid_sample_agrees_with_the_picture():
     scene = scenes.clouds(48)
     camera = scene.camera(40, 30)
     tree = gv.N3Tree.from_volume(scene.volume)
-    marcher = peers.find(Record("march", Settings(device=CPU.device, peers=("grid_sample",))))
+    marcher = find(Record("march", Settings(device=CPU.device, peers=("grid_sample",))))
     for stop, bound in ((1.0, 1e-5), (0.99, 1e-2)):
         options = {"step": scene.step, "lod": "finest", "stop_alpha": stop}
         picture = gv.render(tree, camera, scene.shader, **options)
-        task = peers.Task(
+        task = Task(
             scene=scene, camera=camera, rays=camera.rays(), stop_alpha=stop, device=CPU.device
         )
         peer = marcher["grid_sample"](task)

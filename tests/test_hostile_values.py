@@ -30,8 +30,8 @@ from gvtorch.bench import tables
 from gvtorch.points.table import Table
 from gvtorch.tools import cli
 from gvtorch.tools.bench import Bench
-from gvtorch.tools.channels import parse_channels
 from gvtorch.tools.common import size
+from gvtorch.tools.parse import parse_channels
 
 HUGE = 10**400
 VIEW = gv.Camera.orbit(width=8, height=8)

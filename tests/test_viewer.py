@@ -16,7 +16,7 @@ from helpers.viewer import FUNCTION, Page, bright_ball, pixels, turned
 import gvtorch as gv
 from gvtorch.io.surface import export_surface
 from gvtorch.viewer import export
-from gvtorch.viewer.client import jpeg
+from gvtorch.viewer.client import image_file
 from gvtorch.viewer.view import new_session
 
 pytestmark = pytest.mark.backend("cpp")
@@ -35,7 +35,9 @@ def test_a_page_gets_the_picture_that_python_makes(session):
     made = gv.Progressive(lambda one: gv.render(tree, one, FUNCTION)).refine(camera, 16)
     expected = made.to_srgb8().numpy()
     assert seen.shape == expected.shape == (64, 96, 3) and expected.std() > 10
-    assert np.array_equal(seen, pixels(jpeg(made, 94))), "to the last bit, before JPEG"
+    assert np.array_equal(seen, pixels(image_file(made, "JPEG", quality=94, subsampling=0))), (
+        "to the last bit, before JPEG"
+    )
     assert np.abs(seen.astype(int) - expected).mean() < 1
 
 

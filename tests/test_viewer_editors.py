@@ -17,7 +17,7 @@ from helpers.viewer import FUNCTION, SOON, Grown, Page, bright_ball, pixels, tur
 
 import gvtorch as gv
 from gvtorch.io.stores.conversion import convert
-from gvtorch.viewer.nodes import node_boxes
+from gvtorch.viewer.scene import node_boxes
 from gvtorch.viewer.slices import Planes, panes
 from gvtorch.viewer.state import Development, Eye, Slices
 from gvtorch.viewer.view import new_session

@@ -9,7 +9,7 @@ from helpers import SHARED, shared
 
 import gvtorch as gv
 from gvtorch.io.window import _MOST, value_range
-from gvtorch.tools.colors import chosen_transfer
+from gvtorch.tools.parse import chosen_transfer
 
 FILES = [
     "aneurism_256x256x256_uint8.raw.gz",

@@ -32,21 +32,6 @@ WORKLOADS = {
     "voxelize": "a mesh of 100,000 triangles to voxels and to a store, beside peers",
     "blocks": "random blocks with border out of a store, beside tensorstore and zarr",
 }
-#: What else does the same, by the names of `--peers`, and what must be installed for it.
-PEERS = {
-    "grid_sample": "torch",
-    "warp": "warp-lang",
-    "drjit": "drjit",
-    "vtk": "vtk",
-    "tensorstore": "zarr",  # which writes the chunks that are read
-    "zarr": "zarr",
-    "pyfastnoiselite": "pyfastnoiselite",
-    "pyfastnoisesimd": "pyfastnoisesimd",
-    "trimesh": "trimesh",
-    "igl": "libigl",
-    "viser": "viser",
-    "trame": "trame-vtk",
-}
 _HOME = {
     **dict.fromkeys(("march", "first_hit", "calls", "bricks"), "march"),
     **{"frame": "frames", "deep": "frames"},
@@ -68,6 +53,8 @@ def run(name: str, settings: Settings) -> Record:
         ValueError: There is no such workload or peer, or no case has `only` in its name.
         Unavailable: The workload can't run here.
     """
+    from .record import PEERS, Record, elsewhere
+
     for what, wanted, known in (
         ("workload", (name,), WORKLOADS),
         ("peer", settings.peers or (), PEERS),
@@ -75,8 +62,6 @@ def run(name: str, settings: Settings) -> Record:
         unknown = sorted(set(wanted) - set(known))
         if unknown:
             raise ValueError(f"bench: unknown {what} {unknown[0]!r}; known: {', '.join(known)}")
-    from .record import Record, elsewhere
-
     record = Record(name, settings)
     with elsewhere(record):
         getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)(record)

@@ -13,8 +13,7 @@ import math
 import shutil
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -75,7 +74,6 @@ def executable() -> str | None:
 
 @contextlib.contextmanager
 def running() -> Iterator[Any]:
-    """Runs the browser."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as library:
@@ -85,17 +83,11 @@ def running() -> Iterator[Any]:
         browser.close()
 
 
-@dataclass(frozen=True, kw_only=True)
-class Seen:
-    """What a hand saw.
+class Seen(NamedTuple):
+    """What a hand saw."""
 
-    Attributes:
-        waited: Milliseconds from each jump of the pointer to the first picture that shows it.
-        rate: Pictures a second while it dragged.
-    """
-
-    waited: list[float]
-    rate: float
+    waited: list[float]  # milliseconds from each jump to the first picture that shows it
+    rate: float  # pictures a second while it dragged
 
 
 class Page:
@@ -107,11 +99,8 @@ class Page:
         window = {"width": max(size[0], 640), "height": max(size[1], 400)}
         self.context = browser.new_context(viewport=window)
         self.page = self.context.new_page()
-        given = {"SIZE": str(list(_THUMB)), "SELECTOR": repr(selector)}
-        script = _PROBE
-        for name, value in given.items():
-            script = script.replace(name, value)
-        self.page.add_init_script(script)
+        script = _PROBE.replace("SIZE", str(list(_THUMB)))
+        self.page.add_init_script(script.replace("SELECTOR", repr(selector)))
         self.page.goto(url)
         self._fit(selector)
         self._watch(True)
@@ -195,5 +184,4 @@ class Page:
         return float(shown[0] - moved)
 
     def close(self) -> None:
-        """Closes it."""
         self.context.close()

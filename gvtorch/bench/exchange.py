@@ -77,11 +77,7 @@ def _measure(record: Record, context: Any, name: str, ways: list[gl.Exchange]) -
 
 
 def _context() -> Any:
-    """A context without a window.
-
-    Raises:
-        Unavailable: There is none here.
-    """
+    """A context without a window; raises Unavailable where there is none."""
     try:
         import moderngl
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Literal
 
@@ -16,18 +16,20 @@ import torch
 from ..cameras import Camera
 from ..engine import Engine, FrameStats
 from ..fields import sdf
+from ..pictures import Picture
 from ..pool import Channel, N3Tree
 from ..pool.mapped import mapped
 from ..producers import Bricks, FieldProducer, Nodes, Producer, VolumeProducer
 from ..shaders import TransferFunction
 from ..tracing import render
 from .record import Record, Settings, Timing, clock, spread, synchronize
-from .scenes import BenchScene, aneurism, fog_dense, worn
+from .scenes import BenchScene, scan_or_fog, worn
 
 #: Stages of a frame that are the cache's: what a resident tree has no need of.
 CACHE = ("requests", "lru", "schedule", "produce", "write", "count")
 _MOST = 1000  # frames until something must have converged
 _POOLS = {"node_pool": "16 MB", "brick_pool": "384 MB"}  # hold all of 512^3 uint8
+_Frame = tuple[Picture, FrameStats]
 _Way = Callable[[Engine], Callable[[], list[Any]]]  # what is not timed gives what is
 _QUICK = {"node_pool": "1 MB", "brick_pool": "2 MB"}
 
@@ -36,11 +38,7 @@ def frame(record: Record) -> None:
     """Steady frames beside a resident tree, then cold starts."""
     quick = record.settings.quick
     width, height = (24, 16) if quick else (1920, 1080)
-    try:
-        scene = aneurism(32 if quick else 256)
-    except FileNotFoundError:
-        scene = fog_dense(32 if quick else 256)
-        record.note("the scan comes with the source and is not here: fog takes its place")
+    scene = scan_or_fog(32 if quick else 256, record.note)
     if record.wants("steady"):
         _steady(record, scene, (width, height))
     if record.wants("cold start"):
@@ -97,28 +95,25 @@ def deep(record: Record) -> None:
 def _steady(record: Record, scene: BenchScene, size: tuple[int, int]) -> None:
     settings, camera = record.settings, scene.camera(*size)
     case = f"steady, {scene.name}, {size[0]}x{size[1]}"
-    medians = {}
+    pools: dict[str, Any] = _QUICK if settings.quick else {}
     for monitor in (False, True):
         settings.tell(f"{case}: monitor {monitor}")
         producer = VolumeProducer(scene.volume)
-        options: dict[str, Any] = {"device": settings.device, "monitor": monitor}
-        options |= _QUICK if settings.quick else {}
-        with Engine(producer, **options) as engine:
+        with Engine(producer, device=settings.device, monitor=monitor, **pools) as engine:
             picture = _converge(engine, camera, scene.shader)
             timing, stats = _clock_frames(engine, camera, scene.shader, settings)
             if not stats[-1].converged or any(s.requests["load"] for s in stats):
                 record.note(f"{case}: it was not steady")
             cost = _stages(stats[1:]) if monitor else {}
-            medians[monitor] = timing.median
             record.add(case, "gvtorch, monitored" if monitor else "gvtorch", timing, **cost)
             if settings.device.type == "cuda" and not monitor:
                 _captured(record, case, engine, camera, scene.shader)
     settings.tell(f"{case}: resident")
     tree = N3Tree.from_volume(scene.volume, device=settings.device)
     timing = clock(lambda: render(tree, camera, scene.shader), settings)
-    apart = float((render(tree, camera, scene.shader).color - picture).abs().max())
-    times = timing.median / medians[False]
-    record.add(case, "resident tree", timing, times=times, max_difference=apart)
+    apart = float((timing.last.color - picture).abs().max())
+    times = record.beside_first(case, timing)
+    record.add(case, "resident tree", timing, **times, max_difference=apart)
     record.note(
         "cache share: the stages " + ", ".join(CACHE) + " of a monitored frame, which waits for "
         "the device after each stage"
@@ -165,10 +160,18 @@ def _stages(stats: list[FrameStats]) -> dict[str, Any]:
     }
 
 
+def converging(see: Callable[[], _Frame]) -> Iterator[_Frame]:
+    """Yields frames, up to one that misses nothing, or too many."""
+    for _ in range(_MOST):
+        picture, stats = see()
+        yield picture, stats
+        if stats.settle().converged:
+            return
+
+
 def _converge(engine: Engine, camera: Camera, shader: TransferFunction) -> torch.Tensor:
     """Renders frames until one misses nothing; returns its colour."""
-    for _ in range(_MOST):
-        picture, stats = engine.frame(camera, shader)
+    for picture, stats in converging(partial(engine.frame, camera, shader)):
         if stats.converged:
             return picture.color
     raise ValueError(f"bench: nothing converged within {_MOST} frames")
@@ -183,34 +186,23 @@ def _cold(record: Record, scene: BenchScene, size: tuple[int, int], budget: int)
     side = scene.volume.extent[0]
     case = f"cold start, {scene.name} {side}^3, {size[0]}x{size[1]}, {budget:,} bricks a frame"
 
-    def frames(engine: Engine) -> list[FrameStats]:
-        all_stats = [engine.frame(camera, scene.shader)[1]]
-        while not all_stats[-1].converged and len(all_stats) < _MOST:
-            all_stats.append(engine.frame(camera, scene.shader)[1])
-        return all_stats
+    def frames(engine: Engine) -> Callable[[], list[Any]]:
+        see = partial(engine.frame, camera, scene.shader)
+        return lambda: [stats for _, stats in converging(see)]
 
-    def picture(engine: Engine) -> list[Any]:
-        return [engine.render(camera, scene.shader, max_frames=_MOST).stats]
+    def picture(engine: Engine) -> Callable[[], list[Any]]:
+        return lambda: [engine.render(camera, scene.shader, max_frames=_MOST).stats]
 
     def recorded(engine: Engine) -> Callable[[], list[Any]]:
         graph = engine.capture(camera, scene.shader, batch=budget)
         for tree in engine.trees.values():
             tree.producer.changed()
         engine.renew()  # all that was made goes, but the root
-
-        def replays() -> list[FrameStats]:
-            all_stats: list[FrameStats] = []
-            while len(all_stats) < _MOST:
-                all_stats.append(graph.replay(camera)[1])
-                if all_stats[-1].settle().converged:
-                    break
-            return all_stats
-
-        return replays
+        return lambda: [stats for _, stats in converging(partial(graph.replay, camera))]
 
     ways: dict[str, tuple[Literal["voxels", "mapped"], _Way]] = {
-        "gvtorch, frames": ("voxels", lambda engine: partial(frames, engine)),
-        "gvtorch, render": ("voxels", lambda engine: partial(picture, engine)),
+        "gvtorch, frames": ("voxels", frames),
+        "gvtorch, render": ("voxels", picture),
     }
     if settings.device.type == "cuda":
         ways["gvtorch, mapped, captured"] = ("mapped", recorded)
@@ -255,7 +247,6 @@ class Ready(Producer):
         self.bricks = bricks.pin_memory() if pinned else bricks
 
     def fill(self, nodes: Nodes) -> Bricks:
-        """Hands out the first rows."""
         return Bricks(data={"value": self.bricks[: len(nodes)]})
 
 
@@ -347,8 +338,7 @@ def _pour(side: int, pinned: bool, device: torch.device) -> list[tuple[float, in
     """
     milliseconds, moved = [0.0, 0.0], [0, 0]
     with Engine(Ready(side, pinned), device=device, **_pouring(side)) as engine:
-        for _ in range(_MOST):
-            _, stats = engine.frame(*_POURED, lod="finest", step=2.0)
+        for _, stats in converging(partial(engine.frame, *_POURED, lod="finest", step=2.0)):
             cost = sum(stats.stages.get(name, 0.0) for name in ("produce", "write"))
             for part in (0, 1) if not stats.produced["tiles"] else (0,):
                 if stats.bytes_uploaded:

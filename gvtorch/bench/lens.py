@@ -8,6 +8,7 @@ from ..cameras import Camera
 from ..engine.engine import Engine
 from ..producers import VolumeProducer
 from ..tracing import ThinLens
+from .frames import converging
 from .record import Record, clock
 from .scenes import worn
 
@@ -38,13 +39,13 @@ def lens(record: Record) -> None:
             monitor=False,
         ) as engine:
             see = partial(engine.frame, camera, scene.shader, lens=view)
-            loaded, moved, converged = 0, 0, False
-            while not converged:
-                _, stats = see()
+            loaded, moved = 0, 0
+            for _, stats in converging(see):
                 loaded, moved = loaded + stats.produced["bricks"], moved + stats.bytes_uploaded
-                converged = stats.converged
+            if not stats.converged:
+                record.note(f"{case}: it was not steady")
             timings = {"gvtorch": clock(see, settings)}
-            _, last = see()
+            _, last = timings["gvtorch"].last
             if settings.device.type == "cuda":
                 graph = engine.capture(camera, scene.shader, lens=view)
                 timings["captured"] = clock(partial(graph.replay, camera), settings, calls=20)

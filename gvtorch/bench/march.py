@@ -21,7 +21,7 @@ from ..io.resources import memory_free
 from ..pictures import Picture
 from ..pool import N3Tree
 from ..tracing import render, trace
-from .peers import Peer, Task, find
+from .peers.peer import Peer, Task, find
 from .record import Record, Settings, Timing, clock, once
 from .scenes import SCENES, BenchScene, shell_sparse
 
@@ -151,7 +151,7 @@ def _compare(
     """Adds a row for each level of detail, then one for each peer."""
     settings, case = record.settings, _case(scene.name, size)
     device, camera = settings.device, scene.camera(*size)
-    finest, median = torch.empty(0), 0.0
+    finest = torch.empty(0)
     for lod in lods:
         who = "gvtorch" if lod == "finest" else f"gvtorch {lod}"
         settings.tell(f"{case}: {who}")
@@ -159,11 +159,12 @@ def _compare(
         hits = run()
         timing = clock(run, settings)
         figures = rates(hits, timing) | {"op_ms": op_milliseconds(run, settings)}
+        figures |= record.beside_first(case, timing)
         picture = rgba(hits)
         if lod == "finest":
-            finest, median = picture, timing.median
+            finest = picture
         else:
-            figures |= {"times": timing.median / median} | difference(picture, finest)
+            figures |= difference(picture, finest)
         record.add(case, who, timing, **figures)
         _save(record, picture, f"{case} {who}", size)
     rays = camera.rays(device)
@@ -174,7 +175,7 @@ def _compare(
         timing = clock(peer.render, settings)
         picture = peer.picture().cpu()
         figures = {"rays_per_second": 1e3 * len(picture) / timing.median}
-        figures |= {"times": timing.median / median} | difference(picture, finest)
+        figures |= record.beside_first(case, timing) | difference(picture, finest)
         record.add(case, name, timing, **figures)
         _save(record, picture, f"{case} {name}", size)
 
@@ -235,16 +236,12 @@ class _OpTimer(TorchDispatchMode):
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
-        answer: list[Any] = []
-
-        def call() -> None:
-            answer[:] = [func(*args, **(kwargs or {}))]
-
-        if func.name() in ("gvtorch::trace_rays", "gvtorch::shade_rays"):
-            self.times.append(once(call, self.device))
-        else:
-            call()
-        return answer[0]
+        call = partial(func, *args, **(kwargs or {}))
+        if func.name() not in ("gvtorch::trace_rays", "gvtorch::shade_rays"):
+            return call()
+        milliseconds, answer = once(call, self.device)
+        self.times.append(milliseconds)
+        return answer
 
 
 def _tree_bytes(scene: BenchScene, brick_size: int, border: int) -> int:

@@ -24,35 +24,29 @@ def noise(record: Record) -> None:
     case = f"{count:,} points"
     if record.wants(case):
         _points(record, case, points)
-    kinds = {"value": gv_noise.value, "simplex": gv_noise.simplex, "cellular": gv_noise.cellular}
+    kinds: dict[str, Callable[..., Any]] = {
+        **{"value": gv_noise.value, "simplex": gv_noise.simplex, "cellular": gv_noise.cellular},
+        **{"6 octaves": gv_noise.fbm},
+    }
     for name, kind in kinds.items():
         case = f"{count:,} points, {name}"
         if record.wants(case):
-            _kind(record, case, points, kind)
-    case = f"{count:,} points, 6 octaves"
-    if record.wants(case):
-        _kind(record, case, points, gv_noise.fbm)
-
-
-def _kind(record: Record, case: str, points: torch.Tensor, kind: Callable[..., Any]) -> None:
-    """One noise, of the op."""
-    places = points.to(record.settings.device)
-    _add(record, case, "op", len(points), lambda: kind(places))
+            _add(record, case, "op", count, partial(kind, points.to(settings.device)))
 
 
 def _points(record: Record, case: str, points: torch.Tensor) -> None:
     """The same points by everyone; peers have hashes of their own, so values can't be compared."""
     device = record.settings.device
     on_device, in_numpy = points.to(device), points.numpy()
-    eager = _add(record, case, "op", len(points), lambda: gv_noise.perlin(on_device))
+    _add(record, case, "op", len(points), lambda: gv_noise.perlin(on_device))
     twin = partial(op, kind="perlin", backend="reference")
     apart = float((twin(on_device) - gv_noise.perlin(on_device)).abs().max())
-    _add(record, case, "twin", len(points), lambda: twin(on_device), eager, max_difference=apart)
+    _add(record, case, "twin", len(points), lambda: twin(on_device), max_difference=apart)
     compiled = torch.compile(twin, fullgraph=True, dynamic=False)
     try:
         compiled(on_device)
         synchronize(device)
-        _add(record, case, "twin, compiled", len(points), lambda: compiled(on_device), eager)
+        _add(record, case, "twin, compiled", len(points), lambda: compiled(on_device))
     except Exception as error:  # whatever the compiler finds missing here
         reason = str(error).strip().splitlines()
         record.note(f"compiled: it does not work here: {reason[0] if reason else type(error)}")
@@ -64,18 +58,10 @@ def _points(record: Record, case: str, points: torch.Tensor) -> None:
         for begin in range(0, len(in_numpy), _CHUNK):
             perlin_numpy(in_numpy[begin : begin + _CHUNK], table)
 
-    _add(record, case, "NumPy", len(points), in_chunks, eager)
-    wanted = record.settings.peers
+    _add(record, case, "NumPy", len(points), in_chunks)
     for who, make in (("pyfastnoiselite", _fastnoiselite), ("pyfastnoisesimd", _fastnoisesimd)):
-        if wanted is not None and who not in wanted:
-            continue
-        try:
-            run = make(in_numpy)
-        except ImportError:
-            record.peers[who] = f"not installed ({who})"
-            continue
-        record.peers[who] = "ran"
-        _add(record, case, who, len(points), run, eager)
+        if record.has_peer(who):
+            _add(record, case, who, len(points), make(in_numpy))
     record.note("pyfast...: C++ on one thread, without torch; NumPy is on one thread as well")
 
 
@@ -118,17 +104,8 @@ def _fastnoisesimd(points: np.ndarray) -> Callable[[], object]:
 
 
 def _add(
-    record: Record,
-    case: str,
-    who: str,
-    count: int,
-    run: Callable[[], object],
-    other: float | None = None,
-    **figures: Any,
-) -> float:
-    """Takes a row; `other` are the milliseconds of what its speed is told in."""
+    record: Record, case: str, who: str, count: int, run: Callable[[], object], **figures: Any
+) -> None:
     timing = clock(run, record.settings)
-    ratio = {} if other is None else {"times": timing.median / other}
     rates = {"values_per_second": 1e3 * count / timing.median}
-    record.add(case, who, timing, **rates, **ratio, **figures)
-    return timing.median
+    record.add(case, who, timing, **rates, **record.beside_first(case, timing), **figures)

@@ -35,7 +35,6 @@ class Ripples(Producer):
     """A procedural scene: rings around the centre, uint8."""
 
     def __init__(self) -> None:
-        """Tells where it lies."""
         super().__init__(_SIDE, channels={"value": Channel(torch.uint8)}, box=_BOX)
 
     def fill(self, nodes: Nodes) -> Bricks:
@@ -127,7 +126,7 @@ def _both(record: Record, case: str, producer: Producer, nodes: Nodes, compiles:
         return torch.cat([rows.reshape(len(nodes), -1).float() for rows in data.values()], 1)
 
     expected = eager()
-    timing = _add(record, case, "eager", eager, expected)
+    _add(record, case, "eager", eager, expected)
     if not compiles:
         return
     try:
@@ -139,24 +138,15 @@ def _both(record: Record, case: str, producer: Producer, nodes: Nodes, compiles:
         reason = str(error).strip().splitlines()
         record.note(f"{case}: not compiled: {reason[0] if reason else type(error)}")
         return
-    _add(record, case, "compiled", compiled, expected, timing)
+    _add(record, case, "compiled", compiled, expected)
 
 
-def _add(
-    record: Record,
-    case: str,
-    who: str,
-    run: Callable[[], Tensor],
-    expected: Tensor,
-    eager: float | None = None,
-) -> float:
+def _add(record: Record, case: str, who: str, run: Callable[[], Tensor], expected: Tensor) -> None:
     timing = clock(run, record.settings)
-    apart = (run() - expected).abs().max() / expected.abs().max().clamp(min=1e-30)
+    apart = (timing.last - expected).abs().max() / expected.abs().max().clamp(min=1e-30)
     rates = {
         "bricks_per_second": 1e3 * len(expected) / timing.median,
         "voxels_per_second": 1e3 * len(expected) * 1000 / timing.median,
         "max_difference": float(apart),
     }
-    times = {} if eager is None else {"times": timing.median / eager}
-    record.add(case, who, timing, **rates, **times)
-    return timing.median
+    record.add(case, who, timing, **rates, **record.beside_first(case, timing))

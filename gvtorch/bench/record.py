@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import platform
 import re
@@ -21,11 +22,22 @@ from .. import __version__
 from ..base import check
 from ..ops.trace import choose_backend
 
+#: What else does the same, by the names of `--peers`, and what must be installed for it.
+PEERS = {
+    "grid_sample": "torch",
+    "warp": "warp-lang",
+    "drjit": "drjit",
+    "vtk": "vtk",
+    "tensorstore": "zarr",  # which writes the chunks that are read
+    "zarr": "zarr",
+    "pyfastnoiselite": "pyfastnoiselite",
+    "pyfastnoisesimd": "pyfastnoisesimd",
+    "trimesh": "trimesh",
+    "igl": "libigl",
+    "viser": "viser",
+    "trame": "trame-vtk",
+}
 _DISTURBED = 0.05  # share of the cores that others may take unnoticed
-
-
-def silent(_what: str) -> None:
-    """Does nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,10 +51,9 @@ class Settings:
     peers: tuple[str, ...] | None = None  # None: all that are installed
     only: str = ""  # cases whose name holds it
     pictures: Path | None = None  # a folder for the pictures that were compared
-    tell: Callable[[str], None] = silent  # told what is done now
+    tell: Callable[[str], None] = lambda _: None  # told what is done now
 
     def __post_init__(self) -> None:
-        """Checks numbers and device."""
         check.whole("bench", "repeats", self.repeats, low=1)
         check.number("bench", "seconds", self.seconds, low=0)
         if self.device.type == "cuda":
@@ -57,6 +68,7 @@ class Timing:
     low: float
     high: float
     repeats: int
+    last: Any = None  # what the last call gave
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the columns of a row."""
@@ -81,23 +93,26 @@ def clock(
     """
     device = settings.device
     times: list[float] = []
-    began = 0.0
+    began, last = 0.0, None
     for number in range(settings.repeats + 1):
         if prepare is not None:
             prepare()
         synchronize(device)
-        times.append(once(run, device, calls) / calls)
+        last = None
+        milliseconds, last = once(run, device, calls)
+        times.append(milliseconds / calls)
         if number == 0:
             times.clear()  # the warm-up
             began = time.perf_counter()
         elif time.perf_counter() - began > settings.seconds:
             break
-    return spread(times)
+    return spread(times, last)
 
 
-def spread(milliseconds: list[float]) -> Timing:
+def spread(milliseconds: list[float], last: Any = None) -> Timing:
     """Returns median, smallest and largest of some times."""
     return Timing(
+        last=last,
         median=statistics.median(milliseconds),
         low=min(milliseconds),
         high=max(milliseconds),
@@ -105,21 +120,23 @@ def spread(milliseconds: list[float]) -> Timing:
     )
 
 
-def once(run: Callable[[], object], device: torch.device, calls: int = 1) -> float:
-    """Returns the milliseconds of some calls in a row."""
+def once(run: Callable[[], Any], device: torch.device, calls: int = 1) -> tuple[float, Any]:
+    """Returns the milliseconds of some calls in a row, and what the last one gave."""
     if device.type == "cuda":
         first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         with torch.cuda.device(device):
             first.record()
-            for _ in range(calls):
+            for _ in range(calls - 1):
                 run()
+            given = run()
             last.record()
         last.synchronize()
-        return first.elapsed_time(last)
+        return first.elapsed_time(last), given
     start = time.perf_counter()
-    for _ in range(calls):
+    for _ in range(calls - 1):
         run()
-    return 1e3 * (time.perf_counter() - start)
+    given = run()
+    return 1e3 * (time.perf_counter() - start), given
 
 
 def synchronize(device: torch.device) -> None:
@@ -139,7 +156,6 @@ class Record:
     """
 
     def __init__(self, workload: str, settings: Settings) -> None:
-        """Has measured nothing yet."""
         self.workload, self.settings = workload, settings
         self.rows: list[dict[str, Any]] = []
         self.peers: dict[str, str] = {}
@@ -150,10 +166,24 @@ class Record:
         return self.settings.only in case
 
     def add(self, case: str, who: str, timing: Timing | None = None, **figures: Any) -> None:
-        """Takes a row."""
         self.rows.append(
             {"case": case, "who": who, **(timing.as_dict() if timing else {}), **figures}
         )
+
+    def beside_first(self, case: str, timing: Timing) -> dict[str, float]:
+        """Returns how many times as long it took as the case's first row; nothing of the first."""
+        first = next((row for row in self.rows if row["case"] == case), None)
+        return {} if first is None else {"times": timing.median / first["ms"]}
+
+    def has_peer(self, name: str, module: str = "", why_not: str = "") -> bool:
+        """Tells whether a peer is wanted and can run, which is kept in `peers`; `module` is what it
+        needs, if that has another name, `why_not` what else stands in its way.
+        """
+        if self.settings.peers is not None and name not in self.settings.peers:
+            return False
+        here = importlib.util.find_spec(module or name) is not None
+        self.peers[name] = why_not or ("ran" if here else f"not installed ({PEERS[name]})")
+        return self.peers[name] == "ran"
 
     def note(self, sentence: str) -> None:
         """Takes a note, once."""

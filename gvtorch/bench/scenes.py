@@ -125,6 +125,16 @@ def aneurism(side: int) -> BenchScene:
     return BenchScene(name="aneurism", volume=volume, shader=vessels, surface=76.0)
 
 
+def scan_or_fog(side: int, note: Callable[[str], None] | None = None) -> BenchScene:
+    """The scan; fog where it is not here, which is noted."""
+    try:
+        return aneurism(side)
+    except FileNotFoundError:
+        if note is not None:
+            note("the scan comes with the source and is not here: fog takes its place")
+        return fog_dense(side)
+
+
 def worn_planes(side: int) -> Iterator[np.ndarray]:
     """A sphere worn by gyroids of five scales, a solid with holes, as uint8 planes (y, x) from low
     z to high.
@@ -155,9 +165,8 @@ def worn(side: int) -> BenchScene:
 _FOG = TransferFunction.from_points([(0, 0), (255, 0.004)], [(0, 1, 0.5, 0), (255, 0, 0.5, 1)])
 _SOLID = TransferFunction.from_points([(20, 0), (120, 1)])
 
-Maker = Callable[[int], BenchScene]
 #: Scenes of `march`, by name.
-SCENES: dict[str, Maker] = {
+SCENES: dict[str, Callable[[int], BenchScene]] = {
     "fog dense": fog_dense,
     "fog sparse": fog_sparse,
     "shell dense": shell_dense,

@@ -35,7 +35,7 @@ from ..shaders import (
 from ..shaders.built_in import BY_NAME
 from ..tracing import Lighting, trace
 from .march import Size, difference, op_milliseconds, rates, rgba
-from .record import Record, Settings, Timing, clock
+from .record import Record, clock
 from .scenes import BenchScene, aneurism, fog_dense, worn
 
 _WIDE = 16  # numbers of the widest channel
@@ -195,19 +195,9 @@ def _measure(
     others: Mapping[str, Tensor],
     prepare: Callable[..., object] | None = None,
 ) -> dict[str, Tensor]:
-    """Adds a row for each look that is wanted and that the channels allow.
-
-    Args:
-        record: Takes the rows.
-        case: Of the rows.
-        scene: What is shown.
-        channels: Names of those that the scene has.
-        frame: Renders one frame with a shader and options.
-        others: Pictures by look, with which those of this case are compared.
-        prepare: Called before a look is timed, as `frame` is.
-
-    Returns:
-        The pictures (r, 4) by look.
+    """Adds a row for each look that is wanted and that the channels allow; returns the pictures
+    (r, 4) by look. `frame` renders one frame with a shader and options, `prepare` is called before
+    it is timed, and `others` are pictures by look that are compared with those of this case.
     """
     medians: dict[str, float] = {}
     pictures: dict[str, Tensor] = {}
@@ -225,7 +215,8 @@ def _measure(
         if prepare is not None:
             prepare(shader, **options)
         run = partial(frame, shader, **options)
-        timing, shown = _clock(run, record.settings)
+        timing = clock(run, record.settings)
+        shown = timing.last  # a module's takes long, and is not made again
         medians[look.name], pictures[look.name] = timing.median, rgba(shown)
         figures = {"beside": look.beside, "times": timing.median / medians[look.beside]}
         figures |= rates(shown, timing)
@@ -241,16 +232,6 @@ def _compiles(device: torch.device) -> bool:
     """Whether a header can be compiled for a device."""
     host = shutil.which(compilers.find_cxx()[0])
     return bool(host and (device.type == "cpu" or compilers.find_nvcc()))
-
-
-def _clock(run: Callable[[], Hits | Picture], settings: Settings) -> tuple[Timing, Hits | Picture]:
-    """Returns the time of a call and what it gave: a module's takes long, and is not made again."""
-    given: list[Hits | Picture] = []
-
-    def call() -> None:
-        given[:] = [run()]
-
-    return clock(call, settings), given[0]
 
 
 def _wanted(record: Record, case: str) -> list[ShaderCase]:

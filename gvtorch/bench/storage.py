@@ -8,7 +8,6 @@ the same voxels and gather each bordered block from them and their neighbours.
 from __future__ import annotations
 
 import functools
-import importlib.util
 import os
 import shutil
 import tempfile
@@ -22,7 +21,6 @@ import numpy as np
 
 from ..io.stores.conversion import convert as convert_volume
 from ..io.stores.store import Store
-from . import PEERS
 from .record import Record, clock, spread
 
 _BLOCK = 32
@@ -59,16 +57,13 @@ def blocks(record: Record) -> None:
         grid = np.argwhere((cells[..., 0, 0] != cells[..., 1, 0])[::4, ::4, ::4])
         rng = np.random.default_rng(4)
         for count, case in cases.items():
-            median = 0.0
             for who, read in readers.items():
                 if who == "zarr" and count > 64:
                     continue
                 settings.tell(f"{case}: {who}")
                 timing = clock(functools.partial(_read, read, rng, grid, count), settings)
-                median = median or timing.median
-                rate = 1e3 * count / timing.median
-                more = {} if who == "gvtorch" else {"times": timing.median / median}
-                record.add(case, who, timing, blocks_per_second=rate, **more)
+                rate, times = 1e3 * count / timing.median, record.beside_first(case, timing)
+                record.add(case, who, timing, blocks_per_second=rate, **times)
     record.note("peers read aligned chunks of the same size and gather; zarr, 64 at most")
 
 
@@ -94,12 +89,8 @@ def _raw(folder: Path, side: int) -> Path:
 def _readers(record: Record, folder: Path, store: Store) -> Iterator[tuple[str, Reader]]:
     """Who reads, ours first, and how."""
     yield "gvtorch", lambda zyx: store.read_blocks(0, zyx)
-    wanted = record.settings.peers
-    here = importlib.util.find_spec("zarr") is not None
-    for name in ("tensorstore", "zarr"):
-        if wanted is None or name in wanted:
-            record.peers[name] = "ran" if here else f"not installed ({PEERS[name]})"
-    if not here or not record.peers:
+    peers = [name for name in ("tensorstore", "zarr") if record.has_peer(name, "zarr")]
+    if not peers:
         return
     import tensorstore as ts
     import zarr
@@ -107,7 +98,7 @@ def _readers(record: Record, folder: Path, store: Store) -> Iterator[tuple[str, 
     side = store.extent[0]
     aligned = folder / "aligned.zarr"
     _write_aligned(aligned, store)
-    if "tensorstore" in record.peers:
+    if "tensorstore" in peers:
         spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{aligned}/"}}
         array = ts.open(spec).result()
 
@@ -116,7 +107,7 @@ def _readers(record: Record, folder: Path, store: Store) -> Iterator[tuple[str, 
                 future.result()
 
         yield "tensorstore", batch
-    if "zarr" in record.peers:
+    if "zarr" in peers:
         plain = zarr.open_array(aligned, mode="r")
         yield "zarr", lambda zyx: _gather(lambda place: plain[place], zyx, side)
 
@@ -172,17 +163,14 @@ class Memory:
     """
 
     def __init__(self) -> None:
-        """Starts at nothing."""
         self.most, self.first, self._ends = 0, 0, threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> Memory:
-        """Starts to look."""
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Ends."""
         self._ends.set()
         self._thread.join()
 

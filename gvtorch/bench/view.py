@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.util
 import io
 import json
 import math
 import statistics
 import struct
 import time
+from contextlib import closing
 from typing import Any
 
 import torch
 
-from . import PEERS, Unavailable, browser
+from . import Unavailable, browser
 from .peers.pages import DIFFERS, NEEDS, PAGES, Site, served
 from .record import Record, spread
-from .scenes import BenchScene, aneurism, fog_dense
+from .scenes import BenchScene, scan_or_fog
 
 _RATES = (25.0, 60.0)  # pictures a second that are wanted
 _HELD = 1 / 60  # seconds between camera messages, as of a hand that drags
@@ -31,11 +31,7 @@ def view(record: Record) -> None:
     except ImportError as error:
         raise Unavailable(f"view needs {error.name}: pip install 'gvtorch[view]'") from None
     quick = record.settings.quick
-    try:
-        scene = aneurism(32 if quick else 256)
-    except FileNotFoundError:
-        scene = fog_dense(32 if quick else 256)
-        record.note("the scan comes with the source and is not here: fog takes its place")
+    scene = scan_or_fog(32 if quick else 256, record.note)
     sizes = ((48, 32),) if quick else ((960, 540), (1920, 1080))
     for size in sizes:
         for rate in _RATES[:1] if quick else _RATES:
@@ -56,17 +52,10 @@ def _turn(record: Record, case: str, scene: BenchScene, size: tuple[int, int], r
     from ..viewer.view import new_session
 
     options: dict[str, Any] = {"device": record.settings.device}
-    session = new_session(scene.volume, scene.shader, scene.camera(*size), engine=options)
-    try:
-        server = Server(session)
-        try:
-            seconds = 0.5 if record.settings.quick else min(10.0, record.settings.seconds)
-            found = asyncio.run(_page(server.url, size, rate, seconds))
-        finally:
-            server.close()
-    finally:
-        session.close()
-    waited, first, rest, shares, lasted = found
+    seconds = 0.5 if record.settings.quick else min(10.0, record.settings.seconds)
+    opened = new_session(scene.volume, scene.shader, scene.camera(*size), engine=options)
+    with closing(opened) as session, closing(Server(session)) as server:
+        waited, first, rest, shares, lasted = asyncio.run(_page(server.url, size, rate, seconds))
     record.add(
         case,
         "page",
@@ -87,11 +76,8 @@ def _beside(record: Record, scene: BenchScene, sizes: tuple[tuple[int, int], ...
     """The pages of peers and ours in a browser, turned by the same hand."""
     settings = record.settings
     why = browser.absent()
-    for name, module in NEEDS.items():
-        if settings.peers is None or name in settings.peers:
-            here = importlib.util.find_spec(module) is not None
-            record.peers[name] = why or ("ran" if here else f"not installed ({PEERS[name]})")
-    shown = [one for one in PAGES if record.peers.get(one.split()[0]) == "ran"]
+    peers = [name for name, module in NEEDS.items() if record.has_peer(name, module, why)]
+    shown = [one for one in PAGES if one.split()[0] in peers]
     if why:
         record.note(f"in a browser: left out, {why}")
     if why or (settings.quick and not shown):
@@ -107,7 +93,6 @@ def _beside(record: Record, scene: BenchScene, sizes: tuple[tuple[int, int], ...
                 continue
             side = scene.volume.extent[0]
             site = Site(side=side, size=size, device=str(settings.device), threads=threads)
-            median = 0.0
             for who in ("gvtorch", *shown):
                 settings.tell(f"view: {case}: {who}")
                 try:
@@ -119,10 +104,8 @@ def _beside(record: Record, scene: BenchScene, sizes: tuple[tuple[int, int], ...
                     record.note(f"{case}: {who}: {' '.join(str(error).split())[:120]}")
                     continue
                 timing = spread(seen.waited)
-                median = median or timing.median
-                more = {} if who == "gvtorch" else {"times": timing.median / median}
                 rate = {"p95_ms": _p95(seen.waited), "pictures_per_second": seen.rate}
-                record.add(case, who, timing, **rate, **more)
+                record.add(case, who, timing, **rate, **record.beside_first(case, timing))
                 record.note(f"{who}: {DIFFERS[who]}")
     record.note(
         "in a browser: ms from a jump of the pointer, after 0.4 s of dragging, to the first of the "

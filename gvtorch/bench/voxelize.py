@@ -7,7 +7,6 @@ The mesh is made up: a sphere with bumps, of as many triangles as are asked for.
 from __future__ import annotations
 
 import functools
-import importlib.util
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +17,6 @@ import torch
 from ..io.mesh_source import voxelize as voxelize_store
 from ..meshes.mesh import Mesh
 from ..meshes.voxelizer import Voxelizer
-from . import PEERS
 from .record import Record, clock
 from .storage import clock_store
 
@@ -35,18 +33,13 @@ def voxelize(record: Record) -> None:
     case = f"{count}, {side}^3 in memory"
     if record.wants(case):
         settings.tell(case)
-        filled = [0.0]
-
-        def run() -> None:
-            filled[0] = _volume(Voxelizer(mesh, resolution=side, device=device))
-
-        timing = clock(run, settings)
+        timing = clock(lambda: _volume(Voxelizer(mesh, resolution=side, device=device)), settings)
         a, b, c = mesh.corners.transpose(1, 0, 2)
         volume = float((a * np.cross(b, c)).sum() / 6)
         record.add(
             *(case, "gvtorch", timing),
             voxels_per_second=1e3 * side**3 / timing.median,
-            max_difference=abs(filled[0] - volume) / volume,
+            max_difference=abs(timing.last - volume) / volume,
         )
     case = f"{count}, {side}^3 to a store"
     if record.wants(case):
@@ -80,24 +73,20 @@ def _peers(record: Record, mesh: Mesh, side: int) -> None:
     for; a filled grid of as many voxels, which trimesh makes.
     """
     settings = record.settings
-    wanted = settings.peers
-    runs: dict[str, Callable[[], object]] = {}
     case = f"{len(mesh.faces):,} triangles, {side}^3 beside peers"
     if not record.wants(case):
         return
     grid = Voxelizer(mesh, resolution=side, device=settings.device)
-    runs["gvtorch"] = lambda: _volume(Voxelizer(mesh, resolution=side, device=settings.device))
-    for name in ("trimesh", "igl"):
-        if wanted is None or name in wanted:
-            here = importlib.util.find_spec(name) is not None
-            record.peers[name] = "ran" if here else f"not installed ({PEERS[name]})"
-    if record.peers.get("trimesh") == "ran":
+    runs: dict[str, Callable[[], object]] = {
+        "gvtorch": lambda: _volume(Voxelizer(mesh, resolution=side, device=settings.device))
+    }
+    if record.has_peer("trimesh"):
         import trimesh
 
         other = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
         runs["trimesh"] = lambda: other.voxelized(grid.spacing).fill()
         record.note("trimesh: voxelized().fill(): whole voxels, by cutting triangles until small")
-    if record.peers.get("igl") == "ran":
+    if record.has_peer("igl"):
         import igl
 
         at = [
@@ -106,15 +95,13 @@ def _peers(record: Record, mesh: Mesh, side: int) -> None:
         place = np.stack(np.meshgrid(*at, indexing="ij"), -1).reshape(-1, 3)[::64]
         runs["igl"] = lambda: igl.signed_distance(place, mesh.vertices, mesh.faces)
         record.note("igl: signed_distance of every 64th voxel's centre, its rate for all")
-    median = 0.0
     for who, run in runs.items():
         settings.tell(f"{case}: {who}")
         timing = clock(run, settings)
-        median = median or timing.median
         share = 64 if who == "igl" else 1
-        more = {} if who == "gvtorch" else {"times": share * timing.median / median}
+        times = {name: share * one for name, one in record.beside_first(case, timing).items()}
         rate = 1e3 * side**3 / share / timing.median
-        record.add(case, who, timing, voxels_per_second=rate, **more)
+        record.add(case, who, timing, voxels_per_second=rate, **times)
 
 
 def bumps(faces: int) -> Mesh:

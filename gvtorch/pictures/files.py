@@ -8,11 +8,9 @@ introduction).
 from __future__ import annotations
 
 import errno
-import os
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +26,7 @@ from .tone import finite, to_srgb
 if TYPE_CHECKING:
     Layers = dict[str, np.ndarray]  # color (h, w, 3), alpha, depth, samples (h, w, 1)
 
-_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
+_STRIP = 256  # rows of a PNG that are filtered at once
 _BITS = {".png": (8, 16), ".tif": (8, 16, 32), ".exr": (32, 16), ".npy": (32,), ".npz": (32,)}
 
 
@@ -57,25 +55,15 @@ def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | No
         elif path.suffix == ".npy":
             save_npy(part, stacked(layers))
         elif path.suffix == ".exr":
-            _write_exr(part, layers, bits)
-        elif path.suffix == ".tif":
-            image = tiff_pixels(side_by_side(layers), transparent, bits)
-            write_tiff(part, image.shape, image.dtype, [image], len(image))
+            _write_exr(part, side_by_side(layers), bits)
         else:
-            write_png(part, layers, transparent=transparent, bits=bits)
-
-
-@contextmanager
-def _as_os_errors() -> Iterator[None]:
-    """Raises OSError for whatever a library raises when it can't write."""
-    try:
-        yield
-    except (OSError, MemoryError):
-        raise
-    except Exception as error:
-        text = one_line(error)
-        number = errno.ENOSPC if "No space left" in text else errno.EIO
-        raise OSError(number, text) from None
+            image = file_pixels(side_by_side(layers), transparent, bits)
+            if path.suffix == ".tif":
+                write_tiff(part, image.shape, image.dtype, [image], len(image))
+            else:
+                tops = range(0, len(image), _STRIP)
+                strips = (image[top : top + _STRIP] for top in tops)
+                write_png_rows(part, image.shape, bits, strips)
 
 
 def side_by_side(layers: Layers) -> Layers:
@@ -107,26 +95,12 @@ def display_pixels(color: Tensor, alpha: Tensor | None, bits: int) -> np.ndarray
     return whole.contiguous().numpy().astype(np.uint8 if bits == 8 else np.uint16)
 
 
-def tiff_pixels(layers: Layers, transparent: bool, bits: int) -> np.ndarray:
+def file_pixels(layers: Layers, transparent: bool, bits: int) -> np.ndarray:
     """Returns what a TIFF or PNG holds: (h, w, 3), or (h, w, 4) if transparent."""
     color, alpha = (torch.from_numpy(layers[name]) for name in ("color", "alpha"))
     if bits == 32:
         return torch.cat((color, alpha) if transparent else (color,), -1).numpy()
     return display_pixels(color, alpha if transparent else None, bits)
-
-
-def write_png(path: Path, layers: Layers, *, transparent: bool, bits: int = 8) -> None:
-    """Writes sRGB, with straight alpha if transparent."""
-    from kornia_rs.io import write_image_png_u8, write_image_png_u16
-
-    image = np.ascontiguousarray(tiff_pixels(side_by_side(layers), transparent, bits))
-    write = write_image_png_u8 if bits == 8 else write_image_png_u16
-    with _as_os_errors():
-        write(str(path), image, "rgba" if transparent else "rgb")
-    with path.open("rb") as file:  # of the last bytes that find no place on disk it tells nothing
-        file.seek(-min(len(_PNG_END), path.stat().st_size), os.SEEK_END)
-        if file.read() != _PNG_END:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def write_png_rows(
@@ -189,7 +163,7 @@ def write_tiff(
 
 
 def _write_exr(path: Path, layers: Layers, bits: int) -> None:
-    OpenEXR, layers = need_library(".exr", "OpenEXR", extra="image"), side_by_side(layers)
+    OpenEXR = need_library(".exr", "OpenEXR", extra="image")
     kind = np.float16 if bits == 16 else np.float32
     light = np.concatenate((layers["color"], layers["alpha"]), -1)
     if bits == 16:
@@ -198,5 +172,11 @@ def _write_exr(path: Path, layers: Layers, bits: int) -> None:
     channels["Z"] = np.ascontiguousarray(layers["depth"][..., 0])
     channels["samples"] = layers["samples"][..., 0].astype(np.uint32, "C")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with _as_os_errors():
+    try:
         OpenEXR.File(header, channels).write(str(path))
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:  # whatever the library raises when it can't write
+        text = one_line(error)
+        number = errno.ENOSPC if "No space left" in text else errno.EIO
+        raise OSError(number, text) from None

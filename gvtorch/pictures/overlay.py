@@ -17,8 +17,9 @@ from torch import Tensor
 from ..base import check
 from ..base.messages import need_library
 from ..base.units import unit_symbol
+from .files import display_pixels
 from .picture import Picture
-from .tone import from_srgb, to_srgb
+from .tone import from_srgb
 
 _PART = 36  # of the picture's shorter side: the height of letters
 _SMALLEST = 9  # pixels of a letter
@@ -226,17 +227,12 @@ class _Pen:
         draw.rectangle(edge, fill=(255, 255, 255, 255))
         values = np.linspace(bar.high, bar.low, high)
         colors = torch.from_numpy(np.asarray(bar.colors(values), np.float32)[:, :3])
-        rows = _srgb8(colors)[:, None].repeat(size, 1)
+        rows = display_pixels(colors[:, None], None, 8).repeat(size, 1)
         sheet.paste(self._image.fromarray(rows), (left, top))
         if bar.title:
             self._warn_of_missing(bar.title)
             self._write(draw, (sheet.width - rim - 1, top - 0.6 * size), bar.title, "rb")
         return np.asarray(sheet)
-
-
-def _srgb8(color: Tensor) -> np.ndarray:
-    """Linear RGB (k, 3) as sRGB uint8."""
-    return (to_srgb(color[:, None])[:, 0] * 255).round().to(torch.uint8).numpy()
 
 
 def _round_below(length: float) -> float:

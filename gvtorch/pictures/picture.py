@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..base.records import RenderStats, to_device
-from .files import display_pixels, write_image, write_png
+from .files import display_pixels, write_image
 from .tone import ToneCurve, tone_map
 
 
@@ -92,8 +92,7 @@ class Picture:
         Raises:
             RuntimeError: There is no viewer; the message tells where the PNG lies.
         """
-        shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
-        if shell is not None and hasattr(shell, "kernel"):
+        if in_notebook():
             sys.modules["IPython"].display.display(self)
             return
         path = Path(tempfile.mkdtemp(prefix="gvtorch-")) / "picture.png"
@@ -139,10 +138,16 @@ class Picture:
         """Shows the picture in a notebook."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "picture.png"
-            write_png(path, self.layers(), transparent=self.transparent)
+            self.save(path)
             return path.read_bytes()
 
     def __repr__(self) -> str:
         *_, height, width, _ = self.color.shape
         count = "" if self.color.dim() == 3 else f"{self.color.shape[0]} x "
         return f"Picture({count}{width}x{height}, {self.stats.milliseconds:.0f} ms)"
+
+
+def in_notebook() -> bool:
+    """Tells whether what a cell gives is shown below it."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    return shell is not None and hasattr(shell, "kernel")

@@ -26,7 +26,7 @@ from ..base.stage import Progress, no_progress
 from ..base.whole_file import whole_file
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
-from .files import checked_path, stacked, tiff_pixels, write_png_rows, write_tiff
+from .files import checked_path, file_pixels, side_by_side, stacked, write_png_rows, write_tiff
 from .overlay import Overlay
 from .picture import Picture
 
@@ -220,7 +220,10 @@ def _write(
             for picture in everything:
                 file.write(stacked(picture.layers()).astype("<f4").tobytes())
         return
-    pixels = (_pixels(picture, bits) for picture in everything)
+    pixels = (
+        file_pixels(side_by_side(picture.layers()), picture.transparent, bits)
+        for picture in everything
+    )
     shape = (*size, 4 if first.transparent else 3)
     if suffix == ".png":
         write_png_rows(part, shape, bits, pixels)
@@ -233,11 +236,3 @@ def strip_rows(limit: int, width: int, height: int) -> int:
     """Returns how many rows of a picture are rendered at once within `limit` bytes."""
     most = limit // (_PIXEL_BYTES * width)
     return max(1, min(height, most - most % _TILE or most))
-
-
-def _pixels(picture: Picture, bits: int) -> np.ndarray:
-    rows = picture.color.shape[:-2].numel()
-    layers = {
-        name: layer.reshape(rows, *layer.shape[-2:]) for name, layer in picture.layers().items()
-    }
-    return tiff_pixels(layers, picture.transparent, bits)

@@ -6,7 +6,7 @@ SIGGRAPH 2002, eq. 4; Narkowicz, "ACES filmic tone mapping curve", 2016; IEC 619
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torch import Tensor
 from ..base import check
 
 ToneCurve = Literal["none", "reinhard", "aces"]
-CURVES = ("none", "reinhard", "aces")
+CURVES: tuple[ToneCurve, ...] = get_args(ToneCurve)
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear RGB with the primaries of Rec. 709
 
 

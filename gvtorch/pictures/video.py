@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -50,9 +49,9 @@ class Video:
         check.whole("Video", "fps", fps, low=1, high=_FASTEST_GIF if suffix == ".gif" else 1000)
         if suffix == ".mp4" and (width % 2 or height % 2):
             raise ValueError(f"Video: size must be even for .mp4, got {width}x{height}")
-        kind = _Mp4 if suffix == ".mp4" else _Loop
         self._stack = ExitStack()
-        self._film: _Film = kind(suffix, width, height, fps)
+        is_mp4 = suffix == ".mp4"
+        self._film = _Mp4(width, height, fps) if is_mp4 else _Loop(suffix, fps)
 
     def add(self, picture: Picture) -> None:
         """Appends a picture; raises ValueError if it is of another size, or a batch."""
@@ -63,7 +62,6 @@ class Video:
         self._film.add(pixels)
 
     def __enter__(self) -> Video:
-        """Returns itself."""
         self._film.open(self._stack.enter_context(whole_file(self._path)))
         self._stack.push(lambda kind, *_: self._film.close(whole=kind is None))
         return self
@@ -76,29 +74,11 @@ class Video:
         return f"Video({str(self._path)!r}, {self._size[0]}x{self._size[1]})"
 
 
-class _Film(ABC):
-    """A kind of file."""
+class _Mp4:
+    """Writes (h, w, 3) sRGB uint8 as they come, by PyAV."""
 
-    @abstractmethod
-    def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
-        """Loads its library."""
-
-    @abstractmethod
-    def open(self, part: Path) -> None:
-        """Takes the file to write."""
-
-    @abstractmethod
-    def add(self, pixels: np.ndarray) -> None:
-        """Appends (h, w, 3) sRGB uint8."""
-
-    @abstractmethod
-    def close(self, *, whole: bool) -> None:
-        """Writes what is left, if the film is whole."""
-
-
-class _Mp4(_Film):
-    def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
-        self._av = need_library(suffix, "av", "PyAV", "video")
+    def __init__(self, width: int, height: int, fps: int) -> None:
+        self._av = need_library(".mp4", "av", "PyAV", "video")
         self._size, self._fps = (width, height), fps
 
     def open(self, part: Path) -> None:
@@ -120,9 +100,10 @@ class _Mp4(_Film):
             self._file.close()
 
 
-class _Loop(_Film):
-    def __init__(self, suffix: str, width: int, height: int, fps: int) -> None:
-        del width, height
+class _Loop:
+    """Keeps them until the film is whole, which Pillow writes."""
+
+    def __init__(self, suffix: str, fps: int) -> None:
         need_library(suffix, "PIL", "Pillow", "video")
         from PIL import Image
 

@@ -38,7 +38,6 @@ class Bench:
     """keep the pictures that were compared"""
 
     def run(self) -> None:
-        """Runs and prints."""
         from ..bench import WORKLOADS, Unavailable
 
         if self.name is None:

@@ -31,13 +31,11 @@ from ..io.stores.ngff import is_zarr
 from .bench import Bench
 from .common import Bar, ReadOptions, flags_given, refuse_for_store, volume_formats
 from .fly import Fly
-from .making import Making, told_store
+from .making import Making, Splat, Voxelize, told_store
 from .render import Render
 from .slice import Slice
-from .splat import Splat
 from .surface import Surface
 from .view import View
-from .voxelize import Voxelize
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +49,6 @@ class Info:
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
-        """Prints the answer."""
         if self.path is None:
             flags = flags_given(self.source)
             if flags:
@@ -104,7 +101,6 @@ class Convert:
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
-        """Converts, or tells what it would take."""
         from ..io.stores.conversion import convert, estimate
 
         self.making.check()
@@ -149,12 +145,11 @@ class Filter:
     """where it is worked out; CUDA if left out, where it runs"""
 
     def run(self) -> None:
-        """Adds the colours."""
         from ..io.resources import amount
         from ..io.stores.store import Store
         from ..ops import unavailable
         from ..shaders import Filtered, Lit
-        from .colors import chosen_transfer
+        from .parse import chosen_transfer
 
         on_cuda = self.backend == "cuda" or (self.backend is None and not unavailable()["cuda"])
         start, store = time.perf_counter(), Store.open(self.store)
@@ -243,15 +238,8 @@ def _sparkline(counts: list[int]) -> str:
 
 
 _COMMANDS: dict[str, Any] = {
-    **{"info": Info, "view": View, "render": Render, "fly": Fly, "slice": Slice},
-    **{
-        "surface": Surface,
-        "convert": Convert,
-        "voxelize": Voxelize,
-        "splat": Splat,
-        "filter": Filter,
-    },
-    **{"bench": Bench},
+    one.__name__.lower(): one
+    for one in (Info, View, Render, Fly, Slice, Surface, Convert, Voxelize, Splat, Filter, Bench)
 }
 
 

@@ -59,18 +59,9 @@ class ReadOptions:
 
     def options(self) -> dict[str, Any]:
         """The options as arguments of `read_volume` and `convert`."""
-        return {
-            "shape": numbers("--shape", self.shape, 3, int) if self.shape else None,
-            "dtype": self.dtype,
-            "offset": self.offset,
-            "spacing": numbers("--spacing", self.spacing, 3, float) if self.spacing else None,
-            "key": self.key,
-            "axes": self.axes,
-            "time": self.time,
-            "oblique": self.oblique,
-            "nan": self.nan,
-            "labels": self.labels,
-        }
+        shape = numbers("--shape", self.shape, 3, int) if self.shape else None
+        spacing = numbers("--spacing", self.spacing, 3, float) if self.spacing else None
+        return {**vars(self), "shape": shape, "spacing": spacing}
 
 
 class Bar:
@@ -99,12 +90,10 @@ class Bar:
         self._timer.daemon = True
 
     def __enter__(self) -> Bar:
-        """Starts the clock."""
         self._timer.start()
         return self
 
     def __exit__(self, *_error: object) -> None:
-        """Takes the bar away."""
         self._timer.cancel()
         self._timer.join()
         if self._progress.live.is_started:
@@ -148,15 +137,8 @@ def open_data(path: str, source: ReadOptions, *, image: str | None, level: int) 
 
 
 def check_outputs(read: Mapping[str, Any], written: Mapping[str, Path | None]) -> None:
-    """Checks that a command writes over nothing that it reads, and each of its files once. Of a
-    folder that is read, all files in it count.
-
-    Args:
-        read: By flag, what is read: a path, FILE:NAME, or a text that is none.
-        written: By flag, the files or folders to write.
-
-    Raises:
-        ValueError: It would.
+    """Raises ValueError where a command would write over what it reads (a path, FILE:NAME, or a
+    text that is none; of a folder all files count), or one file twice. Both are told by flag.
     """
     sources: dict[Path, str] = {}
     for flag, text in read.items():
@@ -177,11 +159,7 @@ def check_outputs(read: Mapping[str, Any], written: Mapping[str, Path | None]) -
 
 
 def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:
-    """Returns `count` numbers out of a flag's text.
-
-    Raises:
-        ValueError: They are more, fewer, or no numbers.
-    """
+    """Returns `count` numbers out of a flag's text; raises ValueError if it holds others."""
     try:
         values = [kind(part) for part in text.split(",")]
     except ValueError:
@@ -193,11 +171,7 @@ def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:
 
 
 def size(text: str) -> tuple[int, int]:
-    """Returns width and height out of WIDTHxHEIGHT.
-
-    Raises:
-        ValueError: The text is something else.
-    """
+    """Returns width and height out of WIDTHxHEIGHT; raises ValueError if it is something else."""
     width, height = (whole_number(n) for n in text.lower().partition("x")[::2])
     if not width or not height:
         raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, got {text!r}")

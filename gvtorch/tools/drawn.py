@@ -30,23 +30,15 @@ class Drawn:
     annotate: Annotated[str | None, arg(metavar="TEXT")] = None
     """lines, \\n between them"""
 
-    def given(self) -> list[str]:
-        """Flags that are not left out."""
-        return flags_given(self)
-
     def overlay(
         self, shader: Shader, info: ImageInfo, component: int, camera: Camera, eye: Eye
     ) -> Overlay | None:
-        """Returns what is drawn over pictures of a camera in the world, whose eye is told too;
-        None where that is nothing.
-
-        Raises:
-            ValueError: The shader has no transfer function, the camera no scale, or there is no
-                room.
+        """Returns what is drawn over pictures of a camera in the world, whose eye is told too, or
+        None; raises ValueError if the shader has no bar, the camera no scale, or there is no room.
         """
         from ..pictures import Overlay
 
-        if not self.given():
+        if not flags_given(self):
             return None
         return Overlay(
             camera.width,
@@ -61,10 +53,10 @@ class Drawn:
 def _color_bar(shader: Shader, info: ImageInfo, component: int) -> ColorBar:
     """The bar of a shader's transfer function."""
     from ..pictures import ColorBar
-    from ..shaders import TransferFunction
+    from ..viewer.state import transfer_of
 
-    transfer = shader if isinstance(shader, TransferFunction) else getattr(shader, "transfer", None)
-    if not isinstance(transfer, TransferFunction):
+    transfer = transfer_of(shader)
+    if transfer is None:
         raise ValueError(f"--bar is for transfer functions, not for {type(shader).__name__}")
     values = [*transfer.opacity[:, 0], *transfer.color[:, 0]]
     told = [info.channels[component].name] if component < len(info.channels) else []

@@ -19,7 +19,7 @@ from ..base.digits import whole_number
 from ..base.messages import printable
 from ..base.whole_file import write_whole
 from ..io.stores.ngff import is_zarr
-from .common import Bar, check_outputs, size, volume_formats
+from .common import Bar, check_outputs, flags_given, size, volume_formats
 from .drawn import Drawn
 from .look import first_orbit, parse_camera, parse_orbit, stance
 from .scene import RenderedScene, SceneFlags
@@ -71,7 +71,6 @@ class Fly:
     drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
 
     def run(self) -> None:
-        """Renders frame after frame."""
         from ..base.stage import stage
         from ..base.trace import Trace
         from ..cameras import write_cameras
@@ -129,21 +128,10 @@ class Fly:
                 f"--output must be a folder or end in {kinds}, got {str(self.output)!r}"
             )
         flight = self.flight if self.flight != "orbit" else None
-        check_outputs(
-            {
-                "PATH": self.path,
-                "--state": self.state,
-                "--keys": self.keys,
-                "--path": flight,
-                **self.scene.look.files(),
-            },
-            {
-                "--output": self.output,
-                "--stats": self.stats,
-                "--poses": self.poses,
-                "--trace": self.trace,
-            },
-        )
+        read = {"PATH": self.path, "--state": self.state, "--keys": self.keys, "--path": flight}
+        written = {"--output": self.output, "--stats": self.stats, "--poses": self.poses}
+        files = self.scene.look.files()
+        check_outputs({**read, **files}, {**written, "--trace": self.trace})
         if is_film and options["background"] is None:
             raise ValueError(f"--background transparent is for pictures, not {self.output.suffix}")
 
@@ -168,17 +156,15 @@ class Fly:
         from ..viewer.state import Eye
 
         look = self.scene.look
-        first = parse_camera(None, look, width, height, scene.space)
+        first = parse_camera(None, look, width, height, scene.info.space)
         now = replace(scene.state(options), camera=Eye.of(first, scene.box))
         if self._saved is None:
             path = self._path(scene, width, height)
 
             def shot(at: float) -> tuple[ViewState, Camera, Picture]:
                 camera = path.camera(at, width, height, look.camera_model)
-                state = (
-                    replace(now, camera=Eye.of(camera, scene.box)) if self.drawn.given() else now
-                )
-                return state, camera, scene.render(camera)
+                eye = Eye.of(camera, scene.box) if flags_given(self.drawn) else now.camera
+                return replace(now, camera=eye), camera, scene.render(camera)
         else:
             flight = self._flight(now)
 
@@ -348,7 +334,7 @@ class Fly:
 
         if self.flight != "orbit":
             return self._keys()
-        text = self.orbit or first_orbit(scene.space)
+        text = self.orbit or first_orbit(scene.info.space)
         azimuth, elevation, distance = parse_orbit("--orbit", text)
         look = self.scene.look
         return CameraPath.orbit(
@@ -356,7 +342,7 @@ class Fly:
             azimuth=azimuth,
             elevation=elevation,
             distance=distance,
-            up=look.upward() or stance(scene.space)[0],
+            up=look.upward() or stance(scene.info.space)[0],
             fit=(width, height) if distance is None else None,
         )
 
@@ -371,7 +357,6 @@ class _Kept:
         self.cameras: dict[str, Camera] = {}
 
     def add(self, number: int, camera: Camera, picture: Picture) -> None:
-        """Keeps a picture."""
         name, told = f"{number:04d}.png", picture.stats.as_dict()
         self.cameras[name] = camera
         self.coarse += not told.get("converged", True)

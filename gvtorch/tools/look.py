@@ -11,10 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 from ..base.declared import declared_names
-from .colors import check_component, chosen_transfer
 from .common import flags_given, numbers
-from .image import parse_background
-from .light import parse_lighting
+from .parse import (
+    check_component,
+    chosen_transfer,
+    parse_background,
+    parse_channels,
+    parse_clip,
+    parse_lens,
+    parse_lighting,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -24,8 +30,7 @@ if TYPE_CHECKING:
     from ..cameras.camera import Up
     from ..cameras.models import CameraModel
     from ..io.stores.store import Store
-    from ..shaders import Channels, Labels, Shader, StoredColor
-    from ..tracing import Clip, ThinLens
+    from ..shaders import Shader, StoredColor
 
     ShaderName = str
 else:
@@ -113,17 +118,14 @@ class Look:
         """Fields of `RenderOptions`."""
         if self.shader in _WHOLE and self.stop_alpha != Look().stop_alpha:
             raise ValueError(f"--stop-alpha is for what adds up along a ray, not for {self.shader}")
+        names = ("step", "lod", "stop_alpha", "component", "backend")
         return {
-            "step": self.step,
-            "lod": self.lod,
+            **{name: getattr(self, name) for name in names},
             **({} if self.cone_scale is None else {"cone_scale": self.cone_scale}),
             "background": parse_background(self.background),
-            "stop_alpha": self.stop_alpha,
             "clip": None if self.clip is None else parse_clip(self.clip),
             "lens": None if self.lens is None else parse_lens(self.lens),
             "lighting": None if self.lighting is None else parse_lighting(self.lighting),
-            "component": self.component,
-            "backend": self.backend,
         }
 
     def files(self) -> dict[str, str | None]:
@@ -167,21 +169,6 @@ class Look:
             raise ValueError(f"--up must be +x, -x, +y, -y, +z, -z or X,Y,Z, got {self.up!r}")
         return numbers("--up", self.up, 3, float)
 
-    def _channels(self, data: Volume | Store) -> Channels:
-        """Returns the shader of an image's channels."""
-        from .channels import parse_channels
-
-        self._refuse("it takes --channel", "component")
-        return parse_channels(self.channel, data)
-
-    def _labels(self, data: Volume | Store) -> Labels:
-        """Returns the shader of labels."""
-        from ..shaders import Labels
-
-        self._refuse("labels have colours of their own")
-        check_component(data, self.component)
-        return Labels()
-
     def stored_colors(self, store: Store, names: tuple[str, ...]) -> StoredColor:
         """Returns the shader of a mesh's colours, and of its normals, if they are named."""
         from ..shaders import StoredColor
@@ -203,17 +190,20 @@ class Look:
         """Returns the shader asked for, its transfer function read, or spanned over the data; of
         labels, theirs.
         """
-        from ..shaders import Filtered, Lit, TransferFunction
+        from ..shaders import Filtered, Labels, Lit, TransferFunction
         from ..shaders.built_in import BY_NAME
 
         if self.shader == "channels":
-            return self._channels(data)
+            self._refuse("it takes --channel", "component")
+            return parse_channels(self.channel, data)
         if self.channel is not None:
             raise ValueError("--channel is for --shader channels")
         if self.shader == "colors":
             raise ValueError("--shader colors is for stores of meshes: --channels color,normal")
         if self.shader == "labels" or (self.shader == "plain" and data.info.labels):
-            return self._labels(data)
+            self._refuse("labels have colours of their own")
+            check_component(data, self.component)
+            return Labels()
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
         if self.shader == "isosurface":
@@ -273,11 +263,7 @@ def parse_camera(
 ) -> Camera:
     """Makes a camera from `orbit:AZ,EL`, `orbit:AZ,EL,DIST`, `look:ex,ey,ez,tx,ty,tz`, or
     `file:PATH` or `file:PATH,NAME`; `space` tells what is up, and where it stands, if they are left
-    out.
-
-    Raises:
-        ValueError: The text is none of these, or a number is out of its range.
-        FileNotFoundError: There is no such file.
+    out. Raises ValueError for anything else.
     """
     from ..cameras import Camera
 
@@ -318,35 +304,3 @@ def _camera_of_file(text: str, look: Look, width: int, height: int) -> Camera:
         known = ", ".join(list(cameras)[:5]) + (", ..." if len(cameras) > 5 else "")
         raise ValueError(f"--camera file:{path},NAME must name one of {known}, got {name!r}")
     return cameras[name]
-
-
-def parse_clip(text: str) -> Clip:
-    """Makes a clip from items such as `plane:0,0,1,0;cut:0,0,0,1,1,1;caps`.
-
-    Raises:
-        ValueError: An item is of no known kind, or its numbers are refused by `Clip`.
-    """
-    from ..tracing import Clip
-
-    found: dict[str, list[Any]] = {"plane": [], "box": [], "cut": []}
-    caps = False
-    for item in text.split(";"):
-        kind, _, rest = item.strip().partition(":")
-        if kind == "caps" and not rest:
-            caps = True
-        elif kind in found:
-            values = numbers(f"--clip {kind}", rest, 4 if kind == "plane" else 6, float)
-            found[kind].append(values if kind == "plane" else (values[:3], values[3:]))
-        else:
-            raise ValueError(f"--clip must hold plane:, box:, cut: or caps, got {item.strip()!r}")
-    return Clip(
-        planes=found["plane"], boxes=found["box"], without=found["cut"], frame="box", caps=caps
-    )
-
-
-def parse_lens(text: str) -> ThinLens:
-    """Makes a lens from `APERTURE,FOCUS`."""
-    from ..tracing import ThinLens
-
-    aperture, focus = numbers("--lens", text, 2, float)
-    return ThinLens(aperture=aperture, focus=focus, frame="box")

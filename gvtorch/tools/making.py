@@ -1,4 +1,6 @@
-"""`Making`: the flags of commands that make a store: who works, and how it is told of."""
+"""`gvtorch voxelize`, a mesh to a store, and `gvtorch splat`, points to one; `Making`, the flags of
+all commands that make a store: who works, and how it is told of.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from ..base.messages import printable
-from .common import Bar
+from .common import Bar, numbers
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..io.stores.store import Store
+
+_MESHES = "OBJ, PLY, STL, glTF or OFF, also with .gz behind"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +55,115 @@ class Making:
                 "resume": self.resume,
                 "progress": bar,
             }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Voxelize:
+    """Voxelize a mesh into a store, of any resolution: OME-Zarr with bordered blocks."""
+
+    path: Positional[Annotated[str, arg(metavar="MESH", help=f"the mesh: {_MESHES}")]]
+    output: Annotated[Path, arg(aliases=["-o"], metavar="STORE.zarr")]
+    """the folder to make"""
+    resolution: Annotated[int, arg(metavar="N")] = 1024
+    """voxels along the mesh's longest side"""
+    channels: Annotated[str, arg(aliases=["--channel"], metavar="NAME,NAME,...")] = "coverage"
+    """what a voxel holds, one or several: coverage, the filled share; distance, signed, up to the
+    band; color, premultiplied linear colour and opacity; normal, the surface's; material, labels.
+    color and normal together are drawn as they are, lit"""
+    texture: Annotated[Path | None, arg(metavar="IMAGE")] = None
+    """an image that is laid on all that has texture coordinates"""
+    band: Annotated[float, arg(metavar="VOXELS")] = 4.0
+    """how far from the surface distances, colours and normals are told"""
+    thickness: Annotated[float, arg(metavar="VOXELS")] = 1.0
+    """of parts that are not closed"""
+    solid: Literal["auto", "always", "never"] = "auto"
+    """auto: what is closed is a solid, all else a sheet; always: holes are filled; never: all is a
+    sheet"""
+    making: tyro.conf.OmitArgPrefixes[Making] = Making()
+
+    def run(self) -> None:
+        from ..io.mesh_source import voxelize
+        from ..io.stores.channels import channel_names
+        from ..io.stores.store import Store
+
+        start = time.perf_counter()
+        with self.making.working(speed=True) as work:
+            store = voxelize(
+                *(self.path, self.output),
+                resolution=self.resolution,
+                channels=tuple(name.strip() for name in self.channels.split(",")),
+                band=self.band,
+                thickness=self.thickness,
+                solid=self.solid,
+                texture=self.texture,
+                **work,
+            )
+        names = channel_names(self.output)
+        stores = [Store.open(self.output, image=name) for name in names] or [store]
+        print(told_store(self.output, stores, start))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Splat:
+    """Add points up in the voxels of a store, of any extent: OME-Zarr with bordered blocks."""
+
+    path: Positional[
+        Annotated[str, arg(metavar="POINTS", help="arrays (.npz), PLY, or a FITS table")]
+    ]
+    output: Annotated[Path, arg(aliases=["-o"], metavar="STORE.zarr")]
+    """the folder to make"""
+    extent: Annotated[str, arg(metavar="N or X,Y,Z", aliases=["--resolution"])] = "1024"
+    """voxels along the longest side, or along each"""
+    channels: Annotated[Literal["value", "color"], arg(aliases=["--channel"])] = "value"
+    """what a voxel holds: the sum of values; or light, the value times the colour, and opacity"""
+    opacity: Annotated[float, arg(metavar="SHARE")] = 1e-4
+    """of a point, for color"""
+    box: Annotated[str | None, arg(metavar="X,Y,Z,X,Y,Z")] = None
+    """world corners; points outside are left out; around all if left out"""
+    positions: Annotated[str | None, arg(metavar="NAMES")] = None
+    """columns, as in x,y,z; known by their names if left out, as are the next three"""
+    values: Annotated[str | None, arg(metavar="NAMES")] = None
+    """columns whose numbers add up"""
+    colors: Annotated[str | None, arg(metavar="NAMES")] = None
+    """columns, as in red,green,blue"""
+    radius: Annotated[str | None, arg(metavar="NAME or SIZE")] = None
+    """how far points reach: a column, or one number for all; if there is none, a voxel each"""
+    memory: Annotated[str, arg(metavar="BYTES")] = "1 GB"
+    """that sorting takes, roughly"""
+    making: tyro.conf.OmitArgPrefixes[Making] = Making()
+
+    def run(self) -> None:
+        from ..io.point_source import splat
+
+        start = time.perf_counter()
+        with self.making.working() as work:
+            store = splat(
+                self.path,
+                self.output,
+                opacity=self.opacity,
+                channel=self.channels,
+                memory=self.memory,
+                **work,
+                **self._places(),
+            )
+        print(told_store(self.output, [store], start))
+
+    def _places(self) -> dict[str, Any]:
+        """Extent, box and columns, those that are given."""
+        count = 3 if "," in self.extent else 1
+        extent = numbers("--extent", self.extent, count, int)
+        found: dict[str, Any] = {"extent": extent if count > 1 else extent[0]}
+        if self.box is not None:
+            corners = numbers("--box", self.box, 6, float)
+            found["box"] = (corners[:3], corners[3:])
+        for name in ("positions", "values", "colors", "radius"):
+            if (given := getattr(self, name)) is not None:
+                found[name] = given
+        try:
+            found["radius"] = float(self.radius or "")
+        except ValueError:
+            pass
+        return found
 
 
 def told_store(output: Path, stores: list[Store], start: float) -> str:

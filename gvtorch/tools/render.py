@@ -15,9 +15,8 @@ from tyro.conf import Positional, arg
 
 from ..base.messages import printable
 from ..base.whole_file import write_whole
-from .common import Bar, check_outputs, size, volume_formats
+from .common import Bar, check_outputs, flags_given, size, volume_formats
 from .drawn import Drawn
-from .image import KINDS, STRIPS, Develop, in_strips
 from .look import parse_camera
 from .scene import RenderedScene, SceneFlags
 from .streaming import cost_in_words
@@ -27,6 +26,41 @@ if TYPE_CHECKING:
     from ..cameras import Camera
     from ..pictures import Overlay, Picture
     from ..viewer.state import Eye, ViewState
+
+KINDS = (".png", ".exr", ".npy", ".npz", ".tif")
+STRIPS = (".npy", ".tif")  # written strip by strip: the picture may be larger than memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Develop:
+    """How the picture is developed."""
+
+    samples: Annotated[int, arg(metavar="N")] = 1
+    """rays a pixel, at places of their own"""
+    tone: Literal["none", "reinhard", "aces"] = "none"
+    """curve from scene light to the display"""
+    exposure: Annotated[float, arg(metavar="STOPS")] = 0.0
+    """the light is multiplied by 2^STOPS"""
+
+    def wrap(self, render: Callable[[Camera], Picture]) -> Callable[[Camera], Picture]:
+        """Returns what renders a camera with all samples, tone-mapped."""
+        from ..base import check
+        from ..pictures import Progressive
+        from ..pictures.tone import checked_curve
+
+        check.whole("render", "--samples", self.samples, low=1)
+        checked_curve("render", self.tone, self.exposure)
+
+        def developed(camera: Camera) -> Picture:
+            if self.samples > 1:
+                picture = Progressive(render).refine(camera, self.samples)
+            else:
+                picture = render(camera)
+            if self.tone == "none" and self.exposure == 0:
+                return picture
+            return picture.tone_map(self.tone, exposure=self.exposure)
+
+        return developed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +92,6 @@ class Render:
     drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
 
     def run(self) -> None:
-        """Reads, renders, writes."""
         look = self.scene.look
         width, height = size(look.size)
         self._check()
@@ -67,13 +100,13 @@ class Render:
         flags = self._at_saved_time()
         with Bar() as bar, flags.open(self.path, options, bar) as opened:
             if self.state is None:
-                camera = parse_camera(self.camera, look, width, height, opened.space)
-                stats = self._take(opened, camera, self._overlay(opened, camera, None), bar)
+                camera = parse_camera(self.camera, look, width, height, opened.info.space)
+                stats = self._take(opened, camera, None, bar)
             else:
                 now = opened.state(options).read(self.state)
-                stats = self._take_saved(opened, now, width, height, bar)
+                stats = self._take_saved(opened, now, bar)
         if self.stats is not None:
-            content = {**stats.as_dict(), "extent": opened.extent}
+            content = {**stats.as_dict(), "extent": opened.data.extent}
             write_whole(self.stats, json.dumps(content, indent=2) + "\n")
         print(f"{printable(self.output)}: {width}x{height}, {cost_in_words(stats)}")
 
@@ -82,59 +115,14 @@ class Render:
         source = self.scene.source
         if self.state is None or source.time is not None:
             return self.scene
-        from ..viewer.state import saved_time
+        from ..base import check
+        from ..viewer.state import saved_state
 
-        time = saved_time(self.state)
+        told = saved_state(self.state).get("time", 0.0)
+        time = check.number(f"{self.state}: state", "time", told)
         if time != int(time):
             raise ValueError(f"{self.state}: time must be the number of a time point, got {time:g}")
         return replace(self.scene, source=replace(source, time=int(time))) if time else self.scene
-
-    def _take_saved(
-        self, opened: RenderedScene, now: ViewState, width: int, height: int, bar: Bar
-    ) -> RenderStats:
-        """Takes the picture of a saved state, as a page shows it."""
-        own = {"shader": now.shader, **now.settings()}
-        render, cost = partial(opened.render, **own), partial(opened.cost, **own)
-        scene = replace(opened, shader=now.shader, render=render, cost=cost)
-        taking = replace(self, show=now.show, develop=Develop(**vars(now.develop)))
-        if now.composed:
-            return taking._take_composed(scene, now, width, height, bar)
-        camera = self._saved_camera(scene, now, width, height)
-        return taking._take(scene, camera, taking._overlay(scene, camera, now.camera), bar)
-
-    def _saved_camera(
-        self, scene: RenderedScene, now: ViewState, width: int, height: int
-    ) -> Camera:
-        """The camera of a saved state, for a picture of this size."""
-        if now.camera is None:
-            return parse_camera(None, self.scene.look, width, height, scene.space)
-        return now.camera.camera(width, height, scene.box)
-
-    def _take_composed(
-        self, scene: RenderedScene, now: ViewState, width: int, height: int, bar: Bar
-    ) -> RenderStats:
-        """Takes a picture with planes beside it or costs over it."""
-        from ..viewer.slices import Planes, panes
-        from ..viewer.state import blended
-
-        if self.drawn.given():
-            raise ValueError(
-                f"{self.drawn.given()[0]} is for a picture alone: {self.state} has slices or costs"
-            )
-        part = (width, height) if now.slices is None else panes(width, height)["view"][2:]
-        camera = self._saved_camera(scene, now, *part)
-        picture = self.develop.wrap(partial(scene.render, progress=bar))(camera)
-        whole = picture
-        if now.show != "picture":
-            whole = blended(picture, scene.cost(camera).picture(now.show), now.blend)
-        if now.slices is not None:
-            planes = Planes(scene.data, lambda problem: None)
-            whole = planes.composed(whole, now, width, height, wait=True).picture
-            planes.close()
-        whole.save(self.output, bits=self.bits)
-        if self.npz is not None:
-            picture.save(self.npz)
-        return picture.stats
 
     def _check_state(self) -> None:
         """Raises ValueError where a flag tells what a saved state does."""
@@ -143,7 +131,7 @@ class Render:
         from ..viewer.state import saved_state
 
         state = saved_state(self.state)
-        flags = self.scene.look.told_by(state) + self.develop.given()
+        flags = self.scene.look.told_by(state) + flags_given(self.develop)
         flags += ["--camera"] * (self.camera is not None) + ["--show"] * (self.show != "picture")
         if flags:
             raise ValueError(f"--state tells what {flags[0]} does: leave one out")
@@ -167,62 +155,94 @@ class Render:
             {"--output": self.output, "--npz": self.npz, "--stats": self.stats},
         )
         if self.show != "picture":
-            flags = (self.develop.given() if self.npz is None else []) + self.drawn.given()
+            flags = flags_given(self.drawn)
+            if self.npz is None:
+                flags = flags_given(self.develop) + flags
             if flags:
                 raise ValueError(f"{flags[0]} is for pictures, not for --show {self.show}")
 
+    def _take_saved(self, opened: RenderedScene, now: ViewState, bar: Bar) -> RenderStats:
+        """Takes the picture of a saved state, as a page shows it."""
+        from ..viewer.slices import panes
+
+        if now.composed and (flags := flags_given(self.drawn)):
+            raise ValueError(f"{flags[0]} is for a picture alone: {self.state} has slices or costs")
+        own = {"shader": now.shader, **now.settings()}
+        render, cost = partial(opened.render, **own), partial(opened.cost, **own)
+        scene = replace(opened, shader=now.shader, render=render, cost=cost)
+        taking = replace(self, show=now.show, develop=Develop(**vars(now.develop)))
+        width, height = size(self.scene.look.size)
+        if now.slices is not None:
+            _, _, width, height = panes(width, height)["view"]
+        if now.camera is None:
+            camera = parse_camera(None, self.scene.look, width, height, scene.info.space)
+        else:
+            camera = now.camera.camera(width, height, scene.box)
+        return taking._take(scene, camera, now, bar)
+
+    def _take(
+        self, scene: RenderedScene, camera: Camera, now: ViewState | None, bar: Bar
+    ) -> RenderStats:
+        """Renders and writes the files, strip by strip where the kind of file lets it; planes
+        beside the picture and costs over it as a saved state tells.
+        """
+        from ..pictures import render_tiles
+        from ..viewer.state import blended
+
+        composed = now is not None and now.composed
+        whole = self.npz is not None or self.show != "picture" or composed
+        strips = not whole and in_strips(self.output.suffix, camera.width, camera.height)
+        render = self.develop.wrap(scene.render if strips else partial(scene.render, progress=bar))
+        seen = False
+
+        def taken(camera: Camera) -> Picture:
+            nonlocal seen
+            picture = render(camera)
+            seen = seen or bool(picture.alpha.any())
+            return picture
+
+        overlay = self._overlay(scene, camera, None if now is None else now.camera)
+        if strips:
+            stats = render_tiles(
+                *(taken, camera, self.output), bits=self.bits, overlay=overlay, progress=bar
+            )
+        else:
+            picture = shown = taken(camera)
+            if self.show != "picture":
+                cost = scene.cost(camera).picture(self.show)
+                shown = blended(picture, cost, 1 if now is None else now.blend)
+            if now is not None and now.slices is not None:
+                from ..viewer.slices import Planes
+
+                planes = Planes(scene.data, lambda problem: None)
+                shown = planes.composed(shown, now, *size(self.scene.look.size), wait=True).picture
+                planes.close()
+            shown = shown if overlay is None else overlay.over(shown)
+            shown.save(self.output, bits=self.bits)
+            if self.npz is not None:
+                picture.save(self.npz)
+            stats = picture.stats
+        if not (seen or composed or self.show != "picture"):
+            ends = getattr(scene.data, "value_range", None)  # a store's is not known
+            known = "" if ends is None else f": values range from {ends[0]:g} to {ends[1]:g}"
+            warnings.warn(f"nothing is seen{known}", stacklevel=2)
+        return stats
+
     def _overlay(self, scene: RenderedScene, camera: Camera, eye: Eye | None) -> Overlay | None:
-        """What is drawn over the picture."""
         from ..viewer.state import Eye
 
         placed, component = camera.placed(scene.box), self.scene.look.component
         eye = Eye.of(camera, scene.box) if eye is None else eye
         return self.drawn.overlay(scene.shader, scene.info, component, placed, eye)
 
-    def _take(
-        self, scene: RenderedScene, camera: Camera, overlay: Overlay | None, bar: Bar
-    ) -> RenderStats:
-        """Renders and writes the files, strip by strip where the kind of file lets it."""
-        from ..pictures import render_tiles
 
-        whole = self.npz is not None or self.show != "picture"
-        if not whole and in_strips(self.output.suffix, camera.width, camera.height):
-            seen = _Seen(self.develop.wrap(scene.render))
-            stats = render_tiles(
-                *(seen, camera, self.output), bits=self.bits, overlay=overlay, progress=bar
-            )
-            seen.warn_of_nothing(scene)
-            return stats
-        seen = _Seen(self.develop.wrap(partial(scene.render, progress=bar)))
-        picture = seen(camera)
-        if self.show == "picture":
-            seen.warn_of_nothing(scene)
-        shown = picture if self.show == "picture" else scene.cost(camera).picture(self.show)
-        shown = shown if overlay is None else overlay.over(shown)
-        shown.save(self.output, bits=self.bits)
-        if self.npz is not None:
-            picture.save(self.npz)
-        return picture.stats
+def in_strips(suffix: str, width: int, height: int) -> bool:
+    """Whether a picture is written strip by strip; PNG where it is larger than one."""
+    from ..base import check
+    from ..pictures.progressive import STRIP, strip_rows
 
-
-class _Seen:
-    """Renders, and knows whether anything was seen."""
-
-    def __init__(self, render: Callable[[Camera], Picture]) -> None:
-        self._render, self._any = render, False
-
-    def __call__(self, camera: Camera) -> Picture:
-        """Renders a picture or a strip of one."""
-        picture = self._render(camera)
-        self._any = self._any or bool(picture.alpha.any())
-        return picture
-
-    def warn_of_nothing(self, scene: RenderedScene) -> None:
-        """Warns where nothing was seen."""
-        if not self._any:
-            ends = scene.values
-            known = "" if ends is None else f": values range from {ends[0]:g} to {ends[1]:g}"
-            warnings.warn(f"nothing is seen{known}", stacklevel=3)
+    rows = strip_rows(check.nbytes("render", "memory", STRIP), width, height)
+    return suffix in STRIPS or (suffix == ".png" and rows < height)
 
 
 def _check_suffix(flag: str, path: Path, *kinds: str) -> None:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from ..base.image_info import ImageInfo
     from ..base.volume import Volume
     from ..cameras import Camera
-    from ..engine import Engine
     from ..io.stores.store import Store
     from ..pictures import Picture
     from ..shaders import Shader
@@ -40,20 +39,12 @@ class RenderedScene:
     shader: Shader
     cost: Callable[..., Cost]
     box: Tensor  # (2, 3) float64 world
-    extent: tuple[int, ...]  # (x, y, z) voxels
-    values: tuple[float, float] | None  # the smallest and the largest, if known
     data: Volume | Store
-    engine: Engine | None = None  # of a store
 
     @property
     def info(self) -> ImageInfo:
         """What is known of the image."""
         return self.data.info
-
-    @property
-    def space(self) -> str | None:
-        """Where x, y and z point."""
-        return self.info.space
 
     def state(self, options: dict[str, Any]) -> ViewState:
         """What the flags say, as a state that has no camera."""
@@ -82,10 +73,8 @@ class SceneFlags:
 
     @contextmanager
     def open(self, path: str, options: dict[str, Any], bar: Bar) -> Iterator[RenderedScene]:
-        """Opens a volume or a store, to be rendered with these options.
-
-        Raises:
-            ValueError: A flag is for the other of both.
+        """Opens a volume or a store, to be rendered with these options; raises ValueError where a
+        flag is for the other of both.
         """
         bar("reading", 0, 0)
         if is_zarr(path):
@@ -121,29 +110,33 @@ class SceneFlags:
             partial(render, tree, shader=shader, **options),
             shader,
             partial(cost, tree, shader=shader, **options),
-            tree.box,
-            volume.extent,
-            volume.value_range,
-            volume,
+            *(tree.box, volume),
         )
+
+    def store(self, path: str) -> Store:
+        """Opens a store; raises ValueError where a flag is for volume files."""
+        if self.threshold is not None:
+            raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
+        refuse_for_store(self.source)
+        return self.streaming.store(path, self.source.time)
 
     @contextmanager
     def _stream(self, path: str, options: dict[str, Any]) -> Iterator[RenderedScene]:
         """Streams a store, and tells at last what failed."""
+        from ..engine.engine import Engine
         from ..tracing import cost
 
-        if self.threshold is not None:
-            raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
-        refuse_for_store(self.source)
-        streaming = self.streaming
-        store = streaming.store(path, self.source.time)
-        with streaming.open(store, self.look) as (engine, shader):
+        store, streaming, most = self.store(path), self.streaming, self.streaming.max_frames
+        mode = streaming.mode or "converge"
+        if mode != "converge" and most != Streaming().max_frames:
+            raise ValueError(f"--max-frames is for --mode converge, not {mode}")
+        producer, shader = streaming.content(store, self.look)
+        with Engine(producer, **streaming.memory(self.look, store)) as engine:
             (tree,) = (source.tree for source in engine.trees.values())
-            mode, most = streaming.mode or "converge", streaming.max_frames
             yield RenderedScene(
                 partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
                 shader,
                 partial(cost, tree, shader=shader, **options),
-                *(tree.box, tree.extent, None, store, engine),
+                *(tree.box, store),
             )
             tell_failures(engine)

@@ -10,9 +10,9 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..base.messages import printable
-from .colors import chosen_transfer, parse_window
 from .common import Bar, ReadOptions, check_outputs, open_data, volume_formats
-from .image import KINDS
+from .parse import chosen_transfer, parse_window
+from .render import KINDS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,6 @@ class Slice:
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
-        """Reads, colours, writes."""
         from ..pictures.files import checked_path
         from ..tracing import slice_picture
         from ..tracing.slices import radiological_views

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -111,17 +109,6 @@ class Streaming:
             "strict": self.strict,
             "device": look.device(),
         }
-
-    @contextmanager
-    def open(self, store: Store, look: Look) -> Iterator[tuple[Engine, Shader]]:
-        """Gives an engine over a store, and the transfer function."""
-        from ..engine.engine import Engine
-
-        if self.mode not in (None, "converge") and self.max_frames != type(self)().max_frames:
-            raise ValueError(f"--max-frames is for --mode converge, not {self.mode}")
-        producer, shader = self.content(store, look)
-        with Engine(producer, **self.memory(look, store)) as engine:
-            yield engine, shader
 
 
 def cost_in_words(stats: RenderStats) -> str:

@@ -35,7 +35,6 @@ class Surface:
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
-        """Reads, extracts, writes."""
         from ..io.resources import amount
         from ..io.surface import export_surface
         from ..io.surface_file import check_surface_path

@@ -11,12 +11,14 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..io.stores.ngff import is_zarr
-from .common import Bar, flags_given, refuse_for_store, volume_formats
+from .common import Bar, flags_given, volume_formats
 from .look import parse_camera
 from .scene import SceneFlags
 
 if TYPE_CHECKING:
+    from ..base.volume import Volume
     from ..cameras import Camera
+    from ..io.stores.store import Store
     from ..producers import Producer
     from ..shaders import Shader
     from ..viewer.scene import Scene
@@ -52,7 +54,6 @@ class View:
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
 
     def run(self) -> None:
-        """Opens the scene, and serves it until Ctrl-C."""
         from ..viewer import view
         from ..viewer.server import aiohttp_web
 
@@ -91,49 +92,43 @@ class View:
         look = self.scene.look
         parse_camera(self.camera, look, 16, 9)
         options = look.options()
+        source = replace(self.scene.source, time=self.scene.source.time or 0)
         with Bar() as bar:
             bar("reading", 0, 0)
-            scene, shader = self._store() if is_zarr(self.path) else self._volume()
+            scene, shader = self._scene(replace(self.scene, source=source))
         return scene, shader, parse_camera(self.camera, look, 16, 9, scene.info.space), options
 
-    def _store(self) -> tuple[Scene, Shader]:
-        from ..engine.engine import Engine
-        from ..viewer.scene import Scene, Series
-
-        if self.scene.threshold is not None:
-            raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
-        refuse_for_store(self.scene.source)
-        look, streaming = self.scene.look, self.scene.streaming
-        store = streaming.store(self.path, self.scene.source.time or 0)
-        producer, shader = streaming.content(store, look)
-        engine = Engine(producer, **streaming.memory(look, store))
-
-        def remake(data: Any) -> Producer:
-            return streaming.content(data, look)[0]
-
-        series = vars(Series.of(store))
-        return Scene(store.name, engine, data=store, remake=remake, **series), shader
-
-    def _volume(self) -> tuple[Scene, Shader]:
+    def _scene(self, flags: SceneFlags) -> tuple[Scene, Shader]:
+        """What a page looks at, of a time point, and its shader."""
         from ..engine.engine import Engine
         from ..producers import VolumeProducer
         from ..shaders import Filtered
-        from ..viewer.scene import Scene, Series
+        from ..viewer.scene import Scene, series_of
 
-        source = replace(self.scene.source, time=self.scene.source.time or 0)
-        look, volume = self.scene.look, source.read(self.path)
-        shader = look.chosen(volume)
-        filtered = shader if isinstance(shader, Filtered) else None
+        look, streaming = flags.look, flags.streaming
+        data: Volume | Store
+        if is_zarr(self.path):
+            data = store = flags.store(self.path)
+            producer, shader = streaming.content(store, look)
 
-        def make(data: Any) -> Producer:
-            return VolumeProducer(data, threshold=self.scene.threshold, filtered=filtered)
+            def remake(data: Any) -> Producer:
+                return streaming.content(data, look)[0]
 
-        engine = Engine(make(volume), **self.scene.streaming.memory(look, volume))
-        series = vars(Series.of(self.path, **source.options()))
-        return Scene(volume.name, engine, data=volume, remake=make, **series), shader
+            series = series_of(store)
+        else:
+            data = flags.source.read(self.path)
+            shader = look.chosen(data)
+            filtered = shader if isinstance(shader, Filtered) else None
+
+            def remake(data: Any) -> Producer:
+                return VolumeProducer(data, threshold=flags.threshold, filtered=filtered)
+
+            producer = remake(data)
+            series = series_of(self.path, **flags.source.options())
+        engine = Engine(producer, **streaming.memory(look, data))
+        return Scene(data.name, engine, data=data, remake=remake, **series), shader
 
     def _run_script(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
-        """What a script sets."""
         import runpy
 
         flags = [

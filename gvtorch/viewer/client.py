@@ -28,7 +28,7 @@ _STILL_FRAMES = 3  # frames without new data, after which a picture counts as fi
 
 
 class Interrupted(Exception):
-    """Something newer is to be shown."""
+    """Something newer is to be shown, or nobody waits any more."""
 
 
 def _nobody(_: str | bytes) -> None:
@@ -79,7 +79,6 @@ class Client:
     # The network's side.
 
     def tell(self, kind: str, **content: Any) -> None:
-        """Sends a text."""
         self._send(message_text(kind, **content))
 
     def ack(self, number: int) -> None:
@@ -259,7 +258,7 @@ class Client:
         if self._planes is not None:
             shown, layout, complete = self._planes.composed(shown, state, *self.size)
             final = final and complete
-        data = jpeg(shown, quality)
+        data = image_file(shown, "JPEG", quality=quality, subsampling=0 if quality > 90 else 2)
         head = {
             "number": self._frames,
             "camera": vars(self.eye),
@@ -288,11 +287,10 @@ class Client:
         return place.tolist()
 
 
-def jpeg(picture: Picture, quality: int) -> bytes:
-    """Returns a picture as a JPEG file."""
+def image_file(picture: Picture, kind: str, **options: Any) -> bytes:
+    """Returns a picture as a JPEG or PNG, made with Pillow's options."""
     from PIL import Image
 
     out = io.BytesIO()
-    image = Image.fromarray(picture.to_srgb8().numpy())
-    image.save(out, "JPEG", quality=quality, subsampling=0 if quality > 90 else 2)
+    Image.fromarray(picture.to_srgb8().numpy()).save(out, kind, **options)
     return out.getvalue()

@@ -14,29 +14,18 @@ from ..base.volume import Volume
 from ..io.resources import amount
 from ..io.stores.store import Store
 from ..io.surface import export_surface
-from .client import Client
+from .client import Client, Interrupted
 from .protocol import Surface
 
 _MOST = 1 << 28  # bytes that a page takes into its memory
 _EVERY = 0.2  # seconds between two lines of progress
 
 
-class _Ended(Exception):
-    """Nobody waits for it any more."""
-
-
 class SurfaceExport:
     """A surface on its way to a page."""
 
     def __init__(self, client: Client, wanted: Surface, data: Volume | Store, number: int) -> None:
-        """Starts.
-
-        Args:
-            client: Who asked.
-            wanted: Value, level and kind of file.
-            data: Of what.
-            number: Which number of a voxel.
-        """
+        """Starts to make what a page asked for, of a number of some voxels."""
         self._client, self._wanted, self._data, self._number = client, wanted, data, number
         self._ended, self._told = False, 0.0
         self._thread = threading.Thread(target=self._run, name="gvtorch surface", daemon=True)
@@ -74,14 +63,14 @@ class SurfaceExport:
                         f"{amount(_MOST)} that a page takes: a coarser level, or gvtorch surface"
                     )
                 client.send_file(name, path.read_bytes())
-        except _Ended:
+        except Interrupted:
             pass
         except Exception as error:  # whatever it was, the view goes on
             client.tell("refused", text=one_line(error))
 
     def _progress(self, _what: str, done: int, total: int) -> None:
         if self._ended:
-            raise _Ended
+            raise Interrupted
         now = time.monotonic()
         if now > self._told + _EVERY and done < total:
             self._told = now

@@ -15,16 +15,9 @@ _ENDINGS = (".vp.json", ".json", ".vp", ".xml")
 def read_function(
     file: str, text: str, name: str | None, low: float | None, high: float | None
 ) -> tuple[TransferFunction, list[str]]:
-    """Reads a transfer function of a file's text, and what of it is not kept.
-
-    Args:
-        file: Its name, whose ending tells what it is.
-        text: What it holds.
-        name: Which function, where it has several.
-        low, high: The values over which one is laid whose own are only relative, as ParaView's are.
-
-    Raises:
-        ValueError: It is no such file, or has no such function.
+    """Reads a transfer function of a file's name and text, and what of it is not kept; raises
+    ValueError where it is no such file. `name` tells which function, where it has several; one
+    whose values are only relative, as ParaView's are, is laid over those from low to high.
     """
     ending = next((one for one in _ENDINGS if file.lower().endswith(one)), None)
     if ending is None:

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -284,28 +283,14 @@ def _smooth(times: Sequence[float], values: Sequence[Any], closed: bool, place: 
         return _number_curve(times, arrays, closed, place)
     if isinstance(first, list):
         items = [_curve(times, [v[n] for v in values], closed) for n in range(len(first))]
-        return partial(_each, items)
+        return lambda time: [curve(time) for curve in items]
     if isinstance(first, dict) and "kept" not in first:
-        return partial(
-            _fields,
-            {
-                name: _curve(times, [v[name] for v in values], closed, (first.get("kind"), name))
-                for name in first
-            },
-        )
-    return partial(_newest, times, values)
-
-
-def _each(curves: Sequence[Curve], time: float) -> list[Any]:
-    return [curve(time) for curve in curves]
-
-
-def _fields(curves: Mapping[str, Curve], time: float) -> dict[str, Any]:
-    return {name: curve(time) for name, curve in curves.items()}
-
-
-def _newest(times: Sequence[float], values: Sequence[Any], time: float) -> Any:
-    return values[max(0, bisect_right(times, time) - 1)]
+        fields = {
+            name: _curve(times, [v[name] for v in values], closed, (first.get("kind"), name))
+            for name in first
+        }
+        return lambda time: {name: curve(time) for name, curve in fields.items()}
+    return lambda time: values[max(0, bisect_right(times, time) - 1)]
 
 
 def _number_curve(

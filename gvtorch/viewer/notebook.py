@@ -7,15 +7,15 @@ imports; messages and pictures go through the notebook's own connection.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import re
 from typing import Any
 
 from ..base.messages import need_library
-from .client import Client
+from .client import Client, image_file
 from .server import page_files
 from .session import Session
-from .still import png
 
 _FIRST = "app.js"
 _IMPORT = re.compile(r'from "\./([a-z]+\.js)"')
@@ -64,10 +64,7 @@ def module_text() -> str:
 
 def widget(session: Session, height: int = 560) -> Any:
     """Returns what a notebook shows of a session: the live page, or where nothing live can be, a
-    PNG.
-
-    Raises:
-        ImportError: anywidget is not installed.
+    PNG; raises ImportError without anywidget.
     """
     need_library("view in a notebook", "anywidget", extra="notebook")
     import anywidget
@@ -84,8 +81,10 @@ def widget(session: Session, height: int = 560) -> Any:
             super().__init__(**options)
             self.session = session
             self._client: Client | None = None
-            self._loop = _loop()
             self.on_msg(self._take)
+            self._loop: asyncio.AbstractEventLoop | None = None  # that runs here, if there is one
+            with contextlib.suppress(RuntimeError):
+                self._loop = asyncio.get_running_loop()
 
         def _take(self, _widget: Any, content: Any, _buffers: Any) -> None:
             if content.get("joined") is not None:
@@ -118,7 +117,7 @@ def widget(session: Session, height: int = 560) -> Any:
             eye = self.session.state.camera
             assert eye is not None
             made = self.session.ask(lambda: self.session.still(eye, width, height), 600)
-            return png(made)
+            return image_file(made, "PNG")
 
         def close_view(self) -> None:
             """Ends the view; an engine that was handed in stays open."""
@@ -126,11 +125,3 @@ def widget(session: Session, height: int = 560) -> Any:
             self.send({"gone": "The view was closed."})
 
     return ViewWidget(session, height=height)
-
-
-def _loop() -> Any:
-    """The event loop that runs here, if there is one."""
-    try:
-        return asyncio.get_running_loop()
-    except RuntimeError:
-        return None

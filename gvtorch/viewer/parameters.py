@@ -22,14 +22,15 @@ class Parameters:
     """Names, values, and how they are set.
 
     Attributes:
-        record: The dataclass object from which the producer is made, or None.
+        producer: As it is now.
+        record: The dataclass object from which it is made, or None.
     """
 
     def __init__(
         self, producer: Producer, record: Any = None, make: Callable[[Any], Producer] | None = None
     ) -> None:
         """Takes a producer, and what it was made of, if there was such a record."""
-        self._producer, self.record, self._make = producer, record, make
+        self.producer, self.record, self._make = producer, record, make
 
     @classmethod
     def of_function(cls, make: Callable[[Any], Producer]) -> Parameters:
@@ -48,11 +49,6 @@ class Parameters:
             raise ValueError(f"view: {make.__name__} must give a Producer, got {producer!r:.80}")
         return cls(producer, record, make)
 
-    @property
-    def producer(self) -> Producer:
-        """The producer as it is now."""
-        return self._producer
-
     def describe(self) -> dict[str, Any] | None:
         """Returns for each name its value and what control it gets; None where there is none."""
         told: dict[str, Any] = {}
@@ -70,7 +66,7 @@ class Parameters:
         return told or None
 
     def _tensors(self) -> dict[str, torch.nn.Parameter]:
-        found = self._producer.named_parameters()
+        found = self.producer.named_parameters()
         return {n: p for n, p in found if p.is_floating_point() and p.numel() <= _MOST}
 
     def set(self, name: str, value: Any, scene: Scene) -> None:
@@ -87,7 +83,7 @@ class Parameters:
                 raise ValueError(f"set: {name} has {tensors[name].numel()} numbers")
             with torch.no_grad():
                 tensors[name].copy_(torch.tensor(given).view_as(tensors[name]))
-            self._producer.changed()
+            self.producer.changed()
             return
         known = [] if self.record is None else [field.name for field in fields(self.record)]
         if name not in known or self._make is None:
@@ -98,4 +94,4 @@ class Parameters:
         producer = self._make(record)
         scene.remake = lambda _: producer
         scene.resize()
-        self.record, self._producer = record, producer
+        self.record, self.producer = record, producer

@@ -11,6 +11,7 @@ from os import PathLike, fspath
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..base.arrays import as_volume
@@ -35,6 +36,7 @@ from .schema import MOST_ITEMS
 from .state import ViewState, costed
 
 BINS = 256  # of a histogram, at most
+_MOST_BOXES = 1500  # of nodes, that a page is told
 _LOOKED_AT = 1 << 20  # values by which whole numbers are known
 EngineScene = Producer | Mapping[str, Producer]
 _BUDGET = 40.0  # milliseconds of production a frame, so that none takes long
@@ -42,27 +44,17 @@ _BUDGET = 40.0  # milliseconds of production a frame, so that none takes long
 
 @dataclass
 class Scene:
-    """What is looked at; used by one thread.
+    """What is looked at; used by one thread."""
 
-    Attributes:
-        name: For people.
-        engine: That streams it, or None.
-        tree: Resident, or None.
-        data: The volume or store behind it, if known.
-        remake: Makes the producer again, of `data`, where the engine is the view's own.
-        times: Time points of the series that `data` is one of.
-        reopen: Gives the data of another time point; from any thread.
-        time: What is shown: the number of a time point, or the time of the producers' clocks.
-    """
-
-    name: str
-    engine: Engine | None = None
-    tree: N3Tree | None = None
-    data: Volume | Store | None = None
+    name: str  # for people
+    engine: Engine | None = None  # that streams it
+    tree: N3Tree | None = None  # resident
+    data: Volume | Store | None = None  # behind it, if known
+    #: Makes the producer again, of `data`, where the engine is the view's own.
     remake: Callable[[Volume | Store | None], EngineScene] | None = None
-    times: int = 1
-    reopen: Callable[[int], Volume | Store] | None = None
-    time: float = 0.0
+    times: int = 1  # time points of the series that `data` is one of
+    reopen: Callable[[int], Volume | Store] | None = None  # at another time; from any thread
+    time: float = 0.0  # what is shown: the number of a time point, or that of producers' clocks
     _resident: Volume | None = field(default=None, repr=False)  # of a tree
 
     def __post_init__(self) -> None:
@@ -88,6 +80,11 @@ class Scene:
         if self.engine is not None:
             return [one.tree for one in self.engine.trees.values()]
         return [] if self.tree is None else [self.tree]
+
+    @property
+    def producers(self) -> list[Producer]:
+        """Of the engine's trees."""
+        return [] if self.engine is None else [one.producer for one in self.engine.trees.values()]
 
     def frame(self, camera: Camera, state: ViewState, progress: Progress = no_progress) -> Picture:
         """Renders what is there now; what is missing is on its way to the next frame."""
@@ -116,8 +113,8 @@ class Scene:
         if self.data is not None:
             return self.data
         if self.tree is None:
-            trees = [] if self.engine is None else [*self.engine.trees.values()]
-            found = _voxels_of(trees[0].producer) if len(trees) == 1 else None
+            producers = self.producers
+            found = _voxels_of(producers[0]) if len(producers) == 1 else None
             if found is None:
                 raise ValueError(f"{purpose}: this scene has no voxels of its own")
             return found
@@ -144,9 +141,8 @@ class Scene:
         if name in tree.labels:
             return Labels()
         low, high = (0.0, 1.0)
-        producers = self.engine.trees.values() if self.engine is not None else ()
-        for one in producers:
-            low, high = one.producer.value_range.get(name, (low, high))
+        for one in self.producers:
+            low, high = one.value_range.get(name, (low, high))
         return TransferFunction.preset("gray", low, high)
 
     def histogram(self, component: int, in_view: bool) -> dict[str, Any]:
@@ -183,8 +179,7 @@ class Scene:
 
     def _clocks(self) -> list[Any]:
         """Producers that have a time of their own (`Producer.time`)."""
-        trees = () if self.engine is None else self.engine.trees.values()
-        return [one.producer for one in trees if hasattr(one.producer, "time")]
+        return [one for one in self.producers if hasattr(one, "time")]
 
     def describe_time(self) -> dict[str, Any] | None:
         """Returns what a slider of time needs: how many time points, or None of a clock, and what
@@ -303,10 +298,10 @@ def open_scene(what: Any, **options: Any) -> Scene:
         return Scene(", ".join(what), Engine(what, **options), remake=lambda _: what)
     if isinstance(what, Producer):
         return Scene(repr(what), Engine(what, **options), remake=lambda _: what)
-    data, series = _data_of(what), Series.of(what)
+    data, series = _data_of(what), series_of(what)
     options.setdefault("border", 2 if data.info.labels else EngineOptions.border)
     engine = Engine(_producer_of(data), **options)
-    return Scene(data.name, engine, data=data, remake=_producer_of, **vars(series))
+    return Scene(data.name, engine, data=data, remake=_producer_of, **series)
 
 
 def _producer_of(data: Volume | Store | None) -> Producer:
@@ -315,27 +310,24 @@ def _producer_of(data: Volume | Store | None) -> Producer:
     return VolumeProducer(data) if isinstance(data, Volume) else StoredProducer(data)
 
 
-@dataclass(frozen=True)
-class Series:
-    """The time points that a volume or a store is one of."""
+def series_of(what: Any, **options: Any) -> dict[str, Any]:
+    """Returns the fields of a `Scene` that tell of the time points that a path or a store is one
+    of; `options` as of `read_volume`.
+    """
+    if isinstance(what, (str, PathLike)):
+        path, first = fspath(what), options.pop("time", None) or 0
+        if is_zarr(path):
+            return series_of(Store.open(path, time=first))
+        header = {name: one for name, one in options.items() if name != "nan"}
+        times = open_source(path, **header).times
 
-    times: int = 1
-    reopen: Callable[[int], Volume | Store] | None = None
-    time: float = 0.0
+        def reopen(time: int) -> Volume:
+            return read_volume(path, **options, time=time)
 
-    @classmethod
-    def of(cls, what: Any, **options: Any) -> Series:
-        """Returns those of a path or a store; `options` as of `read_volume`."""
-        if isinstance(what, (str, PathLike)):
-            path, first = fspath(what), options.pop("time", None) or 0
-            if is_zarr(path):
-                return cls.of(Store.open(path, time=first))
-            header = {name: one for name, one in options.items() if name != "nan"}
-            times = open_source(path, **header).times
-            return cls(times, lambda time: read_volume(path, **options, time=time), float(first))
-        if isinstance(what, Store):
-            return cls(what.times, what.at_time, float(what.time))
-        return cls()
+        return {"times": times, "reopen": reopen, "time": float(first)}
+    if isinstance(what, Store):
+        return {"times": what.times, "reopen": what.at_time, "time": float(what.time)}
+    return {}
 
 
 def _voxels_of(producer: Producer) -> Volume | Store | None:
@@ -358,3 +350,34 @@ def _data_of(what: Any) -> Volume | Store:
     except ValueError as error:
         known = "an Engine, Producer, N3Tree, Volume, Store, array or path"
         raise ValueError(f"view: takes {known}: {error}") from None
+
+
+def node_boxes(
+    tree: N3Tree, eye: tuple[float, float, float], most: int = _MOST_BOXES
+) -> dict[str, Any]:
+    """Returns the nodes whose bricks the last frame read, those nearest to an eye first.
+
+    Returns:
+        boxes: At most so many [x, y, z, depth], see `N3Tree.loc`.
+        count: How many there are.
+        low, size: World corner and sides of the root.
+        branching: N.
+    """
+    nodes, bricks = tree.nodes, tree.bricks
+    own = (nodes.tree_t == tree.number)[:, None] & (nodes.brick_tn >= 0)
+    tile, child = own.nonzero().unbind(1)
+    brick = nodes.brick_tn[tile, child].to(torch.int64)
+    read = bricks.stamp_b[brick] == tree.frame
+    loc = tree.loc(tile[read] * nodes.nodes_per_tile + child[read])
+    low, size, _ = tree.place.unbind(0)
+    share = float(tree.branching) ** -loc[:, 3:].to(torch.float64)
+    centre = low + (loc[:, :3] + 0.5) * share * size  # (k, 3) world
+    distance = (centre - torch.tensor(eye, dtype=torch.float64).to(centre)).norm(dim=1)
+    first = distance.argsort(stable=True)[:most]
+    return {
+        "boxes": loc[first].tolist(),
+        "count": len(loc),
+        "low": low.tolist(),
+        "size": size.tolist(),
+        "branching": tree.branching,
+    }

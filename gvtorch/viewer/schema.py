@@ -56,8 +56,6 @@ _KEPT_AS: dict[tuple[str, str], Any] = {
     ("Isosurface", "color_channel"): lambda one: one.other,
     ("Isosurface", "color_component"): lambda one: one.other_component,
     ("DistanceField", "offset"): lambda one: one.value,
-    ("DistanceField", "color_channel"): lambda one: one.other,
-    ("DistanceField", "color_component"): lambda one: one.other_component,
     ("Features", "channel"): lambda one: one.other,
     ("Gradient", "top"): lambda one: one.ends[0],
     ("Gradient", "bottom"): lambda one: one.ends[1],
@@ -214,7 +212,7 @@ def _decoded(where: str, hint: Any, content: Any, now: Any, depth: int) -> Any:
         made = _sequence(where, hint, content, now, depth)
     elif origin in (dict, Mapping):
         made = _mapping(where, hint, content, depth)
-    elif is_class and hint not in (*_SIMPLE, type(None), Tensor, np.ndarray):
+    elif is_class and hint not in (float, *_WORDS, type(None), Tensor, np.ndarray):
         whole = issubclass(hint, Enum)
         made = _named(hint, content) if whole else _object(where, hint, content, now, depth)
     else:
@@ -224,16 +222,19 @@ def _decoded(where: str, hint: Any, content: Any, now: Any, depth: int) -> Any:
 
 def _simple(hint: Any, content: Any) -> Any:
     """A value that is no list and no object, or JSON as it is."""
-    if hint in (None, type(None)):
-        hint = Literal[None]
-    if get_origin(hint) is Literal:
+    if hint is float:
+        return _number(content)
+    hint = Literal[None] if hint in (None, type(None)) else hint
+    if hint in _WORDS:
+        if type(content) is not hint:
+            raise _Other(_WORDS[hint])
+    elif get_origin(hint) is Literal:
         known = get_args(hint)
         if not any(content is one or (type(content) is str and content == one) for one in known):
             raise _Other(" or ".join("null" if one is None else repr(one) for one in known))
-        return content
-    if hint is not Any and hint not in _SIMPLE:
+    elif hint is not Any:
         raise _Other("something else")
-    return content if hint is Any else _SIMPLE[hint](content)
+    return content
 
 
 def _named(hint: type[Enum], content: Any) -> Enum:
@@ -255,21 +256,7 @@ def _number(content: Any) -> float:
     return number
 
 
-def _of_type(kind: type, words: str) -> Any:
-    def checked(content: Any) -> Any:
-        if type(content) is not kind:
-            raise _Other(words)
-        return content
-
-    return checked
-
-
-_SIMPLE: dict[type, Any] = {
-    float: _number,
-    int: _of_type(int, "a whole number"),
-    bool: _of_type(bool, "true or false"),
-    str: _of_type(str, "a text"),
-}
+_WORDS: dict[type, str] = {int: "a whole number", bool: "true or false", str: "a text"}
 
 
 def _sequence(where: str, hint: Any, content: Any, now: Any, depth: int) -> Any:

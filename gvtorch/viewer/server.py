@@ -15,6 +15,7 @@ import secrets
 import socket
 import threading
 from collections.abc import Iterable
+from concurrent.futures import Future
 from importlib import resources
 from typing import Any
 from urllib.parse import urlsplit
@@ -49,11 +50,7 @@ def page_files() -> dict[str, bytes]:
 
 
 def aiohttp_web() -> Any:
-    """Loads the server's library.
-
-    Raises:
-        ImportError: It is not installed; the message tells how.
-    """
+    """Loads the server's library; raises ImportError, which tells how to install it."""
     need_library("view", "PIL", "Pillow", "view")
     return need_library("view", "aiohttp.web", "aiohttp", "view")
 
@@ -62,12 +59,6 @@ def _is_ours(record: logging.LogRecord) -> bool:
     """Whether a line of the server's library is worth a word: not that a request was no HTTP."""
     error = record.exc_info[1] if record.exc_info else None
     return type(error).__module__ != "aiohttp.http_exceptions"
-
-
-def _logger() -> logging.Logger:
-    logger = logging.getLogger("gvtorch.view")
-    logger.addFilter(_is_ours)
-    return logger
 
 
 class Server:
@@ -87,15 +78,8 @@ class Server:
         token: str | None = None,
         allow: Iterable[str] = (),
     ) -> None:
-        """Starts to serve.
-
-        Args:
-            session: What is shown.
-            host: Address to listen at.
-            port: 0: any that is free.
-            token: That pages must know; None: a new one, "" where nobody else can reach the host:
-                none.
-            allow: Further names under which pages may reach this machine.
+        """Starts to serve; for the arguments see `view`. A token "" is none, where nobody else can
+        reach the host.
 
         Raises:
             ValueError: The host needs a token.
@@ -110,16 +94,14 @@ class Server:
         if host not in _LOCAL:
             self._allowed |= {socket.gethostname(), socket.getfqdn()}
         self.port = port
-        started: list[BaseException | None] = []
-        ready = threading.Event()
-        self._loop = asyncio.new_event_loop()
+        self._web, self._files = aiohttp_web(), page_files()
+        self._open: set[Any] = set()
+        self._loop, started = asyncio.new_event_loop(), Future[None]()
         self._thread = threading.Thread(
-            target=self._run, args=(started, ready), name="gvtorch view server", daemon=True
+            target=self._run, args=(started,), name="gvtorch view server", daemon=True
         )
         self._thread.start()
-        ready.wait()
-        if started[0] is not None:
-            raise started[0]
+        started.result()
 
     @property
     def url(self) -> str:
@@ -135,38 +117,35 @@ class Server:
             self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(timeout=10)
 
-    def _run(self, started: list[BaseException | None], ready: threading.Event) -> None:
+    def _run(self, started: Future[None]) -> None:
         asyncio.set_event_loop(self._loop)
         try:
-            self._loop.run_until_complete(self._serve(started, ready))
+            self._loop.run_until_complete(self._serve(started))
         except BaseException as error:
-            started.append(error)
-            ready.set()
+            if not started.done():
+                started.set_exception(error)
         finally:
             self._loop.close()
             del self._session  # aiohttp's own circles would keep it, and its pools, for a while
 
-    async def _serve(self, started: list[BaseException | None], ready: threading.Event) -> None:
-        web = aiohttp_web()
+    async def _serve(self, started: Future[None]) -> None:
         self._stop = asyncio.Event()
-        quiet = {"access_log": None, "logger": _logger()}
-        runner = web.AppRunner(self.application(), shutdown_timeout=1.0, **quiet)
+        logger = logging.getLogger("gvtorch.view")
+        logger.addFilter(_is_ours)
+        runner = self._web.AppRunner(
+            self._application(), shutdown_timeout=1.0, access_log=None, logger=logger
+        )
         await runner.setup()
         try:
-            site = web.TCPSite(runner, self._host, self.port)
-            await site.start()
+            await self._web.TCPSite(runner, self._host, self.port).start()
             self.port = runner.addresses[0][1]
-            started.append(None)
-            ready.set()
+            started.set_result(None)
             await self._stop.wait()
         finally:
             await runner.cleanup()
 
-    def application(self) -> Any:
-        """Returns the aiohttp application."""
-        web = aiohttp_web()
-        self._web = web
-        self._files = page_files()
+    def _application(self) -> Any:
+        web = self._web
 
         @web.middleware
         async def guard(request: Any, handler: Any) -> Any:
@@ -177,7 +156,6 @@ class Server:
         app.router.add_get("/ws", self._socket)
         app.router.add_get("/{name}", self._page)
         app.on_shutdown.append(self._let_go)
-        self._open: set[Any] = set()
         return app
 
     async def _let_go(self, _app: Any) -> None:

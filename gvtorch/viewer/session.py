@@ -8,7 +8,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from concurrent.futures import Future, wait
 from dataclasses import replace
 from typing import Any
 
@@ -28,10 +29,9 @@ from .client import Client, Send
 from .export import SurfaceExport
 from .files import read_function
 from .fitting import trimmed, unfit
-from .nodes import node_boxes
 from .parameters import Parameters
 from .protocol import parse
-from .scene import Scene
+from .scene import Scene, node_boxes
 from .schema import KINDS, decode, describe_kind, encode
 from .slices import Planes
 from .state import Development, Eye, Slices, ViewState, transfer_of
@@ -41,15 +41,7 @@ _TICK = 0.02  # seconds between looks at whether a camera has come to rest
 _FIGURES = 0.25  # seconds between figures for monitors
 _ENGINE = ("brick_pool", "node_pool", "load_budget", "subdivide_budget", "time_budget", "loading")
 _COLOR_MAPS = (
-    "viridis",
-    "magma",
-    "inferno",
-    "plasma",
-    "cividis",
-    "turbo",
-    "coolwarm",
-    "bone",
-    "hot",
+    *("viridis", "magma", "inferno", "plasma", "cividis", "turbo", "coolwarm", "bone", "hot"),
 )
 
 
@@ -125,25 +117,20 @@ class Session:
 
     def ask(self, question: Callable[[], Any], timeout: float = 60.0) -> Any:
         """Lets the thread that renders answer something; waits for it."""
-        done = threading.Event()
-        found: list[tuple[Any, Exception | None]] = []
+        found: Future[Any] = Future()
 
         def answer() -> None:
             try:
-                found.append((question(), None))
+                found.set_result(question())
             except Exception as error:
-                found.append((None, error))
-            done.set()
+                found.set_exception(error)
 
         if self._closed:
             raise RuntimeError("view: it is closed")
         self.post(answer)
-        if not done.wait(timeout):
+        if not wait([found], timeout).done:
             raise TimeoutError("view: no answer")
-        value, error = found[0]
-        if error is not None:
-            raise error
-        return value
+        return found.result()
 
     def close(self) -> None:
         """Ends the thread and closes the scene."""
@@ -275,7 +262,7 @@ class Session:
             told["report"] = {name: report[name] for name in named}
         return told
 
-    # What pages ask for.
+    # What pages ask for: `_take_NAME` does what the message NAME of the protocol says.
 
     def _welcome(self, client: Client) -> None:
         self.clients[client.number] = client
@@ -320,16 +307,17 @@ class Session:
         if client.number not in self.clients:
             return
         try:
-            _TAKES[type(message)](self, client, message)
+            take = getattr(self, f"_take_{type(message).__name__.lower()}")
+            take(client, message)
         except (ValueError, OSError, ImportError, RuntimeError) as error:
             client.tell("refused", text=one_line(error))
             if isinstance(message, protocol.Change):
                 client.tell("state", **self._told_state())
 
-    def _hello(self, client: Client, message: protocol.Hello) -> None:
+    def _take_hello(self, client: Client, message: protocol.Hello) -> None:
         client.resized(message.width, message.height, message.rate)
 
-    def _move(self, client: Client, message: protocol.Move) -> None:
+    def _take_move(self, client: Client, message: protocol.Move) -> None:
         self._place(client, message.camera, message.moving, message.sent)
 
     def _place(self, client: Client, eye: Eye, moving: bool, sent: float = 0.0) -> None:
@@ -346,7 +334,7 @@ class Session:
                     other.move(eye, moving, 0.0)
                     other.tell("camera", camera=encode(eye))
 
-    def _change(self, client: Client, message: protocol.Change) -> None:
+    def _take_change(self, client: Client, message: protocol.Change) -> None:
         content = message.state
         camera = content.pop("camera", None) if isinstance(content, dict) else None
         state = self.state.changed(content)
@@ -427,32 +415,32 @@ class Session:
         self._tell_all("error", text=text)
         self._tell_state(None)
 
-    def _pick(self, client: Client, message: protocol.Pick) -> None:
+    def _take_pick(self, client: Client, message: protocol.Pick) -> None:
         place = client.picked(message.x, message.y)
         client.tell("picked", place=place, purpose=message.purpose)
 
-    def _histogram(self, client: Client, message: protocol.Histogram) -> None:
+    def _take_histogram(self, client: Client, message: protocol.Histogram) -> None:
         found = self.scene.histogram(self.state.component, message.in_view)
         client.tell("histogram", in_view=message.in_view, **found)
 
-    def _preset(self, client: Client, message: protocol.Preset) -> None:
+    def _take_preset(self, client: Client, message: protocol.Preset) -> None:
         function = TransferFunction.preset(message.name, message.low, message.high)
         client.tell("preset", name=message.name, function=encode(function))
 
-    def _read(self, client: Client, message: protocol.Read) -> None:
+    def _take_read(self, client: Client, message: protocol.Read) -> None:
         given = message.file, message.text, message.name, message.low, message.high
         function, lost = read_function(*given)
         name = message.name or message.file
         client.tell("preset", name=name, function=encode(function), lost=lost)
 
-    def _write_function(self, client: Client, message: protocol.Export) -> None:
+    def _take_export(self, client: Client, message: protocol.Export) -> None:
         transfer = transfer_of(self.state.shader)
         if transfer is None:
             raise ValueError("export: there is no transfer function")
         text = transfer.to_paraview(message.name)
         client.send_file("paraview.json", text.encode())
 
-    def _nodes(self, client: Client, message: protocol.Nodes) -> None:
+    def _take_nodes(self, client: Client, message: protocol.Nodes) -> None:
         client.nodes = message.on
         self._tell_nodes(client)
 
@@ -460,7 +448,7 @@ class Session:
         if client.nodes and client.picture is not None:
             client.tell("nodes", **node_boxes(self.scene.trees[0], client.eye.eye))
 
-    def _resize(self, client: Client, message: protocol.Resize) -> None:
+    def _take_resize(self, client: Client, message: protocol.Resize) -> None:
         unknown = sorted(set(message.engine) - set(_ENGINE))
         if unknown:
             raise ValueError(
@@ -476,14 +464,14 @@ class Session:
         for one in self.clients.values():
             one.stir(resting)
 
-    def _set(self, client: Client, message: protocol.Set) -> None:
+    def _take_set(self, client: Client, message: protocol.Set) -> None:
         if self.parameters is None:
             raise ValueError("set: there are no parameters")
         self.parameters.set(message.name, message.value, self.scene)
         self._tell_all("parameters", parameters=self.parameters.describe())
         self._stir()
 
-    def _follow(self, client: Client, message: protocol.Follow) -> None:
+    def _take_follow(self, client: Client, message: protocol.Follow) -> None:
         leader = self.clients.get(message.client or 0)
         if message.client is not None and (leader is None or leader is client):
             raise ValueError(f"follow: there is no client {message.client}")
@@ -493,22 +481,22 @@ class Session:
             client.tell("camera", camera=encode(leader.eye))
         self._tell_clients()
 
-    def _monitor(self, client: Client, message: protocol.Monitor) -> None:
+    def _take_monitor(self, client: Client, message: protocol.Monitor) -> None:
         client.monitor = message.on
         if message.on and client.picture is not None:
             client.tell("figures", **self._figures(client.picture))
 
-    def _still(self, client: Client, message: protocol.Still) -> None:
+    def _take_still(self, client: Client, message: protocol.Still) -> None:
         size = message.width, message.height
         self._stills.add(client, self._steps(client.eye, size, lambda: client.gone))
 
-    def _surface(self, client: Client, message: protocol.Surface) -> None:
+    def _take_surface(self, client: Client, message: protocol.Surface) -> None:
         if self._export is not None and self._export.busy:
             raise ValueError("surface: one is being made already")
         data = self.scene.voxels("surface")
         self._export = SurfaceExport(client, message, data, self.state.component)
 
-    def _do(self, client: Client, message: protocol.Do) -> None:
+    def _take_do(self, client: Client, message: protocol.Do) -> None:
         if message.what == "retry":
             self.scene.retry()
             if self._planes is not None:
@@ -528,26 +516,6 @@ class Session:
             *(self.scene, lambda: self._planes, self.state, eye, size),
             unwanted=lambda: self._closed or gone(),
         )
-
-
-_TAKES: Mapping[type, Callable[[Session, Client, Any], None]] = {
-    protocol.Hello: Session._hello,
-    protocol.Move: Session._move,
-    protocol.Change: Session._change,
-    protocol.Pick: Session._pick,
-    protocol.Histogram: Session._histogram,
-    protocol.Preset: Session._preset,
-    protocol.Read: Session._read,
-    protocol.Export: Session._write_function,
-    protocol.Nodes: Session._nodes,
-    protocol.Resize: Session._resize,
-    protocol.Set: Session._set,
-    protocol.Follow: Session._follow,
-    protocol.Monitor: Session._monitor,
-    protocol.Still: Session._still,
-    protocol.Surface: Session._surface,
-    protocol.Do: Session._do,
-}
 
 
 def fitted(scene: Scene, like: Eye | None, size: tuple[int, int], up: Up | None = None) -> Eye:

@@ -262,10 +262,8 @@ def transfer_of(shader: Shader) -> TransferFunction | None:
 
 
 def costed(shader: Shader) -> TransferFunction:
-    """Returns the transfer function whose costs are shown in a shader's place.
-
-    Raises:
-        ValueError: It has none.
+    """Returns the transfer function whose costs are shown in a shader's place; raises ValueError if
+    it has none.
     """
     return check.instance("cost", "shader", transfer_of(shader) or shader, TransferFunction)
 
@@ -281,16 +279,6 @@ def saved_state(path: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not isinstance(content.get("options", {}), dict):
         raise ValueError(f"{path}: not a state: it must be an object with the state's fields")
     return content
-
-
-def saved_time(path: str | Path) -> float:
-    """Returns the time that a .json file of a state tells, 0 where it tells none.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It holds something else.
-    """
-    return check.number(f"{path}: state", "time", saved_state(path).get("time", 0.0))
 
 
 def blended(picture: Picture, cost: Picture, share: float) -> Picture:

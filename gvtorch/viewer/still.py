@@ -4,13 +4,12 @@ session, a step at a time between the frames of pages.
 
 from __future__ import annotations
 
-import io
 from collections import deque
 from collections.abc import Callable, Generator
 
 from ..base.messages import one_line
 from ..pictures import Picture, Progressive
-from .client import Client, Interrupted
+from .client import Client, Interrupted, image_file
 from .scene import Scene
 from .slices import Planes, panes
 from .state import Eye, ViewState, blended
@@ -30,15 +29,10 @@ def still_steps(
     between its steps, so that others get their frames.
 
     Args:
-        scene: What is shown.
         planes: Gives the slices to draw beside it; called last.
-        state: How it is shown.
-        eye: Where the camera stands.
         size: Width and height in pixels, with the slices.
-        unwanted: Asked between parts of the picture, whether nobody waits for it any more.
-
-    Raises:
-        Interrupted: Nobody waits for it any more.
+        unwanted: Asked between parts of the picture, whether nobody waits for it any more; then it
+            raises Interrupted.
     """
 
     def check(_what: str, _done: int, _total: int) -> None:
@@ -77,7 +71,6 @@ class Stills:
     """Those that pages wait for, which take turns."""
 
     def __init__(self) -> None:
-        """Starts with none."""
         self._waiting: deque[tuple[Client, Steps]] = deque()
 
     def __len__(self) -> int:
@@ -90,7 +83,6 @@ class Stills:
         self._waiting.append((client, steps))
 
     def clear(self) -> None:
-        """Gives all up."""
         self._waiting.clear()
 
     def go_on(self) -> None:
@@ -99,19 +91,10 @@ class Stills:
         try:
             next(steps)
         except StopIteration as end:
-            client.send_file("picture.png", png(end.value))
+            client.send_file("picture.png", image_file(end.value, "PNG"))
         except Interrupted:
             pass
         except Exception as error:  # whatever it was, the view goes on
             client.tell("refused", text=f"still: {one_line(error)}")
         else:
             self._waiting.append((client, steps))
-
-
-def png(picture: Picture) -> bytes:
-    """Returns a picture as a PNG file."""
-    from PIL import Image
-
-    out = io.BytesIO()
-    Image.fromarray(picture.to_srgb8().numpy()).save(out, "PNG")
-    return out.getvalue()

@@ -15,6 +15,7 @@ from ..base import check
 from ..base.explicit import explicit
 from ..cameras import Camera
 from ..cameras.camera import Up
+from ..pictures.picture import in_notebook
 from ..shaders import Shader
 from ..tracing import RenderOptions
 from ..tracing.options import RenderSettings, render_options
@@ -36,7 +37,6 @@ class Viewer:
     """
 
     def __init__(self, session: Session, server: Server) -> None:
-        """Takes both."""
         self.session, self.server = session, server
         self._closed = threading.Event()
 
@@ -121,7 +121,7 @@ def view(
     aiohttp_web()
     check.whole("view", "port", port, low=0, high=65535)
     session = new_session(what, shader, camera, up=up, state=state, engine=engine, **options)
-    if _in_notebook() and wait is None and browser is None:
+    if in_notebook() and wait is None and browser is None:
         from .notebook import widget
 
         return widget(session)
@@ -139,37 +139,29 @@ def view(
     return viewer
 
 
-class SessionSettings(RenderSettings, total=False):
-    """What says how a scene is shown at first; see `view`."""
-
-    up: Up | None
-    state: str | PathLike[str] | ViewState | None
-    engine: Mapping[str, Any] | None
-
-
 def new_session(
     what: Any,
     shader: Shader | None = None,
     camera: Camera | None = None,
-    **given: Unpack[SessionSettings],
+    *,
+    up: Up | None = None,
+    state: str | PathLike[str] | ViewState | None = None,
+    engine: Mapping[str, Any] | None = None,
+    **options: Unpack[RenderSettings],
 ) -> Session:
     """Opens a scene and its session, without a page; see `view`."""
-    up, state, engine = given.pop("up", None), given.pop("state", None), given.pop("engine", None)
-    options: Mapping[str, Any] = given
-    parameters, producer = None, what
+    parameters = None
     if callable(what) and not hasattr(what, "fill"):
         parameters = Parameters.of_function(what)
-        producer = parameters.producer
-    elif isinstance(what, Scene):
-        producer = None
-    scene = what if isinstance(what, Scene) else open_scene(producer, **(engine or {}))
+        what = parameters.producer
+    scene = what if isinstance(what, Scene) else open_scene(what, **(engine or {}))
     try:
-        if parameters is None and scene.engine is not None and len(scene.engine.trees) == 1:
-            (one,) = scene.engine.trees.values()
-            parameters = Parameters(one.producer)
-        first = shader_or_first(scene, shader)
+        if parameters is None and len(scene.producers) == 1:
+            parameters = Parameters(scene.producers[0])
+        if shader is None:
+            shader = scene.first_shader()
         chosen = ViewState(
-            shader=first,
+            shader=check.instance("view", "shader", shader, Shader),
             options=render_options("view", options),
             component=options.get("component", 0),
             time=scene.time,
@@ -193,15 +185,3 @@ def new_session(
     except BaseException:
         scene.close()
         raise
-
-
-def shader_or_first(scene: Scene, shader: Any) -> Shader:
-    """Returns a user's shader, or one that fits."""
-    if shader is None:
-        return scene.first_shader()
-    return check.instance("view", "shader", shader, Shader)
-
-
-def _in_notebook() -> bool:
-    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
-    return shell is not None and hasattr(shell, "kernel")

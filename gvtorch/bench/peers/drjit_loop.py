@@ -55,7 +55,6 @@ class Marcher(Peer):
         dr.sync_thread()
 
     def render(self) -> None:
-        """Runs the loop to its end."""
         scale, step = (_ROWS - 1) / 255, self.step
 
         def goes_on(t: llvm.Float, clear: llvm.Float, color: llvm.Array3f) -> llvm.Bool:
@@ -78,6 +77,5 @@ class Marcher(Peer):
         dr.sync_thread()
 
     def picture(self) -> Tensor:
-        """Copies colour and alpha."""
         planes = [torch.from_numpy(self.color[axis].numpy().copy()) for axis in range(3)]
         return torch.stack([*planes, 1 - torch.from_numpy(self.clear.numpy().copy())], 1)

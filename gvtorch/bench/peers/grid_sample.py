@@ -32,7 +32,6 @@ class Marcher(Peer):
         self.clear = torch.ones_like(self.first)
 
     def render(self) -> None:
-        """Marches."""
         self.color.zero_()
         self.clear.fill_(1)
         start = self.first.clone()
@@ -55,5 +54,4 @@ class Marcher(Peer):
             alive = alive[(t + self.step < self.last[alive]) & (kept > 1 - self.stop)]
 
     def picture(self) -> Tensor:
-        """Joins colour and alpha."""
         return torch.cat((self.color, 1 - self.clear[:, None]), 1)

@@ -20,35 +20,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..scenes import BenchScene, aneurism, fog_dense
+from ..scenes import BenchScene, scan_or_fog
 
+_RATE = 25.0  # pictures a second that are wanted while the camera moves
 _STARTS = 120.0  # seconds in which a page must be there
 
 
 @dataclass(frozen=True, kw_only=True)
 class Site:
-    """What is served.
+    """What is served."""
 
-    Attributes:
-        side: Voxels a side of the scan.
-        size: (width, height) pixels of the picture.
-        device: Where gvtorch renders.
-        threads: How many threads the CPU has for it.
-        rate: Pictures a second that are wanted while the camera moves.
-    """
-
-    side: int
-    size: tuple[int, int]
-    device: str
-    threads: int
-    rate: float = 25.0
-
-    def scene(self) -> BenchScene:
-        """Returns the scan, or fog where it is not here."""
-        try:
-            return aneurism(self.side)
-        except FileNotFoundError:
-            return fog_dense(self.side)
+    side: int  # voxels a side of the scan
+    size: tuple[int, int]  # (width, height) pixels of the picture
+    device: str  # where gvtorch renders
+    threads: int  # that the CPU has for it
 
 
 def gvtorch_page(site: Site, ready: Connection) -> None:
@@ -56,7 +41,7 @@ def gvtorch_page(site: Site, ready: Connection) -> None:
     from ...viewer.server import Server
     from ...viewer.view import new_session
 
-    scene = site.scene()
+    scene = scan_or_fog(site.side)
     session = new_session(
         scene.volume, scene.shader, scene.camera(*site.size), engine={"device": site.device}
     )
@@ -70,7 +55,7 @@ def _viser(site: Site, ready: Connection) -> tuple[Any, BenchScene]:
     """Starts viser's server with the scene's camera and nothing else in the picture."""
     import viser
 
-    scene = site.scene()
+    scene = scan_or_fog(site.side)
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     server.scene.world_axes.visible = False
     view = scene.camera(*site.size).viewmats[0]
@@ -139,7 +124,7 @@ def trame_page(site: Site, ready: Connection) -> None:
     from .peer import Task
     from .vtk_fixed_point import Marcher
 
-    scene, torch_device = site.scene(), torch.device("cpu")
+    scene, torch_device = scan_or_fog(site.side), torch.device("cpu")
     camera = scene.camera(*site.size)
     task = Task(scene=scene, camera=camera, rays=camera.rays(), stop_alpha=1.0, device=torch_device)
     shown = Marcher(task)
@@ -147,7 +132,7 @@ def trame_page(site: Site, ready: Connection) -> None:
     hand = vtkRenderWindowInteractor()
     hand.SetRenderWindow(shown.window)
     hand.SetInteractorStyle(vtkInteractorStyleTrackballCamera())
-    hand.SetDesiredUpdateRate(site.rate)
+    hand.SetDesiredUpdateRate(_RATE)
     hand.Initialize()
     server = get_server("bench")
     with DivLayout(server):
@@ -183,11 +168,7 @@ DIFFERS = {
 
 @contextlib.contextmanager
 def served(who: str, site: Site) -> Iterator[str]:
-    """Serves a page in a process, and yields its address.
-
-    Raises:
-        RuntimeError: It did not start.
-    """
+    """Serves a page in a process, and yields its address; RuntimeError if it does not start."""
     context = get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(who, site, theirs), daemon=True)

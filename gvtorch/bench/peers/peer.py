@@ -1,7 +1,8 @@
-"""What a peer is asked, and what it answers."""
+"""What a peer is asked, what it answers, and which peers can run."""
 
 from __future__ import annotations
 
+import importlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -12,7 +13,16 @@ from torch import Tensor
 from ...base.records import Rays
 from ...cameras import Camera
 from ...shaders import TransferFunction
+from ..record import PEERS, Record
 from ..scenes import BenchScene
+
+#: The module of each renderer.
+_HOME = {
+    "grid_sample": "grid_sample",
+    "warp": "warp_nanovdb",
+    "drjit": "drjit_loop",
+    "vtk": "vtk_fixed_point",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,17 +71,30 @@ def spans(task: Task) -> Tensor:
 
 
 def bake(shader: TransferFunction, step: float, rows: int) -> np.ndarray:
-    """Samples a transfer function over [0, 255].
-
-    Args:
-        shader: The function; its reference length is 1 world unit if it names none.
-        step: World units that an opacity is for.
-        rows: How many rows; 255 k + 1 rows hit every value that is a multiple of 1 / k.
-
-    Returns:
-        (rows, 4) float64 colour, not premultiplied, and opacity of a step.
+    """Samples a transfer function over [0, 255]: (rows, 4) float64 colour, not premultiplied, and
+    opacity of a step in world units; 255 k + 1 rows hit every value that is a multiple of 1 / k.
     """
     table = shader(np.linspace(0, 255, rows))
     with np.errstate(divide="ignore"):
         table[:, 3] = -np.expm1(np.log1p(-table[:, 3]) * step / (shader.reference or 1.0))
     return table
+
+
+def find(record: Record) -> dict[str, type[Peer]]:
+    """Returns the renderers that can run; the record tells why others can't."""
+    wanted = record.settings.peers
+    ready = {}
+    for name, module in _HOME.items():
+        if wanted is not None and name not in wanted:
+            continue
+        try:
+            peer = importlib.import_module(f".{module}", __package__).Marcher
+        except ImportError:
+            record.peers[name] = f"not installed ({PEERS[name]})"
+            continue
+        reason = peer.refuses(record.settings.device)
+        record.peers[name] = reason or "ran"
+        if not reason:
+            ready[name] = peer
+            record.note(f"{name}: {peer.differs}")
+    return ready

@@ -41,7 +41,6 @@ class Marcher(Peer):
 
     @classmethod
     def refuses(cls, device: torch.device) -> str:
-        """It runs on the CPU."""
         return "" if device.type == "cpu" else "runs on the CPU only"
 
     def __init__(self, task: Task) -> None:

@@ -98,11 +98,9 @@ class Marcher(Peer):
         wp.synchronize_device(self.device)
 
     def render(self) -> None:
-        """Launches the kernel."""
         self._launch(_march, len(self.kept[0]), self.inputs)
 
     def picture(self) -> Tensor:
-        """Returns what the kernel wrote."""
         return self.kept[-1]
 
     def _launch(self, kernel: Any, size: Any, inputs: list[Any]) -> None:

@@ -1,0 +1,203 @@
+"""What flags tell in a text: colours, windows, channels, light, what is cut away, backgrounds. All
+raise ValueError, which names the flag, for a text that is none of what they take.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..base.digits import whole_number
+from .common import numbers
+
+if TYPE_CHECKING:
+    from ..base.volume import Volume
+    from ..io.stores.store import Store
+    from ..shaders import Channels, TransferFunction
+    from ..tracing import Clip, Lighting, ThinLens
+
+_ENDINGS = (".json", ".vp", ".xml")  # of files of transfer functions
+_FACTORS = ("shadows", "occlusion", "indirect", "reach")
+
+
+def check_component(data: Volume | Store, component: int) -> None:
+    """Raises ValueError, which tells what there is, where voxels have no such number."""
+    width = data.width
+    if 0 <= component < width:
+        return
+    names = [channel.name for channel in data.info.channels]
+    names += [""] * (width - len(names))
+    told = ", ".join(f"{n} ({name})" if name else str(n) for n, name in enumerate(names))
+    what = "one number" if width == 1 else f"{width} numbers"
+    raise ValueError(f"--component {component}: a voxel has {what}: {told}")
+
+
+def chosen_transfer(
+    name: str | None,
+    span: str | None,
+    data: Volume | Store,
+    component: int,
+    *,
+    background: bool = False,
+) -> TransferFunction:
+    """Returns the transfer function that `--tf` names, stretched over what `--window` tells. Left
+    out, files and presets in Hounsfield units keep their own values, and others are stretched over
+    what `window` finds (see there for `background`). Where the data are in Hounsfield units, `bone`
+    and others stand for those presets.
+    """
+    from ..shaders import TransferFunction
+    from ..shaders.presets import CT_PRESETS, IN_HU
+
+    check_component(data, component)
+    name = name or "gray"
+    file, _, inner = name.rpartition(":")
+    if Path(name).is_file() or name.endswith(_ENDINGS):
+        transfer = TransferFunction.from_file(name)
+    elif file and (Path(file).is_file() or file.endswith(_ENDINGS)):
+        transfer = TransferFunction.from_file(file, inner)
+    elif name in CT_PRESETS:
+        transfer = TransferFunction.preset(name)
+    elif span in (None, "auto") and name in IN_HU and data.info.quantity == "HU":
+        return TransferFunction.preset(IN_HU[name])
+    else:
+        transfer = TransferFunction.preset(name, 0, 1)
+        transfer.relative = True
+    if span is None and not transfer.relative:
+        return transfer
+    values = parse_window(span or "auto", data, component, background=background)
+    return transfer.stretched(*values)
+
+
+def parse_window(
+    text: str, data: Volume | Store, component: int, *, background: bool = False
+) -> tuple[float, float]:
+    """Returns the values of LO,HI, P%,P%, `auto` or `full`; for `background` see `window`."""
+    from ..io.window import value_range, window
+
+    check_component(data, component)
+    if text == "auto":
+        return window(data, component=component, background=background)
+    if text == "full":
+        return value_range(data)
+    try:
+        low, high = numbers("--window", text.replace("%", ""), 2, float)
+    except ValueError:
+        wanted = "--window must be LO,HI, P%,P%, auto or full"
+        raise ValueError(f"{wanted}, got {text!r}") from None
+    if text.count("%") == 2 and all(part.endswith("%") for part in text.split(",")):
+        return window(data, (low, high), component=component)
+    if "%" in text or not low < high:
+        raise ValueError(f"--window must be LO,HI with LO < HI, or P%,P%, got {text!r}")
+    return low, high
+
+
+def parse_channels(text: str | None, image: Volume | Store) -> Channels:
+    """Makes a shader of an image's channels: all of them as it tells, or those of items such as
+    `0:green:100,4000;2:#ff00ff:auto;3`, which replace what it tells.
+    """
+    from ..shaders import Channels
+    from ..shaders.channels import channel_color, window_of
+
+    if text is None:
+        return Channels.of(image)
+    items = [item.strip() for item in text.split(";")]
+    names = {one.name: str(number) for number, one in enumerate(image.info.channels) if one.name}
+    wanted: dict[int, list[str]] = {}
+    for item in items:
+        name, *rest = item.split(":")
+        number = whole_number(names.get(name, name))
+        if item == "opacity":
+            continue
+        if number is None or len(rest) > 2:
+            raise ValueError(
+                "--channel must hold NUMBER:COLOR:LO,HI, or a name for the number, where what is "
+                f"left out or auto is the image's, or opacity; got {item!r}"
+            )
+        if number in wanted:
+            raise ValueError(f"--channel names channel {number} twice")
+        wanted[number] = rest
+    if not wanted:
+        raise ValueError("--channel opacity: name channels, too, as in 0;1;opacity")
+    mode: Any = "opacity" if "opacity" in items else "additive"
+    shader = Channels.of(image, mode, components=list(wanted))
+    for look, (component, told) in zip(shader.looks, wanted.items(), strict=True):
+        color, window = (*told, "auto", "auto")[:2]
+        where = f"--channel {component}"
+        if color not in ("", "auto"):
+            look.color = channel_color(where, color)
+        if window not in ("", "auto"):
+            low, high = numbers(f"{where}: window", window, 2, float)
+            look.window = window_of(where, (low, high))
+    return shader
+
+
+def parse_lighting(text: str) -> Lighting:
+    """Makes light from items such as `sun:-1,-2,-1,4;occlusion:0.8;reach:0.1`."""
+    from ..shaders import DirectionalLight, PointLight
+    from ..tracing import Lighting
+
+    lights: list[Any] = []
+    given: dict[str, Any] = {}
+    for item in text.split(";"):
+        kind, _, rest = item.strip().partition(":")
+        flag = f"--lighting {kind}"
+        if kind in ("sun", "lamp"):
+            *place, size = numbers(flag, rest, 4, float)
+            sun = kind == "sun"
+            lights.append(
+                DirectionalLight(place, angle=size) if sun else PointLight(place, radius=size)
+            )
+        elif kind == "sky":
+            given["ambient"] = numbers(flag, rest, 3, float)
+        elif kind in _FACTORS:
+            (given[kind],) = numbers(flag, rest, 1, float)
+        else:
+            raise ValueError(
+                f"--lighting must hold sun:, lamp:, sky:, {':, '.join(_FACTORS)}:, "
+                f"got {item.strip()!r}"
+            )
+    return Lighting(lights=lights or None, frame="box", **given)
+
+
+def parse_clip(text: str) -> Clip:
+    """Makes a clip from items such as `plane:0,0,1,0;cut:0,0,0,1,1,1;caps`."""
+    from ..tracing import Clip
+
+    found: dict[str, list[Any]] = {"plane": [], "box": [], "cut": []}
+    caps = False
+    for item in text.split(";"):
+        kind, _, rest = item.strip().partition(":")
+        if kind == "caps" and not rest:
+            caps = True
+        elif kind in found:
+            values = numbers(f"--clip {kind}", rest, 4 if kind == "plane" else 6, float)
+            found[kind].append(values if kind == "plane" else (values[:3], values[3:]))
+        else:
+            raise ValueError(f"--clip must hold plane:, box:, cut: or caps, got {item.strip()!r}")
+    return Clip(
+        planes=found["plane"], boxes=found["box"], without=found["cut"], frame="box", caps=caps
+    )
+
+
+def parse_lens(text: str) -> ThinLens:
+    """Makes a lens from `APERTURE,FOCUS`."""
+    from ..tracing import ThinLens
+
+    aperture, focus = numbers("--lens", text, 2, float)
+    return ThinLens(aperture=aperture, focus=focus, frame="box")
+
+
+def parse_background(text: str) -> Any:
+    """Returns a background from R,G,B, two of them (top/bottom), `transparent`, or the file of an
+    environment map.
+    """
+    from ..pictures import Environment, Gradient
+
+    if text == "transparent":
+        return None
+    if Path(text).suffix in (".png", ".exr", ".npy", ".tif"):
+        return Environment.read(text)
+    top, slash, bottom = text.partition("/")
+    if slash:
+        return Gradient(*(tuple(numbers("--background", part, 3, float)) for part in (top, bottom)))
+    return tuple(numbers("--background", text, 3, float))
