@@ -32,6 +32,12 @@ from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
 _PART = 1 << 20  # bytes that are unpacked at a time
+_WHOLE = {1: ("char", "int8"), 2: ("short", "int16"), 4: ("int", "int32"), 8: ("longlong", "int64")}
+_NUMBERS = {
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+    **{name: f"i{size}" for size, names in _WHOLE.items() for name in names},
+    **{f"u{name}": f"u{size}" for size, names in _WHOLE.items() for name in names},
+}
 #: (4, 4) of world axes that run left and posterior, to right and anterior ones.
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -287,6 +293,16 @@ def place_axes(
         "origin": tuple(origin.tolist()),
         "oblique": tuple(map(tuple, affine[:3].tolist())) if is_oblique else None,
     }
+
+
+def number_type(name: str) -> str | None:
+    """Returns the dtype, without byte order, of numbers that are called as in C or by their bits:
+    "unsigned short int", "uchar", "long_long", "uint16_t", "Float32". None: it is unknown, as is
+    "long", which has 4 bytes or 8.
+    """
+    plain = name.lower().replace("_", " ").replace("long long", "longlong").removesuffix(" t")
+    plain = plain.replace("unsigned ", "u").removeprefix("signed ").removesuffix(" int")
+    return _NUMBERS.get(plain)
 
 
 def open_unpacked(file: str, member: str = "") -> IO[bytes]:

@@ -24,30 +24,11 @@ import numpy as np
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.volume import check_extent
 from ..packed import PackedSource, text_numbers, unpack_block
-from ..source import ArraySource, Index, VolumeSource, place_axes
+from ..source import ArraySource, Index, VolumeSource, number_type, place_axes
 from .format import Format, choose
 
-_LEGACY = {
-    "unsigned_char": "u1",
-    "char": "i1",
-    "signed_char": "i1",
-    "unsigned_short": "u2",
-    "short": "i2",
-    "unsigned_int": "u4",
-    "int": "i4",
-    "unsigned_long": "u8",
-    "long": "i8",
-    "vtktypeint64": "i8",
-    "vtktypeuint64": "u8",
-    "vtkidtype": "i4",  # which VTK writes as int
-    "float": "f4",
-    "double": "f8",
-}
-_XML = {
-    **{f"Int{bits}": f"i{bits // 8}" for bits in (8, 16, 32, 64)},
-    **{f"UInt{bits}": f"u{bits // 8}" for bits in (8, 16, 32, 64)},
-    **{"Float32": "f4", "Float64": "f8"},
-}
+_LONG = {"long": "i8", "unsigned_long": "u8", "vtktypeint64": "i8", "vtktypeuint64": "u8"}
+_LONG["vtkidtype"] = "i4"  # which VTK writes as int
 _MOST_HEADER = 1 << 22  # bytes
 _MOST_VALUES = 1 << 33
 _MOST_ARRAYS = 64
@@ -175,7 +156,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     arrays = _xml_arrays(root, piece)
     chosen, lost = choose(path, "array", [array["name"] for array in arrays], key)
     array = arrays[chosen]
-    if array["kind"] not in _XML:
+    if (kind := number_type(array["kind"])) is None:
         raise ValueError(f"{path}: {array['name']} is of {array['kind']}; expected numbers")
     numbers = {
         name: np.array([float(v) for v in image.get(name, plain).split()])
@@ -192,7 +173,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     header = order + {"UInt32": "u4", "UInt64": "u8"}[root.get("header_type", "UInt32")]
     packer = {"": "", "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma",
               "vtkLZ4DataCompressor": "lz4"}[root.get("compressor", "")]  # fmt: skip
-    stored = order + _XML[array["kind"]]
+    stored = order + kind
     if array["format"] == "appended":
         if appended is None:
             raise ValueError(f"{path}: has no appended data")
@@ -353,7 +334,7 @@ def _legacy_parts(
                 raise ValueError(f"{path}: {' '.join(words)[:80]!r} of a grid that has {count}")
         elif name == "FIELD":
             in_field = int(words[2])
-        elif name in _ARRAYS or (len(words) == 4 and words[3].lower() in _LEGACY and in_field > 0):
+        elif name in _ARRAYS or (len(words) == 4 and _legacy_type(words[3]) and in_field > 0):
             array = _legacy_array(path, words, points, cells)
             table = re.match(rb"LOOKUP_TABLE[^\n]*\n", content[at : at + 200])
             at += table.end() if table and name == "SCALARS" else 0
@@ -361,6 +342,10 @@ def _legacy_parts(
             in_field -= name not in _ARRAYS
             at += array["bytes"] * binary
     return affine, points, sorted(arrays, key=lambda array: (array["cells"], not array["first"]))
+
+
+def _legacy_type(name: str) -> str:
+    return _LONG.get(name.lower()) or number_type(name) or ""
 
 
 def _legacy_array(
@@ -371,9 +356,9 @@ def _legacy_array(
     if kind == "COLOR_SCALARS":
         name, dtype, width = words[1].replace("%%", "%"), "u1", int(words[2])  # VTK doubles them
     elif kind not in _ARRAYS:  # of a field
-        name, width, dtype = words[0], int(words[1]), _LEGACY.get(words[3].lower(), "")
+        name, width, dtype = words[0], int(words[1]), _legacy_type(words[3])
     else:
-        name, dtype = words[1], _LEGACY.get(words[2].lower(), "")
+        name, dtype = words[1], _legacy_type(words[2])
         width = 3 if kind == "VECTORS" else int(words[3]) if len(words) > 3 else 1
     if not dtype:
         raise ValueError(f"{path}: {' '.join(words)[:80]!r} is no array of numbers")
