@@ -34,6 +34,7 @@ _KEPT = 16  # idle connections to a server
 _AGENT = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
 _MISSING = (404, 410)
 _ELSEWHERE = (301, 302, 303, 307, 308)
+_CLOSED = (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError)
 
 
 class Endless(OSError):
@@ -155,14 +156,11 @@ def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> by
         done = answer.isclosed()
         return content
     finally:
-        if connection is not None:
-            _connections.end(connection)
-        if connection is not None and done and not answer.will_close:
-            _connections.give_back(url, connection)
-        else:
+        keep = done and not answer.will_close
+        if connection is None or not keep:
             answer.close()
-            if connection is not None:
-                connection.close()
+        if connection is not None:
+            _connections.give_back(url, connection, keep=keep)
 
 
 def _range(part: slice) -> str:
@@ -229,24 +227,18 @@ def _ask(
         connection, used = _connections.take(url, seconds)
         try:
             connection.request("GET", target, headers=headers)
-            _connections.begin(connection)
+            _connections.heard(connection)
             answer = connection.getresponse()
-        except (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError):
-            _connections.end(connection)
-            connection.close()
-            if not used:
-                raise
-            continue  # the server had closed it meanwhile
-        except BaseException:
-            _connections.end(connection)
-            connection.close()
-            raise
-        if answer.status in _ELSEWHERE:
-            _connections.end(connection)
+            if answer.status not in _ELSEWHERE:
+                return connection, answer
             answer.close()
-            connection.close()
-            return None, _by_urllib(url, headers, seconds)
-        return connection, answer
+        except BaseException as error:
+            _connections.give_back(url, connection, keep=False)
+            if used and isinstance(error, _CLOSED):
+                continue  # by the server, meanwhile
+            raise
+        _connections.give_back(url, connection, keep=False)
+        return None, _by_urllib(url, headers, seconds)
 
 
 def _by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client.HTTPResponse:
@@ -291,22 +283,11 @@ class _Connections:
             return safe, False
         return http.client.HTTPConnection(key[2], timeout=seconds), False
 
-    def begin(self, connection: http.client.HTTPConnection) -> None:
-        """Notes that it waits for an answer."""
-        if connection.sock is not None:
-            with self._lock:
-                self._waiting[connection] = time.monotonic(), connection.sock
-
     def heard(self, connection: http.client.HTTPConnection) -> None:
-        """Notes that something came."""
+        """Notes that it waits from now on, for an answer or for more of one."""
         with self._lock:
-            if connection in self._waiting:
-                self._waiting[connection] = time.monotonic(), self._waiting[connection][1]
-
-    def end(self, connection: http.client.HTTPConnection) -> None:
-        """Notes that it does not wait any more."""
-        with self._lock:
-            self._waiting.pop(connection, None)
+            sock = connection.sock or self._waiting[connection][1]
+            self._waiting[connection] = time.monotonic(), sock
 
     def break_off(self, before: float) -> None:
         """Ends those that have heard nothing since a time; whoever waits for them gets an error."""
@@ -316,11 +297,12 @@ class _Connections:
             with contextlib.suppress(OSError):
                 sock.shutdown(socket.SHUT_RDWR)
 
-    def give_back(self, url: str, connection: http.client.HTTPConnection) -> None:
-        """Keeps it for the next, unless there are many."""
+    def give_back(self, url: str, connection: http.client.HTTPConnection, *, keep: bool) -> None:
+        """Ends its wait; keeps it for the next, if it may and there are not many, or closes it."""
         with self._lock:
+            self._waiting.pop(connection, None)
             idle = self._idle.setdefault(self._key(url), [])
-            if len(idle) < _KEPT:
+            if keep and len(idle) < _KEPT:
                 idle.append(connection)
                 return
         connection.close()
