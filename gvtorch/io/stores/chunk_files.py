@@ -74,14 +74,9 @@ def files_of(where: str, array: Any) -> ChunkFiles:
     return files
 
 
-def begin_read(view: Any, files: ChunkFiles, chunks: np.ndarray | None = None) -> Any:
-    """Begins to read an array, once its files on disk were looked at.
-
-    Args:
-        view: tensorstore's array, or a part of one.
-        files: Those of the whole array.
-        chunks: (n, axes) int64 places of the chunks that it needs, where they are known: numbers
-            of chunks along each axis of the whole array. Else tensorstore is asked, which is slow.
+def begin_read(view: Any, files: ChunkFiles) -> Any:
+    """Begins to read one of tensorstore's arrays, or a part of one, once the files on disk that it
+    needs were looked at; `files` are those of the whole array.
 
     Returns:
         tensorstore's future of the values, in the order of C; a failed one where a file is not
@@ -89,7 +84,7 @@ def begin_read(view: Any, files: ChunkFiles, chunks: np.ndarray | None = None) -
     """
     try:
         if files.folder:
-            files.check(view.spec().transform if chunks is None else chunks)
+            files.check(view.spec().transform)
     except Endless as error:
         return failed(error)
     return view.read(order="C")
@@ -173,17 +168,6 @@ class ChunkFiles:
         size = self.index_bytes
         return slice(0, size) if self.index == "start" else slice(-size, None)
 
-    def places(self, time: int, zyx: np.ndarray, shape: Sequence[int]) -> np.ndarray | None:
-        """Returns (n, axes) places of the chunks of items at places (n, 3), in an array
-        ([t,] z, y, x, *shape) that has an item of this shape in each chunk; None for any other.
-        """
-        before = len(self.chunk) - len(shape)
-        if self.transposed or before < 3 or self.chunk != (1,) * before + tuple(shape):
-            return None
-        found = np.zeros((len(zyx), len(self.chunk)), np.int64)
-        found[:, : before - 3], found[:, before - 3 : before] = time, zyx
-        return found
-
     def entries(self, index: bytes) -> np.ndarray:
         """(n, 2) uint64 where chunks lie in a shard and how long they are, of its index or of some
         entries.
@@ -191,15 +175,14 @@ class ChunkFiles:
         found = np.frombuffer(index, f"{self.order}u8", len(index) // _ENTRY * 2)
         return found.astype(np.uint64).reshape(-1, 2)
 
-    def check(self, part: Any) -> None:
-        """Looks at the files on disk that a part of the array lies in: places of chunks, or
-        tensorstore's IndexTransform from the part to the array.
+    def check(self, transform: Any) -> None:
+        """Looks at the files on disk that a part of the array lies in, by tensorstore's
+        IndexTransform from the part to the array.
 
         Raises:
             Endless: A file is no regular one, or too long, or Blosc would make too much of it.
         """
-        found = self._listed(part) if isinstance(part, np.ndarray) else self._files(part)
-        for place, chunks in found:
+        for place, chunks in self._files(transform):
             name = f"{self.begin}{self.separator.join(map(str, place))}"
             try:
                 size = check_file(self.folder + name, self.most)
@@ -244,15 +227,8 @@ class ChunkFiles:
             count = [1] * len(count)
         return np.array(count, np.int64), np.array(strides, np.int64)
 
-    def _listed(self, chunks: np.ndarray) -> Iterator[tuple[Sequence[int], np.ndarray]]:
-        """Places of the files of chunks at places (n, axes), and in each the numbers of those."""
-        count, strides = self._counts
-        files = chunks // count
-        for place, numbers in _by_row(files, (chunks - files * count) @ strides):
-            yield place, numbers if self._every is None else self._every
-
     def _files(self, transform: Any) -> Iterator[tuple[Sequence[int], np.ndarray]]:
-        """The same for a part of the array, of which tensorstore's IndexTransform tells."""
+        """Places of these files, and in each the numbers of the chunks that are wanted."""
         side = self.chunk if self._every is None else self.file
         counts, strides = self._counts
         count = counts.tolist()
