@@ -14,11 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
-from ..base.npy_file import write_npy
 from ..base.stage import Progress, no_progress
-from ..base.whole_file import durable_file
 from .source import Index, MemorySource, VolumeSource
 
+LABELS = "labels.npy"  # in the hidden folder of a store in the making
 _CUBE = 128  # voxels along a side of what is read at once
 
 
@@ -45,9 +44,9 @@ class IndexSource(VolumeSource):
             **{name: getattr(inner, name) for name in told},
         )
 
-    def in_file(self, file: Path) -> IndexSource:
-        """Returns the same for other processes, whose labels lie in a file."""
-        return replace(self, labels=str(file))
+    def staged(self, folder: Path) -> IndexSource:
+        """Takes the labels from `LABELS` in the folder, where they lie already."""
+        return replace(self, inner=self.inner.staged(folder), labels=str(folder / LABELS))
 
     def read_stored(self, index: Index) -> np.ndarray:
         times, low, high = index[0], *zip(*((s.start, s.stop) for s in index[1:4]), strict=True)
@@ -124,9 +123,3 @@ def _labels_of(
                 progress("labels", done, total)
 
     return distinct(source.path, parts())
-
-
-def write_labels(file: Path, labels: np.ndarray) -> None:
-    """Writes labels to a .npy file that is either there as a whole or not at all."""
-    with durable_file(file) as out:
-        write_npy(out, labels)

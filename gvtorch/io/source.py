@@ -28,6 +28,8 @@ from ..base import boxes
 from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
+from ..base.npy_file import save_npy
+from ..base.whole_file import told_of
 from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
@@ -229,6 +231,22 @@ class MemorySource(VolumeSource):
         """Takes (z, y, x, c) values, or (t, z, y, x, c); `told` are path, spacing, origin, info."""
         axes = "tzyxc"[-data.ndim :]
         return cls(data=data, shape=data.shape, axes=axes, stored=data.dtype.str, **told)
+
+    def staged(self, folder: Path) -> VolumeSource:
+        """Writes the values to a file in the folder."""
+        file = folder / "source.npy"
+        with told_of(file):
+            save_npy(file, self.data)
+        return ArraySource(
+            path=str(file),
+            file=str(file),
+            shape=self.shape,
+            axes=self.axes,
+            stored=self.stored,
+            offset=file.stat().st_size - self.data.nbytes,  # behind the header
+            fortran=self.data.flags.fnc,
+            info=self.info,
+        )
 
     def read_stored(self, index: Index) -> np.ndarray:
         return self.data[index]

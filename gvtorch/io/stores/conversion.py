@@ -26,18 +26,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
-from ...base.npy_file import save_npy
+from ...base.npy_file import write_npy
 from ...base.stage import Progress, no_progress
 from ...base.volume import Volume
-from ...base.whole_file import told_of
+from ...base.whole_file import durable_file
 from .. import resources
-from ..label_source import IndexSource, write_labels
+from ..label_source import LABELS
 from ..oblique import Oblique
-from ..reading import FormatSettings, open_source
-from ..source import MemorySource, VolumeSource
+from ..reading import FormatSettings
+from ..source import VolumeSource
 from . import shard, unfinished
 from .conversion_plan import (
-    LABELS,
     Estimate,
     Plan,
     check_room,
@@ -179,7 +178,8 @@ def _write_store(plan: Plan, begun: bool, executor: Executor | None, progress: P
     task, settings = plan.task, plan.settings
     with _told_how_to_go_on(plan), unfinished.claimed(plan.target, settings, resume=begun) as work:
         if plan.labels is not None:
-            write_labels(plan.target / WORK / LABELS, plan.labels)
+            with durable_file(plan.target / WORK / LABELS) as file:
+                write_npy(file, plan.labels)
         with _executor(executor, plan) as pool:
             _write_levels(_staged(plan, pool), work, pool, progress)
         if plan.labels is not None:
@@ -220,23 +220,8 @@ def _staged(plan: Plan, pool: Executor) -> Plan:
     """Writes what lies in memory to files, where other processes shall read it."""
     if isinstance(pool, ThreadPoolExecutor):
         return plan
-    source = plan.task.source
-    if isinstance(source, IndexSource):
-        inner = _in_file(plan, source.inner)
-        source = dataclasses.replace(source, inner=inner).in_file(plan.target / WORK / LABELS)
-    else:
-        source = _in_file(plan, source)
+    source = plan.task.source.staged(plan.target / WORK)
     return dataclasses.replace(plan, task=dataclasses.replace(plan.task, source=source))
-
-
-def _in_file(plan: Plan, source: VolumeSource) -> VolumeSource:
-    if not isinstance(source, MemorySource):
-        return source.staged(plan.target / WORK)
-    file = plan.target / WORK / "source.npy"
-    with told_of(file):
-        save_npy(file, source.data)
-    axes = "tzyxc"[-source.data.ndim :]
-    return dataclasses.replace(open_source(file, axes=axes), info=source.info)
 
 
 def _write_levels(

@@ -21,7 +21,7 @@ from ...base.stage import Progress
 from ...base.volume import Volume
 from ...pool.downsample import pool_majority, pool_mean
 from .. import resources
-from ..label_source import IndexSource, indexed_source
+from ..label_source import LABELS, IndexSource, indexed_source
 from ..oblique import Oblique
 from ..reading import FormatSettings, at_place, open_source, read_whole
 from ..source import MemorySource, VolumeSource, no_time
@@ -36,7 +36,6 @@ _BELOW = 4  # a voxel of a coarser level costs so many of the finest
 _DISK = 2.0  # writing to disk takes so much longer than to memory
 _SAMPLES = 3  # cubes that are converted for an estimate
 _SAMPLE_TIME = 2.0  # seconds after which no further cube is converted for an estimate
-LABELS = "labels.npy"  # beside the journal
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
