@@ -33,24 +33,16 @@ def as_source(where: str, given: Any, axes: str | None = None) -> VolumeSource:
         if not isinstance(given, np.ndarray):
             return as_source(where, as_volume(given, axes=axes, where=where))
     found = ArrayLike.of(where, given, axes)
-    told: dict[str, Any] = {
-        "path": found.name or "array",
-        "shape": found.shape,
-        "axes": found.axes,
-        "stored": found.dtype,
-        "spacing": found.spacing,
-        "origin": found.origin,
-        "flips": found.flips,
-        "info": found.info,
-        "lost": found.lost,
-    }
+    kept = {name: getattr(found, name) for name in ("spacing", "origin", "info", "lost")}
+    kept["path"] = found.name or "array"
+    told = {name: getattr(found, name) for name in ("shape", "axes", "flips")}
+    told |= {"stored": found.dtype, **kept}
     mapped = _mapped(given)
     if mapped is not None:
         return ArraySource(**told, **mapped)
     source = ObjectSource(array=found, **told)
     if found.lazy:
         return source
-    kept = {name: told[name] for name in ("path", "spacing", "origin", "info", "lost")}
     return MemorySource.of(source.read_times(0, source.times), **kept)
 
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..base.image_info import ChannelInfo, ImageInfo, color_channels
+from .source import Triple
 
-Triple = tuple[float, float, float]
 _EVEN = 0.01  # of a step: how far slices may lie beside an even grid
 #: What may tell images of one place apart, the best first.
 _APART = (

@@ -33,6 +33,8 @@ from ..base.whole_file import told_of
 from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
+Triple = tuple[float, float, float]
+Told = tuple[ImageInfo, Triple, list[str]]  # info, spacing, what is not kept
 _PART = 1 << 20  # bytes that are unpacked at a time
 _WHOLE = {1: ("char", "int8"), 2: ("short", "int16"), 4: ("int", "int32"), 8: ("longlong", "int64")}
 _NUMBERS = {
@@ -53,8 +55,8 @@ class VolumeSource(ABC):
     axes: str  # a letter for each of its axes: t, c, z, y, x, or - for one of size 1 to drop
     stored: str  # NumPy dtype as it is stored, with byte order
     flips: str = ""  # letters of axes that run backwards
-    spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)  # x y z, world units
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x y z, centre of voxel 0
+    spacing: Triple = (1.0, 1.0, 1.0)  # x y z, world units
+    origin: Triple = (0.0, 0.0, 0.0)  # x y z, centre of voxel 0
     # Where the axes x, y, z do not lie along the world's: (3, 4), from voxels to the world.
     oblique: tuple[tuple[float, ...], ...] | None = None
     info: ImageInfo = dataclasses.field(default_factory=ImageInfo)  # unit, channels, ...
@@ -250,11 +252,6 @@ class MemorySource(VolumeSource):
 
     def read_stored(self, index: Index) -> np.ndarray:
         return self.data[index]
-
-    def read_region(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
-        """Returns the box `low` to `high`, (z, y, x), as a view."""
-        data = self.data[self.time] if self.data.ndim == 5 else self.data
-        return data[boxes.index(low, high)]
 
 
 def place_axes(

@@ -15,7 +15,7 @@ import numpy as np
 from ...base.digits import finite_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels, from_hex
 from ...base.units import NO_DEPTH, spacing_of
-from ..source import Index, VolumeSource
+from ..source import Index, Told, VolumeSource
 from .format import Format, choose
 
 _DTYPES = {
@@ -101,9 +101,7 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
     )
 
 
-def _told(
-    xml: str, width: int, colors: int, stored: str
-) -> tuple[ImageInfo, tuple[float, float, float], list[str]]:
+def _told(xml: str, width: int, colors: int, stored: str) -> Told:
     """What the metadata tells: info, spacing, and what is not kept."""
     root = ElementTree.fromstring(xml)
     sizes: dict[str, float | None] = {}

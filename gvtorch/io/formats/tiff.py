@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
-from ..source import ArraySource, Index, VolumeSource
-from ..tiff_info import JPEG, Told, check_pictures, imagej_info, ome_info, opened_tiff
+from ..source import ArraySource, Index, Told, VolumeSource
+from ..tiff_info import JPEG, check_pictures, imagej_info, ome_info, opened_tiff
 from .format import Format, choose
 
 _LOST = {  # by the tag PhotometricInterpretation

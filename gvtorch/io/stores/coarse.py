@@ -122,7 +122,7 @@ def _mapped(store: Store, folder: Path, level: int, wide: int) -> np.ndarray:
         try:
             os.posix_fallocate(place.fileno(), 0, file.stat().st_size)
         except OSError as error:
-            sizes = [_voxels(store.level_extent(one)) for one in range(1, store.levels)]
+            sizes = [math.prod(store.level_extent(one)) for one in range(1, store.levels)]
             text = f"{error.strerror}: while it is made, files take {amount(2 * wide * sum(sizes))}"
             raise OSError(error.errno, text, store.location) from None
     return mapped
@@ -139,7 +139,7 @@ def _write_blocks(
     place = Path(store.location) / store.coarse_folder / folder
     shutil.rmtree(place, ignore_errors=True)  # of work that was broken off
     place.mkdir()
-    done, total = 0, sum(_voxels(values.shape[:3]) for values in levels)
+    done, total = 0, sum(math.prod(values.shape[:3]) for values in levels)
     for level, values in enumerate(levels, 1):
         spec = store.layout.coarse(level, f"{store.coarse_folder}/{folder}", width)
         Deadline(_OPEN_TIMEOUT).wait(begin_open(store.root, spec, "create"), spec["path"])
@@ -148,7 +148,7 @@ def _write_blocks(
             blocks = _blocks(store.layout, values, low, size, keep)
             at = [a // store.layout.block for a in low]
             finish_write(write(store.root, spec, at, blocks), store.location, "make it anew")
-            done += _voxels(size)
+            done += math.prod(size)
             progress("writing", done, total)
     write_json(place / "zarr.json", group({}))
 
@@ -168,7 +168,3 @@ def _blocks(
     start, stop = boxes.clamped_box(begin, end, values.shape[:3])
     inside = boxes.repeat_edges(keep(values[boxes.index(start, stop)]), start, begin, end)
     return np.ascontiguousarray(bordered(layout, inside))
-
-
-def _voxels(size: Sequence[int]) -> int:
-    return math.prod(map(int, size))

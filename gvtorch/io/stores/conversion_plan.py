@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import shutil
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -321,4 +320,4 @@ def _fingerprint(given: Any, source: VolumeSource) -> list[Any]:
     if isinstance(given, (str, Path)):
         return unfinished.fingerprint(source.path)
     told: list[Any] = [list(source.shape), source.stored]
-    return told + ([zlib.crc32(source.data.tobytes())] if isinstance(source, MemorySource) else [])
+    return told + ([unfinished.checksum([source.data])] if isinstance(source, MemorySource) else [])

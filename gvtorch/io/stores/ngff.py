@@ -367,25 +367,21 @@ def image_metadata(
 
     `spacing` and `origin` are (x, y, z) of level 0; axes t and c come first where there are such.
     """
-    axes: list[dict[str, str]] = []
-    first_scale, first_move = [], []
-    if layout.times > 1:
-        unit = {"unit": info.time_unit} if info.time_unit else {}
-        axes.append({"name": "t", "type": "time"} | unit)
-        first_scale.append(1.0 if info.time_step is None else info.time_step)
-        first_move.append(info.time_origin)
-    if "c" in layout.axes:
-        axes.append({"name": "c", "type": "channel"})
-        first_scale.append(1.0)
-        first_move.append(0.0)
-    unit = {"unit": info.unit} if info.unit else {}
-    axes += [{"name": axis, "type": "space"} | unit for axis in "zyx"]
+    units = {"t": info.time_unit, "c": None, **dict.fromkeys("zyx", info.unit)}
+    kinds = {"t": "time", "c": "channel", **dict.fromkeys("zyx", "space")}
+    period = 1.0 if info.time_step is None else info.time_step
+    step = dict(zip("xyztc", (*spacing, period, 1.0), strict=True))
+    first = dict(zip("xyztc", (*origin, info.time_origin, 0.0), strict=True))
+    axes = [
+        {"name": axis, "type": kinds[axis]} | ({"unit": units[axis]} if units[axis] else {})
+        for axis in layout.axes
+    ]
     datasets = []
     for level in range(layout.levels):
-        factor = 2**level
-        zyx = list(zip(spacing, origin, strict=True))[::-1]
-        scale = first_scale + [s * factor for s, _ in zyx]
-        move = first_move + [o + (factor - 1) / 2 * s for s, o in zyx]
+        factors = [2**level if axis in "xyz" else 1 for axis in layout.axes]
+        pairs = list(zip(layout.axes, factors, strict=True))
+        scale = [step[axis] * factor for axis, factor in pairs]
+        move = [first[axis] + (factor - 1) / 2 * step[axis] for axis, factor in pairs]
         transforms = [
             {"type": "scale", "scale": scale},
             {"type": "translation", "translation": move},

@@ -9,10 +9,12 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, NamedTuple
+
+import numpy as np
 
 from ...base.image_info import ImageInfo
 from ...base.volume import Volume, movable
@@ -223,11 +225,19 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
         file.write(json.dumps(content, indent=1, allow_nan=False).encode())
 
 
+def checksum(arrays: Iterable[np.ndarray]) -> int:
+    """Returns the CRC-32 of the numbers of arrays, one after the other."""
+    total = 0
+    for one in arrays:
+        total = zlib.crc32(one.tobytes(), total)
+    return total
+
+
 def fingerprint(source: str | Path | Volume) -> list[Any]:
     """Sizes and modification times of a source, or a checksum: equal while it is unchanged."""
     if isinstance(source, Volume):
-        data = movable(source.data)
-        return [list(data.shape), str(source.data.dtype), zlib.crc32(data.cpu().numpy().tobytes())]
+        data = movable(source.data).cpu().numpy()
+        return [list(data.shape), str(source.data.dtype), checksum([data])]
     text = str(source)
     if "://" in text:
         return [text]
