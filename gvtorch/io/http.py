@@ -31,8 +31,8 @@ SMALL = 1 << 20  # bytes that any file may have
 _PART = 1 << 16  # bytes
 _SILENT = 1.0  # seconds without a byte, after which `ask_again` gives a request up
 _KEPT = 16  # idle connections to a server
-_AGENT = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
-_MISSING = (404, 410)
+AGENT = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
+MISSING = (404, 410)  # status of what is not there
 _ELSEWHERE = (301, 302, 303, 307, 308)
 _CLOSED = (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError)
 
@@ -90,12 +90,18 @@ def read_http(
     """
     if time.monotonic() < _refused.get(url, _NOT)[0]:
         raise Endless(_refused[url][1])
+    slow = STALL + most / SLOWEST
+    end = time.monotonic() + min(seconds, slow)
     try:
-        return _in_time(url, most, part, most if whole is None else whole, seconds)
+        return _read(url, most, part, most if whole is None else whole, end)
+    except TimeoutError:
+        if seconds < slow and time.monotonic() >= end:
+            raise
+        found: OSError = Endless("the server sends hardly anything")
     except OSError as error:
-        if not isinstance(error, TimeoutError):
-            keep_reason(url, error, REFUSED if isinstance(error, Endless) else 0.0)
-        raise
+        found = error
+    keep_reason(url, found, REFUSED if isinstance(found, Endless) else 0.0)
+    raise found from None
 
 
 def keep_reason(url: str, error: OSError, seconds: float = 0.0) -> None:
@@ -118,33 +124,22 @@ def ask_again() -> None:
     _connections.break_off(time.monotonic() - _SILENT)
 
 
-def _in_time(url: str, most: int, part: slice | None, whole: int, seconds: float) -> bytes | None:
-    slow = STALL + most / SLOWEST
-    end = time.monotonic() + min(seconds, slow)
-    try:
-        return _read(url, most, part, whole, end)
-    except TimeoutError:
-        if seconds < slow and time.monotonic() >= end:
-            raise
-        raise Endless("the server sends hardly anything") from None
-
-
 def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> bytes | None:
-    headers = dict(_AGENT) | ({} if part is None else {"Range": _range(part)})
+    headers = AGENT | ({} if part is None else {"Range": _range(part)})
     patience = max(1e-3, min(end - time.monotonic(), STALL))
     try:
         connection, answer = _ask(url, headers, patience)
     except TimeoutError:
         raise
     except HttpStatus as error:
-        if error.status in _MISSING:
+        if error.status in MISSING:
             return None
         raise
     except (OSError, http.client.HTTPException, ValueError) as error:
         raise OSError(one_line(error)) from None
     done = False
     try:
-        if answer.status in _MISSING:
+        if answer.status in MISSING:
             return None
         if answer.status not in (200, 206):
             raise HttpStatus(answer.status, answer.reason)
@@ -222,7 +217,7 @@ def _ask(
     target += f"?{place.query}" if place.query else ""
     proxied = place.scheme in urllib.request.getproxies()
     if proxied and not urllib.request.proxy_bypass(place.hostname or ""):
-        return None, _by_urllib(url, headers, seconds)
+        return None, ask_by_urllib(url, headers, seconds)
     while True:
         connection, used = _connections.take(url, seconds)
         try:
@@ -238,10 +233,11 @@ def _ask(
                 continue  # by the server, meanwhile
             raise
         _connections.give_back(url, connection, keep=False)
-        return None, _by_urllib(url, headers, seconds)
+        return None, ask_by_urllib(url, headers, seconds)
 
 
-def _by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client.HTTPResponse:
+def ask_by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client.HTTPResponse:
+    """Sends a request by way of proxies and redirections; raises as `read_http`, but Endless."""
     request = urllib.request.Request(url, headers=headers)
     try:
         found: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=seconds)
@@ -250,7 +246,7 @@ def _by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client
         raise HttpStatus(error.code, error.reason) from None
     except urllib.error.URLError as error:
         if isinstance(error.reason, TimeoutError):
-            raise TimeoutError from None
+            raise TimeoutError(str(error.reason)) from None
         raise OSError(str(error.reason)) from None
     return found
 

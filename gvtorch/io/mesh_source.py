@@ -120,12 +120,10 @@ class MeshSource(VolumeSource):
         return ("gvtorch", "voxelize", self.path, "-o", store, *self.words)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
-        """Makes a part."""
         low, high = [one.start for one in index[:3]], [one.stop for one in index[:3]]
         return self.read_region(low, high)[..., index[3]]
 
     def read_region(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
-        """Makes the box `low` to `high`, (z, y, x), as (z, y, x, c)."""
         with _LOCK:  # the first thread builds the hierarchy
             grid = _voxelizer(self)
         return grid.region(low, high)[self.channel].cpu().numpy()

@@ -46,7 +46,6 @@ class StraightSource(VolumeSource):
         self.inner.check_file()
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Resamples a part."""
         times, low, high = index[0], *zip(*((s.start, s.stop) for s in index[1:4]), strict=True)
         size = [b - a for a, b in zip(low, high, strict=True)]
         out = np.empty((times.stop - times.start, *size, self.width), self.stored)

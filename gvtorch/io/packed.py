@@ -35,7 +35,6 @@ class PackedSource(VolumeSource):
     whole: bool = True
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Unpacks all, and returns a part."""
         count = math.prod(self.shape)
         if self.codec in ("text", "shares"):
             shares = self.codec == "shares"

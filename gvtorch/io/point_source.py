@@ -68,7 +68,6 @@ class SplatSource(VolumeSource):
         return ("gvtorch", "splat", self.path, "-o", store, *self.words)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
-        """Adds a part up."""
         low, high = (
             tuple(end) for end in zip(*((s.start, s.stop) for s in index[:3]), strict=True)
         )

@@ -39,7 +39,6 @@ class ChunkedSource(VolumeSource):
     folder: str
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Reads the chunks of a part."""
         array, files = _array(self.driver, self.folder, self.opened)
         return Deadline(_TIMEOUT).wait(begin_read(array[index], files), self.folder)
 

@@ -37,7 +37,6 @@ class CziSource(VolumeSource):
     starts: tuple[tuple[str, int], ...]  # first number of each of T, C, Z
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Reads the tiles of a part of each plane."""
         from pylibCZIrw import czi
 
         rows, columns = index[3], index[4]

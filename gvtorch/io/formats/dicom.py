@@ -50,7 +50,6 @@ class DicomSource(VolumeSource):
                 raise ValueError(f"{file}: its images take {need} bytes, the file has {size}")
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Unpacks the images of a part."""
         times, places, *inside = index
         depth = self.shape[1]
         wanted = [

@@ -125,17 +125,13 @@ def _placed(
 
 def _info(header: dict[str, str], width: int, rank: int) -> ImageInfo:
     """What the header tells of the values."""
-    modality = header.get("Modality", "")
+    modality, steps = header.get("Modality", ""), header.get("ElementSpacing", "").split()
+    step = float(steps[3]) if rank == len(steps) == 4 else 0.0
     color = width == 3 and header["ElementType"].startswith("MET_UCHAR")
     return ImageInfo(
         unit=length_unit(header.get("DistanceUnits", "mm")),
         quantity="HU" if modality == "MET_MOD_CT" else None,
         channels=color_channels() if color else (),
         space="right-anterior-superior",
-        time_step=_time_step(header) if rank == 4 else None,
+        time_step=step if step > 0 else None,
     )
-
-
-def _time_step(header: dict[str, str]) -> float | None:
-    words = header.get("ElementSpacing", "").split()
-    return float(words[3]) if len(words) == 4 and float(words[3]) > 0 else None

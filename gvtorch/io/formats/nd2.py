@@ -22,7 +22,6 @@ class Nd2Source(VolumeSource):
     position: int
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Maps the frames of a part."""
         import nd2
 
         times, places, *inside = index

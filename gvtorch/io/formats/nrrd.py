@@ -121,7 +121,7 @@ def _letters(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: st
         if len(kinds) == rank and set(kinds) - {"???", "none"}:
             found = ["s" if k in _SPATIAL else "t" if k == "time" else "c" for k in kinds]
         else:  # the axes that have no place, if the header tells of one
-            places = _directions(header, rank), _spacings(header, rank)[:, None]
+            places = _directions(header, rank), _steps(header, rank)[0][:, None]
             table = next((one for one in places if np.isfinite(one).any()), np.zeros((rank, 1)))
             found = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
         if found.count("s") == 3 and found.count("t") <= 1 and found.count("c") <= 1:
@@ -146,11 +146,6 @@ def _numbers(header: dict[str, Any], rank: int, *names: str) -> np.ndarray:
     field = next((header[name] for name in names if name in header), np.zeros(0))
     told = np.asarray(field, dtype=np.float64)
     return told if told.shape == (rank,) else np.full(rank, np.nan)
-
-
-def _spacings(header: dict[str, Any], rank: int) -> np.ndarray:
-    """(axes,) widths of a step along each axis; NaN for none."""
-    return _steps(header, rank)[0]
 
 
 def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
@@ -211,7 +206,7 @@ def _info(
     period = None
     if "t" in letters:
         at = letters.index("t")
-        steps = (*_directions(header, len(letters))[at, 3:], _spacings(header, len(letters))[at])
+        steps = (*_directions(header, len(letters))[at, 3:], _steps(header, len(letters))[0][at])
         step = next((float(one) for one in steps if np.isfinite(one) and one > 0), None)
         period = time_unit(units[at]) if step else None
     space = str(header.get("space", "")).lower().removesuffix("-time")

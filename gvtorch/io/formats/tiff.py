@@ -28,7 +28,6 @@ class TiffSource(VolumeSource):
     series: int = 0
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Unpacks the pages of a part."""
         with opened_tiff(self.path) as (file, _):
             series = file.series[self.series]
             if self.whole:

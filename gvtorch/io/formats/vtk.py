@@ -48,7 +48,6 @@ class VtkSource(VolumeSource):
     whole: bool = True
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Unpacks all, and returns a part."""
         count, dtype = math.prod(self.shape), np.dtype(self.stored)
         with open(self.path, "rb") as file:
             file.seek(self.offset)
@@ -285,26 +284,22 @@ def _open_legacy(path: str, key: str | None) -> VolumeSource:
         open(path, "rb") as file,
         mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
     ):
-        return _open_mapped(path, content, key)
-
-
-def _open_mapped(path: str, content: mmap.mmap, key: str | None) -> VolumeSource:
-    lines = content[:4096].split(b"\n", 4)
-    if len(lines) < 5 or not lines[0].startswith(b"# vtk DataFile"):
-        raise ValueError(f"{path}: is no legacy VTK file")
-    if lines[3].split() != [b"DATASET", b"STRUCTURED_POINTS"]:
-        raise ValueError(f"{path}: {lines[3][:60].decode('latin-1')!r}; expected STRUCTURED_POINTS")
-    binary = lines[2].strip().upper() == b"BINARY"
-    affine, points, arrays = _legacy_parts(
-        path, content, sum(len(line) + 1 for line in lines[:4]), binary
-    )
+        lines = content[:4096].split(b"\n", 4)
+        if len(lines) < 5 or not lines[0].startswith(b"# vtk DataFile"):
+            raise ValueError(f"{path}: is no legacy VTK file")
+        if lines[3].split() != [b"DATASET", b"STRUCTURED_POINTS"]:
+            found = lines[3][:60].decode("latin-1")
+            raise ValueError(f"{path}: {found!r}; expected STRUCTURED_POINTS")
+        binary = lines[2].strip().upper() == b"BINARY"
+        head = sum(len(line) + 1 for line in lines[:4])
+        affine, points, arrays = _legacy_parts(path, content, head, binary)
     chosen, lost = choose(path, "array", [array["name"] for array in arrays], key)
-    found = arrays[chosen]
-    told = _told(path, points, affine, found, lost)
-    told |= {"file": path, "offset": found["offset"], "stored": found["stored"]}
+    array = arrays[chosen]
+    told = _told(path, points, affine, array, lost)
+    told |= {"file": path, "offset": array["offset"], "stored": array["stored"]}
     if binary:
         return ArraySource(**told)
-    return PackedSource(codec="shares" if found["colors"] else "text", **told)
+    return PackedSource(codec="shares" if array["colors"] else "text", **told)
 
 
 def _legacy_parts(

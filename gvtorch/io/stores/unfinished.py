@@ -11,6 +11,7 @@ import shutil
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -34,35 +35,35 @@ class Done(NamedTuple):
     files: Files  # checksums
 
 
+@dataclass
 class UnfinishedStore:
-    """A store that is being made, by this process alone."""
+    """A store that is being made, by this process alone; `done` stands in the journal already."""
 
-    def __init__(self, target: Path, journal: IO[str], done: Mapping[Task, Done]) -> None:
-        """Takes the folder over; `done` stands in the journal already."""
-        self.done = dict(done)
-        self._target, self._journal = target, journal
+    target: Path
+    journal: IO[str]
+    done: dict[Task, Done]
 
     def note(self, done: Mapping[Task, Done]) -> None:
         """Writes down that tasks are done; on disk when this returns."""
         self.done |= done
-        with told_of(self._target / WORK / _JOURNAL):
-            _write_lines(self._journal, done)
+        with told_of(self.target / WORK / _JOURNAL):
+            _write_lines(self.journal, done)
 
     def finish(self, layout: StoreLayout, info: ImageInfo, settings: Mapping[str, Any]) -> None:
         """Writes the metadata, the root's last of all, and removes the hidden folder."""
         for name in GROUPS:
-            write_json(self._target / name / "zarr.json", group({}))
+            write_json(self.target / name / "zarr.json", group({}))
         files = {name: one for done in self.done.values() for name, one in done.files.items()}
-        write_json(self._target / LIST, {"files": files})
+        write_json(self.target / LIST, {"files": files})
         place = {"spacing": settings["spacing"], "origin": settings["origin"]}
-        name = Path(os.path.realpath(self._target)).name.removesuffix(".zarr")
+        name = Path(os.path.realpath(self.target)).name.removesuffix(".zarr")
         image, beside = image_metadata(name, layout, info, **place)
         own = layout.attributes(place) | ({"info": beside} if beside else {})
         own["files_sum"] = sum_of(files)
         own["checksum"] = sum_of(as_json(own))
         attributes = {"ome": image, "gvtorch": own}
-        write_json(self._target / "zarr.json", group(attributes))
-        shutil.rmtree(self._target / WORK, ignore_errors=True)
+        write_json(self.target / "zarr.json", group(attributes))
+        shutil.rmtree(self.target / WORK, ignore_errors=True)
 
 
 def is_finished(target: Path) -> bool:
