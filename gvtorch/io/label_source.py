@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
-from ..base.stage import Progress, no_progress
+from ..base.stage import Progress
+from .resources import cores
 from .source import Index, MemorySource, VolumeSource
 
 LABELS = "labels.npy"  # in the hidden folder of a store in the making
@@ -72,32 +73,35 @@ def _loaded(file: str) -> np.ndarray:
 
 def indexed_source(
     source: VolumeSource,
-    times: tuple[int, int],
-    workers: int,
-    known: Path,
-    progress: Progress = no_progress,
+    time: int | None,
+    workers: int | None,
+    folder: Path,
+    progress: Progress,
 ) -> VolumeSource:
-    """Returns a source of labels as stores hold them: as it is, where they are of 16 bits at most.
+    """Returns a source as stores hold its values: as it is, where these are no labels, are indexed
+    already, or are of 16 bits at most.
 
     Args:
-        source: Of labels.
-        times: The first time point, and one past the last.
-        workers: Threads that read.
-        known: The .npy file of its labels, if it has been written before; else all is read once.
+        source: Any.
+        time: The time point that is wanted; None: all.
+        workers: Threads that read, up to 8; None: one a core.
+        folder: Where `LABELS` lies, if it has been written before; else all is read once.
         progress: Told ("labels", regions done, regions in all).
 
     Raises:
         ValueError: They are no whole numbers, or too many.
         OSError: The source can't be read.
     """
-    if source.dtype in NARROW:
+    if not source.info.labels or isinstance(source, IndexSource) or source.dtype in NARROW:
         return source
     if isinstance(source, MemorySource):
         source = replace(source, data=as_whole(source.path, source.data))
         source = replace(source, stored=source.data.dtype.str)
-    if known.exists():
-        return IndexSource.of(source, np.load(known))
-    return IndexSource.of(source, _labels_of(source, times, workers, progress))
+    if (folder / LABELS).exists():
+        return IndexSource.of(source, np.load(folder / LABELS))
+    times = (0, source.times) if time is None else (source.time, source.time + 1)
+    threads = min(8, cores() if workers is None else workers)
+    return IndexSource.of(source, _labels_of(source, times, threads, progress))
 
 
 def _labels_of(

@@ -15,7 +15,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
@@ -219,19 +219,19 @@ def _source(path: str, headers: list[Any]) -> DicomSource:
                 f"{_image_shape(header)} (rows, columns, samples, {Path(header.filename).name})"
             )
         frames += frames_of(header, count)
-    ordered, affine, lost, times = order_frames(path, frames)
-    depth = len(ordered) // times.count
+    times, affine, lost, moments = order_frames(path, frames)
+    depth, frames = len(times[0]), list(chain(*times))
     told = place_axes(path, LPS_TO_RAS @ affine, (depth, rows, columns))
     color = (samples,) if samples > 1 else ()
     told["axes"] = "t" + told["axes"] + "c" * len(color)
-    info, more = image_info(first, samples, times)
-    if any(frame.position is None for frame in ordered):
+    info, more = image_info(first, samples, moments)
+    if any(frame.position is None for frame in frames):
         info = replace(info, unit=info.unit if first.get("PixelSpacing") else None)
     return DicomSource(
         path=path,
-        shape=(times.count, depth, rows, columns, *color),
-        stored=_dtype(first, ordered),
-        frames=tuple((f.file, f.number, f.slope, f.intercept) for f in ordered),
+        shape=(len(times), depth, rows, columns, *color),
+        stored=_dtype(first, frames),
+        frames=tuple((f.file, f.number, f.slope, f.intercept) for f in frames),
         info=info,
         lost=(*lost, *more),
         **told,

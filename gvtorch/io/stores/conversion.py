@@ -31,7 +31,7 @@ from ...base.stage import Progress, no_progress
 from ...base.volume import Volume
 from ...base.whole_file import durable_file
 from .. import resources
-from ..label_source import LABELS
+from ..label_source import LABELS, indexed_source
 from ..oblique import Oblique
 from ..reading import FormatSettings
 from ..source import VolumeSource
@@ -43,7 +43,6 @@ from .conversion_plan import (
     estimate_of,
     plan_of,
     source_of,
-    with_counted_labels,
     within,
 )
 from .store import Store
@@ -116,7 +115,7 @@ def convert(
             _check_finished(whole, make_source(read=False), block, threshold)
         return whole
     begun = unfinished.is_begun(target, resume=resume)
-    found = with_counted_labels(make_source(), target, time, workers, progress)
+    found = indexed_source(make_source(), time, workers, target / WORK, progress)
     plan = plan_of(source, found, target, block, threshold, nan, time, workers)
     if executor is None and (memory is not None or workers is None):
         plan = within(plan, memory)
@@ -167,10 +166,10 @@ def estimate(
 
     Args, Raises: as `convert`.
     """
-    opened_source = source_of(source, spacing, None, time, oblique, labels, options)
     target = Path(store)
-    opened_source = with_counted_labels(opened_source, target, time, workers, no_progress)
-    return estimate_of(plan_of(source, opened_source, target, block, threshold, nan, time, workers))
+    found = source_of(source, spacing, None, time, oblique, labels, options)
+    found = indexed_source(found, time, workers, target / WORK, no_progress)
+    return estimate_of(plan_of(source, found, target, block, threshold, nan, time, workers))
 
 
 def _write_store(plan: Plan, begun: bool, executor: Executor | None, progress: Progress) -> None:

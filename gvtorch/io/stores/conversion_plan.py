@@ -16,17 +16,16 @@ import numpy as np
 
 from ...base import check
 from ...base.labels import background
-from ...base.stage import Progress
 from ...base.volume import Volume
 from ...pool.downsample import pool_majority, pool_mean
 from .. import resources
-from ..label_source import LABELS, IndexSource, indexed_source
+from ..label_source import IndexSource
 from ..oblique import Oblique
 from ..reading import FormatSettings, at_place, open_source, read_whole
 from ..source import MemorySource, VolumeSource, no_time
 from . import shard, unfinished
 from .level_reader import Pool
-from .store_layout import BLOCKS, DTYPES, WORK, StoreLayout, context, kvstore
+from .store_layout import BLOCKS, DTYPES, StoreLayout, context, kvstore
 
 _FEW = 4  # tasks of level 0 up to which processes are not worth their start
 _PROCESS = 400 << 20  # bytes of a worker process without data
@@ -136,21 +135,6 @@ def source_of(
         )
     told = {name: getattr(found, name) for name in ("path", "spacing", "origin", "info")}
     return MemorySource.of(read_whole(found, first, times), **told)
-
-
-def with_counted_labels(
-    source: VolumeSource,
-    target: Path,
-    time: int | None,
-    workers: int | None,
-    progress: Progress,
-) -> VolumeSource:
-    """Counts labels off that are wider than 16 bits."""
-    if not source.info.labels or isinstance(source, IndexSource):
-        return source
-    times = (0, source.times) if time is None else (source.time, source.time + 1)
-    threads = min(8, resources.cores() if workers is None else workers)
-    return indexed_source(source, times, threads, target / WORK / LABELS, progress)
 
 
 def plan_of(
