@@ -125,7 +125,10 @@ def ask_again() -> None:
 
 
 def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> bytes | None:
-    headers = AGENT | ({} if part is None else {"Range": _range(part)})
+    headers = dict(AGENT)
+    if part is not None:
+        first, last = part.start or 0, "" if part.stop is None else part.stop - 1
+        headers["Range"] = f"bytes={first}" if first < 0 else f"bytes={first}-{last}"
     patience = max(1e-3, min(end - time.monotonic(), STALL))
     try:
         connection, answer = _ask(url, headers, patience)
@@ -156,13 +159,6 @@ def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> by
             answer.close()
         if connection is not None:
             _connections.give_back(url, connection, keep=keep)
-
-
-def _range(part: slice) -> str:
-    """What a request says that asks for a part of a file."""
-    first, last = part.start or 0, part.stop
-    wanted = f"{first}-{last - 1}" if last is not None else f"{first}-"
-    return f"bytes={wanted if first >= 0 else first}"
 
 
 def _content(

@@ -44,8 +44,13 @@ class DicomSource(VolumeSource):
     def check_file(self) -> None:
         """Compares the size of files that are not packed with what their images take."""
         for file, number, *_ in dict((frame[0], frame) for frame in self.frames).values():
-            need = _bytes_unpacked(file, number + 1)
-            size = os.stat(file).st_size
+            header, size = _header(file), os.stat(file).st_size
+            meta = header.file_meta if "file_meta" in vars(header) else {}
+            syntax = meta.get("TransferSyntaxUID")
+            if syntax is None or syntax.is_compressed or syntax == _DEFLATED:
+                continue
+            values = math.prod(_image_shape(header)) * (number + 1)
+            need = values * int(header.get("BitsAllocated") or 0) // 8
             if size < need:
                 raise ValueError(f"{file}: its images take {need} bytes, the file has {size}")
 
@@ -129,7 +134,8 @@ def open_dicom(path: str, key: str | None = None) -> DicomSource:
         headers = [_header(path)]
         if _frame_count(headers[0]) == 1:
             headers += _siblings(path, headers[0])
-    return _source(path, _without_copies(headers))
+    once = {str(h.get("SOPInstanceUID", h.filename)): h for h in reversed(headers)}
+    return _source(path, list(reversed(once.values())))
 
 
 def _siblings(path: str, first: Any) -> Iterator[Any]:
@@ -191,12 +197,6 @@ def _choose(path: str, series: dict[str, list[Any]], key: str | None) -> list[An
 
 def _names(uid: str, header: Any) -> list[str]:
     return [str(header.get("SeriesNumber", uid)), str(header.get("SeriesDescription", "")), uid]
-
-
-def _without_copies(headers: Sequence[Any]) -> list[Any]:
-    """Leaves out a file that is there twice."""
-    found = {str(h.get("SOPInstanceUID", h.filename)): h for h in reversed(headers)}
-    return list(reversed(found.values()))
 
 
 def _frame_count(header: Any) -> int:
@@ -261,16 +261,6 @@ def _dtype(header: Any, frames: Sequence[DicomFrame]) -> str:
         if np.iinfo(kind).min <= min(ends) and max(ends) <= np.iinfo(kind).max:
             return kind
     return "int32" if max(map(abs, ends)) < 2**31 and bits > 16 else "float32"
-
-
-def _bytes_unpacked(file: str, images: int) -> int:
-    """Bytes that the images of a file take if they are not packed, else 0."""
-    header = _header(file)
-    syntax = header.file_meta.get("TransferSyntaxUID") if "file_meta" in vars(header) else None
-    if syntax is None or syntax.is_compressed or syntax == _DEFLATED:
-        return 0
-    bits = int(header.get("BitsAllocated") or 0)
-    return math.prod(_image_shape(header)) * images * bits // 8
 
 
 def _images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:

@@ -143,11 +143,6 @@ class ChunkFiles:
         )
 
     @cached_property
-    def chunks(self) -> int:
-        """Number of them in a file."""
-        return math.prod(self.file) // max(1, math.prod(self.chunk))
-
-    @cached_property
     def most(self) -> int:
         """Bytes of a file, at most."""
         return file_limit(math.prod(self.file), math.prod(self.chunk), self.item)
@@ -214,7 +209,8 @@ class ChunkFiles:
         """Numbers of all chunks of a file, where it is looked at as a whole: it has one, or which
         are wanted can't be told.
         """
-        return np.arange(self.chunks) if self.transposed or not self.index else None
+        chunks = math.prod(self.file) // max(1, math.prod(self.chunk))
+        return np.arange(chunks) if self.transposed or not self.index else None
 
     @cached_property
     def _counts(self) -> tuple[np.ndarray, np.ndarray]:

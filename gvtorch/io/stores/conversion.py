@@ -47,7 +47,6 @@ from .conversion_plan import (
 )
 from .store import Store
 from .store_layout import WORK, Deadline, begin_open
-from .unfinished import Done
 
 _AHEAD = 64  # tasks handed to an executor that does not tell how many workers it has
 _OPEN_TIMEOUT = 60.0  # seconds
@@ -242,7 +241,7 @@ def _write_levels(
             for result in results:
                 bad += result.bad
                 if not result.bad:
-                    work.note({(level, *result.place): Done(result.voxels, result.files)})
+                    work.note({(level, *result.place): result})
                     done += result.voxels * layout.voxel_bytes
                     progress("converting", done, total)
         if bad:
@@ -259,10 +258,10 @@ def _write_levels(
 
 def _run(
     pool: Executor, task: shard.Conversion, level: int, places: Iterable[Any], ahead: int
-) -> Generator[shard.ShardResult, None, None]:
+) -> Generator[unfinished.Done, None, None]:
     """Runs the tasks of a level, a bounded number at a time, and yields what they tell."""
     waiting = iter(places)
-    running: set[Future[shard.ShardResult]] = set()
+    running: set[Future[unfinished.Done]] = set()
     try:
         while True:
             for at in itertools.islice(waiting, ahead - len(running)):

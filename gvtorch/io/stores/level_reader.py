@@ -93,19 +93,18 @@ def open_arrays(
     return stored, chosen, sizes
 
 
-def with_channels(
-    image: MultiscaleImage, sizes: dict[str, int], chosen: slice | list[int]
-) -> MultiscaleImage:
-    """What the metadata tells of the channels that were chosen, if it fits the array."""
-    told, width, lost = image.info.channels, sizes.get("c", 1), list(image.lost)
+def keep_channels(image: MultiscaleImage, sizes: dict[str, int], chosen: slice | list[int]) -> None:
+    """Keeps what is told of the channels that were chosen, if it fits the array."""
+    told, width = image.info.channels, sizes.get("c", 1)
     if told and len(told) != width:
-        lost.append(f"what is told of {len(told)} channels, where there are {width}")
+        image.lost.append(f"what is told of {len(told)} channels, where there are {width}")
         told = ()
     if sizes.get("-", 1) > 1:
-        lost.append(f"an axis that is none of t, c, z, y, x: the first of {sizes['-']} is read")
+        other = f"an axis that is none of t, c, z, y, x: the first of {sizes['-']} is read"
+        image.lost.append(other)
     if told and not isinstance(chosen, slice):
         told = tuple(told[number] for number in chosen)
-    return replace(image, info=replace(image.info, channels=told), lost=tuple(lost))
+    image.info = replace(image.info, channels=told)
 
 
 def _check_array(where: str, array: Any, axes: str) -> ChunkFiles:

@@ -37,15 +37,15 @@ class ImageArray:
     translation: tuple[float, float, float]  # z y x
 
 
-@dataclass(frozen=True)
+@dataclass
 class MultiscaleImage:
-    """A multiscale image."""
+    """A multiscale image; what is told beside it is added as it is found."""
 
     axes: str  # in stored order, a letter each: t, c, z, y, x, or - for another
     scales: tuple[ImageArray, ...]  # finest first
     name: str
     info: ImageInfo = field(default_factory=ImageInfo)
-    lost: tuple[str, ...] = ()  # what is told beside, a few words each
+    lost: list[str] = field(default_factory=list)  # what is not kept, a few words each
     own: dict[str, Any] = field(default_factory=dict)  # what gvtorch tells of it
 
 
@@ -88,7 +88,7 @@ def find_image(
             own = deeper.get("gvtorch") if deeper else None
             layout = None if own is None else StoreLayout.parse(f"{where}/{inner}", own)
             if found is not None and image is None and series is not None:
-                found = _with_series(where, top, found, deadline, inner)
+                _tell_of_images(found, _series(where, top, deadline, inner))
     if found is None:
         asked = "no multiscale image" if image is None else f"no image {image!r}"
         plate = "; it is a plate: name a field of view, as in 'A/1/0'"
@@ -97,9 +97,9 @@ def find_image(
         held = f"; it holds {_few(known)}" if known else ""
         raise ValueError(f"{where}: has {asked} (NGFF multiscales){held}{of}")
     if layout is not None and isinstance(own, dict):
-        found = replace(found, info=_own_info(own.get("info"), found.info), own=own)
+        found.info, found.own = _own_info(own.get("info"), found.info), own
     else:
-        found = _with_labels(where, root, found, deadline)
+        found.lost += _labels(where, root, deadline)
     return root, found, layout
 
 
@@ -175,9 +175,14 @@ def _parse_image(
     for number, item in enumerate(images):
         if image in (None, item.get("name"), str(number)):
             found = _image(where, item, _member(attributes, "omero"))
-            found = _as_labels(found, _member(attributes, "image-label"))
+            labels = _member(attributes, "image-label")
+            if isinstance(labels, dict):
+                found.info = replace(found.info, labels=True)
+                beside = (name for name in ("colors", "properties") if labels.get(name))
+                found.lost += [f"{name} of the labels" for name in beside]
             others = [str(one.get("name", at)) for at, one in enumerate(images) if at != number]
-            return _told_beside(found, others if image is None else [])
+            _tell_of_images(found, others if image is None else [])
+            return found
     return None
 
 
@@ -194,58 +199,41 @@ def _few(names: list[str]) -> str:
     return ", ".join(short) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
-def _as_labels(found: MultiscaleImage, told: Any) -> MultiscaleImage:
-    """An image whose values are labels, if `image-label` says so."""
-    if not isinstance(told, dict):
-        return found
-    beside = [f"{name} of the labels" for name in ("colors", "properties") if told.get(name)]
-    info = replace(found.info, labels=True)
-    return replace(found, info=info, lost=(*found.lost, *beside))
-
-
 def _member(attributes: dict[str, Any], name: str) -> Any:
     """What is told of a name: of 0.5 in `ome`."""
     ome = attributes.get("ome")
     return (ome if isinstance(ome, dict) else attributes).get(name)
 
 
-def _told_beside(found: MultiscaleImage, others: list[str]) -> MultiscaleImage:
-    if not others:
-        return found
-    text = f"the images {_few(others)} beside {brief(found.name)} (key= or image= names one)"
-    return replace(found, lost=(*found.lost, text))
+def _tell_of_images(found: MultiscaleImage, others: list[str]) -> None:
+    if others:
+        beside = f"beside {brief(found.name)} (key= or image= names one)"
+        found.lost.append(f"the images {_few(others)} {beside}")
 
 
-def _with_series(
-    where: str, root: Any, found: MultiscaleImage, deadline: Deadline, first: str
-) -> MultiscaleImage:
-    """Names the other images that converters of microscopy files lay side by side."""
-    others: list[str] = []
+def _series(where: str, root: Any, deadline: Deadline, first: str) -> list[str]:
+    """Names of the other images that converters of microscopy files lay side by side."""
     try:
         listed = _attributes(f"{where}/OME", child(root, "OME"), deadline) or {}
         series = _member(listed, "series")
         if isinstance(series, list):
-            others = [str(path) for path in series if path != first]
-        elif _attributes(f"{where}/1", child(root, "1"), deadline) is not None:
-            others = ["1"]
+            return [str(path) for path in series if path != first]
+        there = _attributes(f"{where}/1", child(root, "1"), deadline) is not None
     except (OSError, ValueError):  # what is beside the image does not keep it from opening
-        pass
-    return _told_beside(found, others)
+        return []
+    return ["1"] if there else []
 
 
-def _with_labels(
-    where: str, root: Any, found: MultiscaleImage, deadline: Deadline
-) -> MultiscaleImage:
-    """Names the label images in the group beside the image."""
+def _labels(where: str, root: Any, deadline: Deadline) -> list[str]:
+    """What is told of the label images in the group beside the image."""
     try:
         group = _attributes(f"{where}/labels", child(root, "labels"), deadline) or {}
     except (OSError, ValueError):
-        return found
+        return []
     labels = _member(group, "labels")
     if not isinstance(labels, list) or not labels:
-        return found
-    named = ", ".join(f"labels/{name}" for name in labels[:5])
-    return replace(found, lost=(*found.lost, f"the labels {named}"))
+        return []
+    return [f"the labels {', '.join(f'labels/{name}' for name in labels[:5])}"]
 
 
 def _own_info(told: Any, info: ImageInfo) -> ImageInfo:
@@ -292,7 +280,7 @@ def _image(where: str, item: dict[str, Any], omero: Any) -> MultiscaleImage:
         time_unit=period,
     )
     text = name if isinstance(name, str) else "image"
-    return MultiscaleImage(axes, tuple(scales), text, info, tuple(dict.fromkeys(lost + damaged)))
+    return MultiscaleImage(axes, tuple(scales), text, info, list(dict.fromkeys(lost + damaged)))
 
 
 def _triple(values: Sequence[float]) -> tuple[float, float, float]:

@@ -25,7 +25,7 @@ from ...base.labels import background, counted
 from ...pool.downsample import pool_majority, pool_mean
 from .checksums import Checksums, file_of, sum_of
 from .chunk_files import ChunkFiles, begin_read, files_of
-from .level_reader import LevelReader, Pool, open_arrays, with_channels
+from .level_reader import LevelReader, Pool, keep_channels, open_arrays
 from .ngff import find_image, read_json
 from .store_layout import (
     BORDER,
@@ -119,9 +119,9 @@ class Store:
         if found.info.labels:
             self.pool = partial(pool_majority, background=background(names))
         self._levels = LevelReader(stored, layout, self.pool)
-        found = with_channels(found, sizes, chosen)
+        keep_channels(found, sizes, chosen)
         self.location, self.root, self.has_blocks = where, kvstore(where), own is not None
-        self.name, self.info, self.lost = found.name, found.info, found.lost
+        self.name, self.info, self.lost = found.name, found.info, tuple(found.lost)
         scale, place = found.scales[0].scale[::-1], found.scales[0].translation[::-1]
         self.spacing, self.origin = check.placed(where, scale, place, layout.extent)
         self.extent, self.levels, self.block = layout.extent, layout.levels, layout.block

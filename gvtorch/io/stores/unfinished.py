@@ -31,8 +31,10 @@ _JOURNAL, _MANIFEST, _LOCK = "journal.jsonl", "manifest.json", "lock"
 class Done(NamedTuple):
     """What a task that is done has written."""
 
+    place: tuple[int, ...]  # z, y, x, or t, z, y, x
     voxels: int
     files: Files  # checksums
+    bad: int = 0  # values that are not finite; nothing is written then
 
 
 @dataclass
@@ -204,7 +206,7 @@ def _read_journal(path: Path) -> dict[Task, Done]:
             entry = json.loads(line)
             if entry["checksum"] == sum_of(entry):
                 task = tuple(int(n) for n in entry["task"])
-                done[task] = Done(int(entry["voxels"]), dict(entry["files"]))
+                done[task] = Done(task[1:], int(entry["voxels"]), dict(entry["files"]))
         except (ValueError, KeyError, TypeError, RecursionError):
             continue
     return done
