@@ -15,7 +15,7 @@ import numpy as np
 
 from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
 from ..base.stage import Progress
-from .resources import cores
+from .resources import cores, run_ahead
 from .source import Index, MemorySource, VolumeSource
 
 LABELS = "labels.npy"  # in the hidden folder of a store in the making
@@ -118,12 +118,11 @@ def _labels_of(
         return np.unique(as_whole(source.path, part))
 
     def parts() -> Iterator[np.ndarray]:
-        places, done = itertools.product(*spans), 0
         progress("labels", 0, total)
         with ThreadPoolExecutor(workers) as pool:
-            while some := list(itertools.islice(places, 4 * workers)):
-                yield from pool.map(read, some)
-                done += len(some)
+            found = run_ahead(pool, read, itertools.product(*spans), 4 * workers)
+            for done, part in enumerate(found, 1):
+                yield part
                 progress("labels", done, total)
 
     return distinct(source.path, parts())

@@ -206,7 +206,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         asked = re.fullmatch(r"/([\w-]+)/(\d+)/(.+)", self.path, re.ASCII)
         if asked is None or not hmac.compare_digest(asked[1], self.server.word):
-            self._answer(403, b"")
+            self._answer(403)
             return
         wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
         part = None
@@ -214,24 +214,22 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             first, last = wanted.groups()
             part = slice(int(first), int(last) + 1) if first else slice(-int(last), None)
         folder, name = self.server.folders[int(asked[2])], asked[3]
+        content: bytes | None = None
         try:
             content = folder.read(name, part)
+            status = 404 if content is None else 200 if part is None else 206
         except Endless:
-            self._answer(403, b"")
+            status = 403
         except HttpStatus as error:
-            self._answer(error.status, b"")
+            status = error.status
         except OSError:  # tensorstore tries again for a while
-            self._answer(503, b"")
-        else:
-            if content is None:
-                self._answer(404, b"")
-            else:
-                self._answer(200 if part is None else 206, content, part)
+            status = 503
+        self._answer(status, content or b"", part)
 
-    def _answer(self, status: int, content: bytes, part: slice | None = None) -> None:
+    def _answer(self, status: int, content: bytes = b"", part: slice | None = None) -> None:
         self.send_response(status)
         self.send_header("Content-Length", str(len(content)))
-        if part is not None:
+        if part is not None and status == 206:
             begin = part.start if part.start >= 0 else 0
             self.send_header("Content-Range", f"bytes {begin}-{begin + len(content) - 1}/*")
         self.end_headers()

@@ -135,10 +135,9 @@ class _Grid:
         self.what, self.more = what, 2 if caps else 0
         self.label: int | None = None
         self.value = check.number(where, "value", value)
-        branching = what.branching if isinstance(what, N3Tree) else 2
-        levels = what.levels if isinstance(what, Store) else 1
+        branching, levels = 2, what.levels if isinstance(what, Store) else 1
         if isinstance(what, N3Tree):
-            levels = what.depth + 1
+            branching, levels = what.branching, what.depth + 1
             self._bricks, self._channel = what.levels(), what.fine_channel(where, channel)
             width = what.bricks.channels[self._channel].width
             known, labels = what.labels.get(self._channel), self._channel in what.labels

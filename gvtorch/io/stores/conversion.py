@@ -7,19 +7,15 @@ data names the tasks that are done (unfinished.py).
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import shlex
 import shutil
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import (
-    FIRST_COMPLETED,
     BrokenExecutor,
     Executor,
-    Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
-    wait,
 )
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from functools import partial
@@ -237,7 +233,8 @@ def _write_levels(
             continue
         shard.create_arrays(plan.task, level)
         bad = 0
-        with closing(_run(pool, plan.task, level, places, ahead)) as results:
+        task = partial(shard.write_shard, plan.task, level)
+        with closing(resources.run_ahead(pool, task, places, ahead)) as results:
             for result in results:
                 bad += result.bad
                 if not result.bad:
@@ -254,26 +251,6 @@ def _write_levels(
         for which in ("low", "high"):  # the bounds below are not needed any more
             folder = plan.target / WORK / which / str(level - 1)
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _run(
-    pool: Executor, task: shard.Conversion, level: int, places: Iterable[Any], ahead: int
-) -> Generator[unfinished.Done, None, None]:
-    """Runs the tasks of a level, a bounded number at a time, and yields what they tell."""
-    waiting = iter(places)
-    running: set[Future[unfinished.Done]] = set()
-    try:
-        while True:
-            for at in itertools.islice(waiting, ahead - len(running)):
-                running.add(pool.submit(shard.write_shard, task, level, at))
-            if not running:
-                return
-            finished, running = wait(running, return_when=FIRST_COMPLETED)
-            for future in sorted(finished, key=lambda future: future.exception() is not None):
-                yield future.result()  # first what is done, then what failed
-    finally:
-        for future in running:
-            future.cancel()
 
 
 def _value_range(task: shard.Conversion) -> list[list[float]]:

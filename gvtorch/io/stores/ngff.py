@@ -445,13 +445,11 @@ def _write_channels(
 def _forget_assumed(channels: Sequence[ChannelInfo], assumed: Any) -> tuple[ChannelInfo, ...]:
     """Returns the channels without the colours and windows that `_write_channels` made up."""
     told = assumed if isinstance(assumed, dict) else {}
-    kept = list(channels)
-    for name in ("color", "window"):
-        numbers = told.get(name)
-        for number, channel in enumerate(kept):
-            if isinstance(numbers, list) and number in numbers:
-                empty: dict[str, Any] = {name: None}
-                kept[number] = replace(channel, **empty)
+    lists = {name: told[name] for name in ("color", "window") if isinstance(told.get(name), list)}
+    kept = []
+    for number, channel in enumerate(channels):
+        empty: dict[str, Any] = {name: None for name, some in lists.items() if number in some}
+        kept.append(replace(channel, **empty))
     return tuple(kept)
 
 
