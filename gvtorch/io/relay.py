@@ -62,25 +62,20 @@ class Relayed:
             "http_request_concurrency": {"limit": _TOGETHER},
             "http_request_retries": _RETRIES,
         }
-        self._future: Any = None
+        self.future: Any = None  # of the array that lies there, once it is asked for
         self._files: ChunkFiles | None = None
         self._indexes: OrderedDict[str, np.ndarray] = OrderedDict()
         self._lock = threading.Lock()
-
-    def opens(self, future: Any) -> Any:
-        """Takes and returns the future of the array that lies there."""
-        self._future = future
-        return future
 
     @property
     def files(self) -> ChunkFiles | None:
         """What its chunks may be; None before the array is open."""
         from .stores.chunk_files import ChunkFiles
 
-        future = self._future
+        future = self.future
         if future is not None and future.done():
             self._files = ChunkFiles.of(future.result()) if future.exception() is None else None
-            self._future = None
+            self.future = None
         return self._files
 
     def read(self, name: str, part: slice | None) -> bytes | None:
@@ -181,18 +176,16 @@ class _Server(http.server.ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.word = secrets.token_urlsafe(16)
         self.folders: list[Relayed] = []
-        self.lock = threading.Lock()
         threading.Thread(target=self.serve_forever, daemon=True, name="gvtorch-relay").start()
 
     def folder(self, url: str, context: Any) -> Relayed:
         """A place for a folder; the same for the same."""
-        with self.lock:
-            for found in self.folders:
-                if found.url == url:
-                    return found
-            base = f"http://127.0.0.1:{self.server_port}/{self.word}/{len(self.folders)}/"
-            self.folders.append(Relayed(url, base, context))
-            return self.folders[-1]
+        for found in self.folders:
+            if found.url == url:
+                return found
+        base = f"http://127.0.0.1:{self.server_port}/{self.word}/{len(self.folders)}/"
+        self.folders.append(Relayed(url, base, context))
+        return self.folders[-1]
 
     def handle_error(self, *_: object) -> None:
         """Says nothing: tensorstore does not wait for what it gave up."""

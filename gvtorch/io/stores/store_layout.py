@@ -533,4 +533,6 @@ def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any
                 return failed(Endless(f"{head}: {error}"))
     store = {**spec, "kvstore": relayed.spec if relayed else folder}
     future = ts.open(store, context=context(), open=True, create=create)
-    return relayed.opens(future) if relayed else future
+    if relayed:
+        relayed.future = future
+    return future
