@@ -247,6 +247,9 @@ def ask_by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.cli
     return found
 
 
+_certificates = functools.cache(ssl.create_default_context)
+
+
 class _Connections:
     """Idle connections, by server, of this process, and those that wait for an answer."""
 
@@ -301,8 +304,3 @@ class _Connections:
 
 
 _connections = _Connections()
-
-
-@functools.cache
-def _certificates() -> ssl.SSLContext:
-    return ssl.create_default_context()

@@ -66,9 +66,7 @@ class IndexSource(VolumeSource):
         return counted
 
 
-@functools.lru_cache(maxsize=2)
-def _loaded(file: str) -> np.ndarray:
-    return np.load(file)
+_loaded = functools.lru_cache(maxsize=2)(np.load)
 
 
 def indexed_source(

@@ -76,9 +76,7 @@ class SplatSource(VolumeSource):
             return held.astype(np.float32)
 
 
-@functools.lru_cache(maxsize=2)
-def _opened(folder: str) -> SortedPoints:
-    return SortedPoints.open(folder)
+_opened = functools.lru_cache(maxsize=2)(SortedPoints.open)
 
 
 @dataclass(frozen=True)

@@ -202,16 +202,12 @@ def at_place(
     return dataclasses.replace(source, spacing=steps, origin=place)
 
 
-def _mapped(source: VolumeSource) -> bool:
-    """Whether a file's numbers stay in the file."""
-    same = np.dtype(source.stored).name == source.dtype
-    return isinstance(source, ArraySource) and not source.whole and same
-
-
 def read_whole(source: VolumeSource, first: int = 0, times: int = 1) -> np.ndarray:
     """Reads whole time points, (t, z, y, x, c); raises ValueError if the file is damaged."""
     is_array = isinstance(source, (ObjectSource, MemorySource))
-    if not isinstance(source, MemorySource) and not _mapped(source):
+    same = np.dtype(source.stored).name == source.dtype
+    stays = isinstance(source, ArraySource) and not source.whole and same  # in the file
+    if not isinstance(source, MemorySource) and not stays:
         free, needed = memory_free(), source.peak_bytes + (times - 1) * source.nbytes
         if needed > free:
             raise ValueError(

@@ -56,14 +56,10 @@ class DicomSource(VolumeSource):
 
     def read_stored(self, index: Index) -> np.ndarray:
         times, places, *inside = index
-        depth = self.shape[1]
-        wanted = [
-            self.frames[t * depth + z]
-            for t in range(times.start, times.stop)
-            for z in range(places.start, places.stop)
-        ]
-        data = np.empty((len(wanted), *(s.stop - s.start for s in inside)), self.stored)
-        at = 0
+        numbers = np.arange(len(self.frames)).reshape(self.shape[:2])[times, places]
+        data = np.empty((numbers.size, *(s.stop - s.start for s in inside)), self.stored)
+        out = iter(data)
+        wanted = (self.frames[number] for number in numbers.ravel())
         for file, group in groupby(wanted, key=lambda frame: frame[0]):
             same = list(group)
             images = _images(file, [number for _, number, _, _ in same])
@@ -73,12 +69,8 @@ class DicomSource(VolumeSource):
                 part = image[tuple(inside)]
                 if (slope, intercept) != (1, 0):
                     part = part * np.float64(slope) + intercept
-                data[at] = part
-                at += 1
-        if at != len(wanted):
-            raise ValueError(f"{self.path}: {len(wanted) - at} images are missing")
-        sizes = (times.stop - times.start, places.stop - places.start)
-        return data.reshape((*sizes, *data.shape[1:]))
+                next(out)[...] = part
+        return data.reshape((*numbers.shape, *data.shape[1:]))
 
 
 def _has_magic(path: str | os.PathLike[str]) -> bool:

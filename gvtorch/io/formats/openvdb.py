@@ -2,7 +2,7 @@
 
 A file is a head, what is told of each grid with its place, and the grids: metadata, transform,
 topology (masks, and the tiles of inner nodes), then the values of the leaves one after another.
-`Parser` walks through topology and leaves once and keeps where each node's values begin; they are
+`_Topology` walks through all nodes once and keeps where the values of each begin; they are
 unpacked where they are asked for. Inactive values that are not the background's are told in a few
 bytes, see `_Packing`.
 Source: the source code of OpenVDB (io/Archive.cc, io/Compression.h, tree/*.h) tells the format.

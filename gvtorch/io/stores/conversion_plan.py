@@ -72,16 +72,9 @@ class Plan:
     target: Path
     task: shard.Conversion
     settings: dict[str, Any]  # what must be the same to go on with a half-written store
+    labels: np.ndarray | None  # (k,) int64, where they are indexed
     workers: int
     uses_processes: bool
-
-    @property
-    def labels(self) -> np.ndarray | None:
-        """(k,) int64 labels that are indexed."""
-        source = self.task.source
-        if not isinstance(source, IndexSource) or isinstance(source.labels, str):
-            return None
-        return source.labels
 
 
 def source_of(
@@ -198,6 +191,7 @@ def plan_of(
         target=target,
         task=shard.Conversion(root=root, layout=layout, source=source, nan=nan, pool=pool),
         settings=settings,
+        labels=names,
         workers=min(workers, tasks[0]),
         uses_processes=tasks[0] > _FEW,
     )

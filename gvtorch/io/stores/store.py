@@ -275,14 +275,18 @@ class Store:
     @property
     def stored(self) -> str:
         """NumPy dtype of what `read_stored` gives: that of the array, before it is narrowed."""
-        return "int64" if self.label_values is not None else self._levels.stored.str
+        return (
+            "int64"
+            if self.label_values is not None
+            else self._levels.finest.array.dtype.numpy_dtype.str
+        )
 
     def read_stored(self, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
         """Reads a box of finest voxels, (z, y, x, c), as they are stored; of labels that are
         indexed, the labels. Box and errors as of `read_region`; it lies inside the volume.
         """
         if not self.has_blocks:
-            return self._levels.read_stored(low, high, Deadline(timeout))
+            return self._levels.finest.read(low, high, Deadline(timeout))
         data = self.read_region(0, low, high, timeout=timeout)
         if self.label_values is None:
             return data

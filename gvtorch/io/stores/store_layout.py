@@ -328,7 +328,7 @@ class CoarseChannel:
     @classmethod
     def parse(cls, where: str, told: Any) -> dict[str, CoarseChannel]:
         """Reads the channels that a store's metadata tells, by name; raises ValueError unless they
-        are what `write_channel` writes.
+        are what `make_channel` writes.
         """
         channels = told.get("channels") if isinstance(told, dict) else None
         if not isinstance(channels, dict):
