@@ -25,12 +25,11 @@ from ...base.stage import Progress, no_progress
 from ...base.whole_file import told_of
 from ..resources import amount
 from .ngff import read_json_file
-from .shard import bordered, finish_write, write
+from .shard import bordered, create_array, finish_write, write
 from .store import Store
-from .store_layout import BORDER, WORK, CoarseChannel, Deadline, StoreLayout, begin_open, is_name
+from .store_layout import BORDER, WORK, CoarseChannel, StoreLayout, is_name
 from .unfinished import group, locked, write_json
 
-_OPEN_TIMEOUT = 60.0  # seconds
 _CUBE = 128  # voxels along a side of what is written at once
 
 
@@ -142,7 +141,7 @@ def _write_blocks(
     done, total = 0, sum(math.prod(values.shape[:3]) for values in levels)
     for level, values in enumerate(levels, 1):
         spec = store.layout.coarse(level, f"{store.coarse_folder}/{folder}", width)
-        Deadline(_OPEN_TIMEOUT).wait(begin_open(store.root, spec, "create"), spec["path"])
+        create_array(store.root, spec)
         for low in itertools.product(*(range(0, n, _CUBE) for n in values.shape[:3])):
             size = [min(_CUBE, n - a) for a, n in zip(low, values.shape, strict=False)]
             blocks = _blocks(store.layout, values, low, size, keep)

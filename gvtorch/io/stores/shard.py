@@ -196,15 +196,16 @@ def create_arrays(conversion: Conversion, level: int) -> None:
     layout = conversion.layout
     arrays = (layout.plain(level), layout.blocks(level), layout.cells(level))
     for spec in (*arrays, *layout.bounds(level)):
-        _create(conversion.root, spec)
+        create_array(conversion.root, spec)
 
 
 def write_label_array(conversion: Conversion, labels: np.ndarray) -> None:
     """Writes the array of labels that are indexed."""
     root, spec = conversion.root, conversion.layout.labels()
-    _create(root, spec)
+    create_array(root, spec)
     finish_write(write(root, spec, [0], labels), root.get("path", "store"))
 
 
-def _create(root: dict[str, Any], spec: dict[str, Any]) -> None:
+def create_array(root: dict[str, Any], spec: dict[str, Any]) -> None:
+    """Creates an array, empty, if it is not there."""
     Deadline(_OPEN_TIMEOUT).wait(begin_open(root, spec, "create"), f"{root['path']}{spec['path']}")

@@ -91,12 +91,8 @@ class Store:
         channels: Sequence[int] | None = None,
     ) -> None:
         """See `open`."""
-        self._asked: dict[str, Any] = {
-            "location": location,
-            "image": image,
-            "time": time,
-            "channels": channels,
-        }
+        asked = {"image": image, "time": time, "channels": channels}
+        self._asked: dict[str, Any] = {"location": location, **asked}
         where, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
         check.text(where, "image", image)
         top = root
