@@ -80,25 +80,18 @@ def make_channel(
     other = f"{folder}: another process makes a coarse channel"
     with locked(folder / ".lock", other), _levels_in_files(store, wide) as levels:
         fill(levels)
-        known = _known(folder)
+        file = folder / "zarr.json"
+        there = read_json_file(file).get("attributes") if file.exists() else {"channels": {}}
+        known = CoarseChannel.parse(str(file), there)
         before = known.get(name)
         made = replace(channel, generation=before.generation + 1 if before else 0)
         _write_blocks(store, made.folder(name), made.width, levels, keep, progress)
         known[name] = made
         told = {one: other.attributes() for one, other in known.items()}
-        write_json(folder / "zarr.json", group({"channels": told}))
+        write_json(file, group({"channels": told}))
         store.coarse = known
         if before is not None:
             shutil.rmtree(folder / before.folder(name), ignore_errors=True)
-
-
-def _known(folder: Path) -> dict[str, CoarseChannel]:
-    """The channels that are on disk now."""
-    file = folder / "zarr.json"
-    if not file.exists():
-        return {}
-    content = read_json_file(file)
-    return CoarseChannel.parse(str(file), content.get("attributes"))
 
 
 @contextmanager
