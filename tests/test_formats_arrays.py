@@ -10,8 +10,7 @@ import torch
 from helpers.stores import noise
 
 import gvtorch as gv
-from gvtorch.io.arrays import ObjectSource
-from gvtorch.io.reading import open_source
+from gvtorch.io.reading import ObjectSource, open_source
 from gvtorch.io.stores import conversion_plan
 from gvtorch.io.stores.conversion import convert
 

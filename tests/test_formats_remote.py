@@ -160,7 +160,7 @@ def test_without_a_network_the_copy_is_used(server, grid, monkeypatch):
     def fail(*_: object, **__: object) -> None:
         raise OSError("no route to host")
 
-    monkeypatch.setattr(remote.urllib.request, "urlopen", fail)
+    monkeypatch.setattr("urllib.request.urlopen", fail)
     with pytest.warns(UserWarning, match=r"no answer \(no route to host\); the copy of before"):
         gv.read_volume(url)
     with pytest.raises(OSError, match="can't be downloaded: no route to host"):

@@ -393,9 +393,7 @@ def test_levels_that_are_missing_are_made_once(tmp_path, monkeypatch):
     write_foreign(tmp_path, [data[..., 0]], "zyx", [[1.0] * 3])
     store = Store.open(tmp_path)
     assert_holds(store, data)
-    from gvtorch.io.stores import level_reader
-
-    monkeypatch.setattr(level_reader, "pool_mean", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(store._levels, "_pool", lambda *_: pytest.fail("made again"))
     store.read_region(2, (0, 0, 0), (35, 3, 3))
 
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..base.image_info import ChannelInfo, ImageInfo, color_channels
+from .source import Triple
 
-Triple = tuple[float, float, float]
 _EVEN = 0.01  # of a step: how far slices may lie beside an even grid
 #: What may tell images of one place apart, the best first.
 _APART = (
@@ -48,13 +48,9 @@ class DicomFrame:
     moments: dict[str, float] = field(default_factory=dict)  # what may tell it from others
 
 
-@dataclass(frozen=True, kw_only=True)
-class Times:
-    """Time points of a series."""
-
-    count: int = 1
-    step: float | None = None
-    unit: str | None = None
+#: The frames of each time, slice by slice; the (4, 4) affine from (slice, row, column) to LPS
+#: millimetres; what is not kept; and the fields time_step and time_unit of an `ImageInfo`.
+Ordered = tuple[list[list[DicomFrame]], np.ndarray, list[str], dict[str, Any]]
 
 
 def frames_of(header: Any, count: int) -> list[DicomFrame]:
@@ -121,14 +117,8 @@ def _frame(header: Any, groups: list[Any], number: int) -> DicomFrame:
     )
 
 
-def order_frames(
-    where: str, frames: Sequence[DicomFrame]
-) -> tuple[list[DicomFrame], np.ndarray, list[str], Times]:
+def order_frames(where: str, frames: Sequence[DicomFrame]) -> Ordered:
     """Sorts frames by time and place.
-
-    Returns:
-        The frames, time by time and slice by slice; the (4, 4) affine from (slice, row, column) to
-        LPS millimetres; what is not kept; and the time points.
 
     Raises:
         ValueError: Slices are missing, are not evenly apart, lie askew or are there twice.
@@ -151,7 +141,7 @@ def order_frames(
         return _without_place(frames, affine, np.cross(rows, columns))
     slices = _by_place(frames, np.cross(rows, columns))
     count, apart = _times(where, slices)
-    ordered = [one[t] for t in range(count) for one in slices]
+    ordered = [[one[t] for one in slices] for t in range(count)]
     places = np.array([one[0].position for one in slices])
     affine[:3, 3] = places[0]
     affine[:3, 0] = np.cross(rows, columns) * (first.between or 1.0)
@@ -162,7 +152,7 @@ def order_frames(
         lost.append("how thick its only slice is: it is 1 thick here")
     if apart is not None and apart not in (*_IN_TIME, *_APART[:2]):
         lost.append(f"{count} images of each slice differ in {apart}: they are taken for times")
-    return ordered, affine, lost, _moments(ordered, count, apart)
+    return ordered, affine, lost, _moments(ordered, apart)
 
 
 def _directions(where: str, frame: DicomFrame) -> tuple[np.ndarray, np.ndarray]:
@@ -175,9 +165,7 @@ def _directions(where: str, frame: DicomFrame) -> tuple[np.ndarray, np.ndarray]:
     return rows / lengths[0], columns / lengths[1]
 
 
-def _without_place(
-    frames: Sequence[DicomFrame], affine: np.ndarray, normal: np.ndarray
-) -> tuple[list[DicomFrame], np.ndarray, list[str], Times]:
+def _without_place(frames: Sequence[DicomFrame], affine: np.ndarray, normal: np.ndarray) -> Ordered:
     """Frames of one place, or of none that is told: in the order of their numbers."""
     ordered = sorted(frames, key=lambda f: (f.moments.get("InstanceNumber", 0), f.file, f.number))
     between = ordered[0].between
@@ -185,7 +173,7 @@ def _without_place(
     lost = ["slices have no place: they follow their numbers, from 0"]
     if between is None:
         lost[0] += ", 1 apart"
-    return ordered, affine, lost if len(ordered) > 1 else [], Times()
+    return [ordered], affine, lost if len(ordered) > 1 else [], {}
 
 
 def _by_place(frames: Sequence[DicomFrame], normal: np.ndarray) -> list[list[DicomFrame]]:
@@ -224,18 +212,15 @@ def _times(where: str, slices: list[list[DicomFrame]]) -> tuple[int, str | None]
     return counts[0], name
 
 
-def _moments(ordered: Sequence[DicomFrame], count: int, apart: str | None) -> Times:
-    if count == 1:
-        return Times()
-    name = (
-        apart if apart in _IN_TIME else next((n for n in _IN_TIME if n in ordered[0].moments), None)
-    )
+def _moments(ordered: list[list[DicomFrame]], apart: str | None) -> dict[str, Any]:
+    if len(ordered) == 1:
+        return {}
+    begin, end = (ordered[at][0].moments for at in (0, -1))
+    name = apart if apart in _IN_TIME else next((n for n in _IN_TIME if n in begin), None)
     if name is None:
-        return Times(count=count)
-    each = len(ordered) // count
-    first = [ordered[t * each].moments.get(name, 0.0) for t in range(count)]
-    step = (first[-1] - first[0]) / (count - 1)
-    return Times(count=count, step=step, unit=_IN_TIME[name]) if step > 0 else Times(count=count)
+        return {}
+    step = (end.get(name, 0.0) - begin.get(name, 0.0)) / (len(ordered) - 1)
+    return {"time_step": step, "time_unit": _IN_TIME[name]} if step > 0 else {}
 
 
 def _step(where: str, places: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -264,7 +249,7 @@ def _step(where: str, places: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return step
 
 
-def image_info(header: Any, samples: int, times: Times) -> tuple[ImageInfo, list[str]]:
+def image_info(header: Any, samples: int, moments: dict[str, Any]) -> tuple[ImageInfo, list[str]]:
     """What the header tells of the values, and what of it is not kept."""
     lost = []
     kind = str(header.get("PhotometricInterpretation", ""))
@@ -297,8 +282,7 @@ def image_info(header: Any, samples: int, times: Times) -> tuple[ImageInfo, list
         channels=channels,
         quantity=quantity or None,
         space="right-anterior-superior",
-        time_step=times.step,
-        time_unit=times.unit,
+        **moments,
     )
     return info, lost
 

@@ -31,9 +31,10 @@ SMALL = 1 << 20  # bytes that any file may have
 _PART = 1 << 16  # bytes
 _SILENT = 1.0  # seconds without a byte, after which `ask_again` gives a request up
 _KEPT = 16  # idle connections to a server
-_AGENT = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
-_MISSING = (404, 410)
+AGENT = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
+MISSING = (404, 410)  # status of what is not there
 _ELSEWHERE = (301, 302, 303, 307, 308)
+_CLOSED = (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError)
 
 
 class Endless(OSError):
@@ -89,12 +90,18 @@ def read_http(
     """
     if time.monotonic() < _refused.get(url, _NOT)[0]:
         raise Endless(_refused[url][1])
+    slow = STALL + most / SLOWEST
+    end = time.monotonic() + min(seconds, slow)
     try:
-        return _in_time(url, most, part, most if whole is None else whole, seconds)
+        return _read(url, most, part, most if whole is None else whole, end)
+    except TimeoutError:
+        if seconds < slow and time.monotonic() >= end:
+            raise
+        found: OSError = Endless("the server sends hardly anything")
     except OSError as error:
-        if not isinstance(error, TimeoutError):
-            keep_reason(url, error, REFUSED if isinstance(error, Endless) else 0.0)
-        raise
+        found = error
+    keep_reason(url, found, REFUSED if isinstance(found, Endless) else 0.0)
+    raise found from None
 
 
 def keep_reason(url: str, error: OSError, seconds: float = 0.0) -> None:
@@ -117,33 +124,25 @@ def ask_again() -> None:
     _connections.break_off(time.monotonic() - _SILENT)
 
 
-def _in_time(url: str, most: int, part: slice | None, whole: int, seconds: float) -> bytes | None:
-    slow = STALL + most / SLOWEST
-    end = time.monotonic() + min(seconds, slow)
-    try:
-        return _read(url, most, part, whole, end)
-    except TimeoutError:
-        if seconds < slow and time.monotonic() >= end:
-            raise
-        raise Endless("the server sends hardly anything") from None
-
-
 def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> bytes | None:
-    headers = dict(_AGENT) | ({} if part is None else {"Range": _range(part)})
+    headers = dict(AGENT)
+    if part is not None:
+        first, last = part.start or 0, "" if part.stop is None else part.stop - 1
+        headers["Range"] = f"bytes={first}" if first < 0 else f"bytes={first}-{last}"
     patience = max(1e-3, min(end - time.monotonic(), STALL))
     try:
         connection, answer = _ask(url, headers, patience)
     except TimeoutError:
         raise
     except HttpStatus as error:
-        if error.status in _MISSING:
+        if error.status in MISSING:
             return None
         raise
     except (OSError, http.client.HTTPException, ValueError) as error:
         raise OSError(one_line(error)) from None
     done = False
     try:
-        if answer.status in _MISSING:
+        if answer.status in MISSING:
             return None
         if answer.status not in (200, 206):
             raise HttpStatus(answer.status, answer.reason)
@@ -155,21 +154,11 @@ def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> by
         done = answer.isclosed()
         return content
     finally:
-        if connection is not None:
-            _connections.end(connection)
-        if connection is not None and done and not answer.will_close:
-            _connections.give_back(url, connection)
-        else:
+        keep = done and not answer.will_close
+        if connection is None or not keep:
             answer.close()
-            if connection is not None:
-                connection.close()
-
-
-def _range(part: slice) -> str:
-    """What a request says that asks for a part of a file."""
-    first, last = part.start or 0, part.stop
-    wanted = f"{first}-{last - 1}" if last is not None else f"{first}-"
-    return f"bytes={wanted if first >= 0 else first}"
+        if connection is not None:
+            _connections.give_back(url, connection, keep=keep)
 
 
 def _content(
@@ -224,32 +213,27 @@ def _ask(
     target += f"?{place.query}" if place.query else ""
     proxied = place.scheme in urllib.request.getproxies()
     if proxied and not urllib.request.proxy_bypass(place.hostname or ""):
-        return None, _by_urllib(url, headers, seconds)
+        return None, ask_by_urllib(url, headers, seconds)
     while True:
         connection, used = _connections.take(url, seconds)
         try:
             connection.request("GET", target, headers=headers)
-            _connections.begin(connection)
+            _connections.heard(connection)
             answer = connection.getresponse()
-        except (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError):
-            _connections.end(connection)
-            connection.close()
-            if not used:
-                raise
-            continue  # the server had closed it meanwhile
-        except BaseException:
-            _connections.end(connection)
-            connection.close()
-            raise
-        if answer.status in _ELSEWHERE:
-            _connections.end(connection)
+            if answer.status not in _ELSEWHERE:
+                return connection, answer
             answer.close()
-            connection.close()
-            return None, _by_urllib(url, headers, seconds)
-        return connection, answer
+        except BaseException as error:
+            _connections.give_back(url, connection, keep=False)
+            if used and isinstance(error, _CLOSED):
+                continue  # by the server, meanwhile
+            raise
+        _connections.give_back(url, connection, keep=False)
+        return None, ask_by_urllib(url, headers, seconds)
 
 
-def _by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client.HTTPResponse:
+def ask_by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client.HTTPResponse:
+    """Sends a request by way of proxies and redirections; raises as `read_http`, but Endless."""
     request = urllib.request.Request(url, headers=headers)
     try:
         found: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=seconds)
@@ -258,9 +242,12 @@ def _by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client
         raise HttpStatus(error.code, error.reason) from None
     except urllib.error.URLError as error:
         if isinstance(error.reason, TimeoutError):
-            raise TimeoutError from None
+            raise TimeoutError(str(error.reason)) from None
         raise OSError(str(error.reason)) from None
     return found
+
+
+_certificates = functools.cache(ssl.create_default_context)
 
 
 class _Connections:
@@ -291,22 +278,11 @@ class _Connections:
             return safe, False
         return http.client.HTTPConnection(key[2], timeout=seconds), False
 
-    def begin(self, connection: http.client.HTTPConnection) -> None:
-        """Notes that it waits for an answer."""
-        if connection.sock is not None:
-            with self._lock:
-                self._waiting[connection] = time.monotonic(), connection.sock
-
     def heard(self, connection: http.client.HTTPConnection) -> None:
-        """Notes that something came."""
+        """Notes that it waits from now on, for an answer or for more of one."""
         with self._lock:
-            if connection in self._waiting:
-                self._waiting[connection] = time.monotonic(), self._waiting[connection][1]
-
-    def end(self, connection: http.client.HTTPConnection) -> None:
-        """Notes that it does not wait any more."""
-        with self._lock:
-            self._waiting.pop(connection, None)
+            sock = connection.sock or self._waiting[connection][1]
+            self._waiting[connection] = time.monotonic(), sock
 
     def break_off(self, before: float) -> None:
         """Ends those that have heard nothing since a time; whoever waits for them gets an error."""
@@ -316,19 +292,15 @@ class _Connections:
             with contextlib.suppress(OSError):
                 sock.shutdown(socket.SHUT_RDWR)
 
-    def give_back(self, url: str, connection: http.client.HTTPConnection) -> None:
-        """Keeps it for the next, unless there are many."""
+    def give_back(self, url: str, connection: http.client.HTTPConnection, *, keep: bool) -> None:
+        """Ends its wait; keeps it for the next, if it may and there are not many, or closes it."""
         with self._lock:
+            self._waiting.pop(connection, None)
             idle = self._idle.setdefault(self._key(url), [])
-            if len(idle) < _KEPT:
+            if keep and len(idle) < _KEPT:
                 idle.append(connection)
                 return
         connection.close()
 
 
 _connections = _Connections()
-
-
-@functools.cache
-def _certificates() -> ssl.SSLContext:
-    return ssl.create_default_context()

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
-from ..base.npy_file import write_npy
-from ..base.stage import Progress, no_progress
-from ..base.whole_file import durable_file
+from ..base.stage import Progress
+from .resources import cores, run_ahead
 from .source import Index, MemorySource, VolumeSource
 
+LABELS = "labels.npy"  # in the hidden folder of a store in the making
 _CUBE = 128  # voxels along a side of what is read at once
 
 
@@ -45,9 +45,9 @@ class IndexSource(VolumeSource):
             **{name: getattr(inner, name) for name in told},
         )
 
-    def in_file(self, file: Path) -> IndexSource:
-        """Returns the same for other processes, whose labels lie in a file."""
-        return replace(self, labels=str(file))
+    def staged(self, folder: Path) -> IndexSource:
+        """Takes the labels from `LABELS` in the folder, where they lie already."""
+        return replace(self, inner=self.inner.staged(folder), labels=str(folder / LABELS))
 
     def read_stored(self, index: Index) -> np.ndarray:
         times, low, high = index[0], *zip(*((s.start, s.stop) for s in index[1:4]), strict=True)
@@ -66,39 +66,40 @@ class IndexSource(VolumeSource):
         return counted
 
 
-@functools.lru_cache(maxsize=2)
-def _loaded(file: str) -> np.ndarray:
-    return np.load(file)
+_loaded = functools.lru_cache(maxsize=2)(np.load)
 
 
 def indexed_source(
     source: VolumeSource,
-    times: tuple[int, int],
-    workers: int,
-    known: Path,
-    progress: Progress = no_progress,
+    time: int | None,
+    workers: int | None,
+    folder: Path,
+    progress: Progress,
 ) -> VolumeSource:
-    """Returns a source of labels as stores hold them: as it is, where they are of 16 bits at most.
+    """Returns a source as stores hold its values: as it is, where these are no labels, are indexed
+    already, or are of 16 bits at most.
 
     Args:
-        source: Of labels.
-        times: The first time point, and one past the last.
-        workers: Threads that read.
-        known: The .npy file of its labels, if it has been written before; else all is read once.
+        source: Any.
+        time: The time point that is wanted; None: all.
+        workers: Threads that read, up to 8; None: one a core.
+        folder: Where `LABELS` lies, if it has been written before; else all is read once.
         progress: Told ("labels", regions done, regions in all).
 
     Raises:
         ValueError: They are no whole numbers, or too many.
         OSError: The source can't be read.
     """
-    if source.dtype in NARROW:
+    if not source.info.labels or isinstance(source, IndexSource) or source.dtype in NARROW:
         return source
     if isinstance(source, MemorySource):
         source = replace(source, data=as_whole(source.path, source.data))
         source = replace(source, stored=source.data.dtype.str)
-    if known.exists():
-        return IndexSource.of(source, np.load(known))
-    return IndexSource.of(source, _labels_of(source, times, workers, progress))
+    if (folder / LABELS).exists():
+        return IndexSource.of(source, np.load(folder / LABELS))
+    times = (0, source.times) if time is None else (source.time, source.time + 1)
+    threads = min(8, cores() if workers is None else workers)
+    return IndexSource.of(source, _labels_of(source, times, threads, progress))
 
 
 def _labels_of(
@@ -115,18 +116,11 @@ def _labels_of(
         return np.unique(as_whole(source.path, part))
 
     def parts() -> Iterator[np.ndarray]:
-        places, done = itertools.product(*spans), 0
         progress("labels", 0, total)
         with ThreadPoolExecutor(workers) as pool:
-            while some := list(itertools.islice(places, 4 * workers)):
-                yield from pool.map(read, some)
-                done += len(some)
+            found = run_ahead(pool, read, itertools.product(*spans), 4 * workers)
+            for done, part in enumerate(found, 1):
+                yield part
                 progress("labels", done, total)
 
     return distinct(source.path, parts())
-
-
-def write_labels(file: Path, labels: np.ndarray) -> None:
-    """Writes labels to a .npy file that is either there as a whole or not at all."""
-    with durable_file(file) as out:
-        write_npy(out, labels)

@@ -10,7 +10,6 @@ import json
 import multiprocessing
 import threading
 import warnings
-import zlib
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -32,7 +31,7 @@ from .source import VolumeSource
 from .stores.channels import convert_channels
 from .stores.conversion import convert
 from .stores.store import Store
-from .stores.unfinished import fingerprint
+from .stores.unfinished import checksum, fingerprint
 
 _LOCK = threading.Lock()
 
@@ -42,9 +41,7 @@ class MeshSource(VolumeSource):
     """One channel of a mesh's finest voxels."""
 
     channel: str
-    resolution: int
-    band: float
-    thickness: float
+    settings: tuple[tuple[str, Any], ...]  # resolution, band and thickness
     solid: SolidParts
     marks: tuple[Any, ...]  # identify mesh and settings: equal while these are unchanged
     words: tuple[str, ...] = ()  # of the command line beside these
@@ -77,7 +74,7 @@ class MeshSource(VolumeSource):
             mesh, marks, name = read_mesh(given, texture=texture), fingerprint(given), str(given)
         if solid == "auto" and (told := told_of_holes(mesh)):
             warnings.warn(told, stacklevel=3)
-        marks.insert(0, _checksum(mesh))
+        marks.insert(0, checksum(v for name, v in _arrays(mesh).items() if name != "name"))
         grid: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
         made = Voxelizer(mesh, channels=names, **grid, solid=solid)
         told_words = [word for key, n in grid.items() for word in (f"--{key}", f"{n:g}")]
@@ -96,9 +93,7 @@ class MeshSource(VolumeSource):
                 origin=made.origin,
                 info=ImageInfo(channels=colors, quantity=channel, labels=channel == "material"),
                 channel=channel,
-                resolution=resolution,
-                band=band,
-                thickness=thickness,
+                settings=tuple(grid.items()),
                 solid=solid,
                 marks=tuple(marks),
                 words=words if texture is None else (*words, "--texture", str(texture)),
@@ -111,14 +106,13 @@ class MeshSource(VolumeSource):
         """Writes the mesh to a file in the folder."""
         if self.mesh is None:
             return self
-        file = folder / "mesh.npz"
-        _save(self.mesh, file)
+        file, arrays = folder / "mesh.npz", _arrays(self.mesh)
+        np.savez(file, **arrays)  # type: ignore[arg-type]
         return dataclasses.replace(self, mesh=None, file=str(file))
 
     def fingerprint(self) -> list[Any]:
         """The mesh, and what is made of it."""
-        told = [self.channel, self.resolution, self.band, self.thickness, self.solid]
-        return [*self.marks, *told]
+        return [*self.marks, self.channel, *(n for _, n in self.settings), self.solid]
 
     def command(self, store: str) -> tuple[str, ...]:
         """As `gvtorch voxelize` takes it."""
@@ -126,12 +120,10 @@ class MeshSource(VolumeSource):
         return ("gvtorch", "voxelize", self.path, "-o", store, *self.words)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
-        """Makes a part."""
         low, high = [one.start for one in index[:3]], [one.stop for one in index[:3]]
         return self.read_region(low, high)[..., index[3]]
 
     def read_region(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
-        """Makes the box `low` to `high`, (z, y, x), as (z, y, x, c)."""
         with _LOCK:  # the first thread builds the hierarchy
             grid = _voxelizer(self)
         return grid.region(low, high)[self.channel].cpu().numpy()
@@ -145,11 +137,9 @@ def _voxelizer(source: MeshSource) -> Voxelizer:
     mesh = _load(Path(source.file)) if source.mesh is None else source.mesh
     return Voxelizer(
         mesh,
-        resolution=source.resolution,
         channels=(source.channel,),
-        band=source.band,
-        thickness=source.thickness,
         solid=once_filled(source.solid),
+        **dict(source.settings),
     )
 
 
@@ -208,19 +198,6 @@ def _arrays(mesh: Mesh) -> dict[str, np.ndarray]:
         if one.texture is not None:
             arrays[f"texture_{number}"] = one.texture
     return arrays
-
-
-def _checksum(mesh: Mesh) -> int:
-    total = 0
-    for name, value in _arrays(mesh).items():
-        if name != "name":
-            total = zlib.crc32(np.ascontiguousarray(value).tobytes(), total)
-    return total
-
-
-def _save(mesh: Mesh, file: Path) -> None:
-    arrays: dict[str, Any] = _arrays(mesh)
-    np.savez(file, **arrays)
 
 
 def _load(file: Path) -> Mesh:

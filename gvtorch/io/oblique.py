@@ -46,7 +46,6 @@ class StraightSource(VolumeSource):
         self.inner.check_file()
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Resamples a part."""
         times, low, high = index[0], *zip(*((s.start, s.stop) for s in index[1:4]), strict=True)
         size = [b - a for a, b in zip(low, high, strict=True)]
         out = np.empty((times.stop - times.start, *size, self.width), self.stored)
@@ -159,21 +158,18 @@ def straighten(
         "voxels as they are",
         stacklevel=3,
     )
+    kept = {name: getattr(source, name) for name in ("path", "info", "lost", "time", "whole")}
     return StraightSource(
-        path=source.path,
         shape=(source.times, z, y, x, source.width),
         axes="tzyxc",
         stored=source.dtype,
         spacing=tuple(spacing.tolist()),
         origin=tuple(origin.tolist()),
-        info=source.info,
-        lost=source.lost,
-        time=source.time,
-        whole=source.whole,
         inner=dataclasses.replace(source, oblique=None),
         to_inner=tuple(map(tuple, to_inner.tolist())),
         nearest=source.info.labels,
         fill=fill,
+        **kept,
     )
 
 

@@ -11,7 +11,7 @@ import zlib
 from bz2 import BZ2Decompressor
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import IO, Any, Literal
+from typing import IO, Any
 
 import numpy as np
 
@@ -29,17 +29,17 @@ class PackedSource(VolumeSource):
 
     file: str
     offset: int
-    codec: Literal["zlib", "text", "shares"]  # shares: text that tells parts of 255
+    codec: str  # zlib, bz2, text, or shares: text that tells parts of 255
+    skip: int = 0  # bytes before the numbers, unpacked
     fortran: bool = False
     whole: bool = True
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Unpacks all, and returns a part."""
         count = math.prod(self.shape)
-        if self.codec != "zlib":
+        if self.codec in ("text", "shares"):
             shares = self.codec == "shares"
             with open(self.file, "rb") as stream:
-                stream.seek(self.offset)
+                stream.seek(self.offset + self.skip)
                 stored = "<f8" if shares else self.stored
                 data = text_numbers(self.path, stream, count, stored, exact=False)
             if shares:
@@ -47,8 +47,9 @@ class PackedSource(VolumeSource):
                     raise ValueError(f"{self.path}: holds colours that are NaN or infinite")
                 data = np.rint(data * 255).clip(0, 255).astype(self.stored)
         else:
-            need = count * np.dtype(self.stored).itemsize
-            data = np.frombuffer(unpack(self.file, self.offset, need, "zlib"), self.stored)
+            need = self.skip + count * np.dtype(self.stored).itemsize
+            content = unpack(self.file, self.offset, need, self.codec)
+            data = np.frombuffer(content, self.stored, count, self.skip)
         return data.reshape(self.shape, order="F" if self.fortran else "C")[index]
 
 

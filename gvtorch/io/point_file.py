@@ -24,7 +24,7 @@ from ..points.points import Points
 from .budget import MOST_PACKED, header_budget
 from .packed import is_packed_fits
 from .resources import amount, memory_free
-from .source import told_as
+from .source import number_type, told_as
 
 ENDINGS = ("npz", "ply", "fits", "fit", "fits.gz")
 _ALL = 2**62  # points
@@ -32,16 +32,6 @@ _PLACES = ("position", "pos", "xyz", "points", "coord")
 _VALUES = ("value", "mass", "lumin", "intensit", "weight", "flux", "bright", "densit")
 _COLORS = ("color", "colour", "rgb")
 _RADII = ("radius", "radii", "smoothing")
-_PLY_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
 _FITS_TYPES = tuple("BIJKEDF")  # numbers, one or an array of them a row
 _MOST_HEADER = 65536  # bytes
 
@@ -230,8 +220,10 @@ def _ply_header(
             name, count, kinds = elements[-1]
             if words[1] == "list" or kinds is None:
                 elements[-1] = (name, count, None)
+            elif (kind := number_type(words[1])) is not None:
+                kinds.append((words[2], layout + kind))
             else:
-                kinds.append((words[2], layout + _PLY_TYPES[words[1]]))
+                raise ValueError(f"{words[1]!r} is no type of numbers")
     if not layout:
         raise ValueError("its header tells no format")
     return ("ascii" if layout == "=" else layout), elements

@@ -7,7 +7,6 @@ from __future__ import annotations
 import functools
 import json
 import shutil
-import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ from .source import VolumeSource
 from .stores.conversion import convert
 from .stores.store import Store
 from .stores.store_layout import WORK
-from .stores.unfinished import as_json, fingerprint, is_begun, write_json
+from .stores.unfinished import as_json, checksum, fingerprint, is_begun, write_json
 
 CHANNELS = ("value", "color")
 _MADE_OF = "made_of.json"
@@ -69,7 +68,6 @@ class SplatSource(VolumeSource):
         return ("gvtorch", "splat", self.path, "-o", store, *self.words)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
-        """Adds a part up."""
         low, high = (
             tuple(end) for end in zip(*((s.start, s.stop) for s in index[:3]), strict=True)
         )
@@ -78,9 +76,7 @@ class SplatSource(VolumeSource):
             return held.astype(np.float32)
 
 
-@functools.lru_cache(maxsize=2)
-def _opened(folder: str) -> SortedPoints:
-    return SortedPoints.open(folder)
+_opened = functools.lru_cache(maxsize=2)(SortedPoints.open)
 
 
 @dataclass(frozen=True)
@@ -189,11 +185,8 @@ def _marks(points: str | Path | Points) -> list[Any]:
     """Values that identify points: equal while these are unchanged."""
     if not isinstance(points, Points):
         return fingerprint(points)
-    total = 0
-    for one in (points.positions, points.values, points.colors, points.radius):
-        if one is not None:
-            total = zlib.crc32(np.ascontiguousarray(one).tobytes(), total)
-    return [len(points), total]
+    columns = (points.positions, points.values, points.colors, points.radius)
+    return [len(points), checksum(one for one in columns if one is not None)]
 
 
 def _words(

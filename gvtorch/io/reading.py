@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -16,15 +17,15 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from ..base import check
+from ..base.arrays import ArrayLike, as_volume
 from ..base.constants import MAX_VOXELS
 from ..base.volume import Volume, check_extent
-from .arrays import ObjectSource, as_source
 from .budget import check_files, check_regular, header_budget
 from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten
 from .remote import fetch, is_file_url, split_url
 from .resources import amount, memory_free
-from .source import ArraySource, MemorySource, VolumeSource, no_time, told_as
+from .source import ArraySource, Index, MemorySource, VolumeSource, no_time, told_as
 from .stores.ngff import is_zarr
 from .stores.store_layout import DTYPES, MOST_TIMES, MOST_VOXELS, StoreError
 
@@ -201,16 +202,12 @@ def at_place(
     return dataclasses.replace(source, spacing=steps, origin=place)
 
 
-def _mapped(source: VolumeSource) -> bool:
-    """Whether a file's numbers stay in the file."""
-    same = np.dtype(source.stored).name == source.dtype
-    return isinstance(source, ArraySource) and not source.whole and same
-
-
 def read_whole(source: VolumeSource, first: int = 0, times: int = 1) -> np.ndarray:
     """Reads whole time points, (t, z, y, x, c); raises ValueError if the file is damaged."""
     is_array = isinstance(source, (ObjectSource, MemorySource))
-    if not isinstance(source, MemorySource) and not _mapped(source):
+    same = np.dtype(source.stored).name == source.dtype
+    stays = isinstance(source, ArraySource) and not source.whole and same  # in the file
+    if not isinstance(source, MemorySource) and not stays:
         free, needed = memory_free(), source.peak_bytes + (times - 1) * source.nbytes
         if needed > free:
             raise ValueError(
@@ -219,3 +216,51 @@ def read_whole(source: VolumeSource, first: int = 0, times: int = 1) -> np.ndarr
     kind = "an array" if is_array else find_format(source.path, raw=True).name
     with told_as(ValueError, source.path, f"can't be read as {kind}", StoreError, TimeoutError):
         return source.read_times(first, first + times)
+
+
+# --- arrays of other libraries, read part by part where they lie elsewhere
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectSource(VolumeSource):
+    """An array whose values are read or computed when they are asked for (dask, zarr, h5py, lazy
+    xarray): as picklable as it is itself.
+    """
+
+    array: ArrayLike
+
+    def read_stored(self, index: Index) -> np.ndarray:
+        return self.array.read(index)
+
+
+def as_source(where: str, given: Any, axes: str | None = None) -> VolumeSource:
+    """Returns a volume or an array as a source; see `ArrayLike.of` for arguments and errors."""
+    if isinstance(given, Volume):
+        place: dict[str, Any] = {"spacing": given.spacing, "origin": given.origin}
+        return MemorySource.of(given.data.cpu().numpy(), path=given.name, info=given.info, **place)
+    if not hasattr(given, "shape") or not hasattr(given, "dtype") or hasattr(given, "device"):
+        if not isinstance(given, np.ndarray):
+            return as_source(where, as_volume(given, axes=axes, where=where))
+    found = ArrayLike.of(where, given, axes)
+    kept = {name: getattr(found, name) for name in ("spacing", "origin", "info", "lost")}
+    kept["path"] = found.name or "array"
+    told = {name: getattr(found, name) for name in ("shape", "axes", "flips")}
+    told |= {"stored": found.dtype, **kept}
+    mapped = _in_file(given)
+    if mapped is not None:
+        return ArraySource(**told, **mapped)
+    source = ObjectSource(array=found, **told)
+    if found.lazy:
+        return source
+    return MemorySource.of(source.read_times(0, source.times), **kept)
+
+
+def _in_file(given: Any) -> dict[str, Any] | None:
+    """Where the numbers of a memory map lie, if it is a whole one: other processes map it too."""
+    if not isinstance(given, np.memmap) or given.filename is None:
+        return None
+    whole = given.base is not None and not isinstance(given.base, np.ndarray)
+    if not whole or not (given.flags.c_contiguous or given.flags.f_contiguous):
+        return None
+    fortran = not given.flags.c_contiguous
+    return {"file": str(given.filename), "offset": int(given.offset), "fortran": fortran}

@@ -62,25 +62,20 @@ class Relayed:
             "http_request_concurrency": {"limit": _TOGETHER},
             "http_request_retries": _RETRIES,
         }
-        self._future: Any = None
+        self.future: Any = None  # of the array that lies there, once it is asked for
         self._files: ChunkFiles | None = None
         self._indexes: OrderedDict[str, np.ndarray] = OrderedDict()
         self._lock = threading.Lock()
-
-    def opens(self, future: Any) -> Any:
-        """Takes and returns the future of the array that lies there."""
-        self._future = future
-        return future
 
     @property
     def files(self) -> ChunkFiles | None:
         """What its chunks may be; None before the array is open."""
         from .stores.chunk_files import ChunkFiles
 
-        future = self._future
+        future = self.future
         if future is not None and future.done():
             self._files = ChunkFiles.of(future.result()) if future.exception() is None else None
-            self._future = None
+            self.future = None
         return self._files
 
     def read(self, name: str, part: slice | None) -> bytes | None:
@@ -181,18 +176,16 @@ class _Server(http.server.ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.word = secrets.token_urlsafe(16)
         self.folders: list[Relayed] = []
-        self.lock = threading.Lock()
         threading.Thread(target=self.serve_forever, daemon=True, name="gvtorch-relay").start()
 
     def folder(self, url: str, context: Any) -> Relayed:
         """A place for a folder; the same for the same."""
-        with self.lock:
-            for found in self.folders:
-                if found.url == url:
-                    return found
-            base = f"http://127.0.0.1:{self.server_port}/{self.word}/{len(self.folders)}/"
-            self.folders.append(Relayed(url, base, context))
-            return self.folders[-1]
+        for found in self.folders:
+            if found.url == url:
+                return found
+        base = f"http://127.0.0.1:{self.server_port}/{self.word}/{len(self.folders)}/"
+        self.folders.append(Relayed(url, base, context))
+        return self.folders[-1]
 
     def handle_error(self, *_: object) -> None:
         """Says nothing: tensorstore does not wait for what it gave up."""
@@ -206,7 +199,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         asked = re.fullmatch(r"/([\w-]+)/(\d+)/(.+)", self.path, re.ASCII)
         if asked is None or not hmac.compare_digest(asked[1], self.server.word):
-            self._answer(403, b"")
+            self._answer(403)
             return
         wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
         part = None
@@ -214,24 +207,22 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             first, last = wanted.groups()
             part = slice(int(first), int(last) + 1) if first else slice(-int(last), None)
         folder, name = self.server.folders[int(asked[2])], asked[3]
+        content: bytes | None = None
         try:
             content = folder.read(name, part)
+            status = 404 if content is None else 200 if part is None else 206
         except Endless:
-            self._answer(403, b"")
+            status = 403
         except HttpStatus as error:
-            self._answer(error.status, b"")
+            status = error.status
         except OSError:  # tensorstore tries again for a while
-            self._answer(503, b"")
-        else:
-            if content is None:
-                self._answer(404, b"")
-            else:
-                self._answer(200 if part is None else 206, content, part)
+            status = 503
+        self._answer(status, content or b"", part)
 
-    def _answer(self, status: int, content: bytes, part: slice | None = None) -> None:
+    def _answer(self, status: int, content: bytes = b"", part: slice | None = None) -> None:
         self.send_response(status)
         self.send_header("Content-Length", str(len(content)))
-        if part is not None:
+        if part is not None and status == 206:
             begin = part.start if part.start >= 0 else 0
             self.send_header("Content-Range", f"bytes {begin}-{begin + len(content) - 1}/*")
         self.end_headers()

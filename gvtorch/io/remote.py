@@ -16,8 +16,6 @@ import os
 import re
 import shutil
 import tempfile
-import urllib.error
-import urllib.request
 import warnings
 from contextlib import closing
 from pathlib import Path
@@ -27,6 +25,7 @@ from urllib.parse import unquote, urlsplit
 from ..base.digits import whole_number
 from ..base.messages import need_library, one_line
 from ..base.whole_file import write_whole
+from .http import AGENT, MISSING, HttpStatus, ask_by_urllib
 from .resources import amount
 
 _TIMEOUT = 30.0  # seconds without a byte
@@ -139,19 +138,16 @@ Answer = tuple[IO[bytes], int | None, Version]
 
 def _open_http(url: str, known: Version) -> Answer | None:
     """Begins a download; None if the version that is known is the server's."""
-    request = urllib.request.Request(url, headers={"Accept-Encoding": "identity"})
-    for name, header in (("ETag", "If-None-Match"), ("Last-Modified", "If-Modified-Since")):
-        if known.get(name):
-            request.add_header(header, known[name])
+    marks = (("ETag", "If-None-Match"), ("Last-Modified", "If-Modified-Since"))
+    asked = {header: known[name] for name, header in marks if known.get(name)}
     try:
-        answer = urllib.request.urlopen(request, timeout=_TIMEOUT)
-    except urllib.error.HTTPError as error:
-        error.close()
-        if error.code == 304 and known:
+        answer = ask_by_urllib(url, AGENT | asked, _TIMEOUT)
+    except HttpStatus as error:
+        if error.status == 304 and known:
             return None
-        if error.code in (404, 410):
+        if error.status in MISSING:
             raise FileNotFoundError(f"volume not found: {url}") from None
-        raise OSError(f"{error.code} {error.reason}") from None
+        raise
     length = answer.headers.get("Content-Length", "")
     version = {n: answer.headers[n] for n in ("ETag", "Last-Modified") if answer.headers.get(n)}
     return answer, whole_number(length), version

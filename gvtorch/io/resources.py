@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 def amount(nbytes: float) -> str:
@@ -76,3 +81,24 @@ def begin_worker() -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def run_ahead(
+    pool: Executor, task: Callable[[Item], Result], items: Iterable[Item], ahead: int
+) -> Generator[Result, None, None]:
+    """Runs a task for each item, a bounded number at a time, and yields what they return, as they
+    end.
+    """
+    waiting, running = iter(items), set[Future[Result]]()
+    try:
+        while True:
+            for item in itertools.islice(waiting, ahead - len(running)):
+                running.add(pool.submit(task, item))
+            if not running:
+                return
+            finished, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in sorted(finished, key=lambda future: future.exception() is not None):
+                yield future.result()  # first what is done, then what failed
+    finally:
+        for future in running:
+            future.cancel()

@@ -28,10 +28,20 @@ from ..base import boxes
 from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
+from ..base.npy_file import save_npy
+from ..base.whole_file import told_of
 from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
+Triple = tuple[float, float, float]
+Told = tuple[ImageInfo, Triple, list[str]]  # info, spacing, what is not kept
 _PART = 1 << 20  # bytes that are unpacked at a time
+_WHOLE = {1: ("char", "int8"), 2: ("short", "int16"), 4: ("int", "int32"), 8: ("longlong", "int64")}
+_NUMBERS = {
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+    **{name: f"i{size}" for size, names in _WHOLE.items() for name in names},
+    **{f"u{name}": f"u{size}" for size, names in _WHOLE.items() for name in names},
+}
 #: (4, 4) of world axes that run left and posterior, to right and anterior ones.
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -45,8 +55,8 @@ class VolumeSource(ABC):
     axes: str  # a letter for each of its axes: t, c, z, y, x, or - for one of size 1 to drop
     stored: str  # NumPy dtype as it is stored, with byte order
     flips: str = ""  # letters of axes that run backwards
-    spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)  # x y z, world units
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x y z, centre of voxel 0
+    spacing: Triple = (1.0, 1.0, 1.0)  # x y z, world units
+    origin: Triple = (0.0, 0.0, 0.0)  # x y z, centre of voxel 0
     # Where the axes x, y, z do not lie along the world's: (3, 4), from voxels to the world.
     oblique: tuple[tuple[float, ...], ...] | None = None
     info: ImageInfo = dataclasses.field(default_factory=ImageInfo)  # unit, channels, ...
@@ -224,13 +234,24 @@ class MemorySource(VolumeSource):
         axes = "tzyxc"[-data.ndim :]
         return cls(data=data, shape=data.shape, axes=axes, stored=data.dtype.str, **told)
 
+    def staged(self, folder: Path) -> VolumeSource:
+        """Writes the values to a file in the folder."""
+        file = folder / "source.npy"
+        with told_of(file):
+            save_npy(file, self.data)
+        return ArraySource(
+            path=str(file),
+            file=str(file),
+            shape=self.shape,
+            axes=self.axes,
+            stored=self.stored,
+            offset=file.stat().st_size - self.data.nbytes,  # behind the header
+            fortran=self.data.flags.fnc,
+            info=self.info,
+        )
+
     def read_stored(self, index: Index) -> np.ndarray:
         return self.data[index]
-
-    def read_region(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
-        """Returns the box `low` to `high`, (z, y, x), as a view."""
-        data = self.data[self.time] if self.data.ndim == 5 else self.data
-        return data[boxes.index(low, high)]
 
 
 def place_axes(
@@ -287,6 +308,16 @@ def place_axes(
         "origin": tuple(origin.tolist()),
         "oblique": tuple(map(tuple, affine[:3].tolist())) if is_oblique else None,
     }
+
+
+def number_type(name: str) -> str | None:
+    """Returns the dtype, without byte order, of numbers that are called as in C or by their bits:
+    "unsigned short int", "uchar", "long_long", "uint16_t", "Float32". None: it is unknown, as is
+    "long", which has 4 bytes or 8.
+    """
+    plain = name.lower().replace("_", " ").replace("long long", "longlong").removesuffix(" t")
+    plain = plain.replace("unsigned ", "u").removeprefix("signed ").removesuffix(" int")
+    return _NUMBERS.get(plain)
 
 
 def open_unpacked(file: str, member: str = "") -> IO[bytes]:

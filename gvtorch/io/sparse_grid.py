@@ -10,12 +10,13 @@ Source: Museth, "VDB: High-resolution sparse volumes with dynamic topology", ACM
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -36,8 +37,11 @@ _QUANTITIES = {"level set": "signed distance", "fog volume": "density"}
 
 @dataclass(kw_only=True)
 class SparseGrid(ABC):
-    """The nodes of a grid; all places are voxel indices i, j, k."""
+    """The nodes of a grid; all places but those in its data are voxel indices i, j, k."""
 
+    data: Any  # bytes in which the nodes lie
+    kind: str  # of its values, as the format names it
+    places: tuple[np.ndarray, np.ndarray, np.ndarray]  # in the data, of each of `origins`
     dtype: np.dtype
     background: np.ndarray  # (c,)
     origins: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n, 3) int64 of uppers, lowers and leaves
@@ -55,6 +59,11 @@ class SparseGrid(ABC):
         if len(np.unique(cells @ np.array((1 << 42, 1 << 21, 1)))) < len(cells):
             raise ValueError("two entries of the root lie at one place")
 
+    @classmethod
+    @abstractmethod
+    def read(cls, path: str, number: int) -> Self:
+        """Finds the nodes of a file's grid."""
+
     @abstractmethod
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns (n, n, n, c) values of an upper (0) or lower (1) node's entries, and (n, n, n)
@@ -70,8 +79,11 @@ class SparseGrid(ABC):
         leaf, a, b = SIDES[2], np.asarray(low), np.asarray(high)
         start, stop = a // leaf * leaf, -(-b // leaf) * leaf  # whole leaves
         whole, axis = math.prod((stop - start).tolist()), int((b - a).argmax())
-        if whole > max(_WHOLE, 2 * math.prod((b - a).tolist())):  # of a thin box
-            return self._pieces(a, b, axis, whole // int((stop - start)[axis]))
+        side = int((stop - start)[axis]) // leaf // 2 * leaf
+        if side and whole > max(_WHOLE, 2 * math.prod((b - a).tolist())):  # a thin box: by halves
+            middle, other = b.tolist(), a.tolist()
+            middle[axis] = other[axis] = int(start[axis]) + side
+            return np.concatenate((self.fill(low, middle), self.fill(other, high)), axis)
         out = np.empty((*(stop - start), len(self.background)), self.dtype)
         out[:] = self.background
         tiles = self._hits(self.root_places, SIDES[0], start, stop)
@@ -87,23 +99,6 @@ class SparseGrid(ABC):
             i, j, k = ((self.origins[2][numbers] - start) // leaf).T
             blocks[i, :, j, :, k] = self.leaves(numbers).reshape(-1, 8, 8, 8, out.shape[3])
         return out[tuple(slice(x - s, y - s) for x, y, s in zip(a, b, start, strict=True))]
-
-    def _pieces(self, low: np.ndarray, high: np.ndarray, axis: int, across: int) -> np.ndarray:
-        """Fills a box piece by piece along an axis; so many voxels of whole leaves lie across."""
-        side = SIDES[2]
-        step = max(side, _WHOLE // across // side * side)
-        out = np.empty((*(high - low), len(self.background)), self.dtype)
-        ends = [
-            *range(int(low[axis]) // side * side + step, int(high[axis]), step),
-            int(high[axis]),
-        ]
-        a, b = low.copy(), high.copy()
-        for end in ends:
-            b[axis], part = end, [slice(None)] * 3
-            part[axis] = slice(a[axis] - low[axis], end - low[axis])
-            out[tuple(part)] = self.fill(a.tolist(), b.tolist())
-            a[axis] = end
-        return out
 
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         """(3,) lowest voxel and (3,) what is behind the highest, of all leaves and all tiles that
@@ -173,67 +168,78 @@ def check_roots(count: int) -> None:
         raise ValueError(f"a root of {count} entries, at most {MOST_ROOTS} are read")
 
 
+@functools.lru_cache(maxsize=2)
+def _grid(kind: type[SparseGrid], path: str, number: int, _opened: int) -> SparseGrid:
+    return kind.read(path, number)
+
+
 @dataclass(frozen=True, kw_only=True)
-class SparseSource(VolumeSource, ABC):
+class SparseSource(VolumeSource):
     """A grid of a file; the array is (i, j, k), or (i, j, k, c)."""
 
-    key: str  # the grid's name
+    grid_type: type[SparseGrid]
+    number: int  # of the grid in its file
     low: tuple[int, int, int]  # voxel 0
+    held: int = 0  # bytes of the grid itself, where it is unpacked as a whole
 
-    @abstractmethod
+    @classmethod
+    def of(
+        cls,
+        path: str,
+        name: str,
+        kind: str,
+        stored: str,
+        width: int,
+        low: np.ndarray,
+        high: np.ndarray,
+        affine: np.ndarray,
+        **told: Any,
+    ) -> SparseSource:
+        """Lays a grid into the world.
+
+        Args:
+            path, name: Of the file and the grid.
+            kind: The grid's class: "level set", "fog volume", ...
+            stored: Dtype of a number.
+            width: Numbers of a voxel.
+            low, high: (3,) Voxel 0, and what is behind the last one.
+            affine: (4, 4) From voxel indices to the world.
+            **told: Other fields.
+        """
+        size = [int(n) for n in high - low]
+        if min(size) < 1 or np.abs((low, high)).max() > MOST_INDEX:
+            raise ValueError(f"{path}: grid {name!r} has no active voxel")
+        check_extent(path, size, most=1 << 62)
+        shifted = affine.astype(np.float64)
+        shifted[:3, 3] += shifted[:3, :3] @ low
+        shape = (*size, width) if width > 1 else tuple(size)
+        names = [f"{name}.{'xyzw'[n]}" for n in range(width)] if width > 1 else [name]
+        channels = tuple(ChannelInfo(name=one) for one in names) if name else ()
+        return cls(
+            path=path,
+            shape=shape,
+            stored=stored,
+            low=tuple(low.tolist()),
+            info=ImageInfo(channels=channels, quantity=_QUANTITIES.get(kind)),
+            **place_axes(path, shifted, shape, component=3 if width > 1 else None),
+            **told,
+        )
+
+    @property
+    def peak_bytes(self) -> int:
+        """As of any source, and the grid itself."""
+        return super().peak_bytes + self.held
+
     def grid(self) -> SparseGrid:
         """Returns the grid, which is kept."""
+        with _LOCK:  # the first thread looks for the nodes
+            return _grid(self.grid_type, self.path, self.number, self.opened)
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Fills a part."""
-        with _LOCK:  # the first thread looks for the nodes
-            grid = self.grid()
         low = [part.start + at for part, at in zip(index[:3], self.low, strict=True)]
         high = [part.stop + at for part, at in zip(index[:3], self.low, strict=True)]
-        values = grid.fill(low, high)
+        values = self.grid().fill(low, high)
         return values[..., index[3]] if len(index) > 3 else values[..., 0]
-
-
-def source_fields(
-    path: str,
-    name: str,
-    kind: str,
-    stored: np.dtype,
-    width: int,
-    low: np.ndarray,
-    high: np.ndarray,
-    affine: np.ndarray,
-) -> dict[str, Any]:
-    """The fields of a source.
-
-    Args:
-        path, name: Of the file and the grid.
-        kind: The grid's class: "level set", "fog volume", ...
-        stored: Dtype of a number.
-        width: Numbers of a voxel.
-        low, high: (3,) Voxel 0, and what is behind the last one.
-        affine: (4, 4) From voxel indices to the world.
-    """
-    size = [int(n) for n in high - low]
-    if min(size) < 1 or np.abs((low, high)).max() > MOST_INDEX:
-        raise ValueError(f"{path}: grid {name!r} has no active voxel")
-    check_extent(path, size, most=1 << 62)
-    shifted = affine.astype(np.float64)
-    shifted[:3, 3] += shifted[:3, :3] @ low
-    shape = (*size, width) if width > 1 else tuple(size)
-    names = [f"{name}.{'xyzw'[n]}" for n in range(width)] if width > 1 else [name]
-    return {
-        "path": path,
-        "shape": shape,
-        "stored": stored.str,
-        "key": name,
-        "low": tuple(low.tolist()),
-        "info": ImageInfo(
-            channels=tuple(ChannelInfo(name=one) for one in names) if name else (),
-            quantity=_QUANTITIES.get(kind),
-        ),
-        **place_axes(path, shifted, shape, component=3 if width > 1 else None),
-    }
 
 
 def bits(data: Any, at: int, count: int) -> np.ndarray:

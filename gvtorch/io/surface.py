@@ -10,7 +10,7 @@ go on from the outermost centres to the faces of the box, as in pictures.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -135,10 +135,9 @@ class _Grid:
         self.what, self.more = what, 2 if caps else 0
         self.label: int | None = None
         self.value = check.number(where, "value", value)
-        branching = what.branching if isinstance(what, N3Tree) else 2
-        levels = what.levels if isinstance(what, Store) else 1
+        branching, levels = 2, what.levels if isinstance(what, Store) else 1
         if isinstance(what, N3Tree):
-            levels = what.depth + 1
+            branching, levels = what.branching, what.depth + 1
             self._bricks, self._channel = what.levels(), what.fine_channel(where, channel)
             width = what.bricks.channels[self._channel].width
             known, labels = what.labels.get(self._channel), self._channel in what.labels
@@ -234,72 +233,46 @@ def _stored_label(label: float, known: torch.Tensor | None) -> int:
 
 
 def _parts(grid: _Grid, progress: Progress) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields new vertices, (v, 3) world x y z, and triangles of all vertices so far."""
+    """Yields new vertices, (v, 3) world x y z, and triangles of all vertices so far. Blocks come
+    along x, then y, then z; vertices on far faces are kept for those behind.
+    """
     spans = [[(a, min(a + _BLOCK, n - 1)) for a in range(0, n - 1, _BLOCK)] for n in grid.samples]
     counts = [len(those) for those in spans]
-    total, shared, vertices = int(np.prod(counts)), _FarVertices(), 0
+    total, vertices = int(np.prod(counts)), 0
+    far: dict[tuple[int, ...], Numbered] = {}  # by block, until the one behind it along z comes
     blocks = itertools.product(*(enumerate(those) for those in spans))
     for done, block in enumerate(blocks):
         at, low, high = (
             tuple(part) for part in zip(*((n, *span) for n, span in block), strict=True)
         )
+        z, y, x = at
+        before = [far.get(place) for place in ((z, y, x - 1), (z, y - 1, x), (z - 1, y, x))]
+        far.pop((z - 1, y, x), None)
         end = [b + 1 for b in high]
         if grid.crossed(low, end):
             made = contour(grid.read(low, end), grid.value, low, grid.samples)
-            number = shared.numbers(at, made.keys, vertices)
+            number = _numbers(made.keys, filter(None, before), vertices)
             new = number >= vertices
             vertices += int(new.sum())
-            shared.keep(at, high, edge_of(made.keys, grid.samples), made.keys, number)
+            start, along = edge_of(made.keys, grid.samples)
+            on = ((start == high) & (along[:, None] != (2, 1, 0))).any(1)
+            far[at] = made.keys[on], number[on]
             if len(made.faces):
                 yield grid.place(made.places[new]), number[made.faces]
-        else:
-            shared.drop(at)
         progress("surface", done + 1, total)
     yield np.zeros((0, 3)), np.zeros((0, 3), np.int64)
 
 
-class _FarVertices:
-    """Vertices on the far faces of blocks, until the blocks behind them come; blocks come along x,
-    then y, then z.
+def _numbers(keys: np.ndarray, known: Iterable[Numbered], count: int) -> np.ndarray:
+    """The vertices that keys are: those that are known on the far faces of blocks before, else new
+    ones, from `count` on.
     """
-
-    def __init__(self) -> None:
-        self._behind: dict[tuple[int, ...], Numbered] = {}  # axis, and place in the other two
-
-    def numbers(self, at: tuple[int, ...], keys: np.ndarray, count: int) -> np.ndarray:
-        """Returns the vertices that keys are: those that a block before has, else new ones."""
-        known = [
-            self._behind[place] for axis in range(3) if (place := _across(axis, at)) in self._behind
-        ]
-        number = np.full(len(keys), -1)
-        for names, numbers in known:
-            if len(names):
-                found = np.minimum(np.searchsorted(names, keys), len(names) - 1)
-                same = names[found] == keys
-                number[same] = numbers[found[same]]
-        new = number < 0
-        number[new] = count + np.arange(int(new.sum()))
-        return number
-
-    def keep(
-        self,
-        at: tuple[int, ...],
-        high: Sequence[int],
-        edges: tuple[np.ndarray, np.ndarray],
-        keys: np.ndarray,
-        number: np.ndarray,
-    ) -> None:
-        """Keeps the vertices on a block's far faces, instead of those that its near ones had."""
-        start, along = edges
-        for axis in range(3):  # z, y, x
-            on = (start[:, axis] == high[axis]) & (along != 2 - axis)
-            self._behind[_across(axis, at)] = (keys[on], number[on])
-
-    def drop(self, at: tuple[int, ...]) -> None:
-        """Forgets what lies before a block without a surface."""
-        for axis in range(3):
-            self._behind.pop(_across(axis, at), None)
-
-
-def _across(axis: int, at: tuple[int, ...]) -> tuple[int, ...]:
-    return (axis, *(n for other, n in enumerate(at) if other != axis))
+    number = np.full(len(keys), -1)
+    for names, numbers in known:
+        if len(names):
+            found = np.minimum(np.searchsorted(names, keys), len(names) - 1)
+            same = names[found] == keys
+            number[same] = numbers[found[same]]
+    new = number < 0
+    number[new] = count + np.arange(int(new.sum()))
+    return number

@@ -22,8 +22,8 @@ from ..base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ..base.units import NO_DEPTH, spacing_of, time_unit
 from .budget import check_beside
 from .picture_size import picture_size
+from .source import Told
 
-Told = tuple[ImageInfo, tuple[float, float, float], list[str]]  # info, spacing, what is not kept
 JPEG = (6, 7, 34892, 33007)
 _LERC = 34887
 _PICTURES = (*JPEG, _LERC, 22610, 33003, 33004, 33005, 34712, 34933, 34934, 50001, 50002, 52546)

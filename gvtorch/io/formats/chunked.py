@@ -19,7 +19,7 @@ import numpy as np
 from ...base.image_info import ImageInfo
 from ...base.named_axes import ask_axes, even_steps, named_axes, place_named
 from ...base.units import spacing_of
-from ..source import Index, VolumeSource
+from ..source import Index, Triple, VolumeSource
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
 from ..stores.ngff import read_json_file
 from ..stores.store_layout import Deadline, is_number, kvstore, opened_at
@@ -39,7 +39,6 @@ class ChunkedSource(VolumeSource):
     folder: str
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Reads the chunks of a part."""
         array, files = _array(self.driver, self.folder, self.opened)
         return Deadline(_TIMEOUT).wait(begin_read(array[index], files), self.folder)
 
@@ -185,9 +184,7 @@ def _source(path: str, driver: str, folder: str) -> tuple[ChunkedSource, tuple[i
     return replace(source, shape=shape, stored=dtype.str), shape
 
 
-def _n5_place(
-    told: dict[str, Any], letters: str
-) -> tuple[tuple[float, float, float], tuple[float, float, float], str | None]:
+def _n5_place(told: dict[str, Any], letters: str) -> tuple[Triple, Triple, str | None]:
     """Voxel size, place and unit of an N5 array; `letters` tell its axes, x first."""
     rank = len(letters)
     sizes: Any = told.get("pixelResolution", told.get("resolution"))

@@ -15,7 +15,7 @@ import numpy as np
 from ...base.digits import finite_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels, from_hex
 from ...base.units import NO_DEPTH, spacing_of
-from ..source import Index, VolumeSource
+from ..source import Index, Told, VolumeSource
 from .format import Format, choose
 
 _DTYPES = {
@@ -37,7 +37,6 @@ class CziSource(VolumeSource):
     starts: tuple[tuple[str, int], ...]  # first number of each of T, C, Z
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Reads the tiles of a part of each plane."""
         from pylibCZIrw import czi
 
         rows, columns = index[3], index[4]
@@ -101,9 +100,7 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
     )
 
 
-def _told(
-    xml: str, width: int, colors: int, stored: str
-) -> tuple[ImageInfo, tuple[float, float, float], list[str]]:
+def _told(xml: str, width: int, colors: int, stored: str) -> Told:
     """What the metadata tells: info, spacing, and what is not kept."""
     root = ElementTree.fromstring(xml)
     sizes: dict[str, float | None] = {}

@@ -15,7 +15,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
@@ -44,22 +44,22 @@ class DicomSource(VolumeSource):
     def check_file(self) -> None:
         """Compares the size of files that are not packed with what their images take."""
         for file, number, *_ in dict((frame[0], frame) for frame in self.frames).values():
-            need = _bytes_unpacked(file, number + 1)
-            size = os.stat(file).st_size
+            header, size = _header(file), os.stat(file).st_size
+            meta = header.file_meta if "file_meta" in vars(header) else {}
+            syntax = meta.get("TransferSyntaxUID")
+            if syntax is None or syntax.is_compressed or syntax == _DEFLATED:
+                continue
+            values = math.prod(_image_shape(header)) * (number + 1)
+            need = values * int(header.get("BitsAllocated") or 0) // 8
             if size < need:
                 raise ValueError(f"{file}: its images take {need} bytes, the file has {size}")
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Unpacks the images of a part."""
         times, places, *inside = index
-        depth = self.shape[1]
-        wanted = [
-            self.frames[t * depth + z]
-            for t in range(times.start, times.stop)
-            for z in range(places.start, places.stop)
-        ]
-        data = np.empty((len(wanted), *(s.stop - s.start for s in inside)), self.stored)
-        at = 0
+        numbers = np.arange(len(self.frames)).reshape(self.shape[:2])[times, places]
+        data = np.empty((numbers.size, *(s.stop - s.start for s in inside)), self.stored)
+        out = iter(data)
+        wanted = (self.frames[number] for number in numbers.ravel())
         for file, group in groupby(wanted, key=lambda frame: frame[0]):
             same = list(group)
             images = _images(file, [number for _, number, _, _ in same])
@@ -69,12 +69,8 @@ class DicomSource(VolumeSource):
                 part = image[tuple(inside)]
                 if (slope, intercept) != (1, 0):
                     part = part * np.float64(slope) + intercept
-                data[at] = part
-                at += 1
-        if at != len(wanted):
-            raise ValueError(f"{self.path}: {len(wanted) - at} images are missing")
-        sizes = (times.stop - times.start, places.stop - places.start)
-        return data.reshape((*sizes, *data.shape[1:]))
+                next(out)[...] = part
+        return data.reshape((*numbers.shape, *data.shape[1:]))
 
 
 def _has_magic(path: str | os.PathLike[str]) -> bool:
@@ -130,7 +126,8 @@ def open_dicom(path: str, key: str | None = None) -> DicomSource:
         headers = [_header(path)]
         if _frame_count(headers[0]) == 1:
             headers += _siblings(path, headers[0])
-    return _source(path, _without_copies(headers))
+    once = {str(h.get("SOPInstanceUID", h.filename)): h for h in reversed(headers)}
+    return _source(path, list(reversed(once.values())))
 
 
 def _siblings(path: str, first: Any) -> Iterator[Any]:
@@ -194,12 +191,6 @@ def _names(uid: str, header: Any) -> list[str]:
     return [str(header.get("SeriesNumber", uid)), str(header.get("SeriesDescription", "")), uid]
 
 
-def _without_copies(headers: Sequence[Any]) -> list[Any]:
-    """Leaves out a file that is there twice."""
-    found = {str(h.get("SOPInstanceUID", h.filename)): h for h in reversed(headers)}
-    return list(reversed(found.values()))
-
-
 def _frame_count(header: Any) -> int:
     count = int(header.get("NumberOfFrames") or 1)
     if not 1 <= count <= os.stat(header.filename).st_size:
@@ -220,19 +211,19 @@ def _source(path: str, headers: list[Any]) -> DicomSource:
                 f"{_image_shape(header)} (rows, columns, samples, {Path(header.filename).name})"
             )
         frames += frames_of(header, count)
-    ordered, affine, lost, times = order_frames(path, frames)
-    depth = len(ordered) // times.count
+    times, affine, lost, moments = order_frames(path, frames)
+    depth, frames = len(times[0]), list(chain(*times))
     told = place_axes(path, LPS_TO_RAS @ affine, (depth, rows, columns))
     color = (samples,) if samples > 1 else ()
     told["axes"] = "t" + told["axes"] + "c" * len(color)
-    info, more = image_info(first, samples, times)
-    if any(frame.position is None for frame in ordered):
+    info, more = image_info(first, samples, moments)
+    if any(frame.position is None for frame in frames):
         info = replace(info, unit=info.unit if first.get("PixelSpacing") else None)
     return DicomSource(
         path=path,
-        shape=(times.count, depth, rows, columns, *color),
-        stored=_dtype(first, ordered),
-        frames=tuple((f.file, f.number, f.slope, f.intercept) for f in ordered),
+        shape=(len(times), depth, rows, columns, *color),
+        stored=_dtype(first, frames),
+        frames=tuple((f.file, f.number, f.slope, f.intercept) for f in frames),
         info=info,
         lost=(*lost, *more),
         **told,
@@ -262,16 +253,6 @@ def _dtype(header: Any, frames: Sequence[DicomFrame]) -> str:
         if np.iinfo(kind).min <= min(ends) and max(ends) <= np.iinfo(kind).max:
             return kind
     return "int32" if max(map(abs, ends)) < 2**31 and bits > 16 else "float32"
-
-
-def _bytes_unpacked(file: str, images: int) -> int:
-    """Bytes that the images of a file take if they are not packed, else 0."""
-    header = _header(file)
-    syntax = header.file_meta.get("TransferSyntaxUID") if "file_meta" in vars(header) else None
-    if syntax is None or syntax.is_compressed or syntax == _DEFLATED:
-        return 0
-    bits = int(header.get("BitsAllocated") or 0)
-    return math.prod(_image_shape(header)) * images * bits // 8
 
 
 def _images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:

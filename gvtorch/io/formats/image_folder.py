@@ -38,7 +38,6 @@ class SlicesSource(VolumeSource):
     files: tuple[str, ...]  # one a slice
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Reads the files of a part."""
         files = self.files[index[0]]
         data = np.empty((len(files), *[s.stop - s.start for s in index[1:]]), self.stored)
         for at, file in enumerate(files):

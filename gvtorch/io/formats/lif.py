@@ -35,7 +35,6 @@ class LifSource(VolumeSource):
     strides: tuple[int, ...]
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Maps the image's block."""
         block = np.memmap(self.path, "u1", "r", self.offset, (self.length,))
         whole = np.ndarray(self.shape, self.stored, block, 0, self.strides)
         return whole[index].copy()

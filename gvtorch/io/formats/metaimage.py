@@ -18,23 +18,10 @@ import numpy as np
 from ...base.image_info import ImageInfo, color_channels
 from ...base.units import length_unit
 from ..packed import PackedSource
-from ..source import LPS_TO_RAS, ArraySource, VolumeSource, place_axes
+from ..source import LPS_TO_RAS, ArraySource, VolumeSource, number_type, place_axes
 from .format import Format
 
-_TYPES = {
-    "MET_CHAR": "i1",
-    "MET_UCHAR": "u1",
-    "MET_SHORT": "i2",
-    "MET_USHORT": "u2",
-    "MET_INT": "i4",
-    "MET_UINT": "u4",
-    "MET_LONG": "i4",
-    "MET_ULONG": "u4",
-    "MET_LONG_LONG": "i8",
-    "MET_ULONG_LONG": "u8",
-    "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-}
+_LONG = {"MET_LONG": "i4", "MET_ULONG": "u4"}
 _MOST_HEADER = 1 << 20  # bytes
 _KEPT = {
     *("ObjectType", "NDims", "BinaryData", "BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
@@ -54,7 +41,8 @@ def open_metaimage(path: str) -> VolumeSource:
     shape = tuple(int(n) for n in header["DimSize"].split())
     if rank not in (2, 3, 4) or len(shape) != rank:
         raise ValueError(f"{path}: expected 2 to 4 dimensions, got {shape} of {rank}")
-    kind = _TYPES.get(header["ElementType"].removesuffix("_ARRAY"))
+    name = header["ElementType"].removesuffix("_ARRAY")
+    kind = _LONG.get(name) or number_type(name.removeprefix("MET_"))
     if kind is None:
         raise ValueError(f"{path}: ElementType {header['ElementType']!r} is unknown")
     width = int(header.get("ElementNumberOfChannels", 1))
@@ -81,10 +69,8 @@ def open_metaimage(path: str) -> VolumeSource:
     if header.get("CompressedData", "False").lower() == "true":
         return PackedSource(file=data, offset=max(offset, 0), codec="zlib", fortran=True, **told)
     if offset < 0:  # the numbers are the last of the file
-        need, size = math.prod(told["shape"]) * np.dtype(kind).itemsize, os.stat(data).st_size
-        if need > size:
-            raise ValueError(f"{path}: takes {need} bytes, the file has {size}")
-        offset = size - need
+        need = math.prod(told["shape"]) * np.dtype(kind).itemsize
+        offset = max(0, os.stat(data).st_size - need)
     return ArraySource(file=data, offset=offset, fortran=True, **told)
 
 
@@ -139,17 +125,13 @@ def _placed(
 
 def _info(header: dict[str, str], width: int, rank: int) -> ImageInfo:
     """What the header tells of the values."""
-    modality = header.get("Modality", "")
+    modality, steps = header.get("Modality", ""), header.get("ElementSpacing", "").split()
+    step = float(steps[3]) if rank == len(steps) == 4 else 0.0
     color = width == 3 and header["ElementType"].startswith("MET_UCHAR")
     return ImageInfo(
         unit=length_unit(header.get("DistanceUnits", "mm")),
         quantity="HU" if modality == "MET_MOD_CT" else None,
         channels=color_channels() if color else (),
         space="right-anterior-superior",
-        time_step=_time_step(header) if rank == 4 else None,
+        time_step=step if step > 0 else None,
     )
-
-
-def _time_step(header: dict[str, str]) -> float | None:
-    words = header.get("ElementSpacing", "").split()
-    return float(words[3]) if len(words) == 4 and float(words[3]) > 0 else None

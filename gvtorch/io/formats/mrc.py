@@ -12,7 +12,7 @@ import numpy as np
 
 from ...base.image_info import ImageInfo
 from ...base.messages import one_line
-from ..source import ArraySource
+from ..source import ArraySource, Triple
 from .format import Format
 
 _PACKED = (".gz", ".bz2")
@@ -67,9 +67,7 @@ def open_mrc(path: str) -> ArraySource:
     )
 
 
-def _place(
-    header: Any,
-) -> tuple[tuple[float, float, float], tuple[float, float, float], str | None]:
+def _place(header: Any) -> tuple[Triple, Triple, str | None]:
     """Voxel size and place of the first voxel, angstroms, x y z."""
     steps, starts = [], []
     names = ("nxstart", "nystart", "nzstart")  # of columns, rows, sections

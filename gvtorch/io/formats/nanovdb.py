@@ -8,7 +8,6 @@ Source: the NanoVDB headers of OpenVDB (NanoVDB.h, PNanoVDB.h, io/IO.h) tell the
 
 from __future__ import annotations
 
-import functools
 import mmap
 import os
 import struct
@@ -27,7 +26,6 @@ from ..sparse_grid import (
     SparseSource,
     bits,
     check_roots,
-    source_fields,
 )
 from .format import Format, choose
 
@@ -82,24 +80,8 @@ class Head(NamedTuple):
     packed: int  # bytes in the file
 
 
-@dataclass(frozen=True, kw_only=True)
-class NanoSource(SparseSource):
-    """A grid of a file."""
-
-    number: int
-
-    @property
-    def peak_bytes(self) -> int:
-        """As of any source, and the grid itself."""
-        head = _heads(self.path)[self.number]
-        return super().peak_bytes + (head.size if head.codec != "none" else 0)
-
-    def grid(self) -> NanoGrid:
-        return _grid(self.path, self.number, self.opened)
-
-
 @Format("NanoVDB", ".nvdb", options=("key",))
-def open_nanovdb(path: str, key: str | None = None) -> NanoSource:
+def open_nanovdb(path: str, key: str | None = None) -> SparseSource:
     """Opens the grid `key` (its name or number); "density" or the first, if left out."""
     heads = _heads(path)
     number, lost = choose(path, "grid", [head.name for head in heads], key, preferred="density")
@@ -111,9 +93,14 @@ def open_nanovdb(path: str, key: str | None = None) -> NanoSource:
         )
     _, dtype, width = _TYPES[head.kind]
     affine, low, high = _place(_content(path, head, _ROOT + 24), head)
-    kind = _CLASSES.get(head.grid_class, "")
-    told = source_fields(path, head.name, kind, np.dtype(dtype), width, low, high, affine)
-    return NanoSource(number=number, lost=lost, **told)
+    held = head.size if head.codec != "none" else 0
+    return SparseSource.of(
+        *(path, head.name, _CLASSES.get(head.grid_class, ""), dtype, width, low, high, affine),
+        grid_type=NanoGrid,
+        number=number,
+        held=held,
+        lost=lost,
+    )
 
 
 def _heads(path: str) -> list[Head]:
@@ -212,12 +199,6 @@ def _place(grid: Any, head: Head) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return affine, box[:3], box[3:] + 1
 
 
-@functools.lru_cache(maxsize=2)
-def _grid(path: str, number: int, _opened: int) -> NanoGrid:
-    head = _heads(path)[number]
-    return NanoGrid.of(_content(path, head), *_TYPES[head.kind])
-
-
 class NodeFormat(NamedTuple):
     """Where things lie in the nodes of a type."""
 
@@ -261,16 +242,14 @@ def _up(n: int, step: int) -> int:
 
 @dataclass(kw_only=True)
 class NanoGrid(SparseGrid):
-    """A grid in memory."""
+    """A grid in memory; `places` are bytes before each node."""
 
-    data: Any  # the grid's bytes
-    kind: str
     layout: NodeFormat
-    places: tuple[np.ndarray, np.ndarray, np.ndarray]  # bytes before each node, as `origins`
 
     @classmethod
-    def of(cls, data: Any, kind: str, dtype: str, width: int) -> NanoGrid:
-        """Finds the nodes."""
+    def read(cls, path: str, number: int) -> NanoGrid:
+        head = _heads(path)[number]
+        data, (kind, dtype, width) = _content(path, head), _TYPES[head.kind]
         layout = NodeFormat.of(kind, dtype, width)
         (count,) = struct.unpack_from("<I", data, _ROOT + 24)
         check_roots(count)

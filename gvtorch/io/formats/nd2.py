@@ -11,7 +11,7 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import spacing_of
-from ..source import Index, VolumeSource
+from ..source import Index, Told, VolumeSource
 from .format import Format, choose
 
 
@@ -22,7 +22,6 @@ class Nd2Source(VolumeSource):
     position: int
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Maps the frames of a part."""
         import nd2
 
         times, places, *inside = index
@@ -71,9 +70,7 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
     )
 
 
-def _told(
-    file: Any, sizes: Mapping[str, int]
-) -> tuple[ImageInfo, tuple[float, float, float], list[str]]:
+def _told(file: Any, sizes: Mapping[str, int]) -> Told:
     """What the metadata tells: info, spacing, and what is not kept."""
     voxel = file.voxel_size()
     spacing, unit = spacing_of([float(side) for side in voxel], ["um"] * 3)

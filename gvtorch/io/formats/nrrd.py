@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +16,11 @@ import numpy as np
 from ...base.image_info import ChannelInfo, ImageInfo, color_channels
 from ...base.named_axes import ask_axes
 from ...base.units import length_unit, time_unit
-from ..packed import PackedSource, unpack
-from ..source import ArraySource, Index, VolumeSource, place_axes
+from ..budget import check_regular
+from ..packed import PackedSource
+from ..source import ArraySource, VolumeSource, number_type, place_axes
 from .format import Format
 
-_TYPES = {
-    **dict.fromkeys(("signed char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "unsigned char", "uint8"), "u1"),
-    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16"), "u2"),
-    **dict.fromkeys(("int", "signed int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "unsigned int", "uint32"), "u4"),
-    **dict.fromkeys(("longlong", "long long", "long long int", "int64"), "i8"),
-    **dict.fromkeys(("ulonglong", "unsigned long long", "uint64"), "u8"),
-    **{"float": "f4", "double": "f8"},
-}
 _ENCODINGS = {
     **{"raw": "raw"},
     **dict.fromkeys(("txt", "text", "ascii"), "text"),
@@ -54,48 +43,6 @@ _FIELDS = {
 _UNKEPT = ("measurement frame", "old min", "oldmin", "old max", "oldmax")
 
 
-@dataclass(frozen=True, kw_only=True)
-class NrrdSource(VolumeSource):
-    """Numbers that are packed, text, or behind lines to skip; unpacked no further than the header
-    tells.
-    """
-
-    file: str
-    offset: int  # of the first line
-    lines: int
-    skip: int  # bytes of what is unpacked; -1: the numbers are its last
-    encoding: str
-    whole: bool = True
-
-    def read_stored(self, index: Index) -> np.ndarray:
-        """Reads all, and returns a part."""
-        count, kind = math.prod(self.shape), np.dtype(self.stored)
-        need = count * kind.itemsize
-        with open(self.file, "rb") as stream:
-            stream.seek(self.offset)
-            for number in range(self.lines):
-                if not stream.readline():
-                    raise ValueError(f"{self.file}: has {number} of {self.lines} lines to skip")
-            at = stream.tell()
-        skipped = max(0, self.skip)
-        if self.encoding == "text":
-            source = PackedSource(
-                path=self.path, shape=(count,), axes="x", stored=self.stored,
-                file=self.file, offset=at + skipped, codec="text",
-            )  # fmt: skip
-            data = source.read_stored((slice(None),))
-        elif self.encoding == "raw":
-            found = os.stat(self.file).st_size - at - skipped
-            if found < need or (found > need and self.skip >= 0):
-                raise ValueError(f"{self.path}: takes {need} bytes, the file has {found}")
-            begin = os.stat(self.file).st_size - need if self.skip < 0 else at + skipped
-            data = np.fromfile(self.file, kind, count, offset=begin)
-        else:
-            content = unpack(self.file, at, need + skipped, self.encoding)
-            data = np.frombuffer(content, kind, count, skipped)
-        return data.reshape(self.shape, order="F")[index]
-
-
 @Format("NRRD", ".nrrd", ".nhdr", options=("axes",), library="nrrd", package="pynrrd")
 def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     """Opens a file; `axes` as of `ask_axes`, the slowest first."""
@@ -107,7 +54,7 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     shape = tuple(int(n) for n in header["sizes"])
     if header.get("dimension") != len(shape):
         raise ValueError(f"{path}: {len(shape)} sizes, dimension {header.get('dimension')}")
-    kind = _TYPES.get(str(header["type"]).lower().removesuffix("_t"))
+    kind = number_type(str(header["type"]))
     if kind is None:
         raise ValueError(f"{path}: type {header['type']!r} is unknown")
     encoding = _ENCODINGS.get(str(header["encoding"]).lower())
@@ -138,17 +85,31 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
         raise ValueError(f"{path}: its numbers lie in several files (data file: {data})")
     if skip < -1 or lines < 0 or (skip == -1 and encoding != "raw"):
         raise ValueError(f"{path}: byte skip {skip}, line skip {lines}")
-    file_path, first = (path, offset) if data is None else (str(Path(path).parent / data), 0)
-    size = os.stat(file_path).st_size
+    data_file, at = (path, offset) if data is None else (str(Path(path).parent / data), 0)
+    size = os.stat(data_file).st_size
     if max(skip, lines) > size and encoding in ("raw", "text"):
         raise ValueError(f"{path}: skips {max(skip, lines)} bytes or lines of {size} bytes")
     if skip > _MOST_SKIPPED and encoding not in ("raw", "text"):
         raise ValueError(f"{path}: byte skip {skip} of what is packed, at most {_MOST_SKIPPED}")
-    if encoding != "raw" or lines or skip < 0:
-        return NrrdSource(
-            file=file_path, offset=first, lines=lines, skip=skip, encoding=encoding, **told
-        )
-    return ArraySource(file=file_path, offset=first + skip, fortran=True, exact=True, **told)
+    at = _behind_lines(data_file, at, lines)
+    if encoding == "raw":
+        need = math.prod(shape) * np.dtype(kind).itemsize
+        begin = max(at, size - need) if skip < 0 else at + skip  # -1: the numbers are its last
+        return ArraySource(file=data_file, offset=begin, fortran=True, exact=True, **told)
+    return PackedSource(file=data_file, offset=at, skip=skip, codec=encoding, fortran=True, **told)
+
+
+def _behind_lines(file: str, at: int, lines: int) -> int:
+    """Where so many lines of a file end that begin at a place."""
+    if lines:
+        check_regular(file)
+        with open(file, "rb") as stream:
+            stream.seek(at)
+            for number in range(lines):
+                if not stream.readline():
+                    raise ValueError(f"{file}: has {number} of {lines} lines to skip")
+            at = stream.tell()
+    return at
 
 
 def _letters(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: str | None) -> str:
@@ -160,7 +121,7 @@ def _letters(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: st
         if len(kinds) == rank and set(kinds) - {"???", "none"}:
             found = ["s" if k in _SPATIAL else "t" if k == "time" else "c" for k in kinds]
         else:  # the axes that have no place, if the header tells of one
-            places = _directions(header, rank), _spacings(header, rank)[:, None]
+            places = _directions(header, rank), _steps(header, rank)[0][:, None]
             table = next((one for one in places if np.isfinite(one).any()), np.zeros((rank, 1)))
             found = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
         if found.count("s") == 3 and found.count("t") <= 1 and found.count("c") <= 1:
@@ -185,11 +146,6 @@ def _numbers(header: dict[str, Any], rank: int, *names: str) -> np.ndarray:
     field = next((header[name] for name in names if name in header), np.zeros(0))
     told = np.asarray(field, dtype=np.float64)
     return told if told.shape == (rank,) else np.full(rank, np.nan)
-
-
-def _spacings(header: dict[str, Any], rank: int) -> np.ndarray:
-    """(axes,) widths of a step along each axis; NaN for none."""
-    return _steps(header, rank)[0]
 
 
 def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
@@ -250,7 +206,7 @@ def _info(
     period = None
     if "t" in letters:
         at = letters.index("t")
-        steps = (*_directions(header, len(letters))[at, 3:], _spacings(header, len(letters))[at])
+        steps = (*_directions(header, len(letters))[at, 3:], _steps(header, len(letters))[0][at])
         step = next((float(one) for one in steps if np.isfinite(one) and one > 0), None)
         period = time_unit(units[at]) if step else None
     space = str(header.get("space", "")).lower().removesuffix("-time")

@@ -2,7 +2,7 @@
 
 A file is a head, what is told of each grid with its place, and the grids: metadata, transform,
 topology (masks, and the tiles of inner nodes), then the values of the leaves one after another.
-`Parser` walks through topology and leaves once and keeps where each node's values begin; they are
+`_Topology` walks through all nodes once and keeps where the values of each begin; they are
 unpacked where they are asked for. Inactive values that are not the background's are told in a few
 bytes, see `_Packing`.
 Source: the source code of OpenVDB (io/Archive.cc, io/Compression.h, tree/*.h) tells the format.
@@ -10,7 +10,6 @@ Source: the source code of OpenVDB (io/Archive.cc, io/Compression.h, tree/*.h) t
 
 from __future__ import annotations
 
-import functools
 import mmap
 import re
 import struct
@@ -28,7 +27,6 @@ from ..sparse_grid import (
     SparseSource,
     bits,
     check_roots,
-    source_fields,
 )
 from .format import Format, choose
 
@@ -145,25 +143,15 @@ class Entry:
         return f"{name}[{number}]" if number not in ("", "0") else name
 
 
-@dataclass(frozen=True, kw_only=True)
-class VdbSource(SparseSource):
-    """A grid of a file; `number` is that of the grid whose tree it is."""
-
-    number: int
-
-    def grid(self) -> VdbGrid:
-        return _grid(self.path, self.number, self.opened)
-
-
 @Format("OpenVDB", ".vdb", options=("key",))
-def open_openvdb(path: str, key: str | None = None) -> VdbSource:
+def open_openvdb(path: str, key: str | None = None) -> SparseSource:
     """Opens the grid `key` (its name or number); "density" or the first, if left out."""
     with _mapped(path) as data:
         version, entries = _entries(data)
         names = [entry.name for entry in entries]
         at, lost = choose(path, "grid", names, key, preferred="density")
         entry = entries[at]
-        number = at
+        number = at  # of the grid whose tree it is
         if entry.parent:
             owners = [n for n, other in enumerate(entries) if other.unique == entry.parent]
             if not owners or entries[owners[0]].parent:
@@ -182,15 +170,12 @@ def open_openvdb(path: str, key: str | None = None) -> VdbSource:
     else:
         low, high = VdbGrid.read(path, number).box()
     grid_class = str(entry.told.get("class", ""))
-    given = source_fields(
-        path, entry.name, grid_class, np.dtype(dtype), width, low, high, entry.affine
+    return SparseSource.of(
+        *(path, entry.name, grid_class, dtype, width, low, high, entry.affine),
+        grid_type=VdbGrid,
+        number=number,
+        lost=lost,
     )
-    return VdbSource(number=number, lost=lost, **given)
-
-
-@functools.lru_cache(maxsize=2)
-def _grid(path: str, number: int, _opened: int) -> VdbGrid:
-    return VdbGrid.read(path, number)
 
 
 def _mapped(path: str) -> mmap.mmap:
@@ -343,16 +328,12 @@ class _Packing:
 
 @dataclass(kw_only=True)
 class VdbGrid(SparseGrid):
-    """A grid of a file; `places` tell where the values of each node are, as `origins`."""
+    """A grid of a file; `places` tell where the values of each node are."""
 
-    data: Any
-    kind: str
     packing: _Packing
-    places: tuple[np.ndarray, np.ndarray, np.ndarray]
 
     @classmethod
     def read(cls, path: str, number: int) -> VdbGrid:
-        """Finds the nodes of a grid."""
         data = _mapped(path)
         version, entries = _entries(data)
         entry = entries[number]

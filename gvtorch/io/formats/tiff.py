@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ...base import boxes
 from ...base.image_info import ImageInfo, color_channels
-from ..source import ArraySource, Index, VolumeSource
-from ..tiff_info import JPEG, Told, check_pictures, imagej_info, ome_info, opened_tiff
+from ..source import ArraySource, Index, Told, VolumeSource
+from ..tiff_info import JPEG, check_pictures, imagej_info, ome_info, opened_tiff
 from .format import Format, choose
 
 _LOST = {  # by the tag PhotometricInterpretation
@@ -28,13 +29,12 @@ class TiffSource(VolumeSource):
     series: int = 0
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Unpacks the pages of a part."""
         with opened_tiff(self.path) as (file, _):
             series = file.series[self.series]
             if self.whole:
                 check_pictures(series.pages)
                 return series.asarray()[index]
-            first = len(self.shape) - len(_page_shape(series))
+            first = len(self.shape) - len(series.keyframe.shape)
             data = np.empty([s.stop - s.start for s in index], self.stored)
             spans = [range(s.start, s.stop) for s in index[:first]]
             for place in itertools.product(*spans):
@@ -62,6 +62,7 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
     )  # fmt: skip
     tall, across = min(tall, length) if not keyframe.is_tiled else tall, -(-width // wide)
     out = np.zeros((rows.stop - rows.start, columns.stop - columns.start, samples), keyframe.dtype)
+    first, last = (rows.start, columns.start), (rows.stop, columns.stop)
     places = itertools.product(
         range(rows.start // tall, -(-rows.stop // tall)),
         range(columns.start // wide, -(-columns.stop // wide)),
@@ -70,14 +71,10 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
         tile = _unpacked(page, keyframe, down * across + right)
         if tile is None:
             continue
-        top, left = down * tall, right * wide
-        tile = tile[: length - top, : width - left]
-        low = max(rows.start, top), max(columns.start, left)
-        high = min(rows.stop, top + tile.shape[0]), min(columns.stop, left + tile.shape[1])
-        out[
-            low[0] - rows.start : high[0] - rows.start,
-            low[1] - columns.start : high[1] - columns.start,
-        ] = tile[low[0] - top : high[0] - top, low[1] - left : high[1] - left]
+        corner = np.array((down * tall, right * wide))
+        tile = tile[: length - corner[0], : width - corner[1]]
+        low, high = np.maximum(first, corner), np.minimum(last, corner + tile.shape[:2])
+        out[boxes.index(low - first, high - first)] = tile[boxes.index(low - corner, high - corner)]
     return out[..., index[2]] if len(index) == 3 else out[..., 0]
 
 
@@ -96,10 +93,6 @@ def _unpacked(page: Any, keyframe: Any, number: int) -> np.ndarray | None:
         more = {"jpegtables": page.jpegtables, "jpegheader": keyframe.jpegheader}
     found = keyframe.decode(packed, number, **more)[0]
     return None if found is None else found[0]
-
-
-def _page_shape(series: Any) -> tuple[int, ...]:
-    return tuple(int(n) for n in series.keyframe.shape)
 
 
 @Format(
@@ -128,7 +121,7 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
             stored = series.dtype.newbyteorder(file.byteorder).str
             offset = int(series.dataoffset)
             return ArraySource(file=path, stored=stored, offset=offset, lost=tuple(lost), **told)
-        inside = _page_shape(series)
+        inside = tuple(series.keyframe.shape)
         first = len(shape) - len(inside)
         by_page = shape[first:] == inside and len(series.pages) == math.prod(shape[:first])
         by_page &= axes[first:].replace("-", "") in ("yx", "yxc") and "-" not in axes[first:]

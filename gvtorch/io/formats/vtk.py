@@ -14,40 +14,21 @@ import mmap
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 from urllib.parse import unquote
 from xml.etree import ElementTree
-from xml.parsers import expat
 
 import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.volume import check_extent
 from ..packed import PackedSource, text_numbers, unpack_block
-from ..source import ArraySource, Index, VolumeSource, place_axes
+from ..source import ArraySource, Index, VolumeSource, number_type, place_axes
 from .format import Format, choose
 
-_LEGACY = {
-    "unsigned_char": "u1",
-    "char": "i1",
-    "signed_char": "i1",
-    "unsigned_short": "u2",
-    "short": "i2",
-    "unsigned_int": "u4",
-    "int": "i4",
-    "unsigned_long": "u8",
-    "long": "i8",
-    "vtktypeint64": "i8",
-    "vtktypeuint64": "u8",
-    "vtkidtype": "i4",  # which VTK writes as int
-    "float": "f4",
-    "double": "f8",
-}
-_XML = {
-    **{f"Int{bits}": f"i{bits // 8}" for bits in (8, 16, 32, 64)},
-    **{f"UInt{bits}": f"u{bits // 8}" for bits in (8, 16, 32, 64)},
-    **{"Float32": "f4", "Float64": "f8"},
-}
+_LONG = {"long": "i8", "unsigned_long": "u8", "vtktypeint64": "i8", "vtktypeuint64": "u8"}
+_LONG["vtkidtype"] = "i4"  # which VTK writes as int
 _MOST_HEADER = 1 << 22  # bytes
 _MOST_VALUES = 1 << 33
 _MOST_ARRAYS = 64
@@ -62,16 +43,19 @@ class VtkSource(VolumeSource):
     encoding: str  # "raw", "base64" or "ascii"
     compressor: str  # "zlib", "lzma", "lz4", or none
     header: str  # dtype of the sizes before the data
-    offset: int
-    length: int  # bytes of the file that may belong to it
+    offset: int = 0  # of appended data
+    number: int | None = None  # among the arrays of the file, where it stands in the XML
     whole: bool = True
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Unpacks all, and returns a part."""
         count, dtype = math.prod(self.shape), np.dtype(self.stored)
-        with open(self.path, "rb") as file:
-            file.seek(self.offset)
-            content = file.read(self.length)
+        if self.number is not None:
+            arrays = _parsed(self.path)[0].iter("DataArray")
+            content = (next(islice(arrays, self.number, None)).text or "").encode()
+        else:
+            with open(self.path, "rb") as file:
+                file.seek(self.offset)
+                content = file.read()
         if self.encoding == "ascii":
             text = io.BytesIO(content)
             return text_numbers(self.path, text, count, self.stored, exact=True).reshape(
@@ -153,20 +137,7 @@ def _told(
 
 
 def _open_xml(path: str, key: str | None) -> VolumeSource:
-    with open(path, "rb") as file:
-        content = file.read(_MOST_HEADER)
-        file.seek(0, 2)
-        end = file.tell()
-    # Looked for in one place: at many that never end it would take their number squared.
-    start = content.find(b"<AppendedData")
-    appended = (
-        re.compile(rb"<AppendedData\b[^>]*>\s*_").match(content, start) if start >= 0 else None
-    )
-    inline = appended is None
-    if inline and end > _MOST_HEADER:
-        content = _read_all(path, end)
-    text = content if inline else content[: appended.start()] + b"</VTKFile>"  # type: ignore[union-attr]
-    root = ElementTree.fromstring(text)
+    root, appended, end = _parsed(path)
     image, piece = _image_and_piece(path, root)
     extent = [int(n) for n in piece.get("Extent", image.get("WholeExtent", "")).split()]
     if len(extent) != 6:
@@ -175,7 +146,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     arrays = _xml_arrays(root, piece)
     chosen, lost = choose(path, "array", [array["name"] for array in arrays], key)
     array = arrays[chosen]
-    if array["kind"] not in _XML:
+    if (kind := number_type(array["kind"])) is None:
         raise ValueError(f"{path}: {array['name']} is of {array['kind']}; expected numbers")
     numbers = {
         name: np.array([float(v) for v in image.get(name, plain).split()])
@@ -192,7 +163,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     header = order + {"UInt32": "u4", "UInt64": "u8"}[root.get("header_type", "UInt32")]
     packer = {"": "", "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma",
               "vtkLZ4DataCompressor": "lz4"}[root.get("compressor", "")]  # fmt: skip
-    stored = order + _XML[array["kind"]]
+    stored = order + kind
     if array["format"] == "appended":
         if appended is None:
             raise ValueError(f"{path}: has no appended data")
@@ -204,23 +175,31 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
             )
             data.check_file()
             return data
-        length = end - offset
-        if length <= 0:
+        if offset >= end:
             raise ValueError(
                 f"{path}: {array['name']} begins at {offset}, the file has {end} bytes"
             )
+        told["offset"] = offset
     else:
         encoding = "ascii" if array["format"] == "ascii" else "base64"
-        offset, length = _inline(content, array["number"])
-    return VtkSource(
-        stored=stored,
-        encoding=encoding,
-        compressor=packer,
-        header=header,
-        offset=offset,
-        length=length,
-        **told,
-    )
+        told["number"] = array["number"]
+    return VtkSource(stored=stored, encoding=encoding, compressor=packer, header=header, **told)
+
+
+def _parsed(path: str) -> tuple[Any, re.Match[bytes] | None, int]:
+    """The XML of a file without appended data, where these begin if there are any, and the file's
+    size.
+    """
+    with open(path, "rb") as file:
+        content = file.read(_MOST_HEADER)
+        end = file.seek(0, 2)
+    # Looked for in one place: at many that never end it would take their number squared.
+    start = content.find(b"<AppendedData")
+    if start >= 0 and (found := re.compile(rb"<AppendedData\b[^>]*>\s*_").match(content, start)):
+        return ElementTree.fromstring(content[: found.start()] + b"</VTKFile>"), found, end
+    if end > 1 << 31:
+        raise ValueError(f"{path}: {end} bytes of XML are too many; write it with appended data")
+    return ElementTree.parse(path).getroot(), None, end
 
 
 def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
@@ -234,14 +213,6 @@ def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
     if len(pieces) != 1:
         raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
     return image, pieces[0]
-
-
-def _read_all(path: str, size: int) -> bytes:
-    """A file whose numbers stand among its XML."""
-    if size > 1 << 31:
-        raise ValueError(f"{path}: {size} bytes of XML are too many; write it with appended data")
-    with open(path, "rb") as file:
-        return file.read()
 
 
 def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
@@ -269,33 +240,6 @@ def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
     return sorted(found, key=lambda array: not array["first"])
 
 
-def _inline(content: bytes, number: int) -> tuple[int, int]:
-    """Where the content of a DataArray begins, by its number in the file, and its length."""
-    found: list[list[int]] = []
-    parser = expat.ParserCreate()
-
-    def ended_tag(_text: str) -> None:
-        """What comes first behind a tag."""
-        parser.DefaultHandler = None
-        found[-1][0] = parser.CurrentByteIndex
-
-    def start(name: str, _attributes: dict[str, str]) -> None:
-        parser.DefaultHandler = None
-        if name == "DataArray":
-            found.append([0, 0])
-            parser.DefaultHandler = ended_tag
-
-    def end(name: str) -> None:
-        parser.DefaultHandler = None
-        if name == "DataArray" and not found[-1][1]:
-            found[-1][1] = parser.CurrentByteIndex
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.Parse(content, True)
-    begin, stop = found[number]
-    return (begin, stop - begin) if begin else (0, 0)
-
-
 # --- legacy
 
 
@@ -304,26 +248,22 @@ def _open_legacy(path: str, key: str | None) -> VolumeSource:
         open(path, "rb") as file,
         mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
     ):
-        return _open_mapped(path, content, key)
-
-
-def _open_mapped(path: str, content: mmap.mmap, key: str | None) -> VolumeSource:
-    lines = content[:4096].split(b"\n", 4)
-    if len(lines) < 5 or not lines[0].startswith(b"# vtk DataFile"):
-        raise ValueError(f"{path}: is no legacy VTK file")
-    if lines[3].split() != [b"DATASET", b"STRUCTURED_POINTS"]:
-        raise ValueError(f"{path}: {lines[3][:60].decode('latin-1')!r}; expected STRUCTURED_POINTS")
-    binary = lines[2].strip().upper() == b"BINARY"
-    affine, points, arrays = _legacy_parts(
-        path, content, sum(len(line) + 1 for line in lines[:4]), binary
-    )
+        lines = content[:4096].split(b"\n", 4)
+        if len(lines) < 5 or not lines[0].startswith(b"# vtk DataFile"):
+            raise ValueError(f"{path}: is no legacy VTK file")
+        if lines[3].split() != [b"DATASET", b"STRUCTURED_POINTS"]:
+            found = lines[3][:60].decode("latin-1")
+            raise ValueError(f"{path}: {found!r}; expected STRUCTURED_POINTS")
+        binary = lines[2].strip().upper() == b"BINARY"
+        head = sum(len(line) + 1 for line in lines[:4])
+        affine, points, arrays = _legacy_parts(path, content, head, binary)
     chosen, lost = choose(path, "array", [array["name"] for array in arrays], key)
-    found = arrays[chosen]
-    told = _told(path, points, affine, found, lost)
-    told |= {"file": path, "offset": found["offset"], "stored": found["stored"]}
+    array = arrays[chosen]
+    told = _told(path, points, affine, array, lost)
+    told |= {"file": path, "offset": array["offset"], "stored": array["stored"]}
     if binary:
         return ArraySource(**told)
-    return PackedSource(codec="shares" if found["colors"] else "text", **told)
+    return PackedSource(codec="shares" if array["colors"] else "text", **told)
 
 
 def _legacy_parts(
@@ -353,7 +293,7 @@ def _legacy_parts(
                 raise ValueError(f"{path}: {' '.join(words)[:80]!r} of a grid that has {count}")
         elif name == "FIELD":
             in_field = int(words[2])
-        elif name in _ARRAYS or (len(words) == 4 and words[3].lower() in _LEGACY and in_field > 0):
+        elif name in _ARRAYS or (len(words) == 4 and _legacy_type(words[3]) and in_field > 0):
             array = _legacy_array(path, words, points, cells)
             table = re.match(rb"LOOKUP_TABLE[^\n]*\n", content[at : at + 200])
             at += table.end() if table and name == "SCALARS" else 0
@@ -361,6 +301,10 @@ def _legacy_parts(
             in_field -= name not in _ARRAYS
             at += array["bytes"] * binary
     return affine, points, sorted(arrays, key=lambda array: (array["cells"], not array["first"]))
+
+
+def _legacy_type(name: str) -> str:
+    return _LONG.get(name.lower()) or number_type(name) or ""
 
 
 def _legacy_array(
@@ -371,9 +315,9 @@ def _legacy_array(
     if kind == "COLOR_SCALARS":
         name, dtype, width = words[1].replace("%%", "%"), "u1", int(words[2])  # VTK doubles them
     elif kind not in _ARRAYS:  # of a field
-        name, width, dtype = words[0], int(words[1]), _LEGACY.get(words[3].lower(), "")
+        name, width, dtype = words[0], int(words[1]), _legacy_type(words[3])
     else:
-        name, dtype = words[1], _LEGACY.get(words[2].lower(), "")
+        name, dtype = words[1], _legacy_type(words[2])
         width = 3 if kind == "VECTORS" else int(words[3]) if len(words) > 3 else 1
     if not dtype:
         raise ValueError(f"{path}: {' '.join(words)[:80]!r} is no array of numbers")

@@ -6,7 +6,7 @@
     unfinished.py    a store in the making: lock, journal, the last step
     shard.py         one task of the converter
     level_reader.py  levels of an image, made where they are missing
-    ngff.py          OME-Zarr metadata; omero.py: names, colours and windows of channels
+    ngff.py          OME-Zarr metadata
     channels.py      stores of several channels; coarse.py: colours of coarse levels
     chunk_files.py   what a chunk's file may be; checksums.py: that it is the right one
 

@@ -70,7 +70,11 @@ def convert_channels(
         FileExistsError, OSError, KeyboardInterrupt: As of `convert`.
     """
     target = Path(store)
-    _check(sources)
+    grids = {(one.extent, one.spacing, one.origin) for one in sources.values()}
+    if len(grids) != 1:
+        raise ValueError(f"a store's channels must be of one grid, got {len(grids)}")
+    if wrong := [name for name in sources if not is_name(name)]:
+        raise ValueError(f"a channel's name is made of letters, digits, - and _, got {wrong[0]!r}")
     begun = unfinished.is_begun(target, resume=resume, manifest=_MANIFEST)
     target.mkdir(exist_ok=True)
     (target / WORK).mkdir(exist_ok=True)
@@ -108,12 +112,3 @@ def _share(progress: Progress, before: int, own: int, total: int) -> Progress:
         progress(stage, before + own * done // max(of, 1), total)
 
     return tell
-
-
-def _check(sources: Mapping[str, VolumeSource]) -> None:
-    grids = {(one.extent, one.spacing, one.origin) for one in sources.values()}
-    if len(grids) != 1:
-        raise ValueError(f"a store's channels must be of one grid, got {len(grids)}")
-    for name in sources:
-        if not is_name(name):
-            raise ValueError(f"a channel's name is made of letters, digits, - and _, got {name!r}")

@@ -10,11 +10,10 @@ that of the list. Stores without a list are read as they are.
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -96,16 +95,6 @@ class Checksums:
             if zlib.crc32(content) != wanted:
                 raise StoreError(f"{where}: its checksum is not the one that was written")
         self._seen.add(name)
-
-    def check_box(
-        self, spec: Mapping[str, Any], low: Sequence[int], high: Sequence[int], deadline: Deadline
-    ) -> None:
-        """Does so for the shards that items `low` to `high` (z, y, x) of an array lie in."""
-        per = spec["metadata"]["chunk_grid"]["configuration"]["chunk_shape"]
-        per = per[len(per) - 3 :] if "dimension_names" in spec["metadata"] else per[-5:-2]
-        ends = zip(low, high, per, strict=True)
-        for place in itertools.product(*(range(a // n, (b - 1) // n + 1) for a, b, n in ends)):
-            self.check(spec, place, deadline)
 
     def _read(self, deadline: Deadline) -> Mapping[str, Any]:
         try:

@@ -25,12 +25,11 @@ from ...base.stage import Progress, no_progress
 from ...base.whole_file import told_of
 from ..resources import amount
 from .ngff import read_json_file
-from .shard import bordered, finish_write, write
+from .shard import bordered, create_array, finish_write, write
 from .store import Store
-from .store_layout import BORDER, WORK, CoarseChannel, Deadline, StoreLayout, begin_open, is_name
+from .store_layout import BORDER, WORK, CoarseChannel, StoreLayout, is_name
 from .unfinished import group, locked, write_json
 
-_OPEN_TIMEOUT = 60.0  # seconds
 _CUBE = 128  # voxels along a side of what is written at once
 
 
@@ -81,25 +80,18 @@ def make_channel(
     other = f"{folder}: another process makes a coarse channel"
     with locked(folder / ".lock", other), _levels_in_files(store, wide) as levels:
         fill(levels)
-        known = _known(folder)
+        file = folder / "zarr.json"
+        there = read_json_file(file).get("attributes") if file.exists() else {"channels": {}}
+        known = CoarseChannel.parse(str(file), there)
         before = known.get(name)
         made = replace(channel, generation=before.generation + 1 if before else 0)
         _write_blocks(store, made.folder(name), made.width, levels, keep, progress)
         known[name] = made
         told = {one: other.attributes() for one, other in known.items()}
-        write_json(folder / "zarr.json", group({"channels": told}))
+        write_json(file, group({"channels": told}))
         store.coarse = known
         if before is not None:
             shutil.rmtree(folder / before.folder(name), ignore_errors=True)
-
-
-def _known(folder: Path) -> dict[str, CoarseChannel]:
-    """The channels that are on disk now."""
-    file = folder / "zarr.json"
-    if not file.exists():
-        return {}
-    content = read_json_file(file)
-    return CoarseChannel.parse(str(file), content.get("attributes"))
 
 
 @contextmanager
@@ -122,7 +114,7 @@ def _mapped(store: Store, folder: Path, level: int, wide: int) -> np.ndarray:
         try:
             os.posix_fallocate(place.fileno(), 0, file.stat().st_size)
         except OSError as error:
-            sizes = [_voxels(store.level_extent(one)) for one in range(1, store.levels)]
+            sizes = [math.prod(store.level_extent(one)) for one in range(1, store.levels)]
             text = f"{error.strerror}: while it is made, files take {amount(2 * wide * sum(sizes))}"
             raise OSError(error.errno, text, store.location) from None
     return mapped
@@ -139,16 +131,16 @@ def _write_blocks(
     place = Path(store.location) / store.coarse_folder / folder
     shutil.rmtree(place, ignore_errors=True)  # of work that was broken off
     place.mkdir()
-    done, total = 0, sum(_voxels(values.shape[:3]) for values in levels)
+    done, total = 0, sum(math.prod(values.shape[:3]) for values in levels)
     for level, values in enumerate(levels, 1):
         spec = store.layout.coarse(level, f"{store.coarse_folder}/{folder}", width)
-        Deadline(_OPEN_TIMEOUT).wait(begin_open(store.root, spec, "create"), spec["path"])
+        create_array(store.root, spec)
         for low in itertools.product(*(range(0, n, _CUBE) for n in values.shape[:3])):
             size = [min(_CUBE, n - a) for a, n in zip(low, values.shape, strict=False)]
             blocks = _blocks(store.layout, values, low, size, keep)
             at = [a // store.layout.block for a in low]
             finish_write(write(store.root, spec, at, blocks), store.location, "make it anew")
-            done += _voxels(size)
+            done += math.prod(size)
             progress("writing", done, total)
     write_json(place / "zarr.json", group({}))
 
@@ -168,7 +160,3 @@ def _blocks(
     start, stop = boxes.clamped_box(begin, end, values.shape[:3])
     inside = boxes.repeat_edges(keep(values[boxes.index(start, stop)]), start, begin, end)
     return np.ascontiguousarray(bordered(layout, inside))
-
-
-def _voxels(size: Sequence[int]) -> int:
-    return math.prod(map(int, size))

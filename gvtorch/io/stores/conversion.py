@@ -7,49 +7,42 @@ data names the tasks that are done (unfinished.py).
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import shlex
 import shutil
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import (
-    FIRST_COMPLETED,
     BrokenExecutor,
     Executor,
-    Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
-    wait,
 )
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
-from ...base.npy_file import save_npy
+from ...base.npy_file import write_npy
 from ...base.stage import Progress, no_progress
 from ...base.volume import Volume
-from ...base.whole_file import told_of
+from ...base.whole_file import durable_file
 from .. import resources
-from ..label_source import IndexSource, write_labels
+from ..label_source import LABELS, indexed_source
 from ..oblique import Oblique
-from ..reading import FormatSettings, open_source
-from ..source import MemorySource, VolumeSource
+from ..reading import FormatSettings
+from ..source import VolumeSource
 from . import shard, unfinished
 from .conversion_plan import (
-    LABELS,
     Estimate,
     Plan,
     check_room,
     estimate_of,
     plan_of,
     source_of,
-    with_counted_labels,
     within,
 )
 from .store import Store
 from .store_layout import WORK, Deadline, begin_open
-from .unfinished import Done
 
 _AHEAD = 64  # tasks handed to an executor that does not tell how many workers it has
 _OPEN_TIMEOUT = 60.0  # seconds
@@ -117,7 +110,7 @@ def convert(
             _check_finished(whole, make_source(read=False), block, threshold)
         return whole
     begun = unfinished.is_begun(target, resume=resume)
-    found = with_counted_labels(make_source(), target, time, workers, progress)
+    found = indexed_source(make_source(), time, workers, target / WORK, progress)
     plan = plan_of(source, found, target, block, threshold, nan, time, workers)
     if executor is None and (memory is not None or workers is None):
         plan = within(plan, memory)
@@ -168,10 +161,10 @@ def estimate(
 
     Args, Raises: as `convert`.
     """
-    opened_source = source_of(source, spacing, None, time, oblique, labels, options)
     target = Path(store)
-    opened_source = with_counted_labels(opened_source, target, time, workers, no_progress)
-    return estimate_of(plan_of(source, opened_source, target, block, threshold, nan, time, workers))
+    found = source_of(source, spacing, None, time, oblique, labels, options)
+    found = indexed_source(found, time, workers, target / WORK, no_progress)
+    return estimate_of(plan_of(source, found, target, block, threshold, nan, time, workers))
 
 
 def _write_store(plan: Plan, begun: bool, executor: Executor | None, progress: Progress) -> None:
@@ -179,7 +172,8 @@ def _write_store(plan: Plan, begun: bool, executor: Executor | None, progress: P
     task, settings = plan.task, plan.settings
     with _told_how_to_go_on(plan), unfinished.claimed(plan.target, settings, resume=begun) as work:
         if plan.labels is not None:
-            write_labels(plan.target / WORK / LABELS, plan.labels)
+            with durable_file(plan.target / WORK / LABELS) as file:
+                write_npy(file, plan.labels)
         with _executor(executor, plan) as pool:
             _write_levels(_staged(plan, pool), work, pool, progress)
         if plan.labels is not None:
@@ -220,23 +214,8 @@ def _staged(plan: Plan, pool: Executor) -> Plan:
     """Writes what lies in memory to files, where other processes shall read it."""
     if isinstance(pool, ThreadPoolExecutor):
         return plan
-    source = plan.task.source
-    if isinstance(source, IndexSource):
-        inner = _in_file(plan, source.inner)
-        source = dataclasses.replace(source, inner=inner).in_file(plan.target / WORK / LABELS)
-    else:
-        source = _in_file(plan, source)
+    source = plan.task.source.staged(plan.target / WORK)
     return dataclasses.replace(plan, task=dataclasses.replace(plan.task, source=source))
-
-
-def _in_file(plan: Plan, source: VolumeSource) -> VolumeSource:
-    if not isinstance(source, MemorySource):
-        return source.staged(plan.target / WORK)
-    file = plan.target / WORK / "source.npy"
-    with told_of(file):
-        save_npy(file, source.data)
-    axes = "tzyxc"[-source.data.ndim :]
-    return dataclasses.replace(open_source(file, axes=axes), info=source.info)
 
 
 def _write_levels(
@@ -254,11 +233,12 @@ def _write_levels(
             continue
         shard.create_arrays(plan.task, level)
         bad = 0
-        with closing(_run(pool, plan.task, level, places, ahead)) as results:
+        task = partial(shard.write_shard, plan.task, level)
+        with closing(resources.run_ahead(pool, task, places, ahead)) as results:
             for result in results:
                 bad += result.bad
                 if not result.bad:
-                    work.note({(level, *result.place): Done(result.voxels, result.files)})
+                    work.note({(level, *result.place): result})
                     done += result.voxels * layout.voxel_bytes
                     progress("converting", done, total)
         if bad:
@@ -271,26 +251,6 @@ def _write_levels(
         for which in ("low", "high"):  # the bounds below are not needed any more
             folder = plan.target / WORK / which / str(level - 1)
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _run(
-    pool: Executor, task: shard.Conversion, level: int, places: Iterable[Any], ahead: int
-) -> Generator[shard.ShardResult, None, None]:
-    """Runs the tasks of a level, a bounded number at a time, and yields what they tell."""
-    waiting = iter(places)
-    running: set[Future[shard.ShardResult]] = set()
-    try:
-        while True:
-            for at in itertools.islice(waiting, ahead - len(running)):
-                running.add(pool.submit(shard.write_shard, task, level, at))
-            if not running:
-                return
-            finished, running = wait(running, return_when=FIRST_COMPLETED)
-            for future in sorted(finished, key=lambda future: future.exception() is not None):
-                yield future.result()  # first what is done, then what failed
-    finally:
-        for future in running:
-            future.cancel()
 
 
 def _value_range(task: shard.Conversion) -> list[list[float]]:

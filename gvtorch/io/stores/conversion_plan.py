@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import shutil
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,17 +16,16 @@ import numpy as np
 
 from ...base import check
 from ...base.labels import background
-from ...base.stage import Progress
 from ...base.volume import Volume
 from ...pool.downsample import pool_majority, pool_mean
 from .. import resources
-from ..label_source import IndexSource, indexed_source
+from ..label_source import IndexSource
 from ..oblique import Oblique
 from ..reading import FormatSettings, at_place, open_source, read_whole
 from ..source import MemorySource, VolumeSource, no_time
 from . import shard, unfinished
 from .level_reader import Pool
-from .store_layout import BLOCKS, DTYPES, WORK, StoreLayout, context, kvstore
+from .store_layout import BLOCKS, DTYPES, StoreLayout, context, kvstore
 
 _FEW = 4  # tasks of level 0 up to which processes are not worth their start
 _PROCESS = 400 << 20  # bytes of a worker process without data
@@ -36,7 +34,6 @@ _BELOW = 4  # a voxel of a coarser level costs so many of the finest
 _DISK = 2.0  # writing to disk takes so much longer than to memory
 _SAMPLES = 3  # cubes that are converted for an estimate
 _SAMPLE_TIME = 2.0  # seconds after which no further cube is converted for an estimate
-LABELS = "labels.npy"  # beside the journal
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -75,16 +72,9 @@ class Plan:
     target: Path
     task: shard.Conversion
     settings: dict[str, Any]  # what must be the same to go on with a half-written store
+    labels: np.ndarray | None  # (k,) int64, where they are indexed
     workers: int
     uses_processes: bool
-
-    @property
-    def labels(self) -> np.ndarray | None:
-        """(k,) int64 labels that are indexed."""
-        source = self.task.source
-        if not isinstance(source, IndexSource) or isinstance(source.labels, str):
-            return None
-        return source.labels
 
 
 def source_of(
@@ -138,21 +128,6 @@ def source_of(
         )
     told = {name: getattr(found, name) for name in ("path", "spacing", "origin", "info")}
     return MemorySource.of(read_whole(found, first, times), **told)
-
-
-def with_counted_labels(
-    source: VolumeSource,
-    target: Path,
-    time: int | None,
-    workers: int | None,
-    progress: Progress,
-) -> VolumeSource:
-    """Counts labels off that are wider than 16 bits."""
-    if not source.info.labels or isinstance(source, IndexSource):
-        return source
-    times = (0, source.times) if time is None else (source.time, source.time + 1)
-    threads = min(8, resources.cores() if workers is None else workers)
-    return indexed_source(source, times, threads, target / WORK / LABELS, progress)
 
 
 def plan_of(
@@ -216,6 +191,7 @@ def plan_of(
         target=target,
         task=shard.Conversion(root=root, layout=layout, source=source, nan=nan, pool=pool),
         settings=settings,
+        labels=names,
         workers=min(workers, tasks[0]),
         uses_processes=tasks[0] > _FEW,
     )
@@ -322,4 +298,4 @@ def _fingerprint(given: Any, source: VolumeSource) -> list[Any]:
     if isinstance(given, (str, Path)):
         return unfinished.fingerprint(source.path)
     told: list[Any] = [list(source.shape), source.stored]
-    return told + ([zlib.crc32(source.data.tobytes())] if isinstance(source, MemorySource) else [])
+    return told + ([unfinished.checksum([source.data])] if isinstance(source, MemorySource) else [])

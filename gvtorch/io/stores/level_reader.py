@@ -20,7 +20,6 @@ import numpy as np
 from ...base import boxes, check
 from ...base.boxes import Zyx
 from ...base.labels import check_narrowed
-from ...pool.downsample import pool_mean
 from ..source import no_time
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
@@ -93,19 +92,18 @@ def open_arrays(
     return stored, chosen, sizes
 
 
-def with_channels(
-    image: MultiscaleImage, sizes: dict[str, int], chosen: slice | list[int]
-) -> MultiscaleImage:
-    """What the metadata tells of the channels that were chosen, if it fits the array."""
-    told, width, lost = image.info.channels, sizes.get("c", 1), list(image.lost)
+def keep_channels(image: MultiscaleImage, sizes: dict[str, int], chosen: slice | list[int]) -> None:
+    """Keeps what is told of the channels that were chosen, if it fits the array."""
+    told, width = image.info.channels, sizes.get("c", 1)
     if told and len(told) != width:
-        lost.append(f"what is told of {len(told)} channels, where there are {width}")
+        image.lost.append(f"what is told of {len(told)} channels, where there are {width}")
         told = ()
     if sizes.get("-", 1) > 1:
-        lost.append(f"an axis that is none of t, c, z, y, x: the first of {sizes['-']} is read")
+        other = f"an axis that is none of t, c, z, y, x: the first of {sizes['-']} is read"
+        image.lost.append(other)
     if told and not isinstance(chosen, slice):
         told = tuple(told[number] for number in chosen)
-    return replace(image, info=replace(image.info, channels=told), lost=tuple(lost))
+    image.info = replace(image.info, channels=told)
 
 
 def _check_array(where: str, array: Any, axes: str) -> ChunkFiles:
@@ -153,14 +151,12 @@ def _factors(
 class LevelReader:
     """Tree levels over stored arrays. Safe to use from several threads."""
 
-    def __init__(
-        self, stored: Sequence[StoredArray], layout: StoreLayout, pool: Pool = pool_mean
-    ) -> None:
+    def __init__(self, stored: Sequence[StoredArray], layout: StoreLayout, pool: Pool) -> None:
         """Plans how each level of the layout is read from arrays, the finest first; `pool` makes
         the voxels of a level that has none.
         """
         self._layout, self._pool, self.width = layout, pool, stored[0].size("c")
-        self._finest = next(s for s in stored if max(s.factors) == 1)
+        self.finest = next(s for s in stored if max(s.factors) == 1)
         self._plans: list[tuple[StoredArray, list[int]] | None] = []
         cost = 1.0
         for level in range(layout.levels):
@@ -187,15 +183,6 @@ class LevelReader:
         """Returns the coarsest level up to `level` that is read without averaging finer ones."""
         plain = [n for n, plan in enumerate(self._plans[: level + 1]) if plan and max(plan[1]) == 1]
         return plain[-1]
-
-    @property
-    def stored(self) -> np.dtype:
-        """The dtype of the finest array."""
-        return self._finest.array.dtype.numpy_dtype
-
-    def read_stored(self, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
-        """Reads (z, y, x, c) finest voxels of this dtype, a box inside the volume."""
-        return self._finest.read(low, high, deadline)
 
     def _inside(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         plan = self._plans[level]

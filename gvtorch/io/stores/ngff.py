@@ -1,12 +1,13 @@
 """OME-Zarr metadata: `find_image` (NGFF 0.1 to 0.5) and `image_metadata` (0.5).
 
 What a file says is checked here before anything is done with it. Arrays are not opened.
-Source: OME-NGFF specification, versions 0.4 and 0.5 (multiscales).
+Source: OME-NGFF specification, versions 0.4 and 0.5 ("multiscales" and "omero" metadata).
 """
 
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -14,15 +15,16 @@ from pathlib import Path
 from reprlib import repr as brief
 from typing import Any
 
-from ...base.image_info import ImageInfo
+from ...base.image_info import ChannelInfo, ImageInfo, Rgb, from_hex, to_hex
 from ...base.units import metres
 from ..http import Endless
 from ..remote import is_file_url
-from .omero import forget_assumed, read_channels, write_channels
 from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, is_number, read_key
 
 SEVERAL = "gvtorch_channels"  # attribute that names the images of a store of several channels
 _MOST_LEVELS = 64
+#: Colours for viewers: of channels without a colour. A single one is white.
+_COLORS = ("00ff00", "ff00ff", "00ffff", "ffff00", "ff0000", "0000ff")
 _DEFAULT_AXES = "tczyx"  # of versions 0.1 and 0.2
 
 
@@ -35,15 +37,15 @@ class ImageArray:
     translation: tuple[float, float, float]  # z y x
 
 
-@dataclass(frozen=True)
+@dataclass
 class MultiscaleImage:
-    """A multiscale image."""
+    """A multiscale image; what is told beside it is added as it is found."""
 
     axes: str  # in stored order, a letter each: t, c, z, y, x, or - for another
     scales: tuple[ImageArray, ...]  # finest first
     name: str
     info: ImageInfo = field(default_factory=ImageInfo)
-    lost: tuple[str, ...] = ()  # what is told beside, a few words each
+    lost: list[str] = field(default_factory=list)  # what is not kept, a few words each
     own: dict[str, Any] = field(default_factory=dict)  # what gvtorch tells of it
 
 
@@ -86,7 +88,7 @@ def find_image(
             own = deeper.get("gvtorch") if deeper else None
             layout = None if own is None else StoreLayout.parse(f"{where}/{inner}", own)
             if found is not None and image is None and series is not None:
-                found = _with_series(where, top, found, deadline, inner)
+                _tell_of_images(found, _series(where, top, deadline, inner))
     if found is None:
         asked = "no multiscale image" if image is None else f"no image {image!r}"
         plate = "; it is a plate: name a field of view, as in 'A/1/0'"
@@ -95,9 +97,9 @@ def find_image(
         held = f"; it holds {_few(known)}" if known else ""
         raise ValueError(f"{where}: has {asked} (NGFF multiscales){held}{of}")
     if layout is not None and isinstance(own, dict):
-        found = replace(found, info=_own_info(own.get("info"), found.info), own=own)
+        found.info, found.own = _own_info(own.get("info"), found.info), own
     else:
-        found = _with_labels(where, root, found, deadline)
+        found.lost += _labels(where, root, deadline)
     return root, found, layout
 
 
@@ -173,9 +175,14 @@ def _parse_image(
     for number, item in enumerate(images):
         if image in (None, item.get("name"), str(number)):
             found = _image(where, item, _member(attributes, "omero"))
-            found = _as_labels(found, _member(attributes, "image-label"))
+            labels = _member(attributes, "image-label")
+            if isinstance(labels, dict):
+                found.info = replace(found.info, labels=True)
+                beside = (name for name in ("colors", "properties") if labels.get(name))
+                found.lost += [f"{name} of the labels" for name in beside]
             others = [str(one.get("name", at)) for at, one in enumerate(images) if at != number]
-            return _told_beside(found, others if image is None else [])
+            _tell_of_images(found, others if image is None else [])
+            return found
     return None
 
 
@@ -192,58 +199,41 @@ def _few(names: list[str]) -> str:
     return ", ".join(short) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
-def _as_labels(found: MultiscaleImage, told: Any) -> MultiscaleImage:
-    """An image whose values are labels, if `image-label` says so."""
-    if not isinstance(told, dict):
-        return found
-    beside = [f"{name} of the labels" for name in ("colors", "properties") if told.get(name)]
-    info = replace(found.info, labels=True)
-    return replace(found, info=info, lost=(*found.lost, *beside))
-
-
 def _member(attributes: dict[str, Any], name: str) -> Any:
     """What is told of a name: of 0.5 in `ome`."""
     ome = attributes.get("ome")
     return (ome if isinstance(ome, dict) else attributes).get(name)
 
 
-def _told_beside(found: MultiscaleImage, others: list[str]) -> MultiscaleImage:
-    if not others:
-        return found
-    text = f"the images {_few(others)} beside {brief(found.name)} (key= or image= names one)"
-    return replace(found, lost=(*found.lost, text))
+def _tell_of_images(found: MultiscaleImage, others: list[str]) -> None:
+    if others:
+        beside = f"beside {brief(found.name)} (key= or image= names one)"
+        found.lost.append(f"the images {_few(others)} {beside}")
 
 
-def _with_series(
-    where: str, root: Any, found: MultiscaleImage, deadline: Deadline, first: str
-) -> MultiscaleImage:
-    """Names the other images that converters of microscopy files lay side by side."""
-    others: list[str] = []
+def _series(where: str, root: Any, deadline: Deadline, first: str) -> list[str]:
+    """Names of the other images that converters of microscopy files lay side by side."""
     try:
         listed = _attributes(f"{where}/OME", child(root, "OME"), deadline) or {}
         series = _member(listed, "series")
         if isinstance(series, list):
-            others = [str(path) for path in series if path != first]
-        elif _attributes(f"{where}/1", child(root, "1"), deadline) is not None:
-            others = ["1"]
+            return [str(path) for path in series if path != first]
+        there = _attributes(f"{where}/1", child(root, "1"), deadline) is not None
     except (OSError, ValueError):  # what is beside the image does not keep it from opening
-        pass
-    return _told_beside(found, others)
+        return []
+    return ["1"] if there else []
 
 
-def _with_labels(
-    where: str, root: Any, found: MultiscaleImage, deadline: Deadline
-) -> MultiscaleImage:
-    """Names the label images in the group beside the image."""
+def _labels(where: str, root: Any, deadline: Deadline) -> list[str]:
+    """What is told of the label images in the group beside the image."""
     try:
         group = _attributes(f"{where}/labels", child(root, "labels"), deadline) or {}
     except (OSError, ValueError):
-        return found
+        return []
     labels = _member(group, "labels")
     if not isinstance(labels, list) or not labels:
-        return found
-    named = ", ".join(f"labels/{name}" for name in labels[:5])
-    return replace(found, lost=(*found.lost, f"the labels {named}"))
+        return []
+    return [f"the labels {', '.join(f'labels/{name}' for name in labels[:5])}"]
 
 
 def _own_info(told: Any, info: ImageInfo) -> ImageInfo:
@@ -252,7 +242,7 @@ def _own_info(told: Any, info: ImageInfo) -> ImageInfo:
     quantity, space = (told.get(name) for name in ("quantity", "space"))
     return replace(
         info,
-        channels=forget_assumed(info.channels, told.get("assumed")),
+        channels=_forget_assumed(info.channels, told.get("assumed")),
         quantity=quantity if isinstance(quantity, str) else None,
         space=space if isinstance(space, str) else None,
         labels=told.get("labels") is True,
@@ -279,7 +269,7 @@ def _image(where: str, item: dict[str, Any], omero: Any) -> MultiscaleImage:
         scales.append(ImageArray(path.strip("/"), _triple(sides), _triple(places)))
         times.append((t, mt))
     name = item.get("name")
-    channels, damaged = read_channels(omero) if omero is not None else ((), [])
+    channels, damaged = _read_channels(omero) if omero is not None else ((), [])
     (step, origin), period = times[0], units.get("t")
     told = "t" in axes and (period is not None or step != 1)
     info = ImageInfo(
@@ -290,7 +280,7 @@ def _image(where: str, item: dict[str, Any], omero: Any) -> MultiscaleImage:
         time_unit=period,
     )
     text = name if isinstance(name, str) else "image"
-    return MultiscaleImage(axes, tuple(scales), text, info, tuple(dict.fromkeys(lost + damaged)))
+    return MultiscaleImage(axes, tuple(scales), text, info, list(dict.fromkeys(lost + damaged)))
 
 
 def _triple(values: Sequence[float]) -> tuple[float, float, float]:
@@ -367,25 +357,21 @@ def image_metadata(
 
     `spacing` and `origin` are (x, y, z) of level 0; axes t and c come first where there are such.
     """
-    axes: list[dict[str, str]] = []
-    first_scale, first_move = [], []
-    if layout.times > 1:
-        unit = {"unit": info.time_unit} if info.time_unit else {}
-        axes.append({"name": "t", "type": "time"} | unit)
-        first_scale.append(1.0 if info.time_step is None else info.time_step)
-        first_move.append(info.time_origin)
-    if "c" in layout.axes:
-        axes.append({"name": "c", "type": "channel"})
-        first_scale.append(1.0)
-        first_move.append(0.0)
-    unit = {"unit": info.unit} if info.unit else {}
-    axes += [{"name": axis, "type": "space"} | unit for axis in "zyx"]
+    units = {"t": info.time_unit, "c": None, **dict.fromkeys("zyx", info.unit)}
+    kinds = {"t": "time", "c": "channel", **dict.fromkeys("zyx", "space")}
+    period = 1.0 if info.time_step is None else info.time_step
+    step = dict(zip("xyztc", (*spacing, period, 1.0), strict=True))
+    first = dict(zip("xyztc", (*origin, info.time_origin, 0.0), strict=True))
+    axes = [
+        {"name": axis, "type": kinds[axis]} | ({"unit": units[axis]} if units[axis] else {})
+        for axis in layout.axes
+    ]
     datasets = []
     for level in range(layout.levels):
-        factor = 2**level
-        zyx = list(zip(spacing, origin, strict=True))[::-1]
-        scale = first_scale + [s * factor for s, _ in zyx]
-        move = first_move + [o + (factor - 1) / 2 * s for s, o in zyx]
+        factors = [2**level if axis in "xyz" else 1 for axis in layout.axes]
+        pairs = list(zip(layout.axes, factors, strict=True))
+        scale = [step[axis] * factor for axis, factor in pairs]
+        move = [first[axis] + (factor - 1) / 2 * step[axis] for axis, factor in pairs]
         transforms = [
             {"type": "scale", "scale": scale},
             {"type": "translation", "translation": move},
@@ -402,6 +388,81 @@ def image_metadata(
         "labels": info.labels or None,
     }
     if info.channels:
-        ome["omero"], assumed = write_channels(info.channels, layout.value_range or ())
+        ome["omero"], assumed = _write_channels(info.channels, layout.value_range or ())
         beside["assumed"] = assumed or None
     return ome, {key: value for key, value in beside.items() if value}
+
+
+# --- omero: names, colours and windows of channels
+
+
+def _read_channels(omero: Any) -> tuple[tuple[ChannelInfo, ...], list[str]]:
+    """Returns what is told of each channel, and what of it is damaged or not kept. Where the
+    picture begins in a viewer (rdefs) and its number on a server (id) are no part of the data.
+    """
+    told = omero.get("channels") if isinstance(omero, dict) else None
+    if not isinstance(told, list) or not all(isinstance(channel, dict) for channel in told):
+        return (), ["omero, which holds no list of channels"]
+    found, lost = [], []
+    for number, channel in enumerate(told):
+        color, window = _shown_color(channel.get("color")), _shown_window(channel.get("window"))
+        for name, value in (("color", color), ("window", window)):
+            if value is None and channel.get(name) is not None:
+                lost.append(f"{name} {brief(channel[name])} of channel {number}")
+        if channel.get("inverted") is True:
+            lost.append(f"channel {number} is shown inverted")
+        label, active = channel.get("label"), channel.get("active")
+        name = label if isinstance(label, str) else "" if label is None else str(label)
+        shown = active is not False
+        found.append(ChannelInfo(name=name, color=color, window=window, active=shown))
+    return tuple(found), lost
+
+
+def _write_channels(
+    channels: Sequence[ChannelInfo], value_range: Sequence[Sequence[float]]
+) -> tuple[dict[str, Any], dict[str, list[int]]]:
+    """Returns the `omero` attribute of channels, and the numbers of those whose colour or window
+    is not told: the specification wants one, so these are made up for viewers.
+    """
+    assumed: dict[str, list[int]] = {"color": [], "window": []}
+    written = []
+    for number, (channel, (low, high)) in enumerate(zip(channels, value_range, strict=True)):
+        for name, numbers in assumed.items():
+            if getattr(channel, name) is None:
+                numbers.append(number)
+        color = _COLORS[number % len(_COLORS)] if len(channels) > 1 else "ffffff"
+        start, end = (low, high) if channel.window is None else channel.window
+        one = {
+            "label": channel.name,
+            "color": (color if channel.color is None else to_hex(channel.color)).upper(),
+            "window": {"min": min(low, start), "max": max(high, end), "start": start, "end": end},
+            "active": channel.active,
+        }
+        written.append(one)
+    return {"channels": written}, {name: numbers for name, numbers in assumed.items() if numbers}
+
+
+def _forget_assumed(channels: Sequence[ChannelInfo], assumed: Any) -> tuple[ChannelInfo, ...]:
+    """Returns the channels without the colours and windows that `_write_channels` made up."""
+    told = assumed if isinstance(assumed, dict) else {}
+    lists = {name: told[name] for name in ("color", "window") if isinstance(told.get(name), list)}
+    kept = []
+    for number, channel in enumerate(channels):
+        empty: dict[str, Any] = {name: None for name, some in lists.items() if number in some}
+        kept.append(replace(channel, **empty))
+    return tuple(kept)
+
+
+def _shown_color(text: Any) -> Rgb | None:
+    plain = text if isinstance(text, str) else ""
+    found = re.fullmatch(r"#?([0-9a-fA-F]{6})([0-9a-fA-F]{2})?", plain)
+    return None if found is None else from_hex(found[1])
+
+
+def _shown_window(told: Any) -> tuple[float, float] | None:
+    if not isinstance(told, dict):
+        return None
+    ends: list[Any] = [told.get("start", told.get("min")), told.get("end", told.get("max"))]
+    if not all(map(is_number, ends)) or ends[0] > ends[1]:
+        return None
+    return (float(ends[0]), float(ends[1]))

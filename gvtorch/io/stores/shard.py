@@ -8,7 +8,7 @@ depends on no other task of its own level, and may be run again after a crash.
 from __future__ import annotations
 
 import errno
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ...base import boxes
 from ...pool.downsample import Reduction, pool_max, pool_mean, pool_min, reduce_windows, round_array
 from ..source import VolumeSource
-from .checksums import Files, shard_files
+from .checksums import shard_files
 from .chunk_files import files_of
 from .level_reader import Pool, StoredArray
 from .store import needed_cells
 from .store_layout import BORDER, CELL, Deadline, StoreError, StoreLayout, begin_open, short
+from .unfinished import Done
 
 _TIMEOUT = 3600.0  # seconds for one read of local data
 _OPEN_TIMEOUT = 60.0  # seconds
@@ -41,17 +42,7 @@ class Conversion:
     pool: Pool = pool_mean  # makes coarser voxels
 
 
-@dataclass(frozen=True)
-class ShardResult:
-    """What a task reports back."""
-
-    place: Place
-    voxels: int
-    bad: int = 0  # values that are not finite; the shard is not written then
-    files: Files = field(default_factory=dict)  # checksums of the store's files that it wrote
-
-
-def write_shard(conversion: Conversion, level: int, place: Place) -> ShardResult:
+def write_shard(conversion: Conversion, level: int, place: Place) -> Done:
     """Writes the shards of one cube of a level, `place` (z, y, x), or (t, z, y, x), in shards;
     level 0 is the finest.
 
@@ -70,7 +61,7 @@ def write_shard(conversion: Conversion, level: int, place: Place) -> ShardResult
     if level == 0:
         values, bad = _from_source(conversion, time or 0, *box, inner)
         if bad:
-            return ShardResult(place, 0, bad)
+            return Done(place, 0, {}, bad)
         least = most = values
     else:
         values, least, most = _from_below(conversion, level, time or 0, *box)
@@ -91,7 +82,7 @@ def write_shard(conversion: Conversion, level: int, place: Place) -> ShardResult
         finish_write(begun, conversion.root.get("path", "store"))
     specs = (layout.plain(level), layout.cells(level), layout.blocks(level))
     files = shard_files(conversion.root, specs, place, Deadline(_TIMEOUT))
-    return ShardResult(place, int(np.prod(size)), files=files)
+    return Done(place, int(np.prod(size)), files)
 
 
 def _from_source(
@@ -205,15 +196,16 @@ def create_arrays(conversion: Conversion, level: int) -> None:
     layout = conversion.layout
     arrays = (layout.plain(level), layout.blocks(level), layout.cells(level))
     for spec in (*arrays, *layout.bounds(level)):
-        _create(conversion.root, spec)
+        create_array(conversion.root, spec)
 
 
 def write_label_array(conversion: Conversion, labels: np.ndarray) -> None:
     """Writes the array of labels that are indexed."""
     root, spec = conversion.root, conversion.layout.labels()
-    _create(root, spec)
+    create_array(root, spec)
     finish_write(write(root, spec, [0], labels), root.get("path", "store"))
 
 
-def _create(root: dict[str, Any], spec: dict[str, Any]) -> None:
+def create_array(root: dict[str, Any], spec: dict[str, Any]) -> None:
+    """Creates an array, empty, if it is not there."""
     Deadline(_OPEN_TIMEOUT).wait(begin_open(root, spec, "create"), f"{root['path']}{spec['path']}")

@@ -25,8 +25,8 @@ from ...base.labels import background, counted
 from ...pool.downsample import pool_majority, pool_mean
 from .checksums import Checksums, file_of, sum_of
 from .chunk_files import ChunkFiles, begin_read, files_of
-from .level_reader import LevelReader, Pool, open_arrays, with_channels
-from .ngff import MultiscaleImage, find_image, read_json
+from .level_reader import LevelReader, Pool, keep_channels, open_arrays
+from .ngff import find_image, read_json
 from .store_layout import (
     BORDER,
     CELL,
@@ -84,43 +84,60 @@ class Store:
 
     def __init__(
         self,
-        location: str,
-        image: MultiscaleImage,
-        layout: StoreLayout,
-        levels: LevelReader,
-        channels: slice | list[int],
+        location: str | Path,
         *,
-        time: int,
-        times: int,
-        has_blocks: bool,
-        label_values: np.ndarray | None = None,
-        pool: Pool = pool_mean,
+        image: str | None = None,
+        time: int = 0,
+        channels: Sequence[int] | None = None,
     ) -> None:
-        """Takes what `open` found."""
-        self.location, self.name = location, image.name
-        self.info, self.lost, self.time, self.times = image.info, image.lost, time, times
-        scale, place = image.scales[0].scale[::-1], image.scales[0].translation[::-1]
-        self.spacing, self.origin = check.placed(location, scale, place, layout.extent)
+        """See `open`."""
+        asked = {"image": image, "time": time, "channels": channels}
+        self._asked: dict[str, Any] = {"location": location, **asked}
+        where, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
+        check.text(where, "image", image)
+        top = root
+        root, found, own = find_image(where, root, image, deadline)
+        if own and root != top:  # one of several channels, a store of its own
+            where = root if isinstance(root, str) else root["path"].rstrip("/")
+        stored, chosen, sizes = open_arrays(where, root, found, time, channels, deadline)
+        dtype = value_dtype(stored[0].array.dtype.numpy_dtype)
+        if dtype not in DTYPES:
+            raise ValueError(f"{where}: dtype {dtype} is unknown; known: {', '.join(DTYPES)}")
+        x, y, z, width = (stored[0].size(axis) for axis in "xyzc")
+        self.time, self.times = time, sizes.get("t", 1)
+        self.layout = layout = own or StoreLayout(extent=(x, y, z), dtype=dtype, width=width)
+        wrong = (layout.extent, layout.dtype) != ((x, y, z), dtype)
+        if wrong or (own and own.times != self.times):
+            raise ValueError(f"{where}: damaged: metadata and level 0 differ in extent or dtype")
+        names = None if layout.label_count is None else _read_labels(where, root, layout, deadline)
+        self.label_values = None if names is None else torch.from_numpy(names)
+        self.pool: Pool = pool_mean
+        if found.info.labels:
+            self.pool = partial(pool_majority, background=background(names))
+        self._levels = LevelReader(stored, layout, self.pool)
+        keep_channels(found, sizes, chosen)
+        self.location, self.root, self.has_blocks = where, kvstore(where), own is not None
+        self.name, self.info, self.lost = found.name, found.info, tuple(found.lost)
+        scale, place = found.scales[0].scale[::-1], found.scales[0].translation[::-1]
+        self.spacing, self.origin = check.placed(where, scale, place, layout.extent)
         self.extent, self.levels, self.block = layout.extent, layout.levels, layout.block
         self.border, self.cell, self.threshold = BORDER, CELL, layout.threshold
-        self.dtype: torch.dtype = getattr(torch, layout.dtype)
-        self.width = levels.width
-        self.has_blocks = has_blocks
+        self.dtype: torch.dtype = getattr(torch, dtype)
+        self.width, self._channels = self._levels.width, chosen
+        self.all_channels = isinstance(chosen, slice)
         self.value_range: list[tuple[float, float]] | None = None
         if layout.value_range is not None:
             ranges = [(float(low), float(high)) for low, high in layout.value_range]
-            self.value_range = [ranges[c] for c in np.arange(layout.width)[channels]]
-        self.layout, self._levels, self._channels = layout, levels, channels
-        self.root = kvstore(location)
-        self._asked: dict[str, Any] = {}  # of `open`
-        self.all_channels = isinstance(channels, slice)
+            self.value_range = [ranges[c] for c in np.arange(layout.width)[chosen]]
         self.coarse: dict[str, CoarseChannel] = {}
-        self.pool = pool
-        self.label_values = None if label_values is None else torch.from_numpy(label_values)
         self._blocks: list[Chunked] = []
         self._cells: list[Chunked] = []
         self._seen: set[tuple[Any, ...]] = set()
-        self._sums = Checksums(location, self.root, layout, time)
+        self._sums = Checksums(where, self.root, layout, time)
+        if own:
+            self._open_own(deadline)
+            if found.own.get("checksum", (kept := sum_of(found.own))) != kept:
+                raise ValueError(f"{where}: damaged: gvtorch's metadata is not what was written")
 
     @classmethod
     def open(
@@ -144,41 +161,7 @@ class Store:
                 place in a brick, or has no such image, time or channel.
             OSError: It can't be read.
         """
-        where, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
-        check.text(where, "image", image)
-        top = root
-        root, found, own = find_image(where, root, image, deadline)
-        if own and root != top:  # one of several channels, a store of its own
-            where = root if isinstance(root, str) else root["path"].rstrip("/")
-        stored, chosen, sizes = open_arrays(where, root, found, time, channels, deadline)
-        dtype = value_dtype(stored[0].array.dtype.numpy_dtype)
-        if dtype not in DTYPES:
-            raise ValueError(f"{where}: dtype {dtype} is unknown; known: {', '.join(DTYPES)}")
-        x, y, z, width = (stored[0].size(axis) for axis in "xyzc")
-        times = sizes.get("t", 1)
-        layout = own or StoreLayout(extent=(x, y, z), dtype=dtype, width=width)
-        if (layout.extent, layout.dtype) != ((x, y, z), dtype) or (own and own.times != times):
-            raise ValueError(f"{where}: damaged: metadata and level 0 differ in extent or dtype")
-        names = None if layout.label_count is None else _read_labels(where, root, layout, deadline)
-        pool: Pool = pool_mean
-        if found.info.labels:
-            pool = partial(pool_majority, background=background(names))
-        levels = LevelReader(stored, layout, pool)
-        found = with_channels(found, sizes, chosen)
-        self = cls(
-            *(where, found, layout, levels, chosen),
-            time=time,
-            times=times,
-            has_blocks=own is not None,
-            label_values=names,
-            pool=pool,
-        )
-        self._asked = {"location": location, "image": image, "time": time, "channels": channels}
-        if own:
-            self._open_own(deadline)
-            if found.own.get("checksum", (kept := sum_of(found.own))) != kept:
-                raise ValueError(f"{where}: damaged: gvtorch's metadata is not what was written")
-        return self
+        return cls(location, image=image, time=time, channels=channels)
 
     def at_time(self, time: int) -> Store:
         """Opens it again at another time point; raises as `open`."""
@@ -276,7 +259,6 @@ class Store:
         data = self._levels.read(self._checked(level), low, high, deadline)
         if self.has_blocks:
             start, stop = boxes.clamped_box(low, high, self.layout.shape(level))
-            self._sums.check_box(self.layout.plain(level), start, stop, deadline)
             inside = data[boxes.index(np.subtract(start, low).clip(0), data.shape[:3])]
             self._check_shards(self.layout.plain(level), inside, start, stop, deadline)
         return data
@@ -289,14 +271,18 @@ class Store:
     @property
     def stored(self) -> str:
         """NumPy dtype of what `read_stored` gives: that of the array, before it is narrowed."""
-        return "int64" if self.label_values is not None else self._levels.stored.str
+        return (
+            "int64"
+            if self.label_values is not None
+            else self._levels.finest.array.dtype.numpy_dtype.str
+        )
 
     def read_stored(self, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
         """Reads a box of finest voxels, (z, y, x, c), as they are stored; of labels that are
         indexed, the labels. Box and errors as of `read_region`; it lies inside the volume.
         """
         if not self.has_blocks:
-            return self._levels.read_stored(low, high, Deadline(timeout))
+            return self._levels.finest.read(low, high, Deadline(timeout))
         data = self.read_region(0, low, high, timeout=timeout)
         if self.label_values is None:
             return data
@@ -327,7 +313,6 @@ class Store:
         array, files = self._cells[level]
         future = begin_read(array[boxes.index(low, high)], files)
         data = deadline.wait(future, f"{self.location}: cells of level {level}")
-        self._sums.check_box(self.layout.cells(level), low, high, deadline)
         self._check_shards(self.layout.cells(level), data, low, high, deadline)
         return data
 
@@ -418,7 +403,6 @@ class Store:
         batch that fails one by one, to tell the good from the bad.
         """
         array, files = chunked
-        chunks = files.places(self.time, zyx, array.shape[3:])
         errors = dict[int, str]()
         running: deque[tuple[np.ndarray, Any]] = deque()
 
@@ -437,8 +421,7 @@ class Store:
             for start in range(0, len(order), batch):
                 rows = order[start : start + batch]
                 z, y, x = zyx[rows].T
-                needed = None if chunks is None else chunks[rows]
-                running.append((rows, begin_read(array[z, y, x], files, needed)))
+                running.append((rows, begin_read(array[z, y, x], files)))
                 if len(running) * batch >= _AHEAD:
                     finish()
             while running:
@@ -474,17 +457,21 @@ class Store:
         high: Zyx,
         deadline: Deadline,
     ) -> None:
-        """Raises StoreError if zeros in `data`, items `low` to `high` of an array, come from a
-        shard that is not there: zeros of these arrays are written.
+        """Raises StoreError if a shard of `data`, items `low` to `high` of an array, is not the one
+        that was written, or if zeros come from one that is not there: zeros of these arrays are
+        written.
         """
-        where, metadata = f"{self.location}/{spec['path']}", spec["metadata"]
-        shape = metadata["chunk_grid"]["configuration"]["chunk_shape"]
-        moment = (self.time,) if self.times > 1 and "coarse" not in spec["path"] else ()
+        where, coarse = f"{self.location}/{spec['path']}", "coarse" in spec["path"]
+        shape = spec["metadata"]["chunk_grid"]["configuration"]["chunk_shape"]
+        moment = (self.time,) if self.times > 1 and not coarse else ()
         shape = shape[len(moment) :]
         first = len(shape) == 4  # c, z, y, x
         per = shape[first]
         spans = [range(a // per, (b - 1) // per + 1) for a, b in zip(low, high, strict=True)]
-        for place in itertools.product(*spans):
+        places = [*itertools.product(*spans)]
+        for place in () if coarse else places:
+            self._sums.check(spec, place, deadline)
+        for place in places:
             key = (spec["path"], *place)
             corner = np.multiply(place, per) - low
             if key in self._seen or data[boxes.index(corner.clip(0), corner + per)].any():

@@ -328,7 +328,7 @@ class CoarseChannel:
     @classmethod
     def parse(cls, where: str, told: Any) -> dict[str, CoarseChannel]:
         """Reads the channels that a store's metadata tells, by name; raises ValueError unless they
-        are what `write_channel` writes.
+        are what `make_channel` writes.
         """
         channels = told.get("channels") if isinstance(told, dict) else None
         if not isinstance(channels, dict):
@@ -533,4 +533,6 @@ def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any
                 return failed(Endless(f"{head}: {error}"))
     store = {**spec, "kvstore": relayed.spec if relayed else folder}
     future = ts.open(store, context=context(), open=True, create=create)
-    return relayed.opens(future) if relayed else future
+    if relayed:
+        relayed.future = future
+    return future

@@ -9,10 +9,13 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NamedTuple
+
+import numpy as np
 
 from ...base.image_info import ImageInfo
 from ...base.volume import Volume, movable
@@ -28,39 +31,41 @@ _JOURNAL, _MANIFEST, _LOCK = "journal.jsonl", "manifest.json", "lock"
 class Done(NamedTuple):
     """What a task that is done has written."""
 
+    place: tuple[int, ...]  # z, y, x, or t, z, y, x
     voxels: int
     files: Files  # checksums
+    bad: int = 0  # values that are not finite; nothing is written then
 
 
+@dataclass
 class UnfinishedStore:
-    """A store that is being made, by this process alone."""
+    """A store that is being made, by this process alone; `done` stands in the journal already."""
 
-    def __init__(self, target: Path, journal: IO[str], done: Mapping[Task, Done]) -> None:
-        """Takes the folder over; `done` stands in the journal already."""
-        self.done = dict(done)
-        self._target, self._journal = target, journal
+    target: Path
+    journal: IO[str]
+    done: dict[Task, Done]
 
     def note(self, done: Mapping[Task, Done]) -> None:
         """Writes down that tasks are done; on disk when this returns."""
         self.done |= done
-        with told_of(self._target / WORK / _JOURNAL):
-            _write_lines(self._journal, done)
+        with told_of(self.target / WORK / _JOURNAL):
+            _write_lines(self.journal, done)
 
     def finish(self, layout: StoreLayout, info: ImageInfo, settings: Mapping[str, Any]) -> None:
         """Writes the metadata, the root's last of all, and removes the hidden folder."""
         for name in GROUPS:
-            write_json(self._target / name / "zarr.json", group({}))
+            write_json(self.target / name / "zarr.json", group({}))
         files = {name: one for done in self.done.values() for name, one in done.files.items()}
-        write_json(self._target / LIST, {"files": files})
+        write_json(self.target / LIST, {"files": files})
         place = {"spacing": settings["spacing"], "origin": settings["origin"]}
-        name = Path(os.path.realpath(self._target)).name.removesuffix(".zarr")
+        name = Path(os.path.realpath(self.target)).name.removesuffix(".zarr")
         image, beside = image_metadata(name, layout, info, **place)
         own = layout.attributes(place) | ({"info": beside} if beside else {})
         own["files_sum"] = sum_of(files)
         own["checksum"] = sum_of(as_json(own))
         attributes = {"ome": image, "gvtorch": own}
-        write_json(self._target / "zarr.json", group(attributes))
-        shutil.rmtree(self._target / WORK, ignore_errors=True)
+        write_json(self.target / "zarr.json", group(attributes))
+        shutil.rmtree(self.target / WORK, ignore_errors=True)
 
 
 def is_finished(target: Path) -> bool:
@@ -201,7 +206,7 @@ def _read_journal(path: Path) -> dict[Task, Done]:
             entry = json.loads(line)
             if entry["checksum"] == sum_of(entry):
                 task = tuple(int(n) for n in entry["task"])
-                done[task] = Done(int(entry["voxels"]), dict(entry["files"]))
+                done[task] = Done(task[1:], int(entry["voxels"]), dict(entry["files"]))
         except (ValueError, KeyError, TypeError, RecursionError):
             continue
     return done
@@ -223,11 +228,19 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
         file.write(json.dumps(content, indent=1, allow_nan=False).encode())
 
 
+def checksum(arrays: Iterable[np.ndarray]) -> int:
+    """Returns the CRC-32 of the numbers of arrays, one after the other."""
+    total = 0
+    for one in arrays:
+        total = zlib.crc32(one.tobytes(), total)
+    return total
+
+
 def fingerprint(source: str | Path | Volume) -> list[Any]:
     """Sizes and modification times of a source, or a checksum: equal while it is unchanged."""
     if isinstance(source, Volume):
-        data = movable(source.data)
-        return [list(data.shape), str(source.data.dtype), zlib.crc32(data.cpu().numpy().tobytes())]
+        data = movable(source.data).cpu().numpy()
+        return [list(data.shape), str(source.data.dtype), checksum([data])]
     text = str(source)
     if "://" in text:
         return [text]
