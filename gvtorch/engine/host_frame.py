@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
@@ -16,7 +16,7 @@ from torch import Tensor
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
 from ..base.records import Hits
 from ..base.volume import movable
-from ..cache import KINDS, Cache, Scheduler
+from ..cache import KINDS, Cache
 from ..cache.write import Children, Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
 from ..pool.staging import TableRows
 from ..producers import Bricks, Region, Regions
@@ -39,21 +39,11 @@ class HostFrame(RecordedFrame):
     that brings them, and posted; the next frame sends what has come, and writes it.
     """
 
-    def __init__(
-        self,
-        cache: Cache,
-        trees: Sequence[ProducedTree],
-        scheduler: Scheduler,
-        batch: int,
-        fit: bool,
-        production: Production,
-    ) -> None:
-        """See `RecordedFrame`; `production` knows what failed."""
-        super().__init__(cache, trees, scheduler, batch, fit)
-        self._production = production
+    def __init__(self, production: Production, batch: int, fit: bool) -> None:
+        super().__init__(production, batch, fit)
         device = self._unused.device
-        self._mail = [Mail(_boxes(cache, one), batch, device) for one in trees]
-        self._by_tree = {one.tree.number: n for n, one in enumerate(trees)}
+        self._mail = [Mail(_boxes(self.cache, one), batch, device) for one in self.trees]
+        self._by_tree = {one.tree.number: n for n, one in enumerate(self.trees)}
         self.turn = 0  # answers to what was asked before the last `release` are dropped
         self._asked = self._done = 0  # rows, since then
         self.active = False  # whether frames have been rendered since then
