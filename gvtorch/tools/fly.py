@@ -72,8 +72,7 @@ class Fly:
 
     def run(self) -> None:
         """Renders frame after frame."""
-        from ..base.stage import stage
-        from ..base.trace import Trace
+        from ..base.stage import Trace, stage
         from ..cameras import write_cameras
         from ..pictures import Video
 
