@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
-from ..base.npy_file import write_npy
 from ..base.stage import Progress, no_progress
-from ..base.whole_file import durable_file
+from ..base.whole_file import durable_file, write_npy
 from .source import Index, MemorySource, VolumeSource
 
 _CUBE = 128  # voxels along a side of what is read at once

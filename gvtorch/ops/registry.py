@@ -311,12 +311,8 @@ _reasons = cpp_ext.load()
 if not _reasons["cpp"]:
     for _name, _fake in FAKES.items():
         _register_fake(getattr(torch.ops.gvtorch, _name), _fake)
-    _refuse_gradients(torch.ops.gvtorch.trace_rays)
-    _refuse_gradients(torch.ops.gvtorch.shade_rays)
-    _refuse_gradients(torch.ops.gvtorch.noise)
-    _refuse_gradients(torch.ops.gvtorch.splat)
-    _refuse_gradients(torch.ops.gvtorch.orbits)
-    _refuse_gradients(torch.ops.gvtorch.orbit_bounds)
+    for _name in ("trace_rays", "shade_rays", "noise", "splat", "orbits", "orbit_bounds"):
+        _refuse_gradients(getattr(torch.ops.gvtorch, _name))
     torch.library.register_autograd(
         "gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples
     )

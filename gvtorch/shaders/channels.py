@@ -11,8 +11,7 @@ import numpy as np
 import torch
 
 from ..base import check
-from ..base.image_info import COLORS, ChannelInfo, to_hex
-from ..base.srgb import array_from_srgb
+from ..base.image_info import COLORS, ChannelInfo, array_from_srgb, to_hex
 from ..base.volume import Volume
 from ..io.stores.store import Store
 from ..io.window import windows

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.srgb import array_from_srgb
+from ..base.image_info import array_from_srgb
 from ..ops.shading import LabelNumbers
 from ..pool import N3Tree
 from .colors import distinct_colors, linear_color
@@ -157,24 +157,16 @@ class Labels(LitShader):
     ) -> ColorTable:
         rows = max(2, len(labels))
         levels = sampling.fitting(rows)
-        table = torch.zeros((levels, rows, 4), dtype=sampling.dtype)
-        opacity = look.opacities(labels)
-        table[:, : len(labels), :3] = torch.from_numpy(look.colors_of(labels)).to(sampling.dtype)
+        table, opacity = np.zeros((levels, rows, 4)), look.opacities(labels)
+        table[:, : len(labels), :3] = look.colors_of(labels)
         length = sampling.step / (self.reference or sampling.smallest_spacing)
         with np.errstate(divide="ignore"):
             thickness = np.log1p(-opacity)
         for level in range(levels):
-            alpha = -np.expm1(length * 2.0**level * thickness)
-            table[level, : len(labels), 3] = torch.from_numpy(alpha).to(sampling.dtype)
-        seen = torch.zeros(rows, dtype=torch.int32)
-        seen[: len(labels)] = torch.from_numpy(opacity > 0)
-        domain = torch.tensor((first, first + rows - 1), dtype=sampling.dtype)
-        device = sampling.device
-        return ColorTable(
-            table_lm4=table.to(device),
-            domain_2=domain.to(device),
-            opaque_m=seen.cumsum(0, dtype=torch.int32).to(device),
-        )
+            table[level, : len(labels), 3] = -np.expm1(length * 2.0**level * thickness)
+        seen = np.zeros(rows, bool)
+        seen[: len(labels)] = opacity > 0
+        return ColorTable.of(table, (first, first + rows - 1), seen, sampling)
 
 
 def label_rows(tree: N3Tree, channel: str) -> tuple[float, np.ndarray]:

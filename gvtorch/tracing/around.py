@@ -96,7 +96,7 @@ def _clipped(
     surface = tracer.shader.cut_surface() if options.clip.caps else None
     together: Callable[[Iterable[Rays]], Hits] | None = None
     if tracer.shader.projection is not None:
-        together = partial(_project_pieces, tracer, tracer.shader.projection)
+        together = partial(_project_pieces, tracer)
     return Clipped(
         trace,
         options.clip,
@@ -152,11 +152,11 @@ def _surface_slab(surface: CutSurface, tracer: Tracer, options: RenderOptions) -
     return slab
 
 
-def _project_pieces(tracer: Tracer, which: str, pieces: Iterable[Rays]) -> Hits:
+def _project_pieces(tracer: Tracer, pieces: Iterable[Rays]) -> Hits:
     """Projects pieces of the same rays: the largest or smallest value of all, at its nearest place,
     or the mean of their means, weighted by their lengths inside the tree's box.
     """
-    rays = list(pieces)
+    rays, which = list(pieces), tracer.shader.projection
     hits = [tracer(piece) for piece in rays]
     depths = torch.stack([one.depth for one in hits])  # (pieces, r, 1)
     known = depths < torch.inf

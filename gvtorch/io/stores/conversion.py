@@ -26,10 +26,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
-from ...base.npy_file import save_npy
 from ...base.stage import Progress, no_progress
 from ...base.volume import Volume
-from ...base.whole_file import told_of
+from ...base.whole_file import save_npy, told_of
 from .. import resources
 from ..label_source import IndexSource, write_labels
 from ..oblique import Oblique
