@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 import gvtorch as gv
+from gvtorch.engine.frame_graph import LookAhead
 from gvtorch.engine.host_frame import HostFrame
-from gvtorch.engine.look_ahead import LookAhead
 from gvtorch.engine.setup import make_recorded_frame
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
