@@ -73,9 +73,7 @@ class DeviceFrame(RecordedFrame):
         self._subdivide(self._answers(REQUEST_SUBDIVIDE, chosen), chosen, priority)
 
     def deeper(self, readbacks: Readbacks) -> int:
-        """Returns what subdivisions wanted in the mean when the host last knew; 0 where each level
-        needs its bricks first.
-        """
+        """What subdivisions wanted in the mean, as far as known; 0 if levels need bricks first."""
         return 0 if self._production.by_level else readbacks.deeper
 
     def _levels(self) -> Tensor:
@@ -107,9 +105,7 @@ class DeviceFrame(RecordedFrame):
             self._made[5:] += failed
 
     def _subdivide(self, answers: Sequence[Unchecked], chosen: Tensor, priority: Tensor) -> None:
-        """Subdivides nodes (batch,), and notes which of their children are to be subdivided, too,
-        those of the first nodes first.
-        """
+        """Subdivides nodes (batch,), and notes which children to subdivide, too, in order."""
         free = self._unused[:1]
         slot, wide = torch.full_like(chosen, -1), torch.zeros_like(chosen)
         for answer in answers:

@@ -216,7 +216,6 @@ class Engine:
                 self._rendering = False
 
     def _new_frame(self, options: RenderOptions) -> Iterator[FrameStats]:
-        """See `new_frame`."""
         stats = FrameStats(
             frame=self.frames + 1,
             backend=choose_backend(options.backend, self.device),

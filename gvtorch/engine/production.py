@@ -175,9 +175,7 @@ class Production:
         return {kind: sum(len(b) for b in batches if b.kind == kind) for kind in KINDS.values()}
 
     def room(self) -> dict[int, list[int]]:
-        """For each kind, how many slots may be taken that no answer on its way needs; see
-        `Cache.room`.
-        """
+        """For each kind, how many free slots no answer on its way needs; see `Cache.room`."""
         room, batches = self.cache.room(), self._under_way()
         for kind, free in room.items():
             for number in range(len(free)):
@@ -279,9 +277,7 @@ class Production:
         stats.pending, stats.failed = sum(self.pending.values()), len(self.failures)
 
     def wait(self, more: float = 0.0, limit: float = _LONGEST) -> None:
-        """Waits until an answer is here, or until patience ends, at most `limit` seconds; then up
-        to `more` seconds for the others.
-        """
+        """Waits for an answer, until patience or `limit` seconds end; then `more` for others."""
         if self._waiting and not self._held:
             left = min(item.left for item in self._waiting)
             futures = [item.future for item in self._waiting]
@@ -368,9 +364,7 @@ class Production:
         return answered
 
     def _sent_ahead(self, batch: RequestBatch, asked: Future) -> Future:
-        """A future that is done once bricks from the host are checked and on their way: all that is
-        left to the frame is to write them.
-        """
+        """A future that is done once bricks from the host are checked and on their way."""
         staging = self.staging
         if staging is None or batch.kind != REQUEST_LOAD:
             return asked
@@ -401,11 +395,9 @@ class Production:
             self._fail(batch, str(error), error)
             return []
         if checked.errors:
-            failed = batch.failed(checked)
+            failed, keep = batch.failed(checked)
             for node, message in failed.items():
                 self._fail(batch[node : node + 1], message)
-            keep = torch.ones(len(batch), dtype=torch.bool)
-            keep[list(failed)] = False
             rows = keep.repeat_interleave(batch.per_node).nonzero()[:, 0]
             batch, checked = batch[keep.nonzero()[:, 0]], checked.rows(rows)
         return [Answered(batch, shipped(batch, checked, self.staging))] if len(batch) else []

@@ -97,9 +97,7 @@ class RecordedFrame:
         return 0
 
     def finish(self, hits: Hits) -> Collected:
-        """Brings slots into the order of use and counts; what the picture used is counted apart
-        from what `look` used.
-        """
+        """Orders slots by use, and counts what the picture used apart from what `look` used."""
         use, samples = in_branches(
             self.cache.sort_by_use, lambda: hits.samples.sum(dtype=torch.int64).view(1)
         )
@@ -118,11 +116,8 @@ class RecordedFrame:
     def _widen_cones(self, use: Tensor, count: Tensor) -> None:
         """Makes the next frame's cones wider if the pools can't hold what this one used and asked
         for, and narrower again, down to the camera's, if there is room. A surface takes bricks as
-        the inverse square of the cones' width.
-
-        Args:
-            use: (5,) int64 as `Cache.sort_by_use` tells.
-            count: (5,) int64 as `compact_requests` tells: what is pending counts as asked for.
+        the inverse square of the cones' width. `use` is what `Cache.sort_by_use` tells, `count`
+        what `compact_requests` does: what is pending counts as asked for.
         """
         nodes, bricks = self.cache.nodes.capacity, self.cache.bricks.capacity
         taken = torch.stack(((use[3] + count[2]) / bricks, (use[1] + count[4]) / nodes)).amax()
