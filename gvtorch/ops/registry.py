@@ -52,16 +52,17 @@ def choose_backend(backend: str, device: torch.device) -> str:
     return backend
 
 
+uncached_backend = choose_backend.__wrapped__  # torch.compile warns of caches
+
+
 def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
     """Makes an op of its twin: checks what comes, and calls the compiled op of the twin's name, or
     the twin, as its argument `backend` says: auto, reference, cpp or cuda.
 
     Tensors must be contiguous, on one device, and of the shape that their name ends with (of any,
     if it has no such end) and the dtype of Words, Longs, Requests, Flags, Bytes or Doubles; numbers
-    inside their range. Else the op raises ValueError.
-
-    Args:
-        also: One more check, which gets the arguments by name.
+    inside their range. Else the op raises ValueError. `also`: one more check, which gets the
+    arguments by name.
     """
 
     def made_of(twin: _Twin) -> _Twin:

@@ -98,9 +98,7 @@ def shares(edge_ke: Tensor, center_k: Tensor, radius_k: Tensor) -> Tensor:
 
 
 def _in_turn(begin_b: Tensor, run_s2: Tensor, rows: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yields the first row of each cube's list, then the second, and so on: which cubes have one,
-    and where it is in the table.
-    """
+    """Yields each cube's first row, then its second, ...: which cubes have one, and the rows."""
     runs, of_run = _expanded(torch.stack((begin_b[:-1], begin_b[1:]), 1).clamp(0, len(run_s2)))
     row, of_row = _expanded(run_s2.clamp(0, rows)[runs])
     count = torch.bincount(of_run[of_row], minlength=len(begin_b) - 1)
