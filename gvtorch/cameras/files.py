@@ -29,7 +29,7 @@ from ..base import check
 from ..base.messages import one_line
 from ..base.whole_file import write_whole
 from .camera import Camera, Frame
-from .rotations import quaternion_of, rotation_of
+from .motion import quaternion_of, rotation_of
 
 _FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))  # y down to y up
 _PVCC = (

@@ -282,8 +282,6 @@ def window_of(where: str, window: Sequence[float]) -> tuple[float, float]:
 
 
 def channel_color(where: str, color: Triple | str) -> Triple:
-    """Returns a colour as linear RGB, as `colors.linear_color`, of which names are those of lookup
-    tables.
-    """
+    """Returns a colour as linear RGB; names are those of lookup tables."""
     named = {name: f"#{to_hex(one)}" for name, one in COLORS.items()}
     return named_color(where, color, named)

@@ -312,9 +312,7 @@ class Filtered(Shader):
         device: torch.device,
         progress: Progress = no_progress,
     ) -> None:
-        """Writes the colours of coarse levels, worked out on a device, into tensors, which may be
-        mapped from files; see `write_colors`.
-        """
+        """Writes colours of coarse levels into tensors, also mapped ones; see `write_colors`."""
         tables = [
             self.transfer.table(
                 Sampling(smallest_spacing=min(spacing), step=side / 2, device=device)

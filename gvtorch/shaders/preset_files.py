@@ -182,9 +182,7 @@ def paraview_item(opacity: np.ndarray, color: np.ndarray) -> dict[str, list[floa
 
 
 def _opacities(nodes: np.ndarray) -> np.ndarray:
-    """(k, 2) of nodes (v, a), or (v, a, midpoint, sharpness) as VTK's vtkPiecewiseFunction has
-    them.
-    """
+    """(k, 2) of nodes (v, a), or (v, a, midpoint, sharpness) as VTK has them."""
     nodes = nodes[np.argsort(nodes[:, 0], kind="stable")]
     if nodes.shape[1] == 2:
         return nodes

@@ -63,9 +63,7 @@ class ColorTable:
 
 @dataclass(frozen=True, kw_only=True)
 class CutSurface:
-    """What a cut through the inside of a surface shows: its own colour, unlit, wherever the value
-    lies inside.
-    """
+    """What a cut through the inside of a surface shows: its own colour, unlit."""
 
     level: Number  # the value at the surface
     below: bool  # inside is where the value is below the level, else where it is not

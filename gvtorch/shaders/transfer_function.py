@@ -17,7 +17,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
-from ..base.checked import Check, kind_of, number_above, or_none
+from ..base.checked import Check, kind_of, or_none, positive
 from ..base.messages import one_line
 from ..base.whole_file import write_whole
 from .preset_files import paraview_item, read_preset
@@ -55,7 +55,7 @@ class TransferFunction(Shader):
     checks: ClassVar[Mapping[str, Check]] = {
         "opacity": lambda owner, name, points: _points(kind_of(owner), name, points, 2),
         "color": lambda owner, name, points: _points(kind_of(owner), name, points, 4),
-        "reference": or_none(number_above(0)),
+        "reference": or_none(positive),
     }
 
     def __init__(
@@ -167,9 +167,7 @@ class TransferFunction(Shader):
         return type(self)(parts[0].tolist(), parts[1].tolist(), self.reference)
 
     def save(self, path: str | Path) -> None:
-        """Writes the .json that `from_file` reads; raises ValueError where the path ends in
-        something else.
-        """
+        """Writes the .json that `from_file` reads; ValueError if the path ends otherwise."""
         if Path(path).suffix != ".json":
             raise ValueError(f"TransferFunction.save: path must end in .json, got {str(path)!r}")
         write_whole(Path(path), self.to_json() + "\n")

@@ -24,16 +24,10 @@ from .tracer import Tracer
 
 def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRays:
     """Wraps a tree's tracer in what the options ask for. Each ray goes through lighting, then the
-    clip, then the lens, then the tree; cones to the lights go through clip and tree alone.
-
-    Args:
-        tracer: Traces rays of one frame through one tree.
-        options: How the picture is made.
-        box: (2, 3) world corners of the scene, all trees together.
-
-    Raises:
-        ValueError: The shader must see a ray in one go, and the options cut rays into pieces or
-            draw caps; or it has no normals, and there is lighting.
+    clip, then the lens, then the tree; cones to the lights go through clip and tree alone. `box`:
+    (2, 3) world corners of the scene, all trees together. Raises ValueError if the shader must see
+    a ray in one go, and the options cut rays into pieces or draw caps; or it has no normals, and
+    there is lighting.
     """
     check_fits(tracer.shader, options)
     lens = options.lens and options.lens.placed(box)
