@@ -26,6 +26,7 @@ from .shader import ColorTable, Sampling, Shader
 
 _LARGEST = 1e300  # values and lengths, so that their differences are numbers
 _KEPT = 8  # tables of a function
+_FOREIGN = {"RGBPoints", "volumeProperties"}  # keys of other programs' files
 # Cells of a table.
 _FEWEST_CELLS = 2**10
 _FEWEST_SAMPLED = 2**12  # where corners fall beside rows
@@ -120,7 +121,8 @@ class TransferFunction(Shader):
         """
         if str(path).endswith(".json") and Path(path).is_file():
             content = check.json_file("transfer function file", path)
-            if not isinstance(content, list) and _is_own(content):
+            told = content.keys() if isinstance(content, dict) else ()  # of ours, if it is broken
+            if not isinstance(content, list) and _FOREIGN.isdisjoint(told):
                 if name is not None:
                     raise ValueError(f"{path}: holds one function, without a name: leave it out")
                 return cls.from_json(path)
@@ -345,11 +347,6 @@ def _common_cells(places: Iterable[float], most: int, tolerance: float = math.in
         if cells > most or abs(float(fraction) - place) > tolerance:
             return None
     return cells
-
-
-def _is_own(content: Any) -> bool:
-    """Tells our JSON, also a broken one, from other programs'."""
-    return not isinstance(content, dict) or not {"RGBPoints", "volumeProperties"} & set(content)
 
 
 def _points(where: str, name: str, points: Points, width: int) -> np.ndarray:

@@ -205,7 +205,8 @@ class Lighted:
             half = normalize(beam + points.eye, dim=1)
             highlight = (points.normal * half).sum(1).clamp(0, 1) ** shininess
             highlight = torch.where(points.has_normal & (facing > 0), highlight, 0.0)
-            count = 1 if _is_small(light) else cones
+            wide = getattr(light, "angle", getattr(light, "radius", 0.0))
+            count = cones if isinstance(wide, Tensor) or wide else 1  # no tensor is read
             lit = self._visible(light, count, points, beam, facing > 0)[:, None] * color
             diffuse, shine = diffuse + facing[:, None] * lit, shine + highlight[:, None] * lit
         return diffuse, shine
@@ -325,12 +326,6 @@ def _towards(light: Light, points: _Points) -> tuple[Tensor, Tensor, Tensor]:
     way = position - points.position
     distance = way.norm(dim=1)
     return normalize(way, dim=1), distance, radius / distance.clamp(min=1e-30)
-
-
-def _is_small(light: Light) -> bool:
-    """Whether a light is known to have no size, without reading tensors."""
-    size = getattr(light, "angle", getattr(light, "radius", 0.0))
-    return not isinstance(size, Tensor) and size == 0
 
 
 def _disc(count: int) -> Iterator[tuple[float, float]]:

@@ -39,7 +39,6 @@ _RAYS = {"cpu": 1 << 14, "cuda": 1 << 18}  # composited by sample at once
 _SLIVER = 1e-3  # steps: ends of intervals that are closer are one
 _MOST_ALPHA = 1 - 1e-9  # of a sample: an opaque one has no extinction that could be added
 
-
 #: A shader for all trees, or one for each by name.
 Shaders = Shader | Mapping[str, Shader]
 
