@@ -110,7 +110,7 @@ from .tracing import (
 )
 
 # What takes how long.
-from .base.trace import Trace as Trace
+from .base.stage import Trace as Trace
 
 # Streaming a scene larger than memory.
 from .engine import (

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
-from gvtorch.cameras.rotations import quaternion_of, rotation_of
+from gvtorch.cameras.motion import quaternion_of, rotation_of
 
 EYE, TARGET, UP = (3.0, -4.0, 5.0), (0.5, 0.25, -1.0), (0.1, 0.9, 0.2)
 POINTS = torch.tensor([TARGET, (0, 0, 0), (1, 1, 1), (-1, 0.5, 2)], dtype=torch.float64)

@@ -202,7 +202,7 @@ class Watched(Checked):
     def __init__(self, *args, **options):
         super().__init__(*args, **options)
         self.rounds = self.evicted = 0
-        self.unwatched, self.serving.serve = self.serving.serve, self.serve
+        self.unwatched, self.production.serve = self.production.serve, self.serve
 
     def frame(self, *args, **options):
         nodes, bricks = self.cache.nodes, self.cache.bricks

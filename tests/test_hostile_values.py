@@ -25,7 +25,7 @@ from helpers.pictures import GRAY
 import gvtorch as gv
 from gvtorch import bench
 from gvtorch.base.digits import whole_number
-from gvtorch.base.npy_file import save_npy
+from gvtorch.base.whole_file import save_npy
 from gvtorch.bench import tables
 from gvtorch.points.table import Table
 from gvtorch.tools import cli

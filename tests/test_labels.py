@@ -18,7 +18,7 @@ from helpers.traces import run
 from helpers.trees import on
 
 import gvtorch as gv
-from gvtorch.base.srgb import array_from_srgb
+from gvtorch.base.image_info import array_from_srgb
 from gvtorch.shaders.colors import distinct_colors, linear_color
 
 ORIGIN = (2.0, -1.0, 0.5)

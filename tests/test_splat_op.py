@@ -18,7 +18,7 @@ from helpers.points import share_below
 from torch import Tensor
 
 from gvtorch.ops import splat
-from gvtorch.ops.reference import splat as twin
+from gvtorch.ops.splat import shares
 from gvtorch.points.codes import point_shares
 from gvtorch.points.points import Points
 from gvtorch.points.sorted import sort_points
@@ -314,7 +314,7 @@ def test_no_gradient_is_lost(compiled):
 def test_points_in_numpy_have_the_shares_of_the_twin():
     edge, center = np.linspace(-1, 1, 12).repeat(3).reshape(12, 3).T.copy(), np.array([0, 0.1, 2])
     radius = np.array([0.5, 0.0, 3.0])
-    expected = twin.shares(*map(torch.from_numpy, (edge, center, radius)))
+    expected = shares(*map(torch.from_numpy, (edge, center, radius)))
     found = point_shares(edge, center, radius)
     assert np.array_equal(found, expected.numpy())
     exact = [np.diff(share_below(edge[i], center[i], radius[i])) for i in range(3)]

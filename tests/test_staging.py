@@ -232,7 +232,7 @@ def serve(engine, node, kind) -> gv.FrameStats:
     """What a frame does for requests, without its rays."""
     stats = gv.FrameStats()
     engine.production.write(engine.production.late(), stats)
-    engine.production.write(engine.production.ask([*engine.trees.values()], {kind: node}), stats)
+    engine.production.write(engine.production.ask({kind: node}), stats)
     return stats
 
 

@@ -51,7 +51,7 @@ def test_times_and_nesting_are_those_of_the_stages(tmp_path):
     names = {one["tid"]: one["args"]["name"] for one in content if one["ph"] == "M"}
     assert names[found["other"]["tid"]] == "host: reader"
     (count,) = (one for one in content if one["ph"] == "C")
-    assert count["args"] == {"loaded": 7} and not stages._recorders
+    assert count["args"] == {"loaded": 7} and not stages._traces
 
 
 def test_a_trace_is_written_after_a_mistake_too(tmp_path):

@@ -57,12 +57,8 @@ class ArrayLike:
 
     @classmethod
     def of(cls, where: str, given: Any, axes: str | None = None) -> ArrayLike:
-        """Looks at an object, without reading its values if it need not.
-
-        Args:
-            where: Who asks, for messages.
-            given: The object.
-            axes: A letter for each axis, where they have no names that tell.
+        """Looks at an object, without reading its values if it need not. `axes`: a letter for each,
+        where they have no names that tell.
 
         Raises:
             ValueError: It is no array of real numbers, or what its axes are must be told.

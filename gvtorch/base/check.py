@@ -33,9 +33,7 @@ def describe(tensor: Any) -> str:
 
 
 def brief(record: Any) -> str:
-    """Returns one line on a dataclass: `Name(field=value, ...)` of the fields that differ from
-    their defaults, of tensors only shape and dtype.
-    """
+    """Returns a line on a dataclass: what differs from defaults, of tensors shape and dtype."""
     parts = []
     for field in fields(record):
         value = getattr(record, field.name)
@@ -136,9 +134,7 @@ def instance(where: str, name: str, value: Any, *kinds: type[Kind]) -> Kind:
 
 
 def text(where: str, name: str, value: Any) -> str | None:
-    """Returns `value`, a text or None; raises ValueError for anything else, which may not even be
-    compared (arrays) or looked up (lists).
-    """
+    """Returns `value`; ValueError unless it is a text or None: arrays can't even be compared."""
     return None if value is None else instance(where, name, value, str)
 
 
@@ -185,9 +181,7 @@ def images(where: str, name: str, value: Any, channels: int, *, batch: bool = Tr
 
 
 def device(where: str, value: Any) -> torch.device:
-    """Returns the device of a name, a CUDA device with its index, as tensors name theirs; raises
-    ValueError where there is none.
-    """
+    """Returns a device, CUDA with its index as tensors name theirs; ValueError if there is none."""
     try:
         found = torch.device(value)
     except (RuntimeError, TypeError):
@@ -223,9 +217,7 @@ _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
 
 
 def nbytes(where: str, name: str, value: Any) -> int:
-    """Returns bytes from a number or a text such as "8 MB" (10^6) or "8 MiB" (2^20); raises
-    ValueError unless it is one of these, and positive.
-    """
+    """Returns bytes of a number or text as "8 MB" (10^6), "8 MiB" (2^20); ValueError otherwise."""
     if isinstance(value, str):
         match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", value)
         unit = _UNITS.get(match[2].upper()) if match else None
@@ -252,9 +244,7 @@ def number(
     high: float = math.inf,
     open_low: bool = False,
 ) -> float:
-    """Returns `value` as a float; raises ValueError unless it is finite and inside [low, high] (or
-    (low, high]).
-    """
+    """Returns `value` as a float; ValueError unless finite and in [low, high] (or (low, high])."""
     no_gradient(where, name, value)
     try:
         result = float(value)
@@ -308,9 +298,7 @@ def triple(
 
 
 def box(where: str, value: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Returns two corners, (x, y, z) each; raises ValueError unless the second lies beyond the
-    first along all axes.
-    """
+    """Returns two corners, (x, y, z) each; ValueError unless the second is beyond the first."""
     if len(value) != 2:
         raise ValueError(f"{where}: box must be two corners, got {value!r}")
     low, high = (triple(where, "box", corner) for corner in value)
@@ -350,9 +338,7 @@ def json_file(what: str, path: str | Path) -> Any:
 
 
 def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:
-    """Returns numbers, of any shape if none is given, as a float64 tensor on the CPU; raises
-    ValueError unless they have the shape and are finite.
-    """
+    """Returns finite numbers, of a shape if given, as float64 on the CPU; ValueError otherwise."""
     no_gradient(where, name, value)
     try:
         numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()

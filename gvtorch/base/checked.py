@@ -55,11 +55,9 @@ def or_none(given: Check) -> Check:
     return lambda owner, name, value: None if value is None else given(owner, name, value)
 
 
-def number_above(low: float) -> Check:
-    """A check for a finite number above `low`; keeps a float."""
-    return lambda owner, name, value: check.number(
-        kind_of(owner), name, value, low=low, open_low=True
-    )
+def positive(owner: Any, name: str, value: Any) -> float:
+    """Checks that a value is a finite number above 0; keeps a float."""
+    return check.number(kind_of(owner), name, value, low=0, open_low=True)
 
 
 def whole_between(low: int, high: int = sys.maxsize) -> Check:

@@ -1,12 +1,15 @@
 """`ImageInfo`: what a file tells of its numbers beside their grid: unit, channels, time, labels.
 
-torch is not imported here, since readers of headers need it.
+torch and NumPy are not imported here, since readers of headers and `gvtorch --help` need it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
 
 Rgb = tuple[float, float, float]
 Rows = tuple[tuple[float, ...], ...]
@@ -57,6 +60,13 @@ def from_hex(text: str) -> Rgb:
     """Returns the colour that RRGGBB tells; raises ValueError of anything else."""
     red, green, blue = (part / 255 for part in bytes.fromhex(text))
     return (red, green, blue)
+
+
+def array_from_srgb(color: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB in [0, 1], IEC 61966-2-1; `pictures/tone.py` does it in torch."""
+    import numpy as np
+
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
 @dataclass(frozen=True, kw_only=True)

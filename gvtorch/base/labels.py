@@ -20,9 +20,7 @@ _SPREAD = 2**22  # labels this close together are found by a table, others by bi
 
 def as_whole(where: str, values: np.ndarray) -> np.ndarray:
     """Returns labels as whole numbers: floats that are whole become int64, bool becomes uint8.
-
-    Raises:
-        ValueError: They are no whole numbers, or beyond int64.
+    Raises ValueError if they are no whole numbers, or beyond int64.
     """
     if values.dtype.kind == "b":
         return values.astype(np.uint8)
@@ -43,10 +41,8 @@ def as_whole(where: str, values: np.ndarray) -> np.ndarray:
 
 
 def distinct(where: str, parts: Iterable[np.ndarray]) -> np.ndarray:
-    """Returns (k,) int64 the labels of whole numbers that come part by part, sorted.
-
-    Raises:
-        ValueError: There are more than 2^24.
+    """Returns (k,) int64 the labels of whole numbers that come part by part, sorted; raises
+    ValueError if there are more than 2^24.
     """
     found, waiting, count = np.zeros(0, np.int64), [], 0
     for part in parts:
@@ -98,9 +94,7 @@ def indexed(where: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | No
 
 
 def counted(labels: Any) -> str:
-    """Returns how many of labels (k,) there are, without the background 0, and from where to where:
-    "12, 1 to 40".
-    """
+    """How many labels (k,) there are, without background 0, and their ends: "12, 1 to 40"."""
     found = labels[labels != 0]
     return f"{len(found)}, {int(found.min())} to {int(found.max())}" if len(found) else "0"
 

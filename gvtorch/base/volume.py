@@ -243,9 +243,7 @@ def to_numpy(values: Tensor) -> np.ndarray:
 
 
 def movable(tensor: Tensor) -> Tensor:
-    """Returns a view that can be indexed and written: torch can do neither to uint16, but to
-    int16.
-    """
+    """Returns a view that can be indexed and written, which torch can't do to uint16."""
     return tensor.view(torch.int16) if tensor.dtype == torch.uint16 else tensor
 
 

@@ -1,16 +1,25 @@
-"""`whole_file`, `write_whole`, `durable_file`: files that appear when they are whole."""
+"""`whole_file`, `write_whole`, `durable_file`: files that appear when they are whole; `write_npy`:
+arrays whose errors of writing are told; `text_path`: paths for libraries that do not take all.
+NumPy is not imported here, so that `gvtorch --help` does not wait for it.
+"""
 
 from __future__ import annotations
 
+import atexit
 import errno
+import functools
+import hashlib
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from types import SimpleNamespace
+from typing import IO, TYPE_CHECKING, Any
 
-from .text_path import text_path
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @contextmanager
@@ -74,3 +83,51 @@ def rename(draft: Path, path: Path) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def write_npy(file: IO[bytes], values: np.ndarray) -> None:
+    """Writes an array into an open file, which is not flushed; raises OSError where the disk is
+    full. NumPy's `save` and `tofile`, which it takes for files on disk, end well where it is full
+    within the last bytes, which the C library holds back.
+    """
+    import numpy as np
+
+    plain: Any = SimpleNamespace(write=file.write)
+    np.lib.format.write_array(plain, np.asarray(values), allow_pickle=False)
+
+
+def save_npy(path: Path, values: np.ndarray) -> None:
+    """Writes an array as a .npy file; raises OSError where the disk is full."""
+    with path.open("wb") as file:
+        write_npy(file, values)
+
+
+def text_path(path: str) -> str:
+    """Returns an absolute path itself, or another one of the same place, which need not exist, that
+    can be written as UTF-8, and holds no backslash (where these part no folders) and no ".__lock":
+    a link in a folder of this process, which goes when the process ends. So take it libraries that
+    do not take all: tensorstore makes "/" of backslashes and refuses folders named as its locks.
+    """
+    bytes_of = os.fsencode(path)
+    plain = path.encode(errors="replace") == bytes_of and ".__lock" not in path
+    if plain and (os.sep == "\\" or "\\" not in path):
+        return path
+    name = hashlib.sha256(bytes_of).hexdigest()[:32]
+    link = os.path.join(_folder(os.getpid()), name)
+    try:
+        os.symlink(path, link)
+    except FileExistsError:
+        pass  # made before
+    return link
+
+
+@functools.cache
+def _folder(process: int) -> str:
+    folder = tempfile.mkdtemp(prefix="gvtorch-")
+
+    def remove() -> None:
+        if os.getpid() == process:  # not in one that was forked
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(remove)
+    return folder

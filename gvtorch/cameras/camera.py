@@ -21,7 +21,6 @@ from ..base import check
 from ..base.records import Rays
 from ..base.volume import DIRECTIONS
 from ..pool.staging import upload
-from .ahead import continued
 from .models import MODELS, CameraModel, PixelRows, last_rising_angle, model_of
 
 if TYPE_CHECKING:
@@ -32,6 +31,7 @@ Up = str | Sequence[float] | Tensor  # a name of `DIRECTIONS` such as "+z", or (
 CONE = slice(16, 18)  # of `Camera.numbers`
 _NARROWEST = 1e-12  # degrees of a field of view
 _FILLED = 0.98  # of half the picture's width or height, which a box that fits takes
+_CUT = 0.1  # radians from frame to frame; a camera that turns by more is taken to have jumped
 
 
 class Frame(Enum):
@@ -47,6 +47,10 @@ class Frame(Enum):
             return cls(value)
         except ValueError:
             raise ValueError(f"{where}: frame must be 'world' or 'box', got {value!r}") from None
+
+    def unit(self, box: Tensor) -> float:
+        """Returns its unit of length, world units, given the (2, 3) box of the scene."""
+        return 1.0 if self is Frame.WORLD else float((box[1] - box[0]).max())
 
 
 class Camera:
@@ -85,10 +89,8 @@ class Camera:
         """Takes matrices (4, 4) and (3, 3), or batches (n, 4, 4) and (n, 3, 3); see the class.
 
         Args:
-            viewmats: World to camera.
-            Ks: Intrinsics.
-            width: Pixels.
-            height: Pixels.
+            viewmats, Ks: World to camera, and intrinsics.
+            width, height: Pixels.
             model: pinhole, ortho, fisheye (equidistant) or panorama (equirectangular).
             radial_coeffs: (4,) or (n, 4) of a fisheye, as OpenCV and gsplat have them.
             max_angle: Of a fisheye, degrees from the axis; pixels beyond show the background.
@@ -227,8 +229,7 @@ class Camera:
                 camera, which shows what a pinhole would at the target's distance, and 180 of a
                 fisheye, whose circle is as high as the picture, and of a panorama, which is twice
                 as wide as high.
-            width: Pixels.
-            height: Pixels.
+            width, height: Pixels.
             model: Name of the camera model.
 
         Raises:
@@ -274,9 +275,7 @@ class Camera:
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera) -> Camera:
-        """Takes kornia's `PinholeCamera` (a batch). Its pixel centres are at integers, ours at
-        +0.5.
-        """
+        """Takes kornia's `PinholeCamera` (a batch), whose pixel centres are at integers."""
         sizes = torch.stack((camera.height, camera.width)).long().unique(dim=1)
         if sizes.shape[1] != 1:
             raise ValueError("Camera.from_kornia: all cameras must have one height and width")
@@ -472,6 +471,18 @@ _ROWS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # a row a camera
 _CORNERS = list(itertools.product((0, 1), repeat=3))
 
 
+def continued(now: Tensor, before: Tensor, frames: float, moving: int, axes: slice) -> Tensor:
+    """Returns the numbers (n, c) float64 of cameras, or of rays, some frames on, given those of now
+    and of a frame ago; does not wait for the device. The first columns are `moving`, and `axes`
+    among these hold unit vectors, three columns each: where one of them turned by more than 0.1
+    radian, that row stays as it is now.
+    """
+    motion = (now - before)[:, :moving]
+    turned = motion[:, axes].unflatten(1, (-1, 3)).square().sum(2).amax(1, keepdim=True)
+    way = torch.where(turned <= _CUT * _CUT, frames * motion, 0.0)
+    return torch.cat((now[:, :moving] + way, now[:, moving:]), 1)
+
+
 def _sum_of_three(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Sums values (3, ...) times weights (3, ...) over the three, in order."""
     return values[0] * weights[0] + values[1] * weights[1] + values[2] * weights[2]
@@ -504,9 +515,7 @@ def _axes_around(up: Tensor) -> Tensor:
 
 
 def _batch(where: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:
-    """Numbers of one camera, each of its shape, or of n cameras (n, *shape), broadcast against each
-    other.
-    """
+    """Numbers of one camera (*shape), or of n cameras (n, *shape), broadcast."""
     found, sizes = [], []
     for name, (value, shape) in values.items():
         numbers = check.reals(where, name, value)

@@ -11,8 +11,7 @@ from torch.nn.functional import normalize
 from ..base.check import describe, instance, whole
 from ..base.records import Rays
 from ..pool.staging import upload
-from .ahead import continued
-from .camera import Camera, Frame
+from .camera import Camera, Frame, continued
 
 
 class CustomCamera(Camera):

@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import math
 import xml.etree.ElementTree as xml
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from ..base import check
 from ..base.messages import one_line
 from ..base.whole_file import write_whole
 from .camera import Camera, Frame
-from .rotations import quaternion_of, rotation_of
+from .motion import quaternion_of, rotation_of
 
 _FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))  # y down to y up
 _PVCC = (
@@ -77,9 +77,16 @@ def read_cameras(
         raise ValueError("read_cameras: width and height go together")
     if not (path.is_file() or path.is_dir()):  # a pipe may never end
         raise FileNotFoundError(f"cameras not found: {path}")
-    read = _reader(path)
+    readers = {".pvcc": _read_pvcc, ".json": _read_transforms}
+    if path.is_file() and path.suffix not in readers:
+        raise ValueError(
+            f"read_cameras: path must end in .pvcc or .json or be a folder of COLMAP, got {path}"
+        )
     try:
-        cameras = read(path, width, height)
+        if path.is_dir():
+            cameras = _read_colmap(path)
+        else:
+            cameras = readers[path.suffix](path, width, height)
     except (KeyError, IndexError, TypeError, ArithmeticError, xml.ParseError) as error:
         told = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{path}: can't be read as cameras: {one_line(told)}") from None
@@ -90,17 +97,6 @@ def read_cameras(
     if width is None or height is None:
         return cameras
     return {name: _scaled(camera, width, height) for name, camera in cameras.items()}
-
-
-def _reader(path: Path) -> Callable[[Path, int | None, int | None], dict[str, Camera]]:
-    if path.is_dir():
-        return _read_colmap
-    known = {".pvcc": _read_pvcc, ".json": _read_transforms}
-    if path.suffix not in known:
-        raise ValueError(
-            f"read_cameras: path must end in .pvcc or .json or be a folder of COLMAP, got {path}"
-        )
-    return known[path.suffix]
 
 
 def write_cameras(
@@ -152,21 +148,9 @@ def _scaled(camera: Camera, width: int, height: int) -> Camera:
     Ks = camera.Ks[0].clone()
     Ks[0] *= width / camera.width
     Ks[1] *= height / camera.height
-    return _camera(camera.viewmats[0], Ks, width, height, camera)
-
-
-def _camera(
-    view: Tensor, Ks: Tensor, width: int, height: int, like: Camera | None = None
-) -> Camera:
-    bends = like is not None and like.distorted
-    return Camera(
-        view,
-        Ks,
-        width,
-        height,
-        model="pinhole" if like is None else like.model,
-        radial_coeffs=like.radial_coeffs[0] if like is not None and bends else None,
-    )
+    bends = camera.radial_coeffs[0] if camera.distorted else None
+    view, model = camera.viewmats[0], camera.model
+    return Camera(view, Ks, width, height, model=model, radial_coeffs=bends)
 
 
 # ParaView.
@@ -238,13 +222,11 @@ def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[
         fx = told["fl_x"] if "fl_x" in told else 0.5 * x / math.tan(told["camera_angle_x"] / 2)
         fy = told.get("fl_y", fx)
         cx, cy = told.get("cx", x / 2), told.get("cy", y / 2)
-        name, model = (
-            told.get("file_path", f"{number:04d}.png"),
-            told.get("camera_model", "PINHOLE"),
-        )
-        if str(name) in cameras:
-            raise ValueError(f"frame {number}: there is one of {str(name)!r} already")
-        cameras[str(name)] = _made(model, view, (fx, fy, cx, cy), told, (x, y))
+        name = str(told.get("file_path", f"{number:04d}.png"))
+        if name in cameras:
+            raise ValueError(f"frame {number}: there is one of {name!r} already")
+        model = told.get("camera_model", "PINHOLE")
+        cameras[name] = _made(model, view, (fx, fy, cx, cy), told, (x, y))
     return cameras
 
 
@@ -297,8 +279,7 @@ def _lens(camera: Camera) -> tuple[str, dict[str, float]]:
 # COLMAP.
 
 
-def _read_colmap(path: Path, width: int | None, height: int | None) -> dict[str, Camera]:
-    del width, height
+def _read_colmap(path: Path) -> dict[str, Camera]:
     lenses: dict[str, tuple[str, dict[str, float], tuple[int, int]]] = {}
     for line in _lines(path / "cameras.txt"):
         number, model, x, y, *values = line.split()

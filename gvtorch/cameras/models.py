@@ -124,12 +124,9 @@ class Model(ABC):
 
     def fit(self, corners: Tensor, half_x: float, half_y: float) -> tuple[Tensor, Tensor]:
         """Returns from how far the corners of a box are in the picture, and the distance that a
-        parallel camera's focal lengths are divided by, (n,) each.
-
-        Args:
-            corners: (n, 8, 3) from the box's centre, along the camera's axes.
-            half_x: Half of the width that they may take, on the image plane at distance 1.
-            half_y: Half of the height.
+        parallel camera's focal lengths are divided by, (n,) each. Corners (n, 8, 3) are told from
+        the box's centre, along the camera's axes; they may take half a width and half a height on
+        the image plane at distance 1.
         """
         across, depth = self.reach(corners, half_x, half_y), corners[..., 2]
         away = (across - depth).amax(1)
@@ -252,9 +249,7 @@ def model_of(where: str, name: str) -> Model:
 
 
 def distort(angle: Tensor, k: Tensor) -> Tensor:
-    """Distance from the middle, in focal lengths, at an angle (..., w), by (..., 4) coefficients
-    that broadcast against it.
-    """
+    """Distance from the middle, in focal lengths, at angles (..., w), by (..., 4) coefficients."""
     a2, (k1, k2, k3, k4) = angle * angle, k.split(1, -1)
     return angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
 

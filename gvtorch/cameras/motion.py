@@ -8,7 +8,8 @@ passes through every key without a jump of velocity.
 
 Source: Kim, Kim and Shin, "A general construction scheme for unit quaternion curves with simple
 high order derivatives", SIGGRAPH 1995 (cumulative Bernstein basis), here in the group of
-similarities; its exponential: Eade, "Lie groups for 2D and 3D transformations", 2013.
+similarities; its exponential: Eade, "Lie groups for 2D and 3D transformations", 2013; Shepperd,
+"Quaternion from rotation matrix", 1978.
 """
 
 from __future__ import annotations
@@ -21,8 +22,6 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from .rotations import quaternion_of
-
 _FASTEST = 2.0  # times the slower of the neighbouring intervals' speeds, at a key
 
 
@@ -30,13 +29,8 @@ class Motion:
     """Poses (4, 4) float64 by time."""
 
     def __init__(self, times: Sequence[float], poses: Sequence[Tensor], closed: bool) -> None:
-        """Takes the keys.
-
-        Args:
-            times: Seconds, increasing.
-            poses: (4, 4) float64 each: a rotation times a positive scale, and a shift; the last row
-                is (0, 0, 0, 1).
-            closed: The last pose is the first, and the path runs on through it.
+        """Takes the keys: times, increasing; poses (4, 4) float64, a rotation times a positive
+        scale and a shift each; whether the last is the first, and the path runs on through it.
         """
         self._times, self._poses = list(times), list(poses)
         spans = [b - a for a, b in pairwise(times)]
@@ -102,9 +96,7 @@ def logarithm(pose: Tensor) -> Tensor:
 
 
 def _flow(step: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the scaled rotation (3, 3) to which growth and turning lead in the time 1, and its
-    integral over that time.
-    """
+    """The scaled rotation (3, 3) that growth and turning make in the time 1, and its integral."""
     growth, angle = float(step[0]), float(step[1:4].norm())
     x, y, z = (step[1:4] / angle if angle > 0 else step[1:4]).tolist()
     across = step.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -131,3 +123,32 @@ def _turn(rotation: Tensor) -> Tensor:
     length = float(xyz.norm())
     angle = 2 * math.atan2(length, w)
     return xyz * (angle / length) if length > 0 else xyz
+
+
+def quaternion_of(rotation: Tensor) -> list[float]:
+    """Returns the unit quaternion w >= 0, x, y, z of a rotation (3, 3), float64."""
+    r = rotation
+    trace = float(r.trace())
+    squares = [1 + trace, *(1 + 2 * float(r[n, n]) - trace for n in range(3))]  # 4 w^2, 4 x^2, ...
+    largest = max(range(4), key=squares.__getitem__)
+    skew = [float(r[2, 1] - r[1, 2]), float(r[0, 2] - r[2, 0]), float(r[1, 0] - r[0, 1])]
+    if largest == 0:
+        q = [squares[0], *skew]
+    else:
+        i = largest - 1
+        q = [skew[i], *(float(r[i, n] + r[n, i]) for n in range(3))]
+        q[largest] = squares[largest]
+    length = sum(n * n for n in q) ** 0.5 * (-1 if q[0] < 0 else 1)
+    return [n / length for n in q]
+
+
+def rotation_of(quaternion: Sequence[float]) -> Tensor:
+    """Returns the rotation (3, 3) of w, x, y, z of any length but 0."""
+    length = sum(n * n for n in quaternion) ** 0.5
+    w, x, y, z = (n / length for n in quaternion)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)

@@ -143,8 +143,7 @@ class CameraPath:
 
         Args:
             at: 0 for the first key, 1 for the last; keys are evenly spaced.
-            width: Pixels.
-            height: Pixels.
+            width, height: Pixels.
             model: Name of the camera model.
         """
         at = check.number("CameraPath", "at", at, low=0, high=1)

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from ..base.branches import in_branches
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
-from ..cache import Cache, Scheduler
 from ..cache.requests import below, levels_wanted
 from ..cache.write import Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
 from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
 from .parents import first_ones, parent_bricks, ready
+from .production import Production
 from .recorded import RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
 from .stats import FrameStats, Readbacks
@@ -37,18 +37,8 @@ class Unchecked(NamedTuple):
 class DeviceFrame(RecordedFrame):
     """Frames of an engine whose producers all answer on the device (`Producer.on_device`)."""
 
-    def __init__(
-        self,
-        cache: Cache,
-        trees: Sequence[ProducedTree],
-        scheduler: Scheduler,
-        batch: int,
-        fit: bool,
-        by_level: bool,
-    ) -> None:
-        """See `RecordedFrame`. `by_level`: levels are loaded one by one."""
-        super().__init__(cache, trees, scheduler, batch, fit)
-        self._by_level = by_level
+    def __init__(self, production: Production, batch: int, fit: bool) -> None:
+        super().__init__(production, batch, fit)
         # What was made last and is to be subdivided in turn: nodes and their priorities.
         self._below = self._unused.new_zeros((batch, 2)) - 1
         self.serve()  # loads what is loaded at first use; nothing is asked for
@@ -83,10 +73,8 @@ class DeviceFrame(RecordedFrame):
         self._subdivide(self._answers(REQUEST_SUBDIVIDE, chosen), chosen, priority)
 
     def deeper(self, readbacks: Readbacks) -> int:
-        """Returns what subdivisions wanted in the mean when the host last knew; 0 where each level
-        needs its bricks first.
-        """
-        return 0 if self._by_level else readbacks.deeper
+        """What subdivisions wanted in the mean, as far as known; 0 if levels need bricks first."""
+        return 0 if self._production.by_level else readbacks.deeper
 
     def _levels(self) -> Tensor:
         word = self._requests[:, 1].flatten()
@@ -117,9 +105,7 @@ class DeviceFrame(RecordedFrame):
             self._made[5:] += failed
 
     def _subdivide(self, answers: Sequence[Unchecked], chosen: Tensor, priority: Tensor) -> None:
-        """Subdivides nodes (batch,), and notes which of their children are to be subdivided, too,
-        those of the first nodes first.
-        """
+        """Subdivides nodes (batch,), and notes which children to subdivide, too, in order."""
         free = self._unused[:1]
         slot, wide = torch.full_like(chosen, -1), torch.zeros_like(chosen)
         for answer in answers:

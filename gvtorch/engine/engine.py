@@ -45,8 +45,6 @@ from .host_frame import HostFrame
 from .production import Failure, Production
 from .ray_subsets import RaySubsets, scouts
 from .renewal import renew_tree
-from .request_batch import ProducedTree
-from .serving import Serving
 from .setup import (
     EngineOptions,
     EngineSettings,
@@ -90,8 +88,7 @@ class Engine:
         trees: Trees and their producers, by name.
         cache: Pools, order of use and requests.
         scheduler: Which requests are served.
-        production: What is on its way, and what failed.
-        serving: Chooses among the requests of a frame, and asks for these nodes.
+        production: Serves requests; what is on its way, and what failed.
         readbacks: The frames whose counts are on their way to the host.
         frames: Number of the last picture.
     """
@@ -110,11 +107,8 @@ class Engine:
             ProductionError: A root can't be produced.
         """
         check.known("Engine", options, EngineSettings)
-        self.options, self.lock, self._rendering = (
-            EngineOptions(**options),
-            threading.RLock(),
-            False,
-        )
+        self.options, self.lock = EngineOptions(**options), threading.RLock()
+        self._rendering = False
         self.device = check.device("Engine", self.options.device)
         producers = dict(scene) if isinstance(scene, Mapping) else {"scene": scene}
         for name in producers:
@@ -128,11 +122,9 @@ class Engine:
             subdivisions=self.options.subdivide_budget,
             milliseconds=self.options.time_budget,
         )
-        self.production = Production(self.cache, self.scheduler, self.options.strict)
-        self.trees: dict[str, ProducedTree] = {}
-        self.serving = Serving(
-            self.cache, self.scheduler, self.production, self.trees, self._by_level
-        )
+        by_level = self.options.loading == "levels"
+        self.production = Production(self.cache, self.scheduler, by_level, self.options.strict)
+        self.trees = self.production.trees
         self.readbacks = Readbacks()
         self.frames, self._closed = 0, False
         self._missed: Tensor | None = None  # (r,) bool, of the last picture's rays
@@ -202,7 +194,7 @@ class Engine:
     def _tracers(self, shaders: Shaders, options: RenderOptions, box: Tensor) -> list[TreeTrace]:
         """What traces rays through each tree of a scene, given its (2, 3) box."""
         scene = {name: (one.tree, one.producer.channels) for name, one in self.trees.items()}
-        by_level, frame_1 = self._by_level, self.cache.frame_1
+        by_level, frame_1 = self.production.by_level, self.cache.frame_1
         return tree_traces(
             "frame", scene, shaders, options, box, by_level=by_level, frame_1=frame_1
         )
@@ -224,7 +216,6 @@ class Engine:
                 self._rendering = False
 
     def _new_frame(self, options: RenderOptions) -> Iterator[FrameStats]:
-        """See `new_frame`."""
         stats = FrameStats(
             frame=self.frames + 1,
             backend=choose_backend(options.backend, self.device),
@@ -264,7 +255,7 @@ class Engine:
             return
         if last is not None:  # nothing was written since it was traced: its nodes are still there
             self.scheduler.begin()
-            self.serving.serve(last.requests, last.wait(), stats)
+            self.production.serve(last.requests, last.wait(), stats)
         with stage("write"):
             self.production.write(self.production.late(), stats)
 
@@ -311,7 +302,7 @@ class Engine:
             collected = self.collect_requests_and_use(hits.samples[:0])
             counts = Counts(*collected.numbers.tolist())  # what misses something waits anyway
             add(stats.requests, counts.by_kind())
-            self.serving.serve(collected.requests, counts, stats)
+            self.production.serve(collected.requests, counts, stats)
 
     def trace(
         self, view: View, progress: Progress = no_progress, again: Again | None = None
@@ -508,10 +499,7 @@ class Engine:
         check.instance("capture", "fit", fit, bool)
         again = partial(self.frame, shader=shader, **options)
         again(camera)  # loads what is loaded at first use
-        trees = [*self.trees.values()]
-        served = make_recorded_frame(
-            self.cache, trees, self.scheduler, batch, self.production, self._by_level, fit
-        )
+        served = make_recorded_frame(self.production, batch, fit)
         if fit and served is None:
             raise ValueError(
                 "Engine.capture: fit needs replays that serve: all producers on_device, or all "
@@ -520,10 +508,6 @@ class Engine:
         if isinstance(served, HostFrame):
             self.recorded.append(served)
         return FrameGraph(self, view, served, again, look_ahead)
-
-    @property
-    def _by_level(self) -> bool:
-        return self.options.loading == "levels"
 
     @property
     def steady(self) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
@@ -16,7 +16,7 @@ from torch import Tensor
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
 from ..base.records import Hits
 from ..base.volume import movable
-from ..cache import KINDS, Cache, Scheduler
+from ..cache import KINDS, Cache
 from ..cache.write import Children, Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
 from ..pool.staging import TableRows
 from ..producers import Bricks, Region, Regions
@@ -39,21 +39,11 @@ class HostFrame(RecordedFrame):
     that brings them, and posted; the next frame sends what has come, and writes it.
     """
 
-    def __init__(
-        self,
-        cache: Cache,
-        trees: Sequence[ProducedTree],
-        scheduler: Scheduler,
-        batch: int,
-        fit: bool,
-        production: Production,
-    ) -> None:
-        """See `RecordedFrame`; `production` knows what failed."""
-        super().__init__(cache, trees, scheduler, batch, fit)
-        self._production = production
+    def __init__(self, production: Production, batch: int, fit: bool) -> None:
+        super().__init__(production, batch, fit)
         device = self._unused.device
-        self._mail = [Mail(_boxes(cache, one), batch, device) for one in trees]
-        self._by_tree = {one.tree.number: n for n, one in enumerate(trees)}
+        self._mail = [Mail(_boxes(self.cache, one), batch, device) for one in self.trees]
+        self._by_tree = {one.tree.number: n for n, one in enumerate(self.trees)}
         self.turn = 0  # answers to what was asked before the last `release` are dropped
         self._asked = self._done = 0  # rows, since then
         self.active = False  # whether frames have been rendered since then
@@ -206,27 +196,27 @@ class HostFrame(RecordedFrame):
                 mine = rows[rows[:, 1] == source.tree.number]
                 if len(mine):
                     targets = Targets(source.tree, mine[:, 0].clone(), mine[:, 2:].clone())
-                    self._submit(turn, RequestBatch(source, kind, targets, on_host=True))
+                    self._submit(RequestBatch(source, kind, targets, turn=turn))
 
-    def _submit(self, turn: int, batch: RequestBatch) -> None:
+    def _submit(self, batch: RequestBatch) -> None:
         """Asks for a batch; a producer that raised is asked again for each half."""
 
         def arrived(future: Future) -> None:
             there = self._waiting.pop(future, None) is not None  # else it was given up
             self._go_on()
-            if there and turn == self.turn:
-                self._settle(turn, batch, future.result)
+            if there and batch.turn == self.turn:
+                self._settle(batch, future.result)
 
         try:
             answer = batch.ask()
         except Exception as error:
-            self._split(turn, batch, error)
+            self._split(batch, error)
             return
         if isinstance(answer, Future):
             self._waiting[answer] = time.monotonic() + batch.source.patience, batch
             answer.add_done_callback(arrived)
         else:
-            self._settle(turn, batch, lambda: answer)
+            self._settle(batch, lambda: answer)
 
     def _give_up(self) -> None:
         """Counts answers as failed that have not come in time."""
@@ -234,92 +224,83 @@ class HostFrame(RecordedFrame):
         for future, (until, batch) in list(self._waiting.items()):
             if until < now and self._waiting.pop(future, None) is not None:
                 future.cancel()
-                self._fail(self.turn, batch, f"no answer within {batch.source.patience:g} s")
+                self._fail(batch, f"no answer within {batch.source.patience:g} s")
 
-    def _split(self, turn: int, batch: RequestBatch, error: Exception) -> None:
+    def _split(self, batch: RequestBatch, error: Exception) -> None:
         if len(batch) == 1:
-            self._fail(turn, batch, f"{type(error).__name__}: {error}", error)
+            self._fail(batch, f"{type(error).__name__}: {error}", error)
             return
         for half in batch.halves():
-            self._submit(turn, half)
+            self._submit(half)
 
-    def _settle(self, turn: int, batch: RequestBatch, answer: Callable[[], Any]) -> None:
+    def _settle(self, batch: RequestBatch, answer: Callable[[], Any]) -> None:
         """Checks an answer and posts it, in whatever thread brings it."""
         try:
             given = answer()
         except CancelledError:
             return  # the producer is closed
         except Exception as error:
-            self._split(turn, batch, error)
+            self._split(batch, error)
             return
         try:
             checked = batch.check(given)
-            bad = self._name_errors(turn, batch, checked)
-            good = (~bad).nonzero()[:, 0]
+            failed, keep = batch.failed(checked)
+            for node, message in failed.items():
+                self._fail(batch[node : node + 1], message)
+            good = keep.nonzero()[:, 0]
             if isinstance(checked, Regions):
-                self._post_tiles(turn, batch, checked, good)
+                self._post_tiles(batch, checked, good)
             else:
-                self._post_bricks(turn, batch, checked, good)
+                self._post_bricks(batch, checked, good)
         except ValueError as error:
-            self._fail(turn, batch, str(error), error)
+            self._fail(batch, str(error), error)
 
-    def _name_errors(self, turn: int, batch: RequestBatch, answer: Regions | Bricks) -> Tensor:
-        """(k,) bool, which nodes of a batch have an item that failed; names them."""
-        bad = torch.zeros(len(batch), dtype=torch.bool)
-        for node, message in batch.failed(answer).items():
-            bad[node] = True
-            self._fail(turn, batch[node : node + 1], message)
-        return bad
-
-    def _fail(
-        self, turn: int, batch: RequestBatch, message: str, cause: BaseException | None = None
-    ) -> None:
+    def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
         """Counts and names a batch's nodes; they stay marked as pending: no ray asks again."""
         with self._lock:
-            if turn == self.turn:
+            if batch.turn == self.turn:
                 self._done += len(batch)
                 self._production.failures.add(batch, message, cause)
 
-    def _post_tiles(self, turn: int, batch: RequestBatch, answer: Regions, good: Tensor) -> None:
+    def _post_tiles(self, batch: RequestBatch, answer: Regions, good: Tensor) -> None:
         if answer.alias is not None:
-            self._leave_to_host(turn, batch[good])
+            self._leave_to_host(batch[good])
             return
         made, targets = children_of(batch, answer, self.cache), batch.targets
         rows = {"node": targets.node, "loc": targets.loc, "child": made.child, "brick": made.brick}
         fields = {"constants": made.constants, "ranges": made.ranges}
-        self._post(turn, batch, "tiles", rows, fields, good)
+        self._post(batch, "tiles", rows, fields, good)
 
-    def _post_bricks(self, turn: int, batch: RequestBatch, answer: Bricks, good: Tensor) -> None:
+    def _post_bricks(self, batch: RequestBatch, answer: Bricks, good: Tensor) -> None:
         fields: dict[str, Mapping[str, Any]]
         targets, kind = batch.targets, answer.kind
         rows = {"node": targets.node, "loc": targets.loc}
         data = {n: d.gather() if isinstance(d, TableRows) else d for n, d in answer.data.items()}
         fields = {"data": data}
         if kind is None:
-            self._post(turn, batch, "bricks", rows, fields, good)
+            self._post(batch, "bricks", rows, fields, good)
             return
         alias = kind[good] == Region.ALIAS
         if bool(alias.any()):
-            self._leave_to_host(turn, batch[good[alias]])
+            self._leave_to_host(batch[good[alias]])
         word = brick_words(kind)
         bare = word[good] != ABSENT
-        self._post(turn, batch, "bricks", rows, fields, good[~bare & ~alias])
+        self._post(batch, "bricks", rows, fields, good[~bare & ~alias])
         known = {
             name: torch.zeros((len(kind), one.width), dtype=one.dtype)
             for name, one in batch.source.producer.channels.items()
         }
         fields = {"constants": {**known, **answer.constants}}
-        self._post(turn, batch, "bare", {**rows, "word": word}, fields, good[bare])
+        self._post(batch, "bare", {**rows, "word": word}, fields, good[bare])
 
-    def _leave_to_host(self, turn: int, batch: RequestBatch) -> None:
+    def _leave_to_host(self, batch: RequestBatch) -> None:
         """Lets `Engine.frame` ask again, which can look up what an alias stands for."""
         self.host_needed = True
         bit = torch.full((len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
-        self._post(turn, batch, "again", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
+        self._post(batch, "again", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
 
     def _post(
         self,
-        turn: int,
         batch: RequestBatch,
         box: str,
         rows: Mapping[str, Tensor],
@@ -333,7 +314,7 @@ class HostFrame(RecordedFrame):
         mail = self._mail[self._by_tree[batch.source.tree.number]]
         some = {n: movable(t)[which].view(t.dtype) for n, t in {**rows, **flat}.items()}
         with self._lock:
-            if turn == self.turn:
+            if batch.turn == self.turn:
                 mail.post(box, some)
 
 

@@ -27,9 +27,7 @@ def ready(cache: Cache, node: Tensor, depth: int) -> Tensor:
 
 
 def first_ones(node: Tensor) -> Tensor:
-    """Returns nodes (k,) with repeated ones replaced by -1, all but the first. The host does not
-    wait.
-    """
+    """Returns nodes (k,) with -1 wherever one comes again. The host does not wait."""
     held, order = node.sort(stable=True)
     again = torch.zeros_like(held, dtype=torch.bool)
     again[1:] = held[1:] == held[:-1]

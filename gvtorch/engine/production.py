@@ -1,6 +1,6 @@
-"""`Production`: asks producers for what was requested, and writes their answers into the slots of
-the cache, at once or later. A node that fails is counted and named, and not asked for again; its
-ancestors stand in for it, and other nodes are not affected.
+"""`Production`: chooses among the requests of a frame, asks producers for these nodes, and writes
+their answers into the slots of the cache, at once or later. A node that fails is counted and named,
+and not asked for again; its ancestors stand in for it, and other nodes are not affected.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT
-from ..cache import KINDS, Cache, Scheduler, write
+from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
+from ..base.stage import stage
+from ..cache import KINDS, Cache, RequestList, Scheduler, write
+from ..cache.requests import Requests, coarser_requests, deeper, levels_wanted, requests_below
 from ..cache.write import Targets, Written
 from ..pool import Staging
 from ..pool.staging import Shipment, upload
@@ -33,7 +35,7 @@ from .request_batch import (
     send_ahead,
     shipped,
 )
-from .stats import FrameStats
+from .stats import Counts, FrameStats
 
 _MOST_RAISES = 256  # calls in one frame that may raise before whole batches are given up
 _LONGEST = 1e6  # seconds
@@ -139,12 +141,15 @@ class Production:
     """What is on its way from the producers into the pools.
 
     Attributes:
+        trees: Trees and their producers, by name.
+        by_level: Whether each level needs its bricks before it is subdivided.
         failures: What failed.
         staging: The way of bricks from the host to a CUDA device; None where they are there.
     """
 
-    def __init__(self, cache: Cache, scheduler: Scheduler, strict: bool) -> None:
-        self.cache, self.scheduler = cache, scheduler
+    def __init__(self, cache: Cache, scheduler: Scheduler, by_level: bool, strict: bool) -> None:
+        self.cache, self.scheduler, self.by_level = cache, scheduler, by_level
+        self.trees: dict[str, ProducedTree] = {}
         self.failures = Failures(strict)
         self._raised = self._skipped = 0
         self._waiting: list[_Waiting] = []
@@ -170,9 +175,7 @@ class Production:
         return {kind: sum(len(b) for b in batches if b.kind == kind) for kind in KINDS.values()}
 
     def room(self) -> dict[int, list[int]]:
-        """For each kind, how many slots may be taken that no answer on its way needs; see
-        `Cache.room`.
-        """
+        """For each kind, how many free slots no answer on its way needs; see `Cache.room`."""
         room, batches = self.cache.room(), self._under_way()
         for kind, free in room.items():
             for number in range(len(free)):
@@ -180,13 +183,54 @@ class Production:
                 free[number] = max(0, free[number] - sum(map(len, known)))
         return room
 
-    def ask(self, trees: Sequence[ProducedTree], chosen: Mapping[int, Tensor]) -> list[Answered]:
+    def serve(self, listed: RequestList, counts: Counts, stats: FrameStats) -> None:
+        """Lets slots be taken again, chooses requests, asks the producers, and writes the answers
+        that are here at once. Recorded frames do the same on the device (`RecordedFrame`).
+        """
+        cache, scheduler = self.cache, self.scheduler
+        cache.make_room(counts.tiles_unused, counts.bricks_unused, counts.coarse_unused)
+        if not counts.listed:
+            return
+        with stage("schedule"):
+            requests = listed.by_kind(cache, counts.by_kind())
+            room = self.room()
+            nodes, deferred, exceeded = scheduler.choose(requests, room)
+            if exceeded:
+                coarser = coarser_requests(cache, requests, room)
+                nodes, deferred, _ = scheduler.choose(coarser, room)
+            stats.deferred += deferred
+            stats.capacity_exceeded |= exceeded
+        self._produce(nodes, stats)
+        if counts.subdivide and not (exceeded or self.by_level):
+            self._deepen(requests[REQUEST_SUBDIVIDE], stats)
+
+    def _produce(self, nodes: Mapping[int, Tensor], stats: FrameStats) -> None:
+        with stage("produce"):
+            answers = self.ask(nodes)
+        with stage("write"):
+            self.write(answers, stats)
+
+    def _deepen(self, asked: Requests, stats: FrameStats) -> None:
+        """Subdivides what has come of subdivisions, too, where rays will want it, before they ask:
+        by as many levels as the subdivisions want in the mean.
+        """
+        branching = max(source.layout.branching for source in self.trees.values())
+        for _ in range(deeper(levels_wanted(asked.priority, branching).tolist())):
+            with stage("schedule"):
+                requests = requests_below(self.cache, asked, branching)
+                asked = requests[REQUEST_SUBDIVIDE]
+                nodes = self.scheduler.choose(requests, self.room()).nodes
+            if not any(map(len, nodes.values())):
+                break
+            self._produce(nodes, stats)
+
+    def ask(self, chosen: Mapping[int, Tensor]) -> list[Answered]:
         """Asks for the chosen (k,) nodes of each kind; returns answers that are here at once."""
         self._raised = 0
         answered: list[Answered] = []
         for kind, nodes in chosen.items():
             self.scheduler.spent[kind] += len(nodes)
-            for source, node in self._by_tree(trees, nodes):
+            for source, node in self._by_tree(nodes):
                 targets = Targets(source.tree, node, source.tree.loc(node))
                 batch = RequestBatch(source, kind, targets)
                 if kind == REQUEST_LOAD and source.producer.needs_parent:
@@ -233,9 +277,7 @@ class Production:
         stats.pending, stats.failed = sum(self.pending.values()), len(self.failures)
 
     def wait(self, more: float = 0.0, limit: float = _LONGEST) -> None:
-        """Waits until an answer is here, or until patience ends, at most `limit` seconds; then up
-        to `more` seconds for the others.
-        """
+        """Waits for an answer, until patience or `limit` seconds end; then `more` for others."""
         if self._waiting and not self._held:
             left = min(item.left for item in self._waiting)
             futures = [item.future for item in self._waiting]
@@ -271,10 +313,9 @@ class Production:
         pending = sum(self.pending.values())
         return f"Production({pending} nodes on their way, {len(self.failures)} failed)"
 
-    def _by_tree(
-        self, trees: Sequence[ProducedTree], node: Tensor
-    ) -> list[tuple[ProducedTree, Tensor]]:
+    def _by_tree(self, node: Tensor) -> list[tuple[ProducedTree, Tensor]]:
         """The nodes of each tree, of those that have any."""
+        trees = [*self.trees.values()]
         if not len(node):
             return []
         if len(trees) == 1:
@@ -313,22 +354,17 @@ class Production:
         answer, raised = _outcome(batch.ask)
         if isinstance(answer, Future):
             if not answer.done():
-                self._wait_for(batch, answer)
+                self._mark(batch)
+                ahead, patience = self._sent_ahead(batch, answer), batch.source.patience
+                self._waiting.append(_Waiting(batch, answer, ahead, patience, time.monotonic()))
                 return []
             answer, raised = _outcome(answer.result)
         answered = self._settle(batch, answer, raised)
         self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
         return answered
 
-    def _wait_for(self, batch: RequestBatch, asked: Future) -> None:
-        self._mark(batch)
-        future, patience = self._sent_ahead(batch, asked), batch.source.patience
-        self._waiting.append(_Waiting(batch, asked, future, patience, time.monotonic()))
-
     def _sent_ahead(self, batch: RequestBatch, asked: Future) -> Future:
-        """A future that is done once bricks from the host are checked and on their way: all that is
-        left to the frame is to write them.
-        """
+        """A future that is done once bricks from the host are checked and on their way."""
         staging = self.staging
         if staging is None or batch.kind != REQUEST_LOAD:
             return asked
@@ -359,11 +395,9 @@ class Production:
             self._fail(batch, str(error), error)
             return []
         if checked.errors:
-            failed = batch.failed(checked)
+            failed, keep = batch.failed(checked)
             for node, message in failed.items():
                 self._fail(batch[node : node + 1], message)
-            keep = torch.ones(len(batch), dtype=torch.bool)
-            keep[list(failed)] = False
             rows = keep.repeat_interleave(batch.per_node).nonzero()[:, 0]
             batch, checked = batch[keep.nonzero()[:, 0]], checked.rows(rows)
         return [Answered(batch, shipped(batch, checked, self.staging))] if len(batch) else []

@@ -5,25 +5,22 @@ taken hold node -1.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..base.branches import in_branches
-from ..base.constants import (
-    REQUEST_KINDS,
-    REQUEST_PENDING_SHIFT,
-)
+from ..base.constants import REQUEST_KINDS, REQUEST_PENDING_SHIFT
 from ..base.records import Hits
-from ..cache import Cache, RequestList, Scheduler
+from ..cache import RequestList
 from ..cache.requests import DEEPER
 from ..cache.write import put_rows_of
 from ..cameras.camera import CONE
 from ..ops import choose_requests
 from ..tracing.pixels import View
-from .request_batch import ProducedTree
+from .production import Production
 from .stats import COARSER_UNIT, Collected, Readbacks
 
 _MOST_LISTED = 1 << 14  # nodes whose requests are listed, or as many as a batch holds
@@ -49,17 +46,11 @@ class RecordedFrame:
 
     host_needed = False
 
-    def __init__(
-        self,
-        cache: Cache,
-        trees: Sequence[ProducedTree],
-        scheduler: Scheduler,
-        batch: int,
-        fit: bool,
-    ) -> None:
+    def __init__(self, production: Production, batch: int, fit: bool) -> None:
         """Takes the memory of what a frame leaves to the next one. `fit`: see `Engine.capture`."""
-        self.cache, self.trees, self.batch = cache, trees, batch
-        self._coarse_first = scheduler.order == "coarse"
+        self._production, self.batch = production, batch
+        self.trees = [*production.trees.values()]
+        self.cache = cache = production.cache
         self._most = min(max(_MOST_LISTED, batch), cache.nodes.request_tn.numel())
         device = cache.frame_1.device
         # What the last picture asked for, and what the next ones will: nodes and their words.
@@ -106,9 +97,7 @@ class RecordedFrame:
         return 0
 
     def finish(self, hits: Hits) -> Collected:
-        """Brings slots into the order of use and counts; what the picture used is counted apart
-        from what `look` used.
-        """
+        """Orders slots by use, and counts what the picture used apart from what `look` used."""
         use, samples = in_branches(
             self.cache.sort_by_use, lambda: hits.samples.sum(dtype=torch.int64).view(1)
         )
@@ -127,11 +116,8 @@ class RecordedFrame:
     def _widen_cones(self, use: Tensor, count: Tensor) -> None:
         """Makes the next frame's cones wider if the pools can't hold what this one used and asked
         for, and narrower again, down to the camera's, if there is room. A surface takes bricks as
-        the inverse square of the cones' width.
-
-        Args:
-            use: (5,) int64 as `Cache.sort_by_use` tells.
-            count: (5,) int64 as `compact_requests` tells: what is pending counts as asked for.
+        the inverse square of the cones' width. `use` is what `Cache.sort_by_use` tells, `count`
+        what `compact_requests` does: what is pending counts as asked for.
         """
         nodes, bricks = self.cache.nodes.capacity, self.cache.bricks.capacity
         taken = torch.stack(((use[3] + count[2]) / bricks, (use[1] + count[4]) / nodes)).amax()
@@ -155,7 +141,7 @@ class RecordedFrame:
             self._unused,
             nodes.nodes_per_tile,
             self.batch,
-            self._coarse_first,
+            self._production.scheduler.order == "coarse",
         )
         return Chosen(node[0], priority[0]), Chosen(node[1], priority[1])
 

@@ -68,7 +68,7 @@ class RequestBatch:
     targets: Targets  # nodes to fill, or to subdivide
     parents: Mapping[str, Tensor] | None = None  # (k, z, y, x, c) bricks, for who needs them
     coarse: bool = False  # their bricks take coarse slots
-    on_host: bool = False  # the targets lie in host memory
+    turn: int | None = None  # of a `HostFrame` that asked: the targets lie in host memory
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -88,9 +88,7 @@ class RequestBatch:
         return parts
 
     def halves(self) -> tuple[RequestBatch, RequestBatch]:
-        """The first half, and the rest: a producer that raised is asked again for each, so that one
-        bad node does not take the others with it.
-        """
+        """The first half, and the rest: asked apart, so that a bad node costs itself alone."""
         half = len(self) // 2
         return self[:half], self[half:]
 
@@ -105,7 +103,7 @@ class RequestBatch:
     @property
     def nodes(self) -> Nodes:
         """What the producer is asked about; made anew, for `Nodes` keep positions once computed."""
-        layout = self.source.host_layout if self.on_host else self.source.layout
+        layout = self.source.layout if self.turn is None else self.source.host_layout
         return Nodes(self.loc, layout, coarse=self.coarse, parents=self.parents)
 
     @cached_property
@@ -124,12 +122,16 @@ class RequestBatch:
         """How many items an answer has for each node of the batch."""
         return len(self.loc) // len(self)
 
-    def failed(self, answer: Regions | Bricks) -> dict[int, str]:
-        """Why nodes failed, by their place in the batch: the first error among a node's items."""
+    def failed(self, answer: Regions | Bricks) -> tuple[dict[int, str], Tensor]:
+        """Why nodes failed, by their place in the batch: the first error among a node's items; and
+        (k,) bool, which nodes did not.
+        """
         found: dict[int, str] = {}
         for index in sorted(answer.errors):
             found.setdefault(index // self.per_node, answer.errors[index])
-        return found
+        keep = torch.ones(len(self), dtype=torch.bool)
+        keep[list(found)] = False
+        return found, keep
 
     def alias_tree(self, answer: Regions | Bricks) -> int:
         """Number of the tree in which the alias targets of an answer lie."""
@@ -195,9 +197,7 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
 
 
 def _untold_range(cache: Cache, name: str, kind: Tensor, constant: Tensor | None) -> Tensor:
-    """(k, 2, c) a range that the producer did not tell: the constant (k, c) of CONSTANT nodes, else
-    all that the channel can hold.
-    """
+    """(k, 2, c) a range not told: the constant (k, c) of CONSTANT nodes, else the channel's."""
     channel = cache.bricks.channels[name]
     shape, dtype, device = (len(kind), channel.width), channel.dtype, kind.device
     ends = [torch.full(shape, end, dtype=dtype, device=device) for end in channel.limits]
@@ -237,9 +237,7 @@ def shipped(
 
 
 def send_ahead(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
-    """Checks an answer and sends it if it is valid voxels from the host and nothing else; any other
-    answer is returned as it is.
-    """
+    """Sends an answer that is valid voxels from the host alone; any other comes back as it is."""
     data = answer.data if isinstance(answer, Bricks) else answer
     if not isinstance(data, Mapping) or not all(
         isinstance(rows, TableRows) or (isinstance(rows, Tensor) and rows.device.type == "cpu")

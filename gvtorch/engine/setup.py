@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, TypedDict
 
@@ -12,7 +12,7 @@ from ..base import check
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.messages import one_line
 from ..base.volume import movable
-from ..cache import Cache, Scheduler
+from ..cache import Cache
 from ..cache.write import write_slots
 from ..io.resources import amount, memory_free
 from ..pool import BrickPool, Channel, N3Tree, NodePool
@@ -277,22 +277,16 @@ def _raise_first(errors: Mapping[int, str]) -> None:
 
 
 def make_recorded_frame(
-    cache: Cache,
-    trees: Sequence[ProducedTree],
-    scheduler: Scheduler,
-    batch: int,
-    production: Production,
-    by_level: bool = False,
-    fit: bool = False,
+    production: Production, batch: int, fit: bool
 ) -> DeviceFrame | HostFrame | None:
     """Returns what serves a captured frame; None where producers answer neither all on the device
     nor all from the host, have coarse channels, or need from the host what their parents hold.
     """
-    producers = [one.producer for one in trees]
+    producers = [one.producer for one in production.trees.values()]
     if any(channel.coarse for one in producers for channel in one.channels.values()):
         return None
     if all(one.on_device for one in producers):
-        return DeviceFrame(cache, trees, scheduler, batch, fit, by_level)
+        return DeviceFrame(production, batch, fit)
     if all(one.on_host and not one.needs_parent for one in producers):
-        return HostFrame(cache, trees, scheduler, batch, fit, production)
+        return HostFrame(production, batch, fit)
     return None

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from ..base import check
+from ..base.image_info import array_from_srgb
 from ..base.messages import need_library, one_line
-from ..base.srgb import array_from_srgb
 from ..meshes.mesh import MOST_FACES, Material, Mesh
 from .polygons import cut_polygons
 from .resources import amount, memory_free

@@ -18,8 +18,8 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from ..base import check
+from ..base.image_info import array_from_srgb
 from ..base.messages import need_library
-from ..base.srgb import array_from_srgb
 from ..points.points import Points
 from .budget import MOST_PACKED, header_budget
 from .packed import is_packed_fits

@@ -95,9 +95,7 @@ class ShadeArguments(NamedTuple):
     """Which fused shader, or a user's, and what it reads beside; see csrc/shaders/shaders.h."""
 
     shader: int = 0  # a `shading.shader_number`; 0 for a user's op
-    features: int = (
-        0  # how many it gives: c for features, 1 for projections (the value) and labels, else 0
-    )
+    features: int = 0  # numbers it gives: c of features, 1 of projections and labels, else 0
     normal_bzyxc: Tensor | None = None  # channel of normals, c = 3; None takes the gradient's
     normal_tnc: Tensor | None = None  # its constants
     other_bzyxc: Tensor | None = None  # second channel: colours an isosurface, or is the features

@@ -39,9 +39,7 @@ def compact_requests(
     request_tn: Requests, capacity: Positive, *, backend: Backend = "auto"
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Lists requests, at most `capacity`, and clears their words, the pending bits excepted; kinds
-    that are pending are not listed.
-
-    Mutates `request_tn`.
+    that are pending are not listed. Mutates `request_tn`.
 
     Returns:
         node_k (capacity,) node indices, rising, -1 behind them; word_k (capacity,) kinds and
@@ -140,9 +138,7 @@ def unlink(
     """Takes slots from their nodes: every pointer to them becomes ABSENT, and so does their owner.
 
     Only its owner points to a slot that is not shared; so the compiled op reads all words only
-    where a shared slot changes hands.
-
-    Mutates `pointer_tn` and `owner_s`.
+    where a shared slot changes hands. Mutates `pointer_tn` and `owner_s`.
     """
     slots = len(owner_s)
     leaving = _marked(slot_k, slots)
@@ -159,10 +155,7 @@ def orphan(
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Clears the owner of the slots that belong to the nodes of tiles that change hands.
-
-    Mutates `owner_s`.
-    """
+    """Clears in `owner_s` the owner of slots that belong to nodes of tiles that change hands."""
     tiles, per_tile = pointer_tn.shape
     leaving = _marked(tile_k, tiles)
     tile = torch.where(owner_s >= 0, owner_s // per_tile, tiles).clamp(max=tiles)
@@ -185,7 +178,6 @@ def link(
     backend: Backend = "auto",
 ) -> None:
     """Writes pointers of nodes and clears the requests that they answer, and their pending bits.
-
     Mutates `pointer_tn` and `request_tn`.
     """
     valid = (node_k >= 0) & (node_k < pointer_tn.numel())
@@ -210,7 +202,6 @@ def link_bricks(
 ) -> None:
     """Links nodes to bricks in slots, of which they become the only owners, and clears their
     requests. The slots count as used in that frame, and are first drawn in the next one.
-
     Mutates the first six.
     """
     valid = (node_k >= 0) & (node_k < brick_tn.numel())
@@ -250,9 +241,7 @@ def link_tiles(
     backend: Backend = "auto",
 ) -> None:
     """Writes tiles, links them to their parent nodes, and clears the requests of these. Words
-    beyond the `w` of the tree become TERMINAL and EMPTY.
-
-    Mutates the first eight.
+    beyond the `w` of the tree become TERMINAL and EMPTY. Mutates the first eight.
     """
     valid = (row_k >= 0) & (row_k < len(node_j)) & (tile_k >= 0) & (tile_k < len(parent_t))
     row_k, tile_k = row_k[valid], tile_k[valid]
@@ -276,10 +265,7 @@ def put_rows(
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Writes rows into slots, bytes as they are.
-
-    Mutates `target_sb`.
-    """
+    """Writes rows into slots, bytes as they are. Mutates `target_sb`."""
     valid = (slot_k >= 0) & (slot_k < len(target_sb))
     target_sb[slot_k[valid]] = rows_kb[valid]
 
@@ -334,20 +320,14 @@ def lacking(
 
 
 def cut_bricks(
-    values_zyxc: Tensor,
-    place_k3: Tensor,
-    brick_size: int,
-    border: int,
+    values_zyxc: Tensor,  # a whole level, of any dtype
+    place_k3: Tensor,  # int64 brick indices, z y x
+    brick_size: int,  # voxels along a side, without the border
+    border: int,  # voxels around
     *,
     backend: Backend = "auto",
 ) -> Tensor:
     """Cuts bricks out of a level, borders from the neighbours, clamped at the level's faces.
-
-    Args:
-        values_zyxc: (z, y, x, c) a whole level, of any dtype.
-        place_k3: (k, 3) int64 brick indices, z y x.
-        brick_size: Voxels along a side, without the border.
-        border: Voxels around.
 
     Returns:
         (k, s, s, s, c), s = brick_size + 2 * border.
@@ -367,13 +347,9 @@ def cut_bricks(
     check.whole(where, "border", border, low=0, high=2**10)
     if not values_zyxc.numel():
         raise ValueError(f"{where}: values_zyxc has no voxels, got {check.describe(values_zyxc)}")
-    arguments = (values_zyxc.contiguous(), place_k3.contiguous(), brick_size, border)
-    if choose_backend(backend, place_k3.device) == "reference":
-        return _cut_twin(*arguments)
-    return torch.ops.gvtorch.cut_bricks(*arguments)
-
-
-def _cut_twin(values_zyxc: Tensor, place_k3: Tensor, brick_size: int, border: int) -> Tensor:
+    if choose_backend(backend, place_k3.device) != "reference":
+        given = (values_zyxc.contiguous(), place_k3.contiguous())
+        return torch.ops.gvtorch.cut_bricks(*given, brick_size, border)
     reach = torch.arange(-border, brick_size + border, device=place_k3.device)
     place = place_k3.clamp(-(2**50), 2**50)  # beyond any level
     corner = place[:, :, None] * brick_size + reach  # (k, 3, s)

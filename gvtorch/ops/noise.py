@@ -9,35 +9,25 @@ from torch import Tensor
 
 from ..base import check
 from .reference import noise as twin
-from .registry import Backend, choose_backend
+from .registry import Backend, uncached_backend
 
 KINDS = twin.KINDS
 
 
 def noise(
-    point_pn: Tensor,  # (p, n)
-    kind: str,
+    point_pn: Tensor,  # float32 or float64, in cells. Beyond 2^29 counts as 0; NaN gives NaN
+    kind: str,  # perlin, value, simplex; F1, F2 or F2-F1 of cellular noise
     *,
-    seed: int = 0,
-    period: Sequence[int] = (0, 0, 0),
-    jitter: float = 1.0,
-    reach: int = 1,
+    seed: int = 0,  # another noise for each
+    period: Sequence[int] = (0, 0, 0),  # cells until it repeats along x, y, z; 0: never
+    jitter: float = 1.0,  # how far the points of cellular noise stray in their cells, 0 to 1
+    reach: int = 1,  # how many cells around its own cellular noise searches, 1 or 2
     backend: Backend = "auto",
 ) -> Tensor:
     """Evaluates a noise of one frequency at p points, in the plane (n = 2) or in space (n = 3).
 
     On all backends and devices every bit is the same. Where gradients by the points are recorded,
     the twin is evaluated, which torch can differentiate.
-
-    Args:
-        point_pn: (p, n) float32 or float64, in cells. Coordinates beyond 2^29 count as 0; NaN
-            gives NaN.
-        kind: perlin, value, simplex; F1, F2 or F2-F1 of cellular noise.
-        seed: Another noise for each.
-        period: After how many cells the noise repeats along x, y, z; 0: never.
-        jitter: How far the points of cellular noise stray in their cells, 0 to 1.
-        reach: How many cells around its own cellular noise searches, 1 or 2.
-        backend: auto, reference, cpp or cuda.
 
     Returns:
         (p,) of the same dtype.
@@ -53,17 +43,17 @@ def noise(
     if kind not in KINDS:
         raise ValueError(f"{where}: kind must be one of {KINDS}, got {kind!r}")
     check.whole(where, "seed", seed, low=-(2**63))
-    check.number(where, "jitter", jitter, low=0, high=1)
+    jitter = check.number(where, "jitter", jitter, low=0, high=1)
     check.whole(where, "reach", reach, low=1, high=2)
     if not isinstance(period, Sequence):
         raise ValueError(f"{where}: period must be numbers of cells, one an axis, got {period!r}")
-    each = (*period, 0, 0, 0)[:3]
-    for one in each:
+    x, y, z = (*period, 0, 0, 0)[:3]
+    for one in (x, y, z):
         check.whole(where, "period", one, low=0, high=2**28)
-    salt = [one & 0xFFFFFFFF for one in twin.salts(seed)]
-    arguments: tuple = (*salt, *each, float(jitter), reach)
+    number, given = KINDS.index(kind), twin.Given(twin.salts(seed), (x, y, z), jitter, reach)
     learns = torch.is_grad_enabled() and point_pn.requires_grad
-    chosen = choose_backend.__wrapped__(backend, device)  # torch.compile warns of caches
+    chosen = uncached_backend(backend, device)
     if chosen == "reference" or (learns and backend == "auto"):
-        return twin.noise(point_pn, KINDS.index(kind), *arguments)
-    return torch.ops.gvtorch.noise(point_pn.contiguous(), KINDS.index(kind), *arguments)
+        return twin.noise(point_pn, number, given)
+    numbers = (*(one & 0xFFFFFFFF for one in given.salt), x, y, z, jitter, reach)
+    return torch.ops.gvtorch.noise(point_pn.contiguous(), number, *numbers)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..base import check
 from .reference import orbits as twin
-from .registry import Backend, choose_backend
+from .registry import Backend, uncached_backend
 
 KINDS = ("power", "fold")
 
@@ -60,15 +60,11 @@ class Orbit(NamedTuple):
 
 
 def orbits(point_p3: Tensor, orbit: Orbit, backend: Backend = "auto") -> Tensor:
-    """Follows the orbits of points until they escape.
+    """Follows the orbits of points, float32 or float64 and contiguous, until they escape. NaN gives
+    NaN.
 
     On all backends and devices every bit is the same. Where gradients are recorded, the twin is
     evaluated, which torch can differentiate.
-
-    Args:
-        point_p3: (p, 3) float32 or float64, contiguous. NaN gives NaN.
-        orbit: How they go on.
-        backend: auto, reference, cpp or cuda.
 
     Returns:
         (3, p) of the same dtype: a distance, as the orbit tells it (-1 where it does not escape),
@@ -80,7 +76,7 @@ def orbits(point_p3: Tensor, orbit: Orbit, backend: Backend = "auto") -> Tensor:
     orbit.check("orbits", point_p3, [("point_p3", point_p3, "p3")])
     given = (point_p3, orbit.constant_3, orbit.bailout_1)
     learns = torch.is_grad_enabled() and any(one.requires_grad for one in given)
-    if _chosen(backend, point_p3) == "reference" or (learns and backend == "auto"):
+    if uncached_backend(backend, point_p3.device) == "reference" or (learns and backend == "auto"):
         return twin.orbits(point_p3, orbit.way())
     return torch.ops.gvtorch.orbits(point_p3, *orbit.arguments())
 
@@ -93,16 +89,9 @@ def orbit_bounds(
     Returns:
         (2, k): no distance that `orbits` gives for a point of a ball is less than the first, or
         more than the second. (-1, inf) where nothing is known.
-
-    Raises:
-        ValueError: See `orbits`.
     """
     fields = [("center_k3", center_k3, "k3"), ("reach_k", reach_k, "k")]
     orbit.check("orbit_bounds", center_k3, fields)
-    if _chosen(backend, center_k3) == "reference":
+    if uncached_backend(backend, center_k3.device) == "reference":
         return twin.orbit_bounds(center_k3, reach_k, orbit.way())
     return torch.ops.gvtorch.orbit_bounds(center_k3, reach_k, *orbit.arguments())
-
-
-def _chosen(backend: str, like: Tensor) -> str:
-    return choose_backend.__wrapped__(backend, like.device)  # torch.compile warns of caches

@@ -52,16 +52,17 @@ def choose_backend(backend: str, device: torch.device) -> str:
     return backend
 
 
+uncached_backend = choose_backend.__wrapped__  # torch.compile warns of caches
+
+
 def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
     """Makes an op of its twin: checks what comes, and calls the compiled op of the twin's name, or
     the twin, as its argument `backend` says: auto, reference, cpp or cuda.
 
     Tensors must be contiguous, on one device, and of the shape that their name ends with (of any,
     if it has no such end) and the dtype of Words, Longs, Requests, Flags, Bytes or Doubles; numbers
-    inside their range. Else the op raises ValueError.
-
-    Args:
-        also: One more check, which gets the arguments by name.
+    inside their range. Else the op raises ValueError. `also`: one more check, which gets the
+    arguments by name.
     """
 
     def made_of(twin: _Twin) -> _Twin:
@@ -311,12 +312,8 @@ _reasons = cpp_ext.load()
 if not _reasons["cpp"]:
     for _name, _fake in FAKES.items():
         _register_fake(getattr(torch.ops.gvtorch, _name), _fake)
-    _refuse_gradients(torch.ops.gvtorch.trace_rays)
-    _refuse_gradients(torch.ops.gvtorch.shade_rays)
-    _refuse_gradients(torch.ops.gvtorch.noise)
-    _refuse_gradients(torch.ops.gvtorch.splat)
-    _refuse_gradients(torch.ops.gvtorch.orbits)
-    _refuse_gradients(torch.ops.gvtorch.orbit_bounds)
+    for _name in ("trace_rays", "shade_rays", "noise", "splat", "orbits", "orbit_bounds"):
+        _refuse_gradients(getattr(torch.ops.gvtorch, _name))
     torch.library.register_autograd(
         "gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples
     )

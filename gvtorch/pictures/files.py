@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from ..base.messages import need_library, one_line
-from ..base.npy_file import save_npy
-from ..base.whole_file import whole_file
+from ..base.whole_file import save_npy, whole_file
 from .tone import finite, to_srgb
 
 if TYPE_CHECKING:

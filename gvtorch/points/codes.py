@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ..ops.reference import splat as twin
+from ..ops.splat import shares
 
 _MOST = 2**62  # codes of an int64
 
@@ -59,10 +59,10 @@ class Codes:
 
 def point_shares(edge: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Returns what each interval between edges (k, m + 1), rising, holds of points at (k,) that
-    reach as far as (k,): (k, m), float64. See the twin.
+    reach as far as (k,): (k, m), float64. See `shares`.
     """
     given = (torch.from_numpy(np.asarray(one, np.float64)) for one in (edge, center, radius))
-    return twin.shares(*given).numpy()
+    return shares(*given).numpy()
 
 
 def peak(radius: np.ndarray, size_3: np.ndarray) -> np.ndarray:

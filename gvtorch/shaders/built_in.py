@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import torch
 
-from ..base.checked import Check, as_name, flag, instance_of, kind_of, number_above, or_none
+from ..base.checked import Check, as_name, flag, instance_of, kind_of, or_none, positive
 from ..ops import ShadeArguments
 from ..ops.shading import (
     GradientMagnitudeNumbers,
@@ -120,7 +120,7 @@ class StoredColor(LitShader):
     component = 3
     checks: ClassVar[Mapping[str, Check]] = {
         "channel": as_name,
-        "reference": or_none(number_above(0)),
+        "reference": or_none(positive),
         "premultiplied": flag,
         "lit": flag,
     }

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 
 from ..base import check
-from ..base.image_info import COLORS, ChannelInfo, to_hex
-from ..base.srgb import array_from_srgb
+from ..base.image_info import COLORS, ChannelInfo, array_from_srgb, to_hex
 from ..base.volume import Volume
 from ..io.stores.store import Store
 from ..io.window import windows
@@ -283,8 +282,6 @@ def window_of(where: str, window: Sequence[float]) -> tuple[float, float]:
 
 
 def channel_color(where: str, color: Triple | str) -> Triple:
-    """Returns a colour as linear RGB, as `colors.linear_color`, of which names are those of lookup
-    tables.
-    """
+    """Returns a colour as linear RGB; names are those of lookup tables."""
     named = {name: f"#{to_hex(one)}" for name, one in COLORS.items()}
     return named_color(where, color, named)

@@ -61,30 +61,22 @@ class VolumeField:
 
 def write_colors(
     field: FinestVoxels,
-    tables: Sequence[ColorTable],
+    tables: Sequence[ColorTable],  # along x, y, z: of intervals of half a voxel
     spacing: tuple[float, float, float],
     branching: int,
     out: Sequence[Tensor],
-    progress: Progress,
+    progress: Progress,  # told ("filtered", voxels done, voxels in all)
     *,
     all_light: bool,
 ) -> None:
-    """Writes the colours of the coarse levels.
+    """Writes the colours of the coarse levels, the finest of them first, (z, y, x, 6 * (n + 1))
+    float16 each: n numbers, PLAIN or LIT, of its voxels as seen along +x -x +y -y +z -z, for a
+    length of the smallest spacing; and which share of the light came to them.
 
-    Args:
-        field: The finest voxels.
-        tables: For each axis x, y, z the colours of intervals of half a voxel, on the device that
-            works.
-        spacing: Size of a voxel along x, y, z.
-        branching: N.
-        out: For each coarse level, the finest of them first, (z, y, x, 6 * (n + 1)) float16: n
-            numbers, PLAIN or LIT, of its voxels as seen along +x -x +y -y +z -z, for a length of
-            the smallest spacing; and which share of the light came to them.
-        progress: Told ("filtered", voxels done, voxels in all).
-        all_light: Columns count by all the light that comes to them from outside, so that a row of
-            voxels lets through what its columns do together. For translucent matter, of which a ray
-            that goes obliquely sees much the same. In opaque matter it may see what no light comes
-            to along an axis: if False, light is lost in the voxel before only.
+    With `all_light` columns count by all the light that comes to them from outside, so that a row
+    of voxels lets through what its columns do together. For translucent matter, of which a ray that
+    goes obliquely sees much the same. In opaque matter it may see what no light comes to along an
+    axis: else light is lost in the voxel before only.
     """
     done, total = 0, 3 * math.prod(field.shape)
     numbers = out[0].shape[-1] // _DIRECTIONS if out else 0

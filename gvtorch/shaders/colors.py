@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base import check
-from ..base.image_info import from_hex
-from ..base.srgb import array_from_srgb
+from ..base.image_info import array_from_srgb, from_hex
 
 #: Colours by name, as sRGB.
 NAMED = {

@@ -272,7 +272,8 @@ class Filtered(Shader):
         """Returns the channel that holds the colours of voxels of this size."""
         directions = self._directions
         if directions is None:
-            table = self.transfer.table(_sampling(min(spacing), min(spacing), torch.device("cpu")))
+            one_voxel = Sampling(smallest_spacing=min(spacing), step=min(spacing))
+            table = self.transfer.table(one_voxel)
             directions = float(table.table_lm4[0, :, 3].max()) > _OPAQUE
         return Channel(torch.float16, self.numbers * (6 if directions else 1), coarse=True)
 
@@ -311,11 +312,13 @@ class Filtered(Shader):
         device: torch.device,
         progress: Progress = no_progress,
     ) -> None:
-        """Writes the colours of coarse levels, worked out on a device, into tensors, which may be
-        mapped from files; see `write_colors`.
-        """
-        smallest = min(spacing)
-        tables = [self.transfer.table(_sampling(smallest, side / 2, device)) for side in spacing]
+        """Writes colours of coarse levels into tensors, also mapped ones; see `write_colors`."""
+        tables = [
+            self.transfer.table(
+                Sampling(smallest_spacing=min(spacing), step=side / 2, device=device)
+            )
+            for side in spacing
+        ]
         one_mean = self.colors(spacing).width == self.numbers
         write_colors(field, tables, spacing, branching, out, progress, all_light=one_mean)
 
@@ -371,9 +374,3 @@ class _StoreField:
         """See `FinestVoxels`."""
         values = self._store.read_region(0, low, high, timeout=_TIMEOUT)[..., self._component]
         return torch.from_numpy(np.ascontiguousarray(values))
-
-
-def _sampling(smallest: float, step: float, device: torch.device) -> Sampling:
-    return Sampling(
-        smallest_spacing=smallest, step=step, levels=1, dtype=torch.float32, device=device
-    )

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.srgb import array_from_srgb
+from ..base.image_info import array_from_srgb
 from ..ops.shading import LabelNumbers
 from ..pool import N3Tree
 from .colors import distinct_colors, linear_color
@@ -34,14 +34,8 @@ class Labels(LitShader):
     to 3: of a ball it is off by 11 degrees in the mean with a border of 1, by 4 with 2, by 2 with
     3. Where there are none, a place is lit as if it faced the light.
 
-    Attributes may be edited, also in place: the next picture is made with them.
-
-    Attributes:
-        colors: By label, or in the order 0, 1, 2, ...; distinct ones for labels that are left out.
-        opacity: Of all labels, or by label (1 for those that are left out), per reference length.
-        visible: The labels that are shown; None: all but 0, the background; "all": all.
-        reference: World units, or None for the smallest spacing.
-        lit: Whether they are lit.
+    Attributes, named as the arguments, may be edited, also in place: the next picture is made with
+    them.
     """
 
     kind = "Labels"
@@ -61,12 +55,14 @@ class Labels(LitShader):
         """See the class.
 
         Args:
-            colors: A colour for each label: linear red, green, blue, or a name or #RRGGBB in sRGB.
-                An array (k, 3) of uint8 holds sRGB.
-            opacity: In [0, 1]; labels of 0 are not there at all.
-            visible: Labels.
+            colors: By label, or in the order 0, 1, 2, ...; distinct ones for labels that are left
+                out: linear red, green, blue, or a name or #RRGGBB in sRGB. An array (k, 3) of uint8
+                holds sRGB.
+            opacity: Of all labels, or by label (1 for those that are left out), in [0, 1]; labels
+                of 0 are not there at all.
+            visible: The labels that are shown; None: all but 0, the background; "all": all.
             channel: Name of the channel of labels; None: that of the options.
-            reference: Length for which opacity is given.
+            reference: World units for which opacity is given; None: the smallest spacing.
             lit: False shows flat colours.
             **light: `light`, `ambient`, `diffuse`, `specular` and `shininess` of `LitShader`.
 
@@ -127,8 +123,6 @@ class Labels(LitShader):
         return self._once(tree, channel, (look.key, self.reference, sampling), make)
 
     def label_names(self, tree: N3Tree, channel: str) -> Tensor:
-        """See `Shader`."""
-
         def make() -> Tensor:
             _, labels = label_rows(tree, channel)
             nothing = torch.full((1,), -1, dtype=torch.int64)
@@ -157,24 +151,16 @@ class Labels(LitShader):
     ) -> ColorTable:
         rows = max(2, len(labels))
         levels = sampling.fitting(rows)
-        table = torch.zeros((levels, rows, 4), dtype=sampling.dtype)
-        opacity = look.opacities(labels)
-        table[:, : len(labels), :3] = torch.from_numpy(look.colors_of(labels)).to(sampling.dtype)
+        table, opacity = np.zeros((levels, rows, 4)), look.opacities(labels)
+        table[:, : len(labels), :3] = look.colors_of(labels)
         length = sampling.step / (self.reference or sampling.smallest_spacing)
         with np.errstate(divide="ignore"):
             thickness = np.log1p(-opacity)
         for level in range(levels):
-            alpha = -np.expm1(length * 2.0**level * thickness)
-            table[level, : len(labels), 3] = torch.from_numpy(alpha).to(sampling.dtype)
-        seen = torch.zeros(rows, dtype=torch.int32)
-        seen[: len(labels)] = torch.from_numpy(opacity > 0)
-        domain = torch.tensor((first, first + rows - 1), dtype=sampling.dtype)
-        device = sampling.device
-        return ColorTable(
-            table_lm4=table.to(device),
-            domain_2=domain.to(device),
-            opaque_m=seen.cumsum(0, dtype=torch.int32).to(device),
-        )
+            table[level, : len(labels), 3] = -np.expm1(length * 2.0**level * thickness)
+        seen = np.zeros(rows, bool)
+        seen[: len(labels)] = opacity > 0
+        return ColorTable.of(table, (first, first + rows - 1), seen, sampling)
 
 
 def label_rows(tree: N3Tree, channel: str) -> tuple[float, np.ndarray]:
@@ -248,9 +234,7 @@ class _Look:
 
 
 def _put(rows: np.ndarray, labels: np.ndarray, told: Mapping[int, Any]) -> None:
-    """Writes the values `told` of labels into the rows of these; labels that have no row are left
-    out.
-    """
+    """Writes the values `told` of labels into their rows; labels without a row are left out."""
     if not told:
         return
     wanted = np.fromiter(told, np.int64, len(told))

@@ -30,21 +30,44 @@ CONE_OF_DISC = 0.35
 
 
 def a_number(low: float = -inf, high: float = inf) -> Check:
-    """A check for a number, or a tensor of one; see `check_number`."""
+    """A check for a finite number in [low, high], or a tensor of one. A tensor on CUDA is not
+    looked at, since that would block.
+    """
 
     def checked(owner: Any, name: str, value: Any) -> Any:
-        check_number(kind_of(owner), name, value, low=low, high=high)
-        return float(value) if isinstance(value, np.ndarray) else value
+        where, number = kind_of(owner), value
+        check.no_gradient(where, name, value)
+        if isinstance(value, Tensor):
+            if value.numel() != 1:
+                got = check.describe(value)
+                raise ValueError(f"{where}: {name} must be a number or a tensor of one, got {got}")
+            if value.is_cuda:
+                return value
+            number = value.item()
+        number = check.number(where, name, number, low=low, high=high)
+        return number if isinstance(value, np.ndarray) else value
 
     return checked
 
 
 def a_triple(low: float = -inf, high: float = inf, zero: bool = True) -> Check:
-    """A check for three numbers, or a tensor of them; see `check_triple`."""
+    """A check for three finite numbers in [low, high], or a tensor of them, as `a_number`; `zero`
+    tells whether all may be 0.
+    """
 
     def checked(owner: Any, name: str, value: Any) -> Any:
-        check_triple(kind_of(owner), name, value, low=low, high=high, zero=zero)
-        return tuple(value.tolist()) if isinstance(value, np.ndarray) else value
+        where = kind_of(owner)
+        check.no_gradient(where, name, value)
+        if isinstance(value, Tensor) and value.is_cuda:
+            if value.shape != (3,):
+                raise ValueError(f"{where}: {name} must be (3,), got {check.describe(value)}")
+            return value
+        numbers = check.triple(where, name, value)
+        for number in numbers:
+            check.number(where, name, number, low=low, high=high)
+        if not zero and not any(numbers):
+            raise ValueError(f"{where}: {name} must not be zero")
+        return numbers if isinstance(value, np.ndarray) else value
 
     return checked
 
@@ -174,11 +197,9 @@ class LitShader(Shader):
         self.octaves, self.anisotropy = octaves, anisotropy
 
     def material(self) -> ShadeParameters:
-        """See `Shader`."""
         return self.light.parameters()._replace(**{name: getattr(self, name) for name in _MATERIAL})
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
-        """See `Shader`."""
         given = super().shading(where, tree)
         if given is None or not (self.shadows or self.octaves):
             return given
@@ -189,7 +210,6 @@ class LitShader(Shader):
         return given._replace(shader=shader_number(self.shadowed_kind))
 
     def unlit(self) -> Self:
-        """See `Shader`."""
         bare = copy(self)
         bare.ambient, bare.diffuse, bare.specular = 1.0, 0.0, 0.0
         bare.shadows, bare.octaves = False, 0
@@ -204,38 +224,3 @@ def check_light(what: str, value: Any) -> Light:
             f"got {type(value).__name__}"
         )
     return value
-
-
-def check_number(
-    where: str, name: str, value: Any, *, low: float = -inf, high: float = inf
-) -> None:
-    """Raises ValueError unless it is a finite number in [low, high], or a tensor of one. A tensor
-    on CUDA is not looked at, since that would block.
-    """
-    check.no_gradient(where, name, value)
-    if isinstance(value, Tensor):
-        if value.numel() != 1:
-            got = check.describe(value)
-            raise ValueError(f"{where}: {name} must be a number or a tensor of one, got {got}")
-        if value.is_cuda:
-            return
-        value = value.item()
-    check.number(where, name, value, low=low, high=high)
-
-
-def check_triple(
-    where: str, name: str, value: Any, *, low: float = -inf, high: float = inf, zero: bool = True
-) -> None:
-    """Raises ValueError unless these are three finite numbers in [low, high], or a tensor of them,
-    as for `check_number`; `zero` tells whether all may be 0.
-    """
-    check.no_gradient(where, name, value)
-    if isinstance(value, Tensor) and value.is_cuda:
-        if value.shape != (3,):
-            raise ValueError(f"{where}: {name} must be (3,), got {check.describe(value)}")
-        return
-    numbers = check.triple(where, name, value)
-    for number in numbers:
-        check.number(where, name, number, low=low, high=high)
-    if not zero and not any(numbers):
-        raise ValueError(f"{where}: {name} must not be zero")

@@ -129,14 +129,7 @@ class TransferModule(torch.nn.Module):
         """
         super().__init__()
         self.reference = float(shader.reference or spacing)
-        sampling = Sampling(
-            smallest_spacing=spacing,
-            step=self.reference,
-            levels=1,
-            dtype=torch.float32,
-            device=torch.device("cpu"),
-        )
-        table = shader.table(sampling)
+        table = shader.table(Sampling(smallest_spacing=spacing, step=self.reference))
         self.low, high = table.domain_2.tolist()
         self.scale = (len(table.opaque_m) - 1) / (high - self.low)
         self.rows = torch.nn.Parameter(table.table_lm4[0].clone())

@@ -13,6 +13,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -168,26 +169,20 @@ def _of_paraview(file: Path, item: Mapping[str, Any]) -> Pair:
 
 def paraview_item(opacity: np.ndarray, color: np.ndarray) -> dict[str, list[float]]:
     """Returns "RGBPoints" and "Points" of ParaView, of opacities (k, 2) and colours (m, 4)."""
-    nodes, ways = [color[0]], np.abs(np.diff(_encoded(color[:, 1:]), axis=0)).max(1)
+    encoded = partial(converted, "linear_rgb_to_rgb")
+    nodes, ways = [color[0]], np.abs(np.diff(encoded(color[:, 1:]), axis=0)).max(1)
     for first, last, way in zip(color[:-1], color[1:], ways, strict=True):
         parts = max(1, math.ceil(_SRGB_PARTS * way))
         nodes += [first + at / parts * (last - first) for at in range(1, parts + 1)]
     points = np.array(nodes)
-    points[:, 1:] = _encoded(points[:, 1:])
+    points[:, 1:] = encoded(points[:, 1:])
     middles = np.broadcast_to((0.5, 0.0), (len(opacity), 2))  # midpoint and sharpness: straight
     told = np.column_stack((opacity, middles))
     return {"RGBPoints": points.ravel().tolist(), "Points": told.ravel().tolist()}
 
 
-def _encoded(light: np.ndarray) -> np.ndarray:
-    """sRGB of linear light."""
-    return converted("linear_rgb_to_rgb", light)
-
-
 def _opacities(nodes: np.ndarray) -> np.ndarray:
-    """(k, 2) of nodes (v, a), or (v, a, midpoint, sharpness) as VTK's vtkPiecewiseFunction has
-    them.
-    """
+    """(k, 2) of nodes (v, a), or (v, a, midpoint, sharpness) as VTK has them."""
     nodes = nodes[np.argsort(nodes[:, 0], kind="stable")]
     if nodes.shape[1] == 2:
         return nodes

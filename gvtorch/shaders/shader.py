@@ -20,6 +20,7 @@ from ..ops.shading import Number, ShadeParameters, Triple, pack, shader_number
 from ..pool import N3Tree
 
 _MOST_BYTES = 64 * 2**20  # of a table in float32
+_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,9 +29,9 @@ class Sampling:
 
     smallest_spacing: float  # world units; opacity's reference length where none was given
     step: float  # world length of the shortest interval
-    levels: int  # lengths of intervals, each twice the one before
-    dtype: torch.dtype
-    device: torch.device
+    levels: int = 1  # lengths of intervals, each twice the one before
+    dtype: torch.dtype = torch.float32
+    device: torch.device = _CPU
 
     def fitting(self, rows: int) -> int:
         """Returns for how many lengths a table is made, where each takes this many rows: fewer than
@@ -62,9 +63,7 @@ class ColorTable:
 
 @dataclass(frozen=True, kw_only=True)
 class CutSurface:
-    """What a cut through the inside of a surface shows: its own colour, unlit, wherever the value
-    lies inside.
-    """
+    """What a cut through the inside of a surface shows: its own colour, unlit."""
 
     level: Number  # the value at the surface
     below: bool  # inside is where the value is below the level, else where it is not

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
-from ..base.checked import Check, kind_of, number_above, or_none
+from ..base.checked import Check, kind_of, or_none, positive
 from ..base.messages import one_line
 from ..base.whole_file import write_whole
 from .preset_files import paraview_item, read_preset
@@ -26,6 +26,7 @@ from .shader import ColorTable, Sampling, Shader
 
 _LARGEST = 1e300  # values and lengths, so that their differences are numbers
 _KEPT = 8  # tables of a function
+_FOREIGN = {"RGBPoints", "volumeProperties"}  # keys of other programs' files
 # Cells of a table.
 _FEWEST_CELLS = 2**10
 _FEWEST_SAMPLED = 2**12  # where corners fall beside rows
@@ -55,7 +56,7 @@ class TransferFunction(Shader):
     checks: ClassVar[Mapping[str, Check]] = {
         "opacity": lambda owner, name, points: _points(kind_of(owner), name, points, 2),
         "color": lambda owner, name, points: _points(kind_of(owner), name, points, 4),
-        "reference": or_none(number_above(0)),
+        "reference": or_none(positive),
     }
 
     def __init__(
@@ -120,7 +121,8 @@ class TransferFunction(Shader):
         """
         if str(path).endswith(".json") and Path(path).is_file():
             content = check.json_file("transfer function file", path)
-            if not isinstance(content, list) and _is_own(content):
+            told = content.keys() if isinstance(content, dict) else ()  # of ours, if it is broken
+            if not isinstance(content, list) and _FOREIGN.isdisjoint(told):
                 if name is not None:
                     raise ValueError(f"{path}: holds one function, without a name: leave it out")
                 return cls.from_json(path)
@@ -167,9 +169,7 @@ class TransferFunction(Shader):
         return type(self)(parts[0].tolist(), parts[1].tolist(), self.reference)
 
     def save(self, path: str | Path) -> None:
-        """Writes the .json that `from_file` reads; raises ValueError where the path ends in
-        something else.
-        """
+        """Writes the .json that `from_file` reads; ValueError if the path ends otherwise."""
         if Path(path).suffix != ".json":
             raise ValueError(f"TransferFunction.save: path must end in .json, got {str(path)!r}")
         write_whole(Path(path), self.to_json() + "\n")
@@ -347,11 +347,6 @@ def _common_cells(places: Iterable[float], most: int, tolerance: float = math.in
         if cells > most or abs(float(fraction) - place) > tolerance:
             return None
     return cells
-
-
-def _is_own(content: Any) -> bool:
-    """Tells our JSON, also a broken one, from other programs'."""
-    return not isinstance(content, dict) or not {"RGBPoints", "volumeProperties"} & set(content)
 
 
 def _points(where: str, name: str, points: Points, width: int) -> np.ndarray:

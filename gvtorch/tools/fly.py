@@ -71,8 +71,7 @@ class Fly:
     drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
 
     def run(self) -> None:
-        from ..base.stage import stage
-        from ..base.trace import Trace
+        from ..base.stage import Trace, stage
         from ..cameras import write_cameras
         from ..pictures import Video
 

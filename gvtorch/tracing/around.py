@@ -24,16 +24,10 @@ from .tracer import Tracer
 
 def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRays:
     """Wraps a tree's tracer in what the options ask for. Each ray goes through lighting, then the
-    clip, then the lens, then the tree; cones to the lights go through clip and tree alone.
-
-    Args:
-        tracer: Traces rays of one frame through one tree.
-        options: How the picture is made.
-        box: (2, 3) world corners of the scene, all trees together.
-
-    Raises:
-        ValueError: The shader must see a ray in one go, and the options cut rays into pieces or
-            draw caps; or it has no normals, and there is lighting.
+    clip, then the lens, then the tree; cones to the lights go through clip and tree alone. `box`:
+    (2, 3) world corners of the scene, all trees together. Raises ValueError if the shader must see
+    a ray in one go, and the options cut rays into pieces or draw caps; or it has no normals, and
+    there is lighting.
     """
     check_fits(tracer.shader, options)
     lens = options.lens and options.lens.placed(box)
@@ -96,7 +90,7 @@ def _clipped(
     surface = tracer.shader.cut_surface() if options.clip.caps else None
     together: Callable[[Iterable[Rays]], Hits] | None = None
     if tracer.shader.projection is not None:
-        together = partial(_project_pieces, tracer, tracer.shader.projection)
+        together = partial(_project_pieces, tracer)
     return Clipped(
         trace,
         options.clip,
@@ -152,11 +146,11 @@ def _surface_slab(surface: CutSurface, tracer: Tracer, options: RenderOptions) -
     return slab
 
 
-def _project_pieces(tracer: Tracer, which: str, pieces: Iterable[Rays]) -> Hits:
+def _project_pieces(tracer: Tracer, pieces: Iterable[Rays]) -> Hits:
     """Projects pieces of the same rays: the largest or smallest value of all, at its nearest place,
     or the mean of their means, weighted by their lengths inside the tree's box.
     """
-    rays = list(pieces)
+    rays, which = list(pieces), tracer.shader.projection
     hits = [tracer(piece) for piece in rays]
     depths = torch.stack([one.depth for one in hits])  # (pieces, r, 1)
     known = depths < torch.inf

@@ -74,7 +74,7 @@ class Clip:
         """Returns the faces in world units, given the (2, 3) box of the scene."""
         if self.frame is Frame.WORLD:
             return self._own
-        centre, side = ((box[0] + box[1]) / 2).tolist(), float((box[1] - box[0]).max())
+        centre, side = ((box[0] + box[1]) / 2).tolist(), Frame.BOX.unit(box)
 
         def place(faces: list[Face]) -> list[Face]:
             return [(*n, d * side - _dot(n, centre)) for *n, d in faces]

@@ -83,15 +83,14 @@ def scatter_hits(rays: Rays, which: Tensor, hits: Hits) -> Hits:
     """Returns the hits of all rays (r), given those of the rays `which` (k,): the others have empty
     ranges, so they hit nothing and keep the light that they had.
     """
-    empty = {"depth": torch.inf, "label": -1}
     columns: dict[str, Any] = {}
     for name, found in vars(hits).items():
-        columns[name] = None
         if found is not None:
-            shape = (len(rays.origin), *found.shape[1:])
-            nothing = found.new_full(shape, empty.get(name, 0))
+            nothing = nothing_like(found, len(rays.origin))
             if name == "alpha":
                 nothing = 1 - rays.light().to(found)
+            elif name == "depth":
+                nothing.fill_(torch.inf)
             columns[name] = nothing.index_put((which,), found)
     return Hits(**columns)
 
@@ -115,9 +114,7 @@ def trace_pieces(trace: TraceRays, pieces: Iterable[Rays], *, cap: TraceRays | N
 
 
 def box_span(low: Tensor, high: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns (r,) first and last distance of lines (r, 3) inside a box, given its corners (3,);
-    last < first where they pass by.
-    """
+    """(r,) first and last distance of lines (r, 3) in a box; last < first where they pass by."""
     a, b = (low - origin) / direction, (high - origin) / direction
     # 0 / 0: the line lies in a face, and no other place on it lies farther out.
     first = torch.minimum(a, b).nan_to_num(-torch.inf, torch.inf, -torch.inf)

@@ -32,8 +32,8 @@ from ..shaders.lights import (
     Headlight,
     Light,
     PointLight,
+    a_triple,
     check_light,
-    check_triple,
 )
 from .composite import TraceRays, behind, if_few, over
 from .thin_lens import ThinLens
@@ -83,17 +83,14 @@ class Lighting:
         if self.reach is not None:
             check.number(where, "reach", self.reach, low=0, open_low=True)
         object.__setattr__(self, "frame", Frame.of(where, self.frame))
-        check_triple(where, "ambient", self.ambient, low=0.0)
+        a_triple(low=0)(self, "ambient", self.ambient)
 
     __repr__ = check.brief
 
     def placed(self, box: Tensor) -> Lighting:
         """Returns the lighting with its reach in world units, given the scene's (2, 3) box."""
-        if self.reach is not None and self.frame is Frame.WORLD:
-            return self
-        side = float((box[1] - box[0]).max())
-        reach = side * (0.25 if self.reach is None else self.reach)
-        return replace(self, reach=reach, frame=Frame.WORLD)
+        frame, reach = (Frame.BOX, 0.25) if self.reach is None else (Frame(self.frame), self.reach)
+        return replace(self, reach=reach * frame.unit(box), frame=Frame.WORLD)
 
 
 @dataclass(frozen=True)
@@ -208,7 +205,8 @@ class Lighted:
             half = normalize(beam + points.eye, dim=1)
             highlight = (points.normal * half).sum(1).clamp(0, 1) ** shininess
             highlight = torch.where(points.has_normal & (facing > 0), highlight, 0.0)
-            count = 1 if _is_small(light) else cones
+            wide = getattr(light, "angle", getattr(light, "radius", 0.0))
+            count = cones if isinstance(wide, Tensor) or wide else 1  # no tensor is read
             lit = self._visible(light, count, points, beam, facing > 0)[:, None] * color
             diffuse, shine = diffuse + facing[:, None] * lit, shine + highlight[:, None] * lit
         return diffuse, shine
@@ -265,6 +263,7 @@ class Lighted:
         middle = torch.maximum(start, reach / 2 * seen)
         lifted = self._lifted(points, _CLOSE)
         eye, weight = rays.origin.to(torch.float64), 1 / lighting.cones
+        (diffuse,) = pack((self.material.diffuse,), torch.float64, eye.device)
         assert rays.sample is not None
         for direction in _cones_over(points.normal, rays.sample, lighting.cones):
             growth = dot(direction, points.normal).clamp(0, _WIDE)  # none dips into a floor
@@ -278,7 +277,8 @@ class Lighted:
             unblocked = unblocked - lighting.occlusion * weight * taken
             if self.matter is not None:
                 met = self._points(first, hits, points.tally, eye)
-                bounced = bounced + weight * self._reflected(met, hits)
+                lit = diffuse * self._direct(met, 1)[0] * hits.color
+                bounced = bounced + weight * torch.where(met.seen[:, None], lit, 0.0)
         return unblocked, lighting.indirect * bounced
 
     def _lifted(self, points: _Points, off: float, beam: Tensor | None = None) -> _Points:
@@ -307,12 +307,6 @@ class Lighted:
             width=points.row,
         )
 
-    def _reflected(self, points: _Points, hits: Hits) -> Tensor:
-        """(r, 3) light that the matter met by cones reflects."""
-        direct, _ = self._direct(points, 1)
-        (diffuse,) = pack((self.material.diffuse,), torch.float64, direct.device)
-        return torch.where(points.seen[:, None], diffuse * direct * hits.color, 0.0)
-
 
 def _towards(light: Light, points: _Points) -> tuple[Tensor, Tensor, Tensor]:
     """(r, 3) unit directions to a light, (r,) its distances, and (r,) its radius over these."""
@@ -332,12 +326,6 @@ def _towards(light: Light, points: _Points) -> tuple[Tensor, Tensor, Tensor]:
     way = position - points.position
     distance = way.norm(dim=1)
     return normalize(way, dim=1), distance, radius / distance.clamp(min=1e-30)
-
-
-def _is_small(light: Light) -> bool:
-    """Whether a light is known to have no size, without reading tensors."""
-    size = getattr(light, "angle", getattr(light, "radius", 0.0))
-    return not isinstance(size, Tensor) and size == 0
 
 
 def _disc(count: int) -> Iterator[tuple[float, float]]:
@@ -381,9 +369,7 @@ def _cones_over(normal: Tensor, sample: Tensor, count: int) -> Iterator[Tensor]:
 
 
 def _scrambled(number: Tensor) -> Tensor:
-    """(r,) numbers below 2^32, of which neighbours have nothing in common any more (a hash as
-    Wellons' lowbias32, 2018).
-    """
+    """(r,) hashes below 2^32: neighbours have nothing in common (as Wellons' lowbias32, 2018)."""
     for shift in (16, 15):
         number = ((number ^ (number >> shift)) * 0x7FEB352D) & _WORD
     return number ^ (number >> 16)

@@ -78,7 +78,8 @@ class RenderOptions:
             )
         check.number(where, "cone_scale", self.cone_scale, low=0, open_low=True)
         check.whole(where, "component", self.component, low=0)
-        for name, kind in _OBJECTS.items():
+        kinds = dict(channel=str, clip=Clip, layer=Layer, lens=ThinLens, lighting=Lighting)
+        for name, kind in kinds.items():
             if getattr(self, name) is not None:
                 check.instance(where, name, getattr(self, name), kind)
         object.__setattr__(self, "pose", checked_poses(where, self.pose))
@@ -88,15 +89,6 @@ class RenderOptions:
             raise ValueError(f"{where}: dtype must be float32 or float64, got {self.dtype}")
 
     __repr__ = check.brief
-
-
-_OBJECTS: dict[str, type] = {
-    "channel": str,
-    "clip": Clip,
-    "layer": Layer,
-    "lens": ThinLens,
-    "lighting": Lighting,
-}
 
 
 class RenderSettings(TypedDict, total=False):
@@ -122,11 +114,8 @@ class RenderSettings(TypedDict, total=False):
 def render_options(
     where: str, settings: Mapping[str, Any], camera: Camera | None = None
 ) -> RenderOptions:
-    """Returns a user's options, for a camera if there is one.
-
-    Raises:
-        ValueError: One is unknown, of the wrong type or out of its range, or does not fit the
-            camera's pictures.
+    """Returns a user's options, for a camera if there is one. Raises ValueError if one is unknown,
+    of the wrong type or out of its range, or does not fit the camera's pictures.
     """
     check.known(where, settings, RenderSettings)
     options = RenderOptions(**settings)

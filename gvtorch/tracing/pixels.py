@@ -219,10 +219,8 @@ class View:
 
     def hits(self, progress: Progress = no_progress, *, again: Again | None = None) -> Hits:
         """Makes the camera's rays and traces them, all or some of them again; they mark what they
-        use and request what is missing. `progress` is told how many rows are done.
-
-        Raises:
-            ValueError: The picture is larger than the device's memory.
+        use and request what is missing. `progress` is told how many rows are done. Raises
+        ValueError if the picture is larger than the device's memory.
         """
         device = self.numbers.device
         at_once = device.type == "cuda" or (

@@ -29,10 +29,8 @@ class Pose:
 
     @classmethod
     def of(cls, where: str, name: str, matrix: Any) -> Pose:
-        """Returns the pose of a (4, 4) matrix from own axes to the world; a pose as it is.
-
-        Raises:
-            ValueError: It is no such matrix, or it stretches or shears.
+        """Returns the pose of a (4, 4) matrix from own axes to the world; a pose as it is. Raises
+        ValueError if it is no such matrix, or stretches or shears.
         """
         if isinstance(matrix, Pose):
             return matrix
@@ -99,11 +97,7 @@ Matrix = Pose | Tensor | np.ndarray | Sequence[Sequence[float]]
 
 
 def checked_poses(where: str, given: Any) -> Any:
-    """Returns a matrix as a `Pose`, and matrices by name as poses by name; None as it is.
-
-    Raises:
-        ValueError: See `Pose.of`.
-    """
+    """Returns a matrix as a `Pose`, and matrices by name as poses by name; None as it is."""
     if given is None:
         return None
     if isinstance(given, Mapping):
@@ -112,10 +106,8 @@ def checked_poses(where: str, given: Any) -> Any:
 
 
 def poses_of(where: str, names: Collection[str], given: Any) -> dict[str, Pose | None]:
-    """Returns the pose of each tree, given what `checked_poses` returned.
-
-    Raises:
-        ValueError: A name is that of no tree, or there is one pose for several trees.
+    """Returns the pose of each tree, given what `checked_poses` returned; raises ValueError if a
+    name is that of no tree, or there is one pose for several trees.
     """
     if given is None or isinstance(given, Mapping):
         by_name: Mapping[str, Pose] = given or {}

@@ -49,11 +49,8 @@ class ThinLens:
 
     def placed(self, box: Tensor) -> ThinLens:
         """Returns the lens in world units, given the (2, 3) box of the scene."""
-        if self.frame is Frame.WORLD:
-            return self
-        side = float((box[1] - box[0]).max())
-        aperture, focus = self.aperture * side, self.focus * side
-        return ThinLens(aperture=aperture, focus=focus)
+        unit = Frame(self.frame).unit(box)
+        return ThinLens(aperture=self.aperture * unit, focus=self.focus * unit)
 
     def cone(self, t: Tensor) -> Tensor:
         """Returns the width of the lens's cone at distances t, for a lens in world units."""

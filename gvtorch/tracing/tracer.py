@@ -43,11 +43,8 @@ class Tracer:
         frame_1: Tensor | None = None,
     ) -> None:
         """Lays the op's arguments ready; see `trace` and, for `by_level`, `trace_rays`. `frame_1`
-        (1,) int32 is the frame's number on the device, if it lies there already.
-
-        Raises:
-            ValueError: It is no shader, the channel is unknown, the step too short, or the backend
-                can't be used.
+        (1,) int32 is the frame's number on the device, if it lies there already. Raises ValueError
+        for no shader, an unknown channel, a step too short, or a backend that can't be used.
         """
         check_shader("render", "shader", shader)
         choose_backend(options.backend, tree.device)
@@ -271,24 +268,16 @@ class Batch:
 
 
 def march(
-    tracer: Tracer,
+    tracer: Tracer,  # a frame; its shader's table tells only what is hidden
     rays: Rays,
-    shade: Callable[[Batch], tuple[Tensor, Tensor]],
-    features: int,
+    shade: Callable[[Batch], tuple[Tensor, Tensor]],  # features (k, c) and alpha (k,) of samples
+    features: int,  # their number c
     *,
-    limit: int = PART_SAMPLES,
-    by_node: bool = True,
+    limit: int = PART_SAMPLES,  # samples of a ray in one part
+    by_node: bool = True,  # see `trace_segments`
 ) -> tuple[Tensor, Hits, Tensor]:
     """Walks rays part by part and shades and composites what each part sampled; rays that have
     ended go no further.
-
-    Args:
-        tracer: A frame; its shader's table tells only what is hidden.
-        rays: World rays.
-        shade: Gives features (k, c) and alpha (k,) of samples.
-        features: Their number c.
-        limit: Samples of a ray in one part.
-        by_node: See `trace_segments`.
 
     Returns:
         Sums (r, c) of the features, hits without colour, and (r,) int32 nodes that were visited.

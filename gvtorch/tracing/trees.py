@@ -39,7 +39,6 @@ _RAYS = {"cpu": 1 << 14, "cuda": 1 << 18}  # composited by sample at once
 _SLIVER = 1e-3  # steps: ends of intervals that are closer are one
 _MOST_ALPHA = 1 - 1e-9  # of a sample: an opaque one has no extinction that could be added
 
-
 #: A shader for all trees, or one for each by name.
 Shaders = Shader | Mapping[str, Shader]
 
@@ -55,24 +54,14 @@ class TreeTrace:
 
 def tree_traces(
     where: str,
-    scene: Mapping[str, tuple[N3Tree, Collection[str]]],
+    scene: Mapping[str, tuple[N3Tree, Collection[str]]],  # by name: trees, and names of channels
     shaders: Shaders,
-    options: RenderOptions,
-    box: Tensor,
-    **settings: Any,
+    options: RenderOptions,  # its channel is the first of each tree if left out
+    box: Tensor,  # (2, 3) world corners of the scene
+    **settings: Any,  # of `Tracer`
 ) -> list[TreeTrace]:
-    """Lays ready what traces rays through trees, in one frame.
-
-    Args:
-        where: Who complains.
-        scene: Trees, and the names of the channels that each has, by name.
-        shaders: For all trees, or for each by name.
-        options: How the picture is made; its channel is the first of each tree if left out.
-        box: (2, 3) world corners of the scene.
-        **settings: Of `Tracer`.
-
-    Raises:
-        ValueError: A shader is missing, or a tree has no such channel; see `Tracer` and `around`.
+    """Lays ready what traces rays through trees, in one frame. Raises ValueError if a shader is
+    missing, or a tree has no such channel; see `Tracer` and `around`.
     """
     traces, poses = [], poses_of(where, scene, options.pose)
     for name, (tree, channels) in scene.items():
@@ -184,9 +173,7 @@ def _ranked(hits: Sequence[Hits], name: str, order: Tensor) -> Sequence[Any]:
 
 
 def _filled(hits: Sequence[Hits], name: str) -> list[Tensor] | None:
-    """A field (r, ...) of each of several hits; zeros, of labels -1, stand for those that do not
-    give it. None if none does.
-    """
+    """A field (r, ...) of each of several hits, nothing where one has none; None if none has."""
     fields = [getattr(one, name) for one in hits]
     given = [field for field in fields if field is not None]
     if not given:
@@ -448,8 +435,6 @@ def _cut(trees: Sequence[TreeTrace], rays: Rays) -> tuple[_Pieces, Tensor]:
 
 def _joined(ray: Tensor, place: Tensor, covered: Tensor, sliver: float) -> _Pieces:
     """Makes pieces of the ends (k,) of intervals, sorted; `covered` (k, m) tells behind each."""
-    if not len(ray):
-        return _Pieces(ray, place.new_zeros((0, 2)), covered.T)
     same = ray[1:] == ray[:-1]
     near, far = place[:-1], place[1:]
     kept = (same & covered[:-1].any(1) & (far - near > sliver)).nonzero()[:, 0]
@@ -470,9 +455,7 @@ def _joined(ray: Tensor, place: Tensor, covered: Tensor, sliver: float) -> _Piec
 
 
 def _spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
-    """(m, r, 2) where rays are in the boxes of trees; the last before the first where they are
-    not.
-    """
+    """(m, r, 2) where rays are in the boxes of trees; last < first where they are not."""
     spans = []
     for one in trees:
         own = one.tracer.inside(rays)

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 import gvtorch as gv
+from gvtorch.engine.frame_graph import LookAhead
 from gvtorch.engine.host_frame import HostFrame
-from gvtorch.engine.look_ahead import LookAhead
 from gvtorch.engine.setup import make_recorded_frame
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
@@ -72,11 +72,7 @@ class Frames:
         self.view = engine.view("test", camera, look, {})
         self.ahead = LookAhead(self.view, look_ahead) if look_ahead else None
         self.look_from(camera)
-        trees = [*engine.trees.values()]
-        by_level = engine.options.loading == "levels"
-        made = make_recorded_frame(
-            engine.cache, trees, engine.scheduler, batch, engine.production, by_level, fit
-        )
+        made = make_recorded_frame(engine.production, batch, fit)
         assert made is not None
         self.served, self.number = made, -1
         if isinstance(made, HostFrame):

@@ -34,7 +34,7 @@ from reprlib import repr as brief
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from ...base.text_path import text_path
+from ...base.whole_file import text_path
 from ..http import Endless, file_url, is_http, read_http
 from ..relay import read_within, through, with_urls
 from ..resources import cores

@@ -155,9 +155,7 @@ def exp2_exact(value: Tensor) -> Tensor:
 
 
 def taken_by(halvings: Tensor) -> Tensor:
-    """What is taken from light that is halved so often: 1 - 2^-halvings, as exact where that is
-    little.
-    """
+    """1 - 2^-halvings, the light that so many halvings take; exact where that is little."""
     thin = halvings < 0.5
     near = torch.where(thin, halvings, 0.0)
     return torch.where(thin, _exp2_slope(-near) * near, 1 - exp2_exact(-halvings))

@@ -16,9 +16,7 @@ _MOST_REACH = 3  # voxels
 
 @dataclass
 class Nearest:
-    """The voxel of a node in whose cube a place lies. A face that two voxels share belongs to the
-    upper one.
-    """
+    """The voxel in whose cube a place lies; a face that two share belongs to the upper one."""
 
     value: Tensor  # (r,) the node's constant where it has no brick, 0 where there is no node
     cell: Tensor  # (r, 3) int64 x y z, counted with the border
@@ -37,8 +35,7 @@ class LabelBricks(ChannelBricks):
         cell = smaller(torch.floor(place), torch.full_like(place, high))
         beside = clamp(at - cell, -0.5, 0.5)
         cell = cell.to(torch.int64)
-        constant = self.constant_nc[holder.node.clamp(min=0), self.component].to(real)
-        constant = torch.where(holder.node >= 0, constant, 0.0)
+        constant = self.constant(holder, real)
         value = torch.where(holder.brick >= 0, self.voxel(holder, cell, real), constant)
         return Nearest(value, cell, beside)
 

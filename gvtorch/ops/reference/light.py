@@ -60,9 +60,7 @@ class Light:
         return torch.where((dot(normal, self.along) > 0)[:, None], -normal, normal)
 
     def towards(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(r, 3) ways from places to the light, (r,) lengths of these ways, and (r,) how much cones
-        to the light grow per unit of length.
-        """
+        """(r, 3) ways to the light, (r,) their lengths, (r,) growth of cones there per length."""
         back, place = -self.along, torch.as_tensor(self.parameters.light)
         length = torch.full_like(t, INF)
         growth = torch.zeros_like(t) + self.parameters.light_growth
@@ -107,7 +105,13 @@ class Light:
         return base * (p.ambient + diffuse * light) + specular * light
 
     def shade_rough(
-        self, base: Tensor, moments: Tensor, front: Tensor | None, t: Tensor
+        self,
+        base: Tensor,  # (r, 3) base colours
+        moments: Tensor,  # (r, 6) mean products xx xy xz yy yz zz of the components of the normals;
+        # where their trace is 0, places are lit as if they faced the light
+        front: Tensor | None,  # (r, 3) mean normals of what is seen from one side alone, in the
+        # same measure: what light comes from behind does not show. None: both sides are seen
+        t: Tensor,  # (r,) distances
     ) -> tuple[Tensor, Tensor]:
         """Lights rough surfaces, of which only the moments of their normals are known.
 
@@ -115,14 +119,6 @@ class Light:
         deviation; it is taken to be evenly spread, as it is for the normals of a ball. Highlights:
         Toksvig, "Mipmapping normal maps", 2005, for a spread that is the same to all sides of a
         main normal.
-
-        Args:
-            base: (r, 3) base colours.
-            moments: (r, 6) mean products xx xy xz yy yz zz of the components of the normals; where
-                their trace is 0, places are lit as if they faced the light.
-            front: (r, 3) mean normals of what is seen from one side alone, in the same measure:
-                what light comes from behind does not show. None: both sides are seen.
-            t: (r,) distances.
 
         Returns:
             (r, 3) colours in the light, and (r, 3) vectors along the normals, towards the eye.
@@ -179,9 +175,7 @@ class Light:
         return base * p.ambient + p.diffuse * light * total
 
     def faintest(self, stop_clear: Tensor) -> Tensor:
-        """The transmittance below which light on its way is no longer followed: the last octave
-        sees its root.
-        """
+        """Transmittance below which light is not followed: the last octave sees its root."""
         for _ in range(1, int(self.parameters.octaves)):
             stop_clear = stop_clear * stop_clear
         return stop_clear

@@ -85,9 +85,7 @@ class Probe:
         return self.blend(t, lambda holder: bricks.sample(holder, self.beam, t))
 
     def gradient(self, t: Tensor, cube: Tensor) -> Tensor:
-        """(r, 3) gradients of the value per world unit, from half a voxel to each side; `cube` (3,)
-        is the world size of the root cube.
-        """
+        """(r, 3) gradients by world units, over one voxel; `cube` (3,): that of the root cube."""
         return self.blend(t, lambda holder: self.slope(holder, t, cube))
 
     def slope(self, holder: Holder, t: Tensor, cube: Tensor) -> Tensor:
@@ -293,9 +291,7 @@ class Walk:
             active = at.inside() & visitor.goes_on(leaves)
 
     def look_up(self, which: Tensor, t: Tensor, visitor: Visitor) -> None:
-        """Finds the nodes of some rays `which` (k,) at distances t (r,); marks what they use and
-        what they miss.
-        """
+        """Finds the nodes of the rays `which` (k,) at t (r,); marks what they use and miss."""
         tree, beam, t = self.tree, self.at.beam[which], t[which]
         cone, position = beam.cone(t), beam.at(t)
         wanted = tree.levels.wanted(cone)

@@ -58,21 +58,8 @@ class Cell(NamedTuple):
     high: Tensor  # int32
 
 
-def noise(
-    point_pn: Tensor,
-    kind: int,
-    salt_x: int,
-    salt_y: int,
-    salt_z: int,
-    period_x: int,
-    period_y: int,
-    period_z: int,
-    jitter: float,
-    reach: int,
-) -> Tensor:
+def noise(point_pn: Tensor, kind: int, given: Given) -> Tensor:
     """See `ops.noise`."""
-    salt = [one - 2**32 if one >= 2**31 else one for one in (salt_x, salt_y, salt_z)]
-    given = Given((salt[0], salt[1], salt[2]), (period_x, period_y, period_z), jitter, reach)
     make: Callable[..., Tensor] = (_perlin, _value, _simplex, _cellular)[min(kind, 3)]
 
     def evaluate(*axes: Tensor) -> Tensor:

@@ -112,9 +112,7 @@ class Beam(Rows):
         return clamp(self.along(t), 0, inside)
 
     def leave(self, low: Tensor, high: Tensor) -> Tensor:
-        """(r,) distances at which rays leave boxes, told by float64 corners (r, 3); +inf without a
-        direction.
-        """
+        """(r,) distances at which rays leave float64 boxes; +inf without a direction."""
         face = torch.where(self.direction > 0, high, low)
         inverse = divide(1.0, self.direction, self.direction)
         way = (face - self.place).to(self.direction)

@@ -53,9 +53,7 @@ class Shade(Plain):
         self.normal = torch.zeros_like(self.light.along)  # (r, 3) sum
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """Shadows differ from place to place, and near a light so does a stored
-        normal's light.
-        """
+        """Shadows differ from place to place, and near a light so does a stored normal's."""
         same = torch.ones_like(fine, dtype=torch.bool)
         for channel in (self.channel, *self.light.normals[:1], *self.others[:1]):
             numbers = channel.constant_nc
@@ -92,9 +90,7 @@ class Shade(Plain):
 
 
 class Sided(ChannelBricks):
-    """The opacity in a channel that holds red, green, blue and opacity for each of six directions,
-    or once.
-    """
+    """Opacity where a channel holds red, green, blue and opacity, once or by six directions."""
 
     def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         low, high = self.range_n2c[node, :, 3::4].to(real).unbind(1)

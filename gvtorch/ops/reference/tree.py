@@ -197,6 +197,11 @@ class ChannelBricks:
         constant = self.constant_nc[:, self.component]
         return constant[a] == constant[b]
 
+    def constant(self, holder: Holder, real: torch.dtype) -> Tensor:
+        """(r,) constants of nodes, 0 where there is none."""
+        constant = self.constant_nc[holder.node.clamp(min=0), self.component].to(real)
+        return torch.where(holder.node >= 0, constant, 0.0)
+
     def places(self, holder: Holder, beam: Beam, t: Tensor) -> Tensor:
         """(r, 3) places x, y, z in bricks at distances t (r,), in voxels from the first one's."""
         scale = holder.scale[:, None]
@@ -210,8 +215,7 @@ class ChannelBricks:
         constant where it has no brick, 0 where there is no node.
         """
         real, side = t.dtype, self.bricks_bzyxc.shape[1]
-        constant = self.constant_nc[holder.node.clamp(min=0), self.component].to(real)
-        constant = torch.where(holder.node >= 0, constant, 0.0)
+        constant = self.constant(holder, real)
         if self.bricks_bzyxc.shape[0] == 0:
             return constant
         columns = zip(self.places(holder, beam, t).unbind(1), shift, strict=True)

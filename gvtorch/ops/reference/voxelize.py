@@ -83,6 +83,17 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack([a[..., i] * b[..., j] - a[..., j] * b[..., i] for i, j in turns], -1)
 
 
+def _beside(from_corner: Tensor, edge: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of places, told from the first corner of an edge: how far out of the triangle they are, times
+    an area; how far along the edge, 0 to 1; and the way to them from there.
+    """
+    area = _dot(_cross(edge, normal), from_corner)
+    edge2 = _dot(edge, edge)
+    inverse = 1 / torch.where(edge2 > 0, edge2, 1)
+    along = (_dot(from_corner, edge) * inverse).clamp(0, 1)
+    return area, along, from_corner - edge * along[..., None]
+
+
 def _nearest(place_p3: Tensor, corner_f33: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Returns for each place the distance to the nearest of f triangles, which it is (-1: none is
     within the reach), and a vector (p, 3) along which it lies, of any length and sign.
@@ -94,13 +105,8 @@ def _nearest(place_p3: Tensor, corner_f33: Tensor, reach: Tensor) -> tuple[Tenso
     best = torch.full(inside.shape, torch.inf, dtype=a.dtype, device=a.device)
     toward = torch.zeros_like(normal).expand(*inside.shape, 3)
     for corner, edge in ((a, b - a), (b, c - b), (c, a - c)):
-        beside = _cross(edge, normal)  # out of the triangle
-        from_corner = place_p3[:, None] - corner
-        inside = inside & (_dot(beside, from_corner) <= 0)
-        edge2 = _dot(edge, edge)
-        inverse = 1 / torch.where(edge2 > 0, edge2, 1)
-        along = (_dot(from_corner, edge) * inverse).clamp(0, 1)
-        from_edge = from_corner - edge * along[..., None]
+        area, _, from_edge = _beside(place_p3[:, None] - corner, edge, normal)
+        inside = inside & (area <= 0)
         gap2 = _dot(from_edge, from_edge)
         toward = torch.where((gap2 < best)[..., None], from_edge, toward)
         best = torch.minimum(gap2, best)
@@ -125,14 +131,10 @@ def _weights(place_p3: Tensor, corner_p33: Tensor) -> Tensor:
     inside = length2 > 0
     over, gaps, shares = [], [], []
     for corner, edge in ((a, b - a), (b, c - b), (c, a - c)):
-        from_corner = place_p3 - corner
-        area = _dot(_cross(edge, normal), from_corner)
+        area, share, from_edge = _beside(place_p3 - corner, edge, normal)
         inside = inside & (area <= 0)
         over.append(-area / torch.where(length2 > 0, length2, 1))
-        edge2 = _dot(edge, edge)
-        inverse = 1 / torch.where(edge2 > 0, edge2, 1)
-        shares.append((_dot(from_corner, edge) * inverse).clamp(0, 1))
-        from_edge = from_corner - edge * shares[-1][..., None]
+        shares.append(share)
         gaps.append(_dot(from_edge, from_edge))
     plane = torch.stack((over[1], over[2], over[0]), 1)  # a corner's weight: its far edge's area
     first = (gaps[0] <= gaps[1]) & (gaps[0] <= gaps[2])
@@ -147,21 +149,16 @@ def _weights(place_p3: Tensor, corner_p33: Tensor) -> Tensor:
 
 
 def _ahead(place_p3: Tensor, corner_f33: Tensor, solid_f: Tensor) -> Tensor:
-    """Returns (p,) int64 winding numbers: triangles that lie ahead along x, those whose normals
-    point ahead as 1.
-    """
+    """(p,) int64 winding numbers: triangles ahead along x, with their normals ahead as 1."""
     where, way = pierced(place_p3[:, None], corner_f33)
     return (way * solid_f * (where > place_p3[:, :1]).long()).sum(1)
 
 
 def pierced(place: Tensor, corner: Tensor) -> tuple[Tensor, Tensor]:
-    """Finds where lines along x through places pierce triangles. Two triangles at an edge agree on
-    whose side a line passes, and a line through an edge passes as if it were moved aside by nearly
-    nothing, the same way for all: so none slips through.
-
-    Args:
-        place: (..., 3) places.
-        corner: (..., 3, 3) triangles; leading dimensions broadcast.
+    """Finds where lines along x through places (..., 3) pierce triangles (..., 3, 3), whose leading
+    dimensions broadcast. Two triangles at an edge agree on whose side a line passes, and a line
+    through an edge passes as if it were moved aside by nearly nothing, the same way for all: so
+    none slips through.
 
     Returns:
         (...) x; (...) int64: 1 where the triangle's normal points along x, -1 where against it, 0
@@ -235,18 +232,9 @@ def _filled(place_p3: Tensor, corner_f33: Tensor) -> Tensor:
 def _clip(
     at: Tensor, count: Tensor, axis: int, limit: float, *, upper: bool
 ) -> tuple[Tensor, Tensor]:
-    """Cuts polygons at a plane across an axis and keeps what is above it (or below). What lies in
-    the plane is above.
-
-    Args:
-        at: (q, CORNERS, 3) corners in order.
-        count: (q,) how many there are of each.
-        axis: The axis, and where the plane crosses it: `limit`.
-        limit: See there.
-        upper: Whether what is above is kept.
-
-    Returns:
-        The same of what is kept. An edge is cut at the same place whichever way it is gone along.
+    """Cuts polygons, (q, CORNERS, 3) corners in order and (q,) how many, where `axis` is `limit`;
+    returns the same of what is above (`upper`) or below. What lies in the plane is above, and an
+    edge is cut at the same place whichever way it is gone along.
     """
     number = torch.arange(CORNERS, device=at.device)
     behind = torch.where(number + 1 < count[:, None], number + 1, 0)
@@ -273,9 +261,7 @@ def _clip(
 
 
 def _before(at: Tensor, count: Tensor) -> Tensor:
-    """Returns (q,) the volume between polygons and the plane x = 0, below 0 where their normals
-    point against x.
-    """
+    """(q,) volumes between polygons and x = 0, below 0 where their normals point against x."""
     a, total = at[:, 0], at.new_zeros(len(at))
     for i in range(1, CORNERS - 1):
         b, c = at[:, i], at[:, i + 1]
@@ -286,14 +272,11 @@ def _before(at: Tensor, count: Tensor) -> Tensor:
 
 
 def box_share(normal_p3: Tensor, offset_p: Tensor) -> Tensor:
-    """Returns (p,) the share of a voxel, a cube of side 1, that lies below a plane, in closed form.
+    """Returns (p,) the share of a voxel, a cube of side 1, that lies below a plane, in closed form:
+    the plane lies so far above the voxel's centre, along a normal of any length; 0 gives 1/2.
 
     Exact but for planes within `FLAT` of an axis, which are turned by less than that: the formula
     would divide by nothing there. The share is then right to 3e-4.
-
-    Args:
-        normal_p3: (p, 3) normals of planes, of any length; that of length 0 gives 1/2.
-        offset_p: (p,) how far the plane lies above the voxel's centre, along the normal.
     """
     length = sqrt_exact(_dot(normal_p3, normal_p3))
     size = normal_p3.abs()

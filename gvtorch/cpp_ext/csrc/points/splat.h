@@ -1,4 +1,4 @@
-// The body of `splat`: what cubes of voxels hold of points. Twin and source: ops/reference/splat.py, whose order of
+// The body of `splat`: what cubes of voxels hold of points. Twin and source: ops/splat.py, whose order of
 // operations is kept. A voxel adds points in the order of its cube's lists, however the work is cut. Skipping what has
 // no share changes no bit: sums begin at 0, so they are never -0, to which alone adding 0 would tell.
 #pragma once
