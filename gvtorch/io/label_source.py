@@ -14,13 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
-<<<<<<< HEAD
 from ..base.stage import Progress
 from .resources import cores, run_ahead
-=======
-from ..base.stage import Progress, no_progress
-from ..base.whole_file import durable_file, write_npy
->>>>>>> slim-core
 from .source import Index, MemorySource, VolumeSource
 
 LABELS = "labels.npy"  # in the hidden folder of a store in the making

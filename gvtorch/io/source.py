@@ -28,8 +28,7 @@ from ..base import boxes
 from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
-from ..base.npy_file import save_npy
-from ..base.whole_file import told_of
+from ..base.whole_file import save_npy, told_of
 from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]

@@ -22,16 +22,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
-<<<<<<< HEAD
-from ...base.npy_file import write_npy
 from ...base.stage import Progress, no_progress
 from ...base.volume import Volume
-from ...base.whole_file import durable_file
-=======
-from ...base.stage import Progress, no_progress
-from ...base.volume import Volume
-from ...base.whole_file import save_npy, told_of
->>>>>>> slim-core
+from ...base.whole_file import durable_file, write_npy
 from .. import resources
 from ..label_source import LABELS, indexed_source
 from ..oblique import Oblique
