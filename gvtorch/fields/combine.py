@@ -39,8 +39,6 @@ class Painted(Changed):
 class Warp(Field):
     """A field asked at points that another field moves."""
 
-    most: Tensor
-
     def __init__(self, field: nn.Module, way: nn.Module, most: float) -> None:
         """Takes the field, and how far points are moved.
 
@@ -53,7 +51,7 @@ class Warp(Field):
         super().__init__()
         self.field = checked_field("Warp", "field", field)
         self.way = checked_field("Warp", "way", way)
-        self.number("most", most, low=0)
+        self.most = self.number("most", most, low=0)
         if isinstance(field, Field) and not field.prefiltered:
             self.threshold, self.dtypes = field.threshold, field.dtypes
 

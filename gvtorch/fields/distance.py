@@ -39,7 +39,6 @@ class Distance(Field):
 
     exact: bool = True
     smooth: bool = True
-    color: Tensor
 
     def __init__(self, color: Color = WHITE) -> None:
         """Takes the colour of the surface."""
@@ -48,7 +47,7 @@ class Distance(Field):
         red, green, blue = check.triple(where, "color", color)
         if min(red, green, blue) < 0 or max(red, green, blue) > 1:
             raise ValueError(f"{where}: color must be in 0 to 1, got {tuple(color)}")
-        self.vector("color", (red, green, blue))
+        self.color = self.vector("color", (red, green, blue))
 
     def forward(self, points: Tensor) -> Tensor:
         """Returns (...,) signed distances at points (..., 3)."""
@@ -194,12 +193,10 @@ class Intersection(Pair):
 class SmoothUnion(Pair):
     """The union, blended where both surfaces are within `width` of each other, colours too."""
 
-    width: Tensor
-
     def __init__(self, first: Distance, second: Distance, width: float) -> None:
         """Takes the shapes, and how far apart they begin to blend."""
         super().__init__(first, second)
-        self.number("width", width, low=0, open_low=True)
+        self.width = self.number("width", width, low=0, open_low=True)
         self.exact = False
 
     def mix(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:

@@ -98,8 +98,6 @@ class Fractal(Distance):
 
     exact = True  # as far as an estimate is
     smooth = False
-    constant: Tensor
-    bailout: Tensor
     colors_33: Tensor
 
     def __init__(
@@ -126,9 +124,9 @@ class Fractal(Distance):
         where = type(self).__name__
         self.iteration = check.instance(where, "iteration", iteration, Iteration)
         self.iterations = check.whole(where, "iterations", iterations, low=1, high=1000)
-        self.number("bailout", bailout, low=1, open_low=True)
+        self.bailout = self.number("bailout", bailout, low=1, open_low=True)
         self.julia = constant is not None
-        self.vector("constant", constant or (0.0, 0.0, 0.0))
+        self.constant = self.vector("constant", constant or (0.0, 0.0, 0.0))
         if len(colors) != 3:
             raise ValueError(f"{where}: colors must be three colours, got {len(colors)}")
         self.register_buffer("colors_33", check.reals(where, "colors", colors, (3, 3)).clamp(0, 1))
