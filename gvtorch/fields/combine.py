@@ -7,7 +7,7 @@ What an interval of the parts tells of the whole is worked out by interval arith
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Self
 
 import torch
@@ -87,7 +87,6 @@ class Stack(Field):
         self.fields = nn.ModuleDict(
             {name: checked_field("Stack", name, one) for name, one in fields.items()}
         )
-
         self.prefiltered = _prefiltered("Stack", fields.values())
 
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:
@@ -130,16 +129,14 @@ class Blend(Field):
         self.prefiltered = _prefiltered(where, (first, second, mask))
 
     def forward(self, points: Tensor) -> Values:
-        return self._mix(self.first(points), self.second(points), self.mask(points))
+        return self._mix(lambda part: part(points))
 
     def filtered(self, points: Tensor, size: Tensor) -> Values:
         """Mixes means; what is not prefiltered is taken at the middles of voxels."""
-        parts = (self.first, self.second, self.mask)
-        first, second, share = (_ask(part, points, size) for part in parts)
-        return self._mix(first, second, share)
+        return self._mix(lambda part: _ask(part, points, size))
 
-    def _mix(self, first: Values, second: Values, mask: Values) -> Values:
-        share = _single(mask)
+    def _mix(self, ask: Callable[[nn.Module], Values]) -> Values:
+        first, second, share = ask(self.first), ask(self.second), _single(ask(self.mask))
         if isinstance(first, Mapping) and isinstance(second, Mapping):
             return {name: _mixed(one, second[name], share) for name, one in first.items()}
         return _mixed(_single(first), _single(second), share)
@@ -187,17 +184,11 @@ class Mask(Blend):
         if isinstance(field, Field):
             self.dtypes = field.dtypes
 
-    def _mix(self, first: Values, second: Values, mask: Values) -> Values:
-        if isinstance(first, Mapping):
-            return {n: _mixed(torch.zeros_like(v), v, _single(mask)) for n, v in first.items()}
-        return _mixed(torch.zeros_like(first), first, _single(mask))
-
-    def forward(self, points: Tensor) -> Values:
-        return self._mix(values := self.first(points), values, self.mask(points))
-
-    def filtered(self, points: Tensor, size: Tensor) -> Values:
-        values = _ask(self.first, points, size)
-        return self._mix(values, values, _ask(self.mask, points, size))
+    def _mix(self, ask: Callable[[nn.Module], Values]) -> Values:
+        values, share = ask(self.first), _single(ask(self.mask))
+        if isinstance(values, Mapping):
+            return {n: _mixed(torch.zeros_like(v), v, share) for n, v in values.items()}
+        return _mixed(torch.zeros_like(values), values, share)
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
         """0 where the mask is; else between 0 and the field."""

@@ -191,6 +191,11 @@ class Fractal(Distance):
         ends = self.colors_33.to(center)
         return ends.amin(0).expand_as(center), ends.amax(0).expand_as(center)
 
+    def _within(self, most: float) -> Tensor:
+        """(2, 3) a cube around the origin."""
+        ends = torch.tensor((-most, most), dtype=torch.float64, device=self.colors_33.device)
+        return ends[:, None].expand(2, 3)
+
 
 class Mandelbulb(Fractal):
     """z^n + c in three dimensions: White and Nylander's bulb."""
@@ -203,9 +208,7 @@ class Mandelbulb(Fractal):
         """Beyond 2^(1 / (n - 1)) all escape: there |z|^n grows by more than |c| takes away."""
         power = self.iteration.power
         assert isinstance(power, int)
-        most = 2.0 ** (1 / (power - 1))
-        ends = torch.tensor((-most, most), dtype=torch.float64, device=self.colors_33.device)
-        return ends[:, None].expand(2, 3)
+        return self._within(2.0 ** (1 / (power - 1)))
 
 
 class Julia(Fractal):
@@ -224,8 +227,7 @@ class Julia(Fractal):
         most, size = 1.0, float(self.constant.norm())
         while most**power - size <= most:
             most += 1 / 64
-        ends = torch.tensor((-most, most), dtype=torch.float64, device=self.colors_33.device)
-        return ends[:, None].expand(2, 3)
+        return self._within(most)
 
 
 class Mandelbox(Fractal):
@@ -242,5 +244,4 @@ class Mandelbox(Fractal):
         """Where all orbits stay that never escape, and a little more for those that have not yet:
         what is beyond gets further away by the scale in each step.
         """
-        side = torch.tensor((-self._side, self._side), dtype=torch.float64)
-        return side.to(self.colors_33.device)[:, None].expand(2, 3)
+        return self._within(self._side)
