@@ -17,16 +17,9 @@ from torch import Tensor, nn
 from ..base import check
 from ..base.boxes import extent_in
 from ..fields import Distance, noise
-from ..fields.noise.fractal import Octave, octaves_from
-from ..fields.noise.tally import Tally
+from ..fields.noise.fractal import Octave, Tally, octaves_from
 from ..pool import Channel
-from .field import (
-    alike,
-    distances_of,
-    dtype_of_places,
-    interval_of,
-    moving,
-)
+from .field import alike, distances_of, dtype_of_places, interval_of, moving
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth, check_points
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between

@@ -16,9 +16,7 @@ import torch
 from torch import Tensor
 
 from ...base import check
-from .basis import perlin
-from .bounds import Basis, Bounds, bounds
-from .lattice import Period, Points, as_points, periods
+from .basis import Basis, Bounds, Period, Points, as_points, bounds, periods, perlin
 
 #: Seeds of the octaves of a sum, and of the components of a warp, are so far apart.
 _NEXT_OCTAVE, _NEXT_AXIS = 0x10001, 0x3000007
@@ -41,6 +39,25 @@ class Octave(NamedTuple):
     amplitude: float
     frequency: float
     seed: int
+
+
+class Tally:
+    """Counts what was evaluated; what a unit is, its user says.
+
+    Nothing is counted while torch compiles: it takes an attribute for a constant, and a function
+    that changes one would be compiled anew at each call.
+
+    Attributes:
+        made: Units that were evaluated so far.
+        wanted: Those that were asked for, whether they had to be evaluated or not.
+    """
+
+    made = wanted = 0
+
+    def _count(self, made: int = 0, wanted: int = 0) -> None:
+        if not torch.compiler.is_compiling():
+            self.made += made
+            self.wanted += wanted
 
 
 def octaves_of(

@@ -28,10 +28,8 @@ import torch
 from torch import Tensor
 
 from ...base import check
-from .basis import perlin
-from .fractal import Octave, octaves_from
-from .lattice import as_points
-from .tally import Tally
+from .basis import as_points, perlin
+from .fractal import Octave, Tally, octaves_from
 
 #: Interpolated from so many voxels along each axis.
 POINTS = 6

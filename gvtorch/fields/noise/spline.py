@@ -29,8 +29,7 @@ from torch import Tensor
 
 from ...base import check
 from ...ops.reference import noise as twin
-from .fractal import Octave, octaves_from
-from .tally import Tally
+from .fractal import Octave, Tally, octaves_from
 
 _APART = 1e-6  # relative, by which a level's voxels may differ from an octave's cells
 
