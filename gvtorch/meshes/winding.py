@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ..ops.voxelize import ARITY
-from .hierarchy import Hierarchy, padded
+from .geometry import Hierarchy, padded
 from .mesh import Mesh
 
 _FAR = 3.5  # radii from which on a box of triangles is a dipole: errors are then below 1e-3
