@@ -136,12 +136,6 @@ def _coarse_channel(store: Store, filtered: CoarseColors) -> dict[str, Channel]:
     return {name: Channel(torch.float16, known.width, coarse=True)}
 
 
-def _read_stage(work: Callable[[Nodes], Any], nodes: Nodes) -> Any:
-    """Does the work of a thread under its name."""
-    with stage("read"):
-        return work(nodes)
-
-
 class StoredProducer(Producer):
     """Streams a `gvtorch convert` store, or any OME-Zarr image. Its channel is "value". Pickled, it
     opens its store again in the other process."""
@@ -221,7 +215,12 @@ class StoredProducer(Producer):
         """Lets a thread work; threads that were made before a fork are not in the child."""
         if os.getpid() != self._process:
             self._begin()
-        return self._threads.submit(_read_stage, work, nodes)
+
+        def read() -> Any:
+            with stage("read"):
+                return work(nodes)
+
+        return self._threads.submit(read)
 
     def __getstate__(self) -> dict[str, Any]:
         own = ("_cache", "_closed", "_threads", "_process")
