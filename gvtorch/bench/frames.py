@@ -17,7 +17,7 @@ from ..cameras import Camera
 from ..engine import Engine, FrameStats
 from ..fields import sdf
 from ..pool import Channel, N3Tree
-from ..pool.mapped import mapped
+from ..pool.staging import mapped
 from ..producers import Bricks, FieldProducer, Nodes, Producer, VolumeProducer
 from ..shaders import TransferFunction
 from ..tracing import render

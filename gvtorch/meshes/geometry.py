@@ -104,16 +104,15 @@ class Geometry:
         return winding, distance
 
     def touched(
-        self, low_k3: Tensor, size_k: Tensor, reach_k: Tensor, *, parts: int = 4, wide: bool
+        self,
+        low_k3: Tensor,  # (k, 3) float64 low corners of the boxes, which are cubes
+        size_k: Tensor,  # (k,) float64 their sides
+        reach_k: Tensor,  # (k,) float64 world distance
+        *,
+        parts: int = 4,  # along a side of a box
+        wide: bool,  # as of `cubes`, for voxels as large as parts
     ) -> tuple[Tensor, Tensor]:
         """Tells which parts of boxes are near triangles: a ball around each is looked at.
-
-        Args:
-            low_k3: (k, 3) float64 low corners of the boxes, which are cubes.
-            size_k: (k,) float64 their sides.
-            reach_k: (k,) float64 world distance.
-            parts: Along a side of a box.
-            wide: As of `cubes`, for voxels as large as parts.
 
         Returns:
             (k, parts, parts, parts) bool, z y x: False where no triangle comes within the reach of

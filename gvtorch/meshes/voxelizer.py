@@ -145,19 +145,16 @@ class Voxelizer:
         )
 
     def cubes(
-        self, low_k3: Tensor, voxel_k: Tensor, side: int, *, coarse_k: Tensor | None = None
+        self,
+        low_k3: Tensor,  # (k, 3) float64 low corners, world units
+        voxel_k: Tensor,  # (k,) float64 world sizes of their voxels
+        side: int,  # voxels along a side of a cube
+        *,
+        coarse_k: Tensor | None = None,  # (k,) bool, which have coarse voxels; None: none
     ) -> dict[str, Tensor]:
-        """Makes k cubes of voxels, on the device and without waiting for it.
-
-        Args:
-            low_k3: (k, 3) float64 low corners, world units.
-            voxel_k: (k,) float64 world sizes of their voxels.
-            side: Voxels along a side of a cube.
-            coarse_k: (k,) bool, whose voxels are means of 2^3 places in each, unless one place
-                tells as much; of none if left out.
-
-        Returns:
-            By channel (k, z, y, x, c) of its dtype.
+        """Makes k cubes of voxels, by channel (k, z, y, x, c) of its dtype, on the device and
+        without waiting for it. Coarse voxels are means of 2^3 places in each, unless one place
+        tells as much.
         """
         parts: dict[str, list[Tensor]] = {name: [] for name in self.channels}
         step = max(1, _BATCH // side**3)

@@ -68,12 +68,8 @@ class _Found(NamedTuple):
 
 
 def values(points: SortedPoints, cubes: Cubes, *, narrow: bool = True) -> np.ndarray:
-    """Returns (k, z, y, x, c) float64 the sums in voxels, per finest voxel.
-
-    Args:
-        points: The points.
-        cubes: The voxels.
-        narrow: Whether points count that are narrower than a finest voxel.
+    """Returns (k, z, y, x, c) float64 the sums in voxels, per finest voxel; without those of points
+    that are narrower than a finest voxel unless `narrow`.
     """
     table = _finer(points, cubes.level) if narrow else None
     edge = np.stack(points.grid.edges(cubes.low_k3, cubes.side, cubes.level), 1)

@@ -112,21 +112,12 @@ class BrickLevels:
         self,
         low: Place,
         high: Place,
-        filters: Mapping[str, str],
-        empty: Mapping[str, float | None],
-        spacing: tuple[float, float, float],
-        threshold: float | None,
+        filters: Mapping[str, str],  # of each channel, see `Volume.filter`
+        empty: Mapping[str, float | None],  # of channels of labels, the value of the background
+        spacing: tuple[float, float, float],  # of the finest voxels
+        threshold: float | None,  # see `N3Tree.from_volume`
     ) -> None:
-        """Makes right what follows from the finest voxels low to high (z y x).
-
-        Args:
-            low: First voxel.
-            high: The one after the last.
-            filters: Of each channel, see `Volume.filter`.
-            empty: Of channels of labels, the value of the background.
-            spacing: (x, y, z) of the finest voxels.
-            threshold: See `N3Tree.from_volume`.
-        """
+        """Makes right what follows from the finest voxels `low` to `high`, which is left out."""
         channels = [
             _ChannelLevels(self, name, how, spacing, empty.get(name))
             for name, how in filters.items()
@@ -187,22 +178,17 @@ class BrickLevels:
         pool.child_tn.view(-1)[node[own]] = below[own].to(torch.int32)
 
 
+@dataclass(eq=False)
 class _ChannelLevels:
     """One channel while it is made anew, level after level, the finest first."""
 
-    def __init__(
-        self,
-        tree: BrickLevels,
-        name: str,
-        how: str,
-        spacing: tuple[float, float, float],
-        empty: float | None,
-    ) -> None:
-        self.tree, self.name, self.how, self.spacing = tree, name, how, spacing
-        self.empty = empty
-        self.dtype = tree.bricks.bricks[name].dtype
-        self._values: np.ndarray | None = None  # of the level before
-        self._begin: Place = (0, 0, 0)  # their first voxel
+    tree: BrickLevels
+    name: str
+    how: str
+    spacing: tuple[float, float, float]
+    empty: float | None
+    _values: np.ndarray | None = None  # of the level before
+    _begin: Place = (0, 0, 0)  # their first voxel
 
     def limit(self, reach: Sequence[tuple[int, Place, Place]]) -> None:
         """Is told, of each level, the nodes (first, after the last) whose ranges are asked for."""
@@ -290,7 +276,8 @@ class _ChannelLevels:
             slice(a * n - at, min(b * n, most) - at)
             for a, (b, most, at) in zip(begin, ends, strict=True)
         )
-        told = self.how, n, self.dtype, self.spacing, level
+        dtype = self.tree.bricks.bricks[self.name].dtype
+        told = self.how, n, dtype, self.spacing, level
         made = coarser(self._values[cut], *told, empty=self.empty)
         if (low, high) == (begin, end):
             return made

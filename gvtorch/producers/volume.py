@@ -12,10 +12,9 @@ from ..base import check
 from ..base.volume import Volume, movable
 from ..ops import cut_bricks
 from ..pool import BrickTable, Channel
-from ..pool.mapped import mapped
 from ..pool.pools import checked_threshold, labels_by_channel, volumes_by_channel
 from ..pool.pyramid import Level, NodeSummary, levels_by_depth
-from ..pool.staging import wide_rows
+from ..pool.staging import mapped, wide_rows
 from .answer import regions_of
 from .producer import (
     Bricks,
@@ -142,23 +141,24 @@ class VolumeProducer(Producer):
 
     def fill(self, nodes: Nodes) -> Bricks:
         """Cuts the bricks, or names their rows where they are held."""
-        layout, data = nodes.layout, {}
+        layout = nodes.layout
         held = {name: c for name, c in self.channels.items() if nodes.coarse or not c.coarse}
         if self._hold == "bricks":
             row = self._row(nodes)
             return Bricks(data={name: self._tables[name][row] for name in held})
         if self._hold == "mapped":
             voxel = self._voxel(nodes)
-            data = {name: self._voxels[name][voxel].view(c.dtype) for name, c in held.items()}
-            return Bricks(data=data)
+            found = {name: self._voxels[name][voxel].view(c.dtype) for name, c in held.items()}
+            return Bricks(data=found)
+        loc, data = nodes.loc.cpu(), {}
         for name, channel in held.items():
             shape = (len(nodes), *(layout.side,) * 3, channel.width)
             bricks = data[name] = torch.empty(shape, dtype=channel.dtype)
-            for depth, here, zyx in _by_depth(nodes):
-                values = self._values[name][depth]
-                cut = cut_bricks(values, zyx, layout.brick_size, layout.border)
-                rows, found = wide_rows(bricks, cut)
-                rows[here] = found
+            for depth, here in by_depth(loc):
+                zyx = loc[here, :3].flip(1)
+                cut = cut_bricks(self._values[name][depth], zyx, layout.brick_size, layout.border)
+                rows, made = wide_rows(bricks, cut)
+                rows[here] = made
         return Bricks(data=data)
 
     def _row(self, nodes: Nodes) -> Tensor:
@@ -197,12 +197,6 @@ def _numbered(sizes: Sequence[Sequence[int]]) -> Tensor:
     grids = torch.tensor([[*size] for size in sizes])
     count = grids.prod(1, keepdim=True)
     return torch.cat((count.cumsum(0) - count, grids), 1)
-
-
-def _by_depth(nodes: Nodes) -> list[tuple[int, Tensor, Tensor]]:
-    """Returns for each depth which of the nodes it has, (m,), and their z, y, x, (m, 3)."""
-    loc = nodes.loc.cpu()
-    return [(depth, here, loc[here, :3].flip(1)) for depth, here in by_depth(loc)]
 
 
 def _all_bricks(values: list[Tensor], levels: list[Level], layout: Layout) -> Tensor:
