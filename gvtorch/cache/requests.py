@@ -320,9 +320,7 @@ class Scheduler:
             self.cost[kind].learn(items, milliseconds)
 
     def _rank(self, requests: Requests) -> Tensor:
-        """(k,) int64 rows by level, then by size on the screen, then by node, so that the order
-        does not depend on chance.
-        """
+        """(k,) int64 rows by level, then by size on the screen, then by node: never by chance."""
         level = requests.depth if self.order == "coarse" else -requests.depth
         small = REQUEST_PRIORITY - requests.priority.to(torch.int64)
         return (level * (REQUEST_PRIORITY + 1) + small).argsort(stable=True)

@@ -168,12 +168,12 @@ def _as_bytes(rows: Tensor) -> Tensor:
 
 def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Written:
     """Gives (k,) nodes their bricks; see `put_bricks`. The host waits for what came of it."""
-    first = data if isinstance(data, Mapping) else data[0].channels
+    first = data if isinstance(data, Mapping) else data[0].data
     coarse = any(cache.bricks.channels[name].coarse for name in first)
     lru = cache.lru[REQUEST_LOAD][coarse]
     put = put_bricks(cache, targets, data, lru.free(), coarse)
     done = _outcome(put, targets, lru)
-    done.nbytes = done.items * _brick_bytes(data)
+    done.nbytes = done.items * sum(row_bytes(rows) for rows in first.values())
     return done
 
 
@@ -243,13 +243,6 @@ def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, 
                 voxels = voxels.to(torch.int32)
             ends = torch.stack(torch.aminmax(voxels, dim=1), 1)
             put_rows_of(words.flatten(0, 1), index, ends)
-
-
-def _brick_bytes(data: Voxels | Sequence[Chunk]) -> int:
-    """Bytes of a brick, all channels together."""
-    if not isinstance(data, Mapping):
-        return data[0].brick_bytes
-    return sum(row_bytes(rows) for rows in data.values())
 
 
 def uniform(

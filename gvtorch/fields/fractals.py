@@ -141,9 +141,7 @@ class Fractal(Distance):
         return value, torch.lerp(color, one, (1.2 - near[..., None]).clamp(0, 1) ** 2)
 
     def _orbits(self, points: Tensor) -> Tensor:
-        """(3, ...) distances, and how near the orbits came to the origin and to a plane of two
-        axes.
-        """
+        """(3, ...) distances, and how near orbits came to the origin and to a plane of axes."""
         point = points.reshape(-1, 3).contiguous()
         orbit = self._orbit(point)
         if orbit is None:

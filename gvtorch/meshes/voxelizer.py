@@ -156,22 +156,18 @@ class Voxelizer:
         without waiting for it. Coarse voxels are means of 2^3 places in each, unless one place
         tells as much.
         """
-        parts: dict[str, list[Tensor]] = {name: [] for name in self.channels}
+        parts: dict[str, list[Tensor]] = {}
+        for name in self.channels:
+            dtype, width = CHANNELS[name]
+            empty = (0, side, side, side, width)
+            parts[name] = [torch.empty(empty, dtype=dtype, device=self.device)]
         step = max(1, _BATCH // side**3)
         for begin in range(0, len(low_k3), step):
             part = slice(begin, begin + step)
             coarse = None if coarse_k is None else coarse_k[part]
             for name, values in self._make(low_k3[part], voxel_k[part], side, coarse).items():
                 parts[name].append(_stored(name, values))
-        empty = (0, side, side, side)
-        return {
-            name: torch.cat(own)
-            if own
-            else torch.empty((*empty, width), dtype=dtype, device=self.device)
-            for (name, own), (dtype, width) in zip(
-                parts.items(), (CHANNELS[name] for name in self.channels), strict=True
-            )
-        }
+        return {name: torch.cat(own) for name, own in parts.items()}
 
     def constants(self, inside_k: Tensor) -> dict[str, Tensor]:
         """Returns by channel (k, c) the values of voxels far from all triangles, inside the mesh or
@@ -226,9 +222,7 @@ class Voxelizer:
         }
 
     def _blank(self, inside: Tensor) -> dict[str, Tensor]:
-        """By channel (gz, gy, gx, z, y, x, c) cubes far from all triangles, (gz, gy, gx) inside or
-        not.
-        """
+        """(gz, gy, gx, z, y, x, c) by channel, far from triangles, (gz, gy, gx) inside or not."""
         both = self.constants(torch.tensor([False, True], device=self.device))
         return {
             name: torch.where(inside[..., None], values[1], values[0])[
@@ -284,9 +278,7 @@ class Voxelizer:
         return self._channels(found._replace(**narrow))
 
     def _channels(self, found: Voxelized) -> dict[str, Tensor]:
-        """By channel (k, z, y, x, c) float32 of what was found, distances in world units (materials
-        int64).
-        """
+        """By channel (k, z, y, x, c) float32, distances in world units (int64 materials)."""
         made: dict[str, Tensor] = {}
         if "coverage" in self.channels:
             made["coverage"] = found.coverage[..., None]

@@ -18,8 +18,7 @@ import numpy as np
 from ..base import check
 from ..base.stage import Progress, no_progress
 from ..base.whole_file import told_of
-from .codes import Codes, peak, point_shares
-from .grid import PointGrid
+from .grid import Codes, PointGrid, peak, point_shares
 from .points import Points
 from .table import Fold, Rows, Runs, Table, grouped
 

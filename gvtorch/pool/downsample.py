@@ -198,9 +198,7 @@ def by_node(values: Grid, how: Reduction, brick_size: int, border: int) -> Grid:
 def _along(
     values: Grid, axis: int, how: Reduction, size: int, step: int, wide: str | None = None
 ) -> Grid:
-    """Reduces windows of `size` voxels, `step` apart, along one axis, in order; sums are of the
-    dtype `wide`, or one that holds them.
-    """
+    """Reduces windows, `step` apart, along one axis; sums are of dtype `wide`, or one that does."""
     if how == "mean" and wide is None:
         wide = _wide(_name(values), size)
     count = (values.shape[axis] - size) // step + 1

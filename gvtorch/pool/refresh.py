@@ -263,9 +263,7 @@ class _ChannelLevels:
         return NodeSummary(*flat)
 
     def _level(self, level: int, begin: Place, end: Place, low: Place, high: Place) -> np.ndarray:
-        """The voxels low to high of a level, of which those from begin to end are made of the level
-        before.
-        """
+        """The voxels low to high of a level, begin to end of them made of the level before."""
         n = self.tree.branching
         if level == 0:
             return to_numpy(self.tree.read(self.name, 0, low, high))
@@ -347,9 +345,7 @@ def _places(first: Place, count: Place, device: torch.device) -> Tensor:
 def _padded(
     values: np.ndarray, low: Place, first: Place, last: Place, size: int, border: int
 ) -> np.ndarray:
-    """Out of voxels that begin at `low`: those of the nodes `first` to `last` and their borders;
-    the outermost voxels are repeated.
-    """
+    """Of voxels from `low` on those of nodes `first` to `last`, with borders; outermost repeat."""
     for axis, at in enumerate(low):
         begin, end = first[axis] * size - border - at, last[axis] * size + border - at
         here = max(0, begin)

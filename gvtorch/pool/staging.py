@@ -150,23 +150,13 @@ class Chunk:
 
     def __init__(self, begin: int, end: int, data: Mapping[str, Tensor], span: _RingSpan) -> None:
         self.begin, self.end = begin, end
-        self._data, self._span = data, span
+        self.data, self._span = data, span
         self._device = next(iter(data.values())).device
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of what it holds."""
-        return tuple(self._data)
-
-    @property
-    def brick_bytes(self) -> int:
-        """Bytes of a brick, all channels together."""
-        return sum(row_bytes(rows) for rows in self._data.values())
 
     def __enter__(self) -> Mapping[str, Tensor]:
         if self._device.type == "cuda":
             torch.cuda.current_stream(self._device).wait_event(self._span.copied)
-        return self._data
+        return self.data
 
     def __exit__(self, *_error: object) -> None:
         if self._device.type == "cuda":

@@ -160,9 +160,7 @@ class FromChildren(OfProducers):
         return {n: from_grid(found[n], c.dtype) for n, c in self.channels.items()}
 
     def _region(self, layout: Layout, depth: int, low: Tensor, size: int) -> Blocks:
-        """size^3 voxels of a level from voxels `low` (k, 3) x y z on; beyond the level's faces the
-        outermost repeat.
-        """
+        """size^3 voxels of a level from `low` (k, 3) x y z on; beyond it the outermost repeat."""
         step, brick = layout.branching ** (layout.depth - depth), layout.brick_size
         last = torch.tensor([-(-n // step) - 1 for n in layout.extent])[:, None]
         voxel = (low[:, :, None] + torch.arange(size)).clamp(min=0).minimum(last)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from ..base import check
 from ..base.boxes import extent_in
 from ..fields import Distance, noise
-from ..fields.noise.fractal import Octave, Tally, octaves_from
+from ..fields.noise.fractal import Octave, Tally, octaves_of
 from ..pool import Channel
 from .field import alike, distances_of, dtype_of_places, interval_of, moving
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth, check_points
@@ -104,7 +104,7 @@ class Hypertexture(Tally, Producer):
         thickness = check.number(where, "thickness", thickness, low=0, open_low=True)
         amplitude = check.number(where, "amplitude", amplitude, low=0)
         softness = check.number(where, "softness", softness, low=0, open_low=True)
-        series = octaves_from(where, frequency, octaves, lacunarity, gain, seed)
+        series = octaves_of(where, octaves, lacunarity, gain, seed, frequency)
         most = amplitude * sum(one.amplitude for one in series) * noise.bounds(noise.perlin).high
         reach = thickness * max(most + softness - 0.5, 0.0)
         extent, box = _cut_out(where, shape, reach, extent, box)

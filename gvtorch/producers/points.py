@@ -142,9 +142,7 @@ class PointProducer(Producer):
 
 
 def _by_level(nodes: Nodes) -> Iterator[tuple[Tensor, Cubes]]:
-    """Yields rows of nodes of one level, a batch at a time, and the voxels of their bricks with
-    border.
-    """
+    """Yields rows of nodes of one level, a batch at a time, and their voxels, borders included."""
     layout, loc = nodes.layout, nodes.loc.cpu()
     for depth, here in by_depth(loc):
         for rows in here.split(_BATCH):

@@ -117,9 +117,7 @@ class _Cubes:
 
 
 def _coarse_channel(store: Store, filtered: CoarseColors) -> dict[str, Channel]:
-    """Returns the channel of a shader's filtered colours; raises ValueError if the store has others
-    or none.
-    """
+    """The channel of a shader's filtered colours; ValueError if the store has others or none."""
     check_filtered("StoredProducer", filtered)
     if not store.all_channels:
         raise ValueError(

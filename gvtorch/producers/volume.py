@@ -200,9 +200,7 @@ def _numbered(sizes: Sequence[Sequence[int]]) -> Tensor:
 
 
 def _all_bricks(values: list[Tensor], levels: list[Level], layout: Layout) -> Tensor:
-    """Returns (n, s, s, s, c) the bricks of a channel's values (z, y, x, c) of each level, level
-    after level, in the order z, y, x.
-    """
+    """(n, s, s, s, c) the bricks of a channel, level after level, in the order z, y, x."""
     places = [torch.cartesian_prod(*map(torch.arange, one.grid)) for one in levels[: len(values)]]
     shape = (sum(map(len, places)), *(layout.side,) * 3, values[0].shape[3])
     bricks, begin = torch.empty(shape, dtype=values[0].dtype), 0

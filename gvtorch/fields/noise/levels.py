@@ -29,7 +29,7 @@ from torch import Tensor
 
 from ...base import check
 from .basis import as_points, perlin
-from .fractal import Octave, Tally, octaves_from
+from .fractal import Octave, Tally, octaves_of
 
 #: Interpolated from so many voxels along each axis.
 POINTS = 6
@@ -109,7 +109,7 @@ class OctaveSum(Tally):
         if not settled >= self.hold:
             raise ValueError(f"{where}: settled must be >= hold, {hold:g}, got {settled!r}")
         self.settled = settled
-        self.octaves = octaves_from(where, frequency, octaves, lacunarity, gain, seed)
+        self.octaves = octaves_of(where, octaves, lacunarity, gain, seed, frequency)
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can hold."""
