@@ -64,7 +64,11 @@ class Requests:
         """
         if self.coarse is None:
             return rank[: sum(room)]
-        return rank[_fits(self.coarse[rank], room)]
+        coarse = self.coarse[rank]
+        fine, wide = (
+            mask & (mask.cumsum(0) <= n) for mask, n in zip((~coarse, coarse), room, strict=True)
+        )
+        return rank[fine | wide]
 
 
 def levels_wanted(priority: Tensor, branching: int) -> Tensor:
@@ -151,14 +155,6 @@ def _at_targets(cache: Cache, asked: dict[int, tuple[Tensor, Tensor]]) -> dict[i
     """Requests of nodes (k,) and their priorities by kind, those of aliases at their targets."""
     asked = by_target(cache.aliases, asked) if len(cache.aliases) else asked
     return {kind: Requests.of(cache, kind, *rows) for kind, rows in asked.items()}
-
-
-def _fits(coarse: Tensor, room: Sequence[int]) -> Tensor:
-    """(k,) bool, whether a slot is left for a row, those before it served."""
-    fine, wide = (
-        mask & (mask.cumsum(0) <= n) for mask, n in zip((~coarse, coarse), room, strict=True)
-    )
-    return fine | wide
 
 
 def coarser_requests(

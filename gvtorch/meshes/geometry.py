@@ -97,9 +97,6 @@ class Geometry:
             low = place - 0.5 * self.size
             found = self.cubes(low, size.contiguous(), 1, wide=True)
             parts.append((found.winding.view(-1), found.distance.view(-1) * self.size))
-        if not parts:
-            none = self.corner.new_empty(0)
-            return none.to(torch.int32), none
         winding, distance = (torch.cat(part) for part in zip(*parts, strict=True))
         return winding, distance
 

@@ -67,8 +67,7 @@ class WindingNumber:
 
     def __call__(self, place_p3: Tensor) -> Tensor:
         """Returns (p,) float64 at places (p, 3) float64."""
-        parts = [self._at(place) for place in place_p3.split(_PLACES)]
-        return torch.cat(parts) if parts else place_p3.new_empty(0)
+        return torch.cat([self._at(place) for place in place_p3.split(_PLACES)])
 
     def _at(self, place_p3: Tensor) -> Tensor:
         total = torch.zeros_like(place_p3[:, 0])

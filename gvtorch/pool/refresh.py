@@ -36,7 +36,6 @@ class BrickLevels:
     depth: int
     branching: int
     extent: Place  # finest voxels z y x
-    number: int  # of the tree
 
     @cached_property
     def slot_n(self) -> Tensor:
@@ -48,7 +47,8 @@ class BrickLevels:
         slot = _owned(self.nodes.brick_tn, self.bricks.owner_b)
         pool = self.nodes
         per_tile, count = pool.nodes_per_tile, self.branching**3
-        tile = ((pool.parent_t >= 0) & (pool.tree_t == self.number)).nonzero()[:, 0]
+        mine = pool.tree_t == self.root // per_tile
+        tile = ((pool.parent_t >= 0) & mine).nonzero()[:, 0]
         node = (tile[:, None] * per_tile + torch.arange(count, device=slot.device)).flatten()
         node = torch.cat((node, node.new_full((1,), self.root)))
         depth = torch.cat((pool.loc_t4[tile, 3].repeat_interleave(count), tile.new_zeros(1)))

@@ -15,6 +15,7 @@ from ..pool.downsample import from_grid
 from ..pool.pyramid import coarser
 from ..pool.staging import on_device
 from .answer import checked_bricks, checked_regions
+from .nodes import grid_of
 from .producer import (
     Bricks,
     Layout,
@@ -25,7 +26,6 @@ from .producer import (
     Regions,
     arrived,
     by_depth,
-    grid_of,
     touched,
 )
 

@@ -107,7 +107,13 @@ class Hypertexture(Tally, Producer):
         series = octaves_of(where, octaves, lacunarity, gain, seed, frequency)
         most = amplitude * sum(one.amplitude for one in series) * noise.bounds(noise.perlin).high
         reach = thickness * max(most + softness - 0.5, 0.0)
-        extent, box = _cut_out(where, shape, reach, extent, box)
+        if box is None:
+            own = shape.box()
+            if own is None or not bool(own.isfinite().all()):
+                told = "box must be given: the shape does not tell where it ends"
+                raise ValueError(f"{where}: {told}")
+            box = [(own[0] - reach).tolist(), (own[1] + reach).tolist()]
+        extent = extent_in(where, extent, box)
         if not check.instance(where, "dtype", dtype, torch.dtype).is_floating_point:
             raise ValueError(f"{where}: dtype must be one of floats, got {dtype}")
         channels = {"density": Channel(dtype)}
@@ -234,19 +240,3 @@ class Hypertexture(Tally, Producer):
         t = ((total - (0.5 - soft)) / (2 * soft)).clamp(0, 1)
         found = {"density": t * t * (3 - 2 * t), "distance": distance}
         return {name: found[name][..., None] for name in self.channels}
-
-
-def _cut_out(
-    where: str,
-    shape: Distance,
-    reach: float,
-    extent: int | Sequence[int],
-    box: Sequence[Sequence[float]] | None,
-) -> tuple[Sequence[int], Sequence[Sequence[float]]]:
-    """Extent along x, y, z, and a box: left out, what lies within `reach` of the shape's."""
-    if box is None:
-        own = shape.box()
-        if own is None or not bool(own.isfinite().all()):
-            raise ValueError(f"{where}: box must be given: the shape does not tell where it ends")
-        box = [(own[0] - reach).tolist(), (own[1] + reach).tolist()]
-    return extent_in(where, extent, box), box

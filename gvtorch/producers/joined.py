@@ -17,7 +17,8 @@ from torch import Tensor
 from ..base import check
 from ..io.stores.channels import channel_names
 from ..io.stores.store import Store
-from .producer import Bricks, Nodes, OfProducers, Producer, Region, Regions, arrived, grid_of
+from .nodes import grid_of
+from .producer import Bricks, Nodes, OfProducers, Producer, Region, Regions, arrived
 from .stored import StoredProducer
 
 

@@ -1,7 +1,5 @@
 """`PointProducer`: points with values, such as stars or particles, as voxels that hold their sum.
 
-What a voxel of any level holds is the integral of the points over it (points/), so a level's voxels
-are the means of those below, and the sum over a level is that of the points, whatever the level.
 Source: Hockney, Eastwood, "Computer simulation using particles", 1988, section 5 (shape functions;
 nearest grid point for points without a radius).
 """
@@ -29,7 +27,8 @@ _BATCH = 256  # bricks worked on at a time
 
 class PointProducer(Producer):
     """Makes bricks of points. Its channel is "value": for each number of a point's the sum over the
-    points in a voxel, per finest voxel, so that a voxel of a coarse level holds the mean.
+    points in a voxel, per finest voxel, so that a voxel of a coarse level holds the mean, and all
+    levels have one sum, that of the points.
 
     Attributes:
         points: The points, sorted.

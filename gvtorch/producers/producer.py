@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
-from typing import Any, Protocol, Self, TypedDict, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -466,22 +466,3 @@ def touched(changes: Sequence[Where], nodes: Nodes) -> Tensor:
 def arrived(answer: Any) -> Any:
     """Returns a producer's answer; waits for one that comes later."""
     return answer.result() if isinstance(answer, Future) else answer
-
-
-class Grid(TypedDict):
-    """The voxels of the finest level, and N."""
-
-    extent: tuple[int, int, int]
-    spacing: tuple[float, float, float]
-    origin: tuple[float, float, float]
-    branching: int
-
-
-def grid_of(producer: Producer) -> Grid:
-    """Returns where a producer's content lies, as another of the same place takes it."""
-    return {
-        "extent": producer.extent,
-        "spacing": producer.spacing,
-        "origin": producer.origin,
-        "branching": producer.branching,
-    }
