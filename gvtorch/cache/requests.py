@@ -22,7 +22,6 @@ from ..base.constants import (
     REQUEST_SUBDIVIDE,
 )
 from ..ops import compact_requests
-from .aliases import by_target
 from .cache import Cache
 
 #: The kinds of request by the names that statistics show.
@@ -153,7 +152,7 @@ def requests_below(cache: Cache, asked: Requests, branching: int) -> RequestsByK
 
 def _at_targets(cache: Cache, asked: dict[int, tuple[Tensor, Tensor]]) -> dict[int, Requests]:
     """Requests of nodes (k,) and their priorities by kind, those of aliases at their targets."""
-    asked = by_target(cache.aliases, asked) if len(cache.aliases) else asked
+    asked = cache.aliases.by_target(asked) if len(cache.aliases) else asked
     return {kind: Requests.of(cache, kind, *rows) for kind, rows in asked.items()}
 
 

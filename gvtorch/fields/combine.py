@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from .distance import HASH, Changed, Distance, grown
-from .field import Bounds, Field, Interval, Values, checked_field
+from .field import Bounds, Field, Interval, Values, between, checked_field
 from .solid import Solid
 
 
@@ -61,8 +61,7 @@ class Warp(Field):
         return self.field(points + way * (self.most / size.clamp(min=1e-30)).clamp(max=1))
 
     def bounds(self, center: Tensor, half: Tensor) -> Bounds:
-        wide = half + self.most
-        return self.field.bounds(center, wide) if isinstance(self.field, Field) else None
+        return _known(self.field, center, half + self.most, None)
 
     def near(self, center: Tensor, half: Tensor) -> Self:
         return self.replaced(field=_near(self.field, center, half + self.most))
@@ -152,10 +151,10 @@ class Blend(Field):
         low, high = self._shares(center, half, size)
         if isinstance(found[0], Mapping) and isinstance(found[1], Mapping):
             both = {*found[0]} & {*found[1]}
-            return {n: _between(found[0][n], found[1][n], low, high) for n in both}
+            return {n: between(found[0][n], found[1][n], low, high) for n in both}
         if isinstance(found[0], Mapping) or isinstance(found[1], Mapping):
             return None
-        return _between(found[0], found[1], low, high)
+        return between(found[0], found[1], low, high)
 
     def _shares(self, center: Tensor, half: Tensor, size: Tensor | None) -> Interval:
         """(k,) what the mask is known to be in boxes; 0 to 1 where nothing is."""
@@ -198,8 +197,8 @@ class Mask(Blend):
             wild = torch.full_like(center[:, 0], torch.inf)
             found = (-wild, wild)
         if isinstance(found, Mapping):
-            return {n: _between(_zero(one), one, low, high) for n, one in found.items()}
-        return _between(_zero(found), found, low, high)
+            return {n: between(_zero(one), one, low, high) for n, one in found.items()}
+        return between(_zero(found), found, low, high)
 
 
 def _zero(interval: Interval) -> Interval:
@@ -271,15 +270,3 @@ def _mixed(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     elif first.dim() > share.dim():
         share = share[..., None]
     return torch.lerp(first, second, share)
-
-
-def _between(first: Interval, second: Interval, low: Tensor, high: Tensor) -> Interval:
-    """Of a mix of two intervals, by shares between low and high (k,)."""
-    if first[0].dim() > low.dim():
-        low, high = low[:, None], high[:, None]
-    hull = torch.minimum(first[0], second[0]), torch.maximum(first[1], second[1])
-    one, other = (
-        torch.where(high <= 0, a, torch.where(low >= 1, b, both))
-        for a, b, both in zip(first, second, hull, strict=True)
-    )
-    return one, other

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .field import Field, Interval, length
+from .field import Field, Interval, between, length
 
 Color = Sequence[float]  # linear red, green, blue, 0 to 1
 WHITE = (0.8, 0.8, 0.8)
@@ -134,14 +134,8 @@ class Pair(Distance):
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         """One shape's where it alone counts, else what lies between both."""
-        low, high = (end[:, None] for end in self._share(center, half, 0.0))
         own, other = self.first.colors(center, half), self.second.colors(center, half)
-        hull = torch.minimum(own[0], other[0]), torch.maximum(own[1], other[1])
-        first, second = (
-            torch.where(high == 0, one, torch.where(low == 1, two, both))
-            for one, two, both in zip(own, other, hull, strict=True)
-        )
-        return first, second
+        return between(own, other, *self._share(center, half, 0.0))
 
     def _share(self, center: Tensor, half: Tensor, rounded: float) -> Interval:
         """(k,) the second one's share in boxes, of values that are rounded by a part of places."""

@@ -159,6 +159,20 @@ def tighter(one: Interval, other: Interval) -> Interval:
     return torch.maximum(one[0], other[0]), torch.minimum(one[1], other[1])
 
 
+def between(first: Interval, second: Interval, low: Tensor, high: Tensor) -> Interval:
+    """Returns what mixes of two values lie in, (k,) or (k, c), by shares between low and high (k,)
+    of the second; one alone where its share is known to be 0 or 1.
+    """
+    if first[0].dim() > low.dim():
+        low, high = low[:, None], high[:, None]
+    hull = torch.minimum(first[0], second[0]), torch.maximum(first[1], second[1])
+    one, other = (
+        torch.where(high <= 0, a, torch.where(low >= 1, b, both))
+        for a, b, both in zip(first, second, hull, strict=True)
+    )
+    return one, other
+
+
 def parts_of(center: Tensor, half: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Returns the count^3 parts of each of k boxes, box after box, (k * count^3, 3) each: of many
     small boxes intervals tell more than of a large one. `joined` makes them intervals of the boxes.

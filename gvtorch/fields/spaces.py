@@ -145,10 +145,7 @@ class Repeat(Space):
     """
 
     def __init__(
-        self,
-        shape: Distance,
-        period: Sequence[float],
-        count: Sequence[int] | None = None,
+        self, shape: Distance, period: Sequence[float], count: Sequence[int] | None = None
     ) -> None:
         """Takes the shape, how far apart it is repeated along x, y, z (0: not at all), and how
         often in all (odd, around the origin); None: without end.

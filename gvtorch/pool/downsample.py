@@ -216,8 +216,10 @@ def _pool(
     factors = [factor] * 3 if isinstance(factor, int) else list(factor)
     shape = [-(-n // f) for n, f in zip(values.shape[:3], factors, strict=True)]
     shape.append(values.shape[3])
-    out = _empty(values, shape)
-    slab = _DEVICE_SLAB if isinstance(values, Tensor) else _SLAB
+    if isinstance(values, Tensor):
+        out, slab = values.new_empty(shape), _DEVICE_SLAB
+    else:
+        out, slab = np.empty(shape, values.dtype), _SLAB
     rows = max(1, slab // max(1, math.prod(values.shape[1:]) * factors[0]))
     for start in range(0, shape[0], rows):
         part = values[start * factors[0] : (start + rows) * factors[0]]
@@ -239,13 +241,6 @@ def _every(values: Grid, axis: int, first: int, step: int, count: int | None = N
     """Returns every `step`-th slice along an axis, `count` of them."""
     stop = None if count is None else first + step * (count - 1) + 1
     return values[(slice(None),) * axis + (slice(first, stop, step),)]
-
-
-def _empty(values: Grid, shape: Sequence[int]) -> Grid:
-    """Returns a grid of a shape, of the kind, dtype and device of another."""
-    if isinstance(values, Tensor):
-        return values.new_empty(shape)
-    return np.empty(shape, values.dtype)
 
 
 def _name(values: Grid) -> str:

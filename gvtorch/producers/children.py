@@ -15,19 +15,8 @@ from ..pool.downsample import from_grid
 from ..pool.pyramid import coarser
 from ..pool.staging import on_device
 from .answer import checked_bricks, checked_regions
-from .nodes import grid_of
-from .producer import (
-    Bricks,
-    Layout,
-    Nodes,
-    OfProducers,
-    Producer,
-    Region,
-    Regions,
-    arrived,
-    by_depth,
-    touched,
-)
+from .nodes import Layout, Nodes, grid_of
+from .producer import Bricks, OfProducers, Producer, Region, Regions, arrived, by_depth, touched
 
 _AT_ONCE = 64  # blocks of a level that are made together, out of N^3 times as many below
 

@@ -25,16 +25,8 @@ from ..io.stores.store import Store
 from ..pool import Channel
 from ..pool.pyramid import NodeSummary
 from .answer import regions_of
-from .producer import (
-    Bricks,
-    CoarseColors,
-    Layout,
-    Nodes,
-    Producer,
-    Region,
-    Regions,
-    check_filtered,
-)
+from .nodes import Layout, Nodes
+from .producer import Bricks, CoarseColors, Producer, Region, Regions, check_filtered
 
 _TILE = 32  # cells along a side of what is read at once
 _GROUP_BYTES = 32 * 10**6  # of cubes held at a time beside the cache

@@ -16,16 +16,8 @@ from ..pool.pools import checked_threshold, labels_by_channel, volumes_by_channe
 from ..pool.pyramid import Level, NodeSummary, levels_by_depth
 from ..pool.staging import mapped, wide_rows
 from .answer import regions_of
-from .producer import (
-    Bricks,
-    CoarseColors,
-    Layout,
-    Nodes,
-    Producer,
-    Regions,
-    by_depth,
-    check_filtered,
-)
+from .nodes import Layout, Nodes
+from .producer import Bricks, CoarseColors, Producer, Regions, by_depth, check_filtered
 
 _BATCH = 4096  # bricks cut from a level at a time
 
@@ -165,7 +157,10 @@ class VolumeProducer(Producer):
         """(k,) int64 which node of all levels; beyond the volume the nearest at its face."""
         loc = nodes.loc.to(self._grids.device)
         first, high, deep, wide = self._grids[loc[:, 3]].unbind(1)
-        z, y, x = (at.minimum(n - 1) for at, n in zip(_zyx(loc), (high, deep, wide), strict=True))
+        z, y, x = (
+            at.minimum(n - 1)
+            for at, n in zip(loc[:, :3].flip(1).unbind(1), (high, deep, wide), strict=True)
+        )
         return first + (z * deep + y) * wide + x
 
     def _voxel(self, nodes: Nodes) -> Tensor:
@@ -174,16 +169,12 @@ class VolumeProducer(Producer):
         first, *sizes = self._sizes[loc[:, 3], :, None, None, None].unbind(1)
         reach = torch.arange(layout.side, device=loc.device) - layout.border
         at = []
-        for axis, (node, size) in enumerate(zip(_zyx(loc), sizes, strict=True)):
+        for axis, (node, size) in enumerate(zip(loc[:, :3].flip(1).unbind(1), sizes, strict=True)):
             along = reach.view([-1 if other == axis else 1 for other in range(3)])
             place = node[:, None, None, None] * layout.brick_size + along
             at.append(place.clamp(min=0).minimum(size - 1))
         z, y, x = at
         return first + (z * sizes[1] + y) * sizes[2] + x
-
-
-def _zyx(loc: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    return loc[:, 2], loc[:, 1], loc[:, 0]
 
 
 def _rows_of(level: Level) -> Tensor:
