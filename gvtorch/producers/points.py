@@ -20,7 +20,7 @@ from ..points.points import Points
 from ..points.sorted import SortedPoints, sort_points
 from ..points.splat import Cubes, ranges, values
 from ..pool import Channel
-from .producer import Layout, Nodes, Producer, Region, Regions, by_depth
+from .producer import Nodes, Producer, Region, Regions, by_depth
 
 _BATCH = 256  # bricks worked on at a time
 
@@ -94,9 +94,6 @@ class PointProducer(Producer):
         )
         self.points, self.drawn = found, drawn
         self._told = False  # of sums that the channel can't hold
-
-    def prepare(self, layout: Layout) -> None:
-        """Does nothing: the points are sorted for any layout."""
 
     def classify(self, nodes: Nodes) -> Regions:
         """EMPTY where no point reaches into the brick, and the ranges of values."""
