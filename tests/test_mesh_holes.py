@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import gvtorch as gv
 from gvtorch.meshes.holes import filled, rims, told_of_holes
 from gvtorch.meshes.mesh import facing_away, solids
 from gvtorch.meshes.voxelizer import Voxelizer
-from gvtorch.meshes.winding import winding_number
+from gvtorch.meshes.winding import WindingNumber
 
 
 def without(mesh: gv.Mesh, *faces: int) -> gv.Mesh:
@@ -23,6 +24,11 @@ def without(mesh: gv.Mesh, *faces: int) -> gv.Mesh:
 def cut(mesh: gv.Mesh, height: float) -> gv.Mesh:
     """The triangles below a height."""
     return mesh.only(np.flatnonzero(mesh.corners[:, :, 2].max(1) < height))
+
+
+def winding_number(mesh: gv.Mesh, points: Any) -> np.ndarray:
+    place = torch.from_numpy(np.asarray(points, np.float64))
+    return WindingNumber(torch.from_numpy(mesh.corners))(place).numpy()
 
 
 def test_a_plane_hole_is_half_wound_around():

@@ -216,7 +216,7 @@ def test_the_search_misses_no_triangle(searched, reach, detail):
     size = torch.tensor([0.1, 0.1, reach], dtype=torch.float64).expand(len(low), 3).contiguous()
     found = geometry.cubes(low, size, 8, 0.0, shares=False, weights=True, wide=False)
     near = exact < reach * (1 - 1e-5)
-    distance, face = found.distance.view(-1), found.face.view(-1).long()
+    distance, face = 0.1 * found.distance.view(-1), found.nearest.view(-1).long()
     assert (distance[near] - exact[near]).abs().max() < 1e-5
     assert (face[exact > reach * (1 + 1e-5)] == -1).all() and near.sum() > 300
     # The weights tell the place itself.

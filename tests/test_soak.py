@@ -23,7 +23,7 @@ from helpers.recorded import recorded, stepped
 
 import gvtorch as gv
 from gvtorch.io.stores.conversion import convert
-from gvtorch.pool import mapped
+from gvtorch.pool import staging
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
 FRAMES = int(os.environ.get("GVTORCH_SOAK", "2000"))
@@ -206,7 +206,7 @@ def memory(device: torch.device) -> tuple[int, int]:
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_random_flights_end_in_the_resident_picture(blobs, tmp_path, backend, monkeypatch):
-    monkeypatch.setattr(mapped, "_SMALL", 0)  # bytes: all that is mapped is read in place
+    monkeypatch.setattr(staging, "_SMALL", 0)  # bytes: all that is mapped is read in place
     device = torch.device(DEVICES[backend])
     store = tmp_path / "store"
     convert(blobs, store)

@@ -14,7 +14,7 @@ import gvtorch as gv
 from gvtorch.points import sorted as sorting
 from gvtorch.points.points import Points
 from gvtorch.points.splat import Cubes, ranges, region, values
-from gvtorch.points.table import Runs, Table, grouped
+from gvtorch.points.table import Runs, grouped
 
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
@@ -107,7 +107,7 @@ def test_a_folder_makes_the_picture_of_its_points(tmp_path):
 
 def test_runs_are_merged_in_order():
     random = np.random.default_rng(2)
-    runs = Runs(Table(None, "runs"), 50)
+    runs = Runs(None, "runs", 50)
     code = random.integers(0, 40, 1000)
     code[300:700] = 7  # more than a block
     for part in np.split(code, 20):

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gvtorch.ops import splat
 from gvtorch.ops.splat import shares
-from gvtorch.points.codes import point_shares
+from gvtorch.points.grid import point_shares
 from gvtorch.points.points import Points
 from gvtorch.points.sorted import sort_points
 from gvtorch.points.splat import Cubes, values

@@ -10,7 +10,7 @@ import torch
 from helpers import DEVICES, meshes
 
 import gvtorch as gv
-from gvtorch.meshes.hierarchy import Hierarchy
+from gvtorch.meshes.geometry import Hierarchy
 from gvtorch.ops import voxelize
 from gvtorch.ops.reference.voxelize import box_share
 

@@ -18,7 +18,7 @@ from ..engine import Engine, FrameStats
 from ..fields import sdf
 from ..pictures import Picture
 from ..pool import Channel, N3Tree
-from ..pool.mapped import mapped
+from ..pool.staging import mapped
 from ..producers import Bricks, FieldProducer, Nodes, Producer, VolumeProducer
 from ..shaders import TransferFunction
 from ..tracing import render

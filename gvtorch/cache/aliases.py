@@ -105,23 +105,38 @@ class Aliases:
             if len(lost):
                 target[lost], exact[lost] = tree.nearest(rows.goal[lost, 1:])
         rows = rows._replace(target=target, exact=exact)
-        bare = ~exact & self._ends(target)
+        bare = ~exact & (self.nodes.child_tn.view(-1)[target] == TERMINAL)
         whole = bare & (self.nodes.brick_tn.view(-1)[target] < ABSENT)  # EMPTY and CONSTANT regions
-        rows = rows._replace(exact=exact | whole).some(
-            ~bare | whole
-        )  # others are asked for themselves
+        stay = ~bare | whole  # others are asked for themselves
+        rows = rows._replace(exact=exact | whole).some(stay)
         rows = self._followed(rows)
         self.rows = rows._replace(target_place=self._places(rows.target))
         self._copy(self.rows.some(self.rows.exact))
         self._copy_pending()
         self._kept = self._paths()
 
-    def asked(self, node: Tensor, kind: int) -> tuple[Tensor, Tensor]:
-        """Returns which nodes are asked in the place of (k,) nodes, and of what kind."""
-        row, known = self._row(node)
-        target = torch.where(known, self.rows.target[row], node)
-        above = known & ~self.rows.exact[row]
-        return target, torch.where(above, REQUEST_SUBDIVIDE, kind)
+    def by_target(
+        self, asked: Mapping[int, tuple[Tensor, Tensor]]
+    ) -> dict[int, tuple[Tensor, Tensor]]:
+        """Returns requests, by kind nodes (k,) and priorities (k,), with targets in the place of
+        their aliases, each once; those that are pending are left out.
+        """
+        nodes, priorities, kinds = [], [], []
+        for kind, (node, priority) in asked.items():
+            row, known = self._row(node)
+            nodes.append(torch.where(known, self.rows.target[row], node))
+            priorities.append(priority)
+            above = known & ~self.rows.exact[row]
+            kinds.append(torch.where(above, REQUEST_SUBDIVIDE, kind))
+        node, priority, kind_k = torch.cat(nodes), torch.cat(priorities), torch.cat(kinds)
+        found = {}
+        for kind in (REQUEST_LOAD, REQUEST_SUBDIVIDE):
+            pending = self.nodes.request_tn.view(-1)[node] & kind << REQUEST_PENDING_SHIFT
+            mine = (kind_k == kind) & (pending == 0)
+            once, inverse = node[mine].unique(return_inverse=True)
+            most = torch.zeros(len(once), dtype=priority.dtype, device=node.device)
+            found[kind] = once, most.scatter_reduce(0, inverse, priority[mine], "amax")
+        return found
 
     def keep(self, frame_1: Tensor) -> None:
         """Stamps the tiles on the way to the targets of aliases that may have been seen in a frame,
@@ -159,10 +174,6 @@ class Aliases:
         roots = tile < len(self.trees)
         linked = (self.nodes.parent_t[tile] >= 0) | self.nodes.shared_t[tile] | roots
         return linked & (self._places(node) == place).all(1)
-
-    def _ends(self, node: Tensor) -> Tensor:
-        """(k,) bool, which nodes have no children."""
-        return self.nodes.child_tn.view(-1)[node] == TERMINAL
 
     def _followed(self, rows: AliasRows) -> AliasRows:
         """The rows, with targets that are no aliases; those that lead back to themselves are left
@@ -224,26 +235,3 @@ class Aliases:
             pairs = torch.stack((pairs[:, 0], above // per_tile), 1)[above >= 0]
         seen, tile = torch.cat([*found, pairs]).unique(dim=0).unbind(1)
         return seen, tile
-
-
-def by_target(
-    aliases: Aliases, asked: Mapping[int, tuple[Tensor, Tensor]]
-) -> dict[int, tuple[Tensor, Tensor]]:
-    """Returns requests, by kind nodes (k,) and priorities (k,), with targets in the place of their
-    aliases, each once; those that are pending are left out.
-    """
-    nodes, priorities, kinds = [], [], []
-    for kind, (node, priority) in asked.items():
-        target, kind_k = aliases.asked(node, kind)
-        nodes.append(target)
-        priorities.append(priority)
-        kinds.append(kind_k)
-    node, priority, kind_k = torch.cat(nodes), torch.cat(priorities), torch.cat(kinds)
-    found = {}
-    for kind in (REQUEST_LOAD, REQUEST_SUBDIVIDE):
-        pending = aliases.nodes.request_tn.view(-1)[node] & kind << REQUEST_PENDING_SHIFT
-        mine = (kind_k == kind) & (pending == 0)
-        once, inverse = node[mine].unique(return_inverse=True)
-        most = torch.zeros(len(once), dtype=priority.dtype, device=node.device)
-        found[kind] = once, most.scatter_reduce(0, inverse, priority[mine], "amax")
-    return found

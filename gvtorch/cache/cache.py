@@ -179,12 +179,9 @@ class Cache:
         return nodes.loc_t4[tile, 3] < self.finest[nodes.tree_t[tile].to(torch.int64)]
 
     def mark_pending(self, node: Tensor, kind: int, pending: bool | Tensor = True) -> None:
-        """Marks that answers are on their way: these requests are not listed again.
-
-        Args:
-            node: (k,) int64 nodes, each once.
-            kind: REQUEST_LOAD or REQUEST_SUBDIVIDE.
-            pending: False clears the marks; a (k,) bool tensor sets those where it is true.
+        """Marks that answers for (k,) int64 nodes, each once, are on their way: these requests are
+        not listed again. A `pending` of False clears the marks, (k,) bool sets those where it is
+        true.
         """
         words, bit = self.nodes.request_tn.view(-1), kind << REQUEST_PENDING_SHIFT
         if isinstance(pending, Tensor):

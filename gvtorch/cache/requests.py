@@ -2,7 +2,7 @@
 
 Rays write them into the node pool's request words. `RequestList` is what one pass over these words
 leaves on the device, `Requests` its rows of one kind, once the host knows how many there are, and
-`Scheduler` chooses among these by priority and within the budgets.
+`Scheduler` chooses among these by priority and within the budgets, of time as well: `CallCost`.
 """
 
 from __future__ import annotations
@@ -22,15 +22,17 @@ from ..base.constants import (
     REQUEST_SUBDIVIDE,
 )
 from ..ops import compact_requests
-from .aliases import by_target
 from .cache import Cache
-from .call_cost import CallCost
 
 #: The kinds of request by the names that statistics show.
 KINDS = {"load": REQUEST_LOAD, "subdivide": REQUEST_SUBDIVIDE}
 #: Levels below the first by which a tree deepens in a frame at most.
 DEEPER = 2
 _PIXEL = 16  # the priority of a node whose voxels are a pixel wide: wider ones are to be subdivided
+_NEWEST = 0.3  # weight of the newest call
+_SPREAD = 0.1  # relative spread of batch sizes from which on the two parts of a cost are told apart
+_PROBE = 1.25  # times as many items are tried where the sizes were all alike
+_LEAST = 0.02  # share of a call's time that its items take at least
 _LEARN_FROM = 64  # items: smaller batches tell more about overhead than about throughput
 
 
@@ -61,7 +63,11 @@ class Requests:
         """
         if self.coarse is None:
             return rank[: sum(room)]
-        return rank[_fits(self.coarse[rank], room)]
+        coarse = self.coarse[rank]
+        fine, wide = (
+            mask & (mask.cumsum(0) <= n) for mask, n in zip((~coarse, coarse), room, strict=True)
+        )
+        return rank[fine | wide]
 
 
 def levels_wanted(priority: Tensor, branching: int) -> Tensor:
@@ -146,16 +152,8 @@ def requests_below(cache: Cache, asked: Requests, branching: int) -> RequestsByK
 
 def _at_targets(cache: Cache, asked: dict[int, tuple[Tensor, Tensor]]) -> dict[int, Requests]:
     """Requests of nodes (k,) and their priorities by kind, those of aliases at their targets."""
-    asked = by_target(cache.aliases, asked) if len(cache.aliases) else asked
+    asked = cache.aliases.by_target(asked) if len(cache.aliases) else asked
     return {kind: Requests.of(cache, kind, *rows) for kind, rows in asked.items()}
-
-
-def _fits(coarse: Tensor, room: Sequence[int]) -> Tensor:
-    """(k,) bool, whether a slot is left for a row, those before it served."""
-    fine, wide = (
-        mask & (mask.cumsum(0) <= n) for mask, n in zip((~coarse, coarse), room, strict=True)
-    )
-    return fine | wide
 
 
 def coarser_requests(
@@ -164,13 +162,9 @@ def coarser_requests(
     """Asks for coarser bricks where slots are too few for all requests, so that what gets no slot
     is drawn from a near ancestor and not from the root.
 
-    Requests are moved up the tree, the deepest first, until they name at most as many nodes as
-    there are slots.
-
-    Args:
-        cache: The pools.
-        requests: All requests of a frame.
-        room: For each kind, how many slots may be taken, and how many coarse ones.
+    All requests of a frame are moved up the tree, the deepest first, until they name at most as
+    many nodes as there are slots; `room` tells for each kind how many may be taken, and how many
+    coarse ones.
 
     Returns:
         The subdivisions as they are, and loads of the coarser nodes; or all of `requests` where
@@ -207,6 +201,60 @@ def _crowded(cache: Cache, node: Tensor, room: Sequence[int]) -> Tensor:
     return torch.where(coarse, few[1], few[0])
 
 
+class CallCost:
+    """The time of a call with n items as a line, own + n * each, fitted to the last calls; older
+    ones weigh less. The first, which may load what all need, is forgotten at the second.
+
+    Attributes:
+        largest: About as many items as a call had lately.
+    """
+
+    def __init__(self) -> None:
+        """Knows nothing yet."""
+        self.largest, self._calls = 0.0, 0
+        self._weight = self._items = self._time = self._squares = self._products = 0.0
+
+    def learn(self, items: int, milliseconds: float) -> None:
+        """Takes note of a call."""
+        self._calls += 1
+        if self._calls == 2:
+            self._weight = self._items = self._time = self._squares = self._products = 0.0
+        new = (1, items, milliseconds, items * items, items * milliseconds)
+        old = (self._weight, self._items, self._time, self._squares, self._products)
+        both = [before + _NEWEST * (n - before) for before, n in zip(old, new, strict=True)]
+        self._weight, self._items, self._time, self._squares, self._products = both
+        self.largest = max(float(items), (1 - _NEWEST) * self.largest)
+
+    def fitting(self, milliseconds: float, unknown: int) -> int:
+        """Returns how many items a call of so many milliseconds has, at least 1, and at most twice
+        as many as were tried; `unknown` where there was no call.
+
+        If a call without items would take most of that time, items get half of it all the same, for
+        many small calls would take longer. If all calls had as many items, a few more are tried:
+        the line cannot be fitted otherwise.
+        """
+        if not self._weight:
+            return unknown
+        own, each, known = self._line()
+        fitting = max(1.0, max(milliseconds - own, 0.5 * milliseconds) / each)
+        mean = self._items / self._weight
+        if not known and abs(fitting - mean) <= _SPREAD * mean:
+            fitting = max(fitting + 1, _PROBE * fitting)
+        return int(min(fitting, max(2 * self.largest, 2.0)))
+
+    def _line(self) -> tuple[float, float, bool]:
+        """What a call takes by itself and for each item, and whether the two can be told apart."""
+        items, time = self._items / self._weight, self._time / self._weight
+        spread = self._squares / self._weight - items * items
+        known = spread > (_SPREAD * items) ** 2
+        most = time / items
+        if not known:
+            return 0.0, most, known
+        slope = (self._products / self._weight - items * time) / spread
+        each = min(max(slope, _LEAST * most), most)
+        return time - each * items, each, known
+
+
 class Choice(NamedTuple):
     """Which requests are served."""
 
@@ -227,20 +275,12 @@ class Scheduler:
     def __init__(
         self,
         *,
-        order: Literal["coarse", "fine"] = "coarse",
-        loads: int = 4096,
-        subdivisions: int = 4096,
-        milliseconds: float | None = None,
+        order: Literal["coarse", "fine"] = "coarse",  # of levels; then by size on the screen
+        loads: int = 4096,  # most bricks a frame
+        subdivisions: int = 4096,  # most node tiles a frame
+        milliseconds: float | None = None,  # most time a frame for production, of both kinds
     ) -> None:
-        """Sets the budgets of a frame.
-
-        Args:
-            order: Coarse levels first, which shows something everywhere soon, or fine ones; then
-                by size on the screen.
-            loads: Most bricks a frame.
-            subdivisions: Most node tiles a frame.
-            milliseconds: Most time a frame for production, shared by both kinds; None: no limit.
-        """
+        """Sets the budgets of a frame. Coarse levels first show something everywhere soon."""
         self.order, self.milliseconds = order, milliseconds
         self.most = {REQUEST_LOAD: loads, REQUEST_SUBDIVIDE: subdivisions}
         self.cost = {kind: CallCost() for kind in self.most}
@@ -275,9 +315,7 @@ class Scheduler:
             self.cost[kind].learn(items, milliseconds)
 
     def _rank(self, requests: Requests) -> Tensor:
-        """(k,) int64 rows by level, then by size on the screen, then by node, so that the order
-        does not depend on chance.
-        """
+        """(k,) int64 rows by level, then by size on the screen, then by node: never by chance."""
         level = requests.depth if self.order == "coarse" else -requests.depth
         small = REQUEST_PRIORITY - requests.priority.to(torch.int64)
         return (level * (REQUEST_PRIORITY + 1) + small).argsort(stable=True)

@@ -168,31 +168,24 @@ def _as_bytes(rows: Tensor) -> Tensor:
 
 def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Written:
     """Gives (k,) nodes their bricks; see `put_bricks`. The host waits for what came of it."""
-    first = data if isinstance(data, Mapping) else data[0].channels
+    first = data if isinstance(data, Mapping) else data[0].data
     coarse = any(cache.bricks.channels[name].coarse for name in first)
     lru = cache.lru[REQUEST_LOAD][coarse]
     put = put_bricks(cache, targets, data, lru.free(), coarse)
     done = _outcome(put, targets, lru)
-    done.nbytes = done.items * _brick_bytes(data)
+    done.nbytes = done.items * sum(row_bytes(rows) for rows in first.values())
     return done
 
 
 def put_bricks(
     cache: Cache,
     targets: Targets,
-    data: Voxels | Sequence[Chunk],
+    data: Voxels | Sequence[Chunk],  # or what is on its way to the device
     free: Tensor,
     coarse: bool = False,
 ) -> Put:
     """Gives (k,) nodes, those of index -1 left out, their bricks: takes slots, at most `free` (1,),
-    unlinks, writes and links them. The host does not wait.
-
-    Args:
-        cache: The pools.
-        targets: The nodes.
-        data: For each channel (k, z, y, x, c), or what is on its way to the device.
-        free: How many slots may be taken.
-        coarse: Whether they get coarse slots.
+    coarse ones or others, unlinks, writes and links them. The host does not wait.
     """
     wanted = targets.lacking(cache, REQUEST_LOAD)
     slot = cache.lru[REQUEST_LOAD][coarse].give(wanted, free)
@@ -250,13 +243,6 @@ def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, 
                 voxels = voxels.to(torch.int32)
             ends = torch.stack(torch.aminmax(voxels, dim=1), 1)
             put_rows_of(words.flatten(0, 1), index, ends)
-
-
-def _brick_bytes(data: Voxels | Sequence[Chunk]) -> int:
-    """Bytes of a brick, all channels together."""
-    if not isinstance(data, Mapping):
-        return data[0].brick_bytes
-    return sum(row_bytes(rows) for rows in data.values())
 
 
 def uniform(

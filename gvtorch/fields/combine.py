@@ -7,14 +7,14 @@ What an interval of the parts tells of the whole is worked out by interval arith
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
 from .distance import HASH, Changed, Distance, grown
-from .field import Bounds, Field, Interval, Values, checked_field
+from .field import Bounds, Field, Interval, Values, between, checked_field
 from .solid import Solid
 
 
@@ -39,8 +39,6 @@ class Painted(Changed):
 class Warp(Field):
     """A field asked at points that another field moves."""
 
-    most: Tensor
-
     def __init__(self, field: nn.Module, way: nn.Module, most: float) -> None:
         """Takes the field, and how far points are moved.
 
@@ -53,7 +51,7 @@ class Warp(Field):
         super().__init__()
         self.field = checked_field("Warp", "field", field)
         self.way = checked_field("Warp", "way", way)
-        self.number("most", most, low=0)
+        self.most = self.number("most", most, low=0)
         if isinstance(field, Field) and not field.prefiltered:
             self.threshold, self.dtypes = field.threshold, field.dtypes
 
@@ -63,8 +61,7 @@ class Warp(Field):
         return self.field(points + way * (self.most / size.clamp(min=1e-30)).clamp(max=1))
 
     def bounds(self, center: Tensor, half: Tensor) -> Bounds:
-        wide = half + self.most
-        return self.field.bounds(center, wide) if isinstance(self.field, Field) else None
+        return _known(self.field, center, half + self.most, None)
 
     def near(self, center: Tensor, half: Tensor) -> Self:
         return self.replaced(field=_near(self.field, center, half + self.most))
@@ -89,7 +86,6 @@ class Stack(Field):
         self.fields = nn.ModuleDict(
             {name: checked_field("Stack", name, one) for name, one in fields.items()}
         )
-
         self.prefiltered = _prefiltered("Stack", fields.values())
 
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:
@@ -132,16 +128,14 @@ class Blend(Field):
         self.prefiltered = _prefiltered(where, (first, second, mask))
 
     def forward(self, points: Tensor) -> Values:
-        return self._mix(self.first(points), self.second(points), self.mask(points))
+        return self._mix(lambda part: part(points))
 
     def filtered(self, points: Tensor, size: Tensor) -> Values:
         """Mixes means; what is not prefiltered is taken at the middles of voxels."""
-        parts = (self.first, self.second, self.mask)
-        first, second, share = (_ask(part, points, size) for part in parts)
-        return self._mix(first, second, share)
+        return self._mix(lambda part: _ask(part, points, size))
 
-    def _mix(self, first: Values, second: Values, mask: Values) -> Values:
-        share = _single(mask)
+    def _mix(self, ask: Callable[[nn.Module], Values]) -> Values:
+        first, second, share = ask(self.first), ask(self.second), _single(ask(self.mask))
         if isinstance(first, Mapping) and isinstance(second, Mapping):
             return {name: _mixed(one, second[name], share) for name, one in first.items()}
         return _mixed(_single(first), _single(second), share)
@@ -157,10 +151,10 @@ class Blend(Field):
         low, high = self._shares(center, half, size)
         if isinstance(found[0], Mapping) and isinstance(found[1], Mapping):
             both = {*found[0]} & {*found[1]}
-            return {n: _between(found[0][n], found[1][n], low, high) for n in both}
+            return {n: between(found[0][n], found[1][n], low, high) for n in both}
         if isinstance(found[0], Mapping) or isinstance(found[1], Mapping):
             return None
-        return _between(found[0], found[1], low, high)
+        return between(found[0], found[1], low, high)
 
     def _shares(self, center: Tensor, half: Tensor, size: Tensor | None) -> Interval:
         """(k,) what the mask is known to be in boxes; 0 to 1 where nothing is."""
@@ -189,17 +183,11 @@ class Mask(Blend):
         if isinstance(field, Field):
             self.dtypes = field.dtypes
 
-    def _mix(self, first: Values, second: Values, mask: Values) -> Values:
-        if isinstance(first, Mapping):
-            return {n: _mixed(torch.zeros_like(v), v, _single(mask)) for n, v in first.items()}
-        return _mixed(torch.zeros_like(first), first, _single(mask))
-
-    def forward(self, points: Tensor) -> Values:
-        return self._mix(values := self.first(points), values, self.mask(points))
-
-    def filtered(self, points: Tensor, size: Tensor) -> Values:
-        values = _ask(self.first, points, size)
-        return self._mix(values, values, _ask(self.mask, points, size))
+    def _mix(self, ask: Callable[[nn.Module], Values]) -> Values:
+        values, share = ask(self.first), _single(ask(self.mask))
+        if isinstance(values, Mapping):
+            return {n: _mixed(torch.zeros_like(v), v, share) for n, v in values.items()}
+        return _mixed(torch.zeros_like(values), values, share)
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
         """0 where the mask is; else between 0 and the field."""
@@ -209,8 +197,8 @@ class Mask(Blend):
             wild = torch.full_like(center[:, 0], torch.inf)
             found = (-wild, wild)
         if isinstance(found, Mapping):
-            return {n: _between(_zero(one), one, low, high) for n, one in found.items()}
-        return _between(_zero(found), found, low, high)
+            return {n: between(_zero(one), one, low, high) for n, one in found.items()}
+        return between(_zero(found), found, low, high)
 
 
 def _zero(interval: Interval) -> Interval:
@@ -282,15 +270,3 @@ def _mixed(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     elif first.dim() > share.dim():
         share = share[..., None]
     return torch.lerp(first, second, share)
-
-
-def _between(first: Interval, second: Interval, low: Tensor, high: Tensor) -> Interval:
-    """Of a mix of two intervals, by shares between low and high (k,)."""
-    if first[0].dim() > low.dim():
-        low, high = low[:, None], high[:, None]
-    hull = torch.minimum(first[0], second[0]), torch.maximum(first[1], second[1])
-    one, other = (
-        torch.where(high <= 0, a, torch.where(low >= 1, b, both))
-        for a, b, both in zip(first, second, hull, strict=True)
-    )
-    return one, other

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .field import Field, Interval, length
+from .field import Field, Interval, between, length
 
 Color = Sequence[float]  # linear red, green, blue, 0 to 1
 WHITE = (0.8, 0.8, 0.8)
@@ -39,7 +39,6 @@ class Distance(Field):
 
     exact: bool = True
     smooth: bool = True
-    color: Tensor
 
     def __init__(self, color: Color = WHITE) -> None:
         """Takes the colour of the surface."""
@@ -48,7 +47,7 @@ class Distance(Field):
         red, green, blue = check.triple(where, "color", color)
         if min(red, green, blue) < 0 or max(red, green, blue) > 1:
             raise ValueError(f"{where}: color must be in 0 to 1, got {tuple(color)}")
-        self.vector("color", (red, green, blue))
+        self.color = self.vector("color", (red, green, blue))
 
     def forward(self, points: Tensor) -> Tensor:
         """Returns (...,) signed distances at points (..., 3)."""
@@ -135,14 +134,8 @@ class Pair(Distance):
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         """One shape's where it alone counts, else what lies between both."""
-        low, high = (end[:, None] for end in self._share(center, half, 0.0))
         own, other = self.first.colors(center, half), self.second.colors(center, half)
-        hull = torch.minimum(own[0], other[0]), torch.maximum(own[1], other[1])
-        first, second = (
-            torch.where(high == 0, one, torch.where(low == 1, two, both))
-            for one, two, both in zip(own, other, hull, strict=True)
-        )
-        return first, second
+        return between(own, other, *self._share(center, half, 0.0))
 
     def _share(self, center: Tensor, half: Tensor, rounded: float) -> Interval:
         """(k,) the second one's share in boxes, of values that are rounded by a part of places."""
@@ -194,12 +187,10 @@ class Intersection(Pair):
 class SmoothUnion(Pair):
     """The union, blended where both surfaces are within `width` of each other, colours too."""
 
-    width: Tensor
-
     def __init__(self, first: Distance, second: Distance, width: float) -> None:
         """Takes the shapes, and how far apart they begin to blend."""
         super().__init__(first, second)
-        self.number("width", width, low=0, open_low=True)
+        self.width = self.number("width", width, low=0, open_low=True)
         self.exact = False
 
     def mix(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:

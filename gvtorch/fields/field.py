@@ -106,8 +106,9 @@ class Field(nn.Module):
         """Returns (2, 3) float64 corners of a box beyond which there is nothing; None: unknown."""
         return None
 
-    def number(self, name: str, value: Any, **limits: Any) -> None:
-        """Keeps a number as a buffer `name`, () float64; `limits` are those of `check.number`.
+    def number(self, name: str, value: Any, **limits: Any) -> Tensor:
+        """Keeps a number as a buffer `name`, () float64, and returns it; `limits` are those of
+        `check.number`.
 
         A () float64 tensor leaves the dtype of what it is multiplied with as it is.
 
@@ -115,16 +116,20 @@ class Field(nn.Module):
             ValueError: It is not finite, or beyond its limits.
         """
         number = check.number(type(self).__name__, name, value, **limits)
-        self.register_buffer(name, torch.tensor(number, dtype=torch.float64))
+        return self._kept(name, number)
 
-    def vector(self, name: str, value: Sequence[float] | Tensor, **limits: Any) -> None:
-        """Keeps x, y, z as a buffer `name`, (3,) float64: `.to(points)` before use.
+    def vector(self, name: str, value: Sequence[float] | Tensor, **limits: Any) -> Tensor:
+        """Keeps x, y, z as a buffer `name`, (3,) float64, and returns it: `.to(points)` before use.
 
         Raises:
             ValueError: They are not three finite numbers, or beyond their limits.
         """
-        triple = check.triple(type(self).__name__, name, value, **limits)
-        self.register_buffer(name, torch.tensor(triple, dtype=torch.float64))
+        return self._kept(name, check.triple(type(self).__name__, name, value, **limits))
+
+    def _kept(self, name: str, value: Any) -> Tensor:
+        kept = torch.tensor(value, dtype=torch.float64)
+        self.register_buffer(name, kept)
+        return kept
 
     def __repr__(self) -> str:
         parts = ", ".join(type(part).__name__ for part in self.children())
@@ -152,6 +157,20 @@ def length(vectors: Tensor) -> Tensor:
 def tighter(one: Interval, other: Interval) -> Interval:
     """Returns what two intervals that both hold have in common."""
     return torch.maximum(one[0], other[0]), torch.minimum(one[1], other[1])
+
+
+def between(first: Interval, second: Interval, low: Tensor, high: Tensor) -> Interval:
+    """Returns what mixes of two values lie in, (k,) or (k, c), by shares between low and high (k,)
+    of the second; one alone where its share is known to be 0 or 1.
+    """
+    if first[0].dim() > low.dim():
+        low, high = low[:, None], high[:, None]
+    hull = torch.minimum(first[0], second[0]), torch.maximum(first[1], second[1])
+    one, other = (
+        torch.where(high <= 0, a, torch.where(low >= 1, b, both))
+        for a, b, both in zip(first, second, hull, strict=True)
+    )
+    return one, other
 
 
 def parts_of(center: Tensor, half: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -98,8 +98,6 @@ class Fractal(Distance):
 
     exact = True  # as far as an estimate is
     smooth = False
-    constant: Tensor
-    bailout: Tensor
     colors_33: Tensor
 
     def __init__(
@@ -126,9 +124,9 @@ class Fractal(Distance):
         where = type(self).__name__
         self.iteration = check.instance(where, "iteration", iteration, Iteration)
         self.iterations = check.whole(where, "iterations", iterations, low=1, high=1000)
-        self.number("bailout", bailout, low=1, open_low=True)
+        self.bailout = self.number("bailout", bailout, low=1, open_low=True)
         self.julia = constant is not None
-        self.vector("constant", constant or (0.0, 0.0, 0.0))
+        self.constant = self.vector("constant", constant or (0.0, 0.0, 0.0))
         if len(colors) != 3:
             raise ValueError(f"{where}: colors must be three colours, got {len(colors)}")
         self.register_buffer("colors_33", check.reals(where, "colors", colors, (3, 3)).clamp(0, 1))
@@ -143,9 +141,7 @@ class Fractal(Distance):
         return value, torch.lerp(color, one, (1.2 - near[..., None]).clamp(0, 1) ** 2)
 
     def _orbits(self, points: Tensor) -> Tensor:
-        """(3, ...) distances, and how near the orbits came to the origin and to a plane of two
-        axes.
-        """
+        """(3, ...) distances, and how near orbits came to the origin and to a plane of axes."""
         point = points.reshape(-1, 3).contiguous()
         orbit = self._orbit(point)
         if orbit is None:
@@ -193,6 +189,11 @@ class Fractal(Distance):
         ends = self.colors_33.to(center)
         return ends.amin(0).expand_as(center), ends.amax(0).expand_as(center)
 
+    def _within(self, most: float) -> Tensor:
+        """(2, 3) a cube around the origin."""
+        ends = torch.tensor((-most, most), dtype=torch.float64, device=self.colors_33.device)
+        return ends[:, None].expand(2, 3)
+
 
 class Mandelbulb(Fractal):
     """z^n + c in three dimensions: White and Nylander's bulb."""
@@ -205,9 +206,7 @@ class Mandelbulb(Fractal):
         """Beyond 2^(1 / (n - 1)) all escape: there |z|^n grows by more than |c| takes away."""
         power = self.iteration.power
         assert isinstance(power, int)
-        most = 2.0 ** (1 / (power - 1))
-        ends = torch.tensor((-most, most), dtype=torch.float64, device=self.colors_33.device)
-        return ends[:, None].expand(2, 3)
+        return self._within(2.0 ** (1 / (power - 1)))
 
 
 class Julia(Fractal):
@@ -226,8 +225,7 @@ class Julia(Fractal):
         most, size = 1.0, float(self.constant.norm())
         while most**power - size <= most:
             most += 1 / 64
-        ends = torch.tensor((-most, most), dtype=torch.float64, device=self.colors_33.device)
-        return ends[:, None].expand(2, 3)
+        return self._within(most)
 
 
 class Mandelbox(Fractal):
@@ -244,5 +242,4 @@ class Mandelbox(Fractal):
         """Where all orbits stay that never escape, and a little more for those that have not yet:
         what is beyond gets further away by the scale in each step.
         """
-        side = torch.tensor((-self._side, self._side), dtype=torch.float64)
-        return side.to(self.colors_33.device)[:, None].expand(2, 3)
+        return self._within(self._side)

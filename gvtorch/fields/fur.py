@@ -31,9 +31,6 @@ class Fur(OfShape):
 
     prefiltered = True
     threshold: Mapping[str, float] = {"value": 0.0}
-    length: Tensor
-    frequency: Tensor
-    fall: Tensor
 
     def __init__(
         self,
@@ -55,9 +52,9 @@ class Fur(OfShape):
         """
         super().__init__()
         self.shape = check.instance("Fur", "shape", shape, Distance)
-        self.number("length", length, low=0, open_low=True)
-        self.number("frequency", frequency, low=0, open_low=True)
-        self.vector("fall", fall)
+        self.length = self.number("length", length, low=0, open_low=True)
+        self.frequency = self.number("frequency", frequency, low=0, open_low=True)
+        self.fall = self.vector("fall", fall)
         self.seed = check.whole("Fur", "seed", seed, low=-(2**62), high=2**62)
 
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:

@@ -34,6 +34,9 @@ class SampledDistance(Distance):
     """
 
     exact = False
+    values: Tensor
+    steepest: Tensor
+    apart: Tensor
 
     def __init__(self, volume: Volume, *, color: Color = WHITE) -> None:
         """Takes the volume, whose place in the world is the field's.
@@ -52,9 +55,9 @@ class SampledDistance(Distance):
             )
         values = data[..., 0].to(torch.float32)
         self.register_buffer("values", values)
-        self.vector("spacing", volume.spacing)
-        self.vector("origin", volume.origin)
-        self.vector("last", [n - 1 for n in volume.extent])
+        self.spacing = self.vector("spacing", volume.spacing)
+        self.origin = self.vector("origin", volume.origin)
+        self.last = self.vector("last", [n - 1 for n in volume.extent])
         self.register_buffer("steepest", _steepest(values, self.spacing))
         self.register_buffer("apart", _apart(values, self.spacing))
 
@@ -94,13 +97,6 @@ class SampledDistance(Distance):
         values = grid.spacing * _spread(near / grid.spacing)
         origin = [one - more * grid.spacing for one in grid.origin]
         return cls(Volume(values, spacing=(grid.spacing,) * 3, origin=origin), color=color)
-
-    values: Tensor
-    spacing: Tensor
-    origin: Tensor
-    last: Tensor
-    steepest: Tensor
-    apart: Tensor
 
     def forward(self, points: Tensor) -> Tensor:
         at = (points - self.origin.to(points)) / self.spacing.to(points)

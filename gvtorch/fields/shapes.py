@@ -20,12 +20,10 @@ from .field import Interval, length
 class Sphere(Distance):
     """A ball around the origin."""
 
-    radius: Tensor
-
     def __init__(self, radius: float = 1.0, *, color: Color = WHITE) -> None:
         """Takes its radius."""
         super().__init__(color)
-        self.number("radius", radius, low=0, open_low=True)
+        self.radius = self.number("radius", radius, low=0, open_low=True)
 
     def forward(self, points: Tensor) -> Tensor:
         return length(points) - self.radius
@@ -43,16 +41,13 @@ class Sphere(Distance):
 class Box(Distance):
     """A box around the origin, with edges rounded by a radius."""
 
-    size: Tensor
-    round: Tensor
-
     def __init__(
         self, size: Sequence[float] = (1.0, 1.0, 1.0), *, round: float = 0.0, color: Color = WHITE
     ) -> None:
         """Takes its sides and how far its edges are rounded, at most half of the shortest side."""
         super().__init__(color)
-        self.vector("size", size, positive=True)
-        self.number("round", round, low=0, high=float(self.size.min()) / 2)
+        self.size = self.vector("size", size, positive=True)
+        self.round = self.number("round", round, low=0, high=float(self.size.min()) / 2)
 
     def forward(self, points: Tensor) -> Tensor:
         beyond = points.abs() - (self.size / 2 - self.round).to(points)
@@ -72,14 +67,11 @@ class Box(Distance):
 class Torus(Distance):
     """A ring around the z axis."""
 
-    radius: Tensor
-    tube: Tensor
-
     def __init__(self, radius: float = 1.0, tube: float = 0.25, *, color: Color = WHITE) -> None:
         """Takes the radius of its middle line and that of its tube."""
         super().__init__(color)
-        self.number("radius", radius, low=0, open_low=True)
-        self.number("tube", tube, low=0, open_low=True)
+        self.radius = self.number("radius", radius, low=0, open_low=True)
+        self.tube = self.number("tube", tube, low=0, open_low=True)
 
     def forward(self, points: Tensor) -> Tensor:
         away = length(points[..., :2]) - self.radius
@@ -93,10 +85,6 @@ class Torus(Distance):
 class Capsule(Distance):
     """What is within a radius of a line from one point to another."""
 
-    start: Tensor
-    end: Tensor
-    radius: Tensor
-
     def __init__(
         self,
         start: Sequence[float] = (0.0, 0.0, -0.5),
@@ -107,9 +95,9 @@ class Capsule(Distance):
     ) -> None:
         """Takes the ends of the line and the radius."""
         super().__init__(color)
-        self.vector("start", start)
-        self.vector("end", end)
-        self.number("radius", radius, low=0, open_low=True)
+        self.start = self.vector("start", start)
+        self.end = self.vector("end", end)
+        self.radius = self.number("radius", radius, low=0, open_low=True)
 
     def forward(self, points: Tensor) -> Tensor:
         start, way = self.start.to(points), (self.end - self.start).to(points)
@@ -124,9 +112,6 @@ class Capsule(Distance):
 class Plane(Distance):
     """What lies below a plane, against its normal."""
 
-    normal: Tensor
-    height: Tensor
-
     def __init__(
         self,
         normal: Sequence[float] = (0.0, 0.0, 1.0),
@@ -136,11 +121,11 @@ class Plane(Distance):
     ) -> None:
         """Takes the normal, of any length but 0, and how far along it the plane lies."""
         super().__init__(color)
-        self.vector("normal", normal)
+        self.normal = self.vector("normal", normal)
         if not float(self.normal.norm()) > 0:
             raise ValueError(f"Plane: normal must have a direction, got {tuple(normal)}")
         self.normal /= self.normal.norm()
-        self.number("height", height)
+        self.height = self.number("height", height)
 
     def forward(self, points: Tensor) -> Tensor:
         return (points * self.normal.to(points)).sum(-1) - self.height
@@ -161,13 +146,12 @@ class Gyroid(Distance):
         bounds the squares of the three derivatives, which then add up to at most 3.
     """
 
-    period: Tensor
     exact = False
 
     def __init__(self, period: float = 1.0, *, color: Color = WHITE) -> None:
         """Takes the length after which it is the same again, along every axis."""
         super().__init__(color)
-        self.number("period", period, low=0, open_low=True)
+        self.period = self.number("period", period, low=0, open_low=True)
 
     def forward(self, points: Tensor) -> Tensor:
         radian = self.period / (2 * math.pi)

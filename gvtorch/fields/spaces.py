@@ -60,7 +60,6 @@ class Transform(Space):
     """
 
     inverse: Tensor
-    offset: Tensor
     scale: Tensor
 
     def __init__(
@@ -80,7 +79,7 @@ class Transform(Space):
         least, most = stretched.min(), stretched.max()
         if not float(least) > 1e-12 * float(most):
             raise ValueError(f"Transform: matrix must have an inverse, got {turn.tolist()}")
-        self.vector("offset", offset)
+        self.offset = self.vector("offset", offset)
         self.register_buffer("inverse", torch.linalg.inv(turn))
         self.register_buffer("scale", least)
         self.exact = shape.exact and float(most / least) < 1 + 1e-9
@@ -108,12 +107,10 @@ class Twist(Space):
     the further from the axis: by about 1 + angle * radius.
     """
 
-    rate: Tensor
-
     def __init__(self, shape: Distance, rate: float) -> None:
         """Takes the shape and the angle by unit of length, in radians."""
         super().__init__(shape)
-        self.number("rate", rate)
+        self.rate = self.number("rate", rate)
         self.exact = False
 
     def place(self, points: Tensor) -> Tensor:
@@ -147,13 +144,8 @@ class Repeat(Space):
     around the origin: then the nearest of the two cells next to a point along each axis is right.
     """
 
-    period: Tensor
-
     def __init__(
-        self,
-        shape: Distance,
-        period: Sequence[float],
-        count: Sequence[int] | None = None,
+        self, shape: Distance, period: Sequence[float], count: Sequence[int] | None = None
     ) -> None:
         """Takes the shape, how far apart it is repeated along x, y, z (0: not at all), and how
         often in all (odd, around the origin); None: without end.
@@ -163,7 +155,7 @@ class Repeat(Space):
         """
         super().__init__(shape)
         where = type(self).__name__
-        self.vector("period", period)
+        self.period = self.vector("period", period)
         self._axes = [axis for axis in range(3) if float(self.period[axis]) != 0]
         if bool((self.period < 0).any()) or not self._axes:
             raise ValueError(f"{where}: period must be >= 0 and once more, got {tuple(period)}")
@@ -226,12 +218,10 @@ class Repeat(Space):
 class Offset(Space):
     """A shape grown by a length on all sides, which rounds its edges; shrunk if it is negative."""
 
-    by: Tensor
-
     def __init__(self, shape: Distance, by: float) -> None:
         """Takes the shape, and how far its surface moves outwards."""
         super().__init__(shape)
-        self.number("by", by)
+        self.by = self.number("by", by)
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
         return value - self.by
@@ -261,12 +251,10 @@ class Shell(Offset):
 class Extrusion(Space):
     """What a shape looks like at z = 0, along z. Right where it lies alike above and below."""
 
-    height: Tensor
-
     def __init__(self, shape: Distance, height: float) -> None:
         """Takes the shape and how high it gets, around z = 0."""
         super().__init__(shape)
-        self.number("height", height, low=0, open_low=True)
+        self.height = self.number("height", height, low=0, open_low=True)
 
     def place(self, points: Tensor) -> Tensor:
         return torch.cat((points[..., :2], torch.zeros_like(points[..., 2:])), -1)
@@ -305,12 +293,10 @@ class Revolution(Space):
     less a radius, its y becomes z. Right where the shape lies alike above and below.
     """
 
-    radius: Tensor
-
     def __init__(self, shape: Distance, radius: float = 0.0) -> None:
         """Takes the shape and how far from the axis its origin goes."""
         super().__init__(shape)
-        self.number("radius", radius, low=0)
+        self.radius = self.number("radius", radius, low=0)
 
     def place(self, points: Tensor) -> Tensor:
         away = length(points[..., :2]) - self.radius

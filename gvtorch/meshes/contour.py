@@ -45,15 +45,13 @@ class Contour(NamedTuple):
     faces: np.ndarray  # (f, 3) vertices, counter-clockwise seen from where values are lower
 
 
-def contour(samples: np.ndarray, value: float, low: Sequence[int], grid: Sequence[int]) -> Contour:
-    """Returns the surface in the cells of a block of samples.
-
-    Args:
-        samples: (z, y, x) float64; -inf is outside, and the vertex beside it is at the other end.
-        value: Inside is where samples are at least this.
-        low: z y x of the block's first sample in the grid, in which keys and places count.
-        grid: Samples z y x of the grid.
-    """
+def contour(
+    samples: np.ndarray,  # (z, y, x) float64; -inf: outside, the vertex beside it at the other end
+    value: float,  # inside is where samples are at least this
+    low: Sequence[int],  # z y x of the first sample in the grid, in which keys and places count
+    grid: Sequence[int],  # samples z y x of the grid
+) -> Contour:
+    """Returns the surface in the cells of a block of samples."""
     inside = samples >= value
     cells = tuple(n - 1 for n in samples.shape)
     kind = np.zeros(cells, np.uint8)

@@ -1,32 +1,45 @@
 """`Geometry`: how far places are from a mesh, whether they lie in it, and what cubes of voxels hold
-of it.
+of it; `Hierarchy`: boxes around triangles, level by level, as the op `voxelize` goes down them.
+
+Source: Karras, "Maximizing parallelism in the construction of BVHs", HPG 2012 (triangles sorted
+    along a Morton curve; here every box holds eight of the level below, so no pointers are needed).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
-from ..ops.voxelize import Voxelized, voxelize
-from .hierarchy import Hierarchy
+from ..ops.voxelize import ARITY, Voxelized, voxelize
 from .mesh import Mesh, solids
 
-_FLOAT32 = 2048.0  # voxels that triangles may reach away from their cube, in float32
+_BITS = 20  # of a Morton code, along an axis
 _HALF_DIAGONAL = 0.5 * 3**0.5  # of a cube of side 1
 _POINTS = 1 << 20  # places that are asked for together
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeshCubes:
-    """What k cubes of side^3 voxels hold; see `ops.voxelize`."""
+class Hierarchy:
+    """The boxes of triangles, sorted so that neighbours in memory are neighbours in space.
 
-    distance: Tensor  # (k, z, y, x) float32 to the nearest place, world units; inf beyond the reach
-    face: Tensor  # (k, z, y, x) int32 the nearest triangle, -1 beyond the reach
-    inside: Tensor  # (k, z, y, x) bool
-    coverage: Tensor  # (k, z, y, x) float32, 0 to 1; or of no cubes
-    weight: Tensor  # (k, z, y, x, 3) of the nearest triangle's corners there; or of no cubes
+    Attributes:
+        order: (f,) int64 the triangle at each place of the lowest level.
+        box: (n, 6) float64 low and high corners of all boxes, those of the triangles first.
+        first: Of each level, lowest first, its first box; and their number. Box i of a level holds
+            boxes 8 i to 8 i + 7 of the level below.
+    """
+
+    def __init__(self, corner_f33: Tensor) -> None:
+        """Sorts (f, 3, 3) float64 triangles and makes all levels."""
+        low, high = corner_f33.amin(1), corner_f33.amax(1)
+        self.order = _morton(0.5 * (low + high)).argsort(stable=True)
+        levels = [torch.cat((low[self.order], high[self.order]), 1)]
+        while len(levels[-1]) > ARITY:
+            below = padded(levels[-1]).view(-1, ARITY, 6)
+            levels.append(torch.cat((below[..., :3].amin(1), below[..., 3:].amax(1)), 1))
+        self.box = torch.cat(levels)
+        self.first = [0]
+        for level in levels:
+            self.first.append(self.first[-1] + len(level))
 
 
 class Geometry:
@@ -82,25 +95,21 @@ class Geometry:
         for place in place_p3.to(self.corner).split(_POINTS):
             size = place.new_tensor((self.size, self.size, reach)).expand(len(place), 3)
             low = place - 0.5 * self.size
-            found = self._voxelize(low, size.contiguous(), 1, wide=True)
+            found = self.cubes(low, size.contiguous(), 1, wide=True)
             parts.append((found.winding.view(-1), found.distance.view(-1) * self.size))
-        if not parts:
-            none = self.corner.new_empty(0)
-            return none.to(torch.int32), none
         winding, distance = (torch.cat(part) for part in zip(*parts, strict=True))
         return winding, distance
 
     def touched(
-        self, low_k3: Tensor, size_k: Tensor, reach_k: Tensor, *, parts: int = 4, wide: bool
+        self,
+        low_k3: Tensor,  # (k, 3) float64 low corners of the boxes, which are cubes
+        size_k: Tensor,  # (k,) float64 their sides
+        reach_k: Tensor,  # (k,) float64 world distance
+        *,
+        parts: int = 4,  # along a side of a box
+        wide: bool,  # as of `cubes`, for voxels as large as parts
     ) -> tuple[Tensor, Tensor]:
         """Tells which parts of boxes are near triangles: a ball around each is looked at.
-
-        Args:
-            low_k3: (k, 3) float64 low corners of the boxes, which are cubes.
-            size_k: (k,) float64 their sides.
-            reach_k: (k,) float64 world distance.
-            parts: Along a side of a box.
-            wide: As of `cubes`, for voxels as large as parts.
 
         Returns:
             (k, parts, parts, parts) bool, z y x: False where no triangle comes within the reach of
@@ -109,52 +118,13 @@ class Geometry:
         part = size_k / parts
         reach = (reach_k + _HALF_DIAGONAL * part) * (1 + 1e-3)  # more than float32 rounds
         size = torch.stack((part, part, reach), 1)
-        found = self._voxelize(low_k3, size, parts, wide=wide)
+        found = self.cubes(low_k3, size, parts, wide=wide)
         return found.nearest >= 0, found.winding != 0
-
-    def is_narrow(self, voxel: float) -> bool:
-        """Whether float32 will do for voxels of a size, and larger ones."""
-        return self.largest < _FLOAT32 * voxel
 
     def cubes(
         self,
         low_k3: Tensor,
         size_k3: Tensor,
-        side: int,
-        thickness: float,
-        *,
-        shares: bool,
-        weights: bool,
-        wide: bool,
-    ) -> MeshCubes:
-        """Looks at cubes of side^3 voxels.
-
-        Args:
-            low_k3: (k, 3) float64 low corners of the cubes' first voxels, world units.
-            size_k3: (k, 3) float64 world sizes: a voxel's side, the distance from one voxel to the
-                next, and how far the nearest triangle may be; no side leaves a cube out.
-            side: Voxels along a side of a cube.
-            thickness: Of sheets, world units.
-            shares: Whether coverage is wanted.
-            weights: Whether weights are wanted.
-            wide: Whether it is worked out in float64.
-        """
-        found = self._voxelize(
-            low_k3, size_k3, side, thickness, shares=shares, weights=weights, wide=wide
-        )
-        world = found.distance * size_k3[:, :1, None, None].to(found.distance.dtype)
-        return MeshCubes(
-            distance=torch.where(found.nearest >= 0, world, torch.inf).to(torch.float32),
-            face=found.nearest,
-            inside=found.winding != 0,
-            coverage=found.coverage.to(torch.float32),
-            weight=found.weight.to(torch.float32),
-        )
-
-    def _voxelize(
-        self,
-        low: Tensor,
-        size: Tensor,
         side: int,
         thickness: float = 0.0,
         *,
@@ -162,10 +132,28 @@ class Geometry:
         shares: bool = False,
         weights: bool = False,
     ) -> Voxelized:
+        """Looks at cubes of side^3 voxels; arguments as of `ops.voxelize`."""
         return voxelize(
-            *(self.corner, self.solid, self.hierarchy.box, low, size, side, thickness),
+            *(self.corner, self.solid, self.hierarchy.box, low_k3, size_k3, side, thickness),
             detail=self.detail,
             shares=shares,
             weights=weights,
             wide=wide,
         )
+
+
+def padded(level: Tensor) -> Tensor:
+    """Returns (n, ...) with its last row repeated, until boxes of the level above are full."""
+    return torch.cat((level, level[-1:].expand(-len(level) % ARITY, *level.shape[1:])))
+
+
+def _morton(place_f3: Tensor) -> Tensor:
+    """Returns (f,) int64 codes: places that are close have close codes."""
+    low, high = place_f3.amin(0), place_f3.amax(0)
+    size = (high - low).max().clamp(min=torch.finfo(place_f3.dtype).tiny)
+    cell = ((place_f3 - low) / size * (2**_BITS - 1)).to(torch.int64)
+    code = torch.zeros_like(cell[:, 0])
+    for bit in range(_BITS):
+        for axis in range(3):
+            code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    return code

@@ -133,11 +133,6 @@ def once_filled(solid: SolidParts) -> SolidParts:
     return "auto" if solid == "always" else solid
 
 
-def prepared(mesh: Mesh, solid: SolidParts) -> Mesh:
-    """Returns what is made into voxels."""
-    return filled(mesh) if solid == "always" else mesh
-
-
 def filled(mesh: Mesh) -> Mesh:
     """Returns the mesh with its holes closed, and single triangles that face the other way turned.
     What encloses nothing even then, such as a leaf, stays as it is.

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .geometry import Geometry, MeshCubes
-from .holes import SolidParts, check_solid, prepared
+from ..ops.voxelize import Voxelized
+from .geometry import Geometry
+from .holes import SolidParts, check_solid, filled
 from .mesh import Mesh
 from .paint import Paint
 
@@ -31,6 +32,7 @@ _CUBE, _PARTS = 8, 4  # voxels along a side of the cubes of a region; of so many
 _BATCH = 1 << 20  # voxels that are made together
 _FINER = 2  # places along a side that a coarse voxel is the mean of
 _DIAGONAL = 0.5 * math.sqrt(3)  # from a voxel's centre to its corner
+_FLOAT32 = 2048.0  # voxels that triangles may reach away from their cube, in float32
 
 
 class GridSettings(TypedDict, total=False):
@@ -104,7 +106,7 @@ class Voxelizer:
         check.whole(where, "resolution", resolution, low=8, high=2**30)
         check_solid(where, solid)
         channels = check_channels(where, channels)
-        mesh = prepared(mesh, solid)
+        mesh = filled(mesh) if solid == "always" else mesh
         if "material" in channels and len(mesh.materials) > 255:
             raise ValueError(
                 f"{mesh.name}: {len(mesh.materials)} materials, a uint8 tells 255 apart"
@@ -123,7 +125,7 @@ class Voxelizer:
         self.thickness = check.number(where, "thickness", thickness, low=0.1) * self.spacing
         self.device = torch.device(device)
         self.geometry = Geometry(mesh, self.device, solid=solid != "never")
-        self._wide = not self.geometry.is_narrow(self.spacing)
+        self._wide = self.geometry.largest >= _FLOAT32 * self.spacing
         # Shares of solids are exact in voxels of any size.
         self._exact = {"coverage"} == {*channels} and bool(self.geometry.solid.all())
         places = torch.tensor(list(itertools.product(range(_FINER), repeat=3)))
@@ -143,36 +145,29 @@ class Voxelizer:
         )
 
     def cubes(
-        self, low_k3: Tensor, voxel_k: Tensor, side: int, *, coarse_k: Tensor | None = None
+        self,
+        low_k3: Tensor,  # (k, 3) float64 low corners, world units
+        voxel_k: Tensor,  # (k,) float64 world sizes of their voxels
+        side: int,  # voxels along a side of a cube
+        *,
+        coarse_k: Tensor | None = None,  # (k,) bool, which have coarse voxels; None: none
     ) -> dict[str, Tensor]:
-        """Makes k cubes of voxels, on the device and without waiting for it.
-
-        Args:
-            low_k3: (k, 3) float64 low corners, world units.
-            voxel_k: (k,) float64 world sizes of their voxels.
-            side: Voxels along a side of a cube.
-            coarse_k: (k,) bool, whose voxels are means of 2^3 places in each, unless one place
-                tells as much; of none if left out.
-
-        Returns:
-            By channel (k, z, y, x, c) of its dtype.
+        """Makes k cubes of voxels, by channel (k, z, y, x, c) of its dtype, on the device and
+        without waiting for it. Coarse voxels are means of 2^3 places in each, unless one place
+        tells as much.
         """
-        parts: dict[str, list[Tensor]] = {name: [] for name in self.channels}
+        parts: dict[str, list[Tensor]] = {}
+        for name in self.channels:
+            dtype, width = CHANNELS[name]
+            empty = (0, side, side, side, width)
+            parts[name] = [torch.empty(empty, dtype=dtype, device=self.device)]
         step = max(1, _BATCH // side**3)
         for begin in range(0, len(low_k3), step):
             part = slice(begin, begin + step)
             coarse = None if coarse_k is None else coarse_k[part]
             for name, values in self._make(low_k3[part], voxel_k[part], side, coarse).items():
                 parts[name].append(_stored(name, values))
-        empty = (0, side, side, side)
-        return {
-            name: torch.cat(own)
-            if own
-            else torch.empty((*empty, width), dtype=dtype, device=self.device)
-            for (name, own), (dtype, width) in zip(
-                parts.items(), (CHANNELS[name] for name in self.channels), strict=True
-            )
-        }
+        return {name: torch.cat(own) for name, own in parts.items()}
 
     def constants(self, inside_k: Tensor) -> dict[str, Tensor]:
         """Returns by channel (k, c) the values of voxels far from all triangles, inside the mesh or
@@ -180,10 +175,10 @@ class Voxelizer:
         """
         shape = (len(inside_k), 1, 1, 1)
         inside = inside_k.view(shape)
-        far = MeshCubes(
+        far = Voxelized(
             distance=torch.full(shape, torch.inf, device=self.device),
-            face=torch.full(shape, -1, dtype=torch.int32, device=self.device),
-            inside=inside,
+            nearest=torch.full(shape, -1, dtype=torch.int32, device=self.device),
+            winding=inside.to(torch.int32),
             coverage=inside.to(torch.float32),
             weight=torch.zeros((*shape, 3), device=self.device),
         )
@@ -227,9 +222,7 @@ class Voxelizer:
         }
 
     def _blank(self, inside: Tensor) -> dict[str, Tensor]:
-        """By channel (gz, gy, gx, z, y, x, c) cubes far from all triangles, (gz, gy, gx) inside or
-        not.
-        """
+        """(gz, gy, gx, z, y, x, c) by channel, far from triangles, (gz, gy, gx) inside or not."""
         both = self.constants(torch.tensor([False, True], device=self.device))
         return {
             name: torch.where(inside[..., None], values[1], values[0])[
@@ -277,19 +270,24 @@ class Voxelizer:
             "weights": self.paint is not None,
             "wide": self._wide,
         }
-        return self._channels(self.geometry.cubes(low, size, side, self.thickness, **told))
+        found = self.geometry.cubes(low, size, side, self.thickness, **told)
+        world = found.distance * voxel[:, None, None, None].to(found.distance.dtype)
+        distance = torch.where(found.nearest >= 0, world, torch.inf)
+        made = {"distance": distance, "coverage": found.coverage, "weight": found.weight}
+        narrow = {name: values.to(torch.float32) for name, values in made.items()}
+        return self._channels(found._replace(**narrow))
 
-    def _channels(self, found: MeshCubes) -> dict[str, Tensor]:
-        """By channel (k, z, y, x, c) float32 of what was found (materials int64)."""
+    def _channels(self, found: Voxelized) -> dict[str, Tensor]:
+        """By channel (k, z, y, x, c) float32, distances in world units (int64 materials)."""
         made: dict[str, Tensor] = {}
         if "coverage" in self.channels:
             made["coverage"] = found.coverage[..., None]
         if "distance" in self.channels:
             distance = found.distance.clamp(max=self.band)
-            made["distance"] = torch.where(found.inside, -distance, distance)[..., None]
+            made["distance"] = torch.where(found.winding != 0, -distance, distance)[..., None]
         if self.paint is not None:
-            near, face = found.face[..., None] >= 0, found.face.clamp(min=0).view(-1)
-            shape, weight = found.face.shape, found.weight.view(-1, 3)
+            near, face = found.nearest[..., None] >= 0, found.nearest.clamp(min=0).view(-1)
+            shape, weight = found.nearest.shape, found.weight.view(-1, 3)
             if "color" in self.channels:
                 color = self.paint.color(face, weight).view(*shape, 4)
                 color = torch.where(near, color, self.paint.mean_color)

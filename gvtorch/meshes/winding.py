@@ -10,15 +10,12 @@ Sources: Jacobson, Kavan, Sorkine-Hornung, "Robust inside-outside segmentation u
 from __future__ import annotations
 
 import math
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..ops.voxelize import ARITY
-from .hierarchy import Hierarchy, padded
-from .mesh import Mesh
+from .geometry import Hierarchy, padded
 
 _FAR = 3.5  # radii from which on a box of triangles is a dipole: errors are then below 1e-3
 _PLACES = 1 << 11  # that are asked for together
@@ -67,8 +64,7 @@ class WindingNumber:
 
     def __call__(self, place_p3: Tensor) -> Tensor:
         """Returns (p,) float64 at places (p, 3) float64."""
-        parts = [self._at(place) for place in place_p3.split(_PLACES)]
-        return torch.cat(parts) if parts else place_p3.new_empty(0)
+        return torch.cat([self._at(place) for place in place_p3.split(_PLACES)])
 
     def _at(self, place_p3: Tensor) -> Tensor:
         total = torch.zeros_like(place_p3[:, 0])
@@ -95,12 +91,6 @@ class WindingNumber:
         trace = second.diagonal(dim1=1, dim2=2).sum(1)
         along = torch.einsum("mi,mij,mj->m", toward, second, toward)
         return (first + trace / distance**3 - 3 * along / distance**5) / (4 * math.pi)
-
-
-def winding_number(mesh: Mesh, points: Any) -> np.ndarray:
-    """Returns (p,) float64 at points (p, 3), of all triangles of a mesh; to about 1e-3."""
-    place = torch.from_numpy(np.asarray(points, np.float64).reshape(-1, 3))
-    return WindingNumber(torch.from_numpy(mesh.corners))(place).numpy()
 
 
 def _turn(corner_m33: Tensor) -> Tensor:

@@ -18,8 +18,7 @@ import numpy as np
 from ..base import check
 from ..base.stage import Progress, no_progress
 from ..base.whole_file import told_of
-from .codes import Codes, peak, point_shares
-from .grid import PointGrid
+from .grid import Codes, PointGrid, peak, point_shares
 from .points import Points
 from .table import Fold, Rows, Runs, Table, grouped
 
@@ -169,7 +168,7 @@ def sort_points(
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir(parents=True)
     try:
-        maker = _Maker(grid, first.width, draft, block, progress)
+        maker = _Maker(grid, draft, block, progress)
         maker.read(where, points)
         maker.add_up()
         made = SortedPoints(grid, first.width, maker.points, maker.sums, draft)
@@ -194,9 +193,9 @@ class _Maker:
     """The steps of `sort_points`, and where its tables lie."""
 
     def __init__(
-        self, grid: PointGrid, width: int, folder: Path | None, block: int, progress: Progress
+        self, grid: PointGrid, folder: Path | None, block: int, progress: Progress
     ) -> None:
-        self.grid, self.width, self.folder, self.block = grid, width, folder, block
+        self.grid, self.folder, self.block = grid, folder, block
         self.codes = Codes(grid.branching, max(grid.extent))
         self.points: dict[int, Table] = {}
         self.sums: dict[int, Table] = {}
@@ -231,7 +230,7 @@ class _Maker:
 
     def _runs(self, runs: dict[int, Runs], level: int) -> Runs:
         if level not in runs:
-            runs[level] = Runs(Table(self.folder, f"runs_{level}"), self.block)
+            runs[level] = Runs(self.folder, f"runs_{level}", self.block)
         return runs[level]
 
     def add_up(self) -> None:
@@ -247,7 +246,7 @@ class _Maker:
                 else:
                     made.remove()
                 continue
-            both = Runs(Table(self.folder, f"both_{level}"), self.block)
+            both = Runs(self.folder, f"both_{level}", self.block)
             for rows in grouped(below, _WITH_ENDS, divide):
                 both.append(rows)
             for rows in own.sorted():
@@ -289,7 +288,7 @@ class _Maker:
         """What points that are as wide as a level's voxels add to them; None if there are none."""
         if not self._is_wide(level):
             return None
-        runs = Runs(Table(self.folder, f"own_{level}"), self.block)
+        runs = Runs(self.folder, f"own_{level}", self.block)
         for rows in self.points[level].blocks(max(1, self.block // 27)):
             runs.append(self._spread(rows, level))
         return runs

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..ops.splat import splat
-from .codes import Codes, peak
+from .grid import Codes, peak
 from .sorted import SortedPoints
 from .table import Rows
 
@@ -60,20 +60,13 @@ class _Cells(NamedTuple):
         return self.first_s3[own] + curve.places(self.size)[within]
 
 
-class _Found(NamedTuple):
-    """Rows of a table in cubes: those of a cube stand together, and those of equal codes in it."""
-
-    row: np.ndarray  # (m,) in the table
-    cube: np.ndarray  # (m,) rising
+#: (m,) rows of a table in cubes, and (m,) the cubes, rising; rows of equal codes stand together.
+_Found = tuple[np.ndarray, np.ndarray]
 
 
 def values(points: SortedPoints, cubes: Cubes, *, narrow: bool = True) -> np.ndarray:
-    """Returns (k, z, y, x, c) float64 the sums in voxels, per finest voxel.
-
-    Args:
-        points: The points.
-        cubes: The voxels.
-        narrow: Whether points count that are narrower than a finest voxel.
+    """Returns (k, z, y, x, c) float64 the sums in voxels, per finest voxel; without those of points
+    that are narrower than a finest voxel unless `narrow`.
     """
     table = _finer(points, cubes.level) if narrow else None
     edge = np.stack(points.grid.edges(cubes.low_k3, cubes.side, cubes.level), 1)
@@ -96,10 +89,9 @@ def ranges(
     if narrow and (table := _finer(points, cubes.level)) is not None:
         rows, level = table
         found = _in_cubes(points, rows["code"], level, cubes)
-        if len(found.row):
+        if len(found[0]):
             _widen(rows, found, some, low, high)
-    for level, (row, cube) in _reaching(points, cubes):
-        rows = points.points[level].rows
+    for rows, (row, cube) in _reaching(points, cubes):
         most = peak(rows["radius"][row].astype(np.float64), points.grid.spacing_3)
         value = most[:, None] * rows["value"][row]
         first = _begins(cube)
@@ -137,15 +129,15 @@ def _finer(points: SortedPoints, level: int) -> tuple[Rows, int] | None:
 
 def _widen(rows: Rows, found: _Found, some: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
     """Widens ranges of cubes by what was found in them."""
-    cube = found.cube
+    row, cube = found
     if "low" in rows:
-        least, most = rows["low"][found.row], rows["high"][found.row]
+        least, most = rows["low"][row], rows["high"][row]
     else:  # points: their sums in finest voxels
-        code = rows["code"][found.row]
+        code = rows["code"][row]
         new = (code[1:] != code[:-1]) | (cube[1:] != cube[:-1])
         first = np.concatenate(([0], np.flatnonzero(new) + 1))
         cube = cube[first]
-        total = np.add.reduceat(rows["value"][found.row].astype(np.float64), first)
+        total = np.add.reduceat(rows["value"][row].astype(np.float64), first)
         least, most = np.minimum(total, 0), np.maximum(total, 0)
     first = _begins(cube)
     here = cube[first]
@@ -155,16 +147,14 @@ def _widen(rows: Rows, found: _Found, some: np.ndarray, low: np.ndarray, high: n
 
 
 def _in_cubes(points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes) -> _Found:
-    """The rows of a table, of codes of voxels of a level not above the cubes', that lie in them;
-    see `_cells`.
-    """
+    """The rows of a table that lie in cubes, of codes of voxels of a level not above theirs."""
     cells = _cells(points, codes, level, cubes)
     row, own = cells.listed()
     cube = cells.cube[own]
     voxel = cells.voxels(points.codes, codes[row], own) - cubes.low_k3[cube]
     x, y, z = ((voxel >= 0) & (voxel < cubes.side)).T
     keep = x & y & z
-    return _Found(row[keep], cube[keep])
+    return row[keep], cube[keep]
 
 
 def _cells(
@@ -197,9 +187,9 @@ def _cells(
     return _Cells(cube, first[cube, which], code, start, count, size, below)
 
 
-def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, Cubes]]:
-    """Yields the levels above the cubes' that have points, and the voxels of these levels in which
-    all points lie that may reach into the cubes.
+def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _Cells]]:
+    """Yields the points of each level above the cubes', and the cells in which all of them lie that
+    may reach into the cubes.
     """
     grid = points.grid
     for level, table in points.points.items():
@@ -211,17 +201,16 @@ def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, Cubes]]:
         if level == grid.levels - 1:
             reach = int(max(grid.extent)) // grid.branching**level + 1
         low = cubes.low_k3 // up - reach
-        yield level, Cubes(low, (cubes.side + up - 2) // up + 1 + 2 * reach, level)
+        around = Cubes(low, (cubes.side + up - 2) // up + 1 + 2 * reach, level)
+        yield table.rows, _cells(points, table.rows["code"], 0, around, least=1)
 
 
-def _reaching(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, _Found]]:
+def _reaching(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _Found]]:
     """Yields for levels above the cubes' the points that reach into them, or very nearly."""
     grid = points.grid
     half = 0.5 * cubes.side * grid.spacing_3 * grid.branching**cubes.level
     middle = grid.low + (2 / cubes.side * cubes.low_k3 + 1) * half
-    for level, around in _wide(points, cubes):
-        rows = points.points[level].rows
-        cells = _cells(points, rows["code"], 0, around, least=1)
+    for rows, cells in _wide(points, cubes):
         row, own = cells.listed()
         cube = cells.cube[own]
         for axis in range(3):
@@ -230,7 +219,7 @@ def _reaching(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[int, _Found]
             near = away < _NEARLY * radius + half[axis]
             row, cube = row[near], cube[near]
         if len(row):
-            yield level, _Found(row, cube)
+            yield rows, (row, cube)
 
 
 def _narrow_lists(
@@ -256,9 +245,7 @@ def _wide_lists(points: SortedPoints, cubes: Cubes) -> tuple[np.ndarray, ...]:
     cube, run = [np.empty(0, np.int64)], [np.empty((0, 2), np.int64)]
     parts = [(np.empty((0, 3)), np.empty(0), np.empty((0, points.width)))]
     ahead = 0
-    for level, around in _wide(points, cubes):
-        rows = points.points[level].rows
-        cells = _cells(points, rows["code"], 0, around, least=1)
+    for rows, cells in _wide(points, cubes):
         once, same = cells.once()
         row, _ = once.listed()
         place, radius, value = (
@@ -298,4 +285,4 @@ def narrow_near(points: SortedPoints, center: np.ndarray, reach: float) -> np.nd
     most = math.ceil(max(grid.extent) / grid.branching**level)
     low, high = (np.clip(end, -1, most).astype(np.int64) for end in (first, last))
     cubes = Cubes(low[None], int((high - low).max()) + 1, level)
-    return _in_cubes(points, points.points[0].rows["code"], 0, cubes).row
+    return _in_cubes(points, points.points[0].rows["code"], 0, cubes)[0]

@@ -96,32 +96,29 @@ class Table:
             self.file(column).unlink(missing_ok=True)
 
 
-class Runs:
+class Runs(Table):
     """Rows that come in any order, and leave sorted by code: sorted a block at a time, and merged.
     Rows of equal codes keep their order within a block.
     """
 
-    def __init__(self, table: Table, block: int) -> None:
-        """Keeps runs in a table, whose files are removed by `remove`."""
-        self._table, self._block = table, block
-        self._ends = [0]
+    def __init__(self, folder: Path | None, name: str, block: int) -> None:
+        """Is empty; see `Table`."""
+        super().__init__(folder, name)
+        self._block, self._ends = block, [0]
 
     def append(self, rows: Rows) -> None:
         """Adds a block of rows."""
         if not len(rows["code"]):
             return
         order = np.argsort(rows["code"], kind="stable")
-        self._table.append({name: values[order] for name, values in rows.items()})
-        self._ends.append(len(self._table))
-
-    def __len__(self) -> int:
-        return len(self._table)
+        super().append({name: values[order] for name, values in rows.items()})
+        self._ends.append(len(self))
 
     def sorted(self) -> Iterator[Rows]:
         """Yields all rows by rising codes, a block at a time."""
-        rows, at, ends = self._table.rows, self._ends[:-1], self._ends[1:]
+        rows, at, ends = self.rows, self._ends[:-1], self._ends[1:]
         if len(at) == 1:
-            yield from self._table.blocks(self._block)
+            yield from self.blocks(self._block)
             return
         while live := [run for run in range(len(at)) if at[run] < ends[run]]:
             step = max(1, self._block // len(live))
@@ -139,10 +136,6 @@ class Runs:
             block = {name: np.concatenate([part[name] for part in parts]) for name in rows}
             order = np.argsort(block["code"], kind="stable")
             yield {name: values[order] for name, values in block.items()}
-
-    def remove(self) -> None:
-        """Removes the files."""
-        self._table.remove()
 
 
 def grouped(blocks: Iterable[Rows], folds: Mapping[str, Fold], divide: int = 1) -> Iterator[Rows]:

@@ -4,12 +4,4 @@ from .n3tree import N3Tree
 from .pools import BrickPool, Channel, NodePool
 from .staging import BrickTable, Staging, TableRows
 
-__all__ = [
-    "BrickPool",
-    "BrickTable",
-    "Channel",
-    "N3Tree",
-    "NodePool",
-    "Staging",
-    "TableRows",
-]
+__all__ = ["BrickPool", "BrickTable", "Channel", "N3Tree", "NodePool", "Staging", "TableRows"]

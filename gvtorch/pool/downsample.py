@@ -116,7 +116,9 @@ def _most_frequent(rows: np.ndarray, background: float | None) -> np.ndarray:
 
 
 def pool_directional(
-    values: np.ndarray, factor: int, sides_zyx: tuple[float, float, float]
+    values: np.ndarray,  # (z, y, x, 24) as `Volume.directional` lays them out
+    factor: int,  # as for `pool_mean`, one number
+    sides_zyx: tuple[float, float, float],  # of a voxel of `values`, in reference lengths
 ) -> np.ndarray:
     """Reduces blocks of factor^3 voxels of premultiplied colour and opacity, as seen along each of
     six directions.
@@ -125,11 +127,6 @@ def pool_directional(
     mean of the columns is stored. Opacity is stored per reference length at every level: that of a
     homogeneous voxel which lets as much light through. So a homogeneous medium stays as it is, and
     so does opacity 1. Sums are float64.
-
-    Args:
-        values: (z, y, x, 24) as `Volume.directional` lays them out.
-        factor: As for `pool_mean`, one number.
-        sides_zyx: Sides of a voxel of `values`, in reference lengths.
     """
 
     def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:
@@ -201,9 +198,7 @@ def by_node(values: Grid, how: Reduction, brick_size: int, border: int) -> Grid:
 def _along(
     values: Grid, axis: int, how: Reduction, size: int, step: int, wide: str | None = None
 ) -> Grid:
-    """Reduces windows of `size` voxels, `step` apart, along one axis, in order; sums are of the
-    dtype `wide`, or one that holds them.
-    """
+    """Reduces windows, `step` apart, along one axis; sums are of dtype `wide`, or one that does."""
     if how == "mean" and wide is None:
         wide = _wide(_name(values), size)
     count = (values.shape[axis] - size) // step + 1
@@ -221,8 +216,10 @@ def _pool(
     factors = [factor] * 3 if isinstance(factor, int) else list(factor)
     shape = [-(-n // f) for n, f in zip(values.shape[:3], factors, strict=True)]
     shape.append(values.shape[3])
-    out = _empty(values, shape)
-    slab = _DEVICE_SLAB if isinstance(values, Tensor) else _SLAB
+    if isinstance(values, Tensor):
+        out, slab = values.new_empty(shape), _DEVICE_SLAB
+    else:
+        out, slab = np.empty(shape, values.dtype), _SLAB
     rows = max(1, slab // max(1, math.prod(values.shape[1:]) * factors[0]))
     for start in range(0, shape[0], rows):
         part = values[start * factors[0] : (start + rows) * factors[0]]
@@ -244,13 +241,6 @@ def _every(values: Grid, axis: int, first: int, step: int, count: int | None = N
     """Returns every `step`-th slice along an axis, `count` of them."""
     stop = None if count is None else first + step * (count - 1) + 1
     return values[(slice(None),) * axis + (slice(first, stop, step),)]
-
-
-def _empty(values: Grid, shape: Sequence[int]) -> Grid:
-    """Returns a grid of a shape, of the kind, dtype and device of another."""
-    if isinstance(values, Tensor):
-        return values.new_empty(shape)
-    return np.empty(shape, values.dtype)
 
 
 def _name(values: Grid) -> str:

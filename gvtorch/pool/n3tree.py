@@ -383,7 +383,6 @@ class N3Tree:
             depth=self.depth,
             branching=self.branching,
             extent=self.extent[::-1],
-            number=self.number,
         )
 
     def warn_if_edited(self, *, learned: bool = False) -> None:

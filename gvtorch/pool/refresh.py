@@ -36,7 +36,6 @@ class BrickLevels:
     depth: int
     branching: int
     extent: Place  # finest voxels z y x
-    number: int  # of the tree
 
     @cached_property
     def slot_n(self) -> Tensor:
@@ -48,7 +47,8 @@ class BrickLevels:
         slot = _owned(self.nodes.brick_tn, self.bricks.owner_b)
         pool = self.nodes
         per_tile, count = pool.nodes_per_tile, self.branching**3
-        tile = ((pool.parent_t >= 0) & (pool.tree_t == self.number)).nonzero()[:, 0]
+        mine = pool.tree_t == self.root // per_tile
+        tile = ((pool.parent_t >= 0) & mine).nonzero()[:, 0]
         node = (tile[:, None] * per_tile + torch.arange(count, device=slot.device)).flatten()
         node = torch.cat((node, node.new_full((1,), self.root)))
         depth = torch.cat((pool.loc_t4[tile, 3].repeat_interleave(count), tile.new_zeros(1)))
@@ -112,21 +112,12 @@ class BrickLevels:
         self,
         low: Place,
         high: Place,
-        filters: Mapping[str, str],
-        empty: Mapping[str, float | None],
-        spacing: tuple[float, float, float],
-        threshold: float | None,
+        filters: Mapping[str, str],  # of each channel, see `Volume.filter`
+        empty: Mapping[str, float | None],  # of channels of labels, the value of the background
+        spacing: tuple[float, float, float],  # of the finest voxels
+        threshold: float | None,  # see `N3Tree.from_volume`
     ) -> None:
-        """Makes right what follows from the finest voxels low to high (z y x).
-
-        Args:
-            low: First voxel.
-            high: The one after the last.
-            filters: Of each channel, see `Volume.filter`.
-            empty: Of channels of labels, the value of the background.
-            spacing: (x, y, z) of the finest voxels.
-            threshold: See `N3Tree.from_volume`.
-        """
+        """Makes right what follows from the finest voxels `low` to `high`, which is left out."""
         channels = [
             _ChannelLevels(self, name, how, spacing, empty.get(name))
             for name, how in filters.items()
@@ -187,22 +178,17 @@ class BrickLevels:
         pool.child_tn.view(-1)[node[own]] = below[own].to(torch.int32)
 
 
+@dataclass(eq=False)
 class _ChannelLevels:
     """One channel while it is made anew, level after level, the finest first."""
 
-    def __init__(
-        self,
-        tree: BrickLevels,
-        name: str,
-        how: str,
-        spacing: tuple[float, float, float],
-        empty: float | None,
-    ) -> None:
-        self.tree, self.name, self.how, self.spacing = tree, name, how, spacing
-        self.empty = empty
-        self.dtype = tree.bricks.bricks[name].dtype
-        self._values: np.ndarray | None = None  # of the level before
-        self._begin: Place = (0, 0, 0)  # their first voxel
+    tree: BrickLevels
+    name: str
+    how: str
+    spacing: tuple[float, float, float]
+    empty: float | None
+    _values: np.ndarray | None = None  # of the level before
+    _begin: Place = (0, 0, 0)  # their first voxel
 
     def limit(self, reach: Sequence[tuple[int, Place, Place]]) -> None:
         """Is told, of each level, the nodes (first, after the last) whose ranges are asked for."""
@@ -277,9 +263,7 @@ class _ChannelLevels:
         return NodeSummary(*flat)
 
     def _level(self, level: int, begin: Place, end: Place, low: Place, high: Place) -> np.ndarray:
-        """The voxels low to high of a level, of which those from begin to end are made of the level
-        before.
-        """
+        """The voxels low to high of a level, begin to end of them made of the level before."""
         n = self.tree.branching
         if level == 0:
             return to_numpy(self.tree.read(self.name, 0, low, high))
@@ -290,7 +274,8 @@ class _ChannelLevels:
             slice(a * n - at, min(b * n, most) - at)
             for a, (b, most, at) in zip(begin, ends, strict=True)
         )
-        told = self.how, n, self.dtype, self.spacing, level
+        dtype = self.tree.bricks.bricks[self.name].dtype
+        told = self.how, n, dtype, self.spacing, level
         made = coarser(self._values[cut], *told, empty=self.empty)
         if (low, high) == (begin, end):
             return made
@@ -360,9 +345,7 @@ def _places(first: Place, count: Place, device: torch.device) -> Tensor:
 def _padded(
     values: np.ndarray, low: Place, first: Place, last: Place, size: int, border: int
 ) -> np.ndarray:
-    """Out of voxels that begin at `low`: those of the nodes `first` to `last` and their borders;
-    the outermost voxels are repeated.
-    """
+    """Of voxels from `low` on those of nodes `first` to `last`, with borders; outermost repeat."""
     for axis, at in enumerate(low):
         begin, end = first[axis] * size - border - at, last[axis] * size + border - at
         here = max(0, begin)

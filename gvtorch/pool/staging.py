@@ -1,5 +1,5 @@
 """`Staging`: sends bricks from the host to the device while the device renders; `BrickTable`:
-bricks that a producer keeps ready in host memory.
+bricks that a producer keeps ready in host memory; `mapped`: host memory that the device reads.
 
 Bricks are gathered chunk by chunk into a ring of pinned memory, copied on a stream of their own,
 and written into their slots by the stream that renders, which waits for each copy by an event. One
@@ -27,6 +27,7 @@ from ..base import check
 
 _MOST = 256 * 10**6  # bytes of a ring
 _CHUNKS = (2 * 10**6, 16 * 10**6)  # bytes of a chunk: fewer are all overhead, more overlap less
+_SMALL = 64 * 10**6  # bytes to be mapped: as much is copied, and read at the device's own speed
 _ALIGN = 16  # bytes: where a channel begins in a chunk
 _WORDS = {8: torch.int64, 4: torch.int32, 2: torch.int16, 1: torch.uint8}
 
@@ -149,23 +150,13 @@ class Chunk:
 
     def __init__(self, begin: int, end: int, data: Mapping[str, Tensor], span: _RingSpan) -> None:
         self.begin, self.end = begin, end
-        self._data, self._span = data, span
+        self.data, self._span = data, span
         self._device = next(iter(data.values())).device
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of what it holds."""
-        return tuple(self._data)
-
-    @property
-    def brick_bytes(self) -> int:
-        """Bytes of a brick, all channels together."""
-        return sum(row_bytes(rows) for rows in self._data.values())
 
     def __enter__(self) -> Mapping[str, Tensor]:
         if self._device.type == "cuda":
             torch.cuda.current_stream(self._device).wait_event(self._span.copied)
-        return self._data
+        return self.data
 
     def __exit__(self, *_error: object) -> None:
         if self._device.type == "cuda":
@@ -292,6 +283,45 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
     if device.type != "cuda" or tensor.device.type != "cpu" or tensor.numel() == 0:
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
+
+
+class _Pages:
+    """Host memory that CUDA has locked, in the form in which torch takes memory over."""
+
+    def __init__(self, host: Tensor) -> None:
+        runtime, start, size = torch.cuda.cudart(), host.data_ptr(), host.nbytes
+        failed = int(runtime.cudaHostRegister(start, size, 0))
+        if failed:
+            raise RuntimeError(
+                f"{size / 1e6:.0f} MB of host memory can't be locked (CUDA {failed})"
+            )
+        self.host = host  # lives as long
+        self.__cuda_array_interface__: dict[str, Any] = {
+            "data": (start, False),
+            "shape": (size,),
+            "typestr": "|u1",
+            "version": 3,
+        }
+        weakref.finalize(self, _unlock, start).atexit = False  # the process's end unlocks as well
+
+
+def _unlock(start: int) -> None:
+    torch.cuda.synchronize()  # nothing reads there any more
+    torch.cuda.cudart().cudaHostUnregister(start)
+
+
+def mapped(host: Tensor, device: torch.device) -> Tensor:
+    """Returns a tensor on the device with the content of a contiguous one on the host: small ones
+    copied, others where they lie, which stays locked while the result lives.
+
+    Raises:
+        RuntimeError: The system does not let that much memory be locked.
+    """
+    if device.type != "cuda" or host.nbytes <= _SMALL:
+        return host.to(device)
+    with torch.cuda.device(device):
+        there = torch.as_tensor(_Pages(host), device=device)
+    return there.view(host.dtype).view(host.shape)
 
 
 def _is_pinned(rows: Tensor | TableRows) -> bool:

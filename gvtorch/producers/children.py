@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Future
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,26 +15,15 @@ from ..pool.downsample import from_grid
 from ..pool.pyramid import coarser
 from ..pool.staging import on_device
 from .answer import checked_bricks, checked_regions
-from .producer import (
-    Bricks,
-    Layout,
-    Nodes,
-    Producer,
-    Region,
-    Regions,
-    Where,
-    arrived,
-    by_depth,
-    grid_of,
-    touched,
-)
+from .nodes import Layout, Nodes, grid_of
+from .producer import Bricks, OfProducers, Producer, Region, Regions, arrived, by_depth, touched
 
 _AT_ONCE = 64  # blocks of a level that are made together, out of N^3 times as many below
 
 Blocks = dict[str, np.ndarray]  # for each channel (k, z, y, x, c) without borders
 
 
-class FromChildren(Producer):
+class FromChildren(OfProducers):
     """A producer's finest level, and coarse levels that are the means of what lies below.
 
     A coarse voxel is the mean of the N^3 voxels below it as they are stored, so that pictures are
@@ -72,22 +60,8 @@ class FromChildren(Producer):
         self._kept: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by place
         self._known = producer.version  # they are of this content
 
-    @property
-    def version(self) -> int:  # type: ignore[override]
-        """That of the producer."""
-        return self.producer.version
-
-    def changed(self, where: Any = None) -> None:
-        """See `Producer.changed`."""
-        self.producer.changed(where)
-
-    def changes(self, since: int) -> list[Where] | None:
-        """Where the producer has changed."""
-        return self.producer.changes(since)
-
-    def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
-        """Where the producer differs."""
-        return self.producer.differs(nodes, before, after)
+    def parts(self) -> dict[str, Producer]:
+        return {"producer": self.producer}
 
     def prepare(self, layout: Layout) -> None:
         """Refuses trees that are too deep."""
@@ -98,12 +72,12 @@ class FromChildren(Producer):
                 f"{count} finest bricks; the most is levels={self.levels}"
             )
         self._kept.clear()
-        self.producer.prepare(layout)
+        super().prepare(layout)
 
     def close(self) -> None:
         """Closes the producer."""
         self._kept.clear()
-        self.producer.close()
+        super().close()
 
     def classify(self, nodes: Nodes) -> Regions | Tensor | Future:
         """As the producer does."""
@@ -175,9 +149,7 @@ class FromChildren(Producer):
         return {n: from_grid(found[n], c.dtype) for n, c in self.channels.items()}
 
     def _region(self, layout: Layout, depth: int, low: Tensor, size: int) -> Blocks:
-        """size^3 voxels of a level from voxels `low` (k, 3) x y z on; beyond the level's faces the
-        outermost repeat.
-        """
+        """size^3 voxels of a level from `low` (k, 3) x y z on; beyond it the outermost repeat."""
         step, brick = layout.branching ** (layout.depth - depth), layout.brick_size
         last = torch.tensor([-(-n // step) - 1 for n in layout.extent])[:, None]
         voxel = (low[:, :, None] + torch.arange(size)).clamp(min=0).minimum(last)

@@ -17,16 +17,9 @@ from torch import Tensor, nn
 from ..base import check
 from ..base.boxes import extent_in
 from ..fields import Distance, noise
-from ..fields.noise.fractal import Octave, octaves_from
-from ..fields.noise.tally import Tally
+from ..fields.noise.fractal import Octave, Tally, octaves_of
 from ..pool import Channel
-from .field import (
-    alike,
-    distances_of,
-    dtype_of_places,
-    interval_of,
-    moving,
-)
+from .field import alike, distances_of, dtype_of_places, interval_of, moving
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth, check_points
 
 _BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
@@ -111,10 +104,16 @@ class Hypertexture(Tally, Producer):
         thickness = check.number(where, "thickness", thickness, low=0, open_low=True)
         amplitude = check.number(where, "amplitude", amplitude, low=0)
         softness = check.number(where, "softness", softness, low=0, open_low=True)
-        series = octaves_from(where, frequency, octaves, lacunarity, gain, seed)
+        series = octaves_of(where, octaves, lacunarity, gain, seed, frequency)
         most = amplitude * sum(one.amplitude for one in series) * noise.bounds(noise.perlin).high
         reach = thickness * max(most + softness - 0.5, 0.0)
-        extent, box = _cut_out(where, shape, reach, extent, box)
+        if box is None:
+            own = shape.box()
+            if own is None or not bool(own.isfinite().all()):
+                told = "box must be given: the shape does not tell where it ends"
+                raise ValueError(f"{where}: {told}")
+            box = [(own[0] - reach).tolist(), (own[1] + reach).tolist()]
+        extent = extent_in(where, extent, box)
         if not check.instance(where, "dtype", dtype, torch.dtype).is_floating_point:
             raise ValueError(f"{where}: dtype must be one of floats, got {dtype}")
         channels = {"density": Channel(dtype)}
@@ -241,19 +240,3 @@ class Hypertexture(Tally, Producer):
         t = ((total - (0.5 - soft)) / (2 * soft)).clamp(0, 1)
         found = {"density": t * t * (3 - 2 * t), "distance": distance}
         return {name: found[name][..., None] for name in self.channels}
-
-
-def _cut_out(
-    where: str,
-    shape: Distance,
-    reach: float,
-    extent: int | Sequence[int],
-    box: Sequence[Sequence[float]] | None,
-) -> tuple[Sequence[int], Sequence[Sequence[float]]]:
-    """Extent along x, y, z, and a box: left out, what lies within `reach` of the shape's."""
-    if box is None:
-        own = shape.box()
-        if own is None or not bool(own.isfinite().all()):
-            raise ValueError(f"{where}: box must be given: the shape does not tell where it ends")
-        box = [(own[0] - reach).tolist(), (own[1] + reach).tolist()]
-    return extent_in(where, extent, box), box

@@ -8,7 +8,6 @@ import functools
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +17,12 @@ from torch import Tensor
 from ..base import check
 from ..io.stores.channels import channel_names
 from ..io.stores.store import Store
-from .producer import (
-    Bricks,
-    Layout,
-    Nodes,
-    Producer,
-    Region,
-    Regions,
-    Where,
-    arrived,
-    grid_of,
-)
+from .nodes import grid_of
+from .producer import Bricks, Nodes, OfProducers, Producer, Region, Regions, arrived
 from .stored import StoredProducer
 
 
-class JoinedProducer(Producer):
+class JoinedProducer(OfProducers):
     """Asks several producers for the same nodes; each gives one channel, under a name of its own.
 
     A node is EMPTY where all say so, and CONSTANT where none has voxels for it. Answers with
@@ -84,57 +74,59 @@ class JoinedProducer(Producer):
         waits = [one.patience for one in producers.values() if one.patience is not None]
         self.patience = max(waits) if waits else None
 
-    def _each(self) -> dict[str, Producer]:
+    def parts(self) -> dict[str, Producer]:
         return {name: one for name, one in self.producers.items() if isinstance(one, Producer)}
-
-    @property
-    def version(self) -> int:  # type: ignore[override]
-        """Rises with that of each."""
-        return max(one.version for one in self._each().values())
-
-    def changed(self, where: Any = None) -> None:
-        """See `Producer.changed`; all have changed."""
-        for one in self._each().values():
-            one.changed(where)
-
-    def changes(self, since: int) -> list[Where] | None:
-        """Wherever any has changed."""
-        new = [one.changes(since) for one in self._each().values() if one.version > since]
-        known = [changes for changes in new if changes is not None]
-        if len(known) < len(new):
-            return None
-        return [*dict.fromkeys(where for changes in known for where in changes)]  # each once
-
-    def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
-        """Where any differs."""
-        timed = [one for one in self._each().values() if hasattr(one, "time")]
-        return torch.stack([one.differs(nodes, before, after) for one in timed]).any(0)
-
-    def prepare(self, layout: Layout) -> None:
-        """Prepares all."""
-        for one in self._each().values():
-            one.prepare(layout)
 
     def classify(self, nodes: Nodes) -> Regions | Future:
         """Asks all."""
-        answers = {name: one.classify(nodes) for name, one in self._each().items()}
-        join = functools.partial(_joined_regions, self._device(nodes), len(nodes), self._each())
-        return _when_all(answers, join)
+        answers = {name: one.classify(nodes) for name, one in self.parts().items()}
+        return _when_all(answers, functools.partial(self._regions, nodes))
 
     def fill(self, nodes: Nodes) -> Bricks | Future:
         """Asks all."""
-        answers = {name: one.fill(nodes) for name, one in self._each().items()}
-        join = functools.partial(_joined_bricks, self._device(nodes), self._each())
-        return _when_all(answers, join)
+        answers = {name: one.fill(nodes) for name, one in self.parts().items()}
+        return _when_all(answers, functools.partial(self._bricks, nodes))
 
-    def _device(self, nodes: Nodes) -> torch.device:
-        """Where answers are joined."""
-        return nodes.loc.device if self.on_device else torch.device("cpu")
+    def _regions(self, nodes: Nodes, answers: Mapping[str, Any]) -> Regions:
+        given = {
+            n: one if isinstance(one, Regions) else Regions(kind=one) for n, one in answers.items()
+        }
+        kind = self._kinds(nodes, [one.kind for one in given.values()])
+        constants, ranges = dict[str, Tensor](), dict[str, Tensor]()
+        for name, one in given.items():
+            ((own, channel),) = self.parts()[name].channels.items()
+            zero = torch.zeros((len(kind), channel.width), dtype=channel.dtype, device=kind.device)
+            constants[name] = one.constants.get(own, zero).view(len(kind), -1).to(channel.dtype)
+            ranges |= {name: one.ranges[own]} if own in one.ranges else {}
+        return Regions(kind=kind, constants=constants, ranges=ranges, errors=_errors(given))
 
-    def close(self) -> None:
-        """Closes all."""
-        for one in self._each().values():
-            one.close()
+    def _bricks(self, nodes: Nodes, answers: Mapping[str, Any]) -> Bricks:
+        data, constants, given = dict[str, Any](), dict[str, Tensor](), dict[str, Bricks]()
+        for name, producer in self.parts().items():
+            one = given[name] = producer.as_bricks(answers[name])
+            (own,) = producer.channels
+            data[name] = one.data[own]
+            constants |= {name: one.constants[own]} if own in one.constants else {}
+        if all(one.kind is None for one in given.values()):
+            return Bricks(data=data, errors=_errors(given))
+        kind = self._kinds(nodes, [one.kind for one in given.values()])
+        if len(constants) < len(given):  # some tell no constants: their voxels do
+            kind = torch.where(kind == Region.CONSTANT, int(Region.DATA), kind)
+        return Bricks(data=data, kind=kind, constants=constants, errors=_errors(given))
+
+    def _kinds(self, nodes: Nodes, kinds: Sequence[Tensor | None]) -> Tensor:
+        """(k,) of regions that hold for all; on CUDA, that of an alias is none that there is."""
+        device = nodes.loc.device if self.on_device else torch.device("cpu")
+        data = torch.full((len(nodes),), int(Region.DATA), device=device)
+        given = torch.stack([data if one is None else one.to(device, torch.int64) for one in kinds])
+        if device.type == "cpu" and bool((given == Region.ALIAS).any()):
+            raise ValueError("JoinedProducer: producers must answer without alias")
+        voxels = (given == Region.DATA) | (given == Region.DATA_MAX_DEPTH)
+        deepest = (~voxels | (given == Region.DATA_MAX_DEPTH)).all(0)
+        kind = torch.where(deepest, int(Region.DATA_MAX_DEPTH), int(Region.DATA))
+        kind = torch.where(voxels.any(0), kind, int(Region.CONSTANT))
+        kind = torch.where((given == Region.EMPTY).all(0), int(Region.EMPTY), kind)
+        return torch.where((given == Region.ALIAS).any(0), -1, kind)
 
 
 class StoredChannels(JoinedProducer):
@@ -199,60 +191,6 @@ def _when_all(answers: Mapping[str, Any], join: Callable[[Mapping[str, Any]], An
     for one in late:
         one.add_done_callback(came)
     return found
-
-
-def _joined_kinds(kinds: Sequence[Tensor | None], count: int, device: torch.device) -> Tensor:
-    """(k,) of regions that hold for all; on CUDA, that of an alias is none that there is."""
-    data = torch.full((count,), int(Region.DATA), device=device)
-    told = [data if kind is None else kind.to(device, torch.int64) for kind in kinds]
-    given = torch.stack(told)
-    if device.type == "cpu" and bool((given == Region.ALIAS).any()):
-        raise ValueError("JoinedProducer: producers must answer without alias")
-    voxels = (given == Region.DATA) | (given == Region.DATA_MAX_DEPTH)
-    deepest = (~voxels | (given == Region.DATA_MAX_DEPTH)).all(0)
-    kind = torch.where(deepest, int(Region.DATA_MAX_DEPTH), int(Region.DATA))
-    kind = torch.where(voxels.any(0), kind, int(Region.CONSTANT))
-    kind = torch.where((given == Region.EMPTY).all(0), int(Region.EMPTY), kind)
-    return torch.where((given == Region.ALIAS).any(0), -1, kind)
-
-
-def _joined_regions(
-    device: torch.device,
-    count: int,
-    producers: Mapping[str, Producer],
-    answers: Mapping[str, Any],
-) -> Regions:
-    given = {
-        name: one if isinstance(one, Regions) else Regions(kind=one)
-        for name, one in answers.items()
-    }
-    constants, ranges = dict[str, Tensor](), dict[str, Tensor]()
-    for name, one in given.items():
-        ((own, channel),) = producers[name].channels.items()
-        zero = torch.zeros((count, channel.width), dtype=channel.dtype, device=device)
-        constants[name] = one.constants.get(own, zero).view(count, -1).to(channel.dtype)
-        ranges |= {name: one.ranges[own]} if own in one.ranges else {}
-    kind = _joined_kinds([one.kind for one in given.values()], count, device)
-    return Regions(kind=kind, constants=constants, ranges=ranges, errors=_errors(given))
-
-
-def _joined_bricks(
-    device: torch.device, producers: Mapping[str, Producer], answers: Mapping[str, Any]
-) -> Bricks:
-    data, constants, given = dict[str, Any](), dict[str, Tensor](), dict[str, Bricks]()
-    for name, one in answers.items():
-        given[name] = producers[name].as_bricks(one)
-        (own,) = producers[name].channels
-        data[name] = given[name].data[own]
-        constants |= {name: given[name].constants[own]} if own in given[name].constants else {}
-    errors = _errors(given)
-    if all(one.kind is None for one in given.values()):
-        return Bricks(data=data, errors=errors)
-    counts = [len(one.kind) for one in given.values() if one.kind is not None]
-    kind = _joined_kinds([one.kind for one in given.values()], counts[0], device)
-    if len(constants) < len(given):  # some tell no constants: their voxels do
-        kind = torch.where(kind == Region.CONSTANT, int(Region.DATA), kind)
-    return replace(Bricks(data=data, errors=errors), kind=kind, constants=constants)
 
 
 def _errors(given: Mapping[str, Regions | Bricks]) -> dict[int, str]:

@@ -108,8 +108,6 @@ class MeshProducer(Producer):
 
 
 def _cubes(nodes: Nodes, grid: Voxelizer) -> tuple[Tensor, Tensor]:
-    """(k, 3) float64 low corners of the nodes' bricks with their borders, and (k,) float64 sizes of
-    their voxels.
-    """
+    """Low corners (k, 3) of bricks with their borders, and sizes (k,) of their voxels, float64."""
     low = nodes.box[:, 0] - nodes.layout.border * nodes.voxel_size
     return low.to(grid.device).contiguous(), nodes.voxel_size[:, 0].to(grid.device)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,13 +18,10 @@ from ..pool.pyramid import tree_depth
 _ROUNDED = 1 / 32  # of a voxel, by which places may be rounded
 
 
-class World(Protocol):
-    """What is cut: a `Producer`."""
-
-    extent: tuple[int, int, int]
-    spacing: tuple[float, float, float]
-    origin: tuple[float, float, float]
-    branching: int
+def grid_of(producer: Any) -> dict[str, Any]:
+    """Returns where a producer's content lies, as another of the same place takes it, by name."""
+    names = ("extent", "spacing", "origin", "branching")
+    return {name: getattr(producer, name) for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,18 +39,11 @@ class Layout:
     scene: Mapping[str, Layout] = field(default_factory=dict, repr=False, compare=False)  # trees
 
     @classmethod
-    def of(cls, producer: World, brick_size: int, border: int, device: torch.device) -> Layout:
+    def of(cls, producer: Any, brick_size: int, border: int, device: torch.device) -> Layout:
         """Returns the layout of a producer's world in bricks of a size."""
-        return cls(
-            depth=tree_depth(producer.extent, brick_size, producer.branching),
-            branching=producer.branching,
-            brick_size=brick_size,
-            border=border,
-            extent=producer.extent,
-            spacing=producer.spacing,
-            origin=producer.origin,
-            device=device,
-        )
+        depth = tree_depth(producer.extent, brick_size, producer.branching)
+        place = grid_of(producer)
+        return cls(depth=depth, brick_size=brick_size, border=border, device=device, **place)
 
     def wider(self, by: int) -> Layout:
         """Returns the layout of bricks with a border that is wider by so many voxels; kept."""

@@ -1,6 +1,4 @@
-"""`OctaveProducer`: sums of octaves of noise of which each level adds the finest to what the bricks
-of its parents hold.
-"""
+"""`OctaveProducer`: sums of octaves of noise, of which each level adds the finest."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
 """`PointProducer`: points with values, such as stars or particles, as voxels that hold their sum.
 
-What a voxel of any level holds is the integral of the points over it (points/), so a level's voxels
-are the means of those below, and the sum over a level is that of the points, whatever the level.
 Source: Hockney, Eastwood, "Computer simulation using particles", 1988, section 5 (shape functions;
 nearest grid point for points without a radius).
 """
@@ -22,14 +20,15 @@ from ..points.points import Points
 from ..points.sorted import SortedPoints, sort_points
 from ..points.splat import Cubes, ranges, values
 from ..pool import Channel
-from .producer import Layout, Nodes, Producer, Region, Regions, by_depth
+from .producer import Nodes, Producer, Region, Regions, by_depth
 
 _BATCH = 256  # bricks worked on at a time
 
 
 class PointProducer(Producer):
     """Makes bricks of points. Its channel is "value": for each number of a point's the sum over the
-    points in a voxel, per finest voxel, so that a voxel of a coarse level holds the mean.
+    points in a voxel, per finest voxel, so that a voxel of a coarse level holds the mean, and all
+    levels have one sum, that of the points.
 
     Attributes:
         points: The points, sorted.
@@ -96,9 +95,6 @@ class PointProducer(Producer):
         self.points, self.drawn = found, drawn
         self._told = False  # of sums that the channel can't hold
 
-    def prepare(self, layout: Layout) -> None:
-        """Does nothing: the points are sorted for any layout."""
-
     def classify(self, nodes: Nodes) -> Regions:
         """EMPTY where no point reaches into the brick, and the ranges of values."""
         channel = self.channels["value"]
@@ -142,9 +138,7 @@ class PointProducer(Producer):
 
 
 def _by_level(nodes: Nodes) -> Iterator[tuple[Tensor, Cubes]]:
-    """Yields rows of nodes of one level, a batch at a time, and the voxels of their bricks with
-    border.
-    """
+    """Yields rows of nodes of one level, a batch at a time, and their voxels, borders included."""
     layout, loc = nodes.layout, nodes.loc.cpu()
     for depth, here in by_depth(loc):
         for rows in here.split(_BATCH):

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
-from typing import Any, Protocol, Self, TypedDict, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -404,6 +404,47 @@ class Producer(torch.nn.Module):
         return f"{type(self).__name__}({extent} (x, y, z), N={self.branching}, {channels})"
 
 
+class OfProducers(Producer):
+    """Base of producers that ask others: these change, are prepared and closed with it."""
+
+    def parts(self) -> dict[str, Producer]:
+        """Returns those that it asks, by name."""
+        raise NotImplementedError
+
+    @property
+    def version(self) -> int:  # type: ignore[override]
+        """Rises with that of each."""
+        return max(one.version for one in self.parts().values())
+
+    def changed(self, where: Any = None) -> None:
+        """See `Producer.changed`; all have changed."""
+        for one in self.parts().values():
+            one.changed(where)
+
+    def changes(self, since: int) -> list[Where] | None:
+        """Wherever any has changed."""
+        new = [one.changes(since) for one in self.parts().values() if one.version > since]
+        known = [changes for changes in new if changes is not None]
+        if len(known) < len(new):
+            return None
+        return [*dict.fromkeys(where for changes in known for where in changes)]  # each once
+
+    def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
+        """Where any differs."""
+        timed = [one for one in self.parts().values() if hasattr(one, "time")]
+        return torch.stack([one.differs(nodes, before, after) for one in timed]).any(0)
+
+    def prepare(self, layout: Layout) -> None:
+        """Prepares all."""
+        for one in self.parts().values():
+            one.prepare(layout)
+
+    def close(self) -> None:
+        """Closes all."""
+        for one in self.parts().values():
+            one.close()
+
+
 def check_points(where: str, points: Any) -> None:
     """Raises ValueError unless points are (..., 3) and finite."""
     if check.instance(where, "points", points, Tensor).shape[-1:] != (3,):
@@ -425,22 +466,3 @@ def touched(changes: Sequence[Where], nodes: Nodes) -> Tensor:
 def arrived(answer: Any) -> Any:
     """Returns a producer's answer; waits for one that comes later."""
     return answer.result() if isinstance(answer, Future) else answer
-
-
-class Grid(TypedDict):
-    """The voxels of the finest level, and N."""
-
-    extent: tuple[int, int, int]
-    spacing: tuple[float, float, float]
-    origin: tuple[float, float, float]
-    branching: int
-
-
-def grid_of(producer: Producer) -> Grid:
-    """Returns where a producer's content lies, as another of the same place takes it."""
-    return {
-        "extent": producer.extent,
-        "spacing": producer.spacing,
-        "origin": producer.origin,
-        "branching": producer.branching,
-    }

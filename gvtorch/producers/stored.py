@@ -25,16 +25,8 @@ from ..io.stores.store import Store
 from ..pool import Channel
 from ..pool.pyramid import NodeSummary
 from .answer import regions_of
-from .producer import (
-    Bricks,
-    CoarseColors,
-    Layout,
-    Nodes,
-    Producer,
-    Region,
-    Regions,
-    check_filtered,
-)
+from .nodes import Layout, Nodes
+from .producer import Bricks, CoarseColors, Producer, Region, Regions, check_filtered
 
 _TILE = 32  # cells along a side of what is read at once
 _GROUP_BYTES = 32 * 10**6  # of cubes held at a time beside the cache
@@ -117,9 +109,7 @@ class _Cubes:
 
 
 def _coarse_channel(store: Store, filtered: CoarseColors) -> dict[str, Channel]:
-    """Returns the channel of a shader's filtered colours; raises ValueError if the store has others
-    or none.
-    """
+    """The channel of a shader's filtered colours; ValueError if the store has others or none."""
     check_filtered("StoredProducer", filtered)
     if not store.all_channels:
         raise ValueError(
@@ -134,12 +124,6 @@ def _coarse_channel(store: Store, filtered: CoarseColors) -> dict[str, Channel]:
             "gvtorch filter (Filtered.add_to) makes them"
         )
     return {name: Channel(torch.float16, known.width, coarse=True)}
-
-
-def _read_stage(work: Callable[[Nodes], Any], nodes: Nodes) -> Any:
-    """Does the work of a thread under its name."""
-    with stage("read"):
-        return work(nodes)
 
 
 class StoredProducer(Producer):
@@ -221,7 +205,12 @@ class StoredProducer(Producer):
         """Lets a thread work; threads that were made before a fork are not in the child."""
         if os.getpid() != self._process:
             self._begin()
-        return self._threads.submit(_read_stage, work, nodes)
+
+        def read() -> Any:
+            with stage("read"):
+                return work(nodes)
+
+        return self._threads.submit(read)
 
     def __getstate__(self) -> dict[str, Any]:
         own = ("_cache", "_closed", "_threads", "_process")

@@ -12,21 +12,12 @@ from ..base import check
 from ..base.volume import Volume, movable
 from ..ops import cut_bricks
 from ..pool import BrickTable, Channel
-from ..pool.mapped import mapped
 from ..pool.pools import checked_threshold, labels_by_channel, volumes_by_channel
 from ..pool.pyramid import Level, NodeSummary, levels_by_depth
-from ..pool.staging import wide_rows
+from ..pool.staging import mapped, wide_rows
 from .answer import regions_of
-from .producer import (
-    Bricks,
-    CoarseColors,
-    Layout,
-    Nodes,
-    Producer,
-    Regions,
-    by_depth,
-    check_filtered,
-)
+from .nodes import Layout, Nodes
+from .producer import Bricks, CoarseColors, Producer, Regions, by_depth, check_filtered
 
 _BATCH = 4096  # bricks cut from a level at a time
 
@@ -142,30 +133,34 @@ class VolumeProducer(Producer):
 
     def fill(self, nodes: Nodes) -> Bricks:
         """Cuts the bricks, or names their rows where they are held."""
-        layout, data = nodes.layout, {}
+        layout = nodes.layout
         held = {name: c for name, c in self.channels.items() if nodes.coarse or not c.coarse}
         if self._hold == "bricks":
             row = self._row(nodes)
             return Bricks(data={name: self._tables[name][row] for name in held})
         if self._hold == "mapped":
             voxel = self._voxel(nodes)
-            data = {name: self._voxels[name][voxel].view(c.dtype) for name, c in held.items()}
-            return Bricks(data=data)
+            found = {name: self._voxels[name][voxel].view(c.dtype) for name, c in held.items()}
+            return Bricks(data=found)
+        loc, data = nodes.loc.cpu(), {}
         for name, channel in held.items():
             shape = (len(nodes), *(layout.side,) * 3, channel.width)
             bricks = data[name] = torch.empty(shape, dtype=channel.dtype)
-            for depth, here, zyx in _by_depth(nodes):
-                values = self._values[name][depth]
-                cut = cut_bricks(values, zyx, layout.brick_size, layout.border)
-                rows, found = wide_rows(bricks, cut)
-                rows[here] = found
+            for depth, here in by_depth(loc):
+                zyx = loc[here, :3].flip(1)
+                cut = cut_bricks(self._values[name][depth], zyx, layout.brick_size, layout.border)
+                rows, made = wide_rows(bricks, cut)
+                rows[here] = made
         return Bricks(data=data)
 
     def _row(self, nodes: Nodes) -> Tensor:
         """(k,) int64 which node of all levels; beyond the volume the nearest at its face."""
         loc = nodes.loc.to(self._grids.device)
         first, high, deep, wide = self._grids[loc[:, 3]].unbind(1)
-        z, y, x = (at.minimum(n - 1) for at, n in zip(_zyx(loc), (high, deep, wide), strict=True))
+        z, y, x = (
+            at.minimum(n - 1)
+            for at, n in zip(loc[:, :3].flip(1).unbind(1), (high, deep, wide), strict=True)
+        )
         return first + (z * deep + y) * wide + x
 
     def _voxel(self, nodes: Nodes) -> Tensor:
@@ -174,16 +169,12 @@ class VolumeProducer(Producer):
         first, *sizes = self._sizes[loc[:, 3], :, None, None, None].unbind(1)
         reach = torch.arange(layout.side, device=loc.device) - layout.border
         at = []
-        for axis, (node, size) in enumerate(zip(_zyx(loc), sizes, strict=True)):
+        for axis, (node, size) in enumerate(zip(loc[:, :3].flip(1).unbind(1), sizes, strict=True)):
             along = reach.view([-1 if other == axis else 1 for other in range(3)])
             place = node[:, None, None, None] * layout.brick_size + along
             at.append(place.clamp(min=0).minimum(size - 1))
         z, y, x = at
         return first + (z * sizes[1] + y) * sizes[2] + x
-
-
-def _zyx(loc: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    return loc[:, 2], loc[:, 1], loc[:, 0]
 
 
 def _rows_of(level: Level) -> Tensor:
@@ -199,16 +190,8 @@ def _numbered(sizes: Sequence[Sequence[int]]) -> Tensor:
     return torch.cat((count.cumsum(0) - count, grids), 1)
 
 
-def _by_depth(nodes: Nodes) -> list[tuple[int, Tensor, Tensor]]:
-    """Returns for each depth which of the nodes it has, (m,), and their z, y, x, (m, 3)."""
-    loc = nodes.loc.cpu()
-    return [(depth, here, loc[here, :3].flip(1)) for depth, here in by_depth(loc)]
-
-
 def _all_bricks(values: list[Tensor], levels: list[Level], layout: Layout) -> Tensor:
-    """Returns (n, s, s, s, c) the bricks of a channel's values (z, y, x, c) of each level, level
-    after level, in the order z, y, x.
-    """
+    """(n, s, s, s, c) the bricks of a channel, level after level, in the order z, y, x."""
     places = [torch.cartesian_prod(*map(torch.arange, one.grid)) for one in levels[: len(values)]]
     shape = (sum(map(len, places)), *(layout.side,) * 3, values[0].shape[3])
     bricks, begin = torch.empty(shape, dtype=values[0].dtype), 0

@@ -13,7 +13,7 @@ import torch
 from ..base import check
 from ..base import constants as config
 from ..cameras.camera import Camera
-from ..points.codes import point_shares
+from ..points.grid import point_shares
 from ..points.splat import narrow_near
 from ..producers.points import PointProducer
 from .layer import Layer

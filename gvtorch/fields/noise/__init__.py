@@ -2,9 +2,7 @@
 periodic on request, of float32 or float64, and its bounds are known.
 """
 
-from .basis import perlin, simplex, value
-from .bounds import LOST, VARIANCE, Bounds, bounds
-from .cellular import cellular
+from .basis import LOST, VARIANCE, Bounds, bounds, cellular, perlin, simplex, value
 from .fractal import fbm, fbm_bounds, ridged, turbulence, warp
 from .levels import OctaveSum, inherit
 from .spline import SplineSum

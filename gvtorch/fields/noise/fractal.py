@@ -16,9 +16,7 @@ import torch
 from torch import Tensor
 
 from ...base import check
-from .basis import perlin
-from .bounds import Basis, Bounds, bounds
-from .lattice import Period, Points, as_points, periods
+from .basis import Basis, Bounds, Period, Points, as_points, bounds, periods, perlin
 
 #: Seeds of the octaves of a sum, and of the components of a warp, are so far apart.
 _NEXT_OCTAVE, _NEXT_AXIS = 0x10001, 0x3000007
@@ -43,31 +41,43 @@ class Octave(NamedTuple):
     seed: int
 
 
+class Tally:
+    """Counts what was evaluated; what a unit is, its user says.
+
+    Nothing is counted while torch compiles: it takes an attribute for a constant, and a function
+    that changes one would be compiled anew at each call.
+
+    Attributes:
+        made: Units that were evaluated so far.
+        wanted: Those that were asked for, whether they had to be evaluated or not.
+    """
+
+    made = wanted = 0
+
+    def _count(self, made: int = 0, wanted: int = 0) -> None:
+        if not torch.compiler.is_compiling():
+            self.made += made
+            self.wanted += wanted
+
+
 def octaves_of(
-    where: str, octaves: int, lacunarity: float, gain: float, seed: int
-) -> Iterator[Octave]:
-    """Yields the octaves of a sum: amplitudes 1, gain, gain^2, ..., frequencies 1, lacunarity, ...
+    where: str, octaves: int, lacunarity: float, gain: float, seed: int, frequency: float = 1.0
+) -> list[Octave]:
+    """Returns the octaves of a sum: amplitudes 1, gain, gain^2, ..., frequencies `frequency` times
+    1, lacunarity, ...
 
     Raises:
         ValueError: There are none, more than 64, or a number is not positive.
     """
+    check.number(where, "frequency", frequency, low=0, open_low=True)
     check.whole(where, "octaves", octaves, low=1, high=64)
     check.number(where, "lacunarity", lacunarity, low=0, open_low=True)
     check.number(where, "gain", gain, low=0, open_low=True)
     check.whole(where, "seed", seed, low=-(2**62), high=2**62)
-    for number in range(octaves):
-        yield Octave(gain**number, lacunarity**number, seed + number * _NEXT_OCTAVE)
-
-
-def octaves_from(
-    where: str, frequency: float, octaves: int, lacunarity: float, gain: float, seed: int
-) -> list[Octave]:
-    """Returns the octaves of a sum whose first has `frequency` cells a world unit; ValueError as of
-    `octaves_of`.
-    """
-    check.number(where, "frequency", frequency, low=0, open_low=True)
-    series = octaves_of(where, octaves, lacunarity, gain, seed)
-    return [one._replace(frequency=one.frequency * frequency) for one in series]
+    return [
+        Octave(gain**number, lacunarity**number * frequency, seed + number * _NEXT_OCTAVE)
+        for number in range(octaves)
+    ]
 
 
 def fbm(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
@@ -169,7 +179,7 @@ def fbm_bounds(
         ValueError: An argument is not that, or nothing is known of the noise.
     """
     one = bounds(basis, n)
-    series = [*octaves_of("noise.fbm_bounds", octaves, lacunarity, gain, 0)]
+    series = octaves_of("noise.fbm_bounds", octaves, lacunarity, gain, 0)
     high = sum(octave.amplitude for octave in series)
     slope = sum(octave.amplitude * octave.frequency for octave in series)
     return Bounds(one.low * high, one.high * high, one.slope * slope)

@@ -28,10 +28,8 @@ import torch
 from torch import Tensor
 
 from ...base import check
-from .basis import perlin
-from .fractal import Octave, octaves_from
-from .lattice import as_points
-from .tally import Tally
+from .basis import as_points, perlin
+from .fractal import Octave, Tally, octaves_of
 
 #: Interpolated from so many voxels along each axis.
 POINTS = 6
@@ -111,7 +109,7 @@ class OctaveSum(Tally):
         if not settled >= self.hold:
             raise ValueError(f"{where}: settled must be >= hold, {hold:g}, got {settled!r}")
         self.settled = settled
-        self.octaves = octaves_from(where, frequency, octaves, lacunarity, gain, seed)
+        self.octaves = octaves_of(where, octaves, lacunarity, gain, seed, frequency)
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can hold."""

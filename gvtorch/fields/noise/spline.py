@@ -29,8 +29,7 @@ from torch import Tensor
 
 from ...base import check
 from ...ops.reference import noise as twin
-from .fractal import Octave, octaves_from
-from .tally import Tally
+from .fractal import Octave, Tally, octaves_of
 
 _APART = 1e-6  # relative, by which a level's voxels may differ from an octave's cells
 
@@ -60,7 +59,7 @@ class SplineSum(Tally):
             ValueError: A number is out of its range.
         """
         where = "noise.SplineSum"
-        self.octaves = octaves_from(where, frequency, octaves, 2.0, gain, seed)
+        self.octaves = octaves_of(where, octaves, 2.0, gain, seed, frequency)
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can hold."""
