@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.stores import noise, read, write_foreign
+from helpers.stores import noise, read, serving, write_foreign
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -268,12 +268,17 @@ def test_what_lies_beside_an_image_is_named(tmp_path):
     assert not told and volume.data[0, 0, 0, 0] == data[0, 0, 0] + 2
     assert convert(several, tmp_path / "one.zarr", key="1").info == ImageInfo()
     assert Store.open(tmp_path / "one.zarr").read_region(0, (0,) * 3, (1,) * 3) == data[0, 0, 0] + 1
-    labels = write_foreign(tmp_path / "cells", [data], "zyx", [[1.0] * 3])
+    labels = write_foreign(tmp_path / "cells.zarr", [data], "zyx", [[1.0] * 3])
     write_foreign(labels / "labels/nuclei", [data], "zyx", [[1.0] * 3])
     group = {"zarr_format": 3, "node_type": "group", "attributes": {"ome": {"labels": ["nuclei"]}}}
     (labels / "labels/zarr.json").write_text(json.dumps(group))
     assert "the labels labels/nuclei" in read(labels)[1][0]
     assert read(labels, key="labels/nuclei")[1] == []
+    with serving(tmp_path) as url:
+        for place in (tmp_path, url):
+            assert read(f"{place}/cells.zarr:/labels/nuclei")[1] == []
+            with pytest.raises(ValueError, match="no image 'labels/none'"):
+                read(f"{place}/cells.zarr:/labels/none")
     (tmp_path / "plate").mkdir()
     (tmp_path / "plate/.zgroup").write_text('{"zarr_format": 2}')
     (tmp_path / "plate/.zattrs").write_text('{"plate": {}}')

@@ -1,5 +1,6 @@
 """`whole_file`, `write_whole`, `durable_file`: files that appear when they are whole; `write_npy`:
-arrays whose errors of writing are told; `text_path`: paths for libraries that do not take all.
+arrays whose errors of writing are told; `text_path`: paths for libraries that do not take all;
+`cache_folder`: where what is kept lies.
 NumPy is not imported here, so that `gvtorch --help` does not wait for it.
 """
 
@@ -119,6 +120,15 @@ def text_path(path: str) -> str:
     except FileExistsError:
         pass  # made before
     return link
+
+
+def cache_folder(part: str) -> Path:
+    """Returns the folder of a part of what is kept between processes: in GVTORCH_CACHE, else in
+    gvtorch of XDG_CACHE_HOME or ~/.cache. Raises RuntimeError where there is no home.
+    """
+    named = os.environ.get("GVTORCH_CACHE")
+    base = named or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "gvtorch"
+    return Path(base).expanduser().absolute() / part
 
 
 @functools.cache

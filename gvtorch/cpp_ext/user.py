@@ -40,6 +40,7 @@ from pathlib import Path
 
 import torch
 
+from ..base.whole_file import cache_folder
 from . import SOURCES, compilers, instructions
 
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]*"([^"\n]+)"', re.MULTILINE)
@@ -346,9 +347,7 @@ def _folder() -> Path:
     to is refused, for a library is code.
     """
     try:
-        named = os.environ.get("GVTORCH_CACHE")
-        base = named or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "gvtorch"
-        folder = Path(base).expanduser().absolute() / "shaders"
+        folder = cache_folder("shaders")
         for one in (*reversed(folder.parents), folder):  # `parents=True` would let others write
             if not one.exists():
                 one.mkdir(mode=0o700, exist_ok=True)

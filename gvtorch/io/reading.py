@@ -170,10 +170,10 @@ def _find(path: Any, given: dict[str, Any]) -> tuple[str, str, Callable[..., Vol
         text, inner = split_url(str(path))
         if is_file_url(text):
             text = str(fetch(text))
-        else:
+        elif inner is None:
             text, inner = split_path(text)
         if inner is not None:
-            given["key"] = inner
+            given["key"] = inner.strip("/") if is_zarr(text) else inner
         if not is_zarr(text) and not Path(text).exists():
             raise FileNotFoundError(f"volume not found: {path}")
         if "://" not in text:

@@ -24,7 +24,7 @@ from urllib.parse import unquote, urlsplit
 
 from ..base.digits import whole_number
 from ..base.messages import need_library, one_line
-from ..base.whole_file import write_whole
+from ..base.whole_file import cache_folder, write_whole
 from .http import AGENT, MISSING, HttpStatus, ask_by_urllib
 from .resources import amount
 
@@ -51,13 +51,6 @@ def split_url(text: str) -> tuple[str, str | None]:
     return (match[1], match[2]) if match else (text, None)
 
 
-def cache_folder() -> Path:
-    """Where downloads are kept."""
-    own = os.environ.get("GVTORCH_CACHE")
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return (Path(own) if own else Path(base) / "gvtorch") / "downloads"
-
-
 def cache_limit() -> int:
     """Bytes of the cache, at most."""
     text = os.environ.get("GVTORCH_CACHE_GB", "50")
@@ -80,7 +73,7 @@ def fetch(url: str) -> Path:
     """
     if url.lower().split("?")[0].endswith(_DETACHED):
         raise ValueError(f"{url}: its numbers lie in a file beside it: download both")
-    folder = cache_folder() / hashlib.sha256(url.encode()).hexdigest()[:32]
+    folder = cache_folder("downloads") / hashlib.sha256(url.encode()).hexdigest()[:32]
     kept = _kept(folder)
     opener = _open_http if urlsplit(url).scheme in ("http", "https") else _open_fsspec
     try:

@@ -54,7 +54,7 @@ def read_preset(path: str | Path, name: str | None) -> tuple[Pair, float | None,
         raise FileNotFoundError(f"transfer function file not found: {file}")
     try:
         if file.suffix == ".vp":
-            _only(file, name)
+            _only(name)
             return _slicer(file, _of_vp(file.read_text("utf-8"))), None, False
         if file.suffix == ".xml":
             nodes = ElementTree.parse(file).iter("VolumeProperty")
@@ -62,7 +62,7 @@ def read_preset(path: str | Path, name: str | None) -> tuple[Pair, float | None,
             return _slicer(file, _chosen(file, found, name)), None, False
         content = check.json_file("transfer function file", file)
         if isinstance(content, dict) and "volumeProperties" in content:
-            _only(file, name)
+            _only(name)
             return *_of_vp_json(file, content), False
         items = content if isinstance(content, list) else [content]
         if not all(
@@ -86,7 +86,7 @@ def read_preset(path: str | Path, name: str | None) -> tuple[Pair, float | None,
         raise ValueError(told if told.startswith(str(file)) else f"{file}: {told}") from None
 
 
-def _only(file: Path, name: str | None) -> None:
+def _only(name: str | None) -> None:
     if name is not None:
         raise ValueError(f"holds one preset, without a name: leave {name!r} out")
 

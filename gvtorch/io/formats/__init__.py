@@ -37,9 +37,11 @@ def find_format(path: str, *, raw: bool = False) -> Format:
 
 
 def split_path(text: str) -> tuple[str, str | None]:
-    """Splits `file.h5:/group/data` into the file and what is named of it; other paths stay."""
+    """Splits `file.h5:/group/data`, `image.zarr:/labels/cells` into the file and what is named of it;
+    other paths stay.
+    """
     file, mark, inner = text.rpartition(":/")
-    if mark and "://" not in text and not Path(text).exists() and Path(file).is_file():
+    if mark and "://" not in text and not Path(text).exists() and Path(file).exists():
         return file, f"/{inner}"
     return text, None
 
