@@ -327,7 +327,7 @@ def test_a_forest_is_made_of_another_producers_tree(backend):
 @pytest.mark.parametrize(
     ("forest", "message"),
     [
-        (Forest("tree"), "alias_tree must be one of plant, forest, got 'tree'"),
+        (Forest("tree"), "alias_tree must be 'plant' or 'forest', got 'tree'"),
         (Forest("plant", (0, 0, 0, 4)), "alias (0, 0, 0, 4) is no node of tree 'plant'"),
         (Forest("plant", branching=3), "tree 'plant' has N=2, this one N=3"),
         (Forest(None), "root"),

@@ -181,7 +181,10 @@ def test_mistakes_have_one_clear_message(blobs):
             lambda: gv.cost(tree, CAMERA, SHADER, lighting=gv.Lighting()),
             "lighting needs normals",
         ),
-        (lambda: counted.picture("heat"), "image must be samples, nodes, lod, age or fill"),
+        (
+            lambda: counted.picture("heat"),
+            "image must be 'samples', 'nodes', 'lod', 'age' or 'fill'",
+        ),
         (lambda: counted.picture("lod", colormap="mud"), "unknown colormap 'mud'"),
     ):
         with pytest.raises(ValueError) as caught:

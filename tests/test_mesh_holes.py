@@ -167,7 +167,7 @@ def test_solid_tells_what_is_filled():
     assert sums["auto"] == sums["never"] == pytest.approx(4 * np.pi * grid.spacing, rel=0.02)
     closed = Voxelizer(meshes.sphere(4), resolution=48, solid="never")
     assert not closed.geometry.solid.any()
-    with pytest.raises(ValueError, match="solid must be one of auto, always, never, got 'yes'"):
+    with pytest.raises(ValueError, match="solid must be 'auto', 'always' or 'never', got 'yes'"):
         Voxelizer(ball, solid="yes")
 
 

@@ -170,7 +170,7 @@ def test_opcheck(compiled):
         ({"point_p3": torch.zeros(3, 4).mT}, "point_p3 must be contiguous"),
         ({"constant_3": torch.zeros(3).double()}, "constant_3 must be"),
         ({"bailout_1": torch.zeros(2)}, "bailout_1 must be"),
-        ({"kind": "knot"}, "kind must be one of"),
+        ({"kind": "knot"}, "kind must be 'power'"),
         ({"amount": 1}, "amount must be"),
         ({"amount": 2.5}, "amount must be"),
         ({"iterations": 0}, "iterations must be"),

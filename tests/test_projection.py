@@ -377,7 +377,7 @@ def test_graphs_on_cuda_replay_every_model(blobs, model):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: gv.Camera.orbit(model="wide"), "model must be one of pinhole, ortho, fisheye"),
+        (lambda: gv.Camera.orbit(model="wide"), "model must be 'pinhole', 'ortho', 'fisheye'"),
         (lambda: gv.Camera(torch.eye(4), torch.eye(3), 4, 4, model="sphere"), "model must be"),
         (lambda: gv.Camera.orbit(fov=180), "fov must be finite and > 0 and <= 179"),
         (

@@ -95,7 +95,7 @@ def test_colours_and_components():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"axis": "w"}, "axis must be x, y, z or all"),
+        ({"axis": "w"}, "axis must be 'x', 'y', 'z' or 'all'"),
         ({"at": 1.5}, "at must be finite and >= 0 and <= 1"),
         ({"at": 14}, "at along z must be an int >= 0 and <= 13"),
         ({"at": "here"}, "at must be a share such as 50%"),

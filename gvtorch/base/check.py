@@ -138,6 +138,15 @@ def text(where: str, name: str, value: Any) -> str | None:
     return None if value is None else instance(where, name, value, str)
 
 
+def one_of(where: str, name: str, value: Any, known: Iterable[Any]) -> None:
+    """Raises ValueError, which tells them, unless a value is one of those known."""
+    first = [*known]
+    if value not in first:
+        *most, last = map(repr, first)
+        told = f"{', '.join(most)} or {last}" if most else last
+        raise ValueError(f"{where}: {name} must be {told}, got {value!r}")
+
+
 def known(where: str, options: Mapping[str, Any], kind: type) -> None:
     """Raises ValueError unless all options are keys of a `TypedDict`."""
     names = kind.__annotations__

@@ -13,6 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from ..base import check
 from ..base.records import Rays
 from ..ops import pinhole_rays
 
@@ -243,8 +244,7 @@ MODELS: dict[str, Model] = {
 
 def model_of(where: str, name: str) -> Model:
     """Returns the camera model of a name; raises ValueError where there is none."""
-    if name not in MODELS:
-        raise ValueError(f"{where}: model must be one of {', '.join(MODELS)}, got {name!r}")
+    check.one_of(where, "model", name, MODELS)
     return MODELS[name]
 
 

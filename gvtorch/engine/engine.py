@@ -384,10 +384,7 @@ class Engine:
         """
         check.whole("render", "productions", productions, low=1)
         check.whole("render", "max_frames", max_frames, low=1)
-        if mode not in ("interactive", "balanced", "converge"):
-            raise ValueError(
-                f"render: mode must be 'interactive', 'balanced' or 'converge', got {mode!r}"
-            )
+        check.one_of("render", "mode", mode, ("interactive", "balanced", "converge"))
         if mode == "interactive":
             return self.frame(camera, shader, **options)[0]
         view = self.view("render", camera, shader, options)

@@ -69,11 +69,8 @@ class EngineOptions:
     __repr__ = check.brief
 
     def __post_init__(self) -> None:
-        names = {"loading": ("straight", "levels"), "order": ("coarse", "fine")}
-        for name, (one, other) in names.items():
-            value = getattr(self, name)
-            if value not in (one, other):
-                raise ValueError(f"Engine: {name} must be {one!r} or {other!r}, got {value!r}")
+        check.one_of("Engine", "loading", self.loading, ("straight", "levels"))
+        check.one_of("Engine", "order", self.order, ("coarse", "fine"))
         check.number("Engine", "patience", self.patience, low=0, open_low=True)
         check.number("Engine", "coarse_share", self.coarse_share, low=0, high=1, open_low=True)
         if self.time_budget is not None:

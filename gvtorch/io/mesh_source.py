@@ -15,7 +15,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Unpack, get_args
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ import torch
 from ..base import check
 from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
-from ..meshes.holes import SolidParts, check_solid, once_filled, told_of_holes
+from ..meshes.holes import SolidParts, once_filled, told_of_holes
 from ..meshes.mesh import Material, Mesh
 from ..meshes.voxelizer import CHANNELS, GridSettings, Voxelizer, check_channels
 from .mesh_file import read_mesh
@@ -64,7 +64,7 @@ class MeshSource(VolumeSource):
         """Reads the mesh, and lays a grid around it: a source for each channel; see `voxelize`."""
         check.whole("voxelize", "resolution", resolution, low=8, high=2**20)
         check.instance("voxelize", "mesh", given, Mesh, str, PathLike)
-        check_solid("voxelize", solid)
+        check.one_of("voxelize", "solid", solid, get_args(SolidParts))
         names = check_channels("voxelize", channels)
         if isinstance(given, Mesh):
             if texture is not None:

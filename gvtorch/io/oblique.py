@@ -134,9 +134,8 @@ def straighten(
         ValueError: `oblique` is something else.
         OSError: The smallest value can't be read.
     """
-    check.text(source.path, "oblique", oblique)
-    if oblique is not None and oblique not in get_args(Oblique):
-        raise ValueError(f"{source.path}: oblique must be 'resample' or 'keep', got {oblique!r}")
+    if oblique is not None:
+        check.one_of(source.path, "oblique", oblique, get_args(Oblique))
     if source.oblique is None:
         return source
     affine = np.array(source.oblique)

@@ -133,8 +133,7 @@ def splat(
         ValueError, OSError, KeyboardInterrupt: As of `read_points`, `sort_points` and `convert`.
     """
     target = Path(store)
-    if channel not in CHANNELS:
-        raise ValueError(f"splat: channel must be one of {', '.join(CHANNELS)}, got {channel!r}")
+    check.one_of("splat", "channel", channel, CHANNELS)
     begun = is_begun(target, resume=resume)
     source: Any = points if isinstance(points, Points) else PointFile(points, **names)
     told = {"extent": extent, "box": box, "channel": channel}

@@ -8,7 +8,7 @@ Source: Jacobson, Kavan, Sorkine-Hornung, "Robust inside-outside segmentation us
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -119,13 +119,6 @@ def told_of_holes(mesh: Mesh) -> str:
         f"{mesh.name}: {', '.join(why)}: they become sheets; "
         'solid="always" (--solid always) mends them'
     )
-
-
-def check_solid(where: str, solid: str) -> None:
-    """Raises ValueError unless it is a `SolidParts`."""
-    known = get_args(SolidParts)
-    if solid not in known:
-        raise ValueError(f"{where}: solid must be one of {', '.join(known)}, got {solid!r}")
 
 
 def once_filled(solid: SolidParts) -> SolidParts:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any, TypedDict, get_args
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torch import Tensor
 from ..base import check
 from ..ops.voxelize import Voxelized
 from .geometry import Geometry
-from .holes import SolidParts, check_solid, filled
+from .holes import SolidParts, filled
 from .mesh import Mesh
 from .paint import Paint
 
@@ -104,7 +104,7 @@ class Voxelizer:
         """
         where = "voxelize"
         check.whole(where, "resolution", resolution, low=8, high=2**30)
-        check_solid(where, solid)
+        check.one_of(where, "solid", solid, get_args(SolidParts))
         channels = check_channels(where, channels)
         mesh = filled(mesh) if solid == "always" else mesh
         if "material" in channels and len(mesh.materials) > 255:

@@ -40,8 +40,7 @@ def noise(
     if n not in (2, 3) or point_pn.dtype not in (torch.float32, torch.float64):
         got = check.describe(point_pn)
         raise ValueError(f"{where}: point_pn must be (p, 2) or (p, 3) floats, got {got}")
-    if kind not in KINDS:
-        raise ValueError(f"{where}: kind must be one of {KINDS}, got {kind!r}")
+    check.one_of(where, "kind", kind, KINDS)
     check.whole(where, "seed", seed, low=-(2**63))
     jitter = check.number(where, "jitter", jitter, low=0, high=1)
     check.whole(where, "reach", reach, low=1, high=2)

@@ -34,8 +34,7 @@ class Orbit(NamedTuple):
             raise ValueError(f"{where}: {fields[0][0]} must be float32 or float64, got {got}")
         own = [("constant_3", self.constant_3, "3"), ("bailout_1", self.bailout_1, "1")]
         check.tensors(where, like.device, [(*one, like.dtype) for one in (*fields, *own)])
-        if self.kind not in KINDS:
-            raise ValueError(f"{where}: kind must be one of {KINDS}, got {self.kind!r}")
+        check.one_of(where, "kind", self.kind, KINDS)
         if self.kind == "power":
             check.whole(where, "amount", self.amount, low=2, high=64)
         else:

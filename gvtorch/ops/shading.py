@@ -39,8 +39,7 @@ SHADER_KINDS = (
 
 def shader_number(kind: str) -> int:
     """Returns the number of a fused shader; raises ValueError if there is none of this name."""
-    if kind not in SHADER_KINDS:
-        raise ValueError(f"shader: kind must be {', '.join(SHADER_KINDS)}, got {kind!r}")
+    check.one_of("shader", "kind", kind, SHADER_KINDS)
     return SHADER_KINDS.index(kind)
 
 

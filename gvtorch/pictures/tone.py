@@ -39,8 +39,7 @@ def tone_map(
 
 def checked_curve(where: str, curve: str, exposure: float) -> float:
     """Returns the exposure; raises ValueError if it or the curve's name is wrong."""
-    if curve not in CURVES:
-        raise ValueError(f"{where}: curve must be one of {', '.join(CURVES)}, got {curve!r}")
+    check.one_of(where, "curve", curve, CURVES)
     return check.number(where, "exposure", exposure, low=-100, high=100)
 
 

@@ -169,9 +169,7 @@ def _alias(
     alias: Any = answer.alias
     layout, name = nodes.layout, answer.alias_tree
     if name is not None:
-        if name not in layout.scene:
-            known = ", ".join(layout.scene)
-            raise ValueError(f"{where}: alias_tree must be one of {known}, got {name!r}")
+        check.one_of(where, "alias_tree", name, layout.scene)
         layout = layout.scene[name]
         if layout.branching != nodes.layout.branching:
             own = nodes.layout.branching

@@ -57,9 +57,7 @@ class VolumeProducer(Producer):
         Raises:
             ValueError: Channels differ in extent, spacing or origin, or `hold` is unknown.
         """
-        if hold not in ("voxels", "bricks", "mapped"):
-            known = "'voxels', 'bricks' or 'mapped'"
-            raise ValueError(f"VolumeProducer: hold must be {known}, got {hold!r}")
+        check.one_of("VolumeProducer", "hold", hold, ("voxels", "bricks", "mapped"))
         given = volumes_by_channel("VolumeProducer", volume)
         volumes = {name: one.to("cpu") for name, one in given.items()}
         first = next(iter(volumes.values()))

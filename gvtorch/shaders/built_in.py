@@ -473,7 +473,5 @@ BY_NAME: Mapping[str, Callable[[TransferFunction, float], Shader]] = {
 
 
 def _projection(which: Any) -> str:
-    found = _PROJECTIONS.get(which) if isinstance(which, str) else None
-    if found is None:
-        raise ValueError(f"Projection: which must be 'maximum', 'minimum' or 'mean', got {which!r}")
-    return found
+    check.one_of("Projection", "which", which, _PROJECTIONS)
+    return _PROJECTIONS[which]

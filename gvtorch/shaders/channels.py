@@ -217,8 +217,7 @@ class Channels(Shader):
     def _shown(self) -> list[tuple[int, TransferFunction]]:
         """Component and transfer function of each channel that is shown, as they are now."""
         where, looks = "Channels", self.looks
-        if self.mode not in get_args(Mode):
-            raise ValueError(f"{where}: mode must be 'additive' or 'opacity', got {self.mode!r}")
+        check.one_of(where, "mode", self.mode, get_args(Mode))
         if not 1 <= len(looks) <= MOST:
             raise ValueError(f"{where}: takes 1 to {MOST} channels, got {len(looks)}")
         shown = []

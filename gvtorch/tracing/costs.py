@@ -71,8 +71,7 @@ class Cost:
         """
         from kornia.color import ColorMap, ColorMapType, rgb_to_linear_rgb
 
-        if name not in IMAGES:
-            raise ValueError(f"Cost: image must be samples, nodes, lod, age or fill, got {name!r}")
+        check.one_of("Cost", "image", name, IMAGES)
         if colormap not in ColorMapType.__members__:
             known = ", ".join(sorted(ColorMapType.__members__))
             raise ValueError(f"Cost: unknown colormap {colormap!r}; known: {known}")

@@ -66,8 +66,7 @@ class RenderOptions:
     def __post_init__(self) -> None:
         where = "render"
         check.number(where, "step", self.step, low=0, open_low=True)
-        if self.lod not in ("auto", "finest"):
-            raise ValueError(f"{where}: lod must be 'auto' or 'finest', got {self.lod!r}")
+        check.one_of(where, "lod", self.lod, ("auto", "finest"))
         object.__setattr__(self, "background", checked_background(where, self.background))
         check.number(where, "stop_alpha", self.stop_alpha, low=0, high=1, open_low=True)
         check.number(where, "depth_alpha", self.depth_alpha, low=0, high=1)

@@ -81,8 +81,7 @@ def slice_picture(
         OSError: The store can't be read.
     """
     where = "slice_picture"
-    if axis not in ("x", "y", "z", "all"):
-        raise ValueError(f"{where}: axis must be x, y, z or all, got {axis!r}")
+    check.one_of(where, "axis", axis, ("x", "y", "z", "all"))
     check.instance(where, "data", data, Volume, Store)
     scale = check.number(where, "scale", scale, low=0, high=_MOST, open_low=True)
     plane = _Plane(data, component, level)

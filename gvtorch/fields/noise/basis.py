@@ -124,8 +124,7 @@ def cellular(
     where = "noise.cellular"
     check.number(where, "jitter", jitter, low=0, high=1)
     check.whole(where, "reach", reach, low=1, high=2)
-    if feature not in FEATURES:
-        raise ValueError(f"{where}: feature must be one of {FEATURES}, got {feature!r}")
+    check.one_of(where, "feature", feature, FEATURES)
     return at_points(where, feature, points, seed, period, jitter=jitter, reach=reach)
 
 

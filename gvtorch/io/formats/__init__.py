@@ -37,8 +37,8 @@ def find_format(path: str, *, raw: bool = False) -> Format:
 
 
 def split_path(text: str) -> tuple[str, str | None]:
-    """Splits `file.h5:/group/data`, `image.zarr:/labels/cells` into the file and what is named of it;
-    other paths stay.
+    """Splits `file.h5:/group/data` or `image.zarr:/labels/cells` into the file and what is named of
+    it; other paths stay.
     """
     file, mark, inner = text.rpartition(":/")
     if mark and "://" not in text and not Path(text).exists() and Path(file).exists():

@@ -140,8 +140,7 @@ def plan_of(
     time: int | None,
     workers: int | None,
 ) -> Plan:
-    if block not in BLOCKS:
-        raise ValueError(f"convert: block must be 32 or 64, got {block!r}")
+    check.one_of("convert", "block", block, BLOCKS)
     if threshold is not None:
         threshold = check.number("convert", "threshold", threshold)
     if nan is not None:
