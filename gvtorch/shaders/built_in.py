@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import torch
 
+from ..base import check
 from ..base.checked import Check, as_name, flag, instance_of, kind_of, or_none, positive
 from ..ops import ShadeArguments
 from ..ops.shading import (
