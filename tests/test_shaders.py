@@ -407,7 +407,7 @@ def test_a_kind_has_a_struct_a_twin_and_a_class():
         assert f"struct {kind} " in structs or kind.startswith("Shadowed"), kind
         names = ("kind", "shadowed_kind", "lit_kind")
         assert any(kind in [getattr(one, name, "") for name in names] for one in classes), kind
-    with pytest.raises(ValueError, match=r"shader: kind must be Lit, .*, got 'Lamp'"):
+    with pytest.raises(ValueError, match=r"shader: kind must be 'Lit', .*, got 'Lamp'"):
         shader_number("Lamp")
 
 

@@ -18,9 +18,11 @@
 #ifdef __CUDACC__
 #define GV_HD __host__ __device__ __forceinline__
 #define GV_CALL __host__ __device__ __noinline__
+#define GV_ASIDE GV_HD  // what few rays come to: on a CPU a call, which leaves the loops around it smaller
 #else
 #define GV_HD inline __attribute__((always_inline))
 #define GV_CALL __attribute__((noinline))
+#define GV_ASIDE GV_CALL
 #endif
 
 namespace gvtorch {

@@ -101,8 +101,8 @@ struct StoredColor : ShaderFacts {
     if constexpr (kPacket<V>) {
       return {probe.number_at(channel, 0, t), probe.number_at(channel, 1, t), probe.number_at(channel, 2, t), V{}};
     } else {
-      const auto read = [&](bool, int32_t behind) { return probe.four_at(channel, behind, t); };
-      return by_direction(true, probe.sight.direction, channel.width, read);
+      if (channel.width == 4) return probe.four_at(channel, 0, t);
+      return of_sides(probe, [&](bool, int32_t behind) { return probe.four_at(channel, behind, t); });
     }
   }
   // One of the four numbers, as it is seen along the ray.
@@ -112,9 +112,12 @@ struct StoredColor : ShaderFacts {
     if constexpr (kPacket<V>) {
       return probe.number_at(channel, number, t);
     } else {
-      const auto read = [&](bool, int32_t behind) { return probe.number_at(channel, number + behind, t); };
-      return by_direction(true, probe.sight.direction, channel.width, read);
+      return of_sides(probe, [&](bool, int32_t behind) { return probe.number_at(channel, number + behind, t); });
     }
+  }
+  template <class Eye, class Read>
+  GV_ASIDE static auto of_sides(const Eye& probe, const Read& read) {
+    return by_direction(true, probe.sight.direction, probe.channels.value.width, read);
   }
   GV_HD void done(Sum&) const {}
 };
