@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import struct
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,12 @@ def test_a_chunk_that_swells_costs_itself(stored, request, place, remote, tmp_pa
             assert not read(array[box(other)]).result(timeout=30).any()
         each = tuple((np.array(others) * CHUNK).T)
         assert not read(array.vindex[each]).result(timeout=30).any()
-        assert bool(ChunkFiles.of(array).folder) != remote
+        files = ChunkFiles.of(array)
+        assert bool(files.folder) != remote
+        if files.folder:
+            files.check(np.array(others))
+            with pytest.raises(http.Endless, match="Blosc would make"):
+                files.check(np.array([*others, place]))
 
 
 @pytest.mark.parametrize("what", ["pipe", "folder", "long", "device"])
@@ -160,6 +166,19 @@ def test_what_is_no_file_of_a_chunk_is_told(stored, what):
     file.rename(head)
     with pytest.raises(http.Endless, match=f"{head.name}: {wanted}"):
         opened_at(kvstore(stored), {"driver": "n5"}).result(timeout=5)
+
+
+def test_places_are_known_of_items_that_are_chunks_alone():
+    zyx, item = np.array([[1, 2, 3], [4, 5, 6]]), (34, 34, 34, 1)
+    plain = {"folder": "/", "separator": "/", "item": 1}
+    for first, time in (((1, 1, 1), []), ((1, 1, 1, 1), [7])):
+        files = ChunkFiles(**plain, file=(*first, *item), chunk=(*first, *item))
+        wanted = [[*time, *place, 0, 0, 0, 0] for place in zyx.tolist()]
+        assert files.places(7, zyx, item).tolist() == wanted
+        assert replace(files, transposed=True).places(7, zyx, item) is None
+        assert replace(files, chunk=(2, *files.chunk[1:])).places(7, zyx, item) is None
+        assert replace(files, chunk=(*files.chunk[:-1], 2)).places(7, zyx, item) is None
+    assert replace(files, chunk=item, file=item).places(7, zyx, item) is None
 
 
 def test_blosc_inside_another_codec_is_refused(tmp_path):

@@ -490,6 +490,10 @@ def test_what_is_left_out_is_told(tmp_path):
     surface = ("--shader", "isosurface", "--value", "9999", "--component", 1)
     run = gvtorch("render", tmp_path / "a.ome.tif", *flags, *surface)
     assert run.returncode == 0 and "nothing is seen: values range from" in run.stderr
+    assert gvtorch("convert", tmp_path / "a.ome.tif", tmp_path / "a.zarr").returncode == 0
+    run = gvtorch("render", tmp_path / "a.zarr", *flags, *surface, "--stats", tmp_path / "a.json")
+    told = f"values range from {data[:, 1].min()} to {data[:, 1].max()}"
+    assert run.returncode == 0 and told in run.stderr and (tmp_path / "a.json").exists()
 
 
 def test_info_counts_labels(tmp_path):

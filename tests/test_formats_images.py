@@ -13,6 +13,7 @@ from helpers.stores import noise
 
 import gvtorch as gv
 from gvtorch.io.reading import open_source
+from gvtorch.io.source import number_type
 from gvtorch.io.stores.conversion import convert
 
 itk = pytest.importorskip("SimpleITK")
@@ -225,6 +226,21 @@ def write_legacy(file: Path, image, kind: str) -> Path:
     getattr(writer, f"SetFileTypeTo{kind}")()
     writer.Write()
     return file
+
+
+@pytest.mark.parametrize(
+    ("dtype", "names"),
+    [
+        ("u1", "uchar, unsigned char, uint8, uint8_t, UInt8, UCHAR, unsigned_char"),
+        ("i2", "short, short int, signed short int, int16, int16_t, SHORT"),
+        ("u8", "ulonglong, unsigned long long, unsigned long long int, uint64, ULONG_LONG"),
+        ("f4", "float, Float32, FLOAT"),
+        (None, "long, unsigned int16, int int, unint, float int, signed float, float_t, bits"),
+    ],
+)
+def test_names_of_numbers(dtype, names):
+    """As NRRD, MetaImage, VTK and PLY spell them."""
+    assert {number_type(name) for name in names.split(", ")} == {dtype}
 
 
 @pytest.mark.parametrize("kind", ["Binary", "ASCII"])

@@ -128,6 +128,8 @@ def test_there_is_a_right_one_of_each_message():
     for kind, fields in GOOD.items():
         assert schema.decode(kind, MESSAGES[kind], fields) is not None
         assert set(fields) == set(schema.arguments(MESSAGES[kind]))
+    taken = {name.removeprefix("_take_") for name in vars(Session) if name.startswith("_take_")}
+    assert taken == {*MESSAGES} - {"ack"}, "what a page may ask for, something takes"
 
 
 def test_wrong_messages_are_each_refused_with_a_line_and_the_view_goes_on(session):

@@ -101,7 +101,10 @@ def read_http(
     except OSError as error:
         found = error
     keep_reason(url, found, REFUSED if isinstance(found, Endless) else 0.0)
-    raise found from None
+    try:
+        raise found from None
+    finally:
+        del found  # its traceback holds this frame, and what was read
 
 
 def keep_reason(url: str, error: OSError, seconds: float = 0.0) -> None:

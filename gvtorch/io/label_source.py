@@ -8,6 +8,7 @@ import functools
 import itertools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -117,8 +118,11 @@ def _labels_of(
 
     def parts() -> Iterator[np.ndarray]:
         progress("labels", 0, total)
-        with ThreadPoolExecutor(workers) as pool:
-            found = run_ahead(pool, read, itertools.product(*spans), 4 * workers)
+        places = itertools.product(*spans)
+        with (
+            ThreadPoolExecutor(workers) as pool,
+            closing(run_ahead(pool, read, places, 4 * workers)) as found,
+        ):
             for done, part in enumerate(found, 1):
                 yield part
                 progress("labels", done, total)

@@ -13,6 +13,7 @@ import dataclasses
 import gzip
 import math
 import os
+import re
 import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -41,6 +42,9 @@ _NUMBERS = {
     **{name: f"i{size}" for size, names in _WHOLE.items() for name in names},
     **{f"u{name}": f"u{size}" for size, names in _WHOLE.items() for name in names},
 }
+_SPELLED = re.compile(
+    r"(?:(?P<un>un)?signed )?(?:(?P<any>char|int)|(?P<long>short|longlong)(?: int)?)"
+)
 #: (4, 4) of world axes that run left and posterior, to right and anterior ones.
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -314,9 +318,10 @@ def number_type(name: str) -> str | None:
     "unsigned short int", "uchar", "long_long", "uint16_t", "Float32". None: it is unknown, as is
     "long", which has 4 bytes or 8.
     """
-    plain = name.lower().replace("_", " ").replace("long long", "longlong").removesuffix(" t")
-    plain = plain.replace("unsigned ", "u").removeprefix("signed ").removesuffix(" int")
-    return _NUMBERS.get(plain)
+    plain = name.lower().replace("_", " ").replace("long long", "longlong")
+    if spelled := _SPELLED.fullmatch(plain):  # in several words
+        plain = ("u" if spelled["un"] else "") + (spelled["any"] or spelled["long"])
+    return _NUMBERS.get(plain.removesuffix(" t") if plain[-3:-2].isdigit() else plain)
 
 
 def open_unpacked(file: str, member: str = "") -> IO[bytes]:

@@ -79,11 +79,8 @@ class SparseGrid(ABC):
         leaf, a, b = SIDES[2], np.asarray(low), np.asarray(high)
         start, stop = a // leaf * leaf, -(-b // leaf) * leaf  # whole leaves
         whole, axis = math.prod((stop - start).tolist()), int((b - a).argmax())
-        side = int((stop - start)[axis]) // leaf // 2 * leaf
-        if side and whole > max(_WHOLE, 2 * math.prod((b - a).tolist())):  # a thin box: by halves
-            middle, other = b.tolist(), a.tolist()
-            middle[axis] = other[axis] = int(start[axis]) + side
-            return np.concatenate((self.fill(low, middle), self.fill(other, high)), axis)
+        if whole > max(_WHOLE, 2 * math.prod((b - a).tolist())):  # of a thin box
+            return self._pieces(a, b, axis, whole // int((stop - start)[axis]))
         out = np.empty((*(stop - start), len(self.background)), self.dtype)
         out[:] = self.background
         tiles = self._hits(self.root_places, SIDES[0], start, stop)
@@ -99,6 +96,23 @@ class SparseGrid(ABC):
             i, j, k = ((self.origins[2][numbers] - start) // leaf).T
             blocks[i, :, j, :, k] = self.leaves(numbers).reshape(-1, 8, 8, 8, out.shape[3])
         return out[tuple(slice(x - s, y - s) for x, y, s in zip(a, b, start, strict=True))]
+
+    def _pieces(self, low: np.ndarray, high: np.ndarray, axis: int, across: int) -> np.ndarray:
+        """Fills a box piece by piece along an axis; so many voxels of whole leaves lie across."""
+        side = SIDES[2]
+        step = max(side, _WHOLE // across // side * side)
+        out = np.empty((*(high - low), len(self.background)), self.dtype)
+        ends = [
+            *range(int(low[axis]) // side * side + step, int(high[axis]), step),
+            int(high[axis]),
+        ]
+        a, b = low.copy(), high.copy()
+        for end in ends:
+            b[axis], part = end, [slice(None)] * 3
+            part[axis] = slice(a[axis] - low[axis], end - low[axis])
+            out[tuple(part)] = self.fill(a.tolist(), b.tolist())
+            a[axis] = end
+        return out
 
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         """(3,) lowest voxel and (3,) what is behind the highest, of all leaves and all tiles that

@@ -15,7 +15,7 @@ import struct
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -37,7 +37,7 @@ def check_surface_path(where: str, path: Path) -> None:
         raise FileNotFoundError(f"{where}: folder not found: {path.parent}")
 
 
-class SurfaceFile(ExitStack):
+class SurfaceFile:
     """A file of triangles that appears when it is whole:
 
     with SurfaceFile(path, origin, step) as file:
@@ -52,21 +52,26 @@ class SurfaceFile(ExitStack):
         """Opens it: a .ply holds world places, of float32 where that tells a thousandth of `step`
         apart, else float64; a .glb holds float32 from the world place `origin`, where it puts them.
         """
-        super().__init__()
         check_surface_path("surface", path)
         self._path, self._origin = path, origin
         self._glb, self._step = path.suffix == ".glb", step
         self.vertices = self.triangles = 0
         self._ends = np.array([[np.inf] * 3, [-np.inf] * 3])
+        self._stack = ExitStack()
 
     def __enter__(self) -> SurfaceFile:
         """Returns itself."""
-        self._part = self.enter_context(whole_file(self._path))
+        self._part = self._stack.enter_context(whole_file(self._path))
         self._places, self._faces = (
-            self.enter_context(tempfile.TemporaryFile(dir=self._path.parent)) for _ in range(2)
+            self._stack.enter_context(tempfile.TemporaryFile(dir=self._path.parent))
+            for _ in range(2)
         )
-        self.push(self._write)
+        self._stack.push(self._write)
         return self
+
+    def __exit__(self, *error: Any) -> None:
+        """Writes the file, or takes away what there is of it after a mistake."""
+        self._stack.__exit__(*error)
 
     def add(self, places: np.ndarray, faces: np.ndarray) -> None:
         """Appends vertices, (v, 3) float64 world x y z, and triangles, (f, 3) of all vertices."""

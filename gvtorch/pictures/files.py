@@ -8,9 +8,11 @@ introduction).
 from __future__ import annotations
 
 import errno
+import os
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +27,7 @@ from .tone import finite, to_srgb
 if TYPE_CHECKING:
     Layers = dict[str, np.ndarray]  # color (h, w, 3), alpha, depth, samples (h, w, 1)
 
-_STRIP = 256  # rows of a PNG that are filtered at once
+_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _BITS = {".png": (8, 16), ".tif": (8, 16, 32), ".exr": (32, 16), ".npy": (32,), ".npz": (32,)}
 
 
@@ -60,9 +62,20 @@ def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | No
             if path.suffix == ".tif":
                 write_tiff(part, image.shape, image.dtype, [image], len(image))
             else:
-                tops = range(0, len(image), _STRIP)
-                strips = (image[top : top + _STRIP] for top in tops)
-                write_png_rows(part, image.shape, bits, strips)
+                _write_png(part, np.ascontiguousarray(image))
+
+
+@contextmanager
+def _as_os_errors() -> Iterator[None]:
+    """Raises OSError for whatever a library raises when it can't write."""
+    try:
+        yield
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:
+        text = one_line(error)
+        number = errno.ENOSPC if "No space left" in text else errno.EIO
+        raise OSError(number, text) from None
 
 
 def side_by_side(layers: Layers) -> Layers:
@@ -100,6 +113,19 @@ def file_pixels(layers: Layers, transparent: bool, bits: int) -> np.ndarray:
     if bits == 32:
         return torch.cat((color, alpha) if transparent else (color,), -1).numpy()
     return display_pixels(color, alpha if transparent else None, bits)
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    """Writes (h, w, 3) or (h, w, 4) at once, faster than row by row."""
+    from kornia_rs.io import write_image_png_u8, write_image_png_u16
+
+    write = write_image_png_u8 if image.dtype == np.uint8 else write_image_png_u16
+    with _as_os_errors():
+        write(str(path), image, "rgba" if image.shape[2] == 4 else "rgb")
+    with path.open("rb") as file:  # of the last bytes that find no place on disk it tells nothing
+        file.seek(-min(len(_PNG_END), path.stat().st_size), os.SEEK_END)
+        if file.read() != _PNG_END:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def write_png_rows(
@@ -171,11 +197,5 @@ def _write_exr(path: Path, layers: Layers, bits: int) -> None:
     channels["Z"] = np.ascontiguousarray(layers["depth"][..., 0])
     channels["samples"] = layers["samples"][..., 0].astype(np.uint32, "C")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    try:
+    with _as_os_errors():
         OpenEXR.File(header, channels).write(str(path))
-    except (OSError, MemoryError):
-        raise
-    except Exception as error:  # whatever the library raises when it can't write
-        text = one_line(error)
-        number = errno.ENOSPC if "No space left" in text else errno.EIO
-        raise OSError(number, text) from None

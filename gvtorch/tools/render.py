@@ -223,7 +223,9 @@ class Render:
                 picture.save(self.npz)
             stats = picture.stats
         if not (seen or composed or self.show != "picture"):
-            ends = getattr(scene.data, "value_range", None)  # a store's is not known
+            ends = getattr(scene.data, "value_range", None)
+            if isinstance(ends, list):  # a store tells those of each channel
+                ends = ends[self.scene.look.component]
             known = "" if ends is None else f": values range from {ends[0]:g} to {ends[1]:g}"
             warnings.warn(f"nothing is seen{known}", stacklevel=2)
         return stats

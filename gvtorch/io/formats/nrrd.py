@@ -106,8 +106,12 @@ def _behind_lines(file: str, at: int, lines: int) -> int:
         with open(file, "rb") as stream:
             stream.seek(at)
             for number in range(lines):
-                if not stream.readline():
-                    raise ValueError(f"{file}: has {number} of {lines} lines to skip")
+                line = stream.readline(_MOST_SKIPPED)
+                if not line.endswith(b"\n"):
+                    raise ValueError(
+                        f"{file}: has {number} of {lines} lines to skip, of at most "
+                        f"{_MOST_SKIPPED} bytes"
+                    )
             at = stream.tell()
     return at
 

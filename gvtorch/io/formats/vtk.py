@@ -14,10 +14,10 @@ import mmap
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 from urllib.parse import unquote
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 
@@ -43,19 +43,15 @@ class VtkSource(VolumeSource):
     encoding: str  # "raw", "base64" or "ascii"
     compressor: str  # "zlib", "lzma", "lz4", or none
     header: str  # dtype of the sizes before the data
-    offset: int = 0  # of appended data
-    number: int | None = None  # among the arrays of the file, where it stands in the XML
+    offset: int
+    length: int  # bytes of the file that may belong to it
     whole: bool = True
 
     def read_stored(self, index: Index) -> np.ndarray:
         count, dtype = math.prod(self.shape), np.dtype(self.stored)
-        if self.number is not None:
-            arrays = _parsed(self.path)[0].iter("DataArray")
-            content = (next(islice(arrays, self.number, None)).text or "").encode()
-        else:
-            with open(self.path, "rb") as file:
-                file.seek(self.offset)
-                content = file.read()
+        with open(self.path, "rb") as file:
+            file.seek(self.offset)
+            content = file.read(self.length)
         if self.encoding == "ascii":
             text = io.BytesIO(content)
             return text_numbers(self.path, text, count, self.stored, exact=True).reshape(
@@ -137,7 +133,20 @@ def _told(
 
 
 def _open_xml(path: str, key: str | None) -> VolumeSource:
-    root, appended, end = _parsed(path)
+    with open(path, "rb") as file:
+        content = file.read(_MOST_HEADER)
+        file.seek(0, 2)
+        end = file.tell()
+    # Looked for in one place: at many that never end it would take their number squared.
+    start = content.find(b"<AppendedData")
+    appended = (
+        re.compile(rb"<AppendedData\b[^>]*>\s*_").match(content, start) if start >= 0 else None
+    )
+    inline = appended is None
+    if inline and end > _MOST_HEADER:
+        content = _read_all(path, end)
+    text = content if inline else content[: appended.start()] + b"</VTKFile>"  # type: ignore[union-attr]
+    root = ElementTree.fromstring(text)
     image, piece = _image_and_piece(path, root)
     extent = [int(n) for n in piece.get("Extent", image.get("WholeExtent", "")).split()]
     if len(extent) != 6:
@@ -175,31 +184,23 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
             )
             data.check_file()
             return data
-        if offset >= end:
+        length = end - offset
+        if length <= 0:
             raise ValueError(
                 f"{path}: {array['name']} begins at {offset}, the file has {end} bytes"
             )
-        told["offset"] = offset
     else:
         encoding = "ascii" if array["format"] == "ascii" else "base64"
-        told["number"] = array["number"]
-    return VtkSource(stored=stored, encoding=encoding, compressor=packer, header=header, **told)
-
-
-def _parsed(path: str) -> tuple[Any, re.Match[bytes] | None, int]:
-    """The XML of a file without appended data, where these begin if there are any, and the file's
-    size.
-    """
-    with open(path, "rb") as file:
-        content = file.read(_MOST_HEADER)
-        end = file.seek(0, 2)
-    # Looked for in one place: at many that never end it would take their number squared.
-    start = content.find(b"<AppendedData")
-    if start >= 0 and (found := re.compile(rb"<AppendedData\b[^>]*>\s*_").match(content, start)):
-        return ElementTree.fromstring(content[: found.start()] + b"</VTKFile>"), found, end
-    if end > 1 << 31:
-        raise ValueError(f"{path}: {end} bytes of XML are too many; write it with appended data")
-    return ElementTree.parse(path).getroot(), None, end
+        offset, length = _inline(content, array["number"])
+    return VtkSource(
+        stored=stored,
+        encoding=encoding,
+        compressor=packer,
+        header=header,
+        offset=offset,
+        length=length,
+        **told,
+    )
 
 
 def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
@@ -213,6 +214,14 @@ def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
     if len(pieces) != 1:
         raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
     return image, pieces[0]
+
+
+def _read_all(path: str, size: int) -> bytes:
+    """A file whose numbers stand among its XML."""
+    if size > 1 << 31:
+        raise ValueError(f"{path}: {size} bytes of XML are too many; write it with appended data")
+    with open(path, "rb") as file:
+        return file.read()
 
 
 def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
@@ -238,6 +247,33 @@ def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
                 }
             )
     return sorted(found, key=lambda array: not array["first"])
+
+
+def _inline(content: bytes, number: int) -> tuple[int, int]:
+    """Where the content of a DataArray begins, by its number in the file, and its length."""
+    found: list[list[int]] = []
+    parser = expat.ParserCreate()
+
+    def ended_tag(_text: str) -> None:
+        """What comes first behind a tag."""
+        parser.DefaultHandler = None
+        found[-1][0] = parser.CurrentByteIndex
+
+    def start(name: str, _attributes: dict[str, str]) -> None:
+        parser.DefaultHandler = None
+        if name == "DataArray":
+            found.append([0, 0])
+            parser.DefaultHandler = ended_tag
+
+    def end(name: str) -> None:
+        parser.DefaultHandler = None
+        if name == "DataArray" and not found[-1][1]:
+            found[-1][1] = parser.CurrentByteIndex
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(content, True)
+    begin, stop = found[number]
+    return (begin, stop - begin) if begin else (0, 0)
 
 
 # --- legacy

@@ -8,6 +8,7 @@ Source: Blosc, README_CHUNK_FORMAT; Zarr 3, sharding codec; N5 specification.
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import stat
@@ -73,9 +74,14 @@ def files_of(where: str, array: Any) -> ChunkFiles:
     return files
 
 
-def begin_read(view: Any, files: ChunkFiles) -> Any:
-    """Begins to read one of tensorstore's arrays, or a part of one, once the files on disk that it
-    needs were looked at; `files` are those of the whole array.
+def begin_read(view: Any, files: ChunkFiles, chunks: np.ndarray | None = None) -> Any:
+    """Begins to read an array, once its files on disk were looked at.
+
+    Args:
+        view: tensorstore's array, or a part of one.
+        files: Those of the whole array.
+        chunks: (n, axes) int64 places of the chunks that it needs, where they are known: numbers
+            of chunks along each axis of the whole array. Else tensorstore is asked, which is slow.
 
     Returns:
         tensorstore's future of the values, in the order of C; a failed one where a file is not
@@ -83,7 +89,7 @@ def begin_read(view: Any, files: ChunkFiles) -> Any:
     """
     try:
         if files.folder:
-            files.check(view.spec().transform)
+            files.check(view.spec().transform if chunks is None else chunks)
     except Endless as error:
         return failed(error)
     return view.read(order="C")
@@ -142,6 +148,11 @@ class ChunkFiles:
         )
 
     @cached_property
+    def chunks(self) -> int:
+        """Number of them in a file."""
+        return math.prod(self.file) // max(1, math.prod(self.chunk))
+
+    @cached_property
     def most(self) -> int:
         """Bytes of a file, at most."""
         return file_limit(math.prod(self.file), math.prod(self.chunk), self.item)
@@ -162,6 +173,17 @@ class ChunkFiles:
         size = self.index_bytes
         return slice(0, size) if self.index == "start" else slice(-size, None)
 
+    def places(self, time: int, zyx: np.ndarray, shape: Sequence[int]) -> np.ndarray | None:
+        """Returns (n, axes) places of the chunks of items at places (n, 3), in an array
+        ([t,] z, y, x, *shape) that has an item of this shape in each chunk; None for any other.
+        """
+        before = len(self.chunk) - len(shape)
+        if self.transposed or before < 3 or self.chunk != (1,) * before + tuple(shape):
+            return None
+        found = np.zeros((len(zyx), len(self.chunk)), np.int64)
+        found[:, : before - 3], found[:, before - 3 : before] = time, zyx
+        return found
+
     def entries(self, index: bytes) -> np.ndarray:
         """(n, 2) uint64 where chunks lie in a shard and how long they are, of its index or of some
         entries.
@@ -169,26 +191,19 @@ class ChunkFiles:
         found = np.frombuffer(index, f"{self.order}u8", len(index) // _ENTRY * 2)
         return found.astype(np.uint64).reshape(-1, 2)
 
-    def check(self, transform: Any) -> None:
-        """Looks at the files on disk that a part of the array lies in, by tensorstore's
-        IndexTransform from the part to the array.
+    def check(self, part: Any) -> None:
+        """Looks at the files on disk that a part of the array lies in: places of chunks, or
+        tensorstore's IndexTransform from the part to the array.
 
         Raises:
             Endless: A file is no regular one, or too long, or Blosc would make too much of it.
         """
-        whole = self.transposed or not self.index  # which chunks are wanted is not told, or is all
-        count = np.array(self.file) // self.chunk
-        files = _places(transform, self.file if whole else self.chunk)
-        numbers = np.zeros(len(files), np.int64)
-        if not whole:
-            numbers = np.ravel_multi_index(tuple((files % count).T), tuple(count))
-            files //= count
-        for place, wanted in _by_row(files, numbers):
+        found = self._listed(part) if isinstance(part, np.ndarray) else self._files(part)
+        for place, chunks in found:
             name = f"{self.begin}{self.separator.join(map(str, place))}"
             try:
                 size = check_file(self.folder + name, self.most)
                 if size is not None and self.blosc:
-                    chunks = np.arange(count.prod()) if whole else wanted
                     self._check_file(self.folder + name, size, chunks)
             except Endless as error:
                 raise Endless(f"{name}: {error}") from None
@@ -210,6 +225,57 @@ class ChunkFiles:
         last = begin + len(content) - _BLOSC
         starts = entries[(entries[:, 0] >= begin) & (entries[:, 0] <= max(last, 0)), 0].tolist()
         self._check_heads([content[at - begin : at - begin + _BLOSC] for at in starts])
+
+    @cached_property
+    def _every(self) -> np.ndarray | None:
+        """Numbers of all chunks of a file, where it is looked at as a whole: it has one, or which
+        are wanted can't be told.
+        """
+        return np.arange(self.chunks) if self.transposed or not self.index else None
+
+    @cached_property
+    def _counts(self) -> tuple[np.ndarray, np.ndarray]:
+        """(axes,) chunks of a file along each axis, and by how much a chunk's number in its file
+        grows along each; one chunk a file where it is looked at as a whole.
+        """
+        count = [a // b for a, b in zip(self.file, self.chunk, strict=True)]
+        strides = [math.prod(count[axis + 1 :]) for axis in range(len(count))]
+        if self._every is not None:  # files for chunks
+            count = [1] * len(count)
+        return np.array(count, np.int64), np.array(strides, np.int64)
+
+    def _listed(self, chunks: np.ndarray) -> Iterator[tuple[Sequence[int], np.ndarray]]:
+        """Places of the files of chunks at places (n, axes), and in each the numbers of those."""
+        count, strides = self._counts
+        files = chunks // count
+        for place, numbers in _by_row(files, (chunks - files * count) @ strides):
+            yield place, numbers if self._every is None else self._every
+
+    def _files(self, transform: Any) -> Iterator[tuple[Sequence[int], np.ndarray]]:
+        """The same for a part of the array, of which tensorstore's IndexTransform tells."""
+        side = self.chunk if self._every is None else self.file
+        counts, strides = self._counts
+        count = counts.tolist()
+        spans, listed, points = _places(transform, side)
+        files = [
+            range(span.start // n, (span.stop - 1) // n + 1)
+            for span, n in zip(spans, count, strict=True)
+        ]
+        rows = points // counts[listed]
+        inner = (points - rows * counts[listed]) @ strides[listed]
+        for group, numbers in _by_row(rows, inner):
+            for axis, file in zip(listed, group, strict=True):
+                files[axis] = range(file, file + 1)
+            for place in itertools.product(*files):
+                wanted = numbers
+                for axis in set(range(len(count))) - set(listed):
+                    first = place[axis] * count[axis]
+                    low = max(spans[axis].start - first, 0)
+                    high = min(spans[axis].stop - first, count[axis])
+                    if high > 1:
+                        along = strides[axis] * np.arange(low, high)
+                        wanted = np.add.outer(wanted, along).ravel()
+                yield place, wanted if self._every is None else self._every
 
     def _check_file(self, path: str, size: int, chunks: np.ndarray) -> None:
         try:
@@ -282,22 +348,25 @@ def _names(codecs: Iterable[dict[str, Any]]) -> Iterator[str]:
         yield codec["name"]
 
 
-def _places(transform: Any, side: Sequence[int]) -> np.ndarray:
-    """(n, axes) places of the chunks of `side` values that a part of an array lies in."""
+def _places(transform: Any, side: Sequence[int]) -> tuple[list[range], list[int], np.ndarray]:
+    """Places of the chunks of `side` values that a part of an array lies in: along each axis those
+    of a span; and which axes are listed instead, and (n, axes) places along these.
+    """
+    spans, listed, lists = [], [], []
     first, count = transform.input_origin, transform.input_shape
-    places = []
     for axis, (out, n) in enumerate(zip(transform.output, side, strict=True)):
+        ends = (out.offset, out.offset)
         if out.index_array is not None:
-            places.append((out.offset + out.stride * np.asarray(out.index_array)) // n)
-            continue
-        ends = [out.offset, out.offset]
-        if (along := out.input_dimension) is not None:
-            ends = [out.offset + out.stride * (first[along] + at) for at in (0, count[along] - 1)]
-        # Spans cross each other, and what is listed along the dimensions of the part.
-        shape = [1] * (len(side) + len(count))
-        shape[axis] = -1
-        places.append(np.arange(min(ends) // n, max(ends) // n + 1).reshape(shape))
-    return np.stack([at.ravel() for at in np.broadcast_arrays(*places)], axis=1)
+            listed.append(axis)
+            lists.append((out.offset + out.stride * np.asarray(out.index_array)) // n)
+        elif out.input_dimension is not None:
+            low, n_along = first[out.input_dimension], count[out.input_dimension]
+            ends = (out.offset + out.stride * low, out.offset + out.stride * (low + n_along - 1))
+        spans.append(range(min(ends) // n, max(ends) // n + 1))
+    if not listed:
+        return spans, listed, np.zeros((1, 0), np.int64)
+    points = [at.ravel() for at in np.broadcast_arrays(*lists)]
+    return spans, listed, np.stack(points, axis=1)
 
 
 def _by_row(rows: np.ndarray, numbers: np.ndarray) -> Iterator[tuple[list[int], np.ndarray]]:

@@ -403,6 +403,7 @@ class Store:
         batch that fails one by one, to tell the good from the bad.
         """
         array, files = chunked
+        chunks = files.places(self.time, zyx, array.shape[3:])
         errors = dict[int, str]()
         running: deque[tuple[np.ndarray, Any]] = deque()
 
@@ -421,7 +422,8 @@ class Store:
             for start in range(0, len(order), batch):
                 rows = order[start : start + batch]
                 z, y, x = zyx[rows].T
-                running.append((rows, begin_read(array[z, y, x], files)))
+                needed = None if chunks is None else chunks[rows]
+                running.append((rows, begin_read(array[z, y, x], files, needed)))
                 if len(running) * batch >= _AHEAD:
                     finish()
             while running:
