@@ -140,9 +140,9 @@ def text(where: str, name: str, value: Any) -> str | None:
 
 def one_of(where: str, name: str, value: Any, known: Iterable[Any]) -> None:
     """Raises ValueError, which tells them, unless a value is one of those known."""
-    first = [*known]
-    if value not in first:
-        *most, last = map(repr, first)
+    choices = [*known]
+    if value not in choices:
+        *most, last = map(repr, choices or [None])
         told = f"{', '.join(most)} or {last}" if most else last
         raise ValueError(f"{where}: {name} must be {told}, got {value!r}")
 

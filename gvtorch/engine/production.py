@@ -185,7 +185,7 @@ class Production:
 
     def serve(self, listed: RequestList, counts: Counts, stats: FrameStats) -> None:
         """Lets slots be taken again, chooses requests, asks the producers, and writes the answers
-        that are here at once. Recorded frames do the same on the device (`RecordedFrame`).
+        that are here at once. Recorded frames choose on the device (`RecordedFrame`).
         """
         cache, scheduler = self.cache, self.scheduler
         cache.make_room(counts.tiles_unused, counts.bricks_unused, counts.coarse_unused)

@@ -431,7 +431,8 @@ class OfProducers(Producer):
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
         """Where any differs."""
-        timed = [one for one in self.parts().values() if hasattr(one, "time")]
+        parts = [*self.parts().values()]
+        timed = [one for one in parts if hasattr(one, "time")] or parts
         return torch.stack([one.differs(nodes, before, after) for one in timed]).any(0)
 
     def prepare(self, layout: Layout) -> None:
