@@ -162,9 +162,13 @@ def coarser_requests(
     """Asks for coarser bricks where slots are too few for all requests, so that what gets no slot
     is drawn from a near ancestor and not from the root.
 
-    All requests of a frame are moved up the tree, the deepest first, until they name at most as
-    many nodes as there are slots; `room` tells for each kind how many may be taken, and how many
-    coarse ones.
+    Requests are moved up the tree, the deepest first, until they name at most as many nodes as
+    there are slots.
+
+    Args:
+        cache: The pools.
+        requests: All requests of a frame.
+        room: For each kind, how many slots may be taken, and how many coarse ones.
 
     Returns:
         The subdivisions as they are, and loads of the coarser nodes; or all of `requests` where
@@ -275,12 +279,20 @@ class Scheduler:
     def __init__(
         self,
         *,
-        order: Literal["coarse", "fine"] = "coarse",  # of levels; then by size on the screen
-        loads: int = 4096,  # most bricks a frame
-        subdivisions: int = 4096,  # most node tiles a frame
-        milliseconds: float | None = None,  # most time a frame for production, of both kinds
+        order: Literal["coarse", "fine"] = "coarse",
+        loads: int = 4096,
+        subdivisions: int = 4096,
+        milliseconds: float | None = None,
     ) -> None:
-        """Sets the budgets of a frame. Coarse levels first show something everywhere soon."""
+        """Sets the budgets of a frame.
+
+        Args:
+            order: Coarse levels first, which shows something everywhere soon, or fine ones; then
+                by size on the screen.
+            loads: Most bricks a frame.
+            subdivisions: Most node tiles a frame.
+            milliseconds: Most time a frame for production, shared by both kinds; None: no limit.
+        """
         self.order, self.milliseconds = order, milliseconds
         self.most = {REQUEST_LOAD: loads, REQUEST_SUBDIVIDE: subdivisions}
         self.cost = {kind: CallCost() for kind in self.most}

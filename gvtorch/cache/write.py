@@ -180,12 +180,19 @@ def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Wr
 def put_bricks(
     cache: Cache,
     targets: Targets,
-    data: Voxels | Sequence[Chunk],  # or what is on its way to the device
+    data: Voxels | Sequence[Chunk],
     free: Tensor,
     coarse: bool = False,
 ) -> Put:
     """Gives (k,) nodes, those of index -1 left out, their bricks: takes slots, at most `free` (1,),
-    coarse ones or others, unlinks, writes and links them. The host does not wait.
+    unlinks, writes and links them. The host does not wait.
+
+    Args:
+        cache: The pools.
+        targets: The nodes.
+        data: For each channel (k, z, y, x, c), or what is on its way to the device.
+        free: How many slots may be taken.
+        coarse: Whether they get coarse slots.
     """
     wanted = targets.lacking(cache, REQUEST_LOAD)
     slot = cache.lru[REQUEST_LOAD][coarse].give(wanted, free)

@@ -320,14 +320,20 @@ def lacking(
 
 
 def cut_bricks(
-    values_zyxc: Tensor,  # a whole level, of any dtype
-    place_k3: Tensor,  # int64 brick indices, z y x
-    brick_size: int,  # voxels along a side, without the border
-    border: int,  # voxels around
+    values_zyxc: Tensor,
+    place_k3: Tensor,
+    brick_size: int,
+    border: int,
     *,
     backend: Backend = "auto",
 ) -> Tensor:
     """Cuts bricks out of a level, borders from the neighbours, clamped at the level's faces.
+
+    Args:
+        values_zyxc: (z, y, x, c) a whole level, of any dtype.
+        place_k3: (k, 3) int64 brick indices, z y x.
+        brick_size: Voxels along a side, without the border.
+        border: Voxels around.
 
     Returns:
         (k, s, s, s, c), s = brick_size + 2 * border.

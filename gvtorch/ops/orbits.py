@@ -59,11 +59,15 @@ class Orbit(NamedTuple):
 
 
 def orbits(point_p3: Tensor, orbit: Orbit, backend: Backend = "auto") -> Tensor:
-    """Follows the orbits of points, float32 or float64 and contiguous, until they escape. NaN gives
-    NaN.
+    """Follows the orbits of points until they escape.
 
     On all backends and devices every bit is the same. Where gradients are recorded, the twin is
     evaluated, which torch can differentiate.
+
+    Args:
+        point_p3: (p, 3) float32 or float64, contiguous. NaN gives NaN.
+        orbit: How they go on.
+        backend: auto, reference, cpp or cuda.
 
     Returns:
         (3, p) of the same dtype: a distance, as the orbit tells it (-1 where it does not escape),
@@ -88,6 +92,9 @@ def orbit_bounds(
     Returns:
         (2, k): no distance that `orbits` gives for a point of a ball is less than the first, or
         more than the second. (-1, inf) where nothing is known.
+
+    Raises:
+        ValueError: See `orbits`.
     """
     fields = [("center_k3", center_k3, "k3"), ("reach_k", reach_k, "k")]
     orbit.check("orbit_bounds", center_k3, fields)

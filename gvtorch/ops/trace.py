@@ -187,15 +187,22 @@ def trace_rays(
 
 def shade_rays(
     rays: RayArguments,
-    arguments: TraceArguments,  # marks are written as by `trace_rays`
+    arguments: TraceArguments,
     shading: ShadeArguments,
-    parameter_54: Tensor,  # in the table's dtype, as `shading.ShadeParameters` packs them. For a
-    # user's op (20 + k,): the same and its own k numbers
+    parameter_54: Tensor,
     *,
-    op: str | None = None,  # name of a user's op, see `cpp_ext.user`; None: `shading` tells which
+    op: str | None = None,
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Traces rays through a tree and shades what they meet with a fused shader, or a user's.
+
+    Args:
+        rays: The rays.
+        arguments: What they go through; marks are written as by `trace_rays`.
+        shading: Which shader, and its channels.
+        parameter_54: (5, 4) in the table's dtype, as `shading.ShadeParameters` packs them. For a
+            user's op (20 + k,): the same and its own k numbers.
+        op: Name of a user's op, see `cpp_ext.user`; None: `shading.shader` tells which.
 
     Returns:
         color, alpha, depth, samples, missed as `trace_rays`; normal (r, 3) in the world, towards
@@ -214,13 +221,12 @@ def shade_rays(
 
 
 def trace_segments(
-    rays: RayArguments,  # their transmittance does not matter
-    arguments: TraceArguments,  # of the table only the lengths of its intervals matter
-    state_r3: Tensor | None = None,  # `Segments.state` of the part before; None: from the start
+    rays: RayArguments,
+    arguments: TraceArguments,
+    state_r3: Tensor | None = None,
     *,
-    limit: int = 0,  # a ray pauses after the visit in which it has taken so many samples; 0: never
-    by_node: bool = False,  # a region counts as constant only where one node answers, for shaders
-    # that read more than `component`
+    limit: int = 0,
+    by_node: bool = False,
     backend: Backend = "auto",
 ) -> Segments:
     """Walks rays through a tree as `trace_rays` does, and lists what they would sample.
@@ -229,6 +235,14 @@ def trace_segments(
     do not end early, which only a shader can decide: with `limit` they are walked in parts, and
     those that have ended need not go on. Lists have exactly the size that is needed: rays are
     walked twice, and the host waits for the count in between.
+
+    Args:
+        rays: The rays; their transmittance does not matter.
+        arguments: What they go through; of the table only the lengths of its intervals matter.
+        state_r3: `Segments.state` of the part before; None: from the start.
+        limit: A ray pauses after the visit in which it has taken this many samples; 0: never.
+        by_node: A region counts as constant only where one node answers, for shaders that read more
+            than `component`.
 
     Raises:
         ValueError: See `trace_rays`; or there are more segments than the device has memory for.
@@ -273,14 +287,21 @@ def list_samples(segments: Segments) -> Samples:
 
 def sample_bricks(
     rays: RayArguments,
-    arguments: TraceArguments,  # with the bricks and constants of any channel
+    arguments: TraceArguments,
     segments: Segments,
-    samples: Samples,  # any; one of no segment, or of one that names what is not there, is 0
+    samples: Samples,
     *,
     backend: Backend = "auto",
 ) -> Tensor:
     """Reads all numbers of a channel at samples, to the bit as `trace_rays` reads one of them:
     trilinear, two levels blended. Differentiable by bricks and constants that are floats.
+
+    Args:
+        rays: The rays that were walked.
+        arguments: What they went through, with the bricks and constants of any channel.
+        segments: What `trace_segments` gave.
+        samples: What `list_samples` gave, or any of them. A sample of no segment, or of one that
+            names what is not there, is 0.
 
     Returns:
         (k, c) in the segments' dtype.
@@ -303,16 +324,23 @@ def sample_bricks(
 
 
 def composite(
-    alpha_k: Tensor,  # float32 or float64 in [0, 1]
-    feature_kc: Tensor,  # same dtype: colour, or any numbers; not premultiplied
-    offset_r: Tensor,  # (r + 1,) int64 `Samples.offset`, rising from 0 to k
-    clear_r: Tensor | None = None,  # light left before a ray's first sample; None: all of it
+    alpha_k: Tensor,
+    feature_kc: Tensor,
+    offset_r: Tensor,
+    clear_r: Tensor | None = None,
     *,
-    stop_alpha: float = 1.0,  # a ray ends at this alpha
+    stop_alpha: float = 1.0,
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Adds samples up along rays, front to back: a sample's share is its alpha times what those
     before it let through. Differentiable by alpha, features and `clear_r`; an alpha of 1 too.
+
+    Args:
+        alpha_k: (k,) float32 or float64 in [0, 1].
+        feature_kc: (k, c) same dtype: colour, or any numbers; not premultiplied.
+        offset_r: (r + 1,) int64 `Samples.offset`, rising from 0 to k.
+        clear_r: (r,) what is left of the light before a ray's first sample; None: all of it.
+        stop_alpha: A ray ends at this alpha.
 
     Returns:
         Sums (r, c), light that is left (r,), and the light that reached each sample (k,), 0 behind

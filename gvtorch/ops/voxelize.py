@@ -26,22 +26,18 @@ class Voxelized(NamedTuple):
 
 
 def voxelize(
-    corner_f33: Tensor,  # float64 corners of at least one triangle, x y z, world units
-    solid_f: Tensor,  # bool: the triangle bounds a solid; else it is a sheet. Those of solids close
-    # each other's edges: then winding numbers are whole
-    box_n6: Tensor,  # float64 low and high corners of boxes: one around each triangle, then one
-    # around each 8 of those (the last may hold fewer), and so on until at most 8 are left
-    low_k3: Tensor,  # float64 low corners of the first voxels of the cubes, world units
-    size_k3: Tensor,  # float64 world sizes: the side of a voxel, the distance from one to the next
-    # along each axis, and how far away triangles are looked for (below 0: none are). Where the side
-    # is not above 0, the cube is left out: nothing is in it
-    side: int,  # voxels along a side of a cube, at most 32
-    thickness: float,  # of sheets, world units
+    corner_f33: Tensor,  # (f, 3, 3)
+    solid_f: Tensor,  # (f,)
+    box_n6: Tensor,  # (n, 6)
+    low_k3: Tensor,  # (k, 3)
+    size_k3: Tensor,  # (k, 3)
+    side: int,
+    thickness: float,
     *,
-    detail: float = 0.0,  # world size of a usual triangle: how to search; it changes no result
-    shares: bool = True,  # whether shares are wanted
-    weights: bool = False,  # whether weights are wanted
-    wide: bool = False,  # whether it is worked out in float64
+    detail: float = 0.0,
+    shares: bool = True,
+    weights: bool = False,
+    wide: bool = False,
     backend: Backend = "auto",
 ) -> Voxelized:
     """Finds for each voxel of k cubes the nearest triangle of a mesh, how often the mesh winds
@@ -53,6 +49,24 @@ def voxelize(
     most. A sheet is taken as a plane through each voxel, whose share is exact where it is one. On
     the CPU, C++ and the twin agree in every bit of float32. In float32 a triangle that comes near a
     cube should reach no farther than some thousand voxels away from it.
+
+    Args:
+        corner_f33: (f, 3, 3) float64 corners of at least one triangle, x y z, world units.
+        solid_f: (f,) bool, whether the triangle bounds a solid; else it is a sheet. Those of
+            solids close each other's edges: then winding numbers are whole.
+        box_n6: (n, 6) float64 low and high corners of boxes: one around each triangle, then one
+            around each 8 of those (the last may hold fewer), and so on until at most 8 are left.
+        low_k3: (k, 3) float64 low corners of the first voxels of the cubes, world units.
+        size_k3: (k, 3) float64 world sizes: the side of a voxel, the distance from one to the next
+            along each axis, and how far away triangles are looked for (below 0: none are). Where
+            the side is not above 0, the cube is left out: nothing is in it.
+        side: Voxels along a side of a cube, at most 32.
+        thickness: Of sheets, world units.
+        detail: World size of a usual triangle: tells how to search, and changes no result.
+        shares: Whether shares are wanted.
+        weights: Whether weights are wanted.
+        wide: Whether it is worked out in float64.
+        backend: auto, reference, cpp or cuda.
 
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.

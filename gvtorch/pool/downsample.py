@@ -116,9 +116,7 @@ def _most_frequent(rows: np.ndarray, background: float | None) -> np.ndarray:
 
 
 def pool_directional(
-    values: np.ndarray,  # (z, y, x, 24) as `Volume.directional` lays them out
-    factor: int,  # as for `pool_mean`, one number
-    sides_zyx: tuple[float, float, float],  # of a voxel of `values`, in reference lengths
+    values: np.ndarray, factor: int, sides_zyx: tuple[float, float, float]
 ) -> np.ndarray:
     """Reduces blocks of factor^3 voxels of premultiplied colour and opacity, as seen along each of
     six directions.
@@ -127,6 +125,11 @@ def pool_directional(
     mean of the columns is stored. Opacity is stored per reference length at every level: that of a
     homogeneous voxel which lets as much light through. So a homogeneous medium stays as it is, and
     so does opacity 1. Sums are float64.
+
+    Args:
+        values: (z, y, x, 24) as `Volume.directional` lays them out.
+        factor: As for `pool_mean`, one number.
+        sides_zyx: Sides of a voxel of `values`, in reference lengths.
     """
 
     def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:

@@ -113,16 +113,27 @@ def middle_of(how: str) -> Literal["mean", "min"]:
 
 
 def coarser(
-    values: Grid,  # (z, y, x, c); an array where the filter is not the mean
-    how: str,  # the volume's filter
+    values: Grid,
+    how: str,
     branching: int,
-    dtype: torch.dtype,  # of the channel
-    spacing: tuple[float, float, float],  # of the volume
-    level: int,  # number of the level that is made, from 1
+    dtype: torch.dtype,
+    spacing: tuple[float, float, float],
+    level: int,
     *,
-    empty: float | None = None,  # of labels, the value of the background
+    empty: float | None = None,
 ) -> Grid:
-    """Returns a level made of the one before, or of a part that begins at a multiple of N."""
+    """Returns a level made of the one before.
+
+    Args:
+        values: That level, (z, y, x, c), or a part of it that begins at a multiple of `branching`;
+            an array where the filter is not the mean.
+        how: The volume's filter.
+        branching: N.
+        dtype: Of the channel.
+        spacing: Of the volume.
+        level: Number of the level that is made, from 1.
+        empty: Of labels, the value of the background.
+    """
     made: Any = values
     if how == "mean":
         made = pool_mean(made, branching)

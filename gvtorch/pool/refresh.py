@@ -47,7 +47,7 @@ class BrickLevels:
         slot = _owned(self.nodes.brick_tn, self.bricks.owner_b)
         pool = self.nodes
         per_tile, count = pool.nodes_per_tile, self.branching**3
-        mine = pool.tree_t == self.root // per_tile
+        mine = pool.tree_t == self.root // per_tile  # see `N3Tree.number`
         tile = ((pool.parent_t >= 0) & mine).nonzero()[:, 0]
         node = (tile[:, None] * per_tile + torch.arange(count, device=slot.device)).flatten()
         node = torch.cat((node, node.new_full((1,), self.root)))
@@ -112,12 +112,21 @@ class BrickLevels:
         self,
         low: Place,
         high: Place,
-        filters: Mapping[str, str],  # of each channel, see `Volume.filter`
-        empty: Mapping[str, float | None],  # of channels of labels, the value of the background
-        spacing: tuple[float, float, float],  # of the finest voxels
-        threshold: float | None,  # see `N3Tree.from_volume`
+        filters: Mapping[str, str],
+        empty: Mapping[str, float | None],
+        spacing: tuple[float, float, float],
+        threshold: float | None,
     ) -> None:
-        """Makes right what follows from the finest voxels `low` to `high`, which is left out."""
+        """Makes right what follows from the finest voxels low to high (z y x).
+
+        Args:
+            low: First voxel.
+            high: The one after the last.
+            filters: Of each channel, see `Volume.filter`.
+            empty: Of channels of labels, the value of the background.
+            spacing: (x, y, z) of the finest voxels.
+            threshold: See `N3Tree.from_volume`.
+        """
         channels = [
             _ChannelLevels(self, name, how, spacing, empty.get(name))
             for name, how in filters.items()

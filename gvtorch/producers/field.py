@@ -233,8 +233,13 @@ class FieldProducer(Producer):
         return (values * most).round().clamp(least, most).to(channel.dtype)
 
 
-#: The same by a verb, for a network or any other module: the engine keeps what rays ask for.
-cache_field = FieldProducer
+def cache_field(
+    field: nn.Module, extent: int | Sequence[int] = 1024, **options: Any
+) -> FieldProducer:
+    """Returns a producer of any module from positions (..., 3) to values (..., c), or to these by
+    channel, such as a network: the engine keeps what rays ask for. Arguments as `FieldProducer`.
+    """
+    return FieldProducer(field, extent, **options)
 
 
 def interval_of(field: nn.Module, name: str, ends: Any, count: int, width: int) -> Interval:

@@ -34,8 +34,14 @@ class Labels(LitShader):
     to 3: of a ball it is off by 11 degrees in the mean with a border of 1, by 4 with 2, by 2 with
     3. Where there are none, a place is lit as if it faced the light.
 
-    Attributes, named as the arguments, may be edited, also in place: the next picture is made with
-    them.
+    Attributes may be edited, also in place: the next picture is made with them.
+
+    Attributes:
+        colors: By label, or in the order 0, 1, 2, ...; distinct ones for labels that are left out.
+        opacity: Of all labels, or by label (1 for those that are left out), per reference length.
+        visible: The labels that are shown; None: all but 0, the background; "all": all.
+        reference: World units, or None for the smallest spacing.
+        lit: Whether they are lit.
     """
 
     kind = "Labels"

@@ -149,16 +149,21 @@ def _weights(place_p3: Tensor, corner_p33: Tensor) -> Tensor:
 
 
 def _ahead(place_p3: Tensor, corner_f33: Tensor, solid_f: Tensor) -> Tensor:
-    """(p,) int64 winding numbers: triangles ahead along x, with their normals ahead as 1."""
+    """Returns (p,) int64 winding numbers: triangles that lie ahead along x, those whose normals
+    point ahead as 1, the others as -1.
+    """
     where, way = pierced(place_p3[:, None], corner_f33)
     return (way * solid_f * (where > place_p3[:, :1]).long()).sum(1)
 
 
 def pierced(place: Tensor, corner: Tensor) -> tuple[Tensor, Tensor]:
-    """Finds where lines along x through places (..., 3) pierce triangles (..., 3, 3), whose leading
-    dimensions broadcast. Two triangles at an edge agree on whose side a line passes, and a line
-    through an edge passes as if it were moved aside by nearly nothing, the same way for all: so
-    none slips through.
+    """Finds where lines along x through places pierce triangles. Two triangles at an edge agree on
+    whose side a line passes, and a line through an edge passes as if it were moved aside by nearly
+    nothing, the same way for all: so none slips through.
+
+    Args:
+        place: (..., 3) places.
+        corner: (..., 3, 3) triangles; leading dimensions broadcast.
 
     Returns:
         (...) x; (...) int64: 1 where the triangle's normal points along x, -1 where against it, 0
@@ -272,11 +277,14 @@ def _before(at: Tensor, count: Tensor) -> Tensor:
 
 
 def box_share(normal_p3: Tensor, offset_p: Tensor) -> Tensor:
-    """Returns (p,) the share of a voxel, a cube of side 1, that lies below a plane, in closed form:
-    the plane lies so far above the voxel's centre, along a normal of any length; 0 gives 1/2.
+    """Returns (p,) the share of a voxel, a cube of side 1, that lies below a plane, in closed form.
 
     Exact but for planes within `FLAT` of an axis, which are turned by less than that: the formula
     would divide by nothing there. The share is then right to 3e-4.
+
+    Args:
+        normal_p3: (p, 3) normals of planes, of any length; that of length 0 gives 1/2.
+        offset_p: (p,) how far the plane lies above the voxel's centre, along the normal.
     """
     length = sqrt_exact(_dot(normal_p3, normal_p3))
     size = normal_p3.abs()
