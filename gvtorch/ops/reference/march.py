@@ -222,7 +222,7 @@ def a_little_below(value: Tensor) -> Tensor:
 
 @dataclass
 class Visitor(ABC):
-    """What a walk feeds intervals to: a shader, or a list of what one would sample."""
+    """Receives the intervals of a walk: a shader, or a recorder of what one would sample."""
 
     transfer: Transfer
     channel: ChannelBricks
