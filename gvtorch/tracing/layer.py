@@ -124,7 +124,7 @@ class LayerPixels:
     alpha: Tensor | None  # (r, 1)
 
     def __getitem__(self, which: slice | Tensor) -> LayerPixels:
-        """Some of the pixels."""
+        """Returns some of the pixels."""
         alpha = None if self.alpha is None else self.alpha[which]
         return LayerPixels(self.color[which], self.distance[which], alpha)
 

@@ -188,7 +188,7 @@ def _check_labels(tree: N3Tree, shader: Shader, channel: str) -> None:
 
 def _check_step(tree: N3Tree, step: float, options: RenderOptions) -> None:
     """Raises ValueError where distances are too coarse for the ends of intervals to differ. With
-    cones they differ longer: an interval is about as long as its cone is wide, far from one ulp.
+    cones they allow more of them: these are as long as cones are wide, far above rounding.
     """
     length = math.dist(*tree.box.tolist())
     most, hint = 2**46, "take a longer step"

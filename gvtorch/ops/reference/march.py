@@ -233,7 +233,7 @@ class Visitor(ABC):
         return self.transfer.transparent(low, high)
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """Returns (k,) bool: two nodes without bricks (k,) look the same and the same all over."""
+        """Returns (k,) bool: two nodes without bricks (k,) are equal, so the region is uniform."""
         return self.channel.same(fine, coarse)
 
     @abstractmethod
