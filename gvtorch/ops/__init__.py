@@ -1,5 +1,5 @@
 """The ops on bare tensors. Importing this package loads the compiled libraries, so that TorchScript
-archives and exported programs that hold `gvtorch::` ops can be loaded."""
+archives and exported programs that contain `gvtorch::` ops can be loaded."""
 
 from .arguments import RayArguments, Samples, Segments, ShadeArguments, TraceArguments
 from .cache import (

@@ -1,9 +1,9 @@
-"""The cache's ops: requests listed, nodes located, slots ordered by use, pointers cleared and
-written. The body of each is its twin in plain torch, right by definition; see `op`. And bricks cut
-out of a level that is in memory.
+"""The cache's ops: they list and choose requests, locate nodes, order slots by use, and clear and
+write pointers. The body of each is its twin in plain torch, right by definition; see `op`. Also
+`cut_bricks`, for a level that is in memory.
 
 Lists have a fixed capacity and a count that stays on the device, so that a frame needs no host
-synchronisation; places that are not taken hold -1. Fields of pools: see `NodePool`, `BrickPool`.
+synchronisation; unused entries hold -1. Fields of pools: see `NodePool`, `BrickPool`.
 
 Source: Crassin et al., "GigaVoxels", I3D 2009, section 5.
 """
@@ -38,13 +38,13 @@ Branching = Annotated[int, range(2, 2**15)]  # N of a tree
 def compact_requests(
     request_tn: Requests, capacity: Positive, *, backend: Backend = "auto"
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Lists requests, at most `capacity`, and clears their words, the pending bits excepted; kinds
-    that are pending are not listed. Mutates `request_tn`.
+    """Lists at most `capacity` requests, except kinds that are pending, and clears all request
+    words but their pending bits. Mutates `request_tn`.
 
     Returns:
         node_k (capacity,) node indices, rising, -1 behind them; word_k (capacity,) kinds and
-        priority; count_5 (5,) int64: nodes listed, nodes that could be listed, requested nodes,
-        pending or not; of those listed loads, and subdivisions.
+        priority; count_5 (5,) int64: nodes listed; nodes with a request that is not pending; nodes
+        with any request; listed loads; listed subdivisions.
     """
     words = request_tn.view(-1)
     requested = int((words & REQUEST_KINDS).count_nonzero())
@@ -64,16 +64,16 @@ def compact_requests(
 @op()
 def choose_requests(
     asked_l2k: Words,  # lists of nodes, -1 for none, and their words; earlier lists first
-    loc_t4: Words,  # of which the depth of each tile's nodes counts
-    room_2: Longs,  # how many tiles and bricks there may be
+    loc_t4: Words,  # only the depth of each tile's nodes is read
+    room_2: Longs,  # most subdivisions (tiles) and loads (bricks) to choose
     per_tile: Positive,  # nodes of a tile
     batch: Positive,
-    coarse_first: bool,
+    coarse_first: bool,  # else fine levels first
     *,
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Chooses which requests are served: list by list, coarse levels first, or fine ones; then by
-    size on the screen; then in their order.
+    """Chooses the requests to serve, ordered by list, then level, then size on the screen, then
+    their order in the list.
 
     Returns:
         node_2b (2, batch) int64 nodes to load, and nodes to subdivide, the most wanted first, -1
@@ -100,7 +100,7 @@ def choose_requests(
 
 @op()
 def lru_partition(
-    order_k: Words,  # slots; those that are never given away are not among them
+    order_k: Words,  # slots, without those that never change hands
     stamp_s: Words,  # last frame that used each slot
     frame_1: Words,  # number of this frame
     *,
@@ -108,10 +108,10 @@ def lru_partition(
 ) -> tuple[Tensor, Tensor]:
     """Orders slots by use: a stable partition, those that this frame did not use first.
 
-    Kept from frame to frame, the order is that of least recent use; victims come from the front.
+    Repeated frame by frame, this sorts slots by least recent use; victims come from the front.
 
     Returns:
-        order_k (k,), unused_1 (1,) int64: how many this frame did not use.
+        order_k (k,), unused_1 (1,) int64: number of slots that this frame did not use.
     """
     order = order_k.to(torch.int64)
     known = (order >= 0) & (order < len(stamp_s))  # others count as unused
@@ -120,7 +120,7 @@ def lru_partition(
 
 
 def _marked(slot_k: Tensor, slots: int) -> Tensor:
-    """(slots + 1,) bool: the slots that are listed; the last stands for none."""
+    """Returns (slots + 1,) bool: true for listed slots; the last entry, for no slot, is false."""
     marked = torch.zeros(slots + 1, dtype=torch.bool, device=slot_k.device)
     marked[slot_k[(slot_k >= 0) & (slot_k < slots)].to(torch.int64)] = True
     return marked
@@ -128,17 +128,17 @@ def _marked(slot_k: Tensor, slots: int) -> Tensor:
 
 @op()
 def unlink(
-    pointer_tn: Words,  # child or brick words; those >= 0 name a slot
+    pointer_tn: Words,  # child or brick words; those >= 0 are slots
     owner_s: Words,  # the node that each slot belongs to, or ABSENT
-    shared_s: Flags,  # whether other nodes may point to it as well
+    shared_s: Flags,  # whether nodes besides the owner may point to the slot
     slot_k: Words,  # slots that change hands; -1 names none
     *,
     backend: Backend = "auto",
 ) -> None:
     """Takes slots from their nodes: every pointer to them becomes ABSENT, and so does their owner.
 
-    Only its owner points to a slot that is not shared; so the compiled op reads all words only
-    where a shared slot changes hands. Mutates `pointer_tn` and `owner_s`.
+    A slot that is not shared has no pointer but its owner's, so the compiled op scans all words
+    only where a shared slot changes hands. Mutates `pointer_tn` and `owner_s`.
     """
     slots = len(owner_s)
     leaving = _marked(slot_k, slots)
@@ -150,12 +150,12 @@ def unlink(
 @op()
 def orphan(
     pointer_tn: Words,  # child or brick words
-    owner_s: Words,  # the node that each slot belongs to, or ABSENT: one that points to it
+    owner_s: Words,  # the node that each slot belongs to (it points to the slot), or ABSENT
     tile_k: Words,  # tiles that change hands; -1 names none
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Clears in `owner_s` the owner of slots that belong to nodes of tiles that change hands."""
+    """Clears the owner of slots that belong to nodes of the given tiles. Mutates `owner_s`."""
     tiles, per_tile = pointer_tn.shape
     leaving = _marked(tile_k, tiles)
     tile = torch.where(owner_s >= 0, owner_s // per_tile, tiles).clamp(max=tiles)
@@ -172,12 +172,12 @@ def link(
     pointer_tn: Words,  # child or brick words
     request_tn: Requests,
     node_k: Words,  # node indices, each once; -1 names none
-    word_k: Words,  # what their words become
+    word_k: Words,  # their new words
     kind: int,  # REQUEST_LOAD for brick words, REQUEST_SUBDIVIDE for child words
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Writes pointers of nodes and clears the requests that they answer, and their pending bits.
+    """Writes pointers of nodes and clears the requests of this kind, and their pending bits.
     Mutates `pointer_tn` and `request_tn`.
     """
     valid = (node_k >= 0) & (node_k < pointer_tn.numel())
@@ -194,15 +194,15 @@ def link_bricks(
     stamp_b: Words,
     born_b: Words,
     shared_b: Flags,
-    node_k: Longs,  # node indices, each once; those of no node are left out
+    node_k: Longs,  # node indices, each once; invalid ones are left out
     slot_k: Words,  # their slots, each once; -1 names none
     frame_1: Words,  # number of the last picture
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Links nodes to bricks in slots, of which they become the only owners, and clears their
-    requests. The slots count as used in that frame, and are first drawn in the next one.
-    Mutates the first six.
+    """Links nodes to brick slots, whose only owners they become, and clears their LOAD requests.
+    The slots count as used in the last picture, and are first drawn in the next one. Mutates the
+    first six arguments.
     """
     valid = (node_k >= 0) & (node_k < brick_tn.numel())
     valid &= (slot_k >= 0) & (slot_k < len(owner_b))
@@ -229,19 +229,19 @@ def link_tiles(
     tree_t: Words,
     stamp_t: Words,
     shared_t: Flags,
-    child_jw: Words,  # what the w <= n children of j nodes hold
-    brick_jw: Words,  # the same of their bricks
-    node_j: Longs,  # the nodes
-    loc_j4: Longs,  # their places
-    row_k: Longs,  # which of the j nodes get tiles, each once
-    tile_k: Words,  # the tiles, each once, none of them a node's own; -1 names none
+    child_jw: Words,  # child words of the w <= n children of j nodes
+    brick_jw: Words,  # their brick words
+    node_j: Longs,  # the j nodes
+    loc_j4: Longs,  # their locs
+    row_k: Longs,  # rows of the nodes that get tiles, each once
+    tile_k: Words,  # the tiles, each once, none the tile of one of the nodes; -1 names none
     tree: int,  # number of the tree
     frame_1: Words,  # number of the last picture: the tiles count as used in it
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Writes tiles, links them to their parent nodes, and clears the requests of these. Words
-    beyond the `w` of the tree become TERMINAL and EMPTY. Mutates the first eight.
+    """Writes tiles, links their parent nodes to them, and clears these nodes' SUBDIVIDE requests.
+    Words beyond the tree's `w` become TERMINAL and EMPTY. Mutates the first eight arguments.
     """
     valid = (row_k >= 0) & (row_k < len(node_j)) & (tile_k >= 0) & (tile_k < len(parent_t))
     row_k, tile_k = row_k[valid], tile_k[valid]
@@ -260,12 +260,12 @@ def link_tiles(
 @op()
 def put_rows(
     target_sb: Bytes,  # slots
-    slot_k: Longs,  # where rows go, each slot once; -1 names none
+    slot_k: Longs,  # slot of each row, each once; -1 names none
     rows_kb: Bytes,
     *,
     backend: Backend = "auto",
 ) -> None:
-    """Writes rows into slots, bytes as they are. Mutates `target_sb`."""
+    """Writes rows of raw bytes into slots. Mutates `target_sb`."""
     valid = (slot_k >= 0) & (slot_k < len(target_sb))
     target_sb[slot_k[valid]] = rows_kb[valid]
 
@@ -279,7 +279,7 @@ def locate(
     *,
     backend: Backend = "auto",
 ) -> Tensor:
-    """Returns where nodes lie, (k, 4) int64 x, y, z, depth; -1 for an index that is no node's."""
+    """Returns the locs of nodes, (k, 4) int64 x, y, z, depth; -1 for an index that is no node's."""
     known = (node_k >= 0) & (node_k < len(loc_t4) * per_tile)
     node = torch.where(known, node_k, 0)
     above = loc_t4.to(torch.int64)[node // per_tile]
@@ -291,23 +291,23 @@ def locate(
 
 @op()
 def lacking(
-    pointer_tn: Words,  # child or brick words: what is asked for is ABSENT
+    pointer_tn: Words,  # child or brick words, by what was requested
     loc_t4: Words,
     parent_t: Words,
     tree_t: Words,
     shared_t: Flags,
     node_k: Longs,  # node indices
-    loc_k4: Longs,  # the places that were asked for
+    loc_k4: Longs,  # the locs that were requested
     tree: int,  # number of the tree
     root: int,  # node index of its root
     branching: Branching,
     *,
     backend: Backend = "auto",
 ) -> Tensor:
-    """Tells which nodes still stand for the places that were asked for, and still have nothing.
+    """Returns which nodes still have the loc that was requested, and still lack what was requested.
 
     Returns:
-        (k,) bool: the node's tile hangs in the tree, at that place, and its word is ABSENT.
+        (k,) bool: the node's tile is linked into the tree, at this loc, and its word is ABSENT.
     """
     per_tile = pointer_tn.shape[1]
     known = (node_k >= 0) & (node_k < pointer_tn.numel())
@@ -327,13 +327,13 @@ def cut_bricks(
     *,
     backend: Backend = "auto",
 ) -> Tensor:
-    """Cuts bricks out of a level, borders from the neighbours, clamped at the level's faces.
+    """Cuts bricks out of a level, with borders from the neighbours, clamped at the level's faces.
 
     Args:
         values_zyxc: (z, y, x, c) a whole level, of any dtype.
         place_k3: (k, 3) int64 brick indices, z y x.
         brick_size: Voxels along a side, without the border.
-        border: Voxels around.
+        border: Width of the border in voxels.
 
     Returns:
         (k, s, s, s, c), s = brick_size + 2 * border.

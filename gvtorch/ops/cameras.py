@@ -36,8 +36,8 @@ def pinhole_rays(
     *,
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Makes the rays through the pixels of whole rows: their directions are (x, y, 1), turned into
-    the world, of unit length, where x = (column - cx) / fx and y = (row - cy) / fy.
+    """Makes the rays through the pixels of whole rows. Their directions are (x, y, 1) with
+    x = (column - cx) / fx and y = (row - cy) / fy, rotated into the world and normalised.
 
     Returns:
         origin_r3, direction_r3, cone_r2 and range_r2, float64, as in `Rays`; r = rows * width.

@@ -27,16 +27,16 @@ def noise(
     """Evaluates a noise of one frequency at p points, in the plane (n = 2) or in space (n = 3).
 
     On all backends and devices every bit is the same. Where gradients by the points are recorded,
-    the twin is evaluated, which torch can differentiate.
+    `auto` runs the twin, which torch can differentiate.
 
     Args:
         point_pn: (p, n) float32 or float64, in cells. Coordinates beyond 2^29 count as 0; NaN
             gives NaN.
         kind: perlin, value, simplex; F1, F2 or F2-F1 of cellular noise.
-        seed: Another noise for each.
-        period: After how many cells the noise repeats along x, y, z; 0: never.
+        seed: Each seed gives a different noise.
+        period: Number of cells after which the noise repeats along x, y, z; 0: never.
         jitter: How far the points of cellular noise stray in their cells, 0 to 1.
-        reach: How many cells around its own cellular noise searches, 1 or 2.
+        reach: How many cells to each side cellular noise searches, 1 or 2.
         backend: auto, reference, cpp or cuda.
 
     Returns:

@@ -16,18 +16,18 @@ KINDS = ("power", "fold")
 
 
 class Orbit(NamedTuple):
-    """How orbits z -> f(z) + c go on, and when they end."""
+    """The iteration z -> f(z) + c of a fractal, and when it ends."""
 
-    constant_3: Tensor  # (3,) c, if `julia`; of the points' dtype, as the next
-    bailout_1: Tensor  # (1,) more than 1: what is further from the origin has escaped
+    constant_3: Tensor  # (3,) c, if `julia`; in the points' dtype, as is `bailout_1`
+    bailout_1: Tensor  # (1,) above 1: an orbit escapes beyond this distance from the origin
     kind: Literal["power", "fold"]  # f: z^n in spherical coordinates, or the Mandelbox's step
     amount: float  # n, or the Mandelbox's scale
-    iterations: int  # most steps
+    iterations: int  # largest number of steps
     julia: bool = False  # whether c is `constant_3`; else it is each point itself
 
     def check(self, where: str, like: Tensor, fields: list[tuple[str, Tensor, str]]) -> None:
-        """Raises ValueError unless tensors are of one dtype, on one device, and of their shapes,
-        and numbers in their ranges. `fields`: names, tensors and shapes of what it goes with.
+        """Raises ValueError unless all tensors have the dtype and device of `like` and their
+        shapes, and numbers are in range. `fields`: names, tensors and shapes of an op's points.
         """
         if like.dtype not in (torch.float32, torch.float64):
             got = check.describe(like)
@@ -42,12 +42,12 @@ class Orbit(NamedTuple):
         check.whole(where, "iterations", self.iterations, low=1, high=1000)
 
     def arguments(self) -> tuple[Any, ...]:
-        """What the compiled ops take behind their own tensors."""
+        """Returns the arguments of the compiled ops that follow their points."""
         number = KINDS.index(self.kind)
         return (*self[:2], number, float(self.amount), self.iterations, self.julia)
 
     def way(self) -> twin.Way:
-        """What the twin takes."""
+        """Returns this iteration in the form that the twin takes."""
         if self.kind == "power":
             step: twin.Step = partial(twin.spherical_power, n=int(self.amount))
             ranges: twin.Ranges = partial(twin.power_ranges, n=int(self.amount))
@@ -61,17 +61,17 @@ class Orbit(NamedTuple):
 def orbits(point_p3: Tensor, orbit: Orbit, backend: Backend = "auto") -> Tensor:
     """Follows the orbits of points until they escape.
 
-    On all backends and devices every bit is the same. Where gradients are recorded, the twin is
-    evaluated, which torch can differentiate.
+    On all backends and devices every bit is the same. Where gradients are recorded, `auto` runs the
+    twin, which torch can differentiate.
 
     Args:
         point_p3: (p, 3) float32 or float64, contiguous. NaN gives NaN.
-        orbit: How they go on.
+        orbit: The iteration.
         backend: auto, reference, cpp or cuda.
 
     Returns:
-        (3, p) of the same dtype: a distance, as the orbit tells it (-1 where it does not escape),
-        and how near it came to the origin, and to the nearest plane of two axes.
+        (3, p) of the same dtype: an estimate of the distance to the fractal (-1 where the orbit
+        does not escape), and the orbit's least distances to the origin and to a coordinate plane.
 
     Raises:
         ValueError: A tensor of the wrong shape or dtype, or a number out of its range.
@@ -87,11 +87,11 @@ def orbits(point_p3: Tensor, orbit: Orbit, backend: Backend = "auto") -> Tensor:
 def orbit_bounds(
     center_k3: Tensor, reach_k: Tensor, orbit: Orbit, backend: Backend = "auto"
 ) -> Tensor:
-    """Follows the orbits of balls of points, with middles (k, 3) and radii (k,); see `orbits`.
+    """Bounds the distances that `orbits` returns over balls of centres (k, 3) and radii (k,).
 
     Returns:
-        (2, k): no distance that `orbits` gives for a point of a ball is less than the first, or
-        more than the second. (-1, inf) where nothing is known.
+        (2, k): lower and upper bounds of the distances of all points of a ball; (-1, inf) where
+        nothing is known.
 
     Raises:
         ValueError: See `orbits`.

@@ -1,6 +1,6 @@
-"""Joins the compiled ops to torch: loads the libraries, chooses the backend of a call, makes ops of
-their twins, and gives each op its fake (shapes without data), which takes what it needs by the
-names of the op's schema in cpp_ext/csrc.
+"""Connects the compiled ops to torch: loads the libraries, chooses the backend of a call, turns
+twins into ops, and registers a fake (output shapes without data) for each op. Fakes receive their
+arguments by the names in the op's schema, see cpp_ext/csrc.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _Twin = TypeVar("_Twin", bound=Callable[..., Any])
 
 
 def unavailable() -> dict[str, str]:
-    """Returns for each of reference, cpp, cuda why it can't be used here; an empty text: it can."""
+    """Returns why each of reference, cpp, cuda can't be used here; an empty text if it can."""
     return {"reference": "", **_reasons}
 
 
 @functools.cache
 def choose_backend(backend: str, device: torch.device) -> str:
-    """Returns the backend that runs on `device`: `auto` takes the compiled one where there is one.
+    """Returns the backend to run on `device`; `auto` is the compiled one where it is available.
 
     Raises:
         ValueError: The backend is unknown, can't be used here, or does not run on `device`.
@@ -56,13 +56,13 @@ uncached_backend = choose_backend.__wrapped__  # torch.compile warns of caches
 
 
 def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
-    """Makes an op of its twin: checks what comes, and calls the compiled op of the twin's name, or
-    the twin, as its argument `backend` says: auto, reference, cpp or cuda.
+    """Turns a twin into an op: it checks the arguments, then calls the compiled op of the twin's
+    name or the twin itself, as the argument `backend` says: auto, reference, cpp or cuda.
 
-    Tensors must be contiguous, on one device, and of the shape that their name ends with (of any,
-    if it has no such end) and the dtype of Words, Longs, Requests, Flags, Bytes or Doubles; numbers
-    inside their range. Else the op raises ValueError. `also`: one more check, which gets the
-    arguments by name.
+    Tensors must be contiguous, on one device, of the dtype that their annotation names (Words,
+    Longs, Requests, Flags, Bytes or Doubles) and of the shape in the suffix of their name (any
+    shape without one); numbers must be in their range. Else the op raises ValueError. `also` is a
+    further check, which gets the arguments by name.
     """
 
     def made_of(twin: _Twin) -> _Twin:
@@ -245,8 +245,9 @@ _libraries: dict[str, torch.library.Library] = {}  # kernels last as long as the
 
 
 def _refuse_gradients(op: Any) -> None:
-    """Lets an op that has no gradients raise where some would be lost: its outputs would require
-    them, and give None. Autograd calls this in every mode: eager, script, compile and export.
+    """Makes an op without a backward raise where an input requires a gradient: its outputs would
+    require one too, and yield None. Autograd calls this in every mode: eager, script, compile and
+    export.
     """
     names = _names(op)
     namespace, _, where = op.default.name().partition("::")
@@ -265,7 +266,7 @@ def _refuse_gradients(op: Any) -> None:
 
 @functools.cache
 def add_user_op(name: str) -> None:
-    """Gives the op of a user's shader, which is loaded, its fake, and lets it refuse gradients."""
+    """Registers the fake of the op of a loaded user's shader, and makes it refuse gradients."""
     op = getattr(torch.ops.gvtorch_user, name)
     _register_fake(op, _shade_rays)
     _refuse_gradients(op)
@@ -280,7 +281,7 @@ def _save_samples(ctx: Any, inputs: tuple, output: Tensor) -> None:
 
 
 def _sample_gradient(ctx: Any, grad_kc: Tensor) -> tuple[Tensor | None, ...]:
-    """The gradient by bricks and constants; in their own dtype."""
+    """Returns the gradients by bricks and constants, in their dtype, and None for the rest."""
     pairs = zip(ctx.saved_tensors, ctx.numbers, strict=True)
     inputs = [number if tensor is None else tensor for tensor, number in pairs]
     bricks, constants = torch.ops.gvtorch.sample_bricks_backward(grad_kc.contiguous(), *inputs)
@@ -305,7 +306,7 @@ def _composite_gradient(
     return alpha, feature, None, clear, None
 
 
-#: Arguments of `sample_bricks` by which it has gradients.
+#: Arguments of `sample_bricks` that have gradients.
 _LEARNED = ("bricks_bzyxc", "constant_tnc")
 
 _reasons = cpp_ext.load()

@@ -1,5 +1,5 @@
-"""What `shade_rays` is told about a shader: which one, and 20 numbers of light, material and the
-shader's own. Shaders write them; the torch twin and csrc/shaders/shaders.h read them.
+"""The shader arguments of `shade_rays`: the shader's number, and 20 numbers for light, material and
+the shader itself. Shaders write them; the torch twin and csrc/shaders/shaders.h read them.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ class LightKind(IntEnum):
     """Where light comes from."""
 
     HEADLIGHT = 0  # the eye of each ray
-    DIRECTIONAL = 1  # far away
-    POINT = 2  # a place
+    DIRECTIONAL = 1  # infinitely far away
+    POINT = 2  # a position
 
 
 class ProjectionKind(IntEnum):
-    """What a projection shows of the values along a ray."""
+    """How a projection reduces the values along a ray."""
 
     MAXIMUM = 0
     MINIMUM = 1
@@ -60,45 +60,45 @@ class ProjectionKind(IntEnum):
 
 
 class StoredColorNumbers(NamedTuple):
-    """A stored colour's own numbers."""
+    """The numbers specific to stored colours."""
 
-    scale: Number  # times a stored number: 0 to 1
+    scale: Number  # factor that brings stored numbers to 0 to 1
     reference: Number  # world length for which opacity is given
     premultiplied: Number  # above 0: colours are stored times opacity
-    lit: Number  # above 0: it is lit
+    lit: Number  # above 0: colours are lit
 
 
 class IsosurfaceNumbers(NamedTuple):
-    """An isosurface's own numbers."""
+    """The numbers specific to isosurfaces."""
 
     level: Number  # the value at the surface
-    filled: float = 1.0  # 1: with what is not below the level; -1: with what is; 0: with nothing
-    scale: float = 0.0  # of the second channel's four numbers, the colour; 0: the table tells it
-    premultiplied: float = 0.0  # above 0: these are stored times the fourth
+    filled: float = 1.0  # the solid side. 1: values >= level; -1: values < level; 0: neither
+    scale: float = 0.0  # factor of the second channel's four numbers, a colour; 0: use the table
+    premultiplied: float = 0.0  # above 0: its colours are stored times the fourth number
 
 
 class ProjectionNumbers(NamedTuple):
-    """A projection's own number."""
+    """The number specific to projections."""
 
     kind: Number  # a ProjectionKind
 
 
 class GradientMagnitudeNumbers(NamedTuple):
-    """The own number of a shader by gradient magnitude."""
+    """The number specific to shading by gradient magnitude."""
 
-    full: Number  # the gradient's length at which opacity is whole, value per world unit
+    full: Number  # the gradient's length from which opacity is unreduced, value per world unit
 
 
 class FilteredNumbers(NamedTuple):
-    """The own number of a transfer function with filtered colours."""
+    """The number specific to filtered colours."""
 
-    side: Number  # of the root cube, its smallest, world length
+    side: Number  # smallest side of the root cube, world units
 
 
 class LabelNumbers(NamedTuple):
-    """The own number of labels."""
+    """The number specific to labels."""
 
-    lit: Number  # above 0: they are lit
+    lit: Number  # above 0: labels are lit
 
 
 _Record = TypeVar("_Record")
@@ -107,17 +107,17 @@ _WIDTHS = (3, 1, 3, 1, 1, 1, 1, 1, 4, 1, 1, 1, 1)
 
 
 class ShadeParameters(NamedTuple):
-    """The 20 numbers of `parameter_54`, in its order; the defaults are for what is not lit."""
+    """The 20 numbers of `parameter_54`, in its order; the defaults show colours unlit."""
 
-    light: Triple = (0.0, 0.0, 0.0)  # where a point light stands, or which way a sun shines, world
+    light: Triple = (0.0, 0.0, 0.0)  # world position of a point light, or direction a sun shines in
     light_kind: Number = LightKind.HEADLIGHT
     light_color: Triple = (1.0, 1.0, 1.0)  # linear RGB
     ambient: Number = 1.0  # factor of the base colour
     diffuse: Number = 0.0  # factor of base colour, light and cosine
     specular: Number = 0.0  # factor of the highlight
     shininess: Number = 1.0  # exponent of the highlight
-    light_growth: Number = 0.0  # of cones to the light, per unit of length; of a point light: width
-    own: Sequence[Number] | Tensor = ()  # the shader's own, up to four: a record above
+    light_growth: Number = 0.0  # of cones to the light, per unit length; of a point light: width
+    own: Sequence[Number] | Tensor = ()  # up to four shader-specific numbers: a record above
     normal_scale: Number = 1.0  # a stored normal is number * scale + offset
     normal_offset: Number = 0.0
     octaves: Number = 0.0  # of scattering; 0: a surface's light
@@ -130,22 +130,22 @@ class ShadeParameters(NamedTuple):
         return pack((*self[:at], *own, *self[at + 1 :]), dtype, device).reshape(5, 4)
 
     def own_as(self, record: Callable[..., _Record]) -> _Record:
-        """Returns the shader's own numbers by name, as one of the records above."""
+        """Returns the shader-specific numbers by name, as one of the records above."""
         count = len(inspect.signature(record).parameters)
         return record(*self.own[:count])
 
     @classmethod
     def read(cls, parameter_54: Tensor) -> ShadeParameters:
-        """Returns the numbers by name, each () or (k,), as views."""
+        """Returns packed numbers by name, as views of shape () or (k,)."""
         parts = parameter_54.reshape(-1)[: sum(_WIDTHS)].split(_WIDTHS)[: len(cls._fields)]
         return cls(*(part if len(part) > 1 else part[0] for part in parts))
 
 
 def pack(parts: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Joins numbers, triples and tensors to one (k,) tensor on the device. Numbers go as arguments
-    of kernels and tensors of the device stay there: it does not block, and a CUDA graph reads them
-    anew. Raises ValueError if a number is beyond what the dtype holds, RuntimeError if its
-    gradient would be lost.
+    """Joins numbers, triples and tensors to one (k,) tensor on the device. It does not block:
+    numbers are passed as kernel arguments, and tensors on the device stay there, so each replay of
+    a CUDA graph reads their current values. Raises ValueError if a number is beyond what the dtype
+    holds, RuntimeError if its gradient would be lost.
     """
     out: list[Tensor] = []
     for part in parts:

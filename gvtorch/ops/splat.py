@@ -1,5 +1,5 @@
-"""`splat`: what cubes of voxels hold of points. Its body is its twin, see `op`: points are added
-one after the other, each to all voxels, those of all cubes side by side.
+"""`splat`: adds points to cubes of voxels. The body is the op's twin, see `op`: a cube's points are
+added one after the other, each to all of its voxels, and all cubes advance in lockstep.
 
 Source: the M4 kernel of Monaghan, Lattanzio, "A refined particle method for astrophysical
     problems", 1985, along each axis, and integrated.
@@ -18,7 +18,7 @@ from .reference.exact import clamp, divide, larger
 from .registry import Backend, Doubles, Longs, op
 
 MOST_VOXELS = (1 << 20) - 1  # along a side of a cube
-SMALLEST = 2.0**-1000  # of radii that are divided by
+SMALLEST = 2.0**-1000  # smallest divisor: smaller radii count as this
 
 
 def _check_sizes(*, edge_k3e: Tensor, narrow_b: Tensor, value_nc: Tensor, **_: Any) -> None:
@@ -34,26 +34,25 @@ def _check_sizes(*, edge_k3e: Tensor, narrow_b: Tensor, value_nc: Tensor, **_: A
 def splat(
     edge_k3e: Doubles,  # rising edges of e - 1 voxels along x, y and z; world units
     low_k3: Longs,  # x, y, z of the cubes' first voxels
-    narrow_b: Longs,  # k + 1: a cube's runs of narrow points are those from its number up to the
-    # next. What is said to be where no run or row is, is left out
-    narrow_s2: Longs,  # the rows of a run are those from the first number up to the second
-    voxel_n3: Longs,  # x, y, z of the voxel; points in no voxel of the cube are left out
-    value_nc: Doubles,  # numbers that are added up
-    wide_b: Longs,  # as `narrow_b`, of wide points
+    narrow_b: Longs,  # (k + 1,) cube i has the runs from narrow_b[i] up to narrow_b[i + 1] of
+    # narrow points. Runs and rows that do not exist are left out
+    narrow_s2: Longs,  # a run's rows of the next two tables: from the first up to the second
+    voxel_n3: Longs,  # x, y, z of the point's voxel; points outside the cube are left out
+    value_nc: Doubles,  # numbers to add
+    wide_b: Longs,  # as `narrow_b`, for wide points
     wide_t2: Longs,  # as `narrow_s2`
     center_m3: Doubles,  # x, y, z, world units
-    radius_m: Doubles,  # how far a point reaches along each axis. 0: it is wholly in one voxel
-    value_mc: Doubles,  # numbers that are added up
+    radius_m: Doubles,  # of the point along each axis, world units; 0: it is wholly in one voxel
+    value_mc: Doubles,  # numbers to add
     *,
     backend: Backend = "auto",
 ) -> Tensor:
-    """Adds up what each voxel of k cubes holds of points, in the order of their lists: first those
-    that lie wholly in a voxel (narrow), then those that reach over several (wide), whose densities
-    are products of cubic splines and are integrated in closed form.
+    """Sums the values of points in each voxel of k cubes, in the order of the cubes' lists: first
+    points that lie wholly in a voxel (narrow), then those that spread over several (wide), whose
+    densities are products of cubic splines and are integrated in closed form.
 
-    Points stand in a table of either kind, and a cube's list of them is runs of its rows, as many
-    as wanted. On all backends and devices every bit is the same, if values are finite. Nothing
-    waits for the host, but in the twin.
+    Narrow and wide points have a table each; a cube's list is any number of runs of its rows. On
+    all backends and devices every bit is the same, if values are finite. Only the twin blocks.
 
     Returns:
         (k, z, y, x, c) float64.
@@ -76,12 +75,12 @@ def splat(
 
 
 def shares(edge_ke: Tensor, center_k: Tensor, radius_k: Tensor) -> Tensor:
-    """Returns what each interval between edges (k, m + 1), rising, holds of points at (k,) that
-    reach as far as (k,): (k, m), which adds up to 1 where the edges enclose the point. Where the
-    radius is 0, the point is wholly in one, in the upper one at an edge.
+    """Returns the shares (k, m) of points that fall between rising edges (k, m + 1); they add up to
+    1 where the edges enclose the point. A point of radius 0 is wholly in one interval, the upper
+    one where it lies on an edge.
 
-    A point's density is a product of cubic splines along x, y and z, and its share of a box the
-    product of these integrals. So the shares of the boxes in a box add up to that box's share.
+    A point's density is a product of cubic splines along x, y and z, so its share in a box is the
+    product of three such integrals, and shares of the parts of a box add up to that of the box.
     """
     away = edge_ke - center_k[:, None]
     most = torch.where(away > 0, 2.0, -2.0).to(away)
@@ -98,7 +97,7 @@ def shares(edge_ke: Tensor, center_k: Tensor, radius_k: Tensor) -> Tensor:
 
 
 def _in_turn(begin_b: Tensor, run_s2: Tensor, rows: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yields each cube's first row, then its second, ...: which cubes have one, and the rows."""
+    """Yields all cubes' first rows, then their second, ...: the cubes that have one, the rows."""
     runs, of_run = _expanded(torch.stack((begin_b[:-1], begin_b[1:]), 1).clamp(0, len(run_s2)))
     row, of_row = _expanded(run_s2.clamp(0, rows)[runs])
     count = torch.bincount(of_run[of_row], minlength=len(begin_b) - 1)
@@ -109,7 +108,7 @@ def _in_turn(begin_b: Tensor, run_s2: Tensor, rows: int) -> Iterator[tuple[Tenso
 
 
 def _expanded(span_k2: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns all numbers in spans, from the first up to the second, and of which span each is."""
+    """Returns all integers in half-open spans, and the index of the span that each is in."""
     begin, end = span_k2.unbind(1)
     count = (end - begin).clamp(min=0)
     each = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)

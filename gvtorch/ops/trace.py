@@ -1,11 +1,11 @@
-"""The ops on rays, checked and sent to a backend: `trace_rays`, `shade_rays`, and what shaders
-outside the kernels are made of: `trace_segments` lists the runs of samples that rays take in
-bricks, `sample_bricks` reads any channel there, and `composite` adds up what the shader makes of
-it. The last two are differentiable.
+"""The ops on rays: they check their arguments and call a backend. `trace_rays` and `shade_rays`
+shade inside the kernel. Shaders outside it use three ops: `trace_segments` lists the runs of
+samples that rays take in bricks, `sample_bricks` reads any channel there, and `composite` sums the
+shader's colours. The last two are differentiable.
 
-The ops, and the checks that they share, raise ValueError for a tensor of the wrong shape, dtype or
-device and for a number out of its range, in a line that says which op, argument and value. Checks
-return the sizes that the letters of shapes stand for.
+The ops and their shared checks raise ValueError for a tensor of the wrong shape, dtype or device
+and for a number out of its range; the message names op, argument and value. Checks return the size
+of each letter in the shapes.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def check_rays(where: str, rays: RayArguments) -> dict[str, int]:
 
 
 def check_channel(where: str, arguments: TraceArguments, device: torch.device) -> dict[str, int]:
-    """Checks what tells where the tree lies, its bricks and constants."""
+    """Checks the fields of `TraceArguments.channel`: placement, bricks and constants."""
     check.whole(where, "branching", arguments.branching, low=2, high=16)
     fields = _fields(arguments, arguments.bricks_bzyxc.dtype, "bricks_bzyxc constant_tnc")
     place = _fields(arguments, torch.float64, "place_33")
@@ -70,7 +70,7 @@ def check_voxels(where: str, arguments: TraceArguments) -> None:
 
 
 def check_real(where: str, name: str, tensor: Tensor, shape: str) -> None:
-    """Checks that a tensor is of float32 or float64; its shape, as in "(k,)", is only told."""
+    """Checks that a tensor is float32 or float64; `shape`, as "(k,)", is only for the message."""
     if tensor.dtype not in (torch.float32, torch.float64):
         got = check.describe(tensor)
         raise ValueError(f"{where}: {name} must be {shape} float32 or float64, got {got}")
@@ -79,7 +79,7 @@ def check_real(where: str, name: str, tensor: Tensor, shape: str) -> None:
 def check_trace(
     where: str, rays: RayArguments, arguments: TraceArguments, table_shape: str = "lm4"
 ) -> dict[str, int]:
-    """Checks rays and all that they go through."""
+    """Checks rays, tree, pools and transfer function."""
     table, device = arguments.table_lm4, rays.origin_r3.device
     check_real(where, "table_lm4", table, f"({', '.join(table_shape)})")
     check_voxels(where, arguments)
@@ -113,7 +113,7 @@ def check_shade(
     parameter_54: Tensor,
     own: bool,
 ) -> None:
-    """Checks all that a shader reads; `own`: it is a user's."""
+    """Checks everything that a shader reads; `own` is true for a user's shader."""
     where = "shade_rays"
     known = ("",) if own else SHADER_KINDS
     kind = known[check.whole(where, "shader", shading.shader, low=0, high=len(known) - 1)]
@@ -122,7 +122,7 @@ def check_shade(
     parameters = ("parameter_54", parameter_54, shape, arguments.table_lm4.dtype)
     check.tensors(where, device, [parameters])
     one = {"Filtered": 4, "FilteredLit": 10}.get(kind, 0)  # numbers seen along a direction
-    others, some = 0, "e" if one else "b"  # colours of the pool's first bricks
+    others, some = 0, "e" if one else "b"  # filtered colours: of coarse slots only, so fewer
     for name, bricks, constants, slots, width in (
         ("normal", shading.normal_bzyxc, shading.normal_tnc, "b", "3"),
         ("other", shading.other_bzyxc, shading.other_tnc, some, "d"),
@@ -155,7 +155,7 @@ def check_shade(
 
 
 def _refuse_gradients(where: str, *records: Any) -> None:
-    """Lets twins refuse what the ops refuse, see `registry.py`."""
+    """Makes twins refuse the gradients that the ops refuse, see `registry.py`."""
     for record in records:
         for name, value in record._asdict().items():
             check.no_gradient(where, name, value)
@@ -168,13 +168,13 @@ def trace_rays(
 
     Mutates `request_tn` (what rays missed), `stamp_t` and `stamp_b` (what rays used).
 
-    Where rays begin with a transmittance, colour is what these pieces add, and alpha that of the
-    whole rays so far.
+    Where rays begin with a transmittance, colour is only what this piece of the ray adds, and alpha
+    that of the whole ray so far.
 
     Returns:
         color (r, 3) premultiplied linear RGB, alpha (r, 1), depth (r, 1) world units or +inf, in
-        the table's dtype; samples (r,) int32, missed (r,) bool: something that the ray saw was not
-        there.
+        the table's dtype; samples (r,) int32, missed (r,) bool: a node or brick that the ray needed
+        was absent.
 
     Source: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels", I3D 2009, sections 3 and 4.
     """
@@ -198,11 +198,11 @@ def shade_rays(
 
     Args:
         rays: The rays.
-        arguments: What they go through; marks are written as by `trace_rays`.
-        shading: Which shader, and its channels.
+        arguments: Tree, pools and transfer function; mutated as by `trace_rays`.
+        shading: The shader and its channels.
         parameter_54: (5, 4) in the table's dtype, as `shading.ShadeParameters` packs them. For a
-            user's op (20 + k,): the same and its own k numbers.
-        op: Name of a user's op, see `cpp_ext.user`; None: `shading.shader` tells which.
+            user's op (20 + k,): the same, then k custom numbers.
+        op: Name of a user's op, see `cpp_ext.user`; None: the fused shader `shading.shader`.
 
     Returns:
         color, alpha, depth, samples, missed as `trace_rays`; normal (r, 3) in the world, towards
@@ -231,21 +231,22 @@ def trace_segments(
 ) -> Segments:
     """Walks rays through a tree as `trace_rays` does, and lists what they would sample.
 
-    The same nodes are visited, stamped, requested and skipped, and the same samples taken, but rays
-    do not end early, which only a shader can decide: with `limit` they are walked in parts, and
-    those that have ended need not go on. Lists have exactly the size that is needed: rays are
-    walked twice, and the host waits for the count in between.
+    It visits, stamps, requests and skips the same nodes and takes the same samples, but rays do not
+    end early, which only a shader can decide: with `limit` rays are walked in parts, and the caller
+    can drop those that have ended. Lists have exactly the needed size: rays are walked twice, and
+    the host waits for the count in between.
 
     Args:
         rays: The rays; their transmittance does not matter.
-        arguments: What they go through; of the table only the lengths of its intervals matter.
-        state_r3: `Segments.state` of the part before; None: from the start.
-        limit: A ray pauses after the visit in which it has taken this many samples; 0: never.
-        by_node: A region counts as constant only where one node answers, for shaders that read more
-            than `component`.
+        arguments: Tree, pools and transfer function, of whose table only the number of lengths
+            matters; mutated as by `trace_rays`.
+        state_r3: `Segments.state` of the previous part; None: from the start.
+        limit: A ray pauses after the visit in which it reaches this many samples; 0: never.
+        by_node: A region counts as constant only where no two nodes blend, for shaders that read
+            more than `component`.
 
     Raises:
-        ValueError: See `trace_rays`; or there are more segments than the device has memory for.
+        ValueError: An argument is invalid, or the segments do not fit into the device's memory.
     """
     where, device = "trace_segments", rays.origin_r3.device
     sizes = check_trace(where, rays, arguments)
@@ -270,7 +271,7 @@ def list_samples(segments: Segments) -> Samples:
     """Lists the samples of segments. The host waits for their number.
 
     Raises:
-        ValueError: They are more than int32 can count, or the device has memory for.
+        ValueError: There are more than int32 can count, or than the device has memory for.
     """
     count, device = segments.interval[:, 1].to(torch.int64), segments.interval.device
     offset = torch.zeros(len(segments.counts) + 1, dtype=torch.int64, device=device)
@@ -293,22 +294,22 @@ def sample_bricks(
     *,
     backend: Backend = "auto",
 ) -> Tensor:
-    """Reads all numbers of a channel at samples, to the bit as `trace_rays` reads one of them:
-    trilinear, two levels blended. Differentiable by bricks and constants that are floats.
+    """Reads all numbers of a channel at samples: trilinear, two levels blended, in the same bits as
+    `trace_rays` reads one of them. Differentiable by bricks and constants that are floats.
 
     Args:
         rays: The rays that were walked.
-        arguments: What they went through, with the bricks and constants of any channel.
-        segments: What `trace_segments` gave.
-        samples: What `list_samples` gave, or any of them. A sample of no segment, or of one that
-            names what is not there, is 0.
+        arguments: The arguments of the walk, with the bricks and constants of any channel.
+        segments: Result of `trace_segments`.
+        samples: Result of `list_samples`, or some of its samples. A sample whose segment does not
+            exist, or whose segment names a ray, node or slot that does not, is 0.
 
     Returns:
         (k, c) in the segments' dtype.
     """
     where, device = "sample_bricks", rays.origin_r3.device
     chosen = choose_backend(backend, device)
-    if chosen != "reference":  # which also reads float64
+    if chosen != "reference":  # the reference also reads float64
         check_voxels(where, arguments)
     check_rays(where, rays)
     check_channel(where, arguments, device)
@@ -332,19 +333,19 @@ def composite(
     stop_alpha: float = 1.0,
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Adds samples up along rays, front to back: a sample's share is its alpha times what those
-    before it let through. Differentiable by alpha, features and `clear_r`; an alpha of 1 too.
+    """Composites samples along rays, front to back: a sample's weight is its alpha times the
+    transmittance before it. Differentiable by alpha, features and `clear_r`, also at an alpha of 1.
 
     Args:
         alpha_k: (k,) float32 or float64 in [0, 1].
         feature_kc: (k, c) same dtype: colour, or any numbers; not premultiplied.
         offset_r: (r + 1,) int64 `Samples.offset`, rising from 0 to k.
-        clear_r: (r,) what is left of the light before a ray's first sample; None: all of it.
+        clear_r: (r,) transmittance before a ray's first sample; None: 1.
         stop_alpha: A ray ends at this alpha.
 
     Returns:
-        Sums (r, c), light that is left (r,), and the light that reached each sample (k,), 0 behind
-        the end of a ray; the last one has no gradient.
+        Sums (r, c), transmittance that is left (r,), and the transmittance before each sample (k,),
+        0 behind the end of a ray; the third has no gradient.
     """
     where = "composite"
     alpha_k = check.instance(where, "alpha_k", alpha_k, Tensor)
@@ -369,7 +370,7 @@ def composite(
 
 
 def op_of(name: str | None) -> Any:
-    """Returns the op of a user's shader; None: that of the fused shaders."""
+    """Returns the op of a user's shader, or for None that of the fused shaders."""
     if name is None:
         return torch.ops.gvtorch.shade_rays
     return getattr(torch.ops.gvtorch_user, name)

@@ -1,4 +1,4 @@
-"""`voxelize`: what cubes of voxels hold of a mesh."""
+"""`voxelize`: samples a mesh into cubes of voxels."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ ARITY = 8  # boxes in a box
 
 
 class Voxelized(NamedTuple):
-    """What k cubes of side^3 voxels hold of a mesh; in float32, or float64 where `wide`."""
+    """A mesh in k cubes of side^3 voxels; floats are float32, or float64 where `wide`."""
 
-    distance: Tensor  # (k, z, y, x) to the nearest place of the mesh, voxels; inf beyond the reach
-    nearest: Tensor  # (k, z, y, x) int32 triangle of it, the first of equally near; -1 beyond
+    distance: Tensor  # (k, z, y, x) to the nearest point of the mesh, voxels; inf beyond the reach
+    nearest: Tensor  # (k, z, y, x) int32 its triangle, the first of equally near; -1 beyond
     winding: Tensor  # (k, z, y, x) int32 winding number of the voxel's centre, not 0 inside solids
-    coverage: Tensor  # (k, z, y, x) filled share, 0 to 1; of no cubes unless wanted
-    weight: Tensor  # (k, z, y, x, 3) of the triangle's corners there; of no cubes unless wanted
+    coverage: Tensor  # (k, z, y, x) filled share, 0 to 1; k is 0 unless `shares`
+    weight: Tensor  # (k, z, y, x, 3) of the triangle's corners there; k is 0 unless `weights`
 
 
 def voxelize(
@@ -41,31 +41,31 @@ def voxelize(
     backend: Backend = "auto",
 ) -> Voxelized:
     """Finds for each voxel of k cubes the nearest triangle of a mesh, how often the mesh winds
-    around it, and what share of the voxel is filled. Nothing waits for the host, and no shape
-    depends on values.
+    around it, and what share of the voxel is filled. It does not block, and no shape depends on
+    values.
 
-    Of a solid, the share is the volume of its triangles in the voxel: exact, to rounding, at edges
-    and corners and of any number of triangles; where solids overlap, their shares add up to 1 at
-    most. A sheet is taken as a plane through each voxel, whose share is exact where it is one. On
-    the CPU, C++ and the twin agree in every bit of float32. In float32 a triangle that comes near a
-    cube should reach no farther than some thousand voxels away from it.
+    The share of a solid is the volume that its triangles enclose in the voxel: exact, to rounding,
+    at edges and corners too and for any number of triangles; where solids overlap, their shares add
+    up to 1 at most. A sheet is approximated by one plane in each voxel, and exact where it is flat.
+    On the CPU, C++ and the twin agree in every bit of float32. In float32 a triangle that comes
+    near a cube should reach no farther than some thousand voxels away from it.
 
     Args:
         corner_f33: (f, 3, 3) float64 corners of at least one triangle, x y z, world units.
-        solid_f: (f,) bool, whether the triangle bounds a solid; else it is a sheet. Those of
-            solids close each other's edges: then winding numbers are whole.
+        solid_f: (f,) bool, whether the triangle bounds a solid; else it is part of a sheet. The
+            triangles of solids should form closed surfaces, so that winding numbers are exact.
         box_n6: (n, 6) float64 low and high corners of boxes: one around each triangle, then one
             around each 8 of those (the last may hold fewer), and so on until at most 8 are left.
         low_k3: (k, 3) float64 low corners of the first voxels of the cubes, world units.
-        size_k3: (k, 3) float64 world sizes: the side of a voxel, the distance from one to the next
-            along each axis, and how far away triangles are looked for (below 0: none are). Where
-            the side is not above 0, the cube is left out: nothing is in it.
+        size_k3: (k, 3) float64 world sizes: the side of a voxel, the distance from one voxel to the
+            next along each axis, and the reach, within which triangles are looked for (below 0:
+            none are). A cube whose voxel side is not above 0 stays empty.
         side: Voxels along a side of a cube, at most 32.
-        thickness: Of sheets, world units.
-        detail: World size of a usual triangle: tells how to search, and changes no result.
-        shares: Whether shares are wanted.
-        weights: Whether weights are wanted.
-        wide: Whether it is worked out in float64.
+        thickness: Thickness of sheets, world units.
+        detail: Typical world size of a triangle: a hint for the search that changes no result.
+        shares: Whether to compute `coverage`.
+        weights: Whether to compute `weight`.
+        wide: Whether to compute in float64.
         backend: auto, reference, cpp or cuda.
 
     Raises:
@@ -98,7 +98,7 @@ def voxelize(
 
 
 def boxes_of(triangles: int) -> int:
-    """Returns how many boxes there are in the hierarchy of so many triangles."""
+    """Returns the number of boxes in the hierarchy over `triangles` triangles."""
     floor = total = triangles
     while floor > ARITY:
         floor = -(-floor // ARITY)

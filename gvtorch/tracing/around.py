@@ -1,4 +1,4 @@
-"""From a tree's tracer to what the options make of it: depth of field, clip, lighting."""
+"""Wraps a tree's tracer in the effects of the options: depth of field, clip, lighting."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from .tracer import Tracer
 
 
 def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRays:
-    """Wraps a tree's tracer in what the options ask for. Each ray goes through lighting, then the
-    clip, then the lens, then the tree; cones to the lights go through clip and tree alone. `box`:
+    """Wraps a tree's tracer in the effects of the options. Each ray passes through lighting, then
+    the clip, then the lens, then the tree; cones to the lights only through clip and tree. `box`:
     (2, 3) world corners of the scene, all trees together. Raises ValueError if the shader must see
-    a ray in one go, and the options cut rays into pieces or draw caps; or it has no normals, and
-    there is lighting.
+    a whole ray at once, and the options cut rays into pieces or draw caps; or if it has no normals,
+    and there is lighting.
     """
     check_fits(tracer.shader, options)
     lens = options.lens and options.lens.placed(box)
@@ -57,7 +57,7 @@ def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRays:
 
 
 def check_fits(shader: Shader, options: RenderOptions) -> None:
-    """Raises ValueError if a shader does not take what the options ask for: see `around`."""
+    """Raises ValueError if a shader does not support the options: see `around`."""
     if options.lighting is not None:
         shader.unlit()
         if options.lighting.indirect:
@@ -78,7 +78,7 @@ def check_fits(shader: Shader, options: RenderOptions) -> None:
 def _clipped(
     tracer: Tracer, options: RenderOptions, box: Tensor, lens: ThinLens | None = None
 ) -> TraceRays:
-    """A tracer with the lens (in world units) and the options' clip."""
+    """Wraps a tracer in the lens (in world units) and the options' clip."""
     opened = tracer.shader if options.clip is None else tracer.shader.opened()
     if opened is not tracer.shader:
         tracer = tracer.seeing(opened, options)
@@ -106,12 +106,12 @@ def _clipped(
 def _slab(
     surface: CutSurface | None, tracer: Tracer, options: RenderOptions, trace: TraceRays
 ) -> TraceRays | None:
-    """What traces the intervals behind cuts; None: what traces all else."""
+    """Returns the tracer of the intervals behind cuts; None: the one that traces everything."""
     if surface is not None:
         return _surface_slab(surface, tracer, options)
     if tracer.names is None:
         return None
-    # A cap hits whatever is seen behind it, be it as thin as it likes.
+    # A cap shows the label right behind the cut, however thin the matter is there.
     first = tracer.seeing(tracer.shader, replace(options, depth_alpha=0.0))
 
     def slab(rays: Rays) -> Hits:
@@ -121,8 +121,8 @@ def _slab(
 
 
 def _surface_slab(surface: CutSurface, tracer: Tracer, options: RenderOptions) -> TraceRays:
-    """What traces the intervals behind cuts through isosurfaces: opaque where the first value lies
-    inside the surface, in its own colour, unlit. The isosurface itself is hollow under a clip.
+    """Returns the tracer of the intervals behind cuts through isosurfaces: opaque where the first
+    value is inside the surface, in its unlit colour. Under a clip the isosurface itself is hollow.
     """
     trace_value = tracer.seeing(surface.value, options)
     trace_colors = surface.colors and tracer.seeing(surface.colors, options)
@@ -147,8 +147,8 @@ def _surface_slab(surface: CutSurface, tracer: Tracer, options: RenderOptions) -
 
 
 def _project_pieces(tracer: Tracer, pieces: Iterable[Rays]) -> Hits:
-    """Projects pieces of the same rays: the largest or smallest value of all, at its nearest place,
-    or the mean of their means, weighted by their lengths inside the tree's box.
+    """Projects pieces of the same rays: to the largest or smallest value of all, at the nearest
+    point that has it, or to the mean, weighted by the pieces' lengths inside the tree's box.
     """
     rays, which = list(pieces), tracer.shader.projection
     hits = [tracer(piece) for piece in rays]
@@ -179,7 +179,7 @@ def _project_pieces(tracer: Tracer, pieces: Iterable[Rays]) -> Hits:
 
 
 def _length_inside(tracer: Tracer, rays: Rays) -> Tensor:
-    """(r,) world length of each ray inside the tree's box."""
+    """Returns (r,) the world length of each ray inside the tree's box."""
     own = tracer.inside(rays)
     enter, leave = tree_span(tracer.tree.place, own.origin, own.direction)
     first, last = rays.range.unbind(1)
@@ -187,8 +187,8 @@ def _length_inside(tracer: Tracer, rays: Rays) -> Tensor:
 
 
 def _table_color(tracer: Tracer, value: Tensor) -> Tensor:
-    """(r, 3) the transfer function's colours of values (r, 1), interpolated in its table."""
-    table = tracer.arguments.table_lm4[0, :, :3]  # (m, 3), at even distances
+    """Returns (r, 3) the transfer function's colours of values (r, 1), read from its table."""
+    table = tracer.arguments.table_lm4[0, :, :3]  # (m, 3), evenly spaced
     low, high = tracer.arguments.domain_2.unbind(0)
     last = len(table) - 1
     place = ((value - low) / (high - low) * last).clamp(0, last)

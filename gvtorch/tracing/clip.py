@@ -1,5 +1,5 @@
-"""`Clip`: the region of interest, from planes and boxes. Rays are cut in float64 into pieces that
-are kept, so it works with every shader, and clipped space is neither sampled nor requested.
+"""`Clip`: the region of interest, from planes and boxes. Rays are cut in float64 into the pieces to
+keep, so it works with every shader, and clipped space is neither sampled nor requested.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Clip:
     boxes: Sequence[Numbers] = ()  # to keep
     without: Sequence[Numbers] = ()  # to remove
     frame: Frame | str = Frame.WORLD  # world units, or the scene's box: centre 0, largest side 1
-    caps: bool = False  # draws a flat surface where a cut goes through matter
-    cap_opacity: float = 1.0  # of that surface
-    cap_light: float = 0.5  # share of its light that comes from the eye; without `Lighting` only
+    caps: bool = False  # draws a flat surface where a cut passes through matter
+    cap_opacity: float = 1.0  # of caps
+    cap_light: float = 0.5  # share of caps' light that comes from the eye; without `Lighting` only
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame", Frame.of("Clip", self.frame))
@@ -66,7 +66,7 @@ class Clip:
         planes = [_face(f"planes[{i}]", plane) for i, plane in enumerate(self.planes)]
         boxes = [_box(f"boxes[{i}]", box) for i, box in enumerate(self.boxes)]
         without = [_box(f"without[{i}]", box) for i, box in enumerate(self.without)]
-        if len(boxes) == 1:  # then its faces act as planes
+        if len(boxes) == 1:  # the faces of a single box act as planes
             return Faces(planes + boxes[0], [], without)
         return Faces(planes, boxes, without)
 
@@ -84,7 +84,7 @@ class Clip:
 
 
 class Faces(NamedTuple):
-    """The convex sets of a clip, by their faces, whose normals point inwards."""
+    """The convex sets of a clip, as lists of faces whose normals point inwards."""
 
     planes: list[Face]
     boxes: list[list[Face]]
@@ -92,15 +92,15 @@ class Faces(NamedTuple):
 
 
 class _Met(NamedTuple):
-    """A face, and rays. float64; numbers of faces stay on the host, so nothing waits for it."""
+    """A face and rays, in float64. The face's numbers stay on the host, so nothing blocks."""
 
     normal: Sequence[float]
-    height: Tensor  # (r,) how far each ray's origin lies inside of it
-    rate: Tensor  # (r,) by how much that grows per unit distance
+    height: Tensor  # (r,) signed distance of each ray's origin from the face, > 0 inside
+    rate: Tensor  # (r,) growth of the height per unit distance along the ray
 
 
 class _MetFaces(NamedTuple):
-    """`Faces`, and where rays meet them: worked out once for all pieces and caps."""
+    """`Faces`, and where rays meet them: computed once for all pieces and caps."""
 
     planes: list[_Met]
     boxes: list[list[_Met]]
@@ -108,7 +108,7 @@ class _MetFaces(NamedTuple):
 
     @staticmethod
     def of(faces: Faces, rays: Rays) -> _MetFaces:
-        """Where rays meet the faces."""
+        """Computes where rays meet the faces."""
         origin, direction = (
             one.to(torch.float64).mT.contiguous() for one in (rays.origin, rays.direction)
         )
@@ -119,7 +119,7 @@ class _MetFaces(NamedTuple):
         return _MetFaces(meet(faces.planes), [*map(meet, faces.boxes)], [*map(meet, faces.without)])
 
     def of_some(self, which: Tensor) -> _MetFaces:
-        """The same for some of the rays."""
+        """Returns the same for some of the rays."""
 
         def some(met: list[_Met]) -> list[_Met]:
             return [_Met(one.normal, one.height[which], one.rate[which]) for one in met]
@@ -127,8 +127,8 @@ class _MetFaces(NamedTuple):
         return _MetFaces(some(self.planes), [*map(some, self.boxes)], [*map(some, self.without)])
 
     def pieces(self, limits: Tensor) -> list[Tensor]:
-        """Returns the kept (r, 2) parts of the (r, 2) limits, nearest first, as many as a ray can
-        have; one that a ray does not need ends where it begins.
+        """Returns the kept pieces (r, 2) of the limits (r, 2), nearest first. There are as many as
+        a ray can have; a piece that a ray does not have ends where it begins.
         """
         first, last = _convex_span(self.planes, *limits.unbind(1))
         last = torch.maximum(first, last)
@@ -139,7 +139,7 @@ class _MetFaces(NamedTuple):
         all_ends = [end.clamp(first, last) for span in boxes + without for end in span]
         ends = torch.stack([first, last, *all_ends], 1).sort(1).values
         low, high = ends[:, :-1], ends[:, 1:]
-        middle = (low + high) / 2  # stands for all places between two neighbouring ends
+        middle = (low + high) / 2  # all points between two neighbouring ends are kept, or none
         kept = torch.full_like(middle, not boxes, dtype=torch.bool)
         for a, b in boxes:
             kept = kept | ((a[:, None] <= middle) & (middle <= b[:, None]))
@@ -159,8 +159,8 @@ class _MetFaces(NamedTuple):
 
     def facing(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (r,) cosines between each ray and the normal of the face that it crosses at
-        distances t (r,), and (r, 3) that normal, towards the eye. Of the faces through which the
-        ray enters the kept region, it is the nearest to that place.
+        distances t (r,), and (r, 3) that normal, towards the eye. The face is the nearest to that
+        point of those through which the ray enters the kept region.
         """
         nearest, cosine = torch.full_like(t, torch.inf), torch.ones_like(t)
         normal = [torch.zeros_like(t)] * 3
@@ -184,7 +184,7 @@ class Clipped:
     trace: TraceRays  # traces a piece
     clip: Clip
     box: Tensor  # (2, 3) world corners of the scene
-    step: float  # world length of the shortest interval: one behind a cut gives its cap the colour
+    step: float  # world length of the shortest interval: a cap is coloured by one behind the cut
     depth_alpha: float  # depth is where alpha passes this
     slab: TraceRays | None = None  # traces the intervals that give caps their colour; None: `trace`
     unlit: bool = False  # caps are not lit here, because `Lighting` lights them later
@@ -206,12 +206,12 @@ class Clipped:
         return trace_pieces(self.trace, pieces, cap=cap)
 
     def meet(self, rays: Rays) -> _MetFaces:
-        """Where rays in world units meet the faces."""
+        """Computes where rays in world units meet the faces."""
         return _MetFaces.of(self._faces, rays)
 
     def _cap(self, met: _MetFaces, begin: Tensor, piece: Rays) -> Hits:
-        """The caps of pieces that begin at a cut, not at `begin` (r,). One interval behind the cut
-        gives the colour, the features, and whether there is matter at all.
+        """Returns the caps of pieces that begin at a cut, not at `begin` (r,). One interval behind
+        the cut gives the colour, the features, and whether there is matter at all.
         """
         first, last = piece.range.unbind(1)
         end = torch.where(first > begin, torch.minimum(first + self.step, last), first)
@@ -221,7 +221,7 @@ class Clipped:
             return scatter_hits(piece, which, caps)
         slab = (self.slab or self.trace)(replace(piece, range=torch.stack((first, end), 1)))
         before = piece.light()[:, 0].to(slab.color)  # transmittance before the cap
-        taken = before - (1 - slab.alpha[:, 0])  # by the slab, of the light
+        taken = before - (1 - slab.alpha[:, 0])  # light absorbed by the slab
         alpha = torch.where(taken > _SEEN * before, self.clip.cap_opacity, 0.0).to(before)
         facing, normal = met.facing(first)
         light = 1 - (0.0 if self.unlit else self.clip.cap_light) * (1 - facing)
@@ -252,7 +252,7 @@ def _face(name: str, numbers: Any) -> Face:
 
 
 def _box(name: str, numbers: Any) -> list[Face]:
-    """The six faces of a box."""
+    """Returns the six faces of a box."""
     if not hasattr(numbers, "__len__"):
         raise ValueError(f"Clip: {name} must be two corners or a (4, 4) matrix, got {numbers!r}")
     if len(numbers) == 2:
@@ -281,8 +281,8 @@ def _box(name: str, numbers: Any) -> list[Face]:
 
 
 def _convex_span(faces: Sequence[_Met], first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-    """(r,) distances between which rays lie inside all faces, cut out of [first, last];
-    last < first where they pass by.
+    """Returns (r,) first and last distance, within [first, last], at which rays are inside all
+    faces; last < first where they miss.
     """
     for _, height, rate in faces:
         t = -height / rate
@@ -293,6 +293,6 @@ def _convex_span(faces: Sequence[_Met], first: Tensor, last: Tensor) -> tuple[Te
 
 
 def _dot(normal: Sequence[float], vector: Sequence[Any]) -> Any:
-    """The dot product with a vector of three numbers or three (r,) columns."""
+    """Returns the dot product with a vector of three numbers or three (r,) columns."""
     x, y, z = vector
     return normal[0] * x + normal[1] * y + normal[2] * z

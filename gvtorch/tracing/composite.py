@@ -1,5 +1,5 @@
-"""Hits put over hits: of the pieces of a ray, of what another renderer drew; and where rays enter
-and leave boxes.
+"""Compositing of hits, of a ray's pieces or of another renderer's picture; and where rays enter and
+leave boxes.
 
 Source: Porter, Duff, "Compositing digital images", 1984 (over, premultiplied).
 """
@@ -16,13 +16,13 @@ from torch.nn.functional import normalize
 
 from ..base.records import Hits, Rays
 
-TraceRays = Callable[[Rays], Hits]  # with whatever the options put around
+TraceRays = Callable[[Rays], Hits]  # a tracer, possibly wrapped by the options' effects
 
 
 def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
-    """Composites `front` over `back`, hits of the same rays; a normal is the mean of both, weighted
-    by the light each takes. If `dimmed`, `back` was traced with `behind(rays, front)` and its alpha
-    includes that of `front`; else with rays of full light.
+    """Composites `front` over `back`, hits of the same rays; normals are the mean of both, weighted
+    by the light each absorbs. If `dimmed`, `back` was traced with `behind(rays, front)` and its
+    alpha includes that of `front`; else with rays of full light.
     """
     color, alpha, features = back.color, back.alpha, back.features
     taken = None if back.normal is None else back.normal * (alpha - front.alpha)
@@ -49,7 +49,7 @@ def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
 
 
 def _nearer_label(front: Hits, back: Hits) -> Tensor | None:
-    """(r, 1) the label of whichever is hit first; None where neither has any."""
+    """Returns (r, 1) the label of whichever is hit first; None if neither has labels."""
     given = front.label if front.label is not None else back.label
     if given is None:
         return None
@@ -59,19 +59,19 @@ def _nearer_label(front: Hits, back: Hits) -> Tensor | None:
 
 
 def nothing_like(field: Tensor, rays: int) -> Tensor:
-    """The field (r, ...) of rays that met nothing that gives it: zeros, of labels -1."""
+    """Returns the field (r, ...) of rays that hit nothing: zeros, or -1 for labels."""
     shape = (rays, *field.shape[1:])
     return field.new_full(shape, -1 if field.dtype == torch.int64 else 0)
 
 
 def behind(rays: Rays, front: Hits) -> Rays:
-    """The rays with the light that `front` lets through."""
+    """Returns the rays with the transmittance that `front` leaves."""
     return replace(rays, transmittance=1 - front.alpha[:, 0].to(torch.float64))
 
 
 def if_few(some: Tensor) -> Tensor | None:
-    """Returns which of `some` (r,) bool are true, on the CPU and if they are less than half; else
-    None: more are as quickly done with the others, and on the GPU the host would wait.
+    """Returns the indices where `some` (r,) is true if they are less than half, on the CPU; else
+    None: tracing more of them alone saves no time, and on the GPU the host would wait.
     """
     if some.device.type != "cpu":
         return None
@@ -81,7 +81,7 @@ def if_few(some: Tensor) -> Tensor | None:
 
 def scatter_hits(rays: Rays, which: Tensor, hits: Hits) -> Hits:
     """Returns the hits of all rays (r), given those of the rays `which` (k,): the others have empty
-    ranges, so they hit nothing and keep the light that they had.
+    ranges, so they hit nothing and keep their transmittance.
     """
     columns: dict[str, Any] = {}
     for name, found in vars(hits).items():
@@ -96,9 +96,9 @@ def scatter_hits(rays: Rays, which: Tensor, hits: Hits) -> Hits:
 
 
 def trace_pieces(trace: TraceRays, pieces: Iterable[Rays], *, cap: TraceRays | None = None) -> Hits:
-    """Traces pieces of the same rays, nearest first, as if each ray were traced in one go: one that
-    has ended takes no more samples, and its depth is found in whichever piece it lies. `cap` traces
-    what lies in front of each piece.
+    """Traces pieces of the same rays, nearest first, with the result of tracing each ray at once: a
+    ray that has ended takes no more samples, and its depth is found in the piece that contains it.
+    `cap` traces the cap in front of each piece.
     """
 
     def trace_open(rays: Rays) -> Hits:
@@ -114,15 +114,15 @@ def trace_pieces(trace: TraceRays, pieces: Iterable[Rays], *, cap: TraceRays | N
 
 
 def box_span(low: Tensor, high: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """(r,) first and last distance of lines (r, 3) in a box; last < first where they pass by."""
+    """Returns (r,) first and last distances of lines (r, 3) in a box; last < first if outside."""
     a, b = (low - origin) / direction, (high - origin) / direction
-    # 0 / 0: the line lies in a face, and no other place on it lies farther out.
+    # 0 / 0: the line lies in a face, so this axis does not bound it.
     first = torch.minimum(a, b).nan_to_num(-torch.inf, torch.inf, -torch.inf)
     last = torch.maximum(a, b).nan_to_num(torch.inf, torch.inf, -torch.inf)
     return first.amax(1), last.amin(1)
 
 
 def tree_span(place_33: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns `box_span` of the box of a tree, given `N3Tree.place`."""
+    """Returns `box_span` of a tree's box, given `N3Tree.place`."""
     low, size, high = place_33
     return box_span(low, low + size * high, origin, direction)

@@ -1,5 +1,5 @@
-"""`cost`: what each ray of a picture cost, and what it saw, as images (Crassin, PhD thesis 2011,
-chapter 6, shows the cost per ray in this way).
+"""`cost`: images of what each ray of a picture cost and sampled (after Crassin, PhD thesis
+2011, chapter 6).
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class Cost:
     """Images of one camera (h, w, 1) or of a batch (n, h, w, 1).
 
     `lod`, `age` and `fill` are means along a ray, weighted by what each sample adds to alpha; NaN
-    where nothing was seen, and for `age` and `fill` where no brick was.
+    where nothing was seen, and for `age` and `fill` also where no brick was.
     """
 
-    samples: Tensor  # int32 places at which the shader was evaluated
+    samples: Tensor  # int32 number of evaluations of the shader
     nodes: Tensor  # int32 nodes visited, including those that were skipped
     lod: Tensor  # depth of the nodes whose bricks were sampled, 0 for the root
     age: Tensor  # frames since the bricks were written
@@ -63,7 +63,7 @@ class Cost:
         Args:
             name: samples, nodes, lod, age or fill.
             low: Value of the colour map's first colour.
-            high: Value of its last one; the largest in the image if left out.
+            high: Value of its last colour; the largest in the image if left out.
             colormap: A name of `kornia.color.ColorMapType`.
 
         Raises:
@@ -105,7 +105,7 @@ def cost(
 ) -> Cost:
     """Counts what the rays of a picture do; writes neither stamps nor requests.
 
-    Of an engine's tree (`engine.trees[NAME].tree`) it shows the last frame. Rays are walked node
+    For an engine's tree (`engine.trees[NAME].tree`) it shows the last frame. Rays are walked node
     by node outside the kernel, which takes many times as long as the picture itself. There is no
     lighting, since transfer functions have no normals.
 
@@ -113,7 +113,7 @@ def cost(
         tree: The tree.
         camera: See `render`.
         shader: The transfer function.
-        progress: Told how many rays are done.
+        progress: Receives the number of finished rows.
         **options: Fields of `RenderOptions`.
 
     Raises:
@@ -143,7 +143,7 @@ def cost(
 
 
 def _means(hits: Hits) -> tuple[Tensor, ...]:
-    """(r,) lod, age and fill, out of a counter's sums."""
+    """Returns (r,) lod, age and fill from a counter's sums."""
     assert hits.features is not None
     seen, lod, bricks, age, fill = hits.features.unbind(1)
     return tuple(
@@ -153,7 +153,7 @@ def _means(hits: Hits) -> tuple[Tensor, ...]:
 
 
 class _Counter(Tracer):
-    """Counts along rays of one tree: sums as features, and the nodes that it visits."""
+    """Counts along rays of one tree: returns sums as features, and counts visited nodes."""
 
     def __init__(self, tree: N3Tree, shader: TransferFunction, options: RenderOptions) -> None:
         super().__init__(tree, shader, options)
@@ -166,21 +166,21 @@ class _Counter(Tracer):
         self._nodes: Tensor | None = None
 
     def begin(self, rays: Rays) -> Rays:
-        """Returns the rays of a block with their numbers, since some may be traced alone."""
+        """Begins a block, and returns its rays numbered, since some may be traced separately."""
         count, device = len(rays.origin), rays.origin.device
         if self._nodes is None:
             self._nodes = torch.zeros(count, dtype=torch.int32, device=device)
         return replace(rays, sample=torch.arange(count, device=device))
 
     def take_nodes(self) -> Tensor:
-        """Returns (r,) int32 nodes that the rays of a block visited."""
+        """Ends a block, and returns (r,) int32 nodes that its rays visited."""
         nodes, self._nodes = self._nodes, None
         assert nodes is not None
         return nodes
 
     def __call__(self, rays: Rays) -> Hits:
-        """Returns as features, for each ray, sums over its samples weighted by what they add to
-        alpha: of 1, the node's depth, whether it has a brick, the brick's age and its fill.
+        """Traces rays. Features are sums over a ray's samples, weighted by what they add to alpha,
+        of 1, the node's depth, whether it has a brick, and the brick's age and fill.
         """
         sums, hits, nodes = march(self, self.inside(rays), self.shade, 5, limit=1, by_node=False)
         assert self._nodes is not None
@@ -189,11 +189,11 @@ class _Counter(Tracer):
         return replace(hits, features=sums)
 
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """(k, 5) of samples: 1, the node's depth, whether it has a brick, the brick's age and fill;
-        and (k,) alpha.
+        """Returns (k, 5) of samples: 1, the node's depth, whether it has a brick, the brick's age
+        and fill; and (k,) alpha.
         """
         values = batch.values()[:, self.component, None]
-        _, alpha = self.module(values, values, values, batch.lengths)  # it reads no places
+        _, alpha = self.module(values, values, values, batch.lengths)  # it reads no positions
         slot = batch.segments.brick[batch.segment, 0].to(torch.int64)
         has, known = slot >= 0, slot.clamp(min=0)
         if not self.tree.bricks.capacity:
@@ -206,7 +206,7 @@ class _Counter(Tracer):
         return torch.stack([c.to(alpha.dtype) for c in columns], 1), alpha[:, 0]
 
     def _fill(self, slots: Tensor) -> None:
-        """Computes how full bricks are, each brick once."""
+        """Computes the fill of bricks, once for each brick."""
         wanted = torch.zeros_like(self.fill_b, dtype=torch.bool)
         wanted[slots] = True
         fresh = (wanted & (self.fill_b < 0)).nonzero()[:, 0]

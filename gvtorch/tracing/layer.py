@@ -1,7 +1,7 @@
 """`Layer`: the colour and depth of another renderer, composited with voxels along each ray.
 
 Voxels in front of the layer are composited over it. Where it is opaque, rays end at it: nothing
-behind is sampled or requested. Where it is translucent, a second trace goes on behind it.
+behind is sampled or requested. Where it is translucent, a second trace continues behind it.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from .composite import TraceRays, over
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """What another renderer drew for the same pixels, on any device.
+    """Another renderer's picture of the same pixels, on any device.
 
-    The tensors are kept, not copied, and read anew in every frame: write into them to change the
-    layer. They are checked once, here; on CUDA that waits for the device. A depth that becomes NaN
-    later counts as +inf.
+    The tensors are kept, not copied, and read in every frame: write into them to change the layer.
+    They are checked once, here; on CUDA that waits for the device. A depth that becomes NaN later
+    counts as +inf.
 
     Attributes:
         color: (h, w, 3) or, for a batch of cameras, (n, h, w, 3); linear RGB, premultiplied by
@@ -62,12 +62,12 @@ class Layer:
         return f"Layer({kind}, color={check.describe(self.color)})"
 
     def _parts(self) -> list[tuple[str, Tensor]]:
-        """The tensors that there are, by name."""
+        """Returns the tensors that are not None, by name."""
         return [(name, part) for name, part in vars(self).items() if part is not None]
 
     def cut(self, where: str, camera: Camera) -> Layer:
-        """Returns the part of the layer that a camera sees: where the camera is a strip of rows,
-        views of these rows.
+        """Returns the part of the layer that a camera sees: if the camera is a strip of rows, views
+        of these rows.
 
         Raises:
             ValueError: The layer's size is not that of the camera's whole pictures.
@@ -87,7 +87,7 @@ class Layer:
         return strip
 
     def check_device(self, device: torch.device) -> None:
-        """Raises ValueError unless all tensors lie on the device."""
+        """Raises ValueError unless all tensors are on the device."""
         for _, part in self._parts():
             if part.device != device:
                 raise ValueError(
@@ -110,9 +110,9 @@ class Layer:
 
 
 def _flat(image: Tensor, device: torch.device) -> Tensor:
-    """(p, c) of (..., h, w, c): a view, where it lies on the device."""
+    """Returns (p, c) of (..., h, w, c), a view if it is on the device already."""
     flat = image.reshape(-1, image.shape[-1])
-    return flat.to(device, non_blocking=device.type == "cuda")  # the CPU would not wait for it
+    return flat.to(device, non_blocking=device.type == "cuda")  # to the CPU it must block
 
 
 @dataclass(frozen=True)
@@ -124,15 +124,15 @@ class LayerPixels:
     alpha: Tensor | None  # (r, 1)
 
     def __getitem__(self, which: slice | Tensor) -> LayerPixels:
-        """Some of the pixels."""
+        """Returns some of the pixels."""
         alpha = None if self.alpha is None else self.alpha[which]
         return LayerPixels(self.color[which], self.distance[which], alpha)
 
     def trace(self, trace_rays: TraceRays, rays: Rays, stop_alpha: float) -> Hits:
         """Traces the rays of these pixels and composites voxels and layer. Depth, normal and
-        features are those of the voxels alone, the normal by the light that the voxels in front of
-        the layer and behind it take. A ray that has reached `stop_alpha` with the layer goes no
-        further.
+        features are those of the voxels alone; the normal is the mean in front of the layer and
+        behind it, weighted by absorbed light. A ray that has reached `stop_alpha` with the layer
+        ends there.
         """
         near, far = rays.range.split(1, dim=1)
         stop = self.distance.to(rays.range.dtype)
@@ -157,6 +157,6 @@ class LayerPixels:
         total = over(mixed, back)
         if front.normal is None or back.normal is None:
             return total
-        taken = (1 - mixed.alpha) * back.alpha  # of the light; the layer has no part in the normal
+        taken = (1 - mixed.alpha) * back.alpha  # light absorbed by the voxels behind the layer
         normal = normalize(front.normal * front.alpha + back.normal * taken, dim=1)
         return replace(total, normal=torch.where(taken > 0, normal, front.normal))

@@ -52,7 +52,7 @@ _FINER = 0.5  # width of the shadow cones of bounced light, relative to the cone
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lighting:
     """The light of a scene, for a shader with normals: `Lit`, `StoredColor`, `Isosurface` or
-    `DistanceField`, whose material it uses.
+    `DistanceField`. It uses the shader's material.
 
     Colour of a pixel = base * (material.ambient * ambient * (1 - occlusion)
     + material.diffuse * (direct + indirect)) + material.specular * highlight.
@@ -60,11 +60,11 @@ class Lighting:
 
     lights: Sequence[Light] | None = None  # None: the shader's own
     shadows: float = 1.0  # how dark full shadow is, 0 to 1; 0: no cone is traced
-    shadow_cones: int = 1  # to each light that has a size; more give more exact penumbras
+    shadow_cones: int = 1  # to each light that has a size; more make penumbras more exact
     occlusion: float = 0.0  # share of the ambient light that matter nearby can block, 0 to 1
     indirect: float = 0.0  # factor of the light that comes from lit matter nearby
     cones: int = 16  # over the hemisphere, for occlusion and indirect light
-    reach: float | None = None  # of occlusion and indirect light; None: a quarter of the box
+    reach: float | None = None  # distance of occlusion and indirect light; None: a quarter box
     frame: Frame | str = Frame.WORLD  # of reach: world units, or largest sides of the scene's box
     ambient: Triple = (1.0, 1.0, 1.0)  # light from all directions, linear RGB
 
@@ -95,20 +95,20 @@ class Lighting:
 
 @dataclass(frozen=True)
 class _Points:
-    """The points where rays met matter, one a ray, float64 in world units."""
+    """The points where rays met matter, one per ray, float64 in world units."""
 
     position: Tensor  # (r, 3)
     normal: Tensor  # (r, 3) unit, towards the eye
     has_normal: Tensor  # (r,) bool, the shader gave the normal; else it is the direction to the eye
-    eye: Tensor  # (r, 3) unit, back along the ray
+    eye: Tensor  # (r, 3) unit direction, back along the ray
     width: Tensor  # (r,) of the ray's cone there
     seen: Tensor  # (r,) bool, the ray met matter
-    headlight: Tensor | None  # (r, 3) its position; None: where these rays came from
+    headlight: Tensor | None  # (r, 3) a headlight's position; None: the origin of these rays
     row: int  # pixels of a row, see `Rays.width`
     tally: _Tally  # of all rays of the pixels
 
     def of_some(self, which: Tensor) -> _Points:
-        """Some of the points, with a tally of their own."""
+        """Returns some of the points, with a new tally."""
         columns = {name: one[which] for name, one in vars(self).items() if isinstance(one, Tensor)}
         counts = (self.tally.samples, self.tally.missed)
         tally = _Tally(*(count.new_zeros(len(which)) for count in counts))
@@ -122,23 +122,23 @@ class _Tally:
         self.samples, self.missed = samples, missed
 
     def __call__(self, hits: Hits) -> Hits:
-        """Adds those of some hits, which it returns."""
+        """Adds the counts of some hits, and returns the hits."""
         self.samples, self.missed = self.samples + hits.samples, self.missed | hits.missed
         return hits
 
     def add_some(self, which: Tensor, other: _Tally) -> None:
-        """Adds those of some pixels."""
+        """Adds the counts of some pixels."""
         self.samples = self.samples.index_add(0, which, other.samples)
         self.missed = self.missed.index_put((which,), self.missed[which] | other.missed)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lighted:
-    """Traces rays of one frame, then cones from the points that they met, and lights these."""
+    """Traces rays of one frame, then cones from the points that they hit, and lights the points."""
 
     trace: TraceRays  # traces the eye's rays: unlit colours and normals
     blocker: TraceRays  # traces cones of which only alpha is used
-    matter: TraceRays | None  # traces cones to what reflects light, as `trace` does; None: no
+    matter: TraceRays | None  # traces cones to matter that reflects light; None: none reflects
     lighting: Lighting  # in world units
     lights: Sequence[Light]  # in world units
     material: ShadeParameters  # how matter reflects light
@@ -158,7 +158,7 @@ class Lighted:
         unblocked, bounced = self._hemisphere(points, rays)
         light = ambient * sky * unblocked.to(color)
         light = light + diffuse * (direct + bounced).to(color)
-        taken = hits.alpha - (1 - rays.light()).to(color)  # of the light, by these rays themselves
+        taken = hits.alpha - (1 - rays.light()).to(color)  # light absorbed by this piece of the ray
         color = color * light + taken * specular * highlight.to(color)
         color = torch.where(hits.alpha > 0, color, 0.0)  # a closed ray may have no direction
         return replace(hits, color=color, samples=tally.samples, missed=tally.missed)
@@ -166,7 +166,7 @@ class Lighted:
     def _points(
         self, rays: Rays, hits: Hits, tally: _Tally, headlight: Tensor | None = None
     ) -> _Points:
-        """The points that the eye's rays met, or, if told where a `Headlight` stands, cones."""
+        """Returns the points that the eye's rays hit, or, if `headlight` is given, cones."""
         origin, direction, cone = RayArguments.of(rays)[:3]
         depth = hits.depth[:, 0].to(torch.float64)
         seen = depth < torch.inf
@@ -192,8 +192,8 @@ class Lighted:
         )
 
     def _direct(self, points: _Points, cones: int) -> tuple[Tensor, Tensor]:
-        """(r, 3) diffuse light and (r, 3) highlight of all lights, with their shadows. A point
-        without a normal faces every light and has no highlight.
+        """Returns (r, 3) diffuse light and (r, 3) highlights of all lights, with their shadows. A
+        point without a normal faces every light and has no highlight.
         """
         (shininess,) = pack((self.material.shininess,), torch.float64, points.eye.device)
         diffuse = shine = torch.zeros_like(points.position)
@@ -206,7 +206,7 @@ class Lighted:
             highlight = (points.normal * half).sum(1).clamp(0, 1) ** shininess
             highlight = torch.where(points.has_normal & (facing > 0), highlight, 0.0)
             wide = getattr(light, "angle", getattr(light, "radius", 0.0))
-            count = cones if isinstance(wide, Tensor) or wide else 1  # no tensor is read
+            count = cones if isinstance(wide, Tensor) or wide else 1  # reading a tensor would block
             lit = self._visible(light, count, points, beam, facing > 0)[:, None] * color
             diffuse, shine = diffuse + facing[:, None] * lit, shine + highlight[:, None] * lit
         return diffuse, shine
@@ -214,7 +214,7 @@ class Lighted:
     def _visible(
         self, light: Light, cones: int, points: _Points, beam: Tensor, facing: Tensor
     ) -> Tensor:
-        """(r,) share of a light that reaches points; a `Headlight` reaches all the eye sees."""
+        """Returns (r,) the share of a light that reaches points; all of the eye's `Headlight`."""
         at_eye = isinstance(light, Headlight) and points.headlight is None
         if not self.lighting.shadows or at_eye:
             return torch.ones_like(points.width)
@@ -238,9 +238,9 @@ class Lighted:
         return 1 - self.lighting.shadows * blocked
 
     def _hemisphere(self, points: _Points, rays: Rays) -> tuple[Tensor, Tensor]:
-        """(r, 1) share of the ambient light that is not occluded, and (r, 3) light that matter
-        around the points reflects; a `Headlight` stands where the eye's rays begin. Matter farther
-        away than half of the reach blocks half as much.
+        """Returns (r, 1) the share of the ambient light that is not occluded, and (r, 3) light that
+        matter around the points reflects; a `Headlight` is where the eye's rays begin. Matter
+        farther away than half of the reach blocks half as much.
         """
         unblocked = torch.ones_like(points.position[:, :1])
         bounced = torch.zeros_like(points.position)
@@ -266,7 +266,7 @@ class Lighted:
         (diffuse,) = pack((self.material.diffuse,), torch.float64, eye.device)
         assert rays.sample is not None
         for direction in _cones_over(points.normal, rays.sample, lighting.cones):
-            growth = dot(direction, points.normal).clamp(0, _WIDE)  # none dips into a floor
+            growth = dot(direction, points.normal).clamp(0, _WIDE)  # keeps cones above the surface
             first, second = (
                 self._cone(lifted, direction, growth, *span)
                 for span in ((start, middle), (middle, end))
@@ -282,9 +282,9 @@ class Lighted:
         return unblocked, lighting.indirect * bounced
 
     def _lifted(self, points: _Points, off: float, beam: Tensor | None = None) -> _Points:
-        """The points moved `off` voxels above the surface, or, where the eye's ray is wider than a
-        voxel, `off` of its widths. Along `beam` (r, 3) if given and not grazing, so that the
-        shadow stays where it is; else along the normal.
+        """Returns the points lifted `off` voxels above the surface, or, where the eye's ray is
+        wider than a voxel, `off` of its widths: along `beam` (r, 3) if given and not grazing, so
+        that the shadow stays where it is; else along the normal.
         """
         way = points.normal
         if beam is not None:
@@ -296,8 +296,8 @@ class Lighted:
     def _cone(
         self, points: _Points, direction: Tensor, growth: Tensor, start: Tensor, end: Tensor
     ) -> Rays:
-        """Cones from points, as wide there as the eye's ray; `growth` (r,) is that of the width per
-        unit distance. A cone that ends where it starts is not traced.
+        """Returns cones from points, as wide there as the eye's ray; their width grows by `growth`
+        (r,) per unit distance. A cone that ends where it starts is not traced.
         """
         return Rays(
             origin=points.position,
@@ -309,7 +309,7 @@ class Lighted:
 
 
 def _towards(light: Light, points: _Points) -> tuple[Tensor, Tensor, Tensor]:
-    """(r, 3) unit directions to a light, (r,) its distances, and (r,) its radius over these."""
+    """Returns (r, 3) unit directions and (r,) distances to a light, and (r,) radius / distance."""
     nothing, device = torch.zeros_like(points.width), points.eye.device
     if isinstance(light, DirectionalLight):
         way = -pack((light.direction,), torch.float64, device)
@@ -329,7 +329,7 @@ def _towards(light: Light, points: _Points) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _disc(count: int) -> Iterator[tuple[float, float]]:
-    """Points (x, y) spread evenly over the unit disc; a single one is its centre (Vogel, 1979)."""
+    """Yields points (x, y) spread evenly over the unit disc; for one, its centre (Vogel, 1979)."""
     for number in range(count):
         radius = math.sqrt((number + 0.5) / count) if count > 1 else 0.0
         turn = number * math.pi * (3 - math.sqrt(5))
@@ -337,8 +337,8 @@ def _disc(count: int) -> Iterator[tuple[float, float]]:
 
 
 def _beside(axis: Tensor) -> tuple[Tensor, Tensor]:
-    """Two (r, 3) unit vectors orthogonal to (r, 3) unit vectors and to each other (Duff et al.,
-    "Building an orthonormal basis, revisited", 2017).
+    """Returns two (r, 3) unit vectors orthogonal to (r, 3) unit vectors and to each other (Duff et
+    al., "Building an orthonormal basis, revisited", 2017).
     """
     x, y, z = axis.unbind(1)
     sign = torch.where(z < 0, -1.0, 1.0).to(z)
@@ -349,10 +349,10 @@ def _beside(axis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _cones_over(normal: Tensor, sample: Tensor, count: int) -> Iterator[Tensor]:
-    """Directions (r, 3), cosine-weighted around (r, 3) normals, the next `count` of a sequence that
-    fills the unit square evenly (Roberts, 2018). It begins at another place for each pixel, and
-    goes on from sample to sample. Made of integers, + - * / and roots: to an ulp the same on every
-    device.
+    """Yields `count` directions (r, 3), cosine-weighted around (r, 3) normals, from a sequence that
+    fills the unit square evenly (Roberts, 2018). It begins at a different position for each pixel,
+    and continues from sample to sample. Made of integers, + - * / and roots: equal to an ulp on
+    every device.
     """
     right, up = _beside(normal)
     begin_x = _scrambled((sample & _WORD) + 1)
@@ -369,14 +369,14 @@ def _cones_over(normal: Tensor, sample: Tensor, count: int) -> Iterator[Tensor]:
 
 
 def _scrambled(number: Tensor) -> Tensor:
-    """(r,) hashes below 2^32: neighbours have nothing in common (as Wellons' lowbias32, 2018)."""
+    """Returns (r,) hashes below 2^32, uncorrelated for neighbours (as Wellons' lowbias32, 2018)."""
     for shift in (16, 15):
         number = ((number ^ (number >> shift)) * 0x7FEB352D) & _WORD
     return number ^ (number >> 16)
 
 
 def _turned(turns: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine of (r,) turns in [0, 1), to 4e-6."""
+    """Returns cosine and sine of (r,) turns in [0, 1), to 4e-6."""
     quarter = torch.floor(4 * turns + 0.5)
     angle = (4 * turns - quarter) * (math.pi / 2)
     square = angle * angle

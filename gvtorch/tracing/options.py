@@ -1,5 +1,5 @@
-"""`RenderOptions`: how a picture is made, checked once; what renders shows them as its keyword
-arguments (base/explicit.py). `RenderSettings` tells type checkers the same.
+"""`RenderOptions`: the options of a picture, checked once. Functions that render show them as their
+keyword arguments (base/explicit.py). `RenderSettings` declares the same for type checkers.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .thin_lens import ThinLens
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """How a picture is made. `help` of what renders shows these texts. Threads may share one.
+    """Options of a picture. `help` of rendering functions shows these texts. Threads may share one.
 
     Attributes:
         step: Shortest interval, in voxels of the finest level, > 0.
@@ -34,15 +34,15 @@ class RenderOptions:
             image (h, w, 3) of the picture's size, or None: transparent.
         stop_alpha: A ray ends at this alpha, 0 to 1; 1 integrates to the end.
         depth_alpha: Depth is where alpha passes this, below `stop_alpha`.
-        cone_scale: Widens the pixel cone by this factor, > 0; larger takes coarser voxels.
+        cone_scale: Widens the pixel cone by this factor, > 0; larger reads coarser voxels.
         channel: Name of the channel that the shader reads; None: the first.
         component: Which number of the channel, from 0.
-        layer: What another renderer drew, composited with the voxels.
+        layer: Another renderer's picture, composited with the voxels by depth.
         clip: The region of interest; None: everything.
         lens: Depth of field; None: all is sharp.
-        lighting: Shadows and light from all around; None: the shader's own.
-        pose: Where a tree stands: a (4, 4) matrix that turns and shifts (and may mirror) its own
-            axes into the world's, or one for each tree by name; None: its axes are the world's.
+        lighting: Shadows, ambient occlusion and indirect light; None: the shader's own light.
+        pose: Placement of a tree: a (4, 4) matrix from its axes to the world's that rotates and
+            shifts (and may mirror), or one for each tree by name; None: its axes are the world's.
         backend: auto, reference, cpp or cuda; all give the same bits.
         dtype: Of rays and picture: float32, or float64 for very thin media and narrow cones.
     """
@@ -91,7 +91,7 @@ class RenderOptions:
 
 
 class RenderSettings(TypedDict, total=False):
-    """The fields of `RenderOptions`, all of which may be left out."""
+    """The fields of `RenderOptions`, all optional."""
 
     step: float
     lod: Literal["auto", "finest"]
@@ -113,8 +113,8 @@ class RenderSettings(TypedDict, total=False):
 def render_options(
     where: str, settings: Mapping[str, Any], camera: Camera | None = None
 ) -> RenderOptions:
-    """Returns a user's options, for a camera if there is one. Raises ValueError if one is unknown,
-    of the wrong type or out of its range, or does not fit the camera's pictures.
+    """Returns a user's options, with the layer cut to the camera if there is one. Raises ValueError
+    if one is unknown, of the wrong type or out of its range, or does not fit the camera's pictures.
     """
     check.known(where, settings, RenderSettings)
     options = RenderOptions(**settings)

@@ -1,5 +1,5 @@
-"""`View`: from a camera to the hits of all its pixels, and from these to a picture; `render` and
-`trace` do so for a resident tree.
+"""`View`: traces all pixels of a camera, and makes a picture of their hits; `render` and `trace`
+use it for resident trees.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Pixels = slice | Tensor  # some of the pixels of all pictures of a camera, row b
 #: Hits of an earlier pass, which are overwritten, and which (r,) bool of their rays to trace again.
 Again = tuple[Hits, Tensor]
 _RAYS_A_BLOCK = 1 << 22  # rays that are traced at once
-_WATCHED = 1 << 16  # the same on a CPU, where progress is to show and Ctrl-C waits for a block
+_WATCHED = 1 << 16  # the same on a CPU: progress is reported, and Ctrl-C noticed, after each block
 
 
 @explicit(RenderOptions)
@@ -54,18 +54,18 @@ def render(
     """Renders a resident tree, or several.
 
     Args:
-        tree: What to render, on the device that renders it; its stamps and request words are
-            written. Or trees by name, on one device: where they overlap, they are composited by
-            sample. A volume or an array (see `as_volume`) in a tree's place becomes one on the CPU,
-            anew in each call: make one where there are more pictures.
-        camera: One camera or a batch; an orbit camera stands around the scene's box. Or rays in
+        tree: The tree, on the device that renders it; its stamps and request words are written. Or
+            trees by name, on one device: where they overlap, they are composited by sample. A
+            volume or array (see `as_volume`) instead of a tree is made into one on the CPU in every
+            call; for several pictures make the tree once.
+        camera: One camera or a batch; an orbit camera is placed around the scene's box. Or rays in
             world units, which make a picture as wide as `Rays.width`, or of one row.
         shader: The transfer function, in data units, or another shader; or one for each tree by
             name.
-        progress: Told how many rows are done.
+        progress: Receives the number of finished rows.
         **options: Fields of `RenderOptions`.
 
-    Several threads may render one tree; `stats` then tell the use of all of them.
+    Several threads may render one tree; `stats` then count the use by all of them.
 
     Returns:
         The picture, (h, w, c) for one camera and (n, h, w, c) for a batch.
@@ -97,7 +97,7 @@ def render(
 @explicit(RenderOptions)
 def trace(tree: Scene, rays: Rays, shader: Shaders, **options: Unpack[RenderSettings]) -> Hits:
     """Traces any world rays through a resident tree, or several, as one frame. Background and layer
-    belong to pictures and have no part in it.
+    apply to pictures only, and are ignored.
 
     Args:
         tree: The tree, or trees by name; stamps and request words are written.
@@ -119,7 +119,7 @@ def trace(tree: Scene, rays: Rays, shader: Shaders, **options: Unpack[RenderSett
 
 
 def _resident(where: str, scene: Any) -> Scene:
-    """The trees of a scene; what is a volume becomes one."""
+    """Returns the scene with trees made of its volumes and arrays."""
 
     def tree_of(one: Any) -> N3Tree:
         if isinstance(one, N3Tree):
@@ -137,7 +137,7 @@ def _resident(where: str, scene: Any) -> Scene:
 
 
 def _trees(where: str, scene: Scene) -> list[N3Tree]:
-    """The trees of a scene; raises ValueError unless there is one, and all are on one device."""
+    """Returns the trees of a scene; raises ValueError if there are none, or not on one device."""
     trees = [*scene.values()] if isinstance(scene, Mapping) else [scene]
     if not trees:
         raise ValueError(f"{where}: there must be a tree, got none")
@@ -150,7 +150,7 @@ def _trees(where: str, scene: Scene) -> list[N3Tree]:
 
 
 def using(where: str, trees: Sequence[N3Tree]) -> ExitStack:
-    """Lets a block render trees; raises RuntimeError while another thread changes one of them."""
+    """Returns a context for rendering trees; raises RuntimeError while a thread changes one."""
     with ExitStack() as stack:
         for tree in trees:
             stack.enter_context(tree.turns.using(where))
@@ -160,7 +160,7 @@ def using(where: str, trees: Sequence[N3Tree]) -> ExitStack:
 def _traced(
     where: str, scene: Scene, shaders: Shaders, options: RenderOptions
 ) -> tuple[TraceRays, Tensor]:
-    """Begins a frame: what traces rays through a scene, and its box."""
+    """Begins a frame, and returns its tracer and the scene's box."""
     trees = _trees(where, scene)
     for tree in trees:
         tree.next_frame()
@@ -182,8 +182,8 @@ def tree_stats(
     samples: Tensor,
     frames: Sequence[int] = (),
 ) -> RenderStats:
-    """Returns the statistics of a picture, given the samples (r,) of its rays; what each tree used
-    since a frame, if they are told. Waits for the device once.
+    """Returns the statistics of a picture, given the samples (r,) of its rays; and, if `frames` are
+    given, with what each tree used since its frame. Waits for the device once.
     """
     sums = [samples.sum(dtype=torch.int64)]
     for tree, frame in zip(trees, frames, strict=False):
@@ -204,10 +204,10 @@ def tree_stats(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class View:
-    """A camera in the world, what traces its rays, and how the picture is made."""
+    """A placed camera, the tracer of its rays, and the options of its picture."""
 
     camera: Camera
-    numbers: Tensor  # of the camera, on the device that traces; a graph's replays write others
+    numbers: Tensor  # of the camera, on the device that traces; graph replays overwrite them
     trace_rays: TraceRays  # through all trees
     options: RenderOptions
     box: Tensor  # (2, 3) world corners of the scene
@@ -218,9 +218,9 @@ class View:
         return len(self.camera) * self.camera.height * self.camera.width
 
     def hits(self, progress: Progress = no_progress, *, again: Again | None = None) -> Hits:
-        """Makes the camera's rays and traces them, all or some of them again; they mark what they
-        use and request what is missing. `progress` is told how many rows are done. Raises
-        ValueError if the picture is larger than the device's memory.
+        """Makes the camera's rays and traces them, all or some of them `again`; they stamp what
+        they use and request what is missing. `progress` receives the number of finished rows.
+        Raises ValueError if the picture is larger than the device's memory.
         """
         device = self.numbers.device
         at_once = device.type == "cuda" or (
@@ -230,7 +230,7 @@ class View:
         size = self.rays * (8 * self.options.dtype.itemsize + 5)  # the colour twice
         check.memory("render", f"a picture of {self.rays} pixels", size, device)
         hits, where = again or (None, None)
-        if hits is None and len(list(self.camera.blocks(block))) > 1:  # fails before the first ray
+        if hits is None and len(list(self.camera.blocks(block))) > 1:  # allocates before any ray
             hits = empty_hits(device, self.options.dtype, self.rays)
         for pixels, part in self.blocks(block, progress, where):
             if hits is None:
@@ -243,7 +243,7 @@ class View:
     def blocks(
         self, pixels: int, progress: Progress, where: Tensor | None = None
     ) -> Iterator[tuple[Pixels, Hits]]:
-        """Traces all pixels, or those that `where` (p,) bool tells, in blocks of whole rows, since
+        """Traces all pixels, or those where `where` (p,) is true, in blocks of whole rows, since
         rays take more memory than their picture. Yields the traced pixels of each block, and their
         hits, composited with the layer.
         """
@@ -269,21 +269,21 @@ class View:
             progress("rays", end, rows)
 
     def _rows(self, rows: tuple[int, int]) -> Rays:
-        """Rays of whole rows."""
+        """Returns the rays of whole rows."""
         rays = self.camera.pixel_rays(self.numbers, rows)
         if self.options.lighting is None:
             return rays
         return replace(rays, sample=self.camera.pixel_samples(self.numbers, rows))
 
     def _some_rays(self, top: int, which: Tensor) -> Rays:
-        """Rays of the pixels `which` (k,), rising, counted from row `top`, made in whole rows."""
+        """Returns the rays of the pixels `which` (k,), which rise and count from row `top`."""
         width = self.camera.width
         ends = torch.stack((which[0], which[-1])).tolist() if len(which) else (0, -1)
         first, last = (end // width for end in ends)
         return self._rows((top + first, top + last + 1))[which - first * width]
 
     def picture(self, hits: Hits, stats: RenderStats) -> Picture:
-        """Puts the hits of all rays over the background, in the camera's shape."""
+        """Composites the hits of all rays over the background, in the camera's shape."""
         color, nearest, layer = hits.color, hits.depth, self.options.layer
         background: Any = self.options.background
         if isinstance(background, Background):
@@ -299,7 +299,7 @@ class View:
 
 
 def _write(hits: Hits, pixels: Pixels, part: Hits, count: int) -> None:
-    """Puts the hits of some pixels among those of all; what some have others have none of."""
+    """Writes the hits of some pixels into those of all; missing fields become `nothing_like`."""
     for name, field in vars(part).items():
         if vars(hits)[name] is None:
             if field is None:
@@ -310,7 +310,7 @@ def _write(hits: Hits, pixels: Pixels, part: Hits, count: int) -> None:
 
 
 def empty_hits(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
-    """Takes the memory of a picture, of which no ray was traced yet: all miss something."""
+    """Allocates the hits of a picture before any ray is traced: all rays count as missing."""
     color, alpha, depth = (
         torch.empty((pixels, width), dtype=dtype, device=device) for width in (3, 1, 1)
     )

@@ -1,8 +1,8 @@
-"""`point_layer`: points that are nearer than a voxel of theirs shows, drawn as points.
+"""`point_layer`: draws points as such where they are too near to be shown by voxels.
 
 A `PointProducer(drawn=True)` leaves points out of its finest level, where a voxel would be wider
-than a pixel. Between the two finest levels the renderer blends, by how wide a pixel is; here a
-point gets the share of its light that it has lost there, so that its light stays the same.
+than a pixel. The renderer blends between the two finest levels by the width of a pixel; here a
+point gets the share of its light that is lost there, so that its total light stays the same.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..producers.points import PointProducer
 from .layer import Layer
 
 _BLOCK = 1 << 17  # points drawn together
-_LEAST = 1e-7  # opacity of what shines and hides nothing
+_LEAST = 1e-7  # opacity of pixels that emit light and hide nothing
 _NEAREST = 1e-3  # finest voxels from the eye; nothing is drawn nearer
 
 
@@ -31,16 +31,16 @@ def point_layer(
     reference: float | None = None,
     cone_scale: float = config.CONE_OVERESTIMATE,
 ) -> Layer:
-    """Returns the points of a producer that are nearer than its voxels show, as the `layer=` of a
-    picture of `gv.StoredColor("value", premultiplied=True)`. A point's light is spread over pixels,
-    as much of it as its voxel would send; points in a pixel share a depth.
+    """Returns those points of a producer that are too near for its voxels, as the `layer=` of a
+    picture of `gv.StoredColor("value", premultiplied=True)`. A point sends as much light as its
+    voxel would, spread over pixels; points in a pixel share a depth.
 
     Args:
         producer: With `drawn=True`, and values of light and opacity, as of `Points.lit`.
         camera: One pinhole camera.
-        size: Pixels, how far a point reaches along the picture's sides.
-        reference: As of the shader, world units; the smallest spacing if left out.
-        cone_scale: As of the picture.
+        size: Radius of a point along the picture's sides, in pixels.
+        reference: The shader's `reference`, world units; the smallest spacing if left out.
+        cone_scale: The picture's `cone_scale`.
 
     Raises:
         ValueError: The producer draws no points or has other values, or the camera is of another
@@ -57,7 +57,7 @@ def point_layer(
     placed = camera.placed(torch.tensor([grid.low, grid.high], dtype=torch.float64))
     view, K = placed.viewmats[0].numpy(), placed.Ks[0].numpy()
     eye = -view[:3, 3] @ view[:3, :3]
-    # The blend of levels, by the width of a pixel: 0 at a finest voxel's, 1 at one of the next's.
+    # The blend of levels: 0 where a pixel is as wide as a finest voxel, 1 where as the next one's.
     finest = float(grid.spacing_3.max())
     growth = cone_scale / min(K[0, 0], K[1, 1])
     reach = finest * grid.branching / growth
@@ -85,7 +85,7 @@ def point_layer(
 
 
 def _layer(total: np.ndarray, shape: tuple[int, int]) -> Layer:
-    """A layer of the sums of pixels (p, 5)."""
+    """Returns a layer, given the sums (p, 5) of pixels."""
     light = total[:, :3]
     bright = light.sum(1)
     shown = (bright > 0) | (total[:, 3] > 0)
@@ -106,7 +106,7 @@ def _draw(
     size: float,
     point_k5: np.ndarray,
 ) -> None:
-    """Adds points' light and opacity (k, 4) and distance to pixels (p, 5), at places (k,) each."""
+    """Adds points' light and opacity (k, 4) and distance, at `at` (k,) pixels, to pixels (p, 5)."""
     height, width = shape
     x, y = at
     inside = (x > -size) & (x < width + size) & (y > -size) & (y < height + size)

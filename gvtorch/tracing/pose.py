@@ -1,5 +1,5 @@
-"""`Pose`: where a tree stands in the world. Rays are turned into the tree's own axes before they go
-through it, and what they bring back is turned out again; distances stay as they are.
+"""`Pose`: the placement of a tree in the world. Rays are transformed into the tree's axes before
+they are traced, and their hits back into the world; distances stay as they are.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from ..base import check
 from ..base.records import Hits, Rays
 from ..ops.shading import LightKind, ShadeParameters
 
-_ROUNDING = 1e-5  # by how much a turn given in float32 may be none
+_ROUNDING = 1e-5  # largest deviation from a rotation: a matrix may be given in float32
 
 
 @dataclass(frozen=True, repr=False)
 class Pose:
-    """A turn, mirrored or not, and a shift. The numbers stay on the host: nobody waits for them."""
+    """A rotation, mirrored or not, and a shift. Its numbers are on the host, so nothing blocks."""
 
-    turn: tuple[tuple[float, ...], ...]  # (3, 3), from own axes to the world's
-    shift: tuple[float, ...]  # (3,) world place of the own origin
+    turn: tuple[tuple[float, ...], ...]  # (3, 3), from the tree's axes to the world's
+    shift: tuple[float, ...]  # (3,) world position of the tree's origin
 
     @classmethod
     def of(cls, where: str, name: str, matrix: Any) -> Pose:
-        """Returns the pose of a (4, 4) matrix from own axes to the world; a pose as it is. Raises
-        ValueError if it is no such matrix, or stretches or shears.
+        """Returns the pose of a (4, 4) matrix from the tree's axes to the world's; a pose as it is.
+        Raises ValueError if it is no such matrix, or stretches or shears.
         """
         if isinstance(matrix, Pose):
             return matrix
@@ -42,11 +42,11 @@ class Pose:
                 f"{where}: {name} must turn and shift, and neither stretch nor shear, "
                 f"got {numbers.tolist()}"
             )
-        left, _, right = torch.linalg.svd(turn)  # the nearest that keeps lengths
+        left, _, right = torch.linalg.svd(turn)  # their product: the nearest orthogonal matrix
         return cls(tuple(map(tuple, (left @ right).tolist())), tuple(numbers[:3, 3].tolist()))
 
     def inside(self, rays: Rays) -> Rays:
-        """World rays in own axes, in float64."""
+        """Returns world rays in the tree's axes, in float64."""
         origin, direction = rays.origin.double(), rays.direction.double()
         columns = [o - s for o, s in zip(origin.unbind(1), self.shift, strict=True)]
         back = tuple(zip(*self.turn, strict=True))
@@ -56,20 +56,20 @@ class Pose:
         )
 
     def outside(self, hits: Hits) -> Hits:
-        """Hits with their normals in the world's axes."""
+        """Returns hits with their normals in the world's axes."""
         return hits if hits.normal is None else replace(hits, normal=self.ways(hits.normal))
 
     def ways(self, own: Tensor) -> Tensor:
-        """World directions (r, 3) of directions in own axes."""
+        """Returns world directions (r, 3) of directions in the tree's axes."""
         return _turned(self.turn, own.unbind(1))
 
     def places(self, own: Tensor) -> Tensor:
-        """World places (r, 3) of places in own axes."""
+        """Returns world positions (r, 3) of positions in the tree's axes."""
         turned = self.ways(own).unbind(1)
         return torch.stack([p + s for p, s in zip(turned, self.shift, strict=True)], 1)
 
     def lit(self, parameter_54: Tensor) -> Tensor:
-        """A shader's numbers (5, 4) with its light in own axes; see `ShadeParameters`."""
+        """Returns `ShadeParameters` (5, 4) with the light in the tree's axes."""
         given = ShadeParameters.read(parameter_54)
         light = torch.as_tensor(given.light).double()
         at_a_place = torch.as_tensor(given.light_kind) == LightKind.POINT
@@ -82,7 +82,7 @@ class Pose:
         return torch.cat((own, parameter_54.reshape(-1)[3:])).view_as(parameter_54)
 
     def box(self, own: Tensor) -> Tensor:
-        """(2, 3) corners of the world's box around a box in own axes."""
+        """Returns (2, 3) corners of the world box around a box in the tree's axes."""
         columns = own.unbind(1)
         corners = torch.stack([torch.stack(one) for one in product(*columns)])
         placed = self.places(corners)
@@ -92,7 +92,7 @@ class Pose:
         return f"Pose(turn={self.turn}, shift={self.shift})"
 
 
-#: (4, 4), from a tree's own axes to the world's.
+#: (4, 4), from a tree's axes to the world's.
 Matrix = Pose | Tensor | np.ndarray | Sequence[Sequence[float]]
 
 
@@ -106,8 +106,8 @@ def checked_poses(where: str, given: Any) -> Any:
 
 
 def poses_of(where: str, names: Collection[str], given: Any) -> dict[str, Pose | None]:
-    """Returns the pose of each tree, given what `checked_poses` returned; raises ValueError if a
-    name is that of no tree, or there is one pose for several trees.
+    """Returns the pose of each tree, given a result of `checked_poses`; raises ValueError if a name
+    is that of no tree, or there is one pose for several trees.
     """
     if given is None or isinstance(given, Mapping):
         by_name: Mapping[str, Pose] = given or {}
@@ -123,11 +123,11 @@ def poses_of(where: str, names: Collection[str], given: Any) -> dict[str, Pose |
 
 
 def world_box(own: Tensor, pose: Pose | None) -> Tensor:
-    """(2, 3) corners of the world's box around that of a tree."""
+    """Returns (2, 3) corners of the world box around a tree's box."""
     return own if pose is None else pose.box(own)
 
 
 def _turned(rows: Sequence[Sequence[float]], columns: Sequence[Tensor]) -> Tensor:
-    """(r, 3) of three columns (r,); sums in order, so that every device has the same bits."""
+    """Returns (r, 3) products of a matrix and columns (r,); the fixed order makes bits equal."""
     x, y, z = columns
     return torch.stack([a * x + b * y + c * z for a, b, c in rows], 1)

@@ -1,7 +1,7 @@
 """`slice_picture`: a plane of voxels as a picture, exact to the voxel.
 
-Nothing is interpolated: a voxel is a rectangle of pixels of one colour. Of a store only the voxels
-of the plane are read.
+Nothing is interpolated: a voxel is a rectangle of pixels of one colour. From a store, only the
+voxels of the plane are read.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from ..shaders.transfer_function import TransferFunction
 
 At = float | int | str
 Colors = Callable[[np.ndarray], np.ndarray]
-#: What is up in the picture of a plane across an axis: rows of a file run down, heads are up.
+#: Up in the picture of the plane across each axis: rows of files run down, and heads are up.
 UP = {"x": "+z", "y": "+z", "z": "-y"}
-#: Where an axis of the world points, as `ImageInfo.space` tells it, by its letter.
+#: Letters of the words for an axis' direction in `ImageInfo.space`.
 _LETTERS = {w: w[0].upper() for w in ("right", "left", "anterior", "posterior", "superior")}
 _LETTERS["inferior"] = "I"
 _OPPOSITE = {**dict(zip("RAS", "LPI", strict=True)), **dict(zip("LPI", "RAS", strict=True))}
-#: Radiological planes, by what lies across them: name, what is up, what is on the left.
+#: Radiological planes, by the letter of the axis across them: name, what is up, what is left.
 _VIEWS = {"S": ("axial", "A", "R"), "A": ("coronal", "S", "R"), "R": ("sagittal", "S", "A")}
 _GAP = 4  # pixels between the three planes
 _MOST = 65536  # pixels along a side
@@ -52,28 +52,28 @@ def slice_picture(
     radiological: bool = False,
     letters: bool = False,
 ) -> Picture:
-    """Returns a plane of voxels across an axis as a picture; of voxels that are not cubes, pixels
-    keep the proportions.
+    """Returns a plane of voxels across an axis as a picture; where voxels are not cubes, the
+    picture keeps their proportions.
 
     Args:
-        data: A volume, or a store, of which no more than the plane is read.
-        axis: x, y, z, or all: the planes across y and x above the one across z, side by side so
-            that what is in line is the same place.
-        at: Where: a share of the extent, 0 to 1 or "50%"; an int, the index of a voxel of the
-            finest level; or a place in the world, "12.5mm". For all axes one, or three (x, y, z).
-        span: The values that are black and white, in steps that look even on a display: a voxel of
-            8 bits has the sRGB number of its value if that is (0, 255). What `window` finds, with
-            the background, if left out.
+        data: A volume, or a store, of which only the plane is read.
+        axis: x, y, z, or all: the planes across y and x above the one across z, aligned so that
+            rows and columns in line show the same position.
+        at: Position: a share of the extent, 0 to 1 or "50%"; an int, the index of a voxel of the
+            finest level; or world units, "12.5mm". For all axes one, or three (x, y, z).
+        span: The values shown black and white, with visually even grays between them: if it is
+            (0, 255), a voxel of 8 bits is shown as the sRGB number of its value. If left out, what
+            `window` finds, with the background.
         colors: Instead of grays, the colours of values (not their opacity): a transfer function,
             `Labels`, or another function from values (...) to linear red, green, blue (..., 3).
         component: Which number of a voxel.
-        level: Of a store: 0 is the finest.
+        level: Level of a store; 0 is the finest.
         scale: Pixels along the shortest side of a voxel.
-        up: Which axis is up in the picture of one plane, as in "+y"; -y (rows run down, as in
-            files) across z, else +z. The other runs to the right.
-        radiological: Patients as radiologists look at them: an axial plane from the feet (front
+        up: Axis that is up in the picture of one plane, as in "+y"; if left out, -y across z (rows
+            run down, as in files), else +z. The other axis runs to the right.
+        radiological: Shows patients as radiologists view them: an axial plane from the feet (front
             up), a coronal one from the front, a sagittal one from their left; so their right is on
-            the left. For data whose `info.space` tells where its axes point, without `up`.
+            the left. Needs data whose `info.space` names the axes' directions, and no `up`.
         letters: Draws letters (R, L, A, P, S, I) at the edges of radiological planes, over voxels.
 
     Raises:
@@ -113,7 +113,7 @@ def slice_picture(
 def _views(
     space: str | None, up: str | None, *, radiological: bool, letters: bool
 ) -> dict[str, PlaneView]:
-    """How the plane across each axis is looked at."""
+    """Returns the view of the plane across each axis."""
     where = "slice_picture"
     if not radiological:
         if letters:
@@ -128,7 +128,7 @@ def _views(
 
 
 def _in_line(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """The planes across y and x above the one across z, side by side."""
+    """Joins three planes: those across y and x, side by side, above the one across z."""
     (top, left), (bottom, right) = y.shape[:2], (z.shape[0], x.shape[1])
     image = np.zeros((top + _GAP + bottom, left + _GAP + right, 3), np.float32)
     image[:top, :left], image[:top, left + _GAP :], image[top + _GAP :, :left] = y, x, z
@@ -136,17 +136,17 @@ def _in_line(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 class PlaneView(NamedTuple):
-    """How the plane across an axis is looked at."""
+    """The orientation of the plane across an axis in its picture."""
 
-    name: str  # axial, coronal or sagittal, where that is known
+    name: str  # axial, coronal or sagittal; empty where unknown
     up: str  # as in "+z"
     mirrored: bool = False  # the other axis runs to the left
-    letters: str = ""  # what lies above, to the right, below and to the left, as in ALPR
+    letters: str = ""  # directions above, to the right, below and to the left, as in ALPR
 
 
 def radiological_views(space: str | None) -> dict[str, PlaneView]:
-    """Returns how radiologists look at the planes across x, y and z, given `ImageInfo.space`; none
-    where that does not tell where the axes point.
+    """Returns radiologists' views of the planes across x, y and z, given `ImageInfo.space`; {} if
+    that does not name the axes' directions.
     """
     words = (space or "").split("-")
     if len(words) != 3 or not _LETTERS.keys() >= set(words):
@@ -186,7 +186,7 @@ class _Plane:
         self.unit = data.info.unit
 
     def index(self, axis: str, at: At) -> int:
-        """Index of a voxel of the finest level along an axis."""
+        """Returns the index of a voxel of the finest level along an axis."""
         where, count = "slice_picture", self.finest[axis]
         if isinstance(at, str):
             text = at.strip()
@@ -202,7 +202,7 @@ class _Plane:
         return check.whole(where, f"at along {axis}", at, low=0, high=count - 1)
 
     def _place(self, axis: str, text: str) -> int:
-        """Index of the voxel in which a place of the world lies, as in "12.5mm"."""
+        """Returns the index of the voxel at a world position, as in "12.5mm"."""
         found = re.fullmatch(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµ]+)", text)
         unit = None if found is None else length_unit(found[2])
         if found is None or unit is None:
@@ -226,7 +226,7 @@ class _Plane:
         return index
 
     def values(self, axis: str, at: At) -> np.ndarray:
-        """The plane across an axis, in the order z, y, x of the other two."""
+        """Returns the plane across an axis, with the other two in the order z, y, x."""
         index = self.index(axis, at) >> self.level
         low, high = [0, 0, 0], [self.extent[n] for n in "zyx"]
         number = "zyx".index(axis)
@@ -241,7 +241,7 @@ class _Plane:
     def colored(
         self, axis: str, at: At, view: PlaneView, pixel: float, colors: Colors
     ) -> np.ndarray:
-        """(h, w, 3) float32 linear light of the plane, of pixels so wide in world units."""
+        """Returns (h, w, 3) float32 linear light of the plane; `pixel`: a pixel's world size."""
         up = view.up
         others = [n for n in "zyx" if n != axis]  # of the rows and columns
         if up not in [sign + n for n in others for sign in "+-"]:
@@ -262,7 +262,7 @@ class _Plane:
 
 
 def _pixels(count: int, size: float) -> np.ndarray:
-    """The voxel of each pixel along an axis; voxels are so many pixels long."""
+    """Returns the voxel of each pixel along an axis, for `count` voxels of `size` pixels each."""
     pixels = max(1, round(count * size))
     if pixels > _MOST:
         raise ValueError(

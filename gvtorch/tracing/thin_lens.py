@@ -1,8 +1,8 @@
 """`ThinLens`: depth of field by a double cone.
 
-A ray stands for its pixel's cone widened by the circle of confusion, which shrinks towards the
-focus and grows behind it. So it is traced as two pieces: a narrowing cone, then a widening one.
-Where the picture is blurred, voxels as wide as the blur are read: fewer samples and fewer bricks.
+A ray's cone is its pixel's, widened by the circle of confusion, which shrinks towards the focus and
+grows behind it. So it is traced as two pieces: a narrowing cone, then a widening one. Where the
+picture is blurred, voxels as wide as the blur are read: fewer samples and fewer bricks.
 
 Sources: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and
 Detailed Voxel Rendering", I3D 2009, section 5; Crassin, PhD thesis 2011, on depth of field;
@@ -63,14 +63,14 @@ class ThroughLens:
 
     trace: TraceRays
     lens: ThinLens  # in world units
-    cone_scale: float  # the tracer's factor on cones, which shall not widen the lens's
+    cone_scale: float  # the tracer's factor on cones; divided out, so it does not widen the lens's
 
     def __call__(self, rays: Rays) -> Hits:
-        """Traces rays up to the focus, then from there on."""
+        """Traces rays up to the focus, then behind it."""
         return trace_pieces(self.trace, (self._piece(rays, -1), self._piece(rays, 1)))
 
     def _piece(self, rays: Rays, side: int) -> Rays:
-        """The rays before the focus (`side` -1) or behind it (1)."""
+        """Returns the pieces of rays before the focus (`side` -1) or behind it (1)."""
         cone, (first, last) = rays.cone.to(torch.float64), rays.range.to(torch.float64).unbind(1)
         focus = self.lens.focus
         wide = _CONE_OF_DISC * self.lens.aperture / self.cone_scale  # its cone at the eye

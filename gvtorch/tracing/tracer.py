@@ -1,8 +1,8 @@
 """`Tracer`: one frame of a tree and a shader, from rays to hits.
 
-Shaders in torch are marched: rays are walked part by part, the bricks that they meet are sampled, a
-function turns samples into features and alpha, and these are composited front to back. The host
-waits for the number of samples of each part.
+Module shaders are marched: rays are walked part by part, the bricks on their way are sampled, the
+module turns samples into features and alpha, and these are composited front to back. The host waits
+for the number of samples of each part.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class Tracer:
         by_level: bool = False,
         frame_1: Tensor | None = None,
     ) -> None:
-        """Lays the op's arguments ready; see `trace` and, for `by_level`, `trace_rays`. `frame_1`
-        (1,) int32 is the frame's number on the device, if it lies there already. Raises ValueError
-        for no shader, an unknown channel, a step too short, or a backend that can't be used.
+        """Prepares the op's arguments; see `trace` and, for `by_level`, `TraceArguments`. `frame_1`
+        (1,) int32 is the frame's number, if it is on the device already. Raises ValueError if the
+        shader is none, the channel unknown, the step too short, or the backend can't be used.
         """
         check_shader("render", "shader", shader)
         choose_backend(options.backend, tree.device)
@@ -98,7 +98,7 @@ class Tracer:
         return Tracer(self.tree, shader, options, by_level=known.by_level, frame_1=known.frame_1)
 
     def inside(self, rays: Rays) -> Rays:
-        """World rays in the tree's own axes."""
+        """Returns world rays in the tree's axes."""
         return rays if self.pose is None else self.pose.inside(rays)
 
     def __call__(self, rays: Rays) -> Hits:
@@ -107,7 +107,7 @@ class Tracer:
         return hits if self.pose is None else self.pose.outside(hits)
 
     def _trace(self, rays: Rays) -> Hits:
-        """Traces rays in the tree's own axes."""
+        """Traces rays in the tree's axes."""
         if isinstance(self.shader, ModuleShader):
             return self._march_module(self.shader, rays)
         given = ops.RayArguments.of(rays)
@@ -127,7 +127,7 @@ class Tracer:
         return replace(hits, features=hits.features[:, :0], label=label)
 
     def _march_module(self, shader: ModuleShader, rays: Rays) -> Hits:
-        """Traces rays with a module, a block at a time."""
+        """Traces rays with a module shader, block by block."""
 
         def shade(batch: Batch) -> tuple[Tensor, Tensor]:
             values = batch.values(shader.channels)
@@ -151,7 +151,7 @@ class Tracer:
 
 
 def _channel_of(tree: N3Tree, shader: Shader, options: RenderOptions) -> str:
-    """Returns the channel whose values the shader turns into colour, once it is known to fit."""
+    """Returns the channel that the shader colours; raises ValueError if it does not fit."""
     first, channels = tree.channel_names[0], tree.bricks.channels
     channel = check.text("render", "channel", shader.channel) or options.channel or first
     if channel not in channels:
@@ -187,8 +187,8 @@ def _check_labels(tree: N3Tree, shader: Shader, channel: str) -> None:
 
 
 def _check_step(tree: N3Tree, step: float, options: RenderOptions) -> None:
-    """Raises ValueError where the ends of intervals can't be told apart. Those of cones can: an
-    interval is about as long as its cone is wide, and a distance is known far better than that.
+    """Raises ValueError where distances are too coarse for the ends of intervals to differ. With
+    cones they allow more of them: these are as long as cones are wide, far above rounding.
     """
     length = math.dist(*tree.box.tolist())
     most, hint = 2**46, "take a longer step"
@@ -205,7 +205,7 @@ def _check_step(tree: N3Tree, step: float, options: RenderOptions) -> None:
 
 @dataclass(frozen=True)
 class Batch:
-    """Samples of rays that were walked, and what can be read there."""
+    """Samples of walked rays, and what can be read there."""
 
     tracer: Tracer
     rays: ops.RayArguments
@@ -213,7 +213,7 @@ class Batch:
     listed: ops.Samples
 
     def values(self, channels: Sequence[str] = ()) -> Tensor:
-        """(k, c) values of channels side by side; of the tracer's channel where none are named."""
+        """Returns (k, c) values of channels side by side; if none is named, of the tracer's."""
         found, tree = [], self.tracer.tree
         for name in channels or (self.tracer.channel,):
             arguments = self.tracer.arguments._replace(
@@ -248,7 +248,7 @@ class Batch:
 
     @cached_property
     def starts(self) -> Tensor:
-        """(k,) where each interval starts, from where the ray enters the tree's box."""
+        """(k,) distance from where the ray enters the tree's box to where each interval starts."""
         first, _, level = self.segments.interval[self.segment].unbind(1)
         base, number = self.segments.distance[self.segment, 0], first + self.listed.number
         return base + torch.where(level < 0, 0, number).to(base.dtype) * self.lengths[:, 0]
@@ -261,14 +261,14 @@ class Batch:
 
     @cached_property
     def positions(self) -> Tensor:
-        """(k, 3) world places of the samples, the middles of their intervals."""
+        """(k, 3) world positions of the samples, the middles of their intervals."""
         t = self.moved[self.ray] + self.starts + 0.5 * self.lengths[:, 0]
         origin, direction = (column[self.ray] for column in self.rays[:2])
         return (origin + t[:, None] * direction).to(self.starts.dtype)
 
 
 def march(
-    tracer: Tracer,  # a frame; its shader's table tells only what is hidden
+    tracer: Tracer,  # a frame; its shader's table only decides what is hidden
     rays: Rays,
     shade: Callable[[Batch], tuple[Tensor, Tensor]],  # features (k, c) and alpha (k,) of samples
     features: int,  # their number c
@@ -276,8 +276,8 @@ def march(
     limit: int = PART_SAMPLES,  # samples of a ray in one part
     by_node: bool = True,  # see `trace_segments`
 ) -> tuple[Tensor, Hits, Tensor]:
-    """Walks rays part by part and shades and composites what each part sampled; rays that have
-    ended go no further.
+    """Walks rays part by part, and shades and composites the samples of each part; rays that have
+    ended are left out of the next part.
 
     Returns:
         Sums (r, c) of the features, hits without colour, and (r,) int32 nodes that were visited.
@@ -292,7 +292,7 @@ def march(
     samples, nodes = like.new_zeros((2, count), dtype=torch.int32)
     missed = like.new_zeros(count, dtype=torch.bool)
     which, state = torch.arange(count, device=like.device), None
-    if rays.transmittance is not None:  # some may have ended before
+    if rays.transmittance is not None:  # some may have ended in an earlier piece
         which = (clear > 1 - stop_alpha).nonzero()[:, 0]
         going_on = going_on.some(which)
     while len(which):

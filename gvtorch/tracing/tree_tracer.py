@@ -27,11 +27,11 @@ from .tracer import Tracer
 
 class TreeTracer(torch.nn.Module):
     """Traces world rays through a resident tree, as `render` does. Pools are buffers: `.to(device)`
-    moves them. Their dtypes stay as kernels need them, also where `half()`, `bfloat16()` or
-    `double()` of a net that holds the module changes those of others. Any number of threads may
-    trace at a time, while none writes into its buffers.
+    moves them. Their dtypes stay as kernels need them, even if `half()`, `bfloat16()` or `double()`
+    is called on a net that contains the module. Any number of threads may trace at a time, while
+    none writes into its buffers.
 
-    Buffers and numbers have the names of the ops' arguments. Light and material of a lit shader are
+    Buffers and numbers are named after the ops' arguments. Light and material of a lit shader are
     the buffer `parameter_54`, see `ops.shade_rays`; it may be edited.
     """
 
@@ -51,8 +51,8 @@ class TreeTracer(torch.nn.Module):
         depth_alpha: float = config.DEPTH_ALPHA,
         cone_scale: float = config.CONE_OVERESTIMATE,
     ) -> None:
-        """Shares the tree's pools, but for the usage stamps, which are its own. The shader is the
-        transfer function, or another fused one; the rest are fields of `RenderOptions`.
+        """Shares the tree's pools, but copies the usage stamps. The shader is the transfer
+        function, or another fused one; the rest are fields of `RenderOptions`.
 
         Raises:
             RuntimeError: The compiled op is missing.
@@ -81,7 +81,7 @@ class TreeTracer(torch.nn.Module):
         width = arguments.bricks_bzyxc.shape[4]
         check.whole("TreeTracer", "component", arguments.component, low=0, high=width - 1)
         arguments = arguments._replace(
-            stamp_t=arguments.stamp_t.clone(),  # frames of its own, not the tree's
+            stamp_t=arguments.stamp_t.clone(),  # not the tree's: frames are counted separately
             stamp_b=arguments.stamp_b.clone(),
             frame_1=torch.zeros_like(arguments.frame_1),
         )
@@ -103,7 +103,7 @@ class TreeTracer(torch.nn.Module):
         return f"TreeTracer({self.about})"
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Moves the buffers, and leaves their dtypes."""
+        """Moves the buffers without changing their dtypes."""
 
         def moved(tensor: Tensor) -> Tensor:
             made = fn(tensor)
@@ -115,7 +115,7 @@ class TreeTracer(torch.nn.Module):
     def rays(self, camera: Camera | Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Returns the rays of a camera's pixels as `forward` takes them, in the shape of its
         picture: origin and direction (h, w, 3), cone and range (h, w, 2), or (n, h, w, ...) for a
-        batch. An orbit camera stands around the tree's box.
+        batch. An orbit camera is placed around the tree's box.
         """
         placed = as_camera("TreeTracer.rays", camera).placed(self.box)
         rays = placed.rays(self.place_33.device)
@@ -125,14 +125,14 @@ class TreeTracer(torch.nn.Module):
         return origin, direction, cone, limits
 
     def __getstate__(self) -> dict[str, Any]:
-        """Names its op, which can't be pickled."""
+        """Replaces the op, which can't be pickled, by its name."""
         return {**self.__dict__, "shade_rays": str(self.shade_rays)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Finds the op again.
 
         Raises:
-            RuntimeError: It is that of a `CompiledShader`, and not loaded in this process.
+            RuntimeError: The op of a `CompiledShader` is not loaded in this process.
         """
         namespace, name = state["shade_rays"].split(".")
         op = getattr(getattr(torch.ops, namespace), name, None)
@@ -148,7 +148,7 @@ class TreeTracer(torch.nn.Module):
     def _load_from_state_dict(
         self, state: dict[str, Any], prefix: str, _told: Any, strict: bool, *lists: list[str]
     ) -> None:
-        """Refuses words that lead out of the pools; nothing is loaded then."""
+        """Loads nothing and reports an error where words point outside the pools."""
         try:
             _check_words(state, prefix)
         except ValueError as error:
@@ -201,7 +201,7 @@ class TreeTracer(torch.nn.Module):
         return color, alpha, depth, samples.reshape(lead), normal, features
 
     def arguments(self) -> TraceArguments:
-        """What rays go through."""
+        """Returns the op's arguments on the tree."""
         return TraceArguments(
             place_33=self.place_33,
             branching=self.branching,
@@ -230,7 +230,7 @@ class TreeTracer(torch.nn.Module):
         )
 
     def shading(self) -> ShadeArguments:
-        """Which shader, and its channels."""
+        """Returns the op's arguments on the shader and its channels."""
         return ShadeArguments(
             shader=self.shader,
             features=self.features,
@@ -243,11 +243,11 @@ class TreeTracer(torch.nn.Module):
 
 
 def _check_words(tensors: Mapping[str, Any], prefix: str) -> None:
-    """Raises ValueError where words lead out of the pools that come with them."""
+    """Raises ValueError where words point outside the pools in `tensors`."""
     names = ("child_tn", "brick_tn", "bricks_bzyxc")
     given: list[Any] = [tensors.get(prefix + name) for name in names]
     if not all(isinstance(one, Tensor) for one in given):
-        return  # a part is loaded: kernels take such words for absent
+        return  # only some tensors are loaded: kernels treat such words as absent
     child, brick, bricks = given
     check.words("TreeTracer", f"{prefix}child_tn", child, config.TERMINAL, len(child) - 1)
     check.words("TreeTracer", f"{prefix}brick_tn", brick, config.CONSTANT, len(bricks) - 1)
@@ -259,5 +259,5 @@ def _led(rows: Tensor, lead: list[int]) -> Tensor:
 
 
 def _given(buffer: Tensor) -> Tensor | None:
-    """Returns what a buffer holds; None if it stands for None."""
+    """Returns the buffer, or None if it is the empty one that represents None."""
     return buffer if buffer.dim() > 1 else None

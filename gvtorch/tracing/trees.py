@@ -2,8 +2,8 @@
 
 Where boxes do not overlap along a ray, trees are traced one by one and composited in the order in
 which the ray enters them. Where they do, they are composited by sample, as media that fill the same
-space: the ray is cut wherever an interval of one of the trees begins or ends, each tree tells what
-a piece shows of it, and in a piece extinctions add. Surfaces are opaque: they end the ray for all.
+space: the ray is cut wherever an interval of one of the trees begins or ends, each tree is traced
+in each piece, and the extinctions of a piece add up. Surfaces are opaque: they end the ray for all.
 
 Source: Max, "Optical models for direct volume rendering", IEEE TVCG 1995 (emission and absorption).
 """
@@ -34,10 +34,10 @@ from .options import RenderOptions
 from .pose import poses_of, world_box
 from .tracer import Batch, Tracer
 
-_PARTS = 8  # of what several trees fill: rays that have ended ask for nothing in those behind
+_PARTS = 8  # traced one after the other where trees overlap, so ended rays request no more behind
 _RAYS = {"cpu": 1 << 14, "cuda": 1 << 18}  # composited by sample at once
-_SLIVER = 1e-3  # steps: ends of intervals that are closer are one
-_MOST_ALPHA = 1 - 1e-9  # of a sample: an opaque one has no extinction that could be added
+_SLIVER = 1e-3  # steps: ends of intervals that are closer count as one
+_MOST_ALPHA = 1 - 1e-9  # of a sample: the extinction of an opaque one would be infinite
 
 #: A shader for all trees, or one for each by name.
 Shaders = Shader | Mapping[str, Shader]
@@ -45,23 +45,23 @@ Shaders = Shader | Mapping[str, Shader]
 
 @dataclass(frozen=True, eq=False)
 class TreeTrace:
-    """What traces rays through one of several trees."""
+    """The tracers of one of several trees."""
 
-    box: Tensor  # (2, 3) float64 world corners around it
-    trace: TraceRays  # with whatever the options put around
+    box: Tensor  # (2, 3) float64 world corners around the tree
+    trace: TraceRays  # the tracer, wrapped by `around`
     tracer: Tracer  # the tree alone
 
 
 def tree_traces(
     where: str,
-    scene: Mapping[str, tuple[N3Tree, Collection[str]]],  # by name: trees, and names of channels
+    scene: Mapping[str, tuple[N3Tree, Collection[str]]],  # by name: the tree, and its channel names
     shaders: Shaders,
     options: RenderOptions,  # its channel is the first of each tree if left out
     box: Tensor,  # (2, 3) world corners of the scene
     **settings: Any,  # of `Tracer`
 ) -> list[TreeTrace]:
-    """Lays ready what traces rays through trees, in one frame. Raises ValueError if a shader is
-    missing, or a tree has no such channel; see `Tracer` and `around`.
+    """Prepares the tracers of all trees for one frame. Raises ValueError if a shader is missing, or
+    a tree has no such channel; see `Tracer` and `around`.
     """
     traces, poses = [], poses_of(where, scene, options.pose)
     for name, (tree, channels) in scene.items():
@@ -94,8 +94,8 @@ def box_around(where: str, trees: Mapping[str, N3Tree], poses: Any = None) -> Te
 def trace_trees(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Traces rays through several trees; see the head of this file.
 
-    Projections, and shaders that must see a ray in one go, are not composited by sample: the tree
-    whose box is entered first comes first as a whole.
+    Projections, and shaders that must see a whole ray at once, are not composited by sample: the
+    tree whose box is entered first is in front as a whole.
     """
     if len(trees) == 1:
         return trees[0].trace(rays)
@@ -119,7 +119,7 @@ def trace_trees(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
 
 
 def overlaps(trees: Sequence[TreeTrace]) -> bool:
-    """Whether trees are composited by sample, which makes the host wait for the device."""
+    """Returns whether trees are composited by sample, which makes the host wait for the device."""
     if any(one.tracer.shader.projection or one.tracer.shader.whole_ray for one in trees):
         return False
     return any(
@@ -129,8 +129,8 @@ def overlaps(trees: Sequence[TreeTrace]) -> bool:
 
 
 def _shows(one: TreeTrace) -> bool:
-    """False where a tree is hidden by a transfer function without any opacity."""
-    shader = one.tracer.shader  # what surfaces and others take of a function is its colour alone
+    """Returns False if a tree is hidden by a transfer function without any opacity."""
+    shader = one.tracer.shader  # surfaces and others only use the colour of a transfer function
     transfer = shader.transfer if isinstance(shader, Lit) else shader
     transfer = shader.function if isinstance(shader, Filtered) else transfer
     return not isinstance(transfer, TransferFunction) or bool(transfer.opacity[:, 1].any())
@@ -150,7 +150,7 @@ def _in_order(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
 
 
 def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
-    """(r, 3) mean of the normals of trees, nearest first, by the light each takes; None without."""
+    """Returns (r, 3) the trees' mean normal, nearest first, by the light each takes, or None."""
     taken = [one.normal * one.alpha for one in ranked if one.normal is not None]
     if not taken:
         return None
@@ -162,7 +162,7 @@ def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
 
 
 def _ranked(hits: Sequence[Hits], name: str, order: Tensor) -> Sequence[Any]:
-    """A field (r, ...) of m trees, in the order (m, r) of the trees along each ray."""
+    """Returns a field (r, ...) of m trees, in the order (m, r) of the trees along each ray."""
     filled = _filled(hits, name)
     if filled is None:
         return [None] * len(hits)
@@ -173,7 +173,7 @@ def _ranked(hits: Sequence[Hits], name: str, order: Tensor) -> Sequence[Any]:
 
 
 def _filled(hits: Sequence[Hits], name: str) -> list[Tensor] | None:
-    """A field (r, ...) of each of several hits, nothing where one has none; None if none has."""
+    """Returns a field (r, ...) of all `hits`, zeros or -1 where one lacks it; None if all do."""
     fields = [getattr(one, name) for one in hits]
     given = [field for field in fields if field is not None]
     if not given:
@@ -200,7 +200,7 @@ def _by_sample(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
 
 
 def _block(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
-    """The media in front of the nearest surface, over it."""
+    """Traces the nearest surface, and composites the media in front over it."""
     surfaces = [one for one in trees if one.tracer.shader.cut_surface() is not None]
     if not surfaces:
         return _media(trees, rays)
@@ -217,7 +217,7 @@ def _block(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
 
 
 def _nearer(one: Hits, two: Hits) -> Hits:
-    """Of two hits of each ray the nearer one."""
+    """Returns the nearer of two hits of each ray."""
     first, fields = (one.depth <= two.depth)[:, 0], {}
     for name in vars(one):
         pair = _filled((one, two), name)
@@ -229,7 +229,7 @@ def _nearer(one: Hits, two: Hits) -> Hits:
 
 
 def _media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
-    """Goes along rays from box to box: where a ray is in one of them its tree is traced as ever."""
+    """Traces rays from box to box: where a ray is in one box only, its tree is traced as usual."""
     span = _spans(trees, rays)
     ends = span.transpose(0, 1).flatten(1).sort(1).values  # (r, 2m)
     hits = _nothing(rays, trees[0].tracer.dtype, trees)
@@ -258,8 +258,8 @@ def _further(
     stop: float,
     trace: TraceRays,
 ) -> Hits:
-    """Traces a stretch of the rays `which` (r,) bool that have not ended, behind their `hits`,
-    whose normals are sums by light.
+    """Traces a stretch of those rays `which` (r,) bool that have not ended, and adds it behind
+    their `hits`, whose normals are sums weighted by light.
     """
     at = (which & (hits.alpha[:, 0] < stop)).nonzero()[:, 0]
     if not len(at):
@@ -312,9 +312,9 @@ def _together(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     for one, covered in zip(trees, pieces.covered, strict=True):
         mine, light = covered[hit], before[hit]
         if label is not None and one.tracer.shader.reads_labels:
-            light = torch.where(single, light, hit_clear)  # among others: what it shows at all
+            light = torch.where(single, light, hit_clear)  # among others: any alpha is a hit
         else:
-            mine = mine & single  # a run of samples: its tree finds the place
+            mine = mine & single  # a run of samples: its tree finds the depth
         at = mine.nonzero()[:, 0]
         if not len(at):
             continue
@@ -329,7 +329,7 @@ def _together(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
 
 
 class _Shown:
-    """What pieces of rays show: sums over the trees that are sampled there, by extinction."""
+    """Colours, normals and features of pieces: sums over trees, weighted by extinction."""
 
     def __init__(self, pieces: _Pieces, dtype: torch.dtype) -> None:
         count, device = len(pieces.ray), pieces.ray.device
@@ -339,12 +339,12 @@ class _Shown:
         self.sums: dict[str, Tensor] = {}
 
     def add(self, at: Tensor, hits: Hits) -> None:
-        """Adds what a tree shows in the pieces `at` (k,)."""
+        """Adds a tree's hits in the pieces `at` (k,)."""
         alpha = hits.alpha.to(torch.float64)
         thick = -torch.log1p(-alpha.clamp(max=_MOST_ALPHA))
         self.extinction.index_add_(0, at, thick)
         self.samples.index_add_(0, at, hits.samples)
-        share = thick / alpha.clamp(min=1e-300)  # of what is premultiplied
+        share = thick / alpha.clamp(min=1e-300)  # from weights of alpha to weights of extinction
         normal = None if hits.normal is None else hits.normal * hits.alpha
         given = {"color": hits.color, "normal": normal, "features": hits.features}
         for name, field in given.items():
@@ -357,18 +357,18 @@ class _Shown:
             known.index_add_(0, at, share * field)
 
     def alpha(self) -> Tensor:
-        """(k,) of the pieces."""
+        """Returns (k,) alphas of the pieces."""
         return -torch.expm1(-self.extinction)[:, 0]
 
     def features(self) -> Tensor:
-        """(k, c) of the pieces, all that `sums` has side by side, not premultiplied."""
+        """Returns (k, c) all fields of `sums` of the pieces side by side, not premultiplied."""
         columns = [*self.sums.values()] or [self.extinction[:, :0]]
         return torch.cat(columns, 1) / self.extinction.clamp(min=1e-300)
 
     def hits(
         self, total: Tensor, left: Tensor, depth: Tensor, samples: Tensor, missed: Tensor
     ) -> Hits:
-        """What rays bring back, of sums (r, c) of the features and what is left of the light."""
+        """Returns the hits of rays, given sums (r, c) of `features` and the transmittance left."""
         widths = [one.shape[1] for one in self.sums.values()]
         given = dict(zip(self.sums, total.to(self.dtype).split(widths, 1), strict=True))
         color = given.get("color", total.new_zeros((len(total), 3), dtype=self.dtype))
@@ -389,21 +389,21 @@ class _Pieces:
 
     ray: Tensor  # (k,) int64
     span: Tensor  # (k, 2) float64 distances from the camera
-    covered: Tensor  # (m, k) bool, which trees are sampled there
+    covered: Tensor  # (m, k) bool, the trees sampled there
 
     def rays(self, rays: Rays, at: Tensor, transmittance: Tensor | None = None) -> Rays:
-        """The pieces `at` (k,) as rays of their own."""
+        """Returns the pieces `at` (k,) as separate rays."""
         return replace(rays[self.ray[at]], range=self.span[at], transmittance=transmittance)
 
     def offset(self, rays: int) -> Tensor:
-        """(r + 1,) int64 where each ray's pieces begin, and how many there are."""
+        """Returns (r + 1,) int64 indices of each ray's first piece; the last is their number."""
         count = torch.bincount(self.ray, minlength=rays)
         return torch.cat((count.new_zeros(1), count.cumsum(0)))
 
 
 def _cut(trees: Sequence[TreeTrace], rays: Rays) -> tuple[_Pieces, Tensor]:
     """Cuts rays wherever an interval that one of the trees samples begins or ends; where only one
-    is sampled, its intervals stay together. Also tells (r,) bool which rays missed something.
+    is sampled, its intervals stay together. Also returns (r,) bool: the ray missed something.
     """
     missed = torch.zeros(len(rays.origin), dtype=torch.bool, device=rays.origin.device)
     ray, place, change = [], [], []
@@ -411,7 +411,7 @@ def _cut(trees: Sequence[TreeTrace], rays: Rays) -> tuple[_Pieces, Tensor]:
         tracer = one.tracer
         given = ops.RayArguments.of(tracer.inside(replace(rays, transmittance=None)))
         known, table = tracer.arguments, tracer.arguments.table_lm4
-        if table.dim() == 4:  # by two values, (l, m, m, 4): of intervals without a change
+        if table.dim() == 4:  # pre-integrated, (l, m, m, 4): use intervals of one value
             known = known._replace(table_lm4=table.diagonal(dim1=1, dim2=2).mT.contiguous())
         segments = ops.trace_segments(given, known, by_node=True, backend=tracer.backend)
         missed |= segments.missed
@@ -428,20 +428,20 @@ def _cut(trees: Sequence[TreeTrace], rays: Rays) -> tuple[_Pieces, Tensor]:
     order = places_k.argsort(stable=True)
     order = order[rays_k[order].argsort(stable=True)]
     rays_k, places_k = rays_k[order], places_k[order]
-    covered = torch.cat(change)[order].cumsum(0) > 0  # behind each end
+    covered = torch.cat(change)[order].cumsum(0) > 0  # just behind each end
     sliver = _SLIVER * min(one.tracer.arguments.step for one in trees)
     return _joined(rays_k, places_k, covered, sliver), missed
 
 
 def _joined(ray: Tensor, place: Tensor, covered: Tensor, sliver: float) -> _Pieces:
-    """Makes pieces of the ends (k,) of intervals, sorted; `covered` (k, m) tells behind each."""
+    """Makes pieces from the sorted ends (k,) of intervals; `covered` (k, m): trees behind each."""
     same = ray[1:] == ray[:-1]
     near, far = place[:-1], place[1:]
     kept = (same & covered[:-1].any(1) & (far - near > sliver)).nonzero()[:, 0]
     ray, near, far, covered = ray[:-1][kept], near[kept], far[kept], covered[:-1][kept]
     if not len(ray):
         return _Pieces(ray, place.new_zeros((0, 2)), covered.T)
-    # Slivers between pieces go to the one behind; runs of one tree alone stay in one piece.
+    # Slivers between pieces are added to the piece behind; a run of one tree stays one piece.
     joins = (ray[1:] == ray[:-1]) & (near[1:] - far[:-1] <= 8 * sliver)
     near = torch.cat((near[:1], torch.where(joins, far[:-1], near[1:])))
     alone = covered.sum(1) == 1
@@ -455,7 +455,7 @@ def _joined(ray: Tensor, place: Tensor, covered: Tensor, sliver: float) -> _Piec
 
 
 def _spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
-    """(m, r, 2) where rays are in the boxes of trees; last < first where they are not."""
+    """Returns (m, r, 2) distances of rays in the trees' boxes; last < first where they miss."""
     spans = []
     for one in trees:
         own = one.tracer.inside(rays)
@@ -467,13 +467,13 @@ def _spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
 
 
 def _nothing(rays: Rays, dtype: torch.dtype, trees: Sequence[TreeTrace] = ()) -> Hits:
-    """Hits of rays before they have met anything, with the fields that any of the trees gives."""
+    """Returns hits of rays that have met nothing yet, with all fields that the trees give."""
     column = torch.zeros(len(rays.origin), 1, dtype=dtype, device=rays.origin.device)
     color = column.expand(-1, 3).contiguous()
     shaded = [
         (one.tracer.names, shading) for one in trees if (shading := one.tracer.shading) is not None
     ]
-    # A label is the kernel's only feature, which the tracer turns into a name: none is left.
+    # The kernel returns a label as its only feature, which the tracer turns into `label`.
     widths = [shading.features if names is None else 0 for names, shading in shaded]
     labeled = any(names is not None for names, _ in shaded)
     return Hits(
@@ -489,7 +489,7 @@ def _nothing(rays: Rays, dtype: torch.dtype, trees: Sequence[TreeTrace] = ()) ->
 
 
 def _scattered(found: Sequence[Hits], places: Sequence[Tensor]) -> Hits:
-    """Hits (r,) of which each of `found` holds those at its `places` (k,)."""
+    """Joins hits to (r,); each of `found` holds those at its indices `places` (k,)."""
     if len(found) == 1:
         return found[0]
     at = torch.cat(list(places)).argsort()

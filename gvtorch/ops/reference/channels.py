@@ -1,5 +1,5 @@
-"""Part of the torch twin: several numbers of a voxel, each with a transfer function of its own, as
-csrc/shaders/channels.h, which tells the formula and how the table is laid out.
+"""Part of the torch twin: several numbers of a voxel, each with its own transfer function, as in
+csrc/shaders/channels.h, which gives the formula and the layout of the table.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .tree import ChannelBricks
 
 
 class AllNumbers(ChannelBricks):
-    """All numbers of a channel, whose smallest and largest values are (r, c)."""
+    """All numbers of a channel; smallest and largest values are (r, c)."""
 
     def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         low, high = self.range_n2c[node].to(real).unbind(1)
@@ -24,7 +24,7 @@ class AllNumbers(ChannelBricks):
 
 
 class ChannelRows(Transfer):
-    """The rows of one channel in the table of all."""
+    """One number's rows of the shared table, as a transfer function."""
 
     def __init__(self, every: Transfer, head: Sequence[float], first: int) -> None:
         component, self.low, self.scale, rows = head
@@ -37,7 +37,7 @@ class ChannelRows(Transfer):
 
 
 class ChannelTable:
-    """The rows of all channels."""
+    """The transfer functions of all numbers."""
 
     def __init__(self, every: Transfer) -> None:
         heads = every.table_lm4[0]
@@ -48,14 +48,14 @@ class ChannelTable:
             first += self.channels[-1].rows
 
     def transparent(self, low: Tensor, high: Tensor) -> Tensor:
-        """(r,) bool: no channel is seen between low and high (r, c)."""
+        """Returns (r,) bool: no number shows anything between low and high (r, c)."""
         unseen = torch.ones_like(low[:, 0], dtype=torch.bool)
         for rows in self.channels:
             unseen = unseen & rows.transparent(low[:, rows.component], high[:, rows.component])
         return unseen
 
     def interval(self, piece: Piece, probe: Probe) -> Tensor:
-        """(r, 4) premultiplied colours and alphas of intervals."""
+        """Returns (r, 4) premultiplied colours and alphas of intervals."""
         total = torch.zeros_like(piece.middle)
         color = total[:, None].expand(-1, 3)
         level = torch.where(piece.odd, 0, piece.level)

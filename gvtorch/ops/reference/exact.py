@@ -1,4 +1,4 @@
-"""Numbers that every backend rounds alike, as csrc/base/arithmetic.h in every bit."""
+"""Arithmetic that every backend rounds alike: the same bits as csrc/base/arithmetic.h."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from torch.compiler import is_compiling
 from torch.jit import is_tracing
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
-TINY = 1.1754944e-38  # smallest normal float32: what lets less through is opaque
+TINY = 1.1754944e-38  # smallest normal float32: a transmittance not above it counts as opaque
 
 
 def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
-    """Clamps; NaN ends at the lower bound."""
+    """Clamps values; NaN becomes the lower bound."""
     low, high = torch.as_tensor(low).to(value), torch.as_tensor(high).to(value)
     raised = torch.where(value > low, value, low)
     return torch.where(raised < high, raised, high)
 
 
 def divide(a: Tensor | float, b: Tensor | float, like: Tensor) -> Tensor:
-    """a / b, rounded once: torch turns a number on either side into a product with a reciprocal."""
+    """Returns a / b, rounded once: where a or b is a number, torch multiplies by a reciprocal."""
     return torch.div(torch.as_tensor(a).to(like), torch.as_tensor(b).to(like).expand(like.shape))
 
 
@@ -36,8 +36,8 @@ def larger(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _seen_by_numpy(value: Tensor) -> np.ndarray | None:
-    """Floats on the CPU as an array, where nothing follows what becomes of them: no gradient of
-    either mode, no compiler, no recording, no transform of `torch.func`.
+    """Returns floats on the CPU as an array, or None where something tracks operations on them:
+    gradients of either mode, a compiler, a recording, a transform of `torch.func`.
     """
     if value.device.type != "cpu" or type(value) is not Tensor or value.requires_grad:
         return None
@@ -46,19 +46,20 @@ def _seen_by_numpy(value: Tensor) -> np.ndarray | None:
         return None
     try:
         return value.numpy() if unpack_dual(value).tangent is None else None
-    except RuntimeError:  # of `torch.func`: there is no memory
+    except RuntimeError:  # a tensor of `torch.func` has no memory
         return None
 
 
 def sqrt_exact(value: Tensor) -> Tensor:
-    """Square root, rounded once: torch's own may be an ulp beside it on the CPU, NumPy's is not.
-    Where NumPy's can't be had, that is mended in float64 by the remainder, whose product is exact
-    in halves (Dekker, "A floating-point technique for extending the available precision", 1971).
+    """Returns the square root, rounded once. torch's may be an ulp off on the CPU, NumPy's is not.
+    Where NumPy can't be used, float64 roots are corrected by the remainder, whose product is exact
+    when split into halves (Dekker, "A floating-point technique for extending the available
+    precision", 1971).
     """
     seen = _seen_by_numpy(value)
     if seen is not None:
         with np.errstate(invalid="ignore"):
-            return torch.from_numpy(np.sqrt(seen, out=np.empty_like(seen)))  # of 0 axes, too
+            return torch.from_numpy(np.sqrt(seen, out=np.empty_like(seen)))  # `out`: for 0 axes
     root = torch.sqrt(value.to(torch.float64))
     if value.dtype != torch.float64:
         return root.to(value.dtype)
@@ -78,7 +79,7 @@ def _polynomial(x: Tensor, highest: float, *coefficients: float) -> Tensor:
 
 
 def log2_exact(value: Tensor) -> Tensor:
-    """Base-2 logarithm of positive normal numbers, from + - * / alone.
+    """Returns the base-2 logarithm of positive normal numbers, by + - * / alone.
 
     Source: Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964, 4.1.27.
     """
@@ -98,8 +99,8 @@ def log2_exact(value: Tensor) -> Tensor:
 
 
 def log_exact(value: Tensor) -> Tensor:
-    """Natural logarithm of positive normal numbers, from + - * / alone in both precisions; of what
-    is infinite or no number, itself. Source: as `log2_exact`.
+    """Returns the natural logarithm of positive normal numbers, by + - * / alone in both
+    precisions; infinity and NaN as they are. Source: as `log2_exact`.
     """
     known = value.detach()
     exponent, s, series = _log_series(known)
@@ -108,7 +109,7 @@ def log_exact(value: Tensor) -> Tensor:
 
 
 def _log_series(value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The power of two next to numbers, and two factors of the natural logarithm of what is left:
+    """Splits numbers into 2^e * m with m near 1. Returns e, and two factors of log(m):
     s = (m - 1) / (m + 1), and 2 + 2/3 s^2 + 2/5 s^4 ...
     """
     fraction, power = torch.frexp(value)
@@ -130,7 +131,7 @@ _SLOPE = (
 
 
 def _exp2_slope(f: Tensor) -> Tensor:
-    """(2^f - 1) / f for f in [-0.5, 0.5]."""
+    """Returns (2^f - 1) / f for f in [-0.5, 0.5]."""
     if f.dtype == torch.float64:
         return _polynomial(f, *_SLOPE)
     low = (1.52527338e-5, 1.54035304e-4, 1.33335581e-3, 9.61812911e-3)
@@ -138,8 +139,8 @@ def _exp2_slope(f: Tensor) -> Tensor:
 
 
 def exp2_exact(value: Tensor) -> Tensor:
-    """2 to the power of a number, from + - * alone: 0 where it is at most -126, and the largest
-    power 2^126; in float64 -1022 and 2^1022.
+    """Returns 2^value, by + - * alone: 0 where the value is at most -126, and never above 2^126; in
+    float64 -1022 and 2^1022.
 
     Source: Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964, 4.2.1.
     """
@@ -155,20 +156,20 @@ def exp2_exact(value: Tensor) -> Tensor:
 
 
 def taken_by(halvings: Tensor) -> Tensor:
-    """1 - 2^-halvings, the light that so many halvings take; exact where that is little."""
+    """Returns 1 - 2^-halvings, the light that is absorbed; exact where that is little."""
     thin = halvings < 0.5
     near = torch.where(thin, halvings, 0.0)
     return torch.where(thin, _exp2_slope(-near) * near, 1 - exp2_exact(-halvings))
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """(r,) products of (r, 3), added from x to z."""
+    """Returns (r,) dot products of (r, 3), added from x to z."""
     product = a * b
     return product[:, 0] + product[:, 1] + product[:, 2]
 
 
 def unit(v: Tensor) -> Tensor:
-    """(r, 3) vectors of length 1, or 0 where there is no direction."""
+    """Returns (r, 3) vectors of length 1, or 0 where there is no direction."""
     columns = v.mT.contiguous()  # (3, r): passes over numbers side by side are several times faster
     x, y, z = columns.abs()
     most = larger(larger(x, y), z)
@@ -180,13 +181,13 @@ def unit(v: Tensor) -> Tensor:
 
 
 def power(x: Tensor, exponent: float | Tensor) -> Tensor:
-    """x^exponent for x in [0, 1]."""
+    """Returns x^exponent for x in [0, 1]."""
     known = x > TINY
     return torch.where(known, exp2_exact(log2_exact(torch.where(known, x, 1.0)) * exponent), 0.0)
 
 
 def stretch(alpha: Tensor, lengths: Tensor) -> Tensor:
-    """Alpha of a length, from that of length 1."""
+    """Returns the alphas of intervals of given lengths, from the alphas of length 1."""
     kept = 1 - alpha
     solid = ~(kept > TINY)
     part = 1 - exp2_exact(log2_exact(torch.where(solid, 0.5, kept)) * lengths)

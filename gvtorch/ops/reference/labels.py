@@ -1,4 +1,4 @@
-"""Part of the torch twin: voxels nearest to places, for labels, as csrc/shaders/labels.h."""
+"""Part of the torch twin: nearest voxels, for labels, as in csrc/shaders/labels.h."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _MOST_REACH = 3  # voxels
 
 @dataclass
 class Nearest:
-    """The voxel in whose cube a place lies; a face that two share belongs to the upper one."""
+    """The voxel whose cube contains a position; a face shared by two belongs to the upper one."""
 
     value: Tensor  # (r,) the node's constant where it has no brick, 0 where there is no node
     cell: Tensor  # (r, 3) int64 x y z, counted with the border
-    place: Tensor  # (r, 3) from the voxel's centre, -0.5 to 0.5
+    place: Tensor  # (r, 3) the position from the voxel's centre, -0.5 to 0.5
 
 
 class LabelBricks(ChannelBricks):
     """One component of a channel of labels."""
 
     def nearest(self, holder: Holder, beam: Beam, t: Tensor) -> Nearest:
-        """The voxels at distances t (r,)."""
+        """Returns the voxels at distances t (r,)."""
         real, side = t.dtype, self.bricks_bzyxc.shape[1]
         at = self.places(holder, beam, t)
         low, high = self.border, side - 1 - self.border
@@ -40,7 +40,7 @@ class LabelBricks(ChannelBricks):
         return Nearest(value, cell, beside)
 
     def voxel(self, holder: Holder, cell: Tensor, real: torch.dtype) -> Tensor:
-        """(r,) values of voxels (r, 3); anything where there is no brick."""
+        """Returns (r,) values of voxels (r, 3); undefined where there is no brick."""
         x, y, z = cell.unbind(1)
         if self.bricks_bzyxc.shape[0] == 0:
             return torch.zeros_like(x, dtype=real)
@@ -48,9 +48,9 @@ class LabelBricks(ChannelBricks):
         return self.bricks_bzyxc[brick, z, y, x, self.component].to(real)
 
     def away(self, holder: Holder, here: Nearest) -> Tensor:
-        """(r, 3) the mean way along x, y, z, in voxels, to those voxels around that are not of the
-        label here, of any length. Each is weighted by a tent around the place, which ends half a
-        voxel beyond as many voxels as bricks have for a border, 1 to 3.
+        """Returns (r, 3) vectors, in voxels and of any length, towards the surrounding voxels of
+        other labels: the sum of the offsets to these, each weighted by a tent around the position,
+        which ends half a voxel beyond the reach: as many voxels as the border is wide, 1 to 3.
         """
         value, last = here.value, self.bricks_bzyxc.shape[1] - 1
         reach = max(1, min(_MOST_REACH, self.border))

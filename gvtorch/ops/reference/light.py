@@ -1,5 +1,5 @@
-"""Light of the fused shaders, and shadows, which are cones from samples to the light: the twin of
-csrc/shaders/light.h.
+"""Lighting of the fused shaders, and shadows, by cones traced from samples to the light: the twin
+of csrc/shaders/light.h.
 
 Sources: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977;
 Wrenninge, Kulla, Lundqvist, "Oz: the great and volumetric", SIGGRAPH 2013 talks; Henyey,
@@ -20,31 +20,31 @@ from .march import Piece, Plain, Probe, Visitor, Walk
 from .rays import INF, Intervals, split
 from .tree import ChannelBricks
 
-#: Each octave of scattering gives so much of the light of the one before it, and keeps so much of
-#: its direction: fitted to path traced clouds (benchmarks/cloud_light.py).
+#: Factors from one octave of scattering to the next, of its light and of its directedness; fitted
+#: to path traced clouds (benchmarks/cloud_light.py).
 OCTAVE_LIGHT, OCTAVE_DIRECTION = 0.55, 0.6
-#: By how much the moments of normals may be lessened where no light comes: see `coarse_colors`.
+#: Largest factor by which moments of normals are reduced where no light comes: see `coarse_colors`.
 FAINT = 32
 
 
 @dataclass
 class Light:
-    """A light, the material it falls on, and the eye that sees it. World units."""
+    """A light, the lit material and the eye. World units."""
 
     parameters: ShadeParameters
     normals: tuple[ChannelBricks, ...]  # three components, or none
-    eye: Tensor  # (r, 3)
-    along: Tensor  # (r, 3)
-    moved: Tensor  # (r,) distance from the eye to where distances begin
+    eye: Tensor  # (r, 3) position
+    along: Tensor  # (r, 3) direction of the rays
+    moved: Tensor  # (r,) distance from the eye to where distances t begin
     cube: Tensor  # (3,) size of the root cube
 
     @property
     def scatters(self) -> bool:
-        """Whether this is a medium, whose places have no normal."""
+        """Whether matter is a scattering medium, which has no normals."""
         return bool(self.parameters.octaves > 0)
 
     def normal_at(self, probe: Probe, t: Tensor) -> Tensor:
-        """(r, 3) normals towards the eye, stored or the gradient's; 0 where there is none."""
+        """Returns (r, 3) normals towards the eye, stored or the gradient's; 0 where none exists."""
         if self.scatters:
             return torch.zeros_like(self.along)
         if self.normals:
@@ -55,12 +55,12 @@ class Light:
         return self.to_eye(normal)
 
     def to_eye(self, way: Tensor) -> Tensor:
-        """(r, 3) normals towards the eye, of vectors of any length."""
+        """Returns (r, 3) unit normals towards the eye, from vectors of any length."""
         normal = unit(way)
         return torch.where((dot(normal, self.along) > 0)[:, None], -normal, normal)
 
     def towards(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(r, 3) ways to the light, (r,) their lengths, (r,) growth of cones there per length."""
+        """Returns (r, 3) directions and (r,) distances to the light, and (r,) growth of cones."""
         back, place = -self.along, torch.as_tensor(self.parameters.light)
         length = torch.full_like(t, INF)
         growth = torch.zeros_like(t) + self.parameters.light_growth
@@ -79,8 +79,8 @@ class Light:
         t: Tensor,
         share: Callable[[Tensor], Tensor] | None = None,
     ) -> Tensor:
-        """(r, 3) colours in the light of base colours (r, 3). `share` gives the share of light that
-        comes to those places that face the light, (r,) bool; None: all comes to all.
+        """Returns (r, 3) lit colours of base colours (r, 3). `share` maps bools (r,), which samples
+        face the light, to the share of light that reaches them; None: all light reaches all.
         """
         zero = torch.zeros_like(t)
         to_light, _, _ = self.towards(t)
@@ -97,7 +97,7 @@ class Light:
         return self.lit(base, facing, highlight)
 
     def lit(self, base: Tensor, facing: Tensor, highlight: Tensor) -> Tensor:
-        """(r, 3) colours of base colours (r, 3), by how much they face the light and shine (r,)."""
+        """Returns (r, 3) lit base colours, given cosines to the light and highlights (r,)."""
         p = self.parameters
         diffuse = (p.diffuse * facing)[:, None]
         specular = (p.specular * highlight)[:, None]
@@ -108,20 +108,20 @@ class Light:
         self,
         base: Tensor,  # (r, 3) base colours
         moments: Tensor,  # (r, 6) mean products xx xy xz yy yz zz of the components of the normals;
-        # where their trace is 0, places are lit as if they faced the light
-        front: Tensor | None,  # (r, 3) mean normals of what is seen from one side alone, in the
-        # same measure: what light comes from behind does not show. None: both sides are seen
+        # where their trace is 0, the matter is lit as if it faced the light
+        front: Tensor | None,  # (r, 3) mean normals of matter that is seen from one side only, on
+        # the same scale: light from behind does not show. None: both sides are seen
         t: Tensor,  # (r,) distances
     ) -> tuple[Tensor, Tensor]:
-        """Lights rough surfaces, of which only the moments of their normals are known.
+        """Lights rough surfaces of which only the moments of the normals are known.
 
-        Of a cosine with the light, as it is on the side that the eye sees, they tell mean and
-        deviation; it is taken to be evenly spread, as it is for the normals of a ball. Highlights:
-        Toksvig, "Mipmapping normal maps", 2005, for a spread that is the same to all sides of a
-        main normal.
+        The moments give mean and deviation of the cosine with the light on the side that the eye
+        sees. The cosine is assumed to be uniformly distributed, as it is for the normals of a ball.
+        Highlights: Toksvig, "Mipmapping normal maps", 2005, for a spread that is the same to all
+        sides of a main normal.
 
         Returns:
-            (r, 3) colours in the light, and (r, 3) vectors along the normals, towards the eye.
+            (r, 3) lit colours, and (r, 3) vectors along the normals, towards the eye.
         """
         zero, d, shininess = torch.zeros_like(t), self.along, self.parameters.shininess
         total = moments[:, 0] + moments[:, 3] + moments[:, 5]
@@ -137,13 +137,13 @@ class Light:
         to_light, _, _ = self.towards(t)
         back = -times(d)
         seen = sqrt_exact(larger(zero, -dot(d, back)))
-        known = 0.8 + 0.2 * square  # the mean of a size over its root mean square
+        known = 0.8 + 0.2 * square  # ratio of mean magnitude to root mean square
         mean = known * dot(to_light, back) / torch.where(seen > 0, seen, 1.0)
         if front is not None:
             outside = known * dot(to_light, front) / torch.where(total > 0, total, 1.0)
             mean = smaller(mean, outside)
         variance = larger(zero, dot(to_light, times(to_light)) - mean * mean)
-        wide = sqrt_exact(3 * variance)  # half of what it is spread over
+        wide = sqrt_exact(3 * variance)  # half the width of the uniform distribution
         above = clamp(mean + wide, 0, 2 * wide)
         part = above * above / torch.where(wide > 0, 4 * wide, 1.0)
         facing = part + larger(zero, mean - wide)
@@ -151,7 +151,7 @@ class Light:
         half = unit(to_light - d)
         even = sqrt_exact(clamp(1.5 * square - 0.5, 0, 1))  # 0: a ball's normals, 1: one normal
         spread = divide(1 - even, 3.0, even)
-        little = 0.9 * (spread * spread)  # where no normal is the main one
+        little = 0.9 * (spread * spread)  # large where there is no main normal
         along = dot(half, times(half)) - spread + divide(little, 3.0, little)
         dull = divide(shininess, 1 + shininess * spread, spread)
         bright = divide(1 + dull, 1 + shininess, dull)
@@ -160,9 +160,9 @@ class Light:
         return self.lit(base, 1 - share + share * facing, share * highlight), back
 
     def scattered(self, base: Tensor, cosine: Tensor, clear: Tensor) -> Tensor:
-        """(r, 3) colours of places in a medium, from the share of light that comes there straight:
-        by one scattering, and by octaves that stand for more and more of them. Each takes half as
-        much from light on its way as the one before, is weaker, more coloured and less directed.
+        """Returns (r, 3) colours of samples in a medium, given the transmittance (r,) to the light.
+        The first octave is single scattering, further ones approximate multiple scattering: each
+        has half the extinction of the one before, is weaker, more coloured and less directed.
         """
         p, weight, total = self.parameters, base, torch.zeros_like(base)
         g = torch.zeros_like(cosine) + p.anisotropy
@@ -175,21 +175,21 @@ class Light:
         return base * p.ambient + p.diffuse * light * total
 
     def faintest(self, stop_clear: Tensor) -> Tensor:
-        """Transmittance below which light is not followed: the last octave sees its root."""
+        """Returns the transmittance at which shadow cones end: the last octave uses its root."""
         for _ in range(1, int(self.parameters.octaves)):
             stop_clear = stop_clear * stop_clear
         return stop_clear
 
 
 def phase(g: Tensor, cosine: Tensor) -> Tensor:
-    """(r,) Henyey's and Greenstein's phase function, its mean over all directions 1."""
+    """Returns (r,) Henyey and Greenstein's phase function, whose mean over all directions is 1."""
     square = g * g
     away = 1 + square - 2 * g * cosine
     return (1 - square) / (away * sqrt_exact(away))
 
 
 class Shadows:
-    """What cones from samples to the light go through, and what they cost."""
+    """Traces cones from samples to the light, and counts their samples and misses."""
 
     def __init__(self, walk: Walk, cube: Tensor, cone_scale: float) -> None:
         self.walk, self.cube, self.cone_scale = walk, cube, cone_scale  # the eye's; see `Light`
@@ -205,9 +205,9 @@ class Shadows:
         where: Tensor,
         light: Light,
     ) -> Tensor:
-        """(r,) share of a light, `length` (r,) away, that comes to places t (r,), where `where` is
-        true. A cone is as wide there as the eye's; its first interval is left out, so that a place
-        does not stand in its own shadow.
+        """Returns (r,) the share of a light, `length` (r,) away, that reaches the points at t (r,)
+        where `where` is true. A cone starts as wide as the eye's is there; its first interval is
+        left out, so that a point does not shadow itself.
         """
         which = where.nonzero()[:, 0]
         t, way, eye = t[which], way[which], self.walk.at.beam[which]
@@ -237,19 +237,19 @@ class Shadows:
 
 @dataclass
 class Veil(Visitor):
-    """What matter takes from the light that goes through."""
+    """The visitor of shadow cones: the transmittance through matter."""
 
     matter: Plain
-    along: Tensor  # (r, 3) world
+    along: Tensor  # (r, 3) world direction
     clear: Tensor  # (r,) transmittance
-    stop_clear: Tensor  # (): at which the way ends
-    each_interval: bool  # regions of one value are not taken as one
+    stop_clear: Tensor  # (): cones end at this transmittance
+    each_interval: bool  # regions of one value are not taken in one step
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
         return self.matter.hides(which, low, high)
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        if self.each_interval:  # 1 - alpha of a long one would round to 0
+        if self.each_interval:  # 1 - alpha of a long interval would round to 0
             return torch.zeros_like(fine, dtype=torch.bool)
         return self.matter.same(fine, coarse)
 

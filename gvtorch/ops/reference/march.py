@@ -1,10 +1,10 @@
 """The torch twins of the ops on rays, right by definition: plain tensors, float32 or float64. Here:
-the walk of rays through a tree, what a visitor of it may ask, the transfer function, compositing,
-and `trace_rays`.
+the walk of rays through a tree, the queries that its visitors may make, the transfer function,
+compositing, and `trace_rays`.
 
-Every float operation stands in the order of the kernel (cpp_ext/csrc), and no two of them are
-fused, so integers come out equal and colours equal to rounding. All rays walk in lockstep: a row of
-every tensor is a ray. docs/design.md, section 3, tells the method.
+Float operations are in the order of the kernel (cpp_ext/csrc), and no two of them are fused, so
+integers are equal and colours equal to rounding. All rays walk in lockstep: each row of a tensor is
+a ray. docs/design.md, section 3, describes the method.
 
 Sources: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels", I3D 2009; Crassin, PhD thesis 2011,
 chapter 6.
@@ -31,35 +31,35 @@ _SLACK = 2.0**-20  # relative
 
 @dataclass
 class NodePair(Rows):
-    """The one or two nodes whose bricks tell a ray's values."""
+    """The one or two nodes whose bricks a ray's values are read from."""
 
     fine: Holder
-    coarse: Holder  # the fine one again where only one answers
+    coarse: Holder  # same as `fine` where only one node is used
     voxel: Tensor  # (r,) world size of a voxel at the wanted depth
     above: Tensor  # (r,) and at the depth above it
 
 
 @dataclass
 class Visit(NodePair):
-    """The node each ray stands in: where the visit ends, and what the node shows."""
+    """The node that each ray is in: where the visit ends, and what the node shows."""
 
     seen: Tensor  # (r,) distance at which the node was looked up
     wanted: Tensor  # (r,) int64 depth that the cone asked for
     reaches: Tensor  # (r,) bool: the cone is at least as wide as a voxel of the wanted depth
     exit: Tensor  # (r,) distance at which the ray leaves the node
-    nothing: Tensor  # (r,) bool: no node answers, or only EMPTY ones
-    uniform: Tensor  # (r,) bool: one value answers all over the node
+    nothing: Tensor  # (r,) bool: nothing is seen, no node has data, or only EMPTY ones
+    uniform: Tensor  # (r,) bool: the node has one value everywhere
 
     @classmethod
     def none(cls, like: Tensor) -> Visit:
-        """Rays that have not looked up any node yet."""
+        """Returns the visit of rays that have not looked up any node yet."""
         zero, no = torch.zeros_like(like), torch.zeros_like(like, dtype=torch.bool)
         word = zero.to(torch.int64)
         holder = Holder(word, word, word, torch.stack((zero,) * 3, 1).double(), zero)
         return cls(holder, holder, zero, zero, zero, word, no, zero, no, no)
 
     def stays(self, at: Intervals) -> Tensor:
-        """(r,) bool: the interval's middle still lies in the node, and wants the same levels."""
+        """Returns (r,) bool: the interval's middle is still in the node, wants the same levels."""
         middle = at.middle
         cone = at.beam.cone(middle)
         fits = torch.where(
@@ -70,26 +70,26 @@ class Visit(NodePair):
 
 @dataclass
 class Probe:
-    """What a visitor may ask of the tree at places of its rays."""
+    """The queries that a visitor may make at points of its rays."""
 
     beam: Beam
     nodes: NodePair
     channel: ChannelBricks
 
     def value(self, t: Tensor) -> Tensor:
-        """(r,) values at distances t (r,)."""
+        """Returns (r,) values at distances t (r,)."""
         return self.number(self.channel, t)
 
     def number(self, bricks: ChannelBricks, t: Tensor) -> Tensor:
-        """(r,) numbers of any channel at distances t (r,)."""
+        """Returns (r,) numbers of any channel at distances t (r,)."""
         return self.blend(t, lambda holder: bricks.sample(holder, self.beam, t))
 
     def gradient(self, t: Tensor, cube: Tensor) -> Tensor:
-        """(r, 3) gradients by world units, over one voxel; `cube` (3,): that of the root cube."""
+        """Returns (r, 3) gradients per world unit, over one voxel; `cube` (3,): root cube size."""
         return self.blend(t, lambda holder: self.slope(holder, t, cube))
 
     def slope(self, holder: Holder, t: Tensor, cube: Tensor) -> Tensor:
-        """(r, 3) gradients as one of the nodes tells them; see `gradient`."""
+        """Returns (r, 3) gradients from one of the nodes; see `gradient`."""
         slopes = []
         for axis in range(3):
             shifts = [[way if a == axis else 0.0 for a in range(3)] for way in (-0.5, 0.5)]
@@ -98,8 +98,8 @@ class Probe:
         return torch.stack(slopes, 1)
 
     def blend(self, t: Tensor, ask: Callable[[Holder], Tensor]) -> Tensor:
-        """(r,) or (r, c): what the node says and what its parent says, whose weight grows from 0
-        where the cone is as wide as the node's voxels to 1 where it is as wide as its parent's.
+        """Returns (r,) or (r, c): `ask` of the node blended with `ask` of its parent, whose weight
+        grows from 0 where the cone is as wide as the node's voxels to 1 where as its parent's.
         """
         nodes = self.nodes
         two, value = nodes.fine.node != nodes.coarse.node, ask(nodes.fine)
@@ -114,17 +114,17 @@ class Probe:
 
 @dataclass
 class Piece:
-    """An interval of every ray: a whole one, or an odd one of any length."""
+    """An interval of each ray: whole, or odd (of any other length)."""
 
     start: Tensor  # (r,)
     end: Tensor  # (r,)
-    middle: Tensor  # (r,) where values are taken
+    middle: Tensor  # (r,) where values are sampled
     length: Tensor  # (r,)
-    lengths: Tensor  # (r,) the same in shortest intervals
+    lengths: Tensor  # (r,) the length in units of the shortest interval
     odd: Tensor  # (r,) bool
     level: Tensor  # (r,) int64, of the whole interval that starts here
     base: Tensor  # (r,) where its level was chosen
-    count: Tensor  # (r,) its number since then, as a float
+    count: Tensor  # (r,) number of intervals since the base, as a float
 
 
 class Accumulator:
@@ -138,22 +138,22 @@ class Accumulator:
         self.hit_clear = hit_clear  # ()
 
     def hits(self, beam: Beam) -> tuple[Tensor, Tensor, Tensor]:
-        """Colours (r, 3), alphas (r, 1) and world depths (r, 1)."""
+        """Returns colours (r, 3), alphas (r, 1) and world depths (r, 1)."""
         return self.color, (1 - self.clear)[:, None], (self.depth + beam.moved)[:, None]
 
     def add(self, rgba: Tensor, piece: Piece, where: Tensor) -> None:
-        """Adds an interval of a colour and an alpha where `where` is true."""
+        """Adds an interval with colour and alpha (r, 4) where `where` is true."""
         share = self.clear * rgba[:, 3]
         self.add_light(share[:, None] * rgba[:, :3], where)
         self.absorb(rgba[:, 3], piece, where)
 
     def add_light(self, color: Tensor, where: Tensor) -> None:
-        """Adds (r, 3) light that comes to the eye, where `where` is true."""
+        """Adds light (r, 3) that reaches the eye, where `where` is true."""
         self.color = torch.where(where[:, None], self.color + color, self.color)
 
     def absorb(self, alpha: Tensor, piece: Piece, where: Tensor) -> None:
-        """Lets an interval take its share of the light where `where` is true. Depth is where,
-        inside it, the transmittance fell to hit_clear, as if it were of one value.
+        """Multiplies the transmittance by 1 - alpha where `where` is true. Depth is where inside
+        the interval the transmittance falls to hit_clear, as if the interval were homogeneous.
         """
         kept = 1 - alpha
         left = self.clear * kept
@@ -173,32 +173,32 @@ class Transfer:
         self.table_lm4, self.domain_2, self.opaque_m = a.table_lm4, a.domain_2, a.opaque_m
 
     def place(self, value: Tensor) -> Tensor:
-        """(r,) rows of values, with a fraction."""
+        """Returns (r,) fractional rows of values."""
         low, high = self.domain_2.unbind(0)
         last = len(self.opaque_m) - 1
         return clamp((value - low) * divide(last, high - low, high), 0, last)
 
     def cell(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """(r,) int64 rows before values, and (r,) how far they are on the way to the next."""
+        """Returns (r,) int64 rows at or before values, and (r,) weights of the next rows."""
         place = self.place(value)
         row = smaller(torch.floor(place), torch.full_like(place, len(self.opaque_m) - 2))
         return row.to(torch.int64), place - row
 
     def look_up(self, value: Tensor, level: Tensor | None = None) -> Tensor:
-        """(r, 4) linear RGB and the alpha of an interval of each ray's level; None: the first."""
+        """Returns (r, 4) linear RGB and alpha of an interval of each ray's level; None: level 0."""
         row, weight = self.cell(value)
         which = torch.zeros_like(row) if level is None else level
         return mix(self.table_lm4[which, row], self.table_lm4[which, row + 1], weight)
 
     def interval(self, value: Tensor, piece: Piece) -> Tensor:
-        """(r, 4) linear RGB and the alpha of an interval of one value."""
+        """Returns (r, 4) linear RGB and the alpha of an interval of one value."""
         odd, whole = self.look_up(value), self.look_up(value, piece.level)
         alpha = stretch(odd[:, 3], piece.lengths)[:, None]
         odd = torch.cat((odd[:, :3], alpha), 1)
         return torch.where(piece.odd[:, None], odd, whole)
 
     def transparent(self, smallest: Tensor, largest: Tensor) -> Tensor:
-        """Bool: no value between the two is seen."""
+        """Returns bools: no value between the two has an opacity."""
         first = torch.floor(self.place(a_little_below(smallest))).to(torch.int64)
         end = torch.ceil(self.place(a_little_above(largest))).to(torch.int64)
         before = torch.where(first > 0, self.opaque_m[(first - 1).clamp(min=0)], 0)
@@ -206,43 +206,43 @@ class Transfer:
 
 
 def mix(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
-    """(r, c) numbers between two."""
+    """Interpolates linearly from a (r, c) to b (r, c)."""
     return a + weight[:, None] * (b - a)
 
 
 def a_little_above(value: Tensor) -> Tensor:
-    """A little more, since interpolation may round beyond its ends."""
+    """Raises values by 2^-20 of their size, since interpolation may round beyond its ends."""
     return value + larger(value, -value) * _SLACK
 
 
 def a_little_below(value: Tensor) -> Tensor:
-    """A little less."""
+    """Lowers values by 2^-20 of their size."""
     return value - larger(value, -value) * _SLACK
 
 
 @dataclass
 class Visitor(ABC):
-    """What rays do on their way: a shader, or a list of what one would sample."""
+    """Receives the intervals of a walk: a shader, or a recorder of what one would sample."""
 
     transfer: Transfer
     channel: ChannelBricks
     sees_empty = False  # whether EMPTY nodes are sampled, too
 
     def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """(k,) bool: nothing between two values (k,) changes anything for the rays `which` (k,)."""
+        """Returns (k,) bool: no value from low to high (k,) has an effect on rays `which` (k,)."""
         return self.transfer.transparent(low, high)
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """(k,) bool: two nodes without bricks (k,) hold the same numbers, everywhere."""
+        """Returns (k,) bool: two nodes without bricks (k,) are equal, so the region is uniform."""
         return self.channel.same(fine, coarse)
 
     @abstractmethod
     def goes_on(self, leaves: Tensor) -> Tensor:
-        """(r,) bool: the ray has not ended; `leaves` (r,): it is between two nodes."""
+        """Returns (r,) bool: the ray has not ended; `leaves` (r,): it is between two nodes."""
 
     @abstractmethod
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """Takes an interval where `where` (r,) is true."""
+        """Adds an interval where `where` (r,) is true."""
 
 
 class Walk:
@@ -252,18 +252,18 @@ class Walk:
         self.at, self.tree, self.channel = at, tree, channel
         self.visit = Visit.none(at.start)
         self.samples = self.visits = torch.zeros_like(at.start, dtype=torch.int32)
-        self.missed = torch.zeros_like(at.start, dtype=torch.bool)  # something that was seen
+        self.missed = torch.zeros_like(at.start, dtype=torch.bool)
 
     @classmethod
     def enter(
         cls, rays: RayArguments, a: TraceArguments, channel: type[ChannelBricks] = ChannelBricks
     ) -> Walk:
-        """World rays where they enter the scene."""
+        """Returns a walk of world rays, at the points where they enter the scene."""
         beam = Beam.enter(rays, a, a.table_lm4.dtype)
         return cls(Intervals(beam, a.step, len(a.table_lm4)), Tree(a), channel.of(a))
 
     def go(self, visitor: Visitor) -> None:
-        """Takes every ray from where it stands to the scene's far side, or until it ends."""
+        """Walks every ray to the scene's far side, or until it ends."""
         at, leaves = self.at, torch.ones_like(self.missed)
         active = at.inside() & visitor.goes_on(leaves)
         while active.any():
@@ -271,7 +271,7 @@ class Walk:
                 self.look_up((active & leaves).nonzero()[:, 0], at.middle, visitor)
             visit = self.visit
 
-            # A node of one value, or of none, is left in one go; else one interval is taken.
+            # A node of one value, or of none, is crossed in one step; else one interval is added.
             whole = active & (visit.uniform | visit.nothing)
             level, base, count, start = at.level, at.base, at.count, at.start
             middle, odd, length = at.middle, visit.uniform | at.cut, at.length
@@ -291,7 +291,7 @@ class Walk:
             active = at.inside() & visitor.goes_on(leaves)
 
     def look_up(self, which: Tensor, t: Tensor, visitor: Visitor) -> None:
-        """Finds the nodes of the rays `which` (k,) at t (r,); marks what they use and miss."""
+        """Finds the nodes of rays `which` (k,) at t (r,); stamps used and requests absent data."""
         tree, beam, t = self.tree, self.at.beam[which], t[which]
         cone, position = beam.cone(t), beam.at(t)
         wanted = tree.levels.wanted(cone)
@@ -328,11 +328,11 @@ class Plain(Visitor):
     """The transfer function."""
 
     sum: Accumulator
-    stop_clear: Tensor  # (): a ray ends where no more light is left
+    stop_clear: Tensor  # (): a ray ends where its transmittance is not above this
 
     @classmethod
     def begin(cls, rays: RayArguments, a: TraceArguments, walk: Walk, *more: Any) -> Self:
-        """A shader before its first interval; `more` are a subclass's own fields."""
+        """Returns a shader before its first interval; `more` are the fields of a subclass."""
         hit_clear, stop_clear = (
             1 - torch.tensor(alpha, dtype=a.table_lm4.dtype).to(a.table_lm4)
             for alpha in (a.depth_alpha, a.stop_alpha)
@@ -347,18 +347,18 @@ class Plain(Visitor):
         self.sum.add(self.rgba(piece, probe), piece, where)
 
     def rgba(self, piece: Piece, probe: Probe) -> Tensor:
-        """(r, 4) what the transfer function makes of intervals."""
+        """Returns (r, 4) colours and alphas of intervals by the transfer function."""
         return self.transfer.interval(probe.value(piece.middle), piece)
 
     def alpha(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
-        """(r,) what intervals take from the light that goes along `along` (r, 3)."""
+        """Returns (r,) alphas of intervals, seen along the directions `along` (r, 3)."""
         return self.rgba(piece, probe)[:, 3]
 
 
 def trace_rays(
     rays: RayArguments, arguments: TraceArguments
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Twin of `ops.trace_rays`. The rays' `width` orders them, which changes nothing."""
+    """Twin of `ops.trace_rays`. The rays' `width` only orders them, so it is ignored."""
     walk = Walk.enter(rays, arguments)
     plain = Plain.begin(rays, arguments, walk)
     walk.go(plain)

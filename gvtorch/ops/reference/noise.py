@@ -1,14 +1,14 @@
 """The twin of `noise`: gradient, value, simplex and cellular noise of points, in plain torch.
 
 Integers wrap at 32 bits, so hashes are equal on every device, and floats are made by + - * and
-square roots alone, in one order. Nothing depends on values but numbers: no shape, no branch.
+square roots alone, in one order. No shape and no branch depends on values.
 
 Sources: Perlin, "Improving noise", SIGGRAPH 2002 (fade, the twelve gradients); Perlin, "Noise
     hardware", SIGGRAPH course notes 2001, and Gustavson, "Simplex noise demystified", 2005 (simplex
     noise); Gustavson, McEwan, "Tiling simplex noise and flow noise in two and three dimensions",
-    JCGT 2022 (which periods simplices have); Worley, "A cellular texture basis function", SIGGRAPH
-    1996 (here each cell has one point, not a Poisson distributed number of them). The hash is our
-    own: products with odd numbers and shifts, its avalanche measured in the tests.
+    JCGT 2022 (the possible periods of simplices); Worley, "A cellular texture basis function",
+    SIGGRAPH 1996 (here each cell has one point, not a Poisson distributed number of them). The hash
+    is ours: products with odd numbers, and shifts; the tests measure its avalanche.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .exact import sqrt_exact
 
 #: Points evaluated together on the CPU: their temporaries then stay in its caches.
 CHUNK = 1 << 16
-#: Coordinates from here on count as 0: 32 bits count cells, skewed ones of simplices too.
+#: Coordinates from here on count as 0: cell numbers must fit into 32 bits, also skewed ones.
 _MOST = 2.0**29
 #: In the order of `NoiseKind` in csrc/noise/noise.h.
 KINDS = ("perlin", "value", "simplex", "F1", "F2", "F2-F1")
@@ -42,7 +42,7 @@ _UNSKEW = {2: (3 - math.sqrt(3)) / 6, 3: 1 / 6}
 
 
 class Given(NamedTuple):
-    """What a noise is made with, but for points."""
+    """The parameters of a noise."""
 
     salt: tuple[int, int, int]  # int32
     period: tuple[int, int, int]  # 0: none
@@ -51,7 +51,7 @@ class Given(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """Along one axis: where points lie in their cell, and the hashes of the cell's two ends."""
+    """Along one axis: the points' offsets in their cells, and the hashes of the cells' two ends."""
 
     offset: Tensor  # from the cell's low end, 0 to 1
     low: Tensor  # int32
@@ -86,8 +86,8 @@ def _value(axes: Sequence[Tensor], given: Given) -> Tensor:
 
 
 def _simplex(axes: Sequence[Tensor], given: Given) -> Tensor:
-    """Ramps fade by (1/2 - r^2)^4, which is 0 before the next corner's cell begins. The 0.6 that is
-    often used in space is not, and such noise jumps.
+    """Evaluates simplex noise. Ramps fade by (1/2 - r^2)^4, which is 0 before the next corner's
+    cell begins; with the 0.6 that is often used in space it is not, and such noise jumps.
     """
     n = len(axes)
     skew = sum(axes[1:], axes[0]).detach() * _SKEW[n]
@@ -137,9 +137,9 @@ def _ranks(offsets: list[Tensor]) -> list[Tensor]:
 
 
 def _simplex_hash(places: list[Tensor], given: Given) -> Tensor:
-    """Returns int32 hashes of corners by their int32 skewed coordinates.
+    """Returns int32 hashes of corners from their int32 skewed coordinates.
 
-    In space, 6 times the coordinates without skew are whole numbers, and a period wraps those.
+    In space, 6 times the unskewed coordinates are integers, and a period wraps those.
     """
     if len(places) == 3:
         total = sum(places[1:], places[0])
@@ -154,8 +154,8 @@ def _simplex_hash(places: list[Tensor], given: Given) -> Tensor:
 
 
 def _neighbours(axes: Sequence[Tensor], given: Given) -> list[tuple[Tensor, list[Tensor]]]:
-    """Returns for each cell in reach its int32 hashes, and along each axis how far the least place
-    of its point is from where we are.
+    """Returns for each cell in reach its int32 hashes, and along each axis the offset from the
+    evaluated point to the lowest position that the cell's point can have.
     """
     steps, hashes, lows = range(-given.reach, given.reach + 1), [], []
     for place, salt, every in zip(axes, given.salt, given.period, strict=False):
@@ -177,7 +177,7 @@ def _neighbours(axes: Sequence[Tensor], given: Given) -> list[tuple[Tensor, list
 
 
 def salts(seed: int) -> tuple[int, int, int]:
-    """Returns for x, y and z 32 bits, as int32, that stand for a seed."""
+    """Returns int32 salts for x, y and z, derived from a seed."""
     x, y, z = (_salt(seed, axis) for axis in range(3))
     return x, y, z
 
@@ -192,24 +192,24 @@ def _salt(seed: int, axis: int) -> int:
 
 
 def scramble(lattice: Tensor, salt: int) -> Tensor:
-    """Returns int32 hashes of int32 coordinates along an axis, by the axis' salt."""
+    """Returns int32 hashes of int32 coordinates along an axis, given the axis' salt."""
     bits = lattice.bitwise_xor(salt).mul_(_FIRST)
     bits = bits.bitwise_xor_(bits >> 15).mul_(_SECOND)
     return bits.bitwise_xor_(bits >> 13)
 
 
 def join(first: Tensor, second: Tensor) -> Tensor:
-    """Returns int32 hashes of pairs of hashes; their high bits are the best ones.
+    """Returns int32 hashes of pairs of hashes; their high bits are the best mixed.
 
-    The shift is arithmetic, so that a word and its complement become one. That costs one bit of 32
-    and saves the mask that a logical shift needs.
+    The shift is arithmetic, so a word and its complement get the same hash. That costs one bit of
+    32 and saves the mask that a logical shift needs.
     """
     bits = first.bitwise_xor(second).mul_(_FIRST)
     return bits.bitwise_xor_(bits >> 15).mul_(_SECOND)
 
 
 def cells(axes: Sequence[Tensor], given: Given) -> list[Cell]:
-    """Returns for each axis where points lie in the cells of the integer lattice."""
+    """Returns for each axis the cells of the integer lattice that contain the points."""
     found = []
     for place, salt, every in zip(axes, given.salt, given.period, strict=False):
         floor = place.detach().floor()
@@ -220,7 +220,7 @@ def cells(axes: Sequence[Tensor], given: Given) -> list[Cell]:
 
 
 def wrapped(lattice: Tensor, period: int) -> Tensor:
-    """Returns lattice coordinates in the first period; 0: there is none."""
+    """Returns lattice coordinates wrapped into the first period; unchanged if the period is 0."""
     return lattice.remainder(period) if period else lattice
 
 
@@ -247,11 +247,11 @@ def blend(values: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
 
 
 def gradient(bits: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns x, y, z of the gradient that int32 hashes choose: from a cube's centre to the middle
+    """Returns x, y, z of the gradient that int32 hashes select: from a cube's centre to the middle
     of one of its twelve edges, so two of them are 1 or -1 and one is 0.
 
-    Signs are bits 6 and 7, and the upper 24 bits, in thirds, tell which is 0. They are floats made
-    bit by bit, since a choice by `torch.where` takes 20 times as long as an addition on the CPU.
+    Bits 6 and 7 are the signs, and the third in which the upper 24 bits lie selects the 0. Floats
+    are assembled from bits, since `torch.where` takes 20 times as long as an addition on the CPU.
     """
     third = bits >> 8
     not_x, not_z = (third + _THIRD) >> 31, (_THIRD - third) >> 31  # -1 where that one is 0, else 0
@@ -267,8 +267,8 @@ def gradient(bits: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def ramp(bits: Tensor, away: Sequence[Tensor]) -> Tensor:
-    """Returns the scalar product of the gradient that hashes choose and (x, y) or (x, y, z). In the
-    plane it is that of the plane z = 0 in space.
+    """Returns the dot product of the gradient that hashes select and (x, y) or (x, y, z). In 2D it
+    equals that in space with z = 0.
     """
     own = gradient(bits, away[0].dtype)
     total = own[0] * away[0] + own[1] * away[1]
@@ -276,8 +276,8 @@ def ramp(bits: Tensor, away: Sequence[Tensor]) -> Tensor:
 
 
 def in_chunks(evaluate: Callable[..., Tensor], axes: Sequence[Tensor]) -> Tensor:
-    """Returns `evaluate(*axes)`, an elementwise function of coordinates of one shape. In chunks on
-    the CPU, unless gradients are recorded or torch.compile fuses the operations.
+    """Returns `evaluate(*axes)`, an elementwise function of coordinates of one shape. It runs in
+    chunks on the CPU, unless gradients are recorded or torch.compile fuses the operations.
     """
     first = axes[0]
     whole = first.device.type != "cpu" or torch.compiler.is_compiling()

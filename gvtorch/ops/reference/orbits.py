@@ -1,6 +1,6 @@
 """Orbits of escape-time fractals: of points, and of balls of points, for any step. The ops of
-`ops/orbits.py` are compiled for two of them, `power` and `fold`. Points are (3, k) here, so that
-each coordinate is a tensor of its own.
+`ops/orbits.py` are compiled for two steps, `power` and `fold`. Points are (3, k) here, so that each
+coordinate is one row.
 
 Sources: White, Nylander, "The Mandelbulb", 2009 (z^n in spherical coordinates); Lowe, "Mandelbox",
     2010; Hart, Sandin, Kauffman, "Ray tracing deterministic 3-D fractals", SIGGRAPH 1989 (distance
@@ -18,20 +18,21 @@ from torch import Tensor
 
 from .exact import clamp, divide, larger, log_exact, smaller, sqrt_exact
 
-#: A step of an orbit, z (3, k) to f(z) (3, k), and how far it takes neighbours apart, (k,).
+#: A step of an orbit: z (3, k) to f(z) (3, k), and the factor (k,) by which it stretches distances
+#: between neighbours.
 Step = Callable[[Tensor], tuple[Tensor, Tensor]]
-#: For balls around z (3, k) of radii (k,): the most that a step takes points apart, by unit of
-#: their distance, and the smallest and largest of its second answers, (k,) each.
+#: For balls around z (3, k) of radii (k,): a bound of the factor by which a step stretches
+#: distances in the ball, and the smallest and largest of the factors of `Step`, (k,) each.
 Ranges = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
-INSIDE = 1.0  # world units that the fractal's inside is told to be deep: no estimate is known
-FAR = 1e3  # a ball's orbits that get so far apart tell nothing any more
+INSIDE = 1.0  # the fractal's inside gets minus this as its distance: no estimate is known
+FAR = 1e3  # a ball of orbits that grows to this radius is given up: nothing is known of it
 
 
 def spherical_power(z: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """z^n in spherical coordinates: |z|^n, and both angles n times. Two complex powers: of z + i
-    rho, whose angle is that from the axis, and of the direction (x + i y) / rho; rho is the
-    distance from the axis.
+    """`Step` to z^n in spherical coordinates: |z|^n, both angles times n. Uses two complex powers:
+    of z + i rho, whose angle is that from the axis, and of the direction (x + i y) / rho, where rho
+    is the distance from the axis.
     """
     x, y, up = z.unbind(0)
     away = sqrt_exact(_at_least(x * x + y * y, 1e-30))
@@ -43,11 +44,10 @@ def spherical_power(z: Tensor, n: int) -> tuple[Tensor, Tensor]:
 
 
 def power_ranges(z: Tensor, reach: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
-    """`Ranges` of `spherical_power`. Along radius and meridian n r^(n-1), along the circle of
-    latitude that times |sin(n angle) / sin(angle)|, which is at most n. The angle, which is that
-    from the axis, changes by at most asin(reach / r) in a ball; asin(s) <= s + (pi / 2 - 1) s^3,
-    since all terms of its series are positive and all beyond the first together pi / 2 - 1 at
-    s = 1.
+    """`Ranges` of `spherical_power`. It stretches by n r^(n-1) along radius and meridian, and along
+    the circle of latitude by |sin(n angle) / sin(angle)|, at most n, times as much. The angle from
+    the axis changes by at most asin(reach / r) in a ball; asin(s) <= s + (pi / 2 - 1) s^3, since
+    all terms of its series are positive and those beyond the first add up to pi / 2 - 1 at s = 1.
     """
     x, y, up = z.unbind(0)
     away, radius = sqrt_exact(x * x + y * y), sqrt_exact(_squared(z))
@@ -64,8 +64,8 @@ def power_ranges(z: Tensor, reach: Tensor, n: int) -> tuple[Tensor, Tensor, Tens
 
 
 def fold(z: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-    """The Mandelbox's step: coordinates beyond 1 are folded back, small vectors inverted in balls
-    of radius 1/2 and 1, and all is scaled.
+    """The Mandelbox's `Step`: folds coordinates beyond 1 back, inverts short vectors in balls of
+    radius 1/2 and 1, and scales.
     """
     folded = 2 * clamp(z, -1.0, 1.0) - z
     grown = divide(1.0, clamp(_squared(folded), 0.25, 1.0), z[0])
@@ -73,7 +73,7 @@ def fold(z: Tensor, scale: float) -> tuple[Tensor, Tensor]:
 
 
 def fold_ranges(z: Tensor, reach: Tensor, scale: float) -> tuple[Tensor, Tensor, Tensor]:
-    """`Ranges` of `fold`: the fold takes nothing apart, inversion at most by 1 / r^2."""
+    """`Ranges` of `fold`: the fold stretches nothing, inversion at most by 1 / r^2."""
     radius = sqrt_exact(_squared(2 * clamp(z, -1.0, 1.0) - z))
     near, far = clamp(radius - reach, 0.5, 1.0), clamp(radius + reach, 0.5, 1.0)
     high = divide(abs(scale), near * near, reach)
@@ -81,18 +81,18 @@ def fold_ranges(z: Tensor, reach: Tensor, scale: float) -> tuple[Tensor, Tensor,
 
 
 class Way(NamedTuple):
-    """How orbits go on, and when they end."""
+    """The iteration of orbits, and when they end."""
 
     step: Step
     ranges: Ranges
-    constant_3: Tensor | None  # what each step adds; None: each point's own place
-    bailout_1: Tensor  # beyond this distance from the origin they have escaped
-    iterations: int  # most steps
+    constant_3: Tensor | None  # added in each step; None: the point that the orbit started at
+    bailout_1: Tensor  # orbits escape beyond this distance from the origin
+    iterations: int  # largest number of steps
     logarithmic: bool  # |z| grows as a power; else by a factor
 
 
 def orbits(point_p3: Tensor, way: Way) -> Tensor:
-    """Follows points until they escape; see `ops.orbits`."""
+    """Iterates points until they escape; see `ops.orbits`."""
     z, bailout = point_p3.mT, way.bailout_1
     constant, add = (z, 1.0) if way.constant_3 is None else (way.constant_3[:, None], 0.0)
     radius = sqrt_exact(_squared(z))
@@ -109,8 +109,8 @@ def orbits(point_p3: Tensor, way: Way) -> Tensor:
 
 
 def orbit_bounds(center_k3: Tensor, reach_k: Tensor, way: Way) -> Tensor:
-    """Follows the middle of balls, and a radius that holds the orbits of all of their points; see
-    `ops.orbit_bounds`.
+    """Iterates the centre of balls, and a radius that contains the orbits of all of their points;
+    see `ops.orbit_bounds`.
     """
     z, reach, bailout = center_k3.mT, reach_k, way.bailout_1
     constant, push, add = z, reach, 1.0
@@ -118,7 +118,7 @@ def orbit_bounds(center_k3: Tensor, reach_k: Tensor, way: Way) -> Tensor:
         constant, push, add = way.constant_3[:, None], torch.zeros_like(reach), 0.0
     low_apart = high_apart = torch.ones_like(reach)
     low, high = torch.full_like(reach, math.inf), torch.full_like(reach, -math.inf)
-    inside = torch.ones_like(reach, dtype=torch.bool)  # whether any point may be, still
+    inside = torch.ones_like(reach, dtype=torch.bool)  # whether any point may not have escaped yet
     lost = ~inside
     for turn in range(way.iterations + 1):
         radius = sqrt_exact(_squared(z))
@@ -145,7 +145,7 @@ def orbit_bounds(center_k3: Tensor, reach_k: Tensor, way: Way) -> Tensor:
 
 
 def _estimate(radius: Tensor, apart: Tensor, way: Way) -> Tensor:
-    """A distance, of orbits that have got to a radius while neighbours came apart."""
+    """Returns distance estimates of orbits at a radius, whose neighbours are stretched apart."""
     return 0.5 * radius * log_exact(radius) / apart if way.logarithmic else radius / apart
 
 
@@ -156,7 +156,7 @@ def _squared(z: Tensor) -> Tensor:
 
 
 def _from_planes(z: Tensor) -> Tensor:
-    """Returns (k,) distances from the nearest of the three planes of two axes."""
+    """Returns (k,) distances from the nearest of the three coordinate planes."""
     x, y, up = larger(z, -z).unbind(0)
     return smaller(smaller(x, y), up)
 
@@ -166,7 +166,7 @@ def _at_least(value: Tensor, low: float) -> Tensor:
 
 
 def _product(value: Tensor, n: int) -> Tensor:
-    """A number n times itself, n >= 1, by squares and products."""
+    """Returns value^n, n >= 1, by squares and products."""
     if n == 1:
         return value
     root = _product(value, n // 2)
@@ -174,7 +174,7 @@ def _product(value: Tensor, n: int) -> Tensor:
 
 
 def _turned(real: Tensor, imaginary: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """The n-th power of complex numbers, by squares and products."""
+    """Returns the n-th power of complex numbers, by squares and products."""
     if n == 1:
         return real, imaginary
     a, b = _turned(real, imaginary, n // 2)

@@ -1,4 +1,4 @@
-"""Part of the torch twin: rays in tree units and their fixed intervals, as csrc/walk/ray.h."""
+"""Part of the torch twin: rays in tree units and their fixed intervals, as in csrc/walk/ray.h."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ INF = math.inf
 
 @dataclass
 class Rows:
-    """Base of dataclasses whose tensors all have one row for each ray."""
+    """Base of dataclasses whose tensors all have one row per ray."""
 
     def __getitem__(self, which: Tensor) -> Self:
-        """The rows of some rays."""
+        """Returns the rows of some rays."""
         return replace(self, **{name: field[which] for name, field in vars(self).items()})
 
     def index_put(self, which: tuple[Tensor], rows: Self) -> Self:
-        """A copy with the rows of some rays replaced."""
+        """Returns a copy with the rows of some rays replaced."""
         mine = vars(self).items()
         return replace(self, **{name: row.index_put(which, vars(rows)[name]) for name, row in mine})
 
 
 @dataclass
 class Beam(Rows):
-    """Rays in tree units, begun where they enter the scene; distances stay world lengths."""
+    """Rays in tree units that start where they enter the scene; distances stay world lengths."""
 
     origin: Tensor  # (r, 3)
-    rest: Tensor  # (r, 3) what rounding took from it where the tree is deep, else 0
+    rest: Tensor  # (r, 3) rounding error of the origin where the tree is deep, else 0
     deep: Tensor  # (r,) bool, see `is_deep`
     direction: Tensor  # (r, 3)
     high: Tensor  # (r, 3) float64 corner of the scene; its low corner is 0
@@ -47,9 +47,9 @@ class Beam(Rows):
 
     @classmethod
     def enter(cls, rays: RayArguments, a: TraceArguments, real: torch.dtype) -> Beam:
-        """Brings world rays into the tree in float64, then rounds them to `real`."""
+        """Transforms world rays to tree units in float64, then rounds them to `real`."""
         corner, size, high = a.place_33
-        high = high.nan_to_num(0.0).clamp(0, 1)  # never outside the root cube, whoever made it
+        high = high.nan_to_num(0.0).clamp(0, 1)  # keeps a caller's scene inside the root cube
         origin, direction = (rays.origin_r3 - corner) / size, rays.direction_r3 / size
         low_t, high_t = -origin / direction, (high - origin) / direction
         near = torch.full_like(origin[:, 0], -INF)
@@ -73,12 +73,12 @@ class Beam(Rows):
 
     @property
     def place(self) -> Tensor:
-        """(r, 3) float64 places where the rays begin."""
+        """(r, 3) float64 positions where the rays begin."""
         return self.origin.double() + self.rest.double()
 
     def clipped(self) -> Beam:
-        """The same with distances cut at the scene (slab test, Kay and Kajiya, 1986); what no face
-        bounds is closed, and a ray whose cone is NaN.
+        """Returns the rays with distances clipped to the scene (slab test, Kay and Kajiya, 1986). A
+        ray that no face bounds, or whose cone is NaN, gets an empty range.
         """
         first, last = self.first, self.last
         for axis in range(3):
@@ -95,24 +95,24 @@ class Beam(Rows):
         return replace(self, first=first, last=torch.where(is_cone & (last < INF), last, first))
 
     def cone(self, t: Tensor) -> Tensor:
-        """(r,) world widths of the cones at distances t (r,)."""
+        """Returns (r,) world widths of the cones at distances t (r,)."""
         return self.cone_near + self.cone_growth * t
 
     def along(self, t: Tensor) -> Tensor:
-        """(r, 3) float64 places at distances t (r,), worked out in float64 in deep trees."""
+        """Returns (r, 3) float64 positions at distances t (r,), exact to float64 in deep trees."""
         near = (self.origin + t[:, None] * self.direction).double()
         exact = self.place + t[:, None].double() * self.direction.double()
         return torch.where(self.deep[:, None], exact, near)
 
     def at(self, t: Tensor) -> Tensor:
-        """The same inside the root cube: a place on the scene's high face belongs to the scene."""
+        """Returns the positions of `along`, clamped into the scene; its high faces belong to it."""
         high = self.high.to(self.origin)
         inside = (high * torch.tensor(0.9999999).to(high)).double()
         inside = torch.where(self.deep[:, None], self.high * (1 - 2.0**-50), inside)
         return clamp(self.along(t), 0, inside)
 
     def leave(self, low: Tensor, high: Tensor) -> Tensor:
-        """(r,) distances at which rays leave float64 boxes; +inf without a direction."""
+        """Returns (r,) distances at which rays leave float64 boxes; +inf for a direction of 0."""
         face = torch.where(self.direction > 0, high, low)
         inverse = divide(1.0, self.direction, self.direction)
         way = (face - self.place).to(self.direction)
@@ -121,8 +121,8 @@ class Beam(Rows):
 
 
 def is_deep(a: TraceArguments) -> bool:
-    """Whether places are worked out in float64: where the root cube has more than 2^18 voxels a
-    side, and where N is no power of two, so that no float32 is the corner of a node.
+    """Returns whether positions are computed in float64: where the root cube has more than 2^18
+    voxels a side, or N is no power of two, so that corners of nodes are no float32.
     """
     brick = a.bricks_bzyxc.shape[1] - 2 * a.border
     power = a.branching & (a.branching - 1) == 0
@@ -130,8 +130,8 @@ def is_deep(a: TraceArguments) -> bool:
 
 
 def split(place: Tensor, deep: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Float64 places (r, 3) as a number of `real` and what rounding takes, which only the deep
-    ones (r,) keep.
+    """Splits float64 positions (r, 3) into numbers of dtype `real` and their rounding errors, which
+    are 0 unless `deep` (r,).
     """
     origin = place.to(real)
     rest = torch.where(deep[:, None], place - origin.double(), 0)
@@ -139,8 +139,8 @@ def split(place: Tensor, deep: Tensor, real: torch.dtype) -> tuple[Tensor, Tenso
 
 
 class Intervals:
-    """Where each ray stands in its fixed sequence of intervals: step * 2^level long, the longest
-    that is at most the cone's width where it starts. See ray.h.
+    """Each ray's position in its fixed sequence of intervals. An interval is step * 2^level long,
+    the longest that is not longer than the cone is wide where it starts. See ray.h.
     """
 
     def __init__(self, beam: Beam, step: float | Tensor, levels: int) -> None:
@@ -157,42 +157,42 @@ class Intervals:
 
     @property
     def state(self) -> Tensor:
-        """(r, 3) base, count and level: where to go on."""
+        """(r, 3) base, count and level, for `resume`."""
         return torch.stack((self.base, self.count, self.level.to(self.base)), 1)
 
     def resume(self, state_r3: Tensor) -> None:
-        """Goes on where rays have stopped before."""
+        """Continues from an earlier `state`."""
         self.base, self.count, level = state_r3.unbind(1)
         self.level = clamp(level, 0, len(self.length_l) - 1).to(torch.int64)
         self.start = self.base + self.count * self.length
 
     @property
     def length(self) -> Tensor:
-        """(r,) of whole intervals."""
+        """(r,) length of whole intervals."""
         return self.length_l[self.level]
 
     @property
     def whole_end(self) -> Tensor:
-        """(r,) where the next interval starts."""
+        """(r,) end of the whole interval, where the next one starts."""
         return self.base + (self.count + 1) * self.length
 
     @property
     def cut(self) -> Tensor:
-        """(r,) bool: the last interval, which ends at the far side."""
+        """(r,) bool: the interval is the last one, cut at the far side."""
         return ~(self.whole_end <= self.beam.last)
 
     @property
     def middle(self) -> Tensor:
-        """(r,) where values are taken."""
+        """(r,) where values are sampled."""
         cut = self.start + (self.beam.last - self.start) * 0.5
         return torch.where(self.cut, cut, self.base + (self.count + 0.5) * self.length)
 
     def inside(self) -> Tensor:
-        """(r,) bool: the interval lies before the far side."""
+        """Returns (r,) bool: the interval starts before the far side."""
         return self.start < self.beam.last
 
     def next(self, move: Tensor) -> None:
-        """Goes to the next interval where `move` (r,) is true."""
+        """Moves to the next interval where `move` (r,) is true."""
         start = self.whole_end
         self.count = torch.where(move, self.count + 1, self.count)
         self.start = torch.where(move, start, self.start)
@@ -204,7 +204,7 @@ class Intervals:
         short, long = self.level > 0, self.level < top
         fits = (~short | ~(width < self.length)) & (~long | ~(width >= self.length + self.length))
         level = (width[:, None] >= self.length_l[1:]).sum(1)
-        full = self.count >= MAX_INTERVALS  # as many as are counted from one base
+        full = self.count >= MAX_INTERVALS  # a float counts no more from one base
         self.start = torch.where(
             move & full & ~(self.start > self.base), self.beam.last, self.start
         )

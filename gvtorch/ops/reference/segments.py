@@ -1,5 +1,5 @@
-"""The torch twins of the ops for shaders that are no kernel: segments of rays, samples of their
-bricks, and what they add up to. See cpp_ext/csrc/shaders/segments.h.
+"""The torch twins of the ops for module shaders: segments of rays, samples in bricks, compositing.
+See cpp_ext/csrc/shaders/segments.h.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ _PIECE = -1  # level of an interval of any length
 
 @dataclass
 class SegmentWriter(Visitor):
-    """Notes what rays would sample. A segment is all the intervals of one visit that have one level
-    and one base, or one odd interval.
+    """Records what rays would sample. A segment is all intervals of a visit with the same level and
+    base, or one odd interval.
     """
 
     walk: Walk
-    limit: int  # a ray pauses between two nodes once it has taken so many samples; 0: never
-    by_node: bool  # only one node alone shows one value
+    limit: int  # a ray pauses between two nodes once it has this many samples; 0: never
+    by_node: bool  # only where no two nodes blend, a region counts as being of one value
 
     def __post_init__(self) -> None:
         real = self.walk.at.start[:0]
@@ -57,7 +57,7 @@ class SegmentWriter(Visitor):
         self.parts.append((ray, *(column[ray] for column in columns)))
 
     def segments(self) -> Segments:
-        """Joins intervals, which came in lockstep, to segments, ray by ray."""
+        """Joins the intervals, recorded for all rays in lockstep, to segments ray by ray."""
         columns = [torch.cat(column) for column in zip(*self.parts, strict=True)]
         order = columns[0].argsort(stable=True)
         ray, visit, node, brick, depth, seen, start, end, base, count, level = (

@@ -1,5 +1,5 @@
 """The torch twin of `shade_rays`: the fused shaders, right by definition. csrc/shaders/shaders.h
-tells what each does, light.py how they are lit, march.py how rays walk.
+describes each of them; light.py lights them, march.py walks the rays.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ from .rays import INF
 from .tree import ChannelBricks, Holder
 
 _BISECTIONS = 4
-LIT = 10  # numbers of filtered colours with moments of normals, seen along a direction
+LIT = 10  # numbers per direction of filtered colours with moments of normals
 
 
 @dataclass
 class Shade(Plain):
-    """The transfer function, lit; and what all shaders share."""
+    """The lit transfer function, and the base of all fused shaders."""
 
     light: Light
     others: tuple[ChannelBricks, ...]  # components of the second channel, or none
     other_component: int
     features: Tensor  # (r, c) sums
     shadows: Shadows | None
-    bricks: ClassVar[type[ChannelBricks]] = ChannelBricks  # what it reads of its channel
+    bricks: ClassVar[type[ChannelBricks]] = ChannelBricks  # how it reads its channel
 
     def __post_init__(self) -> None:
         self.normal = torch.zeros_like(self.light.along)  # (r, 3) sum
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """Shadows differ from place to place, and near a light so does a stored normal's."""
+        """Returns false if shading varies: with shadows, or stored normals and a point light."""
         same = torch.ones_like(fine, dtype=torch.bool)
         for channel in (self.channel, *self.light.normals[:1], *self.others[:1]):
             numbers = channel.constant_nc
@@ -65,11 +65,11 @@ class Shade(Plain):
         self.lit(self.rgba(piece, probe), piece, probe, where)
 
     def lit(self, rgba: Tensor, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """Adds an interval in the light."""
+        """Lights an interval and adds it."""
         t, seen = piece.middle, where & (rgba[:, 3] > 0)
         normal = self.light.normal_at(probe, t)
         at_eye = self.light.parameters.light_kind == LightKind.HEADLIGHT
-        share = None  # all of the light comes
+        share = None  # no shadows
         if self.shadows is not None and not at_eye:
             share = partial(self.comes, self.shadows, t, seen)
         color = self.light.shade(rgba[:, :3], normal, t, share)
@@ -81,16 +81,16 @@ class Shade(Plain):
         self.sum.add(torch.cat((color, rgba[:, 3:]), 1), piece, where)
 
     def comes(self, shadows: Shadows, t: Tensor, seen: Tensor, facing: Tensor) -> Tensor:
-        """(r,) share of the light that comes to places t (r,), where they are seen and face it."""
+        """Returns (r,) the share of light that reaches t (r,), where it is seen and faces it."""
         matter = replace(self, shadows=None)
         return shadows.share(matter, t, *self.light.towards(t), seen & facing, self.light)
 
     def done(self, walk: Walk) -> None:
-        """After the last interval."""
+        """Finishes after the last interval."""
 
 
 class Sided(ChannelBricks):
-    """Opacity where a channel holds red, green, blue and opacity, once or by six directions."""
+    """A channel of red, green, blue, opacity, once or for six directions; ranges are opacity's."""
 
     def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         low, high = self.range_n2c[node, :, 3::4].to(real).unbind(1)
@@ -127,12 +127,12 @@ class StoredColor(Shade):
         return stretch(self.opacity(piece, probe, along), piece.length / self.own.reference)
 
     def opacity(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
-        """(r,) per reference length."""
+        """Returns (r,) opacity per reference length."""
         return clamp(self.seen(probe, 3, piece.middle, along) * self.own.scale, 0, 1)
 
     def seen(self, probe: Probe, number: int, t: Tensor, along: Tensor) -> Tensor:
-        """(r,) one of the four numbers, as it is seen along rays (r, 3): of three directions, where
-        the channel holds six.
+        """Returns (r,) one of the four numbers as seen along rays (r, 3), for which three of the
+        directions are mixed where the channel holds six.
         """
 
         def read(component: int) -> Tensor:
@@ -166,7 +166,7 @@ class PreIntegrated(Shade):
         self.sum.absorb(rgba[:, 3], piece, where)
 
     def _pair(self, front: Tensor, back: Tensor, level: Tensor) -> Tensor:
-        """(r, 4) of an interval of a length of the table, from one value to another."""
+        """Returns (r, 4) table rows of intervals of a level's length, from one value to another."""
         table = self.transfer.table_lm4
         (row, row_weight), (column, weight) = self.transfer.cell(front), self.transfer.cell(back)
         near, far = (
@@ -177,7 +177,7 @@ class PreIntegrated(Shade):
 
 
 class Isosurface(Shade):
-    """The first place where the value passes a level."""
+    """The first point where the value crosses a level."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -203,7 +203,7 @@ class Isosurface(Shade):
         if self.filled != 0:
             early = early | (~under if self.filled > 0 else under)
         early = where & early
-        begins = early & (self.before_end == -INF)  # within, where no surface is
+        begins = early & (self.before_end == -INF)  # the ray starts inside: no surface, no normal
         crosses = where & ~early & (under != (back < level))
         self.before = torch.where(where, back, self.before)
         self.before_end = torch.where(where, piece.end, self.before_end)
@@ -225,7 +225,7 @@ class Isosurface(Shade):
         self.sum.depth = torch.where(hit, torch.where(early, piece.start, t), self.sum.depth)
 
     def done(self, walk: Walk) -> None:
-        """Shades what was found: looks its node up once more."""
+        """Shades the surface points found; each looks its node up once more."""
         self.found = self.sum.depth < INF
         t = torch.where(self.found, self.sum.depth, 0.0)
         walk.look_up(self.found.nonzero()[:, 0], t, self)
@@ -237,7 +237,7 @@ class Isosurface(Shade):
         self.normal = torch.where(self.found[:, None], normal, 0.0)
 
     def color_at(self, probe: Probe, t: Tensor) -> Tensor:
-        """(r, 3) of the surface, where it is t (r,) away."""
+        """Returns (r, 3) base colours of the surface at distances t (r,)."""
         if self.own.scale > 0:
             numbers = [probe.number(self.others[i], t) for i in range(4)]
             rgba = torch.stack(numbers, 1) * self.own.scale
@@ -302,7 +302,7 @@ class Features(Shade):
 
 
 class GradientMagnitude(Shade):
-    """The transfer function, the denser the faster the value changes."""
+    """The transfer function, denser where the value changes faster."""
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         own = self.light.parameters.own_as(GradientMagnitudeNumbers)
@@ -342,12 +342,12 @@ class Labels(Shade):
         self.sum.absorb(alpha[:, 0], piece, shown)
 
     def row(self, label: Tensor) -> Tensor:
-        """(r,) int64 rows of the table that stand for labels."""
+        """Returns (r,) int64 table rows of labels."""
         low, last = self.transfer.domain_2[0], len(self.transfer.opaque_m) - 1
         return clamp(label - low, 0, last).to(torch.int64)
 
     def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
-        """(r, 7) what one of the nodes shows: premultiplied colours, alphas, normals by alpha."""
+        """Returns (r, 7) what a node shows: premultiplied colours, alphas, normals times alpha."""
         t, table = piece.middle, self.transfer.table_lm4
         found = self.channel.nearest(holder, probe.beam, t)
         level = torch.where(piece.odd, 0, piece.level)
@@ -367,7 +367,7 @@ class Labels(Shade):
 
 
 class Filtered(Shade):
-    """The transfer function, and the colours that the pool's first bricks have."""
+    """The transfer function, and filtered colours where bricks have them (in coarse slots)."""
 
     def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         fine, coarse = probe.nodes.fine, probe.nodes.coarse
@@ -383,17 +383,17 @@ class Filtered(Shade):
         self.sum.add(self.rgba(piece, probe), piece, where)
 
     def add_found(self, found: Tensor, piece: Piece, where: Tensor) -> None:
-        """Adds an interval of what `look` tells."""
+        """Adds an interval, given the result of `look`."""
         self.sum.add_light(self.sum.clear[:, None] * found[:, :3], where)
         self.sum.absorb(found[:, 3], piece, where)
 
     def stored(self, holder: Holder) -> Tensor:
-        """(r,) bool: the node's brick has colours."""
+        """Returns (r,) bool: the node's brick has colours."""
         bricks = self.others[0].bricks_bzyxc if self.others else self.channel.bricks_bzyxc[:0]
         return (holder.brick >= 0) & (holder.brick < len(bricks))
 
     def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
-        """(r, 4) premultiplied colours and alphas of intervals, as one of the nodes shows them."""
+        """Returns (r, 4) premultiplied colours and alphas of intervals, from one of the nodes."""
         row = self.row(piece, probe, holder)
         row = torch.cat((row[:, :3] * row[:, 3:], row[:, 3:]), 1)
         read = self.reader(piece, probe, holder)
@@ -403,12 +403,12 @@ class Filtered(Shade):
         return torch.where(self.stored(holder)[:, None], colors, row)
 
     def row(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
-        """(r, 4) what the function makes of a node's values."""
+        """Returns (r, 4) the transfer function's rows for one node's values."""
         value = self.channel.sample(holder, probe.beam, piece.middle)
         return self.transfer.interval(value, piece)
 
     def reader(self, piece: Piece, probe: Probe, holder: Holder) -> Callable[[int], Tensor]:
-        """What reads a number (r,) of the colours that a node has."""
+        """Returns a function that reads one number (r,) of a node's filtered colours."""
         brick = torch.where(self.stored(holder), holder.brick, EMPTY)
         known = replace(holder, brick=brick)
         return lambda number: self.others[number].sample(known, probe.beam, piece.middle)
@@ -416,8 +416,8 @@ class Filtered(Shade):
     def seen(
         self, one: int, read: Callable[[int], Tensor], piece: Piece, holder: Holder
     ) -> tuple[list[Tensor], Tensor, Tensor]:
-        """Colour and alpha (r,) of a node's voxels, of `one` numbers a direction, as rays see them;
-        alphas (r,) of intervals, and these over those of a voxel.
+        """Returns colour and alpha (r,) of a node's voxels as rays see them, `one` numbers a
+        direction; alphas (r,) of intervals; and their ratios to the voxels' alphas.
         """
         width = len(self.others)
         seen = [_by_direction(self.light.along, width, i, read, one) for i in range(4)]
@@ -429,7 +429,7 @@ class Filtered(Shade):
 
 
 class FilteredLit(Filtered):
-    """The lit transfer function, and colours with the moments of normals."""
+    """The lit transfer function, and filtered colours with moments of normals."""
 
     def add_near(self, piece: Piece, probe: Probe, where: Tensor) -> None:
         self.lit(self.rgba(piece, probe), piece, probe, where)
@@ -441,7 +441,7 @@ class FilteredLit(Filtered):
         super().add_found(found, piece, where)
 
     def look(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
-        """(r, 7) as of `Filtered`, lit, and normals by alpha."""
+        """Returns (r, 7): the result of `Filtered.look`, lit, and normals times alpha."""
         t, light = piece.middle, self.light
         row = self.row(piece, probe, holder)
         normal = light.to_eye(probe.slope(holder, t, light.cube))
@@ -462,8 +462,8 @@ class FilteredLit(Filtered):
         return torch.where(self.stored(holder)[:, None], far, near)
 
     def moments(self, read: Callable[[int], Tensor]) -> tuple[Tensor, Tensor | None]:
-        """(r, 6) moments of the normals that rays see; where six directions are known also (r, 3)
-        the mean of these normals, each turned to the side from which its direction sees it.
+        """Returns (r, 6) moments of the normals that rays see, and, if six directions are stored,
+        (r, 3) their mean, each normal turned to the side from which its direction sees it.
         """
         if len(self.others) == LIT:
             return torch.stack([read(i) for i in range(4, LIT)], 1), None
@@ -482,7 +482,7 @@ class FilteredLit(Filtered):
 
 
 class ChannelMix(Shade):
-    """Several numbers of a voxel, each with its function."""
+    """Several numbers of a voxel, each with its transfer function."""
 
     bricks = AllNumbers
 
@@ -502,8 +502,8 @@ class ChannelMix(Shade):
 def _by_direction(
     along: Tensor, width: int, number: int, read: Callable[[int], Tensor], one: int = 4
 ) -> Tensor:
-    """(r,) one of the numbers of a voxel, as it is seen along rays (r, 3): of three directions,
-    where a channel holds six times `one` numbers; `read` gives one of them.
+    """Returns (r,) one of the numbers of a voxel as seen along rays (r, 3); `read` reads one. Where
+    a channel holds six times `one` numbers, three of the directions are mixed.
     """
     if width == one:
         return read(number)
@@ -515,7 +515,7 @@ def _by_direction(
     return side[2] + x * (side[0] - side[2]) + y * (side[1] - side[2])
 
 
-#: Twins by the names of C++'s structs.
+#: Twins by the names of the C++ structs.
 TWINS: dict[str, type[Shade]] = {
     "Lit": Shade,
     "PreIntegrated": PreIntegrated,
@@ -564,7 +564,7 @@ def shade_rays(
 
 
 def _part(rows: Tensor, lengths: Tensor) -> Tensor:
-    """(r, 4) premultiplied colour and alpha of the same values over another length."""
+    """Returns (r, 4) premultiplied colour and alpha of the same values over another length."""
     whole = rows[:, 3]
     changed = (whole > 0) & (lengths != 1)
     alpha = torch.where(lengths > 0, stretch(whole, lengths), 0.0)

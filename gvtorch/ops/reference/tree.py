@@ -1,4 +1,4 @@
-"""Part of the torch twin: descents, marks, samples of bricks, as csrc/walk/tree.h and brick.h."""
+"""Part of the torch twin: descents, marks, samples of bricks, as in csrc/walk/tree.h, brick.h."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .rays import INF, Beam, Rows
 
 
 class Levels:
-    """The nodes and voxels of each depth."""
+    """Sizes and numbers of the nodes and voxels of each depth."""
 
     def __init__(self, a: TraceArguments, real: torch.dtype) -> None:
         counts = [float(a.branching**depth) for depth in range(a.max_depth + 1)]
@@ -29,36 +29,36 @@ class Levels:
         self.voxel_d = (a.root_voxel / self.count_d).to(real)  # (d,) side of a voxel, world units
 
     def wanted(self, cone: Tensor) -> Tensor:
-        """(r,) first depths whose voxels are not wider than the cone: the level of detail."""
+        """Returns (r,) the first depths whose voxels are not wider than the cone (the lod)."""
         return (self.voxel_d[:-1] > cone[:, None]).sum(1)
 
     def voxels(self, depth: Tensor) -> tuple[Tensor, Tensor]:
-        """(r,) voxel at each depth, and the one above (+inf above the root)."""
+        """Returns (r,) voxel sizes at each depth, and at the one above (+inf above the root)."""
         above = torch.where(depth > 0, self.voxel_d[(depth - 1).clamp(min=0)], INF)
         return self.voxel_d[depth], above
 
     def cells(self, position_r3: Tensor, depth: Tensor) -> Tensor:
-        """(r, 3) int64 places x, y, z of the nodes at a depth (r,) in which float64 places lie."""
+        """Returns (r, 3) int64 x, y, z of the nodes at a depth (r,) around float64 positions."""
         finest = torch.floor(position_r3 * self.count_d[-1]).to(torch.int64)
         up = self.count_d[len(self.count_d) - 1 - depth].to(torch.int64)
         return finest // up[:, None]
 
     def corners(self, position_r3: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-        """(r, 3) float64 low and high corners of these nodes."""
+        """Returns (r, 3) float64 low and high corners of the same nodes."""
         cell, size = self.cells(position_r3, depth), self.size_d[depth, None]
         return cell * size, (cell + 1) * size
 
     def holder(self, node: Tensor, brick: Tensor, depth: Tensor, position_r3: Tensor) -> Holder:
-        """Nodes (r,) with their brick words, found at a depth around places."""
+        """Returns nodes (r,), with brick words, that were found at a depth around positions."""
         corner, _ = self.corners(position_r3, depth)
         return Holder(node, brick, depth, corner, self.scale_d[depth])
 
 
 @dataclass
 class Holder(Rows):
-    """A node and its brick, where one answers."""
+    """A node that holds data, and its brick."""
 
-    node: Tensor  # (r,) int64; -1: no node answers
+    node: Tensor  # (r,) int64; -1: none holds data
     brick: Tensor  # (r,) int64 slot, or the node's brick word below 0
     depth: Tensor  # (r,) int64
     corner: Tensor  # (r, 3) float64, tree units
@@ -67,15 +67,15 @@ class Holder(Rows):
 
 @dataclass
 class Descent:
-    """Where a descent ended, and the two nodes whose bricks answer (-1: none)."""
+    """Where a descent ended, and the two nodes whose data is used (-1: none)."""
 
     node: Tensor  # (r,) last node reached
     depth: Tensor  # (r,) its depth
     parent: Tensor  # (r,)
     hidden: Tensor  # (r,) bool: nothing in the node or below it is seen
-    fine: Tensor  # (r,) the deepest node with a brick or a constant
+    fine: Tensor  # (r,) the deepest node on the path whose brick word is not ABSENT
     fine_depth: Tensor  # (r,)
-    coarse: Tensor  # (r,) the deepest above the wanted depth
+    coarse: Tensor  # (r,) the deepest such node above the wanted depth
     coarse_depth: Tensor  # (r,)
 
 
@@ -84,7 +84,7 @@ class Tree:
 
     def __init__(self, a: TraceArguments) -> None:
         self.arguments, self.levels = a, Levels(a, a.table_lm4.dtype)
-        # A word that names what the pool has not counts as absent.
+        # A word that names a tile or slot beyond the pool counts as absent.
         child, brick, tiles, bricks = a.child_tn, a.brick_tn, len(a.child_tn), len(a.bricks_bzyxc)
         self.child_n = torch.where(child < tiles, child, ABSENT).view(-1)
         self.brick_n = torch.where(brick < bricks, brick, ABSENT).view(-1)
@@ -122,15 +122,15 @@ class Tree:
             at.hidden = torch.where(going, hides(at.node), at.hidden)
 
     def holder(self, node: Tensor, depth: Tensor, position_r3: Tensor) -> Holder:
-        """The nodes (r,), or -1, that were found at a depth around places."""
+        """Returns nodes (r,), or -1, that were found at a depth around positions."""
         brick = torch.where(node >= 0, self.brick_n[node.clamp(min=0)].to(torch.int64), ABSENT)
         return self.levels.holder(node, brick, depth, position_r3)
 
     def mark(
         self, found: Descent, wanted: Tensor, blends: Tensor, cone: Tensor, seen: Tensor
     ) -> Tensor:
-        """Requests what is not there where something is seen, straight to the wanted level or level
-        by level; returns (r,) bool whether it did.
+        """Requests absent tiles and bricks where something is seen, straight to the wanted level or
+        level by level; returns (r,) bool: the ray made a request.
         """
         by_level, absent = self.arguments.by_level, self.brick_n[found.node] == ABSENT
         deeper = (found.depth < wanted) & (self.child_n[found.node] == ABSENT)
@@ -144,13 +144,13 @@ class Tree:
         return short | missing | above
 
     def stamp(self, brick: Tensor) -> None:
-        """Stamps brick slots as used in this frame; words below 0 name none."""
+        """Stamps brick slots as used in this frame; words below 0 are no slots."""
         a = self.arguments
         a.stamp_b[torch.unique(brick[brick >= 0])] = a.frame_1[0]
 
     def request(self, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
-        """Joins requests into the request words: kinds by OR, priorities, widths of one voxel on
-        the screen in sixteenths of a pixel, up to 128 pixels, by maximum.
+        """Joins requests into the request words: kinds by OR, priorities by maximum. A priority is
+        the width of one voxel on the screen, in 1/16 pixel, up to 128 pixels.
         """
         voxel = self.levels.voxel_d[depth]
         priority = torch.where(cone > 0, voxel / cone * 16, REQUEST_PRIORITY)
@@ -179,31 +179,31 @@ class ChannelBricks:
         return cls(a.bricks_bzyxc, constant_nc, range_n2c, a.border, a.component)
 
     def components(self, bricks: Tensor | None, constants: Tensor | None) -> tuple[Self, ...]:
-        """Every number of another channel of the same nodes; none where there is no channel."""
+        """Returns every number of another channel of the same nodes; () where that is None."""
         if bricks is None:
             return ()
-        if constants is None:  # of coarse bricks, which are not asked for them
+        if constants is None:  # a coarse channel, whose constants are never read
             constants = bricks.new_zeros((1, len(self.constant_nc), bricks.shape[4]))
         other = replace(self, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
         return tuple(replace(other, component=c) for c in range(bricks.shape[4]))
 
     def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
-        """(r,) smallest and largest value in reach of the nodes' bricks, and of the nodes below."""
+        """Returns (r,) smallest and largest values in reach of the nodes' bricks, at all levels."""
         low, high = self.range_n2c[node, :, self.component].to(real).unbind(1)
         return low, high
 
     def same(self, a: Tensor, b: Tensor) -> Tensor:
-        """(r,) bool: two nodes have the same constant."""
+        """Returns (r,) bool: two nodes have the same constant."""
         constant = self.constant_nc[:, self.component]
         return constant[a] == constant[b]
 
     def constant(self, holder: Holder, real: torch.dtype) -> Tensor:
-        """(r,) constants of nodes, 0 where there is none."""
+        """Returns (r,) constants of nodes, 0 where there is no node."""
         constant = self.constant_nc[holder.node.clamp(min=0), self.component].to(real)
         return torch.where(holder.node >= 0, constant, 0.0)
 
     def places(self, holder: Holder, beam: Beam, t: Tensor) -> Tensor:
-        """(r, 3) places x, y, z in bricks at distances t (r,), in voxels from the first one's."""
+        """Returns (r, 3) x, y, z in bricks at distances t (r,), in voxels from the first centre."""
         scale = holder.scale[:, None]
         offset = (beam.place - holder.corner).to(t.dtype) * scale + (self.border - 0.5)
         return offset + t[:, None] * (beam.direction * scale)
@@ -211,7 +211,7 @@ class ChannelBricks:
     def sample(
         self, holder: Holder, beam: Beam, t: Tensor, shift: Sequence[float] = (0, 0, 0)
     ) -> Tensor:
-        """(r,) trilinear values at distances t (r,), `shift` voxels beside the ray; the node's
+        """Returns (r,) trilinear values at distances t (r,), `shift` voxels off the ray; the node's
         constant where it has no brick, 0 where there is no node.
         """
         real, side = t.dtype, self.bricks_bzyxc.shape[1]

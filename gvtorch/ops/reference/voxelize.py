@@ -1,5 +1,5 @@
-"""The twin of `voxelize`: what cubes of voxels hold of a mesh, in plain torch, one cube after the
-other, all triangles for each voxel. It defines what the compiled op gives, in every bit of float32.
+"""The twin of `voxelize` in plain torch: it tests all triangles for each voxel, one cube after the
+other. It defines the results of the compiled op, in every bit of float32.
 
 Sources: Ericson, "Real-Time Collision Detection", 2005, section 5.1.5 (closest point on a
     triangle); Jacobson, Kavan, Sorkine-Hornung, "Robust inside-outside segmentation using
@@ -17,11 +17,11 @@ from torch import Tensor
 from .exact import sqrt_exact
 
 FLAT = 1e-3  # least share of the normal's sum along an axis, see `box_share`
-TOUCH = 1e-6  # squared distance in voxels below which the triangle's own normal is taken
+TOUCH = 1e-6  # squared distance in voxels below which the triangle's normal is used
 BEYOND = 0.8661  # voxels, more than from a voxel's centre to its corner
 CORNERS = 16  # a clipped triangle has at most 9, more only where rounding dents it
-PARTS = 2.0**30  # of a voxel, in whole numbers of which volumes add up the same in any order
-_PAIRS = 1 << 20  # of place and triangle that are looked at together
+PARTS = 2.0**30  # units per voxel: volumes are added as integers, so in any order
+_PAIRS = 1 << 20  # pairs of point and triangle that are tested together
 
 
 def voxelize(
@@ -37,7 +37,7 @@ def voxelize(
     weights: bool,
     wide: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """See `ops.voxelize`. Boxes and detail only save work, so they are not looked at here."""
+    """See `ops.voxelize`. Boxes and detail only save work, so they are ignored here."""
     real = torch.float64 if wide else torch.float32
     items, cube = len(low_k3), (side,) * 3
     distance = torch.full((items, *cube), torch.inf, dtype=real, device=low_k3.device)
@@ -84,8 +84,9 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _beside(from_corner: Tensor, edge: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of places, told from the first corner of an edge: how far out of the triangle they are, times
-    an area; how far along the edge, 0 to 1; and the way to them from there.
+    """Returns, for points relative to the first corner of an edge: their scaled distance outside
+    it in the triangle's plane (below 0: inside), the position of the nearest point on the edge, 0
+    to 1, and the vectors from there.
     """
     area = _dot(_cross(edge, normal), from_corner)
     edge2 = _dot(edge, edge)
@@ -95,8 +96,8 @@ def _beside(from_corner: Tensor, edge: Tensor, normal: Tensor) -> tuple[Tensor, 
 
 
 def _nearest(place_p3: Tensor, corner_f33: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns for each place the distance to the nearest of f triangles, which it is (-1: none is
-    within the reach), and a vector (p, 3) along which it lies, of any length and sign.
+    """Returns for each point the distance to the nearest of f triangles, its index (-1: none is
+    within reach), and a vector (p, 3) along the line to it, of any length and sign.
     """
     a, b, c = corner_f33.unbind(1)
     normal = _cross(b - a, c - a)
@@ -124,7 +125,7 @@ def _nearest(place_p3: Tensor, corner_f33: Tensor, reach: Tensor) -> tuple[Tenso
 
 
 def _weights(place_p3: Tensor, corner_p33: Tensor) -> Tensor:
-    """Returns (p, 3) weights of a triangle's corners at what of it is nearest to a place."""
+    """Returns (p, 3) weights of a triangle's corners at its point nearest to a given point."""
     a, b, c = corner_p33.unbind(1)
     normal = _cross(b - a, c - a)
     length2 = _dot(normal, normal)
@@ -149,25 +150,25 @@ def _weights(place_p3: Tensor, corner_p33: Tensor) -> Tensor:
 
 
 def _ahead(place_p3: Tensor, corner_f33: Tensor, solid_f: Tensor) -> Tensor:
-    """Returns (p,) int64 winding numbers: triangles that lie ahead along x, those whose normals
-    point ahead as 1, the others as -1.
+    """Returns (p,) int64 winding numbers: each triangle hit by a ray along +x adds 1 if its normal
+    points along x, else -1.
     """
     where, way = pierced(place_p3[:, None], corner_f33)
     return (way * solid_f * (where > place_p3[:, :1]).long()).sum(1)
 
 
 def pierced(place: Tensor, corner: Tensor) -> tuple[Tensor, Tensor]:
-    """Finds where lines along x through places pierce triangles. Two triangles at an edge agree on
-    whose side a line passes, and a line through an edge passes as if it were moved aside by nearly
-    nothing, the same way for all: so none slips through.
+    """Finds where lines along x through points pierce triangles. Two triangles agree on which side
+    of a shared edge a line passes, and a line through an edge counts as moved aside by nearly
+    nothing, in the same direction for all triangles, so no line slips through.
 
     Args:
-        place: (..., 3) places.
+        place: (..., 3) points.
         corner: (..., 3, 3) triangles; leading dimensions broadcast.
 
     Returns:
         (...) x; (...) int64: 1 where the triangle's normal points along x, -1 where against it, 0
-        where the line passes beside.
+        where the line misses the triangle.
     """
     y, z = place[..., 1], place[..., 2]
     sides, positive = [], []
@@ -191,9 +192,9 @@ def pierced(place: Tensor, corner: Tensor) -> tuple[Tensor, Tensor]:
 def _coverage(
     gap: Tensor, away: Tensor, winding: Tensor, row: Tensor, solid_f: Tensor, half: Tensor
 ) -> Tensor:
-    """Returns (p,) the share of each voxel that is filled where no solid's surface passes: all of
-    it inside, nothing outside; where the nearest triangle is a sheet's, `half` of a thickness to
-    either side of the plane at the nearest place.
+    """Returns (p,) the filled share of voxels that no solid's surface cuts: 1 inside, 0 outside;
+    where a sheet's triangle is nearest, the part within `half` of a thickness of the plane at its
+    nearest point.
     """
     inside = (winding != 0).to(gap.dtype)
     sheet = (row >= 0) & ~solid_f[row.clamp(min=0)]
@@ -203,9 +204,9 @@ def _coverage(
 
 
 def _filled(place_p3: Tensor, corner_f33: Tensor) -> Tensor:
-    """Returns (p,) the winding number's mean over voxels around places, 0 to 1 (of solids that
-    neither overlap nor are inside out next to others, the share that is filled): a triangle adds
-    what lies before it along x, which is signed as its normal points.
+    """Returns (p,) the winding number's mean over voxels around points, 0 to 1 (the filled share,
+    unless solids overlap or are inside out next to others). Each triangle adds the volume before it
+    along x, with the sign of its normal's x.
     """
     low_p3 = place_p3 - 0.5
     least, most = corner_f33.amin(1), corner_f33.amax(1)
@@ -237,9 +238,9 @@ def _filled(place_p3: Tensor, corner_f33: Tensor) -> Tensor:
 def _clip(
     at: Tensor, count: Tensor, axis: int, limit: float, *, upper: bool
 ) -> tuple[Tensor, Tensor]:
-    """Cuts polygons, (q, CORNERS, 3) corners in order and (q,) how many, where `axis` is `limit`;
-    returns the same of what is above (`upper`) or below. What lies in the plane is above, and an
-    edge is cut at the same place whichever way it is gone along.
+    """Clips polygons, (q, CORNERS, 3) corners in order and (q,) their numbers, at the plane where
+    `axis` is `limit`, and returns the part above it (`upper`) or below. Points in the plane are
+    above, and an edge is cut at the same point in both directions.
     """
     number = torch.arange(CORNERS, device=at.device)
     behind = torch.where(number + 1 < count[:, None], number + 1, 0)
@@ -258,7 +259,7 @@ def _clip(
     crossing[..., axis] = limit
     kept = torch.stack((inside & real, cut), 2).flatten(1)
     slot = kept.cumsum(1) - 1
-    slot = torch.where(kept & (slot < CORNERS), slot, CORNERS)  # one more for what is left out
+    slot = torch.where(kept & (slot < CORNERS), slot, CORNERS)  # the extra slot is discarded
     both = torch.stack((at, crossing), 2).flatten(1, 2)
     out = at.new_zeros(len(at), CORNERS + 1, 3)
     out = out.scatter(1, slot[..., None].expand_as(both), both)[:, :CORNERS]
@@ -266,7 +267,7 @@ def _clip(
 
 
 def _before(at: Tensor, count: Tensor) -> Tensor:
-    """(q,) volumes between polygons and x = 0, below 0 where their normals point against x."""
+    """Returns (q,) volumes between polygons and x = 0, below 0 where normals point against x."""
     a, total = at[:, 0], at.new_zeros(len(at))
     for i in range(1, CORNERS - 1):
         b, c = at[:, i], at[:, i + 1]
@@ -279,12 +280,12 @@ def _before(at: Tensor, count: Tensor) -> Tensor:
 def box_share(normal_p3: Tensor, offset_p: Tensor) -> Tensor:
     """Returns (p,) the share of a voxel, a cube of side 1, that lies below a plane, in closed form.
 
-    Exact but for planes within `FLAT` of an axis, which are turned by less than that: the formula
-    would divide by nothing there. The share is then right to 3e-4.
+    Exact except for normals within `FLAT` of being perpendicular to an axis, which are turned by
+    less than that, since the formula would divide by 0. The share is then right to 3e-4.
 
     Args:
-        normal_p3: (p, 3) normals of planes, of any length; that of length 0 gives 1/2.
-        offset_p: (p,) how far the plane lies above the voxel's centre, along the normal.
+        normal_p3: (p, 3) normals of planes, of any length; length 0 gives 1/2.
+        offset_p: (p,) distance of the plane above the voxel's centre, along the normal.
     """
     length = sqrt_exact(_dot(normal_p3, normal_p3))
     size = normal_p3.abs()
