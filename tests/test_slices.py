@@ -101,6 +101,7 @@ def test_colours_and_components():
         ({"at": "here"}, "at must be a share such as 50%"),
         ({"at": "99mm"}, "at 99mm lies beyond the data, z is -5 to 23 millimeter"),
         ({"at": ("1", "2", "3")}, "at must be one place"),
+        ({"axis": "all", "at": (0.5, 0.5)}, "at must be one place or three, for x, y and z"),
         ({"up": "+z"}, r"up must be \+y, -y, \+x or -x across z"),
         ({"axis": "all", "up": "+z"}, "up is for one plane"),
         ({"level": 1}, "level is for stores"),

@@ -234,7 +234,8 @@ def trace_segments(
     It visits, stamps, requests and skips the same nodes and takes the same samples, but rays do not
     end early, which only a shader can decide: with `limit` rays are walked in parts, and the caller
     can drop those that have ended. Lists have exactly the needed size: rays are walked twice, and
-    the host waits for the count in between.
+    the host waits for the count in between. The lists carry no gradients: those of colours and
+    voxels flow through `sample_bricks` and `composite`.
 
     Args:
         rays: The rays; their transmittance does not matter.

@@ -99,6 +99,8 @@ def slice_picture(
     if axis == "all":
         if up is not None:
             raise ValueError(f"{where}: up is for one plane, not for axis 'all'")
+        if isinstance(at, tuple) and len(at) != 3:
+            raise ValueError(f"{where}: at must be one place or three, for x, y and z, got {at!r}")
         places = dict(zip("xyz", at if isinstance(at, tuple) else (at, at, at), strict=True))
         pixel = min(plane.spacing.values()) / scale
         shown = (plane.colored(n, places[n], views[n], pixel, colors) for n in "xyz")
