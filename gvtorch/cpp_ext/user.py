@@ -52,7 +52,7 @@ _lock = threading.Lock()
 
 
 class CompileError(RuntimeError):
-    """A compiler refused a user's shader. The text: a line with file and command, then its output."""
+    """A compiler refused a user's shader. Text: a line with file and command, then its output."""
 
 
 @dataclass(frozen=True)

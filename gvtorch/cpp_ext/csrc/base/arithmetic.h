@@ -51,7 +51,7 @@ GV_HD void set_lane(T& value, int, T own) {
   value = own;
 }
 // The smallest value among the threads of a warp that run this together; values are not negative. On the CPU, and on
-// GPUs before compute capability 8.0, which have no such instruction, the thread's own.
+// GPUs before compute capability 8.0, which have no such instruction, the thread's own value.
 GV_HD float smallest_together(float value) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   return __uint_as_float(__reduce_min_sync(__activemask(), __float_as_uint(value)));

@@ -415,7 +415,7 @@ struct PutRows {
   }
 };
 
-// --- Places
+// --- Locs
 
 #define GV_LOCATE(X)               \
   X(Words, loc_t4, 4 * tiles)      \

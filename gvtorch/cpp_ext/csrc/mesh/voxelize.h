@@ -63,7 +63,7 @@ GV_HD Vec3<T> outer(Vec3<T> a, Vec3<T> b) {
 template <class T>
 struct Triangle {
   Vec3<T> corner[3], edge[3], beside[3], normal;
-  T inverse2[3], length2, most;  // most: limit inside of products with `beside`; below 0 for a triangle without area
+  T inverse2[3], length2, most;  // most: largest product with `beside` inside; below 0 for a triangle without area
 
   GV_HD explicit Triangle(const Vec3<T>* corner_3) {
     for (int i = 0; i < 3; ++i) corner[i] = corner_3[i];

@@ -11,7 +11,7 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-constexpr int32_t kMostNumbers = 16;  // that are read at once
+constexpr int32_t kMostNumbers = 16;  // of a voxel that `numbers_at` reads at once
 
 template <class T>
 GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {

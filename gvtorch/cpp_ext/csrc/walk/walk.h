@@ -55,7 +55,7 @@ struct Visit : Extent<T> {
   Holder fine, coarse;  // of the wanted level and of the one above it; equal where they do not blend
   T voxel, above;       // world size of a voxel of either level
   T seen;               // distance at which the node was looked up
-  int32_t wanted;       // the level
+  int32_t wanted;       // depth that the level of detail asks for
   bool hidden;          // neither marked nor sampled
 };
 
