@@ -20,7 +20,7 @@ SOURCES = Path(__file__).parent / "csrc"
 @functools.cache
 def load() -> dict[str, str]:
     """Loads each library once; returns for each backend, `cpp` and `cuda`, an empty text if it can
-    be used and else the reason why not.
+    be used, else the reason why it can't.
     """
     reasons = {"cpp": _load("libgvtorch_cpu.so")}
     if reasons["cpp"]:

@@ -3,9 +3,9 @@
 setuptools loads this file by itself (see `[tool.setuptools]` in pyproject.toml), so it imports
 nothing of gvtorch and runs compilers.py by its path. Both libraries use the LibTorch Stable ABI and
 no Python C API: one wheel serves every Python >= 3.11 and every torch >= 2.11. The CUDA library is
-built where nvcc stands and is loaded only where torch has CUDA.
+built where nvcc is found and is loaded only where torch has CUDA.
 
-As a program it compiles them in the source tree.
+Run as a program, this file compiles them in the source tree.
 
 Environment:
     GVTORCH_COMPILE     0: an installation compiles nothing (the program does)
@@ -51,8 +51,8 @@ def chosen_nvcc() -> str | None:
 
 
 def compression(nvcc: str) -> str:
-    """Returns the flag by which the machine code of all architectures is compressed: to a twelfth
-    by CUDA 13, whose drivers all read it, and otherwise so that every driver does.
+    """Returns the flag that compresses the machine code of all architectures: with CUDA 13 to a
+    twelfth, which all of its drivers read; else in a form that every driver reads.
     """
     told = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True).stdout
     release = re.search(r"release (\d+)", told)
@@ -63,7 +63,7 @@ def compression(nvcc: str) -> str:
 
 def commands(output: Path) -> dict[Path, list[list[str]]]:
     """Returns the compiler calls of each library, by the library's path under `output`; all but the
-    last, which links, may run side by side.
+    last, which links, may run in parallel.
     """
     source = FOLDER / "csrc"
     include, link = compilers.torch_flags()
@@ -96,14 +96,14 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
 
 
 def compile_libraries(output: Path) -> list[Path]:
-    """Compiles what is missing or older than its sources or flags, side by side; returns the
-    libraries.
+    """Compiles, in parallel, the libraries that are missing or were made of other sources or with
+    other flags; returns the paths of all.
     """
     sources = sorted(path for path in (FOLDER / "csrc").rglob("*") if path.is_file())
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
     output.mkdir(parents=True, exist_ok=True)
     calls = commands(output)
-    workers = max(1, (os.cpu_count() or 1) - (len(calls) - 1))  # nvcc, which takes longest, has one
+    workers = max(1, (os.cpu_count() or 1) - (len(calls) - 1))  # one is nvcc's, which takes longest
     with ThreadPoolExecutor(workers) as pool, ThreadPoolExecutor(len(calls)) as linkers:
 
         def make(library: Path) -> None:
@@ -125,7 +125,7 @@ def _run(call: list[str]) -> None:
 
 
 class BuildExt(build_ext):
-    """Puts the libraries beside cpp_ext/__init__.py, in the source tree and in the wheel."""
+    """Puts the libraries into cpp_ext/lib, in the source tree and in the wheel."""
 
     def run(self) -> None:
         """Compiles in the source tree, where the next build finds them, and copies from there."""
@@ -139,7 +139,7 @@ class BuildExt(build_ext):
                 shutil.copy2(library, target)
 
     def get_outputs(self) -> list[str]:
-        """Returns the libraries as they lie in the build folder."""
+        """Returns the paths of the libraries in the build folder."""
         return list(self.get_output_mapping())
 
     def get_output_mapping(self) -> dict[str, str]:

@@ -14,13 +14,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 TARGET_VERSION = "0x020b000000000000"  # torch 2.11, the oldest that may load the libraries
-# Contraction stays off: a fused multiply-add would round other than the torch twin does.
+# Contraction stays off: a fused multiply-add would round differently from the torch twin.
 SHARED = ("-std=c++17", "-O3", f"-DTORCH_TARGET_VERSION={TARGET_VERSION}")
 CXX_FLAGS = (
     *(*SHARED, "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"),
     "-Wno-psabi",
 )
-# Scalars of a struct packed into vectors make the descent wait for its own stores.
+# If a struct's scalars are packed into vectors, the descent waits for its own stores.
 PACKET_FLAGS = ("-fno-tree-slp-vectorize",)
 AVX2_FLAGS = (*PACKET_FLAGS, "-mavx2", "-mf16c")
 # Packets are compiled for each of these, a user's shader for the one that cpu.cpp chooses.
@@ -29,7 +29,7 @@ INSTRUCTION_SETS = {
     "avx2": AVX2_FLAGS,
     "avx512": (
         *(*AVX2_FLAGS, "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl"),
-        # GCC's own header warns of what is not initialised.
+        # GCC's own header causes warnings of uninitialised variables.
         *("-mprefer-vector-width=512", "-Wno-maybe-uninitialized", "-Wno-uninitialized"),
     ),
 }
@@ -40,7 +40,7 @@ NVCC_FLAGS = (
 
 
 def find_cxx() -> list[str]:
-    """Returns the C++ compiler's call: CXX, which may be several words, or g++."""
+    """Returns the C++ compiler's command: CXX, which may be several words, or g++."""
     return shlex.split(os.environ.get("CXX") or "g++")
 
 
@@ -57,7 +57,7 @@ def machine_codes(archs: Sequence[str]) -> list[str]:
 
 
 def torch_flags() -> tuple[list[str], list[str]]:
-    """Returns what finds torch's headers, and what links its libraries."""
+    """Returns the flags that find torch's headers, and those that link its libraries."""
     import torch
 
     root = Path(torch.__file__).parent

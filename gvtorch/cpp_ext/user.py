@@ -1,15 +1,15 @@
-"""Compiles a user's shader, a C++ header, into a library of one op, and keeps the library.
+"""Compiles a user's shader, a C++ header, into a library of one op, and caches the library.
 
-csrc/user_shader.h says what a header holds, csrc/user.cpp how it becomes an op. A library is found
-by a digest of all that it is made of: the header and what it includes, gvtorch's headers, the flags
-(and with them the CPU's instruction set), torch's version, and the compilers (path, size, time of
-change, and the environment variables that they read). It is written beside its place and then
-renamed, so two processes may compile the same one at once.
+csrc/user_shader.h describes what a header contains, csrc/user.cpp makes an op of it. The name of a
+library has a digest of all that it is made of: the header and what it includes, gvtorch's headers,
+the flags (and with them the CPU's instruction set), torch's version, and the compilers (path, size,
+time of change, and the environment variables that they read). It is written in a folder next to it
+and then renamed, so two processes may compile the same one at once.
 
-What a header includes is found by looking at its lines. What the compiler reads beside, by a macro
-or from another folder, is noted in a file (OP.more) and is part of the digest from then on.
-Compilers get names of ours in the folder where they run: no name of a user comes to a shell. A
-library is looked at (its owner, who may write, its digest) and loaded by one descriptor.
+The includes of a header are found by searching its lines. Other files that the compiler reads, by a
+macro or from another folder, are listed in a file (OP.more) and are part of the digest from then
+on. Compilers run in a folder where files have fixed names, so no path of a user reaches a shell. A
+library's owner, permissions and digest are checked before it is loaded.
 
 Environment:
     GVTORCH_CACHE  folder of the libraries; else gvtorch in XDG_CACHE_HOME or in ~/.cache. gvtorch
@@ -46,13 +46,13 @@ from . import SOURCES, compilers, instructions
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]*"([^"\n]+)"', re.MULTILINE)
 _NAME = re.compile(r"(?=.{1,128}$)[A-Za-z_]\w*(::[A-Za-z_]\w*)*", re.ASCII)
 _READ_BY_COMPILERS = ("CPATH", "CPLUS_INCLUDE_PATH", "NVCC_PREPEND_FLAGS", "NVCC_APPEND_FLAGS")
-_HEADER, _DRAFT = "gv_user_header.h", "draft-"  # what compilers see of a user's header
-_LONGEST = 3600.0  # seconds after which a compilation has been killed
+_HEADER, _DRAFT = "gv_user_header.h", "draft-"  # a user's header as compilers see it; folders
+_LONGEST = 3600.0  # seconds after which a folder is taken for that of a killed compilation
 _lock = threading.Lock()
 
 
 class CompileError(RuntimeError):
-    """A compiler refused a user's shader: a line with file and command, then its output."""
+    """A compiler refused a user's shader. Text: a line with file and command, then its output."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class ShaderSource:
     name: str  # of the struct, with its namespaces
     digest: str
     known: tuple[Path, ...]  # the header, and what its lines include
-    more: Path  # where the other files that it is compiled from are noted
+    more: Path  # the file that lists the other files that it is compiled from
     noted: tuple[tuple[Path, bytes], ...]  # those files, each with its digest
 
     @staticmethod
@@ -97,8 +97,8 @@ class ShaderSource:
         return f"{self.name.replace('::', '_')}_{self.digest[:16]}"
 
     def unchanged(self) -> ShaderSource:
-        """Returns the code as it is read now, in which a compiler may have noted more files. Raises
-        RuntimeError if one that was read has changed since.
+        """Returns the source read again, for which a compiler may have listed more files. Raises
+        RuntimeError if a file that was read before has changed.
         """
         if self.header.is_file():
             now = self.read(self.header, self.name)
@@ -109,9 +109,9 @@ class ShaderSource:
 
 @dataclass(frozen=True)
 class UserShader(ShaderSource):
-    """A compiled shader, and what its struct says of itself."""
+    """A compiled shader, and the facts that its struct declares."""
 
-    features: int  # numbers it gives for each ray; -1: as many as the second channel holds
+    features: int  # numbers it writes for each ray; -1: as many as the second channel holds
     whole: bool  # a ray must not be traced in pieces
     uniforms: tuple[str, ...] | None  # their names; None: any number, without names
 
@@ -135,7 +135,7 @@ def load_op(header: str | os.PathLike[str], name: str) -> UserShader:
             f"got {name!r}"
         )
     compiled(ShaderSource.read(path, name), ())
-    source = ShaderSource.read(path, name)  # the compiler may have told of more files
+    source = ShaderSource.read(path, name)  # the compiler may have listed more files
     _loaded(source, ())
     library = _handles[source.op, "cpu"]
     library.gvtorch_uniforms.restype = ctypes.c_char_p
@@ -161,8 +161,8 @@ def load_cuda(shader: UserShader) -> None:
 
 
 def reload(shader: UserShader) -> UserShader:
-    """Returns a shader that another process compiled (an unpickled one, say) as it is if its op is
-    loaded here, else made anew from its header.
+    """Returns a shader if its op is loaded in this process, else (an unpickled one, say) the shader
+    that `load_op` loads from its header.
     """
     return shader if (shader.op, "cpu") in _libraries else load_op(shader.header, shader.name)
 
@@ -184,9 +184,7 @@ def _loaded(source: ShaderSource, archs: Sequence[str]) -> Path:
             library = compiled(source, archs, source.op)
             checked = _opened(library)
             try:
-                with (
-                    torch._ops.dl_open_guard()
-                ):  # as torch.ops.load_library, which takes links away
+                with torch._ops.dl_open_guard():  # as torch.ops.load_library, which resolves links
                     _handles[key] = ctypes.CDLL(checked)
             except OSError as error:
                 text = str(error).replace(checked, str(library))
@@ -198,8 +196,8 @@ def _loaded(source: ShaderSource, archs: Sequence[str]) -> Path:
 
 def compiled(source: ShaderSource, archs: Sequence[str], op: str | None = None) -> Path:
     """Returns the path of a library in the cache, after compiling it if it is not there. `archs`
-    are CUDA compute capabilities, as in ("90",); none for the CPU. `op` is the name of its op where
-    one is loaded already, else its source's.
+    are CUDA compute capabilities, as in ("90",); none for the CPU. `op` is the name of its op if
+    that is fixed, as by a library that is loaded already; else it is the source's.
     """
     header, name, asked, op = source.header, source.name, op, op or source.op
     kind, for_whom = ("cuda", "CUDA") if archs else ("cpu", "the CPU")
@@ -242,7 +240,7 @@ def compiled(source: ShaderSource, archs: Sequence[str], op: str | None = None) 
             )
         _note(source.unchanged(), Path(folder))
         now = source.unchanged()
-        if now.digest != source.digest:  # this compiler, or that of another process, told of more
+        if now.digest != source.digest:  # this compiler, or another process's, listed more
             return compiled(now, archs, asked)
         with target.open("ab") as file:
             file.write(hashlib.sha256(target.read_bytes()).digest())
@@ -252,13 +250,13 @@ def compiled(source: ShaderSource, archs: Sequence[str], op: str | None = None) 
 
 
 def _note(source: ShaderSource, folder: Path) -> None:
-    """Notes the files that a compiler has read and the source does not know. Those of gvtorch, of
-    torch and of the system are no user's.
+    """Adds the files that a compiler has read, and that the source does not know, to the list of
+    other files. Files of gvtorch, of torch and of the system are left out.
     """
     try:
         told = (folder / "shader.d").read_text(errors="surrogateescape")
     except OSError:
-        return  # a compiler that does not tell
+        return  # this compiler lists nothing
     words = re.findall(r"(?:[^\s\\]|\\.)+", told.partition(":")[2].replace("\\\n", " "))
     names = (re.sub(r"\\(.)", r"\1", word).replace("$$", "$") for word in words)
     read = {(folder / name).resolve() for name in names}
@@ -277,7 +275,7 @@ def _note(source: ShaderSource, folder: Path) -> None:
 
 
 def _noted(more: Path) -> list[Path]:
-    """The files that were noted of a source."""
+    """Returns the files in a list of other files; none where it is missing or damaged."""
     try:
         told = json.loads(more.read_text())
     except (OSError, ValueError, RecursionError):
@@ -286,7 +284,7 @@ def _noted(more: Path) -> list[Path]:
 
 
 def _sweep(folder: Path) -> None:
-    """Removes what killed compilations have left."""
+    """Removes the folders that killed compilations have left."""
     for draft in folder.glob(f"{_DRAFT}*"):
         with contextlib.suppress(OSError):
             if time.time() - draft.lstat().st_mtime > _LONGEST:
@@ -294,8 +292,8 @@ def _sweep(folder: Path) -> None:
 
 
 def _is_intact(library: Path) -> bool:
-    """Returns whether a library is in the cache and ends with the digest of its other bytes, which
-    it lacks where a crash or a full disk cut it short.
+    """Returns whether a library is in the cache and ends with the digest of its other bytes: it
+    does not if a crash or a full disk cut it short.
     """
     try:
         with library.open("rb") as file:
@@ -309,8 +307,8 @@ def _is_intact(library: Path) -> bool:
 
 
 def _opened(library: Path) -> str:
-    """Opens a library, looks at it once more, and returns a path of what is open, so that nothing
-    else can be loaded in its place. It stays open: the loader knows libraries by their paths.
+    """Opens a library, checks its owner again, and returns a path of the open file, so that nothing
+    else can be loaded instead. It stays open: the loader identifies libraries by their paths.
     """
     try:
         file = os.open(library, os.O_RDONLY | os.O_CLOEXEC)
@@ -322,8 +320,8 @@ def _opened(library: Path) -> str:
 
 
 def _check_owner(path: Path, state: os.stat_result) -> None:
-    """Raises RuntimeError if others may change what is loaded as code. In a folder with the sticky
-    bit others may not rename or remove what is not theirs.
+    """Raises RuntimeError if others may change a library, or a folder on its path. In a folder with
+    the sticky bit, others can't rename or remove what is not theirs.
     """
     if state.st_uid not in (0, os.geteuid()):
         raise _refused(f"{path} is another user's")
@@ -333,7 +331,7 @@ def _check_owner(path: Path, state: os.stat_result) -> None:
 
 
 def _compiler(archs: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Returns the compiler's call and its flags, without those that name a path."""
+    """Returns the compiler's command and its flags, without those that contain a path."""
     if not archs:  # "defs": an undefined symbol is an error now, not when the library is loaded
         linker = "-Wl,--no-as-needed,-z,defs"
         own = compilers.INSTRUCTION_SETS[instructions()]
@@ -344,7 +342,7 @@ def _compiler(archs: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def _folder() -> Path:
     """Returns the folder of the cache; makes it, for its owner alone. One that others can write
-    to is refused, for a library is code.
+    to is refused, because a library is code.
     """
     try:
         folder = cache_folder("shaders")
@@ -374,8 +372,8 @@ def _own_sources() -> bytes:
 
 
 def _identity(command: Sequence[str]) -> str:
-    """Returns a text by which a compiler is known without calling it: its command, and path, size
-    and time of change of each program in it (both `ccache` and `g++`, say).
+    """Returns a text that identifies a compiler without calling it: its command, and path, size and
+    time of change of each program in it (both `ccache` and `g++`, say).
     """
     parts = [shlex.join(command)]
     for word in command:

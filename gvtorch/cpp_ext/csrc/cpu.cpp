@@ -1,5 +1,5 @@
 // The CPU library: defines the ops (entry.h) and runs every functor on torch's threads. The ops of rays are implemented
-// in cpu_rays.cpp, those of segments in cpu_segments.cpp, so that they compile side by side.
+// in cpu_rays.cpp, those of segments in cpu_segments.cpp, so that they compile in parallel.
 
 #include <algorithm>
 #include <cstdint>
@@ -10,7 +10,7 @@
 
 namespace gvtorch {
 
-// A user's shader is compiled for the same (cpp_ext/user.py).
+// The instruction set in use; users' shaders are compiled for the same one (cpp_ext/user.py).
 extern "C" __attribute__((visibility("default"))) const char* gvtorch_instructions() { return processor().name; }
 
 // Calls run(args, begin, end), one of `processor().chunks`, for all items of an op, `share` at a time.
@@ -41,7 +41,7 @@ template <class List>
 void compact(const Tensor&, int64_t count, const List& list) {
   constexpr int64_t kChunk = 1 << 11;
   const int64_t chunks = (count + kChunk - 1) / kChunk;
-  std::vector<Counts> before(static_cast<size_t>(chunks) + 1);  // each chunk; all stand behind the last
+  std::vector<Counts> before(static_cast<size_t>(chunks) + 1);  // each chunk; the last entry is the total
   for_shares(count, kChunk, [&](int64_t begin, int64_t end) {
     Counts own{};
     for (int64_t index = begin; index < end; ++index) own.add(list.flags(index));
@@ -52,7 +52,7 @@ void compact(const Tensor&, int64_t count, const List& list) {
   for_shares(count, kChunk, [&](int64_t begin, int64_t end) {
     const Counts &here = before[begin / kChunk], &behind = before[begin / kChunk + 1];
     if (here.any == behind.any) return;
-    const List own = list;  // which nothing written can alias
+    const List own = list;  // a copy, which nothing written can alias
     int64_t rank = here.listed;
     for (int64_t index = begin; index < end; ++index) {
       const int32_t flags = own.flags(index);

@@ -1,4 +1,4 @@
-// The ops of rays on the CPU: in packets where those can, else ray by ray.
+// The ops of rays on the CPU: in packets where possible, else ray by ray.
 
 #include "entry/entry.h"
 #include "packets/processor.h"

@@ -1,4 +1,4 @@
-// The CUDA library: the same functors, one thread an index. It needs the CPU library, which defines the ops.
+// The CUDA library: the same functors, one thread per index. It needs the CPU library, which defines the ops.
 
 #include <cub/block/block_reduce.cuh>
 #include <cub/block/block_scan.cuh>
@@ -41,7 +41,7 @@ void follow_points(const Tensor& like, const OrbitArgs& args) {
 }
 
 // `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks take their
-// chunks. What a chunk has nothing of is not read again.
+// chunks. Chunks without flags are not read again.
 constexpr int kThreads = 256;
 constexpr int kScanThreads = 1024;
 constexpr int64_t kChunk = 8 * kThreads;
@@ -60,7 +60,7 @@ __global__ void __launch_bounds__(kThreads) count_chunks(List list, int64_t coun
   if (threadIdx.x == 0) chunk_c[blockIdx.x] = own;
 }
 
-// Makes counts of chunks those of the chunks before; all stand behind the last.
+// Replaces each chunk's counts by those of the chunks before it; the total is stored behind the last.
 __global__ void __launch_bounds__(kScanThreads) add_chunks(Counts* chunk_c, int64_t chunks) {
   using Scan = cub::BlockScan<Counts, kScanThreads, cub::BLOCK_SCAN_WARP_SCANS>;
   __shared__ typename Scan::TempStorage scratch;
@@ -78,7 +78,7 @@ __global__ void __launch_bounds__(kScanThreads) add_chunks(Counts* chunk_c, int6
 
 template <class List>
 __global__ void __launch_bounds__(kThreads) take_chunks(List list, int64_t count, const Counts* chunk_c) {
-  __shared__ int32_t listed[kThreads / 32];  // in each warp
+  __shared__ int32_t listed[kThreads / 32];  // how many in each warp
   const int warp = threadIdx.x / 32;
   const int lane = threadIdx.x % 32;
   const Counts before = chunk_c[blockIdx.x], behind = chunk_c[blockIdx.x + 1], all = chunk_c[gridDim.x];
@@ -125,7 +125,7 @@ void sort_keys(const Tensor& like, int64_t* keys, int64_t count) {
     const cudaError_t status = cub::DeviceRadixSort::SortKeys(scratch, bytes, buffers, count, 0, 64, launch.stream());
     STD_TORCH_CHECK(status == cudaSuccess, "gvtorch: sorting failed: ", cudaGetErrorString(status));
   };
-  sort(nullptr);  // asks for the scratch memory
+  sort(nullptr);  // only computes the size of the scratch memory
   const Tensor scratch = torch::stable::new_empty(like, {static_cast<int64_t>(bytes)}, ScalarType::Byte);
   sort(scratch.mutable_data_ptr());
   if (buffers.Current() != keys) {

@@ -1,5 +1,5 @@
-// Tracing, voxelizing, noise, orbits and points on the CPU, compiled once for each instruction set (build.py),
-// GV_NAMESPACE its name. Nothing of torch or of the standard library's templates may stand here: see hd.h.
+// Tracing, voxelizing, noise, orbits and points on the CPU, compiled once for each instruction set (build.py), with
+// GV_NAMESPACE as its name. Nothing of torch and no template of the standard library may be used here: see hd.h.
 #include "fields/orbits.h"
 #include "mesh/voxelize.h"
 #include "noise/noise.h"

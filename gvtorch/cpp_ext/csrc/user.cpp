@@ -1,12 +1,12 @@
 // The library of a user's shader (user_shader.h): the op `gvtorch_user::GV_USER_OP`, with the schema of `shade_rays`.
 // The compiler gets the user's header by -include, and GV_USER_SHADER, the name of the struct in it. A C++ compiler
-// makes the op and its CPU kernel of this, nvcc the CUDA kernel. On the CPU rays of float32 go in packets, for the
-// instruction set of the flags; a header that defines GV_RAY_BY_RAY has its rays go one by one, for tests.
+// makes the op and its CPU kernel, nvcc the CUDA kernel. On the CPU, float32 rays are traced in packets, for the
+// instruction set of the flags; if the header defines GV_RAY_BY_RAY, rays are traced one by one, for tests.
 
 #include "user_shader.h"
 
 template <class T>
-using UserShaderOf = GV_USER_SHADER<T>;  // the name that CompiledShader was told: a template <class T> struct
+using UserShaderOf = GV_USER_SHADER<T>;  // the name given to CompiledShader: a template <class T> struct
 
 #include <type_traits>
 
@@ -20,13 +20,13 @@ using UserShaderOf = GV_USER_SHADER<T>;  // the name that CompiledShader was tol
 
 namespace gvtorch {
 
-// Never called: asked whether they could be.
+// Never called: used only to test whether such calls compile.
 constexpr auto kCallAdd = [](auto& shader, auto& piece, auto& probe,
                              auto& sum) -> decltype(shader.add(piece, probe, sum), void()) {};
 constexpr auto kCallSurface = [](auto& shader, auto& probe, auto& sum) -> decltype(shader.surface(probe, sum), void()) {
 };
 
-// What a shader must have, told in words.
+// What a shader must have, checked with readable messages.
 template <class T, class Shader>
 struct Interface {
   using Sum = typename Shader::Sum;
@@ -71,7 +71,7 @@ struct OneShader {
         trace_packets<CalledShader<UserShaderOf, float>, AnyValues>(args, begin, end);
       });
     }
-    each(ShadeRay<float, CalledShader<UserShaderOf, float>, Digits<float>>(args));  // what packets refuse
+    each(ShadeRay<float, CalledShader<UserShaderOf, float>, Digits<float>>(args));  // where packets can't
 #else
     with_digits<float>(args, [&](auto* digits) {
       each(ShadeRay<float, CalledShader<UserShaderOf, float>, std::decay_t<decltype(*digits)>>(args));
@@ -101,7 +101,7 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch_user, CPU, library) {
   gvtorch::implement_as<gvtorch::UserOp>(library, GV_TEXT(GV_USER_OP));
 }
 
-// What Python asks of the struct.
+// What Python reads from the struct.
 #define GV_TELLS extern "C" __attribute__((visibility("default")))
 GV_TELLS int32_t gvtorch_features() { return gvtorch::OneShader::Known::kFeatures; }
 GV_TELLS int32_t gvtorch_whole() { return gvtorch::OneShader::Known::kWhole; }

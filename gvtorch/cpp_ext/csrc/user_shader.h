@@ -1,5 +1,5 @@
-// A shader of one's own, in C++: what `CompiledShader` (shaders/compiled.py) compiles into an op. A header of
-// one's own holds it:
+// A user's shader in C++, which `CompiledShader` (shaders/compiled.py) compiles into an op. The user's header defines
+// it:
 //
 //   #include "user_shader.h"
 //
@@ -14,9 +14,9 @@
 //     }
 //   };
 //
-// `add` is all that must be there. All else of a shader (see shaders.h) has a default here, and may be told anew:
-// kEnds, kSeesEmpty, kSurface and `surface`, Sum, hides, done; and kWhole and kFeatures. The struct is copied into the
-// kernel. Without a Sum and a `hides` of its own, `add` need not be called where the transfer function shows nothing.
+// Only `add` is required. Everything else of a shader (see shaders.h) has a default here and may be overridden: kEnds,
+// kSeesEmpty, kSurface and `surface`, Sum, hides, done; and kWhole and kFeatures. The struct is copied into the kernel.
+// Where Sum and `hides` are not overridden, `add` may not be called where the transfer function shows nothing.
 #pragma once
 
 #include <type_traits>
@@ -26,7 +26,7 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// Names the numbers that come from Python; each becomes an index of `uniform`.
+// Names the uniforms, numbers that Python sets; each name becomes an index for `uniform`.
 #define GV_UNIFORMS(...)                             \
   enum Uniform : int32_t { __VA_ARGS__, kUniforms }; \
   static constexpr const char* kUniformNames = #__VA_ARGS__
@@ -34,8 +34,8 @@ inline namespace GV_NAMESPACE {
 template <class T>
 struct UserShader : ShaderFacts {
   static constexpr bool kHidesAlike = false;
-  static constexpr bool kWhole = false;     // a ray must not be traced in pieces, each with a Sum of its own
-  static constexpr int32_t kUniforms = -1;  // without GV_UNIFORMS: any number of them
+  static constexpr bool kWhole = false;     // true: a ray must not be traced in pieces, each with its own Sum
+  static constexpr int32_t kUniforms = -1;  // how many; -1, without GV_UNIFORMS: any number
   static constexpr const char* kUniformNames = "";
   using Sum = ShadeSum<T>;
 
@@ -43,7 +43,7 @@ struct UserShader : ShaderFacts {
   Light<T> light;
   const T* uniform_k;
   int32_t uniforms;         // how many
-  int32_t other_component;  // which number of the second channel was asked for
+  int32_t other_component;  // which number of the second channel the user chose
   T step;                   // world length of the shortest interval
 
   explicit UserShader(const ShadeArgs& args)
@@ -56,22 +56,22 @@ struct UserShader : ShaderFacts {
 
   GV_HD T uniform(int32_t index) const { return uniform_k[index]; }
 
-  // Colour of a value and the alpha of the interval, by the transfer function.
+  // The transfer function's colour of a value, and its alpha over the interval.
   GV_HD Row<T> look_up(T value, const Piece<T>& piece) const {
     return gvtorch::look_up(Transfer<T>(transfer), value, piece, step);
   }
 
-  // Puts an interval behind what the ray met before: its colour, not premultiplied, and its alpha.
+  // Composites an interval behind the previous ones: its colour (not premultiplied) and alpha.
   GV_HD void composite(const Row<T>& row, const Piece<T>& piece, ShadeSum<T>& sum) const {
     sum.add(row, piece.start, piece.length, sum.hit_clear);
   }
 
-  // What the transfer function shows nothing of.
+  // True if the transfer function shows no value in [low, high].
   GV_HD bool hides(T low, T high, const ShadeSum<T>&) const { return Transfer<T>(transfer).transparent(low, high); }
   GV_HD void done(ShadeSum<T>&) const {}
 };
 
-// Whether `hides` is that of UserShader, which asks the transfer function alone.
+// True if a shader has UserShader's `hides`, which depends on the transfer function alone.
 template <class Shader, class = void>
 constexpr bool kHidesByTransfer = false;
 template <template <class> class Kind, class T>
@@ -79,7 +79,7 @@ constexpr bool kHidesByTransfer<Kind<T>, std::void_t<decltype(&Kind<T>::hides)>>
     std::is_same_v<decltype(&Kind<T>::hides), decltype(&UserShader<T>::hides)>;
 
 #ifndef __CUDACC__
-// The Sums of a packet's rays, each a user's own. The walk looks at what a ray lets through, and tells what it missed.
+// The users' Sums of a packet's rays. The walk reads `clear` and writes `missed`, which are vectors over the lanes.
 template <class Sum>
 struct UserSums {
   Sum of_lane[kLanes];
@@ -110,7 +110,7 @@ GV_HD Mask hides_of(const Shader& shader, Mask which, Floats low, Floats high, U
 }
 #endif
 
-// A user's shader as the walks call it. In a packet the walk and the values are those of all lanes at once; the user's
+// A user's shader as the walks call it. A packet is walked and its values are read for all lanes at once; the user's
 // `add` is called for one lane after the other.
 template <template <class> class Kind, class T>
 struct CalledShader : Kind<T> {
@@ -124,13 +124,13 @@ struct CalledShader : Kind<T> {
 #ifndef __CUDACC__
   template <class V>
   using SumOf = UserSums<Sum>;
-  // Values that are hidden change nothing, unless a Sum of the user's own counts them.
+  // Lanes whose value is hidden are left out: it changes nothing, unless the user's own Sum counts it.
   static constexpr bool kLeavesOut = kHidesByTransfer<Base> && std::is_same_v<Sum, ShadeSum<T>> && !Base::kEnds;
 
   template <class Packet>
   GV_HD void add(Mask which, const Piece<Floats>& pieces, Packet& packet, UserSums<Sum>& sums) const {
     if constexpr (kLeavesOut) which = which && !this->transfer.transparent(pieces.value, pieces.value);
-    // All lanes' gradients take about as long as those of two, one by one.
+    // The gradients of all lanes at once take about as long as two lanes' one by one.
     const bool ahead = sums.asked >= 2;
     Vec3<Floats> slope{};
     if (ahead) slope = packet.gradient(pieces.middle);

@@ -1,21 +1,21 @@
-// What ops and kernels are given, each argument declared once, in lists of lines
+// The arguments of ops and kernels, each declared once, in lists of lines
 //
 //   X(kind, name, limit)
 //
-// `kind` is one of the types below: what the argument is in the op's schema, what torch hands over, which dtype a
-// tensor must have, and what the kernels get. `limit` keeps memory safe: how many numbers a tensor holds, or what an
-// int stays below (it is never negative); kAny where that is told elsewhere. It is an expression of the sizes that the
-// function knows in which the list is taken. An X makes one thing of each line:
+// `kind` is one of the types below: it defines the argument's type in the op's schema, what torch passes, the dtype of
+// a tensor, and what kernels get. `limit` keeps memory safe: how many numbers a tensor holds, or what an int is below
+// (it is never negative); kAny where that is checked elsewhere. It is an expression of sizes that are known in the
+// function that expands the list. An X makes one thing of each line:
 //
 //   GV_VIEW    a member of the struct that kernels read
-//   GV_FIELD   a member of the struct that torch fills (entry.h, as the others)
-//   GV_WORD    its words in the schema
+//   GV_FIELD   a member of the struct that torch fills (in entry.h, like those below)
+//   GV_WORD    its text in the schema
 //   GV_TYPE    its type, in the order of the schema
-//   GV_TAKE    its check, and the step from torch's struct to the kernels'
+//   GV_TAKE    its check, and the copy from torch's struct to the kernels'
 //
-// An op's list is a row of groups: trace_rays has GV_RAYS, GV_CHANNEL and GV_WALK, shade_rays these and GV_SHADE; those
-// of segments stand in entry_segments.h, the cache's in cache.h. ops/arguments.py holds the fields on rays with what
-// they mean, shape by shape; tests/test_arguments.py holds the two equal.
+// An op's list consists of groups: trace_rays has GV_RAYS, GV_CHANNEL and GV_WALK, shade_rays these and GV_SHADE; those
+// of segments are in entry_segments.h, the cache's in cache.h. ops/arguments.py documents the arguments on rays, with
+// their shapes; tests/test_arguments.py checks that both are equal.
 #pragma once
 
 #include <cstdint>
@@ -30,7 +30,7 @@ constexpr int64_t kAny = -1;
 namespace kinds {
 
 struct AnyReal;   // float32 or float64: the dtype in which an op computes
-struct AnyVoxel;  // that of a channel
+struct AnyVoxel;  // the dtype of a channel
 
 // A tensor of T. kAlias: it is written in place, under this letter of the schema. kOptional: it may be None.
 template <class T, char kAlias = 0, bool kOptional = false>
@@ -47,7 +47,7 @@ using Bytes = TensorOf<uint8_t>;
 using Reals = TensorOf<AnyReal>;
 using MaybeReals = TensorOf<AnyReal, 0, true>;
 using Voxels = TensorOf<AnyVoxel>;
-using MaybeVoxels = TensorOf<AnyVoxel, 0, true>;  // each of a dtype of its own
+using MaybeVoxels = TensorOf<AnyVoxel, 0, true>;  // each with its own dtype
 template <char kAlias>
 using Written = TensorOf<int32_t, kAlias>;
 template <char kAlias>
@@ -62,13 +62,13 @@ struct NumberOf {
   using View = T;
 };
 using Int = NumberOf<int32_t>;
-using Count = NumberOf<int64_t>;  // an int that torch.compile need not know, of any size
+using Count = NumberOf<int64_t>;  // an int of any size, which torch.compile need not know
 using Float = NumberOf<double>;
 using Bool = NumberOf<bool>;
 
 }  // namespace kinds
 
-// World rays. rays
+// World rays. Sizes in limits: rays
 #define GV_RAYS(X)                 \
   X(World, origin_r3, 3 * rays)    \
   X(World, direction_r3, 3 * rays) \
@@ -77,7 +77,7 @@ using Bool = NumberOf<bool>;
   X(Int, width, kAny)              \
   X(MaybeWorld, clear_r, rays)
 
-// Where the tree lies, how rays are cut, and a channel. side, nodes, channels
+// Placement and shape of the tree, how rays are cut, and a channel. Sizes in limits: side, nodes, channels
 #define GV_CHANNEL(X)            \
   X(World, place_33, 9)          \
   X(Int, branching, 17)          \
@@ -89,7 +89,7 @@ using Bool = NumberOf<bool>;
   X(Voxels, bricks_bzyxc, kAny)  \
   X(Voxels, constant_tnc, nodes* channels)
 
-// The node pool, the transfer function, and where rays end. channels, nodes, tiles, bricks, table, rows
+// Node pool, transfer function, and where rays end. Sizes in limits: channels, nodes, tiles, bricks, table, rows
 #define GV_WALK(X)                            \
   X(Voxels, range_tn2c, 2 * nodes * channels) \
   X(Int, component, channels)                 \
@@ -107,7 +107,7 @@ using Bool = NumberOf<bool>;
   X(Float, depth_alpha, kAny)                 \
   X(Bool, by_level, kAny)
 
-// What a shader reads beside.
+// What a shader reads in addition.
 #define GV_SHADE(X)                  \
   X(Int, shader, kAny)               \
   X(Int, features, kAny)             \
@@ -139,29 +139,29 @@ enum class LightKind { kHeadlight, kDirectional, kPoint };
 enum class ProjectionKind { kMaximum, kMinimum, kMean };
 constexpr int32_t kDirections = 6;  // +x -x +y -y +z -z: a stored colour may have four numbers for each
 
-// The numbers of a fused shader, `parameter_54`, by name; a user's own stand behind them.
+// The numbers of a fused shader, `parameter_54`, by name; the uniforms of a user's shader follow them.
 template <class T>
 struct Parameters {
-  T light_place[3];  // of a point light; of a directional one: the way it shines
+  T light_place[3];  // position of a point light; direction in which a directional one shines
   T light_kind;      // a LightKind
   T light_color[3], ambient;
   T diffuse, specular, shininess;
   T light_width;                  // of a cone to the light: its growth (directional), or the width at the light (point)
-  T own[4];                       // the shader's own: its Own, see shaders.h
+  T own[4];                       // the shader's struct Own, see shaders.h
   T normal_scale, normal_offset;  // a stored normal is number * scale + offset
-  T octaves, anisotropy;          // of light that is scattered several times; 0 octaves: a surface's
+  T octaves, anisotropy;          // of multiple scattering; 0 octaves: a surface is lit
 };
 constexpr int32_t kParameters = sizeof(Parameters<float>) / sizeof(float);
 
 constexpr int32_t kPlainShader = -1;  // the transfer function alone
 
-// Of what is optional, null: there is no such channel.
+// Optional channels are null where they are absent.
 struct ShadeArgs : TraceArgs {
   GV_SHADE(GV_VIEW)
 
   VoxelType normal_voxel, other_voxel;
   int32_t other_channels, other_bricks;
-  int32_t parameters;  // how many numbers there are: 20, and behind them a user's own
+  int32_t parameters;  // how many numbers parameter_54 has: kParameters, then a user's uniforms
   void *normal_r3, *features_rc;
 };
 

@@ -1,14 +1,14 @@
-// Arithmetic on T, which is float, double, or on the CPU `Floats` (simd.h): a number of each ray of a packet. What is
-// written on T is one source for one ray and for a packet:
+// Arithmetic on T, which is float, double, or on the CPU `Floats` (simd.h): a number for each ray of a packet. Code
+// written for T serves both one ray and a packet:
 //
-//   RealOf<T>, IntOf<T>, MaskOf<T>    the type of one number; of a whole number and of a comparison's result, per lane
+//   RealOf<T>, IntOf<T>, MaskOf<T>    type of one number; of a whole number per lane; of a comparison's result per lane
 //   select(mask, a, b)                a where the mask is set, else b
-//   any(mask)                         some lane is set
-//   for_lanes(mask, body)             body(lane) for each lane that is set; `lane_of` and `set_lane` take it apart
+//   any(mask)                         true if some lane is set
+//   for_lanes(mask, body)             body(lane) for each lane that is set; `lane_of` and `set_lane` read and write it
 //
-// Masks are joined by && || and !. A single ray is one lane: its mask is a bool, for which && and || stop early.
+// Masks are combined by && || and !. A single ray is one lane: its mask is a bool, for which && and || stop early.
 //
-// log2 and exp2 are written with + - * / and bit moves alone, always in the same order, so that the torch
+// log2 and exp2 use only + - * / and bit operations, always in the same order, so that the torch
 // twin (ops/reference/exact.py), the CPU and the GPU agree to the last bit. Series: Abramowitz and Stegun, "Handbook of
 // Mathematical Functions", 1964, 4.1.27 (logarithm by atanh) and 4.2.1 (exponential).
 #pragma once
@@ -51,7 +51,7 @@ GV_HD void set_lane(T& value, int, T own) {
   value = own;
 }
 // The smallest value among the threads of a warp that run this together; values are not negative. On the CPU, and on
-// GPUs before compute capability 8.0, which have no such instruction, the thread's own.
+// GPUs before compute capability 8.0, which have no such instruction, the thread's own value.
 GV_HD float smallest_together(float value) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   return __uint_as_float(__reduce_min_sync(__activemask(), __float_as_uint(value)));
@@ -84,8 +84,8 @@ GV_HD T square_root(T value) {
   return sqrt(value);
 }
 
-// Which of two comes out where one is no number is the same for rays and packets. Clamped, a NaN ends at the lower
-// bound: an index made from the result is always valid.
+// If one of two is NaN, rays and packets return the same one of them. `clamp` turns NaN into the lower bound, so that
+// an index made from the result is always valid.
 template <class T>
 GV_HD T smaller(T a, T b) {
   return b < a ? b : a;
@@ -192,7 +192,7 @@ GV_HD T absolute(T value) {
   return larger(value, -value);
 }
 
-// floor of a value that fits an int32; lanes that are not asked for may hold any. Without SSE4.1 (the baseline of
+// floor of a value that fits an int32; lanes that are not used may hold any value. Without SSE4.1 (the baseline of
 // x86-64) std::floor is a call.
 template <class T>
 GV_HD IntOf<T> floor_int(T value) {
@@ -243,7 +243,7 @@ GV_HD T exp2_exact(T value) {
   return select(normal, series * bit_cast<T>((bit_cast<WordOf<T>>(whole) + 127u) << 23), T{});
 }
 
-// Takes a positive, normal number apart: it is the returned fraction, in [1/2, 1), times 2^power.
+// Splits a positive, normal number: it is the returned fraction, in [1/2, 1), times 2^power.
 template <class T>
 GV_HD T fraction_of(T value, IntOf<T>& power) {
   const auto bits = bit_cast<IntOf<T>>(value);
@@ -266,8 +266,8 @@ GV_HD double fraction_of(double value, int32_t& power) {
 GV_HD Doubles fraction_of(Doubles value, Longs& power) { return wide_fraction_of(value, power); }
 #endif
 
-// Of a positive, normal number: the exponent of the power of two next to it, and what is left: s * series is its
-// natural logarithm.
+// A positive, normal number split for logarithms: the exponent of the nearest power of two, and the natural logarithm
+// of the remaining factor, s * series.
 template <class T>
 struct LogParts {
   T exponent, s, series;
@@ -287,7 +287,7 @@ GV_HD LogParts<T> log_parts(T value) {
   return {exponent, s, series};
 }
 
-// Natural logarithm of a positive, normal number, in both precisions; of what is infinite or no number, itself.
+// Natural logarithm of a positive, normal number, in both precisions; infinity and NaN are returned as they are.
 template <class T>
 GV_HD T log_exact(T value) {
   using Real = RealOf<T>;
@@ -319,7 +319,7 @@ GV_HD double exp2_exact(double value) {
   return (exp2_slope(f) * f + 1.0) * bit_cast<double>(static_cast<int64_t>(whole + 1023) << 52);
 }
 
-// What is taken from light that is halved so often: 1 - 2^-halvings, as exact where that is little.
+// The share of light absorbed after `halvings` halvings: 1 - 2^-halvings, without cancellation where that is small.
 template <class T>
 GV_HD T taken_by(T halvings) {
   const auto thin = halvings < static_cast<RealOf<T>>(0.5);

@@ -1,5 +1,5 @@
-// How a functor of one index is run: `for_each(like, count, functor)` on the device of the tensor `like`. Every library
-// has it once, for the CPU where a C++ compiler reads this, for CUDA where nvcc does.
+// Runs a functor for each index: `for_each(like, count, functor)`, on the device of the tensor `like`. Each library has
+// one version: a C++ compiler compiles the CPU's, nvcc the one for CUDA.
 #pragma once
 
 #ifdef __CUDACC__
@@ -41,9 +41,9 @@ class Launcher {
   cudaStream_t current;
 };
 
-// That many blocks on a multiprocessor leave 64 registers to a thread: waiting for memory is what tracing must hide.
+// Eight blocks of this size on a multiprocessor leave 64 registers to a thread; many threads hide waits for memory.
 constexpr int kBlock = 128;
-// Functors that shade ask for fewer: their values in registers are more than their loads.
+// Functors may override this. Those that shade ask for fewer blocks, because they need more registers.
 template <class Functor, class = void>
 constexpr int kBlocksAtOnce = 8;
 template <class Functor>
@@ -65,14 +65,14 @@ void for_each(const torch::stable::Tensor& like, int64_t count, const Functor& f
 
 #else
 
-// Functors whose indices take long say how few make it worth to wake another thread.
+// How many indices a thread takes at a time. Functors whose indices take long override this with fewer.
 template <class Functor, class = void>
 constexpr int64_t kShare = 256;
 template <class Functor>
 constexpr int64_t kShare<Functor, std::void_t<decltype(Functor::kShare)>> = Functor::kShare;
 
-// Calls body(begin, end) for all indices, `share` neighbours at a time, which threads draw from a counter: long rays do
-// not leave a thread idle. Nothing that a body writes depends on which thread ran it.
+// Calls body(begin, end) for all indices, in chunks of `share` that threads draw from a counter, so that long rays do
+// not leave a thread idle. Nothing that a body writes may depend on which thread runs it.
 template <class Body>
 void for_shares(int64_t count, int64_t share, const Body& body) {
   const int64_t chunks = (count + share - 1) / share;

@@ -1,16 +1,16 @@
-// What every kernel header stands on: the host/device marker, vectors of three, voxels to numbers, and atomics on
-// integers. Arithmetic stands in arithmetic.h.
+// The basis of every kernel header: host/device markers, vectors of three, conversion of voxels to numbers, and
+// atomics. Arithmetic is in arithmetic.h.
 //
 // Kernels are functors of ONE index, `GV_HD void operator()(int64_t) const`, and are run by `for_each`
-// (for_each.h). No other header in this folder but entry*.h knows torch.
+// (for_each.h). Of the headers, only that one, shade_each.h, trace_chunks.h and entry*.h include torch.
 #pragma once
 
 #include <cmath>
 #include <cstdint>
 #include <cstring>
 
-// The CPU's kernels are compiled once for each instruction set, each in a namespace of its own: a function that the
-// linker merges would else run instructions that a machine does not have.
+// The CPU's kernels are compiled once for each instruction set, each in its own namespace. Otherwise the linker would
+// merge functions, which might then run instructions that a machine does not have.
 #ifndef GV_NAMESPACE
 #define GV_NAMESPACE plain
 #endif
@@ -18,7 +18,7 @@
 #ifdef __CUDACC__
 #define GV_HD __host__ __device__ __forceinline__
 #define GV_CALL __host__ __device__ __noinline__
-#define GV_ASIDE GV_HD  // what few rays come to: on a CPU a call, which leaves the loops around it smaller
+#define GV_ASIDE GV_HD  // code that few rays reach: on a CPU a call, which keeps the loops around it small
 #else
 #define GV_HD inline __attribute__((always_inline))
 #define GV_CALL __attribute__((noinline))
@@ -35,7 +35,7 @@ struct Vec3 {
   GV_HD T operator[](int axis) const { return axis == 0 ? x : (axis == 1 ? y : z); }
 };
 
-// Also of vectors of lanes (A) and of numbers (B).
+// Also for vectors of lanes (A) and of numbers (B).
 template <class A, class B>
 GV_HD Vec3<A> minus(Vec3<A> a, Vec3<B> b) {
   return {a.x - b.x, a.y - b.y, a.z - b.z};
@@ -45,7 +45,7 @@ GV_HD auto dot(Vec3<A> a, Vec3<B> b) {
   return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
-// 16-bit floats as they are stored; every one of them is a float.
+// 16-bit floats as they are stored; a float32 holds each exactly.
 struct Half {
   uint16_t bits;
 };
@@ -61,7 +61,7 @@ GV_HD To bit_cast(From value) {
   return out;
 }
 
-// Voxel to number. Halves by moving their bits and scaling, which is exact for denormals too.
+// Converts a voxel to a number. Halves are converted by shifting their bits and scaling, exact for denormals too.
 template <class T, class Voxel>
 GV_HD T number(Voxel voxel) {
   return static_cast<T>(voxel);
@@ -79,9 +79,9 @@ GV_HD T number(Half voxel) {
   return static_cast<T>(bit_cast<float>(sign | bits));
 }
 
-// Stamps: many rays store the same value, so a relaxed store is enough; the read first spares the cache line. On a GPU
-// it may come from the first-level cache, which is not kept up to date: an old value there costs one more store, while
-// a read past it (volatile) waits some 200 cycles.
+// Stamps: many rays store the same value, so a relaxed store is enough; reading first avoids most stores and keeps the
+// cache line shared. On a GPU the read may hit the first-level cache, which is not coherent: an old value there costs
+// one more store, while a read past it (volatile) waits some 200 cycles.
 GV_HD void store_stamp(int32_t* word, int32_t stamp) {
 #ifdef __CUDA_ARCH__
   if (*word != stamp) *word = stamp;
@@ -90,7 +90,7 @@ GV_HD void store_stamp(int32_t* word, int32_t stamp) {
 #endif
 }
 
-// A byte that several threads may fill with the same value.
+// Access to a byte into which several threads may write the same value.
 GV_HD uint8_t load_byte(const uint8_t* byte) {
 #ifdef __CUDA_ARCH__
   return *byte;
@@ -106,7 +106,7 @@ GV_HD void store_byte(uint8_t* byte, uint8_t value) {
 #endif
 }
 
-// Adds to a sum that other threads add to as well.
+// Adds atomically to a sum.
 template <class T>
 GV_HD void add_to(T* sum, T value) {
 #ifdef __CUDA_ARCH__
@@ -121,7 +121,7 @@ GV_HD void add_to(T* sum, T value) {
   while (!__atomic_compare_exchange(sum, &seen, &next, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) next = seen + value;
 #endif
 }
-// Raises a number that other threads raise as well.
+// Raises a number atomically to at least `least`.
 GV_HD void raise_to(int32_t* count, int32_t least) {
 #ifdef __CUDA_ARCH__
   atomicMax(count, least);
@@ -133,7 +133,7 @@ GV_HD void raise_to(int32_t* count, int32_t least) {
 }
 
 // Joins a request into a request word, which is never negative: kind bits (above kPriorityMask) by OR, priority by
-// maximum. Commutative, so the word does not depend on the order of the rays.
+// maximum. This is commutative, so the word does not depend on the order of the rays.
 constexpr int32_t kPriorityMask = 0x7ff;
 constexpr int32_t kLoad = 1 << 11;
 constexpr int32_t kSubdivide = 1 << 12;

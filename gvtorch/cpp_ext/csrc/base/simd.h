@@ -1,6 +1,6 @@
-// Vectors of kLanes numbers, one for each ray of a packet: the compiler's (GCC and Clang "vector extensions"), as wide
-// as the instruction set that this file is compiled for. Only what these lack is written for each set: the exact
-// minimum and maximum, square roots, loads from many addresses, and which lanes of a mask are set.
+// Vectors of kLanes numbers, one for each ray of a packet: GCC's and Clang's "vector extensions", as wide as the
+// instruction set that this file is compiled for. Only what these lack is written for each set: exact minimum and
+// maximum, square roots, loads from many addresses, and the set lanes of a mask as bits.
 #pragma once
 
 #if defined(__SSE2__)
@@ -33,7 +33,7 @@ typedef float Floats __attribute__((vector_size(kLanes * 4)));
 typedef int32_t Ints __attribute__((vector_size(kLanes * 4)));
 typedef uint32_t Words __attribute__((vector_size(kLanes * 4)));  // sums and products wrap
 using Mask = Ints;                                                // -1 or 0 in each lane
-typedef double Doubles __attribute__((vector_size(kLanes * 4)));  // half as many
+typedef double Doubles __attribute__((vector_size(kLanes * 4)));  // half as many lanes
 typedef int64_t Longs __attribute__((vector_size(kLanes * 4)));
 
 GV_HD Floats to_floats(Ints value) { return __builtin_convertvector(value, Floats); }
@@ -45,7 +45,7 @@ GV_HD Ints lane_numbers() {
   return lane;
 }
 
-// As in arithmetic.h: which of two comes out where one is no number is the same.
+// As in arithmetic.h, also in which of two is returned if one is NaN.
 #ifdef GV_MM
 GV_HD Floats smaller(Floats a, Floats b) { return (Floats)GV_MM(min_ps)((Native)b, (Native)a); }
 GV_HD Floats larger(Floats a, Floats b) { return (Floats)GV_MM(max_ps)((Native)b, (Native)a); }
@@ -66,7 +66,7 @@ GV_HD Ints smaller(Ints a, Ints b) { return b < a ? b : a; }
 GV_HD Ints larger(Ints a, Ints b) { return b > a ? b : a; }
 // value > low ? value : low, then raised < high ? raised : high.
 GV_HD Floats clamp(Floats value, Floats low, Floats high) { return smaller(high, larger(low, value)); }
-// A bit for each lane that is set.
+// The set lanes as bits.
 GV_HD uint32_t bits(Mask mask) {
 #if defined(__AVX512F__)
   return _mm512_movepi32_mask((__m512i)mask);
@@ -84,13 +84,13 @@ GV_HD bool any(Mask mask) { return bits(mask) != 0; }
 GV_HD bool any(Longs mask) { return any((Mask)mask); }
 GV_HD int32_t count(Mask mask) { return __builtin_popcount(bits(mask)); }
 
-// body(lane) for each lane that is set.
+// Calls body(lane) for each lane that is set.
 template <class Body>
 GV_HD void for_lanes(Mask mask, const Body& body) {
   for (uint32_t left = bits(mask); left != 0; left &= left - 1) body(__builtin_ctz(left));
 }
 
-// 4 bytes at each address base + offset.
+// Loads 4 bytes at each address base + offset.
 GV_HD Ints gather(const void* base, Ints offset) {
 #if defined(__AVX512F__)
   return (Ints)_mm512_i32gather_epi32((__m512i)offset, base, 1);
@@ -107,7 +107,7 @@ GV_HD Ints gather(const void* base, Ints offset) {
 #endif
 }
 GV_HD Ints pick(const int32_t* table, Ints index) { return gather(table, index << 2); }
-// Of words that other threads may store meanwhile: each is read whole.
+// The same for words that other threads may write meanwhile: each is read atomically.
 GV_HD Ints pick_shared(const int32_t* table, Ints index) {
 #if defined(__AVX2__)
   return pick(table, index);
@@ -120,7 +120,7 @@ GV_HD Ints pick_shared(const int32_t* table, Ints index) {
 GV_HD Floats pick(const float* table, Ints index) { return (Floats)gather(table, index << 2); }
 
 #ifdef GV_MM
-// Rows of four numbers, of the lanes i, i + 4, i + 8, ... in own[i]: each of the four numbers of all lanes.
+// Transposes rows of four numbers: own[i] holds those of the lanes i, i + 4, i + 8, ...; number[k], number k of all.
 GV_HD void transpose(const Native own[4], Floats number[4]) {
   const Native a = GV_MM(unpacklo_ps)(own[0], own[1]), b = GV_MM(unpacklo_ps)(own[2], own[3]);
   const Native c = GV_MM(unpackhi_ps)(own[0], own[1]), d = GV_MM(unpackhi_ps)(own[2], own[3]);
@@ -131,8 +131,8 @@ GV_HD void transpose(const Native own[4], Floats number[4]) {
 }
 #endif
 
-// Four floats at each address base + offset (a multiple of 16 bytes), the first of all lanes in row[0], and so on: a
-// load for each lane and a transposition, where four gathers would load each number alone.
+// Loads four floats at each address base + offset (a multiple of 16 bytes); row[0] gets the first of all lanes, and so
+// on. A load per lane and a transposition replace four gathers, which would load each number alone.
 GV_HD void load_rows(const void* base, Ints offset, Floats row[4]) {
 #ifdef GV_MM
   int32_t lane[kLanes];
@@ -159,7 +159,7 @@ GV_HD void load_rows(const void* base, Ints offset, Floats row[4]) {
 #endif
 }
 
-// Two such rows, one behind the other: wider loads, and half as many.
+// Loads two such rows, the second right behind the first: half as many loads, twice as wide.
 GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats second[4]) {
 #if defined(__AVX2__)
   int32_t lane[kLanes];
@@ -167,7 +167,7 @@ GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats
   const auto eight = [&](int i) {
     return _mm256_loadu_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
   };
-  Floats half[2][4];  // of four or eight lanes, each number of the first row, then of the second, by turns
+  Floats half[2][4];  // number i for half of the lanes: of four lanes' first rows, then of their second rows, in turn
   for (int h = 0; h < 2; ++h) {
     Native own[4];
     for (int i = 0; i < 4; ++i) {
@@ -195,7 +195,7 @@ GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats
 #endif
 }
 
-// The voxel in the low bytes of each word, as a number.
+// Converts the voxel in the low bytes of each word to a number.
 template <class Voxel>
 struct Unpack;
 template <>
@@ -232,7 +232,7 @@ struct Unpack<float> {
   GV_HD static Floats low(Ints word) { return (Floats)word; }
 };
 
-// Four voxels that lie side by side, as numbers.
+// Converts four consecutive voxels to numbers.
 typedef float Four __attribute__((vector_size(16)));
 template <class Voxel>
 GV_HD Four four_numbers(const char* first) {

@@ -1,14 +1,14 @@
-// The cache's ops on bare words: what rays asked for becomes a list, nodes tell their places and whether they still
-// lack what they asked for, slots are ordered by use, pointers to slots that change hands are cleared, new pointers are
-// written, and bricks are cut out of a level. Each op's arguments stand before its functors, see arguments.h.
+// The cache's ops on plain words: list the requests of rays and choose which are served, order slots by use, clear
+// pointers to slots that change hands, write new pointers, find the locs of nodes and whether these still lack what
+// they requested, and cut bricks out of a level. Each op's arguments are declared before its functors, see arguments.h.
 //
-// Equal to the twins in ops/cache.py in every integer. What a device brings (cpu.cpp, cuda.cu):
-//   compact(n, list)   list.flags(index) says for each index what of kListed, kSeen and kTouched it is
-//                      list.take(index, flags, rank, listed)  for all that are touched, as all listed and seen are;
-//                                                             rank: those listed before it; listed: all
-//                      list.blank(rank)                       for every place left over of list.places()
-//                      list.total(listed, seen)               once
-//   sort_keys(keys, n) brings n numbers into rising order
+// Equal to the twins in ops/cache.py in every integer. What each device defines (cpu.cpp, cuda.cu):
+//   compact(n, list)   list.flags(index) returns which of kListed, kSeen and kTouched each index is
+//                      list.take(index, flags, rank, listed)  is called for every touched index; listed and seen ones
+//                                                             are touched. rank: listed ones before it; listed: all
+//                      list.blank(rank)                       is called for every unused one of list.places()
+//                      list.total(listed, seen)               is called once
+//   sort_keys(keys, n) sorts n numbers in ascending order
 // Method: Crassin et al., "GigaVoxels", I3D 2009, section 5 (usage stamps, LRU by compaction, request lists).
 #pragma once
 
@@ -22,7 +22,7 @@ inline namespace GV_NAMESPACE {
 
 constexpr int32_t kListed = 1, kSeen = 2, kTouched = 4;
 
-// How many indices are listed and seen; any: not 0 where one has a flag.
+// How many indices are listed, and seen; `any` is not 0 if one has a flag.
 struct Counts {
   int32_t listed, seen, any;
 
@@ -38,7 +38,7 @@ struct Counts {
 
 // --- Requests
 
-// Pending bits stand above the kind bits: asked for, answer not here yet. Such a request is not listed again.
+// Pending bits are above the kind bits: requested, and the answer not written yet. Such a request is not listed again.
 constexpr int32_t kPendingShift = 2;
 constexpr int32_t kKinds = kLoad | kSubdivide;
 constexpr int32_t kPending = kKinds << kPendingShift;
@@ -47,11 +47,11 @@ GV_HD int32_t open_kinds(int32_t word) { return word & kKinds & ~(word >> kPendi
 
 #define GV_COMPACT_REQUESTS(X) X(Requests<'a'>, request_tn, kAny) X(Int, capacity, kAny)
 
-// Lists requests and clears them; what a full list has no place for is only counted.
+// Lists requests and clears them; those beyond the capacity of the list are only counted.
 struct ListRequests {
   GV_COMPACT_REQUESTS(GV_VIEW)
   int32_t *node_k, *word_k;
-  int64_t* count_5;  // kept, found, requested; of those kept loads, and subdivisions
+  int64_t* count_5;  // kept, found, requested; loads among those kept, and subdivisions
 
   GV_HD int32_t flags(int64_t node) const {
     const int32_t word = request_tn[node];
@@ -80,7 +80,7 @@ struct ListRequests {
   }
 };
 
-// lists, listed, tiles
+// Sizes in limits: lists, listed, tiles
 #define GV_CHOOSE_REQUESTS(X)             \
   X(Words, asked_l2k, 2 * lists * listed) \
   X(Words, loc_t4, 4 * tiles)             \
@@ -89,22 +89,22 @@ struct ListRequests {
   X(Int, batch, kAny)                     \
   X(Bool, coarse_first, kAny)
 
-constexpr int64_t kNoKey = INT64_MAX;       // no request of a node of the pool
-constexpr int64_t kComparers = 16;          // threads that share what a request is compared with
+constexpr int64_t kNoKey = INT64_MAX;       // not a request of a node of the pool
+constexpr int64_t kComparers = 16;          // threads that share the comparisons of a request
 constexpr int64_t kMostCompared = 1 << 15;  // longer lists are sorted
 constexpr int64_t kIndices = int64_t{1} << 31;
 
 struct ChooseArgs {
   GV_CHOOSE_REQUESTS(GV_VIEW)
   int64_t lists, listed, tiles;
-  int64_t* key_lk;              // rank, index in the lists, and two bits of kinds: the lower, the more wanted
-  int32_t *end_l, *before_2lk;  // behind a list's last request; how many loads, and subdivisions, are wanted more
+  int64_t* key_lk;              // rank, index in the lists, and two bits of kinds: lower keys are served first
+  int32_t *end_l, *before_2lk;  // end of each list's requests; how many loads, and subdivisions, have lower keys
   int64_t* node_2b;             // loads, then subdivisions
   int32_t* priority_2b;
 
   GV_HD int64_t node_at(int64_t index) const { return asked_l2k[index + index / listed * listed]; }
   GV_HD int32_t word_at(int64_t index) const { return asked_l2k[index + (index / listed + 1) * listed]; }
-  // Serves a request as a load (0) or a subdivision (1), of which so many are wanted more.
+  // Serves a request as a load (`which` 0) or a subdivision (1) if there is room behind the `place` ones before it.
   GV_HD void serve(int64_t which, int64_t place, int64_t index) const {
     const int64_t room = room_2[1 - which];  // tiles, bricks
     if (place >= smaller<int64_t>(batch, room)) return;
@@ -113,7 +113,7 @@ struct ChooseArgs {
   }
 };
 
-// Ranks requests, and empties what is given.
+// Computes the keys of requests, and clears the outputs.
 struct RankRequests : ChooseArgs {
   GV_HD void operator()(int64_t index) const {
     if (index < int64_t{2} * batch) {
@@ -133,9 +133,9 @@ struct RankRequests : ChooseArgs {
   }
 };
 
-// Counts the requests that are wanted more than one; an index is one of kComparers threads that share this, each for
-// every kComparers-th of the others. Most frames have some hundred requests: to compare each with each costs less than
-// to sort the places of as many as there may be.
+// Counts the requests with lower keys than each. An index is a request and one of the kComparers threads that share it,
+// each of which compares every kComparers-th of the others. Most frames have some hundred requests: comparing each with
+// each costs less than sorting lists of full capacity.
 struct CompareRequests : ChooseArgs {
   GV_HD void operator()(int64_t number) const {
     const int64_t index = number % (lists * listed), first = number / (lists * listed);
@@ -166,7 +166,7 @@ struct ServeRequests : ChooseArgs {
   }
 };
 
-// The same for keys in order, of loads or of subdivisions; see `compact`.
+// ServeRequests for sorted keys, for loads or for subdivisions; see `compact`.
 struct ServeSorted : ChooseArgs {
   int64_t which;
 
@@ -189,12 +189,12 @@ struct ServeSorted : ChooseArgs {
 struct UseArgs {
   GV_LRU_PARTITION(GV_VIEW)
   int64_t slots;
-  uint8_t *used_s, *used_k;  // of the slots a bit each, of the order a byte each
+  uint8_t *used_s, *used_k;  // a bit per slot; a byte per entry of the order
   int32_t* sorted_k;
   int64_t* unused_1;
 };
 
-// Stamps as one bit a slot, eight to an index: the order of use visits slots at random, and bits fit near caches.
+// Packs stamps to a bit per slot, eight per index: the order of use reads slots at random, and bits fit near caches.
 struct PackUse : UseArgs {
   GV_HD void operator()(int64_t index) const {
     const int32_t frame = *frame_1;
@@ -213,8 +213,8 @@ struct FlagUse : UseArgs {
   }
 };
 
-// Puts slots that the frame did not use before the others. kFromStamps: for a device that reads at random without
-// waiting; else FlagUse has run.
+// Moves slots that the frame did not use before the others. kFromStamps: stamps are read, on a device where random
+// reads cost little; else FlagUse has run.
 template <bool kFromStamps>
 struct SplitByUse : UseArgs {
   GV_HD bool used(int64_t index) const {
@@ -225,7 +225,7 @@ struct SplitByUse : UseArgs {
   GV_HD int32_t flags(int64_t index) const { return kTouched | static_cast<int32_t>(!used(index)); }
   GV_HD void take(int64_t index, int32_t flags, int64_t rank, int64_t listed) const {
     const int64_t behind = listed + index - rank;
-    const int64_t mask = -static_cast<int64_t>(flags & kListed);  // no branch: half of them would be guessed wrong
+    const int64_t mask = -static_cast<int64_t>(flags & kListed);  // no branch: it would often be mispredicted
     sorted_k[behind + ((rank - behind) & mask)] = order_k[index];
   }
   GV_HD int64_t places() const { return 0; }
@@ -262,7 +262,7 @@ struct TakeFromOwner : UnlinkArgs {
   }
 };
 
-// An index is kTogether words. Only shared slots have pointers beside their owner's.
+// An index is kTogether words. Only shared slots have pointers other than their owner's.
 struct ClearShared : UnlinkArgs {
   static constexpr int64_t kTogether = 16;
 
@@ -303,7 +303,7 @@ struct ClearOwner {
   X(Words, word_k, count)             \
   X(Int, kind, kAny)
 
-// node_k names each node once; -1 is a place that is not taken.
+// node_k holds each node at most once; -1 is an unused entry.
 struct WritePointer {
   GV_LINK(GV_VIEW)
   int64_t nodes;
@@ -327,7 +327,7 @@ struct WritePointer {
   X(Words, slot_k, count)               \
   X(Words, frame_1, 1)
 
-// Gives nodes the bricks in slots, which are theirs from now on.
+// Links nodes to the bricks in slots, and makes the nodes their owners.
 struct LinkBrick {
   GV_LINK_BRICKS(GV_VIEW)
   int64_t nodes, slots;
@@ -363,8 +363,8 @@ struct LinkBrick {
   X(Int, tree, kAny)                            \
   X(Words, frame_1, 1)
 
-// Writes tiles and hangs them below nodes: an index is a word of a tile. Words beyond those of the tree are TERMINAL
-// and EMPTY. A node's own tile is not among those written.
+// Writes tiles and links them to their parent nodes: an index is a node of a tile. Nodes beyond the tree's N^3 become
+// TERMINAL and EMPTY. The tile that holds a parent node is not among those written.
 struct LinkTile {
   GV_LINK_TILES(GV_VIEW)
   int64_t tiles, rows;
@@ -400,7 +400,7 @@ struct LinkTile {
   X(Longs, slot_k, kAny)                        \
   X(Bytes, rows_kb, count* bytes)
 
-// Writes rows into slots, in words as wide as they allow: an index is a word. -1 is a place that is not taken.
+// Writes rows into slots, in words as wide as the rows allow: an index is a word. A slot of -1 is an unused entry.
 template <class Word>
 struct PutRows {
   GV_PUT_ROWS(GV_VIEW)
@@ -415,7 +415,7 @@ struct PutRows {
   }
 };
 
-// --- Places
+// --- Locs
 
 #define GV_LOCATE(X)               \
   X(Words, loc_t4, 4 * tiles)      \
@@ -423,7 +423,7 @@ struct PutRows {
   X(Int, branching, INT16_MAX + 1) \
   X(Int, per_tile, kAny)
 
-// Where nodes lie: x, y, z and depth of each, from those of its tile; -1 for an index that is no node's.
+// Computes the locs of nodes (x, y, z, depth) from those of their tiles; -1 for an index that is not a node.
 struct LocateNodes {
   GV_LOCATE(GV_VIEW)
   int64_t* loc_k4;
@@ -433,7 +433,7 @@ struct LocateNodes {
     const int64_t node = node_k[index];
     for (int32_t part = 0; part < 4; ++part) loc_k4[4 * index + part] = at(node, part);
   }
-  // x, y, z or depth.
+  // A part of a node's loc: x, y, z or depth.
   GV_HD int64_t at(int64_t node, int32_t part) const {
     if (node < 0 || node >= nodes) return -1;
     const int64_t tile = node / per_tile;
@@ -457,8 +457,8 @@ struct LocateNodes {
   X(Int, root, kAny)                    \
   X(Int, branching, INT16_MAX + 1)
 
-// Which nodes still stand for the places that were asked for, reached from a parent or from an alias, and still have
-// nothing there.
+// Finds which nodes are still those of the requested locs, reachable from a parent or from an alias, and still have no
+// pointer.
 struct FindLacking {
   GV_LACKING(GV_VIEW)
   LocateNodes places;  // its loc_k4 is not written
@@ -485,9 +485,9 @@ struct FindLacking {
   X(Int, brick_size, 1025)       \
   X(Int, border, 1025)
 
-// Borders are from the neighbours, clamped at the level's faces. An index is a plane of a brick. Sizes in voxels, of z,
-// y, x; a voxel is `bytes` bytes, all its channels. Bricks lie anywhere in a level, so that each row is a miss: the
-// rows of a later plane are fetched ahead.
+// Borders come from the neighbours, clamped at the level's faces. An index is a plane of a brick. Sizes are in voxels,
+// (z, y, x); a voxel has `bytes` bytes, with all its channels. Bricks are scattered over a level, so each row is a
+// cache miss: the rows of a later plane are prefetched.
 struct CutBricks {
   GV_CUT_BRICKS(GV_VIEW)
   char* bricks_kzyxc;
@@ -502,7 +502,7 @@ struct CutBricks {
   GV_HD int64_t inside(int64_t at, int32_t axis) const {
     return larger<int64_t>(0, smaller<int64_t>(at, size_3[axis] - 1));
   }
-  // The voxel x = 0 of a row.
+  // Address of the voxel x = 0 of a row.
   GV_HD const char* row(int64_t plane, int32_t y) const {
     const int64_t z = inside(low(plane, 0) + plane % side(), 0);
     return static_cast<const char*>(values_zyxc) + (z * size_3[1] + inside(low(plane, 1) + y, 1)) * size_3[2] * bytes;

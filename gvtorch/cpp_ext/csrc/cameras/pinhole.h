@@ -7,7 +7,7 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// Rows are counted through the batch: `rows` of them from `first`, `height` a camera. cameras, columns
+// Rows are counted through the batch: `rows` from `first`, `height` per camera. Sizes in limits: cameras, columns
 #define GV_PINHOLE_RAYS(X)              \
   X(World, camera_nc, cameras* columns) \
   X(Int, first, kAny)                   \
@@ -20,14 +20,14 @@ struct PinholeRays {
   int64_t columns;
   double *origin_r3, *direction_r3, *cone_r2, *range_r2;
 #ifdef __CUDACC__
-  static constexpr int64_t kThreads = 3;  // a ray, so that neighbouring threads write side by side
+  static constexpr int64_t kThreads = 3;  // per ray, so that neighbouring threads write neighbouring numbers
 #else
   static constexpr int64_t kThreads = 1;
 #endif
 
   GV_HD void operator()(int64_t index) const {
     const int64_t ray = index / kThreads;
-    const int32_t narrow = static_cast<int32_t>(ray);  // of 31 bits: a GPU takes long to divide wider numbers
+    const int32_t narrow = static_cast<int32_t>(ray);  // 31 bits: a GPU divides wider numbers slowly
     const int32_t down = narrow / width, row = first + down;
     const double* const camera = camera_nc + row / height * columns;
     const double x = (static_cast<double>(narrow - down * width) - camera[14]) / camera[12];

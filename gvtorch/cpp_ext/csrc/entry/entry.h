@@ -1,8 +1,8 @@
-// Where torch meets the kernels: how the lists of arguments.h become ops, and the ops that trace rays. Included by the
-// two libraries (cpu*.cpp, cuda.cu) and by every user's shader (user.cpp). The other ops stand in the other headers of
-// this folder; entry_all.h lists them all.
+// Connects torch and the kernels: turns the lists of arguments.h into ops, and defines the ops that trace rays.
+// Included by the two libraries (cpu*.cpp, cuda.cu) and by every user's shader (user.cpp). The other ops are in the
+// other headers of this folder; entry_all.h lists them all.
 //
-// An op is a struct of its arguments (GV_OP), and a function `run` of it, which checks them and runs kernels.
+// An op is a struct of its arguments (GV_OP), and a function `run` that takes it, checks them and runs kernels.
 //
 // Only the LibTorch Stable ABI is used (torch/csrc/stable), so that one binary serves every torch >= 2.11.
 // Messages for users are made in gvtorch/ops/*.py; the checks here only keep memory safe.
@@ -30,7 +30,7 @@ using torch::headeronly::CppTypeToScalarType;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
-// --- From a kind to what torch hands over, and to its word in a schema.
+// --- From a kind to the type that torch passes, and to its word in a schema.
 
 template <class Kind>
 struct Handed;
@@ -59,7 +59,7 @@ inline std::string schema_of(const char* name, std::initializer_list<std::string
   return text + ") -> " + returns;
 }
 
-struct Begin {};  // the first of a list's types, for each of the others has a comma before it
+struct Begin {};  // the first of a list's types, because GV_TYPE puts a comma before each of the others
 template <class...>
 struct Types {};
 template <class... One, class... Other>
@@ -105,7 +105,7 @@ void implement(Library& library, Types<Op...>) {
 
 // What tensors of an op have in common.
 struct Like {
-  const Tensor& tensor;  // on whose device all lie
+  const Tensor& tensor;  // all are on its device
   ScalarType real = ScalarType::Float;
   ScalarType voxel = ScalarType::Float;
   ScalarType request = ScalarType::Short;
@@ -141,7 +141,7 @@ void check(kinds::NumberOf<T>, int64_t number, const char* name, const Like&, in
 inline void check(kinds::Float, double, const char*, const Like&, int64_t) {}
 inline void check(kinds::Bool, bool, const char*, const Like&, int64_t) {}
 
-// The memory of a tensor, as a pointer of whatever type a kernel has for it; null where none was given.
+// The memory of a tensor, which converts to a pointer of the type that a kernel declares; null without a tensor.
 struct Memory {
   const Tensor* tensor;
 
@@ -160,10 +160,10 @@ Number lay(Number number) {
 }
 
 #define GV_CHECK(kind, name, limit) check(kinds::kind{}, a.name, #name, like, limit);
-// Checks an argument of `a`, and lays it ready in the kernels' `args`.
+// Checks an argument of `a`, and stores it in the kernels' `args`.
 #define GV_TAKE(kind, name, limit) GV_CHECK(kind, name, limit) args.name = lay(a.name);
 
-// Makes a tensor for the kernels to fill; where they do not tell its dtype, it is that of `like`.
+// Makes a tensor for the kernels to fill, of the pointer's dtype, or of that of `like` if the pointer is void.
 template <class T>
 Tensor give(T*& pointer, const Tensor& like, std::initializer_list<int64_t> shape) {
   ScalarType dtype = like.scalar_type();
@@ -181,14 +181,14 @@ inline VoxelType voxel_type(ScalarType dtype) {
   return static_cast<VoxelType>(found - kInOrder);
 }
 
-// Whether an op computes in float64, not in float32.
+// True if an op computes in float64, not in float32.
 inline bool is_wide(const Tensor& tensor) {
   const ScalarType dtype = tensor.scalar_type();
   STD_TORCH_CHECK(dtype == ScalarType::Float || dtype == ScalarType::Double, "gvtorch: must be float32 or float64");
   return dtype == ScalarType::Double;
 }
 
-// Returns the side of bricks of any channel.
+// Checks the bricks of any channel; returns their side, border included.
 inline int64_t check_bricks(const Tensor& bricks_bzyxc) {
   STD_TORCH_CHECK(bricks_bzyxc.dim() == 5 && bricks_bzyxc.size(1) >= 2 && bricks_bzyxc.size(1) <= 1024 &&
                       bricks_bzyxc.size(1) == bricks_bzyxc.size(2) && bricks_bzyxc.size(2) == bricks_bzyxc.size(3),
@@ -198,7 +198,7 @@ inline int64_t check_bricks(const Tensor& bricks_bzyxc) {
   return side;
 }
 
-// Takes what all ops on rays and bricks have in common.
+// Checks and stores the arguments that all ops on rays and bricks have in common.
 template <class Op>
 void take_channel(TraceArgs& args, const Op& a, const Like& like, int64_t nodes) {
   STD_TORCH_CHECK(a.origin_r3.dim() == 2 && a.origin_r3.size(1) == 3 && a.origin_r3.size(0) <= INT32_MAX,
@@ -218,12 +218,12 @@ void take_channel(TraceArgs& args, const Op& a, const Like& like, int64_t nodes)
   args.channels = static_cast<int32_t>(channels);
 }
 
-// Takes what all ops that walk rays have in common. integrates: the table is (l, m, m, 4).
+// Checks and stores the arguments that all ops that walk rays have in common. integrates: the table is (l, m, m, 4).
 template <class Op>
 ShadeArgs take_walk(const Op& a, bool integrates = false) {
   ShadeArgs args{};
   args.shader = kPlainShader;
-  // Programs that version 0.1 exported bring requests of 32 bits, which nobody reads.
+  // Programs that version 0.1 exported pass requests of 32 bits. Nobody reads them, so none are written.
   const bool unread = a.request_tn.scalar_type() == ScalarType::Int;
   const Like like{a.origin_r3, a.table_lm4.scalar_type(), a.bricks_bzyxc.scalar_type(),
                   unread ? ScalarType::Int : ScalarType::Short};
@@ -250,15 +250,15 @@ ShadeArgs take_walk(const Op& a, bool integrates = false) {
 
 // --- The ops
 
-// What a traced ray gives.
+// Makes the tensors of what traced rays return.
 inline std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> give_hits(TraceArgs& args, const Tensor& table) {
   return {give(args.color_r3, table, {args.rays, 3}), give(args.alpha_r1, table, {args.rays, 1}),
           give(args.depth_r1, table, {args.rays, 1}), give(args.samples_r, table, {args.rays}),
           give(args.missed_r, table, {args.rays})};
 }
 
-// Checks a second channel of the same pool (coarse: of its first bricks, and then it may have no constants), with
-// `width` numbers a voxel (0: any); returns them, 0 where there is none.
+// Checks a second channel of the same pool, with `width` numbers per voxel (0: any); returns how many it has, 0 where
+// there is no channel. coarse: it may be of the pool's first bricks alone, and have no constants.
 inline int32_t check_second(const std::optional<Tensor>& bricks_bzyxc, const std::optional<Tensor>& constant_tnc,
                             const char* name, int64_t width, const TraceArgs& args, VoxelType& voxel,
                             bool coarse = false) {
@@ -278,8 +278,8 @@ inline int32_t check_second(const std::optional<Tensor>& bricks_bzyxc, const std
   return static_cast<int32_t>(channels);
 }
 
-// The shaders of a library: what is asked of their arguments, and `run`, which shades all rays. A user's library has a
-// class like this one (user.cpp).
+// The shaders of a library: what they require of their arguments, and `run`, which shades all rays. A user's library
+// has a class like this one (user.cpp).
 struct FusedShaders {
   static bool integrates(int64_t shader) {
     STD_TORCH_CHECK(shader < static_cast<int64_t>(ShaderKind::kCount), "gvtorch: shader is unknown");
@@ -306,7 +306,7 @@ struct FusedShaders {
     STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold 20 elements, got ",
                     args.parameters);
   }
-  static void run(const Tensor& like, ShadeArgs args, bool wide);  // in cpu.cpp and in cuda.cu
+  static void run(const Tensor& like, ShadeArgs args, bool wide);  // in cpu_rays.cpp and in cuda.cu
 };
 
 #define GV_TRACE_RAYS(X) GV_RAYS(X) GV_CHANNEL(X) GV_WALK(X)

@@ -1,5 +1,5 @@
 // The ops of cache and pools: from tensors to the functors of cache.h. Included once by cpu.cpp and once by cuda.cu,
-// each of which brings its own `compact` and `sort_keys`. How lists become ops: entry.h.
+// each of which defines its own `compact` and `sort_keys`. How lists become ops: entry.h.
 #pragma once
 
 #include "cache/cache.h"
@@ -7,7 +7,7 @@
 
 namespace gvtorch {
 
-struct alignas(16) Wide {  // as much as a thread moves at once
+struct alignas(16) Wide {  // the most that a thread moves at once
   int64_t part_2[2];
 };
 

@@ -23,7 +23,7 @@ inline auto run(const OrbitsOp& a) {
   OrbitArgs args{};
   GV_ORBITS(GV_TAKE)
   args.points = points;
-  args.wide = is_wide(a.point_p3);  // or refuses
+  args.wide = is_wide(a.point_p3);  // raises for other dtypes
   Tensor found_3p = give(args.found_3p, a.point_p3, {3, points});
   follow_points(a.point_p3, args);
   return found_3p;

@@ -19,7 +19,7 @@ void with_real(const Tensor& tensor, const Body& body) {
 
 // --- Walks
 
-// A part of a walk: it goes on from state_r3, and pauses after `limit` samples.
+// A part of a walk: it continues from state_r3, and pauses after `limit` samples.
 #define GV_PART(X)                  \
   X(MaybeReals, state_r3, 3 * rays) \
   X(Int, limit, kAny)               \
@@ -32,7 +32,7 @@ GV_OP(WriteSegmentsOp, "write_segments", GV_WRITE_SEGMENTS,
       "(Tensor ray_s, Tensor node_s2, Tensor brick_s2, Tensor depth_s3, Tensor interval_s3, Tensor distance_s3, "
       "Tensor t0_s, Tensor t1_s)");
 
-// Runs make(WalkRay, T{}) for every ray.
+// Runs the functor that make(WalkRay, T{}) returns for every ray.
 template <class Op, class Make>
 void walk_rays(const Op& a, const Make& make) {
   const ShadeArgs walked = take_walk(a);
@@ -85,7 +85,7 @@ inline auto run(const WriteSegmentsOp& a) {
 
 // --- Samples
 
-// Segments, and samples of them. segments, samples
+// Segments, and samples of them. Sizes in limits: segments, samples
 #define GV_SAMPLES(X)                 \
   X(Words, ray_s, segments)           \
   X(Words, node_s2, 2 * segments)     \
@@ -102,7 +102,7 @@ GV_OP(SampleBricksOp, "sample_bricks", GV_SAMPLE_BRICKS, "Tensor value_kc");
 GV_OP(SampleBricksBackwardOp, "sample_bricks_backward", GV_SAMPLE_BRICKS_BACKWARD,
       "(Tensor grad_bzyxc, Tensor grad_tnc)");
 
-// Runs make(AimSample, T{}, Voxel{}) for every sample.
+// Runs the functor that make(AimSample, T{}, Voxel{}) returns for every sample.
 template <class Op, class Make>
 void aim_samples(const Op& a, const Make& make) {
   const Like like{a.origin_r3, a.distance_s3.scalar_type(), a.bricks_bzyxc.scalar_type()};
@@ -158,7 +158,7 @@ inline auto run(const SampleBricksBackwardOp& a) {
 
 // --- Compositing
 
-// Packed samples of rays. count, rays, channels
+// Packed samples of rays. Sizes in limits: count, rays, channels
 #define GV_PACKED(X)                    \
   X(Reals, alpha_k, count)              \
   X(Reals, feature_kc, count* channels) \

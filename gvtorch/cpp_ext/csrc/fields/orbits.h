@@ -1,5 +1,5 @@
-// Orbits of escape-time fractals: of points, and of balls of points. Twin and sources: ops/reference/orbits.py, whose
-// order of operations is kept. On a T of arithmetic.h: one point, or one in each lane.
+// Orbits of escape-time fractals: of points, and of balls of points. Twin and sources: ops/reference/orbits.py, with
+// the same order of operations. T is as in arithmetic.h: one point, or one in each lane.
 #pragma once
 
 #include "base/arguments.h"
@@ -9,8 +9,8 @@ namespace gvtorch {
 
 enum class StepKind : int32_t { kPower, kFold, kCount };
 
-// What orbits go by. `amount`: n of z^n, or the Mandelbox's scale; `julia`: constant_3 is added, else each point's own
-// place.
+// The parameters of orbits. `amount`: n of z^n, or the Mandelbox's scale; `julia`: each step adds constant_3, else the
+// point's own position.
 #define GV_ORBIT(X)                                    \
   X(Reals, constant_3, 3)                              \
   X(Reals, bailout_1, 1)                               \
@@ -19,12 +19,12 @@ enum class StepKind : int32_t { kPower, kFold, kCount };
   X(Int, iterations, kAny)                             \
   X(Bool, julia, kAny)
 
-// points
+// Sizes in limits: points
 #define GV_ORBITS(X)             \
   X(Reals, point_p3, 3 * points) \
   GV_ORBIT(X)
 
-// balls
+// Sizes in limits: balls
 #define GV_ORBIT_BOUNDS(X)       \
   X(Reals, center_k3, 3 * balls) \
   X(Reals, reach_k, balls)       \
@@ -34,7 +34,7 @@ struct OrbitArgs {
   GV_ORBITS(GV_VIEW)
   int64_t points;
   bool wide;       // float64
-  void* found_3p;  // distance, least distance from the origin and from a plane of two axes
+  void* found_3p;  // distance; the orbit's least distance from the origin, and from a coordinate plane
 };
 
 struct OrbitBoundsArgs {
@@ -60,7 +60,7 @@ GV_HD T number_of(double value) {
   return splat<T>(static_cast<RealOf<T>>(value));
 }
 
-// The bits of n below its highest one, from high to low: body(whether it is set).
+// Calls body(whether it is set) for each bit of n below its highest set one, from high to low.
 template <class Body>
 GV_HD void for_bits(int32_t n, const Body& body) {
   int32_t bit = 1;
@@ -70,7 +70,7 @@ GV_HD void for_bits(int32_t n, const Body& body) {
     body((n & bit) != 0);
   }
 }
-// A number n times itself, n >= 1.
+// value^n, for n >= 1.
 template <class T>
 GV_HD T product(T value, int32_t n) {
   T whole = value;
@@ -91,7 +91,7 @@ GV_HD void complex_power(T& real, T& imaginary, int32_t n) {
   });
 }
 
-// How far a step may take points of a ball apart, and the ends of how far it takes neighbours.
+// By how much a step stretches distances in a ball: `most` between any two points; `low` to `high` between neighbours.
 template <class T>
 struct Stretch {
   T most, low, high;
@@ -157,7 +157,7 @@ struct FoldStep {
   }
 };
 
-// A distance, of an orbit that has got to a radius while neighbours came apart.
+// Estimates the distance from an orbit's radius and from how far (`apart`) neighbouring orbits have come apart.
 template <class Step, class T>
 GV_HD T estimate(T radius, T apart) {
   if constexpr (Step::kLogarithmic) return static_cast<RealOf<T>>(0.5) * radius * log_exact(radius) / apart;
@@ -202,7 +202,7 @@ struct FollowPoints {
   }
 };
 
-// Follows the middle of balls, and a radius that holds the orbits of all of their points. An index is a ball.
+// Follows the centres of balls, and a radius within which the orbits of all points of a ball stay. An index is a ball.
 template <class T, class Step>
 struct FollowBalls {
   OrbitBoundsArgs args;
@@ -217,7 +217,7 @@ struct FollowBalls {
     const Vec3<T> constant = args.julia ? Vec3<T>{own[0], own[1], own[2]} : z;
     const T push = args.julia ? T{} : first, add = args.julia ? 0 : 1;
     T reach = first, low_apart = 1, high_apart = 1, low = infinity, high = -infinity;
-    bool inside = true, lost = false;  // whether any point may be, still
+    bool inside = true, lost = false;  // inside: some point may still be
     for (int32_t turn = 0;; ++turn) {
       const T radius = square_root(squared(z)), least = larger(radius - reach, T{}), most = radius + reach;
       if (most > bailout) {
@@ -241,7 +241,7 @@ struct FollowBalls {
   }
 };
 
-// body(Step*), with a null pointer, for a step of T has no default.
+// Calls body(Step*) with a null pointer, because steps have no default constructor.
 template <class T, class Body>
 void with_step(int32_t kind, const Body& body) {
   if (kind == static_cast<int32_t>(StepKind::kPower)) return body(static_cast<PowerStep<T>*>(nullptr));
@@ -249,7 +249,7 @@ void with_step(int32_t kind, const Body& body) {
 }
 
 #ifndef __CUDACC__
-// Points begin to end, a vector of them at a time.
+// Follows the points begin to end, a vector of them at a time.
 template <class T>
 void orbits_in_lanes(const OrbitArgs& args, int64_t begin, int64_t end) {
   using Real = RealOf<T>;

@@ -1,7 +1,7 @@
-// The body of `voxelize`: what cubes of voxels hold of a mesh. Every voxel goes down a hierarchy of boxes by itself, so
-// that nobody makes lists of triangles and nobody waits for their length. Twin and sources: ops/reference/voxelize.py,
-// which looks at all triangles; what is found does not depend on the way. Coordinates are in voxels, from a cube's low
-// corner.
+// The kernels of `voxelize`: distance to a mesh, nearest triangle, winding number, coverage and weights, in cubes of
+// voxels. Every voxel descends a hierarchy of boxes by itself, so that no list of triangles is made, for whose length
+// the host would wait. Twin and sources: ops/reference/voxelize.py, which tests all triangles, with equal results.
+// Coordinates are in voxels, from a cube's low corner.
 #pragma once
 
 #include "base/arguments.h"
@@ -11,13 +11,13 @@ namespace gvtorch {
 
 constexpr int32_t kMostVoxels = 32;  // along a side of a cube
 constexpr int32_t kArity = 8;        // boxes in a box
-constexpr int32_t kMostFloors = 12;  // levels of boxes: of 2^33 triangles
+constexpr int32_t kMostFloors = 12;  // levels of boxes: enough for 8^12 triangles
 constexpr int32_t kWaiting = (kArity - 1) * kMostFloors + kArity;
 constexpr double kFlat = 1e-3, kTouch = 1e-6, kBeyond = 0.8661, kParts = 1 << 30;
 constexpr int32_t kCorners = 16;  // of a clipped triangle
-constexpr double kCoarse = 2;     // triangles along a side of a voxel from which on each voxel goes down alone
+constexpr double kCoarse = 2;     // size of voxels, in usual triangles, above which each voxel descends alone
 
-// triangles, boxes, cubes
+// Sizes in limits: triangles, boxes, cubes
 #define GV_VOXELIZE(X)                \
   X(World, corner_f33, 9 * triangles) \
   X(Flags, solid_f, triangles)        \
@@ -31,7 +31,7 @@ constexpr double kCoarse = 2;     // triangles along a side of a voxel from whic
   X(Bool, weights, kAny)              \
   X(Bool, wide, kAny)
 
-// What the kernels get: boxes of floor i begin at first[i], the lowest are those of the triangles.
+// The kernels' arguments: boxes of floor i begin at first[i]; those of floor 0 are the triangles'.
 struct VoxelizeArgs {
   GV_VOXELIZE(GV_VIEW)
   int64_t triangles, cubes;
@@ -43,7 +43,7 @@ struct VoxelizeArgs {
 
 inline namespace GV_NAMESPACE {
 
-// The voxels of a row that are looked at together: on the CPU a vector of float32, else one.
+// The voxels of a row that are processed together: on the CPU a vector of float32, else one.
 #ifdef __CUDACC__
 template <class T>
 using Together = T;
@@ -59,11 +59,11 @@ GV_HD Vec3<T> outer(Vec3<T> a, Vec3<T> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
-// What of a triangle is the same for all places. A place may be of one number an axis, or of a vector of them (F).
+// What is computed of a triangle once for all positions. A position has one number per axis, or a vector of them (F).
 template <class T>
 struct Triangle {
   Vec3<T> corner[3], edge[3], beside[3], normal;
-  T inverse2[3], length2, most;  // most: what `beside` may give inside; less where there is no area
+  T inverse2[3], length2, most;  // most: largest product with `beside` inside; below 0 for a triangle without area
 
   GV_HD explicit Triangle(const Vec3<T>* corner_3) {
     for (int i = 0; i < 3; ++i) corner[i] = corner_3[i];
@@ -85,7 +85,7 @@ struct Triangle {
     const F t = clamp(dot(from, edge[i]) * inverse2[i], F{}, F{} + 1);
     return {from.x - t * edge[i].x, from.y - t * edge[i].y, from.z - t * edge[i].z};
   }
-  // Whether the nearest place of the triangle's plane lies in the triangle.
+  // True if the nearest point of the triangle's plane lies in the triangle.
   template <class F>
   GV_HD auto over(Vec3<F> place) const {
     const F first = dot(minus(place, corner[0]), beside[0]), second = dot(minus(place, corner[1]), beside[1]),
@@ -99,8 +99,8 @@ struct Triangle {
     const F height = dot(minus(place, corner[0]), normal);
     return select(over(place), height * height / length2, best);
   }
-  // Weights of the corners at the nearest place. It and `away` each look for the nearest edge: one function for both
-  // costs 5 to 11 % of a mesh with distances.
+  // Weights of the corners at the nearest point. This and `away` both search for the nearest edge: one function for
+  // both costs 5 to 11 % of the time for a mesh with distances.
   GV_HD Vec3<T> weight(Vec3<T> place) const {
     Vec3<T> found{};
     if (over(place)) {
@@ -122,7 +122,7 @@ struct Triangle {
     found[(at + 1) % 3] = t;
     return found;
   }
-  // A vector along which the nearest place lies, of any length and sign.
+  // A vector along the line to the nearest point, of any length and sign.
   GV_HD Vec3<T> away(Vec3<T> place, T gap2) const {
     if (over(place) || gap2 < static_cast<T>(kTouch)) return normal;
     Vec3<T> toward{};
@@ -139,7 +139,7 @@ struct Triangle {
   }
 };
 
-// Where a line along x pierces a triangle (`at`), and which way its normal points along it; 0: it passes beside.
+// Where a line along x pierces a triangle (`at`), and the sign of the triangle's normal along x; 0: it misses.
 template <class T>
 struct Pierced {
   T at;
@@ -167,7 +167,7 @@ GV_HD Pierced<T> pierced(T y, T z, const Vec3<T>* corner) {
   return {height / total, positive[0] ? 1 : -1};
 }
 
-// A triangle that is cut at the sides of voxels.
+// A triangle clipped at the sides of voxels.
 template <class T>
 struct Polygon {
   Vec3<T> at[kCorners];
@@ -176,14 +176,14 @@ struct Polygon {
   GV_HD void push(Vec3<T> corner) {
     if (count < kCorners) at[count++] = corner;
   }
-  // Whether all of it is above `limit` along an axis, or below it. What lies in the plane is above.
+  // True if all of it is above (`upper`) or below `limit` along an axis. Points in the plane are above.
   GV_HD bool within(int axis, T limit, bool upper) const {
     for (int32_t i = 0; i < count; ++i) {
       if ((at[i][axis] >= limit) != upper) return false;
     }
     return true;
   }
-  // The part that is.
+  // The part that is above or below.
   GV_HD Polygon clip(int axis, T limit, bool upper) const {
     if (within(axis, limit, upper)) return *this;
     Polygon kept;
@@ -202,7 +202,7 @@ struct Polygon {
     }
     return kept;
   }
-  // The volume before it, from x = 0 on.
+  // The volume between x = 0 and the polygon, with the sign of its normal along x.
   GV_HD T before() const {
     T total{};
     for (int32_t i = 1; i + 1 < count; ++i) {
@@ -250,7 +250,7 @@ GV_HD T box_share(Vec3<T> normal, T offset) {
   return clamp(share, static_cast<T>(0), static_cast<T>(1));
 }
 
-// The boxes that are still to be looked at.
+// A stack of the boxes that are still to be visited.
 struct Waiting {
   int32_t box[kWaiting], floor[kWaiting];
   double gap2[kWaiting];
@@ -264,14 +264,14 @@ struct Waiting {
   }
 };
 
-// An index is as many voxels of a row along x as are looked at together, after `wind`. T: in which it is computed.
+// An index is kPack voxels of a row along x, for which `wind` has run. T: float or double, for the computation.
 template <class T>
 struct VoxelizePack {
   VoxelizeArgs a;
 
   static constexpr double kMargin = sizeof(T) == 4 ? 1e-2 : 1e-6;  // voxels, more than rounding moves a triangle
   static constexpr int32_t kPack = kTogether<T>;
-  static constexpr int kBlocksAtOnce = 4;  // triangles take 128 registers to a thread
+  static constexpr int kBlocksAtOnce = 4;  // triangles need 128 registers per thread
 
   struct Cube {
     double low[3], voxel, inverse;
@@ -324,13 +324,13 @@ struct VoxelizePack {
     read_corners(cube, number, corner);
     return Triangle<T>(corner);
   }
-  // How far a box is from what lies between two places along an axis; world units, 0 in it.
+  // Distance along an axis between a box and the range from low to high; world units, 0 where they overlap.
   GV_HD double beside(int64_t box, int axis, double low, double high) const {
     const double below = a.box_n6[6 * box + axis] - high, above = low - a.box_n6[6 * box + 3 + axis];
     return larger(larger(below, above), 0.0);
   }
 
-  // Calls meet(triangle) for all triangles whose boxes are as near as `gap2(box)` says and `most()` allows, those of
+  // Calls meet(triangle) for all triangles whose boxes have gap2(box) <= most(), which may fall meanwhile; those of
   // nearer boxes first.
   template <class Gap, class Most, class Meet>
   GV_HD void descend(const Gap& gap2, const Most& most, const Meet& meet) const {
@@ -342,7 +342,7 @@ struct VoxelizePack {
       for (int32_t box = from; box < to; ++box) {
         const double gap = gap2(a.first[floor] + box);
         if (!(gap <= most())) continue;
-        int32_t at = waiting.count;  // the nearest of them lies on top
+        int32_t at = waiting.count;  // sorted: the nearest of them is on top
         waiting.push(box, floor, gap);
         for (; at > before && waiting.gap2[at - 1] < gap; --at) {
           waiting.box[at] = waiting.box[at - 1];
@@ -369,7 +369,7 @@ struct VoxelizePack {
     }
   }
 
-  // Meets the triangles of solids whose boxes reach into a beam along x, from x on.
+  // Calls meet(triangle) for the triangles of solids whose boxes reach into a beam along x, from x on.
   template <class Meet>
   GV_HD void ahead(double x, double y0, double y1, double z0, double z1, const Meet& meet) const {
     descend(
@@ -384,8 +384,8 @@ struct VoxelizePack {
         });
   }
 
-  // Writes the winding numbers of a row, which packs take: triangles ahead along x, those whose normals point ahead
-  // as 1.
+  // Writes the winding numbers of a row, which packs read: triangles ahead along x count 1 if their normals point
+  // ahead, else -1.
   GV_HD void wind(int64_t row) const {
     const int64_t number = row / (a.side * a.side);
     if (!(a.size_k3[3 * number] > 0)) return;
@@ -405,8 +405,8 @@ struct VoxelizePack {
     });
   }
 
-  // Writes the coverage of those of the voxels begin..end of a row through which a solid's surface may pass: the mean
-  // of the winding number. A triangle adds what lies before it along x, signed as its normal points.
+  // Writes the coverage (the mean of the winding number) of those of the voxels begin..end of a row through which a
+  // solid's surface may pass. A triangle adds the volume before it along x, with the sign of its normal.
   GV_HD void fill(const Cube& cube, int64_t row, int32_t begin, int32_t end, T y, T z) const {
     const T* distance = static_cast<const T*>(a.distance_kzyx) + row * a.side;
     const int32_t* nearest = a.nearest_kzyx + row * a.side;
@@ -440,7 +440,7 @@ struct VoxelizePack {
     }
   }
 
-  // A triangle within the sides across y and z of a row of voxels, from its low side; x stays.
+  // A triangle clipped to the y and z of a row of voxels, and moved so that the row begins at 0 there; x stays.
   GV_HD static Polygon<T> in_column(const Polygon<T>& whole, Vec3<T> low) {
     Polygon<T> cut = whole;
     for (int axis = 1; axis < 3; ++axis) {
@@ -455,7 +455,7 @@ struct VoxelizePack {
     return cut;
   }
 
-  // The part of a voxel of a row that lies before a triangle, in parts of kParts.
+  // The volume of a row's voxel that is before a triangle, in units of 1 / kParts.
   GV_HD static int64_t in_voxel(const Polygon<T>& column, T low, const Polygon<T>& whole) {
     if (!(larger(larger(whole.at[0].x, whole.at[1].x), whole.at[2].x) > low)) return 0;
     Polygon<T> own = column;
@@ -468,14 +468,14 @@ struct VoxelizePack {
     return static_cast<int64_t>((most > -1 ? most : static_cast<T>(-1)) * static_cast<T>(kParts));
   }
 
-  // Finds the nearest triangles of voxels begin..end of a row together, and writes what they hold.
+  // Finds the nearest triangles of the voxels begin..end of a row together, and writes the voxels' results.
   template <class F>
   GV_HD void look(const Cube& cube, int64_t row, int32_t begin, int32_t end, T y, T z) const {
     using I = typename LanesOf<F>::Int;
     constexpr int32_t kOwn = static_cast<int32_t>(sizeof(F) / sizeof(T));
     F x{}, best{};
     I found = I{} - 1;
-    for (int32_t lane = 0; lane < kOwn; ++lane) {  // those behind the row's end are as its last
+    for (int32_t lane = 0; lane < kOwn; ++lane) {  // lanes behind the row's end repeat its last voxel
       set_lane(x, lane, place(cube, begin + lane < end ? begin + lane : end - 1));
       set_lane(best, lane, cube.reach * cube.reach);
     }

@@ -1,5 +1,5 @@
 // Noise of one frequency at a point: gradient, value, simplex and cellular noise. Twin and sources:
-// ops/reference/noise.py, whose order of operations is kept. On a T of arithmetic.h: one point, or one in each lane.
+// ops/reference/noise.py, with the same order of operations. T is as in arithmetic.h: one point, or one in each lane.
 #pragma once
 
 #include <type_traits>
@@ -11,7 +11,7 @@ namespace gvtorch {
 
 enum class NoiseKind : int32_t { kPerlin, kValue, kSimplex, kNearest, kSecond, kApart, kCount };
 
-// points, axes. Salts are 32 bits; a period of 0 is none; jitter and reach are those of cellular noise.
+// Sizes in limits: points, axes. Salts are 32 bits; a period of 0 means none; jitter and reach are for cellular noise.
 #define GV_NOISE(X)                \
   X(Reals, point_pn, axes* points) \
   X(Int, kind, kNoiseKinds)        \
@@ -82,12 +82,12 @@ struct NoiseAt {
     const Signed left = (Signed)lattice % every;
     return (Words)(left < 0 ? left + every : left);
   }
-  // Adding 0 makes one of the two zeros.
+  // Adding 0 turns -0 into 0.
   static GV_HD T offset_from(T place, Signed floor) { return place - to_real<T>(floor) + static_cast<Real>(0); }
 
   // --- Gradients
 
-  // Two components of 1 or -1 and one of 0, of which `bits` tell.
+  // A gradient of two components of 1 or -1 and one of 0, chosen by `bits`.
   struct Slope {
     T x, y, z;
   };
@@ -111,14 +111,14 @@ struct NoiseAt {
 
   // --- Kinds
 
-  // A coordinate; those beyond what 32 bits can count, skewed too, count as 0.
+  // A coordinate, or 0 where it, or it skewed, exceeds what 32 bits can count.
   static GV_HD T counted(T place) {
     constexpr auto kMost = static_cast<Real>(0x1p29);
     const T none{};
     return select(place >= kMost, none, select(place <= -kMost, none, place));
   }
 
-  // What `corner(bits, away)` gives at the 2^N corners of the point's cell, interpolated.
+  // Interpolates corner(bits, away) between the 2^N corners of the point's cell.
   template <class Corner>
   GV_HD T between(const T* place, const Corner& corner) const {
     Words end[3][2];
@@ -196,7 +196,7 @@ struct NoiseAt {
       T away[N];
       Words at[N];
       for (int axis = 0; axis < N; ++axis) {
-        const Signed step = select(rank[axis] + corner >= N, Signed{} + 1, Signed{});  // the `corner` largest
+        const Signed step = select(rank[axis] + corner >= N, Signed{} + 1, Signed{});  // 1 for the `corner` largest
         away[axis] = offset[axis] - to_real<T>(step) + static_cast<Real>(corner * kUnskew);
         at[axis] = (Words)floor[axis] + (Words)step;
       }
@@ -243,7 +243,7 @@ struct NoiseAt {
         }
       }
     }
-    // What is no number is nowhere.
+    // `unknown` is NaN where a coordinate is NaN, else 0.
     const T near = square_root(first) + unknown, next = square_root(second) + unknown;
     return feature == NoiseKind::kNearest ? near : feature == NoiseKind::kSecond ? next : next - near;
   }
@@ -257,7 +257,7 @@ struct NoiseAt {
   }
 };
 
-// body(kind, axes), both constants.
+// Calls body(kind, axes), both as compile-time constants.
 template <class Body>
 void with_noise(const NoiseArgs& args, const Body& body) {
   const auto with_axes = [&](auto kind) {
@@ -294,7 +294,7 @@ struct MakeNoise {
 };
 
 #ifndef __CUDACC__
-// Points begin to end of float32, a vector of them at a time.
+// Makes the noise of the float32 points begin to end, a vector of them at a time.
 template <NoiseKind kKind, int N>
 void noise_in_lanes(const NoiseArgs& args, int64_t begin, int64_t end) {
   const NoiseAt<Floats, N> noise(args);

@@ -1,4 +1,4 @@
-// What packet.cpp gives for each instruction set that it is compiled for: functions of items `begin` to `end`.
+// The functions that packet.cpp defines for each instruction set it is compiled for; each handles items begin to end.
 #pragma once
 
 #include <cstdint>
@@ -15,7 +15,7 @@ struct Chunks {
   void (*shade)(const ShadeArgs& args, int64_t begin, int64_t end);        // rays
   void (*voxelize)(const VoxelizeArgs& args, int64_t begin, int64_t end);  // rows of voxels
   void (*noise)(const NoiseArgs& args, int64_t begin, int64_t end);        // points, in float32
-  void (*orbits)(const OrbitArgs& args, int64_t begin, int64_t end);       // the same
+  void (*orbits)(const OrbitArgs& args, int64_t begin, int64_t end);       // points
   void (*splat)(const SplatArgs& args, int64_t begin, int64_t end);        // parts of cubes
 };
 

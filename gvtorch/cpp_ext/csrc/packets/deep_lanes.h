@@ -1,5 +1,5 @@
-// Where the lanes of a packet are in a deep tree: in float64 and 64 bits, so lane by lane. No shader is compiled into
-// it.
+// The positions of a packet's lanes in a deep tree: in float64 and int64, and so lane by lane. Independent of the
+// shader, so that it is compiled once.
 #pragma once
 
 #include "base/simd.h"
@@ -17,7 +17,7 @@ struct DeepLanes {
 
   DeepLanes(const RayView& rays, const TreeView& tree, const Levels<float>& levels)
       : rays(rays), tree(tree), levels(levels) {}
-  // A lane takes another ray; it remembers where the one before was.
+  // Begins a ray in a lane; `cell` is still that of the previous ray.
   GV_HD void begin(int lane, const Ray<float>& ray) {
     for (int axis = 0; axis < 3; ++axis) origin[lane][axis] = ray.place(axis);
   }

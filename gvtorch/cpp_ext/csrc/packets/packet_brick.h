@@ -1,5 +1,5 @@
-// Bricks as packets read them, each lane in a brick of its own. Coordinates, weights and blending are those of brick.h;
-// only the loads differ.
+// How packets read bricks, each lane its own. Coordinates, weights and blending are those of brick.h; only the loads
+// differ.
 #pragma once
 
 #include "shaders/probe.h"
@@ -7,14 +7,14 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// As Spot. A lane with a constant has no slope and reads the pool's first voxels in vain.
+// Spot for a packet. A lane with a constant has slope 0; it reads the pool's first voxels, and the result is ignored.
 struct PacketBrick {
   Vec3<Floats> offset, slope;
   Floats constant;
   Mask stored;
-  Ints brick;  // as `first_of` of what reads it has it
+  Ints brick;  // its slot, or its first byte in the pool: what `first_of` of the values returns
 
-  // It has one of the first `count` slots; of bricks that are told by their numbers.
+  // True where the brick is in one of the first `count` slots; only if `brick` holds slots.
   GV_HD Mask among(int32_t count) const { return stored & (brick < count); }
 
   GV_HD Vec3<Floats> at(Floats t) const {
@@ -24,7 +24,7 @@ struct PacketBrick {
 
 // A channel of the brick pool.
 struct PacketPool {
-  const void* first;  // of the first voxel: the number to read
+  const void* first;  // the number to read, in the pool's first voxel
   int64_t stride;     // bytes of a brick
   int32_t side, channels;
 
@@ -32,7 +32,7 @@ struct PacketPool {
       : stride(brick_bytes(type, side, channels)), side(side), channels(channels) {
     with_voxel(type, [&](auto voxel) { first = static_cast<const decltype(voxel)*>(bricks) + component; });
   }
-  // Offsets in the pool need 64 bits.
+  // True if offsets in the pool need 64 bits.
   bool far(int64_t bricks) const { return stride * bricks > INT32_MAX; }
 };
 
@@ -48,7 +48,7 @@ GV_HD Ints load_words(const PacketPool& pool, Ints brick, Ints offset) {
   return word;
 }
 
-// Values at places of bricks, each told by its first byte in the pool; kFar: by its number, for offsets of 64 bits.
+// Trilinear interpolation. `brick` is the brick's first byte in the pool or, with kFar, its slot, for 64-bit offsets.
 template <class Voxel, bool kFar>
 GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& at) {
   constexpr int32_t kBytes = sizeof(Voxel);
@@ -71,7 +71,7 @@ GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& a
   });
 }
 
-// Four numbers of each voxel, `shift` bytes behind the first, lane by lane: they lie side by side.
+// Interpolates four numbers of the voxels, from `shift` bytes on; lane by lane, as the four are consecutive in memory.
 template <class Voxel>
 GV_CALL Row<Floats> read_packet_four(const PacketPool& pool, int64_t shift, Mask which, Ints brick, Floats x, Floats y,
                                      Floats z) {
@@ -97,7 +97,8 @@ GV_CALL Row<Floats> read_packet_four(const PacketPool& pool, int64_t shift, Mask
   return {row[0], row[1], row[2], row[3]};
 }
 
-// Several numbers of each voxel. A word holds up to four of them, and of narrow voxels those of the next one along x.
+// Interpolates several numbers of the voxels. A word of 32 bits holds up to four of them, which may include those of
+// the next voxel along x.
 template <class Voxel, bool kFar>
 GV_CALL void read_packet_numbers(const PacketPool& pool, Components<float> components, int32_t count, Ints brick,
                                  Floats x, Floats y, Floats z, Floats* out) {
@@ -109,7 +110,7 @@ GV_CALL void read_packet_numbers(const PacketPool& pool, Components<float> compo
                 eight.cell[0] * static_cast<float>(step_x));
   const Ints slot = kFar ? brick : brick * static_cast<int32_t>(pool.stride);
   Ints words[8]{};
-  int32_t loaded = -1;  // bytes behind the voxel's first
+  int32_t loaded = -1;  // offset of the loaded words in the voxel, bytes
   for (int32_t i = 0; i < count; ++i) {
     const int32_t byte = components[i] * kBytes, word = byte / 4 * 4, shift = 8 * (byte - word);
     if (word != loaded) {
@@ -128,7 +129,7 @@ GV_CALL void read_packet_numbers(const PacketPool& pool, Components<float> compo
   }
 }
 
-// One component, `shift` bytes behind the first, of bricks that are told by their numbers.
+// Interpolates the component at `shift` bytes in a voxel; `brick` is a slot.
 template <class Voxel, bool kFar>
 GV_HD Floats read_shifted(PacketPool pool, int64_t shift, Ints brick, const Vec3<Floats>& at) {
   pool.first = static_cast<const char*>(pool.first) + shift;
@@ -139,7 +140,7 @@ GV_CALL Floats read_packet(const PacketPool& pool, int64_t shift, Ints brick, Fl
   return read_shifted<Voxel, kFar>(pool, shift, brick, {x, y, z});
 }
 
-// How much it grows along each axis over one voxel, half a voxel to each side.
+// Differences of the component along each axis over one voxel, half a voxel to each side.
 template <class Voxel, bool kFar>
 GV_CALL Vec3<Floats> read_rise(const PacketPool& pool, int64_t shift, Ints brick, Floats x, Floats y, Floats z) {
   Vec3<Floats> rise;
@@ -153,7 +154,7 @@ GV_CALL Vec3<Floats> read_rise(const PacketPool& pool, int64_t shift, Ints brick
   return rise;
 }
 
-// A channel whose dtype is known at run time. Bricks are told by their numbers.
+// A channel whose dtype is known at run time only. `brick` is a slot.
 struct PacketChannel : ChannelView {
   PacketPool pool;
   int64_t bytes;  // of a number
@@ -188,7 +189,7 @@ struct PacketChannel : ChannelView {
   }
 };
 
-// The values that a packet walks on: of a dtype known to the compiler, or only at run time.
+// The shader's values: of a dtype known to the compiler, or only at run time.
 template <class Known, bool kFar>
 struct TypedValues {
   using Voxel = Known;
@@ -196,7 +197,7 @@ struct TypedValues {
 
   TypedValues(const ChannelView& channel, int32_t side, int32_t component, int64_t)
       : pool(channel.bricks_bzyxc, channel.type, side, channel.width, component) {}
-  GV_HD Ints first_of(Ints brick) const {  // lanes that have none hold anything, whose product wraps
+  GV_HD Ints first_of(Ints brick) const {  // lanes without a brick may hold anything, so the product wraps
     return kFar ? brick : reinterpret_cast<Ints>(reinterpret_cast<Words>(brick) * static_cast<uint32_t>(pool.stride));
   }
   GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return trilinear<Voxel, kFar>(pool, brick, at); }

@@ -1,11 +1,11 @@
-// kLanes rays at once through the tree with any shader of shaders.h, each lane in a node and an interval of its own,
-// in float32. Each lane does what its ray does alone, so every bit is the same.
+// Traces kLanes rays at once with any shader of shaders.h, in float32; each lane is in its own node and interval. A
+// lane computes what its ray computes alone, so every bit is the same.
 //
-// A second walk beside that of walk.h, for two reasons. Lanes keep the path of their last descent and go on from where
-// the next one parts from it; a GPU's threads would have to keep it in local memory, which takes twice as long as to
-// begin again. And lanes whose run of intervals has ended wait, while the others march on together, until too few are
-// left. What is rare (the cut interval at the far side, the pool's last brick, a request) is done lane by lane by the
-// functions of a single ray.
+// This is a second walk next to that of walk.h, for two reasons. Lanes keep the path of their last descent, and the
+// next descent continues where it departs from that path; a GPU's threads would keep it in local memory, which takes
+// twice as long as to restart from the root. And lanes whose run of intervals has ended wait while the others march on
+// together, until too few are left. Rare cases (the cut interval at the far side, the pool's last brick, a request) are
+// handled lane by lane, by the functions for a single ray.
 #pragma once
 
 #include "packets/deep_lanes.h"
@@ -15,7 +15,7 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// A lane's own part of a struct of all lanes, and back.
+// Copies one lane out of a struct of all lanes, and back.
 template <class One, class All>
 GV_HD One take_lane(const All& all, int lane) {
   One one;
@@ -26,7 +26,7 @@ template <class All, class One>
 GV_HD void put_lane(All& all, int lane, const One& one) {
   All::each(all, one, [&](auto& own, const auto& in) { set_lane(own, lane, in); });
 }
-// The same of Sums. What keeps a Sum for each lane has functions of its own, see user_shader.h.
+// The same for Sums. UserSums, which keeps a Sum for each lane, has overloads, see user_shader.h.
 template <class Sum, class Sums>
 GV_HD Sum sum_of(const Sums& sums, int lane) {
   return take_lane<Sum>(sums, lane);
@@ -35,7 +35,7 @@ template <class Sums, class Sum>
 GV_HD void put_sum(Sums& sums, int lane, const Sum& one) {
   put_lane(sums, lane, one);
 }
-// Of the lanes `which`, those in which nothing between low and high changes the sum.
+// The lanes of `which` in which no value between low and high changes the sum.
 template <class Shader, class Sums>
 GV_HD Mask hides_of(const Shader& shader, Mask which, Floats low, Floats high, const Sums& sums) {
   return which && shader.hides(low, high, sums);
@@ -45,7 +45,7 @@ struct PacketChannels {
   const PacketChannel value, normal, other;
 };
 
-// Is the probe (see probe.h) of the lanes that march. Values: TypedValues or AnyValues.
+// The walk of a packet, and the probe (see probe.h) of its lanes that march. Values: TypedValues or AnyValues.
 template <class Shader, class Values>
 struct PacketWalk {
   using Number = Floats;
@@ -53,7 +53,7 @@ struct PacketWalk {
   using Eye = typename Kernel::Eye;
   using Sum = typename Shader::Sum;
   static constexpr bool kEnds = Shader::kEnds;
-  static constexpr bool kKeepsPath = Kernel::kHidesAlike;  // else the nodes that are hidden differ from ray to ray
+  static constexpr bool kKeepsPath = Kernel::kHidesAlike;  // else hidden nodes differ from ray to ray
 
   const Kernel& kernel;
   const Walk<float>& walk;
@@ -75,19 +75,19 @@ struct PacketWalk {
   typename Shader::template SumOf<Floats> sum;
   Ints samples;
 
-  // The last descent: a node of each level, below 0 (bit 31) where it is hidden.
+  // The last descent: the node of each level, negative (bit 31 is set) where it is hidden.
   Vec3<Ints> cell{};
   DeepLanes deep_lanes;  // in place of `cell` where the tree is deep
   Ints path_depth = Ints{} - 1;
   Ints path_node[kMostLevels], path_brick[kMostLevels], path_tile[kMostLevels];
 
   // The run of intervals that a lane is in.
-  Mask marching;  // lanes that are asked for values
+  Mask marching;  // lanes whose values are read
   Ints left;
   Floats number;
   Extent<Floats> extent;
   Floats voxel, blend_scale;
-  Floats back;  // value where the last interval ended
+  Floats back;  // value at the end of the last interval
   Mask mixed;
   PacketBrick fine, coarse;
   Ints fine_depth, coarse_depth;
@@ -106,7 +106,7 @@ struct PacketWalk {
         frame(*kernel.frame_1),
         deep_lanes(walk.rays, walk.tree, walk.levels) {}
 
-  // Traces the rays at places begin to end of the order, at most kLanes.
+  // Traces the rays at positions begin to end of the order, at most kLanes.
   GV_HD void trace(int64_t begin, int64_t end) {
     load(begin, end);
     while (any(alive)) {
@@ -121,7 +121,7 @@ struct PacketWalk {
     }
   }
 
-  // As those of Probe, for all lanes that march.
+  // The functions of Probe, for all lanes that march.
   GV_HD Floats value(Floats t) const {
     const Floats value = value_in(fine, t);
     return any(mixed & marching) ? between(value, value_in(coarse, t), t) : value;
@@ -161,7 +161,7 @@ struct PacketWalk {
   }
 
   GV_HD void narrow(Mask which) { marching = which; }
-  // body(lane, probe) with each lane's own.
+  // Calls body(lane, probe) with the lane's own probe.
   template <class Body>
   GV_HD void each(Mask which, const Body& body, KnownGradient<float>* known = nullptr) const {
     const double* cube = walk.rays.place_33 + 3;
@@ -230,7 +230,7 @@ struct PacketWalk {
     kernel.finish(numbers[lane], ray.moved[lane], samples[lane], one);
   }
 
-  // Lanes without a run: begins the next one in the same node, or visits the next node.
+  // For lanes whose run has ended: begins the next one in the same node, or visits the next node.
   GV_HD void go_on(Mask waiting) {
     const Mask ran = waiting & (number > at.count);
     at.go(ran, number);
@@ -242,7 +242,7 @@ struct PacketWalk {
     alive = alive & ~(waiting & (left == 0) & ~(at.inside() & (sum.clear > stop_clear)));
   }
 
-  // As Walk::find, and what Walk::follow does with the visit.
+  // The same as Walk::visit and Walk::find.
   GV_HD void visit(Mask which) {
     const TreeView& tree = walk.tree;
     const Levels<float>& levels = walk.levels;
@@ -275,7 +275,7 @@ struct PacketWalk {
     const Floats exit = ray.leave([&](int axis, Mask upper) { return face(which, axis, reach, upper); });
     extent.exit = which ? exit : extent.exit;
 
-    // The nodes whose bricks answer.
+    // The nodes whose bricks are read.
     Ints fine_level = reach, fine_brick = brick;
     for (;;) {
       const Mask higher = which & (fine_level > 0) & (fine_brick == kAbsent);
@@ -339,7 +339,7 @@ struct PacketWalk {
     leave(nothing);
   }
 
-  // As `descend` in tree.h, level by level for all lanes: those whose known part of the path ends deeper wait.
+  // The same as `descend` in tree.h, level by level for all lanes; those whose path is known to a deeper level wait.
   GV_HD void descend(Mask which, Floats middle, Ints& reach, Ints& node, Ints& brick, Ints& tile) {
     const TreeView& tree = walk.tree;
     const Ints known = go(which, middle, kKeepsPath ? smaller(path_depth, wanted) : Ints{} - 1);
@@ -376,9 +376,9 @@ struct PacketWalk {
     path_depth = which ? reach : path_depth;
   }
 
-  // Goes to the places at distance t; returns the deepest level, at most `known`, of which a lane is in the same node
-  // as it was. Then which child of the node above a lane is in, and how far a face of its node of a level is from its
-  // ray's origin. As Digits and BitDigits.
+  // `go` moves lanes to their positions at distance t; it returns the deepest level, at most `known`, at which a lane
+  // is in the same node as before. `child` and `face` are those of Digits and BitDigits: which child of the node above
+  // a lane is in, and the offset of a face of its node from its ray's origin.
   GV_HD Ints go(Mask which, Floats t, Ints known) {
     if (walk.rays.deep) return deep_lanes.go(which, ray.direction, t, known);
     const TreeView& tree = walk.tree;
@@ -391,7 +391,7 @@ struct PacketWalk {
       parted = parted | (cell[axis] ^ here);
       cell[axis] = here;
     }
-    // The exponent of a number tells its highest bit; rounded up to a power of two it tells one level too few.
+    // A float's exponent is its highest bit. If it was rounded up to a power of two, the result is one level less.
     const Ints high = ((Ints)to_floats(parted) >> 23) - 126;
     const Ints equal = truncated(to_floats(top - high) / static_cast<float>(tree.digit_bits));
     return parted == 0 ? known : smaller(known, equal);
@@ -431,7 +431,7 @@ struct PacketWalk {
     for_lanes(old, [&](int lane) { store_stamp(&stamps[index[lane]], frame); });
   }
 
-  // Each lane's entry of a level of its own.
+  // Each lane's entry at its own level.
   GV_HD static Ints own_lane(const Ints* path, Ints level) {
     return pick(reinterpret_cast<const int32_t*>(path), level * kLanes + lane_numbers());
   }
@@ -461,14 +461,14 @@ struct PacketWalk {
   GV_HD Ints depth_of(const PacketBrick& brick) const { return &brick == &fine ? fine_depth : coarse_depth; }
   GV_HD int32_t node_of(int lane, Ints depth) const { return path_node[depth[lane]][lane] & INT32_MAX; }
 
-  // Begins the run of intervals that are alike; lanes that need care are done with the node at once.
+  // Begins a run of alike intervals; lanes that need care march alone to the end of the visit at once.
   GV_HD void begin_run(Mask which) {
     const Ints last = values.first_of(Ints{} + static_cast<int32_t>(bricks - 1));
     const Mask end = (fine.stored & (fine.brick == last)) | (mixed & coarse.stored & (coarse.brick == last));
     const Mask careful = which & (at.cut() | end);
     if (any(careful)) {
       march_alone(careful);
-      fine.brick = careful ? Ints{} : fine.brick;  // what other lanes read in vain must lie in the pool
+      fine.brick = careful ? Ints{} : fine.brick;  // reads that lanes ignore must stay in the pool too
       coarse.brick = careful ? Ints{} : coarse.brick;
       which = which & ~careful;
     }
@@ -480,7 +480,7 @@ struct PacketWalk {
     }
   }
 
-  // A region of one value, as one interval.
+  // Adds a region of one value as one interval.
   GV_HD void add_region(Mask which) {
     Piece<Floats> piece;
     piece.odd = true;
@@ -495,8 +495,8 @@ struct PacketWalk {
     shader.add(which, piece, *this, sum);
   }
 
-  // One interval of all lanes that march; returns those whose run goes on. Nothing that leads to the next sample waits
-  // for this one's colour: a lane that has seen enough marches on in vain to the end of its run.
+  // Takes one interval in all lanes that march; returns those whose run goes on. So that the next sample never waits
+  // for this one's colour, a lane whose ray has ended marches on without effect to the end of its run.
   GV_HD Mask march(Mask which) {
     marching = which;
     Piece<Floats> piece;
@@ -566,7 +566,7 @@ struct PacketWalk {
   }
 };
 
-// Traces a share of the rays.
+// Traces the rays at positions begin to end of the order.
 template <class Shader, class Values>
 void trace_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
   const typename PacketWalk<Shader, Values>::Kernel kernel(args);

@@ -1,4 +1,4 @@
-// Which instruction set packets are traced by: chosen once, when the first are asked for.
+// The instruction set of packets: chosen once, at the first use.
 #pragma once
 
 #include <cstdlib>
@@ -26,7 +26,7 @@ struct Processor {
   const Chunks& chunks;
 };
 
-// The widest instructions that this processor has; GVTORCH_CPU=baseline, avx2 or avx512 asks for fewer.
+// The widest instruction set of this processor; GVTORCH_CPU=baseline, avx2 or avx512 limits it.
 inline Processor find_processor() {
 #ifdef GV_X86
   const char* named = std::getenv("GVTORCH_CPU");

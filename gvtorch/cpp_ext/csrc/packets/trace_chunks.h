@@ -1,4 +1,4 @@
-// Which rays the CPU traces in packets, and how it shares them out.
+// Which rays the CPU traces in packets, and how they are distributed to threads.
 #pragma once
 
 #include "base/for_each.h"
@@ -7,14 +7,14 @@
 
 namespace gvtorch {
 
-// Packets find nodes by 32-bit bytes, count the places in a brick in floats, and load 4 bytes at once, which may reach
-// behind a voxel, but never behind the pool: its last brick is read by single rays.
+// True if packets can trace the rays. They address nodes by 32-bit byte offsets, compute offsets in a brick in floats,
+// and load 4 bytes at once: beyond a voxel, but not beyond the pool, whose last brick only single rays' functions read.
 inline bool packs(const TraceArgs& args) {
   constexpr int64_t kMostNodes = INT32_MAX / sizeof(int32_t);
   return args.nodes <= kMostNodes && args.bricks >= 2 && brick_bytes(args.voxel, args.side, args.channels) < 1 << 24;
 }
 
-// Whether packets take a fused shader's rays.
+// True if packets can trace a fused shader's rays.
 inline bool shades(const ShadeArgs& args) {
   const auto fits = [&](VoxelType type, int32_t channels) { return brick_bytes(type, args.side, channels) < 1 << 24; };
   if (!packs(args) || !fits(args.normal_voxel, 3) || !fits(args.other_voxel, args.other_channels)) return false;
@@ -24,7 +24,7 @@ inline bool shades(const ShadeArgs& args) {
   });
 }
 
-// body(begin, end) for chunks of the rays; first an empty byte for each node, in which it is kept what is hidden.
+// Calls body(begin, end) for chunks of the rays. args.hidden_tn gets a zero byte for each node: see kUnknown in walk.h.
 template <class Body>
 void trace_chunks(const torch::stable::Tensor& like, TraceArgs& args, const Body& body) {
   constexpr int64_t kChunk = 256;

@@ -1,6 +1,6 @@
-// The body of `splat`: what cubes of voxels hold of points. Twin and source: ops/splat.py, whose order of
-// operations is kept. A voxel adds points in the order of its cube's lists, however the work is cut. Skipping what has
-// no share changes no bit: sums begin at 0, so they are never -0, to which alone adding 0 would tell.
+// The kernels of `splat`: sums of the values of points in cubes of voxels. Twin and source: ops/splat.py, with the same
+// order of operations. A voxel adds points in the order of its cube's lists, however the work is divided. Skipping
+// points without a share changes no bit: sums begin at 0 and are never -0, the only number that adding 0 changes.
 #pragma once
 
 #include "base/arguments.h"
@@ -9,10 +9,10 @@
 namespace gvtorch {
 
 constexpr int64_t kMostSplatted = 1 << 20;  // voxels along a side of a cube
-constexpr double kSmallest = 0x1p-1000;     // of radii that are divided by: SMALLEST of the twin
+constexpr double kSmallest = 0x1p-1000;     // smallest radius to divide by: SMALLEST of the twin
 
-// cubes, side, width, and of narrow and of wide points the rows of the tables and the runs of rows. A cube's list is
-// the runs from begin_b[k] to begin_b[k + 1].
+// Sizes in limits: cubes, side, width; rows and runs of rows of narrow and of wide points. The list of cube k is the
+// runs narrow_b[k] to narrow_b[k + 1], and wide_b[k] to wide_b[k + 1].
 #define GV_SPLAT(X)                          \
   X(World, edge_k3e, 3 * cubes * (side + 1)) \
   X(Longs, low_k3, 3 * cubes)                \
@@ -34,7 +34,7 @@ struct SplatArgs {
 
 inline namespace GV_NAMESPACE {
 
-// Some of `count` things, whatever the numbers are that say which.
+// A range of `count` things, clamped to them whatever `ends` holds.
 struct Span {
   int64_t begin, end;
 
@@ -42,7 +42,7 @@ struct Span {
       : begin(clamp<int64_t>(ends[0], 0, count)), end(clamp<int64_t>(ends[1], 0, count)) {}
 };
 
-// body(row) for the rows of a cube's list.
+// Calls body(row) for the rows of a cube's list.
 template <class Body>
 GV_HD void for_rows(const Span& runs, const int64_t* run_s2, int64_t rows, const Body& body) {
   for (int64_t run = runs.begin; run < runs.end; ++run) {
@@ -51,32 +51,32 @@ GV_HD void for_rows(const Span& runs, const int64_t* run_s2, int64_t rows, const
   }
 }
 
-// A voxel's place in a cube; in no cube if it is beyond its side.
+// A voxel's index in a cube; at least the side if it is outside the cube.
 GV_HD uint64_t from_low(int64_t voxel, int64_t low) {
   return static_cast<uint64_t>(voxel) - static_cast<uint64_t>(low);
 }
 
-// A point along one axis.
+// The spread of a point along one axis.
 struct Spread {
   double center, scale;
   bool wide;
 
   GV_HD Spread(double center, double radius) : center(center), scale(2 / larger(radius, kSmallest)), wide(radius > 0) {}
 
-  // Whether a point surely has nothing between two edges; a little wider than it reaches, for products are rounded.
+  // True if a point certainly has no share between two edges; with a margin, because products are rounded.
   static GV_HD bool misses(double center, double radius, double low, double high) {
     const double reach = larger(radius, kSmallest) * (1 + 0x1p-20);
     return low - center > reach || center - high > reach;
   }
 
-  // How far an edge is from the point: the spline's knots are whole numbers, -2 to 2.
+  // Distance of an edge from the point, scaled so that the spline's knots are the whole numbers -2 to 2.
   template <class T>
   GV_HD T away(T edge) const {
     const T most = T{} + 2.0, least = T{} - 2.0, from = edge - center;
     if (!wide) return select(from > T{}, most, least);
     return clamp(from * scale, least, most);
   }
-  // What lies below an edge.
+  // The share of the point that is below an edge.
   template <class T>
   static GV_HD T below(T away) {
     const T none{}, one = none + 1.0, far = absolute(away), rest = 2.0 - far, square = rest * rest;
@@ -90,7 +90,7 @@ struct Spread {
 // An index is a voxel.
 struct SplatVoxel {
   SplatArgs args;
-  static constexpr int kTogether = 4;  // numbers of a value
+  static constexpr int kTogether = 4;  // numbers of a value that are summed at once
 
   GV_HD void operator()(int64_t index) const {
     const int64_t side = args.side;
@@ -128,16 +128,16 @@ struct SplatVoxel {
 };
 
 #ifndef __CUDACC__
-constexpr int64_t kPartX = 256, kPartY = 32, kPartZ = 16;  // numbers along x (voxels and their numbers), voxels
+constexpr int64_t kPartX = 256, kPartY = 32, kPartZ = 16;  // numbers along x (all those of its voxels); voxels
 
-// What a point has in some voxels of an axis.
+// The shares of a point in some voxels along an axis.
 template <int64_t kMost>
 struct Shares {
   static constexpr int64_t kStep = sizeof(Doubles) / sizeof(double);
   double share[kMost + kStep];
-  int64_t begin, end;  // of what is not 0
+  int64_t begin, end;  // of the shares that are not 0
 
-  // Fills shares of `count` voxels between edges.
+  // Computes the shares of `count` voxels, from their count + 1 edges.
   void fill(const Spread& point, const double* edge, int64_t count) {
     double below[kMost + 2 * kStep];
     Doubles at;
@@ -159,7 +159,7 @@ struct Shares {
   }
 };
 
-// Parts of cubes, which are filled one by one.
+// An index is a part of a cube.
 struct SplatPart {
   SplatArgs args;
 
@@ -168,7 +168,7 @@ struct SplatPart {
   int64_t along_z() const { return (args.side + kPartZ - 1) / kPartZ; }
   int64_t parts() const { return args.cubes * along_x() * along_y() * along_z(); }
 
-  // A row of the cube is numbers: those of each voxel, one after the other.
+  // A row of the cube has all numbers of its first voxel, then those of the next, and so on.
   void operator()(int64_t index) const {
     const int64_t side = args.side, width = args.width, row_size = side * width;
     const int64_t x0 = index % along_x() * kPartX, x1 = least(x0 + kPartX, row_size);

@@ -26,13 +26,13 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// A whole number that a table holds, up to a bound.
+// A whole number that a table holds, clamped to [0, most].
 template <class T>
 GV_HD int32_t whole_up_to(T number, int32_t most) {
   return static_cast<int32_t>(clamp(number, static_cast<T>(0), static_cast<T>(most)));
 }
 
-// The rows of one channel, as those of a transfer function.
+// The rows of one channel, as a transfer function.
 template <class T>
 struct ChannelRows : Transfer<T> {
   int32_t component;
@@ -47,7 +47,7 @@ struct ChannelRows : Transfer<T> {
 template <class T>
 struct ChannelMix : ShaderFacts {
   static constexpr bool kReadsAll = true;
-  static bool packs(const ShadeArgs& args) {  // which count the bytes of the table in 32 bits
+  static bool packs(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
     return int64_t{args.levels} * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
   }
   template <class V>
@@ -58,7 +58,7 @@ struct ChannelMix : ShaderFacts {
   int32_t width;
 #ifndef __CUDACC__
   int32_t known = 0;
-  ChannelRows<T> known_rows[kMostNumbers];  // read once; what lies on a GPU is read where it is needed
+  ChannelRows<T> known_rows[kMostNumbers];  // read once; on a GPU, rows are read where they are needed
 #endif
 
   explicit ChannelMix(const ShadeArgs& args) : view(args), step(static_cast<T>(args.step)), width(args.channels) {
@@ -70,7 +70,7 @@ struct ChannelMix : ShaderFacts {
 #endif
   }
 
-  // range_of(component): between which two values a number of the voxels lies. None of them is seen.
+  // True if no channel has an opacity in the node. range_of(component): smallest and largest value of a voxel's number.
   template <class RangeOf>
   GV_HD bool hides_ranges(const RangeOf& range_of) const {
     bool hides = true;
@@ -89,7 +89,7 @@ struct ChannelMix : ShaderFacts {
     V red{}, green{}, blue{}, total{};
     const bool added = view.table_lm[0].green > 0;
     each([&](int32_t i, const ChannelRows<T>& rows) {
-      const Row<V> row = rows.look_up(values[i], piece.level, which, view.rows);  // its alpha: halvings
+      const Row<V> row = rows.look_up(values[i], piece.level, which, view.rows);  // its alpha holds halvings
       red = red + row.alpha * row.red;
       green = green + row.alpha * row.green;
       blue = blue + row.alpha * row.blue;
@@ -106,7 +106,7 @@ struct ChannelMix : ShaderFacts {
   GV_HD void done(Sum&) const {}
 
  private:
-  // body(i, rows) for each channel. No head leads out of the table.
+  // Calls body(i, rows) for each channel. Whatever the head holds, no row outside the table is read.
   template <class Body>
   GV_HD void each(const Body& body) const {
 #ifdef __CUDACC__

@@ -1,5 +1,5 @@
-// Voxels that hold numbers of things: each place shows the label of its nearest voxel, and no two labels are ever
-// mixed.
+// Voxels that hold labels (the numbers of things in a segmentation): each position shows the label of its nearest
+// voxel, and no two labels are ever mixed.
 //
 // Equal to ops/reference/shaders.py and labels.py.
 #pragma once
@@ -11,13 +11,13 @@ inline namespace GV_NAMESPACE {
 
 constexpr int32_t kMostReach = 3;  // voxels
 
-// A row of the table for each label, from the first row's value on, a whole number apart. Where two levels blend, their
-// colours do. Lit by where the voxels around lie that are not of this label: the mean way to them, each weighted by a
-// tent around the place, which ends half a voxel beyond as many voxels as bricks have for a border, 1 to 3.
+// The table has a row for each label: consecutive whole numbers, from the first row's value on. Where two levels blend,
+// their colours do. The normal is the mean offset to the voxels of other labels around the position, weighted by a tent
+// that ends half a voxel beyond `border` voxels, 1 to 3.
 template <class T>
 struct Labels : ShaderFacts {
   static constexpr bool kReadsAll = true;
-  static constexpr int32_t kFeatures = 1;  // 1 + the row of the label where depth is taken
+  static constexpr int32_t kFeatures = 1;  // 1 + the row of the label where depth is recorded
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;
@@ -32,7 +32,7 @@ struct Labels : ShaderFacts {
   struct Own {
     T lit;  // 1 or 0
   };
-  // What one of the nodes shows of an interval.
+  // What one of the nodes adds for an interval.
   struct Look {
     Row<T> row{};      // premultiplied
     Vec3<T> normal{};  // times alpha
@@ -75,7 +75,7 @@ struct Labels : ShaderFacts {
   GV_HD static int32_t row_of(const Transfer<T>& places, T label) {
     return static_cast<int32_t>(clamp(label - places.low, static_cast<T>(0), places.last));
   }
-  // What both nodes show; the label is the finer one's, unless only the other is seen.
+  // Blends both nodes; the label is the finer node's, or the coarser one's where the finer node shows nothing.
   GV_HD Look blended(T t, T length, int32_t level, bool odd, const Probe<T>& probe) const {
     Look look;
 #ifdef __CUDA_ARCH__
@@ -116,8 +116,8 @@ struct Labels : ShaderFacts {
     look.row = {row.red * row.alpha, row.green * row.alpha, row.blue * row.alpha, row.alpha};
     return look;
   }
-  // The voxel of the node whose cube a place lies in, and where in it, from its centre; a face that two voxels share
-  // belongs to the upper one.
+  // Finds the node's voxel whose cube contains a position, and the offset `from` the voxel's centre; a face that two
+  // voxels share belongs to the upper one.
   GV_HD static void find(const Channels& channels, const Vec3<T>& at, int32_t (&cell)[3], T (&from)[3]) {
     const T half = static_cast<T>(0.5);
     for (int axis = 0; axis < 3; ++axis) {
@@ -127,11 +127,11 @@ struct Labels : ShaderFacts {
       from[axis] = clamp(at[axis] - static_cast<T>(cell[axis]), -half, half);
     }
   }
-  // Away from the voxels of this label, and towards the eye. Voxels beyond the brick repeat its outermost ones.
+  // Unit normal along the mean offset, turned towards the eye. Beyond the brick, its outermost voxels are repeated.
   GV_HD Vec3<T> normal(const Probe<T>& probe, const Spot<T>& spot, const int32_t (&cell)[3], const T (&from)[3],
                        T label) const {
     const int32_t reach = larger(smaller(probe.channels.border, kMostReach), 1), last = probe.channels.side - 1;
-    T share[3][2 * kMostReach + 1], way[3][2 * kMostReach + 1];  // of each axis: weights, and these times offsets
+    T share[3][2 * kMostReach + 1], way[3][2 * kMostReach + 1];  // per axis: weights, and weights times offsets
     for (int axis = 0; axis < 3; ++axis) {
       for (int k = -reach; k <= reach; ++k) {
         const T offset = static_cast<T>(k) - from[axis];

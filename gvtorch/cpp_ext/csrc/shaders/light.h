@@ -1,5 +1,5 @@
-// What the fused shaders share: an interval of a ray or of each of a packet, the sums of a shader, and how a place
-// answers light. T is float, double or Floats (arithmetic.h).
+// What the fused shaders share: Piece, an interval of a ray or of each ray of a packet; ShadeSum, a shader's sums; and
+// Light, the lighting of a position. T is float, double or Floats (arithmetic.h).
 //
 // Sources: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977; Wrenninge, Kulla,
 // Lundqvist, "Oz: the great and volumetric", SIGGRAPH 2013 talks; Henyey, Greenstein, "Diffuse radiation in the
@@ -15,10 +15,10 @@ inline namespace GV_NAMESPACE {
 template <class T>
 struct Piece {
   T start, end, length, middle;  // distances, world units
-  IntOf<T> level{};              // step * 2^level is as long, unless `odd`
+  IntOf<T> level{};              // the length is step * 2^level, unless `odd`
   T value;                       // in the middle
-  T front, back;                 // at both ends, where the shader is of kEnds
-  bool odd = false;              // of any length, and of level 0
+  T front, back;                 // values at both ends, for shaders with kEnds
+  bool odd = false;              // of any length, with level 0
 };
 
 template <class T>
@@ -27,14 +27,14 @@ struct ShadeSum : Accumulator<T> {
   using typename Base::Mask;
   using typename Base::Real;
   Vec3<T> normal{};                        // towards the eye, weighted by share
-  Real hit_clear;                          // transmittance at which depth is taken
+  Real hit_clear;                          // transmittance at which depth is recorded
   typename LanesOf<T>::Pointer feature_c;  // of each lane
 
   GV_HD void add_normal(Vec3<T> n, T share, Mask which = all_lanes<T>()) {
     for (int axis = 0; axis < 3; ++axis) normal[axis] = select(which, normal[axis] + share * n[axis], normal[axis]);
   }
 
-  // A lane has a new ray.
+  // Begins a new ray in a lane.
   GV_HD void begin(int lane, Real clear, Real hit_clear, Real* feature_c) {
     set_lane(this->clear, lane, clear);
     this->hit_clear = hit_clear;
@@ -49,7 +49,7 @@ struct ShadeSum : Accumulator<T> {
   }
 };
 
-// The function's colour of a value, and its alpha over an interval of any length.
+// The transfer function's colour of a value, and its alpha over an interval of any length.
 template <class T, class V>
 GV_HD Row<V> look_up(const Transfer<T>& transfer, V value, const Piece<V>& piece, T step,
                      MaskOf<V> which = all_lanes<V>()) {
@@ -66,18 +66,18 @@ GV_HD T power_of(T x, Power power) {
   return select(positive, exp2_exact(log2_exact(x) * power), T{});
 }
 
-// A shader's own numbers by name: a struct of at most four.
+// A shader's own parameters by name: a struct of at most four numbers.
 template <class Own, class T>
 GV_HD const Own& own_numbers(const Parameters<T>* parameters) {
   static_assert(sizeof(Own) <= sizeof(parameters->own));
   return *reinterpret_cast<const Own*>(parameters->own);
 }
 
-// Each octave of scattering gives so much of the light of the one before it, and keeps so much of its direction: fitted
-// to path traced clouds (benchmarks/cloud_light.py).
+// Factors of an octave of scattering over the one before it: of its light, and of its anisotropy. Fitted to path traced
+// clouds (benchmarks/cloud_light.py).
 constexpr double kOctaveLight = 0.55, kOctaveDirection = 0.6;
 
-// By how much the moments of normals may be lessened where no light comes: see shaders/coarse_colors.py.
+// The moments of normals that no light reaches are stored divided by this: see shaders/coarse_colors.py.
 constexpr double kFaint = 32;
 
 // Mean products of the components of normals.
@@ -103,12 +103,12 @@ struct Light {
 
   explicit Light(const ShadeArgs& args) : parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
 
-  // A medium, whose places have no normal.
+  // True for a scattering medium, which has no normals.
   GV_HD bool scatters() const { return parameters->octaves > 0; }
 
   GV_HD LightKind kind() const { return static_cast<LightKind>(static_cast<int32_t>(parameters->light_kind)); }
 
-  // The normal at distance t, towards the eye: stored, or the gradient's. Of a ray or of each of a packet.
+  // The unit normal at distance t, towards the eye: the stored one, or the gradient's direction. 0 in a medium.
   template <class Eye, class V = typename Eye::Number>
   GV_HD Vec3<V> normal(const Eye& probe, typename Eye::Number t) const {
     Vec3<V> n{};
@@ -123,7 +123,7 @@ struct Light {
     }
     return to_eye(n, probe.sight.direction);
   }
-  // The normal along a vector of any length, towards the eye that looks along d.
+  // The unit normal along a vector of any length, towards the eye that looks along d.
   template <class V>
   GV_HD static Vec3<V> to_eye(Vec3<V> n, const Vec3<V>& d) {
     n = unit(n);
@@ -131,7 +131,7 @@ struct Light {
     for (int axis = 0; axis < 3; ++axis) n[axis] = select(away, -n[axis], n[axis]);
     return n;
   }
-  // The way to the light, how long it is, and how much cones to the light grow per unit of length.
+  // Direction and distance to the light, and how much cones to the light grow per unit of length.
   template <class V>
   struct Way {
     Vec3<V> direction;
@@ -156,7 +156,7 @@ struct Light {
     }
     return way;
   }
-  // Colour of a place in the light. Where there is no normal, it is lit as if it faced the light, without a highlight.
+  // Lit colour of a position. Without a normal (n is 0), it is lit as if it faced the light, without a highlight.
   template <class Eye, class V = typename Eye::Number, class... Shadow>
   GV_HD Row<V> shade(Row<typename Eye::Number> base, Vec3<typename Eye::Number> n, const Eye& probe,
                      typename Eye::Number t, const Shadow&... shadow) const {
@@ -181,7 +181,7 @@ struct Light {
     }
     return lit(base, facing, highlight);
   }
-  // A base colour by how much it faces the light, and shines.
+  // Lights a base colour by the factors of its diffuse (`facing`) and specular (`highlight`) light.
   template <class V>
   GV_HD Row<V> lit(const Row<V>& base, V facing, V highlight) const {
     const Parameters<T>& own = *parameters;
@@ -194,13 +194,13 @@ struct Light {
     return {lit(base.red, 0), lit(base.green, 1), lit(base.blue, 2), base.alpha};
   }
 
-  // Colour of rough surfaces in the light, of which only the moments of their normals are known, and a vector along the
-  // normals, towards the eye. Where the trace is 0, places are lit as if they faced the light. `front`: the mean normal
-  // of what is seen from one side alone, in the same measure; what light comes from behind does not show.
+  // Lit colour of rough surfaces of which only the moments of their normals are known; sets `normal` to a vector along
+  // the normals, towards the eye. Where the trace is 0, they are lit as if they faced the light. `front` is used if
+  // `sided`: the mean normal of what is seen from one side, scaled as the moments; light from behind then adds nothing.
   //
-  // Of a cosine with the light, as it is on the side that the eye sees, the moments tell mean and deviation; it is
-  // taken to be evenly spread, as it is for the normals of a ball. Highlights: Toksvig, "Mipmapping normal maps", 2005,
-  // for a spread that is the same to all sides of a main normal.
+  // The moments give the mean and deviation of the normals' cosine with the light, on the side that the eye sees; it is
+  // assumed to be uniformly distributed, as it is for the normals of a ball. Highlights: Toksvig, "Mipmapping normal
+  // maps", 2005, for a spread that is the same to all sides of a main normal.
   template <class Eye, class V>
   GV_HD Row<V> shade_rough(const Row<V>& base, Moments<V> m, bool sided, const Vec3<V>& front, const Eye& probe, V t,
                            Vec3<V>& normal) const {
@@ -214,7 +214,7 @@ struct Light {
     normal = m.times(d);
     for (int axis = 0; axis < 3; ++axis) normal[axis] = -normal[axis];
     const V seen = square_root(larger(V{}, -dot(d, normal)));
-    // The mean of a size over its root mean square.
+    // The ratio of a mean magnitude to its root mean square.
     const V known = static_cast<T>(0.8) + static_cast<T>(0.2) * square;
     V mean = known * dot(to_light, normal) / select(seen > 0, seen, unity);
     if (sided) mean = smaller(mean, known * dot(to_light, front) / whole);
@@ -238,9 +238,9 @@ struct Light {
     return lit(base, one - share + share * facing, share * highlight);
   }
 
-  // Colour of a place in a medium, from the share of light that comes there straight: by one scattering, and by octaves
-  // that stand for more and more of them. Each takes half as much from light on its way as the one before, is weaker,
-  // more coloured and less directed.
+  // Colour of a position in a medium, from the share of light that reaches it unscattered (`clear`). The first octave
+  // is single scattering; the others approximate more and more scatterings: each has half the optical depth of the one
+  // before, is weaker, more coloured and less directed.
   GV_HD Row<T> scattered(Row<T> base, T cosine, T clear) const {
     const Parameters<T>& own = *parameters;
     const T albedo[3] = {base.red, base.green, base.blue};
@@ -258,13 +258,13 @@ struct Light {
     const auto lit = [&](int i) { return albedo[i] * own.ambient + own.diffuse * own.light_color[i] * sum[i]; };
     return {lit(0), lit(1), lit(2), base.alpha};
   }
-  // Henyey's and Greenstein's phase function, its mean over all directions 1.
+  // The Henyey-Greenstein phase function, scaled to a mean of 1 over all directions.
   GV_HD static T phase(T g, T cosine) {
     const T square = g * g;
     const T away = 1 + square - 2 * g * cosine;
     return (1 - square) / (away * square_root(away));
   }
-  // The transmittance below which light on its way is no longer followed: the last octave sees its root.
+  // The transmittance at which rays to the light end: so small because the last octave uses a root of it.
   GV_HD T faintest(T stop_clear) const {
     for (T octave = 1; octave < parameters->octaves; octave = octave + 1) stop_clear = stop_clear * stop_clear;
     return stop_clear;

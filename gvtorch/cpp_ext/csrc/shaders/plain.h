@@ -1,5 +1,5 @@
-// The facts that every shader tells of itself, and the simplest shader: the plain transfer function. The head of
-// shaders.h explains what a shader is.
+// The facts that every shader declares, and the simplest shader: the plain transfer function. The head of shaders.h
+// explains what a shader is.
 #pragma once
 
 #include "shaders/light.h"
@@ -8,14 +8,14 @@ namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
 // Facts about a shader that the compiler must know: the walks and the checks of arguments read them. A shader inherits
-// these defaults and declares anew what differs. The first line and kReadsAll are explained in the head of shaders.h.
+// these defaults and overrides what differs. The first line and kReadsAll are explained in the head of shaders.h.
 struct ShaderFacts {
   static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
   static constexpr bool kReadsAll = false;
   static constexpr bool kIntegrates = false;  // its table is (l, m, m, 4)
   static constexpr bool kColored = false;     // its channel holds red, green, blue and opacity, once or by direction
-  static constexpr int32_t kFiltered = 0;     // above 0: its second channel holds so many numbers a voxel, or six times
-                                              // so many, in the pool's first bricks
+  static constexpr int32_t kFiltered = 0;     // above 0: numbers per voxel (or a sixth of them) of its second channel,
+                                              // which only the pool's first bricks have
   static constexpr int32_t kFeatures = 0;     // how many numbers it writes to sum.feature_c; they begin as 0
   static constexpr int32_t kAsOther = -1;     // for kFeatures: as many as the second channel holds
   static bool packs(const ShadeArgs&) { return true; }  // whether packets can trace its rays
@@ -46,7 +46,7 @@ struct Plain : ShaderFacts {
   GV_HD void done(Sum&) const {}
 };
 
-// The shader that a ray carries: what all of its samples need has been read from memory.
+// The shader that a ray carries, with what all of its samples need already read from memory.
 template <class Shader>
 GV_HD const Shader& ready_for_ray(const Shader& shader) {
   return shader;

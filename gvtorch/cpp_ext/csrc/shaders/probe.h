@@ -1,6 +1,6 @@
-// What a shader may ask of the tree at a place of its ray: values of any channel, of any dtype, and gradients. Where
-// two levels blend, the coarse one gets the weight (cone - voxel) * blend, linear from the one's voxel to the other's.
-// The dtype is a switch at run time, the same for all threads, unless the compiler is told.
+// Probe: what a shader can read at a position on its ray: values of any channel, of any dtype, and gradients. Where two
+// levels blend, the coarse one has the weight (cone - voxel) * blend, linear from 0 at the fine voxel's width to 1 at
+// the coarse one's. The dtype is a switch at run time, the same for all threads, unless it is compiled in.
 #pragma once
 
 #include <type_traits>
@@ -11,7 +11,7 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-constexpr int32_t kMostNumbers = 16;  // that are read at once
+constexpr int32_t kMostNumbers = 16;  // of a voxel that `numbers_at` reads at once
 
 template <class T>
 GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {
@@ -24,7 +24,7 @@ struct ChannelView {
   const void* bricks_bzyxc;  // null where there is no brick
   const void* constant_tnc;  // null: there is no such channel
   VoxelType type;
-  int32_t width;  // numbers a voxel
+  int32_t width;  // numbers per voxel
 
   GV_HD bool given() const { return constant_tnc != nullptr; }
   // A number of a node without a brick.
@@ -34,8 +34,8 @@ struct ChannelView {
   }
 };
 
-// A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes. Its arguments are
-// values, for an address would put the whole kernel's arguments on the stack.
+// A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes. Arguments are passed
+// by value, because an address would put the whole kernel's arguments on the stack.
 template <class T>
 GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> at) {
   T out = 0;
@@ -44,7 +44,7 @@ GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t 
   return out;
 }
 
-// Four numbers of each voxel, from one on.
+// Interpolates four consecutive numbers of the voxels.
 template <class T>
 GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> at) {
   Row<T> row{};
@@ -65,7 +65,7 @@ GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int6
   return row;
 }
 
-// Which numbers of a voxel are asked for: whole numbers, `stride` apart in memory.
+// The indices of the numbers of a voxel to read: whole numbers, `stride` apart in memory.
 template <class T>
 struct Components {
   const T* first;
@@ -76,7 +76,7 @@ struct Components {
   }
 };
 
-// Several numbers of each voxel: the eight voxels are found once.
+// Interpolates several numbers of the voxels; the eight voxels are found once.
 template <class T>
 GV_CALL void read_numbers(const void* voxels, VoxelType type, Components<T> components, int32_t count, int64_t first,
                           int32_t side, Vec3<T> at, T* out) {
@@ -128,7 +128,7 @@ struct Sight {
     return {origin.x + far * direction.x, origin.y + far * direction.y, origin.z + far * direction.z};
   }
 
-  // body(number, other's) for each number that a lane has of its own.
+  // Calls body(own member, other's member) for each member that differs between lanes.
   template <class Own, class Other, class Body>
   GV_HD static void each(Own& own, Other& other, const Body& body) {
     body(own.origin, other.origin);
@@ -143,7 +143,7 @@ struct Channels {
   int32_t component;  // of `value`
 };
 
-// A gradient that the CPU worked out for many rays at once, before a shader asks for it.
+// A gradient that the CPU computed for many rays at once, before a shader asks for it.
 template <class T>
 struct KnownGradient {
   T at;  // distance; NaN: none is known
@@ -181,7 +181,7 @@ struct Probe {
     for (int axis = 0; axis < 3; ++axis) cube[axis] = static_cast<T>(rays.place_33[3 + axis]);
   }
 
-  // All its fields, as another has them that walks.
+  // From fields that a packet's walk has already.
   GV_HD Probe(const Channels& channels, const Sight<T>& sight, const Spot<T>& fine, const Spot<T>& coarse, bool mixed,
               T near, T growth, T voxel, T blend, Vec3<T> cube)
       : channels(channels),
@@ -195,17 +195,17 @@ struct Probe {
         blend(blend),
         cube(cube) {}
 
-  // What a packet's probe has beside: see shaders.h.
+  // What shaders call to select lanes of a packet's probe (see shaders.h); here there is one ray.
   GV_HD void narrow(bool) const {}
   template <class Body>
   GV_HD void each(bool which, const Body& body) const {
     if (which) body(0, *this);
   }
 
-  // The shader's own value at distance t.
+  // The shader's value at distance t.
   GV_HD T value(T t) const { return number_at(channels.value, channels.component, t); }
-  // Calls body(value), where value(t) is that for distances from `begin` to `end`: in the quickest way there is for
-  // this visit. Places along a ray keep their order where they are rounded, so those of the ends tell for all.
+  // Calls body(value) with the fastest function value(t) that this visit allows for distances from `begin` to `end`.
+  // Rounding keeps the order of positions along a ray, so it suffices to check both ends.
   template <class Body>
   GV_HD int32_t with_value(T, T, const Body& body) const {
     return body([this](T t) { return value(t); });
@@ -217,7 +217,7 @@ struct Probe {
     return mixed ? between(number, read(channel, component, coarse, coarse.at(t)), t) : number;
   }
 
-  // Four numbers of a channel at distance t, from one on: the voxels around it are found once.
+  // Four consecutive numbers of a channel at distance t; the voxels around it are found once.
   GV_HD Row<T> four_at(const ChannelView& channel, int32_t first, T t) const {
     const Row<T> row = four_in(channel, first, fine, t);
     return mixed ? between(row, four_in(channel, first, coarse, t), t) : row;
@@ -233,8 +233,8 @@ struct Probe {
     for (int32_t i = 0; i < count; ++i) out[i] = out[i] + part * (other[i] - out[i]);
   }
 
-  // Gradient of the value at distance t, per world unit: differences over one voxel, half a voxel to each side, which a
-  // border of 1 just holds. Neighbours read the same voxels at the face they share, so no seam shows.
+  // Gradient of the value at distance t, per world unit: differences over one voxel, half a voxel to each side, for
+  // which a border of 1 suffices. Neighbours read the same voxels at the face they share, so no seam shows.
   GV_HD Vec3<T> gradient(T t) const {
 #ifndef __CUDACC__
     if (known != nullptr) {
@@ -246,8 +246,8 @@ struct Probe {
     return mixed ? between(slope, differences(coarse, t), t) : slope;
   }
 
-  // What one of the two nodes, fine or coarse, says of the value and of its gradient, and its brick of four numbers of
-  // another channel; how large it is, and how much the coarse one counts.
+  // For one of the two nodes, fine or coarse: the value, its gradient, four numbers of another channel in its brick,
+  // and its scale. `weight` is that of the coarse node.
   GV_HD T value_of(const Spot<T>& spot, T t) const {
     return read(channels.value, channels.component, spot, spot.at(t));
   }
@@ -268,7 +268,7 @@ struct Probe {
     return read_four(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, spot.at(t));
   }
   GV_HD static T scale_of(const Spot<T>& spot) { return spot.scale; }
-  // The value of a voxel of a brick, counted with its border.
+  // The value of one voxel of a brick; x, y and z count the border.
   GV_HD T value_in(const Spot<T>& spot, int32_t x, int32_t y, int32_t z) const {
     const ChannelView& channel = channels.value;
     const int64_t voxel = (static_cast<int64_t>(z) * channels.side + y) * channels.side + x;
@@ -277,21 +277,21 @@ struct Probe {
   }
   GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }
 
-  // What the two nodes say at distance t, a number or several, mixed: the coarse one counts by `weight`.
+  // Blends the two nodes' results at distance t, a number or several: the coarse one has `weight`.
   template <class Some>
   GV_HD Some between(const Some& finer, const Some& coarser, T t) const {
     const T part = weight(t);
     return combined(finer, coarser, [&](T a, T b) { return a + part * (b - a); });
   }
 
-  // No node that answers has a brick, and all numbers of both are equal: one value all over the visit.
+  // True if neither node has a brick and all numbers of both are equal: one value all over the visit.
   GV_HD bool uniform() const {
     if (fine.brick >= 0 || coarse.brick >= 0) return false;
     return !mixed || (same(channels.value) && same(channels.normal) && same(channels.other));
   }
 
  protected:
-  // The difference along an axis, of values told by read(at).
+  // Central difference along an axis of the values read(at), per world unit.
   template <class Read>
   GV_HD T difference(const Spot<T>& spot, T t, int axis, const Read& read) const {
     Vec3<T> below = spot.at(t), above = below;
@@ -333,7 +333,7 @@ struct Probe {
   }
 };
 
-// A probe whose value is of a dtype that the compiler knows, and whose reads are no calls.
+// A probe whose value is of a dtype that the compiler knows, and whose reads are inlined.
 template <class T, class Voxel>
 struct TypedProbe : Probe<T> {
   using Probe<T>::Probe;
@@ -365,7 +365,7 @@ struct TypedProbe : Probe<T> {
   template <class Body>
   GV_HD int32_t with_value([[maybe_unused]] T begin, [[maybe_unused]] T end, const Body& body) const {
 #ifdef __CUDA_ARCH__
-    // The usual bricks, 8 and 16 voxels wide with a border of 1: eight addresses are one and seven constants.
+    // The usual bricks, 8 and 16 voxels wide with a border of 1: eight addresses are one and seven constant offsets.
     const int32_t side = this->channels.side;
     const Spot<T>& spot = this->fine;
     if (!this->mixed && spot.brick >= 0 && this->channels.value.width == 1 &&

@@ -1,11 +1,11 @@
-// Segments: the runs of intervals that rays take in the bricks they pass, for shaders that are no kernel. Rays are
-// walked as in shade_rays.h (the same visits, marks and intervals), but nothing is shaded: what a sample needs is
-// written down. SampleBricks then reads any channel at any sample, to the bit as the renderer does; CompositeRay adds
-// up.
+// Segments: the runs of intervals that rays take in the nodes they visit, for module shaders, which are not part of a
+// kernel. Rays are walked as in shade_rays.h (the same visits, marks and intervals), but nothing is shaded: what a
+// sample needs is stored. SampleBricks then reads any channel at any sample, with the renderer's bits; CompositeRay
+// composites.
 //
 // A segment is all the whole intervals of one visit that have one length and one base, or one piece of any length: the
 // last interval of a ray, cut at the far side, or a region of one value. Lists have exact sizes: rays are walked twice,
-// to count and to write. A ray may be walked by parts: `limit` samples, at least one visit, and on from `state_r3`.
+// to count and to write. A ray may be walked in parts of `limit` samples and at least one visit, from `state_r3` on.
 #pragma once
 
 #include "shaders/shade_rays.h"
@@ -20,7 +20,7 @@ template <class T>
 struct Segment {
   Holder fine, coarse;
   int32_t wanted = 0;            // depth that the cone asked for
-  int32_t first = 0, count = 0;  // number of the first interval since base, intervals
+  int32_t first = 0, count = 0;  // number of the first interval, counted from base; how many intervals
   int32_t level = kPiece;        // intervals are step * 2^level long, or kPiece
   // Distances from where the ray enters the scene; seen: where the nodes were looked up.
   T base = 0, start = 0, end = 0, seen = 0;
@@ -55,9 +55,9 @@ struct SegmentView {
 template <class T, class Digits>
 struct WalkRay {
   ShadeRay<T, Plain<T>, Digits> kernel;
-  const T* state_r3;  // base, count and level that each ray goes on with; null: rays begin
-  int32_t limit;      // a ray pauses behind the visit in which it has taken so many samples; 0: it goes to its end
-  bool by_node;       // a region is of one value only where one node answers
+  const T* state_r3;  // base, count and level from which each ray continues; null: rays begin
+  int32_t limit;      // a ray pauses after the visit in which it reaches this many samples; 0: it goes to its end
+  bool by_node;       // a visit of two nodes is never a region, even where their constants are equal
 
   GV_HD Intervals<T> begin(const Ray<T>& ray, int64_t number) const {
     Intervals<T> at(ray, kernel.options.step, kernel.lengths);
@@ -126,7 +126,7 @@ struct WalkRay {
       segment.end = at.start_of(at.count + static_cast<T>(alike));
       return alike;
     }
-    // The segment is complete; another may begin.
+    // Emits the complete segment; another may begin.
     GV_HD void finish(Segment<T>& segment) {
       if (segment.count == 0) return;
       emit(segment);
@@ -193,7 +193,7 @@ struct WriteSegments {
   }
 };
 
-// A channel of a dtype that the compiler knows.
+// A channel whose dtype the compiler knows.
 template <class Voxel>
 struct BrickView {
   const Voxel *bricks_bzyxc, *constant_tnc;
@@ -202,14 +202,14 @@ struct BrickView {
   GV_HD int64_t first(int32_t brick) const { return static_cast<int64_t>(brick) * side * side * side * channels; }
 };
 
-// What a sample of a segment reads: the bricks (or constants) of two nodes, and the weight of the coarse one.
+// Finds what a sample of a segment reads: the bricks (or constants) of two nodes, and the weight of the coarse one.
 template <class T, class Voxel>
 struct AimSample {
   RayView rays;
-  TreeView tree;  // its shape alone
+  TreeView tree;  // only its shape
   Levels<T> levels;
   BrickView<Voxel> bricks;
-  SegmentView<T> segments;  // read
+  SegmentView<T> segments;  // read only
   const int32_t *segment_k, *number_k;
   int64_t ray_count, segment_count, node_count, brick_count;
   T step;
@@ -217,7 +217,7 @@ struct AimSample {
   struct Aimed {
     Spot<T> fine, coarse;
     T t, weight;
-    bool known = false;  // all that the segment names exists
+    bool known = false;  // everything the segment refers to exists
   };
 
   GV_HD Aimed operator()(int64_t k) const {
@@ -251,7 +251,7 @@ struct AimSample {
     }
     return aimed;
   }
-  // The middle of a segment's interval.
+  // Distance of the middle of a segment's interval.
   GV_HD T place(int64_t segment, int32_t number) const {
     const int32_t level = segments.interval_s3[3 * segment + 2];
     const T base = segments.distance_s3[3 * segment];
@@ -329,7 +329,7 @@ struct SpreadGradient {
   }
 };
 
-// Samples of rays, packed, each ray's in a row from front to back.
+// Packed samples of rays: those of a ray are consecutive, from front to back.
 struct PackedView {
   const int64_t* offset_r;  // (r + 1,)
   int64_t count;
@@ -339,8 +339,8 @@ struct PackedView {
   GV_HD int64_t end(int64_t ray) const { return clamp<int64_t>(offset_r[ray + 1], 0, count); }
 };
 
-// Front to back: feature = sum of clear * alpha * feature, where clear is what the samples before let through.
-// A ray ends where no more than `stop_clear` is left; what lies behind has a `before` of 0. stop_clear 0: all count.
+// Front to back: sum of clear * alpha * feature, where clear is the transmittance of the samples in front. A ray ends
+// where at most `stop_clear` of it is left; samples behind have a `before` of 0. stop_clear 0: all samples count.
 template <class T>
 struct CompositeRay {
   PackedView packed;
@@ -366,8 +366,9 @@ struct CompositeRay {
   }
 };
 
-// The gradient of CompositeRay, from back to front. With S the sum and L the light left behind a sample, both of what
-// enters it: S' = alpha f + (1 - alpha) S, L' = (1 - alpha) L. No division, so an alpha of 1 is nothing special.
+// The gradient of CompositeRay, from back to front. With S the sum and L the light left of the samples behind one, per
+// unit of light that enters, the sample makes them S' = alpha f + (1 - alpha) S, L' = (1 - alpha) L. No division, so an
+// alpha of 1 is no special case.
 template <class T>
 struct CompositeGradient {
   PackedView packed;
@@ -380,7 +381,7 @@ struct CompositeGradient {
     T behind = grad_left_r[ray];  // gradient of the light that enters the samples behind
     for (int64_t k = end - 1; k >= begin; --k) {
       const T before = before_k[k], alpha = alpha_k[k];
-      T own = 0;  // gradient of the light that the sample takes
+      T own = 0;  // gradient of the light that the sample absorbs
       for (int32_t channel = 0; channel < packed.channels; ++channel) {
         const T grad = grad_sum_rc[ray * packed.channels + channel];
         own = own + grad * feature_kc[k * packed.channels + channel];

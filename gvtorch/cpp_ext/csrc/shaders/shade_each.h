@@ -1,4 +1,4 @@
-// Rays one by one, with any shader and on any device.
+// Traces rays one by one, with any shader and on any device.
 #pragma once
 
 #include "base/for_each.h"
@@ -6,8 +6,8 @@
 
 namespace gvtorch {
 
-// Gives a ShadeRay a place for each node, in which it is kept what is hidden from all rays: see kUnknown in walk.h.
-// They live as long as what is returned.
+// Gives a ShadeRay memory for each node, to cache what is hidden from all rays: see kUnknown in walk.h. The returned
+// tensor owns it.
 template <class Kernel>
 torch::stable::Tensor hide_nodes(const torch::stable::Tensor& like, int64_t nodes, Kernel& kernel) {
   torch::stable::Tensor places;
@@ -30,9 +30,9 @@ void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel)
   for_each(like, kernel.order.count(), kernel);
 }
 
-// Rays with a fused shader. On CUDA the voxels' dtype is compiled in for the plain function, filtered or not, and where
-// it is usual for stored colours, lit matter and surfaces; on the CPU, where packets take nearly all rays, for the
-// plain function in float32 alone.
+// Traces rays with a fused shader. The voxels' dtype is compiled in, on CUDA for the plain function, filtered or not,
+// and for the usual dtypes of stored colours, lit functions and isosurfaces; on the CPU, where packets trace nearly all
+// rays, for the plain function in float32 alone.
 template <class T>
 void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
   const auto each = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };

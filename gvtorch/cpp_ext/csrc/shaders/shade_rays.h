@@ -1,6 +1,7 @@
-// ShadeRay: one ray from the scene's near side to its far side. Descend, skip or sample, give each interval to a shader
-// of shaders.h, which composites front to back, and mark what was used and what was missed. With shadows, a cone goes
-// from each sample to the light, through the same tree; its samples, stamps and requests count as the ray's own.
+// ShadeRay traces one ray from the scene's near side to its far side: it descends the tree, skips or samples nodes,
+// passes each interval to a shader of shaders.h, which composites front to back, and marks what it used and missed.
+// With shadows, each sample traces a cone to the light through the same tree, and its samples, stamps and requests
+// count as the ray's own.
 //
 // Equal to ops/reference/march.py and shaders.py: integers exactly, and every float operation in the same order.
 // Method: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and Detailed Voxel
@@ -14,15 +15,15 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// Digits: see `with_digits`. Voxel: of the shader's value; void: told at run time.
+// Digits: see `with_digits`. Voxel: dtype of the shader's value; void: known at run time only.
 template <class T, class Shader, class Digits, bool kShadows = false, class Voxel = void>
 struct ShadeRay : Walk<T> {
   using Eye = ProbeOf<T, Voxel>;
   using Walk<T>::tree;
   using Walk<T>::options;
   using Sum = typename Shader::Sum;
-  // Reads of a known dtype are no calls; a short shader's loop may be there several times. See for_each.h for blocks at
-  // once: 128 or 64 registers a thread.
+  // Reads of a known dtype are inlined, and a short shader's loop may be instantiated several times. kBlocksAtOnce (see
+  // for_each.h): 8 leave 64 registers to a thread, 4 leave 128.
   static constexpr bool kShort =
       !std::is_void_v<Voxel> && std::is_base_of_v<Plain<T>, Shader> && !std::is_base_of_v<Lit<T>, Shader>;
   static constexpr int kBlocksAtOnce = kShort && Shader::kFiltered == 0 ? 8 : 4;
@@ -31,7 +32,7 @@ struct ShadeRay : Walk<T> {
   Channels channels;
   Light<T> light;
   const void* range_tn2c;
-  // Of a shader with kHidesAlike, see shade_each.h:
+  // For a shader with kHidesAlike, see shade_each.h:
   uint8_t* hidden_tn;             // on the CPU
   NodeWords* words_tn = nullptr;  // on a GPU
   int32_t lengths, features, directions;
@@ -75,7 +76,7 @@ struct ShadeRay : Walk<T> {
     finish(number, ray.moved, visitor.samples, sum);
   }
 
-  // Smallest and largest value of the node, in any direction.
+  // Smallest and largest value of a node, over all directions.
   struct Range {
     T low, high;
   };
@@ -90,7 +91,7 @@ struct ShadeRay : Walk<T> {
     }
     return range;
   }
-  // Nothing between the ends of the node's range changes the sum.
+  // True if no value in the node's range changes the sum.
   template <class Any>
   GV_HD bool hides(const Any& shader, int32_t node, const typename Any::Sum& sum) const {
     if constexpr (Any::kReadsAll) {
@@ -101,7 +102,7 @@ struct ShadeRay : Walk<T> {
     }
   }
 
-  // The same for all rays: looked at once.
+  // The same for all rays, computed once per node.
   bool hides(int32_t node) const {
     uint8_t known = load_byte(&hidden_tn[node]);
     if (known == kUnknown) {
@@ -118,7 +119,7 @@ struct ShadeRay : Walk<T> {
 #endif
   }
 
-  // The place where depth was set may lie half an interval beside the node that found it.
+  // Shades where depth was set. This may be half an interval outside the visited node, so the node is looked up anew.
   template <class Number>
   GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, Sum& sum) const {
     Number digits(tree, this->levels, this->rays, ray, sum.depth);
@@ -129,7 +130,7 @@ struct ShadeRay : Walk<T> {
     shader.surface(Probe<T>(channels, sight, this->rays, ray, visit, digits), sum);
   }
 
-  // What comes after the last interval.
+  // Called after the last interval: stores the results.
   GV_HD void finish(int64_t number, T moved, int32_t samples, Sum& sum) const {
     shader.done(sum);
     this->store(number, sum, moved, samples);
@@ -138,14 +139,14 @@ struct ShadeRay : Walk<T> {
     for (int axis = 0; axis < 3; ++axis) normal_r3[3 * number + axis] = normal[axis];
   }
 
-  // Near a light, a stored normal is lit differently wherever it stands.
+  // True if light varies in a node of one value: a point light shines on a stored normal from different directions.
   GV_HD bool shades_each_place() const { return channels.normal.given() && light.kind() == LightKind::kPoint; }
 
-  // See Walk::follow. Any: the shader, or its Veil on the way to a light.
+  // See Walk::follow. Any: the shader, or its Veil for a ray to a light.
   template <class Any>
   struct Visitor {
     static constexpr bool kSeesEmpty = Any::kSeesEmpty, kEnds = Any::kEnds;
-    static constexpr bool kShadowed = kShadows && std::is_same_v<Any, Shader>;  // none on the way to a light
+    static constexpr bool kShadowed = kShadows && std::is_same_v<Any, Shader>;  // none for a ray to a light
     static constexpr bool kToLight = std::is_same_v<Any, Veil<T, Shader>>;
     const ShadeRay& kernel;
     const Any& shader;
@@ -169,7 +170,7 @@ struct ShadeRay : Walk<T> {
     GV_HD Eye enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
       return Eye(kernel.channels, *sight, kernel.rays, ray, visit, digits);
     }
-    GV_HD bool uniform(const Eye& probe) const {              // shadows differ within it
+    GV_HD bool uniform(const Eye& probe) const {              // shadows vary in it
       if (kToLight && kernel.light.scatters()) return false;  // 1 - alpha of a long interval would round to 0
       return !kShadowed && probe.uniform() && !kernel.shades_each_place();
     }
@@ -183,7 +184,7 @@ struct ShadeRay : Walk<T> {
       ++samples;
     }
     GV_HD int32_t take(const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
-      if constexpr (Any::kFiltered > 0) {  // it reads colours by itself; a visit without any is the plain function's
+      if constexpr (Any::kFiltered > 0) {  // it reads colours by itself; visits without any use the plain function
         if (shader.stored(probe)) return take_by(shader, [](T) { return T{}; }, probe, at, alike, last);
         return take(ready_for_ray(shader.plain()), probe, at, alike, last);
       } else if constexpr (Any::kReadsAll) {
@@ -251,8 +252,8 @@ struct ShadeRay : Walk<T> {
   };
 
  private:
-  // How much light comes from `length` away to the place at distance t. The cone is as wide there as the ray's; its
-  // first interval is left out, so that a place does not stand in its own shadow.
+  // Share of the light from `length` away that reaches the position at distance t. The cone to the light begins as wide
+  // as the ray's is there; its first interval is left out, so that a position does not shadow itself.
   GV_HD T share_of_light(const Ray<T>& ray, const Probe<T>& probe, T t, Vec3<T> way, T length, T growth,
                          int32_t& samples, bool& missed) const {
     const RayView& rays = this->rays;
@@ -273,7 +274,7 @@ struct ShadeRay : Walk<T> {
   }
 };
 
-// Works out what a shader with kHidesAlike hides.
+// Computes the words of a node, with what a shader with kHidesAlike hides.
 template <class Kernel>
 struct HideShaded {
   Kernel kernel;
@@ -284,7 +285,7 @@ struct HideShaded {
   }
 };
 
-// Calls body(ShadeRay) with the rays of a fused shader.
+// Calls body(ShadeRay) for the fused shader of the arguments.
 template <class T, class Body>
 void with_rays(const ShadeArgs& args, const Body& body) {
   with_shader<T>(args.shader, [&](auto type) {

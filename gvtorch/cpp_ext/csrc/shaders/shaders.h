@@ -1,37 +1,37 @@
-// The fused shaders: what a ray makes of the values it meets. `ShadeRay` (shade_rays.h) and `PacketWalk`
+// The fused shaders, which turn the values along a ray into colour. `ShadeRay` (shade_rays.h) and `PacketWalk`
 // (packet_walk.h) walk the tree and call them.
 //
 // A shader is a small struct, copied into the kernel:
 //
 //   explicit Shader(const ShadeArgs&)             on the host: borrows tables and parameters
-//   kEnds                                         its values are those at an interval's two ends, else in the middle
-//   kSeesEmpty                                    EMPTY nodes count, with their mean value
-//   SumOf<V> : ShadeSum<V>, Sum = SumOf<T>        what it keeps of a ray; `clear` at 1 - stop_alpha ends the ray
-//   hides(low, high, sum)                         true: no value in [low, high] changes the sum. The node is left out;
-//                                                 without kHidesAlike, of V as `add`
-//   kHidesAlike                                   it does not look at the sum: nodes are hidden from all rays alike
-//   kReadsAll, hides_ranges(range_of)             `add` reads all numbers through its probe, and pieces come without a
-//                                                 value. hides_ranges then stands in the place of `hides`:
-//                                                 range_of(component) has the smallest and the largest value (low,
-//                                                 high) that one of a voxel's numbers has in the node
+//   kEnds                                         pieces have the values at an interval's two ends, else in its middle
+//   kSeesEmpty                                    EMPTY nodes are shaded too, with their mean value
+//   SumOf<V> : ShadeSum<V>, Sum = SumOf<T>        the state of a ray; `clear` at 1 - stop_alpha ends the ray
+//   hides(low, high, sum)                         true if no value in [low, high] changes the sum: the node is skipped.
+//                                                 Without kHidesAlike, it is written for V, like `add`
+//   kHidesAlike                                   `hides` ignores the sum: nodes are hidden from all rays alike
+//   kReadsAll, hides_ranges(range_of)             `add` reads all numbers through its probe, and pieces have no value.
+//                                                 hides_ranges then replaces `hides`: range_of(component) returns the
+//                                                 smallest and largest value (low, high) that one of a voxel's numbers
+//                                                 has in the node
 //   add(which, piece, probe, sum)                 adds an interval; `probe` reads any channel at any distance
-//   kSurface, surface(probe, sum)                 where depth was set: `probe` then stands in the node of that place
-//   done(sum)                                     after the last interval
+//   kSurface, surface(probe, sum)                 called where depth was set, with a probe of the node found there
+//   done(sum)                                     called after the last interval
 //
-// One that shadows fall on has, beside,
+// A shader that receives shadows also has
 //
-//   alpha(piece, probe)                           of an interval: what it takes from the light behind it
-//   add(which, piece, probe, sum, shadow)         `shadow(t, way, length, growth)`: share of the light that comes there
+//   alpha(piece, probe)                           share that an interval absorbs of the light from behind
+//   add(which, piece, probe, sum, shadow)         `shadow(t, way, length, growth)`: share of the light that reaches t
 //
-// T is float or double. `add` is written once for a ray and for a packet (V is T or Floats, see arithmetic.h), whose
-// lanes in `which` add an interval each: piece, probe and sum are those of V. `probe.narrow(which)` tells that fewer
-// lanes are asked for from here on, `probe.each(which, body)` gives each lane's own probe. All else is called for one
-// ray.
+// T is float or double. `add` is written once for a ray (V is T) and for a packet (V is Floats, see arithmetic.h), in
+// which each lane of `which` adds an interval; piece, probe and sum are of V. `probe.narrow(which)` limits what is read
+// from then on to fewer lanes, `probe.each(which, body)` passes each lane's own probe. Everything else is called for
+// one ray.
 //
-// An interval lies in the node in which its middle lies. Its ends may stand up to half an interval outside; they are
-// read in this node all the same, where a brick's outermost voxel centres bound them. With a border of 1 and steps of
-// at most a voxel that bound is never reached, so an end is the same number from both sides; and since all that is read
-// lies in the node's range, leaving a hidden node out changes no bit.
+// An interval belongs to the node that contains its middle. Its ends may lie up to half an interval outside; they are
+// still read in this node, clamped to its brick's outermost voxel centres. With a border of 1 and steps of at most a
+// voxel this clamp changes nothing, so an end has the same value from both sides; and since all values read lie in the
+// node's range, skipping a hidden node changes no bit.
 //
 // Equal to ops/reference/shaders.py. Sources: Blinn, "Models of light reflection for computer synthesized pictures",
 // SIGGRAPH 1977; Engel, Kraus, Ertl, "High-quality pre-integrated volume rendering using hardware-accelerated pixel
@@ -72,7 +72,7 @@ struct Lit : Plain<T> {
   }
 };
 
-// What a lit node shows of an interval.
+// What one node adds for an interval, lit.
 template <class V>
 struct LitRow {
   Row<V> row{};      // premultiplied colour in the light, and alpha
@@ -83,7 +83,7 @@ GV_HD LitRow<V> combined(const LitRow<V>& a, const LitRow<V>& b, const F& f) {
   return {combined(a.row, b.row, f), combined(a.normal, b.normal, f)};
 }
 
-// The lit transfer function from afar: Filtered's numbers are followed by the mean products xx xy xz yy yz zz of the
+// The lit transfer function, filtered: Filtered's numbers are followed by the mean products xx xy xz yy yz zz of the
 // components of the normals below a voxel, times its alpha.
 template <class T>
 struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
@@ -97,7 +97,7 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
     sum.add_light(found.row, sum.clear, which);
     sum.absorb(found.row.alpha, piece.start, piece.length, sum.hit_clear, which);
   }
-  // What one of the nodes shows; nothing in other lanes.
+  // What one of the nodes adds; 0 in other lanes.
   template <class V, class Eye, class Node>
   GV_HD LitRow<V> look(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
     const MaskOf<V> colored = which && node.among(this->bricks), others = which && !colored;
@@ -144,8 +144,8 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
     const auto a = read(which, first + 4), b = read(which, first + 6);
     return Moments<decltype(a.red + b.red)>{a.red, a.green, a.blue, a.alpha, b.blue, b.alpha};
   }
-  // The moments of what is seen along direction d, and the mean of these normals, each turned to the side from which
-  // its direction sees it.
+  // The moments of the normals seen along direction d, and in `front` the mean of these normals: those seen along an
+  // axis are turned against the ray's direction along it.
   template <class V, class Read>
   GV_HD static Moments<V> seen(MaskOf<V> which, const Read& read, const Vec3<V>& d, Vec3<V>& front) {
     Moments<V> sum{};
@@ -177,13 +177,13 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
   }
 };
 
-// What a shader takes from the light that goes through: the shader of rays that go to a light.
+// The shader of rays to a light (shadow rays): only the transmittance through what another shader shows.
 template <class T, class Shader>
 struct Veil : ShaderFacts {
   static constexpr bool kHidesAlike = Shader::kHidesAlike;
   struct Sum {
     T clear = 1;     // transmittance
-    T stop_clear{};  // at which the way ends
+    T stop_clear{};  // at which the ray ends
     bool missed = false;
   };
   const Shader& shader;
@@ -194,12 +194,12 @@ struct Veil : ShaderFacts {
   }
 };
 
-// A table over the values at both ends of an interval, (l, m, m): premultiplied colour and alpha. Beyond its domain the
-// function is constant: the parts of an interval that lie there are added before and behind.
+// Pre-integrated transfer function: a table (l, m, m) over the values at both ends of an interval, of premultiplied
+// colour and alpha. Outside its domain it is constant: such parts of an interval are added in front and behind.
 template <class T>
 struct PreIntegrated : ShaderFacts {
   static constexpr bool kEnds = true, kIntegrates = true;
-  static bool packs(const ShadeArgs& args) {  // which count the bytes of the table in 32 bits
+  static bool packs(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
     return int64_t{args.levels} * args.rows * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
   }
   template <class V>
@@ -234,7 +234,7 @@ struct PreIntegrated : ShaderFacts {
     sum.add_light(row, sum.clear, which);
     sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, which);
   }
-  // What an interval of a length of the table shows, from one value to another.
+  // The row of an interval from one value to another, of a length that the table has.
   template <class V>
   GV_HD Row<V> between(const Transfer<T>& places, V from, V to, IntOf<V> level, MaskOf<V> which) const {
     const Cell<V> front = places.find(from), back = places.find(to);
@@ -263,8 +263,8 @@ struct PreIntegrated : ShaderFacts {
   GV_HD void done(Sum&) const {}
 };
 
-// The first place where the value passes a number, in either direction. Four bisections and a secant: an interval of a
-// voxel is cut to a sixteenth before its rest is taken for linear. The side on which the last interval ended is kept,
+// The first position where the value crosses a level, in either direction. Four bisections and a secant: an interval of
+// a voxel is narrowed to a sixteenth, which is then assumed linear. The value at the end of the last interval is kept,
 // so that no crossing is lost between two nodes that round differently.
 template <class T>
 struct Isosurface : ShaderFacts {
@@ -272,8 +272,8 @@ struct Isosurface : ShaderFacts {
   template <class V>
   struct SumOf : ShadeSum<V> {
     V before{};
-    V before_end = splat<V>(static_cast<T>(-INFINITY));  // +INFINITY: the ray began within, where no surface is
-    V share{};                                           // of the light, that came to the surface
+    V before_end = splat<V>(static_cast<T>(-INFINITY));  // +INFINITY: the ray began inside, without a surface there
+    V share{};                                           // transmittance in front of the surface
 
     template <class Own, class Other, class Body>
     GV_HD static void each(Own& own, Other& other, const Body& body) {
@@ -292,9 +292,9 @@ struct Isosurface : ShaderFacts {
 
   struct Own {
     T level;
-    T filled;         // 1: with what is not below the level; -1: with what is; 0: with nothing
-    T scale;          // of four numbers of the second channel, which are the colour; 0: the transfer function tells it
-    T premultiplied;  // 1: these are stored times the fourth
+    T filled;         // 1: solid where the value is not below the level; -1: where it is; 0: nowhere
+    T scale;          // of the second channel's four numbers, which are the colour; 0: the transfer function's colour
+    T premultiplied;  // 1: the colour is stored times the fourth number
   };
   GV_HD const Own& own() const { return own_numbers<Own>(light.parameters); }
   GV_HD T iso() const { return own().level; }
@@ -363,7 +363,7 @@ struct Isosurface : ShaderFacts {
 };
 
 // Maximum, minimum or mean of the value along the ray, coloured by the transfer function. A node that can't change a
-// maximum or minimum is left out.
+// maximum or minimum is skipped.
 template <class T>
 struct Projection : ShaderFacts {
   static constexpr bool kSeesEmpty = true, kHidesAlike = false;
@@ -372,7 +372,7 @@ struct Projection : ShaderFacts {
   struct SumOf : ShadeSum<V> {
     V found{};   // extreme so far, or sum of value * length
     V length{};  // sum of lengths
-    V at{};      // where the extreme is; where the first interval starts
+    V at{};      // distance of the extreme; for a mean, of the first interval's start
 
     template <class Own, class Other, class Body>
     GV_HD static void each(Own& own, Other& other, const Body& body) {
@@ -430,7 +430,8 @@ struct Projection : ShaderFacts {
   }
 };
 
-// All numbers of a second channel, composited with the transfer function's alpha. Sums lie in the output: any number.
+// All numbers of a second channel, composited with the transfer function's alpha. The output holds the sums, so there
+// may be any number of them.
 template <class T>
 struct Features : Plain<T> {
   static constexpr int32_t kFeatures = Plain<T>::kAsOther;
@@ -458,14 +459,14 @@ struct Features : Plain<T> {
   }
 };
 
-// The transfer function, the denser the faster the value changes (after Levoy 1988, "region boundary surfaces"): the
-// optical depth of an interval times the gradient's length over `full`, 1 at most.
+// The transfer function, with the optical depth of an interval scaled by the gradient's length over `full`, at most 1
+// (after Levoy 1988, "region boundary surfaces").
 template <class T>
 struct GradientMagnitude : Plain<T> {
   template <class V>
   using SumOf = ShadeSum<V>;
   struct Own {
-    T full;  // a unit of the value per world unit
+    T full;  // gradient length of full density, in units of the value per world unit
   };
   const Parameters<T>* parameters;
 
@@ -486,8 +487,8 @@ struct GradientMagnitude : Plain<T> {
   }
 };
 
-// The fused shaders: X(kind, struct, whether a cone goes from each sample to the light), in the order of their numbers.
-// SHADER_KINDS of ops/shading.py are the same.
+// The fused shaders: X(kind, struct, true if each sample traces a cone to the light), in the order of their numbers, as
+// in SHADER_KINDS of ops/shading.py.
 #define GV_SHADERS(X)                            \
   X(Lit, Lit, false)                             \
   X(PreIntegrated, PreIntegrated, false)         \
@@ -513,7 +514,7 @@ struct ShaderType {
   static constexpr bool kShadows = kWithShadows;
 };
 
-// Returns body(ShaderType) with the shader of a kind.
+// Returns body(ShaderType) for the shader of a kind.
 template <class T, class Body>
 auto with_shader(int32_t kind, const Body& body) {
 #define GV_CASE(kind, Shader, shadows) \

@@ -1,4 +1,4 @@
-// Shaders whose voxels hold colours: those of a channel, and those that a transfer function made of finer voxels.
+// Shaders that read colours from voxels: stored ones, and those that a transfer function made of finer voxels.
 //
 // Equal to ops/reference/shaders.py.
 #pragma once
@@ -8,8 +8,8 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// What lanes read of one of a voxel's two sides on an axis: the numbers from `first` on where a ray goes ahead along
-// it, those `one` places behind where it goes back.
+// Reads one of a voxel's two sides along an axis: the numbers from `first` on where a ray goes in the axis' direction,
+// those from first + one on in lanes of `back`, where it goes against it.
 template <class V, class Read>
 GV_HD auto of_side(MaskOf<V> which, MaskOf<V> back, int32_t first, const Read& read, int32_t one) {
   if constexpr (kPacket<V>) {
@@ -22,10 +22,10 @@ GV_HD auto of_side(MaskOf<V> which, MaskOf<V> back, int32_t first, const Read& r
   }
 }
 
-// A voxel's number, or four of them, as seen along direction d; read(which, k) gives lanes the number k places behind
-// the first, or the four that begin there. A channel may hold `one` numbers for each of six directions (Crassin et al.,
-// "Interactive indirect illumination using voxel cone tracing", CGF 2011): then the three that d goes along are read,
-// weighted by the squares of d, whose sum is 1. Where all six are equal, the result has the bits of one.
+// A voxel's number, or four of them, as seen along direction d; read(which, k) returns number k of the voxel, or the
+// four that begin there. A channel may hold `one` numbers for each of six directions (Crassin et al., "Interactive
+// indirect illumination using voxel cone tracing", CGF 2011): then the three on d's side of each axis are read and
+// weighted by the squares of d, whose sum is 1. Where all six are equal, the result has the same bits as each.
 template <class V, class Read>
 GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const Read& read, int32_t one = 4) {
   if (width == one) return read(which, 0);
@@ -42,9 +42,9 @@ GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const 
   return seen;
 }
 
-// Voxels that hold a colour themselves: red, green, blue and opacity, or these four for each of six directions (see
-// by_direction). The opacity is the value by which nodes are hidden. Packets read four numbers a voxel; rays through
-// colours by direction are traced one by one.
+// Voxels that hold a colour: red, green, blue and opacity, or these four for each of six directions (see by_direction).
+// Nodes are hidden by their opacity. Packets trace rays only where a voxel has four numbers; rays through colours by
+// direction are traced one by one.
 template <class T>
 struct StoredColor : ShaderFacts {
   static constexpr bool kColored = true;
@@ -61,8 +61,8 @@ struct StoredColor : ShaderFacts {
     return !(a_little_above(high) > 0);
   }
   struct Own {
-    T scale;               // of the numbers stored
-    T reference_length;    // of which they tell the opacity
+    T scale;               // of the stored numbers
+    T reference_length;    // to which the stored opacity refers, world
     T premultiplied, lit;  // 1 or 0
   };
   GV_HD const Own& own() const { return own_numbers<Own>(light.parameters); }
@@ -94,7 +94,7 @@ struct StoredColor : ShaderFacts {
     }
     sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
   }
-  // All four; a packet reads no opacity, which it has.
+  // All four numbers as seen along the ray; a packet does not read the opacity, which it already has.
   template <class Eye, class V>
   GV_HD static Row<V> four_seen(const Eye& probe, V t) {
     const auto& channel = probe.channels.value;
@@ -105,7 +105,7 @@ struct StoredColor : ShaderFacts {
       return of_sides(probe, [&](bool, int32_t behind) { return probe.four_at(channel, behind, t); });
     }
   }
-  // One of the four numbers, as it is seen along the ray.
+  // One of the four numbers as seen along the ray.
   template <class Eye, class V>
   GV_HD static V seen(const Eye& probe, int32_t number, V t) {
     const auto& channel = probe.channels.value;
@@ -122,17 +122,18 @@ struct StoredColor : ShaderFacts {
   GV_HD void done(Sum&) const {}
 };
 
-// A transfer function, `Base`, right from afar too: a second channel, which the first bricks of the pool have, holds
-// what the function makes of the finest voxels below each of theirs. Other bricks, and nodes without one, are seen
-// through the function as ever; where two levels blend, what is seen of them does. `Shader` stands on this and has
+// A transfer function, `Base`, that is right at coarse levels too: a second channel, which only the first bricks of the
+// pool have, holds for each of their voxels what the function makes of the finest voxels below it. Other bricks, and
+// nodes without one, are shaded by the function as usual. Where two levels blend, what they show is blended, not their
+// values. `Shader` derives from this and has
 //
-//   look(which, piece, probe, node)   what one of the nodes shows of an interval, which `combined` can mix
-//   take(which, found, piece, sum)    adds it to what the ray has met
+//   look(which, piece, probe, node)   what one of the nodes adds for an interval, of a type that `combined` accepts
+//   take(which, found, piece, sum)    adds it to the sum
 template <class T, class Base, class Shader>
 struct FromAfar : Base {
   template <class V>
   using SumOf = ShadeSum<V>;
-  int32_t bricks;  // that the second channel has
+  int32_t bricks;  // number of bricks that have the second channel
 
   explicit FromAfar(const ShadeArgs& args) : Base(args), bricks(args.other_bricks) {}
 
@@ -158,13 +159,13 @@ struct FromAfar : Base {
   }
 };
 
-// The plain transfer function from afar: the second channel holds premultiplied colour and alpha of an interval as long
-// as the voxel, once or by direction, as StoredColor reads them.
+// The plain transfer function, filtered: the second channel holds premultiplied colour and alpha of an interval as long
+// as the voxel, once or by direction, as for StoredColor.
 template <class T>
 struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
   static constexpr int32_t kFiltered = 4;
   struct Own {
-    T side;  // of the root cube, world
+    T side;  // world size of the root cube
   };
   const Parameters<T>* parameters;
 
@@ -176,7 +177,7 @@ struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
     sum.add_light(found, sum.clear, which);
     sum.absorb(found.alpha, piece.start, piece.length, sum.hit_clear, which);
   }
-  // Premultiplied colour and alpha of an interval, as one of the nodes shows them.
+  // Premultiplied colour and alpha of an interval in one of the nodes.
   template <class V, class Eye, class Node>
   GV_HD Row<V> look(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
     const V t = piece.middle;

@@ -2,7 +2,7 @@
 //
 // A brick is B*B*B voxels plus `border` voxels on every side, stored (z, y, x, c), x next to fastest. Voxel
 // centres lie at half-integers of the brick's own units [0, B], so neighbours agree at the face they share as
-// long as border >= 1: both interpolate the same two voxels. A place beyond the stored centres is clamped.
+// long as border >= 1: both interpolate the same two voxels. Positions beyond the stored centres are clamped.
 #pragma once
 
 #include "base/arguments.h"
@@ -42,11 +42,11 @@ inline int64_t brick_bytes(VoxelType type, int32_t side, int32_t channels) {
   return bytes;
 }
 
-// One node seen along one ray: place in its brick, in voxels = offset + t * slope.
+// A node's brick along a ray: offset + t * slope is the position at distance t, in voxels from its first voxel centre.
 template <class T>
 struct Spot {
   int32_t node = kAbsent, brick = kAbsent;
-  T scale = 0;  // voxels a tree unit
+  T scale = 0;  // voxels per tree unit
   Vec3<T> offset{0, 0, 0}, slope{0, 0, 0};
 
   Spot() = default;
@@ -62,11 +62,11 @@ struct Spot {
     }
   }
   GV_HD Vec3<T> at(T t) const { return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z}; }
-  // It has one of the first `count` slots.
+  // True if the brick is in one of the first `count` slots.
   GV_HD bool among(int32_t count) const { return brick >= 0 && brick < count; }
 };
 
-// The lower of the two voxels beside a place, along one axis; the upper one exists. A packet multiplies floats faster.
+// Lower one of the two voxels around a position along an axis; the upper one exists. Packets multiply floats faster.
 template <class T>
 GV_HD int32_t voxel_below(T place, int32_t side) {
   return smaller(static_cast<int32_t>(place), side - 2);
@@ -77,7 +77,7 @@ GV_HD Floats voxel_below(Floats place, int32_t side) {
 }
 #endif
 
-// Eight values by the weights of the upper ones along each axis; pair(y, z) gives those of two neighbours along x.
+// Blends eight values: weight_3 belongs to the upper one along each axis, pair(y, z, left, right) reads two along x.
 template <class V, class T, class Pair>
 GV_HD V blend_eight(const T* weight_3, const Pair& pair) {
   V plane[2];
@@ -93,8 +93,8 @@ GV_HD V blend_eight(const T* weight_3, const Pair& pair) {
   return plane[0] + weight_3[2] * (plane[1] - plane[0]);
 }
 
-// The eight voxels around a place of a brick, in voxels from the centre of its first one; a place beyond the last is
-// clamped.
+// The eight voxels around a position in a brick, and their weights. Positions count in voxels from the centre of the
+// first one, and are clamped to the voxel centres.
 template <class T>
 struct Eight {
   decltype(voxel_below(T{}, 0)) cell[3];
@@ -108,7 +108,7 @@ struct Eight {
       weight[axis] = place - static_cast<T>(cell[axis]);
     }
   }
-  // Of a place for which is_inside is true.
+  // Without the clamp, for positions for which is_inside is true.
   GV_HD explicit Eight(const Vec3<T>& at) {
     for (int axis = 0; axis < 3; ++axis) {
       cell[axis] = static_cast<int32_t>(at[axis]);
@@ -125,7 +125,7 @@ struct Eight {
   }
 };
 
-// Value at a place of a brick, between the voxels that are told.
+// Trilinear interpolation of a brick's voxels, between those of `eight` or at a position.
 template <class T, class Voxel>
 GV_HD T trilinear(const Voxel* voxels, const Eight<T>& eight, int32_t side, int32_t channels) {
   const int32_t step_y = channels * side, step_z = step_y * side;

@@ -1,9 +1,9 @@
-// Rays: from the world into tree units, where they meet the scene, and the intervals they are cut into.
+// Rays: conversion from the world into tree units, clipping to the scene, and the intervals they are cut into.
 //
-// The samples of a ray are fixed before anything is read. An interval is step * 2^level long, the longest that is not
-// longer than the cone is wide where it starts; level 0 where even `step` is. A value is taken in its middle and
-// stands for its length; the last one is cut at the far side. What is skipped therefore never moves a sample, and data
-// that begins behind skipped space gets each of its samples, the first included.
+// The samples of a ray are fixed before anything is read. An interval is step * 2^level long: the longest length that
+// does not exceed the cone's width where the interval starts, or level 0 where even `step` does. It is sampled in its
+// middle; the last interval is cut at the far side. Skipping space therefore never moves a sample, and data behind
+// skipped space gets all of its samples, the first included.
 #pragma once
 
 #include "base/arithmetic.h"
@@ -16,29 +16,29 @@ struct RayView {
   const double* direction_r3;  // world, unit length
   const double* cone_r2;       // world: width at the origin, growth per unit
   const double* range_r2;      // world: first and last distance
-  const double* place_33;      // world: low corner of the scene, size of the root cube; tree units: its high corner
+  const double* place_33;      // world: low corner of the scene, size of the root cube; tree units: scene's high corner
   double cone_scale;
-  bool deep;                        // places are worked out in float64, see tree.h
+  bool deep;                        // positions are computed in float64, see tree.h
   const double* clear_r = nullptr;  // transmittance with which a ray begins; null: 1
 
   GV_HD double clear(int64_t index) const { return clear_r == nullptr ? 1.0 : clear_r[index]; }
-  // The scene's high corner, never outside the root cube, whoever made the tensors: nodes are found by it.
+  // The scene's high corner, clamped to the root cube whatever the tensor holds: node indices are computed from it.
   GV_HD double high(int axis) const {
     const double told = place_33[6 + axis];
     return told > 0 ? smaller(told, 1.0) : 0.0;
   }
 };
 
-// One ray in tree units (a distance along it stays a world length), begun where it enters the scene: float32 then
-// counts from there, however far the camera is. Or the rays of a packet. A distance is never less exact than a cone is
-// wide there; a place is, so in a deep tree it is the difference of two float64 before it is rounded.
+// One ray, or the rays of a packet, in tree units (distances along it stay world lengths). The origin is moved to where
+// the ray enters the scene, so float32 serves however far the camera is. float32 distances are exact enough (to less
+// than the cone's width); positions are not, so deep trees subtract them in float64 before they round.
 template <class T>
 struct Ray {
   using Real = RealOf<T>;
   Vec3<T> origin, direction;
-  Vec3<T> rest;      // what rounding took from the origin, in a deep tree; else 0
+  Vec3<T> rest;      // what rounding removed from the origin, in a deep tree; else 0
   Vec3<T> inverse;   // of the direction
-  Vec3<Real> inner;  // the last place of the scene along each axis: what lies on its high face belongs to it
+  Vec3<Real> inner;  // largest position in the scene along each axis: points on its high face are clamped to it
   T cone_near, cone_growth;
   T first, last;
   T moved;  // distance from the camera to the origin
@@ -68,7 +68,7 @@ struct Ray {
     begin(rays, start);
   }
 
-  // A cone of its own from a place inside the scene; `way` in the world.
+  // A secondary cone from a position inside the scene (tree units); `way` is its direction in the world.
   GV_HD Ray(const RayView& rays, Vec3<double> start, Vec3<T> way, Vec3<T> cube, T cone_near, T cone_growth, T last)
       : direction{way.x / cube.x, way.y / cube.y, way.z / cube.z},
         cone_near(cone_near),
@@ -80,8 +80,8 @@ struct Ray {
   }
 
   // Slab test (Kay and Kajiya, "Ray tracing complex scenes", 1986).
-  // A ray that no face bounds (no direction, NaN, infinite), or whose cone is NaN, is closed, so that no loop runs on
-  // for ever.
+  // A ray that no face bounds (zero, NaN or infinite direction) or whose cone is NaN gets an empty range, so that every
+  // loop ends.
   GV_HD void begin(const RayView& rays, Vec3<double> start) {
     for (int axis = 0; axis < 3; ++axis) {
       origin[axis] = static_cast<T>(start[axis]);
@@ -102,10 +102,10 @@ struct Ray {
     if (!is_cone || !(last < static_cast<T>(INFINITY))) last = first;
   }
 
-  // Where the ray begins, as exactly as it is known.
+  // The origin along an axis, with what rounding removed.
   GV_HD double place(int axis) const { return static_cast<double>(origin[axis]) + static_cast<double>(rest[axis]); }
 
-  // Where it is at distance t.
+  // Position at distance t.
   GV_HD Vec3<double> along(T t, bool deep) const {
     Vec3<double> found;
     for (int axis = 0; axis < 3; ++axis) {
@@ -115,7 +115,7 @@ struct Ray {
     return found;
   }
 
-  // The same inside the scene.
+  // Position at distance t, clamped to the scene.
   GV_HD Vec3<T> at(T t) const {
     Vec3<T> place;
     for (int axis = 0; axis < 3; ++axis) {
@@ -127,7 +127,7 @@ struct Ray {
     return static_cast<Real>(rays.high(axis)) * static_cast<Real>(0.9999999);
   }
 
-  // Distance at which the ray leaves a box; face(axis, upper) tells how far its lower or upper face is from the origin.
+  // Distance at which the ray leaves a box; face(axis, upper): offset of its lower or upper face from the origin.
   template <class Face>
   GV_HD T leave(const Face& face) const {
     T exit = splat<T>(static_cast<Real>(INFINITY));
@@ -138,7 +138,7 @@ struct Ray {
     return exit;
   }
 
-  // body(number, other's) for each number that a lane has of its own.
+  // Calls body(own member, other's member) for each member that differs between lanes.
   template <class Own, class Other, class Body>
   GV_HD static void each(Own& own, Other& other, const Body& body) {
     body(own.origin, other.origin);
@@ -148,7 +148,7 @@ struct Ray {
   }
 };
 
-// Where an answer of the tree holds: up to `exit`, and while the cone is in [cone_low, cone_high).
+// The part of a ray for which a tree lookup stays valid: up to `exit`, and while the cone is in [cone_low, cone_high).
 template <class T>
 struct Extent {
   T exit, cone_low, cone_high;
@@ -156,17 +156,17 @@ struct Extent {
   GV_HD MaskOf<T> holds(T t, T cone) const { return t < exit && cone >= cone_low && cone < cone_high; }
 };
 
-constexpr int32_t kMostIntervals = 1 << 23;  // counted from one base, in a float32
+constexpr int32_t kMostIntervals = 1 << 23;  // counted from one base: float32 holds every count + 1/2 below it
 
-// Where a ray stands in its fixed sequence of intervals. Starts are products, not sums of roundings. `which`: the lanes
-// that a change or a question is for.
+// A ray's current interval in its fixed sequence. Starts are products, so rounding errors do not add up. `which`: the
+// lanes that a call changes or tests.
 template <class T>
 struct Intervals {
   using Real = RealOf<T>;
   using Mask = MaskOf<T>;
   T near, growth, stop;
   Real step;
-  int32_t top;  // longest level
+  int32_t top;  // level of the longest intervals
   IntOf<T> level{};
   T base, length, shortness;  // start = base + count * length; shortness: 1 / length
   T count{};
@@ -189,7 +189,7 @@ struct Intervals {
   GV_HD T start_of(T number) const { return base + number * length; }
   GV_HD T middle_of(T number) const { return base + (number + static_cast<Real>(0.5)) * length; }
   GV_HD Mask inside() const { return start < stop; }
-  // The last interval, which ends at the far side.
+  // True for the last interval, which is cut at the far side.
   GV_HD Mask cut() const { return !(start_of(count + static_cast<Real>(1)) <= stop); }
   GV_HD T middle() const { return select(cut(), start + (stop - start) * static_cast<Real>(0.5), middle_of(count)); }
 
@@ -201,7 +201,7 @@ struct Intervals {
     const Mask full = count >= static_cast<Real>(kMostIntervals);
     const Mask wrong = which && (full || !fits(width));
     if (!any(wrong)) return;
-    start = select(which && full && !(start > base), stop, start);  // intervals too short to be told apart
+    start = select(which && full && !(start > base), stop, start);  // intervals too short to move it
     base = select(wrong, start, base);
     count = select(wrong, T{}, count);
     level = select(wrong, IntOf<T>{}, level);
@@ -214,14 +214,14 @@ struct Intervals {
     }
     shortness = select(wrong, 1 / length, shortness);
   }
-  // Goes to the interval `number` of those of this length.
+  // Moves to interval `number`, counted from `base` in intervals of this length.
   GV_HD void go(Mask which, T number) {
     count = select(which, number, count);
     start = select(which, start_of(count), start);
     choose_level(which);
   }
-  // How many intervals from this one on are alike: whole, of one length, in one extent. At least 1. All bounds are
-  // monotone along the ray, also where the cone narrows, so the last one tells for all.
+  // Number of alike intervals from this one on: whole, of one length, in the extent. At least 1. All bounds are
+  // monotone along the ray, also where the cone narrows, so it suffices to test the last interval.
   GV_HD IntOf<T> run(Mask which, const Extent<T>& extent) const {
     T limit = smaller(extent.exit, stop);
     if (any(growth > 0)) {
@@ -245,12 +245,12 @@ struct Intervals {
     return extent.holds(middle, cone(middle)) && start_of(number + static_cast<Real>(1)) <= stop &&
            fits(cone(start_of(number)));
   }
-  // This interval lies in the extent.
+  // True if this interval lies in the extent.
   GV_HD Mask stays(const Extent<T>& extent) const {
     const T here = middle();
     return inside() && extent.holds(here, cone(here));
   }
-  // Goes to the first interval behind the extent.
+  // Moves to the first interval behind the extent.
   GV_HD void leave(Mask which, const Extent<T>& extent) {
     for (Mask inside = which; any(inside); inside = inside && stays(extent)) {
       const Mask whole = inside && !cut();
@@ -260,7 +260,7 @@ struct Intervals {
     }
   }
 
-  // body(number, other's) for each number.
+  // Calls body(own member, other's member) for each member.
   template <class Own, class Other, class Body>
   GV_HD static void each(Own& own, Other& other, const Body& body) {
     body(own.near, other.near);

@@ -16,7 +16,7 @@ struct alignas(16) alignas(T) Row {
 };
 constexpr int kAlpha = 3;
 
-// f(a, b) of two numbers, or of each number of two rows or vectors; other structs have an overload beside them.
+// f(a, b) of two numbers, or member by member of two rows or vectors; other structs have an overload next to them.
 template <class V, class F>
 GV_HD V combined(V a, V b, const F& f) {
   return f(a, b);
@@ -29,20 +29,20 @@ template <class V, class F>
 GV_HD Vec3<V> combined(const Vec3<V>& a, const Vec3<V>& b, const F& f) {
   return {f(a.x, b.x), f(a.y, b.y), f(a.z, b.z)};
 }
-// `select` of all that `combined` takes.
+// `select` for everything that `combined` accepts.
 template <class Mask, class Some>
 GV_HD Some choose(Mask which, const Some& a, const Some& b) {
   return combined(a, b, [&](auto one, auto other) { return select(which, one, other); });
 }
 
-// A packet of which nothing is seen is done with an interval; to a single ray the question costs more than it spares.
+// True if no lane of a packet has alpha. False for a single ray, where the test costs more than it saves.
 template <class T>
 GV_HD bool unseen(MaskOf<T> which, T alpha) {
   if constexpr (kPacket<T>) return !any(which && alpha > 0);
   return false;
 }
 
-// A row made of its numbers, column(0) to column(kAlpha); without colours where a packet sees nothing.
+// Builds a row of column(0) to column(kAlpha); colours stay 0 where no lane of a packet has alpha.
 template <class T, class Column>
 GV_HD Row<T> make_row(MaskOf<T> which, const Column& column) {
   Row<T> row{};
@@ -73,14 +73,14 @@ struct RowPair {
   GV_HD T at(T weight, int column) const { return first[column] + weight * (second[column] - first[column]); }
 };
 
-// Where a value stands in the table: between two rows.
+// Position of a value in the table: a row, and the weight of the next one.
 template <class T>
 struct Cell {
   IntOf<T> row;
   T weight;
 };
 
-// Values a little apart: interpolation may round beyond the ends of a range.
+// Ends of a range, moved outwards: interpolation may round beyond them.
 template <class T>
 GV_HD T a_little_below(T value) {
   return value - absolute(value) * static_cast<RealOf<T>>(9.5367431640625e-7);  // 2^-20
@@ -90,12 +90,12 @@ GV_HD T a_little_above(T value) {
   return value + absolute(value) * static_cast<RealOf<T>>(9.5367431640625e-7);
 }
 
-// The table as a kernel carries it: what lies on a GPU is not read before a ray is traced.
+// The table as kernels carry it: as pointers, since only a GPU reads what lies on it.
 template <class T>
 struct TransferView {
   const Row<T>* table_lm;   // for each length of interval, step * 2^l
   const T* domain_2;        // value of the first row, value of the last row
-  const int32_t* opaque_m;  // rows with an opacity up to this one, itself included
+  const int32_t* opaque_m;  // number of rows with an opacity, up to and including this one
   int32_t rows;
 
   explicit TransferView(const TraceArgs& args)
@@ -105,7 +105,7 @@ struct TransferView {
         rows(args.rows) {}
 };
 
-// The transfer function with its numbers read once: by each ray on a GPU, by the kernel itself on the CPU.
+// The transfer function with its domain read: once per ray on a GPU, once per kernel on the CPU.
 template <class T>
 struct Transfer {
   const Row<T>* table_lm;
@@ -114,7 +114,7 @@ struct Transfer {
   int32_t rows;
 
   Transfer() = default;
-  // Rows that begin at the value `low`, `scale` of them a unit of the value.
+  // A table whose first row is at the value `low`, with `scale` rows per unit of the value.
   GV_HD Transfer(const Row<T>* table_lm, const int32_t* opaque_m, T low, T scale, int32_t rows)
       : table_lm(table_lm),
         opaque_m(opaque_m),
@@ -147,7 +147,7 @@ struct Transfer {
     return {row, place - to_real<V>(row)};
   }
 
-  // The row so many behind `index`, and the next one.
+  // Row index + behind, and the next one.
   GV_HD RowPair<T> rows_at(int32_t index, int32_t behind = 0) const {
     const Row<T>* const row = table_lm + (index + behind);
     return {load_row(row), load_row(row + 1)};
@@ -160,12 +160,12 @@ struct Transfer {
   }
 #endif
 
-  // Colour and alpha of a value, for a level of intervals. Lanes that are not asked for may get anything.
+  // Colour and alpha of a value in an interval of a level. Lanes outside `which` are undefined.
   template <class V>
   GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which = all_lanes<V>()) const {
     return look_up(value, level, which, rows);
   }
-  // The same in a table of several functions, so many rows a level.
+  // The same in a table of several functions, with `level_rows` rows per level.
   template <class V>
   GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which, int32_t level_rows) const {
     const Cell<V> cell = find(value);
@@ -174,7 +174,7 @@ struct Transfer {
     return make_row<V>(which, [&](int column) { return pair.at(cell.weight, column); });
   }
 
-  // No value between the two is seen. They are taken a little apart: interpolation may round beyond its ends.
+  // True if no value in the range has an opacity. The range is widened: interpolation may round beyond its ends.
   template <class V>
   GV_HD MaskOf<V> transparent(V smallest, V largest) const {
     const IntOf<V> before = floor_int(place_of(a_little_below(smallest))) - 1;
@@ -183,7 +183,7 @@ struct Transfer {
   }
 };
 
-// What a shader has as a member, and makes a Transfer of.
+// The member of a shader from which it makes a Transfer.
 #ifdef __CUDACC__
 template <class T>
 using TransferTable = TransferView<T>;
@@ -192,7 +192,7 @@ template <class T>
 using TransferTable = Transfer<T>;
 #endif
 
-// Alpha of a length, from the alpha of an interval of level 0.
+// Alpha over a length of `lengths` intervals of level 0, from the alpha of one.
 template <class T>
 GV_HD T stretch(T alpha, T lengths) {
   using Real = RealOf<T>;
@@ -209,7 +209,7 @@ struct Accumulator {
   T red{}, green{}, blue{};
   T clear = splat<T>(static_cast<Real>(1));  // transmittance
   T depth = splat<T>(static_cast<Real>(INFINITY));
-  Mask missed{};  // something that was seen was not there
+  Mask missed{};  // visible data was missing
 
   // Adds an interval.
   GV_HD void add(const Row<T>& row, T start, T length, Real hit_clear, Mask which = all_lanes<T>()) {
@@ -221,7 +221,7 @@ struct Accumulator {
     green = select(which, green + share * row.green, green);
     blue = select(which, blue + share * row.blue, blue);
   }
-  // Depth is where, inside the interval, the transmittance fell to hit_clear, as if it were of one value.
+  // Depth is where in the interval the transmittance falls to hit_clear, as if the interval were homogeneous.
   GV_HD void absorb(T alpha, T start, T length, Real hit_clear, Mask which) {
     const T left = clear * (1 - alpha);
     for_lanes(which && left < hit_clear && clear >= hit_clear, [&](int lane) {
@@ -230,14 +230,14 @@ struct Accumulator {
     });
     clear = select(which, left, clear);
   }
-  // Part of an interval after which the transmittance is hit_clear.
+  // Fraction of an interval after which the transmittance is hit_clear.
   GV_HD static Real reach(Real clear, Real alpha, Real hit_clear) {
     const Real kept = 1 - alpha;
     if (!(kept > static_cast<Real>(1.1754944e-38f))) return 0;
     return clamp(log2_exact(hit_clear / clear) / log2_exact(kept), static_cast<Real>(0), static_cast<Real>(1));
   }
 
-  // body(number, other's) for each number that a lane has of its own.
+  // Calls body(own member, other's member) for each member that differs between lanes.
   template <class Own, class Other, class Body>
   GV_HD static void each(Own& own, Other& other, const Body& body) {
     body(own.red, other.red);

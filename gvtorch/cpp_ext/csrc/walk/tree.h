@@ -9,10 +9,10 @@
 //   brick_tn    >= 0 brick slot | kAbsent: not loaded yet | kEmpty | kConstant: one value, see constant_tnc
 //   request_tn  what rays ask for, see post_request in hd.h; null where nobody reads it
 //
-// Tree units: the root is the cube [0,1]^3. float32 tells the corners of nodes where N is a power of two and the root
-// is at most kMostShallow voxels wide; other trees are *deep*: places in them are float64. A descent that restarts from
-// the root needs no stack (Horn et al., "Interactive k-d tree GPU raytracing", I3D 2007, kd-restart; Crassin, PhD
-// thesis 2011, 6.1).
+// Tree units: the root is the cube [0,1]^3. float32 holds the corners of nodes exactly where N is a power of two and
+// the root is at most kMostShallow voxels wide; other trees are *deep*: their positions are float64. A descent that
+// restarts from the root needs no stack (Horn et al., "Interactive k-d tree GPU raytracing", I3D 2007, kd-restart;
+// Crassin, PhD thesis 2011, 6.1).
 #pragma once
 
 #include <type_traits>
@@ -27,18 +27,18 @@ constexpr int32_t kAbsent = -1;
 constexpr int32_t kTerminal = -2;
 constexpr int32_t kEmpty = -2;
 constexpr int32_t kConstant = -3;
-constexpr int32_t kConcealed = -3;  // in the place of a tile: nothing in the node or below it is seen
+constexpr int32_t kConcealed = -3;  // instead of a tile: nothing in the node or below it is visible
 constexpr int32_t kMostLevels = 63;
 constexpr double kMostShallow = 1 << 18;
 constexpr double kMostNodes = 1LL << 50;  // along a side of the root cube: float64 counts them
 
-// Numbers of each depth.
+// Constants of each depth.
 template <class T>
 struct Levels {
   T voxel[kMostLevels];            // world size of a voxel
-  T scale[kMostLevels];            // voxels a tree unit
-  T size[kMostLevels];             // tree units: a node's box
-  double exact_size[kMostLevels];  // the same
+  T scale[kMostLevels];            // voxels per tree unit
+  T size[kMostLevels];             // tree units: side of a node's box
+  double exact_size[kMostLevels];  // the same in float64
   double count[kMostLevels];       // nodes along a side of the root cube
 
   Levels(double root_voxel, double brick, int32_t branching) {
@@ -68,15 +68,15 @@ struct TreeView {
   int32_t branching;  // N
   int32_t nodes_per_tile;
   int32_t max_depth;
-  int32_t digit_bits;  // N is 2 to the power of it; 0: it is no such power
+  int32_t digit_bits;  // log2(N); 0: N is no power of two
   int32_t tiles, bricks;
 
-  // Words of a node. One that names what the pool has not counts as absent, so that no word, whoever wrote it, leads
-  // out of the pools.
+  // Words of a node. An index beyond its pool counts as absent, so that no word, whoever wrote it, leads out of the
+  // pools.
   GV_HD int32_t tile_of(int32_t node) const { return within(child_tn[node], tiles); }
   GV_HD int32_t brick_of(int32_t node) const { return within(brick_tn[node], bricks); }
   GV_HD NodeWords words_of(int32_t node, bool hidden) const {
-    return {brick_of(node), hidden ? kConcealed : larger(tile_of(node), kTerminal)};  // whoever wrote a lower word
+    return {brick_of(node), hidden ? kConcealed : larger(tile_of(node), kTerminal)};  // never kConcealed by itself
   }
   GV_HD static int32_t within(int32_t word, int32_t count) { return word < count ? word : kAbsent; }
 };
@@ -92,38 +92,38 @@ inline bool is_deep(const TraceArgs& args) {
   return digit_bits_of(args.branching) == 0 || voxels > kMostShallow;
 }
 
-// A node whose brick answers for a place. node < 0: nobody answers.
+// A node whose brick is read at a position. node < 0: there is none.
 struct Holder {
   int32_t node = -1;
   int32_t brick = kAbsent;
   int32_t depth = 0;
 };
 
-// Where a descent ended: the wanted level's holder and the holder of the level above it (they blend), and what a
-// request may name. The same descent ends in the same node all over the node's box.
+// Result of a descent: the holders of the wanted level and of the level above it, which blend, and what requests refer
+// to. From every position in the node's box, the descent ends in the same node.
 struct Place {
   int32_t node = -1;
   int32_t parent = -1;
   int32_t depth = 0;
   int32_t brick = kAbsent;  // words of the node
   int32_t tile = kAbsent;
-  bool hidden = false;  // nothing in the node or below it is seen
+  bool hidden = false;  // nothing in the node or below it is visible
   Holder fine;
   Holder coarse;
 };
 
-// Which nodes the place at distance t of a ray lies in, by the digits of its number in base N. `child`, asked for level
-// after level, is which child of the node above; `face`, how far the node's lower or upper face is from the ray's
-// origin.
+// The nodes around the position at distance t of a ray, from the base-N digits of its finest node's number. `child`,
+// called for one level after the other, returns which child of the node above it is; `face`, the offset of the node's
+// lower or upper face from the ray's origin.
 //
-// In any tree, in float64.
+// This one is for any tree, in float64.
 template <class T>
 struct Digits {
-  static constexpr bool kDeep = true;  // as RayView tells
+  static constexpr bool kDeep = true;  // where RayView::deep is set
   const Levels<T>& levels;
   Vec3<double> origin;
   Vec3<int64_t> cell;            // number of the node at the finest level, below 2^51
-  Vec3<int64_t> upper{0, 0, 0};  // and of the one above the next child
+  Vec3<int64_t> upper{0, 0, 0};  // number of the node above the next child, at its level
   int32_t branching, bits, max_depth;
 
   GV_HD Digits(const TreeView& tree, const Levels<T>& levels, const RayView& rays, const Ray<T>& ray, T t)
@@ -143,20 +143,20 @@ struct Digits {
         bits(tree.digit_bits),
         max_depth(tree.max_depth) {}
 
-  // The last place of the scene, where the tree is deep.
+  // Largest position in the scene along an axis, where the tree is deep.
   GV_HD static double inner_of(const RayView& rays, int axis) {
     return rays.high(axis) * (1 - 8.8817841970012523e-16);  // 2^-50
   }
   GV_HD static int64_t cell_at(const Levels<T>& levels, int32_t max_depth, double place, double high) {
     return static_cast<int64_t>(clamp(place, 0.0, high) * levels.count[max_depth]);
   }
-  // Whether another place lies in the same node of a level.
+  // True if both positions lie in the same node of a level.
   GV_HD bool shares(const Digits& other, int32_t level) const {
     bool same = true;
     for (int axis = 0; axis < 3; ++axis) same = same && cell_of(axis, level) == other.cell_of(axis, level);
     return same;
   }
-  // The next child is one of the node of this level.
+  // Makes the next `child` a child of the node of this level.
   GV_HD void start_below(int32_t level) {
     for (int axis = 0; axis < 3; ++axis) upper[axis] = cell_of(axis, level);
   }
@@ -174,7 +174,7 @@ struct Digits {
   }
 
  private:
-  // Divided by a power of N; where that is no shift, by a product that may be off by one.
+  // Divides by a power of N; where that is no shift, by a product that may be off by one and is corrected.
   GV_HD int64_t cell_of(int axis, int32_t level) const {
     if (bits > 0) return cell[axis] >> (max_depth - level) * bits;
     const auto below = static_cast<int64_t>(levels.count[max_depth - level]);
@@ -184,7 +184,7 @@ struct Digits {
   }
 };
 
-// Where a tree is not deep: digits are the bits of one number, and float32 tells every corner.
+// For trees that are not deep: digits are the bits of one number, and float32 holds every corner exactly.
 struct BitDigits {
   static constexpr bool kDeep = false;
   const Levels<float>& levels;
@@ -209,7 +209,7 @@ struct BitDigits {
   }
 };
 
-// Calls body(Digits{}) with the type that rays of T and a tree go with; as a null pointer, for it has no default.
+// Calls body with a null pointer to the type of digits for rays of T in a tree; the type can't be default-constructed.
 template <class T, class Body>
 void with_digits(const TraceArgs& args, const Body& body) {
   if constexpr (std::is_same_v<T, float>) {
@@ -218,14 +218,14 @@ void with_digits(const TraceArgs& args, const Body& body) {
   body(static_cast<Digits<T>*>(nullptr));
 }
 
-// Descends to `wanted` depth, or as far as tiles exist and something is seen; stamps every tile on the way.
-// The coarse holder is looked for where two levels blend. words_of(node) tells its NodeWords.
+// Descends to `wanted` depth, or as far as tiles exist and something is visible; stamps every tile on the way.
+// The coarse holder is set where two levels blend. words_of(node) returns the node's NodeWords.
 template <class Number, class Words>
 GV_HD Place descend(const TreeView& tree, Number& digits, int32_t wanted, bool blend, int32_t frame,
                     const Words& words_of) {
   Place place;
   place.node = tree.root;
-  int32_t own_tile = tree.root_tile;  // of the node
+  int32_t own_tile = tree.root_tile;  // the tile that holds the node
   for (;;) {
     const NodeWords words = words_of(place.node);
     store_stamp(&tree.stamp_t[own_tile], frame);

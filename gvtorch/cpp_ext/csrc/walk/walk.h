@@ -1,6 +1,6 @@
-// From node to node along a ray: which node a visit stands in, what is marked there, where the visit ends, and which
-// intervals are taken in it. What is made of them a visitor tells: that of shade_rays.h or segments.h. Packets
-// have a walk of their own (packet_walk.h).
+// Traversal of one ray, node by node: finds the node of each visit, marks what is used and what is missing, and finds
+// where the visit ends and which intervals lie in it. A visitor (shade_rays.h, segments.h) defines what is done with
+// them. Packets have their own walk (packet_walk.h).
 #pragma once
 
 #include "base/arguments.h"
@@ -14,7 +14,7 @@ inline namespace GV_NAMESPACE {
 template <class T>
 struct TraceOptions {
   T step;         // world length of the shortest interval
-  bool by_level;  // a node's brick is asked for before its children
+  bool by_level;  // a node's brick is requested before its children
 };
 
 template <class T>
@@ -26,36 +26,36 @@ struct HitView {
   bool* missed_r;
 };
 
-// Which nodes show nothing: looked at once, when the first ray comes, on the CPU, where most nodes are never visited.
-// On a GPU, where many threads would each do it again, before the rays are traced: see NodeWords.
+// Whether a node is hidden. The CPU computes this when the first ray reaches a node, since most are never visited; a
+// GPU, where many threads would repeat it, does so for all nodes before the rays are traced: see NodeWords.
 constexpr uint8_t kUnknown = 0, kShown = 1, kHidden = 2;
 
-// Rays of a picture are taken in tiles of 8 x 4 pixels, which share bricks; others in order.
+// Rays of a picture are traced in tiles of 8 x 4 pixels, which share bricks; other rays in order.
 struct RayOrder {
   int64_t rays;
   int64_t width;  // pixels of a row; 0: no picture
 
   GV_HD int64_t count() const { return width == 0 ? rays : (width + 7) / 8 * ((rays / width + 3) / 4) * 32; }
-  // The ray at a place of the order; -1: none.
+  // The ray at a position in the order; -1: none.
   GV_HD int64_t operator()(int64_t index) const {
     if (width == 0) return index;
     const int64_t tile = index / 32;
     const int64_t tiles = (width + 7) / 8;
-    const int32_t bits = static_cast<int32_t>(index % 32);  // of x and y in turn, so that a half is a square
+    const int32_t bits = static_cast<int32_t>(index % 32);  // of x and y in turn: half a tile is a square
     const int64_t x = tile % tiles * 8 + ((bits & 1) | (bits >> 1 & 2) | (bits >> 2 & 4));
     const int64_t y = tile / tiles * 4 + ((bits >> 1 & 1) | (bits >> 2 & 2));
     return x < width && y * width < rays ? y * width + x : -1;
   }
 };
 
-// A visit: the two nodes that answer, and where they do. That ends with the node's box, or where other levels are
-// wanted.
+// A visit: the two nodes whose bricks are read, and the part of the ray for which they are. It ends with the node's
+// box, or where other levels are wanted.
 template <class T>
 struct Visit : Extent<T> {
-  Holder fine, coarse;  // of the wanted level and of the one above it: the same where they do not blend
+  Holder fine, coarse;  // of the wanted level and of the one above it; equal where they do not blend
   T voxel, above;       // world size of a voxel of either level
   T seen;               // distance at which the node was looked up
-  int32_t wanted;       // the level
+  int32_t wanted;       // depth that the level of detail asks for
   bool hidden;          // neither marked nor sampled
 };
 
@@ -69,7 +69,7 @@ struct Walk {
   HitView<T> hits;
   const int32_t* frame_1;
   int32_t* stamp_b;
-  T stop_clear, hit_clear;  // transmittance at which a ray ends, and at which its depth is taken
+  T stop_clear, hit_clear;  // transmittance at which a ray ends, and at which its depth is recorded
 
   static constexpr int64_t kShare = 16;  // see for_each.h
 
@@ -98,19 +98,19 @@ struct Walk {
         stop_clear(1 - static_cast<T>(args.stop_alpha)),
         hit_clear(1 - static_cast<T>(args.depth_alpha)) {}
 
-  // Goes along a ray to its end, or until the visitor has enough. Digits: see `with_digits`. A visitor has:
+  // Follows a ray to its end, or until the visitor stops it. Digits: see `with_digits`. A visitor has:
   //
-  //   kSeesEmpty                       EMPTY nodes count
-  //   missed()                         a bool&: something that is seen was not there
-  //   more()                           the ray goes on to another node
-  //   words(node)                      its NodeWords, concealed where nothing in the node is seen
-  //   enter(ray, visit, digits)        what the visitor has to know of a visit, `node` below
-  //   uniform(node)                    the visit may be taken as one interval
-  //   region(node, start, end)         takes it so
-  //   take(node, at, alike, last)      takes up to so many whole intervals, or the ray's last one, which is cut at
-  //                                    the far side; returns how many
-  //   sees()                           the ray goes on in this node
-  //   finish(node)                     all intervals of the visit have been taken
+  //   kSeesEmpty                       true if EMPTY nodes are visited too
+  //   missed()                         a bool&, set where visible data is missing
+  //   more()                           true while the ray goes on to another node
+  //   words(node)                      the node's NodeWords, with kConcealed where nothing in it is visible
+  //   enter(ray, visit, digits)        begins a visit; returns the visitor's data for it, `node` below
+  //   uniform(node)                    true if the visit may be taken as one interval
+  //   region(node, start, end)         takes the visit as one interval
+  //   take(node, at, alike, last)      takes at most `alike` whole intervals or, with `last`, the ray's last one, which
+  //                                    is cut at the far side; returns how many it took
+  //   sees()                           true while the ray goes on in this node
+  //   finish(node)                     ends a visit whose intervals have been taken
   template <class Digits, class Visitor>
   GV_HD void follow(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor) const {
     int32_t wanted = 0;
@@ -121,15 +121,15 @@ struct Walk {
     }
   }
 
-  // Whether a ray waits for the others of its warp (on CUDA; results do not depend on it). In each turn a warp visits
-  // one node a ray and samples as long as the ray with the most intervals there. Rays that cut a corner of one more
-  // node fall a turn behind, and then long and short runs fall together. So a ray waits while it is more than the side
-  // of a node ahead of the warp's hindmost one, which never waits.
+  // True if a ray has to wait for the others of its warp (on CUDA; results do not depend on it). In each turn, every
+  // ray of a warp visits one node, and the turn lasts as long as the visit with the most intervals. Rays that cut a
+  // corner of one more node fall a turn behind, so that long and short visits share turns. A ray therefore waits while
+  // it is more than a node's side ahead of the warp's hindmost ray, which never waits.
   GV_HD bool is_ahead(T start, int32_t wanted) const {
     return start - smallest_together(start) > levels.voxel[wanted] * levels.scale[0];
   }
 
-  // One node: finds it, marks it, and takes all intervals whose middle lies in it.
+  // Visits one node: finds it, marks it, and takes all intervals whose middle lies in it.
   template <class Digits, class Visitor>
   GV_HD void visit(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor, int32_t& wanted) const {
     const T middle = at.middle();
@@ -149,7 +149,7 @@ struct Walk {
     visitor.finish(node);
   }
 
-  // All intervals of a visit that are still to come.
+  // Takes the remaining intervals of a visit.
   template <class Visitor, class Node>
   GV_HD void march(const Extent<T>& extent, Intervals<T>& at, Visitor& visitor, Node& node) const {
     do {
@@ -161,9 +161,9 @@ struct Walk {
     } while (visitor.sees() && at.stays(extent));
   }
 
-  // Finds the node in which an interval's middle lies; marks what is used and what is missing. `wanted` is the depth
-  // that the visit before wanted. Level of detail: the first depth whose voxel fits into the cone (packet_walk.h
-  // decides likewise for many rays; Levels.wanted in the twin).
+  // Finds the node in which an interval's middle lies; marks what is used and what is missing. `wanted` enters as the
+  // depth that the previous visit wanted. Level of detail: the first depth whose voxel fits into the cone
+  // (packet_walk.h has the same for packets; Levels.wanted in the twin).
   template <class Digits, class Words>
   GV_HD Visit<T> find(const Ray<T>& ray, Digits& digits, T cone, const Words& words, int32_t& wanted,
                       bool& missed) const {
@@ -184,7 +184,7 @@ struct Walk {
     visit.hidden = place.hidden && (place.depth < wanted || !blend);
     if (!visit.hidden && mark_missing(place, wanted, blend, cone)) missed = true;
 
-    // The two levels that blend; below the finest level, or where both are the same node, only one is read.
+    // The two levels that blend. Only one is read where both are the same node, as where no voxel fits into the cone.
     visit.fine = place.fine;
     visit.coarse = place.coarse.node >= 0 ? place.coarse : visit.fine;
     if (!visit.hidden && visit.fine.brick >= 0) store_stamp(&stamp_b[visit.fine.brick], *frame_1);
@@ -193,8 +193,8 @@ struct Walk {
     return visit;
   }
 
-  // Asks for what is not there, and tells whether it did. Straight to the wanted level, or level by level: then a
-  // brick is there before its node is subdivided. A node that is absent or too coarse always leads to a request.
+  // Requests what is missing; returns whether anything is. Requests go straight to the wanted level, or level by level:
+  // then a node has its brick before it is subdivided. A missing brick or too coarse a node always leads to a request.
   GV_HD bool mark_missing(const Place& place, int32_t wanted, bool blend, T cone) const {
     const bool absent = place.brick == kAbsent;
     const bool deeper = place.depth < wanted && place.tile == kAbsent;
@@ -207,7 +207,7 @@ struct Walk {
     return absent || deeper || above;
   }
 
-  // Priority: how wide one voxel of the node is on the screen, in sixteenths of a pixel, up to 128 pixels.
+  // Priority: the width of one of the node's voxels on the screen, in sixteenths of a pixel, up to 128 pixels.
   GV_HD void request(int32_t node, int32_t depth, T cone, int32_t kind) const {
     const T most = static_cast<T>(kPriorityMask);
     const T priority = cone > 0 ? smaller(levels.voxel[depth] / cone * 16, most) : most;
@@ -215,7 +215,7 @@ struct Walk {
     post_request(&tree.request_tn[node], kind | static_cast<int32_t>(priority));
   }
 
-  // What a ray gives. `moved`: from the camera to where depth counts from.
+  // Stores the results of a ray. `moved`: distance from the camera to the ray's origin, from where sum.depth counts.
   GV_HD void store(int64_t number, const Accumulator<T>& sum, T moved, int32_t samples) const {
     hits.color_r3[3 * number] = sum.red;
     hits.color_r3[3 * number + 1] = sum.green;
