@@ -250,7 +250,7 @@ class Functions:
 
     @contextmanager
     def temporary(self, kind: str) -> Iterator[int]:
-        """Yields a new name, and deletes it at once, because contexts don't share such objects."""
+        """Yields a new name and deletes it afterwards: contexts don't share objects of its kind."""
         name = self.make(kind)
         try:
             yield name

@@ -33,9 +33,8 @@ class Drawn:
     def overlay(
         self, shader: Shader, info: ImageInfo, component: int, camera: Camera, eye: Eye
     ) -> Overlay | None:
-        """Returns the annotations for a camera in world units, or None if no flag is given; the
-        scale bar holds at the distance from `eye` to its target. Raises ValueError if the shader
-        has no bar, the camera no scale, or there is no room.
+        """Returns the overlay for a camera in the world, or None; its scale holds at the target of
+        `eye`. Raises ValueError if the shader has no bar, the camera no scale, or there is no room.
         """
         from ..pictures import Overlay
 

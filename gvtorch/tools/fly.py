@@ -197,7 +197,7 @@ class Fly:
         return Flight.turntable(now.read(self.state))
 
     def _parts(self, frames: int) -> list[tuple[int | None, range]]:
-        """Returns time points and the numbers of their pictures; None: the one that is read."""
+        """Returns time points and the numbers of their pictures; None: the one of --time."""
         if self.times is None:
             return [(None, range(frames))] if self._saved is None else self._parts_of_keys(frames)
         moments = self._moments()

@@ -221,7 +221,7 @@ class Look:
 
 
 def _tell_of_others(data: Volume | Store, component: int) -> None:
-    """Warns if the first of several channels is shown, which is also the default."""
+    """Warns if the first of several channels is shown, as it is by default."""
     names = [one.name for one in data.info.channels]
     if len(names) > 1 and component == 0:
         first = f" ({names[0]})" if names[0] else ""

@@ -167,9 +167,7 @@ class Splat:
 
 
 def told_store(output: Path, stores: list[Store], start: float) -> str:
-    """Returns a line on stores made since `time.perf_counter()` was `start`: size of all, time, and
-    extent and levels of the first.
-    """
+    """Returns a line on the stores: extent of the first, size of all, time since `start`."""
     from ..io.resources import amount
 
     seconds, first = time.perf_counter() - start, stores[0]

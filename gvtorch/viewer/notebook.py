@@ -71,7 +71,7 @@ def widget(session: Session, height: int = 560) -> Any:
     import traitlets
 
     class ViewWidget(anywidget.AnyWidget):
-        """A view below a cell; `session` is what it shows, `close_view` ends it."""
+        """A view below a cell; it shows `session`, and `close_view` ends it."""
 
         _esm = module_text()
         _css = page_files()["style.css"].decode()
@@ -120,7 +120,7 @@ def widget(session: Session, height: int = 560) -> Any:
             return image_file(made, "PNG")
 
         def close_view(self) -> None:
-            """Ends the view; an engine that was handed in stays open."""
+            """Ends the view; an engine that the caller made stays open."""
             self.session.close()
             self.send({"gone": "The view was closed."})
 

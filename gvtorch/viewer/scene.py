@@ -276,7 +276,7 @@ class Scene:
 
 
 def open_scene(what: Any, **options: Any) -> Scene:
-    """Returns the scene of anything that can be looked at.
+    """Returns the scene of anything that can be viewed.
 
     Args:
         what: An `Engine`, a `Producer`, several by name, an `N3Tree`, a `Volume`, an array, a

@@ -162,7 +162,7 @@ class ViewState:
 
     Attributes:
         shader: What turns values into colour.
-        options: Options of the picture: step, level of detail, background, clip, lens, ...
+        options: Picture options: step, level of detail, background, clip, lens, lighting, ...
         develop: Samples, tone and exposure.
         show: The picture, or in its place what each ray cost, see `gv.cost`.
         blend: Share of such a cost picture that lies over the picture; 1 shows it alone.

@@ -58,7 +58,7 @@ class Viewer:
             self.close()
 
     def close(self) -> None:
-        """Ends the view; an engine that was handed in stays open."""
+        """Ends the view; an engine that the caller made stays open."""
         self.server.close()
         self.session.close()
         self._closed.set()
