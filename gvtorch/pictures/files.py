@@ -132,7 +132,7 @@ def write_png_rows(
     path: Path, shape: tuple[int, ...], bits: int, strips: Iterable[np.ndarray]
 ) -> None:
     """Writes a PNG (h, w, c), c 3, or 4 with alpha, strip by strip, (rows, w, c) uint8 or uint16.
-    Each row gets the filter (None, Sub or Up) with the smallest sum of absolute differences.
+    Each row gets the filter (None, Sub or Up) with the smallest sum of absolute values.
     """
     height, width, count = shape
     apart = count * bits // 8  # bytes from pixel to pixel
