@@ -1,4 +1,4 @@
-"""What voxels share with OpenGL: cameras, depth, and the pictures themselves."""
+"""Exchange with OpenGL: cameras, depth, and the pictures themselves."""
 
 from .conventions import ClipDepth, camera, matrices, ray_distance, window_depth
 from .exchange import Exchange

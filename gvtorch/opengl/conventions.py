@@ -2,9 +2,9 @@
 distances along its rays.
 
 Conventions: OpenGL's eye space has x right, y up, z backward. The pixel in row j and column i has
-its centre at (i + 0.5, j + 0.5), in both worlds; our rows go down, OpenGL's go up, so what
-`glReadPixels` gives is flipped first (`image.flip(0)`). Matrices are float64 and act on columns:
-`clip = projection @ modelview @ (x, y, z, 1)`; OpenGL stores columns, so it is handed `matrix.mT`.
+its centre at (i + 0.5, j + 0.5) in both. Rows run downwards here and upwards in OpenGL, so flip an
+image that comes from `glReadPixels` (`image.flip(0)`). Matrices are float64 and act on columns:
+`clip = projection @ modelview @ (x, y, z, 1)`; OpenGL stores columns, so pass it `matrix.mT`.
 
 Source: OpenGL 4.6 core specification, sections 13.6 (clip space) and 13.8 (window coordinates).
 """
@@ -22,13 +22,13 @@ from ..base import check
 from ..cameras.camera import Camera, Frame
 from ..pool.staging import upload
 
-_AXES = torch.tensor([1, -1, -1, 1], dtype=torch.float64)  # turns y and z
+_AXES = torch.tensor([1, -1, -1, 1], dtype=torch.float64)  # flips y and z
 
 
 class ClipDepth(Enum):
     """The range of clip space's z / w, as `glClipControl` sets it."""
 
-    NEGATIVE_ONE_TO_ONE = "negative_one_to_one"  # OpenGL's own
+    NEGATIVE_ONE_TO_ONE = "negative_one_to_one"  # OpenGL's default
     ZERO_TO_ONE = "zero_to_one"  # Direct3D's and Vulkan's; best for reversed depth
 
 
@@ -45,17 +45,17 @@ def matrices(
     Args:
         camera: In world units (an orbit camera: `camera.placed(tree.box)`).
         near: Distance of the near plane along the view axis, world units.
-        far: Distance of the far plane, likewise; may be infinite.
+        far: Distance of the far plane along the view axis, world units; may be infinite.
         clip_depth: What `glClipControl` is set to.
         reversed_z: Window depth is 1 at the near plane and 0 at the far one; needs `glDepthFunc`
-            with GREATER and a buffer cleared to 0. In float32 with ZERO_TO_ONE its relative error
-            is about the same at all distances.
+            with GREATER and a buffer cleared to 0. In float32 with ZERO_TO_ONE the relative error
+            of a distance is about the same everywhere.
 
     Returns:
         projection and modelview, both (4, 4) float64, or (n, 4, 4) for a batch.
 
     Raises:
-        ValueError: The camera has no place yet, or not 0 < near < far.
+        ValueError: The camera is an orbit camera without a position, or not 0 < near < far.
     """
     where = "opengl.matrices"
     if camera.frame is not Frame.WORLD:
@@ -91,7 +91,7 @@ def camera(projection: Tensor, modelview: Tensor, width: int, height: int) -> Ca
         height: Pixels of the viewport.
 
     Raises:
-        ValueError: The matrix is not that of a pinhole camera, or see `Camera`.
+        ValueError: `projection` is not that of a pinhole camera, or `Camera` refuses the matrices.
     """
     where = "opengl.camera"
     matrix, orthographic = _projection(where, projection)
@@ -115,7 +115,7 @@ def ray_distance(
     *,
     clip_depth: ClipDepth = ClipDepth.NEGATIVE_ONE_TO_ONE,
 ) -> Tensor:
-    """Turns a depth buffer into distances along the rays: what `Layer` takes.
+    """Converts a depth buffer into distances along the rays, as `Layer` takes them.
 
     Does not wait for the device. The error is that of the buffer's rounding: a window depth off by
     e puts a perspective distance d off by about e * d^2 / near. e is 2^-25 far away in float32 and
@@ -128,8 +128,8 @@ def ray_distance(
         clip_depth: What `glClipControl` was set to.
 
     Returns:
-        As `window_depth`, float64: world distance along the ray, from the eye (from the plane of
-        the eye, where the projection is orthographic); +inf where the buffer holds the depth of
+        Shape of `window_depth`, float64: world distance along the ray, from the eye (from the plane
+        through the eye if the projection is orthographic); +inf where the buffer holds the depth of
         the far plane, to which it is cleared: nothing was drawn there.
 
     Raises:
@@ -151,16 +151,16 @@ def window_depth(
     *,
     clip_depth: ClipDepth = ClipDepth.NEGATIVE_ONE_TO_ONE,
 ) -> Tensor:
-    """Turns distances along the rays into a depth buffer, against which OpenGL can test; the
+    """Converts distances along the rays into a depth buffer that OpenGL can test against: the
     inverse of `ray_distance`.
 
     Args:
         distance: (h, w, 1) or (n, h, w, 1) floats, such as `Picture.depth`.
-        projection: See `ray_distance`; so for `clip_depth`, and errors.
+        projection: See `ray_distance`, also for `clip_depth` and the errors.
 
     Returns:
-        As `distance`, float64 from 0 to 1; what is nearer than the near plane has its depth, and
-        what is beyond the far plane, +inf too, has that of the far one.
+        Shape of `distance`, float64, clamped to 0 to 1: points before the near plane get its depth,
+        points beyond the far plane, and +inf, get that of the far plane.
     """
     pixels = _Pixels.of("opengl.window_depth", "distance", distance, projection, clip_depth)
     along = distance.to(torch.float64) / pixels.stretch
@@ -172,7 +172,7 @@ def window_depth(
 
 
 class _Pixels(NamedTuple):
-    """What converts the depth of each pixel of an image, on the image's device.
+    """Coefficients that convert the depth of each pixel of an image, on the image's device.
 
     Window depth (0 to 1) from z along the view axis: offset / z - slope in a perspective, offset -
     slope * z in an orthographic projection.
@@ -181,14 +181,14 @@ class _Pixels(NamedTuple):
     slope: Tensor  # (n, 1, 1, 1) or (1, 1, 1)
     offset: Tensor
     far: Tensor  # window depth of the far plane
-    stretch: Tensor  # (n, h, w, 1) or (h, w, 1) distance along the ray over z
+    stretch: Tensor  # (n, h, w, 1) or (h, w, 1) distance along the ray, divided by z
     orthographic: bool
 
     @classmethod
     def of(
         cls, where: str, name: str, image: Tensor, projection: Tensor, clip_depth: ClipDepth
     ) -> _Pixels:
-        """Reads the projection of an image."""
+        """Checks an image and its projection, and returns the coefficients."""
         matrix, orthographic = _projection(where, projection)
         check.instance(where, "clip_depth", clip_depth, ClipDepth)
         batch = matrix.shape[:-2]
@@ -236,7 +236,7 @@ def _projection(where: str, projection: Tensor) -> tuple[Tensor, bool]:
             f"{where}: projection must end in the row (0, 0, -1, 0) (perspective) or "
             f"(0, 0, 0, 1) (orthographic), got {last}"
         )
-    other = 2 if orthographic else 3  # the column in which such a projection has no x and y
+    other = 2 if orthographic else 3  # column whose x and y must be 0
     zeros = torch.stack((p[:, 0, 1], p[:, 1, 0], p[:, 2, 0], p[:, 2, 1]), 1)
     zeros = torch.cat((zeros, p[:, :2, other]), 1)
     moves = p[:, 2, 2 if orthographic else 3]

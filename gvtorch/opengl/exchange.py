@@ -1,9 +1,9 @@
-"""`Exchange`: pictures that pass between OpenGL and torch, on the device where both are on one.
+"""`Exchange`: passes pictures between OpenGL and torch, on the device where both use the same one.
 
 Colours and depths are read as tensors from the framebuffer bound for reading, and written into the
-one bound for drawing. Each moves in the type in which OpenGL stores it, because drivers convert
-types on the host. They do so for most formats of depth, in both directions, so depth is turned into
-a colour (or back) by drawing one triangle.
+one bound for drawing. Each is transferred in the type in which OpenGL stores it, because drivers
+convert types on the host. They also convert most formats of depth there, in both directions, so
+depth is turned into a colour (or back) by drawing one triangle.
 
 Source: CUDA runtime API, section "OpenGL interoperability".
 """
@@ -43,13 +43,13 @@ _READ_TYPES = {gl.UNSIGNED_BYTE: torch.uint8, gl.HALF_FLOAT: torch.float16}
 _TYPES = {torch.uint8: gl.UNSIGNED_BYTE, torch.float16: gl.HALF_FLOAT, torch.float32: gl.FLOAT}
 _STORED = {torch.uint8: gl.RGBA8, torch.float16: gl.RGBA16F, torch.float32: gl.RGBA32F}
 _DEPTHS = {16: gl.DEPTH_COMPONENT16, 24: gl.DEPTH_COMPONENT24, 32: gl.DEPTH_COMPONENT32F}
-#: Filters that don't mix, and a last level 0.
+#: Texture parameters: nearest filters, and 0 as the last mipmap level.
 _ONE_LEVEL = {0x2800: 0x2600, 0x2801: 0x2600, 0x813D: 0}
 _ONE_SAMPLE = "it must be complete, and a framebuffer of several samples a pixel resolved first"
 
 
 class Exchange:
-    """Pictures of one size between an OpenGL context and torch.
+    """Passes pictures of one size between an OpenGL context and torch.
 
     The context, or one that shares its objects, must be current on this thread in every call,
     `close` included; its state is left unchanged. Tensors have their first row at the top, as
@@ -74,12 +74,12 @@ class Exchange:
         """Makes an exchange in the current context, OpenGL 3.2 or newer.
 
         Args:
-            width: Of the pictures, pixels.
-            height: Likewise.
-            device: Of the tensors that are read.
+            width: Pixels of each picture.
+            height: Pixels of each picture.
+            device: Device of the tensors that are read.
             share: Whether buffers are shared with CUDA; default: wherever that is possible.
-            load: Address of an OpenGL function by its name, from the library that made the
-                context (`glfw.get_proc_address`, for one); default: the system's library.
+            load: Returns the address of an OpenGL function by its name, from the library that made
+                the context (such as `glfw.get_proc_address`); default: the system's library.
 
         Raises:
             ValueError: A size is not positive or more than a texture can have, or there is no such
@@ -101,11 +101,11 @@ class Exchange:
         if share and self.reason:
             raise RuntimeError(f"{where}: buffers can't be shared: {self.reason}")
         self.shared = not self.reason
-        self._most = torch.full((1,), 255.0, device=self.device)  # divides alike on every device
+        self._most = torch.full((1,), 255.0, device=self.device)  # all devices divide alike
         way = _Shared if self.shared else _ThroughHost
         self._ways = defaultdict[str, _ThroughHost](partial(way, self._gl, self.device))
         self._textures: dict[str, tuple[int, int]] = {}  # name and format
-        # No other program has an output of this name, by which our context is recognised.
+        # No other program has an output of this name: `_require_context` looks it up.
         self._mark = f"result_{next(_NUMBERS)}"
         with self._gl.unchanged(drawing=True):
             self._program = self._gl.program(_VERTEX, _FRAGMENT.replace("result", self._mark))
@@ -119,26 +119,26 @@ class Exchange:
         return f"Exchange({self.width}x{self.height}, {how})"
 
     def read_color(self) -> Tensor:
-        """Reads the framebuffer that is bound for reading, its read buffer.
+        """Reads the read buffer of the framebuffer that is bound for reading.
 
         Returns:
-            (h, w, 4) float32 as it is stored: 0 to 1 in normalised formats, not decoded in sRGB's.
+            (h, w, 4) float32 as stored: 0 to 1 in normalised formats; sRGB formats are not decoded.
 
         Raises:
-            RuntimeError: It has no such colours, several samples a pixel, or another size (which
-                OpenGL does not tell of a window).
+            RuntimeError: It has no such colours, several samples a pixel, or another size (OpenGL
+                does not report that of a window).
         """
         with self._work("read_color"):
             self._require_size(self._gl.integer(gl.READ_BUFFER), "colours")
             dtype = _READ_TYPES.get(self._gl.integer(gl.COLOR_READ_TYPE), torch.float32)
-            self._gl.forget_errors()  # OpenGL before 4.1 need not know the type
+            self._gl.forget_errors()  # the query may fail before OpenGL 4.1
             return self._pull("read color", gl.RGBA, dtype)
 
     def read_depth(self) -> Tensor:
         """Reads the depth of the framebuffer that is bound for reading.
 
         Returns:
-            (h, w, 1) float32 window depth, 0 to 1; `ray_distance` makes distances of it.
+            (h, w, 1) float32 window depth, 0 to 1; `ray_distance` converts it to distances.
 
         Raises:
             RuntimeError: It has no depth, several samples a pixel, or another size.
@@ -160,16 +160,16 @@ class Exchange:
             return self._pull("read depth", gl.RED, torch.float32)
 
     def upload(self, color: Tensor, depth: Tensor | None = None) -> tuple[int, int]:
-        """Writes pictures into textures, for shaders of the caller.
+        """Writes pictures into textures that the caller's shaders can sample.
 
         Args:
-            color: (h, w, 3) or (h, w, 4), uint8, float16 or float32, on any device; kept in RGBA8,
-                RGBA16F or RGBA32F.
-            depth: (h, w, 1) floats, kept in R32F.
+            color: (h, w, 3) or (h, w, 4), uint8, float16 or float32, on any device; stored as
+                RGBA8, RGBA16F or RGBA32F.
+            depth: (h, w, 1) floats, stored as R32F.
 
         Returns:
-            The names of both textures, whose first row is the lowest; 0 for a depth that was not
-            given. They belong to the exchange, which overwrites them in the next call.
+            The names of both textures, whose first row is the bottom one; 0 for a depth that was
+            not given. They belong to the exchange: the next `upload` or `draw` overwrites them.
 
         Raises:
             ValueError: A wrong shape or dtype.
@@ -236,12 +236,12 @@ class Exchange:
             raise RuntimeError(f"{where}: the exchange is closed")
         self._gl.require_context()
         ours = self._gl.GetFragDataLocation(self._program, self._mark.encode()) >= 0
-        self._gl.forget_errors()  # there is no such program
+        self._gl.forget_errors()  # of a context without this program
         if not ours:
             raise RuntimeError(f"{where}: another OpenGL context is current than the exchange's")
 
     def _pull(self, kind: str, channels: int, dtype: torch.dtype) -> Tensor:
-        """Reads the framebuffer that is bound for reading; RGBA or RED."""
+        """Reads RGBA (h, w, 4) or RED (h, w, 1), float32, of the framebuffer bound for reading."""
 
         def read(place: int) -> None:
             self._gl.ReadPixels(0, 0, *self._size, channels, _TYPES[dtype], place)
@@ -252,10 +252,10 @@ class Exchange:
         return image / self._most if dtype == torch.uint8 else image
 
     def _texture(self, kind: str, stored: int) -> int:
-        """Binds the texture of a kind, which is made again if its format has changed."""
+        """Binds and returns the texture of a kind; recreates it if its format has changed."""
         name, before = self._textures.get(kind, (0, 0))
         if before != stored:
-            self._gl.drop("Textures", name)  # 0 is nothing
+            self._gl.drop("Textures", name)  # ignores 0
             name = self._gl.make("Textures")
             self._textures[kind] = name, stored
             self._gl.BindTexture(gl.TEXTURE_2D, name)
@@ -321,15 +321,15 @@ class Exchange:
         self._gl.check("is the framebuffer that is bound for drawing complete?")
 
     def _attached(self, target: int, attachment: int, what: int) -> int:
-        """A parameter of what is attached to a framebuffer, or 0."""
+        """Returns a parameter of a framebuffer's attachment, or 0 if there is none."""
         if attachment == gl.DEPTH_ATTACHMENT and not self._gl.integer(gl.FRAMES[target]):
-            attachment = gl.DEPTH  # as a window calls it
+            attachment = gl.DEPTH  # its name in a window's framebuffer
         get = "GetFramebufferAttachmentParameteriv"
         return self._gl.parameter(get, target, attachment, what)
 
     def _require_size(self, attachment: int, name: str) -> None:
-        """Raises unless something of the exchange's size is attached to the framebuffer bound for
-        reading. The size of a window's own framebuffer is not known to OpenGL.
+        """Raises unless an image of the exchange's size is attached to the framebuffer bound for
+        reading. A window's own framebuffer passes: OpenGL does not know its size.
         """
         if not self._gl.integer(gl.READ_FRAMEBUFFER_BINDING):
             return
@@ -341,7 +341,7 @@ class Exchange:
         if not kind:
             raise RuntimeError(f"{frame} no {name}")
         size = self._gl.attached_size(kind, which, level)
-        # Whether a texture without a size can be read, OpenGL reports by itself.
+        # If the size is unknown, OpenGL itself reports whether the texture can be read.
         if size is not None and size != self._size:
             raise RuntimeError(
                 f"{frame} {size[0]}x{size[1]} pixels, the exchange {self.width}x{self.height}"
@@ -349,8 +349,8 @@ class Exchange:
 
 
 class _ThroughHost:
-    """Moves pixels between any OpenGL and any device, by a copy in host memory; and flips their
-    rows, which go up in OpenGL.
+    """Moves pixels between any OpenGL and any device through host memory, and flips their rows,
+    which run upwards in OpenGL.
     """
 
     def __init__(self, functions: gl.Functions, device: torch.device) -> None:
@@ -359,14 +359,16 @@ class _ThroughHost:
     def pull(
         self, read: Callable[[int], None], shape: tuple[int, ...], dtype: torch.dtype
     ) -> Tensor:
-        """Returns what OpenGL reads at an address, or at an offset in the bound buffer."""
+        """Returns an image; `read` has OpenGL write it to a host address, or to an offset in the
+        bound buffer.
+        """
         host = torch.empty(shape, dtype=dtype, pin_memory=self._device.type == "cuda")
         self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, 0)
         read(host.data_ptr())
         return host.to(self._device).flip(0)
 
     def push(self, image: Tensor, write: Callable[[int], None]) -> None:
-        """Has OpenGL write an image from there."""
+        """Passes an image to OpenGL; `write` has OpenGL read it from such an address or offset."""
         host = image.flip(0).cpu().contiguous()
         self._gl.BindBuffer(gl.PIXEL_UNPACK_BUFFER, 0)
         write(host.data_ptr())
@@ -376,7 +378,7 @@ class _ThroughHost:
 
 
 class _Shared(_ThroughHost):
-    """Moves them through a buffer object of OpenGL that CUDA maps. The host does not wait: mapping
+    """Moves pixels through an OpenGL buffer object that CUDA maps. The host does not wait: mapping
     and unmapping order the work of each side after the other's.
     """
 
@@ -409,10 +411,10 @@ class _Shared(_ThroughHost):
                 with torch.cuda.device(self._device):
                     self._cuda("cudaGraphicsUnregisterResource", resource)
         finally:
-            self._gl.drop("Buffers", name)  # 0 is nothing
+            self._gl.drop("Buffers", name)  # ignores 0
 
     def _hold(self, nbytes: int) -> None:
-        """Makes sure that the buffer has so many bytes."""
+        """Recreates the buffer unless it has `nbytes` bytes."""
         if self._nbytes == nbytes:
             return
         self.close()
@@ -426,7 +428,7 @@ class _Shared(_ThroughHost):
 
     @contextmanager
     def _seen(self, shape: tuple[int, ...], dtype: torch.dtype) -> Iterator[Tensor]:
-        """The buffer's memory as a tensor, while it is mapped to CUDA."""
+        """Yields the buffer's memory as a tensor while it is mapped to CUDA."""
         with torch.cuda.device(self._device):
             stream = torch.cuda.current_stream(self._device).cuda_stream
             self._cuda("cudaGraphicsMapResources", 1, self._resource, stream)
@@ -451,7 +453,7 @@ class _Shared(_ThroughHost):
 
 
 def _why_not_shared(functions: gl.Functions, device: torch.device) -> str:
-    """Why CUDA on the device (with its index) can't see the current context's buffers, or ""."""
+    """Returns why CUDA on the device (with index) can't map the context's buffers, or ""."""
     if device.type != "cuda" or torch.version.cuda is None:
         return f"{device} is not a CUDA device"
     try:

@@ -1,7 +1,7 @@
-"""OpenGL's functions and constants that `Exchange` needs, for the current context. Python's
-bindings of OpenGL do not help: they must know the window system, or make the context themselves.
+"""OpenGL's functions and constants that `Exchange` needs, for the current context. The existing
+Python bindings do not fit: they must know the window system, or make the context themselves.
 
-Source: OpenGL 3.2 core specification, and its registry for the numbers.
+Source: OpenGL 3.2 core specification, and the OpenGL registry for the constants.
 """
 
 from __future__ import annotations
@@ -37,31 +37,31 @@ FRAGMENT_SHADER, VERTEX_SHADER, LINK_STATUS = 0x8B30, 0x8B31, 0x8B82
 VERSION, RENDERER, MAJOR_VERSION, MINOR_VERSION = 0x1F02, 0x1F01, 0x821B, 0x821C
 PROFILE, CORE_PROFILE = 0x9126, 1
 
-#: Switches that are off while `Exchange` works: culling, dither, scissors, the stencil test, what
-#: discards or masks samples, smooth polygons, logic, clamped depth, the encoding of sRGB, clip
-#: distances.
+#: Capabilities that are disabled while `Exchange` draws: face culling, dithering, scissor and
+#: stencil test, rasterizer discard, sample mask and coverage, polygon smoothing, logic operation,
+#: depth clamping, sRGB encoding, clip distances.
 _SWITCHES = (0x0B44, 0x0BD0, 0x0C11, 0x0B90, 0x8C89, 0x8E51, 0x809E, 0x809F, 0x80A0, 0x0B41)
 _SWITCHES += (0x0BF2, 0x864F, 0x8DB9, *range(0x3000, 0x3008))
-#: Those with an index, of which only the first counts: blending and (from 4.1 on) scissors.
+#: Indexed capabilities, disabled at index 0 only: blending and (from 4.1 on) the scissor test.
 _FIRST_SWITCHES = (0x0BE2, 0x0C11)
-#: Of compatibility profiles: the alpha test, stipple; what happens to pixels on their way: whether
-#: colours are looked up in a table, then scale and bias of red, green, blue, alpha and depth.
+#: Of compatibility profiles: alpha test and polygon stipple; neutral values of the pixel transfer:
+#: whether colours are looked up in a table, scale and bias of red, green, blue, alpha and depth.
 _LEGACY_SWITCHES = (0x0BC0, 0x0B42)
 _TRANSFER = {0x0D10: 0.0, 0x0D14: 1.0, 0x0D15: 0.0}
 _TRANSFER |= {number: float(number % 2 == 0) for number in range(0x0D18, 0x0D20)}
-#: How pixels lie in memory: swapped bytes, order of bits, row length, skipped rows and pixels,
-#: alignment; first for what is written (unpack), then for what is read (pack).
+#: Pixel storage modes: swapped bytes, order of bits, row length, skipped rows and pixels,
+#: alignment; first for uploads (unpack), then for reads (pack).
 _STORE = {number: 0 for number in (*range(0x0CF0, 0x0CF5), *range(0x0D00, 0x0D05))}
 _STORE |= {0x0CF5: 1, 0x0D05: 1}
 _BUFFERS = {PIXEL_PACK_BUFFER: 0x88ED, PIXEL_UNPACK_BUFFER: 0x88EF}
-#: Bindings of framebuffers, with what asks for them.
+#: Framebuffer targets, with the constant that queries the binding.
 FRAMES = {READ_FRAMEBUFFER: READ_FRAMEBUFFER_BINDING, DRAW_FRAMEBUFFER: DRAW_FRAMEBUFFER_BINDING}
 _ERRORS = {0x0500: "INVALID_ENUM", 0x0501: "INVALID_VALUE", 0x0502: "INVALID_OPERATION"}
 _ERRORS |= {0x0505: "OUT_OF_MEMORY", 0x0506: "INVALID_FRAMEBUFFER_OPERATION"}
 _CONTEXT_LOST = 0x0507
 _ERRORS |= {_CONTEXT_LOST: "CONTEXT_LOST"}
-#: Numbers of the state: what sets them, and where; what asks for them; what they are while
-#: `Exchange` works (None: as each step needs it).
+#: A number of the state: the function that sets it, that function's first arguments, the constant
+#: that queries it, and its value while `Exchange` works (None: each step sets what it needs).
 _Number = tuple[str, tuple[int, ...], int, "int | None"]
 _STATE: list[_Number] = [
     *(("PixelStorei", (number,), number, value) for number, value in _STORE.items()),
@@ -79,14 +79,14 @@ _DRAWING_STATE: list[_Number] = [
 _LEGACY_STATE: list[_Number] = [
     ("ClampColor", (CLAMP_FRAGMENT_COLOR,), CLAMP_FRAGMENT_COLOR, FIXED_ONLY)
 ]
-#: Targets of textures of two sizes, with what asks for their binding and what for their size: 2D,
-#: rectangle, array, cube, 3D, array of cubes.
+#: Targets of textures with a width and a height, the constant that queries their binding, and the
+#: target that queries their size: 2D, rectangle, array, cube, 3D, array of cubes.
 _TARGETS = [(TEXTURE_2D, 0x8069, TEXTURE_2D), (0x84F5, 0x84F6, 0x84F5), (0x8C1A, 0x8C1D, 0x8C1A)]
 _TARGETS += [(0x8513, 0x8514, 0x8515), (0x806F, 0x806A, 0x806F), (0x9009, 0x900A, 0x9009)]
 
 _TYPES: dict[str, Any] = {"i": c_int, "u": c_uint, "f": c_float, "n": c_ssize_t}
 _TYPES |= {"p": c_void_p, "s": c_char_p, "-": None}
-#: Functions behind their prototype: what they return, then what they take.
+#: Functions by their prototype in letters of `_TYPES`: the return type, then the arguments.
 _PROTOTYPES = """
 -u ActiveTexture BindVertexArray CompileShader DeleteProgram DeleteShader DepthFunc Disable Enable
 -u LinkProgram UseProgram
@@ -127,19 +127,19 @@ _LEGACY = {"GetFloatv": "-up", "PixelTransferf": "-uf"}
 
 _NO_CONTEXT = "no OpenGL context is current on this thread, none at least that the library knows"
 
-#: Address of a function by its name.
+#: Returns the address of a function by its name.
 Loader = Callable[[str], "int | None"]
 
 
 class Functions:
-    """OpenGL 3.2 of the current context; functions have their names without `gl`.
+    """The OpenGL 3.2 functions of the current context, by their names without `gl`.
 
     Attributes:
-        where: Who calls, for messages.
+        where: Name of the caller, for messages.
     """
 
     def __init__(self, where: str, load: Loader | None = None) -> None:
-        """Finds the functions, by `load` or in the system's library; raises as `Exchange`."""
+        """Loads the functions by `load` or from the system's library; raises as `Exchange`."""
         self.where = where
         load = _system(where) if load is None else load
         if not callable(load):
@@ -170,7 +170,7 @@ class Functions:
             setattr(self, name, prototype(place))
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
-        raise AttributeError(name)  # tells the type of the functions that __init__ sets
+        raise AttributeError(name)  # for type checkers: `_take` sets the functions
 
     def require_context(self) -> None:
         """Raises RuntimeError unless a context is current; clears earlier errors."""
@@ -186,32 +186,32 @@ class Functions:
 
     def forget_errors(self) -> None:
         """Clears OpenGL's errors."""
-        while self.GetError() not in (0, _CONTEXT_LOST):  # the latter stays for ever
+        while self.GetError() not in (0, _CONTEXT_LOST):  # which is reported for ever
             pass
 
     def read(self, get: str, kind: Any, count: int, *arguments: int) -> list[Any]:
-        """The numbers that a function such as glGetIntegerv writes; 0 where it writes none."""
+        """Returns the numbers that a function such as glGetIntegerv writes; 0 if it writes none."""
         values = (kind * max(count, 4))()
         getattr(self, get)(*arguments, values)
         return list(values)[:count]
 
     def integer(self, what: int) -> int:
-        """A number of the context's state."""
+        """Returns a number of the context's state."""
         return self.integers(what, 1)[0]
 
     def integers(self, what: int, count: int) -> list[int]:
-        """Several numbers of the context's state."""
+        """Returns several numbers of the context's state."""
         return self.read("GetIntegerv", c_int, count, what)
 
     def parameter(self, get: str, *arguments: int) -> int:
-        """The number that a function such as glGetProgramiv writes; 0 if there is none."""
+        """Returns the number that a function such as glGetProgramiv writes; 0 if there is none."""
         (value,) = self.read(get, c_int, 1, *arguments)
         self.forget_errors()
         return value
 
     def attached_size(self, kind: int, name: int, level: int) -> list[int] | None:
-        """Width and height of a renderbuffer or of a level of a texture; None if its target has not
-        both.
+        """Returns width and height of a renderbuffer or of a mipmap level of a texture; None if the
+        texture's target does not have both.
         """
         if kind == RENDERBUFFER:
             before = self.integer(RENDERBUFFER_BINDING)
@@ -232,25 +232,25 @@ class Functions:
         return None
 
     def view(self, width: int, height: int) -> None:
-        """Sets the first viewport to so many pixels from the lower left corner on."""
+        """Sets the first viewport: its size in pixels, from the lower left corner on."""
         if self._viewports:
             self.ViewportIndexedf(0, 0, 0, width, height)
         else:
             self.Viewport(0, 0, width, height)
 
     def make(self, kind: str) -> int:
-        """A new name: of Buffers, Textures, Framebuffers or VertexArrays."""
+        """Returns a new name; `kind` is Buffers, Textures, Framebuffers or VertexArrays."""
         name = c_uint()
         getattr(self, f"Gen{kind}")(1, ctypes.byref(name))
         return name.value
 
     def drop(self, kind: str, name: int) -> None:
-        """Deletes what `make` made."""
+        """Deletes an object that `make` created; ignores 0."""
         getattr(self, f"Delete{kind}")(1, ctypes.byref(c_uint(name)))
 
     @contextmanager
     def temporary(self, kind: str) -> Iterator[int]:
-        """A name of a kind that contexts don't share: it lives no longer than needed."""
+        """Yields a new name and deletes it afterwards: contexts don't share objects of its kind."""
         name = self.make(kind)
         try:
             yield name
@@ -266,7 +266,7 @@ class Functions:
             self.ShaderSource(shader, 1, ctypes.byref(source), None)
             self.CompileShader(shader)
             self.AttachShader(program, shader)
-            self.DeleteShader(shader)  # as soon as the program is
+            self.DeleteShader(shader)  # takes effect with the program
         self.LinkProgram(program)
         if not self.parameter("GetProgramiv", program, LINK_STATUS):
             self.DeleteProgram(program)
@@ -275,10 +275,10 @@ class Functions:
 
     @contextmanager
     def unchanged(self, *, drawing: bool) -> Iterator[None]:
-        """Puts the context's state back afterwards, as far as `Exchange` changes it.
+        """Restores afterwards the part of the context's state that `Exchange` changes.
 
-        Until then pixels lie in the host's memory, close together, and pass as they are; with
-        `drawing` filled triangles replace colours of the first draw buffer, whatever they cover.
+        Until then pixels are tightly packed in host memory and transferred unconverted; with
+        `drawing`, filled triangles overwrite the first draw buffer, without blending and tests.
         """
         with ExitStack() as later:
             later.callback(self.forget_errors)
@@ -298,7 +298,7 @@ class Functions:
             yield
 
     def _set(self, later: ExitStack, states: list[_Number]) -> None:
-        """Sets numbers of the state; later they are put back."""
+        """Sets numbers of the state; `later` restores them."""
         for function, place, asked, value in states:
             put: Callable[..., None] = getattr(self, function)
             later.callback(put, *place, self.integer(asked))
@@ -306,7 +306,7 @@ class Functions:
                 put(*place, value)
 
     def _draw_plainly(self, later: ExitStack) -> None:
-        """Sets the state of drawing; what has an index only at the first, but for the masks."""
+        """Sets the drawing state; indexed state only at index 0, except for the colour masks."""
         for each in _FIRST_SWITCHES:
             if self.IsEnabledi(each, 0):
                 later.callback(self.Enablei, each, 0)
@@ -333,8 +333,8 @@ class Functions:
 
 
 def _system(where: str) -> Loader:
-    """The functions of the system's library that knows the current context. Libglvnd's (the first
-    two) hand calls on to any driver; OSMesa's contexts are its own.
+    """Returns the loader of the system's library that knows the current context. Libglvnd's (the
+    first two) forward calls to any driver; OSMesa knows only its own contexts.
     """
     found = False
     for name in ("libOpenGL.so.0", "libGL.so.1", "libOSMesa.so.8"):

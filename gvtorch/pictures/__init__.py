@@ -1,4 +1,4 @@
-"""Pictures: what a render gives, what stands behind it, how it is shown, refined and written."""
+"""Pictures: the result of a render, its background, and how it is shown, refined and written."""
 
 from .background import Backdrop, Environment, Gradient
 from .overlay import ColorBar, Overlay

@@ -1,4 +1,4 @@
-"""What stands behind a picture, in linear light."""
+"""Backgrounds of pictures, in linear light."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..cameras.camera import Camera
 from .read_files import read_image
 
 Color = tuple[float, float, float]
-_PIXELS_A_BLOCK = 1 << 20  # whose rays are in memory at once
+_PIXELS_A_BLOCK = 1 << 20  # pixels whose rays are in memory at once
 
 
 class Background(ABC):
@@ -28,8 +28,8 @@ class Background(ABC):
 
         Args:
             camera: Placed in the world.
-            numbers: What `camera.numbers` gave, on the device of the picture.
-            dtype: Of the colours.
+            numbers: What `camera.numbers` returned, on the device of the picture.
+            dtype: Dtype of the colours.
         """
 
     def check(self, where: str, camera: Camera) -> None:
@@ -61,8 +61,8 @@ class Backdrop(Background):
     """An image of the size of the picture."""
 
     def __init__(self, image: Tensor) -> None:
-        """Takes linear RGB, (h, w, 3) or, for a batch of cameras, (n, h, w, 3). From another device
-        it is uploaded once; on the device of the picture it may be edited between frames.
+        """Takes linear RGB, (h, w, 3) or, for a batch of cameras, (n, h, w, 3). An image on another
+        device is uploaded once; one on the picture's device may be edited between frames.
         """
         check.images("Backdrop", "image", image, 3)
         if not (image.is_cuda or bool(torch.isfinite(image).all())):
@@ -126,7 +126,7 @@ class Environment(Background):
         return f"Environment({check.describe(self.image)})"
 
     def _on(self, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """The map (1, 3, h, w + 2) with a column repeated on either side, and the rotation."""
+        """Returns the map (1, 3, h, w + 2), wrapped by a column on both sides, and the rotation."""
         if (device, dtype) not in self._there:
             image = self.image.to(device, dtype).movedim(-1, 0)[None]
             around = torch.cat((image[..., -1:], image, image[..., :1]), -1)
@@ -169,5 +169,5 @@ def _color(where: str, name: str, value: Sequence[float], high: float = math.inf
 
 
 def _by_pixel(image: Tensor, camera: Camera) -> Tensor:
-    """(r, 3) of an image (..., h, w, 3) that is as large as the picture or is repeated over it."""
+    """Expands an image, broadcastable to (n, h, w, 3), to a colour (r, 3) for each pixel."""
     return image.expand(len(camera), camera.height, camera.width, 3).reshape(-1, 3)

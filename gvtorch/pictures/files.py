@@ -1,4 +1,4 @@
-"""Image files: layers of a picture to PNG, TIFF, EXR and NumPy; back: read_files.py.
+"""Image files: writes the layers of a picture as PNG, TIFF, EXR and NumPy; reading: read_files.py.
 
 PNG and integer TIFF hold sRGB and, where there is alpha, straight colour (PNG specification,
 section 12.3); EXR, NumPy and float TIFF hold linear light, premultiplied (OpenEXR technical
@@ -32,8 +32,8 @@ _BITS = {".png": (8, 16), ".tif": (8, 16, 32), ".exr": (32, 16), ".npy": (32,), 
 
 
 def checked_path(where: str, path: Path, bits: int | None, known: tuple[str, ...]) -> int:
-    """Returns the bits of a number in a file to be written; raises ValueError if the ending is not
-    known or has no such number of bits, FileNotFoundError if there is no such folder.
+    """Returns the bits per number of a file to be written; raises ValueError if the ending is
+    unknown or does not allow `bits`, FileNotFoundError if there is no such folder.
     """
     if path.suffix not in known:
         wanted = f"{', '.join(known[:-1])} or {known[-1]}"
@@ -79,7 +79,7 @@ def _as_os_errors() -> Iterator[None]:
 
 
 def side_by_side(layers: Layers) -> Layers:
-    """The pictures of a batch as one."""
+    """Joins the pictures of a batch to one, side by side."""
     return {
         name: np.concatenate(layer, 1) if layer.ndim == 4 else layer
         for name, layer in layers.items()
@@ -87,14 +87,14 @@ def side_by_side(layers: Layers) -> Layers:
 
 
 def stacked(layers: Layers) -> np.ndarray:
-    """All layers as one array (..., 6) float32."""
+    """Returns color, alpha, depth and samples as one array (..., 6) float32."""
     names = ("color", "alpha", "depth", "samples")
     return np.concatenate([layers[name].astype(np.float32) for name in names], -1)
 
 
 def display_pixels(color: Tensor, alpha: Tensor | None, bits: int) -> np.ndarray:
-    """Returns sRGB (..., 3), or with alpha (..., 1) straight sRGB and alpha (..., 4), as uint8 or
-    uint16, of linear RGB, which is premultiplied if there is alpha.
+    """Encodes linear RGB (..., 3) as sRGB (..., 3), uint8 or uint16. With alpha (..., 1) the input
+    is premultiplied, and the result is straight colour and alpha (..., 4).
     """
     color = color.detach().to("cpu", torch.float32 if bits == 8 else torch.float64)
     if alpha is None:
@@ -122,7 +122,7 @@ def _write_png(path: Path, image: np.ndarray) -> None:
     write = write_image_png_u8 if image.dtype == np.uint8 else write_image_png_u16
     with _as_os_errors():
         write(str(path), image, "rgba" if image.shape[2] == 4 else "rgb")
-    with path.open("rb") as file:  # of the last bytes that find no place on disk it tells nothing
+    with path.open("rb") as file:  # it does not report that the last bytes did not fit
         file.seek(-min(len(_PNG_END), path.stat().st_size), os.SEEK_END)
         if file.read() != _PNG_END:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -131,8 +131,8 @@ def _write_png(path: Path, image: np.ndarray) -> None:
 def write_png_rows(
     path: Path, shape: tuple[int, ...], bits: int, strips: Iterable[np.ndarray]
 ) -> None:
-    """Writes a PNG (h, w, c), c 3, or 4 with alpha, as its strips (rows, w, c) of uint8 or uint16
-    come; each row as it is, or less what stands to its left or above, whichever is smallest.
+    """Writes a PNG (h, w, c), c 3, or 4 with alpha, strip by strip, (rows, w, c) uint8 or uint16.
+    Each row gets the filter (None, Sub or Up) with the smallest sum of absolute values.
     """
     height, width, count = shape
     apart = count * bits // 8  # bytes from pixel to pixel
@@ -169,8 +169,8 @@ def write_tiff(
     strips: Iterable[np.ndarray],
     rows: int,
 ) -> None:
-    """Writes a BigTIFF (h, w, c), c 3, or 4 with alpha, as its strips (rows, w, c) come, the last
-    of what rows are left.
+    """Writes a BigTIFF (h, w, c), c 3, or 4 with alpha, strip by strip, (rows, w, c); the last
+    strip may have fewer rows.
     """
     tifffile = need_library(".tif", "tifffile", extra="image")
     kind = "assocalpha" if dtype.kind == "f" else "unassalpha"

@@ -1,10 +1,10 @@
-"""Letters at the edges of planes of voxels: where right and left, front and back are."""
+"""Orientation letters at the edges of slices: R right, L left, A front, P back, S head, I feet."""
 
 from __future__ import annotations
 
 import numpy as np
 
-#: 5 x 7 pixels, a number for each row.
+#: Letters of 5 x 7 pixels: the bits of each row as a number.
 _ROWS = {
     "A": (14, 17, 17, 31, 17, 17, 17),
     "I": (14, 4, 4, 4, 4, 4, 14),
@@ -17,8 +17,8 @@ _SMALLEST = 40  # pixels: a smaller plane has no room
 
 
 def draw_letters(image: np.ndarray, letters: str) -> None:
-    """Draws letters into an image (h, w, 3), white on black: what lies above, to the right, below
-    and to the left. An image without room for them stays as it is.
+    """Draws four letters into an image (h, w, 3), white on black: at its top, right, bottom and
+    left edge. An image without room for them stays as it is.
     """
     height, width, _ = image.shape
     if min(height, width) < _SMALLEST:

@@ -1,5 +1,5 @@
-"""`Overlay`: what is drawn over a picture: a colour bar, a scale bar, a text. White with a dark
-rim, so that it is read on any picture; its sizes follow the picture's.
+"""`Overlay`: annotations of a picture: a colour bar, a scale bar, a text. They are white with a
+dark rim, so that they are legible on any picture, and their size follows the picture's.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from .files import display_pixels
 from .picture import Picture
 from .tone import from_srgb
 
-_PART = 36  # of the picture's shorter side: the height of letters
+_PART = 36  # the picture's shorter side, in heights of a letter
 _SMALLEST = 9  # pixels of a letter
-_BAR = 0.45  # of the picture's height, which a colour bar takes
-_SCALE = 0.25  # of the picture's width, which a scale bar takes at most
-_TICKS = 6  # at most, of a colour bar
+_BAR = 0.45  # height of a colour bar, as a share of the picture's height
+_SCALE = 0.25  # greatest length of a scale bar, as a share of the picture's width
+_TICKS = 6  # most ticks of a colour bar
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColorBar:
-    """The colours of values, and what these are.
+    """A colour bar: the colours of a range of values, and a title.
 
     Attributes:
-        colors: From values (k,) to linear RGB and more, (k, 3 or 4), as a `TransferFunction`.
+        colors: Maps values (k,) to linear RGB and more, (k, 3 or 4), as a `TransferFunction` does.
         low: Value at the bar's lower end.
         high: Value at its upper end.
-        title: Above it: what the values are.
+        title: Text above the bar, which says what the values are.
     """
 
     colors: Callable[[np.ndarray], np.ndarray]
@@ -58,7 +58,7 @@ class _Stamp(NamedTuple):
 
 
 class Overlay:
-    """Draws over pictures of one size, or over strips of one."""
+    """Draws annotations over pictures of one size, or over strips of such a picture."""
 
     def __init__(
         self,
@@ -70,19 +70,19 @@ class Overlay:
         unit: str | None = None,
         text: str | None = None,
     ) -> None:
-        """Prepares what is drawn.
+        """Prepares the annotations.
 
         Args:
             width: Pixels of the whole picture.
             height: Pixels.
             bar: A colour bar at the right edge.
-            pixel: World units that a pixel is wide, for a scale bar at the lower left; in
-                perspective at one distance only, see `Camera.pixel_width`.
-            unit: Of these, as `ImageInfo.unit` has it.
+            pixel: Width of a pixel in world units, for a scale bar at the lower left; in
+                perspective it holds at one distance only, see `Camera.pixel_width`.
+            unit: Unit of `pixel`, as in `ImageInfo.unit`.
             text: Lines at the upper left.
 
         Raises:
-            ValueError: The picture is too small for it, or a number is out of its range.
+            ValueError: The picture is too small for them, or a number is out of its range.
             ImportError: Pillow is not installed.
         """
         self._size = (width, height)
@@ -100,7 +100,7 @@ class Overlay:
             self._put(made, top=top, left=width - made.shape[1] - self._pen.size)
 
     def _put(self, image: np.ndarray, *, top: int, left: int) -> None:
-        """Takes sRGB with straight alpha, (h, w, 4) uint8."""
+        """Adds a stamp, sRGB with straight alpha, (h, w, 4) uint8."""
         height, width = image.shape[:2]
         if top < 0 or left < 0 or top + height > self._size[1] or left + width > self._size[0]:
             have = "x".join(map(str, self._size))
@@ -112,11 +112,11 @@ class Overlay:
         self._stamps.append(_Stamp(top, left, from_srgb(parts[..., :3]), parts[..., 3:]))
 
     def over(self, picture: Picture, first: int = 0) -> Picture:
-        """Returns the picture, (h, w, ...), with it drawn over colour and alpha.
+        """Returns the picture, (h, w, ...), with the annotations over its colour and alpha.
 
         Args:
-            picture: Of the size, or some of its rows.
-            first: Which is the first of them.
+            picture: A picture of the overlay's size, or a strip of its rows.
+            first: Number of the strip's first row.
         """
         height, width = picture.color.shape[-3:-1]
         if picture.color.dim() != 3 or width != self._size[0]:
@@ -160,7 +160,7 @@ class _Pen:
         draw.text(at, text, font=self._font, fill=(255, 255, 255, 255), **options)
 
     def text(self, text: str) -> np.ndarray:
-        """Lines of text, (h, w, 4)."""
+        """Returns lines of text, (h, w, 4)."""
         text = text.replace("\\n", "\n")
         self._warn_of_missing(text)
         lines = text.split("\n")
@@ -172,7 +172,7 @@ class _Pen:
         return np.asarray(sheet)
 
     def _warn_of_missing(self, text: str) -> None:
-        """Warns of letters that the font has not: they become boxes."""
+        """Warns of characters that the font lacks and draws as boxes."""
         box = bytes(self._font.getmask("\uffff"))
         lacks = sorted(
             {one for one in text if one.strip() and bytes(self._font.getmask(one)) == box}
@@ -181,7 +181,7 @@ class _Pen:
             warnings.warn(f"the font of pictures has no {' '.join(lacks)}", stacklevel=4)
 
     def scale(self, most: float, pixel: float, unit: str | None) -> np.ndarray:
-        """A scale bar of at most so many pixels."""
+        """Returns a scale bar at most `most` pixels long, (h, w, 4)."""
         length = _round_below(most * pixel)
         wide = length / pixel
         label = f"{length:g} {unit_symbol(unit)}".rstrip()
@@ -208,7 +208,7 @@ class _Pen:
                 draw.rectangle((left, top, max(left, right), max(top, bottom)), fill=color)
 
     def bar(self, bar: ColorBar, high: int) -> np.ndarray:
-        """A colour bar, its numbers to the left of it, and its title above."""
+        """Returns a colour bar `high` pixels high, numbers to its left and the title above it."""
         ticks = _ticks(bar.low, bar.high)
         labels = [f"{value:g}" for value in ticks]
         size, rim, line = self.size, self._rim, self._line
@@ -236,13 +236,13 @@ class _Pen:
 
 
 def _round_below(length: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten up to a length."""
+    """Returns the largest 1, 2 or 5 times a power of ten that is not above a length."""
     power = _power(length)
     return max(n * power for n in (1, 2, 5) if n * power <= length * (1 + 1e-12))
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Round values from low to high, a few: as near to each other as that allows."""
+    """Returns round values from low to high, as many as possible but at most `_TICKS`."""
     least = _power((high - low) / _TICKS)
     for step in (n * least for n in (1, 2, 5, 10, 20)):
         first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
@@ -252,5 +252,5 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def _power(length: float) -> float:
-    """The largest power of ten up to a length."""
+    """Returns the largest power of ten that is not above a length."""
     return 10.0 ** math.floor(math.log10(length))

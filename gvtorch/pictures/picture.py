@@ -1,4 +1,4 @@
-"""`Picture`: what a render gives, and how it is shown and saved."""
+"""`Picture`: the result of a render, and how it is shown and saved."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Picture:
     color: Tensor  # (h, w, 3) linear RGB over the background; premultiplied if transparent
     alpha: Tensor  # (h, w, 1)
     depth: Tensor  # (h, w, 1) of the voxels, world units along the ray, +inf where nothing was hit
-    nearest: Tensor  # (h, w, 1) likewise, of voxels and layer: the nearer of both
+    nearest: Tensor  # (h, w, 1) as `depth`, to the nearer of voxels and layer
     samples: Tensor  # (h, w, 1) int32
-    missed: Tensor | None = None  # (h, w, 1) bool, something that the ray saw was not there
+    missed: Tensor | None = None  # (h, w, 1) bool, the ray needed data that was not loaded
     transparent: bool = False  # there is no background
     stats: RenderStats
-    # What only some shaders give, else None:
+    # Results of some shaders only, else None:
     normal: Tensor | None = None  # (h, w, 3) world, towards the eye, of unit length or 0
     features: Tensor | None = None  # (h, w, c)
     label: Tensor | None = None  # (h, w, 1) int64, of the voxels at the depth; -1: nothing was hit
@@ -70,8 +70,8 @@ class Picture:
         return np.concatenate((layers["color"], layers["alpha"]), -1)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """Returns what a display shows, as `np.asarray(picture)`, Pillow and matplotlib take it:
-        sRGB uint8, (h, w, 3), or (h, w, 4) with straight alpha if the picture is transparent.
+        """Returns the picture as displayed, for `np.asarray(picture)`, Pillow and matplotlib: sRGB
+        uint8, (h, w, 3), or (h, w, 4) with straight alpha if the picture is transparent.
         """
         if copy is False:
             raise ValueError("Picture: an array of it is always made anew: copy must not be False")
@@ -90,7 +90,7 @@ class Picture:
         """Shows the picture: in a notebook below the cell, else as a PNG in the system's viewer.
 
         Raises:
-            RuntimeError: There is no viewer; the message tells where the PNG lies.
+            RuntimeError: There is no viewer; the message has the path of the PNG.
         """
         if in_notebook():
             sys.modules["IPython"].display.display(self)
@@ -101,8 +101,8 @@ class Picture:
             raise RuntimeError(f"Picture.show: no viewer can be opened here; the PNG is {path}")
 
     def layers(self) -> dict[str, np.ndarray]:
-        """Returns color, alpha, depth, and normal and features where they are (float32), samples
-        (int32), and label where it is (int64) as arrays.
+        """Returns the layers as arrays: color, alpha, depth (float32), samples (int32), and where
+        they exist normal, features (float32) and label (int64).
         """
         names = ("color", "alpha", "depth", "normal", "features")
         given = {name: getattr(self, name) for name in names}
@@ -121,11 +121,11 @@ class Picture:
         - .exr: linear, 32 or 16 bits float: R G B A (premultiplied), Z (depth), samples.
         - .npy: (h, w, 6) float32: color, alpha, depth, samples.
         - .npz: float32 color, alpha and depth, int32 samples; normal, features and label where
-          they are.
+          they exist.
 
         Args:
             path: The file; its ending chooses the format.
-            bits: Of each number; 8 for .png and .tif, 32 for .exr if left out.
+            bits: Bits of each number; 8 for .png and .tif, 32 for .exr if left out.
 
         Raises:
             ValueError: The ending or the number of bits is unknown.
@@ -148,6 +148,6 @@ class Picture:
 
 
 def in_notebook() -> bool:
-    """Tells whether what a cell gives is shown below it."""
+    """Returns whether this runs in a notebook, which shows the result of a cell below it."""
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     return shell is not None and hasattr(shell, "kernel")

@@ -1,10 +1,10 @@
-"""Pictures of several renders: `Progressive`, of a camera at rest, gets better frame by frame;
-`render_tiles` goes strip of rows by strip of rows to a file, and may be larger than memory.
+"""Pictures of several renders: `Progressive` refines a picture of a camera at rest frame by frame;
+`render_tiles` writes a picture strip by strip to a file, and the picture may exceed memory.
 
-The first frame of a camera at rest samples the centres of the pixels, each later one another place
+The first frame of a camera at rest samples the pixels' centres, each later frame another position
 in every pixel: a point of Roberts' R2 sequence and, in the next frame, its mirror image through the
-centre. So samples cover a pixel evenly after any number of frames, and what varies linearly across
-it cancels out (antithetic sampling). The mean converges to the picture under a box filter.
+centre. So samples cover a pixel evenly after any number of frames, and linear variation across it
+cancels out (antithetic sampling). The mean converges to the picture under a box filter.
 
 Source: Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
 """
@@ -30,22 +30,22 @@ from .files import checked_path, file_pixels, side_by_side, stacked, write_png_r
 from .overlay import Overlay
 from .picture import Picture
 
-_OF_CENTRES = ("depth", "nearest", "normal", "features", "label")  # the first frame's are kept
+_OF_CENTRES = ("depth", "nearest", "normal", "features", "label")  # not averaged
 _PLASTIC = 1.32471795724474602596  # the real root of x^3 = x + 1
-STRIP = "256 MB"  # of a strip, if nothing else is asked for
-_PIXEL_BYTES = 400  # of a strip on its way: rays (80), hits twice, layers and their encoding
+STRIP = "256 MB"  # default memory of a strip
+_PIXEL_BYTES = 400  # memory of a strip's pixel: rays (80), hits twice, layers and their encoding
 _TILE = 4  # rows of the tiles in which rays are traced
 
 
 def jitter(index: int) -> tuple[float, float]:
-    """Returns the place (x, y) of a sample in its pixel, [-1/2, 1/2] from the centre."""
+    """Returns the offset (x, y) of a frame's samples from the pixels' centres, in [-1/2, 1/2]."""
     pair, side = (index + 1) // 2, 1 if index % 2 else -1
     x, y = (side * ((0.5 + pair / _PLASTIC**power) % 1 - 0.5) for power in (1, 2))
     return x, y
 
 
 def _renderer(where: str, render: Callable[[Camera], Any]) -> Callable[[Camera], Picture]:
-    """Returns what renders a picture, without the statistics that `render` may give with it."""
+    """Wraps `render`, which may return statistics with its picture, to return the picture alone."""
     if not callable(render):
         raise ValueError(f"{where}: render must be callable, got {type(render).__name__}")
 
@@ -60,7 +60,7 @@ class Progressive:
     """The running mean of jittered frames; does not wait for the device. For one thread at a time.
 
     Each ray's cone is as wide as `render` makes it: for a still of n samples give it a `cone_scale`
-    of 4 / 3 / sqrt(n), so that what lies within a pixel is seen by several narrow rays.
+    of 4 / 3 / sqrt(n), so that several narrow rays resolve the detail within a pixel.
 
     A pixel's mean begins with its first frame without a miss, and leaves out later frames with one.
     Until then the pixel shows the newest frame.
@@ -70,7 +70,7 @@ class Progressive:
     """
 
     def __init__(self, render: Callable[[Camera], Any]) -> None:
-        """Takes a function from a camera to a `Picture`, or to one and its statistics, such as
+        """Takes a function from a camera to a `Picture`, or to a picture and statistics, such as
         `partial(gv.render, tree, shader=shader)`, `partial(engine.frame, shader=shader)` or the
         `replay` of a graph.
         """
@@ -81,7 +81,7 @@ class Progressive:
         return f"Progressive({self._camera}, {self.count} frames)"
 
     def reset(self) -> None:
-        """Starts a new mean; to be called when the scene or its shader changed."""
+        """Starts a new mean; call it when the scene or its shader has changed."""
         self.count = 0
         self._given: Camera | Rays | None = None
         self._camera: Camera | None = None
@@ -90,10 +90,10 @@ class Progressive:
         """Renders one more frame, the first of a new mean if the camera moved.
 
         Returns:
-            The mean of colour and alpha so far, summed up in float64; depth, nearest, normal,
-            features and label are those of the pixels' centres where nothing was missing, `samples`
-            and `stats` those of this frame, and `missed` tells which pixels have seen no frame
-            without a miss. The first is the plain picture to the last bit.
+            The mean of colour and alpha so far, summed in float64. Depth, nearest, normal, features
+            and label are those of the pixel's first frame without a miss (frame 0: its centre);
+            `samples` and `stats` are those of this frame; `missed` is true where every frame so far
+            had a miss. The first picture equals the plain one to the last bit.
         """
         if self._camera is None or camera is not self._given:
             own = as_camera("Progressive", camera)
@@ -127,8 +127,8 @@ class Progressive:
     def refine(
         self, camera: Camera | Rays, samples: int, progress: Progress = no_progress
     ) -> Picture:
-        """Returns the mean of `samples` frames, of which those that were rendered of this camera
-        before count.
+        """Renders frames, at least one, until the mean has `samples`, and returns it; frames that
+        were rendered of this camera before count.
 
         Raises:
             ValueError: `samples` is no whole number >= 1.
@@ -152,25 +152,25 @@ def render_tiles(
     overlay: Overlay | None = None,
     progress: Progress = no_progress,
 ) -> RenderStats:
-    """Renders a picture of any size and writes it as it comes.
+    """Renders a picture of any size and writes it strip by strip.
 
     - .png: sRGB of 8 or 16 bits.
     - .tif: BigTIFF, Deflate; sRGB of 8 or 16 bits, or linear float of 32.
     - .npy: (h, w, 6) float32: linear color, alpha, depth, samples.
 
     Args:
-        render: From the camera of a strip to its `Picture`, as `partial(gv.render, tree,
+        render: Renders a strip's camera to its `Picture`, such as `partial(gv.render, tree,
             shader=shader)` or `partial(engine.render, shader=shader)`; what it does to the picture,
             such as `tone_map`, must treat pixels one by one.
-        camera: One camera; an orbit camera must be placed by what renders.
+        camera: One camera; `render` must place an orbit camera.
         path: The file; it appears when it is complete.
-        bits: Of a number; 8 for .png and .tif if left out.
-        overlay: What is drawn over the picture.
-        memory: Most bytes that a strip, of at least one row, takes beside scene and libraries.
-        progress: Told how many rows are done.
+        bits: Bits of a number; 8 for .png and .tif if left out.
+        overlay: Annotations over the picture.
+        memory: Most bytes for a strip (of at least one row), without scene and libraries.
+        progress: Called with the number of finished rows.
 
     Returns:
-        Statistics of the last strip, with milliseconds, rays and samples of all.
+        Statistics of the last strip, but milliseconds, rays and samples summed over all strips.
 
     Raises:
         ValueError: The path ends in none of these, the camera is a batch, or an argument is out of
@@ -210,7 +210,7 @@ def _write(
     size: tuple[int, int],
     rows: int,
 ) -> None:
-    """Writes strips of so many rows, the last of what is left, as they come."""
+    """Writes strips of `rows` rows, of which the last may have fewer, as they come."""
     first = next(strips)
     everything = itertools.chain((first,), strips)
     if suffix == ".npy":

@@ -1,7 +1,7 @@
-"""`read_image`: PNG, TIFF, EXR and NumPy files as linear light; how they are written: files.py.
+"""`read_image`: reads PNG, TIFF, EXR and NumPy files as linear light; files.py writes them.
 
-What a header tells is compared with the file and with free memory before anything is unpacked: the
-libraries take the memory, and one of them ends the process where it is not there.
+The size in a header is compared with the file and with free memory before anything is unpacked: the
+libraries allocate that memory, and one of them ends the process if it is not available.
 Source: ISO/IEC 15948 (PNG), IHDR; OpenEXR file layout (attributes, box2i, chlist).
 """
 
@@ -31,20 +31,20 @@ from .tone import from_srgb
 _EXR = b"\x76\x2f\x31\x01"
 _MOST_HEAD = 1 << 20  # bytes
 _LOCK = threading.Lock()
-_COPIES = 6  # of 8 bytes a number, what is read and the steps to linear light
+_COPIES = 6  # of 8 bytes a number: the pixels read, and the steps to linear light
 
 
 def read_image(path: str | Path) -> Tensor:
     """Reads a PNG (8 or 16 bits, sRGB), EXR, TIFF or NPY as linear light.
 
     Returns:
-        (h, w, c) float32; c is 3, or 4 with alpha: straight from PNG and integer TIFF, whose colour
-        is decoded from sRGB, else as the file has it.
+        (h, w, c) float32; c is 3, or 4 with alpha. Integers, as in PNG, are decoded as sRGB with
+        straight alpha; floats stay as they are in the file.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The ending is unknown, the file holds something else, or takes more memory than
-            is free or than it can be worth.
+        ValueError: The ending is unknown, the file holds something else, or its pixels take more
+            memory than is free or than its bytes can unpack to.
         ImportError: The library for this kind of file is missing.
     """
     path = Path(path)
@@ -67,8 +67,8 @@ def read_image(path: str | Path) -> Tensor:
 
 
 def _check_size(path: Path, shape: tuple[int, ...], itemsize: int, worth: int = 0) -> None:
-    """Raises ValueError for numbers that do not fit into free memory, or that so many bytes can't
-    unpack to (0: any).
+    """Raises ValueError if the numbers do not fit into free memory, or exceed `worth`, the most
+    bytes that the file can unpack to (0: not checked).
     """
     count = math.prod(shape)
     if count < 1 or (worth and count * itemsize > worth):
@@ -116,9 +116,9 @@ def _read_exr(path: Path) -> np.ndarray:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """OpenEXR writes to both streams what is wrong with a file, which is told in a line anyhow."""
+    """Silences both streams: OpenEXR prints there what is wrong with a file, and raises it too."""
     with _LOCK, redirect_stdout(io.StringIO()), ExitStack() as stack:
-        with suppress(OSError):  # no stream of errors
+        with suppress(OSError):  # there is no standard error
             stream = os.dup(2)
             stack.callback(os.close, stream)
             nothing = os.open(os.devnull, os.O_WRONLY)
@@ -129,9 +129,9 @@ def _quiet() -> Iterator[None]:
 
 
 def _check_exr(path: Path) -> None:
-    """Raises ValueError where the header tells of several parts, which are not read, or of more
-    pixels than the file can be worth: it holds an offset for each 256 lines, and OpenEXR takes
-    memory for all of them.
+    """Raises ValueError if the header declares several parts, which are not supported, or more
+    pixels than the file can hold: a file has an offset for at least every 256 lines, and OpenEXR
+    allocates memory for all lines.
     """
     with path.open("rb") as file:
         head = file.read(_MOST_HEAD)
@@ -152,12 +152,12 @@ def _check_exr(path: Path) -> None:
 
 
 def _attributes(head: bytes) -> Iterator[tuple[str, bytes]]:
-    """Names and values of an EXR's header."""
+    """Yields names and values of an EXR header's attributes."""
     at = 8
     while head[at : at + 1] not in (b"", b"\0"):
         name = head[at : head.index(b"\0", at)]
         at += len(name) + 1
-        at = head.index(b"\0", at) + 1  # the kind
+        at = head.index(b"\0", at) + 1  # its type
         (size,) = struct.unpack_from("<i", head, at)
         if not 0 <= size <= len(head) - at - 4:
             raise ValueError(f"damaged: an attribute of {size} bytes")
@@ -166,7 +166,7 @@ def _attributes(head: bytes) -> Iterator[tuple[str, bytes]]:
 
 
 def _channels(told: bytes) -> Iterator[str]:
-    """Names of an EXR's channels; each takes 16 bytes behind its name."""
+    """Yields the names of an EXR's channels; 16 bytes follow each name."""
     at = 0
     while told[at : at + 1] not in (b"", b"\0"):
         end = told.index(b"\0", at)
@@ -175,7 +175,7 @@ def _channels(told: bytes) -> Iterator[str]:
 
 
 def _read_npy(path: Path) -> np.ndarray:
-    """Mapped: a file that is shorter than its header tells is found out before memory is taken."""
+    """Maps the file: one that is shorter than its header says is refused before memory is used."""
     mapped = np.lib.format.open_memmap(path, mode="r")
     _check_size(path, mapped.shape, mapped.itemsize)
     return mapped

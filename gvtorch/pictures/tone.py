@@ -1,4 +1,4 @@
-"""From scene light to what a display shows: tone curves and the sRGB encoding.
+"""From scene light to display values: tone curves and the sRGB encoding.
 
 Sources: Reinhard, Stark, Shirley, Ferwerda, "Photographic tone reproduction for digital images",
 SIGGRAPH 2002, eq. 4; Narkowicz, "ACES filmic tone mapping curve", 2016; IEC 61966-2-1:1999 (sRGB).
@@ -32,7 +32,7 @@ def tone_map(
         light = (color * weights).sum(-1, keepdim=True)
         color = color * ((1 + light / white**2) / (1 + light))
     elif curve == "aces":
-        x = color.clamp(max=1e9)  # whose square float32 still holds
+        x = color.clamp(max=1e9)  # so that the squares fit into float32
         color = x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
     return color.clamp(0, 1)
 

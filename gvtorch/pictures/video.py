@@ -1,4 +1,4 @@
-"""`Video`: pictures to a film: H.264 through PyAV, or a GIF or WebP that loops, through Pillow."""
+"""`Video`: writes pictures as a film: H.264 by PyAV, or a looping GIF or WebP by Pillow."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from ..base.whole_file import whole_file
 from .picture import Picture
 
 FILMS = [".mp4", ".gif", ".webp"]
-_FASTEST_GIF = 50  # pictures a second; viewers slow down what is faster
+_FASTEST_GIF = 50  # pictures a second; viewers play faster ones slowly
 _OF_PALETTE = 16  # pictures from which the colours of a GIF are taken
 
 
 class Video:
-    """A film of pictures of one size that appears when it is whole, written by one thread:
+    """A film of pictures of one size, written by one thread; the file appears when complete:
 
     with gv.Video("turn.mp4", 640, 480, fps=25) as video:
         video.add(picture)
     """
 
     def __init__(self, path: str | Path, width: int, height: int, *, fps: int = 25) -> None:
-        """Opens it; .gif and .webp loop, and are in memory until they are written.
+        """Prepares the film; .gif and .webp loop, and stay in memory until they are written.
 
         Args:
             path: The file: .mp4, .gif or .webp.
             width: Pixels; even for .mp4.
-            height: Pixels, likewise.
-            fps: Pictures a second; at most 50 of .gif.
+            height: Pixels; even for .mp4.
+            fps: Pictures a second; at most 50 for .gif.
 
         Raises:
-            ValueError: The ending is unknown, or does not go with the size or the speed.
+            ValueError: The ending is unknown, or does not allow the size or the frame rate.
             FileNotFoundError: The folder does not exist.
             ImportError: The library for this kind of film is missing.
         """
@@ -67,7 +67,7 @@ class Video:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        """Finishes the file, or takes it away after a mistake."""
+        """Finishes the file, or deletes it after an error."""
         self._stack.__exit__(*error)
 
     def __repr__(self) -> str:
@@ -75,7 +75,7 @@ class Video:
 
 
 class _Mp4:
-    """Writes (h, w, 3) sRGB uint8 as they come, by PyAV."""
+    """Writes pictures, (h, w, 3) sRGB uint8, as they come, by PyAV."""
 
     def __init__(self, width: int, height: int, fps: int) -> None:
         self._av = need_library(".mp4", "av", "PyAV", "video")
@@ -101,7 +101,7 @@ class _Mp4:
 
 
 class _Loop:
-    """Keeps them until the film is whole, which Pillow writes."""
+    """Keeps the pictures until the film is complete; then Pillow writes it."""
 
     def __init__(self, suffix: str, fps: int) -> None:
         need_library(suffix, "PIL", "Pillow", "video")
@@ -131,7 +131,7 @@ class _Loop:
         first.save(self._part, save_all=True, append_images=rest, duration=lasts, loop=0, **options)
 
     def _in_palette(self) -> list[Any]:
-        """The frames in 256 colours of all, so that still parts do not flicker."""
+        """Returns the frames in 256 colours common to all, so that still parts do not flicker."""
         step = -(-len(self._frames) // _OF_PALETTE)
         some = [np.asarray(frame) for frame in self._frames[::step]]
         colors = self._image.fromarray(np.concatenate(some)).quantize(256, kmeans=1)

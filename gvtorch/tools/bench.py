@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Measure a workload on this machine, beside what else does the same."""
+    """Measure a workload on this machine, side by side with other renderers."""
 
     name: Positional[Annotated[str | None, arg(metavar="NAME")]] = None
     """a workload, or all; without it the workloads are listed"""

@@ -40,7 +40,7 @@ from .view import View
 
 @dataclass(frozen=True, kw_only=True)
 class Info:
-    """Tell about this installation, a volume file, or a store."""
+    """Show information on this installation, a volume file, or a store."""
 
     path: Positional[Annotated[str | None, arg(metavar="PATH")]] = None
     """a volume or a store; without it backends, devices and versions"""
@@ -109,7 +109,7 @@ class Convert:
             from ..base import check
             from ..io.stores.unfinished import is_begun
 
-            is_begun(self.store, resume=self.making.resume)  # raises where it would
+            is_begun(self.store, resume=self.making.resume)  # raises as `convert` would
             if self.memory is not None:
                 check.nbytes("convert", "--memory", self.memory)
             common |= {"block": self.making.block, "workers": self.making.workers}
@@ -126,7 +126,7 @@ class Convert:
 
 @dataclass(frozen=True, kw_only=True)
 class Filter:
-    """Give a store filtered colours: `--shader filtered` then shows it right from afar."""
+    """Add filtered colours to a store: `--shader filtered` then shows it correctly from afar."""
 
     store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
     """a store that gvtorch convert made; its voxels are read and stay as they are"""
@@ -194,7 +194,7 @@ def installation() -> dict[str, Any]:
 
 
 def _readable(content: dict[str, Any]) -> dict[str, Any]:
-    """Underscores to blanks, and bytes for people."""
+    """Returns names with blanks for underscores, and bytes in readable units."""
     from ..io.resources import amount
 
     out = {}
@@ -227,7 +227,7 @@ def _print_table(content: dict[str, Any]) -> None:
 
 
 def _sparkline(counts: list[int]) -> str:
-    """Bars of the counts' logarithms: most volumes are mostly air."""
+    """Returns bars of the counts' logarithms, because most volumes are mostly air."""
     import math
 
     most = math.log1p(max(1, *counts))
@@ -244,8 +244,8 @@ _COMMANDS: dict[str, Any] = {
 
 
 def _unboxed(said: str) -> str:
-    """The parser's box on a mistake as one line; what an unknown flag may mean goes in brackets."""
-    box = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", said)  # and its title
+    """Returns the parser's boxed error as one line, with suggestions for an unknown flag."""
+    box = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", said)  # without frame and title
     words = " ".join(box.split())
     unknown = re.match(r"Unrecognized options: (--[\w-]+)", words)
     if unknown is None:
@@ -256,8 +256,8 @@ def _unboxed(said: str) -> str:
 
 
 def _joined(args: list[str]) -> list[str]:
-    """The arguments with values that begin with a minus joined to their flags, as in `--up -z` and
-    `--at -4mm`, which the parser would take for flags.
+    """Joins values that begin with a minus to their flags, as in `--up=-z` and `--at=-4mm`, because
+    the parser would take them for flags.
     """
     joined: list[str] = []
     for word in args:
@@ -271,8 +271,8 @@ def _joined(args: list[str]) -> list[str]:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """Ctrl-C raises while a command runs, where it ended the process at once (`__main__`), as it
-    does again while the process ends.
+    """Makes Ctrl-C raise KeyboardInterrupt while a command runs, if it ended the process at once
+    before (`__main__`), and end it at once again afterwards.
     """
     at_once = signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     if at_once:
@@ -286,8 +286,8 @@ def _interruptible() -> Iterator[None]:
 
 
 def _interrupt(_number: int, frame: FrameType | None) -> None:
-    """Raises KeyboardInterrupt; while a module is imported, of which some catch what they do not
-    expect and others are left half made, a moment later.
+    """Raises KeyboardInterrupt; during an import it tries again a moment later, because some
+    modules catch it and others would stay half initialised.
     """
     while frame is not None:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
@@ -298,13 +298,13 @@ def _interrupt(_number: int, frame: FrameType | None) -> None:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Runs the command line and ends the process, quietly where nobody reads on (`| head`)."""
+    """Runs the command line; ends the process quietly if its output is closed (`| head`)."""
     try:
         try:
             _run(args)
         finally:
             sys.stdout.flush()
-    except OSError as error:  # of standard output: others are told by then
+    except OSError as error:  # of standard output: `_run` reports all others
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         if isinstance(error, BrokenPipeError):
             sys.exit(1)
@@ -313,7 +313,7 @@ def main(args: list[str] | None = None) -> None:
 
 
 def _run(args: list[str] | None) -> None:
-    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may hold what it can't write
+    if isinstance(sys.stdout, io.TextIOWrapper):  # file names may hold what it can't encode
         sys.stdout.reconfigure(errors="backslashreplace")
     args = _joined(sys.argv[1:] if args is None else args)
     if args == ["--version"]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def volume_formats() -> str:
-    """What a volume may be, for help texts."""
+    """Returns what a volume may be, for help texts."""
     from ..io.formats import format_names
 
     return f"{format_names()}; an OME-Zarr image is a folder or a URL"
@@ -28,7 +28,7 @@ def volume_formats() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
-    """How to read the volume where the file does not tell."""
+    """How to read the volume, where the file does not say so itself."""
 
     shape: Annotated[str | None, arg(metavar="X,Y,Z")] = None
     """RAW, or a file of any ending: voxels; else taken from the name *_XxYxZ_dtype.raw"""
@@ -58,17 +58,17 @@ class ReadOptions:
         return read_volume(path, **self.options())
 
     def options(self) -> dict[str, Any]:
-        """The options as arguments of `read_volume` and `convert`."""
+        """Returns the options as arguments of `read_volume` and `convert`."""
         shape = numbers("--shape", self.shape, 3, int) if self.shape else None
         spacing = numbers("--spacing", self.spacing, 3, float) if self.spacing else None
         return {**vars(self), "shape": shape, "spacing": spacing}
 
 
 class Bar:
-    """A progress bar on standard error that shows itself once the work has taken a second."""
+    """A progress bar on standard error that appears once the work has taken a second."""
 
     def __init__(self, *, speed: bool = False) -> None:
-        """Shows nothing yet. With `speed` what is done counts bytes."""
+        """Prepares the bar; with `speed` the progress is in bytes, and their rate is shown."""
         from rich.console import Console
         from rich.progress import (
             BarColumn,
@@ -109,14 +109,14 @@ class Bar:
 
 
 def flags_given(options: Any) -> list[str]:
-    """Flags of a group of options that differ from what they are if left out."""
+    """Returns the flags of a group of options that differ from their defaults."""
     plain = vars(type(options)())
     return [f"--{n.replace('_', '-')}" for n, v in vars(options).items() if v != plain[n]]
 
 
 def refuse_for_store(source: ReadOptions, *known: str) -> None:
-    """Raises ValueError where flags tell how to read a volume file, but a store was named; --time
-    and those `known` are for stores too.
+    """Raises ValueError if flags for volume files are given with a store; --time and the flags in
+    `known` are for stores too.
     """
     flags = [flag for flag in flags_given(source) if flag not in ("--time", *known)]
     if flags:
@@ -124,7 +124,7 @@ def refuse_for_store(source: ReadOptions, *known: str) -> None:
 
 
 def open_data(path: str, source: ReadOptions, *, image: str | None, level: int) -> Volume | Store:
-    """Opens a store, or reads a volume; raises ValueError where a flag is for the other of both."""
+    """Opens a store, or reads a volume; raises ValueError if a flag is for the other kind."""
     from ..io.stores.store import Store
 
     if is_zarr(path):
@@ -137,8 +137,9 @@ def open_data(path: str, source: ReadOptions, *, image: str | None, level: int) 
 
 
 def check_outputs(read: Mapping[str, Any], written: Mapping[str, Path | None]) -> None:
-    """Raises ValueError where a command would write over what it reads (a path, FILE:NAME, or a
-    text that is none; of a folder all files count), or one file twice. Both are told by flag.
+    """Raises ValueError if a command would overwrite a file that it reads, or one in a folder that
+    it reads, or write a file twice. `read` and `written` map flags to paths; a text in `read` may
+    also be FILE:NAME, or no path at all.
     """
     sources: dict[Path, str] = {}
     for flag, text in read.items():
@@ -159,7 +160,7 @@ def check_outputs(read: Mapping[str, Any], written: Mapping[str, Path | None]) -
 
 
 def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:
-    """Returns `count` numbers out of a flag's text; raises ValueError if it holds others."""
+    """Returns the `count` numbers of a flag's text; raises ValueError if it is anything else."""
     try:
         values = [kind(part) for part in text.split(",")]
     except ValueError:
@@ -171,7 +172,7 @@ def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:
 
 
 def size(text: str) -> tuple[int, int]:
-    """Returns width and height out of WIDTHxHEIGHT; raises ValueError if it is something else."""
+    """Returns width and height of WIDTHxHEIGHT; raises ValueError if the text is anything else."""
     width, height = (whole_number(n) for n in text.lower().partition("x")[::2])
     if not width or not height:
         raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, got {text!r}")

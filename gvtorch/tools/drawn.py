@@ -1,4 +1,4 @@
-"""`Drawn`: what is drawn over a picture, as flags of `gvtorch render` and `gvtorch fly`."""
+"""`Drawn`: the flags of `gvtorch render` and `gvtorch fly` for annotations over a picture."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Drawn:
     def overlay(
         self, shader: Shader, info: ImageInfo, component: int, camera: Camera, eye: Eye
     ) -> Overlay | None:
-        """Returns what is drawn over pictures of a camera in the world, whose eye is told too, or
-        None; raises ValueError if the shader has no bar, the camera no scale, or there is no room.
+        """Returns the overlay for a camera in the world, or None; its scale holds at the target of
+        `eye`. Raises ValueError if the shader has no bar, the camera no scale, or there is no room.
         """
         from ..pictures import Overlay
 
@@ -51,7 +51,7 @@ class Drawn:
 
 
 def _color_bar(shader: Shader, info: ImageInfo, component: int) -> ColorBar:
-    """The bar of a shader's transfer function."""
+    """Returns the colour bar of a shader's transfer function."""
     from ..pictures import ColorBar
     from ..viewer.state import transfer_of
 

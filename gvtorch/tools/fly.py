@@ -1,4 +1,4 @@
-"""`gvtorch fly`: a picture a frame along a path through a volume or a store, or a film."""
+"""`gvtorch fly`: renders pictures, or a film, along a path through a volume or a store."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Fly:
             is_film = self.output.suffix in _FILMS
             film = Video(self.output, width, height, fps=fps) if is_film else None
             kept = _Kept(self.output, film)
-            if self.stats is not None:  # as a whole: a full disk leaves what was there
+            if self.stats is not None:  # at the end: a full disk leaves the old file
                 kept.lines = []
                 stack.callback(kept.tell, self.stats)
             steps = math.inf if self._stands() else max(1, frames - 1 + self._loops())
@@ -98,7 +98,7 @@ class Fly:
                 source = source if moment is None else replace(source, time=moment)
                 with replace(self.scene, source=source).open(self.path, options, bar) as scene:
                     taken = self._taken(scene, options, width, height)
-                    if numbers.start == 0 and film is not None:  # what is there can be read
+                    if numbers.start == 0 and film is not None:  # data could be read
                         stack.enter_context(film)
                     elif film is None:
                         self.output.mkdir(exist_ok=True)
@@ -115,7 +115,7 @@ class Fly:
         print(f"{printable(self.output)}: {frames} pictures{missing}")
 
     def _check_output(self, options: dict[str, Any]) -> None:
-        """Raises what is wrong with the film or folder before the volume is read."""
+        """Raises ValueError or FileNotFoundError for wrong outputs before the volume is read."""
         is_film = self.output.suffix in _FILMS
         if not self.output.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self.output.parent}")
@@ -140,7 +140,7 @@ class Fly:
 
     @property
     def _saved(self) -> Path | None:
-        """The file of states that the flight goes through: key frames, or one, once around."""
+        """The file of states that define the flight: key frames, or one state to circle around."""
         return self.state if self.keys is None else self.keys
 
     def _stands(self) -> bool:
@@ -151,7 +151,7 @@ class Fly:
     def _taken(
         self, scene: RenderedScene, options: dict[str, Any], width: int, height: int
     ) -> Callable[[float], tuple[Camera, Picture]]:
-        """What takes the picture at a place of the path, 0 to 1."""
+        """Returns a function that takes the picture at a position along the path, 0 to 1."""
         from ..viewer.state import Eye
 
         look = self.scene.look
@@ -183,7 +183,7 @@ class Fly:
         return picture
 
     def _flight(self, now: ViewState | None = None) -> Flight:
-        """Its states; if none is given that they begin with, to see that they are right."""
+        """Returns the flight; `now` supplies what its states leave out (None: only a check)."""
         from ..shaders import TransferFunction
         from ..viewer.flight import Flight
         from ..viewer.state import Eye, ViewState
@@ -197,7 +197,7 @@ class Fly:
         return Flight.turntable(now.read(self.state))
 
     def _parts(self, frames: int) -> list[tuple[int | None, range]]:
-        """Time points, and the pictures that are taken of each; None: of whichever is read."""
+        """Returns time points and the numbers of their pictures; None: the one of --time."""
         if self.times is None:
             return [(None, range(frames))] if self._saved is None else self._parts_of_keys(frames)
         moments = self._moments()
@@ -205,7 +205,7 @@ class Fly:
         return [(m, range(a, b)) for m, a, b in zip(moments, ends, ends[1:], strict=False) if a < b]
 
     def _parts_of_keys(self, frames: int) -> list[tuple[int | None, range]]:
-        """The same, where key frames tell the time: pictures in a row of one time point."""
+        """Returns the same by the times of key frames: runs of pictures of one time point."""
         flight = self._flight()
         if all(state.time == 0 for _, state in flight.keys):
             return [(None, range(frames))]
@@ -223,7 +223,7 @@ class Fly:
         return [(shown[a], range(a, b)) for a, b in pairwise((*starts, frames))]
 
     def _times_there(self) -> int:
-        """How many time points the data have."""
+        """Returns the number of time points of the data."""
         from ..io.reading import open_source
         from ..io.stores.store import Store
 
@@ -234,7 +234,7 @@ class Fly:
         return open_source(self.path, **options).times
 
     def _moments(self) -> range:
-        """The time points that `--times` names."""
+        """Returns the time points that `--times` selects."""
         if self.scene.source.time is not None:
             raise ValueError("--times and --time both tell which: leave one out")
         count = self._times_there()
@@ -248,7 +248,7 @@ class Fly:
         )
 
     def _length(self) -> tuple[int, int]:
-        """Number of pictures, and pictures a second."""
+        """Returns the number of pictures, and pictures a second."""
         from ..base import check
 
         fps = check.whole("fly", "--fps", 25 if self.fps is None else self.fps, low=1, high=1000)
@@ -269,7 +269,7 @@ class Fly:
         return max(1, round(seconds * fps)), fps
 
     def _check_path(self) -> None:
-        """Raises what is wrong with the path before the volume is read."""
+        """Raises ValueError for a wrong path before the volume is read."""
         if self._saved is not None:
             self._check_saved()
         elif self.flight != "orbit":
@@ -280,7 +280,7 @@ class Fly:
             parse_orbit("--orbit", self.orbit)
 
     def _check_poses(self) -> None:
-        """Raises what is wrong with the file of cameras before there are pictures."""
+        """Raises ValueError or FileNotFoundError for a wrong --poses before there are pictures."""
         if self.poses is None:
             return
         is_folder = not self.poses.suffix and not self.poses.is_file()
@@ -296,11 +296,11 @@ class Fly:
             raise ValueError(f"--poses tells of pinhole and fisheye, not of {other}")
 
     def _check_saved(self) -> None:
-        """Raises ValueError where a flag tells what the states do."""
+        """Raises ValueError if a flag sets what the saved states set."""
         from ..base import check
         from ..viewer.state import saved_state
 
-        self._flight()  # what is wrong with it
+        self._flight()  # raises if it is wrong
         path = self.flight if self.flight != "orbit" else None
         paths: dict[str, Any] = {"--path": path, "--orbit": self.orbit}
         if self.keys is None:
@@ -347,11 +347,11 @@ class Fly:
 
 
 class _Kept:
-    """What there is of a flight's pictures: in a film or a folder, and figures in a file."""
+    """Writes a flight's pictures to a film or a folder, and their statistics to a file."""
 
     def __init__(self, output: Path, film: Video | None) -> None:
         self._output, self._film = output, film
-        self.lines: list[str] | None = None  # of JSON, if figures are wanted
+        self.lines: list[str] | None = None  # of JSON, if statistics are wanted
         self.coarse = 0
         self.cameras: dict[str, Camera] = {}
 
@@ -367,6 +367,6 @@ class _Kept:
             picture.save(self._output / name)
 
     def tell(self, stats: Path) -> None:
-        """Writes what the pictures cost, if there are any."""
+        """Writes the statistics of the pictures, if there are any."""
         if self.lines:
             write_whole(stats, "".join(self.lines))

@@ -42,17 +42,17 @@ else:
         )
     ]
 
-_OF_STATE = {  # fields that a part of a saved state tells
+_OF_STATE = {  # fields that a part of a saved state sets too
     "shader": ("tf", "window", "shader", "channel", "value"),
     "camera": ("camera_model", "fov", "up"),
     "component": ("component",),
 }
-_WHOLE = ("isosurface", "maximum", "minimum", "mean")  # see one value, or a whole ray
+_WHOLE = ("isosurface", "maximum", "minimum", "mean")  # use one value, or a whole ray
 
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """How it is shown."""
+    """How the scene is shown."""
 
     camera_model: Annotated[CameraModel, arg(metavar="MODEL")] = "pinhole"
     """pinhole, ortho (parallel), fisheye (equidistant) or panorama (equirectangular)"""
@@ -115,7 +115,7 @@ class Look:
     """what traces the rays"""
 
     def options(self) -> dict[str, Any]:
-        """Fields of `RenderOptions`."""
+        """Returns fields of `RenderOptions`."""
         if self.shader in _WHOLE and self.stop_alpha != Look().stop_alpha:
             raise ValueError(f"--stop-alpha is for what adds up along a ray, not for {self.shader}")
         names = ("step", "lod", "stop_alpha", "component", "backend")
@@ -129,19 +129,19 @@ class Look:
         }
 
     def files(self) -> dict[str, str | None]:
-        """What is read beside the volume, by flag."""
+        """Returns the files that are read in addition to the volume, by flag."""
         return {"--tf": self.tf, "--background": self.background}
 
     def told_by(self, state: Mapping[str, Any]) -> list[str]:
-        """Flags that were given and that a saved state tells as well, so that they would do
-        nothing.
+        """Returns the given flags that a saved state sets as well, so that they would have no
+        effect.
         """
         names = {one for part, those in _OF_STATE.items() if part in state for one in those}
         names |= set(state.get("options", ()))
         return [flag for flag in flags_given(self) if flag[2:].replace("-", "_") in names]
 
     def device(self) -> torch.device:
-        """The device that the backend needs; for auto, CUDA if it can be used."""
+        """Returns the device that the backend needs; for auto, CUDA if it can be used."""
         import torch
 
         from ..ops import unavailable
@@ -160,7 +160,7 @@ class Look:
         return self.brick_size, border if self.border is None else self.border
 
     def upward(self) -> Up | None:
-        """What `--up` tells."""
+        """Returns the up direction of `--up`, or None if it is left out."""
         if self.up is None or (self.up[:1] in ("+", "-") and self.up[1:].isalpha()):
             return self.up
         if self.up in ("x", "y", "z"):
@@ -170,25 +170,25 @@ class Look:
         return numbers("--up", self.up, 3, float)
 
     def stored_colors(self, store: Store, names: tuple[str, ...]) -> StoredColor:
-        """Returns the shader of a mesh's colours, and of its normals, if they are named."""
+        """Returns the shader of a mesh's stored colours, and of its normals if `names` has them."""
         from ..shaders import StoredColor
 
         self._refuse("colours are stored", "component")
-        # What is opaque is so within a voxel: the light enters no farther.
+        # An opaque voxel must be opaque within its own width: light enters no farther.
         told: dict[str, Any] = {"reference": 0.3 * min(store.spacing), "premultiplied": True}
         if len(names) == 1:
             return StoredColor("value", lit=True, **told)
         return StoredColor("color", normals="normal", **told)
 
     def _refuse(self, why: str, *more: str) -> None:
-        """Raises ValueError where a flag of transfer functions is given."""
+        """Raises ValueError if a flag of transfer functions, or one of `more`, is given."""
         for name in ("tf", "window", "value", *more):
             if getattr(self, name) != getattr(Look(), name):
                 raise ValueError(f"--{name} is not for --shader {self.shader}: {why}")
 
     def chosen(self, data: Volume | Store) -> Shader:
-        """Returns the shader asked for, its transfer function read, or spanned over the data; of
-        labels, theirs.
+        """Returns the shader that the flags choose, with its transfer function read from a file or
+        stretched over the data; `Labels` for data that holds labels.
         """
         from ..shaders import Filtered, Labels, Lit, TransferFunction
         from ..shaders.built_in import BY_NAME
@@ -221,7 +221,7 @@ class Look:
 
 
 def _tell_of_others(data: Volume | Store, component: int) -> None:
-    """Warns where one channel of several is shown that nobody asked for."""
+    """Warns if the first of several channels is shown, as it is by default."""
     names = [one.name for one in data.info.channels]
     if len(names) > 1 and component == 0:
         first = f" ({names[0]})" if names[0] else ""
@@ -234,7 +234,7 @@ def _tell_of_others(data: Volume | Store, component: int) -> None:
 
 def parse_orbit(flag: str, text: str) -> tuple[float, float, float | None]:
     """Returns azimuth, elevation and distance of AZ,EL, AZ,EL,fit or AZ,EL,DIST; the distance is
-    None where the box is to fit; raises ValueError if the text is something else.
+    None if the whole box is to be in the picture. Raises ValueError for any other text.
     """
     if text.count(",") == 1 or text.endswith(",fit"):
         azimuth, elevation = numbers(flag, text.removesuffix(",fit"), 2, float)
@@ -244,8 +244,8 @@ def parse_orbit(flag: str, text: str) -> tuple[float, float, float | None]:
 
 
 def stance(space: str | None) -> tuple[Up, float]:
-    """Returns what is up, and the azimuth of the front, by where x, y and z point
-    (`ImageInfo.space`): of patients the head and the face.
+    """Returns the up direction and the azimuth of the front, given where x, y and z point
+    (`ImageInfo.space`): for patients, the directions of the head and of the face.
     """
     words = (space or "").split("-")
     if len(words) == 3 and words[2] == "superior" and words[1] in ("anterior", "posterior"):
@@ -254,7 +254,7 @@ def stance(space: str | None) -> tuple[Up, float]:
 
 
 def first_orbit(space: str | None) -> str:
-    """AZ,EL of a camera that nobody placed: a little from the side, and from above."""
+    """Returns AZ,EL of the default camera: a little from the side, and from above."""
     return f"{stance(space)[1] + 30:g},20"
 
 
@@ -262,8 +262,8 @@ def parse_camera(
     text: str | None, look: Look, width: int, height: int, space: str | None = None
 ) -> Camera:
     """Makes a camera from `orbit:AZ,EL`, `orbit:AZ,EL,DIST`, `look:ex,ey,ez,tx,ty,tz`, or
-    `file:PATH` or `file:PATH,NAME`; `space` tells what is up, and where it stands, if they are left
-    out. Raises ValueError for anything else.
+    `file:PATH` or `file:PATH,NAME`; the defaults of the up direction and of the position depend on
+    `space` (see `stance`). Raises ValueError for anything else.
     """
     from ..cameras import Camera
 
@@ -287,7 +287,7 @@ def parse_camera(
 
 
 def _camera_of_file(text: str, look: Look, width: int, height: int) -> Camera:
-    """The camera of PATH, or the one of PATH,NAME."""
+    """Returns the only camera of PATH, or the camera NAME of PATH,NAME."""
     from ..cameras import read_cameras
 
     model = None if look.camera_model == "pinhole" else look.camera_model

@@ -1,5 +1,5 @@
-"""`gvtorch voxelize`, a mesh to a store, and `gvtorch splat`, points to one; `Making`, the flags of
-all commands that make a store: who works, and how it is told of.
+"""`gvtorch voxelize` makes a store of a mesh, `gvtorch splat` one of points; `Making`: the flags of
+all commands that make a store: block size, workers, resuming.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ class Making:
     """go on with a half-written store"""
 
     def check(self) -> None:
-        """Raises ValueError where flags do not go together."""
+        """Raises ValueError if flags exclude each other."""
         if self.scheduler is not None and self.workers is not None:
             raise ValueError("--scheduler brings its own workers: leave --workers out")
 
     @contextlib.contextmanager
     def working(self, *, speed: bool = False) -> Iterator[dict[str, Any]]:
-        """Gives what `convert`, `voxelize` and `splat` are told of it; see `Bar` for `speed`."""
+        """Yields arguments of `convert`, `voxelize` and `splat`; for `speed` see `Bar`."""
         self.check()
         with Bar(speed=speed) as bar, cluster(self.scheduler) as executor:
             yield {
@@ -105,7 +105,7 @@ class Voxelize:
 
 @dataclass(frozen=True, kw_only=True)
 class Splat:
-    """Add points up in the voxels of a store, of any extent: OME-Zarr with bordered blocks."""
+    """Accumulate points in the voxels of a store, of any extent: OME-Zarr with bordered blocks."""
 
     path: Positional[
         Annotated[str, arg(metavar="POINTS", help="arrays (.npz), PLY, or a FITS table")]
@@ -149,7 +149,7 @@ class Splat:
         print(told_store(self.output, [store], start))
 
     def _places(self) -> dict[str, Any]:
-        """Extent, box and columns, those that are given."""
+        """Returns extent, box and columns as arguments of `splat`, those that are given."""
         count = 3 if "," in self.extent else 1
         extent = numbers("--extent", self.extent, count, int)
         found: dict[str, Any] = {"extent": extent if count > 1 else extent[0]}
@@ -167,7 +167,7 @@ class Splat:
 
 
 def told_store(output: Path, stores: list[Store], start: float) -> str:
-    """What was made since `time.perf_counter()` was `start`; the first image tells extent."""
+    """Returns a line on the stores: extent of the first, size of all, time since `start`."""
     from ..io.resources import amount
 
     seconds, first = time.perf_counter() - start, stores[0]
@@ -179,7 +179,7 @@ def told_store(output: Path, stores: list[Store], start: float) -> str:
 
 @contextlib.contextmanager
 def cluster(address: str | None) -> Iterator[Executor | None]:
-    """The executor of a dask cluster, or none."""
+    """Yields the executor of a dask cluster, or None without an address."""
     if address is None:
         yield None
         return

@@ -1,5 +1,5 @@
-"""What flags tell in a text: colours, windows, channels, light, what is cut away, backgrounds. All
-raise ValueError, which names the flag, for a text that is none of what they take.
+"""Parsers of flags: colours, windows, channels, lights, clips, backgrounds. All raise ValueError,
+which names the flag, for a text that they do not accept.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _FACTORS = ("shadows", "occlusion", "indirect", "reach")
 
 
 def check_component(data: Volume | Store, component: int) -> None:
-    """Raises ValueError, which tells what there is, where voxels have no such number."""
+    """Raises ValueError, which lists the components, if voxels have no such component."""
     width = data.width
     if 0 <= component < width:
         return
@@ -40,10 +40,10 @@ def chosen_transfer(
     *,
     background: bool = False,
 ) -> TransferFunction:
-    """Returns the transfer function that `--tf` names, stretched over what `--window` tells. Left
-    out, files and presets in Hounsfield units keep their own values, and others are stretched over
-    what `window` finds (see there for `background`). Where the data are in Hounsfield units, `bone`
-    and others stand for those presets.
+    """Returns the transfer function that `--tf` names, stretched over the values of `--window`.
+    Without a window, files with absolute values and presets in Hounsfield units keep their values,
+    others are stretched over what `window` finds (see there for `background`). For data in
+    Hounsfield units, `bone` and others mean the presets in these units.
     """
     from ..shaders import TransferFunction
     from ..shaders.presets import CT_PRESETS, IN_HU
@@ -92,8 +92,8 @@ def parse_window(
 
 
 def parse_channels(text: str | None, image: Volume | Store) -> Channels:
-    """Makes a shader of an image's channels: all of them as it tells, or those of items such as
-    `0:green:100,4000;2:#ff00ff:auto;3`, which replace what it tells.
+    """Makes a shader of an image's channels: all of them with the image's colours and windows, or
+    those of items such as `0:green:100,4000;2:#ff00ff:auto;3`, which override these.
     """
     from ..shaders import Channels
     from ..shaders.channels import channel_color, window_of
@@ -132,7 +132,7 @@ def parse_channels(text: str | None, image: Volume | Store) -> Channels:
 
 
 def parse_lighting(text: str) -> Lighting:
-    """Makes light from items such as `sun:-1,-2,-1,4;occlusion:0.8;reach:0.1`."""
+    """Makes lighting from items such as `sun:-1,-2,-1,4;occlusion:0.8;reach:0.1`."""
     from ..shaders import DirectionalLight, PointLight
     from ..tracing import Lighting
 

@@ -43,7 +43,7 @@ class Develop:
     """the light is multiplied by 2^STOPS"""
 
     def wrap(self, render: Callable[[Camera], Picture]) -> Callable[[Camera], Picture]:
-        """Returns what renders a camera with all samples, tone-mapped."""
+        """Returns a function that renders a camera with all samples, tone-mapped."""
         from ..base import check
         from ..pictures import Progressive
         from ..pictures.tone import checked_curve
@@ -111,7 +111,7 @@ class Render:
         print(f"{printable(self.output)}: {width}x{height}, {cost_in_words(stats)}")
 
     def _at_saved_time(self) -> SceneFlags:
-        """The flags of the scene, of the time point that a saved state tells."""
+        """Returns the scene's flags; without --time, at the time point of the saved state."""
         source = self.scene.source
         if self.state is None or source.time is not None:
             return self.scene
@@ -125,7 +125,7 @@ class Render:
         return replace(self.scene, source=replace(source, time=int(time))) if time else self.scene
 
     def _check_state(self) -> None:
-        """Raises ValueError where a flag tells what a saved state does."""
+        """Raises ValueError if a flag sets what a saved state sets."""
         if self.state is None:
             return
         from ..viewer.state import saved_state
@@ -137,7 +137,7 @@ class Render:
             raise ValueError(f"--state tells what {flags[0]} does: leave one out")
 
     def _check(self) -> None:
-        """Raises what is wrong with files and flags before the volume is read."""
+        """Raises ValueError or FileNotFoundError for wrong flags before the volume is read."""
         self._check_state()
         from ..pictures.files import checked_path
 
@@ -183,8 +183,8 @@ class Render:
     def _take(
         self, scene: RenderedScene, camera: Camera, now: ViewState | None, bar: Bar
     ) -> RenderStats:
-        """Renders and writes the files, strip by strip where the kind of file lets it; planes
-        beside the picture and costs over it as a saved state tells.
+        """Renders and writes the files, strip by strip where the file format allows it; a saved
+        state may add slices beside the picture and costs over it.
         """
         from ..pictures import render_tiles
         from ..viewer.state import blended
@@ -224,7 +224,7 @@ class Render:
             stats = picture.stats
         if not (seen or composed or self.show != "picture"):
             ends = getattr(scene.data, "value_range", None)
-            if isinstance(ends, list):  # a store tells those of each channel
+            if isinstance(ends, list):  # a store has one for each channel
                 ends = ends[self.scene.look.component]
             known = "" if ends is None else f": values range from {ends[0]:g} to {ends[1]:g}"
             warnings.warn(f"nothing is seen{known}", stacklevel=2)
@@ -239,7 +239,7 @@ class Render:
 
 
 def in_strips(suffix: str, width: int, height: int) -> bool:
-    """Whether a picture is written strip by strip; PNG where it is larger than one."""
+    """Returns whether a picture is written strip by strip; a PNG if it is larger than a strip."""
     from ..base import check
     from ..pictures.progressive import STRIP, strip_rows
 

@@ -1,4 +1,4 @@
-"""`RenderedScene`: what `gvtorch render` and `gvtorch fly` look at: a volume, built into a tree in
+"""`RenderedScene`: the scene of `gvtorch render` and `gvtorch fly`: a volume, built into a tree in
 memory, or a store, streamed.
 """
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """A scene and what renders it."""
+    """A scene and the functions that render it."""
 
     render: Callable[..., Picture]  # of a camera
     shader: Shader
@@ -47,7 +47,7 @@ class RenderedScene:
         return self.data.info
 
     def state(self, options: dict[str, Any]) -> ViewState:
-        """What the flags say, as a state that has no camera."""
+        """Returns the flags as a state without a camera."""
         from ..tracing import RenderOptions
         from ..viewer.state import ViewState
 
@@ -55,7 +55,7 @@ class RenderedScene:
         return ViewState(shader=self.shader, options=told, component=told.component)
 
     def picture(self, state: ViewState, camera: Camera) -> Picture:
-        """The picture of a state, or the cost that it shows, from a camera of its own."""
+        """Returns the picture of a state, or the cost that it shows, from the given camera."""
         if state.show == "picture":
             return state.taken(self.render, camera)
         return self.cost(camera, shader=state.shader, **state.settings()).picture(state.show)
@@ -73,8 +73,8 @@ class SceneFlags:
 
     @contextmanager
     def open(self, path: str, options: dict[str, Any], bar: Bar) -> Iterator[RenderedScene]:
-        """Opens a volume or a store, to be rendered with these options; raises ValueError where a
-        flag is for the other of both.
+        """Opens a volume or a store, to be rendered with these options; raises ValueError if a flag
+        is for the other kind.
         """
         bar("reading", 0, 0)
         if is_zarr(path):
@@ -122,7 +122,7 @@ class SceneFlags:
 
     @contextmanager
     def _stream(self, path: str, options: dict[str, Any]) -> Iterator[RenderedScene]:
-        """Streams a store, and tells at last what failed."""
+        """Streams a store, and reports at the end what failed."""
         from ..engine.engine import Engine
         from ..tracing import cost
 

@@ -1,4 +1,4 @@
-"""`Streaming`: the flags of an engine over a store; what is told about its pictures."""
+"""`Streaming`: the flags of an engine over a store; messages about its pictures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Streaming:
-    """Stores: what is kept, and how it is loaded."""
+    """Stores: memory, and how data is loaded."""
 
     node_pool: Annotated[str, arg(metavar="BYTES")] = "8 MB"
     """memory of node tiles"""
@@ -44,7 +44,7 @@ class Streaming:
     """a block that can't be read ends the work"""
 
     def store(self, path: str, time: int | None) -> Store:
-        """Opens a store at a time point; tells which, where nobody did."""
+        """Opens a store at a time point; warns if it has several and none was chosen."""
         from ..io.stores.channels import channel_names
         from ..io.stores.store import Store
 
@@ -60,8 +60,8 @@ class Streaming:
         return found
 
     def _drawn(self, store: Store, look: Look) -> tuple[str, ...]:
-        """The channels of a mesh that are drawn as they are: color, and normal, by which it is lit;
-        none where something else is asked for.
+        """Returns the stored channels of a mesh that are drawn directly: color, and normal if there
+        is one for lighting; none if the flags choose another shader.
         """
         from ..io.stores.channels import channel_names
 
@@ -74,7 +74,7 @@ class Streaming:
         return ("color", "normal") if beside else ("color",)
 
     def content(self, store: Store, look: Look) -> tuple[Producer, Shader]:
-        """Returns what streams a store, and the shader."""
+        """Returns the producer that streams a store, and the shader."""
         from ..producers import StoredChannels, StoredProducer
         from ..shaders import Filtered, Lit
 
@@ -112,7 +112,7 @@ class Streaming:
 
 
 def cost_in_words(stats: RenderStats) -> str:
-    """What a picture cost, in a few words."""
+    """Returns what a picture cost, in a few words."""
     from ..engine import FrameStats
 
     text = f"{stats.samples / 1e6:.1f} M samples in {stats.milliseconds:.0f} ms ({stats.backend})"

@@ -1,4 +1,4 @@
-"""`gvtorch surface`: where a volume or a store passes a value, as triangles."""
+"""`gvtorch surface`: writes the surface of a volume or a store at a value as triangles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`gvtorch view`: a volume, a store or a script's scene in a page that turns it."""
+"""`gvtorch view`: opens a volume, a store or a script's scene in an interactive page."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NAMES = ("scene", "shader", "camera", "options")  # that a script may set
 
 
 def _path_help() -> str:
-    """What may be looked at; asked for by its own help alone, since formats load torch."""
+    """Returns what PATH may be; evaluated for this command only, since formats load torch."""
     script = (
         "a Python file that sets scene (what gv.view takes) and perhaps shader, camera, options"
     )
@@ -74,7 +74,7 @@ class View:
         )
 
     def _check_state(self) -> None:
-        """Raises ValueError where a flag tells what a saved state does."""
+        """Raises ValueError if a flag sets what a saved state sets."""
         if self.state is None:
             return
         from ..viewer.state import saved_state
@@ -86,7 +86,7 @@ class View:
             raise ValueError(f"--state tells what {flags[0]} does: leave one out")
 
     def _opened(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
-        """What is looked at, its shader, its camera, and fields of `RenderOptions`."""
+        """Returns the scene, its shader, its camera, and fields of `RenderOptions`."""
         if self.path.endswith(".py"):
             return self._run_script()
         look = self.scene.look
@@ -99,7 +99,7 @@ class View:
         return scene, shader, parse_camera(self.camera, look, 16, 9, scene.info.space), options
 
     def _scene(self, flags: SceneFlags) -> tuple[Scene, Shader]:
-        """What a page looks at, of a time point, and its shader."""
+        """Returns the scene of a page, at a time point, and its shader."""
         from ..engine.engine import Engine
         from ..producers import VolumeProducer
         from ..shaders import Filtered

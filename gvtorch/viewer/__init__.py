@@ -1,8 +1,8 @@
-"""The viewer: a page in which a scene is turned and looked into.
+"""The viewer: an interactive page that shows a scene.
 
-`view` opens it. A `Session` owns the scene and renders in a thread of its own for any number of
-`Client`s; `Server` brings pages to them by aiohttp, `notebook` by anywidget. What is shown is a
-`ViewState`, which `schema` makes of the dataclasses of the other rooms.
+`view` opens it. A `Session` owns the scene and renders in its own thread for any number of
+`Client`s; `Server` serves their pages by aiohttp, `notebook` by anywidget. What is shown is a
+`ViewState`, made of dataclasses of the other rooms; `schema` converts it to and from JSON.
 """
 
 from .flight import Flight as Flight

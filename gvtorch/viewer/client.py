@@ -1,5 +1,6 @@
-"""`Client`: one page that looks: its camera, its picture that gets better while it rests, and what
-is on the way to it. All but `send` and `ack` runs in the thread that renders.
+"""`Client`: one page: its camera, its picture, which is refined while the camera rests, and data on
+its way to the page. `tell`, `ack` and `send_file` may be called from any thread; everything else
+runs in the thread that renders.
 """
 
 from __future__ import annotations
@@ -19,33 +20,33 @@ from .state import Eye, ViewState, blended
 
 Send = Callable[[str | bytes], None]  # from any thread; does not block
 
-_REST = 0.18  # seconds without a move, after which a camera rests although nobody said so
+_REST = 0.18  # seconds without a move after which a camera counts as resting
 _EVERY = 0.3  # seconds between pictures of a camera at rest
 _DRAFT, _FINAL = 80, 94  # JPEG quality
 _LITTLE = 200_000  # pixels up to which the final quality costs little
-_SMALLEST = 0.1  # of the resolution
+_SMALLEST = 0.1  # least share of the width and height, of a draft
 _STILL_FRAMES = 3  # frames without new data, after which a picture counts as finished
 
 
 class Interrupted(Exception):
-    """Something newer is to be shown, or nobody waits any more."""
+    """Ends work early: something newer is to be shown, or nobody waits any more."""
 
 
 def _nobody(_: str | bytes) -> None:
-    """Takes what is sent to a page that has gone."""
+    """Drops messages to a page that has left."""
 
 
 class Client:
     """A page.
 
     Attributes:
-        number: Its name for others.
+        number: The number by which other pages name it.
         eye: Its camera.
         size: (width, height) pixels of its picture.
-        follows: The number of the client whose camera it takes, or None.
-        picture: The last one.
-        monitor: Whether it is told the figures of each frame.
-        nodes: Whether it is told the boxes of the nodes of each frame.
+        follows: The number of the client whose camera it follows, or None.
+        picture: Its last picture, or None.
+        monitor: Whether it receives figures of the frames.
+        nodes: Whether it receives boxes of the nodes of each frame.
         gone: Whether it has left.
     """
 
@@ -56,13 +57,13 @@ class Client:
         self.follows: int | None = None
         self.monitor = self.nodes = self.gone = False
         self._moving, self._moved, self._sent = False, 0.0, 0.0
-        self._drawn: tuple[Any, ...] | None = None  # what the last picture showed
+        self._drawn: tuple[Any, ...] | None = None  # (eye, size) of the last draft
         self._progressive: Progressive | None = None
         self._settled, self._still, self._done = False, 0, False
         self._last_sent = self._not_before = 0.0
         self._last: tuple[Picture, float, bool] | None = None  # developed, milliseconds, final
         self._renew = False  # whether planes beside it have changed
-        self._milliseconds, self._fixed = 5e-4, 0.0  # of a pixel, and of a frame beside
+        self._milliseconds, self._fixed = 5e-4, 0.0  # cost of a pixel; of a frame in addition
         self.picture: Picture | None = None
         self._camera: Camera | None = None
         self._frames = 0
@@ -73,7 +74,7 @@ class Client:
         self._waiting: tuple[int, bytes] | None = None
 
     def end(self) -> None:
-        """Lets go of the page and of the scene: whoever kept one would keep the other."""
+        """Drops the references to page and scene, so that neither keeps the other alive."""
         self._send, self._progressive, self.gone = _nobody, None, True
 
     # The network's side.
@@ -82,7 +83,7 @@ class Client:
         self._send(message_text(kind, **content))
 
     def ack(self, number: int) -> None:
-        """Notes that a picture was drawn, and sends the next one if it waits."""
+        """Notes that the page has drawn a picture, and sends the next one if it waits."""
         with self._lock:
             if number != self._in_flight:
                 return
@@ -92,11 +93,11 @@ class Client:
             self._post(*waiting)
 
     def send_file(self, name: str, data: bytes) -> None:
-        """Sends a file to be kept."""
+        """Sends a file that the page saves."""
         self._send(with_picture({"file": name}, data))
 
     def _post(self, number: int, data: bytes) -> None:
-        """Sends a picture, or keeps it until the one before is drawn."""
+        """Sends a picture, or keeps it until the page has drawn the one before."""
         with self._lock:
             if self._in_flight is not None:
                 self._waiting = number, data
@@ -112,7 +113,7 @@ class Client:
     # The renderer's side.
 
     def move(self, eye: Eye, moving: bool, sent: float) -> None:
-        """Takes a camera."""
+        """Sets the camera."""
         self.eye, self._moving, self._moved, self._sent = eye, moving, time.monotonic(), sent
         self._done = False
 
@@ -121,14 +122,14 @@ class Client:
         self._renew = True
 
     def stir(self, resting: bool) -> None:
-        """Notes that what is shown has changed."""
+        """Restarts the picture after a change; unless `resting`, as if the camera moved."""
         self._progressive, self._done, self._drawn = None, False, None
         self._settled, self._still = False, 0
         if not resting:
             self._moving, self._moved = True, time.monotonic()
 
     def resized(self, width: int, height: int, rate: float) -> None:
-        """Takes the size of the picture."""
+        """Sets the size of the picture, and the pictures a second wanted during moves."""
         if (width, height) != self.size:
             self.size = (width, height)
             self.stir(False)
@@ -140,13 +141,13 @@ class Client:
         return not self._moving or time.monotonic() - self._moved > _REST
 
     def wants(self) -> bool:
-        """Whether there is something to be drawn now."""
+        """Returns whether a picture is to be drawn now."""
         if not self.waits() or self.busy or time.monotonic() < self._not_before:
             return False
         return self.resting or self._renew or self._drawn != (self.eye, self.size)
 
     def waits(self) -> bool:
-        """Whether it will want something without being told."""
+        """Returns whether it will want a picture without a further message."""
         return bool(self.size[0]) and (self._renew or not self._done)
 
     def pause(self) -> None:
@@ -158,7 +159,7 @@ class Client:
     ) -> Picture | None:
         """Draws and sends the next picture: a coarse one while the camera moves, else one more
         frame of the mean, with planes beside it if the state says so. Returns it, or None if
-        `newer` said that it is out of date, or if only the planes have changed.
+        `newer` returned true, so that it is out of date, or if only the planes have changed.
         """
         self._planes, self._time = planes if state.slices is not None else None, scene.time
         if self._drawn != (self.eye, self.size):
@@ -173,7 +174,7 @@ class Client:
             return None
 
     def _part(self) -> tuple[int, int]:
-        """Pixels of the picture, without the planes beside it."""
+        """Returns (width, height) of the picture without the planes beside it."""
         return self.size if self._planes is None else panes(*self.size)["view"][2:]
 
     def _draft(self, scene: Scene, state: ViewState) -> Picture:
@@ -194,10 +195,10 @@ class Client:
         return picture
 
     def _learn(self, picture: Picture, took: float, pixels: int) -> None:
-        """Notes what a draft cost by the pixel, and what it would have cost however small."""
+        """Updates the estimated cost of a draft: per pixel, and fixed whatever its size."""
         stages = picture.stats.stages
         traced = sum(stages.get(name, 0.0) for name in ("rays", "trace")) or took
-        share = 0.4  # of the newest
+        share = 0.4  # weight of the newest
         self._milliseconds += share * (traced / pixels - self._milliseconds)
         self._fixed += share * (max(0.0, took - traced) - self._fixed)
 
@@ -220,7 +221,7 @@ class Client:
         if self._progressive is None:
             self._progressive = Progressive(lambda one: scene.frame(one, state, check))
         if not self._settled:
-            self._progressive.reset()  # what was missing is there now
+            self._progressive.reset()  # missing data may be there now
         picture = self._progressive.frame(camera)
         took = 1e3 * (time.perf_counter() - start)
         if not self._settled:
@@ -273,7 +274,7 @@ class Client:
         self._post(self._frames, with_picture(head, data))
 
     def picked(self, x: float, y: float) -> list[float] | None:
-        """Returns the world place (3,) that is seen at a place of the last picture, or None."""
+        """Returns the world position (3,) seen at x, y (0 to 1) of the last picture, or None."""
         if self.picture is None or self._camera is None:
             return None
         rows, columns = self.picture.nearest.shape[:2]

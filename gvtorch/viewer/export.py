@@ -1,5 +1,5 @@
-"""`SurfaceExport`: a surface that a page asks for, as a file of triangles, made in a thread so that
-pictures go on.
+"""`SurfaceExport`: makes a surface that a page asks for, as a file of triangles, in a thread, so
+that rendering goes on.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from ..io.surface import export_surface
 from .client import Client, Interrupted
 from .protocol import Surface
 
-_MOST = 1 << 28  # bytes that a page takes into its memory
-_EVERY = 0.2  # seconds between two lines of progress
+_MOST = 1 << 28  # most bytes of a file, which a page holds in memory
+_EVERY = 0.2  # seconds between two messages of progress
 
 
 class SurfaceExport:
-    """A surface on its way to a page."""
+    """A surface that is being made for a page."""
 
     def __init__(self, client: Client, wanted: Surface, data: Volume | Store, number: int) -> None:
-        """Starts to make what a page asked for, of a number of some voxels."""
+        """Starts to make the surface that a page asked for, of component `number` of voxels."""
         self._client, self._wanted, self._data, self._number = client, wanted, data, number
         self._ended, self._told = False, 0.0
         self._thread = threading.Thread(target=self._run, name="gvtorch surface", daemon=True)
@@ -33,15 +33,15 @@ class SurfaceExport:
 
     @property
     def busy(self) -> bool:
-        """Whether it is still made."""
+        """Whether it is still being made."""
         return self._thread.is_alive()
 
     def serves(self, client: Client) -> bool:
-        """Whether it is this page's."""
+        """Returns whether it is made for this page."""
         return client is self._client
 
     def end(self) -> None:
-        """Gives it up at the next block; does not wait for it."""
+        """Stops it at the next block; does not wait for that."""
         self._ended = True
 
     def _run(self) -> None:

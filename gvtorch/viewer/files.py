@@ -1,4 +1,4 @@
-"""What a page hands over as a file: transfer functions of gvtorch, ParaView and 3D Slicer."""
+"""Files that a page sends: transfer functions of gvtorch, ParaView and 3D Slicer."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _ENDINGS = (".vp.json", ".json", ".vp", ".xml")
 def read_function(
     file: str, text: str, name: str | None, low: float | None, high: float | None
 ) -> tuple[TransferFunction, list[str]]:
-    """Reads a transfer function of a file's name and text, and what of it is not kept; raises
-    ValueError where it is no such file. `name` tells which function, where it has several; one
-    whose values are only relative, as ParaView's are, is laid over those from low to high.
+    """Returns the transfer function of a file, given its name and text, and notes on what of it is
+    lost; raises ValueError if the file holds none. `name` selects one of several functions; one
+    with relative values only, such as ParaView's, is stretched over `low` to `high`.
     """
     ending = next((one for one in _ENDINGS if file.lower().endswith(one)), None)
     if ending is None:

@@ -1,5 +1,5 @@
-"""What does not go with a view's shader, found by the checks that refuse it in a picture: the page
-does not offer it, and it is left out when such a shader is chosen.
+"""Options that a view's shader does not support, found by the checks that refuse them in a render:
+the page disables their controls, and they are dropped when such a shader is chosen.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from .state import ViewState, costed
 
 _BARE = RenderOptions()
 _LENS = ThinLens(aperture=0.1, focus=1.0)
-# Controls (`Class.field`), and the change of a state that is without them.
+# Controls (`Class.field`), and the change of a state that turns each of them off.
 _WITHOUT = {
     "RenderOptions.lighting": {"options": {"lighting": None}},
     "Lighting.indirect": {"options": {"lighting": {"indirect": 0.0}}},
@@ -52,7 +52,7 @@ def unfit(state: ViewState) -> dict[str, str]:
 
 
 def trimmed(state: ViewState) -> tuple[ViewState, list[str]]:
-    """Returns a state without what its shader does not take, and why for each thing left out."""
+    """Returns a state without the options that its shader does not support, and the reasons."""
     left_out: list[str] = []
     alone = replace(state, options=replace(state.options, lens=None))
     for control, why in unfit(alone).items():

@@ -1,11 +1,11 @@
 """`Flight`: a film's key frames, each a `ViewState` at a time, and the states between them.
 
-Numbers run along monotone cubics (base/smooth.py), so what is allowed at the keys is allowed
-between them: opacities, clips, lights, exposure, all that the state's JSON tells as numbers with a
-point. The camera moves as `cameras/motion.py` tells, its field of view like any number. The points
-of a transfer function slide where all keys have as many; else the function itself fades, point by
-point of all keys' points. Whatever else differs (names, switches, whole numbers, kinds of shaders,
-lists of other lengths) is that of the key before, until the next key.
+Numbers follow monotone cubics (base/smooth.py), so what is allowed at the keys is allowed between
+them: opacities, clips, lights, exposure, all floats of the state's JSON. The camera moves as
+`cameras/motion.py` describes; its field of view is interpolated like any number. The points of a
+transfer function slide if all keys have the same number of them; else the functions are resampled
+at the points of all keys, and blended. Whatever else differs (names, switches, whole numbers, kinds
+of shaders, lists of other lengths) keeps the value of a key until the next key.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from ..cameras.motion import Motion
 from .state import Eye, ViewState
 
 Curve = Callable[[float], Any]
-_MOST_PICTURES = 2**31  # of a film
+_MOST_PICTURES = 2**31  # most pictures of a film
 _ROUND = 4  # keys of a turntable: between them the camera turns, so that the circle is exact
-#: Numbers that increase along an axis of theirs: they slide without meeting.
+#: Fields whose numbers increase along an axis, and must do so between keys too.
 _ORDERED = {
     ("TransferFunction", "opacity"): (2, 0, slice(0, 1)),  # dimensions, axis, columns of the last
     ("TransferFunction", "color"): (2, 0, slice(0, 1)),
@@ -45,11 +45,11 @@ _ORDERED = {
 
 
 class Flight:
-    """States by time, smooth between their keys.
+    """View states as a function of time, smooth between keys.
 
     Attributes:
         keys: (seconds, state) of each key, in order; each state has a camera.
-        closed: Whether the last key shows what the first does, and there are others: then the
+        closed: Whether the last key shows the same as the first, with others between: then the
             flight runs smoothly on from its end to its start, and a film of it loops.
     """
 
@@ -57,7 +57,7 @@ class Flight:
         """Takes the keys.
 
         Args:
-            keys: Seconds, increasing, and what is shown then.
+            keys: Times in seconds, increasing, and the state shown at each.
 
         Raises:
             ValueError: There is no key, a time does not come after the one before, or a state has
@@ -86,8 +86,8 @@ class Flight:
     @classmethod
     def read(cls, path: str | Path, now: ViewState) -> Flight:
         """Reads keys from a .json file: [{"time": seconds, "state": {...}}, ...]; a state may be
-        the name of its own file, from this file's folder on. What the first state leaves out is
-        that of `now`, what a later one leaves out that of the key before it.
+        the path of a state file, relative to this file's folder. Fields that the first state leaves
+        out come from `now`, those that a later one leaves out from the key before it.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -114,8 +114,8 @@ class Flight:
 
     @classmethod
     def turntable(cls, state: ViewState, seconds: float = 10.0) -> Flight:
-        """Returns a flight once around what a state's camera looks at, about its own up; it ends
-        where it begins.
+        """Returns a flight once around the target of a state's camera, about the camera's up
+        vector; it ends where it begins.
 
         Raises:
             ValueError: The state has no camera, or `seconds` is not positive.
@@ -127,7 +127,7 @@ class Flight:
         up, target = np.array(eye.up) / np.linalg.norm(eye.up), np.array(eye.target)
         away = np.array(eye.eye) - target
         keys = [(0.0, state)]
-        for n in range(1, _ROUND):  # Rodrigues' rotation of what lies across the axis
+        for n in range(1, _ROUND):  # Rodrigues' rotation of the part across the axis
             angle = 2 * np.pi * n / _ROUND
             along = (up @ away) * up
             turned = along + np.cos(angle) * (away - along) + np.sin(angle) * np.cross(up, away)
@@ -144,15 +144,15 @@ class Flight:
 
     @property
     def seconds(self) -> float:
-        """How long it takes."""
+        """Time from the first key to the last, in seconds."""
         return self._times[-1] - self._times[0]
 
     def at(self, time: float) -> ViewState:
-        """Returns what is shown at a time, exactly the key's state at a key; the first before the
-        first key, the last after the last.
+        """Returns the state at a time: exactly a key's state at its time, the first state before
+        the first key, the last after the last.
 
         Raises:
-            ValueError: What lies between two keys can't be: a clip plane turns over, ...
+            ValueError: The state between two keys is invalid: a clip plane turns over, ...
         """
         time = check.number("Flight", "time", time)
         n = bisect_right(self._times, time) - 1
@@ -168,7 +168,7 @@ class Flight:
         return replace(state, camera=eye)
 
     def along(self, share: float) -> ViewState:
-        """Returns what is shown at a share of the time, 0 to 1."""
+        """Returns the state at a share of the flight's time, 0 to 1."""
         share = check.number("Flight", "share", share, low=0, high=1)
         return self.at(self._times[-1] if share == 1 else self._times[0] + share * self.seconds)
 
@@ -178,7 +178,7 @@ class Flight:
 
         Args:
             fps: Pictures a second.
-            frames: How many in all, evenly spaced, instead.
+            frames: Number of pictures, evenly spaced, instead of `fps`.
         """
         count = (
             self.count(fps) if frames is None else check.whole("Flight", "frames", frames, low=1)
@@ -188,7 +188,7 @@ class Flight:
             yield self.along(n / steps)
 
     def count(self, fps: float = 25) -> int:
-        """Number of pictures of a film."""
+        """Returns the number of pictures of a film."""
         fps = check.number("Flight", "fps", fps, low=0, open_low=True)
         if self.seconds * fps > _MOST_PICTURES:
             raise ValueError(
@@ -206,8 +206,8 @@ class Flight:
 
 
 def _pose(eye: Eye) -> Tensor:
-    """(4, 4): where a camera's axes (x right, y down, z forward) from its target, as long as it is
-    far from it, lie in the world.
+    """Returns a camera's pose in the world (4, 4): its axes (x right, y down, z forward), scaled by
+    the distance from eye to target, and the target as their origin.
     """
     view = Camera.look_at(eye.eye, eye.target, eye.up).viewmats[0]
     target = torch.tensor(eye.target, dtype=torch.float64)
@@ -218,15 +218,15 @@ def _pose(eye: Eye) -> Tensor:
 
 
 def _eye(pose: Tensor, fov: float, before: Eye) -> Eye:
-    """The camera of a pose; of the model of the key before."""
+    """Returns the camera of a pose, with the camera model of the key before."""
     down, forward, target = pose[:3, 1], pose[:3, 2], pose[:3, 3]
     x, y, z = (tuple(part.tolist()) for part in (target - forward, target, -down / down.norm()))
     return Eye(eye=x, target=y, up=z, fov=fov, model=before.model)
 
 
 def _curve(times: Sequence[float], values: Sequence[Any], closed: bool, place: Any = None) -> Curve:
-    """What plain JSON is at a time: smooth through keys in a row whose values have one form, else
-    that of the key before. `place` is the kind and the name of what has these values.
+    """Returns plain JSON as a function of time: smooth through consecutive keys whose values have
+    one form, else the value of the key before. `place`: class and field that hold the values.
     """
     forms = [_form(value, place) for value in values]
     starts = [0, *(n for n in range(1, len(forms)) if forms[n] != forms[n - 1]), len(forms)]
@@ -245,7 +245,7 @@ def _curve(times: Sequence[float], values: Sequence[Any], closed: bool, place: A
 
 
 def _form(value: Any, place: Any) -> Any:
-    """What two values must share to have others between them."""
+    """Returns the form of a value: between values of equal form there are others."""
     if isinstance(value, float):
         return "number"
     if isinstance(value, dict):
@@ -259,7 +259,7 @@ def _form(value: Any, place: Any) -> Any:
 
 
 def _numbers(value: Any) -> np.ndarray | None:
-    """A list of floats, or of lists of them, as an array; None where it is something else."""
+    """Returns a list of floats, or of lists of them, as an array; None for anything else."""
     flat = value if isinstance(value, list) else []
     while flat and isinstance(flat[0], list):
         flat = [item for part in flat if isinstance(part, list) for item in part]
@@ -272,7 +272,7 @@ def _numbers(value: Any) -> np.ndarray | None:
 
 
 def _smooth(times: Sequence[float], values: Sequence[Any], closed: bool, place: Any) -> Curve:
-    """The curve through values of one form."""
+    """Returns the curve through values of one form."""
     first = values[0]
     if isinstance(first, float):
         return _number_curve(times, [np.array(value) for value in values], closed)
@@ -296,8 +296,8 @@ def _smooth(times: Sequence[float], values: Sequence[Any], closed: bool, place: 
 def _number_curve(
     times: Sequence[float], arrays: Sequence[np.ndarray], closed: bool, place: Any = None
 ) -> Curve:
-    """The curve through arrays of one shape; what must increase along an axis is kept as its first
-    number and the gaps, which stay positive.
+    """Returns the curve through arrays of one shape. Numbers that must increase along an axis are
+    interpolated as their first one and the gaps between them, which stay positive.
     """
     dimensions, axis, columns = _ORDERED.get(place, (None, 0, slice(None)))
     if arrays[0].ndim != dimensions:
@@ -317,7 +317,7 @@ def _number_curve(
 
 
 def _sampled(functions: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Piecewise linear functions, rows (value, number, ...), at the values of all of them."""
+    """Resamples piecewise linear functions, rows (value, number, ...), at the values of all."""
     values = np.unique(np.concatenate([one[:, 0] for one in functions]))
     return [
         np.stack([values, *(np.interp(values, one[:, 0], c) for c in one.T[1:])], 1)

@@ -1,7 +1,7 @@
-"""`widget`: the same page below the cell of a notebook (JupyterLab, VS Code, Colab), by anywidget.
+"""`widget`: the viewer's page below a notebook's cell (JupyterLab, VS Code, Colab), by anywidget.
 
-The page's modules travel as texts, and a few lines hand them to the browser in the order of their
-imports; messages and pictures go through the notebook's own connection.
+The page's modules are sent as texts, and a few lines load them in the browser in the order of their
+imports; messages and pictures use the notebook's own connection.
 """
 
 from __future__ import annotations
@@ -63,15 +63,15 @@ def module_text() -> str:
 
 
 def widget(session: Session, height: int = 560) -> Any:
-    """Returns what a notebook shows of a session: the live page, or where nothing live can be, a
-    PNG; raises ImportError without anywidget.
+    """Returns the widget that shows a session in a notebook: the live page, or a PNG where widgets
+    do not run; raises ImportError without anywidget.
     """
     need_library("view in a notebook", "anywidget", extra="notebook")
     import anywidget
     import traitlets
 
     class ViewWidget(anywidget.AnyWidget):
-        """A view below a cell; `session` is what it shows, `close_view` ends it."""
+        """A view below a cell; it shows `session`, and `close_view` ends it."""
 
         _esm = module_text()
         _css = page_files()["style.css"].decode()
@@ -82,7 +82,7 @@ def widget(session: Session, height: int = 560) -> Any:
             self.session = session
             self._client: Client | None = None
             self.on_msg(self._take)
-            self._loop: asyncio.AbstractEventLoop | None = None  # that runs here, if there is one
+            self._loop: asyncio.AbstractEventLoop | None = None  # running in this thread
             with contextlib.suppress(RuntimeError):
                 self._loop = asyncio.get_running_loop()
 
@@ -120,7 +120,7 @@ def widget(session: Session, height: int = 560) -> Any:
             return image_file(made, "PNG")
 
         def close_view(self) -> None:
-            """Ends the view; an engine that was handed in stays open."""
+            """Ends the view; an engine that the caller made stays open."""
             self.session.close()
             self.send({"gone": "The view was closed."})
 

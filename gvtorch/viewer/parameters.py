@@ -1,4 +1,4 @@
-"""`Parameters`: what of a scene itself can be changed while it is looked at: the numbers of a
+"""`Parameters`: values of the scene itself that can be changed while it is shown: the numbers of a
 producer's `nn.Parameter`s, and the fields of a dataclass from which a script makes its scene.
 """
 
@@ -15,21 +15,21 @@ from ..producers import Producer
 from .scene import Scene
 from .schema import control_for, decode, encode
 
-_MOST = 16  # numbers of a parameter that gets controls
+_MOST = 16  # most numbers of a parameter that gets a control
 
 
 class Parameters:
-    """Names, values, and how they are set.
+    """The adjustable parameters of a scene.
 
     Attributes:
-        producer: As it is now.
+        producer: The present producer.
         record: The dataclass object from which it is made, or None.
     """
 
     def __init__(
         self, producer: Producer, record: Any = None, make: Callable[[Any], Producer] | None = None
     ) -> None:
-        """Takes a producer, and what it was made of, if there was such a record."""
+        """Takes a producer, and the record and the function that made it, if there are such."""
         self.producer, self.record, self._make = producer, record, make
 
     @classmethod
@@ -37,7 +37,7 @@ class Parameters:
         """Takes a function of one argument, a dataclass whose fields all have defaults.
 
         Raises:
-            ValueError: It takes something else, or gives no producer.
+            ValueError: It takes something else, or returns no producer.
         """
         hints, names = get_type_hints(make), [*inspect.signature(make).parameters]
         kind = hints.get(names[0]) if len(names) == 1 else None
@@ -50,7 +50,7 @@ class Parameters:
         return cls(producer, record, make)
 
     def describe(self) -> dict[str, Any] | None:
-        """Returns for each name its value and what control it gets; None where there is none."""
+        """Returns value and control of each parameter, by name; None if there are none."""
         told: dict[str, Any] = {}
         if self.record is not None:
             hints = get_type_hints(type(self.record))
@@ -70,10 +70,10 @@ class Parameters:
         return {n: p for n, p in found if p.is_floating_point() and p.numel() <= _MOST}
 
     def set(self, name: str, value: Any, scene: Scene) -> None:
-        """Sets one, and lets the scene be made again.
+        """Sets a parameter, and has the scene produced again.
 
         Raises:
-            ValueError: There is no such parameter, or the value does not fit; then all stays.
+            ValueError: There is no such parameter, or the value does not fit; nothing changes then.
         """
         tensors = self._tensors()
         if name in tensors:

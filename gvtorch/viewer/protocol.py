@@ -1,9 +1,9 @@
-"""The messages between a view and its pages, as records: what a page may send is decoded by the
-schema of the state, so a wrong one is refused with a line that says what was expected.
+"""The messages between a view and its pages, as records. `schema` decodes those of a page, so a
+wrong one is refused with a line that says what was expected.
 
-A page gets texts, JSON objects with a `type`, and pictures: bytes that begin with the length of a
-JSON head (4 bytes, little endian), the head, then a JPEG. A page answers each picture with its
-number (`Ack`); until then no other one is sent to it.
+A page gets texts, JSON objects with a `type`, and bytes: the length of a JSON head (4 bytes, little
+endian), the head, then a JPEG, or a file that the head names. A page answers each picture with its
+number (`Ack`); until then no other picture is sent to it.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from ..base import check
 from .schema import decode
 from .state import Eye
 
-MOST_BYTES = 1 << 20  # of a message from a page
+MOST_BYTES = 1 << 20  # largest message from a page
 _SIDE = (16, 8192)  # pixels
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hello:
-    """The first message, and after each change of size: the size of the picture."""
+    """The size of the picture: the first message, and sent again after each change of size."""
 
     width: int
     height: int
@@ -56,7 +56,7 @@ class Ack:
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """Part of the state in place of what was there, as `ViewState.changed` takes it."""
+    """New values for part of the state, as `ViewState.changed` takes them."""
 
     state: dict[str, Any]
     rest: bool = True  # false while a slider is dragged
@@ -64,11 +64,11 @@ class Change:
 
 @dataclass(frozen=True, kw_only=True)
 class Pick:
-    """Asks what is seen at a place of the picture, 0 to 1 from its upper left corner."""
+    """Asks for the world position seen at a point of the picture, 0 to 1 from its upper left."""
 
     x: float
     y: float
-    purpose: str = ""  # comes back
+    purpose: str = ""  # comes back with the answer
 
     def __post_init__(self) -> None:
         check.number("pick", "x", self.x, low=0, high=1)
@@ -77,7 +77,7 @@ class Pick:
 
 @dataclass(frozen=True, kw_only=True)
 class Histogram:
-    """Asks how often values occur."""
+    """Asks for a histogram of the values."""
 
     in_view: bool = False
 
@@ -93,12 +93,12 @@ class Preset:
 
 @dataclass(frozen=True, kw_only=True)
 class Read:
-    """Hands over the text of a file of transfer functions, of gvtorch or another program."""
+    """Sends the text of a file of transfer functions, of gvtorch or another program."""
 
     file: str
     text: str
-    name: str | None = None  # which, where it has several
-    low: float | None = None  # the values over which relative ones are laid
+    name: str | None = None  # which function, if the file has several
+    low: float | None = None  # a function of relative values is stretched over low to high
     high: float | None = None
 
 
@@ -111,14 +111,14 @@ class Export:
 
 @dataclass(frozen=True, kw_only=True)
 class Nodes:
-    """Asks for boxes of the tree's nodes with each picture, or no more."""
+    """Starts or stops the boxes of the tree's nodes that come with each picture."""
 
     on: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
 class Resize:
-    """Makes the engine anew with other memory and budgets."""
+    """Recreates the engine with other memory and budgets."""
 
     engine: dict[str, Any]
 
@@ -133,14 +133,14 @@ class Set:
 
 @dataclass(frozen=True, kw_only=True)
 class Follow:
-    """Follows another client's camera; None: stands for itself."""
+    """Follows another client's camera, or None."""
 
     client: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Monitor:
-    """Asks for figures of each frame, or no more."""
+    """Starts or stops the figures of frames."""
 
     on: bool = True
 
@@ -172,7 +172,7 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class Do:
-    """Something without arguments: look at the whole box, or ask again for what failed."""
+    """A command without arguments: show the whole box, or request again what failed."""
 
     what: Literal["fit", "retry"]
 
@@ -188,7 +188,7 @@ def parse(text: str | bytes) -> Any:
     """Returns the message that a page sent.
 
     Raises:
-        ValueError: It is none, or out of its range.
+        ValueError: The text is no message, or a value is out of its range.
     """
     if len(text) > MOST_BYTES:
         raise ValueError(f"message: {len(text)} bytes, more than {MOST_BYTES}")
@@ -210,11 +210,11 @@ def _no_number(name: str) -> float:
 
 
 def message_text(kind: str, **content: Any) -> str:
-    """Returns a text for a page."""
+    """Returns a message to a page, as text."""
     return json.dumps({"type": kind, **content})
 
 
 def with_picture(head: dict[str, Any], picture: bytes) -> bytes:
-    """Returns a picture for a page."""
+    """Returns a picture or a file for a page, with its head, as bytes."""
     text = json.dumps(head).encode()
     return struct.pack("<I", len(text)) + text + picture

@@ -1,5 +1,5 @@
-"""`Scene`: what a view looks at, whatever it was given: an engine, a producer, a resident tree, a
-volume, a store or a path; and how it is rendered, a frame at a time, by the thread that owns it.
+"""`Scene`: what a view shows, made of an engine, a producer, a resident tree, a volume, a store or
+a path; it is rendered frame by frame by the thread that owns it.
 """
 
 from __future__ import annotations
@@ -36,26 +36,26 @@ from .schema import MOST_ITEMS
 from .state import ViewState, costed
 
 BINS = 256  # of a histogram, at most
-_MOST_BOXES = 1500  # of nodes, that a page is told
-_LOOKED_AT = 1 << 20  # values by which whole numbers are known
+_MOST_BOXES = 1500  # most boxes of nodes that are sent to a page
+_LOOKED_AT = 1 << 20  # values that are checked for being whole numbers
 EngineScene = Producer | Mapping[str, Producer]
 _BUDGET = 40.0  # milliseconds of production a frame, so that none takes long
 
 
 @dataclass
 class Scene:
-    """What is looked at; used by one thread."""
+    """The scene of a view; used by one thread."""
 
     name: str  # for people
     engine: Engine | None = None  # that streams it
     tree: N3Tree | None = None  # resident
-    data: Volume | Store | None = None  # behind it, if known
-    #: Makes the producer again, of `data`, where the engine is the view's own.
+    data: Volume | Store | None = None  # that it shows, if known
+    #: Makes the producer of `data` again; None: the engine belongs to the caller.
     remake: Callable[[Volume | Store | None], EngineScene] | None = None
     times: int = 1  # time points of the series that `data` is one of
     reopen: Callable[[int], Volume | Store] | None = None  # at another time; from any thread
-    time: float = 0.0  # what is shown: the number of a time point, or that of producers' clocks
-    _resident: Volume | None = field(default=None, repr=False)  # of a tree
+    time: float = 0.0  # shown now: the number of a time point, or the time of producers' clocks
+    _resident: Volume | None = field(default=None, repr=False)  # voxels of a tree
 
     def __post_init__(self) -> None:
         if self.times == 1 and (clocks := self._clocks()):
@@ -71,7 +71,7 @@ class Scene:
 
     @property
     def info(self) -> ImageInfo:
-        """What is known of the numbers."""
+        """What is known of the values."""
         return ImageInfo() if self.data is None else self.data.info
 
     @property
@@ -83,11 +83,11 @@ class Scene:
 
     @property
     def producers(self) -> list[Producer]:
-        """Of the engine's trees."""
+        """The producers of the engine's trees."""
         return [] if self.engine is None else [one.producer for one in self.engine.trees.values()]
 
     def frame(self, camera: Camera, state: ViewState, progress: Progress = no_progress) -> Picture:
-        """Renders what is there now; what is missing is on its way to the next frame."""
+        """Renders with the data that is loaded now; what is missing is requested."""
         common: Any = {"shader": state.shader, "progress": progress, **state.settings()}
         if self.engine is not None:
             picture, stats = self.engine.frame(camera, **common)
@@ -97,7 +97,7 @@ class Scene:
         return render(self.tree, camera, **common)
 
     def cost(self, camera: Camera, state: ViewState, progress: Progress) -> Picture:
-        """Renders what the last frame cost in false colours."""
+        """Renders what a frame costs with the data loaded now, in false colours."""
         (tree,) = self.trees[:1]
         assert state.show != "picture"
         unlit = {**state.settings(), "lighting": None}
@@ -105,7 +105,7 @@ class Scene:
         return counted.picture(state.show)
 
     def voxels(self, purpose: str) -> Volume | Store:
-        """Returns what planes are cut of, and surfaces made of.
+        """Returns the voxels of which planes and surfaces are made.
 
         Raises:
             ValueError: It has no voxels of its own, or they are not all in memory.
@@ -123,7 +123,7 @@ class Scene:
         return self._resident
 
     def first_shader(self) -> Shader:
-        """Returns a shader that shows something, where nobody named one."""
+        """Returns the default shader, which fits the data."""
         data = self.data
         if data is None:
             return self._shader_of_tree()
@@ -146,8 +146,8 @@ class Scene:
         return TransferFunction.preset("gray", low, high)
 
     def histogram(self, component: int, in_view: bool) -> dict[str, Any]:
-        """Counts values: of the bricks that the last frame read, or of all, as far as a sample
-        tells. Returns low, high, and at most BINS counts.
+        """Counts the values of the bricks that the last frame read, or of a sample of all values.
+        Returns low, high, and at most BINS counts.
         """
         values = self._in_view(component) if in_view or self.data is None else None
         if values is None and self.data is not None:
@@ -159,7 +159,7 @@ class Scene:
         bins = BINS
         if bool((values[:_LOOKED_AT] == np.rint(values[:_LOOKED_AT])).all()):
             apart = float(np.diff(np.unique(values[:_LOOKED_AT])).min(initial=high - low))
-            width = apart * max(1, math.ceil((high - low) / apart / BINS))  # else some stay empty
+            width = apart * max(1, math.ceil((high - low) / apart / BINS))  # no empty bins
             low, bins = low - apart / 2, math.ceil((high - low + apart) / width)
             high = low + bins * width
         counts, _ = np.histogram(values, bins, (low, high))
@@ -178,12 +178,12 @@ class Scene:
         return values[np.isfinite(values)]
 
     def _clocks(self) -> list[Any]:
-        """Producers that have a time of their own (`Producer.time`)."""
+        """Returns the producers that have a clock (`Producer.time`)."""
         return [one for one in self.producers if hasattr(one, "time")]
 
     def describe_time(self) -> dict[str, Any] | None:
-        """Returns what a slider of time needs: how many time points, or None of a clock, and what
-        one step of a series is in the world; None where nothing changes with time.
+        """Returns what a time slider needs: the number of time points (None for a clock), and step,
+        origin and unit of a series' times; None if nothing changes with time.
         """
         if self.times > 1:
             info = self.info
@@ -192,8 +192,8 @@ class Scene:
         return {"times": None} if self._clocks() else None
 
     def describe_labels(self) -> dict[str, Any] | None:
-        """Returns the first labels of the first channel and the colours that they have where
-        nobody tells, and how many there are; None where it has no labels.
+        """Returns the first labels of the first channel, their default colours, and the number of
+        all labels; None if the channel has none.
         """
         tree = self.trees[0]
         channel = tree.channel_names[0]
@@ -219,13 +219,13 @@ class Scene:
             raise ValueError(f"state: nothing changes with time here, got time {time:g}")
 
     def set_clocks(self, time: float) -> None:
-        """Sets the time of the producers that have one: they are made anew."""
+        """Sets the time of the producers that have a clock; what differs is produced again."""
         for producer in self._clocks():
             producer.time = time
         self.time = time
 
     def show_time(self, time: float, data: Volume | Store) -> None:
-        """Shows another time point of a series, which `reopen` gave."""
+        """Shows another time point of a series: `data` is what `reopen` returned."""
         before, self.data = self.data, data
         try:
             self.resize()
@@ -235,20 +235,20 @@ class Scene:
         self.time = time
 
     def failures(self) -> list[str]:
-        """What could not be produced, the newest last."""
+        """Returns messages on what could not be produced, the newest last."""
         return [] if self.engine is None else [str(one) for one in self.engine.failures]
 
     def retry(self) -> None:
-        """Lets what could not be produced be asked for again."""
+        """Allows what could not be produced to be requested again."""
         if self.engine is not None:
             self.engine.forget_failures()
 
     def resize(self, **options: Any) -> None:
-        """Makes the engine anew with other `EngineOptions`; what was there is made again.
+        """Recreates the engine with other `EngineOptions`; its data is loaded again.
 
         Raises:
-            ValueError: The engine is not the view's own, or refuses the options; then the old one
-                goes on.
+            ValueError: The engine belongs to the caller, or refuses the options; it is then
+                recreated with the old ones.
         """
         if self.engine is None or self.remake is None:
             raise ValueError("view: the engine was handed in: its memory is its owner's to set")
@@ -262,7 +262,7 @@ class Scene:
             raise
 
     def settled(self, picture: Picture) -> bool:
-        """Whether a picture shows all that can be had."""
+        """Returns whether a picture shows all data that can be loaded."""
         stats = picture.stats
         if not isinstance(stats, FrameStats):
             return True
@@ -270,13 +270,13 @@ class Scene:
         return stats.converged or not (made or stats.pending or stats.deferred)
 
     def close(self) -> None:
-        """Closes an engine that is the view's own."""
+        """Closes the engine unless it belongs to the caller."""
         if self.engine is not None and self.remake is not None:
             self.engine.close()
 
 
 def open_scene(what: Any, **options: Any) -> Scene:
-    """Returns the scene of anything that can be looked at.
+    """Returns the scene of anything that can be viewed.
 
     Args:
         what: An `Engine`, a `Producer`, several by name, an `N3Tree`, a `Volume`, an array, a
@@ -305,14 +305,14 @@ def open_scene(what: Any, **options: Any) -> Scene:
 
 
 def _producer_of(data: Volume | Store | None) -> Producer:
-    """Makes the producer of what is looked at."""
+    """Makes the producer of a volume or a store."""
     assert data is not None
     return VolumeProducer(data) if isinstance(data, Volume) else StoredProducer(data)
 
 
 def series_of(what: Any, **options: Any) -> dict[str, Any]:
-    """Returns the fields of a `Scene` that tell of the time points that a path or a store is one
-    of; `options` as of `read_volume`.
+    """Returns the fields of a `Scene` that describe the time series of a path or a store; `options`
+    are those of `read_volume`.
     """
     if isinstance(what, (str, PathLike)):
         path, first = fspath(what), options.pop("time", None) or 0
@@ -331,7 +331,7 @@ def series_of(what: Any, **options: Any) -> dict[str, Any]:
 
 
 def _voxels_of(producer: Producer) -> Volume | Store | None:
-    """The volume or store that a producer gives bricks of, or None."""
+    """Returns the volume or store of which a producer makes bricks, or None."""
     if isinstance(producer, StoredProducer):
         return producer.store
     if isinstance(producer, VolumeProducer):
@@ -358,8 +358,8 @@ def node_boxes(
     """Returns the nodes whose bricks the last frame read, those nearest to an eye first.
 
     Returns:
-        boxes: At most so many [x, y, z, depth], see `N3Tree.loc`.
-        count: How many there are.
+        boxes: At most `most` [x, y, z, depth], see `N3Tree.loc`.
+        count: Number of all these nodes.
         low, size: World corner and sides of the root.
         branching: N.
     """

@@ -1,10 +1,10 @@
-"""Plain JSON to and from the objects that Python and the command line use, by their constructors'
-type hints; and the same hints as a description from which the page makes its controls.
+"""Converts objects of Python and the command line to plain JSON and back, by their constructors'
+type hints; and describes these hints to the page, which makes its controls from them.
 
-So there is one list of options: a field that a dataclass or a shader has is in the state file, in
-the messages and in the page, and its own checks refuse what is wrong. JSON tells objects as
-`{"kind": "Lit", ...}`, with the constructor's arguments by name; what it can't tell (a module, an
-image) as `{"kept": "..."}`, which stands for what is there already.
+So there is one list of options: a field of a dataclass or a shader is in the state file, in the
+messages and in the page, and the object's own checks refuse wrong values. In JSON an object is
+`{"kind": "Lit", ...}`, with the constructor's arguments by name; what JSON can't hold (a module, an
+image) is `{"kept": "..."}`, which means the value that is there already.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from ..shaders import (
 from ..tracing import Clip, Lighting, RenderOptions, ThinLens
 
 MOST_ITEMS = 4096  # of a list
-_MOST_NUMBERS = 4 * MOST_ITEMS  # of an array: a transfer function has four in a row
+_MOST_NUMBERS = 4 * MOST_ITEMS  # of an array: a row of a transfer function has four
 MOST_DEPTH = 16  # of objects in objects
 
-#: What JSON may name, by name.
+#: Classes that JSON may name, by name.
 KINDS: dict[str, type] = {
     one.__name__: one
     for one in (
@@ -51,7 +51,7 @@ KINDS: dict[str, type] = {
         *(getattr(built_in, name) for name in built_in.__all__),
     )
 }
-#: Arguments of constructors that are kept under another name, or otherwise.
+#: Reads arguments of constructors that are stored under another name, or in another form.
 _KEPT_AS: dict[tuple[str, str], Any] = {
     ("Isosurface", "color_channel"): lambda one: one.other,
     ("Isosurface", "color_component"): lambda one: one.other_component,
@@ -67,7 +67,7 @@ _OF_THE_SCENE = {
     "DistanceField": ("value",),
     "Labels": ("normals",),
 }
-#: Where a slider begins and ends; what is allowed, the objects themselves check.
+#: Range of a slider; which values are allowed, the objects themselves check.
 SLIDERS: dict[tuple[str, str], tuple[float, float]] = {
     ("RenderOptions", "step"): (0.1, 4),
     ("RenderOptions", "stop_alpha"): (0.5, 1),
@@ -100,7 +100,7 @@ SLIDERS: dict[tuple[str, str], tuple[float, float]] = {
 @functools.cache
 def arguments(kind: Any) -> dict[str, tuple[Any, Any]]:
     """Returns type hint and default (`inspect.Parameter.empty`: none) of each argument that a
-    constructor takes, those that it hands on to its base class included.
+    constructor takes, including those that it passes on to its base class.
     """
     found: dict[str, tuple[Any, Any]] = {}
     left_out = _OF_THE_SCENE.get(kind.__name__, ())
@@ -120,7 +120,7 @@ def arguments(kind: Any) -> dict[str, tuple[Any, Any]]:
 
 
 def encode(value: Any) -> Any:
-    """Returns an object as plain JSON; what JSON can't tell as `{"kept": ...}`."""
+    """Returns an object as plain JSON; what JSON can't hold as `{"kept": ...}`."""
     if isinstance(value, Enum):
         value = value.value
     elif isinstance(value, (np.ndarray, np.generic, Tensor)):
@@ -165,10 +165,10 @@ def decode(where: str, hint: Any, content: Any, now: Any = None, depth: int = 0)
 
     Args:
         where: Begins messages.
-        hint: What it must be.
-        content: What `json.loads` gave.
-        now: What stands there now: what the JSON leaves out, or says is kept.
-        depth: Objects around this one.
+        hint: The type that it must have.
+        content: What `json.loads` returned.
+        now: The present value, for what the JSON leaves out or marks as kept.
+        depth: Number of objects around this one.
 
     Raises:
         ValueError: The content is not of the type, or the object refuses it.
@@ -178,7 +178,7 @@ def decode(where: str, hint: Any, content: Any, now: Any = None, depth: int = 0)
     if isinstance(content, dict) and set(content) == {"kept"}:
         if now is not None:
             return now
-        if hint is not Any:  # which is JSON as it is
+        if hint is not Any:  # Any: JSON as it is
             raise ValueError(f"{where}: JSON can't tell what was here: {content['kept']!r:.200}")
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     problems = []
@@ -201,7 +201,7 @@ def _brief(content: Any) -> str:
 
 
 def _fits(hint: Any, content: Any) -> bool:
-    """Whether a class is the one that the content names."""
+    """Returns whether a class is the one that the content names."""
     return isinstance(content, dict) and getattr(hint, "__name__", "") == content.get("kind")
 
 
@@ -221,7 +221,7 @@ def _decoded(where: str, hint: Any, content: Any, now: Any, depth: int) -> Any:
 
 
 def _simple(hint: Any, content: Any) -> Any:
-    """A value that is no list and no object, or JSON as it is."""
+    """Checks and returns a value that is no list and no object, or (Any) JSON as it is."""
     if hint is float:
         return _number(content)
     hint = Literal[None] if hint in (None, type(None)) else hint
@@ -329,9 +329,9 @@ def _object(where: str, hint: type, content: Any, now: Any, depth: int) -> Any:
 
 
 def control_for(hint: Any, owner: str = "", name: str = "") -> dict[str, Any]:
-    """Returns what the page needs to know of a type hint to make a control: its `type`, and by that
-    `choices`, `items`, `fields` with their texts, or the `range` of a slider. What has no control
-    is of type "kept".
+    """Returns the description from which the page makes the control of a type hint: its `type`, and
+    depending on it `choices`, `items`, the `kind` of an object, or the `range` of a slider;
+    `optional` if None is allowed. What has no control is of type "kept".
     """
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     told = [found for one in choices if (found := _described(one, owner, name)) is not None]
@@ -394,7 +394,7 @@ def _slider(owner: str, name: str) -> tuple[float, float] | None:
 
 
 def describe_kind(kind: type) -> dict[str, Any]:
-    """Returns the fields of a class: for each its description, default and text."""
+    """Returns a class's text, and for each of its fields the description, default and text."""
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         texts |= option_texts(base)

@@ -1,8 +1,9 @@
-"""`Server`: a session's page over HTTP and one websocket, in a thread of its own (aiohttp).
+"""`Server`: serves a session's page over HTTP and a websocket for each page, in its own thread
+(aiohttp).
 
-Only the package's own files of the page are served, by name. Who may speak: with a token in the
-address, from a page of this very server (Origin), under a name that is this machine's (Host), so
-that another site's page can't, though its name may be made to point here (DNS rebinding).
+Only the page's files of this package are served, by name. A websocket needs the token in its
+address, a page of this server (Origin) and a name of this machine (Host), so that a page of another
+site is refused even if that site's name is made to point here (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-cache",
 }
-_QUEUED = 4096  # texts that wait for a page, after which it is let go
+_QUEUED = 4096  # messages that may wait for a page before it is disconnected
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
@@ -50,23 +51,23 @@ def page_files() -> dict[str, bytes]:
 
 
 def aiohttp_web() -> Any:
-    """Loads the server's library; raises ImportError, which tells how to install it."""
+    """Imports aiohttp.web; raises ImportError, which says what to install, if it can't be used."""
     need_library("view", "PIL", "Pillow", "view")
     return need_library("view", "aiohttp.web", "aiohttp", "view")
 
 
 def _is_ours(record: logging.LogRecord) -> bool:
-    """Whether a line of the server's library is worth a word: not that a request was no HTTP."""
+    """Returns whether a log record of aiohttp is worth showing: not one of a malformed request."""
     error = record.exc_info[1] if record.exc_info else None
     return type(error).__module__ != "aiohttp.http_exceptions"
 
 
 class Server:
-    """A session's page.
+    """The server of a session's page.
 
     Attributes:
-        url: Where it is, with the token.
-        port: Its port.
+        url: The page's address, with the token.
+        port: The page's port.
     """
 
     def __init__(
@@ -78,8 +79,8 @@ class Server:
         token: str | None = None,
         allow: Iterable[str] = (),
     ) -> None:
-        """Starts to serve; for the arguments see `view`. A token "" is none, where nobody else can
-        reach the host.
+        """Starts to serve; for the arguments see `view`. A token "" means none, which is allowed if
+        only this machine can reach the host.
 
         Raises:
             ValueError: The host needs a token.
@@ -112,7 +113,7 @@ class Server:
         return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
 
     def close(self) -> None:
-        """Stops to serve."""
+        """Stops the server."""
         if self._loop.is_running():
             self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(timeout=10)
@@ -126,7 +127,7 @@ class Server:
                 started.set_exception(error)
         finally:
             self._loop.close()
-            del self._session  # aiohttp's own circles would keep it, and its pools, for a while
+            del self._session  # aiohttp's reference cycles would keep it, and its pools
 
     async def _serve(self, started: Future[None]) -> None:
         self._stop = asyncio.Event()
@@ -163,7 +164,7 @@ class Server:
             await one.close(code=1001, message=b"the view was closed")
 
     def is_allowed(self, host: str | None) -> bool:
-        """Whether a page may reach this server under a name, as the Host header tells it."""
+        """Returns whether a page may reach this server under the name of its Host header."""
         name = (urlsplit(f"//{host or ''}").hostname or "").rstrip(".")
         if name in self._allowed:
             return True
@@ -174,7 +175,7 @@ class Server:
         return self._host not in _LOCAL  # an address can't be rebound
 
     async def _guard(self, request: Any, handler: Any) -> Any:
-        """Refuses foreign hosts, and adds the headers that keep a page to itself."""
+        """Refuses foreign hosts, and adds the headers that isolate the page from other sites."""
         web = self._web
         try:
             if not self.is_allowed(request.headers.get("Host")):
@@ -216,7 +217,7 @@ class Server:
             if queue.qsize() < _QUEUED:
                 queue.put_nowait(data)
             elif queue.qsize() == _QUEUED:
-                queue.put_nowait(None)  # it does not listen
+                queue.put_nowait(None)  # the page does not keep up
 
         def send(data: str | bytes) -> None:
             if not loop.is_closed():

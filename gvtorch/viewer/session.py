@@ -1,6 +1,6 @@
-"""`Session`: a scene, what is shown of it, and the pages that look. One thread owns the scene and
+"""`Session`: a scene, its view state, and the pages that show it. One thread owns the scene and
 renders for all pages in turn; whatever comes from the network is put into a queue that it empties
-between frames. It waits for no page: see `Client`.
+between frames. It never waits for a page: see `Client`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from .slices import Planes
 from .state import Development, Eye, Slices, ViewState, transfer_of
 from .still import Steps, Stills, finished_picture, still_steps
 
-_TICK = 0.02  # seconds between looks at whether a camera has come to rest
+_TICK = 0.02  # seconds between checks whether a camera has come to rest
 _FIGURES = 0.25  # seconds between figures for monitors
 _ENGINE = ("brick_pool", "node_pool", "load_budget", "subdivide_budget", "time_budget", "loading")
 _COLOR_MAPS = (
@@ -46,12 +46,12 @@ _COLOR_MAPS = (
 
 
 class Session:
-    """What pages look at.
+    """A scene that pages show.
 
     Attributes:
         state: What is shown; its camera is the one that new pages begin with.
         clients: The pages, by number.
-        scene: What is looked at.
+        scene: The scene; only the session's thread uses it.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Session:
         self.scene, self.state, self.parameters = scene, state, parameters
         self.clients: dict[int, Client] = {}
         self.errors = 0  # pictures that failed
-        self._good = state  # the last state of which there was a picture
+        self._good = state  # the last state that was drawn
         self._count, self._turn = 0, 0
         self._tasks: deque[Callable[[], None]] = deque()
         self._stills = Stills()
@@ -72,12 +72,12 @@ class Session:
         self._figures_at = 0.0
         self._planes: Planes | None = None
         self._export: SurfaceExport | None = None
-        self._opening: float | None = None  # the time point that is read in a thread
+        self._opening: float | None = None  # the time point that a thread reads now
         self._open_planes(state)
         self._thread = threading.Thread(target=self._run, name="gvtorch view", daemon=True)
         self._thread.start()
 
-    # From any thread.
+    # For any thread.
 
     def join(self, send: Send) -> Client:
         """Adds a page; `send` sends it a text or bytes, from any thread, without waiting."""
@@ -90,11 +90,11 @@ class Session:
 
     def leave(self, client: Client) -> None:
         """Forgets a page."""
-        client.gone = True  # what is being made for it ends
+        client.gone = True  # ends work for it
         self.post(lambda: self._goodbye(client))
 
     def receive(self, client: Client, text: str | bytes) -> None:
-        """Takes a message of a page; a wrong one is answered with a line."""
+        """Handles a message of a page; answers a wrong one with the reason."""
         try:
             message = parse(text)
         except ValueError as error:
@@ -108,7 +108,7 @@ class Session:
         self.post(lambda: self._take(client, message))
 
     def post(self, task: Callable[[], None]) -> None:
-        """Lets the thread that renders do something between two frames; not once it is closed."""
+        """Queues a task for the thread that renders, between two frames; drops it once closed."""
         with self._wake:
             if self._closed:
                 return
@@ -116,7 +116,7 @@ class Session:
             self._wake.notify()
 
     def ask(self, question: Callable[[], Any], timeout: float = 60.0) -> Any:
-        """Lets the thread that renders answer something; waits for it."""
+        """Runs a function in the thread that renders; waits for its result and returns it."""
         found: Future[Any] = Future()
 
         def answer() -> None:
@@ -157,7 +157,7 @@ class Session:
         self.scene.close()
 
     def _step(self) -> bool:
-        """Does what was asked for, and draws one picture; False: the session is closed."""
+        """Runs queued tasks, draws one picture; returns False once the session is closed."""
         with self._wake:
             while not (self._closed or self._tasks or self._stills or self._someone()):
                 waits = any(one.waits() for one in self.clients.values())
@@ -178,7 +178,7 @@ class Session:
         return True
 
     def _someone(self) -> Client | None:
-        """The next client that wants a picture."""
+        """Returns the next client, in turn, that wants a picture, or None."""
         wanting = [number for number, one in self.clients.items() if one.wants()]
         if not wanting:
             return None
@@ -205,7 +205,7 @@ class Session:
         return bool(self._tasks) or self._closed
 
     def _fell(self, client: Client, error: Exception) -> None:
-        """After a picture that failed: tells why, and returns to the last state that was drawn."""
+        """Reports why a picture failed, and returns to the last state that was drawn."""
         self.errors += 1
         self._tell_all("error", text=one_line(error))
         if self._good is not self.state:
@@ -262,7 +262,7 @@ class Session:
             told["report"] = {name: report[name] for name in named}
         return told
 
-    # What pages ask for: `_take_NAME` does what the message NAME of the protocol says.
+    # Messages of pages: `_take_NAME` handles the message NAME of the protocol.
 
     def _welcome(self, client: Client) -> None:
         self.clients[client.number] = client
@@ -303,7 +303,7 @@ class Session:
         self._tell_all("clients", clients=follows)
 
     def _take(self, client: Client, message: Any) -> None:
-        """Does what a page's message says."""
+        """Handles a page's message; answers with the reason if it is refused."""
         if client.number not in self.clients:
             return
         try:
@@ -321,7 +321,7 @@ class Session:
         self._place(client, message.camera, message.moving, message.sent)
 
     def _place(self, client: Client, eye: Eye, moving: bool, sent: float = 0.0) -> None:
-        """Moves a page's camera, and those of pages that follow it, or one that does."""
+        """Moves a page's camera and those of all pages that follow it, directly or indirectly."""
         client.move(eye, moving, sent)
         moved = {client.number}
         waiting = deque(moved)
@@ -361,12 +361,12 @@ class Session:
     # Planes beside the picture, and time.
 
     def _open_planes(self, state: ViewState) -> None:
-        """Makes what cuts planes, where a state shows some; raises ValueError where it can't be."""
+        """Creates `Planes` if a state shows slices; raises ValueError if there are no voxels."""
         if state.slices is not None and self._planes is None:
             self._planes = Planes(self.scene.voxels("slices"), self._plane_came)
 
     def _plane_came(self, problem: str) -> None:
-        """From the thread that reads."""
+        """Called by the thread that reads planes; `problem` is the reason of a failure, or ""."""
         if problem:
             self.post(lambda: self._tell_all("error", text=problem))
         self.post(self._renew_planes)
@@ -376,7 +376,7 @@ class Session:
             one.renew()
 
     def _follow_time(self) -> None:
-        """Shows the time of the state: that of a clock at once, of a series when it is read."""
+        """Shows the time of the state: a clock's at once, a series' once a thread has read it."""
         wanted = self.state.time
         if wanted == self.scene.time or self._opening is not None:
             return
@@ -388,7 +388,7 @@ class Session:
         read.start()
 
     def _read_time(self, wanted: float) -> None:
-        """Runs in a thread of its own, so that pictures go on."""
+        """Reads a time point, in its own thread, so that rendering goes on."""
         assert self.scene.reopen is not None
         try:
             data = self.scene.reopen(int(wanted))
@@ -409,7 +409,7 @@ class Session:
         self._follow_time()
 
     def _time_failed(self, text: str) -> None:
-        """Goes back to the time that is shown."""
+        """Sets the state back to the time that is shown."""
         self._opening = None
         self.state = replace(self.state, time=self.scene.time)
         self._tell_all("error", text=text)
@@ -508,7 +508,7 @@ class Session:
             client.tell("camera", camera=encode(eye))
 
     def still(self, eye: Eye, width: int, height: int) -> Picture:
-        """Renders a whole picture: all that can be had, all samples."""
+        """Renders a finished picture: nothing missing, all samples."""
         return finished_picture(self._steps(eye, (width, height), lambda: False))
 
     def _steps(self, eye: Eye, size: tuple[int, int], gone: Callable[[], bool]) -> Steps:
@@ -519,7 +519,7 @@ class Session:
 
 
 def fitted(scene: Scene, like: Eye | None, size: tuple[int, int], up: Up | None = None) -> Eye:
-    """Returns from where the whole box is seen, in the direction of another camera."""
+    """Returns an eye that sees the whole box in the direction of `like`, or by default."""
     box = scene.box
     width, height = (max(1, n) for n in size)
     if like is None:
@@ -536,7 +536,7 @@ def fitted(scene: Scene, like: Eye | None, size: tuple[int, int], up: Up | None 
 
 
 def schema() -> dict[str, Any]:
-    """Returns what the page makes its controls of: each record's fields, by its name."""
+    """Returns the description that the page makes its controls of: the fields of each class."""
     kinds = {**KINDS, **{one.__name__: one for one in (Eye, Development, Slices, ViewState)}}
     told = {name: describe_kind(kind) for name, kind in kinds.items()}
     told["EngineOptions"] = describe_kind(EngineOptions)

@@ -1,5 +1,5 @@
-"""Three planes of voxels beside the picture: where each lies in a page's picture, what of the world
-its pixels show, and how its voxels come without a wait: those of a store are read in a thread.
+"""Three planes of voxels beside the picture: the layout of a page's picture, the world extent that
+each plane shows, and a thread that reads the voxels, so that rendering does not wait for them.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from ..tracing.slices import UP, PlaneView, radiological_views
 from .state import ViewState, transfer_of
 
 GAP = 4  # pixels between the four parts
-_KEPT = 48  # planes
-_BACKGROUND = 0.004  # of what no plane covers, linear light
+_KEPT = 48  # planes in the cache
+_BACKGROUND = 0.004  # linear light where there is no plane
 
 
 class Pane(NamedTuple):
@@ -40,8 +40,8 @@ class Pane(NamedTuple):
 
 
 def panes(width: int, height: int) -> dict[str, Pane]:
-    """Returns the parts: the planes across y and x above the one across z and the picture, so that
-    what is in line is the same place.
+    """Returns the parts: the planes across y and x above the plane across z and the picture, so
+    that neighbouring planes line up along their common axis.
     """
     w, h = max(1, (width - GAP) // 2), max(1, (height - GAP) // 2)
     right, below = w + GAP, h + GAP
@@ -58,20 +58,20 @@ class Composed(NamedTuple):
     """A picture with planes beside it."""
 
     picture: Picture
-    layout: dict[str, Any]  # of each part its place, and of a plane what its edges are in the world
-    complete: bool  # whether all planes are those that are wanted
+    layout: dict[str, Any]  # the position of each part, and each plane's edges in the world
+    complete: bool  # whether no plane is still being read
 
 
 class Planes:
     """The planes of a volume or a store.
 
     Attributes:
-        data: What is cut.
+        data: The volume or store that is cut.
     """
 
     def __init__(self, data: Volume | Store, arrived: Callable[[str], None]) -> None:
-        """Takes a function that is told, from another thread, that a plane has come, or with a
-        text why it can't.
+        """`arrived` is called, from another thread, with "" when a plane has been read, or with the
+        reason why it can't be.
         """
         self.data, self._arrived = data, arrived
         self._made: OrderedDict[Any, np.ndarray] = OrderedDict()
@@ -86,13 +86,13 @@ class Planes:
 
     @cached_property
     def views(self) -> dict[str, PlaneView]:
-        """How each plane is looked at: as radiologists do, where the data tells how it lies."""
+        """The view of each plane: radiological if the data's anatomical directions are known."""
         return radiological_views(self.data.info.space) or {
             axis: PlaneView("", up) for axis, up in UP.items()
         }
 
     def place(self, state: ViewState) -> tuple[float, float, float]:
-        """The world place through which the planes go, inside the data."""
+        """Returns the world position through which the planes go, clamped to the data."""
         low, high = self._ends()
         at = (low + high) / 2
         if state.slices is not None and state.slices.at is not None:
@@ -101,7 +101,7 @@ class Planes:
         return x, y, z
 
     def index(self, axis: str, state: ViewState) -> int:
-        """The voxel of the finest level in which the place lies, along an axis."""
+        """Returns the index, along an axis, of the finest voxel that contains this position."""
         n = "xyz".index(axis)
         found = (self.place(state)[n] - self.data.origin[n]) / self.data.spacing[n]
         return min(max(int(np.floor(found + 0.5)), 0), self.data.extent[n] - 1)
@@ -118,10 +118,10 @@ class Planes:
 
         Args:
             picture: Developed, of the size of its part or smaller.
-            state: Tells where the planes lie, and their colours.
+            state: Has the position of the planes, and their colours.
             width: Pixels.
             height: Pixels.
-            wait: Whether to wait for voxels; else the planes before stand for those to come.
+            wait: Whether to wait for voxels; else the last planes are shown until the new are read.
 
         Raises:
             ValueError, OSError: With `wait`, a plane can't be read.
@@ -147,26 +147,26 @@ class Planes:
         return Composed(made, layout, complete)
 
     def _sides(self, axis: str) -> tuple[str, str]:
-        """The axes along the columns and rows of the picture of a plane."""
+        """Returns the axes along the columns and rows of the picture of a plane."""
         row = self.views[axis].up[1]
         return next(n for n in "xyz" if n not in (axis, row)), row
 
     def _pixel(self, axis: str, pane: Pane) -> float:
-        """World size of a pixel at which a plane fits its part."""
+        """Returns the world size of a pixel at which a plane fits its part."""
         low, high = self._ends()
         size = dict(zip("xyz", high - low, strict=True))
         column, row = self._sides(axis)
         return float(max(size[column] / pane.width, size[row] / pane.height))
 
     def _level(self, axis: str, pixel: float) -> int:
-        """The level whose voxels are at most as large as a pixel."""
+        """Returns the coarsest level whose voxels are no larger than a pixel."""
         if not isinstance(self.data, Store):
             return 0
         least = min(self.data.spacing["xyz".index(n)] for n in self._sides(axis))
         return int(np.clip(np.floor(np.log2(pixel / least)), 0, self.data.levels - 1))
 
     def _told(self, axis: str, pane: Pane, pixel: float) -> dict[str, Any]:
-        """Where the picture of a plane lies in its part, and what its edges are in the world."""
+        """Returns the layout of a plane: its part, its picture there, its edges in the world."""
         low, high = (dict(zip("xyz", one.tolist(), strict=True)) for one in self._ends())
         column, row = self._sides(axis)
         view = self.views[axis]
@@ -188,7 +188,7 @@ class Planes:
     def _image(
         self, axis: str, state: ViewState, pixel: float, wait: bool
     ) -> tuple[np.ndarray | None, bool]:
-        """(h, w, 3) of a plane, and whether it is the one that is wanted; else the one before."""
+        """Returns the newest picture (h, w, 3) of a plane, and whether no newer one will come."""
         key = (axis, self.index(axis, state), round(pixel, 9), self._look(state))
         if wait and key not in self._made:
             self._keep(key, self._cut(axis, state, pixel))
@@ -203,7 +203,7 @@ class Planes:
             return self._newest.get(axis), made is not None or key in self._failed
 
     def _read(self) -> None:
-        """The thread that reads: of each axis the plane that was wanted last."""
+        """Runs in the thread that reads: for each axis, the plane that was wanted last."""
         while True:
             with self._wake:
                 while not (self._wanted or self._closed):
@@ -228,7 +228,7 @@ class Planes:
                 self._made.popitem(last=False)
 
     def _look(self, state: ViewState) -> Any:
-        """What of the state the colours depend on, as a key."""
+        """Returns the part of the state on which the colours depend, as a key."""
         assert state.slices is not None
         coloured = state.slices.colors == "shader" or self.data.info.labels
         shader = repr(_colors_told(state.shader)) if coloured else None
@@ -264,7 +264,7 @@ class Planes:
         return self._windows[component]
 
     def _colors(self, state: ViewState) -> Callable[[np.ndarray], np.ndarray] | None:
-        """What colours values; None: grays."""
+        """Returns the function that colours values; None: grays."""
         assert state.slices is not None
         if self.data.info.labels:
             shader = state.shader if isinstance(state.shader, Labels) else Labels()
@@ -275,7 +275,7 @@ class Planes:
         return transfer_of(state.shader)
 
     def retry(self) -> None:
-        """Lets planes that could not be read be asked for again."""
+        """Allows planes that could not be read to be read again."""
         ask_again()
         self._failed.clear()
 
@@ -287,7 +287,7 @@ class Planes:
 
 
 def _colors_told(shader: Shader) -> Any:
-    """What tells apart how shaders colour values."""
+    """Returns a key that differs if two shaders colour values differently."""
     transfer = transfer_of(shader)
     if transfer is not None:
         return transfer.to_json()
@@ -295,7 +295,7 @@ def _colors_told(shader: Shader) -> Any:
 
 
 def _fitted(color: Tensor, pane: Pane) -> Tensor:
-    """(h, w, 3) of another size as large as a part."""
+    """Scales an image (h, w, 3) to the size of a part."""
     if color.shape[:2] == (pane.height, pane.width):
         return color
     planar = color.movedim(-1, 0)[None]

@@ -1,5 +1,5 @@
 """`ViewState`: all that a view shows, as one JSON; `Eye`, its camera. `gvtorch view --state FILE`,
-`gvtorch render --state FILE` and the page read and write the same.
+`gvtorch render --state FILE` and the page share this format.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ..tracing import RenderOptions, render
 from .schema import decode, encode
 
 Triple = tuple[float, float, float]
-_FAR = 1e30  # from where a ray can still be told in numbers
+_FAR = 1e30  # largest coordinate, so that a ray's numbers stay finite
 Show = Literal["picture", "samples", "nodes", "lod", "age", "fill"]
 
 
@@ -38,10 +38,10 @@ class Eye:
     """Where a camera stands, in world units.
 
     Attributes:
-        eye: Its place.
-        target: What is in the middle of the picture; an orthographic camera shows as much as a
-            pinhole would at this distance.
-        up: What is up in the picture.
+        eye: Position of the camera.
+        target: Point in the middle of the picture; an orthographic camera shows as much as a
+            pinhole camera does at this distance.
+        up: Direction that is up in the picture.
         fov: Vertical field of view, degrees.
         model: pinhole, ortho, fisheye or panorama.
     """
@@ -63,8 +63,8 @@ class Eye:
             raise ValueError("Eye: eye and target must differ, and up must not be zero")
 
     def camera(self, width: int, height: int, box: Tensor) -> Camera:
-        """Returns the camera; an orthographic one stands before all of the (2, 3) box, whatever its
-        scale is.
+        """Returns the camera; an orthographic one is moved back until all of the (2, 3) box is in
+        front of it.
         """
         made = Camera.look_at(self.eye, self.target, self.up, self.fov, width, height, self.model)
         if MODELS[self.model].parallel:
@@ -76,11 +76,11 @@ class Eye:
 
     @classmethod
     def of(cls, camera: Camera, box: Tensor) -> Self:
-        """Returns where one of `gv`'s cameras stands, given the scene's (2, 3) box; what it looks
-        at is the place of its axis nearest to the middle of the box.
+        """Returns the eye of a camera, given the scene's (2, 3) box; its target is the point of the
+        view axis nearest to the middle of the box.
 
         Raises:
-            ValueError: It is a batch.
+            ValueError: The camera is a batch.
         """
         if camera.batched:
             raise ValueError(f"view: camera must be one, got a batch of {len(camera)}")
@@ -135,8 +135,8 @@ class Slices:
     """Three planes of voxels beside the picture, exact to the voxel (`gv.slice_picture`).
 
     Attributes:
-        at: World place through which they go; the middle of the box if left out.
-        window: Values that are black and white; found if left out.
+        at: World position through which they go; the middle of the box if left out.
+        window: Values shown as black and white; found automatically if left out.
         colors: Grays, or the colours of the shader (without its opacity). Labels always have
             theirs.
     """
@@ -162,14 +162,14 @@ class ViewState:
 
     Attributes:
         shader: What turns values into colour.
-        options: Of the picture: step, level of detail, background, clip, lens, lighting, ...
+        options: Picture options: step, level of detail, background, clip, lens, lighting, ...
         develop: Samples, tone and exposure.
         show: The picture, or in its place what each ray cost, see `gv.cost`.
         blend: Share of such a cost picture that lies over the picture; 1 shows it alone.
         slices: Three planes beside the picture, or none.
-        time: Of a series the time point, from 0; of a producer with a clock its time.
+        time: Time point of a series, from 0; or the time of producers that have a clock.
         component: Which number of a voxel is shown.
-        camera: Where the camera stands; None: from where the whole box is seen.
+        camera: Where the camera stands; None: where it sees the whole box.
     """
 
     shader: Shader
@@ -217,20 +217,20 @@ class ViewState:
         return self.taken(drawn, self.camera.camera(width, height, what.box))
 
     def taken(self, drawn: Callable[..., Picture], camera: Camera) -> Picture:
-        """Returns the picture at rest from another camera; `drawn` takes it, shader and options."""
+        """Renders the picture at rest; `drawn` takes the camera, and by name shader and options."""
         shown = partial(drawn, shader=self.shader, **self.settings())
         return self.develop.develop(Progressive(shown).refine(camera, self.develop.samples))
 
     def to_json(self) -> dict[str, Any]:
-        """Returns plain values."""
+        """Returns the state as plain values, ready for JSON."""
         return encode(self)
 
     def changed(self, content: Any) -> ViewState:
-        """Returns the state with what plain JSON tells in place of its own; what it leaves out, or
-        says is kept, stays.
+        """Returns the state with the fields of plain JSON in place of its own; fields that it
+        leaves out, or marks as kept, stay.
 
         Raises:
-            ValueError: It tells what is not there, or out of its range.
+            ValueError: A field is unknown, or a value out of its range.
         """
         return decode("state", ViewState, content, self)
 
@@ -242,7 +242,7 @@ class ViewState:
         write_whole(Path(path), text + "\n")
 
     def read(self, path: str | Path) -> ViewState:
-        """Returns the state with what a .json file tells in place of its own.
+        """Returns the state with the fields of a .json file in place of its own.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -256,20 +256,20 @@ class ViewState:
 
 
 def transfer_of(shader: Shader) -> TransferFunction | None:
-    """Returns a shader's transfer function, which may be itself, or None."""
+    """Returns a shader's transfer function, which may be the shader itself, or None."""
     found = getattr(shader, "transfer", None) or shader
     return found if isinstance(found, TransferFunction) else None
 
 
 def costed(shader: Shader) -> TransferFunction:
-    """Returns the transfer function whose costs are shown in a shader's place; raises ValueError if
-    it has none.
+    """Returns the transfer function with which a shader's costs are shown; raises ValueError if it
+    has none.
     """
     return check.instance("cost", "shader", transfer_of(shader) or shader, TransferFunction)
 
 
 def saved_state(path: str | Path) -> dict[str, Any]:
-    """Returns what a .json file of a state tells, unchecked: its fields, some of them or all.
+    """Returns the fields of a state's .json file, some of them or all, unchecked.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -282,7 +282,7 @@ def saved_state(path: str | Path) -> dict[str, Any]:
 
 
 def blended(picture: Picture, cost: Picture, share: float) -> Picture:
-    """Returns a cost picture, or so much of it over the picture, both developed."""
+    """Returns a cost picture, blended by `share` over the picture (1: alone); both developed."""
     if share == 1:
         return cost
     over = share * cost.alpha.to(picture.color)

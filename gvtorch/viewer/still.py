@@ -29,10 +29,10 @@ def still_steps(
     between its steps, so that others get their frames.
 
     Args:
-        planes: Gives the slices to draw beside it; called last.
+        planes: Returns the slices to draw beside it; called last.
         size: Width and height in pixels, with the slices.
-        unwanted: Asked between parts of the picture, whether nobody waits for it any more; then it
-            raises Interrupted.
+        unwanted: Called between parts of the picture; returns whether nobody waits for it any more,
+            in which case Interrupted is raised.
     """
 
     def check(_what: str, _done: int, _total: int) -> None:
@@ -41,7 +41,7 @@ def still_steps(
 
     width, height = size if state.slices is None else panes(*size)["view"][2:]
     camera = eye.camera(width, height, scene.box)
-    if scene.engine is not None:  # until all is there
+    if scene.engine is not None:  # loads all data
         scene.engine.render(camera, state.shader, progress=check, **state.settings())
         yield
     mean = Progressive(lambda one: scene.frame(one, state, check))
@@ -59,7 +59,7 @@ def still_steps(
 
 
 def finished_picture(steps: Steps) -> Picture:
-    """Returns the picture, without a turn for others."""
+    """Runs all steps and returns the picture, without frames of pages in between."""
     while True:
         try:
             next(steps)
@@ -68,7 +68,7 @@ def finished_picture(steps: Steps) -> Picture:
 
 
 class Stills:
-    """Those that pages wait for, which take turns."""
+    """The stills that pages wait for, made in turns."""
 
     def __init__(self) -> None:
         self._waiting: deque[tuple[Client, Steps]] = deque()
@@ -77,7 +77,7 @@ class Stills:
         return len(self._waiting)
 
     def add(self, client: Client, steps: Steps) -> None:
-        """Begins one for a page; raises ValueError if it waits for one already."""
+        """Queues a still for a page; raises ValueError if the page waits for one already."""
         if any(one is client for one, _ in self._waiting):
             raise ValueError("still: one is being made already")
         self._waiting.append((client, steps))
@@ -86,7 +86,7 @@ class Stills:
         self._waiting.clear()
 
     def go_on(self) -> None:
-        """Takes the next step of the one that waits longest, and sends it if that was the last."""
+        """Runs the next step of the first still in the queue; sends it if that was the last."""
         client, steps = self._waiting.popleft()
         try:
             next(steps)

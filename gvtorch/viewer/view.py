@@ -1,4 +1,4 @@
-"""`view`: a page in which anything that gvtorch renders is turned, and looked into."""
+"""`view`: opens anything that gvtorch renders in an interactive page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .server import Server, aiohttp_web
 from .session import Session, fitted
 from .state import Eye, ViewState
 
-_SIZE = (16, 9)  # of the picture from where the whole box is seen at first
+_SIZE = (16, 9)  # shape of the picture to which the first camera fits the box
 
 
 class Viewer:
@@ -33,7 +33,7 @@ class Viewer:
 
     Attributes:
         session: What is shown; see `Session`.
-        server: Its page.
+        server: The server of its page.
     """
 
     def __init__(self, session: Session, server: Server) -> None:
@@ -42,12 +42,12 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """The page's address."""
         return self.server.url
 
     @property
     def state(self) -> ViewState:
-        """What is shown now; `gv.view(..., state=FILE)` takes what its `save` writes."""
+        """What is shown now; `gv.view(..., state=FILE)` reads what its `save` writes."""
         return self.session.state
 
     def wait(self) -> None:
@@ -58,7 +58,7 @@ class Viewer:
             self.close()
 
     def close(self) -> None:
-        """Ends the view; an engine that was handed in stays open."""
+        """Ends the view; an engine that the caller made stays open."""
         self.server.close()
         self.session.close()
         self._closed.set()
@@ -90,24 +90,24 @@ def view(
     wait: bool | None = None,
     **options: Unpack[RenderSettings],
 ) -> Any:
-    """Opens a page in the browser that shows a scene, turns it, and edits how it looks. In a
-    notebook it is shown below the cell.
+    """Opens a page in the browser in which a scene can be explored and its look edited. In a
+    notebook the page is shown below the cell.
 
     Args:
         what: A path or URL, `Volume`, array, `Store`, `N3Tree`, `Producer` or several by name,
             `Engine`, or a function from a dataclass to a producer, whose fields become controls.
         shader: What turns values into colour; one that fits the data if left out.
-        camera: Where it stands at first; from where the whole box is seen if left out.
-        up: What is up for a camera that is left out, such as "+z".
-        state: What the page saved, or `Viewer.state`: in place of shader, camera and options.
+        camera: The first camera; one that sees the whole box if left out.
+        up: Up direction of a camera that is left out, such as "+z".
+        state: A file that the page saved, or `Viewer.state`: replaces shader, camera and options.
         engine: Fields of `EngineOptions`, where an engine is made.
         host: Address to listen at. Other machines reach it at "0.0.0.0"; ssh -L PORT:localhost:PORT
             is the safer way.
         port: 0: any that is free.
-        token: That the page's address must hold; a new one if left out.
+        token: Secret that the page's address must hold; a new one if left out.
         allow: Further names under which pages may reach this machine.
-        browser: Whether a browser is opened; if left out, where no notebook shows it.
-        wait: Whether to wait until Ctrl-C; if left out, in a script.
+        browser: Whether a browser is opened; if left out, unless a notebook shows the page.
+        wait: Whether to wait until Ctrl-C; if left out, only in a script.
         **options: Fields of `RenderOptions`.
 
     Returns:

@@ -1,4 +1,4 @@
-// The page: what it knows of the view, what it shows, and what it sends.
+// The page: its copy of the view's state, its parts, and the messages that it handles and sends.
 import { between, distance, facing } from "./camera.js";
 import { el, iconButton, keep, openJson } from "./dom.js";
 import { ClipEditor } from "./clip.js";
@@ -25,7 +25,7 @@ const TOOLS = {
 const TYPES = { png: "image/png", json: "application/json", glb: "model/gltf-binary" };
 const REST = 160;  // milliseconds after which a wheel or a key is at rest
 
-/** Puts changes over a value: objects of one kind by their fields, all else whole. */
+/** Merges a change into a value: objects of one kind field by field; anything else is replaced. */
 function merged(now, change) {
   const plain = (one) => one !== null && typeof one === "object" && !Array.isArray(one);
   if (!plain(change) || !plain(now) || (change.kind && now.kind && change.kind !== now.kind)) return change;
@@ -167,12 +167,12 @@ export class App {
     this.view.overlay();
   }
 
-  /** Notes an edit of the state, to be undone. */
+  /** Adds an edit of the state to the history. */
   remember(before, after) {
     this.history.push(() => this.put(before), () => this.put(after));
   }
 
-  /** Shows a whole state. */
+  /** Replaces the whole state. */
   put(state) {
     this.state = state;
     this.link.send("change", { state, rest: true });
@@ -223,7 +223,7 @@ export class App {
     this.change({ shader: shader.kind === "TransferFunction" ? f : { ...shader, transfer: f } }, rest);
   }
 
-  /** Whether a shader is of use here: those that need another channel, only where there is one. */
+  /** Whether a kind of shader is offered: Features needs a second channel; StoredColor and Labels are only kept. */
   offers(kind) {
     const many = Object.keys(this.widths).length > 1;
     return { Features: many, StoredColor: this.state.shader.kind === "StoredColor", Labels: this.state.shader.kind === "Labels" }[kind] ?? this.state.shader.kind !== "Labels";
@@ -288,7 +288,7 @@ export class App {
     this.resting = setTimeout(() => this.rest(), REST);
   }
 
-  /** Goes to a camera in a quarter of a second. */
+  /** Moves smoothly to a camera in a quarter of a second. */
   glide(camera) {
     const from = this.camera, start = performance.now();
     const step = (now) => {
@@ -336,7 +336,7 @@ export class App {
     this.link.send("still", { width: this.view.over.width, height: this.view.over.height });
   }
 
-  // What is told.
+  // Figures, progress and notes.
 
   watch(on) {
     this.link.send("monitor", { on });

@@ -1,4 +1,4 @@
-// A camera as the state tells it, {eye, target, up, fov, model}, and how it moves; no DOM here.
+// A camera as in the state, {eye, target, up, fov, model}, and how it moves; no DOM here.
 import { add, clamp, cross, dot, length, sub, times, turned, unit } from "./vectors.js";
 
 export const distance = (c) => length(sub(c.target, c.eye));
@@ -12,10 +12,10 @@ export function axes(c) {
   return { right, up: cross(right, forward), forward };
 }
 
-/** World units that half the picture's height shows at the target's distance. */
+/** Half the picture's height in world units, at the target's distance. */
 export const halfHeight = (c) => distance(c) * Math.tan(((Math.min(c.fov, 170) / 2) * Math.PI) / 180);
 
-/** Goes around the target by angles to the right and up. */
+/** Orbits the target by angles (radians) to the right and up. */
 export function orbited(c, yaw, pitch) {
   const pole = unit(c.up), away = sub(c.eye, c.target);
   const { right } = axes(c);
@@ -25,7 +25,7 @@ export function orbited(c, yaw, pitch) {
   return { ...c, eye: add(c.target, turned(lifted, pole, -yaw)) };
 }
 
-/** Looks elsewhere from the same place. */
+/** Turns the view direction by angles (radians), from the same position. */
 export function looked(c, yaw, pitch) {
   const pole = unit(c.up), towards = sub(c.target, c.eye);
   const { right } = axes(c);
@@ -38,25 +38,25 @@ export function shifted(c, move) {
   return { ...c, eye: add(c.eye, move), target: add(c.target, move) };
 }
 
-/** Shifts by shares of half the picture's height, so that what is at the target stays under the pointer. */
+/** Shifts by x, y in half heights of the picture, so that a point at the target's distance stays under the pointer. */
 export function panned(c, x, y) {
   const { right, up } = axes(c), half = halfHeight(c);
   return shifted(c, add(times(right, -x * half), times(up, y * half)));
 }
 
-/** The world place at the target's distance under a place of the picture: x, y in half heights from its middle. */
+/** The world position, at the target's distance, of a point of the picture: x, y in half heights from its middle. */
 export function under(c, x, y) {
   const { right, up } = axes(c), half = halfHeight(c);
   return add(c.target, add(times(right, x * half), times(up, -y * half)));
 }
 
-/** Comes nearer (factor < 1) to a place. */
+/** Scales the distance to a world position: nearer if factor < 1. */
 export function zoomed(c, factor, place) {
   const near = (p) => add(place, times(sub(p, place), factor));
   return { ...c, eye: near(c.eye), target: near(c.target) };
 }
 
-/** Looks along an axis: axis 0, 1, 2 and side +1 or -1 of where the eye stands. */
+/** Looks along an axis (0, 1, 2) from its positive or negative side (+1, -1). */
 export function facing(c, axis, side, up) {
   const away = [0, 0, 0];
   away[axis] = side;
@@ -65,7 +65,7 @@ export function facing(c, axis, side, up) {
   return { ...c, eye: add(c.target, times(away, distance(c))), up: along ? other : up };
 }
 
-/** Place in the picture, in half heights from its middle (x right, y down), and depth; null: behind the eye. */
+/** Projects a world position: half heights from the picture's middle (x right, y down), depth; null: behind the eye. */
 export function projected(c, place) {
   const { right, up, forward } = axes(c), from = sub(place, c.eye);
   const depth = dot(from, forward);
@@ -74,7 +74,7 @@ export function projected(c, place) {
   return { x: dot(from, right) / half, y: -dot(from, up) / half, depth };
 }
 
-/** Between two cameras; t from 0 to 1. */
+/** Interpolates two cameras; t from 0 to 1. */
 export function between(a, b, t) {
   const mix = (p, q) => add(times(p, 1 - t), times(q, t));
   const far = Math.exp((1 - t) * Math.log(distance(a)) + t * Math.log(distance(b)));

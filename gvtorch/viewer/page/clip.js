@@ -4,7 +4,7 @@ import { COLORS, corner, EDGES, largestSide } from "./picture.js";
 import { add, clamp, cross, dot, sub, times, unit } from "./vectors.js";
 
 const WARM = "242,181,107";
-const ARROW = 0.16;  // of the largest side
+const ARROW = 0.16;  // length, in largest sides of the box
 
 export class ClipEditor {
   constructor(app) {
@@ -69,7 +69,7 @@ export class ClipEditor {
     this.put({ ...this.clip, planes: this.clip.planes.map((old, at) => (at === n ? numbers : old)) }, rest);
   }
 
-  /** Puts a plane that is told in the world. */
+  /** Sets a plane that is given in the world. */
   putPlane(n, normal, offset) {
     const d = this.inWorld ? offset : (offset + dot(normal, this.middle)) / this.side;
     this.setPlane(n, [...normal, d], false);
@@ -99,7 +99,7 @@ export class ClipEditor {
     return handles;
   }
 
-  /** Pixels by which a way in the world moves a place; null: behind the eye. */
+  /** Pixel of a world position, and the step in pixels of a displacement from it; null: behind the eye. */
   step(place, way) {
     const ends = [place, add(place, way)].map((one) => projected(this.camera, one));
     if (!ends.every(Boolean)) return null;
@@ -123,7 +123,7 @@ export class ClipEditor {
     }
   }
 
-  /** Turns a move of the pointer into one along a way that is so many pixels long on the screen. */
+  /** Converts a move of the pointer to a world distance along a direction: `step` pixels there are `size` long. */
   along(step, dx, dy, size, take) {
     const long = step[0] ** 2 + step[1] ** 2;
     if (long > 1e-6) take(((dx * step[0] + dy * step[1]) * size) / long);
@@ -173,7 +173,7 @@ export class ClipEditor {
     this.putPlane(n, turned, -dot(turned, anchor));
   }
 
-  /** Where a plane cuts the box of the scene: corners in order around it. */
+  /** The polygon in which a plane cuts the box of the scene: its corners in order. */
   rim(normal, offset, anchor) {
     const { box } = this.app, found = [];
     for (const [a, b] of EDGES) {

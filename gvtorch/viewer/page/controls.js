@@ -1,4 +1,4 @@
-// Controls made from the schema: each by the type and range of a field, whichever class it is of.
+// Controls made from the schema: each by the type and range of a field, whatever its class.
 import { el } from "./dom.js";
 import { hex, linear } from "./vectors.js";
 
@@ -6,15 +6,15 @@ const words = (name) => name.replaceAll("_", " ");
 const LETTERS = ["x", "y", "z"];
 
 export class Controls {
-  /** `schema`: fields by the name of their class; `first(kind)` gives a new object of it; `unfit()` why
-   * controls, `Class.field`, or choices of theirs, `Class.field=choice`, can't be used as things are. */
+  /** `schema`: fields by class name; `first(kind)` returns a new object of a class; `unfit()` returns why
+   * controls (`Class.field`), or choices of them (`Class.field=choice`), can't be used at present. */
   constructor(schema, first, unfit) {
     this.schema = schema;
     this.first = first;
     this.unfit = unfit;
   }
 
-  /** Rows for the fields of an object; `change(value, rest)` takes the whole object anew. */
+  /** Rows for the fields of an object; `change(value, rest, name)` gets the whole changed object. */
   fields(value, change, { only, without = [] } = {}) {
     const told = this.schema[value.kind]?.fields ?? {};
     const names = (only ?? Object.keys(told)).filter((name) => name in told && !without.includes(name));

@@ -1,4 +1,4 @@
-// Elements in a line.
+// Helpers that make elements, and save and open files.
 
 /** Makes an element: el("div.a.b", {title: "..."}, child, "text"). */
 export function el(kind, props = {}, ...children) {
@@ -54,14 +54,14 @@ export function iconButton(name, title, onclick) {
   return made;
 }
 
-/** Keeps a file that the page made. */
+/** Saves a file that the page made. */
 export function keep(name, content, type) {
   const url = URL.createObjectURL(new Blob([content], { type }));
   el("a", { href: url, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
 
-/** Asks for a file; gives its name and text to `take`. */
+/** Asks for a file; passes its name and text to `take`. */
 export function openText(accept, take, fail) {
   const input = el("input", { type: "file", accept });
   input.onchange = async () => {
@@ -74,5 +74,5 @@ export function openText(accept, take, fail) {
   input.click();
 }
 
-/** Asks for a JSON file; gives its content to `take`. */
+/** Asks for a JSON file; passes its content to `take`. */
 export const openJson = (take, fail) => openText(".json,application/json", (_, text) => take(JSON.parse(text)), fail);

@@ -1,4 +1,4 @@
-// Key frames: what this page shows, each at a time, as `gvtorch fly --keys` takes them.
+// Key frames: states of this page, each at a time, in the format of `gvtorch fly --keys`.
 import { el, iconButton, keep, openJson } from "./dom.js";
 
 const APART = 2;  // seconds from a key to the next
@@ -30,7 +30,7 @@ export class Film {
     this.put([...this.keys, { time, state: { ...this.app.state, camera: this.app.camera } }]);
   }
 
-  /** Gives a key another time. */
+  /** Moves a key to another time. */
   move(at, time) {
     if (Number.isFinite(time) && !this.keys.some((key, n) => n !== at && key.time === time)) {
       return this.put(this.keys.map((key, n) => (n === at ? { ...key, time } : key)));

@@ -1,4 +1,4 @@
-// What was edited, step by step, and back.
+// The history of edits: undo and redo.
 
 const MOST = 100;  // steps that are kept
 
@@ -8,13 +8,13 @@ export class History {
     this.undone = [];
   }
 
-  /** Notes an edit by what takes it back and what does it again. */
+  /** Adds an edit: `back` undoes it, `forth` redoes it. */
   push(back, forth) {
     this.done = [...this.done.slice(1 - MOST), { back, forth }];
     this.undone = [];
   }
 
-  /** Takes the last edit back; false: there is none. */
+  /** Undoes the last edit; returns false if there is none. */
   undo() {
     return step(this.done, this.undone, "back");
   }

@@ -2,7 +2,7 @@
 import { el } from "./dom.js";
 import { hex, linear } from "./vectors.js";
 
-const ROWS = 60;  // that are shown at a time
+const ROWS = 60;  // shown at a time
 
 export class LabelTable {
   constructor(app, controls) {
@@ -19,7 +19,7 @@ export class LabelTable {
 
   change(part, rest = true) {
     this.app.change({ shader: { ...this.shader, ...part } }, rest);
-    if (rest) this.fill();  // else a hand is still on a row
+    if (rest) this.fill();  // else a row is still being edited
   }
 
   /** Colours that were chosen, by label. */

@@ -1,7 +1,7 @@
-// The messages: texts by their type, and pictures, which are drawn and answered one by one.
+// The messages: texts, passed on by their type, and pictures and files, which come as bytes.
 
 export class Link {
-  /** `connect(take, gone)` opens a transport and returns what sends a text. */
+  /** `connect(take, gone)` opens a transport and returns the function that sends a text. */
   constructor(connect) {
     this.takers = new Map();
     this.post = connect((data) => this.take(data), (why) => this.emit("gone", { why }));

@@ -1,10 +1,10 @@
-// The page that a server shows: its transport is a websocket at the page's own address.
+// The page that a server serves: its transport is a websocket at the page's own address.
 import { mount } from "./app.js";
 
 const address = new URL("ws" + location.search, location.href);
 address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
 
-/** Opens the socket, and opens it again when it was lost. */
+/** Opens the socket, and reopens it when it is lost. */
 function connect(take, gone) {
   let socket = null;
   let wait = 500, why = "";

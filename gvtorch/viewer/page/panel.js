@@ -19,7 +19,7 @@ export class Panel {
     this.element = el("aside.gv-panel", {}, this.body);
   }
 
-  /** A new object of a class, as the page makes them. */
+  /** A new object of a class: fields of the present shader where they fit, else the page's defaults. */
   first(kind, name) {
     const { app } = this, now = app.state.shader;
     const told = this.controls.schema[kind].fields, made = { kind };
@@ -53,7 +53,7 @@ export class Panel {
     return made;
   }
 
-  /** Makes all rows anew from the state. */
+  /** Rebuilds all rows from the state. */
   show() {
     const { app } = this, { state } = app, top = this.body.scrollTop;
     const put = (name) => (value, rest) => app.change({ [name]: value }, rest);
@@ -122,7 +122,7 @@ export class Panel {
     return [el("label.gv-row", {}, el("span.gv-name", {}, "shader"), pick), ...rows, this.surface()];
   }
 
-  /** The surface that is shown, as a file. */
+  /** The row that saves the shown surface as a file. */
   surface() {
     const { app } = this, { value, kind } = app.state.shader;
     if (kind !== "Isosurface") return null;
@@ -199,13 +199,13 @@ export class Panel {
 
 const words = (kind) => kind.replace(/([a-z])([A-Z])/g, (_, a, b) => `${a} ${b.toLowerCase()}`);
 
-/** The channel that a surface's colour is taken from: its own or else the last that will do. */
+/** The channel that colours a surface: the present one if it fits, else the last that does; null: one fixed colour. */
 function colorChannel({ color, color_channel }, widths) {
   const names = Object.keys(widths).filter((name) => color !== null || widths[name] === 4);
   return Array.isArray(color) ? null : names.find((name) => name === color_channel) ?? names.at(-1) ?? null;
 }
 
-/** What colours a surface can't have for want of channels. */
+/** Why some choices of a surface's colour can't be used: they need channels that the scene lacks. */
 function unfitColours(widths) {
   const numbers = Object.values(widths), told = {};
   for (const kind of ["Isosurface", "DistanceField"]) {
@@ -215,7 +215,7 @@ function unfitColours(widths) {
   return told;
 }
 
-/** Whether two fields hold the same: a function's `color` is a list of knots, a surface's one colour. */
+/** Whether two fields have the same type: a function's `color` is a list of points, a surface's is one colour. */
 function alike(one, other) {
   return ["type", "items", "choices"].every((part) => JSON.stringify(one[part]) === JSON.stringify(other[part]));
 }

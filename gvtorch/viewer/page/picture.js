@@ -9,7 +9,7 @@ const UNITS = {
   angstrom: "Å", picometer: "pm", kilometer: "km", inch: "in", foot: "ft",
 };
 export const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
-const REACH = 12;  // pixels from which a handle is taken
+const REACH = 12;  // pixels within which a handle is hit
 
 /** Corner n of a box: bit 0 is x, bit 1 y, bit 2 z. */
 export const corner = (box, n) => [0, 1, 2].map((axis) => box[(n >> axis) & 1][axis]);
@@ -48,7 +48,7 @@ export class PictureView {
     this.app.link.send("hello", { width, height });
   }
 
-  /** Draws a picture, then tells that it is drawn. */
+  /** Draws a picture, then acknowledges it. */
   take({ head, bytes }) {
     this.drawing = this.drawing.then(async () => {
       try {
@@ -75,7 +75,7 @@ export class PictureView {
     });
   }
 
-  /** Where the picture lies in the canvas, [left, top, width, height] in its pixels: beside planes, in a part of it. */
+  /** The part of the canvas that the picture covers, [left, top, width, height] in pixels: all of it without planes. */
   get part() {
     return this.app.slices.layout?.view ?? [0, 0, this.over.width, this.over.height];
   }
@@ -90,7 +90,7 @@ export class PictureView {
     return UNITS[this.app.unit] ?? "";
   }
 
-  /** A place of the picture in half heights from its middle, as pixels. */
+  /** Canvas pixels of a point that is given in half heights from the picture's middle. */
   pixel({ x, y }) {
     const [left, top, width, height] = this.part;
     return [left + width / 2 + (x * height) / 2, top + height / 2 + (y * height) / 2];
@@ -130,7 +130,7 @@ export class PictureView {
     context.stroke();
   }
 
-  /** A handle. */
+  /** Draws a handle. */
   dot(context, at, color, size = 6) {
     context.beginPath();
     context.arc(...at, size * this.ratio, 0, 2 * Math.PI);
@@ -141,7 +141,7 @@ export class PictureView {
     context.stroke();
   }
 
-  /** Text over the picture, told from anything behind it by a dark rim. */
+  /** Draws text over the picture, with a dark rim, so that it is legible on any background. */
   label(context, text, x, y, align, color = "rgba(255,255,255,.92)") {
     context.font = `500 ${12 * this.ratio}px system-ui, sans-serif`;
     context.textAlign = align;
@@ -158,7 +158,7 @@ export class PictureView {
   handleAt(x, y) {
     const far = ({ at }) => Math.hypot(at[0] / this.ratio - x, at[1] / this.ratio - y);
     const near = this.handles.filter((one) => far(one) < REACH);
-    return near.reduce((best, one) => (best && far(best) < far(one) ? best : one), undefined);  // of equal ones the uppermost
+    return near.reduce((best, one) => (best && far(best) < far(one) ? best : one), undefined);  // of equals the topmost
   }
 
   gizmo(context, camera) {

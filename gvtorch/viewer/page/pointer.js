@@ -1,4 +1,4 @@
-// What mouse, keys and fingers do: the camera, the window of values, the handles of the clip, the place of slices.
+// Mouse, keys and touch: they move the camera, the window of values, the handles of the clip, and the slices.
 import { distance, halfHeight, looked, orbited, panned, shifted, under, zoomed, axes } from "./camera.js";
 import { add, clamp, times } from "./vectors.js";
 
@@ -25,13 +25,13 @@ export class Pointer {
     on("blur", () => this.keys.clear());
   }
 
-  /** Pixels from the stage's corner. */
+  /** CSS pixels from the stage's corner. */
   place(event) {
     const box = this.stage.getBoundingClientRect();
     return [event.clientX - box.left, event.clientY - box.top];
   }
 
-  /** Half heights from the picture's middle. */
+  /** Converts such pixels to half heights from the picture's middle. */
   middle([x, y]) {
     const { left, top, width, height } = this.view.area;
     return [(x - left - width / 2) / (height / 2), (y - top - height / 2) / (height / 2)];
@@ -99,7 +99,7 @@ export class Pointer {
     this.handle = this.plane = null;
   }
 
-  /** Moves a handle with the pointer; what it moves is drawn anew, and with it the handle. */
+  /** Moves a handle with the pointer, and finds it again: the drawing makes new handles. */
   drag(dx, dy) {
     const { ratio } = this.view, { kind, axis, side, n } = this.handle;
     this.handle.drag(dx * ratio, dy * ratio);

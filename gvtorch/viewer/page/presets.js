@@ -1,13 +1,13 @@
-// Transfer functions by name: those that come with gvtorch, one's own, kept by the browser, and those of files: of
-// gvtorch, ParaView and 3D Slicer. Files of other programs are read by the server.
+// Transfer functions by name: those that come with gvtorch, the user's own, stored by the browser, and those of
+// files of gvtorch, ParaView and 3D Slicer, which the server reads.
 import { el, iconButton, keep, openText } from "./dom.js";
 import { domain } from "./transfer.js";
 
 const STORE = "gvtorch transfer functions";
-const MOST = 900000;  // letters of a file that may be sent
+const MOST = 900000;  // characters of a file that may be sent
 const ENDINGS = ".json,.vp,.xml";
 
-/** One's own functions by name; none where the browser keeps nothing. */
+/** The user's own functions by name; none if the browser stores nothing. */
 function ownFunctions() {
   try {
     return JSON.parse(localStorage.getItem(STORE)) ?? {};
@@ -20,12 +20,12 @@ export class Presets {
   constructor(app) {
     this.app = app;
     this.builtIn = [];
-    this.file = null;  // the last one that holds several: {name, names, text(name)}
+    this.file = null;  // the last file with several functions: {name, names, text(name)}
     this.name = el("input", { type: "text", placeholder: "name", maxLength: 60, onkeydown: (e) => { if (e.key === "Enter") this.save(); } });
     this.target = el("select", { title: "Where these colours are saved" }, ...["save mine", "save file", "ParaView"].map((one) => el("option", {}, one)));
   }
 
-  /** The values over which presets without values of their own are laid. */
+  /** The values over which presets with relative values are stretched. */
   span() {
     const { app } = this, f = app.transfer(), h = app.panel.editor.histogram;
     let [low, high] = f ? domain(f) : [h.low, h.high];
@@ -72,7 +72,7 @@ export class Presets {
     app.say([name, ...(lost ?? [])].join("; "));
   }
 
-  /** A file of one function is read at once; of several, their names are offered. */
+  /** Reads a file with one function at once; offers the names if it has several. */
   open(name, text) {
     const found = several(name, text);
     if (!found) return this.read(name, text, null);
@@ -86,7 +86,7 @@ export class Presets {
     this.app.link.send("read", { file, text, name, ...this.span() });
   }
 
-  /** Keeps the colours in this browser, or as a file of gvtorch or ParaView. */
+  /** Saves the colours in this browser, or as a file of gvtorch or ParaView. */
   save() {
     const name = this.name.value.trim(), { app } = this, target = this.target.selectedIndex;
     if (target === 2) return app.link.send("export", name ? { name } : {});
@@ -115,7 +115,7 @@ export class Presets {
   }
 }
 
-/** The names of the functions of a file that has several, and the text of one; null: it has one. */
+/** The names of a file's functions, and what returns the text of one; null if the file has only one. */
 function several(file, text) {
   if (file.endsWith(".xml")) {
     const parsed = new DOMParser().parseFromString(text, "text/xml");
@@ -127,7 +127,7 @@ function several(file, text) {
   try {
     items = JSON.parse(text);
   } catch {
-    return null;  // the server tells what is wrong
+    return null;  // the server reports what is wrong
   }
   if (!Array.isArray(items) || items.length < 2) return null;
   const named = new Map(items.filter((one) => one?.RGBPoints).map((one, n) => [String(one.Name ?? n), one]));

@@ -1,4 +1,4 @@
-// Three planes beside the picture: where they lie, what is drawn over them, and how hands move their place.
+// Three planes beside the picture: their layout, what is drawn over them, and how the pointer moves them.
 import { COLORS } from "./picture.js";
 
 const AXES = ["x", "y", "z"];
@@ -10,12 +10,12 @@ export class SlicesView {
     this.view = view;
   }
 
-  /** What the newest picture tells of its parts, or null where it is one picture alone. */
+  /** The layout of the newest picture's parts, or null if it has no planes. */
   get layout() {
     return this.app.state?.slices ? this.view.head?.layout ?? null : null;
   }
 
-  /** The place through which the planes go, in the world. */
+  /** The world position through which the planes go. */
   get place() {
     return this.app.state.slices.at ?? this.layout.x.at;
   }
@@ -36,7 +36,7 @@ export class SlicesView {
     this.app.change({ slices: { ...this.app.state.slices, at } }, rest);
   }
 
-  /** Moves the place to what a plane shows at a place in CSS pixels. */
+  /** Moves the planes to the point that a plane shows at a position in CSS pixels. */
   pick(axis, x, y) {
     const { image: [left, top, width, height], columns, rows } = this.layout[axis];
     const share = (one, from, size) => Math.min(1, Math.max(0, (one * this.view.ratio - from) / size));
@@ -47,7 +47,7 @@ export class SlicesView {
     this.moveTo(at, false);
   }
 
-  /** Goes to the next plane, a voxel further. */
+  /** Moves a plane by one voxel. */
   wheel(axis, lines) {
     const at = [...this.place], { step } = this.layout[axis], number = AXES.indexOf(axis), { box } = this.app;
     const moved = at[number] - Math.sign(lines) * step;

@@ -1,9 +1,9 @@
-// The slider of time, where the scene has one, below the picture.
+// The time slider below the picture, for scenes that change with time.
 import { el, icon, ICONS } from "./dom.js";
 import { short } from "./vectors.js";
 
-const SPAN = 10;  // of a clock's slider, which has no end of its own
-const STEP = 0.1;  // of a clock that plays
+const SPAN = 10;  // a clock's slider ends at a multiple of it, since clocks have no end
+const STEP = 0.1;  // by which a clock advances while it plays
 
 export class TimeBar {
   constructor(app) {
@@ -47,14 +47,14 @@ export class TimeBar {
     else if (this.app.before) this.app.settle();
   }
 
-  /** Goes on, when the picture of the time before is here. */
+  /** Goes to the next time. */
   next() {
     const { time } = this.app.state;
     const after = this.times === null ? Number((time + STEP).toFixed(6)) : (time + 1) % this.times;
     this.go(after, false);
   }
 
-  /** A picture was drawn that shows a time. */
+  /** Handles a picture that was drawn: goes on playing if it shows the present time. */
   drawn(head) {
     if (this.playing && head.time === this.app.state.time) {
       clearTimeout(this.timer);

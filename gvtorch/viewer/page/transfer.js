@@ -1,24 +1,24 @@
-// The editor of a transfer function: opacity over the histogram, colours below, by their corner points.
+// The editor of a transfer function: opacity over the histogram, colours below, both edited by their points.
 import { el } from "./dom.js";
 import { clamp, hex, linear, short, toSrgb } from "./vectors.js";
 
 const [HEIGHT, STRIP, EDGE, TOP] = [136, 18, 10, 24];  // CSS pixels
-const MOST = 40;  // corner points that are drawn
-const TAKEN = 9;  // pixels from which a point is taken
+const MOST = 40;  // points of a function up to which they are drawn and can be edited
+const TAKEN = 9;  // pixels within which a point is hit
 
-/** The values between which a function has corner points. */
+/** The range of values of a function's points. */
 export function domain(f) {
   const values = [...f.opacity, ...f.color].map((point) => point[0]);
   return [Math.min(...values), Math.max(...values)];
 }
 
-/** The function with its corner points moved from [a, b] to [low, high]. */
+/** The function with its points stretched from [a, b] to [low, high]. */
 export function stretched(f, [a, b], [low, high]) {
   const move = (points) => points.map(([v, ...rest]) => [low + ((v - a) / (b - a || 1)) * (high - low), ...rest]);
   return { ...f, opacity: move(f.opacity), color: move(f.color) };
 }
 
-/** A piecewise linear function of rising points, constant beyond its ends. */
+/** Evaluates a piecewise linear function at v: points by increasing value; constant beyond its ends. */
 export function valueAt(points, v) {
   const next = points.findIndex((point) => point[0] >= v);
   if (next === 0) return points[0].slice(1);
@@ -28,7 +28,7 @@ export function valueAt(points, v) {
   return a.slice(1).map((one, at) => one + t * (b[at + 1] - one));
 }
 
-// Opacity is drawn by its square root: what is thin needs the finer hand.
+// The opacity axis is a square root, so that small opacities can be set finely.
 const up = (alpha) => Math.sqrt(alpha);
 const down = (height) => height * height;
 
@@ -68,7 +68,7 @@ export class TransferEditor {
     this.draw();
   }
 
-  /** The values that the editor shows. */
+  /** The range of values that the editor shows. */
   wholeSpan() {
     let [low, high] = domain(this.f);
     const h = this.histogram;
@@ -180,7 +180,7 @@ export class TransferEditor {
     this.f.color.forEach(([v, ...color], n) => this.dot(c, this.x(v), top + STRIP - 4, hex(color), this.chosen?.what === "color" && this.chosen.at === n));
   }
 
-  /** What lies at a place: a point of the opacity or of the colours, or the row itself. */
+  /** What is under the pointer: point `at` of the opacity or of the colours, or no point of that row (-1). */
   found(event) {
     const box = this.canvas.getBoundingClientRect();
     const [x, y] = [event.clientX - box.left, event.clientY - box.top];
