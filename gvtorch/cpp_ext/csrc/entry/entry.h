@@ -303,7 +303,7 @@ struct FusedShaders {
       STD_TORCH_CHECK(args.features == (by_other ? args.other_channels : Shader::kFeatures),
                       "gvtorch: features is not what the shader gives");
     });
-    STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold 20 elements, got ",
+    STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold ", kParameters, " elements, got ",
                     args.parameters);
   }
   static void run(const Tensor& like, ShadeArgs args, bool wide);  // in cpu_rays.cpp and in cuda.cu

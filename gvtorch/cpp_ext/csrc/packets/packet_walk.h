@@ -112,9 +112,9 @@ struct PacketWalk {
     while (any(alive)) {
       const Mask waiting = alive & (left == 0);
       if (any(waiting)) go_on(waiting);
-      Mask marching = alive & (left > 0);
+      Mask ready = alive & (left > 0);
       const int32_t enough = count(alive) / 2 + 1;
-      while (count(marching) >= enough) marching = march(marching);
+      while (count(ready) >= enough) ready = march(ready);
     }
     for (int lane = 0; lane < kLanes; ++lane) {
       if (numbers[lane] >= 0) end_ray(lane);

@@ -10,8 +10,8 @@ namespace gvtorch {
 // True if packets can trace the rays. They address nodes by 32-bit byte offsets, compute offsets in a brick in floats,
 // and load 4 bytes at once: beyond a voxel, but not beyond the pool, whose last brick only single rays' functions read.
 inline bool packs(const TraceArgs& args) {
-  constexpr int64_t kMostNodes = INT32_MAX / sizeof(int32_t);
-  return args.nodes <= kMostNodes && args.bricks >= 2 && brick_bytes(args.voxel, args.side, args.channels) < 1 << 24;
+  constexpr int64_t kMostWords = INT32_MAX / sizeof(int32_t);
+  return args.nodes <= kMostWords && args.bricks >= 2 && brick_bytes(args.voxel, args.side, args.channels) < 1 << 24;
 }
 
 // True if packets can trace a fused shader's rays.
