@@ -155,8 +155,8 @@ def estimate(
     workers: int | None = None,
     **options: Unpack[FormatSettings],
 ) -> Estimate:
-    """Returns the estimated cost of `convert`, from a few cubes converted in memory. Writes no
-    store. Reads the whole source to list its labels if they are wider than 16 bits.
+    """Returns the estimated cost of `convert`, from a few cubes converted in memory. Writes
+    nothing. Reads the whole source to list its labels if they are wider than 16 bits.
 
     Args, Raises: as `convert`.
     """
@@ -253,9 +253,7 @@ def _write_levels(
 
 
 def _value_range(task: shard.Conversion) -> list[list[float]]:
-    """Returns each channel's smallest and largest value over all times, from the last level, which
-    is one cell.
-    """
+    """Returns [low, high] of each channel over all times, from the last level: a single cell."""
     deadline = Deadline(_OPEN_TIMEOUT)
     spec = task.layout.cells(task.layout.levels - 1)
     cells = deadline.wait(deadline.wait(begin_open(task.root, spec), "cells").read(), "cells")
