@@ -13,8 +13,8 @@ from torch import Tensor
 from ..ops.voxelize import ARITY, Voxelized, voxelize
 from .mesh import Mesh, solids
 
-_BITS = 20  # of a Morton code, along an axis
-_HALF_DIAGONAL = 0.5 * 3**0.5  # of a cube of side 1
+_BITS = 20  # bits of a Morton code along each axis
+_HALF_DIAGONAL = 0.5 * 3**0.5  # half the diagonal of a unit cube
 _POINTS = 1 << 20  # points per call of the op
 
 

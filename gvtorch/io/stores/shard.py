@@ -184,7 +184,7 @@ def finish_write(begun: Any, where: str, then: str = "--resume (resume=True) goe
     """Waits for a write; `then` is the advice in the error message if the disk is full."""
     try:
         begun.result()
-    except Exception as error:  # tensorstore raises what its status maps to
+    except Exception as error:  # tensorstore raises exceptions of several types
         if "No space left" in str(error):
             text = f"the disk is full; with room again, {then}"
             raise OSError(errno.ENOSPC, text, where) from None

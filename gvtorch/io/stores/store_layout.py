@@ -402,7 +402,7 @@ class Deadline:
         except TimeoutError:
             future.cancel()
             raise self.over(where) from None
-        except Exception as error:  # tensorstore raises what its status maps to
+        except Exception as error:  # tensorstore raises exceptions of several types
             raise StoreError(f"{where}: {short(error)}") from None
 
 
