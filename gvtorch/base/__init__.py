@@ -1,1 +1,1 @@
-"""What every room stands on: records, checks, constants, the names of stages."""
+"""What every other package builds on: records, checks, constants, the names of stages."""

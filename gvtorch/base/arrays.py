@@ -1,5 +1,5 @@
-"""`ArrayLike`: arrays of other libraries (xarray, dask, zarr, h5py, NumPy, and what offers
-`__array__`, `__array_interface__` or `__dlpack__`), by what they offer: none of them is imported.
+"""`ArrayLike`: arrays of other libraries (xarray, dask, zarr, h5py, NumPy, and any object with
+`__array__`, `__array_interface__` or `__dlpack__`), by duck typing: no library is imported.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from .named_axes import ask_axes, even_steps, named_axes, place_named
 from .units import spacing_of
 from .volume import Volume, check_extent
 
-#: Attributes by which files of NetCDF and HDF5 tell what their numbers stand for.
+#: Attributes by which NetCDF and HDF5 files specify how stored numbers map to values.
 _PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned", "valid_range")
 _OFFERS = ("__array__", "__array_interface__", "__dlpack__")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayLike:
-    """An array of numbers, and what it tells of itself."""
+    """An array of numbers, and the metadata it carries."""
 
     data: Any = field(repr=False)
     shape: tuple[int, ...]
     axes: str  # a letter for each: t, c, z, y, x, or - for one of size 1 to drop
     dtype: str
-    lazy: bool  # values are read or computed when they are asked for
+    lazy: bool  # values are read or computed on access
     name: str = ""
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)  # x y z
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     flips: str = ""  # letters of axes that run backwards
     info: ImageInfo = field(default_factory=ImageInfo)
-    lost: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()  # phrases: metadata that is not kept
 
     def grid(self, time: int) -> np.ndarray:
-        """Reads a time point, (z, y, x, c)."""
+        """Returns a time point, (z, y, x, c), with axes that run backwards flipped."""
         data = self.read(
             tuple(
                 slice(time, time + 1) if axis == "t" else slice(0, n)
@@ -52,16 +52,16 @@ class ArrayLike:
         return np.flip(data, tuple("zyx".index(axis) for axis in self.flips))
 
     def read(self, index: tuple[slice, ...]) -> np.ndarray:
-        """Reads or computes a part."""
+        """Reads or computes a part of the array."""
         return np.asarray(self.data[index])
 
     @classmethod
     def of(cls, where: str, given: Any, axes: str | None = None) -> ArrayLike:
-        """Looks at an object, without reading its values if it need not. `axes`: a letter for each,
-        where they have no names that tell.
+        """Returns the description of an array, reading its values only if necessary. `axes` has a
+        letter for each axis, for arrays whose axes have no meaningful names.
 
         Raises:
-            ValueError: It is no array of real numbers, or what its axes are must be told.
+            ValueError: It is not an array of real numbers, or `axes` is needed, or does not fit.
         """
         where = f"{where} ({type(given).__name__})"
         if hasattr(given, "data_vars"):
@@ -120,26 +120,26 @@ def as_volume(
     """Returns an array of any library as a volume in memory.
 
     Args:
-        given: A volume (returned as it is), a tensor, or an array: NumPy, xarray (names, places and
-            units of its axes are kept), dask, zarr, h5py, or any object with `__array__`,
+        given: A volume (returned as it is), a tensor, or an array: NumPy, xarray (keeps names,
+            coordinates and units of its axes), dask, zarr, h5py, or any object with `__array__`,
             `__array_interface__` or `__dlpack__`.
-        axes: A letter among t c z y x for each axis, where their names do not tell. Left out, three
-            axes are (z, y, x).
+        axes: A letter among t c z y x for each axis, for axes without meaningful names. If left
+            out, three axes are (z, y, x).
         time: Which time point, from 0; the first, with a warning, if left out where there are more.
-        spacing: (x, y, z) world units; overrides what the array tells.
-        origin: (x, y, z) world place of the first voxel's centre; overrides what the array tells.
-        nan: Value for voxels that are NaN or infinite; they are refused if left out.
-        where: Who asks, for messages.
+        spacing: (x, y, z) world units; overrides the array's metadata.
+        origin: (x, y, z) world position of the first voxel's centre; overrides the metadata.
+        nan: Value for voxels that are NaN or infinite; they are an error if left out.
+        where: The caller's name, for messages.
 
     Raises:
-        ValueError: It is no array of real numbers, does not fit into memory, or what its axes are
-            must be told.
+        ValueError: It is not an array of real numbers, does not fit into memory, or `axes` is
+            needed, or does not fit.
     """
     if isinstance(given, Volume):
         return given
     if isinstance(given, Tensor):
         letters = ask_axes(where, given.shape, axes)
-        if letters in ("zyx", "zyxc"):  # every dtype of torch, and no copy
+        if letters in ("zyx", "zyxc"):  # supports every dtype of torch, and copies nothing
             return Volume(given, spacing or (1, 1, 1), origin or (0, 0, 0), nan=nan)
         found = ArrayLike.of(where, given.detach().cpu().numpy(), letters)
     else:
@@ -166,7 +166,7 @@ def as_volume(
 
 
 def _plain(where: str, given: Any) -> np.ndarray:
-    """The NumPy array of an object that offers one."""
+    """Returns the NumPy array of an object that offers one."""
     if not any(hasattr(given, name) for name in _OFFERS):
         raise ValueError(f"{where}: expected a volume or an array")
     try:
@@ -176,7 +176,7 @@ def _plain(where: str, given: Any) -> np.ndarray:
 
 
 def _filled(where: str, given: np.ma.MaskedArray) -> np.ndarray:
-    """The array with NaN for what is masked; whole numbers become float32 then."""
+    """Returns the array with NaN where it is masked; integers become float32 if anything is."""
     data, gaps = np.asarray(given.data), np.ma.getmaskarray(given)
     if not gaps.any() or data.dtype.kind not in "biuf":
         return data
@@ -203,8 +203,8 @@ def _attributes(given: Any) -> dict[str, Any]:
 def _described(
     given: Any, rank: int
 ) -> tuple[list[str], list[tuple[float, float] | None], list[str | None], list[str]]:
-    """Names, places and units of axes, and what is not kept."""
-    metadata = getattr(given, "metadata", None)  # of zarr
+    """Returns each axis's name, coordinates (step and first) and unit, and notes on losses."""
+    metadata = getattr(given, "metadata", None)  # zarr arrays have it
     dims: Any = getattr(given, "dims", None) or getattr(metadata, "dimension_names", None) or ()
     names = [str(name or "") for name in dims]
     if len(names) != rank or any("<" in name for name in names):  # h5py's dims are objects
@@ -225,7 +225,7 @@ def _described(
 
 
 def _channels(given: Any, letters: str, width: int) -> tuple[ChannelInfo, ...]:
-    """Names of channels: the coordinates of their axis, if they are words."""
+    """Returns the names of channels: the coordinates of the axis c, if they are text."""
     if "c" not in letters or not hasattr(given, "coords"):
         return ()
     name = given.dims[letters.index("c")]

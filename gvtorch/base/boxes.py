@@ -1,5 +1,5 @@
-"""Boxes of voxels, `low` to `high` in z, y, x: their index, and what lies beyond a grid; how many
-voxels a box of the world has.
+"""Boxes of voxels, `low` to `high` in z, y, x: indexing them and padding them beyond a grid; and
+the number of voxels of a box in the world.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ Zyx = Sequence[int]
 
 
 def index(low: Any, high: Any) -> tuple[slice, ...]:
-    """The NumPy index of a box."""
+    """Returns the NumPy index of a box."""
     return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
 
 
 def clamped_box(low: Zyx, high: Zyx, shape: Zyx) -> tuple[list[int], list[int]]:
-    """The part of a box that lies in a grid, or what is next to it: at least one voxel a side."""
+    """Returns the part of a box inside a grid, or the nearest: at least one voxel a side."""
     start = [min(max(a, 0), n - 1) for a, n in zip(low, shape, strict=True)]
     stop = [max(min(b, n), a + 1) for a, b, n in zip(start, high, shape, strict=True)]
     return start, stop
 
 
 def repeat_edges(data: np.ndarray, start: Zyx, low: Zyx, high: Zyx) -> np.ndarray:
-    """Extends (z, y, x, c) voxels, which begin at `start`, to a box; the outermost repeat."""
+    """Returns (z, y, x, c) voxels that begin at `start`, extended to a box by edge voxels."""
     for axis, (at, a, b) in enumerate(zip(start, low, high, strict=True)):
         size = data.shape[axis]
         if (at, at + size) != (a, b):
@@ -36,8 +36,8 @@ def repeat_edges(data: np.ndarray, start: Zyx, low: Zyx, high: Zyx) -> np.ndarra
 
 
 def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
-    """Returns an array whose axes are `axes` as (z, y, x, c), or as another order of the same and
-    more; those that it lacks have size 1. Axes -, of size 1, are dropped.
+    """Returns an array whose axes are `axes` transposed to `order`, which holds all of them; axes
+    that the array lacks get size 1. Axes -, of size 1, are dropped.
     """
     data = data.squeeze(tuple(at for at, axis in enumerate(axes) if axis == "-"))
     axes = axes.replace("-", "")
@@ -47,7 +47,7 @@ def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
 
 
 def rows_by_place(places: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns the different ones (m, n) of places (k, n), in order, and the rows of each."""
+    """Returns the distinct places (m, n) of (k, n), sorted, and the row indices of each."""
     order = np.lexsort(places.T[::-1])
     places = places[order]
     others = np.flatnonzero((places[1:] != places[:-1]).any(1)) + 1
@@ -58,8 +58,8 @@ def rows_by_place(places: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
 def extent_in(
     where: str, extent: int | Sequence[int], box: Sequence[Sequence[float]]
 ) -> Sequence[int]:
-    """Returns an extent along x, y, z as it is; a number is that of the box's longest side, and
-    voxels are cubes then, or nearly so.
+    """Returns an extent (x, y, z) as it is. A single number is the extent along the box's longest
+    side; the others are chosen so that voxels are cubes, or nearly so.
     """
     if not isinstance(extent, int):
         return extent

@@ -1,4 +1,4 @@
-"""`in_branches`: jobs of a recorded frame that do not wait for one another."""
+"""`in_branches`: runs jobs of a recorded frame as parallel branches of its CUDA graph."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import torch
 
 
 def in_branches(*jobs: Callable[[], Any]) -> list[Any]:
-    """Returns what each job returns. While a CUDA graph is recorded, jobs become branches of it,
-    which run at the same time and end before what comes next; else they run one after the other.
-    No job may write what another reads.
+    """Runs jobs and returns their results in order. While a CUDA graph is captured, jobs become its
+    branches, which run at the same time and are joined at the end; else they run one by one. No job
+    may write what another reads.
     """
     if not (torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()):
         return [job() for job in jobs]

@@ -1,5 +1,5 @@
-"""Checks of what a user hands in: one line that says who complains, what was expected and what
-came.
+"""Checks of user input. Errors are one line that names the caller, what was expected and what was
+given.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def describe(tensor: Any) -> str:
 
 
 def brief(record: Any) -> str:
-    """Returns a line on a dataclass: what differs from defaults, of tensors shape and dtype."""
+    """Returns one line on a dataclass: fields that differ from their default, tensors by shape."""
     parts = []
     for field in fields(record):
         value = getattr(record, field.name)
@@ -43,7 +43,7 @@ def brief(record: Any) -> str:
 
 
 def shown(value: Any) -> str:
-    """Returns a value as text, of a tensor or array only shape and dtype."""
+    """Returns a value as text; for a tensor or array only its shape and dtype."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {shown(one)}" for key, one in value.items()) + "}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
@@ -52,9 +52,9 @@ def shown(value: Any) -> str:
 
 
 def given(value: Any) -> str:
-    """Returns what was given, as an error tells it: in a line that is not long."""
+    """Returns a value as an error message shows it: one line of at most 200 characters."""
     if isinstance(value, int) and value.bit_length() > 1000:
-        return f"a number of {value.bit_length()} bits"  # Python writes none of 4,300 digits
+        return f"a number of {value.bit_length()} bits"  # Python refuses to print over 4,300 digits
     return one_line(shown(value), 200)
 
 
@@ -66,8 +66,8 @@ def tensor(
     dtype: torch.dtype,
     device: torch.device,
 ) -> None:
-    """Raises ValueError unless `value` is a tensor of this shape (a letter: of any size), dtype and
-    device: `where: name must be (r, 3) float32 on cpu, got (4, 2) float64 on cpu`.
+    """Raises ValueError unless `value` is a tensor of this shape (a letter matches any size), dtype
+    and device: `where: name must be (r, 3) float32 on cpu, got (4, 2) float64 on cpu`.
     """
     fits = isinstance(value, Tensor) and value.dtype == dtype and value.device == device
     if fits and value.dim() == len(shape):
@@ -82,7 +82,8 @@ def tensor(
 
 
 _DIGITS = {str(digit): digit for digit in range(10)}
-#: Name, tensor, shape (a letter or digit a size), dtype: ("origin_r3", origin_r3, "r3", float64).
+#: Name, tensor, shape (a letter or digit per dimension) and dtype of a tensor to check, as in
+#: ("origin_r3", origin_r3, "r3", float64).
 Field = tuple[str, Tensor, str, torch.dtype]
 
 
@@ -92,8 +93,8 @@ def tensors(
     fields: Iterable[Field],
     sizes: Mapping[str, int] | None = None,
 ) -> dict[str, int]:
-    """Returns the sizes that letters stand for, each for the same in all fields; `sizes` are known
-    before.
+    """Checks tensors and returns the size of each letter, which is one over all fields; `sizes` are
+    known beforehand.
 
     Raises:
         ValueError: A tensor is not contiguous or not of its shape, dtype and device.
@@ -110,23 +111,24 @@ def tensors(
                 if value.is_contiguous():
                     continue
                 raise ValueError(f"{where}: {name} must be contiguous")
-        told = dict(itertools.islice(known.items(), before))  # by the fields before this one
+        told = dict(itertools.islice(known.items(), before))  # from the fields before this one
         expected = [told.get(letter, letter) for letter in shape]
-        tensor(where, name, value, expected, dtype, device)  # raises, unless a letter differs in it
+        # Raises, unless the only fault is a letter that has two sizes within this field.
+        tensor(where, name, value, expected, dtype, device)
         raise ValueError(f"{where}: {name} must be ({', '.join(shape)}), got {describe(value)}")
     return known
 
 
 @functools.cache
 def shape_of(name: str) -> str:
-    """Returns the shape that a name ends with, as in "r3" of origin_r3; bricks are cubes: "bsssc"
-    of bricks_bzyxc.
+    """Returns the shape suffix of a name, "r3" for origin_r3. Bricks are cubes, so bricks_bzyxc
+    gives "bsssc".
     """
     return name.rpartition("_")[2].replace("bzyx", "bsss")
 
 
 def instance(where: str, name: str, value: Any, *kinds: type[Kind]) -> Kind:
-    """Returns `value`; raises ValueError unless it is of one of the classes."""
+    """Returns `value`; raises ValueError unless it is an instance of one of the classes."""
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in kinds)
         raise ValueError(f"{where}: {name} must be a {wanted}, got {type(value).__name__}")
@@ -134,12 +136,12 @@ def instance(where: str, name: str, value: Any, *kinds: type[Kind]) -> Kind:
 
 
 def text(where: str, name: str, value: Any) -> str | None:
-    """Returns `value`; ValueError unless it is a text or None: arrays can't even be compared."""
+    """Returns `value`; ValueError unless it is a str or None (`==` and `or` fail on arrays)."""
     return None if value is None else instance(where, name, value, str)
 
 
 def one_of(where: str, name: str, value: Any, known: Iterable[Any]) -> None:
-    """Raises ValueError, which tells them, unless a value is one of those known."""
+    """Raises ValueError, which lists the known values, unless `value` is one of them."""
     choices = [*known]
     if value not in choices:
         *most, last = map(repr, choices or [None])
@@ -156,10 +158,10 @@ def known(where: str, options: Mapping[str, Any], kind: type) -> None:
 
 
 def no_gradient(where: str, name: str, value: Any) -> None:
-    """Raises RuntimeError if a tensor requires gradients, which are recorded and would be lost.
+    """Raises RuntimeError if a tensor requires gradients that autograd records but would lose.
 
-    The same in eager, scripted, compiled and exported programs: ops/registry.py calls it for the
-    arguments of ops, others where numbers leave torch.
+    Works alike in eager, scripted, compiled and exported programs: ops/registry.py calls it for the
+    arguments of ops, other modules call it where values leave torch.
     """
     if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
         raise lost_gradient(where, name)
@@ -174,8 +176,8 @@ def lost_gradient(where: str, name: str) -> RuntimeError:
 
 
 def images(where: str, name: str, value: Any, channels: int, *, batch: bool = True) -> None:
-    """Raises ValueError unless `value` is a picture (h, w, channels) of floats, not empty, or, if
-    `batch`, several (n, h, w, channels).
+    """Raises ValueError unless `value` is a non-empty float picture (h, w, channels) or, if `batch`
+    is true, several (n, h, w, channels).
     """
     if (
         isinstance(value, Tensor)
@@ -190,7 +192,7 @@ def images(where: str, name: str, value: Any, channels: int, *, batch: bool = Tr
 
 
 def device(where: str, value: Any) -> torch.device:
-    """Returns a device, CUDA with its index as tensors name theirs; ValueError if there is none."""
+    """Returns a device, CUDA always with an index (as in `tensor.device`); ValueError if absent."""
     try:
         found = torch.device(value)
     except (RuntimeError, TypeError):
@@ -218,15 +220,15 @@ def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:
         )
 
 
-_LEAST = 1e-60  # of positive numbers, so that their ratios and squares are numbers
-_MOST_VOXELS_AWAY = 2.0**50  # from the 0 of the world: places are told to an eighth voxel there
+_LEAST = 1e-60  # smallest positive number: ratios and squares neither overflow nor become 0
+_MOST_VOXELS_AWAY = 2.0**50  # from the world's origin: positions are exact to 1/8 voxel there
 _MOST_JSON = 1 << 26  # bytes of a user's file
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
 
 
 def nbytes(where: str, name: str, value: Any) -> int:
-    """Returns bytes of a number or text as "8 MB" (10^6), "8 MiB" (2^20); ValueError otherwise."""
+    """Returns bytes from a number, "8 MB" (10^6) or "8 MiB" (2^20); ValueError otherwise."""
     if isinstance(value, str):
         match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", value)
         unit = _UNITS.get(match[2].upper()) if match else None
@@ -271,7 +273,7 @@ def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsiz
     """Returns `value` as an int; raises ValueError unless it is a whole number in [low, high]."""
     try:
         plain = operator.index(value)
-    except (TypeError, RuntimeError):  # of tensors and arrays
+    except (TypeError, RuntimeError):  # from tensors and arrays
         plain = None
     if isinstance(value, bool) or plain is None or not low <= plain <= high:
         upper = f" and <= {high}" if high < sys.maxsize else ""
@@ -280,7 +282,7 @@ def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsiz
 
 
 def halves(where: str, branching: Any, what: str) -> None:
-    """Raises ValueError unless N is 2, for `what`, whose levels halve their voxels."""
+    """Raises ValueError unless N is 2, as `what` requires: its levels halve the resolution."""
     if branching != 2:
         raise ValueError(f"{where}: branching must be 2 for {what}, got {given(branching)}")
 
@@ -288,7 +290,7 @@ def halves(where: str, branching: Any, what: str) -> None:
 def triple(
     where: str, name: str, value: Any, *, positive: bool = False
 ) -> tuple[float, float, float]:
-    """Returns (x, y, z); raises ValueError unless they are finite and, if asked, positive."""
+    """Returns (x, y, z); raises ValueError unless they are finite, and positive if `positive`."""
     no_gradient(where, name, value)
     if isinstance(value, Tensor):
         value = value.tolist()
@@ -307,7 +309,7 @@ def triple(
 
 
 def box(where: str, value: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Returns two corners, (x, y, z) each; ValueError unless the second is beyond the first."""
+    """Returns two corners, (x, y, z) each; ValueError unless the second exceeds the first."""
     if len(value) != 2:
         raise ValueError(f"{where}: box must be two corners, got {value!r}")
     low, high = (triple(where, "box", corner) for corner in value)
@@ -319,8 +321,8 @@ def box(where: str, value: Any) -> tuple[tuple[float, float, float], tuple[float
 def placed(
     where: str, spacing: Any, origin: Any, extent: Sequence[int]
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Returns spacing and origin, (x, y, z) each, of a grid of so many voxels (x, y, z); raises
-    ValueError unless float64 tells its voxels apart where it lies.
+    """Returns spacing and origin, (x, y, z) each, of a grid of `extent` voxels (x, y, z); raises
+    ValueError if it is so far from 0 that float64 can't resolve its voxels.
     """
     steps = triple(where, "spacing", spacing, positive=True)
     place = triple(where, "origin", origin)
@@ -334,7 +336,7 @@ def placed(
 
 
 def json_file(what: str, path: str | Path) -> Any:
-    """Returns what a user's JSON file holds; FileNotFoundError or ValueError if it is none."""
+    """Returns the content of a user's JSON file; raises FileNotFoundError or ValueError."""
     file = Path(path)
     if not file.is_file():
         raise FileNotFoundError(f"{what} not found: {file}")
@@ -347,7 +349,7 @@ def json_file(what: str, path: str | Path) -> Any:
 
 
 def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:
-    """Returns finite numbers, of a shape if given, as float64 on the CPU; ValueError otherwise."""
+    """Returns a float64 CPU tensor; ValueError unless finite and of `shape`, if that is given."""
     no_gradient(where, name, value)
     try:
         numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()

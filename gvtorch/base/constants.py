@@ -1,10 +1,8 @@
-"""Constants that more than one floor needs. What a user may change is an argument with this as its
-default.
-"""
+"""Constants that several packages use. Those that a user may change are defaults of arguments."""
 
 from __future__ import annotations
 
-#: The pixel cone is taken this much wider than the pixel, so that a level of detail is chosen a
+#: A pixel's cone is this many times as wide as the pixel, so that a coarser level is chosen a
 #: little early rather than late. Source: the original engine's factor (devkit, GvRendererKernel
 #: documentation: 1.333).
 CONE_OVERESTIMATE = 4 / 3
@@ -13,23 +11,23 @@ CONE_OVERESTIMATE = 4 / 3
 #: I3D 2009.
 STOP_ALPHA = 0.99
 
-#: The depth of a ray is where its alpha passes this; rays that stay below have depth +inf.
+#: The depth of a ray is where its alpha exceeds this; rays that stay below have depth +inf.
 DEPTH_ALPHA = 0.1
 
 #: Shortest interval, in voxels of the finest level.
 STEP = 0.5
 
-#: Most voxels that a volume read at once may have (2^31).
+#: Most voxels that a volume in memory may have (2^31).
 MAX_VOXELS = 2**31
 
-#: Most intervals that a ray counts from one base: their number is kept in a float32.
+#: Most intervals that a ray counts from one base: the count is a float32.
 MAX_INTERVALS = 2**23
 
-#: Above so many voxels a side of the root cube, places are worked out in float64: float32 would
-#: tell them to 1/128 of a voxel at best.
+#: Where the root cube has more voxels than this along a side, positions are computed in float64:
+#: those in float32 would be exact to 1/128 of a voxel at best.
 DEEP_VOXELS = 2**18
 
-#: Most nodes of the finest level along a side of the root cube: float64 counts them.
+#: Most nodes of the finest level along a side of the root cube: float64 can count them.
 MOST_NODES = 2**50
 
 #: Node words, see cpp_ext/csrc/walk/tree.h.
@@ -44,5 +42,6 @@ REQUEST_PRIORITY = 0x7FF
 REQUEST_LOAD = 1 << 11
 REQUEST_SUBDIVIDE = 1 << 12
 REQUEST_KINDS = REQUEST_LOAD | REQUEST_SUBDIVIDE
-#: Kinds shifted by this are pending: asked for, not here yet, see cpp_ext/csrc/cache/cache.h.
+#: Kind bits shifted by this are the pending bits: requested, and the answer is not written yet.
+#: See cpp_ext/csrc/cache/cache.h.
 REQUEST_PENDING_SHIFT = 2

@@ -1,5 +1,5 @@
-"""`declared_names`: names that a file declares, read without running it, so that `gvtorch --help`
-does not wait for torch. `did_you_mean`: which name was meant.
+"""`declared_names`: names that a module declares, read without importing it, so that
+`gvtorch --help` does not wait for torch. `did_you_mean`: suggestions for a misspelt name.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def declared_names(module: str, variable: str) -> list[str]:
-    """Returns the texts of the list, or the keys of the dict, that a module, named as in
-    `shaders.built_in`, assigns to a variable once, at its top level.
+    """Returns the items of the list of strings, or the keys of the dict, that a module (such as
+    `shaders.built_in`) assigns to a variable once, at its top level.
     """
     path = _PACKAGE.joinpath(*module.split(".")).with_suffix(".py")
     for node in ast.parse(path.read_text("utf-8")).body:
@@ -28,7 +28,7 @@ def declared_names(module: str, variable: str) -> list[str]:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Returns " (did you mean ...?)" with the known names most like this one, or nothing."""
+    """Returns " (did you mean ...?)" with the known names most like `name`, or an empty text."""
     names = {text.lower(): text for text in known}
     close = difflib.get_close_matches(name.lower(), names, n=3)
     return f" (did you mean {' or '.join(names[text] for text in close)}?)" if close else ""

@@ -1,4 +1,4 @@
-"""Numbers that texts tell. torch is not imported here."""
+"""Strict parsing of numbers from text. Does not import torch."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 
 def whole_number(text: str | None) -> int | None:
-    """Returns the whole number that a text of digits 0 to 9 tells, at most 18 of them; None of any
-    other text. (`str.isdigit` is true of "²", which `int` refuses, as it does thousands of digits.)
+    """Returns the whole number written in a text of 1 to 18 digits 0 to 9; None for any other text.
+    (`str.isdigit` accepts "²", which `int` refuses, as it does thousands of digits.)
     """
     return int(text) if text is not None and re.fullmatch("[0-9]{1,18}", text) else None
 
 
 def finite_number(text: Any) -> float | None:
-    """Returns the number that a text tells; None if it is none, or not finite."""
+    """Returns a text as a float; None if it is not a number, or not finite."""
     try:
         value = float(text)
     except (TypeError, ValueError, OverflowError):

@@ -1,8 +1,8 @@
-"""`explicit`: functions that take the fields of a record of options as keyword arguments show each
-of them, with its type, default and meaning, to `help`, editors and `inspect`.
+"""`explicit`: makes functions that take the fields of an options record as keyword arguments show
+each field, with its type, default and meaning, to `help`, editors and `inspect`.
 
-The record is the only place where an option stands with its default and text. Type checkers read a
-`TypedDict` of the same fields, which a test holds equal.
+An option's default and description are written in the record only. Type checkers read a
+`TypedDict` of the same fields; a test keeps the two equal.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def option_texts(record: type) -> dict[str, str]:
-    """Returns the text of each field, as the part "Attributes:" of the record's docstring tells."""
+    """Returns each field's text from the section "Attributes:" of the record's docstring."""
     part = inspect.cleandoc(record.__doc__ or "").partition("Attributes:\n")[2]
     items = re.split(r"^(?=\w+: )", textwrap.dedent(part), flags=re.MULTILINE)
     pairs = (item.partition(": ") for item in items if item.strip())
@@ -26,8 +26,8 @@ def option_texts(record: type) -> dict[str, str]:
 
 
 def explicit(record: type) -> Callable[[Function], Function]:
-    """Lets a function that ends in `**options: Unpack[...]` show the fields of a dataclass instead,
-    in its signature and in the place of the line "**options:" of its docstring.
+    """Makes a function whose last parameter is `**options: Unpack[...]` show the fields of a
+    dataclass instead: in its signature, and in place of its docstring's line "**options:".
     """
 
     def shown(function: Function) -> Function:

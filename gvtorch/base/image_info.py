@@ -1,6 +1,6 @@
-"""`ImageInfo`: what a file tells of its numbers beside their grid: unit, channels, time, labels.
+"""`ImageInfo`: what a file says about its values apart from their grid: unit, channels, time, ...
 
-torch and NumPy are not imported here, since readers of headers and `gvtorch --help` need it.
+torch and NumPy are not imported here, since readers of headers and `gvtorch --help` import it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ Rows = tuple[tuple[float, ...], ...]
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelInfo:
-    """How one channel is called, and how it is meant to be shown."""
+    """The name of one channel, and how it is meant to be shown."""
 
     name: str = ""
     color: Rgb | None = None  # sRGB, 0 to 1
-    window: tuple[float, float] | None = None  # the values that are shown dark and bright
+    window: tuple[float, float] | None = None  # the values shown darkest and brightest
     active: bool = True  # whether it is shown at first
 
     def describe(self) -> str:
@@ -41,12 +41,12 @@ COLORS: dict[str, Rgb] = {
     **{"orange": (1.0, 128 / 255, 0.0)},
     **dict.fromkeys(("white", "gray", "grey"), (1.0, 1.0, 1.0)),
 }
-#: Of light that is added up: premultiplied colour, and what it hides.
+#: The channels of light that adds up: premultiplied colour, and the opacity with which it occludes.
 PREMULTIPLIED = tuple(ChannelInfo(name=name) for name in ("red", "green", "blue", "opacity"))
 
 
 def color_channels(count: int = 3) -> tuple[ChannelInfo, ...]:
-    """Returns the channels of colours: red, green, blue, and whatever follows is alpha."""
+    """Returns `count` channels of a colour image: red, green, blue; any others are alpha."""
     colors = [ChannelInfo(name=name, color=COLORS[name]) for name in ("red", "green", "blue")]
     return (*colors, *[ChannelInfo(name="alpha")] * (count - 3))
 
@@ -57,13 +57,13 @@ def to_hex(color: Rgb) -> str:
 
 
 def from_hex(text: str) -> Rgb:
-    """Returns the colour that RRGGBB tells; raises ValueError of anything else."""
+    """Returns the colour of the text RRGGBB; raises ValueError for any other text."""
     red, green, blue = (part / 255 for part in bytes.fromhex(text))
     return (red, green, blue)
 
 
 def array_from_srgb(color: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB in [0, 1], IEC 61966-2-1; `pictures/tone.py` does it in torch."""
+    """Returns linear light from sRGB in [0, 1], IEC 61966-2-1; in torch: `pictures/tone.py`."""
     import numpy as np
 
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
@@ -71,14 +71,14 @@ def array_from_srgb(color: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageInfo:
-    """What is known of an image's numbers; what a file does not tell is left out."""
+    """What is known about an image's values; what a file does not say keeps its default."""
 
     unit: str | None = None  # of length, as OME-NGFF spells it: "micrometer", "millimeter", ...
     channels: tuple[ChannelInfo, ...] = ()  # one for each channel, or none
     quantity: str | None = None  # what the values measure, as in "HU"
-    labels: bool = False  # values are numbers of things, which must not be blended
+    labels: bool = False  # values are label numbers, which must not be blended
     space: str | None = None  # where x, y, z point: "right-anterior-superior", ...
-    pose: Rows | None = None  # (4, 4) from own axes to the world, of voxels kept as they lie there
+    pose: Rows | None = None  # (4, 4) to the world from the axes of oblique voxels kept as they are
     time_step: float | None = None  # from one time point to the next
     time_origin: float = 0.0  # of the first time point
     time_unit: str | None = None  # as OME-NGFF spells it: "second", ...

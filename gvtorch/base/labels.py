@@ -1,7 +1,7 @@
-"""Numbers of things: whole numbers of any width that must stay apart, in the dtypes of bricks.
+"""Labels: integers of any width, stored exactly in the dtypes that bricks can have.
 
-Numbers of 16 bits at most are kept as they are. Wider ones are indexed: voxels hold the index of
-their label in a table of all labels.
+Labels of at most 16 bits are stored as they are. Wider ones are indexed: a voxel holds the index of
+its label in a table of all labels.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-#: Labels that are kept as they are.
+#: The dtypes of labels that are stored as they are.
 NARROW = ("uint8", "int8", "uint16", "int16")
-#: Up to this one float32 keeps whole numbers apart.
+#: float32 represents all whole numbers up to this one.
 MOST_WHOLE = 2**24
-_SPREAD = 2**22  # labels this close together are found by a table, others by bisection
+_SPREAD = 2**22  # labels in a range below this are looked up in a table, others by bisection
 
 
 def as_whole(where: str, values: np.ndarray) -> np.ndarray:
-    """Returns labels as whole numbers: floats that are whole become int64, bool becomes uint8.
-    Raises ValueError if they are no whole numbers, or beyond int64.
+    """Returns labels as integers: whole floats become int64, bool becomes uint8. Raises ValueError
+    if a label is not a whole number, or beyond int64.
     """
     if values.dtype.kind == "b":
         return values.astype(np.uint8)
@@ -41,8 +41,8 @@ def as_whole(where: str, values: np.ndarray) -> np.ndarray:
 
 
 def distinct(where: str, parts: Iterable[np.ndarray]) -> np.ndarray:
-    """Returns (k,) int64 the labels of whole numbers that come part by part, sorted; raises
-    ValueError if there are more than 2^24.
+    """Returns (k,) int64 the sorted distinct labels of arrays of integers; raises ValueError if
+    there are more than 2^24.
     """
     found, waiting, count = np.zeros(0, np.int64), [], 0
     for part in parts:
@@ -66,25 +66,25 @@ def check_count(where: str, count: int) -> None:
 
 
 def index_dtype(count: int) -> np.dtype:
-    """Returns the smallest dtype of bricks that holds so many indices."""
+    """Returns the smallest dtype of bricks that holds `count` indices."""
     return np.dtype("uint8" if count <= 2**8 else "uint16" if count <= 2**16 else "float32")
 
 
 def indices(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Returns of whole numbers of any shape, all among `labels` (k,), which one they are."""
+    """Returns the index of each value in the sorted `labels` (k,), which hold all values."""
     dtype = index_dtype(len(labels))
     low, high = int(labels[0]), int(labels[-1])
     if high - low < max(_SPREAD, values.size):
         table = np.zeros(high - low + 1, dtype)
         table[labels - low] = np.arange(len(labels), dtype=dtype)
-        # Also of uint64, where NumPy would go by way of float64.
+        # To int64 first: NumPy may turn uint64 mixed with int64 into float64.
         return table[values.astype(np.int64, copy=False) - low]
     return np.searchsorted(labels, values.astype(np.int64, copy=False)).astype(dtype)
 
 
 def indexed(where: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Returns labels as bricks hold them, and (k,) int64 what each of their numbers stands for;
-    None where they are kept as they are. Raises ValueError as `as_whole` and `distinct`.
+    """Returns labels as bricks hold them, and (k,) int64 the label of each index; None where they
+    are stored as they are. Raises ValueError as `as_whole` and `distinct`.
     """
     values = as_whole(where, values)
     if values.dtype.name in NARROW:
@@ -94,13 +94,13 @@ def indexed(where: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | No
 
 
 def counted(labels: Any) -> str:
-    """How many labels (k,) there are, without background 0, and their ends: "12, 1 to 40"."""
+    """Returns the number and range of labels (k,), without background 0, as "12, 1 to 40"."""
     found = labels[labels != 0]
     return f"{len(found)}, {int(found.min())} to {int(found.max())}" if len(found) else "0"
 
 
 def background(labels: np.ndarray | None) -> int | None:
-    """Returns what stands for label 0, the background; None where there is none."""
+    """Returns the stored value of label 0, the background; None if `labels` has no 0."""
     if labels is None:
         return 0
     at = int(np.searchsorted(labels, 0))
@@ -108,7 +108,7 @@ def background(labels: np.ndarray | None) -> int | None:
 
 
 def check_narrowed(where: str, values: np.ndarray) -> None:
-    """Raises ValueError where whole numbers would merge, since float32 does not keep them apart."""
+    """Raises ValueError if float32 can't keep all of these integers distinct."""
     if values.dtype.kind not in "iu" or values.dtype.itemsize < 4 or not values.size:
         return
     low, high = int(values.min()), int(values.max())

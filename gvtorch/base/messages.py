@@ -1,4 +1,4 @@
-"""What users are told of errors: in one line, and what to install. torch is not imported here."""
+"""Error messages for users: one printable line, and what to install. Does not import torch."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import importlib
 import re
 from typing import Any
 
-# What a terminal takes for a command, or for the end of a line, or writes from right to left.
+# Characters by which a terminal runs a command, ends a line or writes from right to left.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 
 
-_MOST = 1500  # characters of a line
+_MOST = 1500  # characters in a line
 
 
 def one_line(error: object, most: int = _MOST) -> str:
-    """Returns what an error says, in one printable line; its type if it says nothing. Of a longer
-    line, in which a file or a user may tell anything, the middle is left out.
+    """Returns an error's message as one printable line; its type if the message is empty. A line
+    longer than `most` (files and users may put anything into it) loses its middle.
     """
     text = str(error)
     text = text if len(text) <= 8 * most else f"{text[: 4 * most]} {text[-4 * most :]}"
@@ -27,17 +27,17 @@ def one_line(error: object, most: int = _MOST) -> str:
 
 
 def printable(text: object) -> str:
-    """Returns a text in which characters that a terminal obeys are told, as in "\\x1b": names of
-    files and what stands in them come from anyone.
+    """Returns a text with control characters escaped, as in "\\x1b": names and contents of files
+    are untrusted.
     """
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), str(text))
 
 
 def need_library(what: str, library: str, package: str = "", extra: str = "io") -> Any:
-    """Returns a module, for what needs it.
+    """Imports and returns a module on behalf of `what`.
 
     Raises:
-        ImportError: It is missing; the message tells which extra of gvtorch brings the package.
+        ImportError: It is missing; the message names the extra of gvtorch that installs it.
     """
     try:
         return importlib.import_module(library)

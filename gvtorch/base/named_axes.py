@@ -1,4 +1,4 @@
-"""What the axes of an array are: by their names, by places along them, or as the user told.
+"""The axes of an array: identified by name, by coordinates along them, or by the user.
 
 torch is not imported here, since readers of headers need it.
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 from .units import length_unit, spacing_of, time_unit
 
-FEW = 4  # a last axis of so many counts channels if nothing else is told
+FEW = 4  # a last axis of at most this size holds channels unless the user says otherwise
 _NAMES = {
     "z": "z depth lev level plane planes slice slices altitude pln",
     "y": "y lat latitude row rows height",
@@ -21,7 +21,7 @@ _NAMES = {
     "c": "c channel channels band bands component components ch",
 }
 _LETTERS = {name: letter for letter, names in _NAMES.items() for name in names.split()}
-Steps = Sequence[tuple[float, float] | None]  # of each axis: from one place to the next, the first
+Steps = Sequence[tuple[float, float] | None]  # for each axis: step and first coordinate, if known
 
 
 def letter_of(name: str) -> str:
@@ -30,8 +30,8 @@ def letter_of(name: str) -> str:
 
 
 def named_axes(names: Sequence[str], shape: Sequence[int]) -> str | None:
-    """Returns a letter for each axis, - for one of size 1 without meaning; None if the names do not
-    tell all of them.
+    """Returns a letter for each axis, - for an unknown one of size 1; None if the names do not
+    identify all others.
     """
     pairs = list(zip(map(letter_of, names), shape, strict=True))
     letters = "".join("-" if letter == "?" and size == 1 else letter for letter, size in pairs)
@@ -41,12 +41,11 @@ def named_axes(names: Sequence[str], shape: Sequence[int]) -> str | None:
 
 
 def ask_axes(path: str, shape: Sequence[int], axes: str | None = None) -> str:
-    """Returns what the axes of an array without names are, a letter each: as the user told, else
-    (z, y, x), or (z, y, x, c) where the last axis counts at most 4 and the first one more.
+    """Returns a letter for each axis of an array without names: `axes` if given, else (z, y, x), or
+    (z, y, x, c) where the last axis has a size of at most 4 and the first a larger one.
 
     Raises:
-        ValueError: They could be something else as well; the message asks. Or what was told does
-            not fit.
+        ValueError: The axes are ambiguous, and the message asks for them; or `axes` does not fit.
     """
     sizes = "(" + ", ".join(map(str, shape)) + ")"
     if axes is not None:
@@ -71,7 +70,9 @@ def ask_axes(path: str, shape: Sequence[int], axes: str | None = None) -> str:
 
 
 def even_steps(places: Any) -> tuple[tuple[float, float] | None, bool]:
-    """Step and first of evenly rising or falling places, and whether they are even."""
+    """Returns step and first of evenly spaced coordinates (None if they are not, or not numbers),
+    and whether they are even; also true for what can't be uneven, such as text.
+    """
     found = np.asarray(places)
     if found.ndim != 1 or found.dtype.kind not in "iuf" or not np.isfinite(found).all():
         return None, found.dtype.kind not in "iuf"
@@ -85,8 +86,8 @@ def even_steps(places: Any) -> tuple[tuple[float, float] | None, bool]:
 def place_named(
     axes: str, shape: Sequence[int], steps: Steps, units: Sequence[str | None]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns spacing, origin and flips of a grid whose axes have places, and the unit, time_step,
-    time_origin and time_unit of its `ImageInfo`.
+    """Returns spacing, origin and flips of a grid from the coordinates along its axes, and the
+    unit, time_step, time_origin and time_unit of its `ImageInfo`.
     """
     told = dict(zip(axes, zip(steps, units, shape, strict=True), strict=True))
     found = [told.get(letter, (None, None, 1)) for letter in "xyz"]
@@ -94,7 +95,7 @@ def place_named(
     names = [length_unit(unit) for _, unit, _ in found]
     bare = any(size and not name for size, name in zip(sizes, names, strict=True))
     spacing, unit = spacing_of(sizes, names)
-    if unit is None or bare:  # degrees, pressure levels, ...: numbers without one unit of length
+    if unit is None or bare:  # degrees, pressure levels, ...: no common unit of length
         unit, (x, y, z) = None, (size or 1.0 for size in sizes)
         spacing = (x, y, z)
     origin, flips = [0.0, 0.0, 0.0], ""

@@ -29,20 +29,20 @@ class Rays:
     direction: Tensor  # (r, 3), unit length
     cone: Tensor  # (r, 2) width at the origin, growth of the width per unit distance
     range: Tensor  # (r, 2) first and last distance along the ray; +inf is allowed for the last
-    width: int = 0  # pixels of a row, if these are whole rows of a picture: traced in tiles
+    width: int = 0  # pixels per row if the rays are whole rows of a picture: traced in tiles
     transmittance: Tensor | None = None  # (r,) at the first distance; None: 1
-    # (r,) int64: number of the pixel in its picture + 2^32 * that of the pixel's sample; None: rays
-    # are counted from 0. Directions of `Lighting` follow from it.
+    # (r,) int64: index of the pixel in its picture + 2^32 * index of the pixel's sample; None: the
+    # index of the ray. `Lighting` derives its directions from it.
     sample: Tensor | None = None
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
-        """Some of the rays, which are no rows any more."""
+        """Returns some of the rays; they no longer count as rows of a picture (width 0)."""
         return self._each(lambda column: column[index], 0)
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Rays:
-        """The rays on a device, in float32 or float64; None leaves each as it is."""
+        """Returns the rays on a device, in float32 or float64; None leaves either as it is."""
         return self._each(lambda column: to_device(column, device, dtype), self.width)
 
     def light(self) -> Tensor:
@@ -63,14 +63,14 @@ class Rays:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Hits:
-    """What the rays brought back."""
+    """The results of tracing rays."""
 
     color: Tensor  # (r, 3) linear RGB, premultiplied by alpha
     alpha: Tensor  # (r, 1)
     depth: Tensor  # (r, 1) distance along the ray in world units, +inf where nothing was hit
-    samples: Tensor  # (r,) int32, places at which the shader was evaluated
-    missed: Tensor  # (r,) bool, something that the ray saw was not there
-    # What only some shaders give, else None:
+    samples: Tensor  # (r,) int32, positions at which the shader was evaluated
+    missed: Tensor  # (r,) bool, true where a node or brick that the ray wanted was missing
+    # Only some shaders give these, else None:
     normal: Tensor | None = None  # (r, 3) world, towards the eye, of unit length or 0
     features: Tensor | None = None  # (r, c)
     label: Tensor | None = None  # (r, 1) int64, at the depth; -1 where nothing was hit
@@ -78,7 +78,7 @@ class Hits:
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Hits:
-        """The hits on a device; its floats in another dtype. None leaves each as it is."""
+        """Returns the hits on a device, floats in another dtype. None leaves either as it is."""
         return replace(
             self, **{name: to_device(v, device, dtype) for name, v in vars(self).items()}
         )
@@ -98,7 +98,7 @@ class RenderStats:
     stages: dict[str, float] = field(default_factory=dict)  # milliseconds by stage
     backend: str = ""
     rays: int = 0
-    samples: int = 0  # places at which the shader was evaluated
+    samples: int = 0  # positions at which the shader was evaluated
     nodes: int = 0  # nodes in the pool
     bricks: int = 0  # bricks in the pool
     bytes: int = 0  # memory of the pools
@@ -106,8 +106,8 @@ class RenderStats:
     bricks_used: int = 0  # bricks that rays sampled
 
     def after(self, before: RenderStats) -> RenderStats:
-        """Returns the statistics of this part of a picture, with the milliseconds, rays and samples
-        of the parts `before` it added.
+        """Returns these statistics with the milliseconds, rays and samples of `before`, the earlier
+        parts of the same picture, added.
         """
         summed = ("milliseconds", "rays", "samples")
         return replace(self, **{n: getattr(self, n) + getattr(before, n) for n in summed})
@@ -122,7 +122,7 @@ class RenderStats:
 
 
 def add(sums: dict[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
-    """Adds numbers by name; returns `sums`."""
+    """Adds the numbers of `more` to `sums` by name, in place; returns `sums`."""
     for key, value in more.items():
         sums[key] = sums.get(key, 0) + value
     return sums

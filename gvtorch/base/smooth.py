@@ -1,5 +1,5 @@
-"""Numbers that run smoothly through keys: piecewise cubics that never leave the span of two
-neighbouring keys, so that what lies in a range at the keys lies in it between them.
+"""Smooth interpolation between keys: piecewise cubics that stay between the values of two
+neighbouring keys, so that a range that holds at the keys also holds between them.
 
 Source: Fritsch and Butland, "A method for constructing local monotone piecewise cubic
 interpolants", 1984.
@@ -14,11 +14,11 @@ import numpy as np
 
 
 class Smooth:
-    """Arrays of numbers by time."""
+    """An array of numbers as a smooth function of time."""
 
     def __init__(self, times: Sequence[float], values: Sequence[np.ndarray], closed: bool) -> None:
-        """Takes the keys: times, increasing; an array each, of one shape, float64; and whether the
-        last is the first, and the curve runs on through it.
+        """Takes the keys: increasing times, and for each an array (float64, all of one shape).
+        `closed`: the last key equals the first, and the curve passes smoothly through it.
         """
         self._times = list(times)
         self._values = np.stack([np.asarray(one, np.float64) for one in values])
@@ -45,13 +45,13 @@ class Smooth:
         a, b = self._values[n : n + 2]
         slope_a, slope_b = span * self._slopes[n : n + 2]
         found = a + s * s * (3 - 2 * s) * (b - a) + s * (1 - s) * ((1 - s) * slope_a - s * slope_b)
-        return np.clip(found, np.minimum(a, b), np.maximum(a, b))  # rounding leads out of the span
+        return np.clip(found, np.minimum(a, b), np.maximum(a, b))  # rounding may leave the span
 
 
 def _slope(
     before: np.ndarray, after: np.ndarray, span_before: np.ndarray, span_after: np.ndarray
 ) -> np.ndarray:
-    """The slope at a key: a harmonic mean of those beside it, 0 where they differ in sign."""
+    """Returns slopes at keys: weighted harmonic means of both sides' slopes, 0 if signs differ."""
     same = before * after > 0
     first, second = 2 * span_after + span_before, span_after + 2 * span_before
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,9 +1,9 @@
-"""Names for the steps of a frame: `with stage("trace"):` feeds timer, profiler, an open `Trace`,
-and under NVIDIA's tools the NVTX ranges that these show. `Trace`: when which stage ran, of all
-threads and of the device, as a file for Perfetto (ui.perfetto.dev) or chrome://tracing.
+"""Named stages of a frame: `with stage("trace"):` reports to the timer, torch's profiler, an open
+`Trace`, and as NVTX ranges to NVIDIA's tools. `Trace`: when each stage ran, in all threads and on
+the device, as a file for Perfetto (ui.perfetto.dev) or chrome://tracing.
 
-Times are differences of marks. On CUDA a mark is an event in the stream: taking one does not make
-the host wait, reading the time between two does.
+Times are differences of marks. On CUDA a mark is an event in the stream: recording one does not
+make the host wait, reading the time between two does.
 
 Source: "Trace Event Format" (the Chromium project).
 """
@@ -26,7 +26,7 @@ import torch
 from . import check
 from .whole_file import whole_file
 
-#: Told (what, done, total) by work that can take long, as a progress bar needs it.
+#: Called with (what, done, total) by long work, for a progress bar.
 Progress = Callable[[str, int, int], None]
 Mark = float | torch.cuda.Event
 
@@ -36,7 +36,7 @@ def no_progress(what: str, done: int, total: int) -> None:
 
 
 def mark(device: torch.device) -> Mark:
-    """Notes the time: the host's, or on CUDA the moment at which the device comes to this place."""
+    """Returns a mark of now: the host's time, or on CUDA an event recorded in the stream."""
     if device.type != "cuda":
         return time.perf_counter()
     event = torch.cuda.Event(enable_timing=True)
@@ -45,7 +45,7 @@ def mark(device: torch.device) -> Mark:
 
 
 def milliseconds(start: Mark, end: Mark) -> float:
-    """Returns the time between two marks of one device; waits until it has come to the second."""
+    """Returns the time between two marks of one device; waits for the device to reach `end`."""
     if isinstance(start, float) or isinstance(end, float):
         return 1e3 * (end - start)  # type: ignore[operator]
     end.synchronize()
@@ -60,7 +60,7 @@ class Timings:
     spans: list[tuple[str, Mark, Mark]] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, float]:
-        """Returns milliseconds by stage; waits until the device has come to the last one's end."""
+        """Returns milliseconds by stage; waits for the device to reach the end of the last one."""
         total: dict[str, float] = {}
         for name, start, end in self.spans:
             total[name] = total.get(name, 0.0) + milliseconds(start, end)
@@ -68,22 +68,22 @@ class Timings:
 
 
 _timings: ContextVar[Timings | None] = ContextVar("gvtorch_timings", default=None)
-_traces: list[Trace] = []  # that are open, of all threads
-#: Nsight Systems and Compute name their library in the first; the second asks for ranges by hand.
+_traces: list[Trace] = []  # those that are open, in all threads
+#: Nsight Systems and Compute set the first variable; users set the second to get ranges anyway.
 _RANGES = torch.version.cuda is not None and bool(
     {"NVTX_INJECTION64_PATH", "GVTORCH_NVTX"} & set(os.environ)
 )
 
 
-class stage:  # no generator, which takes longer: a frame has several
-    """Names the step that the block does, for the open `collect_timings()`, torch's profiler and
-    whoever else listens; costs next to nothing where nobody does.
+class stage:  # not a generator-based context manager, which is slower: a frame has several stages
+    """Names the stage that the block runs, for `collect_timings`, torch's profiler, NVTX and open
+    `Trace`s; costs next to nothing where none of them is active.
     """
 
     __slots__ = ("_began", "_name", "_ranges", "_start", "_timings")
 
     def __init__(self, name: str) -> None:
-        """Takes the step's name."""
+        """Takes the stage's name."""
         self._name = name
 
     def __enter__(self) -> None:
@@ -105,7 +105,7 @@ class stage:  # no generator, which takes longer: a frame has several
 
 
 def _open_ranges(name: str) -> ExitStack:
-    """Opens a range of torch's profiler and of NVIDIA's tools, where they listen."""
+    """Opens a range in torch's profiler and in NVIDIA's tools, if they are active."""
     with ExitStack() as ranges:
         if torch.autograd._profiler_enabled():
             ranges.enter_context(torch.profiler.record_function(name))
@@ -125,7 +125,7 @@ def collect_timings(device: torch.device) -> Iterator[Timings]:
         _timings.reset(token)
 
 
-_ON_DEVICE = 0  # the track of the device; threads have theirs from 1 on
+_ON_DEVICE = 0  # the track of the device; tracks of threads are numbered from 1
 
 
 class _Span(NamedTuple):
@@ -133,28 +133,28 @@ class _Span(NamedTuple):
     track: int
     begin: int  # nanoseconds of the host's clock
     end: int
-    marks: tuple[torch.cuda.Event, torch.cuda.Event] | None  # when the device did it
+    marks: tuple[torch.cuda.Event, torch.cuda.Event] | None  # begin and end on the device
 
 
 class Trace:
-    """Writes down the stages, of all threads, that run while it is open:
+    """Records the stages of all threads while it is open:
 
     with gv.Trace("frames.json"):
         engine.render(camera, shader)
 
-    The names are those of `FrameStats.stages`. On CUDA a stage is there twice: when the host
-    ordered it, and when the device did it.
+    The names are those of `FrameStats.stages`. On CUDA a stage appears twice: when the host issued
+    it, and when the device ran it.
     """
 
     def __init__(self, path: str | Path, device: torch.device | str = "cpu") -> None:
-        """Takes the file, which is written at the end, also after a mistake.
+        """Takes the file, which is written when the block ends, even by an exception.
 
         Args:
             path: Ends in .json.
-            device: Whose time is told beside the host's, if it is CUDA: of its current stream.
+            device: If CUDA, times on its current stream are recorded in addition to the host's.
 
         Raises:
-            ValueError: The ending is another, or there is no such device.
+            ValueError: The path ends differently, or there is no such device.
             FileNotFoundError: The folder does not exist.
         """
         self._path, self._device = Path(path), check.device("Trace", device)
@@ -164,11 +164,11 @@ class Trace:
             raise FileNotFoundError(f"Trace: folder not found: {self._path.parent}")
         self._spans: list[_Span] = []
         self._counts: list[tuple[str, int, dict[str, float]]] = []
-        self._tracks: dict[int, tuple[int, str]] = {}  # of threads
+        self._tracks: dict[int, tuple[int, str]] = {}  # number and name, by thread
         self._lock = threading.Lock()
 
     def __enter__(self) -> Trace:
-        """Begins to listen."""
+        """Starts recording."""
         self._zero = time.perf_counter_ns()
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
@@ -177,27 +177,27 @@ class Trace:
         return self
 
     def __exit__(self, *_error: object) -> None:
-        """Writes the file."""
+        """Stops recording and writes the file."""
         _traces.remove(self)
         with whole_file(self._path) as part, part.open("w", encoding="utf-8") as file:
             json.dump({"traceEvents": self._events(), "displayTimeUnit": "ms"}, file)
 
     def count(self, name: str, **values: float) -> None:
-        """Notes numbers of now, which are drawn as curves over time."""
+        """Records current values, which are drawn as curves over time."""
         self._counts.append((name, time.perf_counter_ns(), values))
 
     def begin(self) -> tuple[int, torch.cuda.Event | None]:
-        """Notes that a stage begins; what it returns comes back at the end."""
+        """Records the begin of a stage; the result is passed to `end`."""
         return time.perf_counter_ns(), self._event()
 
     def end(self, name: str, began: tuple[int, torch.cuda.Event | None]) -> None:
-        """Notes that a stage ends."""
+        """Records the end of a stage; `began` is what `begin` returned."""
         (begin, first), last, end = began, self._event(), time.perf_counter_ns()
         marks = None if first is None or last is None else (first, last)
         self._spans.append(_Span(name, self._track(), begin, end, marks))
 
     def _event(self) -> torch.cuda.Event | None:
-        """A mark in the device's stream; none in what is being captured."""
+        """Returns a mark in the device's stream; None on a CPU or during graph capture."""
         if self._device.type != "cuda" or torch.cuda.is_current_stream_capturing():
             return None
         event = mark(self._device)
@@ -213,7 +213,7 @@ class Trace:
         return known[0]
 
     def _events(self) -> list[dict[str, object]]:
-        """All that is in the file; waits for the device."""
+        """Returns all events of the file; waits for the device."""
         common = {"pid": os.getpid()}
         names = [(number, f"host: {name}") for number, name in self._tracks.values()]
         if any(span.marks for span in self._spans):

@@ -1,5 +1,5 @@
-"""`Turns`: many threads may use a thing at a time, or one alone may change it. What does not go
-together raises at once: to wait would hide a race in the caller's program.
+"""`Turns`: many threads may use an object at a time, or one alone may change it. A conflict raises
+at once: waiting would hide a race in the caller's program.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from contextlib import contextmanager
 
 
 class Turns:
-    """Who uses a thing now. A thread may use what it changes, and change what it uses."""
+    """Tracks which threads use an object now, and which changes it. One thread may do both."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._users: Counter[int] = Counter()  # by thread
+        self._users: Counter[int] = Counter()  # open `using` blocks by thread
         self._changer: int | None = None
 
     @contextmanager
     def using(self, where: str) -> Iterator[None]:
-        """Lets the block read; raises RuntimeError while another thread changes the thing."""
+        """Lets the block read; raises RuntimeError while another thread changes the object."""
         me = threading.get_ident()
         with self._lock:
             if self._changer not in (None, me):
@@ -36,7 +36,7 @@ class Turns:
 
     @contextmanager
     def changing(self, where: str) -> Iterator[None]:
-        """Lets the block write; raises RuntimeError while another thread uses the thing."""
+        """Lets the block write; raises RuntimeError while another thread uses or changes it."""
         me = threading.get_ident()
         with self._lock:
             before = self._changer
@@ -52,4 +52,4 @@ class Turns:
                 self._changer = before
 
     def __reduce__(self) -> tuple[type[Turns], tuple[()]]:
-        return Turns, ()  # nobody uses a copy
+        return Turns, ()  # a copy has no users yet

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-#: NGFF's name, metres, and what else files call it.
+#: NGFF's name, length in metres, and other spellings in files.
 _LENGTHS: tuple[tuple[str, float, str], ...] = (
     ("meter", 1.0, "m meters metre metres"),
     ("decimeter", 1e-1, "dm decimetre"),
@@ -41,22 +41,22 @@ _LENGTH, _TIME = _table(_LENGTHS), _table(_TIMES)
 
 
 def length_unit(text: str | None) -> str | None:
-    """Returns NGFF's name of a unit of length; None if it is none, or unknown."""
+    """Returns NGFF's name of a unit of length; None if it is not a known one."""
     return _find(_LENGTH, text)[0]
 
 
 def time_unit(text: str | None) -> str | None:
-    """Returns NGFF's name of a unit of time; None if it is none, or unknown."""
+    """Returns NGFF's name of a unit of time; None if it is not a known one."""
     return _find(_TIME, text)[0]
 
 
 def metres(name: str | None) -> float | None:
-    """Returns the length of a unit that `length_unit` names; None of any other name."""
+    """Returns the metres in a unit that `length_unit` returned; None for any other name."""
     return next((size for known, size, _ in _LENGTHS if known == name), None)
 
 
 def unit_symbol(text: str | None) -> str:
-    """Returns how pictures write a unit of length, as in "\u00b5m"; what is unknown as it is."""
+    """Returns the symbol of a unit of length, as in "\u00b5m"; an unknown unit as it is."""
     name = length_unit(text)
     if name is None:
         return text or ""
@@ -64,15 +64,16 @@ def unit_symbol(text: str | None) -> str:
     return symbols.get(name) or next(words.split()[0] for n, _, words in _LENGTHS if n == name)
 
 
-#: What is told of files that know the width of pixels, and not how far slices are apart.
+#: The note for files that store the width of pixels, but not the distance between slices.
 NO_DEPTH = "how far slices are apart, which is not told: as far as pixels"
 
 
 def spacing_of(
     sizes: Sequence[float | None], units: Sequence[str | None]
 ) -> tuple[tuple[float, float, float], str | None]:
-    """Returns (x, y, z) voxel sizes in one unit, that of x, and its name. What is not told, not
-    positive or without a known unit is 1 (as wide as x, if that is told).
+    """Returns (x, y, z) voxel sizes in one unit, and its name: that of the first axis that has a
+    positive size and a known unit. Axes that lack either get that axis's size. If all do, sizes are
+    returned as they are, 1 unless positive, with None as the unit.
     """
     named = [_find(_LENGTH, unit) for unit in units]
     good = [

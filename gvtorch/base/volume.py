@@ -1,4 +1,4 @@
-"""`Volume`: a dense grid of values with a place in the world."""
+"""`Volume`: a dense grid of values with a position in the world."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CHANNEL_DTYPES = (
     torch.float32,
 )
 
-#: The ways that `Volume.directional` looks along, in the order of its numbers.
+#: The viewing directions of `Volume.directional`, in the order of its numbers.
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
@@ -37,7 +37,7 @@ def check_extent(
 ) -> None:
     """Raises ValueError unless all sizes are positive and their product is at most `most`.
 
-    Readers call it with what a file's header says, before they take any memory for it.
+    Readers call it with the sizes in a file's header, before they allocate memory.
     """
     sizes = " x ".join(str(size) for size in shape)
     if any(size < 1 for size in shape):
@@ -54,16 +54,16 @@ class Volume:
     """A dense grid. The centre of voxel (x, y, z) lies at index * spacing + origin in the world.
 
     The box runs from voxel face to voxel face, -0.5 to n - 0.5 in index units; between the
-    outermost centres and the box's faces the outermost values go on. Threads may share one that
-    none changes.
+    outermost centres and the box's faces the outermost values continue. Threads may share a volume
+    that none of them changes.
 
     Attributes:
         data: (z, y, x, c) tensor, one of `CHANNEL_DTYPES`, on the device where it was given.
         spacing, origin, name, info: See the constructor.
-        filter: How coarse levels are made: the mean; of labels the most frequent; or what is seen
-            along six directions, see `directional`.
-        label_values: (k,) int64, sorted: the label that each value of the data stands for, where
-            labels are indexed; None: values stand for themselves.
+        filter: How coarse levels are made: "mean"; "majority", the most frequent label; or
+            "directional", what is seen along six directions, see `directional`.
+        label_values: (k,) int64, sorted, where labels are indexed: the data's value i is the label
+            label_values[i]. None: the data's values are the labels.
     """
 
     filter: Literal["mean", "majority", "directional"] = "mean"
@@ -80,26 +80,26 @@ class Volume:
         info: ImageInfo | None = None,
         labels: bool = False,
     ) -> None:
-        """Checks and takes over a grid.
+        """Checks a grid and holds it, without a copy where its dtype and layout allow.
 
         Args:
             data: (z, y, x) or (z, y, x, c). Any device, any byte order. bool becomes uint8; 32 and
                 64 bit integers and float64 become float32. Labels are whole numbers of any dtype,
                 below 2^63; those of more than 16 bits are indexed, see `label_values`.
-            spacing: (x, y, z) world units, distance of neighbouring voxel centres.
+            spacing: (x, y, z) world units, distance between neighbouring voxel centres.
             origin: (x, y, z) world units, centre of voxel 0.
             name: Where it came from, for messages.
-            nan: The value that voxels which are not finite get; None refuses them.
+            nan: Replaces values that are NaN or infinite; None: they are an error.
             info: Unit, names and colours of channels, ...; nothing is known if left out.
-            labels: Values are numbers of things: they are kept exactly and never blended, and the
-                shader is `Labels`. Also if `info` says so.
+            labels: Whether values are label numbers: kept exactly, never blended, and shaded by
+                `Labels`. Also true if `info.labels` is.
 
         Raises:
             ValueError: data is empty, of another shape or dtype, has more than 2^31 voxels or
-                holds values that are not finite, or integers beyond 2^24 that float32 does not
-                keep apart; spacing is not positive, or the origin lies more than 2^50 voxels from
-                0. Or labels are no whole numbers, or more than 2^24.
-            RuntimeError: data requires gradients, and they are recorded.
+                holds values that are not finite, or integers beyond 2^24, which float32 can't
+                all represent; spacing is not positive, or the origin lies more than 2^50 voxels
+                from 0. Or labels are not whole numbers, or there are more than 2^24 of them.
+            RuntimeError: data requires gradients, and autograd is recording.
         """
         where = f"Volume {name!r}" if name != "volume" else "Volume"
         if isinstance(data, Tensor) and data.requires_grad and torch.is_grad_enabled():
@@ -132,24 +132,24 @@ class Volume:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Of the data: (z, y, x, c)."""
+        """Shape of the data: (z, y, x, c)."""
         z, y, x, c = self.data.shape
         return (z, y, x, c)
 
     @property
     def width(self) -> int:
-        """Numbers of a voxel."""
+        """How many numbers a voxel has."""
         return int(self.data.shape[3])
 
     @property
     def value_range(self) -> tuple[float, float]:
         """Smallest and largest value over all channels."""
-        unordered = self.data.dtype == torch.uint16  # torch does not compare them
+        unordered = self.data.dtype == torch.uint16  # torch can't compare them
         low, high = torch.aminmax(self.data.to(torch.int32) if unordered else self.data)
         return (float(low), float(high))
 
     def to(self, device: torch.device | str) -> Volume:
-        """Returns the volume with its data on a device; what lies there already is shared."""
+        """Returns the volume with its data on a device; data that is there already is shared."""
         other = copy.copy(self)
         other.data = self.data.to(check.device("Volume.to", device))
         return other
@@ -157,18 +157,18 @@ class Volume:
     def directional(
         self, *, premultiplied: bool = False, dtype: torch.dtype = torch.float16
     ) -> Volume:
-        """Returns a volume of colour and opacity as `StoredColor` reads it with six directions: 24
-        numbers a voxel, for each of `DIRECTIONS` the premultiplied red, green, blue and the opacity
-        that are seen along it. A finest voxel looks the same from all sides; in coarser ones, what
-        lies in front hides what lies behind. So thin walls let no light through, and their two
-        sides keep their colours.
+        """Returns a volume of colour and opacity for `StoredColor` with six directions: 24 numbers
+        a voxel, namely for each of `DIRECTIONS` the premultiplied red, green, blue and the opacity
+        seen along it. A finest voxel looks the same from all sides; in coarser voxels, the front
+        hides what lies behind it. So thin walls let no light through, and their two sides keep
+        their colours.
 
-        Opacity is that of the smallest spacing. `premultiplied` tells whether colours are given
-        times opacity, `dtype` is float16, bfloat16 or float32.
+        Opacity is per length of the smallest spacing. `premultiplied` states whether colours are
+        already multiplied by opacity; `dtype` is float16, bfloat16 or float32.
 
         Raises:
-            ValueError: A voxel holds no 4 numbers, an opacity lies beyond 0 to 1 (integers stand
-                for 0 to 1), or the dtype is another.
+            ValueError: A voxel does not have 4 numbers, an opacity lies outside 0 to 1 (integers
+                are scaled to 0 to 1), or the dtype is not one of the three.
 
         Source: Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF
             2011 (anisotropic voxels).
@@ -194,13 +194,13 @@ class Volume:
         return volume
 
     def describe(self, bins: int = 32) -> dict[str, Any]:
-        """Returns extent, dtype, place, range and a histogram of so many bins as plain values."""
+        """Returns extent, dtype, position, range, a histogram of `bins` etc. as plain values."""
         check.whole("Volume.describe", "bins", bins, low=1)
         low, high = self.value_range
         values = to_numpy(self.data)
         limits = (low, high) if high > low else (low, low + max(1.0, abs(low)))
         counts, total = np.zeros(bins, np.int64), 0.0
-        for part in values:  # by z: float16 and float32 can't tell the bins of their full range
+        for part in values:  # by z, in float64: the full range of float16 or float32 needs it
             wide = part.astype(np.float64)
             counts += np.histogram(wide, bins=bins, range=limits)[0]
             total += float(wide.sum())
@@ -220,7 +220,7 @@ class Volume:
         }
 
     def _labels_told(self) -> dict[str, Any]:
-        """How many labels there are, without the background 0, and which; of labels alone."""
+        """For label volumes: the count and range of the labels, without the background 0."""
         if not self.info.labels:
             return {}
         known = self.label_values
@@ -238,23 +238,23 @@ class Volume:
 
 
 def to_numpy(values: Tensor) -> np.ndarray:
-    """Returns voxels as an array. NumPy has no bfloat16: float32 holds its values."""
+    """Returns voxels as an array; bfloat16, which NumPy lacks, as float32."""
     return (values.float() if values.dtype == torch.bfloat16 else values).cpu().numpy()
 
 
 def movable(tensor: Tensor) -> Tensor:
-    """Returns a view that can be indexed and written, which torch can't do to uint16."""
+    """Returns the tensor, or for uint16, which torch can't index or write, a view as int16."""
     return tensor.view(torch.int16) if tensor.dtype == torch.uint16 else tensor
 
 
 def _as_labels(
     where: str, data: Tensor | np.ndarray, nan: float | None
 ) -> tuple[Tensor | np.ndarray, Tensor | None]:
-    """Labels as bricks hold them, and what they stand for."""
+    """Returns labels as bricks hold them, and the table of labels if they are indexed."""
     if isinstance(data, Tensor):
         data = to_numpy(data.detach())
     if not isinstance(data, np.ndarray) or data.ndim not in (3, 4) or not data.size:
-        return data, None  # `_as_tensor` and `Volume` tell what is wrong
+        return data, None  # `_as_tensor` and `Volume` raise the error
     if data.dtype.kind == "f" and nan is not None:
         data = np.where(np.isfinite(data), data, nan)
     values, labels = indexed(where, data)

@@ -1,6 +1,6 @@
-"""`whole_file`, `write_whole`, `durable_file`: files that appear when they are whole; `write_npy`:
-arrays whose errors of writing are told; `text_path`: paths for libraries that do not take all;
-`cache_folder`: where what is kept lies.
+"""`whole_file`, `write_whole`, `durable_file`: files that appear only when complete; `write_npy`:
+arrays, without losing write errors; `text_path`: paths for libraries that reject some paths;
+`cache_folder`: where caches on disk lie.
 NumPy is not imported here, so that `gvtorch --help` does not wait for it.
 """
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 @contextmanager
 def told_of(path: Path, *drafts: str) -> Iterator[None]:
-    """Gives an OSError of writing that names no file, as of a full disk, or one of its drafts, the
-    name of this file.
+    """Makes an OSError of the block name `path`, if it names no file (a full disk) or one of the
+    drafts of this file.
     """
     try:
         yield
@@ -39,14 +39,14 @@ def told_of(path: Path, *drafts: str) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A place to write to, which takes the file's name once the block ends well."""
+    """Yields a temporary path to write to; it is renamed to `path` if the block succeeds."""
     try:
         handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from None
     try:
         part = os.path.join(text_path(os.path.abspath(path.parent)), os.path.basename(name))
-        with told_of(path, name, part):  # what stands there already stays
+        with told_of(path, name, part):  # on an error, an existing file stays as it is
             os.close(handle)
             yield Path(part)
         mask = os.umask(0)
@@ -58,14 +58,14 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Writes text; on a full disk what stands there already stays."""
+    """Writes a text file; on a full disk an existing file stays as it is."""
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 @contextmanager
 def durable_file(path: Path) -> Iterator[IO[bytes]]:
-    """Opens a file that takes its name once the block ends well, and is on disk then: a power cut
+    """Opens a draft that is synced to disk and renamed to `path` if the block succeeds: a power cut
     leaves the whole file or none.
     """
     draft = path.with_name(f".{path.name}.draft")
@@ -77,7 +77,7 @@ def durable_file(path: Path) -> Iterator[IO[bytes]]:
 
 
 def rename(draft: Path, path: Path) -> None:
-    """Gives a file its name; on disk when this returns."""
+    """Renames a draft to `path`; the new name is on disk when this returns."""
     draft.replace(path)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
@@ -87,9 +87,9 @@ def rename(draft: Path, path: Path) -> None:
 
 
 def write_npy(file: IO[bytes], values: np.ndarray) -> None:
-    """Writes an array into an open file, which is not flushed; raises OSError where the disk is
-    full. NumPy's `save` and `tofile`, which it takes for files on disk, end well where it is full
-    within the last bytes, which the C library holds back.
+    """Writes an array into an open file without flushing it; raises OSError if the disk is full.
+    `np.save` into a file on disk uses `tofile`, which reports no error if the disk fills up within
+    the last bytes, those that the C library buffers.
     """
     import numpy as np
 
@@ -104,10 +104,10 @@ def save_npy(path: Path, values: np.ndarray) -> None:
 
 
 def text_path(path: str) -> str:
-    """Returns an absolute path itself, or another one of the same place, which need not exist, that
-    can be written as UTF-8, and holds no backslash (where these part no folders) and no ".__lock":
-    a link in a folder of this process, which goes when the process ends. So take it libraries that
-    do not take all: tensorstore makes "/" of backslashes and refuses folders named as its locks.
+    """Returns an absolute path (which need not exist) in a form that every library accepts: itself,
+    or, if it is not valid UTF-8 or holds ".__lock" or a backslash that is no separator, a link to
+    it in a folder that is removed when this process ends. (tensorstore turns backslashes into "/"
+    and refuses folders named like its locks.)
     """
     bytes_of = os.fsencode(path)
     plain = path.encode(errors="replace") == bytes_of and ".__lock" not in path
@@ -118,13 +118,13 @@ def text_path(path: str) -> str:
     try:
         os.symlink(path, link)
     except FileExistsError:
-        pass  # made before
+        pass  # an earlier call made it
     return link
 
 
 def cache_folder(part: str) -> Path:
-    """Returns the folder of a part of what is kept between processes: in GVTORCH_CACHE, else in
-    gvtorch of XDG_CACHE_HOME or ~/.cache. Raises RuntimeError where there is no home.
+    """Returns the folder `part` of the cache on disk: in GVTORCH_CACHE, else in gvtorch below
+    XDG_CACHE_HOME or ~/.cache. Raises RuntimeError if there is no home folder.
     """
     named = os.environ.get("GVTORCH_CACHE")
     base = named or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "gvtorch"
@@ -136,7 +136,7 @@ def _folder(process: int) -> str:
     folder = tempfile.mkdtemp(prefix="gvtorch-")
 
     def remove() -> None:
-        if os.getpid() == process:  # not in one that was forked
+        if os.getpid() == process:  # not in a forked child
             shutil.rmtree(folder, ignore_errors=True)
 
     atexit.register(remove)

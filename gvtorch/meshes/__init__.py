@@ -1,1 +1,1 @@
-"""Triangles, and what voxels hold of them."""
+"""Triangle meshes, and their voxelization."""

@@ -1,13 +1,13 @@
-"""`contour`: the surface where a grid of samples passes a value, cell by cell (marching cubes).
+"""`contour`: the surface where a grid of samples crosses a value, cell by cell (marching cubes).
 
 A cell has a sample at each of its 8 corners. A vertex lies on each edge whose ends are on different
-sides of the value; on each face lines join the vertices of its edges; the lines of all six faces
-make loops, and these are cut into triangles. Which lines a face has follows from its own four
-samples: where two inside corners are diagonal, each is cut off for itself. So the two cells at a
-face agree, and there are no cracks. All other edges of triangles lie within their cell. So each
-edge belongs to exactly two triangles, and the surface is a manifold, except where the grid ends.
+sides of the value; on each face, lines join the vertices of its edges; the lines of all six faces
+form loops, and these are cut into triangles. A face's lines depend on its own four samples only:
+where two inside corners are diagonal, each is cut off separately. So the two cells at a face agree,
+and there are no cracks. All other edges of triangles lie inside their cell. So each edge belongs to
+exactly two triangles, and the surface is a manifold, except where the grid ends.
 
-The tables are made here, from that rule.
+The tables are computed here, from that rule.
 
 Source: Lorensen and Cline, "Marching cubes", SIGGRAPH 1987; Duerst, "Additional reference to
 marching cubes", 1988 (faces that can be joined in two ways).
@@ -32,23 +32,23 @@ _AT = np.array([[n >> 2 & 1, n >> 1 & 1, n & 1] for _, n in _EDGES])  # z y x
 class Tables(NamedTuple):
     """Triangles of each of the 256 kinds of cells: corner n is inside where bit n is set."""
 
-    triangles: np.ndarray  # (256,) how many
-    first: np.ndarray  # (256,) row of the first
-    edges: np.ndarray  # (t, 3) their corners, by edge
+    triangles: np.ndarray  # (256,) number of triangles
+    first: np.ndarray  # (256,) row in `edges` of the first triangle
+    edges: np.ndarray  # (t, 3) the cell's edges on which a triangle's corners lie
 
 
 class Contour(NamedTuple):
     """A part of a surface."""
 
     keys: np.ndarray  # (v,) int64, increasing: `key` of the edge on which each vertex lies
-    places: np.ndarray  # (v, 3) float64 z y x in samples
-    faces: np.ndarray  # (f, 3) vertices, counter-clockwise seen from where values are lower
+    places: np.ndarray  # (v, 3) float64 positions of the vertices, z y x in samples
+    faces: np.ndarray  # (f, 3) vertices, counter-clockwise seen from the side of lower values
 
 
 def contour(
-    samples: np.ndarray,  # (z, y, x) float64; -inf: outside, the vertex beside it at the other end
-    value: float,  # inside is where samples are at least this
-    low: Sequence[int],  # z y x of the first sample in the grid, in which keys and places count
+    samples: np.ndarray,  # (z, y, x) float64; -inf: outside, vertices lie at edges' other ends
+    value: float,  # samples of at least this are inside
+    low: Sequence[int],  # z y x of the first sample in the grid; keys and places refer to the grid
     grid: Sequence[int],  # samples z y x of the grid
 ) -> Contour:
     """Returns the surface in the cells of a block of samples."""
@@ -73,8 +73,8 @@ def contour(
 
 
 def key(start: np.ndarray, axis: np.ndarray, grid: Sequence[int]) -> np.ndarray:
-    """Returns a number for each edge of a grid of samples (z y x): of its first sample (..., 3) and
-    its axis, 0 along x.
+    """Returns a unique number for each edge of a grid of samples (z y x), from its first sample
+    (..., 3) and its axis, 0 along x.
     """
     z, y, x = np.moveaxis(start, -1, 0)
     return ((z * grid[1] + y) * grid[2] + x) * 3 + axis
@@ -89,7 +89,7 @@ def edge_of(keys: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarr
 def _places(
     samples: np.ndarray, value: float, keys: np.ndarray, low: Sequence[int], grid: Sequence[int]
 ) -> np.ndarray:
-    """(v, 3) where the value lies on each edge, by linear interpolation."""
+    """Returns (v, 3) the position of the value on each edge, by linear interpolation."""
     start, axis = edge_of(keys, grid)
     end = start.copy()
     row, column = np.arange(len(keys)), 2 - axis
@@ -114,13 +114,13 @@ def _tables() -> Tables:
 
 
 def _loops(kind: int) -> list[list[int]]:
-    """The loops of edges around the inside corners of a cell."""
+    """Returns the loops of cell edges around the inside corners of a cell."""
     after: dict[int, int] = {}
     for corners in _faces():
         pairs = list(itertools.pairwise((*corners, corners[0])))
         crossed = [(_edge(a, b), kind >> b & 1) for a, b in pairs if (kind >> a ^ kind >> b) & 1]
         for n, (edge, enters) in enumerate(crossed):
-            if enters:  # from where the face's rim comes inside to where it next leaves
+            if enters:  # join the edge where the face's rim enters to the next, where it leaves
                 after[edge] = crossed[(n + 1) % len(crossed)][0]
     loops = []
     while after:
@@ -134,7 +134,7 @@ def _loops(kind: int) -> list[list[int]]:
 
 
 def _faces() -> list[tuple[int, ...]]:
-    """The corners of each face of a cell in turn, counter-clockwise seen from outside."""
+    """Returns the corners of each face of a cell, counter-clockwise seen from outside."""
     faces = []
     for axis, side in itertools.product(range(3), (0, 1)):
         u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
@@ -148,14 +148,14 @@ def _edge(a: int, b: int) -> int:
 
 
 def _on_one_face(a: int, b: int) -> bool:
-    """Whether two edges of a cell lie on one of its faces."""
+    """Returns whether two edges of a cell lie on the same face."""
     ends = [{n, n | 1 << axis} for axis, n in (_EDGES[a], _EDGES[b])]
     return any(ends[0] | ends[1] <= set(corners) for corners in _faces())
 
 
 @functools.cache
 def _cut(loop: tuple[int, ...]) -> list[tuple[int, int, int]]:
-    """Cuts a loop into triangles whose other edges lie within the cell; the shortest of these."""
+    """Cuts a loop into triangles, with cuts inside the cell only and the least total length."""
     if len(loop) == 3:
         return [(loop[0], loop[1], loop[2])]
     best: list[tuple[int, int, int]] = []
@@ -172,7 +172,7 @@ def _cut(loop: tuple[int, ...]) -> list[tuple[int, int, int]]:
 
 
 def _length(triangles: list[tuple[int, int, int]]) -> float:
-    """Of all edges, where vertices are in the middle of the cell's edges."""
+    """Returns the length of all triangles' edges, with vertices in the middle of cell edges."""
     middles = _AT.astype(np.float64)
     middles[np.arange(12), 2 - _AXIS] = 0.5
     corners = middles[np.array(triangles)]

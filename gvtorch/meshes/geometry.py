@@ -1,5 +1,5 @@
-"""`Geometry`: how far places are from a mesh, whether they lie in it, and what cubes of voxels hold
-of it; `Hierarchy`: boxes around triangles, level by level, as the op `voxelize` goes down them.
+"""`Geometry`: distances from a mesh, winding numbers, and the voxels of cubes; `Hierarchy`: boxes
+around triangles, level by level, as the op `voxelize` traverses them.
 
 Source: Karras, "Maximizing parallelism in the construction of BVHs", HPG 2012 (triangles sorted
     along a Morton curve; here every box holds eight of the level below, so no pointers are needed).
@@ -13,23 +13,23 @@ from torch import Tensor
 from ..ops.voxelize import ARITY, Voxelized, voxelize
 from .mesh import Mesh, solids
 
-_BITS = 20  # of a Morton code, along an axis
-_HALF_DIAGONAL = 0.5 * 3**0.5  # of a cube of side 1
-_POINTS = 1 << 20  # places that are asked for together
+_BITS = 20  # bits of a Morton code along each axis
+_HALF_DIAGONAL = 0.5 * 3**0.5  # half the diagonal of a unit cube
+_POINTS = 1 << 20  # points per call of the op
 
 
 class Hierarchy:
     """The boxes of triangles, sorted so that neighbours in memory are neighbours in space.
 
     Attributes:
-        order: (f,) int64 the triangle at each place of the lowest level.
+        order: (f,) int64 the triangle in each box of the lowest level.
         box: (n, 6) float64 low and high corners of all boxes, those of the triangles first.
-        first: Of each level, lowest first, its first box; and their number. Box i of a level holds
-            boxes 8 i to 8 i + 7 of the level below.
+        first: The index of each level's first box, lowest level first, and the number of all boxes.
+            Box i of a level holds boxes 8 i to 8 i + 7 of the level below.
     """
 
     def __init__(self, corner_f33: Tensor) -> None:
-        """Sorts (f, 3, 3) float64 triangles and makes all levels."""
+        """Sorts (f, 3, 3) float64 triangles and builds all levels."""
         low, high = corner_f33.amin(1), corner_f33.amax(1)
         self.order = _morton(0.5 * (low + high)).argsort(stable=True)
         levels = [torch.cat((low[self.order], high[self.order]), 1)]
@@ -43,24 +43,24 @@ class Hierarchy:
 
 
 class Geometry:
-    """The triangles of a mesh in their hierarchy. All that it tells is worked out without waiting
-    for the device.
+    """The triangles of a mesh in a hierarchy. No method waits for the device.
 
     Attributes:
-        kept: (f,) int64 the mesh's triangles that are here: see `solids`.
+        kept: (f,) int64 index in the mesh of each triangle used here, in the hierarchy's order; see
+            `solids`.
         corner: (f, 3, 3) float64 corners.
         solid: (f,) bool, whether a triangle bounds a solid.
-        hierarchy: Boxes around them.
-        size: World size of their bounds.
-        detail: World size of a usual one, the square root of the median area: a few large ones tell
-            nothing of the many.
-        largest: World size of the bounds of the largest.
+        hierarchy: Boxes around the triangles.
+        size: Longest side of the mesh's bounds, world units.
+        detail: World size of a typical triangle: the square root of the median area, which a few
+            large triangles do not change.
+        largest: Longest side of the bounds of any triangle, world units.
     """
 
     def __init__(
         self, mesh: Mesh, device: torch.device | str = "cpu", *, solid: bool = True
     ) -> None:
-        """Builds the hierarchy; not `solid`: all are sheets."""
+        """Builds the hierarchy; if `solid` is False, all triangles are sheets."""
         kept, closed = solids(mesh)
         corner = torch.from_numpy(mesh.vertices[mesh.faces[kept]]).to(device)
         self.hierarchy = Hierarchy(corner)
@@ -74,23 +74,23 @@ class Geometry:
 
     @property
     def area(self) -> Tensor:
-        """(f,) float64 of each triangle, world units squared."""
+        """(f,) float64 area of each triangle, square world units."""
         a, b, c = self.corner.unbind(1)
         return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
 
     def winding(self, place_p3: Tensor) -> Tensor:
-        """Returns (p,) int32 how often closed parts wind around places (p, 3)."""
+        """Returns (p,) int32 winding numbers of the closed parts at points (p, 3)."""
         return self._at(place_p3, -1.0)[0]
 
     def signed_distance(self, place_p3: Tensor) -> Tensor:
-        """Returns (p,) float64 distances to the nearest triangle, below 0 inside of closed parts;
-        to what float64 can tell, anywhere.
+        """Returns (p,) float64 distances to the nearest triangle, negative inside of closed parts;
+        exact to float64's rounding at any distance.
         """
         winding, distance = self._at(place_p3, torch.inf)
         return torch.where(winding != 0, -distance, distance)
 
     def _at(self, place_p3: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-        """(p,) winding numbers, and distances up to a reach: of voxels as large as the mesh."""
+        """Returns (p,) winding numbers and distances up to `reach`, from mesh-sized voxels."""
         parts = []
         for place in place_p3.to(self.corner).split(_POINTS):
             size = place.new_tensor((self.size, self.size, reach)).expand(len(place), 3)
@@ -107,16 +107,16 @@ class Geometry:
         reach_k: Tensor,  # (k,) float64 world distance
         *,
         parts: int = 4,  # along a side of a box
-        wide: bool,  # as of `cubes`, for voxels as large as parts
+        wide: bool,  # as for `cubes`, for voxels as large as parts
     ) -> tuple[Tensor, Tensor]:
-        """Tells which parts of boxes are near triangles: a ball around each is looked at.
+        """Finds which parts of boxes are near triangles, by a ball around each part.
 
         Returns:
-            (k, parts, parts, parts) bool, z y x: False where no triangle comes within the reach of
-            a part; bool, whether it lies inside then.
+            (k, parts, parts, parts) bool, z y x: False where no triangle comes within reach of a
+            part; and bool, for those parts whether they lie inside the mesh.
         """
         part = size_k / parts
-        reach = (reach_k + _HALF_DIAGONAL * part) * (1 + 1e-3)  # more than float32 rounds
+        reach = (reach_k + _HALF_DIAGONAL * part) * (1 + 1e-3)  # exceeds float32's rounding
         size = torch.stack((part, part, reach), 1)
         found = self.cubes(low_k3, size, parts, wide=wide)
         return found.nearest >= 0, found.winding != 0
@@ -132,7 +132,7 @@ class Geometry:
         shares: bool = False,
         weights: bool = False,
     ) -> Voxelized:
-        """Looks at cubes of side^3 voxels; arguments as of `ops.voxelize`."""
+        """Voxelizes cubes of side^3 voxels; arguments as for `ops.voxelize`."""
         return voxelize(
             *(self.corner, self.solid, self.hierarchy.box, low_k3, size_k3, side, thickness),
             detail=self.detail,
@@ -143,12 +143,12 @@ class Geometry:
 
 
 def padded(level: Tensor) -> Tensor:
-    """Returns (n, ...) with its last row repeated, until boxes of the level above are full."""
+    """Returns (n, ...) with its last row repeated, up to a multiple of the hierarchy's arity."""
     return torch.cat((level, level[-1:].expand(-len(level) % ARITY, *level.shape[1:])))
 
 
 def _morton(place_f3: Tensor) -> Tensor:
-    """Returns (f,) int64 codes: places that are close have close codes."""
+    """Returns (f,) int64 Morton codes of positions: close positions tend to have close codes."""
     low, high = place_f3.amin(0), place_f3.amax(0)
     size = (high - low).max().clamp(min=torch.finfo(place_f3.dtype).tiny)
     cell = ((place_f3 - low) / size * (2**_BITS - 1)).to(torch.int64)

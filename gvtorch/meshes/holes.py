@@ -1,8 +1,8 @@
-"""Holes of meshes: where they are, and `filled`, which closes them along the surface on which the
-generalised winding number is one half; then all else takes the mesh as the solid that it bounds.
+"""Holes of meshes: `rims` finds them, and `filled` closes them along the surface on which the
+generalised winding number is one half; all other code then treats the mesh as a solid.
 
 Source: Jacobson, Kavan, Sorkine-Hornung, "Robust inside-outside segmentation using generalized
-    winding numbers", SIGGRAPH 2013, section 3 (that surface closes what is open).
+    winding numbers", SIGGRAPH 2013, section 3 (that surface closes open parts).
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ import torch
 from .mesh import Mesh, edges_of, facing_away, part_of_faces, solids, welded
 from .winding import WindingNumber
 
-#: Which parts are solids: closed ones, filled ones, none.
+#: Which parts are solids: closed ones, those that are closed after filling holes, or none.
 SolidParts = Literal["auto", "always", "never"]
 
-_RINGS = 4  # of triangles between a hole's rim and its middle
-_STEPS = 12  # of the bisection
-_FEW = 0.02  # edges of holes for each triangle, up to which a part is nearly closed
-_FLAT = 1e-3  # volume of a part, over its area^(3/2), below which it encloses nothing
+_RINGS = 4  # rings of triangles between a hole's rim and its middle
+_STEPS = 12  # steps of the bisection
+_FEW = 0.02  # a part with at most this many hole edges per triangle is nearly closed
+_FLAT = 1e-3  # a part whose volume / area^(3/2) is at most this encloses nothing
 
 
 @dataclass(frozen=True)
 class Rim:
-    """A hole's rim: corners of triangles, one after another around it, such that the hole lies to
-    their left seen from outside.
+    """A hole's rim: triangle corners in order around it, with the hole to their left seen from
+    outside.
     """
 
-    part: int  # the part that it belongs to, by one of its triangles
+    part: int  # the part that it belongs to, named by one of its triangles
     face: np.ndarray  # (n,) the triangle along each edge
-    corner: np.ndarray  # (n,) the corner of it at which the rim's edge begins
+    corner: np.ndarray  # (n,) the corner of that triangle at which the rim's edge begins
 
 
 def rims(mesh: Mesh) -> tuple[list[Rim], np.ndarray]:
-    """Returns the rims of all holes of what is open; and (f,) of each triangle its part, -1 where
-    it is left out (see `solids`).
+    """Returns the rims of all holes; and (f,) each triangle's part, -1 for triangles that `solids`
+    leaves out.
     """
     kept, _ = solids(mesh)
     faces = welded(mesh)[kept]
@@ -47,8 +47,8 @@ def rims(mesh: Mesh) -> tuple[list[Rim], np.ndarray]:
     part = np.full(len(mesh.faces), -1)
     own = part_of_faces(face, edge, len(faces), int(edge.max()) + 1)
     part[kept] = kept[own]
-    # An edge that is gone along once too often is gone back along the rim; of several triangles
-    # at one edge those are taken that came first.
+    # Where triangles run along an edge more often than back, the rim runs back; if an edge has more
+    # triangles than that, the first ones are used.
     spare = np.abs(balance)[edge]
     ahead = np.sign(balance)[edge] == np.where(begin < end, 1, -1)
     order = np.lexsort((np.arange(len(edge)), edge))
@@ -63,8 +63,8 @@ def rims(mesh: Mesh) -> tuple[list[Rim], np.ndarray]:
 
 
 def _loops(begin: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
-    """Splits edges, of which as many end in each vertex as begin there, into loops that pass no
-    vertex twice: (n,) edges each, in order.
+    """Splits edges into loops that pass no vertex twice: (n,) edges each, in order. As many edges
+    must end in each vertex as begin there.
     """
     leaving: dict[int, list[int]] = {}
     for number, vertex in enumerate(begin.tolist()):
@@ -94,7 +94,7 @@ def _loops(begin: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
 
 
 def told_of_holes(mesh: Mesh) -> str:
-    """Returns a line where parts of a mesh are nearly closed, else nothing."""
+    """Returns a warning if parts are nearly closed, or few triangles turned; else an empty text."""
     kept, solid = solids(mesh)
     if solid.all():
         return ""
@@ -127,8 +127,8 @@ def once_filled(solid: SolidParts) -> SolidParts:
 
 
 def filled(mesh: Mesh) -> Mesh:
-    """Returns the mesh with its holes closed, and single triangles that face the other way turned.
-    What encloses nothing even then, such as a leaf, stays as it is.
+    """Returns the mesh with its holes closed, and triangles that face the wrong way turned. Parts
+    that enclose nothing even then, such as a leaf, are not closed.
     """
     away = facing_away(mesh)
     mesh = mesh.turned(away) if len(away) else mesh
@@ -153,8 +153,8 @@ def filled(mesh: Mesh) -> Mesh:
 
 
 def _cap(mesh: Mesh, rim: Rim, winding: WindingNumber) -> Mesh:
-    """Triangles that close a hole: rings from its rim to its middle, moved along the rim's normal
-    to where the winding number is one half.
+    """Returns triangles that close a hole: rings from its rim to its middle, moved along the rim's
+    normal to where the winding number is one half.
     """
     assert mesh.material is not None
     around, n = np.arange(len(rim.face)), len(rim.face)
@@ -178,7 +178,7 @@ def _cap(mesh: Mesh, rim: Rim, winding: WindingNumber) -> Mesh:
     faces = np.concatenate((faces.reshape(-1, 3), last))
 
     def spread(values: np.ndarray | None) -> np.ndarray | None:
-        """Of each corner what the rim has, in the middle its mean."""
+        """Returns values for each corner, blended from the rim's to their mean in the middle."""
         if values is None:
             return None
         own = values[rim.face, rim.corner]
@@ -201,8 +201,8 @@ def _cap(mesh: Mesh, rim: Rim, winding: WindingNumber) -> Mesh:
 def _on_half(
     points: np.ndarray, normal: np.ndarray, reach: float, winding: WindingNumber
 ) -> np.ndarray:
-    """Moves points (p, 3) along a normal to where the winding number is +-1/2, no farther than a
-    reach; those that have no such place near them stay.
+    """Moves points (p, 3) along a normal to where the winding number is +-1/2, at most by `reach`;
+    points without such a position in reach stay.
     """
     place, way = torch.from_numpy(points), torch.from_numpy(normal)
 
@@ -221,7 +221,7 @@ def _on_half(
 
 
 def _joined(mesh: Mesh, caps: list[Mesh]) -> Mesh:
-    """The mesh and its caps as one."""
+    """Returns the mesh and its caps as one mesh."""
     every = [mesh, *caps]
     first = np.cumsum([0, *(len(one.vertices) for one in every)])
 

@@ -1,4 +1,4 @@
-"""`Mesh`: triangles with what is painted on them, and which of them bound solids."""
+"""`Mesh`: triangles with colours, textures and materials; `solids`: which of them bound solids."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-_LEAST = 1e-30  # world units that a mesh may span; 1 / _LEAST at most: their squares are numbers
-_WELDED = 2.0**40  # steps along a mesh's longest side: places that round to the same one are one
-MOST_FACES = 2**28  # triangles of a mesh: they and their hierarchy would take 100 GB
+_LEAST = 1e-30  # least world size of a mesh, 1 / _LEAST the most: squares must be finite, not 0
+_WELDED = 2.0**40  # steps along a mesh's longest side; vertices that round to one step are one
+MOST_FACES = 2**28  # most triangles of a mesh: with their hierarchy, they would take 100 GB
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """How some triangles of a mesh look."""
+    """The look of some triangles of a mesh."""
 
     name: str = ""
     color: tuple[float, float, float, float] = (0.8, 0.8, 0.8, 1.0)  # linear RGB, opacity
@@ -22,17 +22,17 @@ class Material:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mesh:
-    """Triangles, checked, with one entry a corner of what is painted on them.
+    """Triangles, with colours and texture coordinates for each of their corners.
 
-    Raises ValueError where a field has the wrong shape, an index is out of range, a place is not
+    Raises ValueError if a field has the wrong shape, an index is out of range, a position is not
     finite, or there is no triangle.
     """
 
     vertices: np.ndarray  # (v, 3) float64, world units, x y z
     faces: np.ndarray  # (f, 3) int64 vertices, counter-clockwise seen from outside
     color: np.ndarray | None = None  # (f, 3, 4) float32 of each corner, linear RGB and opacity
-    uv: np.ndarray | None = None  # (f, 3, 2) float32 of each corner, (0, 0) is a texture's low left
-    material: np.ndarray | None = None  # (f,) int64 into materials; all the first if left out
+    uv: np.ndarray | None = None  # (f, 3, 2) float32 of each corner, (0, 0) at the lower left
+    material: np.ndarray | None = None  # (f,) int64 index into materials; all 0 if left out
     materials: tuple[Material, ...] = (Material(),)
     name: str = "mesh"  # for messages
 
@@ -55,7 +55,7 @@ class Mesh:
                 whole = dtype != np.int64 or (given == np.trunc(given)).all()
                 with np.errstate(invalid="ignore"):
                     value = np.ascontiguousarray(given, dtype)
-            except (TypeError, ValueError):  # rows of different lengths, texts
+            except (TypeError, ValueError):  # rows of different lengths, text
                 raise ValueError(f"{self.name}: {field_name} must be ({wanted}) numbers") from None
             if not whole:
                 raise ValueError(f"{self.name}: {field_name} must be whole numbers")
@@ -107,16 +107,16 @@ class Mesh:
 
     @property
     def corners(self) -> np.ndarray:
-        """(f, 3, 3) float64 places of the corners."""
+        """(f, 3, 3) float64 positions of the corners."""
         return self.vertices[self.faces]
 
     def only(self, kept: np.ndarray) -> Mesh:
-        """Returns the mesh with some of its triangles, (m,) int64."""
+        """Returns the mesh with only the triangles `kept`, (m,) int64."""
         told = {name: getattr(self, name) for name in ("faces", "color", "uv", "material")}
         return replace(self, **{n: one[kept] for n, one in told.items() if one is not None})
 
     def turned(self, which: np.ndarray) -> Mesh:
-        """Returns the mesh with some of its triangles, (m,) int64, facing the other way."""
+        """Returns the mesh with the triangles `which`, (m,) int64, facing the other way."""
         corner = np.tile(np.arange(3), (len(self.faces), 1))
         corner[which] = (0, 2, 1)
         row = np.arange(len(self.faces))[:, None]
@@ -124,7 +124,7 @@ class Mesh:
         return replace(self, **{n: one[row, corner] for n, one in told.items() if one is not None})
 
     def __repr__(self) -> str:
-        """Tells counts and bounds."""
+        """Returns counts and bounds as text."""
         low, high = (", ".join(f"{n:.6g}" for n in corner) for corner in self.bounds)
         painted = [n for n in ("color", "uv") if getattr(self, n) is not None]
         return (
@@ -134,14 +134,13 @@ class Mesh:
 
 
 def solids(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Finds which triangles bound solids. Triangles that lie on others, corner by corner, are left
-    out but for one of them; those without area stay, for they close gaps, unless two corners are
-    one.
+    """Finds which triangles bound solids. Of triangles with the same three corners, one is kept;
+    those without area are kept, since they close gaps, unless two of their corners are one.
 
-    A part is a set of triangles that hang together by edges (vertices at the same place count as
-    one). It bounds a solid if each edge is gone along as often one way as the other: then every
-    place has a whole winding number. Others are sheets, and so is a part of which only triangles
-    remain that lie back to back.
+    A part is a set of triangles connected by edges (vertices at the same position count as one). It
+    bounds a solid if its triangles run along each edge equally often in both directions: then every
+    point has a whole winding number. All other parts are sheets, and so are triangles that lie back
+    to back, which are not counted in parts.
 
     Returns:
         kept (m,) int64 triangles; solid (m,) bool.
@@ -158,20 +157,20 @@ def solids(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     ways[place, _evenness(faces)] = True
     back_to_back = ways[:, 0] & ways[:, 1]
     faces, kept = faces[first], kept[first]
-    order = np.argsort(kept)  # as they came
+    order = np.argsort(kept)  # back in the mesh's order
     faces, kept, back_to_back = faces[order], kept[order], back_to_back[order]
     return kept, _closed(faces, ~back_to_back) & ~back_to_back
 
 
 def _evenness(faces: np.ndarray) -> np.ndarray:
-    """(f,) 1 where the corners' order is an even permutation of their sorted one, else 0."""
+    """Returns (f,) 1 where the corners are an even permutation of their sorted order, else 0."""
     a, b, c = faces.T
     return ((a < b).astype(np.int64) + (b < c) + (a < c)) % 2
 
 
 def welded(mesh: Mesh) -> np.ndarray:
-    """(f, 3) int64 vertices, those at the same place being one: to 10^-12 of the mesh's size, for
-    whoever computes a pole or a seam twice gets two places.
+    """Returns faces (f, 3) int64 with vertices at the same position merged, to 10^-12 of the mesh's
+    size: a pole or a seam that is computed twice differs by rounding.
     """
     low, high = mesh.bounds
     size = float((high - low).max())
@@ -180,8 +179,8 @@ def welded(mesh: Mesh) -> np.ndarray:
 
 
 def _different(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the first (m,) of each of the different rows (n, 3), in order, and which of these
-    each row (n,) is: a fifth of the time of np.unique.
+    """Returns (m,) the index of the first of each distinct row of `rows` (n, 3), in sorted order,
+    and (n,) which of these each row equals; takes a fifth of the time of np.unique.
     """
     order = np.lexsort(rows.T[::-1])
     ordered = rows[order]
@@ -192,9 +191,9 @@ def _different(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns of each corner of each triangle (3 f,) the edge that begins there, the vertices where
-    it begins and ends, and for each edge how much oftener it is gone along from its lower vertex to
-    its higher one than back.
+    """Returns for each corner of each triangle (3 f,) the edge that begins there and the vertices
+    where it begins and ends; and for each edge, how many more triangles run along it from its lower
+    to its higher vertex than back.
     """
     begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     low, high = np.minimum(begin, end), np.maximum(begin, end)
@@ -205,10 +204,10 @@ def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 
 def facing_away(mesh: Mesh) -> np.ndarray:
-    """Finds triangles that face the other way than most of their part. Two triangles that alone
-    share an edge face the same way if they run along it in opposite directions; in each part that
-    hangs together by such edges, the side of less area is returned. A part that can't face one way
-    altogether, such as a Moebius strip, is left as it is.
+    """Finds triangles that face the other way than most of their part. If exactly two triangles
+    share an edge, they face the same way if they run along it in opposite directions; in each part
+    that is connected by such edges, the orientation with less area is returned. A part that can't
+    be oriented, such as a Moebius strip, is left as it is.
 
     Returns:
         (m,) int64 triangles.
@@ -219,15 +218,15 @@ def facing_away(mesh: Mesh) -> np.ndarray:
     order = np.argsort(edge, kind="stable")
     first = np.searchsorted(edge[order], np.flatnonzero(np.bincount(edge) == 2))
     ahead = (begin < end).astype(np.int64)
-    # Each triangle stands twice, as it is and turned, and hangs together with the neighbours that
-    # then go along their edge the other way.
+    # Each triangle is two nodes, as it is and flipped; a node is connected to the neighbours' nodes
+    # that run along the shared edge in the opposite direction.
     state = np.arange(2)[:, None]
     hooks = [2 * np.arange(len(first)) + (ahead[order[first + at]] ^ state ^ at) for at in range(2)]
     nodes = [order[first + at] // 3 + state * len(faces) for at in range(2)]
     part = part_of_faces(np.ravel(nodes), np.ravel(hooks), 2 * len(faces), 2 * len(first))
     part = part.reshape(2, len(faces))
     own = part.min(0)
-    unlike_first = part[0] > own  # they face the other way than the first one of their part
+    unlike_first = part[0] > own  # whether they face the other way than their part's first triangle
     a, b, c = mesh.corners[kept].transpose(1, 0, 2)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     excess = np.bincount(own, np.where(unlike_first, area, -area), len(faces))[own]
@@ -235,12 +234,12 @@ def facing_away(mesh: Mesh) -> np.ndarray:
 
 
 def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """(f,) bool whether a triangle's part, among those that are counted, is closed."""
+    """Returns (f,) bool, whether a triangle's part is closed, by the triangles `counted` alone."""
     closed = np.zeros(len(faces), bool)
     own = np.flatnonzero(counted)
     if len(own):
         edge, _, _, balance = edges_of(faces[own])
-        if not balance.any():  # no need to tell parts apart
+        if not balance.any():  # all parts are closed
             closed[own] = True
             return closed
         face = np.repeat(np.arange(len(own)), 3)
@@ -250,14 +249,14 @@ def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
 
 
 def part_of_faces(face: np.ndarray, edge: np.ndarray, faces: int, edges: int) -> np.ndarray:
-    """(faces,) the lowest triangle number of each part; pairs (face, edge) hang together."""
+    """Returns (faces,) the lowest face number in each face's part; `face` i has `edge` i."""
     label = np.arange(faces)
     while True:
         least = np.full(edges, faces)
         np.minimum.at(least, edge, label[face])
         new = label.copy()
         np.minimum.at(new, face, least[edge])
-        np.minimum.at(new, label, new)  # what an old label's triangle learns, all of its label do
+        np.minimum.at(new, label, new)  # pass a face's new label on to its old label's face
         new = new[new]
         if (new == label).all():
             return label

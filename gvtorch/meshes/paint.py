@@ -1,4 +1,4 @@
-"""`Paint`: colour, normal and material of places on a mesh."""
+"""`Paint`: colour, normal and material at points on a mesh."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 from .geometry import Geometry
 from .mesh import Mesh
 
-_CREASE = 0.9  # cosine between a corner's mean normal and its triangle's below which it is an edge
+_CREASE = 0.9  # cosine of a corner's mean normal and its triangle's; an edge is sharp below this
 
 
 class Paint:
-    """What is painted on the triangles of a geometry, corner by corner.
+    """Colours, textures, normals and materials of a geometry's triangles.
 
     Attributes:
-        material: (f,) int64 of each triangle.
-        mean_color: (4,) colour of all the surface, by area.
-        main_material: The one with the most area.
+        material: (f,) int64 material of each triangle.
+        mean_color: (4,) mean colour of the surface, weighted by area.
+        main_material: The material with the largest area.
     """
 
     def __init__(self, mesh: Mesh, geometry: Geometry) -> None:
-        """Lays colours, textures and normals ready on the geometry's device."""
+        """Copies colours, textures and normals to the geometry's device."""
         kept, device = geometry.kept.numpy(), geometry.corner.device
 
         def lay(values: np.ndarray | None) -> Tensor | None:
@@ -49,8 +49,8 @@ class Paint:
         self.main_material = int(sums.argmax())
 
     def color(self, face_p: Tensor, weight_p3: Tensor) -> Tensor:
-        """Returns (p, 4) float32 linear RGB and opacity at places on triangles, by the weights of
-        their corners.
+        """Returns (p, 4) float32 linear RGB and opacity at points on triangles `face_p` (p,), given
+        by the weights (p, 3) of their corners.
         """
         material = self.material[face_p]
         color = self._base[material]
@@ -62,13 +62,13 @@ class Paint:
         return color
 
     def normal(self, face_p: Tensor, weight_p3: Tensor) -> Tensor:
-        """Returns (p, 3) float32 unit normals, smooth where the surface is."""
+        """Returns (p, 3) float32 unit normals, interpolated except across sharp edges."""
         normal = (self._normal[face_p] * weight_p3[..., None]).sum(1)
         return torch.nn.functional.normalize(normal, dim=1)
 
 
 def _linear(texture: Tensor) -> Tensor:
-    """(h, w, 4) float16 linear RGB and opacity of sRGB bytes (IEC 61966-2-1)."""
+    """Returns (h, w, 4) float16 linear RGB and opacity from sRGB bytes (IEC 61966-2-1)."""
     value = torch.arange(256) / 255
     table = torch.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     rgb = table[texture[..., :3].long()]
@@ -78,8 +78,8 @@ def _linear(texture: Tensor) -> Tensor:
 def _side_by_side(
     textures: Sequence[np.ndarray | None], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """(n, 4) float16 texels of all textures, row after row, and (m, 3) int64 of each its first
-    texel, its height and width. One that is missing is a white texel.
+    """Returns (n, 4) float16 texels of all textures, row after row, and (m, 3) int64 the first
+    texel, height and width of each texture. A missing texture is one white texel.
     """
     white = torch.ones((1, 1, 4), dtype=torch.float16)
     known: dict[int, Tensor] = {}
@@ -96,7 +96,7 @@ def _side_by_side(
 
 
 def _bilinear(texel: Tensor, sheet_p3: Tensor, uv: Tensor) -> Tensor:
-    """(p, 4) values of textures that repeat; v runs upwards."""
+    """Returns (p, 4) bilinear samples of repeating textures; v runs upwards."""
     first, high, wide = sheet_p3.unbind(1)
     x, y = uv[:, 0] * wide - 0.5, (1 - uv[:, 1]) * high - 0.5
     x0, y0 = x.floor(), y.floor()
@@ -110,9 +110,9 @@ def _bilinear(texel: Tensor, sheet_p3: Tensor, uv: Tensor) -> Tensor:
 
 
 def _corner_normals(mesh: Mesh, geometry: Geometry) -> Tensor:
-    """(f, 3, 3) float32: at each corner the mean of the normals that meet there, weighted by angle
-    (Thuermer, Wuethrich, "Computing vertex normals from polygonal facets", J. Graphics Tools 1998);
-    the triangle's own where it lies at an edge.
+    """Returns (f, 3, 3) float32: at each corner the mean of the normals that meet there, weighted
+    by angle (Thuermer, Wuethrich, "Computing vertex normals from polygonal facets", J. Graphics
+    Tools 1998); at sharp edges the triangle's normal.
     """
     corner = geometry.corner
     _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)

@@ -1,5 +1,5 @@
-"""`Voxelizer`: the voxels of a mesh, at any level and in any part. One definition for what a
-producer makes while it is looked at and for what is written into a store.
+"""`Voxelizer`: the voxels of a mesh, at any level and in any part. Producers that stream a mesh and
+conversions into a store both use it, and so make the same voxels.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ CHANNELS = {
     "material": (torch.uint8, 1),
 }
 _MARGIN = 2  # voxels around the mesh
-_CUBE, _PARTS = 8, 4  # voxels along a side of the cubes of a region; of so many one is looked for
-_BATCH = 1 << 20  # voxels that are made together
-_FINER = 2  # places along a side that a coarse voxel is the mean of
+_CUBE, _PARTS = 8, 4  # voxels along a cube's side; cubes along the side of a block of a region
+_BATCH = 1 << 20  # voxels that are computed together
+_FINER = 2  # samples along a side of a coarse voxel, which is their mean
 _DIAGONAL = 0.5 * math.sqrt(3)  # from a voxel's centre to its corner
-_FLOAT32 = 2048.0  # voxels that triangles may reach away from their cube, in float32
+_FLOAT32 = 2048.0  # size of a triangle, in voxels, from which on float64 is used
 
 
 class GridSettings(TypedDict, total=False):
@@ -45,7 +45,7 @@ class GridSettings(TypedDict, total=False):
 
 
 def check_channels(where: str, channels: str | Sequence[str]) -> tuple[str, ...]:
-    """Returns names of channels, once each; raises ValueError where one is unknown."""
+    """Returns the names as a tuple; raises ValueError if one is unknown or repeated, or if none."""
     names = (channels,) if isinstance(channels, str) else tuple(channels)
     unknown = [name for name in names if name not in CHANNELS]
     if unknown or not names or len({*names}) < len(names):
@@ -61,19 +61,20 @@ class Voxelizer:
     Attributes:
         mesh: The mesh.
         extent: Finest voxels along x, y, z.
-        spacing: World size of one, the same along x, y and z.
-        origin: World place of the centre of voxel 0.
+        spacing: World size of a finest voxel, the same along x, y and z.
+        origin: World position of the centre of voxel 0.
         channels: Names of what a voxel holds:
             coverage uint8, 255 times the share of the voxel that is filled.
-            distance float32, to the surface in world units, below 0 inside of solids; no farther
-                than `band`.
-            color float16 x 4, premultiplied linear red, green, blue, and opacity: the surface's at
-                the nearest place, times the coverage; its mean farther inside than the band.
-            normal int8 x 3, 127 times the unit normal at the nearest place; 0 beyond the band.
-            material uint8, 1 + the material of the nearest triangle where the voxel is half filled
-                or more, else 0: labels.
-        band: World distance up to which the nearest place counts.
-        thickness: World thickness of what is no solid.
+            distance float32, to the surface in world units, negative inside of solids; its absolute
+                value is at most `band`.
+            color float16 x 4, premultiplied linear red, green, blue, and opacity: the colour of the
+                nearest surface point, or the surface's mean beyond the band, times the coverage.
+            normal int8 x 3, 127 times the unit normal at the nearest surface point; 0 beyond the
+                band.
+            material uint8, a label: 1 + the material of the nearest triangle if at least half of
+                the voxel is filled, else 0.
+        band: World distance up to which the nearest surface point is used.
+        thickness: World thickness of sheets, the parts that are not solids.
     """
 
     def __init__(
@@ -87,17 +88,17 @@ class Voxelizer:
         solid: SolidParts = "auto",
         device: torch.device | str = "cpu",
     ) -> None:
-        """Lays the grid around the mesh.
+        """Places the grid around the mesh.
 
         Args:
             mesh: The mesh.
-            resolution: Finest voxels along its longest side, 2 at either end beyond it.
-            channels: Of `CHANNELS`.
+            resolution: Finest voxels along its longest side, including a margin of 2 at either end.
+            channels: Names from `CHANNELS`.
             band: In finest voxels, at least 2.
             thickness: Of sheets, in finest voxels.
-            solid: auto: what is closed is a solid; always: holes are filled before; never: all is a
-                sheet.
-            device: Where it is worked out.
+            solid: auto: closed parts are solids; always: holes are filled first; never: all parts
+                are sheets.
+            device: Where voxels are computed.
 
         Raises:
             ValueError: An unknown channel, or a number out of its range.
@@ -134,12 +135,12 @@ class Voxelizer:
         self.paint = Paint(mesh, self.geometry) if painted else None
 
     def reach(self, voxel_k: Tensor) -> Tensor:
-        """World distances from voxels of sizes (k,) up to which triangles matter to them."""
+        """Returns (k,) the world distance up to which triangles affect voxels of sizes (k,)."""
         share = (_DIAGONAL * voxel_k + 0.5 * self.thickness) * (1 + 1e-6)
         return share if {"coverage"} == {*self.channels} else share.clamp(min=self.band)
 
     def touched(self, low_k3: Tensor, size_k: Tensor, voxel_k: Tensor) -> tuple[Tensor, Tensor]:
-        """As `Geometry.touched`, for what may change voxels of sizes (k,) float64 in boxes."""
+        """Calls `Geometry.touched` with the `reach` of voxels of sizes (k,) float64."""
         return self.geometry.touched(
             low_k3, size_k, self.reach(voxel_k), parts=_PARTS, wide=self._wide
         )
@@ -152,9 +153,9 @@ class Voxelizer:
         *,
         coarse_k: Tensor | None = None,  # (k,) bool, which have coarse voxels; None: none
     ) -> dict[str, Tensor]:
-        """Makes k cubes of voxels, by channel (k, z, y, x, c) of its dtype, on the device and
-        without waiting for it. Coarse voxels are means of 2^3 places in each, unless one place
-        tells as much.
+        """Computes k cubes of voxels, by channel (k, z, y, x, c) of its dtype, on the device and
+        without waiting for it. A coarse voxel is the mean of 2^3 samples in it, unless one sample
+        is exact (coverage alone, of solids alone).
         """
         parts: dict[str, list[Tensor]] = {}
         for name in self.channels:
@@ -170,8 +171,8 @@ class Voxelizer:
         return {name: torch.cat(own) for name, own in parts.items()}
 
     def constants(self, inside_k: Tensor) -> dict[str, Tensor]:
-        """Returns by channel (k, c) the values of voxels far from all triangles, inside the mesh or
-        outside.
+        """Returns by channel (k, c) the values of voxels far from all triangles, inside the mesh
+        where `inside_k` (k,) is true, else outside.
         """
         shape = (len(inside_k), 1, 1, 1)
         inside = inside_k.view(shape)
@@ -186,7 +187,7 @@ class Voxelizer:
         return {name: _stored(name, values)[:, 0, 0, 0] for name, values in made.items()}
 
     def region(self, low: Sequence[int], high: Sequence[int]) -> dict[str, Tensor]:
-        """Makes the finest voxels of a box `low` to `high`, (z, y, x).
+        """Computes the finest voxels of a box `low` to `high`, (z, y, x).
 
         Returns:
             By channel (z, y, x, c) of its dtype, on the device.
@@ -206,7 +207,7 @@ class Voxelizer:
         near, inside = map(joined, found)
         cubes = near.nonzero()
         at = (cubes + first * _PARTS) * _CUBE
-        # Those behind the region's end are not asked for.
+        # Blocks may stick out of the region; cubes outside of it are not computed.
         begin, end = torch.tensor((tuple(low), tuple(high)), device=device)
         wanted = ((at + _CUBE > begin) & (at < end)).all(1)
         out = self._blank(inside)
@@ -222,7 +223,7 @@ class Voxelizer:
         }
 
     def _blank(self, inside: Tensor) -> dict[str, Tensor]:
-        """(gz, gy, gx, z, y, x, c) by channel, far from triangles, (gz, gy, gx) inside or not."""
+        """Returns by channel (gz, gy, gx, z, y, x, c) cubes as if far from all triangles."""
         both = self.constants(torch.tensor([False, True], device=self.device))
         return {
             name: torch.where(inside[..., None], values[1], values[0])[
@@ -232,15 +233,15 @@ class Voxelizer:
         }
 
     def _corner(self, zyx: Tensor) -> Tensor:
-        """(k, 3) float64 world place of the low corner of voxels z, y, x."""
+        """Returns (k, 3) float64 world positions x, y, z of the low corners of voxels z, y, x."""
         origin = torch.tensor(self.origin, dtype=torch.float64, device=zyx.device)
         return origin + (zyx.flip(1) - 0.5) * self.spacing
 
     def _make(
         self, low: Tensor, voxel: Tensor, side: int, coarse: Tensor | None
     ) -> dict[str, Tensor]:
-        """By channel (k, z, y, x, c) of cubes, means of places where they are coarse; labels are
-        those of the last place.
+        """Returns by channel (k, z, y, x, c) of cubes; coarse ones are means of samples (labels:
+        the last sample).
         """
         if coarse is None or self._exact:
             return self._look(low, voxel, voxel, side)
@@ -248,7 +249,7 @@ class Voxelizer:
         used = coarse.view(-1, 1, 1, 1, 1)
 
         def mean(begin: int, end: int) -> dict[str, Tensor]:
-            """Of some of the places, half by half: of equal values it is the same."""
+            """Averages a range of samples pairwise: equal values then have exactly that mean."""
             if end - begin == 1:
                 there = own if begin == 0 else torch.where(coarse, own, 0)
                 return self._look(low + self._places[begin] * own[:, None], there, voxel, side)
@@ -278,7 +279,7 @@ class Voxelizer:
         return self._channels(found._replace(**narrow))
 
     def _channels(self, found: Voxelized) -> dict[str, Tensor]:
-        """By channel (k, z, y, x, c) float32, distances in world units (int64 materials)."""
+        """Returns (k, z, y, x, c) float32 by channel (material int64); distances in world units."""
         made: dict[str, Tensor] = {}
         if "coverage" in self.channels:
             made["coverage"] = found.coverage[..., None]

@@ -2,9 +2,9 @@
 
 Sources: Jacobson, Kavan, Sorkine-Hornung, "Robust inside-outside segmentation using generalized
     winding numbers", SIGGRAPH 2013; Barill, Dickson, Schmidt, Levin, Jacobson, "Fast winding
-    numbers for soups and clouds", SIGGRAPH 2018 (far away, many triangles are one dipole, with the
-    next term of its series); Van Oosterom, Strackee, "The solid angle of a plane triangle", IEEE
-    Trans. Biomed. Eng. 30, 1983.
+    numbers for soups and clouds", SIGGRAPH 2018 (from afar, many triangles act as one dipole, plus
+    the next term of its series); Van Oosterom, Strackee, "The solid angle of a plane triangle",
+    IEEE Trans. Biomed. Eng. 30, 1983.
 """
 
 from __future__ import annotations
@@ -17,17 +17,15 @@ from torch import Tensor
 from ..ops.voxelize import ARITY
 from .geometry import Hierarchy, padded
 
-_FAR = 3.5  # radii from which on a box of triangles is a dipole: errors are then below 1e-3
-_PLACES = 1 << 11  # that are asked for together
+_FAR = 3.5  # distance, in radii of a box, beyond which it acts as a dipole: errors are below 1e-3
+_PLACES = 1 << 11  # points that are computed together
 
 
 class WindingNumber:
-    """Of some triangles: how often they wind around places. Whole where they are closed; 1/2 on a
-    plane hole.
-    """
+    """Winding numbers of triangles at any point: whole if closed, 1/2 on a plane hole."""
 
     def __init__(self, corner_f33: Tensor) -> None:
-        """Takes (f, 3, 3) float64 corners, and adds up the dipoles of all boxes."""
+        """Takes (f, 3, 3) float64 corners, and sums the dipoles of all boxes."""
         self._first = (hierarchy := Hierarchy(corner_f33)).first
         self._corner = corner_f33[hierarchy.order]
         a, b, c = self._corner.unbind(1)
@@ -38,7 +36,7 @@ class WindingNumber:
             spare = -len(area) % ARITY
             area = torch.cat((area, area.new_zeros(spare))).view(-1, ARITY, 1)
             middle = padded(middle).view(-1, ARITY, 3)
-            weight = area.clamp(min=1e-300)  # of boxes without area: any place in them
+            weight = area.clamp(min=1e-300)  # for boxes without area, any middle inside will do
             middle = (weight * middle).sum(1) / weight.sum(1)
             normal = torch.cat((normal, normal.new_zeros(spare, 3))).view(-1, ARITY, 3).sum(1)
             levels.append((area.sum((1, 2)), middle, normal))
@@ -50,7 +48,9 @@ class WindingNumber:
         self._second = torch.cat(self._moments(len(levels)))
 
     def _moments(self, levels: int) -> list[Tensor]:
-        """(n, 3, 3) of each level: sums of (middle of a triangle - the box's) x its normal."""
+        """Returns for each level (n, 3, 3): sums over a box's triangles of the outer products of
+        (triangle's middle - box's middle) and the triangle's normal.
+        """
         found = [self._corner.new_zeros(len(self._corner), 3, 3)]
         for number in range(1, levels):
             below = slice(self._first[number - 1], self._first[number])
@@ -63,7 +63,7 @@ class WindingNumber:
         return found
 
     def __call__(self, place_p3: Tensor) -> Tensor:
-        """Returns (p,) float64 at places (p, 3) float64."""
+        """Returns (p,) float64 winding numbers at points (p, 3) float64."""
         return torch.cat([self._at(place) for place in place_p3.split(_PLACES)])
 
     def _at(self, place_p3: Tensor) -> Tensor:
@@ -85,7 +85,7 @@ class WindingNumber:
         return total.index_add_(0, which, _turn(self._corner[box] - place_p3[which, None]))
 
     def _dipole(self, box: Tensor, toward: Tensor, distance: Tensor) -> Tensor:
-        """(m,) what far boxes add: the first two terms of the series about their middles."""
+        """Returns (m,) what far boxes add: the first two terms of the series at their middles."""
         first = (self._normal[box] * toward).sum(1) / distance**3
         second = self._second[box]
         trace = second.diagonal(dim1=1, dim2=2).sum(1)
@@ -94,7 +94,7 @@ class WindingNumber:
 
 
 def _turn(corner_m33: Tensor) -> Tensor:
-    """(m,) the solid angle of triangles seen from the origin, as a share of the whole."""
+    """Returns (m,) the signed solid angle of triangles seen from the origin, over 4 pi."""
     a, b, c = corner_m33.unbind(1)
     la, lb, lc = (one.norm(dim=1) for one in (a, b, c))
     above = (a * torch.linalg.cross(b, c)).sum(1)

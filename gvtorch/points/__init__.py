@@ -1,1 +1,1 @@
-"""Points with values: what voxels of any size hold of them."""
+"""Points with values, and their sums in voxels of any size."""

@@ -1,6 +1,6 @@
-"""`PointGrid`: the voxels that points are laid into; `Codes`: their numbers along a curve that
-fills a node before it leaves it; and the kernel by which a point that is wider than a voxel is
-shared among several.
+"""`PointGrid`: the grid of voxels for points; `Codes`: numbers of voxels along a curve that visits
+all voxels of a node before it leaves the node; and the kernel that distributes a point that is
+wider than a voxel over several.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from ..base.boxes import extent_in
 from ..ops.splat import shares
 from .points import Points
 
-_MOST = 2**62  # codes of an int64
+_MOST = 2**62  # codes that an int64 may count
 
 
 class Codes:
-    """The digits of x, y and z to base N, in turn (Morton's order for N = 2). So the voxels of a
-    node, at any level, have codes without a gap: those of its first voxel's code, divided by N^3
-    for each level up.
+    """Codes that interleave the base-N digits of x, y and z (Morton order for N = 2). So the voxels
+    of a node, at any level, have consecutive codes, and a voxel's code divided by N^3 is that of
+    the voxel one level up.
 
     Source: Morton, "A computer oriented geodetic data base", 1966.
     """
 
     def __init__(self, branching: int, side: int) -> None:
-        """Lays the curve through a cube of at least `side` voxels; ValueError if it is too long."""
+        """Covers a cube of at least `side`^3 voxels; ValueError if that is too many for int64."""
         self.branching, self.digits = branching, 1
         while branching**self.digits < side:
             self.digits += 1
@@ -38,7 +38,7 @@ class Codes:
                 f"points: an extent of {side} has more voxels than a 64-bit number tells apart; "
                 "take a smaller one"
             )
-        self._places: dict[int, np.ndarray] = {}  # by side; a producer asks for one or two
+        self._places: dict[int, np.ndarray] = {}  # by side; a producer uses one or two
         self._low = branching ** -(-self.digits // 2)
         at = np.arange(self._low)
         self._spread = np.zeros(self._low, np.int64)
@@ -46,7 +46,7 @@ class Codes:
             self._spread += at // branching**digit % branching * branching ** (3 * digit)
 
     def of(self, voxel_k3: np.ndarray) -> np.ndarray:
-        """Returns (k,) int64 codes of voxels x, y, z, inside the cube of any level."""
+        """Returns (k,) int64 codes of voxels (k, 3) x, y, z of any level, inside the cube."""
         code = np.zeros(len(voxel_k3), np.int64)
         for axis in (2, 1, 0):
             high, low = np.divmod(voxel_k3[:, axis], self._low)
@@ -56,7 +56,7 @@ class Codes:
         return code
 
     def places(self, side: int) -> np.ndarray:
-        """Returns (side^3, 3) x, y, z of the codes from 0 on; `side` is a power of N."""
+        """Returns (side^3, 3) x, y, z of the codes 0, 1, ...; `side` is a power of N."""
         if side not in self._places:
             at = np.indices((side,) * 3).reshape(3, -1).T
             found = np.empty_like(at)
@@ -67,7 +67,7 @@ class Codes:
 
 @dataclass(frozen=True)
 class PointGrid:
-    """A box of finest voxels; voxels of level l are N^l of them wide."""
+    """A box of finest voxels; a voxel of level l is N^l finest voxels wide."""
 
     extent: tuple[int, int, int]  # finest voxels along x, y, z
     low: tuple[float, float, float]  # world corners
@@ -83,7 +83,7 @@ class PointGrid:
         box: Sequence[Sequence[float]] | None,
         branching: int,
     ) -> PointGrid:
-        """Returns the grid of a user's extent and box, around all points if there is none."""
+        """Returns the grid of a user's extent and box; without a box, one around all points."""
         check.whole(where, "branching", branching, low=2, high=16)
         low, high = check.box(where, _bounds(blocks) if box is None else box)
         extent = extent_in(where, extent, (low, high))
@@ -99,28 +99,28 @@ class PointGrid:
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """World place of the centre of voxel 0."""
+        """World position of the centre of voxel 0."""
         x, y, z = (np.array(self.low) + 0.5 * self.spacing_3).tolist()
         return (x, y, z)
 
     @property
     def levels(self) -> int:
-        """Levels up to that of one voxel."""
+        """Number of levels; the last one is one voxel."""
         side, levels = max(self.extent), 1
         while self.branching ** (levels - 1) < side:
             levels += 1
         return levels
 
     def voxel(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the finest voxels (k, 3) that positions (k, 3) are in, and which are inside."""
+        """Returns (m, 3) the finest voxels of positions (k, 3) in the box, and (k,) their mask."""
         with np.errstate(over="ignore", invalid="ignore"):
             place = np.floor((positions.astype(np.float64) - self.low) / self.spacing_3)
             inside = ((place >= 0) & (place < self.extent)).all(1)
         return place[inside].astype(np.int64), inside
 
     def edges(self, voxel_k3: np.ndarray, count: int, level: int) -> list[np.ndarray]:
-        """Returns for each axis (k, count + 1) world places of the edges of `count` voxels of a
-        level, from voxels on; none is outside of the box.
+        """Returns for each axis (k, count + 1) world coordinates of the edges of `count` voxels of
+        a level, beginning at voxels (k, 3), clamped to the box.
         """
         size = self.spacing_3 * self.branching**level
         at = np.arange(count + 1)
@@ -134,8 +134,8 @@ class PointGrid:
         ]
 
     def own_level(self, radius: np.ndarray) -> np.ndarray:
-        """Returns the first level whose voxels are as wide as points with radii (k,) reach: there a
-        point is in at most 3^3 of them.
+        """Returns (k,) the finest level whose voxels are at least as wide as the radii (k,) of
+        points: there, a point overlaps at most 3^3 voxels.
         """
         own = np.zeros(len(radius), np.int64)
         for level in range(self.levels - 1):
@@ -143,9 +143,9 @@ class PointGrid:
         return own
 
 
-@np.errstate(over="ignore")  # a box that is not finite is refused
+@np.errstate(over="ignore")  # a box that is not finite is an error later
 def _bounds(blocks: Iterable[Points]) -> list[list[float]]:
-    """A box around all points, as far as they reach, and a little more."""
+    """Returns a box around all points with their radii, and a small margin."""
     low, high = np.full(3, math.inf), np.full(3, -math.inf)
     for block in blocks:
         reach = 0.0 if block.radius is None else block.radius[:, None]
@@ -159,15 +159,15 @@ def _bounds(blocks: Iterable[Points]) -> list[list[float]]:
 
 
 def point_shares(edge: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Returns what each interval between edges (k, m + 1), rising, holds of points at (k,) that
-    reach as far as (k,): (k, m), float64. See `shares`.
+    """Returns (k, m) float64 the share of each point, with centre (k,) and radius (k,), in each of
+    its intervals, which lie between increasing edges (k, m + 1). See `shares`.
     """
     given = (torch.from_numpy(np.asarray(one, np.float64)) for one in (edge, center, radius))
     return shares(*given).numpy()
 
 
 def peak(radius: np.ndarray, size_3: np.ndarray) -> np.ndarray:
-    """Returns (k,) the most that a box of a size holds of points with radii (k,)."""
+    """Returns (k,) upper bounds of the share of points with radii (k,) in any box of a size."""
     safe = np.maximum(radius, np.finfo(np.float64).tiny)
     share = np.minimum(1, 4 / 3 * size_3 / safe[:, None])
     return share[:, 0] * share[:, 1] * share[:, 2]

@@ -1,4 +1,4 @@
-"""`Points`: positions with values, and what goes with them."""
+"""`Points`: positions with values, and optional colours and radii."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ..base import check
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points in the world. Tensors and lists become arrays; float32 stays, all else is float64.
+    """Points in the world. Tensors and lists become arrays, of float64 unless given as float32.
 
     Attributes:
         positions: (n, 3) x, y, z.
         values: (n, c) numbers that add up, such as mass, light, or premultiplied colour and
             opacity; (n,) counts as (n, 1); 1 each if left out.
         colors: (n, 3) linear red, green, blue, at least 0.
-        radius: (n,) world units, or one for all: how far a point reaches along each axis. 0, or
-            left out: it is in one voxel.
+        radius: (n,) world units, or one for all: a point's extent along each axis. 0, or left out:
+            the point lies in one voxel.
     """
 
     positions: Any
@@ -60,7 +60,7 @@ class Points:
 
     @property
     def width(self) -> int:
-        """Numbers of a point's value."""
+        """How many numbers a point's value has."""
         return int(self.values.shape[1])
 
     def part(self, start: int, stop: int) -> Points:
@@ -70,14 +70,14 @@ class Points:
         return Points(*cut)
 
     def blocks(self, count: int) -> Iterator[Points]:
-        """Yields all points, so many at a time."""
+        """Yields all points, `count` at a time."""
         for start in range(0, len(self), count):
             yield self.part(start, start + count)
 
     def lit(self, opacity: float = 1e-4) -> Points:
         """Returns points whose values are light: red, green, blue (the first value times the
-        colour, white where there is none) and an opacity, as
-        `gv.StoredColor("value", premultiplied=True)` reads them.
+        colour, or times white without colours) and an opacity, as read by
+        `gv.StoredColor("value", premultiplied=True)`.
         """
         check.number("Points.lit", "opacity", opacity, low=0, high=1, open_low=True)
         color = np.ones((1, 3)) if self.colors is None else self.colors

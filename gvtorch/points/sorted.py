@@ -1,5 +1,5 @@
-"""`SortedPoints`: points in the order of a curve, and their sums in voxels of coarser levels; in
-memory, or in a folder of files that are mapped. Made in bounded memory (`sort_points`).
+"""`SortedPoints`: points in the order of a space-filling curve, and their sums in voxels of coarser
+levels; in memory, or in a folder of mapped files. `sort_points` makes them in bounded memory.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from .table import Fold, Rows, Runs, Table, grouped
 
 _META = "points.json"
 _VERSION = 1
-_FULL = 512  # rows in one voxel from which on a level is kept
-_COPIES = 8  # of a block of rows that are in memory while it is sorted
+_FULL = 512  # a level's sums are stored if one of its voxels adds up more rows than this
+_COPIES = 8  # copies of a block of rows in memory while it is sorted
 _ADDED: Mapping[str, Fold] = {"value": np.add.reduceat}
 _WITH_ENDS: Mapping[str, Fold] = {**_ADDED, "low": np.minimum.reduceat, "high": np.maximum.reduceat}
 _ALL_ADDED: Mapping[str, Fold] = dict.fromkeys(("value", "low", "high"), np.add.reduceat)
@@ -33,12 +33,12 @@ _ALL_ADDED: Mapping[str, Fold] = dict.fromkeys(("value", "low", "high"), np.add.
 
 @runtime_checkable
 class PointSource(Protocol):
-    """What points come from: `Points`, or a file that is read in parts."""
+    """A source of points: `Points`, or a file that is read in parts."""
 
     def __len__(self) -> int: ...
 
     def blocks(self, count: int, /) -> Iterator[Points]:
-        """Yields all points, so many at a time; may be called again."""
+        """Yields all points, `count` at a time; may be called again."""
 
 
 class SortedPoints:
@@ -46,13 +46,13 @@ class SortedPoints:
 
     Attributes:
         grid: The voxels.
-        codes: Their numbers.
-        width: Numbers of a point's value.
-        points: By level, the points that are as wide as its voxels (of level 0 and narrower): code
-            of the finest voxel, position, value and radius.
-        sums: By level, as many as it pays to keep: code of each voxel that holds something, its
-            sum, and the smallest and largest sum of a finest voxel in it.
-        folder: Where it lies; None: in memory.
+        codes: The codes of voxels.
+        width: How many numbers a point's value has.
+        points: By level, the points whose radius needs its voxels (see `PointGrid.own_level`; level
+            0 has all narrower ones): code of the finest voxel, position, value, and radius if any.
+        sums: By level, only where worth storing: code of each voxel that holds points, its sum, and
+            the smallest and largest sum of a finest voxel in it.
+        folder: The folder of its files; None: in memory.
     """
 
     def __init__(
@@ -63,17 +63,17 @@ class SortedPoints:
         sums: dict[int, Table],
         folder: Path | None = None,
     ) -> None:
-        """Holds them."""
+        """Takes the tables; see `sort_points`."""
         self.grid, self.width, self.points, self.sums = grid, width, points, sums
         self.codes = Codes(grid.branching, max(grid.extent))
         self.folder = folder
 
     @classmethod
     def open(cls, folder: str | Path) -> SortedPoints:
-        """Opens what `sort_points` wrote.
+        """Opens a folder that `sort_points` wrote.
 
         Raises:
-            FileNotFoundError, ValueError: It is not there, or damaged.
+            FileNotFoundError, ValueError: It does not exist, or is damaged.
         """
         folder = Path(folder)
         meta = check.json_file("sorted points", folder / _META)
@@ -108,7 +108,7 @@ class SortedPoints:
         return f"SortedPoints({len(self)}, values of {self.width}, {x}x{y}x{z} (x, y, z), {place})"
 
     def save(self) -> None:
-        """Writes what `open` reads, the last step of making it."""
+        """Writes the metadata that `open` reads, the last step of writing the folder."""
         assert self.folder is not None
         told = {
             what: {level: {"count": len(one), "kinds": one.kinds} for level, one in tables.items()}
@@ -133,22 +133,22 @@ def sort_points(
     memory: int | str = "1 GB",
     progress: Progress = no_progress,
 ) -> SortedPoints:
-    """Sorts points along a curve through a grid of voxels, once, and adds them up in its levels.
+    """Sorts points along a curve through a grid of voxels, once, and sums them in its levels.
 
     Args:
         points: `Points`, or a `PointFile`, which is read part by part (twice, unless
             there is a box).
         extent: Voxels of the finest level, (x, y, z), or along the longest side of the box.
-        box: World corners ((x, y, z), (x, y, z)); points outside are left out. Around all points,
-            as far as they reach, if left out.
+        box: World corners ((x, y, z), (x, y, z)); points outside are left out. Around all points
+            with their radii, if left out.
         branching: N.
-        folder: To make; it appears when all is done. In memory if left out.
-        memory: Bytes that sorting takes, roughly; for a folder.
-        progress: Told ("sorting", points done, of all).
+        folder: Folder to create; it appears when complete. In memory if left out.
+        memory: Approximate bytes of memory for sorting, if there is a folder.
+        progress: Called with ("sorting", done, total), then ("adding up", levels done, levels).
 
     Raises:
         ValueError: A number is out of its range or not finite, or no point lies in the box.
-        FileExistsError: The folder is there.
+        FileExistsError: The folder exists.
         OSError: The disk is full.
     """
     where, target = "sort_points", None if folder is None else Path(folder)
@@ -184,13 +184,13 @@ def sort_points(
 
 
 def _columns(points: Points) -> Rows:
-    """The columns of a row of points."""
+    """Returns the columns of points."""
     rows = {"position": points.positions, "value": points.values}
     return rows if points.radius is None else {**rows, "radius": points.radius}
 
 
 class _Maker:
-    """The steps of `sort_points`, and where its tables lie."""
+    """The steps of `sort_points`, and its tables."""
 
     def __init__(
         self, grid: PointGrid, folder: Path | None, block: int, progress: Progress
@@ -234,7 +234,7 @@ class _Maker:
         return runs[level]
 
     def add_up(self) -> None:
-        """Makes the sums, level by level, of those that are kept below."""
+        """Computes the sums level by level, each from the nearest stored sums below it."""
         for level in range(self.grid.levels):
             self.progress("adding up", level, self.grid.levels)
             own = self._own(level)
@@ -259,7 +259,7 @@ class _Maker:
         self.progress("adding up", self.grid.levels, self.grid.levels)
 
     def _below(self, level: int) -> tuple[Iterator[Rows], int]:
-        """What is kept below a level, sorted, and how many of its voxels one of the level has."""
+        """Returns the nearest sums below a level, and how many of their voxels one of it holds."""
         n = self.grid.branching**3
         if kept := [one for one in self.sums if one < level]:
             return self.sums[kept[-1]].blocks(self.block), n ** (level - kept[-1])
@@ -271,8 +271,8 @@ class _Maker:
         return level in self.points and "radius" in self.points[level].rows
 
     def _kept(self, name: str, below: Iterator[Rows], divide: int) -> tuple[Table, bool]:
-        """The sums of a level, and whether they are worth keeping: they are half as many, or there
-        are voxels in which many rows would have to be added up each time.
+        """Computes the sums of a level; returns them, and whether they are worth storing: they are
+        at most half as many rows as below, or a voxel adds up more than `_FULL` rows.
         """
         before, most = 0, 0
         ones = ({"rows": np.ones(len(rows["code"]), np.int64), **rows} for rows in below)
@@ -285,7 +285,7 @@ class _Maker:
         return made, 0 < 2 * len(made) <= before or most > _FULL
 
     def _own(self, level: int) -> Runs | None:
-        """What points that are as wide as a level's voxels add to them; None if there are none."""
+        """Returns the shares of a level's wide points in its voxels; None if there are none."""
         if not self._is_wide(level):
             return None
         runs = Runs(self.folder, f"own_{level}", self.block)
@@ -294,7 +294,7 @@ class _Maker:
         return runs
 
     def _spread(self, rows: Rows, level: int) -> Rows:
-        """The shares of points (k,) in the voxels of their own level."""
+        """Returns rows with the shares of points (k,) in the voxels of their level."""
         n = self.grid.branching**level
         size = self.grid.spacing_3 * n
         place, radius = rows["position"].astype(np.float64), rows["radius"].astype(np.float64)
@@ -315,7 +315,7 @@ class _Maker:
         some = share > 0
         row, share = row[some], share[some]
         value = rows["value"][row].astype(np.float64)
-        # A finest voxel holds all of it at most, or its share at the point's centre.
+        # A finest voxel holds the share itself (level 0), or at most that at the point's centre.
         most = share if level == 0 else peak(radius, self.grid.spacing_3)[row]
         ends = ends_of(most[:, None] * value)
         return {"code": self.codes.of(at[some]), "value": share[:, None] * value, **ends}
@@ -336,7 +336,7 @@ def finest_sums(blocks: Iterator[Rows]) -> Iterator[Rows]:
 
 
 def ends_of(value: np.ndarray) -> Rows:
-    """The smallest and largest of values and 0, as float32."""
+    """Returns as float32 the smaller and the larger of each value and 0."""
     with np.errstate(over="ignore"):
         ends = value.astype(np.float32)
     return {"low": np.minimum(ends, 0), "high": np.maximum(ends, 0)}

@@ -1,4 +1,4 @@
-"""What cubes of voxels hold of sorted points, and between which values all lies that is in them."""
+"""The sums of sorted points in cubes of voxels, and bounds of these sums."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .grid import Codes, peak
 from .sorted import SortedPoints
 from .table import Rows
 
-_CELL = 4  # voxels along a side of what is looked up at least
-_NEARLY = 1.001  # of how far a point reaches: more than rounding makes of it
+_CELL = 4  # voxels along a side up to which cells are made, in small cubes
+_NEARLY = 1.001  # factor on a point's radius that covers rounding errors
 
 
 class Cubes(NamedTuple):
-    """k cubes of `side` voxels of a level, from voxels x, y, z (k, 3) on, in the box or not."""
+    """k cubes of `side`^3 voxels of a level, from voxels (k, 3) x, y, z on; may leave the box."""
 
     low_k3: np.ndarray
     side: int
@@ -28,45 +28,45 @@ class Cubes(NamedTuple):
 
 
 class _Cells(NamedTuple):
-    """Cells of cubes that hold rows of a table; those of a cube stand together."""
+    """Cells of cubes that hold rows of a table, ordered by cube."""
 
-    cube: np.ndarray  # (s,) rising
-    first_s3: np.ndarray  # voxel x, y, z, of the cubes' level
-    code: np.ndarray  # (s,) of the first voxel, as the table has it
-    start: np.ndarray  # (s,) row in the table
-    rows: np.ndarray  # (s,) how many
+    cube: np.ndarray  # (s,) the cell's cube, increasing
+    first_s3: np.ndarray  # first voxel x, y, z, at the cubes' level
+    code: np.ndarray  # (s,) code of the first voxel, at the table's level
+    start: np.ndarray  # (s,) first row in the table
+    rows: np.ndarray  # (s,) number of rows
     size: int  # voxels along a side
-    below: int  # codes of the table in a voxel
+    below: int  # how many codes of the table a voxel has
 
     def once(self) -> tuple[_Cells, np.ndarray]:
-        """Returns each cell once, and (s,) which of these they are."""
+        """Returns the distinct cells, and (s,) the index of each cell among these."""
         _, one, same = np.unique(self.code, return_index=True, return_inverse=True)
         return self._replace(**{n: getattr(self, n)[one] for n in self._fields[:5]}), same
 
     def ahead(self) -> np.ndarray:
-        """Returns (s,) how many rows the cells before each have."""
+        """Returns (s,) the number of rows in all cells before each cell."""
         return np.cumsum(self.rows) - self.rows
 
     def listed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns (m,) the rows of all cells, and of which cell each is."""
+        """Returns (m,) the rows of all cells, and (m,) the cell of each row."""
         own = np.repeat(np.arange(len(self.rows)), self.rows)
         return (self.start - self.ahead())[own] + np.arange(len(own)), own
 
     def voxels(self, curve: Codes, code: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """Returns (m, 3) the voxels of codes in cells."""
+        """Returns (m, 3) the voxels x, y, z of codes (m,), which lie in cells `own` (m,)."""
         within = code - self.code[own]
         if self.below > 1:
             within //= self.below
         return self.first_s3[own] + curve.places(self.size)[within]
 
 
-#: (m,) rows of a table in cubes, and (m,) the cubes, rising; rows of equal codes stand together.
+#: (m,) rows of a table in cubes, and (m,) their cubes, increasing; equal codes are adjacent.
 _Found = tuple[np.ndarray, np.ndarray]
 
 
 def values(points: SortedPoints, cubes: Cubes, *, narrow: bool = True) -> np.ndarray:
-    """Returns (k, z, y, x, c) float64 the sums in voxels, per finest voxel; without those of points
-    that are narrower than a finest voxel unless `narrow`.
+    """Returns (k, z, y, x, c) float64 the mean sum per finest voxel in each voxel; unless `narrow`,
+    without points that are narrower than a finest voxel.
     """
     table = _finer(points, cubes.level) if narrow else None
     edge = np.stack(points.grid.edges(cubes.low_k3, cubes.side, cubes.level), 1)
@@ -80,8 +80,8 @@ def values(points: SortedPoints, cubes: Cubes, *, narrow: bool = True) -> np.nda
 def ranges(
     points: SortedPoints, cubes: Cubes, *, narrow: bool = True
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns (k,) whether cubes hold anything, and (k, c) each two numbers between which lie all
-    voxels in them, of this level and of those below; 0 is between them.
+    """Returns (k,) whether cubes hold any points, and (k, c) lower and upper bounds of the values
+    of their voxels, at this level and all finer ones; 0 lies between the bounds.
     """
     k = len(cubes.low_k3)
     some, low = np.zeros(k, bool), np.zeros((k, points.width))
@@ -116,23 +116,23 @@ def region(points: SortedPoints, low: tuple[int, ...], high: tuple[int, ...]) ->
 
 
 def _begins(cube: np.ndarray) -> np.ndarray:
-    """Where rows of another cube begin."""
+    """Returns the indices at which a new cube begins."""
     return np.flatnonzero(np.diff(cube, prepend=-1))
 
 
 def _finer(points: SortedPoints, level: int) -> tuple[Rows, int] | None:
-    """The rows, and their level, that a level's sums are made of."""
+    """Returns the rows from which a level's sums are computed, and their level, if any."""
     if kept := [one for one in points.sums if one <= level]:
         return points.sums[kept[-1]].rows, kept[-1]
     return (points.points[0].rows, 0) if 0 in points.points else None
 
 
 def _widen(rows: Rows, found: _Found, some: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
-    """Widens ranges of cubes by what was found in them."""
+    """Updates bounds of cubes in place by the rows found in them."""
     row, cube = found
     if "low" in rows:
         least, most = rows["low"][row], rows["high"][row]
-    else:  # points: their sums in finest voxels
+    else:  # points: add them up by finest voxel
         code = rows["code"][row]
         new = (code[1:] != code[:-1]) | (cube[1:] != cube[:-1])
         first = np.concatenate(([0], np.flatnonzero(new) + 1))
@@ -147,7 +147,7 @@ def _widen(rows: Rows, found: _Found, some: np.ndarray, low: np.ndarray, high: n
 
 
 def _in_cubes(points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes) -> _Found:
-    """The rows of a table that lie in cubes, of codes of voxels of a level not above theirs."""
+    """Returns the rows of a table that lie in cubes; its level is the cubes' or a finer one."""
     cells = _cells(points, codes, level, cubes)
     row, own = cells.listed()
     cube = cells.cube[own]
@@ -160,8 +160,8 @@ def _in_cubes(points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes)
 def _cells(
     points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes, *, least: int = _CELL
 ) -> _Cells:
-    """Where the rows of a table are, of codes of voxels of a level not above the cubes', in cells
-    of at least so many voxels along a side that together hold the cubes.
+    """Returns the cells that cover the cubes and hold rows of a table, whose level is the cubes' or
+    a finer one. A cell's side is N, or the largest power of N up to max(least, side // 8).
     """
     grid, curve = points.grid, points.codes
     n = grid.branching
@@ -176,7 +176,7 @@ def _cells(
     inside = (first + size > 0) & (first * scale < np.array(grid.extent))
     inside &= first < (cubes.low_k3 + cubes.side)[:, None]
     cube, which = np.nonzero(inside.all(2))
-    # Codes that a cell covers, among those of the table.
+    # How many codes of the table a cell covers.
     below = n ** (3 * (cubes.level - level))
     covers = min(size**3 * below, n ** (3 * max(0, curve.digits - level)))
     code = curve.of(cell[cube, which]) * (size**3 * below)
@@ -188,14 +188,14 @@ def _cells(
 
 
 def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _Cells]]:
-    """Yields the points of each level above the cubes', and the cells in which all of them lie that
-    may reach into the cubes.
+    """Yields for each level coarser than the cubes' its points, and the cells that hold all points
+    that may reach into the cubes.
     """
     grid = points.grid
     for level, table in points.points.items():
         if level <= cubes.level or "radius" not in table.rows:
             continue
-        # Their centres are at most a voxel of their level away, of the widest as far as they reach.
+        # Radii are at most a voxel of their level; only those of the coarsest level are unbounded.
         up = grid.branching ** (level - cubes.level)
         reach = 1
         if level == grid.levels - 1:
@@ -206,7 +206,7 @@ def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _Cells]]:
 
 
 def _reaching(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _Found]]:
-    """Yields for levels above the cubes' the points that reach into them, or very nearly."""
+    """Yields for each level coarser than the cubes' the points that reach into them, or nearly."""
     grid = points.grid
     half = 0.5 * cubes.side * grid.spacing_3 * grid.branching**cubes.level
     middle = grid.low + (2 / cubes.side * cubes.low_k3 + 1) * half
@@ -225,7 +225,7 @@ def _reaching(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _Found
 def _narrow_lists(
     points: SortedPoints, cubes: Cubes, table: tuple[Rows, int] | None
 ) -> tuple[np.ndarray, ...]:
-    """What `ops.splat` takes of rows that lie wholly in a voxel: lists of cubes, voxels, values."""
+    """Returns the arguments of `ops.splat` for narrow rows: lists of cubes, voxels, values."""
     if table is None:
         none = (np.empty((0, 3), np.int64), np.empty((0, points.width)))
         return (*_lists(cubes, np.empty(0, np.int64), np.empty((0, 2), np.int64)), *none)
@@ -239,8 +239,8 @@ def _narrow_lists(
 
 
 def _wide_lists(points: SortedPoints, cubes: Cubes) -> tuple[np.ndarray, ...]:
-    """What `ops.splat` takes of points that are wider than the cubes' voxels, those of finer levels
-    first: lists of cubes, positions, radii, values.
+    """Returns the arguments of `ops.splat` for points wider than the cubes' voxels, those of finer
+    levels first: lists of cubes, positions, radii, values.
     """
     cube, run = [np.empty(0, np.int64)], [np.empty((0, 2), np.int64)]
     parts = [(np.empty((0, 3)), np.empty(0), np.empty((0, points.width)))]
@@ -260,20 +260,20 @@ def _wide_lists(points: SortedPoints, cubes: Cubes) -> tuple[np.ndarray, ...]:
 
 
 def _runs(once: _Cells, same: np.ndarray) -> np.ndarray:
-    """(s, 2) where the rows of cells begin and end, of a table of the rows of each cell once."""
+    """Returns (s, 2) begin and end of each cell's rows in a table of the distinct cells' rows."""
     begin = once.ahead()
     return np.stack((begin, begin + once.rows), 1)[same]
 
 
 def _lists(cubes: Cubes, cube_s: np.ndarray, run_s2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the runs of each cube begin, and all runs by cubes."""
+    """Returns the index at which each cube's runs begin, and all runs sorted by cube."""
     order = np.argsort(cube_s, kind="stable")
     return np.searchsorted(cube_s[order], np.arange(len(cubes.low_k3) + 1)), run_s2[order]
 
 
 def narrow_near(points: SortedPoints, center: np.ndarray, reach: float) -> np.ndarray:
-    """Returns which points (m,) that are narrower than a finest voxel are in a cube of the world,
-    twice as wide as `reach`; their rows are `points.points[0].rows`.
+    """Returns as rows (m,) of `points.points[0].rows` points narrower than a finest voxel: all that
+    lie within `reach` of `center` along each axis, and some others nearby.
     """
     if 0 not in points.points:
         return np.empty(0, np.int64)

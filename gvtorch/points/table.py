@@ -1,5 +1,5 @@
-"""`Table`: rows that are appended and then read, in memory or in files that are mapped; sorted runs
-of rows, and what is made of them in one pass: merged, and added up.
+"""`Table`: rows that are appended and then read, in memory or in mapped files; `Runs`: sorted runs
+of rows, merged on reading; `grouped`: rows of equal codes, reduced in one pass.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import numpy as np
 from ..base.whole_file import told_of
 
 Rows = dict[str, np.ndarray]  # columns of equal length; "code" is int64
-Fold = Callable[[np.ndarray, np.ndarray], np.ndarray]  # as `np.add.reduceat`
+Fold = Callable[[np.ndarray, np.ndarray], np.ndarray]  # a reduction such as `np.add.reduceat`
 
 
 class Table:
-    """Columns by name. In a folder each is a file of numbers, `NAME.COLUMN`."""
+    """Columns by name. In a folder, each column is a raw binary file, `NAME.COLUMN`."""
 
     def __init__(self, folder: Path | None, name: str) -> None:
-        """Is empty; in memory if there is no folder."""
+        """Creates an empty table; in memory if `folder` is None."""
         self.folder, self.name = folder, name
-        self.kinds: dict[str, tuple[str, tuple[int, ...]]] = {}  # dtype, and sizes of a row
+        self.kinds: dict[str, tuple[str, tuple[int, ...]]] = {}  # dtype, and shape of a row
         self._count = 0
         self._parts: list[Rows] = []
         self._rows: Rows | None = None
@@ -30,7 +30,7 @@ class Table:
     def mapped(
         cls, folder: Path, name: str, count: int, kinds: dict[str, tuple[str, tuple[int, ...]]]
     ) -> Table:
-        """Returns one that lies in a folder; ValueError if a file is missing or cut short."""
+        """Opens a table in a folder; ValueError if a file is missing or has the wrong size."""
         table = cls(folder, name)
         table._count, table.kinds = count, kinds
         for column, (dtype, sizes) in kinds.items():
@@ -43,7 +43,7 @@ class Table:
         return table
 
     def file(self, column: str) -> Path:
-        """Where a column lies."""
+        """Returns the path of a column's file."""
         assert self.folder is not None
         return self.folder / f"{self.name}.{column}"
 
@@ -61,7 +61,7 @@ class Table:
 
     @property
     def rows(self) -> Rows:
-        """All rows, mapped where they lie in files."""
+        """All rows; those in files are memory-mapped."""
         if self._rows is not None:
             return self._rows
         if self.folder is None:
@@ -72,7 +72,7 @@ class Table:
         elif not self._count:
             self._rows = {"code": np.empty(0, np.int64)}
         else:
-            # As plain arrays: cutting a memmap into parts takes ten times as long.
+            # As plain arrays: slicing a memmap takes ten times as long.
             self._rows = {
                 column: np.asarray(
                     np.memmap(self.file(column), np.dtype(dtype), "r", 0, (self._count, *sizes))
@@ -85,7 +85,7 @@ class Table:
         return self._count
 
     def blocks(self, count: int) -> Iterator[Rows]:
-        """Yields all rows, so many at a time."""
+        """Yields all rows, `count` at a time."""
         for start in range(0, self._count, count):
             yield {name: values[start : start + count] for name, values in self.rows.items()}
 
@@ -97,17 +97,17 @@ class Table:
 
 
 class Runs(Table):
-    """Rows that come in any order, and leave sorted by code: sorted a block at a time, and merged.
-    Rows of equal codes keep their order within a block.
+    """Rows that are appended in any order, and read sorted by code: blocks are sorted one by one,
+    and merged on reading. Rows of equal codes keep their order within a block.
     """
 
     def __init__(self, folder: Path | None, name: str, block: int) -> None:
-        """Is empty; see `Table`."""
+        """Creates an empty table; see `Table`. `block`: rows to read at a time."""
         super().__init__(folder, name)
         self._block, self._ends = block, [0]
 
     def append(self, rows: Rows) -> None:
-        """Adds a block of rows."""
+        """Adds a block of rows as a sorted run."""
         if not len(rows["code"]):
             return
         order = np.argsort(rows["code"], kind="stable")
@@ -115,7 +115,7 @@ class Runs(Table):
         self._ends.append(len(self))
 
     def sorted(self) -> Iterator[Rows]:
-        """Yields all rows by rising codes, a block at a time."""
+        """Yields all rows by increasing codes, a block at a time."""
         rows, at, ends = self.rows, self._ends[:-1], self._ends[1:]
         if len(at) == 1:
             yield from self.blocks(self._block)
@@ -124,7 +124,7 @@ class Runs(Table):
             step = max(1, self._block // len(live))
             read = {run: min(at[run] + step, ends[run]) for run in live}
             codes = {run: np.asarray(rows["code"][at[run] : read[run]]) for run in live}
-            # Codes up to which all runs have been read.
+            # Up to this code, all runs have been read.
             limit = min((codes[r][-1] for r in live if read[r] < ends[r]), default=None)
             parts = []
             for run in live:
@@ -139,8 +139,8 @@ class Runs(Table):
 
 
 def grouped(blocks: Iterable[Rows], folds: Mapping[str, Fold], divide: int = 1) -> Iterator[Rows]:
-    """Yields a row for each code, divided by a number, of sorted blocks of rows: each column folded
-    over the rows that share it. Columns without a fold are left out.
+    """Groups sorted blocks of rows by code // divide, and yields blocks with one row for each
+    group: each column reduced by its fold. Columns without a fold are left out.
     """
     carried: Rows | None = None
     for rows in blocks:
@@ -153,7 +153,7 @@ def grouped(blocks: Iterable[Rows], folds: Mapping[str, Fold], divide: int = 1) 
         first = np.concatenate(([0], np.flatnonzero(code[1:] != code[:-1]) + 1))
         made = {name: fold(block[name], first) for name, fold in folds.items()}
         made["code"] = code[first]
-        carried = {name: values[-1:] for name, values in made.items()}  # may go on
+        carried = {name: values[-1:] for name, values in made.items()}  # its group may continue
         yield {name: values[:-1] for name, values in made.items()}
     if carried is not None:
         yield carried

@@ -1,14 +1,14 @@
-"""Stores: OME-Zarr images with bordered blocks for streaming beside the pyramid.
+"""Stores: OME-Zarr images with, in addition to the pyramid, bordered blocks for streaming.
 
-    store.py         `Store`: reading, block by block, of our own and of any other OME-Zarr image
-    store_layout.py  how a store lies on disk
-    conversion.py    `convert`, `estimate`: any volume to a store; conversion_plan.py: its price
-    unfinished.py    a store in the making: lock, journal, the last step
+    store.py         `Store`: reads gvtorch's stores and any other OME-Zarr image, block by block
+    store_layout.py  the layout of a store on disk
+    conversion.py    `convert`, `estimate`: any volume to a store; conversion_plan.py: its cost
+    unfinished.py    a store that is being written: lock, journal, the last step
     shard.py         one task of the converter
-    level_reader.py  levels of an image, made where they are missing
+    level_reader.py  levels of an image, computed where they are missing
     ngff.py          OME-Zarr metadata
     channels.py      stores of several channels; coarse.py: colours of coarse levels
-    chunk_files.py   what a chunk's file may be; checksums.py: that it is the right one
+    chunk_files.py   limits on chunk files; checksums.py: whether a file is the one written
 
 Nothing is imported here.
 """

@@ -1,10 +1,10 @@
-"""Stores of several channels: images of one grid, each of a dtype of its own, side by side in one
-folder, as OME-Zarr lays several images (`bioformats2raw.layout`).
+"""Stores of several channels: images on one grid, each with its own dtype, side by side in one
+folder, in OME-Zarr's layout for several images (`bioformats2raw.layout`).
 
-    STORE.zarr/zarr.json      names the channels; written last
-    STORE.zarr/OME/zarr.json  names them for other readers
-    STORE.zarr/NAME/ ...      a store for each, see store_layout.py
-    STORE.zarr/.gvtorch-work  only while it is made: what it was begun with
+    STORE.zarr/zarr.json      lists the channels; written last
+    STORE.zarr/OME/zarr.json  lists them for other readers
+    STORE.zarr/NAME/ ...      a store for each channel, see store_layout.py
+    STORE.zarr/.gvtorch-work  only during the conversion: fingerprints of the sources
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MANIFEST = "channels.json"
 
 
 def channel_names(location: str | Path) -> tuple[str, ...]:
-    """Returns the channels of a store of several; () of any other place.
+    """Returns the channel names of a store of several channels; () for any other location.
 
     Raises:
         ValueError: The metadata is damaged.
@@ -55,19 +55,19 @@ def convert_channels(
     """Writes a store of several channels, one after the other.
 
     Args:
-        sources: By name, of letters, digits, "-" and "_"; all of one extent, spacing and origin.
-        store: The folder to make.
-        resume: Go on with a half-written one.
-        progress: Told ("converting", bytes done, bytes in all) of all channels together.
-        **told: block, executor and workers, as of `convert`.
+        sources: By name (letters, digits, "-" and "_"); all of one extent, spacing and origin.
+        store: The folder to create.
+        resume: Continue a half-written store.
+        progress: Called with ("converting", bytes done, bytes in all), for all channels together.
+        **told: block, executor and workers, as for `convert`.
 
     Returns:
         The store of the first channel, open; `Store.open(store, image=NAME)` opens another.
 
     Raises:
-        ValueError: The sources have different grids, a name does not do, or `resume` finds a store
+        ValueError: The sources have different grids, a name is invalid, or `resume` finds a store
             of other channels.
-        FileExistsError, OSError, KeyboardInterrupt: As of `convert`.
+        FileExistsError, OSError, KeyboardInterrupt: As for `convert`.
     """
     target = Path(store)
     grids = {(one.extent, one.spacing, one.origin) for one in sources.values()}
@@ -106,7 +106,7 @@ def convert_channels(
 
 
 def _share(progress: Progress, before: int, own: int, total: int) -> Progress:
-    """Tells what one channel adds to those before it."""
+    """Returns a callback that maps one channel's progress to the progress of all channels."""
 
     def tell(stage: str, done: int, of: int) -> None:
         progress(stage, before + own * done // max(of, 1), total)

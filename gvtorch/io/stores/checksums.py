@@ -1,11 +1,11 @@
-"""Checksums of a store: they tell a file that another one was copied over from the right one, which
-the checksums that each chunk has in itself can't.
+"""Checksums of a store's files: they detect a file that was replaced by another valid one, which
+the checksums inside each chunk can't.
 
     STORE.zarr/gvtorch/checksums.json   {"files": {"gvtorch/cells/0/c/0/0/0/0/0": CRC-32, ...}}
 
-That of cells is of the whole file, that of pyramid and blocks of the file's end, where its index
-lies. A file is looked at when it is first read. The root's metadata carries its own checksum and
-that of the list. Stores without a list are read as they are.
+The checksum of a cells file covers the whole file, that of a pyramid or blocks file only its end,
+where its index lies. A file is checked when it is first read. The root's metadata holds its own
+checksum and that of the list. Stores without a list are read unchecked.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from .store_layout import Deadline, StoreError, StoreLayout, read_key
 
 LIST = "gvtorch/checksums.json"
 _LINE = 128  # bytes of a file's line in the list, at most
-Files = dict[str, int | None]  # CRC-32 by a file's place in the store; None: there is none
+Files = dict[str, int | None]  # CRC-32 by a file's path in the store; None: no such file
 
 
 def sum_of(content: Mapping[str, Any]) -> int:
-    """CRC-32 of what JSON holds, however it is written, the key "checksum" left out."""
+    """Returns the CRC-32 of JSON content, independent of formatting, without key "checksum"."""
     kept = {name: value for name, value in content.items() if name != "checksum"}
     return zlib.crc32(json.dumps(kept, sort_keys=True, separators=(",", ":")).encode())
 
@@ -36,7 +36,7 @@ def sum_of(content: Mapping[str, Any]) -> int:
 def shard_files(
     root: Any, specs: Iterable[Mapping[str, Any]], place: tuple[int, ...], deadline: Deadline
 ) -> Files:
-    """Reads the checksums of the shards at a place (t,) z, y, x of arrays of the store."""
+    """Computes the checksums of the shards at index (t,) z, y, x of arrays of the store."""
     found: Files = {}
     for spec in specs:
         name = file_of(spec, place)
@@ -46,17 +46,17 @@ def shard_files(
 
 
 def file_of(spec: Mapping[str, Any], place: tuple[int, ...]) -> str:
-    """Where a shard lies in the store."""
+    """Returns the path of a shard's file in the store."""
     shape, names = spec["metadata"]["shape"], spec["metadata"].get("dimension_names", "")
     at = list(place)
-    if "c" in names:  # its shards hold all channels
+    if "c" in names:  # each shard holds all channels
         at.insert(len(at) - 3, 0)
     at += [0] * (len(shape) - len(at))
     return "/".join(map(str, (spec["path"], "c", *at)))
 
 
 def _read(where: str, root: Any, spec: Mapping[str, Any], name: str, deadline: Deadline) -> Any:
-    """What of a file its checksum is of; None: there is no such file."""
+    """Reads the bytes of a file that its checksum covers; None: there is no such file."""
     metadata = spec["metadata"]
     shard = math.prod(metadata["chunk_grid"]["configuration"]["chunk_shape"])
     chunk = math.prod(metadata["codecs"][0]["configuration"]["chunk_shape"])
@@ -67,7 +67,7 @@ def _read(where: str, root: Any, spec: Mapping[str, Any], name: str, deadline: D
 
 
 class Checksums:
-    """The list of a store, read when it is first needed. Safe to use from several threads."""
+    """A store's list of checksums, read when first needed. Safe to use from several threads."""
 
     def __init__(self, where: str, root: Any, layout: StoreLayout, time: int) -> None:
         self._where, self._root, self._sum = where, root, layout.files_sum
@@ -78,7 +78,7 @@ class Checksums:
         self._seen: set[str] = set()
 
     def check(self, spec: Mapping[str, Any], place: tuple[int, ...], deadline: Deadline) -> None:
-        """Raises StoreError unless the shard at a place z, y, x is the one that was written."""
+        """Raises StoreError unless the shard at index z, y, x is the one that was written."""
         if self._sum is None:
             return
         name = file_of(spec, (*self._time, *place))
@@ -88,10 +88,10 @@ class Checksums:
             self._files = self._read(deadline)
         wanted = self._files.get(name)
         where = f"{self._where}/{name}"
-        if wanted is not None:  # what should not be there is never asked for
+        if wanted is not None:  # None: no file was written, so there is nothing to compare
             content = _read(self._where, self._root, spec, name, deadline)
             if content is None:
-                return  # zeros come of it, and the store finds out why
+                return  # it reads as zeros, and the store then finds out why
             if zlib.crc32(content) != wanted:
                 raise StoreError(f"{where}: its checksum is not the one that was written")
         self._seen.add(name)

@@ -1,8 +1,8 @@
-"""What the files of a chunked array may be: how long, of which kind, and how much Blosc makes of
-them. tensorstore opens what lies there, of any length, and takes the memory that Blosc's head asks
-for, up to 2 GiB a chunk; so `begin_read` looks first, and the relay at what servers send.
+"""Checks of a chunked array's files: their length and kind, and the size that Blosc unpacks them
+to. tensorstore opens any file of any length, and allocates what Blosc's header asks for, up to
+2 GiB a chunk; so `begin_read` checks the files first, and the relay checks what servers send.
 
-gzip, zlib, bzip2, xz and zstd need no look: tensorstore unpacks only what a chunk has room for.
+gzip, zlib, bzip2, xz and zstd need no check: tensorstore unpacks only what fits into a chunk.
 Source: Blosc, README_CHUNK_FORMAT; Zarr 3, sharding codec; N5 specification.
 """
 
@@ -22,28 +22,28 @@ import numpy as np
 from ...base.boxes import rows_by_place
 from ..http import SMALL, Endless
 
-HEADS = ("zarr.json", ".zarray", "attributes.json")  # files of an array that are no chunks
+HEADS = ("zarr.json", ".zarray", "attributes.json")  # an array's metadata files
 _MOST_CHUNK = 1 << 31  # bytes
-_ENTRY = 16  # bytes of a shard's index: where a chunk lies, and how long it is
+_ENTRY = 16  # bytes per chunk in a shard's index: the chunk's offset and length
 _CHECKSUM = 4  # bytes
-_NOWHERE = 2**63  # and beyond: of chunks that are not there
-_BLOSC = 8  # bytes of its head; the last four tell what it makes
+_NOWHERE = 2**63  # offsets from here on mark missing chunks
+_BLOSC = 8  # bytes read of its header; the last four are the unpacked size
 
 
 def index_bytes(values: int, chunk: int, *, summed: bool = True) -> int:
-    """Bytes of the index of a shard of so many values, in chunks of so many."""
+    """Returns the bytes of a shard's index: `values` values in chunks of `chunk` values."""
     return _ENTRY * (values // max(1, chunk)) + _CHECKSUM * summed
 
 
 def file_limit(values: int, chunk: int, item: int) -> int:
-    """Bytes that a file of so many values of `item` bytes each may take, and its index: no codec
-    makes twice of what it packs.
+    """Returns the most bytes that a file may have, of `values` values of `item` bytes each, plus
+    the index of its chunks of `chunk` values: no codec doubles the size of its input.
     """
     return 2 * values * item + index_bytes(values, chunk) + SMALL
 
 
 def check_file(path: str, most: int) -> int | None:
-    """Returns the bytes of a file; None if there is none. Links are followed.
+    """Returns the size of a file in bytes; None if there is none. Follows links.
 
     Raises:
         Endless: It is a folder, a pipe, a device, or longer than `most` bytes.
@@ -51,7 +51,7 @@ def check_file(path: str, most: int) -> int | None:
     try:
         found = os.stat(path)
     except (OSError, ValueError):
-        return None  # tensorstore tells what is wrong, if it is
+        return None  # if this is an error, tensorstore reports it
     if not stat.S_ISREG(found.st_mode):
         raise Endless("is no regular file")
     if found.st_size > most:
@@ -60,8 +60,8 @@ def check_file(path: str, most: int) -> int | None:
 
 
 def files_of(where: str, array: Any) -> ChunkFiles:
-    """Reads the metadata of one of tensorstore's arrays; raises ValueError where reading a chunk
-    takes too much memory, or can.
+    """Returns the file metadata of one of tensorstore's arrays; raises ValueError if reading a
+    chunk takes too much memory, or if that can't be checked.
     """
     try:
         files = ChunkFiles.of(array)
@@ -75,17 +75,16 @@ def files_of(where: str, array: Any) -> ChunkFiles:
 
 
 def begin_read(view: Any, files: ChunkFiles, chunks: np.ndarray | None = None) -> Any:
-    """Begins to read an array, once its files on disk were looked at.
+    """Starts reading an array, after checking its files on disk.
 
     Args:
         view: tensorstore's array, or a part of one.
-        files: Those of the whole array.
-        chunks: (n, axes) int64 places of the chunks that it needs, where they are known: numbers
-            of chunks along each axis of the whole array. Else tensorstore is asked, which is slow.
+        files: The file metadata of the whole array.
+        chunks: (n, axes) int64 indices of the chunks to be read, counted along each axis of the
+            whole array, if known. If left out, they come from tensorstore, which is slow.
 
     Returns:
-        tensorstore's future of the values, in the order of C; a failed one where a file is not
-        what it may be.
+        tensorstore's future of the values, in C order; a failed one if a file fails its check.
     """
     try:
         if files.folder:
@@ -96,7 +95,7 @@ def begin_read(view: Any, files: ChunkFiles, chunks: np.ndarray | None = None) -
 
 
 def failed(error: Exception) -> Any:
-    """Returns a future of tensorstore's that has failed."""
+    """Returns a tensorstore future that has failed."""
     import tensorstore as ts
 
     promised: tuple[Any, Any] = ts.Promise.new()
@@ -106,29 +105,29 @@ def failed(error: Exception) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class ChunkFiles:
-    """What an array's metadata tells of its files: a chunk each, or shards, which hold an index and
-    many; "chunk" is then the inner one.
+    """What an array's metadata specifies about its files. A file holds one chunk, or is a shard
+    with an index and many inner chunks; "chunk" then means an inner one.
     """
 
-    folder: str  # path of the array; "" behind a URL, where the relay looks
-    begin: str = ""  # of a file's name
-    separator: str  # of the numbers in a file's name
-    file: tuple[int, ...]  # values of a file along each axis
-    chunk: tuple[int, ...]  # and of a chunk
+    folder: str  # path of the array; "" for a URL, whose files the relay checks
+    begin: str = ""  # prefix of a file's name
+    separator: str  # between the numbers in a file's name
+    file: tuple[int, ...]  # values along each axis of a file
+    chunk: tuple[int, ...]  # values along each axis of a chunk
     item: int  # bytes of a value
-    index: str = ""  # "start" or "end": where a shard's index lies; "": files are no shards
-    order: str = "<"  # of the index's bytes
+    index: str = ""  # "start" or "end": where a shard's index lies; "": files are not shards
+    order: str = "<"  # byte order of the index
     summed: bool = True  # whether a checksum follows the index
     transposed: bool = False  # whether a shard's axes are in another order than the array's
-    blosc: bool = False  # whether chunks begin with its head
-    n5: bool = False  # its own head comes first
+    blosc: bool = False  # whether chunks begin with Blosc's header
+    n5: bool = False  # whether N5's header comes first
 
     @classmethod
     def of(cls, array: Any) -> ChunkFiles:
         """Reads the array's metadata.
 
         Raises:
-            Endless: Blosc lies inside another codec, where it can't be looked at.
+            Endless: Blosc is nested inside another codec, where it can't be checked.
         """
         told, item = array.spec().to_json(), array.dtype.numpy_dtype.itemsize
         folder = told["kvstore"]["path"] if told["kvstore"]["driver"] == "file" else ""
@@ -149,7 +148,7 @@ class ChunkFiles:
 
     @cached_property
     def chunks(self) -> int:
-        """Number of them in a file."""
+        """Number of chunks in a file."""
         return math.prod(self.file) // max(1, math.prod(self.chunk))
 
     @cached_property
@@ -169,13 +168,13 @@ class ChunkFiles:
 
     @property
     def index_part(self) -> slice:
-        """Where in a shard its index lies."""
+        """The slice of a shard's bytes that is its index."""
         size = self.index_bytes
         return slice(0, size) if self.index == "start" else slice(-size, None)
 
     def places(self, time: int, zyx: np.ndarray, shape: Sequence[int]) -> np.ndarray | None:
-        """Returns (n, axes) places of the chunks of items at places (n, 3), in an array
-        ([t,] z, y, x, *shape) that has an item of this shape in each chunk; None for any other.
+        """Returns (n, axes) indices of the chunks of items at (n, 3) z, y, x, in an array
+        ([t,] z, y, x, *shape) whose chunks hold one item of `shape` each; None for any other array.
         """
         before = len(self.chunk) - len(shape)
         if self.transposed or before < 3 or self.chunk != (1,) * before + tuple(shape):
@@ -185,18 +184,18 @@ class ChunkFiles:
         return found
 
     def entries(self, index: bytes) -> np.ndarray:
-        """(n, 2) uint64 where chunks lie in a shard and how long they are, of its index or of some
-        entries.
+        """Returns (n, 2) uint64 offset and length of chunks in a shard, parsed from its index or
+        from some entries.
         """
         found = np.frombuffer(index, f"{self.order}u8", len(index) // _ENTRY * 2)
         return found.astype(np.uint64).reshape(-1, 2)
 
     def check(self, part: Any) -> None:
-        """Looks at the files on disk that a part of the array lies in: places of chunks, or
+        """Checks the files on disk that hold a part of the array, given as indices of chunks, or as
         tensorstore's IndexTransform from the part to the array.
 
         Raises:
-            Endless: A file is no regular one, or too long, or Blosc would make too much of it.
+            Endless: A file is not a regular one, or is too long, or Blosc would unpack too much.
         """
         found = self._listed(part) if isinstance(part, np.ndarray) else self._files(part)
         for place, chunks in found:
@@ -209,13 +208,12 @@ class ChunkFiles:
                 raise Endless(f"{name}: {error}") from None
 
     def check_sent(self, begin: int, content: bytes, entries: np.ndarray | None) -> None:
-        """Looks at bytes that a server sent, those of a file from byte `begin` on. Raises as
-        `check`.
+        """Checks bytes that a server sent, those of a file from byte `begin` on. Raises as `check`.
 
         Args:
             begin: 0 for the file's first byte.
             content: The bytes.
-            entries: (n, 2) where the chunks lie in the file, if it is a shard.
+            entries: (n, 2) offset and length of the file's chunks, if it is a shard.
         """
         if not self.blosc:
             return
@@ -228,31 +226,31 @@ class ChunkFiles:
 
     @cached_property
     def _every(self) -> np.ndarray | None:
-        """Numbers of all chunks of a file, where it is looked at as a whole: it has one, or which
-        are wanted can't be told.
+        """Numbers of all chunks of a file, if files are checked as a whole: if they are not shards,
+        or transposed ones, where chunks can't be matched to a part of the array. Else None.
         """
         return np.arange(self.chunks) if self.transposed or not self.index else None
 
     @cached_property
     def _counts(self) -> tuple[np.ndarray, np.ndarray]:
-        """(axes,) chunks of a file along each axis, and by how much a chunk's number in its file
-        grows along each; one chunk a file where it is looked at as a whole.
+        """(axes,) chunks of a file along each axis (1 if files are checked as a whole), and the
+        stride of a chunk's number in its file along each axis.
         """
         count = [a // b for a, b in zip(self.file, self.chunk, strict=True)]
         strides = [math.prod(count[axis + 1 :]) for axis in range(len(count))]
-        if self._every is not None:  # files for chunks
+        if self._every is not None:  # each file counts as one chunk
             count = [1] * len(count)
         return np.array(count, np.int64), np.array(strides, np.int64)
 
     def _listed(self, chunks: np.ndarray) -> Iterator[tuple[Sequence[int], np.ndarray]]:
-        """Places of the files of chunks at places (n, axes), and in each the numbers of those."""
+        """Yields the index of each file that holds chunks (n, axes), and their numbers in it."""
         count, strides = self._counts
         files = chunks // count
         for place, numbers in _by_row(files, (chunks - files * count) @ strides):
             yield place, numbers if self._every is None else self._every
 
     def _files(self, transform: Any) -> Iterator[tuple[Sequence[int], np.ndarray]]:
-        """The same for a part of the array, of which tensorstore's IndexTransform tells."""
+        """Yields the same for the part of the array that an IndexTransform of tensorstore maps."""
         side = self.chunk if self._every is None else self.file
         counts, strides = self._counts
         count = counts.tolist()
@@ -281,7 +279,7 @@ class ChunkFiles:
         try:
             file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError:
-            return  # tensorstore tells
+            return  # tensorstore reports the error
         try:
             if not self.index:
                 content = os.pread(file, 64 + 4 * len(self.file), 0)
@@ -292,7 +290,7 @@ class ChunkFiles:
             if self.index == "end":
                 at += size - self.index_bytes
             if at < 0:
-                return  # cut, as tensorstore tells
+                return  # the file is truncated; tensorstore reports it
             entries = self.entries(os.pread(file, _ENTRY * (high - low), at))
             starts = entries[chunks[chunks - low < len(entries)] - low, 0]
             starts = starts[starts < _NOWHERE].tolist()
@@ -301,7 +299,7 @@ class ChunkFiles:
             os.close(file)
 
     def _head(self, content: bytes) -> int:
-        """Bytes of a chunk before Blosc's head."""
+        """Returns the bytes of a chunk before Blosc's header: those of N5's."""
         if not self.n5:
             return 0
         return 4 + 4 * len(self.file) + (4 if content[:2] != b"\0\0" else 0)
@@ -316,7 +314,7 @@ class ChunkFiles:
 
 
 def _of_zarr3(about: dict[str, Any]) -> dict[str, Any]:
-    """Fields of `ChunkFiles` out of an array's zarr.json."""
+    """Returns fields of `ChunkFiles` from an array's zarr.json."""
     file = tuple(about["chunk_grid"]["configuration"]["chunk_shape"])
     keys = about["chunk_key_encoding"]
     plain = keys["name"] == "default"
@@ -342,15 +340,16 @@ def _of_zarr3(about: dict[str, Any]) -> dict[str, Any]:
 
 
 def _names(codecs: Iterable[dict[str, Any]]) -> Iterator[str]:
-    """Names of codecs, those inside others too."""
+    """Yields the names of codecs, nested ones before the codec that holds them."""
     for codec in codecs:
         yield from _names(codec.get("configuration", {}).get("codecs", ()))
         yield codec["name"]
 
 
 def _places(transform: Any, side: Sequence[int]) -> tuple[list[range], list[int], np.ndarray]:
-    """Places of the chunks of `side` values that a part of an array lies in: along each axis those
-    of a span; and which axes are listed instead, and (n, axes) places along these.
+    """Returns the chunks of `side` values that hold a part of an array: a range of chunk indices
+    for each axis; the axes that index arrays select instead; and (n, axes) chunk indices along
+    those.
     """
     spans, listed, lists = [], [], []
     first, count = transform.input_origin, transform.input_shape
@@ -370,7 +369,7 @@ def _places(transform: Any, side: Sequence[int]) -> tuple[list[range], list[int]
 
 
 def _by_row(rows: np.ndarray, numbers: np.ndarray) -> Iterator[tuple[list[int], np.ndarray]]:
-    """Yields each different row of `rows` (n, k) once, with the numbers (n,) that stand at it."""
+    """Yields each distinct row of `rows` (n, k), with those of `numbers` (n,) that belong to it."""
     if (rows == rows[:1]).all():
         if len(rows):
             yield rows[0].tolist(), numbers

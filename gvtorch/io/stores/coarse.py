@@ -1,9 +1,9 @@
-"""Coarse channels of a store: what its coarse voxels hold beside their means, such as the colours
-of a `Filtered` shader. They are written into a store that is there already.
+"""Coarse channels of a store: values of its coarse voxels in addition to their means, such as the
+colours of a `Filtered` shader. They are written into an existing store.
 
-    STORE.zarr/gvtorch/coarse/zarr.json        tells of each channel; written when it is whole
+    STORE.zarr/gvtorch/coarse/zarr.json        lists the channels; written when one is complete
     STORE.zarr/gvtorch/coarse/NAME.0/1 ...     (gz, gy, gx, s, s, s, c) float16 bordered blocks of
-                                               a level, cut as the store's own; all are written
+                                               a level, cut like the store's; all are written
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from .store import Store
 from .store_layout import BORDER, WORK, CoarseChannel, StoreLayout, is_name
 from .unfinished import group, locked, write_json
 
-_CUBE = 128  # voxels along a side of what is written at once
+_CUBE = 128  # voxels along a side of the cubes that are written at once
 
 
 def make_channel(
@@ -42,21 +42,21 @@ def make_channel(
     keep: Callable[[np.ndarray], np.ndarray],
     progress: Progress = no_progress,
 ) -> None:
-    """Makes a coarse channel; one of the same name is replaced when the new one is whole, and stays
-    as it is if the work is broken off.
+    """Writes a coarse channel. An existing one of the same name is replaced when the new one is
+    complete, and stays as it is if the work is interrupted.
 
     Args:
         store: A store that `convert` made, in a folder.
         name: Letters, digits, "-" and "_"; not "value".
-        channel: What it is.
-        wide: Numbers of a voxel that `fill` writes.
-        fill: Writes an array (z, y, x, wide) float16, mapped from a file, for each coarse level,
-            the finest of them first.
-        keep: Turns boxes (z, y, x, wide) of these into what the channel holds, (z, y, x, c).
-        progress: Told ("writing", voxels done, voxels in all), after `fill`.
+        channel: Its metadata.
+        wide: How many numbers a voxel has that `fill` writes.
+        fill: Fills the arrays that it is given, (z, y, x, wide) float16, mapped from files, one for
+            each coarse level, the finest of them first.
+        keep: Turns boxes (z, y, x, wide) of these arrays into the channel's values, (z, y, x, c).
+        progress: Called with ("writing", voxels done, voxels in all), after `fill`.
 
     Raises:
-        ValueError: The store is not of ours, or name or channel do not do.
+        ValueError: The store was not made by `convert`, or name or channel are invalid.
         OSError: It can't be written, or another process makes a channel of this store.
     """
     target = Path(store.location)
@@ -96,7 +96,7 @@ def make_channel(
 
 @contextmanager
 def _levels_in_files(store: Store, wide: int) -> Iterator[Sequence[np.ndarray]]:
-    """Gives an array for each coarse level, in files of the store's folder, which go again."""
+    """Yields an array for each coarse level, mapped from temporary files in the store's folder."""
     folder = Path(store.location) / WORK
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
@@ -110,7 +110,7 @@ def _mapped(store: Store, folder: Path, level: int, wide: int) -> np.ndarray:
     shape, file = (*store.level_extent(level)[::-1], wide), folder / f"{level}.npy"
     with told_of(file):
         mapped = np.lib.format.open_memmap(file, mode="w+", dtype=np.float16, shape=shape)
-    with file.open("r+b") as place:  # writing to what has no place on disk would end the process
+    with file.open("r+b") as place:  # reserve the disk space: a full disk would kill the process
         try:
             os.posix_fallocate(place.fileno(), 0, file.stat().st_size)
         except OSError as error:
@@ -129,7 +129,7 @@ def _write_blocks(
     progress: Progress,
 ) -> None:
     place = Path(store.location) / store.coarse_folder / folder
-    shutil.rmtree(place, ignore_errors=True)  # of work that was broken off
+    shutil.rmtree(place, ignore_errors=True)  # left by interrupted work
     place.mkdir()
     done, total = 0, sum(math.prod(values.shape[:3]) for values in levels)
     for level, values in enumerate(levels, 1):
@@ -152,7 +152,7 @@ def _blocks(
     size: Sequence[int],
     keep: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """(gz, gy, gx, s, s, s, c) blocks of a cube of a level, borders included."""
+    """Returns (gz, gy, gx, s, s, s, c) blocks of a cube of a level, borders included."""
     begin = [a - BORDER for a in low]
     end = [
         a + -(-n // layout.block) * layout.block + BORDER for a, n in zip(low, size, strict=True)

@@ -1,7 +1,7 @@
-"""`convert`: any volume -> a store, out of core, on all cores, resumable; `estimate`: its price.
+"""`convert`: any volume -> a store, out of core, on all cores, resumable; `estimate`: its cost.
 
-One task writes one cube of one level (shard.py); levels follow one another. A journal beside the
-data names the tasks that are done (unfinished.py).
+One task writes one cube of one level (shard.py); levels are written one after the other, the finest
+first. A journal in the store's folder lists the finished tasks (unfinished.py).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from .conversion_plan import (
 from .store import Store
 from .store_layout import WORK, Deadline, begin_open
 
-_AHEAD = 64  # tasks handed to an executor that does not tell how many workers it has
+_AHEAD = 64  # tasks submitted at a time to an executor whose number of workers is unknown
 _OPEN_TIMEOUT = 60.0  # seconds
 
 
@@ -66,46 +66,46 @@ def convert(
     progress: Progress = no_progress,
     **options: Unpack[FormatSettings],
 ) -> Store:
-    """Writes a store: a mean pyramid, blocks with borders, and the range of every cell; of all
-    time points, with what the file tells of its channels and units. Larger conversions start worker
+    """Writes a store: a mean pyramid, blocks with borders, and the range of every cell, for all
+    time points, with the file's metadata on channels and units. Larger conversions start worker
     processes: a script that calls this needs the usual `if __name__ == "__main__":`.
 
     Args:
-        source: A file or folder that `read_volume` knows, an OME-Zarr image, a volume, or an array
-            as of `as_volume`; one of dask, zarr or h5py is computed or read part by part. Or a
-            `VolumeSource`, as it is.
-        store: The folder to make.
+        source: A file or folder that `read_volume` reads, an OME-Zarr image, a volume, or an array
+            as for `as_volume`; dask, zarr and h5py arrays are computed or read part by part. Or a
+            `VolumeSource`, used as it is.
+        store: The folder to create.
         block: Voxels along a side of a block, 32 or 64.
         threshold: Blocks with no value above it are not written; see `N3Tree.from_volume`.
         spacing, origin: (x, y, z) world units; override the file's.
-        nan: Value for voxels that are NaN or infinite; they are refused if left out.
+        nan: Value for voxels that are NaN or infinite; they are an error if left out.
         time: The one time point to write; all if left out.
-        oblique: As of `read_volume`.
-        labels: Values are numbers of things, kept exactly; also where the file says so. Those wider
-            than 16 bits are indexed: all is read once before, to find which there are.
-        executor: Runs the tasks, such as a dask client's `get_executor()`; the store's folder must
-            be the same for all of its workers. A pool of processes if left out.
-        workers: Number of processes of that pool; left out, one a core, as far as memory goes.
-        memory: Most bytes of all processes, as in "2 GB": fewer workers then. Left out, all free.
-        resume: Go on with a half-written store. A finished one is given as it is, if its grid,
-            dtype, block and threshold are those asked for; its voxels are not compared.
-        progress: Told ("converting", bytes done, bytes in all).
-        **options: shape, dtype, key and axes, as of `read_volume`.
+        oblique: As for `read_volume`.
+        labels: Values are label numbers, kept exactly; also if the file says so. Labels wider than
+            16 bits are indexed: the whole source is read once before, to list them.
+        executor: Runs the tasks, such as a dask client's `get_executor()`; all of its workers must
+            see the store's folder under the same path. A pool of processes if left out.
+        workers: Number of processes in that pool. If left out, one per core, as memory permits.
+        memory: Most bytes of all processes, as in "2 GB"; limits the workers. Left out, all free.
+        resume: Continue a half-written store. A finished one is returned as it is, if its grid,
+            dtype, block and threshold are those requested; its voxels are not compared.
+        progress: Called with ("converting", bytes done, bytes in all).
+        **options: shape, dtype, key and axes, as for `read_volume`.
 
     Returns:
         The store, open.
 
     Raises:
         FileExistsError: There is something at `store` already.
-        ValueError: The source is damaged or holds NaN, an argument does not fit, or `resume` finds
+        ValueError: The source is damaged or holds NaN, an argument is invalid, or `resume` finds
             a store of other settings or of a source that has changed.
-        OSError: The disk is full, or a file can't be read or written; `resume` goes on from there.
-        KeyboardInterrupt: It was interrupted; `resume` goes on, as the message says.
+        OSError: The disk is full, or a file can't be read or written; `resume` continues.
+        KeyboardInterrupt: It was interrupted; `resume` continues, as the message says.
     """
     target = Path(store)
     make_source = partial(source_of, source, spacing, origin, time, oblique, labels, options)
     if resume and unfinished.is_finished(target) and (whole := Store.open(target)).has_blocks:
-        with suppress(FileNotFoundError):  # it may be gone when all is done
+        with suppress(FileNotFoundError):  # the source may be gone once the store is finished
             _check_finished(whole, make_source(read=False), block, threshold)
         return whole
     begun = unfinished.is_begun(target, resume=resume)
@@ -122,7 +122,7 @@ def convert(
 def _check_finished(
     store: Store, source: VolumeSource, block: int, threshold: float | None
 ) -> None:
-    """Raises ValueError where a finished store can't be the one that would be made."""
+    """Raises ValueError if a finished store differs from the one that would be written."""
     is_labels = source.info.labels
     for name, before, now in (
         ("extent", store.layout.extent, source.extent),
@@ -155,8 +155,8 @@ def estimate(
     workers: int | None = None,
     **options: Unpack[FormatSettings],
 ) -> Estimate:
-    """Tells what `convert` would take, from a few cubes converted in memory. Writes nothing. Labels
-    wider than 16 bits are all read, to find which there are.
+    """Returns the estimated cost of `convert`, from a few cubes converted in memory. Writes
+    nothing. Reads the whole source to list its labels if they are wider than 16 bits.
 
     Args, Raises: as `convert`.
     """
@@ -167,7 +167,7 @@ def estimate(
 
 
 def _write_store(plan: Plan, begun: bool, executor: Executor | None, progress: Progress) -> None:
-    """Writes what is not there yet: levels, labels, and last the metadata that make it a store."""
+    """Writes what is missing: levels, labels, and last the metadata that completes the store."""
     task, settings = plan.task, plan.settings
     with _told_how_to_go_on(plan), unfinished.claimed(plan.target, settings, resume=begun) as work:
         if plan.labels is not None:
@@ -191,7 +191,7 @@ def _executor(given: Executor | None, plan: Plan) -> AbstractContextManager[Exec
 
 @contextmanager
 def _told_how_to_go_on(plan: Plan) -> Iterator[None]:
-    """Tells how to resume where the work is broken off from outside."""
+    """Adds how to resume to the error when a worker ends or the user interrupts."""
     target = plan.target
     command = shlex.join((*plan.task.source.command(str(target)), "--resume"))
     try:
@@ -210,7 +210,7 @@ def _told_how_to_go_on(plan: Plan) -> Iterator[None]:
 
 
 def _staged(plan: Plan, pool: Executor) -> Plan:
-    """Writes what lies in memory to files, where other processes shall read it."""
+    """Writes a source in memory to files, if other processes have to read it."""
     if isinstance(pool, ThreadPoolExecutor):
         return plan
     source = plan.task.source.staged(plan.target / WORK)
@@ -247,13 +247,13 @@ def _write_levels(
                 f"{layout.times * math.prod(layout.extent) * layout.width}); pass nan=VALUE "
                 "(--nan VALUE) to replace them"
             )
-        for which in ("low", "high"):  # the bounds below are not needed any more
+        for which in ("low", "high"):  # bounds of the level below are no longer needed
             folder = plan.target / WORK / which / str(level - 1)
             shutil.rmtree(folder, ignore_errors=True)
 
 
 def _value_range(task: shard.Conversion) -> list[list[float]]:
-    """Smallest and largest value of each channel, of all times: of the last level's one cell."""
+    """Returns [low, high] of each channel over all times, from the last level: a single cell."""
     deadline = Deadline(_OPEN_TIMEOUT)
     spec = task.layout.cells(task.layout.levels - 1)
     cells = deadline.wait(deadline.wait(begin_open(task.root, spec), "cells").read(), "cells")

@@ -1,4 +1,4 @@
-"""What a conversion is going to do, and its price, before anything is written."""
+"""The plan of a conversion and an estimate of its cost, made before anything is written."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ from . import shard, unfinished
 from .level_reader import Pool
 from .store_layout import BLOCKS, DTYPES, StoreLayout, context, kvstore
 
-_FEW = 4  # tasks of level 0 up to which processes are not worth their start
+_FEW = 4  # up to this many tasks of level 0, starting processes does not pay
 _PROCESS = 400 << 20  # bytes of a worker process without data
-_COPIES = 12  # of a cube that a task holds at its peak
-_BELOW = 4  # a voxel of a coarser level costs so many of the finest
-_DISK = 2.0  # writing to disk takes so much longer than to memory
+_COPIES = 12  # copies of its cube that a task holds at its peak
+_BELOW = 4  # cost of a coarser level's voxel, in finest voxels
+_DISK = 2.0  # time of writing to disk, relative to memory
 _SAMPLES = 3  # cubes that are converted for an estimate
 _SAMPLE_TIME = 2.0  # seconds after which no further cube is converted for an estimate
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Estimate:
-    """What a conversion takes."""
+    """The estimated cost of a conversion."""
 
     extent: tuple[int, int, int]  # x y z
     dtype: str
     channels: int
     levels: int
     tasks: int
-    source_bytes: int  # of the values, unpacked
-    disk_bytes: int  # of the store
-    temporary_bytes: int  # beside it, while it is made
+    source_bytes: int  # size of the values, uncompressed
+    disk_bytes: int  # size of the store
+    temporary_bytes: int  # further bytes on disk during the conversion
     memory_bytes: int  # of all processes together, at most
     seconds: float
     workers: int
@@ -63,7 +63,7 @@ class Estimate:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields as plain values."""
+        """Returns the fields as plain values."""
         return dataclasses.asdict(self)
 
 
@@ -71,8 +71,8 @@ class Estimate:
 class Plan:
     target: Path
     task: shard.Conversion
-    settings: dict[str, Any]  # what must be the same to go on with a half-written store
-    labels: np.ndarray | None  # (k,) int64, where they are indexed
+    settings: dict[str, Any]  # must be equal to resume a half-written store
+    labels: np.ndarray | None  # (k,) int64, the table of indexed labels, or None
     workers: int
     uses_processes: bool
 
@@ -88,8 +88,8 @@ def source_of(
     *,
     read: bool = True,
 ) -> VolumeSource:
-    """Opens the source; one that can only be read whole is read, once, unless `read` is False. Its
-    time points are those that are written.
+    """Opens the source. One that can only be read as a whole is read here, once, unless `read` is
+    False; it then holds only the time points to be written.
     """
     check.known("convert", options, FormatSettings)
     if isinstance(source, VolumeSource):
@@ -113,7 +113,7 @@ def source_of(
         )
         if source.label_values is None:
             return found
-        # They are indexed already.
+        # The volume's labels are indexed already.
         return IndexSource.of(found, source.label_values.numpy(), indexed=True)
     placement: dict[str, Any] = {"spacing": spacing, "origin": origin, "oblique": oblique}
     found = open_source(source, time=time, labels=labels, **placement, **options)
@@ -225,7 +225,7 @@ def estimate_of(plan: Plan) -> Estimate:
 
 
 def _task_bytes(plan: Plan) -> tuple[int, int]:
-    """Bytes of memory that a worker takes at most, and those of a source in memory."""
+    """Returns the most bytes of memory a worker uses, and the bytes of a source in memory."""
     layout, inner = plan.task.layout, plan.task.source
     copies = _COPIES * (layout.shard + 2) ** 3 * layout.voxel_bytes
     cube = min(1.0, math.prod(layout.extent) / layout.shard**3)
@@ -236,7 +236,7 @@ def _task_bytes(plan: Plan) -> tuple[int, int]:
 
 
 def within(plan: Plan, memory: int | str | None) -> Plan:
-    """Takes no more workers than fit into some bytes of memory; None: into what is free."""
+    """Returns the plan with at most the workers that fit into `memory`; None: into free memory."""
     each, held = _task_bytes(plan)
     free = resources.memory_free() + held
     limit = free if memory is None else check.nbytes("convert", "memory", memory)
@@ -250,11 +250,11 @@ def within(plan: Plan, memory: int | str | None) -> Plan:
 
 
 def _sample(task: shard.Conversion) -> tuple[int, int, int, float]:
-    """Converts a few cubes in memory: bytes of the pyramid, bytes beside it, voxels, seconds."""
+    """Converts a few cubes into memory; returns pyramid bytes, other bytes, voxels, seconds."""
     import tensorstore as ts
 
     layout = task.layout
-    places = list(layout.places(0))  # spread over space, and over time
+    places = list(layout.places(0))  # the picks are spread over space and time
     picked = [places[(2 * i + 1) * len(places) // (2 * _SAMPLES)] for i in range(_SAMPLES)]
     root = {"driver": "memory", "path": f"gvtorch-estimate-{id(task)}/"}
     store = ts.KvStore.open(root, context=context()).result()
@@ -273,7 +273,7 @@ def _sample(task: shard.Conversion) -> tuple[int, int, int, float]:
 
 
 def check_room(target: Path, needs: Estimate) -> None:
-    """Raises OSError if disk or memory are too small, before anything is written."""
+    """Raises OSError if disk or memory are too small."""
     disk = needs.disk_bytes + needs.temporary_bytes
     if disk > needs.disk_free:
         raise OSError(

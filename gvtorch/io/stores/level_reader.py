@@ -1,8 +1,8 @@
 """`LevelReader`: the tree levels of a multiscale image, from the arrays that `open_arrays` opens.
 
-A tree level is 2^L coarser along every axis. A level without an array is averaged: from the
+Tree level L is 2^L times coarser along every axis. A level without an array is averaged: from the
 coarsest array whose factors divide 2^L, or tile by tile from the tree level below, whichever reads
-less. Memory stays bounded, and tiles that were made are kept for a while.
+less. Computed tiles are cached, in bounded memory.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from .ngff import ImageArray, MultiscaleImage, read_json
 from .store_layout import MOST_VOXELS, Deadline, StoreError, StoreLayout, begin_open, child, short
 
 Pool = Callable[[np.ndarray, int | Sequence[int]], np.ndarray]
-_TILE = 64  # voxels along a side of a tile that is made on demand
-_KEPT = 128 << 20  # bytes of such tiles
+_TILE = 64  # voxels along a side of a tile that is computed on demand
+_KEPT = 128 << 20  # bytes of cached tiles
 
 
 @dataclass(frozen=True)
 class StoredArray:
-    """One array of a multiscale image, the time point chosen."""
+    """One array of a multiscale image, at one time point."""
 
     array: Any  # tensorstore.TensorStore
     files: ChunkFiles
     axes: str  # letters among c, z, y, x in stored order
-    factors: tuple[int, int, int]  # z y x, finest voxels along a side of one of its own
+    factors: tuple[int, int, int]  # z y x, finest voxels along a side of one of its voxels
     where: str
 
     def size(self, axis: str) -> int:
-        """Voxels along an axis, 1 where it has none."""
+        """Returns the voxels along an axis; 1 if the array lacks the axis."""
         return int(self.array.shape[self.axes.index(axis)]) if axis in self.axes else 1
 
     def read(self, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
@@ -61,9 +61,9 @@ def open_arrays(
     channels: Sequence[int] | None,
     deadline: Deadline,
 ) -> tuple[list[StoredArray], slice | list[int], dict[str, int]]:
-    """Opens the image's arrays that fit the tree, the finest first, at one time point; returns
-    them, the index of their channels, and how many times, channels, ... the image has. What they
-    say is checked before memory is taken.
+    """Opens the image's arrays, the finest first, at one time point, without those that are not
+    coarser by whole factors; returns them, the index of their channels, and the image's size along
+    each axis. Metadata is checked before memory is allocated.
     """
     finest = image.scales[0]
     at = child(root, finest.path)
@@ -82,7 +82,7 @@ def open_arrays(
             chosen = _choose(where, array, image.axes, moment, channels)
             sizes = dict(zip(image.axes, map(int, array.shape), strict=True))
         picked: dict[str, Any] = {"t": moment, "c": chosen, "-": 0}
-        # Singleton axes of an index array would move: oindex leaves every axis where it is.
+        # An index array of channels would move its axis: oindex leaves every axis in place.
         array = array.oindex[tuple(picked.get(axis, slice(None)) for axis in image.axes)]
         axes = image.axes.replace("t", "").replace("-", "")
         found = StoredArray(array, files, axes, (1, 1, 1), name)
@@ -93,7 +93,7 @@ def open_arrays(
 
 
 def keep_channels(image: MultiscaleImage, sizes: dict[str, int], chosen: slice | list[int]) -> None:
-    """Keeps what is told of the channels that were chosen, if it fits the array."""
+    """Reduces the channel metadata to the chosen channels; drops it if it doesn't fit the array."""
     told, width = image.info.channels, sizes.get("c", 1)
     if told and len(told) != width:
         image.lost.append(f"what is told of {len(told)} channels, where there are {width}")
@@ -135,11 +135,11 @@ def _choose(
 def _factors(
     first: StoredArray, other: StoredArray, fine: ImageArray, coarse: ImageArray
 ) -> tuple[int, int, int] | None:
-    """Whole factors (z, y, x) between the finest array and another; None where there are none."""
+    """Returns whole factors (z, y, x) between the finest array and another; None if not whole."""
     found = []
     for axis, a, b in zip("zyx", fine.scale, coarse.scale, strict=True):
         big, small = first.size(axis), other.size(axis)
-        # Where scales don't tell, sizes do; a last voxel that is not full may have been dropped.
+        # Sizes are the fallback for scales; a partial last voxel may have been dropped.
         for ratio in (b / a, big / small):
             factor = round(ratio) if math.isfinite(ratio) else 0
             if factor >= 1 and small in (-(-big // factor), big // factor):
@@ -152,8 +152,8 @@ class LevelReader:
     """Tree levels over stored arrays. Safe to use from several threads."""
 
     def __init__(self, stored: Sequence[StoredArray], layout: StoreLayout, pool: Pool) -> None:
-        """Plans how each level of the layout is read from arrays, the finest first; `pool` makes
-        the voxels of a level that has none.
+        """Plans how each level of the layout is read from the arrays, the finest first; `pool`
+        averages the voxels of a level without an array.
         """
         self._layout, self._pool, self.width = layout, pool, stored[0].size("c")
         self.finest = next(s for s in stored if max(s.factors) == 1)
@@ -162,7 +162,7 @@ class LevelReader:
         for level in range(layout.levels):
             fits = [s for s in stored if all(2**level % f == 0 for f in s.factors)]
             base = max(fits, key=lambda s: math.prod(s.factors))
-            rest = [2**level // f for f in base.factors]  # what is left to average
+            rest = [2**level // f for f in base.factors]  # factors that remain to be averaged
             direct = math.prod(rest)
             if level == 0 or direct < 8 * cost:
                 self._plans.append((base, rest))
@@ -174,7 +174,7 @@ class LevelReader:
         self._lock = threading.Lock()
 
     def read(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
-        """Reads (z, y, x, c) voxels `low` to `high` of a level; beyond it the outermost repeat."""
+        """Reads (z, y, x, c) voxels `low` to `high` of a level; edge voxels repeat beyond it."""
         start, stop = boxes.clamped_box(low, high, self._layout.shape(level))
         data = self._inside(level, start, stop, deadline)
         return np.ascontiguousarray(boxes.repeat_edges(data, start, low, high))
@@ -224,7 +224,7 @@ class LevelReader:
             self._tiles[key] = tile
             size = sum(kept.nbytes for kept in self._tiles.values())
             while len(self._tiles) > 1 and size > _KEPT:
-                # The finest level's oldest: coarse tiles are few, and cost most to make again.
+                # The oldest of the finest level: coarse tiles are few, and cost most to recompute.
                 victim = min(self._tiles, key=lambda key: key[0])
                 size -= self._tiles.pop(victim).nbytes
         return tile

@@ -1,6 +1,6 @@
 """OME-Zarr metadata: `find_image` (NGFF 0.1 to 0.5) and `image_metadata` (0.5).
 
-What a file says is checked here before anything is done with it. Arrays are not opened.
+All metadata is validated here before it is used. Arrays are not opened.
 Source: OME-NGFF specification, versions 0.4 and 0.5 ("multiscales" and "omero" metadata).
 """
 
@@ -23,9 +23,9 @@ from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, is_numb
 
 SEVERAL = "gvtorch_channels"  # attribute that names the images of a store of several channels
 _MOST_LEVELS = 64
-#: Colours for viewers: of channels without a colour. A single one is white.
+#: Colours written for channels that have none, since viewers want one. A single channel is white.
 _COLORS = ("00ff00", "ff00ff", "00ffff", "ffff00", "ff0000", "0000ff")
-_DEFAULT_AXES = "tczyx"  # of versions 0.1 and 0.2
+_DEFAULT_AXES = "tczyx"  # in versions 0.1 and 0.2
 
 
 @dataclass(frozen=True)
@@ -39,18 +39,18 @@ class ImageArray:
 
 @dataclass
 class MultiscaleImage:
-    """A multiscale image; what is told beside it is added as it is found."""
+    """A multiscale image; further metadata is added to it as it is read."""
 
-    axes: str  # in stored order, a letter each: t, c, z, y, x, or - for another
+    axes: str  # in stored order, a letter each: t, c, z, y, x, or - for any other axis
     scales: tuple[ImageArray, ...]  # finest first
     name: str
     info: ImageInfo = field(default_factory=ImageInfo)
-    lost: list[str] = field(default_factory=list)  # what is not kept, a few words each
-    own: dict[str, Any] = field(default_factory=dict)  # what gvtorch tells of it
+    lost: list[str] = field(default_factory=list)  # phrases: metadata that is not kept
+    own: dict[str, Any] = field(default_factory=dict)  # gvtorch's attributes, in its stores
 
 
 def is_zarr(path: str | Path) -> bool:
-    """Tells a Zarr group, or what is named like one (a URL, `NAME.zarr`), from any other file."""
+    """Returns whether a path is a Zarr group, or is named like one (a URL, `NAME.zarr`)."""
     text = str(path)
     if is_file_url(text):
         return False
@@ -62,13 +62,13 @@ def is_zarr(path: str | Path) -> bool:
 def find_image(
     where: str, root: Any, image: str | None, deadline: Deadline
 ) -> tuple[Any, MultiscaleImage, StoreLayout | None]:
-    """Finds a multiscale image by its name, number or folder; None takes the first.
+    """Finds a multiscale image by its name, number or folder; None finds the first.
 
     Returns:
-        Its group's kvstore, what the metadata tells, and the layout if it is a store of ours.
+        Its group's kvstore, its metadata, and its layout, which is None unless gvtorch wrote it.
 
     Raises:
-        ValueError: There is none, or the metadata is damaged.
+        ValueError: There is no such image, or the metadata is damaged.
     """
     attributes = _attributes(where, root, deadline)
     if attributes is None:
@@ -78,7 +78,7 @@ def find_image(
     found = _parse_image(where, attributes, image)
     series = _member(attributes, "bioformats2raw.layout")
     if found is None and layout is None:
-        first = attributes.get(SEVERAL, ["0"])  # where converters of microscopy files put it
+        first = attributes.get(SEVERAL, ["0"])  # "0": the folder used by bioformats2raw
         named = isinstance(first, list) and first and isinstance(first[0], str)
         inner = image if image is not None else first[0] if named else "0"
         if ".." not in inner and not inner.startswith("/"):
@@ -106,14 +106,14 @@ def find_image(
 def read_json(
     where: str, root: Any, name: str, deadline: Deadline, most: int = MOST_JSON
 ) -> dict[str, Any] | None:
-    """Reads a JSON object of a folder, as `parse_json`; returns None if there is no such file."""
+    """Reads a JSON object from a file in a folder, as `parse_json`; None if there is no file."""
     content = read_key(where, root, name, deadline, most=most)
     return None if content is None else parse_json(f"{where}/{name}", content, most)
 
 
 def parse_json(where: str, content: bytes, most: int = MOST_JSON) -> dict[str, Any]:
-    """Reads a JSON object; raises ValueError if it is damaged, no object, or of more than `most`
-    bytes.
+    """Parses a JSON object; raises ValueError if it is damaged, not an object, or longer than
+    `most` bytes.
     """
     if len(content) > most:
         raise ValueError(f"{where}: more than {most} bytes of JSON are too many")
@@ -127,8 +127,8 @@ def parse_json(where: str, content: bytes, most: int = MOST_JSON) -> dict[str, A
 
 
 def read_json_file(file: Path) -> dict[str, Any]:
-    """Reads a JSON object of a file on disk, as `parse_json`."""
-    from .chunk_files import check_file  # NumPy: not when the program starts
+    """Reads a JSON object from a file on disk, as `parse_json`."""
+    from .chunk_files import check_file  # it imports NumPy, for which start-up must not wait
 
     try:
         check_file(str(file), MOST_JSON)
@@ -138,7 +138,7 @@ def read_json_file(file: Path) -> dict[str, Any]:
 
 
 def _attributes(where: str, root: Any, deadline: Deadline) -> dict[str, Any] | None:
-    """A group's attributes: of zarr.json (v3), or .zattrs (v2)."""
+    """Returns a group's attributes, from zarr.json (v3) or .zattrs (v2)."""
     group = read_json(where, root, "zarr.json", deadline)
     if group is None:
         return read_json(where, root, ".zattrs", deadline)
@@ -166,7 +166,7 @@ def _no_store(where: str, root: Any, deadline: Deadline) -> Exception:
 def _parse_image(
     where: str, attributes: dict[str, Any], image: str | None
 ) -> MultiscaleImage | None:
-    """Reads an image out of a group's attributes, if it is there."""
+    """Returns the image of this name or number from a group's attributes; None if not found."""
     images = _member(attributes, "multiscales")
     if not isinstance(images, list) or not images:
         return None
@@ -187,7 +187,7 @@ def _parse_image(
 
 
 def _image_names(attributes: dict[str, Any]) -> list[str]:
-    """By what `find_image` finds the images of a group, as far as it tells them."""
+    """Returns the names under which `find_image` finds the images that a group lists."""
     images, folders = _member(attributes, "multiscales"), attributes.get(SEVERAL)
     scales, inner = (one if isinstance(one, list) else [] for one in (images, folders))
     names = [str(one.get("name", n)) for n, one in enumerate(scales) if isinstance(one, dict)]
@@ -200,7 +200,7 @@ def _few(names: list[str]) -> str:
 
 
 def _member(attributes: dict[str, Any], name: str) -> Any:
-    """What is told of a name: of 0.5 in `ome`."""
+    """Returns an attribute of NGFF; version 0.5 keeps them in `ome`."""
     ome = attributes.get("ome")
     return (ome if isinstance(ome, dict) else attributes).get(name)
 
@@ -212,20 +212,20 @@ def _tell_of_images(found: MultiscaleImage, others: list[str]) -> None:
 
 
 def _series(where: str, root: Any, deadline: Deadline, first: str) -> list[str]:
-    """Names of the other images that converters of microscopy files lay side by side."""
+    """Returns the names of the other images of a bioformats2raw layout."""
     try:
         listed = _attributes(f"{where}/OME", child(root, "OME"), deadline) or {}
         series = _member(listed, "series")
         if isinstance(series, list):
             return [str(path) for path in series if path != first]
         there = _attributes(f"{where}/1", child(root, "1"), deadline) is not None
-    except (OSError, ValueError):  # what is beside the image does not keep it from opening
+    except (OSError, ValueError):  # damage there must not prevent opening the image
         return []
     return ["1"] if there else []
 
 
 def _labels(where: str, root: Any, deadline: Deadline) -> list[str]:
-    """What is told of the label images in the group beside the image."""
+    """Returns a phrase on the label images in the image's group `labels`, if it has any."""
     try:
         group = _attributes(f"{where}/labels", child(root, "labels"), deadline) or {}
     except (OSError, ValueError):
@@ -237,7 +237,7 @@ def _labels(where: str, root: Any, deadline: Deadline) -> list[str]:
 
 
 def _own_info(told: Any, info: ImageInfo) -> ImageInfo:
-    """Adds what a store of ours tells beside NGFF."""
+    """Returns `info` with the metadata that gvtorch stores in addition to NGFF's."""
     told = told if isinstance(told, dict) else {}
     quantity, space = (told.get(name) for name in ("quantity", "space"))
     return replace(
@@ -289,7 +289,7 @@ def _triple(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _in_one_unit(units: dict[str, str], lost: list[str]) -> list[float]:
-    """Factors along z, y, x that bring lengths into the unit of x."""
+    """Returns factors along z, y, x that convert lengths to the unit of x."""
     one, factors = units.get("x"), []
     for axis in "zyx":
         other = units.get(axis)
@@ -301,7 +301,7 @@ def _in_one_unit(units: dict[str, str], lost: list[str]) -> list[float]:
 
 
 def _axes(where: str, axes: Any) -> tuple[str, dict[str, str], list[str]]:
-    """Letters of the axes, their units by letter, and what is not kept of them."""
+    """Returns a letter for each axis, their units by letter, and phrases on what is not kept."""
     if axes is None:
         return _DEFAULT_AXES, {}, []
     letters, units, lost = "", dict[str, str](), list[str]()
@@ -325,7 +325,7 @@ def _axes(where: str, axes: Any) -> tuple[str, dict[str, str], list[str]]:
 def _transform(
     where: str, items: Any, axes: str, lost: list[str]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Scale and translation along t, z, y, x; 1 and 0 where they are not told."""
+    """Returns scale and translation along t, z, y, x; 1 and 0 where they are not given."""
     told = {"scale": dict.fromkeys("tzyx", 1.0), "translation": dict.fromkeys("tzyx", 0.0)}
     for item in items if isinstance(items, list) else []:
         kind = item.get("type") if isinstance(item, dict) else None
@@ -353,9 +353,9 @@ def image_metadata(
     origin: Sequence[float],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Returns the `ome` attribute (0.5) of a pyramid of factor 2 in the arrays "0", "1", ..., and
-    what `find_image` needs to know beside it.
+    the further metadata that `find_image` reads back.
 
-    `spacing` and `origin` are (x, y, z) of level 0; axes t and c come first where there are such.
+    `spacing` and `origin` are (x, y, z) of level 0; axes t and c come first if they exist.
     """
     units = {"t": info.time_unit, "c": None, **dict.fromkeys("zyx", info.unit)}
     kinds = {"t": "time", "c": "channel", **dict.fromkeys("zyx", "space")}
@@ -377,7 +377,7 @@ def image_metadata(
             {"type": "translation", "translation": move},
         ]
         datasets.append({"path": str(level), "coordinateTransformations": transforms})
-    how = "mode" if info.labels else "mean"  # coarse levels are made
+    how = "mode" if info.labels else "mean"  # how coarse levels are made
     ome: dict[str, Any] = {
         "version": "0.5",
         "multiscales": [{"name": name, "type": how, "axes": axes, "datasets": datasets}],
@@ -397,8 +397,8 @@ def image_metadata(
 
 
 def _read_channels(omero: Any) -> tuple[tuple[ChannelInfo, ...], list[str]]:
-    """Returns what is told of each channel, and what of it is damaged or not kept. Where the
-    picture begins in a viewer (rdefs) and its number on a server (id) are no part of the data.
+    """Returns the channels, and phrases on metadata that is damaged or not kept. A viewer's initial
+    state (rdefs) and a server's image number (id) are ignored: they are not part of the data.
     """
     told = omero.get("channels") if isinstance(omero, dict) else None
     if not isinstance(told, list) or not all(isinstance(channel, dict) for channel in told):
@@ -421,8 +421,8 @@ def _read_channels(omero: Any) -> tuple[tuple[ChannelInfo, ...], list[str]]:
 def _write_channels(
     channels: Sequence[ChannelInfo], value_range: Sequence[Sequence[float]]
 ) -> tuple[dict[str, Any], dict[str, list[int]]]:
-    """Returns the `omero` attribute of channels, and the numbers of those whose colour or window
-    is not told: the specification wants one, so these are made up for viewers.
+    """Returns the `omero` attribute of channels, and the numbers of those without a colour or a
+    window: the specification requires both, so they are made up.
     """
     assumed: dict[str, list[int]] = {"color": [], "window": []}
     written = []

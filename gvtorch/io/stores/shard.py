@@ -1,8 +1,8 @@
 """`write_shard`: one task of the converter, a plain function of picklable arguments.
 
 A task writes one cube of a level: its shard of the pyramid, of the blocks and of the cells. It
-reads the source (level 0) or the level below as stored, with the voxels around the cube, so it
-depends on no other task of its own level, and may be run again after a crash.
+reads the source (level 0) or the stored level below, including the voxels around the cube, so it
+depends on no other task of its level, and may be run again after a crash.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from .unfinished import Done
 
 _TIMEOUT = 3600.0  # seconds for one read of local data
 _OPEN_TIMEOUT = 60.0  # seconds
-_SLAB = 32  # planes of a level made at a time: two chunks of the level below
+_SLAB = 32  # planes of a level made at a time, from one chunk (64 planes) of the level below
 
 Place = tuple[int, ...]  # z, y, x, or t, z, y, x where a store has several time points
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conversion:
-    """What all tasks of a conversion share: where they read, where they write, and how."""
+    """What all tasks of a conversion share: their source, target and settings."""
 
-    root: dict[str, Any]  # kvstore of the store
+    root: dict[str, Any]  # tensorstore's spec of the store's folder
     layout: StoreLayout
     source: VolumeSource
     nan: float | None
@@ -70,7 +70,7 @@ def write_shard(conversion: Conversion, level: int, place: Place) -> Done:
     writes = [write(conversion.root, layout.plain(level), low, plain, time)]
     for spec, bound in zip(layout.bounds(level), (least, most), strict=False):
         writes.append(write(conversion.root, spec, low, _plain(bound[inner], axes), time))
-    middle: Reduction = "min" if conversion.source.info.labels else "mean"  # a label that is there
+    middle: Reduction = "min" if conversion.source.info.labels else "mean"  # a mean is no label
     cells = _cells(values, least, most, [-(-n // CELL) for n in size], middle)
     first = [a // CELL for a in low]
     writes.append(write(conversion.root, layout.cells(level), first, cells, time))
@@ -88,7 +88,7 @@ def write_shard(conversion: Conversion, level: int, place: Place) -> Done:
 def _from_source(
     conversion: Conversion, time: int, low: list[int], high: list[int], inner: tuple[slice, ...]
 ) -> tuple[np.ndarray, int]:
-    """Reads a box; returns also how many of its `inner` values are not finite."""
+    """Reads a box; also returns how many of its `inner` values are not finite and not replaced."""
     start, stop = boxes.clamped_box(low, high, conversion.layout.shape(0))
     source = conversion.source.at_time(conversion.source.time + time)
     values, bad = source.read_region(start, stop), 0
@@ -103,13 +103,13 @@ def _from_source(
 def _from_below(
     conversion: Conversion, level: int, time: int, low: list[int], high: list[int]
 ) -> list[np.ndarray]:
-    """Makes a box of a level, voxels around it included, from the level below: means (labels: the
-    most frequent), smallest and largest finest values.
+    """Computes a box of a level, which may reach beyond the volume, from the level below: means
+    (labels: the most frequent), and smallest and largest finest values.
     """
     pools: tuple[Pool, ...] = (conversion.pool, pool_min, pool_max)
     layout, deadline = conversion.layout, Deadline(_TIMEOUT)
     arrays = []
-    # The finest values are their own smallest and largest.
+    # Level 0 has no bounds: there, values are both the smallest and the largest.
     for spec in (layout.plain(level - 1), *layout.bounds(level - 1)):
         array = deadline.wait(begin_open(conversion.root, spec), spec["path"])
         files = files_of(spec["path"], array)
@@ -129,14 +129,14 @@ def _from_below(
 
 
 def _plain(values: np.ndarray, axes: str) -> np.ndarray:
-    """(z, y, x, c) as the pyramid stores it, whose axes are czyx or zyx."""
+    """Returns (z, y, x, c) with the pyramid's axes, czyx or zyx."""
     return np.moveaxis(values, 3, 0) if "c" in axes else values[..., 0]
 
 
 def _cells(
     values: np.ndarray, least: np.ndarray, most: np.ndarray, count: list[int], middle: Reduction
 ) -> np.ndarray:
-    """(gz, gy, gx, 3, c) low, high, mean of the cells of a cube with its border."""
+    """Returns (gz, gy, gx, 3, c) low, high, mean of the cells of a cube with its border."""
     reach = tuple(slice(0, n * CELL + 2 * BORDER) for n in count)
     own = tuple(slice(BORDER, BORDER + n * CELL) for n in count)
     size = CELL + 2 * BORDER
@@ -147,8 +147,8 @@ def _cells(
 
 
 def _blocks(layout: StoreLayout, values: np.ndarray, needed: np.ndarray) -> np.ndarray | None:
-    """(gz, gy, gx, s, s, s, c) blocks of a cube; zero, which is not written, where no cell needs
-    them.
+    """Returns (gz, gy, gx, s, s, s, c) blocks of a cube: zeros, which are not written, where no
+    cell needs the block; None if no block is needed.
     """
     wanted = pool_max(needed[..., None], layout.block // CELL)[..., 0]
     if not wanted.any():
@@ -159,7 +159,7 @@ def _blocks(layout: StoreLayout, values: np.ndarray, needed: np.ndarray) -> np.n
 
 
 def bordered(layout: StoreLayout, values: np.ndarray) -> np.ndarray:
-    """Returns a view (gz, gy, gx, s, s, s, c) of a cube (z, y, x, c) with its border as blocks."""
+    """Returns a bordered cube (z, y, x, c) as bordered blocks: a view (gz, gy, gx, s, s, s, c)."""
     every, side = slice(None, None, layout.block), layout.stored
     view = sliding_window_view(values, (side, side, side), (0, 1, 2))[every, every, every]
     return np.moveaxis(view, 3, 6)
@@ -172,7 +172,7 @@ def write(
     data: np.ndarray,
     time: int | None = None,
 ) -> Any:
-    """Begins to write a box into an array of the store, at a time if it has an axis for that."""
+    """Starts writing a box into an array of the store, at `time` if given; returns a future."""
     array = Deadline(_TIMEOUT).wait(begin_open(root, spec, "write"), spec["path"])
     array = array if time is None else array[time]
     low = [0, *low] if data.ndim == 4 else low  # (c, z, y, x)
@@ -181,10 +181,10 @@ def write(
 
 
 def finish_write(begun: Any, where: str, then: str = "--resume (resume=True) goes on") -> None:
-    """Waits until it is written; `then` tells what helps after a full disk."""
+    """Waits for a write; `then` is the advice in the error message if the disk is full."""
     try:
         begun.result()
-    except Exception as error:  # tensorstore raises what its status maps to
+    except Exception as error:  # tensorstore raises exceptions of several types
         if "No space left" in str(error):
             text = f"the disk is full; with room again, {then}"
             raise OSError(errno.ENOSPC, text, where) from None
@@ -192,7 +192,7 @@ def finish_write(begun: Any, where: str, then: str = "--resume (resume=True) goe
 
 
 def create_arrays(conversion: Conversion, level: int) -> None:
-    """Creates the arrays of a level, empty."""
+    """Creates the empty arrays of a level."""
     layout = conversion.layout
     arrays = (layout.plain(level), layout.blocks(level), layout.cells(level))
     for spec in (*arrays, *layout.bounds(level)):
@@ -200,12 +200,12 @@ def create_arrays(conversion: Conversion, level: int) -> None:
 
 
 def write_label_array(conversion: Conversion, labels: np.ndarray) -> None:
-    """Writes the array of labels that are indexed."""
+    """Writes the table of indexed labels."""
     root, spec = conversion.root, conversion.layout.labels()
     create_array(root, spec)
     finish_write(write(root, spec, [0], labels), root.get("path", "store"))
 
 
 def create_array(root: dict[str, Any], spec: dict[str, Any]) -> None:
-    """Creates an array, empty, if it is not there."""
+    """Creates an empty array unless it exists."""
     Deadline(_OPEN_TIMEOUT).wait(begin_open(root, spec, "create"), f"{root['path']}{spec['path']}")

@@ -1,8 +1,8 @@
-"""`Store`: a volume on disk or behind a URL, read block by block, region by region.
+"""`Store`: a volume on disk or behind a URL, read block by block or region by region.
 
 Opens what `convert` writes (see store_layout.py) and any other OME-Zarr image (NGFF on Zarr v2 or
-v3). The latter has no bordered blocks and no cells: its blocks are cut out of region reads, slower
-but right. Writing is in conversion.py.
+v3). The latter has no bordered blocks and no cells: its blocks are cut out of region reads, which
+is slower. Writing is in conversion.py.
 """
 
 from __future__ import annotations
@@ -43,42 +43,42 @@ from .store_layout import (
 )
 
 _OPEN_TIMEOUT = 20.0  # seconds
-_BATCH = 256  # blocks read at once; more only makes memory travel
-_AHEAD = 2 * _BATCH  # blocks on their way
+_BATCH = 256  # blocks read at once; larger batches only cost memory traffic
+_AHEAD = 2 * _BATCH  # blocks being read at a time
 _GROUP = 4  # blocks along a side of a group that may be read as one region
 _READERS = 4  # threads that read such groups
 Chunked = tuple[Any, ChunkFiles]  # one of tensorstore's arrays, and its files
 
 
 class Store:
-    """A volume that is read in parts. Safe to use from several threads, and pickled: it is opened
-    again where it is unpickled. A process that was forked after a store was opened can't read any.
+    """A volume that is read in parts. Safe to use from several threads. Can be pickled: unpickling
+    opens it again. A process that was forked after a store was opened can't read any store.
 
     Attributes:
         location: Path or URL.
         name: The image's name.
         extent: (x, y, z) voxels of the finest level.
         spacing: (x, y, z) world size of a finest voxel.
-        origin: (x, y, z) world place of the centre of voxel 0.
+        origin: (x, y, z) world position of the centre of voxel 0.
         info: Unit, names and colours of channels, time step, ...
-        lost: What the metadata tells beside, and this does not keep; a few words each.
+        lost: Phrases on metadata that is not kept.
         times: Number of time points.
-        time: The one that is read.
+        time: The time point that is read.
         dtype: torch dtype of the values.
         width: Number of channels.
         levels: Number of tree levels; the last one is at most 8 voxels wide.
         block: Voxels along a side of a block, without border.
         border: Voxels around a block.
         cell: Voxels along a side of a cell.
-        has_blocks: Whether blocks are stored with their border, and cells are there.
-        value_range: [low, high] of each channel, or None where the store does not tell.
-        threshold: What EMPTY was decided by, or None.
-        all_channels: Whether it was opened with all of its channels, as they are.
+        has_blocks: Whether bordered blocks and cells are stored, so whether `convert` made it.
+        value_range: [low, high] of each channel, or None if the store does not have it.
+        threshold: Regions with no value above it are EMPTY; None: no region is.
+        all_channels: Whether it was opened with all of its channels, in their stored order.
         coarse: Its coarse channels by name; see coarse.py.
-        label_values: (k,) int64 the label that each value stands for, where labels are indexed;
-            None: values stand for themselves.
-        pool: Makes coarser voxels: their mean, or the most frequent label.
-        layout: What lies where on disk.
+        label_values: (k,) int64, where labels are indexed: value i is the label label_values[i].
+            None: values are the labels.
+        pool: Reduces voxels to coarser ones: to the mean, or to the most frequent label.
+        layout: The store's parameters and the arrays that follow from them.
         root: tensorstore's spec of its folder.
     """
 
@@ -97,7 +97,7 @@ class Store:
         check.text(where, "image", image)
         top = root
         root, found, own = find_image(where, root, image, deadline)
-        if own and root != top:  # one of several channels, a store of its own
+        if own and root != top:  # a channel of a store of several: its folder is a store, too
             where = root if isinstance(root, str) else root["path"].rstrip("/")
         stored, chosen, sizes = open_arrays(where, root, found, time, channels, deadline)
         dtype = value_dtype(stored[0].array.dtype.numpy_dtype)
@@ -148,30 +148,30 @@ class Store:
         time: int = 0,
         channels: Sequence[int] | None = None,
     ) -> Store:
-        """Opens a store of ours or any OME-Zarr multiscale image.
+        """Opens a store that `convert` wrote, or any OME-Zarr multiscale image.
 
         Args:
             location: A folder, or a URL (file://, http(s)://, s3://, gs://).
-            image: Name, number or folder of the image, where the store has several.
-            time: Which time point.
-            channels: Which channels, in which order; None takes all.
+            image: Name, number or folder of the image, if the store has several.
+            time: Index of the time point.
+            channels: Indices of the channels to read, in this order; None reads all.
 
         Raises:
-            ValueError: It is no store, half-written, damaged, too large, of a dtype that has no
-                place in a brick, or has no such image, time or channel.
+            ValueError: It is not a store, is half-written, damaged or too large, has a dtype that
+                bricks can't hold, or has no such image, time or channel.
             OSError: It can't be read.
         """
         return cls(location, image=image, time=time, channels=channels)
 
     def at_time(self, time: int) -> Store:
-        """Opens it again at another time point; raises as `open`."""
+        """Opens the store again at another time point; raises as `open`."""
         return Store.open(**{**self._asked, "time": time})
 
     def __reduce__(self) -> Any:
         return partial(Store.open, **self._asked), ()
 
     def _open_own(self, deadline: Deadline) -> None:
-        """Opens blocks and cells of all levels, and compares them with what they must be."""
+        """Opens blocks and cells of all levels and checks their shapes and dtypes."""
         kinds = (self.layout.blocks, self._blocks), (self.layout.cells, self._cells)
         specs = [(spec(at), arrays) for spec, arrays in kinds for at in range(self.levels)]
         for spec, arrays, future in [(*pair, begin_open(self.root, pair[0])) for pair in specs]:
@@ -193,11 +193,11 @@ class Store:
 
     @property
     def coarse_folder(self) -> str:
-        """Where its coarse channels lie, inside it."""
+        """Path of its coarse channels inside the store."""
         return self.layout.coarse_folder(self.time)
 
     def describe(self) -> dict[str, Any]:
-        """Returns extent, dtype, place, levels, range and size on disk as plain values."""
+        """Returns extent, dtype, position, levels, range, size on disk etc. as plain values."""
         times = {"times": self.times, "time": self.time} if self.times > 1 else {}
         folder = Path(self.location)
         files = (file for file in folder.rglob("*") if file.is_file()) if folder.is_dir() else ()
@@ -227,7 +227,7 @@ class Store:
         return self.layout.shape(self._checked(level))[::-1]
 
     def stored_level(self, level: int) -> int:
-        """Coarsest level up to this one that lies on disk, and is not averaged when it is read."""
+        """Returns the coarsest level up to `level` that is stored, not averaged on reading."""
         return self._levels.coarsest(self._checked(level))
 
     def block_grid(self, level: int) -> tuple[int, int, int]:
@@ -243,7 +243,7 @@ class Store:
 
         Args:
             level: 0 is the finest.
-            low: (z, y, x) first voxel; may lie outside, where the outermost voxels repeat.
+            low: (z, y, x) first voxel; beyond the volume, edge voxels repeat.
             high: (z, y, x) one past the last voxel.
             timeout: Seconds.
 
@@ -270,7 +270,7 @@ class Store:
 
     @property
     def stored(self) -> str:
-        """NumPy dtype of what `read_stored` gives: that of the array, before it is narrowed."""
+        """NumPy dtype that `read_stored` returns: the array's, before it is narrowed."""
         return (
             "int64"
             if self.label_values is not None
@@ -278,8 +278,8 @@ class Store:
         )
 
     def read_stored(self, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
-        """Reads a box of finest voxels, (z, y, x, c), as they are stored; of labels that are
-        indexed, the labels. Box and errors as of `read_region`; it lies inside the volume.
+        """Reads a box of finest voxels, (z, y, x, c), in the stored dtype; indexed labels are
+        returned as labels. Box and errors as for `read_region`; the box lies inside the volume.
         """
         if not self.has_blocks:
             return self._levels.finest.read(low, high, Deadline(timeout))
@@ -289,13 +289,13 @@ class Store:
         return self.label_values.numpy()[data.astype(np.int64)]
 
     def read_cells(self, level: int, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
-        """Reads smallest, largest and mean value of a box of cells, of our own stores only.
+        """Reads smallest, largest and mean value of a box of cells, if `convert` made the store.
 
         `low` and `high` are (z, y, x) cells inside `cell_grid(level)`.
 
         Returns:
-            (z, y, x, 3, c) of the store's dtype: low and high over the finest voxels in reach (one
-            voxel of this level around the cell included), mean of the cell's own voxels.
+            (z, y, x, 3, c) of the store's dtype: low and high over the finest voxels in the cell
+            and in one voxel of this level around it; mean of the cell's voxels alone.
 
         Raises:
             ValueError: The store has no cells, or the box leaves the grid.
@@ -322,12 +322,12 @@ class Store:
         """Reads many blocks with their borders, in bulk: (k, 3) z, y, x inside `block_grid(level)`.
 
         Returns:
-            (k, s, s, s, c) with s = block + 2 * border, and for each place in `zyx` that could not
-            be read what was wrong. Rows of those are zero.
+            (k, s, s, s, c) with s = block + 2 * border, and an error message for each row of `zyx`
+            that could not be read; these rows are zero.
 
         Raises:
-            ValueError: A place lies outside the grid.
-            TimeoutError: All of them together took longer.
+            ValueError: A block lies outside the grid.
+            TimeoutError: Reading all of them took longer.
         """
         zyx = np.asarray(zyx, np.int64).reshape(-1, 3)
         grid = self.block_grid(level)
@@ -360,10 +360,10 @@ class Store:
     def read_coarse(
         self, name: str, level: int, zyx: np.ndarray, *, timeout: float = 60.0
     ) -> tuple[np.ndarray, dict[int, str]]:
-        """Reads blocks of a coarse channel, of levels from 1 on, as `read_blocks` does.
+        """Reads blocks of a coarse channel, at levels from 1 on, as `read_blocks` does.
 
         Returns:
-            (k, s, s, s, c) float16, and what was wrong with which.
+            (k, s, s, s, c) float16, and an error message for each row that could not be read.
 
         Raises:
             KeyError: There is no such channel.
@@ -379,7 +379,7 @@ class Store:
         out = np.empty((len(zyx), *chunked[0].shape[3:]), np.float16)
         order = np.lexsort(zyx.T[::-1])
         errors = self._read_stored(chunked, level, zyx, order, out, deadline)
-        for row in _blank(out):  # also zeros are written
+        for row in _blank(out):  # zeros are written, too: the shard of a zero block must exist
             try:
                 if row not in errors:
                     at = zyx[row].tolist()
@@ -399,8 +399,8 @@ class Store:
         deadline: Deadline,
         batch: int = _BATCH,
     ) -> dict[int, str]:
-        """Fills the rows `order` of `out` in batches, the next on its way meanwhile; those of a
-        batch that fails one by one, to tell the good from the bad.
+        """Fills the rows `order` of `out` in batches, reading the next batch meanwhile. Blocks of a
+        batch that fails are read one by one, to find the bad ones; returns their errors.
         """
         array, files = chunked
         chunks = files.places(self.time, zyx, array.shape[3:])
@@ -434,8 +434,8 @@ class Store:
         return errors
 
     def _fill_in(self, level: int, at: np.ndarray, out: np.ndarray, deadline: Deadline) -> None:
-        """Gives a block that came back as all zeros the values that it should have; raises
-        StoreError if it should have been stored.
+        """Fills a block that was read as all zeros, so may not be stored, with its values from
+        cells or pyramid; raises StoreError if it should have been stored.
         """
         per = self.block // CELL
         high = np.minimum((at + 1) * per, self.cell_grid(level))
@@ -460,8 +460,8 @@ class Store:
         deadline: Deadline,
     ) -> None:
         """Raises StoreError if a shard of `data`, items `low` to `high` of an array, is not the one
-        that was written, or if zeros come from one that is not there: zeros of these arrays are
-        written.
+        that was written, or if zeros come from a missing shard: these arrays are written in full,
+        zeros included.
         """
         where, coarse = f"{self.location}/{spec['path']}", "coarse" in spec["path"]
         shape = spec["metadata"]["chunk_grid"]["configuration"]["chunk_shape"]
@@ -486,7 +486,7 @@ class Store:
     def _cut_blocks(
         self, level: int, zyx: np.ndarray, out: np.ndarray, deadline: Deadline
     ) -> dict[int, str]:
-        """Cuts blocks out of region reads; neighbours share one where that reads less."""
+        """Cuts blocks out of region reads; neighbours share a read if that reads less."""
         errors = dict[int, str]()
         side = self.layout.stored
 
@@ -521,7 +521,7 @@ class Store:
 
 
 def _as_told(where: str, spec: dict[str, Any], future: Any, deadline: Deadline) -> Chunked:
-    """Waits for an array of ours; raises ValueError if its shape or dtype is not its spec's."""
+    """Waits for an array to open; raises ValueError if its shape or dtype is not its spec's."""
     name, wanted = f"{where}/{spec['path']}", spec["metadata"]
     array = deadline.wait(future, name)
     if list(array.shape) != wanted["shape"] or array.dtype.name != wanted["data_type"]:
@@ -530,7 +530,7 @@ def _as_told(where: str, spec: dict[str, Any], future: Any, deadline: Deadline) 
 
 
 def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline) -> np.ndarray:
-    """(k,) int64 labels that are indexed."""
+    """Returns (k,) int64 the table of indexed labels."""
     spec = layout.labels()
     name = f"{where}/{spec['path']}"
     chunked = _as_told(where, spec, begin_open(root, spec), deadline)
@@ -541,23 +541,23 @@ def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline)
 
 
 def needed_cells(cells: np.ndarray, threshold: float | None) -> np.ndarray:
-    """(z, y, x, 3, c) -> (z, y, x) bool: neither CONSTANT nor EMPTY."""
+    """Returns (z, y, x) bool: which of the cells (z, y, x, 3, c) are neither CONSTANT nor EMPTY."""
     low, high = cells[..., 0, :], cells[..., 1, :]
     needed = (low != high).any(-1)
-    if threshold is not None:  # in float32, as the tree compares
+    if threshold is not None:  # compared in float32, as in the tree
         needed &= (high.astype(np.float32) > np.float32(threshold)).any(-1)
     return needed
 
 
 def _blank(out: np.ndarray) -> list[int]:
-    """Rows that are all zero."""
+    """Returns the rows that are all zero."""
     rows = out.reshape(len(out), -1)
     likely = np.flatnonzero(~rows[:, :64].any(1)).tolist()
     return [row for row in likely if not rows[row].any()]
 
 
 def _groups(zyx: np.ndarray, side: int) -> list[np.ndarray]:
-    """Indices of blocks to be read together."""
+    """Returns groups of indices of blocks, each to be read as one region."""
     groups = []
     for index in rows_by_place(zyx // _GROUP)[1]:
         span = (zyx[index].max(0) - zyx[index].min(0) + 1) * (side - 2 * BORDER) + 2 * BORDER

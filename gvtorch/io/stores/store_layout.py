@@ -1,20 +1,20 @@
-"""What a store is and how it lies on disk; and tensorstore: its settings, and waiting for it.
+"""The layout of a store on disk; and tensorstore: its settings, and waiting for its results.
 
-    STORE.zarr/zarr.json             metadata; written last, so a store that has it is whole
+    STORE.zarr/zarr.json             metadata; written last, so a store that has it is complete
     STORE.zarr/0, 1, ...             (z, y, x) or (c, z, y, x), the mean pyramid, 0 the finest;
-                                     (t, c, z, y, x) of several time points, and t comes first in
-                                     all other arrays; coarse/TIME/ takes the place of coarse/
-    STORE.zarr/gvtorch/blocks/0 ...  (gz, gy, gx, s, s, s, c), s = block + 2 border, a chunk each,
-                                     its border the true neighbours, repeated at the volume's faces;
-                                     blocks of CONSTANT and EMPTY cells only are not written
+                                     with several time points (t, c, z, y, x), all other arrays
+                                     begin with t, too, and coarse/TIME/ replaces coarse/
+    STORE.zarr/gvtorch/blocks/0 ...  (gz, gy, gx, s, s, s, c), s = block + 2 border, a chunk each;
+                                     borders are the neighbours' voxels, repeated at the volume's
+                                     faces; blocks of CONSTANT and EMPTY cells only are not written
     STORE.zarr/gvtorch/cells/0 ...   (gz, gy, gx, 3, c) low, high, mean of every cell of 8^3 voxels
-    STORE.zarr/gvtorch/labels        (k,) int64, rising: of labels that are indexed, since they are
-                                     wider than 16 bits, the label that each value stands for
-    STORE.zarr/gvtorch/coarse/ ...   what coarse voxels hold beside means; see coarse.py
-    STORE.zarr/.gvtorch-work         only while it is made: manifest, journal, low and high pyramids
+    STORE.zarr/gvtorch/labels        (k,) int64, increasing: the label of each index, for labels
+                                     wider than 16 bits, which are indexed
+    STORE.zarr/gvtorch/coarse/ ...   values of coarse voxels other than means; see coarse.py
+    STORE.zarr/.gvtorch-work         during conversion only: manifest, journal, low, high pyramids
 
-A shard of any array covers the same cube of voxels, and one task of the converter writes it. Of
-labels, coarse voxels hold the most frequent, and cells the smallest in place of the mean.
+Shards of pyramid, blocks and cells cover the same cube of voxels, and one task of the converter
+writes them. For labels, coarse voxels hold the most frequent, cells the smallest, not the mean.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from ..relay import read_within, through, with_urls
 from ..resources import cores
 
 if TYPE_CHECKING:
-    import numpy as np  # not when the program starts: `gvtorch --help` comes this way
+    import numpy as np  # not at run time: `gvtorch --help` imports this module
 
-VERSION = 1  # of stores of one time point; of more: 2
+VERSION = 1  # of stores with one time point; those with more have 2
 CELL = 8  # voxels along a side of a cell
-BORDER = 1  # voxels around a block, and around a cell for its low and high
+BORDER = 1  # voxels around a block; a cell's low and high cover that many around it, too
 BLOCKS = (32, 64)  # voxels along a side of a block
 WORK = ".gvtorch-work"
 MOST_VOXELS = 2**40
@@ -56,12 +56,12 @@ _PLAIN_CHUNK = 64  # voxels
 _CELL_CHUNK = 16  # cells
 _LABEL_CHUNK = 2**16
 _COARSE_SHARD = 128  # voxels along a side of a shard of a coarse channel
-_KEEP = "store_data_equal_to_fill_value"  # zeros are written too: what is missing then shows
+_KEEP = "store_data_equal_to_fill_value"  # write chunks of zeros, too: a missing one is an error
 
 
 def value_dtype(stored: np.dtype, *, labels: bool = False) -> str:
-    """Name of the dtype that values are read as: bool becomes uint8, wide numbers float32, unless
-    they are labels.
+    """Returns the name of the dtype that values are read as: bool becomes uint8, and wide numbers
+    become float32 unless they are labels.
     """
     if stored.kind == "b":
         return "uint8"
@@ -72,16 +72,16 @@ def value_dtype(stored: np.dtype, *, labels: bool = False) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class StoreLayout:
-    """What a store holds; the sizes of its arrays follow from it. Picklable."""
+    """The parameters of a store, from which the sizes of its arrays follow. Picklable."""
 
     extent: tuple[int, int, int]  # x y z
     dtype: str
     width: int
     block: int = BLOCKS[0]
-    threshold: float | None = None  # what EMPTY was decided by
+    threshold: float | None = None  # regions with no value above it are EMPTY
     value_range: Sequence[Sequence[float]] | None = None  # [low, high] of each channel
     times: int = 1  # time points
-    label_count: int | None = None  # of labels that are indexed
+    label_count: int | None = None  # size of the table of labels, where they are indexed
     files_sum: int | None = None  # checksum of the list of checksums, see checksums.py
 
     @property
@@ -91,7 +91,7 @@ class StoreLayout:
 
     @property
     def levels(self) -> int:
-        """Number of levels: the last one is one cell."""
+        """Number of levels; the last one is one cell."""
         return 1 + max(0, math.ceil(math.log2(max(self.extent) / CELL)))
 
     @property
@@ -120,7 +120,7 @@ class StoreLayout:
         return (z, y, x)
 
     def shards(self, level: int) -> tuple[int, int, int]:
-        """(z, y, x) number of shards of a level: one a task of the converter."""
+        """(z, y, x) number of shards of a level; each is a task of the converter."""
         return self.grid(level, self.shard)
 
     @property
@@ -129,12 +129,12 @@ class StoreLayout:
         return self.times * sum(math.prod(self.shape(level)) for level in range(self.levels))
 
     def places(self, level: int) -> Iterator[tuple[int, ...]]:
-        """Places of all shards of a level: (z, y, x), or (t, z, y, x) of several time points."""
+        """Indices of all shards of a level: (z, y, x), or (t, z, y, x) of several time points."""
         times = [self.times] if self.times > 1 else []
         return itertools.product(*map(range, (*times, *self.shards(level))))
 
     def at_time(self, array: Any, time: int) -> Any:
-        """One time point of an array of the store, without its axis of time."""
+        """Returns an array of the store at one time point, without the time axis."""
         return array[time] if self.times > 1 else array
 
     def plain(self, level: int, *, path: str = "") -> dict[str, Any]:
@@ -173,12 +173,12 @@ class StoreLayout:
         )
 
     def coarse_folder(self, time: int) -> str:
-        """Where the coarse channels of a time point lie."""
+        """Returns the folder of a time point's coarse channels."""
         return "gvtorch/coarse" if self.times == 1 else f"gvtorch/coarse/{time}"
 
     def coarse(self, level: int, folder: str, width: int) -> dict[str, Any]:
-        """Spec of the array of bordered blocks of a coarse channel, from level 1 on; `folder` is
-        that of the channel.
+        """Spec of the array of bordered blocks of a coarse channel at a level from 1 on; `folder`
+        is the channel's.
         """
         inside = [self.stored] * 3 + [width]
         return dataclasses.replace(self, dtype="float16")._array(
@@ -189,7 +189,7 @@ class StoreLayout:
         )
 
     def labels(self) -> dict[str, Any]:
-        """Spec of the array of labels that are indexed."""
+        """Spec of the table of indexed labels."""
         count = self.label_count or 0
         shard = -(-count // _LABEL_CHUNK) * _LABEL_CHUNK
         return dataclasses.replace(self, dtype="int64")._array(
@@ -197,8 +197,8 @@ class StoreLayout:
         )
 
     def bounds(self, level: int) -> list[dict[str, Any]]:
-        """Specs of the temporary arrays of the smallest and largest finest value below each voxel.
-        Level 0 needs none (its values are both), nor does the last (nothing is made of it).
+        """Specs of the temporary arrays of the smallest and largest finest value in each voxel.
+        Level 0 needs none (its values are both), nor does the last (no level is made from it).
         """
         needed = 0 < level < self.levels - 1
         paths = [f"{WORK}/{which}/{level}" for which in ("low", "high")]
@@ -249,7 +249,7 @@ class StoreLayout:
         return {"path": path, "driver": "zarr3", "metadata": metadata, _KEEP: keep}
 
     def attributes(self, place: dict[str, Any]) -> dict[str, Any]:
-        """What the metadata says of a whole store; `place` is its spacing and origin."""
+        """Returns the metadata of a complete store; `place` is its spacing and origin."""
         several = {"times": self.times} if self.times > 1 else {}
         counted = {"label_count": self.label_count} if self.label_count is not None else {}
         return {
@@ -314,21 +314,21 @@ class CoarseChannel:
     """A coarse channel of a store: float16 numbers of all voxels above the finest level."""
 
     width: int
-    made_of: dict[str, Any]  # what made it, as JSON
-    generation: int = 0  # how often it was made anew: readers of the one before find nothing
+    made_of: dict[str, Any]  # what it was computed from, as JSON
+    generation: int = 0  # times it was replaced: readers of an older one fail, and read no mixture
 
     def attributes(self) -> dict[str, Any]:
-        """What the metadata says of it."""
+        """Returns its metadata."""
         return {"version": VERSION, **dataclasses.asdict(self)}
 
     def folder(self, name: str) -> str:
-        """Where it lies."""
+        """Returns the name of its folder."""
         return f"{name}.{self.generation}"
 
     @classmethod
     def parse(cls, where: str, told: Any) -> dict[str, CoarseChannel]:
-        """Reads the channels that a store's metadata tells, by name; raises ValueError unless they
-        are what `make_channel` writes.
+        """Returns the channels in a store's metadata, by name; raises ValueError unless they are as
+        `make_channel` writes them.
         """
         channels = told.get("channels") if isinstance(told, dict) else None
         if not isinstance(channels, dict):
@@ -351,12 +351,12 @@ class CoarseChannel:
 
 
 def is_name(value: Any) -> bool:
-    """Whether this may name a channel: 1 to 64 letters, digits, "-" and "_"."""
+    """Returns whether a value may name a channel: 1 to 64 letters, digits, "-" and "_"."""
     return isinstance(value, str) and re.fullmatch(r"[\w-]{1,64}", value, re.ASCII) is not None
 
 
 def is_number(value: Any) -> bool:
-    """Whether this is a number of JSON that a float holds: neither true nor infinite."""
+    """Returns whether a value from JSON is a number, not a bool, and finite as a float."""
     plain = isinstance(value, (int, float)) and not isinstance(value, bool)
     return plain and -sys.float_info.max <= value <= sys.float_info.max
 
@@ -377,7 +377,7 @@ class StoreError(OSError):
 
 
 class Deadline:
-    """The time at which reads are given up: `timeout` seconds after this is made."""
+    """The time at which reads are abandoned: `timeout` seconds after this is created."""
 
     def __init__(self, timeout: float) -> None:
         check_process()
@@ -402,22 +402,22 @@ class Deadline:
         except TimeoutError:
             future.cancel()
             raise self.over(where) from None
-        except Exception as error:  # tensorstore raises what its status maps to
+        except Exception as error:  # tensorstore raises exceptions of several types
             raise StoreError(f"{where}: {short(error)}") from None
 
 
 def short(error: BaseException) -> str:
-    """tensorstore's message in one line, without its annotations."""
+    """Returns tensorstore's message in one line, without its annotations."""
     text = re.sub(r"\s*\[[a-z_]+(=| locations=).*", "", str(error), flags=re.DOTALL)
     return with_urls(" ".join(text.split()))[:400] or type(error).__name__
 
 
-_users: set[int] = set()  # processes that use tensorstore: this one, one that it was forked from
+_users: set[int] = set()  # processes that used tensorstore: this one, or one it was forked from
 
 
 def check_process() -> None:
-    """Raises StoreError in a process that was forked from one that had used tensorstore, which has
-    lost its threads and would end the process.
+    """Raises StoreError in a process that was forked after tensorstore was used: it has lost
+    tensorstore's threads, and would crash.
     """
     if _users - {os.getpid()}:
         raise StoreError(
@@ -429,7 +429,7 @@ def check_process() -> None:
 
 @functools.cache
 def context() -> Any:
-    """tensorstore's resources: no cache (the pools and their host cache are it), few threads."""
+    """Returns tensorstore's context: few threads, no cache (pools and host cache replace it)."""
     import tensorstore as ts
 
     _users.add(os.getpid())
@@ -444,9 +444,9 @@ def context() -> Any:
 
 
 def kvstore(location: str | Path) -> Any:
-    """Returns tensorstore's spec of a folder: a path, or a URL that it knows. Whatever a path is
-    made of, links and ".." too, stands for the folder that the system finds there; of one that is
-    no UTF-8, which tensorstore can't be told, a link to it is given.
+    """Returns tensorstore's spec of a folder, given as a path, or as a URL that tensorstore knows.
+    Links and ".." in a path are resolved as the operating system does; a path that tensorstore
+    can't take is replaced by a link to it, see `text_path`.
     """
     text = str(location)
     if text.startswith("file://"):
@@ -458,7 +458,7 @@ def kvstore(location: str | Path) -> Any:
 
 
 def child(root: Any, path: str) -> Any:
-    """Spec of a folder inside a folder."""
+    """Returns the spec of a folder inside a folder."""
     if isinstance(root, str):
         return file_url(root, f"{path}/")
     return {**root, "path": f"{root.get('path', '')}{path}/"}
@@ -473,7 +473,7 @@ def read_key(
     most: int = MOST_JSON,
 ) -> Any:
     """Returns the content of a file in a folder, or a part of its bytes, which may count from its
-    end; None if there is no such file. It is at most `most` bytes. Raises as
+    end; None if there is no such file. A file of more than `most` bytes is a StoreError. Raises as
     `Deadline.wait`, and ValueError if there can be no such folder.
     """
     import tensorstore as ts
@@ -508,10 +508,10 @@ def read_key(
 
 
 def begin_open(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
-    """Begins to open an array of a store; returns tensorstore's future.
+    """Starts opening an array of a store; returns tensorstore's future.
 
     `root` comes from `kvstore`, `spec` from `StoreLayout`; `mode` is "read", "write" or "create"
-    (if it is not there).
+    (unless it exists).
     """
     left_out = {"read": ("path", "metadata", _KEEP), "write": ("path", "metadata")}
     store = {key: value for key, value in spec.items() if key not in left_out.get(mode, ("path",))}
@@ -519,7 +519,7 @@ def begin_open(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
 
 
 def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any:
-    """Begins to open the array that a folder is; returns tensorstore's future."""
+    """Starts opening the array in a folder; returns tensorstore's future."""
     import tensorstore as ts
 
     relayed = through(folder, context()) if isinstance(folder, str) else None

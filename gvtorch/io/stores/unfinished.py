@@ -1,5 +1,5 @@
-"""`UnfinishedStore`: lock, manifest and journal of a store in the making, and the last step, which
-makes it a store. The work itself is in conversion.py.
+"""`UnfinishedStore`: lock, manifest and journal of a store that is being written, and the last
+step, which completes it. The conversion itself is in conversion.py.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ _JOURNAL, _MANIFEST, _LOCK = "journal.jsonl", "manifest.json", "lock"
 
 
 class Done(NamedTuple):
-    """What a task that is done has written."""
+    """What a finished task has written."""
 
     place: tuple[int, ...]  # z, y, x, or t, z, y, x
     voxels: int
     files: Files  # checksums
-    bad: int = 0  # values that are not finite; nothing is written then
+    bad: int = 0  # values that are not finite; if there are any, nothing was written
 
 
 @dataclass
 class UnfinishedStore:
-    """A store that is being made, by this process alone; `done` stands in the journal already."""
+    """A store that only this process is writing; `done` holds the tasks in the journal."""
 
     target: Path
     journal: IO[str]
     done: dict[Task, Done]
 
     def note(self, done: Mapping[Task, Done]) -> None:
-        """Writes down that tasks are done; on disk when this returns."""
+        """Adds finished tasks to the journal; they are on disk when this returns."""
         self.done |= done
         with told_of(self.target / WORK / _JOURNAL):
             _write_lines(self.journal, done)
 
     def finish(self, layout: StoreLayout, info: ImageInfo, settings: Mapping[str, Any]) -> None:
-        """Writes the metadata, the root's last of all, and removes the hidden folder."""
+        """Writes the metadata, the root's last of all, and removes the work folder."""
         for name in GROUPS:
             write_json(self.target / name / "zarr.json", group({}))
         files = {name: one for done in self.done.values() for name, one in done.files.items()}
@@ -69,16 +69,16 @@ class UnfinishedStore:
 
 
 def is_finished(target: Path) -> bool:
-    """Returns whether there is a whole store."""
+    """Returns whether there is a finished store."""
     return (target / "zarr.json").exists()
 
 
 def is_begun(target: Path, *, resume: bool, manifest: str = _MANIFEST) -> bool:
-    """Returns whether there is a half-written store to go on with, begun with a file of this name.
+    """Returns whether there is a half-written store, with a file `manifest`, to continue.
 
     Raises:
-        FileExistsError: There is a whole store, a half-written one without `resume`, or something
-            else.
+        FileExistsError: There is a finished store, a half-written one without `resume`, or
+            something else.
         FileNotFoundError: Its parent folder is not there.
     """
     if is_finished(target):
@@ -102,12 +102,12 @@ def is_begun(target: Path, *, resume: bool, manifest: str = _MANIFEST) -> bool:
 
 @contextmanager
 def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator[UnfinishedStore]:
-    """Makes or takes over the hidden folder. What is there is looked at once more under the lock:
-    another process may have begun, or even finished, since `is_begun` was asked.
+    """Creates the work folder, or takes over an existing one. Checks `is_begun` again under the
+    lock: another process may have begun, or even finished, since the first check.
 
     Raises:
-        OSError: Another process is at work there.
-        FileExistsError: As of `is_begun`.
+        OSError: Another process is writing there.
+        FileExistsError: As for `is_begun`.
         ValueError: Settings or source differ from those of the store to resume.
     """
     folder = target / WORK
@@ -129,8 +129,8 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
 
 @contextmanager
 def _claimed_folder(target: Path) -> Iterator[None]:
-    """Holds the lock of a target. At the end a folder is removed that this made and that is still
-    empty. While it waits, the process before may remove the folder and the lock: it tries again.
+    """Holds the lock of a target. At the end, removes the work folder if it is empty, and then the
+    target if this created it. If another process removes folder and lock meanwhile, tries again.
     """
     folder, made = target / WORK, not target.exists()
     while True:
@@ -184,13 +184,13 @@ def _compare(target: Path, settings: dict[str, Any]) -> None:
 
 
 def count_done(target: Path) -> int:
-    """Number of tasks that a journal names as done."""
+    """Returns the number of finished tasks in a target's journal."""
     journal = target / WORK / _JOURNAL
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
 
 def _write_lines(journal: IO[str], done: Mapping[Task, Done]) -> None:
-    """Writes a line with a checksum for each task; on disk when this returns."""
+    """Writes a line with a checksum for each task; they are on disk when this returns."""
     for task, one in done.items():
         entry = {"task": list(task), "voxels": one.voxels, "files": one.files}
         journal.write(json.dumps(entry | {"checksum": sum_of(entry)}) + "\n")
@@ -199,7 +199,7 @@ def _write_lines(journal: IO[str], done: Mapping[Task, Done]) -> None:
 
 
 def _read_journal(path: Path) -> dict[Task, Done]:
-    """Finished tasks. A line that was cut off or changed tells of none: its task runs again."""
+    """Returns the finished tasks. A truncated or altered line is skipped: its task runs again."""
     done = {}
     for line in path.read_bytes().splitlines() if path.exists() else []:
         try:
@@ -213,7 +213,7 @@ def _read_journal(path: Path) -> dict[Task, Done]:
 
 
 def as_json(value: Any) -> Any:
-    """Returns a value as it comes back from a JSON file: tuples are lists."""
+    """Returns a value as JSON reads it back: tuples become lists."""
     return json.loads(json.dumps(value))
 
 
@@ -223,13 +223,13 @@ def group(attributes: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes a file that is either there as a whole or not at all."""
+    """Writes a JSON file, which appears only when complete."""
     with durable_file(path) as file:
         file.write(json.dumps(content, indent=1, allow_nan=False).encode())
 
 
 def checksum(arrays: Iterable[np.ndarray]) -> int:
-    """Returns the CRC-32 of the numbers of arrays, one after the other."""
+    """Returns the CRC-32 of the bytes of arrays, one after the other."""
     total = 0
     for one in arrays:
         total = zlib.crc32(one.tobytes(), total)
@@ -237,7 +237,7 @@ def checksum(arrays: Iterable[np.ndarray]) -> int:
 
 
 def fingerprint(source: str | Path | Volume) -> list[Any]:
-    """Sizes and modification times of a source, or a checksum: equal while it is unchanged."""
+    """Returns a source's sizes and modification times, or a checksum: equal while unchanged."""
     if isinstance(source, Volume):
         data = movable(source.data).cpu().numpy()
         return [list(data.shape), str(source.data.dtype), checksum([data])]
