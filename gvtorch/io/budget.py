@@ -105,7 +105,7 @@ class _Watch:
         self._over.set()
         if self._sent:
             # An exception may still be pending. It can't be withdrawn: Python 3.11 would then check
-            # for it for ever, and hang under a profiler. So one more replaces it, caught here.
+            # for it for ever, and hang under a profiler. So another replaces it and is caught here.
             with suppress(_TooMuch):
                 self._send()
                 while True:

@@ -61,7 +61,7 @@ class MeshSource(VolumeSource):
         solid: SolidParts = "auto",
         texture: str | Path | None = None,
     ) -> dict[str, MeshSource]:
-        """Reads the mesh, lays a grid around it, returns a source per channel; see `voxelize`."""
+        """Reads a mesh, lays a grid around it, and returns a source per channel; see `voxelize`."""
         check.whole("voxelize", "resolution", resolution, low=8, high=2**20)
         check.instance("voxelize", "mesh", given, Mesh, str, PathLike)
         check.one_of("voxelize", "solid", solid, get_args(SolidParts))

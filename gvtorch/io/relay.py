@@ -149,7 +149,7 @@ def read_within(
     folder: Any, name: str, part: slice | None, most: int, wait: Callable[[Any], Any]
 ) -> bytes | None:
     """Returns the content of a file in a key-value store of tensorstore, or a part of it; None if
-    there is no such file. Before a whole file, the byte after `most` is requested, to limit it.
+    there is no such file. Before a whole file, the byte after `most` is requested, as a check.
 
     Raises:
         Endless: The file has more than `most` bytes.

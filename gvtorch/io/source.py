@@ -120,7 +120,7 @@ class VolumeSource(ABC):
         return self
 
     def fingerprint(self) -> list[Any] | None:
-        """Returns values that change if the content does; None: those of the files at `path`."""
+        """Returns values that change if the content does; None if those of the path's files do."""
         return None
 
     def command(self, store: str) -> tuple[str, ...]:

@@ -41,7 +41,7 @@ class SparseGrid(ABC):
 
     data: Any  # the bytes that hold the nodes
     kind: str  # type of the values, as the format calls it
-    places: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n,) offsets in `data` of the nodes below
+    places: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n,) offsets in `data` of each of `origins`
     dtype: np.dtype
     background: np.ndarray  # (c,)
     origins: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n, 3) int64 of uppers, lowers and leaves

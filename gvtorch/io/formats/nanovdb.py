@@ -156,7 +156,7 @@ def _packed(file: Any, head: Head, end: int) -> int:
 
 
 def _content(path: str, head: Head, most: int = 0) -> Any:
-    """Returns a grid's bytes, mapped or unpacked; if `most` is given, at least the first of them."""
+    """Returns a grid's bytes, mapped or unpacked; if `most` is given, at least its first `most`."""
     with open(path, "rb") as file:
         if head.codec == "none":
             if head.size > head.packed or head.size < _ROOT:

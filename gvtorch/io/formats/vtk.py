@@ -91,7 +91,7 @@ class VtkSource(VolumeSource):
 
 
 def _bytes(content: bytes, encoding: str, count: int) -> bytes:
-    """The first bytes of raw or base64 content."""
+    """Returns the first `count` bytes of raw or base64 content."""
     if encoding == "raw":
         return content[:count]
     return base64.b64decode(content[: -(-count // 3) * 4])[:count]
