@@ -1,10 +1,10 @@
-"""What reading a header may take. The libraries that read files parse what they are told, for as
-long and into as much memory as it says; a header that takes more than its file can be worth is
-damaged.
+"""Limits on the time and memory that reading a header may take. The libraries that read files trust
+the sizes in a header, however large; a header that takes far more than the size of its file
+justifies is treated as damaged.
 
 A second thread watches the one that reads. It counts the processor time of that thread alone, so a
 busy machine makes no difference. Memory is that of the whole process, other threads included: so it
-is looked at only after a while, and the limit is far beyond what a file holds.
+is checked only after a while, and the limit is far beyond what a file holds.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ SECONDS = 5.0  # of processor time for any header
 SECONDS_A_BYTE = 5e-7  # and for each byte of its file
 MEMORY = 512 * 10**6  # bytes of memory for any header
 MEMORY_A_BYTE = 40  # and for each byte of its file
-MOST_PACKED = 1032  # bytes that DEFLATE makes of one, at most
+MOST_PACKED = 1032  # largest ratio of unpacked to packed bytes in DEFLATE
 _PATIENCE = 0.5  # seconds of processor time before memory counts
-_LOOK = 0.05  # seconds
+_LOOK = 0.05  # seconds between two checks
 
 
 class _TooMuch(BaseException):
-    """Ends the reading thread's work; libraries swallow what is an `Exception`."""
+    """Ends the reading thread's work; no `Exception`, because libraries may swallow those."""
 
 
 def check_regular(path: str | Path) -> None:
@@ -42,8 +42,8 @@ def check_regular(path: str | Path) -> None:
 
 
 def check_beside(path: str, other: str) -> None:
-    """Raises ValueError for a file that `path` names and that lies neither in its folder nor below,
-    or is no regular file.
+    """Raises ValueError if `other`, a file that the content of `path` refers to, lies outside the
+    folder of `path` and the folders below it, or is no regular file.
     """
     folder = os.path.realpath(os.path.dirname(path))
     place = os.path.join(folder, other)
@@ -54,7 +54,7 @@ def check_beside(path: str, other: str) -> None:
 
 
 def check_files(source: object) -> None:
-    """Raises ValueError if a source would read what is no regular file."""
+    """Raises ValueError if a file that a source reads is no regular file."""
     for file in (getattr(source, "file", None), *getattr(source, "files", ())):
         if isinstance(file, str) and os.path.exists(file):
             check_regular(file)
@@ -62,7 +62,7 @@ def check_files(source: object) -> None:
 
 @contextmanager
 def header_budget(path: str) -> Iterator[None]:
-    """Raises ValueError if the block, which reads a header, takes more than its file allows."""
+    """Raises ValueError if the `with` block, which reads a header, exceeds the file's limits."""
     try:
         size = os.stat(path).st_size if os.path.isfile(path) else 0
     except (OSError, ValueError):
@@ -84,7 +84,7 @@ def header_budget(path: str) -> Iterator[None]:
 
 
 class _Watch:
-    """Watches the thread that enters, and raises in it once a limit is passed."""
+    """Watches the thread that enters, and raises `_TooMuch` in it once a limit is exceeded."""
 
     def __init__(self, seconds: float, most: int) -> None:
         self._seconds, self._most = seconds, most
@@ -99,20 +99,20 @@ class _Watch:
 
     def __exit__(self, *_error: object) -> None:
         while not self._ended:
-            with suppress(_TooMuch):  # one more, that came before the lock was held
+            with suppress(_TooMuch):  # one may still arrive until the lock is held
                 with self._lock:
                     self._ended = True  # no exception is sent from here on
         self._over.set()
         if self._sent:
-            # One may be on its way still. It can't be withdrawn: Python 3.11 would then look for it
-            # for ever, and hang under a profiler. So one more takes its place, and is met here.
+            # An exception may still be pending. It can't be withdrawn: Python 3.11 would then check
+            # for it for ever, and hang under a profiler. So another replaces it and is caught here.
             with suppress(_TooMuch):
                 self._send()
                 while True:
                     time.sleep(0)
 
     def _send(self) -> None:
-        """Has `_TooMuch` raised in the thread that reads."""
+        """Makes Python raise `_TooMuch` in the thread that reads."""
         reader, error = ctypes.c_ulong(self._reader), ctypes.py_object(_TooMuch)
         ctypes.pythonapi.PyThreadState_SetAsyncExc(reader, error)
 
@@ -127,11 +127,11 @@ class _Watch:
                 if spent > self._seconds or greedy:
                     self._sent = True
                     self._send()
-                    pause *= 2  # it may be swallowed; or be met already, and on its way out
+                    pause *= 2  # a library may have swallowed it, or it is still propagating
 
 
 def _resident() -> int:
-    """Bytes of memory that this process holds; 0 where it is not told."""
+    """Returns the resident memory of this process, bytes; 0 on systems other than Linux."""
     if not sys.platform.startswith("linux"):
         return 0
     with open("/proc/self/statm") as file:

@@ -1,8 +1,8 @@
-"""Packed DICOM frames through imagecodecs, as a decoding plugin of pydicom: RLE, JPEG (8, 12 bits
-and lossless), JPEG-LS, JPEG 2000 and its high-throughput kind.
+"""Decodes compressed DICOM frames with imagecodecs, as a decoding plugin of pydicom: RLE, JPEG (8
+and 12 bits, lossless), JPEG-LS, JPEG 2000 and High-Throughput JPEG 2000.
 
-A frame's own header is compared with the file's before it is unpacked; RLE, which has none, is
-unpacked no further than the file tells.
+The size in a frame's own header is compared with the file's header before it is decoded; RLE frames
+have no header, and are decoded to no more bytes than the file's header states.
 Source: DICOM PS3.5, annex A.
 """
 
@@ -32,7 +32,7 @@ _NAME = "gvtorch-imagecodecs"
 
 
 def plugin_of(syntax: str) -> str:
-    """Returns the plugin's name, made known to pydicom, if it unpacks a transfer syntax."""
+    """Registers this plugin with pydicom and returns its name; "" if it can't decode `syntax`."""
     if syntax not in _CODECS:
         return ""
     from pydicom.pixels import get_decoder
@@ -44,17 +44,17 @@ def plugin_of(syntax: str) -> str:
 
 
 def is_available(uid: str) -> bool:
-    """Whether imagecodecs is here; pydicom asks."""
+    """Returns whether imagecodecs is installed; called by pydicom."""
     import importlib.util
 
     return uid in _CODECS and importlib.util.find_spec("imagecodecs") is not None
 
 
 def decode_frame(packed: bytes, runner: Any) -> bytes:
-    """Unpacks a frame; pydicom calls it.
+    """Decodes a frame; called by pydicom.
 
     Raises:
-        ValueError: The frame is damaged, or of another extent than the file tells.
+        ValueError: The frame is damaged, or its size differs from that in the file's header.
     """
     import imagecodecs
     import numpy as np
@@ -66,7 +66,7 @@ def decode_frame(packed: bytes, runner: Any) -> bytes:
     size = jpeg2k_size(packed) if codec == "jpeg2k" else jpeg_size(packed)
     if size != wanted:
         raise ValueError(f"a frame is of {size} (columns, rows, samples), not of {wanted}")
-    if codec == "jpeg":  # colours stay as they are stored: pydicom turns them
+    if codec == "jpeg":  # colours stay as they are stored: pydicom converts them
         kind: dict[str, Any] = (
             {"colorspace": "YCBCR", "outcolorspace": "YCBCR"} if size[2] == 3 else {}
         )
@@ -85,7 +85,7 @@ def decode_frame(packed: bytes, runner: Any) -> bytes:
 
 
 def _unpacked_rle(packed: bytes, runner: Any) -> bytes:
-    """Plane after plane, low bytes first."""
+    """Returns the values plane by plane, little-endian."""
     import imagecodecs
 
     width = runner.bits_allocated // 8

@@ -1,7 +1,7 @@
-"""The frames of a DICOM series: where each lies, how its values are scaled, and their order.
+"""The frames of a DICOM series: their positions, the scaling of their values, and their order.
 
-A frame is an image of a file, be it the only one (classic) or one of many (enhanced: what is told
-of it stands in the functional groups; others: in vectors beside the pixels).
+A frame is one image of a file: the only one (classic), or one of many, which are described by
+functional groups (enhanced) or by vectors in the header (others).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from ..base.image_info import ChannelInfo, ImageInfo, color_channels
 from .source import Triple
 
-_EVEN = 0.01  # of a step: how far slices may lie beside an even grid
-#: What may tell images of one place apart, the best first.
+_EVEN = 0.01  # of the usual step between slices: how much a step may differ from it
+#: Attributes that may distinguish images at one position, in order of preference.
 _APART = (
     "TemporalPositionIndex",
     "TemporalPositionIdentifier",
@@ -38,18 +38,18 @@ class DicomFrame:
     """An image of a file."""
 
     file: str
-    number: int  # in its file
+    number: int  # index of the image in its file
     slope: float
     intercept: float
     position: Triple | None  # of the first voxel's centre, LPS millimetres
     orientation: tuple[float, ...] | None  # of rows, then of columns
     spacing: tuple[float, float]  # between rows, between columns
-    between: float | None  # slices, where they have no place
-    moments: dict[str, float] = field(default_factory=dict)  # what may tell it from others
+    between: float | None  # millimetres between slices, for those without positions
+    moments: dict[str, float] = field(default_factory=dict)  # its values of `_APART`
 
 
 #: The frames of each time, slice by slice; the (4, 4) affine from (slice, row, column) to LPS
-#: millimetres; what is not kept; and the fields time_step and time_unit of an `ImageInfo`.
+#: millimetres; metadata that is not kept; and the fields time_step and time_unit of an `ImageInfo`.
 Ordered = tuple[list[list[DicomFrame]], np.ndarray, list[str], dict[str, Any]]
 
 
@@ -64,12 +64,12 @@ def frames_of(header: Any, count: int) -> list[DicomFrame]:
     for number in range(count):
         groups = [g for g in (each[number] if each else None, shared) if g is not None]
         frame = _frame(header, groups, number)
-        if len(offsets) == count > 1 and frame.position and frame.orientation:  # of doses
+        if len(offsets) == count > 1 and frame.position and frame.orientation:  # a grid of doses
             normal = np.cross(frame.orientation[:3], frame.orientation[3:])
             moved = np.add(frame.position, normal * (offsets[number] - offsets[0]))
             x, y, z = moved.tolist()
             frame = replace(frame, position=(x, y, z))
-        elif count > 1 and not each:  # one place is told of all of them
+        elif count > 1 and not each:  # the header has one position for all of them
             frame = replace(frame, position=None)
         found.append(frame)
     return found
@@ -118,10 +118,11 @@ def _frame(header: Any, groups: list[Any], number: int) -> DicomFrame:
 
 
 def order_frames(where: str, frames: Sequence[DicomFrame]) -> Ordered:
-    """Sorts frames by time and place.
+    """Sorts frames by time and position.
 
     Raises:
-        ValueError: Slices are missing, are not evenly apart, lie askew or are there twice.
+        ValueError: Slices differ in orientation or spacing, are missing, not evenly spaced or not
+            on a line, or no attribute distinguishes several images at one position.
     """
     first = frames[0]
     for frame in frames:
@@ -156,7 +157,7 @@ def order_frames(where: str, frames: Sequence[DicomFrame]) -> Ordered:
 
 
 def _directions(where: str, frame: DicomFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors along a row and along a column."""
+    """Returns unit vectors along a row and along a column."""
     told = np.array(frame.orientation or (1, 0, 0, 0, 1, 0), dtype=np.float64)
     rows, columns = told[:3], told[3:]
     lengths = np.linalg.norm(rows), np.linalg.norm(columns)
@@ -166,7 +167,7 @@ def _directions(where: str, frame: DicomFrame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _without_place(frames: Sequence[DicomFrame], affine: np.ndarray, normal: np.ndarray) -> Ordered:
-    """Frames of one place, or of none that is told: in the order of their numbers."""
+    """Orders frames without positions of their own by their numbers."""
     ordered = sorted(frames, key=lambda f: (f.moments.get("InstanceNumber", 0), f.file, f.number))
     between = ordered[0].between
     affine[:3, 0] = normal * (between or 1.0)
@@ -177,7 +178,7 @@ def _without_place(frames: Sequence[DicomFrame], affine: np.ndarray, normal: np.
 
 
 def _by_place(frames: Sequence[DicomFrame], normal: np.ndarray) -> list[list[DicomFrame]]:
-    """Groups frames whose places are the same, along the normal of their plane."""
+    """Groups frames by their position along the normal of their plane, in increasing order."""
     depths = np.array([frame.position for frame in frames]) @ normal
     order = np.argsort(depths, kind="stable")
     slices: list[list[DicomFrame]] = []
@@ -191,7 +192,9 @@ def _by_place(frames: Sequence[DicomFrame], normal: np.ndarray) -> list[list[Dic
 
 
 def _times(where: str, slices: list[list[DicomFrame]]) -> tuple[int, str | None]:
-    """Sorts the frames of each slice by what tells them apart; returns how many they are and it."""
+    """Sorts the frames of each slice by the attribute that distinguishes them; returns how many
+    they are, and its name.
+    """
     counts = sorted({len(one) for one in slices})
     if counts == [1]:
         return 1, None
@@ -224,7 +227,7 @@ def _moments(ordered: list[list[DicomFrame]], apart: str | None) -> dict[str, An
 
 
 def _step(where: str, places: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """From one slice to the next; raises ValueError unless all are evenly apart, on a line."""
+    """Returns the step between slices; raises ValueError unless all are evenly spaced on a line."""
     gaps = np.diff(places @ normal)
     usual = float(np.median(gaps))
     odd = np.abs(gaps - usual) > max(_EVEN * usual, 2e-3)
@@ -250,7 +253,7 @@ def _step(where: str, places: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def image_info(header: Any, samples: int, moments: dict[str, Any]) -> tuple[ImageInfo, list[str]]:
-    """What the header tells of the values, and what of it is not kept."""
+    """Returns what the header says of the values, and which of it is not kept."""
     lost = []
     kind = str(header.get("PhotometricInterpretation", ""))
     if kind == "PALETTE COLOR":
@@ -299,7 +302,7 @@ def _list(value: Any) -> list[float]:
 
 
 def _seconds(text: str) -> float:
-    """Seconds since midnight of HHMMSS.FFF."""
+    """Returns the seconds since midnight of HHMMSS.FFF."""
     clock = text.replace(":", "").partition(".")
     digits = clock[0].ljust(6, "0")
     rest = float(f"0.{clock[2]}") if clock[2] else 0.0

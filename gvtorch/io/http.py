@@ -1,5 +1,5 @@
-"""`read_http`: a file behind http or https, or a part of it, read within bounds of size and time
-whatever the server does. Connections are kept and used again; proxies and redirections are left to
+"""`read_http`: reads a file, or a part of it, over http or https, within bounds of size and time
+whatever the server does. Connections are kept open and reused; proxies and redirections are left to
 urllib.
 """
 
@@ -21,31 +21,31 @@ from typing import Any
 
 from ..base.messages import one_line
 
-STALL = 20.0  # seconds without a byte that a server is given
+STALL = 20.0  # seconds for which a server may send nothing
 SLOWEST = 20_000  # bytes a second that a server must send after its first STALL seconds
-REFUSED = 30.0  # seconds for which a file that had no end is not asked for again
-_REASONS = 1000  # that are kept
+REFUSED = 30.0  # seconds for which a file is not requested again after `Endless`
+_REASONS = 1000  # errors that are remembered
 _NOT = (0.0, "")
-_refused: dict[str, tuple[float, str]] = {}  # by URL: until when, and why
-SMALL = 1 << 20  # bytes that any file may have
+_refused: dict[str, tuple[float, str]] = {}  # by URL: until when it is refused, and why
+SMALL = 1 << 20  # bytes that any file may take, even if its content should take fewer
 _PART = 1 << 16  # bytes
-_SILENT = 1.0  # seconds without a byte, after which `ask_again` gives a request up
-_KEPT = 16  # idle connections to a server
+_SILENT = 1.0  # seconds without a byte after which `ask_again` aborts a request
+_KEPT = 16  # idle connections that are kept open to a server
 AGENT = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
-MISSING = (404, 410)  # status of what is not there
+MISSING = (404, 410)  # status codes for a file that does not exist
 _ELSEWHERE = (301, 302, 303, 307, 308)
 _CLOSED = (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError)
 
 
 class Endless(OSError):
-    """There is more than a file can have, or no end to wait for: a server that stalls, a pipe."""
+    """A file is larger than it can rightly be, or may never end: a server stalls, it is a pipe."""
 
 
 class HttpStatus(OSError):
     """The server answered with an error.
 
     Attributes:
-        status: Its number, as 503.
+        status: The status code, as 503.
     """
 
     def __init__(self, status: int, reason: str) -> None:
@@ -54,12 +54,12 @@ class HttpStatus(OSError):
 
 
 def is_http(root: object) -> bool:
-    """Tells such a folder from others."""
+    """Returns whether a folder is an http or https URL."""
     return isinstance(root, str) and root.startswith(("http://", "https://"))
 
 
 def file_url(folder: str, name: str) -> str:
-    """URL of a file in a folder, whose URL may end in a query."""
+    """Returns the URL of a file in a folder; the folder's URL may end in a query."""
     base, mark, query = folder.partition("?")
     return f"{base.rstrip('/')}/{name}{mark}{query}"
 
@@ -72,21 +72,21 @@ def read_http(
     whole: int | None = None,
     seconds: float = 1e9,
 ) -> bytes | None:
-    """Returns the content of a file, or a part of its bytes, which may count from its end; None if
-    there is no such file.
+    """Returns the content of a file, or a part of its bytes; None if there is no such file.
 
     Args:
-        url: Where it lies.
-        most: Bytes that come back, at most.
-        part: Which bytes.
-        whole: Bytes of the whole file, at most, which servers send that know no parts; None: most.
-        seconds: How long it may take.
+        url: The file.
+        most: Largest number of bytes to return.
+        part: The range of bytes; a negative start counts from the end of the file.
+        whole: Largest size of the whole file in bytes, because servers without support for ranges
+            send all of it; None: `most`.
+        seconds: Time limit.
 
     Raises:
-        TimeoutError: It took longer.
-        Endless: The server sends more, sends nothing for long, or hardly anything.
-        HttpStatus: It answers with an error.
-        OSError: It can't be reached, or breaks off.
+        TimeoutError: It took longer than `seconds`.
+        Endless: The server sends too much or too slowly, or did so less than `REFUSED` s ago.
+        HttpStatus: The server answers with an error.
+        OSError: The server can't be reached, or breaks off.
     """
     if time.monotonic() < _refused.get(url, _NOT)[0]:
         raise Endless(_refused[url][1])
@@ -108,20 +108,20 @@ def read_http(
 
 
 def keep_reason(url: str, error: OSError, seconds: float = 0.0) -> None:
-    """Keeps why a file can't be read; for so many seconds `read_http` does not ask for it."""
+    """Remembers why a file can't be read; `read_http` refuses it for the next `seconds`."""
     _refused[url] = time.monotonic() + seconds, str(error)
     while len(_refused) > _REASONS:
         _refused.pop(next(iter(_refused)), None)
 
 
 def refused(url: str) -> str:
-    """Tells why a file could not be read the last time, or ""."""
+    """Returns why a file could not be read the last time, or ""."""
     return _refused.get(url, _NOT)[1]
 
 
 def ask_again() -> None:
-    """Lets what could not be read be read at once, by whoever asks next: files that were refused
-    are asked for again, and what waits for a server that sends nothing breaks off.
+    """Makes the next read of any file try again at once: no file is refused any longer, and
+    requests that wait for a silent server are aborted.
     """
     _refused.clear()
     _connections.break_off(time.monotonic() - _SILENT)
@@ -172,10 +172,10 @@ def _content(
     whole: int,
     connection: http.client.HTTPConnection | None,
 ) -> bytes:
-    """Reads to the end, or as far as `cut` needs; of a file that is cut, what lies before is not
-    kept.
+    """Reads to the end of an answer, or to the end of `cut`, the range to return of a whole file;
+    bytes before that range are not kept in memory.
     """
-    content, begin = bytearray(), 0  # which starts at byte `begin`
+    content, begin = bytearray(), 0  # `content` starts at byte `begin` of the answer
     first, last = (cut.start or 0, cut.stop) if cut is not None else (0, None)
     limit = most if cut is None else whole
     while last is None or begin + len(content) < last:
@@ -185,7 +185,7 @@ def _content(
             more = answer.read1(_PART)
         except TimeoutError:
             raise
-        except Exception as error:  # of http.client
+        except Exception as error:  # http.client has its own kinds
             raise OSError(one_line(error)) from None
         if not more:
             break
@@ -210,7 +210,9 @@ def _content(
 def _ask(
     url: str, headers: dict[str, str], seconds: float
 ) -> tuple[http.client.HTTPConnection | None, http.client.HTTPResponse]:
-    """Sends a request; returns the connection, None if it is urllib's, and the answer's head."""
+    """Sends a request; returns the connection (None if it is urllib's) and the answer, whose body
+    is not read yet.
+    """
     place = urllib.parse.urlsplit(url)
     target = urllib.parse.quote(place.path or "/", safe="/%:@!$&'()*+,;=~")
     target += f"?{place.query}" if place.query else ""
@@ -229,14 +231,14 @@ def _ask(
         except BaseException as error:
             _connections.give_back(url, connection, keep=False)
             if used and isinstance(error, _CLOSED):
-                continue  # by the server, meanwhile
+                continue  # the server has closed the idle connection
             raise
         _connections.give_back(url, connection, keep=False)
         return None, ask_by_urllib(url, headers, seconds)
 
 
 def ask_by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client.HTTPResponse:
-    """Sends a request by way of proxies and redirections; raises as `read_http`, but Endless."""
+    """Sends a request through proxies and redirections; raises as `read_http`, except Endless."""
     request = urllib.request.Request(url, headers=headers)
     try:
         found: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=seconds)
@@ -254,7 +256,7 @@ _certificates = functools.cache(ssl.create_default_context)
 
 
 class _Connections:
-    """Idle connections, by server, of this process, and those that wait for an answer."""
+    """This process's idle connections, by server, and those that wait for an answer."""
 
     def __init__(self) -> None:
         self._idle: dict[Any, list[http.client.HTTPConnection]] = {}
@@ -282,13 +284,13 @@ class _Connections:
         return http.client.HTTPConnection(key[2], timeout=seconds), False
 
     def heard(self, connection: http.client.HTTPConnection) -> None:
-        """Notes that it waits from now on, for an answer or for more of one."""
+        """Records that a connection waits from now on for an answer, or for more of one."""
         with self._lock:
             sock = connection.sock or self._waiting[connection][1]
             self._waiting[connection] = time.monotonic(), sock
 
     def break_off(self, before: float) -> None:
-        """Ends those that have heard nothing since a time; whoever waits for them gets an error."""
+        """Shuts down connections that are silent since `before`; reading from them then fails."""
         with self._lock:
             silent = [sock for since, sock in self._waiting.values() if since < before]
         for sock in silent:
@@ -296,7 +298,7 @@ class _Connections:
                 sock.shutdown(socket.SHUT_RDWR)
 
     def give_back(self, url: str, connection: http.client.HTTPConnection, *, keep: bool) -> None:
-        """Ends its wait; keeps it for the next, if it may and there are not many, or closes it."""
+        """Ends a connection's wait; keeps it open if `keep` and few are idle, else closes it."""
         with self._lock:
             self._waiting.pop(connection, None)
             idle = self._idle.setdefault(self._key(url), [])

@@ -1,4 +1,4 @@
-"""Labels on their way into a store: which there are, found region by region, and sources of their
+"""Prepares labels for a store: finds the distinct ones region by region, and makes sources of their
 indices.
 """
 
@@ -19,13 +19,13 @@ from ..base.stage import Progress
 from .resources import cores, run_ahead
 from .source import Index, MemorySource, VolumeSource
 
-LABELS = "labels.npy"  # in the hidden folder of a store in the making
-_CUBE = 128  # voxels along a side of what is read at once
+LABELS = "labels.npy"  # in the hidden folder of an unfinished store
+_CUBE = 128  # voxels along a side of a region that is read at once
 
 
 @dataclass(frozen=True, kw_only=True)
 class IndexSource(VolumeSource):
-    """A source of labels, (t, z, y, x, c): of each its index among all that there are."""
+    """A source of labels, (t, z, y, x, c), each replaced by its index among the distinct ones."""
 
     inner: VolumeSource
     labels: np.ndarray | str  # (k,) int64, or the .npy file that holds them
@@ -33,7 +33,7 @@ class IndexSource(VolumeSource):
 
     @classmethod
     def of(cls, inner: VolumeSource, labels: np.ndarray, *, indexed: bool = False) -> IndexSource:
-        """Indexes the labels of a source."""
+        """Returns the source of the indices of a source's labels."""
         x, y, z = inner.extent
         told = ("path", "spacing", "origin", "info", "time")
         return cls(
@@ -47,7 +47,7 @@ class IndexSource(VolumeSource):
         )
 
     def staged(self, folder: Path) -> IndexSource:
-        """Takes the labels from `LABELS` in the folder, where they lie already."""
+        """Reads the labels from `LABELS` in the folder, which has been written before."""
         return replace(self, inner=self.inner.staged(folder), labels=str(folder / LABELS))
 
     def read_stored(self, index: Index) -> np.ndarray:
@@ -77,18 +77,18 @@ def indexed_source(
     folder: Path,
     progress: Progress,
 ) -> VolumeSource:
-    """Returns a source as stores hold its values: as it is, where these are no labels, are indexed
-    already, or are of 16 bits at most.
+    """Returns a source of values as a store holds them: indices of labels; or the source itself if
+    its values are no labels, are indexed already, or have at most 16 bits.
 
     Args:
         source: Any.
         time: The time point that is wanted; None: all.
-        workers: Threads that read, up to 8; None: one a core.
-        folder: Where `LABELS` lies, if it has been written before; else all is read once.
-        progress: Told ("labels", regions done, regions in all).
+        workers: Threads that read, up to 8; None: one per core.
+        folder: Holds `LABELS`, if that has been written before; else the whole source is read once.
+        progress: Called with ("labels", regions done, regions in all).
 
     Raises:
-        ValueError: They are no whole numbers, or too many.
+        ValueError: The labels are no whole numbers, or too many.
         OSError: The source can't be read.
     """
     if not source.info.labels or isinstance(source, IndexSource) or source.dtype in NARROW:

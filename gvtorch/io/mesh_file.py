@@ -1,5 +1,5 @@
-"""`read_mesh`: a file of triangles, by trimesh, as a `Mesh`: OBJ, PLY, STL, glTF and others; parts
-of a scene are put in place and joined.
+"""`read_mesh`: reads a file of triangles as a `Mesh`, with trimesh: OBJ, PLY, STL, glTF, OFF; the
+parts of a scene are transformed to their positions and joined.
 """
 
 from __future__ import annotations
@@ -24,30 +24,31 @@ from .polygons import cut_polygons
 from .resources import amount, memory_free
 from .source import told_as
 
-#: Endings that are read, also with .gz behind them. Others of trimesh's need more than it, or
-#: unpickle what they find.
+#: Endings that are read, also followed by .gz. Other formats of trimesh need more libraries, or
+#: unpickle the content of files.
 ENDINGS = ("obj", "ply", "stl", "gltf", "glb", "off")
-_MEMORY_A_BYTE = 4  # of a file, at least, that reading it takes
-_TEXTURES = 1500 * 10**6  # bytes that unpacking textures may take, of any file
-_TEXTURES_A_BYTE = 100  # and for each byte of it and of those that it names
-_FACE_BYTES = 1  # a triangle takes more bytes than this in any of them
+_MEMORY_A_BYTE = 4  # bytes of memory that reading takes for each byte of a file, at least
+_TEXTURES = 1500 * 10**6  # bytes of memory that decoding textures may take, for any file
+_TEXTURES_A_BYTE = 100  # and for each byte of it and of the files that it refers to
+_FACE_BYTES = 1  # a triangle takes more bytes than this in any format
 
 
 def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
-    """Reads a mesh: textures, colours of vertices, materials, the parts of a scene in their places.
-    Only files beside it are read (materials, textures, buffers), and nothing is fetched.
+    """Reads a mesh with its textures, vertex colours and materials, and all parts of a scene. Files
+    that it refers to are read only from its folder and below; nothing is downloaded.
 
     Args:
         path: A file whose name ends in obj, ply, stl, gltf, glb or off, or these and .gz.
-        texture: An image that is laid on all that has texture coordinates, in place of its own.
+        texture: An image that replaces the textures and colours of all materials; the mesh must
+            have texture coordinates.
 
     Returns:
         The mesh.
 
     Raises:
-        FileNotFoundError: It is not there.
-        ValueError: It is none of these, is damaged, has no triangles, places that are NaN, indices
-            out of range, or names a texture or a buffer that is not there; or is no path.
+        FileNotFoundError: The file or the texture does not exist.
+        ValueError: The file has another format, is damaged, has no triangles, positions that are
+            NaN or indices out of range, or refers to a missing file; or it is no path.
         ImportError: trimesh is not installed.
     """
     check.instance("read_mesh", "path", path, str, PathLike)
@@ -84,7 +85,7 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
 
 
 def _textured(mesh: Mesh, texture: Path) -> Mesh:
-    """The mesh with one image on all of it."""
+    """Returns the mesh with one image as the texture of all materials."""
     if mesh.uv is None:
         raise ValueError(f"{mesh.name}: has no texture coordinates for {texture}")
     if not texture.is_file():
@@ -132,7 +133,7 @@ def _check_size(what: str, size: int) -> None:
 
 
 def _images(loaded: Any) -> list[Any]:
-    """The textures of what trimesh read, which are not unpacked yet."""
+    """Returns the textures that trimesh found, which are not decoded yet."""
     parts = getattr(loaded, "geometry", {"": loaded}).values()
     looks = (getattr(getattr(part, "visual", None), "material", None) for part in parts)
     found = {id(one): one for one in looks}.values()
@@ -141,17 +142,17 @@ def _images(loaded: Any) -> list[Any]:
 
 
 def _check_textures(images: list[Any], size: int) -> None:
-    """Raises ValueError where images unpack to more than files of `size` bytes are worth."""
+    """Raises ValueError if decoding images takes more memory than files of `size` bytes justify."""
     sizes = [4 * math.prod(image.size) for image in images]
-    takes = sum(sizes) + 2 * max(sizes, default=0)  # one after another
+    takes = sum(sizes) + 2 * max(sizes, default=0)  # they are decoded one after another
     most = min(_TEXTURES + _TEXTURES_A_BYTE * size, memory_free())
     if takes > most:
         raise ValueError(f"its textures take {amount(takes)} of memory, at most {amount(most)}")
 
 
 def _check_gltf(ending: str, content: bytes) -> None:
-    """Raises ValueError for accessors that tell of more than is there, or whose numbers lie where
-    trimesh does not look, which then are zeros.
+    """Raises ValueError for accessors that claim more values than their buffer holds, or whose
+    numbers trimesh would not find and read as zeros.
     """
     if ending == "glb":
         content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
@@ -168,13 +169,13 @@ def _check_gltf(ending: str, content: bytes) -> None:
 
 
 def _count(word: bytes) -> int:
-    """What a header's word tells: 0 if it is no number; its first 19 digits are enough to know."""
+    """Returns the number in a header's word, 0 if it is none; 19 digits are enough to compare."""
     return int(word.lstrip(b"0")[:19] or b"0") if word.isdigit() else 0
 
 
 def _check_claims(path: Path, ending: str, content: bytes) -> None:
-    """Raises ValueError where a header tells of more triangles than the file can hold, or than a
-    mesh may have, before memory is asked for.
+    """Raises ValueError, before memory is allocated, if a header claims more triangles than the
+    file can hold, or than a mesh may have.
     """
     claimed = None
     if ending in ("gltf", "glb"):
@@ -201,11 +202,11 @@ def _check_claims(path: Path, ending: str, content: bytes) -> None:
 
 
 class _Beside:
-    """Gives trimesh the files that a mesh names, from the mesh's own folder and those below it."""
+    """Reads the files that a mesh refers to for trimesh, from the mesh's folder and below it."""
 
     def __init__(self, path: Path) -> None:
         self._folder, self.missing = path.absolute().parent, ""
-        self.images = self.size = 0  # that were handed out, and bytes
+        self.images = self.size = 0  # number of image files read; bytes of all files read
 
     def get(self, name: str) -> bytes:
         """Returns a file's content."""
@@ -217,7 +218,7 @@ class _Beside:
         inside = file.is_relative_to(self._folder.resolve())
         if not inside or not file.is_file():
             where = "is not there" if inside else "lies in another folder"
-            # An OBJ names its material library even where nobody kept one: it is white then.
+            # An OBJ may name a material library that was not kept: the mesh is white then.
             if not plain.lower().endswith(".mtl"):
                 self.missing = f"names {plain}, which {where}"
             raise FileNotFoundError(f"{plain} {where}")
@@ -234,20 +235,20 @@ class _Beside:
         return self.get(name)
 
     def namespaced(self, _namespace: str) -> _Beside:
-        """Returns itself: there are no folders of their own."""
+        """Returns itself: trimesh's namespaces are not used."""
         return self
 
 
 def _parts(trimesh: Any, loaded: Any) -> list[Any]:
-    """Returns the meshes of what was loaded, in their places."""
+    """Returns the meshes that trimesh loaded, with the transforms of their scene applied."""
     found = loaded.dump(concatenate=False) if isinstance(loaded, trimesh.Scene) else [loaded]
     found = found if isinstance(found, list) else [found]
     return [one for one in found if isinstance(one, trimesh.Trimesh) and len(one.faces)]
 
 
 def _joined(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh:
-    """Joins trimesh's meshes. OBJ and PLY tell colours as they are shown, glTF linear ones.
-    If not `mapped`, no image was read: one that trimesh tells of was made up by it.
+    """Joins trimesh's meshes. If not `mapped`, no image was read, and an image that trimesh returns
+    is a placeholder of its own.
     """
     vertices, faces, colors, uvs, numbers = [], [], [], [], []
     materials: list[Material] = []
@@ -288,7 +289,9 @@ def _joined(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh:
 
 
 def _colors(part: Any, faces: np.ndarray, ending: str) -> np.ndarray | None:
-    """(f, 3, 4) float32 linear colours of corners, where vertices or triangles have some."""
+    """Returns (f, 3, 4) float32 linear colours of triangle corners; None if there are none. Colours
+    are stored linear in glTF, as sRGB in other formats.
+    """
     look, attributes = part.visual, part.vertex_attributes
     if look.kind == "vertex":
         told = np.asarray(look.vertex_colors)[faces]
@@ -307,18 +310,18 @@ def _colors(part: Any, faces: np.ndarray, ending: str) -> np.ndarray | None:
 
 
 def _opacity(material: Any) -> float:
-    """What an MTL file tells: d, or 1 - Tr."""
+    """Returns the opacity from an MTL file: d, or 1 - Tr; 1 if it has neither."""
     told = material.kwargs
     name = "d" if "d" in told else "tr"
     try:
-        value = float(told[name][-1])  # behind -halo
+        value = float(told[name][-1])  # after the option -halo, if there is one
     except (KeyError, IndexError, ValueError):
         return 1.0
     return min(max(value if name == "d" else 1 - value, 0.0), 1.0)
 
 
 def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
-    """Turns trimesh's material into ours; white if there is none."""
+    """Converts a material of trimesh; white if there is none."""
     if material is None:
         return Material(color=(1.0, 1.0, 1.0, 1.0))
     gltf = ending in ("gltf", "glb")
@@ -330,7 +333,7 @@ def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
     if base is not None and np.asarray(base).dtype.kind in "ui":
         color = color / 255
     if image is not None and not gltf:
-        color = np.ones(4)  # its texture is all
+        color = np.ones(4)  # the texture replaces the colour
     if ending == "obj":
         color[3] *= _opacity(material)
     if not gltf:

@@ -1,5 +1,5 @@
-"""A mesh as volumes that are read region by region (`MeshSource`, one a channel), and `voxelize`,
-which writes them into a store by the writer of `convert`.
+"""A mesh as volumes that are read region by region (one `MeshSource` per channel), and `voxelize`,
+which writes them into a store with the writer of `convert`.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class MeshSource(VolumeSource):
     settings: tuple[tuple[str, Any], ...]  # resolution, band and thickness
     solid: SolidParts
     marks: tuple[Any, ...]  # identify mesh and settings: equal while these are unchanged
-    words: tuple[str, ...] = ()  # of the command line beside these
-    several: bool = False  # whether its store holds other channels, too
+    words: tuple[str, ...] = ()  # options of the command line that makes the store
+    several: bool = False  # whether its store is one of several, one per channel
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)  # with its holes filled
-    file: str = ""  # where it lies, if not in memory
+    file: str = ""  # holds the mesh, if that is not in memory
 
     @classmethod
     def of(
@@ -61,7 +61,7 @@ class MeshSource(VolumeSource):
         solid: SolidParts = "auto",
         texture: str | Path | None = None,
     ) -> dict[str, MeshSource]:
-        """Reads the mesh, and lays a grid around it: a source for each channel; see `voxelize`."""
+        """Reads a mesh, lays a grid around it, and returns a source per channel; see `voxelize`."""
         check.whole("voxelize", "resolution", resolution, low=8, high=2**20)
         check.instance("voxelize", "mesh", given, Mesh, str, PathLike)
         check.one_of("voxelize", "solid", solid, get_args(SolidParts))
@@ -111,11 +111,11 @@ class MeshSource(VolumeSource):
         return dataclasses.replace(self, mesh=None, file=str(file))
 
     def fingerprint(self) -> list[Any]:
-        """The mesh, and what is made of it."""
+        """Returns values that identify the mesh, the channel and the settings."""
         return [*self.marks, self.channel, *(n for _, n in self.settings), self.solid]
 
     def command(self, store: str) -> tuple[str, ...]:
-        """As `gvtorch voxelize` takes it."""
+        """Returns the words of the `gvtorch voxelize` command that makes a store of it."""
         store = str(Path(store).parent) if self.several else store
         return ("gvtorch", "voxelize", self.path, "-o", store, *self.words)
 
@@ -131,7 +131,7 @@ class MeshSource(VolumeSource):
 
 @functools.lru_cache(maxsize=2)
 def _voxelizer(source: MeshSource) -> Voxelizer:
-    """Kept, for every region of a source needs it."""
+    """Returns the voxelizer of a source, which is cached because every region needs it."""
     if multiprocessing.parent_process() is not None:
         torch.set_num_threads(1)  # one of several processes that share the cores
     mesh = _load(Path(source.file)) if source.mesh is None else source.mesh
@@ -156,27 +156,27 @@ def voxelize(
     progress: Progress = no_progress,
     **settings: Unpack[GridSettings],
 ) -> Store:
-    """Writes a mesh into a store, out of core: what is in memory is the mesh and a few cubes of
+    """Writes a mesh into a store, out of core: memory holds only the mesh and a few cubes of
     voxels.
 
-    Larger ones start worker processes; a script that calls this needs the usual
+    Large stores are written by worker processes; a script that calls this needs the usual
     `if __name__ == "__main__":` around its work.
 
     Args:
-        mesh: A `Mesh`, or a file that `read_mesh` knows.
-        store: The folder to make.
+        mesh: A `Mesh`, or a file that `read_mesh` can read.
+        store: The folder to create.
         channels: One or several of coverage, distance, color, normal and material; see `Voxelizer`.
-            Several lie side by side in the folder, for `StoredChannels`.
-        texture: As of `read_mesh`, of files.
-        block, executor, workers, resume, progress: As of `convert`.
-        **settings: resolution, band, thickness and solid, as of `gv.MeshProducer`.
+            Several become stores side by side in the folder, for `StoredChannels`.
+        texture: As in `read_mesh`; for files only.
+        block, executor, workers, resume, progress: As in `convert`.
+        **settings: resolution, band, thickness and solid, as in `gv.MeshProducer`.
 
     Returns:
-        The store, open; of several channels that of the first. Its coarse levels are means of those
-        below (of materials the most frequent).
+        The open store; with several channels, that of the first. Its coarse levels are means of
+        finer ones (for materials, the most frequent).
 
     Raises:
-        ValueError, OSError, KeyboardInterrupt: As of `read_mesh` and `convert`.
+        ValueError, OSError, KeyboardInterrupt: As in `read_mesh` and `convert`.
     """
     check.known("voxelize", settings, GridSettings)
     sources = MeshSource.of(mesh, channels, **settings, texture=texture)
@@ -188,7 +188,7 @@ def voxelize(
 
 
 def _arrays(mesh: Mesh) -> dict[str, np.ndarray]:
-    """What a mesh is made of, by name."""
+    """Returns the data of a mesh as arrays by name."""
     told = [{"name": one.name, "color": one.color} for one in mesh.materials]
     arrays = {"materials": np.array(json.dumps(told)), "name": np.array(mesh.name)}
     for name in ("vertices", "faces", "color", "uv", "material"):

@@ -1,7 +1,7 @@
-"""`straighten`: a source whose voxel axes do not lie along the world's, resampled along these.
+"""`straighten`: resamples a source whose voxel axes are not parallel to the world's along those.
 
-Voxels are interpolated (trilinear, float64); those of labels are the nearest ones. A region of the
-result reads only the voxels of the source that it lies over, and has the bits of the whole.
+Values are interpolated (trilinear, float64); labels are those of the nearest voxel. A region of the
+result reads only the voxels of the source that it overlaps, and has the same bits as in the whole.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from .source import Index, VolumeSource
 Oblique = Literal["resample", "keep"]
 
 _SLAB = 1 << 18  # voxels that are interpolated at a time
-_TIE = 2.0**-20  # voxels by which rounding may shift a place
+_TIE = 2.0**-20  # voxels by which rounding may shift a position
 
 
 @dataclass(frozen=True, kw_only=True)
 class StraightSource(VolumeSource):
-    """A source on a grid along the world's axes, (t, z, y, x, c)."""
+    """A source resampled on a grid parallel to the world's axes, (t, z, y, x, c)."""
 
     inner: VolumeSource
-    to_inner: tuple[tuple[float, ...], ...]  # (3, 4): from own x, y, z to those of `inner`
-    nearest: bool  # values are not to be blended
-    fill: float  # of voxels that lie beside `inner`
+    to_inner: tuple[tuple[float, ...], ...]  # (3, 4): from this grid's x, y, z to `inner`'s, voxels
+    nearest: bool  # takes the nearest value instead of interpolating
+    fill: float  # value of voxels that lie outside `inner`
 
     @property
     def peak_bytes(self) -> int:
-        """As of any source: the inner one is held while it is resampled."""
+        """Bytes that reading a time point takes: the inner source is held while it is resampled."""
         return self.inner.peak_bytes + self.nbytes
 
     def check_file(self) -> None:
@@ -62,13 +62,13 @@ class StraightSource(VolumeSource):
         return out[..., index[4]]
 
     def _places(self, low: Sequence[int], high: Sequence[int]) -> list[np.ndarray]:
-        """Places z, y, x in the inner source of a box of voxels; the same bits for any box."""
+        """Returns positions z, y, x of a box in the inner source; the same bits for any box."""
         z, y, x = np.ogrid[boxes.index(low, high)]
         found = [a * x + b * y + c * z + d for a, b, c, d in self.to_inner]
         return found[::-1]
 
     def _reach(self, low: Sequence[int], high: Sequence[int]) -> tuple[list[int], list[int]]:
-        """Voxels of the inner source, z y x, that a box lies over; none where stop <= start."""
+        """Returns start and stop, z y x, of the inner voxels under a box; none if stop <= start."""
         ends = zip(low, np.subtract(high, 1), strict=True)
         corners = np.array([(x, y, z, 1) for z, y, x in itertools.product(*ends)])
         places = (corners @ np.array(self.to_inner).T)[:, ::-1]
@@ -84,7 +84,7 @@ class StraightSource(VolumeSource):
         box: tuple[Sequence[int], Sequence[int]],
         out: np.ndarray,
     ) -> None:
-        """Writes a box (z, y, x, c) from inner values (z, y, x, c), which begin at `start`."""
+        """Writes a box (z, y, x, c) from inner values (z, y, x, c), the first of voxel `start`."""
         places = np.broadcast_arrays(*self._places(*box))
         shape = self.inner.extent[::-1]
         inside = np.logical_and.reduce(
@@ -107,9 +107,9 @@ class StraightSource(VolumeSource):
             for a, first, upper, n, s in zip(at, lows, corner, values.shape, start, strict=False):
                 weight = weight * (a - first if upper else 1 - (a - first))
                 place = (first + upper).astype(np.int64) - s
-                index.append(np.minimum(place, n - 1))  # what lies beyond weighs nothing
+                index.append(np.minimum(place, n - 1))  # voxels beyond have weight 0
             found = values[tuple(index)].astype(np.float64)
-            total += np.where(weight[:, None] > 0, found * weight[:, None], 0)  # 0 * NaN is none
+            total += np.where(weight[:, None] > 0, found * weight[:, None], 0)  # 0 * NaN is NaN
         out[inside] = round_array(total, out.dtype)
 
 
@@ -118,17 +118,17 @@ def straighten(
     oblique: Oblique | None = None,
     place: Sequence[float] | None = None,
 ) -> VolumeSource:
-    """Returns a source whose axes lie along the world's, and tells in a line what it did.
+    """Returns a source whose axes are parallel to the world's, and warns about what it did.
 
-    A step along an axis of the world is as long as the voxels are in that direction, so as many
-    voxels come out as there were, and the whole turned box lies inside. What lies beside the
-    source's box is 0 for labels, else the smallest value of the time point that is read first.
+    The new spacing along an axis of the world is that of the voxels in that direction, and the grid
+    covers the source's whole box. Voxels outside that box are 0 for labels, else the smallest value
+    of the source's current time point.
 
     Args:
-        source: Returned as it is, if its axes lie along the world's.
+        source: Returned as it is, if its axes are parallel to the world's.
         oblique: "resample" (the default), or "keep": the voxels stay as they are, and their axes
-            are taken for the world's; `info.pose` tells how to turn them (`RenderOptions.pose`).
-        place: World place of the first voxel, if it is not what the file tells.
+            count as the world's; `info.pose` holds the missing rotation (`RenderOptions.pose`).
+        place: World position of the first voxel, if it is not the file's.
 
     Raises:
         ValueError: `oblique` is something else.
@@ -173,8 +173,8 @@ def straighten(
 
 
 def _grid(affine: np.ndarray, inner: Sequence[int]) -> tuple[np.ndarray, ...]:
-    """Extent, spacing and origin (x, y, z) of a grid along the world's axes that covers voxels, and
-    where its own lie among them, (3, 4).
+    """Returns extent, spacing and origin (x, y, z) of a grid along the world's axes that covers all
+    voxels, and the affine from its voxels to theirs, (3, 4).
     """
     inverse = np.linalg.inv(affine[:, :3])
     spacing = 1 / np.linalg.norm(inverse, axis=0)
@@ -188,7 +188,7 @@ def _grid(affine: np.ndarray, inner: Sequence[int]) -> tuple[np.ndarray, ...]:
 
 
 def _pose(turn: np.ndarray, origin: np.ndarray) -> Rows | None:
-    """(4, 4) matrix that turns the axes about the first voxel; None if they are sheared."""
+    """Returns the (4, 4) rotation of the axes about the first voxel; None if they are sheared."""
     if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-4:
         return None
     left, _, right = np.linalg.svd(turn)
@@ -198,7 +198,7 @@ def _pose(turn: np.ndarray, origin: np.ndarray) -> Rows | None:
 
 
 def _smallest(source: VolumeSource) -> float:
-    """The smallest finite value, read part by part where that is possible."""
+    """Returns the smallest finite value, reading part by part where that is possible."""
     x, y, z = source.extent
     rows = z if source.whole else max(1, 16 * _SLAB // (y * x * source.width))
     smallest = math.inf

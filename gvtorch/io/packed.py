@@ -1,5 +1,5 @@
-"""What files pack, unpacked no further than their headers tell: what would unpack to more is
-damaged. `PackedSource` is an array that is packed as a whole (zlib, gzip, bzip2, text).
+"""Decompression that is bounded by the size stated in a file's header: data that would unpack to
+more is damaged. `PackedSource` is an array packed as a whole (zlib, gzip, bzip2, text).
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from ..base.messages import need_library
 from .source import Index, VolumeSource
 
 _READ = 1 << 20  # bytes
-_MOST_BLOCK = 1 << 26  # bytes of a block of Blosc; writers of VDB make them of 256 KB
-_STORED = 2  # Blosc's flag of a part that is not packed
+_MOST_BLOCK = 1 << 26  # bytes of a Blosc block; VDB writers use blocks of 256 KB
+_STORED = 2  # Blosc's flag for data that is stored uncompressed
 
 
 @dataclass(frozen=True, kw_only=True)
 class PackedSource(VolumeSource):
-    """Numbers in a stretch of a file."""
+    """An array that is compressed as a whole, or written as text, in a file."""
 
     file: str
     offset: int
-    codec: str  # zlib, bz2, text, or shares: text that tells parts of 255
-    skip: int = 0  # bytes before the numbers, unpacked
+    codec: str  # zlib, bz2, text, or shares: text of numbers from 0 to 1, which become 0 to 255
+    skip: int = 0  # bytes before the numbers in the unpacked data
     fortran: bool = False
     whole: bool = True
 
@@ -56,12 +56,12 @@ class PackedSource(VolumeSource):
 def text_numbers(
     path: str, stream: IO[bytes], count: int, stored: str, *, exact: bool
 ) -> np.ndarray:
-    """Reads (count,) numbers of dtype `stored` that are written as words, a part of the text at a
-    time: all of them as objects of Python would take twenty times their place.
+    """Reads (count,) numbers of dtype `stored` that are written as text, part by part: as Python
+    objects, all of them at once would take twenty times the memory.
 
     Raises:
-        ValueError: There are fewer, or more if it must be `exact`; a word is no number, or one that
-            `stored` does not hold.
+        ValueError: There are fewer numbers, or more and `exact` is true; a word is no number, or an
+            integer out of the range of `stored`.
     """
     kind, at = np.dtype(stored), stream.tell()
     wide = kind.kind == "f"
@@ -74,7 +74,7 @@ def text_numbers(
         if exact and len(words) > count - done:
             raise ValueError(f"{path}: {count} numbers expected, got more")
         del words[count - done :]
-        if b"_" in b"".join(words):  # which Python passes over
+        if b"_" in b"".join(words):  # which int() and float() would ignore
             raise ValueError(f"{path}: holds words that are no numbers")
         numbers: list[Any] = [float(word) if wide else int(word) for word in words]
         if numbers and not wide:
@@ -92,7 +92,7 @@ def text_numbers(
 
 
 def _words(stream: IO[bytes]) -> Iterator[list[bytes]]:
-    """The words of a text, a list for each part of it."""
+    """Yields the words of a text, one list for each part that is read."""
     text, rest = b" ", b""
     while text:
         text = stream.read(_READ)
@@ -104,7 +104,7 @@ def _words(stream: IO[bytes]) -> Iterator[list[bytes]]:
 
 
 def unpack_block(codec: str, packed: Any, need: int) -> bytes:
-    """Unpacks "zlib", "lzma", "lz4" or "blosc" data in memory, which must be of `need` bytes."""
+    """Unpacks "zlib", "lzma", "lz4" or "blosc" data in memory, which must yield `need` bytes."""
     if not need:
         return b""
     if codec == "zlib":
@@ -125,8 +125,8 @@ def unpack_block(codec: str, packed: Any, need: int) -> bytes:
 
 
 def is_packed_fits(path: str) -> bool:
-    """Whether a FITS file is packed by gzip, whatever its name says; raises ValueError where it is
-    neither that nor plain. (astropy unpacks others, ZIP archives into a file, without a bound.)
+    """Returns whether a FITS file is packed by gzip, whatever its name says; raises ValueError if
+    it is neither gzip nor plain, as astropy unpacks others (ZIP, into a file) without a bound.
     """
     with open(path, "rb") as file:
         begin = file.read(6)
@@ -136,8 +136,8 @@ def is_packed_fits(path: str) -> bool:
 
 
 def unpack(file: str, offset: int, need: int, codec: str) -> bytes:
-    """Unpacks "zlib" (or gzip) or "bz2" data of a file, which must be of `need` bytes, and no
-    further than these.
+    """Unpacks "zlib" (or gzip) or "bz2" data of a file, which must yield `need` bytes; stops at the
+    first byte beyond them.
     """
     parts, size = [], 0
     with open(file, "rb") as stream:
@@ -151,7 +151,7 @@ def unpack(file: str, offset: int, need: int, codec: str) -> bytes:
 
 
 def _unpacked(stream: IO[bytes], codec: str, need: int) -> Iterator[bytes]:
-    """Parts of at most one byte more than is needed, of one stream after another."""
+    """Yields the content of consecutive streams in parts, at most `need` + 1 bytes in all."""
     size, packed = 0, b""
     engine: Any = None
     while size <= need:
@@ -174,8 +174,8 @@ def _unpacked(stream: IO[bytes], codec: str, need: int) -> Iterator[bytes]:
 
 
 def blosc_begin(packed: bytes, most: int) -> bytes:
-    """The first bytes, at least `most` if there are so many, of what Blosc packed: only its first
-    block is unpacked, as a part of its own. (Layout: README_CHUNK_FORMAT of c-blosc 1.)
+    """Returns at least the first `most` bytes of Blosc data, or all if it has fewer, by unpacking
+    its first block alone, with a header of its own. (Layout: README_CHUNK_FORMAT of c-blosc 1.)
     """
     size, block = struct.unpack_from("<2I", packed, 4)
     most = min(most, size)

@@ -1,4 +1,4 @@
-"""`picture_size`: what the header of a packed image tells of its extent, before it is unpacked.
+"""`picture_size`: the size of a compressed image, read from its header before it is decoded.
 
 Source: ISO/IEC 10918-1 (JPEG), markers SOF; 15444-1 (JPEG 2000), SIZ and boxes; 15948 (PNG), IHDR;
 29199-2 (JPEG XR), annex A and IMAGE_HEADER; 18181 (JPEG XL), SizeHeader; RFC 9649 (WebP); Esri's
@@ -14,14 +14,14 @@ _JPEG_FRAMES = {*range(0xC0, 0xD0), 0xF7} - {0xC4, 0xC8, 0xCC}  # of JPEG and of
 _JPEG_SCAN = 0xDA
 _BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
 _RATIOS = ((1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))  # of JPEG XL
-_MOST_LAYERS = 64  # numbers of a pixel of LERC
-_LONG = (9, 13, 18, 30)  # bits of a side
-_JXL_HEADER = 32  # bytes, more than what is read of one takes
+_MOST_LAYERS = 64  # numbers per pixel of LERC
+_LONG = (9, 13, 18, 30)  # bits of a side of JPEG XL
+_JXL_HEADER = 32  # bytes; more than the fields that are read take
 
 
 def picture_size(packed: bytes) -> tuple[int, int] | None:
-    """(columns, rows) of an image: PNG, WebP, JPEG, JPEG-LS, JPEG 2000, JPEG XR, JPEG XL or LERC;
-    None where its header is none of these, or tells of a film.
+    """Returns (columns, rows) of a PNG, WebP, JPEG, JPEG-LS, JPEG 2000, JPEG XR, JPEG XL or LERC
+    image; None for any other header, and for animations.
     """
     for begin, read in _READERS.items():
         if packed.startswith(begin):
@@ -34,8 +34,8 @@ def picture_size(packed: bytes) -> tuple[int, int] | None:
 
 
 def jpeg_size(packed: bytes) -> tuple[int, int, int] | None:
-    """(columns, rows, samples) that the header of a JPEG or JPEG-LS image tells; None if it tells
-    of two.
+    """Returns (columns, rows, samples) from the header of a JPEG or JPEG-LS image; None if it has
+    no frame header, or several.
     """
     at, found = 2, None
     while packed[:2] == b"\xff\xd8" and at + 9 < len(packed) and packed[at] == 0xFF:
@@ -53,8 +53,8 @@ def jpeg_size(packed: bytes) -> tuple[int, int, int] | None:
 
 
 def jpeg_ends(packed: bytes) -> bool:
-    """Whether a JPEG has its end behind its first scan: of what is missing libraries make gray. In
-    a scan no other marker has the number of the end.
+    """Returns whether a JPEG has an end marker after the start of its first scan; if not, libraries
+    make the missing part grey. The two bytes of that marker can't occur in a scan's data.
     """
     at = 2
     while packed[at : at + 1] == b"\xff" and packed[at + 1 : at + 2] != bytes([_JPEG_SCAN]):
@@ -64,8 +64,8 @@ def jpeg_ends(packed: bytes) -> bool:
 
 
 def jpeg2k_size(packed: bytes) -> tuple[int, int, int] | None:
-    """(columns, rows, samples) that the header of JPEG 2000 tells: of a codestream, or of the first
-    in a file of boxes.
+    """Returns (columns, rows, samples) from the header of a JPEG 2000 codestream, or of the first
+    codestream in a file of boxes (JP2).
     """
     at = 0
     if packed[4:8] == b"jP  ":
@@ -77,13 +77,13 @@ def jpeg2k_size(packed: bytes) -> tuple[int, int, int] | None:
 
 
 def _boxes(packed: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Where the content of each box begins and ends, and its kind."""
+    """Yields where the content of each box begins and ends, and its kind."""
     at = 0
     while at + 8 <= len(packed):
         size, head = int.from_bytes(packed[at : at + 4]), 8
         if size == 1:
             size, head = int.from_bytes(packed[at + 8 : at + 16]), 16
-        end = at + size if size >= head else len(packed)  # 0: to the end
+        end = at + size if size >= head else len(packed)  # a size of 0: to the end of the file
         yield at + head, end, packed[at + 4 : at + 8]
         if size < head:
             return
@@ -119,7 +119,7 @@ def _lerc_size(packed: bytes) -> tuple[int, int] | None:
 
 
 def _jpegxr_size(packed: bytes) -> tuple[int, int] | None:
-    """What the codestream tells, to which the container points."""
+    """Returns the size from the codestream that the container points to."""
     (at,) = struct.unpack_from("<I", packed, 4)
     (count,) = struct.unpack_from("<H", packed, at)
     tags = (struct.unpack_from("<HHII", packed, at + 2 + 12 * n) for n in range(count))
@@ -132,7 +132,7 @@ def _jpegxr_size(packed: bytes) -> tuple[int, int] | None:
 
 
 def _jpegxl_size(packed: bytes) -> tuple[int, int] | None:
-    """None for films, and for what has a preview before its picture."""
+    """Returns None for animations, and for images with a preview before the picture."""
     if packed[4:8] == b"JXL ":
         packed = b"".join(_jpegxl_parts(packed))[:_JXL_HEADER]
     if packed[:2] != b"\xff\x0a" or len(packed) < 14:
@@ -152,17 +152,17 @@ def _jpegxl_size(packed: bytes) -> tuple[int, int] | None:
         return 8 * (take(5) + 1) if small else take(_LONG[take(2)]) + 1, rows
 
     told = size()
-    if not take(1) and take(1):  # not all as by default, and more than colours
-        take(3)  # how it is turned
+    if not take(1) and take(1):  # all_default is unset, extra_fields is set
+        take(3)  # orientation
         if take(1):
-            size()  # in which it was meant to be shown
-        if take(2):  # a preview, a film
+            size()  # intrinsic size
+        if take(2):  # a preview, an animation
             return None
     return told
 
 
 def _jpegxl_parts(packed: bytes) -> Iterator[bytes]:
-    """The codestream, of which each part but a whole one begins with its number."""
+    """Yields the codestream: whole (jxlc), or in parts (jxlp), without the number before each."""
     for begin, end, kind in _boxes(packed):
         if kind in (b"jxlc", b"jxlp"):
             yield packed[begin + 4 * (kind == b"jxlp") : end]

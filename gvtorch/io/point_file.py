@@ -1,7 +1,7 @@
-"""`read_points`: points out of arrays (NPZ), PLY files and FITS tables, by the names of columns.
+"""`read_points`: reads points from arrays (NPZ), PLY files and FITS tables, by names of columns.
 
-PLY: Turk, "The PLY polygon file format", 1994. Its rows are mapped, since a scan may be larger than
-memory; FITS tables come through astropy.
+PLY: Turk, "The PLY polygon file format", 1994. Its rows are memory-mapped, since a scan may be
+larger than memory; FITS tables are read with astropy.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ _PLACES = ("position", "pos", "xyz", "points", "coord")
 _VALUES = ("value", "mass", "lumin", "intensit", "weight", "flux", "bright", "densit")
 _COLORS = ("color", "colour", "rgb")
 _RADII = ("radius", "radii", "smoothing")
-_FITS_TYPES = tuple("BIJKEDF")  # numbers, one or an array of them a row
+_FITS_TYPES = tuple("BIJKEDF")  # codes of columns with a number or an array of numbers per row
 _MOST_HEADER = 65536  # bytes
 
 
 class ColumnNames(TypedDict, total=False):
-    """Which columns are what; those left out are known by their names."""
+    """Which columns hold what; those that are left out are found by their usual names."""
 
-    positions: str | Sequence[str]  # one of three numbers, or three
+    positions: str | Sequence[str]  # one column of three numbers, or three columns
     values: str | Sequence[str]
-    colors: str | Sequence[str]  # one of three or four numbers, or three
-    radius: str | float  # or one for all, world units
+    colors: str | Sequence[str]  # one column of three or four numbers, or several columns
+    radius: str | float  # a column, or one number for all points; world units
 
 
 class PointFile:
@@ -51,7 +51,7 @@ class PointFile:
     Attributes:
         path: The file.
         columns: All columns of numbers, by name, (n,) or (n, k), mapped where the format allows.
-        used: For each of positions, values, colors, radius the columns that it is made of.
+        used: The names of the columns that make up positions, values, colors and radius.
     """
 
     def __init__(self, path: str | Path, **names: Unpack[ColumnNames]) -> None:
@@ -67,7 +67,7 @@ class PointFile:
         return len(self.columns[self.used["positions"][0]])
 
     def blocks(self, count: int) -> Iterator[Points]:
-        """Yields all points, so many at a time; ValueError if a number is not finite."""
+        """Yields all points, `count` at a time; raises ValueError if a number is not finite."""
         for start in range(0, len(self), count):
             part = slice(start, start + count)
             with told_as(ValueError, str(self.path), "can't be read"):
@@ -89,19 +89,19 @@ def read_points(path: str | Path, **names: Unpack[ColumnNames]) -> Points:
     Args:
         path: The file.
         **names: Which columns are positions, values, colors and radius: a name, or several in a
-            list or with commas between them ("x,y,z"). Left out, positions are x, y and z or
-            a column of three numbers that is called position, pos, xyz, points or coord (or begins
-            so); values one that is called value, mass, luminosity, intensity, weight, flux,
-            brightness or density; colors red, green and blue, r, g and b, or one called color or
-            rgb; radius one called radius or smoothing length, and may be a number for all.
+            list or with commas between them ("x,y,z"). If left out, positions are x, y and z, or
+            a column of three numbers whose name begins with position, pos, xyz, points or coord;
+            values one that begins with value, mass, lumin, intensit, weight, flux, bright or
+            densit; colors red, green and blue, r, g and b, or one that begins with color, colour or
+            rgb; radius one that begins with radius, radii or smoothing, or a number for all.
 
     Returns:
-        The points. Colours that are whole numbers are taken as sRGB, others as linear.
+        The points. Colours that are whole numbers are read as sRGB, others as linear.
 
     Raises:
-        FileNotFoundError: It is not there.
-        ValueError: It is none of these formats or damaged, a column is missing, several may be
-            meant, or a number is not finite.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file has another format or is damaged, a column is missing or ambiguous, or
+            a number is not finite.
         ImportError: astropy is not installed.
     """
     return next(PointFile(path, **names).blocks(_ALL))
@@ -118,10 +118,10 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     with told_as(ValueError, str(path), f"can't be read as {ending}"):
         found = {n: one for n, one in read(path).items() if one.dtype.kind in "iuf" and one.ndim}
     sizes = [len(one) for one in found.values()]
-    count = max(sizes, key=sizes.count) if sizes else 0  # of most columns
+    count = max(sizes, key=sizes.count) if sizes else 0  # the length that most columns have
     if not count:
         raise ValueError(f"{path}: holds no columns of numbers")
-    meant = _PLACES + _COLORS + _VALUES + _RADII  # others may be of anything
+    meant = _PLACES + _COLORS + _VALUES + _RADII  # columns of other names may have any length
     others = [
         f"{name} ({len(one)})"
         for name, one in found.items()
@@ -143,7 +143,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_fits(path: Path) -> dict[str, np.ndarray]:
-    """Columns of numbers of the first table that has rows; those of lists are left out."""
+    """Returns the numeric columns of the first table that has rows, without those of lists."""
     fits = need_library(f"{path}: FITS", "astropy.io.fits", "astropy")
     packed = is_packed_fits(str(path))
     with warnings.catch_warnings():
@@ -169,7 +169,7 @@ def _read_fits(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_ply(path: Path) -> dict[str, np.ndarray]:
-    """The vertices; what stands before them must have rows of one size."""
+    """Returns the columns of the vertices; elements before them must have rows of fixed size."""
     with path.open("rb") as file:
         head = file.read(_MOST_HEADER)
         lines = head.partition(b"end_header")[0].decode("ascii").splitlines()
@@ -208,7 +208,9 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
 def _ply_header(
     lines: Sequence[str],
 ) -> tuple[str, list[tuple[str, int, list[tuple[str, str]] | None]]]:
-    """ascii, < or >; and for each element its name, rows, and columns (None: lists are among)."""
+    """Returns "ascii", "<" or ">", and the name, the number of rows and the columns of each element
+    (None if some are lists).
+    """
     order, layout = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}, ""
     elements: list[tuple[str, int, list[tuple[str, str]] | None]] = []
     for words in (line.split() for line in lines[1:]):
@@ -232,7 +234,7 @@ def _ply_header(
 def _chosen(
     path: Path, columns: Mapping[str, np.ndarray], names: ColumnNames
 ) -> dict[str, list[str]]:
-    """For each part the columns that it is made of."""
+    """Returns the names of the columns that make up positions, values, colors and radius."""
     widths = {name: math.prod(one.shape[1:]) for name, one in columns.items()}
     plain = {name.lower(): name for name in columns}
     found: dict[str, list[str]] = {}
@@ -286,7 +288,7 @@ def _chosen(
 
 
 def _linear(colors: np.ndarray, kinds: set[Any]) -> np.ndarray:
-    """Linear light of whole numbers, which are sRGB; of others themselves."""
+    """Converts whole numbers, which are sRGB, to linear colours; others are linear already."""
     if not all(kind.kind in "iu" for kind in kinds):
         return colors
     return array_from_srgb(colors / max(np.iinfo(kind).max for kind in kinds))

@@ -1,5 +1,5 @@
 """Points as a volume that is read region by region (`SplatSource`), and `splat`, which writes it
-into a store by the writer of `convert`.
+into a store with the writer of `convert`.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ _MADE_OF = "made_of.json"
 
 @dataclass(frozen=True, kw_only=True)
 class SplatSource(VolumeSource):
-    """Sorted points in finest voxels."""
+    """Sorted points, summed in the finest voxels."""
 
     folder: str
     marks: tuple[Any, ...]  # identify points and settings: equal while these are unchanged
-    words: tuple[str, ...]  # of the command line
+    words: tuple[str, ...]  # options of the command line that makes the store
 
     @classmethod
     def of(cls, folder: Path, channel: str, **told: Any) -> SplatSource:
-        """The sorted points of a folder as a volume; `told` are path, marks and words."""
+        """Returns the sorted points of a folder as a volume; `told` are path, marks and words."""
         _opened.cache_clear()  # other points may have been there
         found = _opened(str(folder))
         x, y, z = found.grid.extent
@@ -60,11 +60,11 @@ class SplatSource(VolumeSource):
         )
 
     def fingerprint(self) -> list[Any]:
-        """The points, and what is made of them."""
+        """Returns values that identify the points and the settings."""
         return list(self.marks)
 
     def command(self, store: str) -> tuple[str, ...]:
-        """As `gvtorch splat` takes it."""
+        """Returns the words of the `gvtorch splat` command that makes a store of it."""
         return ("gvtorch", "splat", self.path, "-o", store, *self.words)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
@@ -81,7 +81,7 @@ _opened = functools.lru_cache(maxsize=2)(SortedPoints.open)
 
 @dataclass(frozen=True)
 class _Lit:
-    """Points whose values are light."""
+    """Points that `Points.lit` has turned into light."""
 
     points: PointSource
     opacity: float
@@ -110,27 +110,27 @@ def splat(
     progress: Progress = no_progress,
     **names: Unpack[ColumnNames],
 ) -> Store:
-    """Writes points into a store, out of core: they are sorted on disk, beside the half-written
-    store, and read from there part by part.
+    """Writes points into a store, out of core: they are sorted on disk, in the folder of the
+    unfinished store, and read from there part by part.
 
-    Larger ones start worker processes; a script that calls this needs the usual
+    Large stores are written by worker processes; a script that calls this needs the usual
     `if __name__ == "__main__":` around its work.
 
     Args:
-        points: A file as of `read_points`, or `Points`.
-        store: The folder to make.
-        extent, box: As of `sort_points`.
-        channel: value: sums of the values in a finest voxel; color: light, as of `Points.lit`.
-        opacity: Of a point, for color.
+        points: A file as in `read_points`, or `Points`.
+        store: The folder to create.
+        extent, box: As in `sort_points`.
+        channel: value: sums of the values in a finest voxel; color: light, as in `Points.lit`.
+        opacity: Opacity of a point, for color.
         memory: Bytes that sorting takes, roughly.
-        block, executor, workers, resume, progress: As of `convert`.
-        **names: As of `read_points`.
+        block, executor, workers, resume, progress: As in `convert`.
+        **names: As in `read_points`.
 
     Returns:
-        The store, open, of float32.
+        The open store, float32.
 
     Raises:
-        ValueError, OSError, KeyboardInterrupt: As of `read_points`, `sort_points` and `convert`.
+        ValueError, OSError, KeyboardInterrupt: As in `read_points`, `sort_points` and `convert`.
     """
     target = Path(store)
     check.one_of("splat", "channel", channel, CHANNELS)
@@ -181,7 +181,7 @@ def _sort(source: PointSource, folder: Path, marks: list[Any], begun: bool, **op
 
 
 def _marks(points: str | Path | Points) -> list[Any]:
-    """Values that identify points: equal while these are unchanged."""
+    """Returns values that identify points: equal while these are unchanged."""
     if not isinstance(points, Points):
         return fingerprint(points)
     columns = (points.positions, points.values, points.colors, points.radius)
@@ -195,7 +195,7 @@ def _words(
     box: Sequence[Sequence[float]] | None,
     names: ColumnNames,
 ) -> tuple[str, ...]:
-    """Flags of the command line."""
+    """Returns the options of the command line that makes the same store."""
     sizes = [extent] if isinstance(extent, int) else extent
     words = ["--extent", ",".join(map(str, sizes)), "--channel", channel]
     words += ["--opacity", f"{opacity:g}"] if channel == "color" else []

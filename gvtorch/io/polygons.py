@@ -1,5 +1,5 @@
-"""Polygons of OBJ files: those that are not convex are cut into triangles that lie in them, before
-trimesh reads the file, which would draw a fan from their first corner.
+"""Cuts the polygons of OBJ files that are not convex into triangles inside them, before trimesh
+reads the file, because trimesh would make a fan around the first corner.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ import numpy as np
 
 _FACE = re.compile(rb"^[ \t]*f((?:[ \t]+[-\d/]+){4,})[ \t]*(?=\r?$)", re.MULTILINE)
 _VERTEX = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
-_MOST = 1000  # corners of a polygon to cut: the worst take the cube of them
-_ROUND = 1e-9  # of the polygon's area, below which a corner counts as straight
+_MOST = 1000  # corners of a polygon to cut: in the worst case, the time grows as their cube
+_ROUND = 1e-9  # of the polygon's area: turns up to this count as straight
 
 
 def cut_polygons(content: bytes) -> bytes:
     """Returns an OBJ file with triangles in place of the polygons that are not convex.
 
     Raises:
-        ValueError: A place is no number, or such a polygon has more than 1000 corners.
+        ValueError: A position is no number, or such a polygon has more than 1000 corners.
     """
     faces: dict[int, list[re.Match[bytes]]] = defaultdict(list)
     for found in _FACE.finditer(content):
@@ -27,7 +27,7 @@ def cut_polygons(content: bytes) -> bytes:
     if not faces:
         return content
     places = np.array([found.groups() for found in _VERTEX.finditer(content)], np.float64)
-    cut: dict[int, tuple[re.Match[bytes], list[list[int]]]] = {}  # by where the line begins
+    cut: dict[int, tuple[re.Match[bytes], list[list[int]]]] = {}  # by the begin of the line
     for count, some in faces.items():
         words = re.sub(rb"/\S*", b"", b" ".join(found[1] for found in some)).split()
         corner = np.array(words, np.int64).reshape(-1, count)
@@ -52,7 +52,8 @@ def cut_polygons(content: bytes) -> bytes:
 
 
 def _flat(places: np.ndarray) -> np.ndarray:
-    """Corners (p, n, 3) of polygons in their planes, (p, n, 2): counter-clockwise, of area 1.
+    """Projects corners (p, n, 3) of polygons to their planes, (p, n, 2): counter-clockwise, of
+    area 1.
 
     Source: the normal is Newell's; Sutherland, Sproull, Schumacker, "A characterization of ten
         hidden-surface algorithms", ACM Computing Surveys 6, 1974.
@@ -74,8 +75,8 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _turns(flat: np.ndarray) -> np.ndarray:
-    """(..., n) how much a polygon (..., n, 2) turns left at each corner, as twice the area of its
-    triangle there.
+    """Returns (..., n) by how much a polygon (..., n, 2) turns left at each corner: twice the area
+    of the triangle of the corner and its two neighbours.
     """
     before, after = np.roll(flat, 1, -2), np.roll(flat, -1, -2)
     return _cross(flat - before, after - flat)

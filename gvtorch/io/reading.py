@@ -1,6 +1,5 @@
-"""`read_volume`: a file into memory; `open_source`: a file of any size, to be read in regions.
-
-Every header is read first and refused if its extent does not fit, before memory is taken.
+"""`read_volume`: reads a file into memory; `open_source`: opens a file of any size, to be read by
+region. A header whose extent does not fit is refused before memory is allocated.
 """
 
 from __future__ import annotations
@@ -53,29 +52,29 @@ def read_volume(
     labels: bool = False,
     **options: Unpack[FormatSettings],
 ) -> Volume:
-    """Reads a volume, with what the file tells of it: `Volume.info`.
+    """Reads a volume and the metadata of its file, `Volume.info`.
 
-    `gvtorch info` and docs/formats.md list the formats. RAW is x fastest. NumPy arrays are
-    (z, y, x), or (z, y, x, c) with at most 4 channels; others are asked about (`axes`). NIfTI and
-    NRRD with axes along the world's are turned to x, y, z; oblique ones are resampled along them.
-    What is done so, and what of the file is not kept, is told in a warning.
+    `gvtorch info` and docs/formats.md list the formats. RAW has x as its fastest axis. NumPy arrays
+    are (z, y, x), or (z, y, x, c) with at most 4 channels; others need `axes`. NIfTI and NRRD axes
+    that are parallel to the world's are reordered to x, y, z; oblique ones are resampled. A warning
+    reports resampling, and metadata that is not kept.
 
     Args:
         path: The file, a folder of slices, `file.h5:/dataset`, a URL (a file is downloaded, see
-            docs/formats.md), or an array as of `as_volume`.
-        spacing: (x, y, z) world units; overrides the file's. 1 where neither tells.
-        origin: (x, y, z) world place of the first voxel's centre; overrides the file's. 0 where
-            neither tells.
-        nan: Value for voxels that are NaN or infinite; they are refused if left out.
-        time: Which time point, from 0; the first, with a warning, if left out where there are more.
-        oblique: Of voxel axes that do not lie along the world's: "resample" (the default), or
-            "keep", which keeps the voxels and takes their axes for the world's.
-        labels: Values are numbers of things, see `Volume`; also where the file says so.
-        **options: RAW, and files of any ending: shape, (x, y, z) voxels, dtype, a NumPy dtype as in
-            "int16" or ">i2" (the name's `_XxYxZ_dtype` if left out), and offset, bytes of a header
-            to skip. key: which of several arrays, series, scenes or images. Formats without names
-            of axes (NPY, NPZ, NRRD, HDF5, Zarr): axes, a letter among t c z y x for each axis of
-            the array, the slowest first. docs/formats.md has all formats.
+            docs/formats.md), or an array that `as_volume` takes.
+        spacing: (x, y, z) world units; overrides the file's. 1 where neither is given.
+        origin: (x, y, z) world position of the first voxel's centre; overrides the file's. 0 where
+            neither is given.
+        nan: Value that replaces NaN and infinite voxels; if left out, they are refused.
+        time: Index of the time point; if left out, the first, with a warning if there are more.
+        oblique: What to do if voxel axes are not parallel to the world's: "resample" (the default),
+            or "keep", which keeps the voxels and uses their axes as the world's.
+        labels: Values are numbers of objects, see `Volume`; also set if the file says so.
+        **options: RAW, and files of unknown ending: shape, (x, y, z) voxels, dtype, a NumPy dtype
+            as in "int16" or ">i2" (if left out, from `_XxYxZ_dtype` in the name), and offset, bytes
+            of a header to skip. key: which of several arrays, series, scenes or images. Formats
+            without names of axes (NPY, NPZ, NRRD, HDF5, Zarr): axes, a letter among t c z y x for
+            each axis of the array, the slowest first. docs/formats.md has all formats.
 
     Returns:
         The volume, dtype kept (64 and 32 bit integers and float64 become float32, unless they are
@@ -85,7 +84,7 @@ def read_volume(
         FileNotFoundError: There is no such file.
         ValueError: The format is unknown, the file is damaged or too short, or an argument does
             not fit.
-        ImportError: A library is missing; the message tells which pip command brings it.
+        ImportError: A library is missing; the message has the pip command that installs it.
     """
     told: dict[str, Any] = {"spacing": spacing, "origin": origin, "time": time, "oblique": oblique}
     source = open_source(path, most=MAX_VOXELS, labels=labels, **told, **options)
@@ -99,7 +98,7 @@ def read_volume(
 
 
 def volume_of(source: VolumeSource, nan: float | None = None) -> Volume:
-    """Reads a source's time point; `nan` and errors as of `read_volume`."""
+    """Reads a source's time point; `nan` and errors as in `read_volume`."""
     data, name = read_whole(source, source.time)[0], Path(source.path).name
     return Volume(data, source.spacing, source.origin, name=name, nan=nan, info=source.info)
 
@@ -115,7 +114,7 @@ def open_source(
     most: int = MOST_VOXELS * _MOST_CHANNELS,
     **options: Unpack[FormatSettings],
 ) -> VolumeSource:
-    """Reads a volume's header: what there is, where it lies, what reading will take.
+    """Reads a volume's header and returns a source, from which its voxels can be read by region.
 
     Args, Raises: as `read_volume`, and
         most: Values (voxels times channels) of a time point; a larger volume is refused.
@@ -130,7 +129,7 @@ def open_source(
         check.text(text, name, given.get(name))
     check.instance(text, "labels", labels, bool)
     with told_as(ValueError, text, f"can't be read as {kind}", StoreError, TimeoutError):
-        # What lies beyond numbers is refused below; NumPy's warnings would come before that line.
+        # Numbers out of range are refused below; NumPy would print its warnings before the error.
         with header_budget(text), np.errstate(all="ignore"):
             source = opener(**given)
         check_files(source)
@@ -161,7 +160,7 @@ def open_source(
 
 
 def _find(path: Any, given: dict[str, Any]) -> tuple[str, str, Callable[..., VolumeSource]]:
-    """Returns what to call a volume, its kind, and what opens it, which takes `given`."""
+    """Returns a volume's name in messages, its format's name, and what opens it with `given`."""
     if not isinstance(path, (str, PathLike)):
         text, kind = "array", "an array"
         opener: Callable[..., VolumeSource] = partial(as_source, "read_volume", path)
@@ -206,7 +205,7 @@ def read_whole(source: VolumeSource, first: int = 0, times: int = 1) -> np.ndarr
     """Reads whole time points, (t, z, y, x, c); raises ValueError if the file is damaged."""
     is_array = isinstance(source, (ObjectSource, MemorySource))
     same = np.dtype(source.stored).name == source.dtype
-    stays = isinstance(source, ArraySource) and not source.whole and same  # in the file
+    stays = isinstance(source, ArraySource) and not source.whole and same  # mapped, not copied
     if not isinstance(source, MemorySource) and not stays:
         free, needed = memory_free(), source.peak_bytes + (times - 1) * source.nbytes
         if needed > free:
@@ -218,13 +217,13 @@ def read_whole(source: VolumeSource, first: int = 0, times: int = 1) -> np.ndarr
         return source.read_times(first, first + times)
 
 
-# --- arrays of other libraries, read part by part where they lie elsewhere
+# --- arrays of other libraries, read part by part if they are not in memory
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectSource(VolumeSource):
-    """An array whose values are read or computed when they are asked for (dask, zarr, h5py, lazy
-    xarray): as picklable as it is itself.
+    """An array whose values are read or computed on demand (dask, zarr, h5py, lazy xarray). It can
+    be pickled if the array can.
     """
 
     array: ArrayLike
@@ -256,7 +255,9 @@ def as_source(where: str, given: Any, axes: str | None = None) -> VolumeSource:
 
 
 def _in_file(given: Any) -> dict[str, Any] | None:
-    """Where the numbers of a memory map lie, if it is a whole one: other processes map it too."""
+    """Returns file, offset and order of an array that is a whole memory map, which other processes
+    can map too; None for others.
+    """
     if not isinstance(given, np.memmap) or given.filename is None:
         return None
     whole = given.base is not None and not isinstance(given.base, np.ndarray)

@@ -1,9 +1,9 @@
-"""`through`: a folder behind a URL as tensorstore reads it, by way of a server in this process.
+"""`through`: lets tensorstore read the folder at a URL by way of a relay, a server in this process.
 
-tensorstore takes what a server sends, as long as it sends. So it asks this one, on 127.0.0.1 and
-behind a word that nobody else knows, which asks the other by `read_http`, or, where it is s3:// or
-gs://, by `read_within`, and answers when it has all of a file or of a part of it: what is longer
-than a chunk can be, stalls or drips is refused.
+tensorstore accepts whatever a server sends, for however long. So it asks the relay instead, on
+127.0.0.1 and under a secret path. The relay reads the file, or the part of it, with `read_http` (of
+s3:// and gs:// with `read_within`) and answers once it has all of it; it refuses files that are
+longer than a chunk can be, and servers that stall or send too slowly.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from .http import (
     refused,
 )
 
-if TYPE_CHECKING:  # not when the program starts: `gvtorch --help` comes this way
+if TYPE_CHECKING:  # not at run time: `gvtorch --help` imports this module
     import numpy as np
 
     from .stores.chunk_files import ChunkFiles
 
-_JOINED = 1 << 27  # bytes of parts that tensorstore asks for together
-_METADATA = 1 << 24  # bytes
-_INDEXES = 1 << 26  # bytes of shards' indexes that are kept of a folder
+_JOINED = 1 << 27  # bytes of parts that tensorstore joins in one request
+_METADATA = 1 << 24  # bytes of a file of metadata
+_INDEXES = 1 << 26  # bytes of shards' indexes that are cached for a folder
 _RETRIES = {"max_retries": 4, "initial_delay": "200ms", "max_delay": "1s"}
-_TOGETHER = 16  # requests that wait for one folder
+_TOGETHER = 16  # concurrent requests for one folder
 
 
 class Relayed:
-    """A folder with an array.
+    """A folder with an array, read through the relay.
 
     Attributes:
-        spec: What tensorstore opens in its place.
+        spec: The key-value store that tensorstore opens in place of the folder.
     """
 
     def __init__(self, url: str, base: str, context: Any) -> None:
@@ -58,18 +58,18 @@ class Relayed:
         self.spec = {
             "driver": "http",
             "base_url": base,
-            # Of its own, so that a server that stalls keeps no other one's files waiting.
+            # Limited per folder, so that a server that stalls does not block files of others.
             "http_request_concurrency": {"limit": _TOGETHER},
             "http_request_retries": _RETRIES,
         }
-        self.future: Any = None  # of the array that lies there, once it is asked for
+        self.future: Any = None  # of the folder's array, once that is being opened
         self._files: ChunkFiles | None = None
         self._indexes: OrderedDict[str, np.ndarray] = OrderedDict()
         self._lock = threading.Lock()
 
     @property
     def files(self) -> ChunkFiles | None:
-        """What its chunks may be; None before the array is open."""
+        """The sizes that the array's files may have; None before the array is open."""
         from .stores.chunk_files import ChunkFiles
 
         future = self.future
@@ -108,8 +108,8 @@ class Relayed:
         return self._read_bucket(urllib.parse.unquote(name), part, most)
 
     def _look(self, name: str, part: slice | None, content: bytes, files: ChunkFiles) -> None:
-        """Keeps a shard's index that came; raises Endless if anything else holds a chunk of which
-        Blosc would make too much.
+        """Caches the content if it is a shard's index; else raises Endless if it holds a chunk that
+        Blosc would unpack to too many bytes.
         """
         place, index = files.index_part, None
         if files.index and part == place:
@@ -123,7 +123,7 @@ class Relayed:
         elif files.index:
             with self._lock:
                 index = self._indexes.get(name)
-            if index is None:  # it was of too many files
+            if index is None:  # it was evicted from the cache
                 index = files.entries(self._read(name, place, files) or b"")
         files.check_sent(part.start if part else 0, content, index)
 
@@ -148,11 +148,11 @@ class Relayed:
 def read_within(
     folder: Any, name: str, part: slice | None, most: int, wait: Callable[[Any], Any]
 ) -> bytes | None:
-    """Returns the content of a file in one of tensorstore's folders, or a part of it, None if there
-    is no such file. Of a whole one the byte after `most` is asked for first: there is none.
+    """Returns the content of a file in a key-value store of tensorstore, or a part of it; None if
+    there is no such file. Before a whole file, the byte after `most` is requested, as a check.
 
     Raises:
-        Endless: There is.
+        Endless: The file has more than `most` bytes.
         Exception: What `wait` raises, which returns a future's result.
     """
     if part is None:
@@ -179,7 +179,7 @@ class _Server(http.server.ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, daemon=True, name="gvtorch-relay").start()
 
     def folder(self, url: str, context: Any) -> Relayed:
-        """A place for a folder; the same for the same."""
+        """Returns the relayed folder of a URL, the same one for the same URL."""
         for found in self.folders:
             if found.url == url:
                 return found
@@ -188,12 +188,12 @@ class _Server(http.server.ThreadingHTTPServer):
         return self.folders[-1]
 
     def handle_error(self, *_: object) -> None:
-        """Says nothing: tensorstore does not wait for what it gave up."""
+        """Prints nothing: errors are normal when tensorstore gives up a request."""
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
     server: _Server
-    protocol_version = "HTTP/1.1"  # connections stay
+    protocol_version = "HTTP/1.1"  # keeps connections open
     disable_nagle_algorithm = True
 
     def do_GET(self) -> None:
@@ -229,12 +229,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, *_: object) -> None:
-        """Says nothing."""
+        """Prints nothing."""
 
 
 @functools.cache
 def _server() -> _Server:
-    for name in ("no_proxy", "NO_PROXY"):  # of libcurl, which would ask a proxy for this machine
+    for name in ("no_proxy", "NO_PROXY"):  # libcurl would ask a proxy even for this machine
         told = os.environ.get(name, "")
         if any(key.lower().endswith("_proxy") for key in os.environ) and "127.0.0.1" not in told:
             os.environ[name] = f"{told},127.0.0.1" if told else "127.0.0.1"
@@ -245,14 +245,14 @@ _starting = threading.Lock()
 
 
 def through(url: str, context: Any = None) -> Relayed:
-    """Returns the folder at a URL as tensorstore is to read it, `context` tensorstore's own."""
+    """Returns the relayed folder of a URL; `context` is tensorstore's, for s3:// and gs://."""
     with _starting:
         return _server().folder(url, context)
 
 
 def with_urls(text: str) -> str:
-    """Replaces the relay's addresses in a message by the URLs that they stand for; if a file was
-    refused, tells why.
+    """Replaces the relay's addresses in a message by the original URLs; if a file was refused,
+    returns its URL and the reason instead.
     """
     if not _server.cache_info().currsize:
         return text

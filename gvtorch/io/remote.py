@@ -1,11 +1,11 @@
-"""`fetch`: a file behind a URL, downloaded into a cache on disk: http and https need not know byte
-ranges; s3, gs and others go through fsspec.
+"""`fetch`: downloads the file at a URL into a cache on disk. http and https servers need not
+support byte ranges; s3, gs and other schemes use fsspec.
 
-    CACHE/KEY/about.json      the URL, and by what the server tells its versions apart
-    CACHE/KEY/VERSION/NAME    the file; a folder appears when it is whole
+    CACHE/KEY/about.json      the URL, and what identifies the version of the file on the server
+    CACHE/KEY/VERSION/NAME    the file; its folder appears once the file is complete
 
-The cache is bounded, and what was not used for longest goes first. GVTORCH_CACHE names another
-folder (that of compiled shaders too), GVTORCH_CACHE_GB another bound (50), of one file too.
+The cache is bounded: the least recently used files are removed first. GVTORCH_CACHE sets another
+folder (also for compiled shaders), GVTORCH_CACHE_GB another bound (50), also for a single file.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from .resources import amount
 
 _TIMEOUT = 30.0  # seconds without a byte
 _PART = 1 << 20  # bytes
-_FOLDERS = ("zarr", "n5")  # what is read in parts where it lies
+_FOLDERS = ("zarr", "n5")  # read in parts from the server, not downloaded
 _DETACHED = (".mhd", ".nhdr")
 
-Version = dict[str, str]  # by what a server tells versions of a file apart
+Version = dict[str, str]  # what identifies the version of a file on its server, as its ETag
 
 
 def is_file_url(text: str) -> bool:
-    """Tells a URL of a file, which ends in a file's ending, from that of a Zarr or N5 folder."""
+    """Returns whether a URL is of a file, with a file's ending, and not of a Zarr or N5 folder."""
     if not re.match(r"[a-z0-9+]{2,}://", text) or text.startswith("file://"):
         return False
     name = _name(text)
@@ -46,13 +46,13 @@ def is_file_url(text: str) -> bool:
 
 
 def split_url(text: str) -> tuple[str, str | None]:
-    """Splits `https://host/file.h5:/group/data` into the URL and what is named of the file."""
+    """Splits `https://host/file.h5:/group/data` into the URL and the path inside the file."""
     match = re.fullmatch(r"(\w+://.+\.\w+):(/.+)", text)
     return (match[1], match[2]) if match else (text, None)
 
 
 def cache_limit() -> int:
-    """Bytes of the cache, at most."""
+    """Returns the most bytes that the cache may hold."""
     text = os.environ.get("GVTORCH_CACHE_GB", "50")
     try:
         limit = float(text)
@@ -64,10 +64,12 @@ def cache_limit() -> int:
 
 
 def fetch(url: str) -> Path:
-    """Returns a copy of the file, downloaded unless the one that is kept is the server's.
+    """Returns a local copy of the file, downloaded unless the one in the cache is up to date. With
+    a warning it returns the one in the cache where the server does not answer.
 
     Raises:
         FileNotFoundError: There is no such file.
+        ValueError: It is a header whose numbers lie in another file (.mhd, .nhdr).
         OSError: It can't be downloaded, is cut off, or is larger than the cache or the disk.
         ImportError: A library is missing.
     """
@@ -96,7 +98,7 @@ def fetch(url: str) -> Path:
     place = folder / (_key(version) if version else file.parent.name.strip(".").split("-")[1])
     try:
         file.parent.rename(place)
-    except OSError:  # it is there already, by another process
+    except OSError:  # another process has written it already
         shutil.rmtree(file.parent, ignore_errors=True)
     about = {"url": url, "name": file.name, "place": place.name, "version": version}
     write_whole(folder / "about.json", json.dumps(about))
@@ -105,7 +107,7 @@ def fetch(url: str) -> Path:
 
 
 def _name(url: str) -> str:
-    """A file name for a URL, of harmless characters."""
+    """Returns a file name for a URL, made of harmless characters."""
     name = unquote(urlsplit(url).path.rpartition("/")[2])
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".")[-120:] or "file"
 
@@ -116,7 +118,7 @@ def _key(version: Version) -> str:
 
 
 def _kept(folder: Path) -> tuple[Path, Version] | None:
-    """The copy that is there, and which version it is."""
+    """Returns the copy in the cache, and its version; None if there is none."""
     try:
         about = json.loads((folder / "about.json").read_text(encoding="utf-8"))
         file = folder / Path(about["place"]).name / Path(about["name"]).name
@@ -130,7 +132,7 @@ Answer = tuple[IO[bytes], int | None, Version]
 
 
 def _open_http(url: str, known: Version) -> Answer | None:
-    """Begins a download; None if the version that is known is the server's."""
+    """Begins a download; returns None if the server still has the known version."""
     marks = (("ETag", "If-None-Match"), ("Last-Modified", "If-Modified-Since"))
     asked = {header: known[name] for name, header in marks if known.get(name)}
     try:
@@ -147,7 +149,7 @@ def _open_http(url: str, known: Version) -> Answer | None:
 
 
 def _open_fsspec(url: str, known: Version) -> Answer | None:
-    """The same for other schemes; what is public is read without credentials."""
+    """Does the same for other schemes; where s3 or gs fails, tries again without credentials."""
     scheme = urlsplit(url).scheme
     fsspec = need_library(f"{url}: reading {scheme}://", "fsspec", extra="remote")
     try:
@@ -180,7 +182,7 @@ def _open_fsspec(url: str, known: Version) -> Answer | None:
 
 
 def _download(url: str, folder: Path, stream: IO[bytes], size: int | None) -> Path:
-    """Writes a stream into a folder of its own, which is removed again if it can't be."""
+    """Writes a stream to a file in a new folder, which is removed again if that fails."""
     limit = cache_limit()
     free = shutil.disk_usage(folder).free
     most = min(limit, free)
@@ -207,12 +209,12 @@ def _download(url: str, folder: Path, stream: IO[bytes], size: int | None) -> Pa
 def _read(url: str, stream: IO[bytes]) -> bytes:
     try:
         return stream.read(_PART)
-    except Exception as error:  # of http.client, of fsspec's file systems
+    except Exception as error:  # http.client and fsspec's file systems have their own kinds
         raise OSError(f"{url}: is cut off: {_reason(error)}") from None
 
 
 def _evict(newest: Path) -> None:
-    """Removes versions, those first that were not used for longest, until the rest fits."""
+    """Removes the least recently used versions until the rest fits into the cache."""
     found: list[tuple[float, int, Path]] = []
     for place in newest.parent.parent.glob("*/*"):
         if place.is_dir():

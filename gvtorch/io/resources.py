@@ -1,4 +1,4 @@
-"""What the machine has, cores and memory, and how a worker process begins."""
+"""The machine's cores and memory, and starting worker processes."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ Result = TypeVar("Result")
 
 
 def amount(nbytes: float) -> str:
-    """Bytes for people: "3.2 MB", "1.50 GB"."""
+    """Formats a number of bytes for messages: "3.2 MB", "1.50 GB"."""
     return f"{nbytes / 1e9:.2f} GB" if nbytes >= 1e9 else f"{nbytes / 1e6:.1f} MB"
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Returns the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def memory_free() -> int:
-    """Bytes of memory that can be had without swapping; half of all where it is not told."""
+    """Returns the memory available without swapping, bytes; half of all if that is unknown."""
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -40,14 +40,15 @@ def memory_free() -> int:
 
 @contextmanager
 def worker_processes(count: int) -> Iterator[Executor]:
-    """Starts worker processes, which leave Ctrl-C to this one from their first moment on."""
+    """Starts worker processes, which ignore Ctrl-C from the start and leave it to this process."""
     spawn = multiprocessing.get_context("spawn")
     with ExitStack() as stack:
-        with _interrupts_later():  # a semaphore that is half made would be left behind
+        with _interrupts_later():  # Ctrl-C here would leave a half-made semaphore behind
             pool = stack.enter_context(ProcessPoolExecutor(count, spawn, begin_worker))
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # making it unblocks
+            # Blocked only now, because creating the pool unblocks the signal.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
             try:
-                for _ in range(count):  # each task starts a process, which inherits what is blocked
+                for _ in range(count):  # each task starts a process, which inherits the mask
                     pool.submit(int)
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -56,9 +57,9 @@ def worker_processes(count: int) -> Iterator[Executor]:
 
 @contextmanager
 def _interrupts_later() -> Iterator[None]:
-    """Starts processes in one piece: Ctrl-C, which any thread may receive, comes behind."""
+    """Defers Ctrl-C, which any thread may receive, to the end of the block."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # never interrupted
+        yield  # KeyboardInterrupt is raised in the main thread only
         return
     came: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _frame: came.append(number))
@@ -86,8 +87,8 @@ def begin_worker() -> None:
 def run_ahead(
     pool: Executor, task: Callable[[Item], Result], items: Iterable[Item], ahead: int
 ) -> Generator[Result, None, None]:
-    """Runs a task for each item, a bounded number at a time, and yields what they return, as they
-    end.
+    """Runs a task for each item, at most `ahead` at a time, and yields their results in the order
+    in which they finish.
     """
     waiting, running = iter(items), set[Future[Result]]()
     try:
@@ -98,7 +99,7 @@ def run_ahead(
                 return
             finished, running = wait(running, return_when=FIRST_COMPLETED)
             for future in sorted(finished, key=lambda future: future.exception() is not None):
-                yield future.result()  # first what is done, then what failed
+                yield future.result()  # results before failures
     finally:
         for future in running:
             future.cancel()

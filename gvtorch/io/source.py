@@ -1,9 +1,9 @@
-"""`VolumeSource`: a volume in a file, its header read, its voxels read region by region.
+"""`VolumeSource`: a volume in a file whose header has been read; its voxels are read by region.
 
-A source is plain data (path, shape, offset, ...) that can be pickled, so that worker processes can
-have it; files are opened in the process that reads. The formats (formats/) make sources:
-`ArraySource` where numbers lie one after another; `place_axes` where the header tells how axes lie
-in the world.
+A source is plain data (path, shape, offset, ...) that can be pickled for worker processes; files
+are opened in the process that reads. The formats (formats/) make sources: `ArraySource` if numbers
+lie one after another in the file; `place_axes` helps if the header has an affine from voxels to the
+world.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
 Triple = tuple[float, float, float]
-Told = tuple[ImageInfo, Triple, list[str]]  # info, spacing, what is not kept
+Told = tuple[ImageInfo, Triple, list[str]]  # info, spacing, metadata that is not kept
 _PART = 1 << 20  # bytes that are unpacked at a time
 _WHOLE = {1: ("char", "int8"), 2: ("short", "int16"), 4: ("int", "int32"), 8: ("longlong", "int64")}
 _NUMBERS = {
@@ -45,13 +45,13 @@ _NUMBERS = {
 _SPELLED = re.compile(
     r"(?:(?P<un>un)?signed )?(?:(?P<any>char|int)|(?P<long>short|longlong)(?: int)?)"
 )
-#: (4, 4) of world axes that run left and posterior, to right and anterior ones.
+#: (4, 4) from world axes left, posterior, superior (LPS) to right, anterior, superior (RAS).
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, kw_only=True)
 class VolumeSource(ABC):
-    """What a header tells: an array whose axes lie in any order, and its place in the world."""
+    """A volume as its header describes it: axes in any order, and a position in the world."""
 
     path: str  # the file, folder or URL, as the user named it
     shape: tuple[int, ...]  # of the array as it is stored
@@ -60,14 +60,14 @@ class VolumeSource(ABC):
     flips: str = ""  # letters of axes that run backwards
     spacing: Triple = (1.0, 1.0, 1.0)  # x y z, world units
     origin: Triple = (0.0, 0.0, 0.0)  # x y z, centre of voxel 0
-    # Where the axes x, y, z do not lie along the world's: (3, 4), from voxels to the world.
+    # (3, 4) from voxels to the world, if the axes x, y, z are not parallel to the world's.
     oblique: tuple[tuple[float, ...], ...] | None = None
     info: ImageInfo = dataclasses.field(default_factory=ImageInfo)  # unit, channels, ...
-    lost: tuple[str, ...] = ()  # what the file tells and this can't keep, a few words each
+    lost: tuple[str, ...] = ()  # metadata of the file that is not kept, a few words each
     time: int = 0  # the time point that is read
     whole: bool = False  # every read unpacks the whole file: one read of all is better
-    unpacked_bytes: int = 0  # of the largest piece that is unpacked as one
-    # When (ns): tells sources of one path apart, for what is kept open between reads.
+    unpacked_bytes: int = 0  # size of the largest piece that is unpacked at once
+    # Time in ns; distinguishes sources of one path in caches of open files.
     opened: int = dataclasses.field(default_factory=time_ns)
 
     @property
@@ -87,7 +87,7 @@ class VolumeSource(ABC):
 
     @property
     def dtype(self) -> str:
-        """What values are read as: wide numbers become float32, as in `Volume`; labels stay."""
+        """Dtype of the values read: wide numbers become float32, as in `Volume`; labels do not."""
         return value_dtype(np.dtype(self.stored), labels=self.info.labels)
 
     @property
@@ -97,14 +97,14 @@ class VolumeSource(ABC):
 
     @property
     def peak_bytes(self) -> int:
-        """Bytes of memory that reading a time point takes: as it is stored, and as it is read."""
-        unpacked = self.times if self.whole else 1  # a file that is packed is unpacked whole
+        """Bytes of memory that reading a time point takes: the stored values and the result."""
+        unpacked = self.times if self.whole else 1  # time points that are unpacked
         return self.nbytes + self.nbytes // np.dtype(self.dtype).itemsize * unpacked * (
             np.dtype(self.stored).itemsize
         )
 
     def size(self, axis: str) -> int:
-        """Voxels along an axis, 1 where it has none."""
+        """Returns the size along an axis; 1 if the array does not have it."""
         return self.shape[self.axes.index(axis)] if axis in self.axes else 1
 
     def at_time(self, time: int) -> Self:
@@ -112,27 +112,27 @@ class VolumeSource(ABC):
         return self if time == self.time else dataclasses.replace(self, time=time)
 
     def as_labels(self) -> Self:
-        """Returns the source of labels: its values are numbers of things, kept exactly."""
+        """Returns the source as one of labels: its values are numbers of objects, kept exactly."""
         return dataclasses.replace(self, info=dataclasses.replace(self.info, labels=True))
 
     def staged(self, folder: Path) -> VolumeSource:
-        """Returns a source that other processes can read: what lies in memory goes to a folder."""
+        """Returns a source that other processes can read; data in memory is written to `folder`."""
         return self
 
     def fingerprint(self) -> list[Any] | None:
-        """Returns values that are equal while the content is; None: those of the path's files."""
+        """Returns values that change if the content does; None if those of the path's files do."""
         return None
 
     def command(self, store: str) -> tuple[str, ...]:
-        """Returns the words by which the command line makes a store of it."""
+        """Returns the words of the command line that makes a store of it."""
         return ("gvtorch", "convert", self.path, store)
 
     def covers(self, index: Index) -> bool:
-        """Whether an index takes the whole array."""
+        """Returns whether an index covers the whole array."""
         return all(s.stop - s.start == n for s, n in zip(index, self.shape, strict=True))
 
     def check_file(self) -> None:  # noqa: B027, most formats find out when they read
-        """Raises ValueError if the file is seen to be too short, without reading it."""
+        """Raises ValueError if the file is evidently too short, without reading it."""
 
     @abstractmethod
     def read_stored(self, index: Index) -> np.ndarray:
@@ -149,7 +149,7 @@ class VolumeSource(ABC):
         """
         with told_as(OSError, self.path, "can't be read", OSError):
             data = self.read_box(low, high, (self.time, self.time + 1))[0]
-            # Pages of a mapping that stays would count as this process's memory.
+            # A copy, because pages of a mapping that is kept would count as this process's memory.
             return data.copy() if isinstance(data.base, np.memmap) else data
 
     def read_times(self, start: int, stop: int) -> np.ndarray:
@@ -169,7 +169,7 @@ class VolumeSource(ABC):
             start, stop = spans.get(axis, (0, size))
             backwards = axis in self.flips
             index.append(slice(size - stop, size - start) if backwards else slice(start, stop))
-        with np.errstate(all="ignore"):  # what is no number is told, or replaced, as such
+        with np.errstate(all="ignore"):  # NaN and infinity are refused or replaced later
             data = self.read_stored(tuple(index))
         data = boxes.to_zyxc(data, self.axes, "tzyxc")
         data = np.flip(data, tuple("tzyx".index(axis) for axis in self.flips))
@@ -181,11 +181,11 @@ class VolumeSource(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class ArraySource(VolumeSource):
-    """Numbers one after another in a file: mapped into memory, or unpacked whole."""
+    """An array that is contiguous in a file: mapped into memory, or unpacked whole."""
 
-    file: str  # where they lie
-    member: str = ""  # which file inside it, where it is a ZIP archive
-    offset: int = 0  # bytes before the array, unpacked
+    file: str  # holds the array
+    member: str = ""  # the file inside it, if it is a ZIP archive
+    offset: int = 0  # bytes before the array, in the unpacked file
     fortran: bool = False  # first axis fastest
     exact: bool = False  # nothing may follow the array
 
@@ -233,7 +233,7 @@ class MemorySource(VolumeSource):
 
     @classmethod
     def of(cls, data: np.ndarray, **told: Any) -> MemorySource:
-        """Takes (z, y, x, c) values, or (t, z, y, x, c); `told` are path, spacing, origin, info."""
+        """Wraps (z, y, x, c) or (t, z, y, x, c) values; `told` are path, spacing, origin, info."""
         axes = "tzyxc"[-data.ndim :]
         return cls(data=data, shape=data.shape, axes=axes, stored=data.dtype.str, **told)
 
@@ -264,14 +264,14 @@ def place_axes(
     component: int | None = None,
     time: int | None = None,
 ) -> dict[str, Any]:
-    """Lays voxel axes along the world's, by `affine` (4, 4) from voxel indices to the world.
+    """Matches voxel axes with the world's, by `affine` (4, 4) from voxel indices to the world.
 
-    Axes lie along the world's if no voxel comes to lie more than half a voxel beside its place.
-    Others are called x, y, z in their order, and `oblique` tells where they lie (oblique.py).
+    Axes count as parallel to the world's if this moves no voxel by more than half a voxel. Others
+    are called x, y, z in their order, and `oblique` is their affine (see oblique.py).
 
     Args:
         path: For messages.
-        affine: Of the three axes of space, in their order.
+        affine: From indices along the three axes of space, in the order of the array.
         shape: Of the array as it is stored.
         component: The axis of the array that counts components, if any.
         time: The axis that counts time points, if any.
@@ -292,7 +292,7 @@ def place_axes(
     straight = np.zeros((3, 3))
     straight[world_axis, [0, 1, 2]] = matrix[world_axis, [0, 1, 2]]
     most = np.array([shape[axis] - 1 for axis in spatial])
-    beside = np.abs((matrix - straight) * most).sum(1)  # of the voxel that lies farthest off
+    beside = np.abs((matrix - straight) * most).sum(1)  # by which the farthest voxel is moved
     is_oblique = len(set(world_axis.tolist())) != 3 or (beside > lengths.min() / 2).any()
     if is_oblique:
         order, steps = np.arange(3), lengths
@@ -314,8 +314,8 @@ def place_axes(
 
 
 def number_type(name: str) -> str | None:
-    """Returns the dtype, without byte order, of numbers that are called as in C or by their bits:
-    "unsigned short int", "uchar", "long_long", "uint16_t", "Float32". None: it is unknown, as is
+    """Returns the dtype, without byte order, for the name of a type as in C or with its bits:
+    "unsigned short int", "uchar", "long_long", "uint16_t", "Float32". None if it is unknown, as is
     "long", which has 4 bytes or 8.
     """
     plain = name.lower().replace("_", " ").replace("long long", "longlong")
@@ -325,9 +325,9 @@ def number_type(name: str) -> str | None:
 
 
 def open_unpacked(file: str, member: str = "") -> IO[bytes]:
-    """Opens a file to read what it unpacks to: .gz, .bz2, or a member of a ZIP archive."""
+    """Opens a file (.gz, .bz2, plain) or a member of a ZIP archive to read its unpacked content."""
     if member:
-        with zipfile.ZipFile(file) as archive:  # what is open in it stays open
+        with zipfile.ZipFile(file) as archive:  # the member stays open
             return archive.open(member)
     if file.lower().endswith(".gz"):
         return gzip.open(file, "rb")  # type: ignore[return-value]
@@ -335,7 +335,7 @@ def open_unpacked(file: str, member: str = "") -> IO[bytes]:
 
 
 def no_time(where: str, time: object, times: int) -> str:
-    """The message about a time point that is not there."""
+    """Returns the message about a time point that does not exist."""
     one = "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
     return f"{where}: has no time {time!r}; it has {one}"
 
@@ -344,8 +344,9 @@ def no_time(where: str, time: object, times: int) -> str:
 def told_as(
     kind: type[Exception], path: str, what: str, *through: type[Exception]
 ) -> Iterator[None]:
-    """Turns what a format library raises for a damaged file, which may be anything, into one line:
-    `kind`(path: what: reason). Missing libraries and files pass as they are, as `through` do.
+    """Converts whatever a format library raises for a damaged file to `kind`, with the one-line
+    message "path: what: reason". Errors about missing libraries and files, and the types in
+    `through`, pass unchanged.
     """
     try:
         yield

@@ -1,8 +1,8 @@
-"""Sparse grids of VDB's shape, read box by box without a dense copy of the whole.
+"""Sparse grids with the tree of VDB, read box by box without a dense copy of the whole.
 
-A root, upper nodes of 32^3 entries, lower nodes of 16^3 and leaves of 8^3 voxels: 4096, 128 and 8
-voxels a side. An entry that is no child is a tile, one value for all of its voxels; what nothing
-covers has the background value. `SparseGrid` fills boxes, whatever file the nodes lie in;
+The tree is a root, upper nodes of 32^3 entries, lower nodes of 16^3 and leaves of 8^3 voxels: 4096,
+128 and 8 voxels a side. An entry without a child is a tile, one value for all of its voxels; voxels
+that no node covers have the background value. `SparseGrid` fills boxes from nodes in any format;
 `SparseSource` is a grid as a volume: the box of its active voxels.
 
 Source: Museth, "VDB: High-resolution sparse volumes with dynamic topology", ACM TOG 2013.
@@ -30,18 +30,18 @@ VOXELS = 512  # of a leaf
 MOST_INDEX = 2**31
 MOST_ROOTS = 1 << 20  # entries of a root
 _BATCH = 4096  # leaves
-_WHOLE = 1 << 22  # voxels of whole leaves around a box that is thinner than these
+_WHOLE = 1 << 22  # voxels of the whole leaves around a thin box, above which it is filled in pieces
 _LOCK = threading.Lock()
 _QUANTITIES = {"level set": "signed distance", "fog volume": "density"}
 
 
 @dataclass(kw_only=True)
 class SparseGrid(ABC):
-    """The nodes of a grid; all places but those in its data are voxel indices i, j, k."""
+    """The nodes of a grid; all positions except `places` are voxel indices i, j, k."""
 
-    data: Any  # bytes in which the nodes lie
-    kind: str  # of its values, as the format names it
-    places: tuple[np.ndarray, np.ndarray, np.ndarray]  # in the data, of each of `origins`
+    data: Any  # the bytes that hold the nodes
+    kind: str  # type of the values, as the format calls it
+    places: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n,) offsets in `data` of each of `origins`
     dtype: np.dtype
     background: np.ndarray  # (c,)
     origins: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n, 3) int64 of uppers, lowers and leaves
@@ -98,7 +98,7 @@ class SparseGrid(ABC):
         return out[tuple(slice(x - s, y - s) for x, y, s in zip(a, b, start, strict=True))]
 
     def _pieces(self, low: np.ndarray, high: np.ndarray, axis: int, across: int) -> np.ndarray:
-        """Fills a box piece by piece along an axis; so many voxels of whole leaves lie across."""
+        """Fills a box piece by piece along an axis; a layer of its leaves has `across` voxels."""
         side = SIDES[2]
         step = max(side, _WHOLE // across // side * side)
         out = np.empty((*(high - low), len(self.background)), self.dtype)
@@ -115,8 +115,8 @@ class SparseGrid(ABC):
         return out
 
     def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """(3,) lowest voxel and (3,) what is behind the highest, of all leaves and all tiles that
-        differ from the background.
+        """Returns (3,) the lowest voxel and (3,) one past the highest voxel of all leaves and all
+        tiles that differ from the background.
         """
         low, high = [self.origins[2]], [self.origins[2] + SIDES[2]]
         everywhere = np.array((-MOST_INDEX,) * 3), np.array((MOST_INDEX,) * 3)
@@ -134,7 +134,7 @@ class SparseGrid(ABC):
     def _shown(
         self, level: int, number: int, start: np.ndarray, stop: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(t, 3) places and (t, c) values of a node's tiles in a box that are not background."""
+        """Returns (t, 3) positions and (t, c) values of a node's non-background tiles in a box."""
         values, is_tile = self.tiles(level, number)
         side, origin = SIDES[level + 1], self.origins[level][number]
         a = np.maximum((start - origin) // side, 0)
@@ -151,7 +151,7 @@ class SparseGrid(ABC):
 
     @staticmethod
     def _hits(origins: np.ndarray, side: int, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
-        """(k,) numbers of the nodes in a box."""
+        """Returns (k,) the indices of the nodes that overlap a box."""
         return np.flatnonzero(((origins < stop) & (origins + side > start)).all(1))
 
     @staticmethod
@@ -171,13 +171,13 @@ class SparseGrid(ABC):
 
 
 def _blocks(out: np.ndarray) -> np.ndarray:
-    """A box of whole leaves as (i, 8, j, 8, k, 8, c), without a copy."""
+    """Returns a view of a box of whole leaves as (i, 8, j, 8, k, 8, c)."""
     i, j, k, c = out.shape
     return out.reshape(i // 8, 8, j // 8, 8, k // 8, 8, c)
 
 
 def check_roots(count: int) -> None:
-    """Raises ValueError for more entries of a root than are read."""
+    """Raises ValueError if a root has more entries than can be read."""
     if count > MOST_ROOTS:
         raise ValueError(f"a root of {count} entries, at most {MOST_ROOTS} are read")
 
@@ -192,8 +192,8 @@ class SparseSource(VolumeSource):
     """A grid of a file; the array is (i, j, k), or (i, j, k, c)."""
 
     grid_type: type[SparseGrid]
-    number: int  # of the grid in its file
-    low: tuple[int, int, int]  # voxel 0
+    number: int  # index of the grid in its file
+    low: tuple[int, int, int]  # voxel index i, j, k of the array's first voxel
     held: int = 0  # bytes of the grid itself, where it is unpacked as a whole
 
     @classmethod
@@ -209,16 +209,16 @@ class SparseSource(VolumeSource):
         affine: np.ndarray,
         **told: Any,
     ) -> SparseSource:
-        """Lays a grid into the world.
+        """Returns the source of a grid.
 
         Args:
             path, name: Of the file and the grid.
             kind: The grid's class: "level set", "fog volume", ...
             stored: Dtype of a number.
-            width: Numbers of a voxel.
-            low, high: (3,) Voxel 0, and what is behind the last one.
+            width: Numbers per voxel.
+            low, high: (3,) The first voxel, and one past the last.
             affine: (4, 4) From voxel indices to the world.
-            **told: Other fields.
+            **told: Other fields of the source.
         """
         size = [int(n) for n in high - low]
         if min(size) < 1 or np.abs((low, high)).max() > MOST_INDEX:
@@ -241,12 +241,12 @@ class SparseSource(VolumeSource):
 
     @property
     def peak_bytes(self) -> int:
-        """As of any source, and the grid itself."""
+        """Bytes of memory that reading takes, and those of the grid itself."""
         return super().peak_bytes + self.held
 
     def grid(self) -> SparseGrid:
-        """Returns the grid, which is kept."""
-        with _LOCK:  # the first thread looks for the nodes
+        """Returns the grid, which is cached."""
+        with _LOCK:  # the first thread searches the nodes
             return _grid(self.grid_type, self.path, self.number, self.opened)
 
     def read_stored(self, index: Index) -> np.ndarray:
@@ -257,5 +257,5 @@ class SparseSource(VolumeSource):
 
 
 def bits(data: Any, at: int, count: int) -> np.ndarray:
-    """Reads (count,) bool, bits of a mask from a byte on, the lowest of each byte first."""
+    """Returns (count,) bool, the bits of a mask at byte `at`, the lowest bit of each byte first."""
     return np.unpackbits(np.frombuffer(data, "u1", count // 8, at), bitorder="little").view(bool)

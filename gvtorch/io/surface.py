@@ -1,10 +1,10 @@
-"""`extract_surface`, `export_surface`: where a volume, a store or a tree passes a value, as
-triangles; block by block, so that memory holds a block and the vertices on the faces of those
-beside it.
+"""`extract_surface`, `export_surface`: the surface on which a volume, a store or a tree crosses a
+value, as triangles; made block by block, so that memory holds a block and the vertices on the faces
+of earlier ones.
 
-A block's cells are made once, and its vertices on faces that it shares carry the number of their
-edge, so those of neighbours are the same vertex. Values between voxel centres are interpolated, and
-go on from the outermost centres to the faces of the box, as in pictures.
+Every cell is in one block. Vertices on the face between two blocks are identified by the number of
+their edge, so both blocks use the same vertex. Values are interpolated between voxel centres, and
+constant from the outermost centres to the faces of the box, as in pictures.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from .stores.store import CELL, Store
 from .surface_file import SurfaceFile, check_surface_path
 
 _BLOCK = 64  # cells along a side
-Numbered = tuple[np.ndarray, np.ndarray]  # keys, increasing, and the vertices that they are
+Numbered = tuple[np.ndarray, np.ndarray]  # keys, increasing, and the numbers of their vertices
 
 
 class SurfaceSize(NamedTuple):
-    """How large a surface is."""
+    """The size of a surface."""
 
     vertices: int
     triangles: int
@@ -53,21 +53,22 @@ def extract_surface(
 
     Args:
         what: A volume; a store, of which a block is read at a time; or a resident tree.
-        value: Of the surface; of labels: whose.
-        level: Of a store or a tree: 0 is the finest. A tree's and a store's coarse voxels are
-            means, so thin things go.
-        component: Which number of a voxel.
-        channel: Of a tree; the first if left out.
-        caps: Closes it where it leaves the box. Else it ends at the outermost voxel centres.
-        progress: Told how many blocks are done.
+        value: The value on the surface; for labels, the label.
+        level: Level of a store or a tree; 0 is the finest. Voxels of coarse levels are means, so
+            thin structures vanish.
+        component: Index of the component (a number of each voxel).
+        channel: Channel of a tree; the first if left out.
+        caps: Closes the surface where it leaves the box. Else it ends at the outermost voxel
+            centres.
+        progress: Called with the number of blocks done.
 
     Returns:
-        Triangles, counter-clockwise seen from lower values; every edge belongs to two, but where an
-        open surface ends. Where a voxel is `value` exactly, some have no area.
+        Triangles, counter-clockwise seen from lower values; every edge belongs to two triangles,
+        except where an open surface ends. Where a voxel is `value` exactly, some have no area.
 
     Raises:
-        ValueError: The value is nowhere reached or nowhere not, an argument is out of its range, or
-            not all of the tree is in memory.
+        ValueError: The data has no surface at `value`, an argument is out of its range, or not all
+            of the tree is in memory.
         OSError: The store can't be read.
 
     Source: see meshes/contour.py.
@@ -91,16 +92,16 @@ def export_surface(
     caps: bool = True,
     progress: Progress = no_progress,
 ) -> SurfaceSize:
-    """Writes what `extract_surface` returns to a file, of any size, as it is made; the file appears
-    when it is whole.
+    """Writes the surface of `extract_surface` to a file block by block, so that it may be larger
+    than memory; the file appears once it is complete.
 
     Args:
         path: .ply (binary), or .glb (glTF 2.0; below 4 GB).
-        what, value, level, component, channel, caps, progress: As of `extract_surface`.
+        what, value, level, component, channel, caps, progress: As in `extract_surface`.
 
     Raises:
-        ValueError: The ending is another, there are more vertices than the file can hold, or see
-            `extract_surface`.
+        ValueError: `path` has another ending, there are more vertices than the file can hold, or as
+            in `extract_surface`.
         FileNotFoundError: The folder does not exist.
     """
     path = Path(path)
@@ -115,8 +116,8 @@ def export_surface(
 
 
 class _Grid:
-    """Samples of one component and level, z y x. With caps there are two more layers around the
-    voxels: on the faces of the box, where the outermost values go on, and outside.
+    """Samples of one component and level, z y x. With caps, two more layers surround the voxels:
+    one on the faces of the box, which repeats the outermost values, and one outside.
     """
 
     def __init__(
@@ -155,11 +156,11 @@ class _Grid:
         spacing, origin = np.array(what.spacing[::-1]), np.array(what.origin[::-1])
         self.step = spacing * scale
         self._first = origin + spacing * (scale - 1) / 2  # of the first voxel's centre
-        ends = np.array(what.extent[::-1]) / scale - 0.5  # of the box
+        ends = np.array(what.extent[::-1]) / scale - 0.5  # far faces of the box, in voxels
         self._ends = np.clip(ends, np.array(self.voxels) - 1, None)
 
     def place(self, at: np.ndarray) -> np.ndarray:
-        """Returns world places (k, 3) x y z of places z y x in samples."""
+        """Returns world positions (k, 3) x y z of positions z y x in samples."""
         found = at - self.more
         if self.more:
             found = np.where(found < 0, -0.5 * np.clip(-found, 0, 1), found)
@@ -184,7 +185,7 @@ class _Grid:
         return samples
 
     def _voxels(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
-        """Voxels low to high, which are inside, (z, y, x, c)."""
+        """Returns voxels low to high, which must lie inside, (z, y, x, c)."""
         if isinstance(self.what, Store):
             return self.what.read_region(self.level, low, high)
         if isinstance(self.what, N3Tree):
@@ -194,8 +195,8 @@ class _Grid:
         return to_numpy(found)
 
     def crossed(self, low: Sequence[int], high: Sequence[int]) -> bool:
-        """Whether samples low to high may lie on both sides of the level, as the cells of
-        a store tell, without reading voxels.
+        """Returns whether samples low to high may lie on both sides of the value: judged by the
+        cells of a store, without reading voxels; true if there are none.
         """
         store = self.what
         outside = self.more and any(
@@ -214,13 +215,13 @@ class _Grid:
         return bool(most >= self.value and (least < self.value or outside))
 
     def nothing(self) -> str:
-        """What to say where there is no surface."""
+        """Returns the message for data without a surface."""
         what = f"value {self.value:g}" if self.label is None else "that label"
         return f"extract_surface: the data has no surface at {what}"
 
 
 def _stored_label(label: float, known: torch.Tensor | None) -> int:
-    """The number that stands for a label."""
+    """Returns the number by which a label is stored: its index in `known`, or itself."""
     value = check.whole(
         "extract_surface", "value of labels", int(label) if label % 1 == 0 else label, low=0
     )
@@ -233,13 +234,13 @@ def _stored_label(label: float, known: torch.Tensor | None) -> int:
 
 
 def _parts(grid: _Grid, progress: Progress) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields new vertices, (v, 3) world x y z, and triangles of all vertices so far. Blocks come
-    along x, then y, then z; vertices on far faces are kept for those behind.
+    """Yields new vertices, (v, 3) world x y z, and triangles that index all vertices so far. Blocks
+    are visited along x, then y, then z; vertices on far faces are kept for the blocks behind them.
     """
     spans = [[(a, min(a + _BLOCK, n - 1)) for a in range(0, n - 1, _BLOCK)] for n in grid.samples]
     counts = [len(those) for those in spans]
     total, vertices = int(np.prod(counts)), 0
-    far: dict[tuple[int, ...], Numbered] = {}  # by block, until the one behind it along z comes
+    far: dict[tuple[int, ...], Numbered] = {}  # by block, until the one behind it along z is done
     blocks = itertools.product(*(enumerate(those) for those in spans))
     for done, block in enumerate(blocks):
         at, low, high = (
@@ -264,8 +265,8 @@ def _parts(grid: _Grid, progress: Progress) -> Iterator[tuple[np.ndarray, np.nda
 
 
 def _numbers(keys: np.ndarray, known: Iterable[Numbered], count: int) -> np.ndarray:
-    """The vertices that keys are: those that are known on the far faces of blocks before, else new
-    ones, from `count` on.
+    """Returns the number of each key's vertex: the known one, if it is on the far face of an
+    earlier block, else a new one, from `count` on.
     """
     number = np.full(len(keys), -1)
     for names, numbers in known:

@@ -1,7 +1,7 @@
-"""`SurfaceFile`: triangles that come part by part, to a PLY or binary glTF file.
+"""`SurfaceFile`: writes triangles that arrive part by part to a PLY or binary glTF file.
 
-Vertices and triangles wait in files beside the one to be written, since both formats begin with
-their numbers; memory holds a part at a time.
+Vertices and triangles are collected in temporary files first, since both formats begin with their
+numbers; memory holds a part at a time.
 
 Sources: Turk, "The PLY polygon file format", 1994; glTF 2.0 specification (Khronos), sections 3.6
 and 4.4.
@@ -22,7 +22,7 @@ import numpy as np
 from ..base.whole_file import whole_file
 
 ENDINGS = (".ply", ".glb")
-_MOST = 2**31 - 1  # vertices that int32 counts
+_MOST = 2**31 - 1  # vertices that int32 can index
 _COPIED = 1 << 24  # bytes at a time
 _PAD = 4  # chunks of a .glb end at multiples of this
 
@@ -38,19 +38,19 @@ def check_surface_path(where: str, path: Path) -> None:
 
 
 class SurfaceFile:
-    """A file of triangles that appears when it is whole:
+    """A file of triangles that appears once it is complete:
 
     with SurfaceFile(path, origin, step) as file:
         file.add(places, faces)
 
     Attributes:
-        vertices: Number so far.
-        triangles: Likewise.
+        vertices: Number of vertices so far.
+        triangles: Number of triangles so far.
     """
 
     def __init__(self, path: Path, origin: np.ndarray, step: float) -> None:
-        """Opens it: a .ply holds world places, of float32 where that tells a thousandth of `step`
-        apart, else float64; a .glb holds float32 from the world place `origin`, where it puts them.
+        """Describes the file: a .ply holds world positions, float32 if that resolves a thousandth
+        of `step`, else float64; a .glb holds float32 relative to `origin`, its translation.
         """
         check_surface_path("surface", path)
         self._path, self._origin = path, origin
@@ -60,7 +60,7 @@ class SurfaceFile:
         self._stack = ExitStack()
 
     def __enter__(self) -> SurfaceFile:
-        """Returns itself."""
+        """Opens the temporary files and returns itself."""
         self._part = self._stack.enter_context(whole_file(self._path))
         self._places, self._faces = (
             self._stack.enter_context(tempfile.TemporaryFile(dir=self._path.parent))
@@ -70,11 +70,11 @@ class SurfaceFile:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        """Writes the file, or takes away what there is of it after a mistake."""
+        """Writes the file; after an error, removes what there is of it."""
         self._stack.__exit__(*error)
 
     def add(self, places: np.ndarray, faces: np.ndarray) -> None:
-        """Appends vertices, (v, 3) float64 world x y z, and triangles, (f, 3) of all vertices."""
+        """Appends vertices, (v, 3) float64 world x y z, and triangles, (f, 3) vertex indices."""
         self.vertices += len(places)
         self.triangles += len(faces)
         if self.vertices > _MOST:
@@ -94,7 +94,7 @@ class SurfaceFile:
             self._ends[1] = np.maximum(self._ends[1], places.max(0))
 
     def _write(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Writes the file at the end, unless there was a mistake."""
+        """Writes the file at the end, unless there was an error."""
         if kind is None:
             with self._part.open("wb") as file:
                 (self._write_glb if self._glb else self._write_ply)(file)
@@ -131,7 +131,7 @@ class SurfaceFile:
             shutil.copyfileobj(part, file, _COPIED)
 
     def _scene(self, places: int, faces: int) -> dict[str, object]:
-        """The JSON of a .glb, given the bytes of both parts."""
+        """Returns the JSON of a .glb, given the sizes of both parts in bytes."""
         ends = {"min": self._ends[0].tolist(), "max": self._ends[1].tolist()}
         return {
             "asset": {"version": "2.0", "generator": "gvtorch"},

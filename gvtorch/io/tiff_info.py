@@ -1,4 +1,4 @@
-"""What TIFF files of microscopes tell of their numbers: OME-XML, and ImageJ's description and tags.
+"""Reads the metadata in TIFF files of microscopes: OME-XML, and ImageJ's description and tags.
 
 Source: OME model 2016-06 (Pixels, Channel, Plane); ImageJ, class TiffEncoder (metadata of stacks).
 """
@@ -29,15 +29,15 @@ _LERC = 34887
 _PICTURES = (*JPEG, _LERC, 22610, 33003, 33004, 33005, 34712, 34933, 34934, 50001, 50002, 52546)
 _MOST_XML = 1 << 28  # characters
 _MOST_PLANES = 1 << 16
-_MOST_LISTED = 1 << 22  # planes that a file may tell of
+_MOST_LISTED = 1 << 22  # planes that OME-XML may list
 
 
 @contextmanager
 def opened_tiff(path: str) -> Iterator[tuple[Any, list[str]]]:
-    """Opens a file through tifffile, which logs damage and reads on.
+    """Opens a file with tifffile, and raises an error for damage that tifffile only logs.
 
     Yields:
-        The `TiffFile`, and what it has warned of, in a list that grows.
+        The `TiffFile`, and the list of its warnings, which grows while it is read.
 
     Raises:
         ValueError: The file is damaged.
@@ -49,9 +49,9 @@ def opened_tiff(path: str) -> Iterator[tuple[Any, list[str]]]:
     log.addHandler(heard)
     try:
         with tifffile.TiffFile(path) as file:
-            pages = len(file.pages)  # finds out where the chain of pages ends
+            pages = len(file.pages)  # follows the chain of pages to its end
             _check_told(path, file.pages.first.description if pages else "")
-            if file.is_micromanager:  # tifffile opens others of its data set
+            if file.is_micromanager:  # tifffile opens other files of the data set
                 for name in os.listdir(os.path.dirname(os.path.abspath(path))):
                     if name == "NDTiff.index" or "_MMStack" in name:
                         check_beside(path, name)
@@ -67,8 +67,8 @@ def opened_tiff(path: str) -> Iterator[tuple[Any, list[str]]]:
 
 
 def _check_told(path: str, text: str) -> None:
-    """Raises ValueError where OME-XML tells of more planes than a list of them can be made for, or
-    of files that are not beside it.
+    """Raises ValueError if OME-XML lists too many planes, or refers to files outside the folder of
+    `path`.
     """
     if not text[-10:].strip().endswith("OME>"):
         return
@@ -77,7 +77,7 @@ def _check_told(path: str, text: str) -> None:
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
-        return  # which tifffile tells
+        return  # tifffile reports it
     counts = dict[str, int]()
     for element in root.iter():
         if (other := element.get("FileName")) is not None:
@@ -91,8 +91,8 @@ def _check_told(path: str, text: str) -> None:
 
 
 def check_pictures(pages: Iterable[Any]) -> None:
-    """Has pages compare the pictures in their tiles and strips with these, before one is unpacked:
-    tifffile unpacks all of it, and leaves out what is too much.
+    """Makes pages check the size of the picture in each tile and strip before it is decoded, as
+    tifffile would decode all of it, and drop what is too much.
     """
     for page in pages:
         frame = None if page is None else page.keyframe
@@ -101,7 +101,7 @@ def check_pictures(pages: Iterable[Any]) -> None:
 
 
 def _checked(frame: Any, decode: Callable[..., Any]) -> Callable[..., Any]:
-    """Wraps what unpacks the pictures of a page; raises ValueError for one that does not fit."""
+    """Wraps the `decode` of a page: it raises ValueError for pictures larger than their tile."""
     is_jpeg = frame.compression in JPEG
     wide, tall = frame.tilewidth, frame.tilelength
     if not frame.is_tiled:
@@ -130,7 +130,7 @@ def _checked(frame: Any, decode: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _lerc(packed: bytes, most: int) -> bytes:
-    """LERC that is packed once more, unpacked no further than `most` bytes."""
+    """Returns LERC data, unpacked to at most `most` bytes if it is packed by zstd or zlib too."""
     if packed[:4] == b"\x28\xb5\x2f\xfd":
         import imagecodecs
 
@@ -139,7 +139,7 @@ def _lerc(packed: bytes, most: int) -> bytes:
 
 
 class _TiffLog(logging.Handler):
-    """Keeps what tifffile logs in this thread."""
+    """Collects what tifffile logs in this thread."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -155,7 +155,7 @@ class _TiffLog(logging.Handler):
 
 
 def ome_info(xml: str, number: int, name: str, width: int) -> Told:
-    """Reads what OME-XML tells of an image, by its number among the images, or its name."""
+    """Reads the OME-XML of an image, found by its name, or by its number if that is not unique."""
     root = ElementTree.fromstring(xml)
     images = [child for child in root.iter() if _tag(child) == "Image"]
     named = [image for image in images if image.get("Name") == name]
@@ -196,7 +196,7 @@ def _ome_channel(element: Any) -> ChannelInfo:
 
 
 def _step_of_planes(pixels: Any) -> tuple[float | None, str]:
-    """The mean step between the times of the first channel's first slices."""
+    """Returns the mean time step between the first channel's first slices, and its unit."""
     times: dict[int, float] = {}
     unit = "s"
     for plane in [child for child in pixels if _tag(child) == "Plane"][:_MOST_PLANES]:
@@ -244,7 +244,7 @@ def imagej_info(described: dict[str, Any], resolution: list[float | None], width
 
 
 def _color(table: Any) -> Rgb | None:
-    """The colour that a look-up table ends with."""
+    """Returns the last colour of a look-up table; None if that is black."""
     last = np.asarray(table).reshape(3, -1)[:, -1] / 255
     return (float(last[0]), float(last[1]), float(last[2])) if last.any() else None
 

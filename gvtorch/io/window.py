@@ -1,7 +1,7 @@
 """`window`: the values that a picture shows dark and bright, from percentiles of the data.
 
-The range of the data seldom serves: one hot voxel pushes all else into the dark, and most of a scan
-is the air around it. Background, where there is any, is the highest peak of the histogram.
+The full range of the data is seldom useful: one hot voxel makes all others dark, and most of a scan
+is the air around it. The background, if there is one, is the highest peak of the histogram.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from ..base.volume import Volume, to_numpy
 from ..pool.downsample import pool_mean
 from .stores.store import Store
 
-_MOST = 2**22  # voxels that are looked at
-_BOXES = 4  # along each axis, of voxels that stand for all
+_MOST = 2**22  # voxels in the sample
+_BOXES = 4  # boxes of the sample along each axis
 _BINS = 64  # of the histogram, at most: values of a scan may have gaps
 _DOMINATES = 0.25  # share of all values that makes the highest peak the background
-_TAIL = 1.0  # percent of the values, at either end of the window, that lie beyond
+_TAIL = 1.0  # percent of the values that lie beyond each end of the window
 
 
 def window(
@@ -31,23 +31,23 @@ def window(
     component: int = 0,
     background: bool = False,
 ) -> tuple[float, float]:
-    """Returns the values to show dark and bright: of `TransferFunction.preset`, for one.
+    """Returns the values to show dark and bright, for `TransferFunction.preset` for example.
 
-    Of large data a coarse level is looked at, of at most 4 million voxels, or boxes of as many in
-    all; a volume and a store made of it have the same window.
+    Large data is sampled: a coarse level of at most 4 million voxels, or boxes with as many voxels
+    in total. A volume and a store made from it have the same window.
 
     Args:
-        data: A volume, or a store, of which no more than that is read.
+        data: A volume, or a store, of which only the sample is read.
         percent: Percentiles of all values, as in (1, 99). If left out, a background is looked for:
             a quarter or more of the values, close together in the lower half. The window goes from
-            its end to the 99th percentile of what lies above; without one, from the 1st to the
-            99th percentile of all.
-        component: Which number of a voxel.
-        background: The low end is not that of the background but the 1st percentile of all, as
+            the end of the background to the 99th percentile of the values above; without a
+            background, from the 1st to the 99th percentile of all values.
+        component: Index of the component (a number of each voxel) to look at.
+        background: Shows the background too: the low end is the 1st percentile of all values, as
             pictures of slices need it.
 
     Raises:
-        ValueError: There is no such component, or the percentiles are none, or out of order.
+        ValueError: There is no such component, or the percentiles are out of range or order.
     """
     check.instance("window", "data", data, Volume, Store)
     if percent is not None:
@@ -71,8 +71,8 @@ def window(
 def windows(
     data: Volume | Store, percent: tuple[float, float], components: Sequence[int]
 ) -> list[tuple[float, float]]:
-    """Returns the `window` of several components, between the same percentiles (not checked). One
-    whose percentiles are the same value goes up to its largest value.
+    """Returns the `window` of several components, between the same percentiles (not checked). If
+    both percentiles of a component are the same value, its window ends at its largest value.
     """
     values, spans = looked_at(data), []
     for component in components:
@@ -83,7 +83,7 @@ def windows(
 
 def value_range(data: Volume | Store) -> tuple[float, float]:
     """Returns the smallest and the largest value. Images that were not written by gvtorch do not
-    tell them: of these a coarse level is read, as for `window`, whose extremes are a little less.
+    store them: for these the sample of `window` is read, whose range is a little narrower.
     """
     if isinstance(data, Volume):
         return data.value_range
@@ -94,13 +94,13 @@ def value_range(data: Volume | Store) -> tuple[float, float]:
 
 
 def _span(low: float, high: float) -> tuple[float, float]:
-    """A window that is wider than nothing."""
+    """Returns the window, widened if it is empty."""
     low, high = float(low), float(high)
     return (low, high) if high > low else (low, low + max(1.0, 1e-6 * abs(low)))
 
 
 def looked_at(data: Volume | Store) -> np.ndarray:
-    """A sample of the values (..., c)."""
+    """Returns a sample of the values, (..., c)."""
     if isinstance(data, Volume):
         values = to_numpy(data.data)
         while values[..., 0].size > _MOST:
@@ -108,13 +108,13 @@ def looked_at(data: Volume | Store) -> np.ndarray:
         return values
     sizes = [data.level_extent(level)[::-1] for level in range(data.levels)]
     level = next((n for n, size in enumerate(sizes) if np.prod(size) <= _MOST), data.levels - 1)
-    level = data.stored_level(level)  # none that would be averaged from all of a finer one
+    level = data.stored_level(level)  # others would be averaged from all of a finer level
     parts = [data.read_region(level, *box) for box in _boxes(sizes[level])]
     return np.concatenate([part.reshape(-1, data.width) for part in parts])
 
 
 def _boxes(size: Zyx) -> list[tuple[Zyx, Zyx]]:
-    """All of a level, or as many voxels of it as are looked at in evenly spaced boxes."""
+    """Returns a box that is all of a level, or evenly spaced ones of `_MOST` voxels in total."""
     if np.prod(size) <= _MOST:
         return [((0, 0, 0), size)]
     share = (_MOST / np.prod(size)) ** (1 / 3)
@@ -129,8 +129,8 @@ def _boxes(size: Zyx) -> list[tuple[Zyx, Zyx]]:
 
 
 def _background(values: np.ndarray) -> float | None:
-    """Where the background ends: beyond the highest peak of the histogram by as much again as it
-    is wide at half its height; None where there is none, or nothing else.
+    """Returns the value at which the background ends: twice as far above the highest peak of the
+    histogram as the count drops to half; None if there is no background, or nothing else.
     """
     low, high = (float(end) for end in np.percentile(values, (0.01, 99.99)))
     step = (high - low) / int(np.clip(values.size**0.5 / 2, 16, _BINS))

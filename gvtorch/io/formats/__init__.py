@@ -1,6 +1,6 @@
-"""The file formats, one file for each; files in this folder are found by themselves.
+"""The file formats, one module for each; all modules in this folder are imported and registered.
 
-torch is not imported here, so that the command line can name the formats at once.
+torch is not imported here, so that the command line can list the formats quickly.
 """
 
 import importlib
@@ -14,11 +14,11 @@ for _module in sorted(module.name for module in pkgutil.iter_modules(__path__)):
 
 
 def find_format(path: str, *, raw: bool = False) -> Format:
-    """Returns the format of a file, folder or URL, by its name and kind. With `raw` a file of
-    unknown kind is RAW, since its extent is known.
+    """Returns the format of a file, folder or URL, by its name and content. With `raw`, which says
+    that the extent is known, a file of unknown format is RAW.
 
     Raises:
-        ValueError: There is none.
+        ValueError: No format matches.
     """
     for candidate in FORMATS:
         if candidate.matches(path):
@@ -37,8 +37,8 @@ def find_format(path: str, *, raw: bool = False) -> Format:
 
 
 def split_path(text: str) -> tuple[str, str | None]:
-    """Splits `file.h5:/group/data` or `image.zarr:/labels/cells` into the file and what is named of
-    it; other paths stay.
+    """Splits `file.h5:/group/data` or `image.zarr:/labels/cells` into the file and the path inside
+    it; other paths are returned whole, with None.
     """
     file, mark, inner = text.rpartition(":/")
     if mark and "://" not in text and not Path(text).exists() and Path(file).exists():
@@ -47,7 +47,7 @@ def split_path(text: str) -> tuple[str, str | None]:
 
 
 def format_names() -> str:
-    """The names of all formats for help texts, as in "FITS, NIfTI or RAW"."""
+    """Returns the names of all formats for help texts, as in "FITS, NIfTI or RAW"."""
     *names, last = (candidate.name for candidate in FORMATS)
     return f"{', '.join(names)} or {last}"
 

@@ -1,7 +1,7 @@
-"""Plain Zarr arrays (versions 2 and 3) and N5 arrays, through tensorstore: by region.
+"""Plain Zarr arrays (versions 2 and 3) and N5 arrays, read by region with tensorstore.
 
-What axes are and where they lie is read from their names (`dimension_names`, xarray's
-`_ARRAY_DIMENSIONS`) and the arrays of these names beside, of N5 from `pixelResolution`,
+The meaning and coordinates of Zarr's axes come from their names (`dimension_names`, xarray's
+`_ARRAY_DIMENSIONS`) and from sibling arrays of these names, those of N5's from `pixelResolution`,
 `resolution` or `transform`. N5's first axis is the fastest one: x.
 Source: Zarr specification, versions 2 and 3; N5 specification (github.com/saalfeldlab/n5).
 """
@@ -33,7 +33,7 @@ _HEADS = (("zarr3", "zarr.json"), ("zarr", ".zarray"), ("n5", "attributes.json")
 
 @dataclass(frozen=True, kw_only=True)
 class ChunkedSource(VolumeSource):
-    """An array."""
+    """A Zarr or N5 array."""
 
     driver: str
     folder: str
@@ -51,7 +51,7 @@ def _array(driver: str, folder: str, _opened: int) -> tuple[Any, ChunkFiles]:
 
 
 def _head(folder: str) -> tuple[str, dict[str, Any]] | None:
-    """The driver and the metadata of an array; None for anything else."""
+    """Returns the driver and the metadata of an array; None for anything else."""
     for driver, name in _HEADS:
         file = Path(folder) / name
         if file.is_file():
@@ -62,7 +62,7 @@ def _head(folder: str) -> tuple[str, dict[str, Any]] | None:
 
 
 def _attributes(folder: str) -> dict[str, Any]:
-    """What users wrote beside an array or a group."""
+    """Returns the user attributes of an array or a group."""
     for name, inner in (("zarr.json", "attributes"), (".zattrs", ""), ("attributes.json", "")):
         file = Path(folder) / name
         if file.is_file():
@@ -73,14 +73,14 @@ def _attributes(folder: str) -> dict[str, Any]:
 
 
 def _arrays(folder: str) -> list[str]:
-    """Names of the arrays below a group that have three or more axes."""
+    """Returns the names of the arrays below a group that have three or more axes."""
     found, seen = [], 0
     for place, folders, _ in os.walk(folder):
         seen += 1
         if seen > _MOST_FOLDERS:
             break
         if (head := _head(place)) is not None:
-            folders.clear()  # chunks
+            folders.clear()  # these hold chunks
             shape = head[1].get("shape", head[1].get("dimensions", ()))
             if isinstance(shape, list) and len(shape) >= 3:
                 found.append(os.path.relpath(place, folder))
@@ -89,7 +89,7 @@ def _arrays(folder: str) -> list[str]:
 
 
 def _is_zarr_group(path: str) -> bool:
-    """A Zarr array, or a group that tells of no image as OME-NGFF does."""
+    """Returns whether a path is a Zarr array, or a group of arrays that is no OME-NGFF image."""
     if "://" in path or not Path(path).is_dir():
         return False
     if not any((Path(path) / name).is_file() for name in ("zarr.json", ".zarray", ".zgroup")):
@@ -99,14 +99,14 @@ def _is_zarr_group(path: str) -> bool:
             return head[0] != "n5"
         told = _attributes(path)
     except (ValueError, OSError):
-        return False  # OME-Zarr tells what is wrong
+        return False  # the OME-Zarr format reports what is wrong
     own = {"multiscales", "ome", "gvtorch", "bioformats2raw.layout", "plate", "well"}
     return not own & set(told) and bool(_arrays(path))
 
 
 @Format("Zarr", matches=_is_zarr_group, options=("key", "axes"))
 def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) -> ChunkedSource:
-    """Opens an array, or the array `key` of a group, the only one if left out. `axes` as of
+    """Opens an array, or the array `key` of a group, the only one if left out. `axes` as in
     `ask_axes`.
     """
     folder = _choose(path, key)
@@ -123,7 +123,7 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
         for at, name in enumerate(names):
             beside = Path(folder).parent / name
             if beside.parent != Path(folder).parent or name == "..":
-                continue  # names of axes, not ways to other folders
+                continue  # the name of an axis must not be a path to another folder
             if name and beside != Path(folder) and (head := _head(str(beside))) is not None:
                 places, files = _array(head[0], str(beside), source.opened)
                 if places.shape == (shape[at],) and shape[at] < 1 << 24:
@@ -147,8 +147,8 @@ def _is_n5(path: str) -> bool:
 
 @Format("N5", ".n5", matches=_is_n5, options=("key", "axes"))
 def open_n5(path: str, key: str | None = None, axes: str | None = None) -> ChunkedSource:
-    """Opens an array, or the array `key` of a container, the only one if left out. `axes` as of
-    `ask_axes`, the slowest first: the last axis of N5.
+    """Opens an array, or the array `key` of a container, the only one if left out. `axes` as in
+    `ask_axes`, the slowest first, which is the last axis of N5.
     """
     if "://" in path:
         folder, told = f"{path.rstrip('/')}/{key}" if key else path, {}
@@ -175,7 +175,7 @@ def _choose(path: str, key: str | None) -> str:
 
 
 def _source(path: str, driver: str, folder: str) -> tuple[ChunkedSource, tuple[int, ...]]:
-    """The array without its place."""
+    """Returns the source of an array, without axes and position, and its shape."""
     source = ChunkedSource(path=path, shape=(), axes="", stored="u1", driver=driver, folder=folder)
     array, _ = _array(driver, folder, source.opened)
     dtype, shape = array.dtype.numpy_dtype, tuple(int(n) for n in array.shape)
@@ -185,7 +185,7 @@ def _source(path: str, driver: str, folder: str) -> tuple[ChunkedSource, tuple[i
 
 
 def _n5_place(told: dict[str, Any], letters: str) -> tuple[Triple, Triple, str | None]:
-    """Voxel size, place and unit of an N5 array; `letters` tell its axes, x first."""
+    """Returns voxel size, origin and unit of an N5 array; `letters` are its axes, fastest first."""
     rank = len(letters)
     sizes: Any = told.get("pixelResolution", told.get("resolution"))
     unit: Any = told.get("units", told.get("unit"))
@@ -193,7 +193,7 @@ def _n5_place(told: dict[str, Any], letters: str) -> tuple[Triple, Triple, str |
     if isinstance(sizes, dict):
         unit, sizes = sizes.get("unit", unit), sizes.get("dimensions")
     transform = told.get("transform")
-    if isinstance(transform, dict):  # its lists are in the order of C
+    if isinstance(transform, dict):  # its lists are in C order
         sizes, origin = (list(transform.get(n) or [])[::-1] for n in ("scale", "translate"))
         unit = transform.get("units")
     unit = unit[0] if isinstance(unit, list) and unit else unit

@@ -1,4 +1,4 @@
-"""CZI of Zeiss, through pylibCZIrw: by region, the finest level, tiles put together.
+"""Zeiss CZI, read with pylibCZIrw: by region, the finest level, with tiles joined.
 
 Source: ZISRAW (CZI) metadata of pylibCZIrw's documentation: Scaling, Channels, DisplaySetting.
 """
@@ -34,7 +34,7 @@ class CziSource(VolumeSource):
 
     scene: int | None
     corner: tuple[int, int]  # x y of its rectangle
-    starts: tuple[tuple[str, int], ...]  # first number of each of T, C, Z
+    starts: tuple[tuple[str, int], ...]  # first index along each of T, C, Z
 
     def read_stored(self, index: Index) -> np.ndarray:
         from pylibCZIrw import czi
@@ -57,7 +57,7 @@ class CziSource(VolumeSource):
 
 @Format("CZI", ".czi", options=("key",), library="pylibCZIrw", extra="microscopes")
 def open_czi(path: str, key: str | None = None) -> CziSource:
-    """Opens a scene: its number, the first one if left out."""
+    """Opens the scene of number `key`, the first one if left out."""
     from pylibCZIrw import czi
 
     with open(path, "rb") as file:
@@ -101,7 +101,7 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
 
 
 def _told(xml: str, width: int, colors: int, stored: str) -> Told:
-    """What the metadata tells: info, spacing, and what is not kept."""
+    """Returns info and spacing from the metadata, and which metadata is not kept."""
     root = ElementTree.fromstring(xml)
     sizes: dict[str, float | None] = {}
     for item in root.iterfind(".//Scaling/Items/Distance"):
@@ -131,7 +131,7 @@ def _told(xml: str, width: int, colors: int, stored: str) -> Told:
 
 
 def _channel(item: Any, shown: Any, stored: str) -> ChannelInfo:
-    """Name, colour and window of a channel; Low and High are of the largest number."""
+    """Returns name, colour, window of a channel; Low and High are shares of the dtype's maximum."""
     text = (None if shown is None else shown.findtext("Color")) or item.findtext("Color") or ""
     color: Rgb | None = None
     if len(text) in (7, 9) and text.startswith("#"):

@@ -1,8 +1,8 @@
-"""DICOM, through pydicom: the images of a series in a folder, or the frames of one file.
+"""DICOM, read with pydicom: the images of a series in a folder, or the frames of one file.
 
-World axes are NIfTI's, x to the right, y to the front, z upwards (RAS), millimetres: DICOM's own x
-and y (LPS) are turned round. So a scan lies where it lies as NIfTI. Slices are told apart by their
-place (Image Position), never by their thickness.
+World axes are those of NIfTI, x right, y anterior, z superior (RAS), in millimetres: DICOM's own x
+and y (LPS) are negated, so a scan lies where its NIfTI version lies. Slices are separated by their
+positions (Image Position), never by their thickness.
 Source: DICOM PS3.3, C.7.6.2 (image plane), C.7.6.16 (functional groups), C.11.1 (rescale).
 """
 
@@ -31,7 +31,7 @@ from .format import Format, not_chosen
 _MOST_FILES = 200_000
 _MOST_UNPACKED = 1 << 32  # bytes
 _ENDINGS = (".dcm", ".dicom", ".ima")
-_OTHERS = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".bmp", ".txt", ".json")  # not looked into
+_OTHERS = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".bmp", ".txt", ".json")  # not opened
 _DEFLATED = "1.2.840.10008.1.2.1.99"
 
 
@@ -39,10 +39,11 @@ _DEFLATED = "1.2.840.10008.1.2.1.99"
 class DicomSource(VolumeSource):
     """Images (t, z, rows, columns) or (t, z, rows, columns, c)."""
 
-    frames: tuple[tuple[str, int, float, float], ...]  # file, number, slope, intercept; time, place
+    # File, number in it, slope and intercept of each frame, by time, then slice.
+    frames: tuple[tuple[str, int, float, float], ...]
 
     def check_file(self) -> None:
-        """Compares the size of files that are not packed with what their images take."""
+        """Raises ValueError if an uncompressed file is too short for its images."""
         for file, number, *_ in dict((frame[0], frame) for frame in self.frames).values():
             header, size = _header(file), os.stat(file).st_size
             meta = header.file_meta if "file_meta" in vars(header) else {}
@@ -75,7 +76,7 @@ class DicomSource(VolumeSource):
 
 def _has_magic(path: str | os.PathLike[str]) -> bool:
     try:
-        if not os.path.isfile(path):  # a pipe would be waited for
+        if not os.path.isfile(path):  # opening a pipe would block
             return False
         with open(path, "rb") as file:
             return file.read(132)[128:] == b"DICM"
@@ -84,7 +85,7 @@ def _has_magic(path: str | os.PathLike[str]) -> bool:
 
 
 def _files(folder: str) -> Iterator[str]:
-    """DICOM files in a folder and those below, in order of their names."""
+    """Yields the DICOM files in a folder and those below, in order of their names."""
     seen = 0
     for place, folders, names in os.walk(folder):
         folders.sort()
@@ -112,8 +113,8 @@ def _is_dicom(path: str) -> bool:
 
 @Format("DICOM", *_ENDINGS, matches=_is_dicom, options=("key",), library="pydicom")
 def open_dicom(path: str, key: str | None = None) -> DicomSource:
-    """Opens a series: the only one of a folder, or `key` (its number, UID or description); or the
-    series that a file belongs to, or the frames of a file that has several.
+    """Opens a series. Of a folder: the only one, or `key` (its number, UID or description). Of a
+    file: its frames, if it has several, else the series that it belongs to.
     """
     series: dict[str, list[Any]] = defaultdict(list)
     if Path(path).is_dir():
@@ -131,7 +132,7 @@ def open_dicom(path: str, key: str | None = None) -> DicomSource:
 
 
 def _siblings(path: str, first: Any) -> Iterator[Any]:
-    """Headers of the other files of a folder that belong to the same series."""
+    """Yields the headers of the other files in the folder that belong to the same series."""
     for entry in sorted(Path(path).absolute().parent.iterdir()):
         if entry.is_file() and not os.path.samefile(entry, path) and _has_magic(entry):
             header = _header(str(entry))
@@ -141,7 +142,7 @@ def _siblings(path: str, first: Any) -> Iterator[Any]:
 
 
 def _header(file: str) -> Any:
-    """Reads all but the pixels; what unpacks to far too much is refused before it is unpacked."""
+    """Reads all but the pixels; refuses deflated files that would unpack to far too much."""
     import pydicom
 
     _check_deflated(file)
@@ -236,7 +237,7 @@ def _image_shape(header: Any) -> tuple[int, int, int]:
 
 
 def _dtype(header: Any, frames: Sequence[DicomFrame]) -> str:
-    """The smallest dtype that holds every value after rescaling."""
+    """Returns the smallest dtype that holds every value after rescaling."""
     for tag, kind in (("FloatPixelData", "float32"), ("DoubleFloatPixelData", "float64")):
         if tag in header:
             return kind
@@ -256,12 +257,12 @@ def _dtype(header: Any, frames: Sequence[DicomFrame]) -> str:
 
 
 def _images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:
-    """Unpacks some of the images of a file."""
+    """Decodes some of the images of a file."""
     import pydicom
     from pydicom.filereader import read_file_meta_info
     from pydicom.pixels import iter_pixels
 
     syntax = read_file_meta_info(file).get("TransferSyntaxUID", "") if _has_magic(file) else ""
-    if syntax == _DEFLATED:  # which pydicom unpacks for whole files alone
+    if syntax == _DEFLATED:  # pydicom can only unpack whole files of this kind
         return iter_pixels(pydicom.dcmread(file), indices=numbers)
     return iter_pixels(file, indices=numbers, decoding_plugin=plugin_of(str(syntax)))

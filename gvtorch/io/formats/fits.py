@@ -1,4 +1,4 @@
-"""FITS, through astropy: the first image of three dimensions.
+"""FITS, read with astropy: the first image of three dimensions.
 
 Spacing is 1, since FITS axes have units of their own (degrees, m/s).
 """
@@ -19,7 +19,7 @@ from .format import Format
 
 @dataclass(frozen=True, kw_only=True)
 class FitsSource(VolumeSource):
-    """An image that is scaled or packed: plane by plane, or all at once."""
+    """An image that is scaled or packed; it is read plane by plane, or all at once."""
 
     def read_stored(self, index: Index) -> np.ndarray:
         from astropy.io import fits
@@ -36,7 +36,7 @@ class FitsSource(VolumeSource):
 
 @Format("FITS", ".fits", ".fits.gz", ".fit", library="astropy")
 def open_fits(path: str) -> VolumeSource:
-    """Opens a cube; its first voxel tells the dtype after scaling."""
+    """Opens a cube; its first voxel is read to find the dtype after scaling."""
     from astropy.io import fits
 
     packed = is_packed_fits(path)
@@ -57,7 +57,7 @@ def open_fits(path: str) -> VolumeSource:
 
 
 def _cube(path: str, units: Any) -> Any:
-    """The first image of three dimensions among the units of a file."""
+    """Returns the first image of three dimensions among the header-data units of a file."""
     cube = next((unit for unit in units if unit.is_image and len(unit.shape) >= 3), None)
     if cube is None:
         raise ValueError(f"{path}: holds no image of three dimensions")

@@ -1,4 +1,4 @@
-"""`Format`: an entry of the registry of file formats; `choose`: one of several things in a file."""
+"""`Format`: an entry of the registry of file formats; `choose`: finds an item of a file by name."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _MOST_LISTED = 50  # names in a message
 
 
 class Format:
-    """A file format: decorates the function that opens its files and enters it into `FORMATS`.
+    """A file format: decorates the function that opens its files and registers it in `FORMATS`.
 
-    That function is called with the path (str) and the options that the user gave. It reads the
-    header alone and returns a source. It may raise anything if the file is damaged.
+    That function is called with the path (str) and the options that the user gave. It reads only
+    the header and returns a source. It may raise anything if the file is damaged.
     """
 
     open: Callable[..., VolumeSource]
@@ -41,18 +41,19 @@ class Format:
         Args:
             name: As users know it.
             endings: Of file names, in lower case.
-            matches: Tells whether a path is of this format, where endings do not (folders, URLs).
+            matches: Returns whether a path has this format, if that is not decided by its ending
+                (folders, URLs).
             options: Arguments of `read_volume` that this format takes.
-            library: The module that reading needs; it is there when files are opened.
-            package: What pip installs it as, if that is another name.
-            extra: The extra of gvtorch that brings it.
+            library: The module that reading needs; checked before a file is opened.
+            package: Its name for pip, if that is another one.
+            extra: The extra of gvtorch that installs it.
         """
         self.name, self.endings, self.options = name, endings, options
         self.matches = matches or (lambda path: path.lower().endswith(endings))
         self.library, self.package, self.extra = library, package or library, extra
 
     def __call__(self, opener: Opener) -> Opener:
-        """Takes the function that opens files."""
+        """Registers the function that opens files."""
         self.open = opener
         FORMATS.append(self)
         return opener
@@ -77,22 +78,22 @@ class Format:
 def choose(
     path: str, what: str, names: Sequence[str | int], key: str | None, preferred: str = ""
 ) -> tuple[int, tuple[str, ...]]:
-    """Finds which of several things in a file is meant.
+    """Chooses one of several items of a file by its name or number.
 
     Args:
         path: For messages.
-        what: What they are: "image".
-        names: Of all of them; or their numbers, where they have no names.
-        key: A name or a number (of those that have names: from 0), also behind a slash, as in
-            `file.vdb:/density`.
-        preferred: The name that is meant if `key` is left out. Where it is not there, the first is.
+        what: What the items are, for messages: "image".
+        names: The names of all items; or their numbers, if they have no names.
+        key: A name or a number (if items have names: their index, from 0), also after a slash, as
+            in `file.vdb:/density`.
+        preferred: The name to choose if `key` is left out; if there is none, the first is chosen.
 
     Returns:
-        Its index among `names`, and what `VolumeSource.lost` tells of the others if `key` is left
-        out.
+        Its index among `names`, and an entry about the others for `VolumeSource.lost` if `key` is
+        left out.
 
     Raises:
-        ValueError: There is none, or none that `key` means.
+        ValueError: There are no items, or none that matches `key`.
     """
     numbers = [at if isinstance(name, str) else name for at, name in enumerate(names)]
     listed = [
@@ -113,8 +114,8 @@ def choose(
 def not_chosen(
     path: str, what: str, names: Sequence[str], key: str | None, kind: str = ""
 ) -> ValueError:
-    """Returns the error where `key` means none of several things, or is left out and one must be
-    chosen. `kind` tells which ones are listed: " of three or more axes".
+    """Returns the error for a `key` that matches none of several items, or is left out although one
+    must be chosen. `kind` says which items are listed: " of three or more axes".
     """
     if key is not None:
         told = f"has no {what} {key!r}; it holds {_list(names) or f'none{kind}'}"

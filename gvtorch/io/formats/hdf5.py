@@ -1,7 +1,7 @@
-"""HDF5 and NetCDF 4, through h5py: a data set of a file, `file.h5:/group/data`, by region.
+"""HDF5 and NetCDF 4, read with h5py: a data set of a file, `file.h5:/group/data`, by region.
 
-What axes are and how far apart is read from dimension scales and CF attributes (NetCDF), `axistags`
-(ilastik), `element_size_um` (ImageJ, ilastik) and `spacing`; else asked, as of arrays.
+The meaning and steps of axes come from dimension scales and CF attributes (NetCDF), `axistags`
+(ilastik) and `element_size_um` (ImageJ, ilastik); else `axes` is needed, as for arrays.
 Source: HDF5 dimension scales; CF conventions 1.11, 4 (axes) and 8.1 (packed data).
 """
 
@@ -28,8 +28,8 @@ _ENDINGS = (".h5", ".hdf5", ".hdf", ".he5", ".h5ad", ".ilp", ".nc", ".nc4", ".cd
 _MOST_CHUNK = 1 << 31  # bytes
 _MOST_SETS = 100_000
 _KIND = " of three or more axes"  # the data sets that messages list
-_MOST_LINKS = 16  # that lead one to another
-_MOST_PLACES = 1 << 24  # along an axis
+_MOST_LINKS = 16  # in a chain
+_MOST_PLACES = 1 << 24  # coordinates of an axis that are read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,13 +37,13 @@ class Hdf5Source(VolumeSource):
     """A data set."""
 
     name: str
-    packed: str  # dtype of the values in the file, as its attributes tell
+    packed: str  # dtype of the values in the file, according to its attributes
     scale: tuple[float, float] | None = None  # factor and offset of packed values
-    missing: tuple[float, ...] = ()  # packed values that stand for none
-    valid: tuple[float, float] = (-math.inf, math.inf)  # packed values beyond stand for none
+    missing: tuple[float, ...] = ()  # packed values that mark missing ones
+    valid: tuple[float, float] = (-math.inf, math.inf)  # packed values beyond mark missing ones
 
     def as_labels(self) -> Self:
-        """See `VolumeSource`; a value that stands for none is a label like others."""
+        """See `VolumeSource`; a value that marks missing ones is a label like others."""
         found = super().as_labels()
         if self.scale:
             return found
@@ -74,7 +74,7 @@ class Hdf5Source(VolumeSource):
 @Format("HDF5", *_ENDINGS, options=("key", "axes"), library="h5py")
 def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf5Source:
     """Opens the data set `key` of a file, the only one of three or more axes if left out. `axes` as
-    of `ask_axes`.
+    in `ask_axes`.
     """
     import h5py
 
@@ -116,8 +116,8 @@ def _check_kind(path: str) -> None:
 
 
 def _check_files(path: str, file: Any, name: str, left: int = _MOST_LINKS) -> None:
-    """Raises ValueError where what `name` leads to is kept in a file that is no regular one, which
-    may never end, or that lies elsewhere: links, virtual and external data sets name others.
+    """Raises ValueError if `name` leads to another file, by a link or by a virtual or external data
+    set, that lies outside the folder of `path` or is no regular file, which may never end.
     """
     import h5py
 
@@ -142,8 +142,8 @@ def _check_files(path: str, file: Any, name: str, left: int = _MOST_LINKS) -> No
 
 
 def _check_other(path: str, other: str, name: str | None, left: int) -> None:
-    """Checks a file that is named, and what it names in turn. It lies beside the one that names it,
-    or below: HDF5 looks in its folder, or in that of the process.
+    """Checks a file that `path` refers to, and those that it refers to. It must lie in the folder
+    of `path` or below. HDF5 may find it in that folder, or in the process's: both are checked.
     """
     import h5py
 
@@ -175,7 +175,7 @@ def _choose(path: str, file: Any, key: str | None) -> str:
 
 
 def _volumes(group: Any) -> dict[str, str]:
-    """Data sets of numbers that have three or more axes."""
+    """Returns the numeric data sets of three or more axes: shape and dtype, as text, by name."""
     import h5py
 
     found: dict[str, str] = {}
@@ -207,7 +207,7 @@ def _check(path: str, name: str, data: Any) -> None:
 def _axes(
     where: str, data: Any, shape: tuple[int, ...], axes: str | None
 ) -> tuple[str, list[tuple[float, float] | None], list[str | None], list[str]]:
-    """Returns a letter, (step, first place) and the unit of each axis, and what is not kept."""
+    """Returns letter, (step, first position) and unit of each axis, and metadata not kept."""
     rank = len(shape)
     names: list[str] = [""] * rank
     steps: list[tuple[float, float] | None] = [None] * rank
@@ -243,7 +243,7 @@ def _axes(
 
 
 def _tags(data: Any) -> list[Any]:
-    """ilastik's `axistags`."""
+    """Returns ilastik's `axistags`, one for each axis."""
     try:
         found = json.loads(_text(data.attrs.get("axistags")) or "{}")
     except ValueError:
@@ -253,7 +253,7 @@ def _tags(data: Any) -> list[Any]:
 
 
 def _info(data: Any, letters: str, shape: tuple[int, ...]) -> ImageInfo:
-    """What the attributes tell of the image."""
+    """Returns quantity and channel names from the attributes."""
     quantity, name = (_text(data.attrs.get(key)) for key in ("units", "long_name"))
     width = shape[letters.index("c")] if "c" in letters else 1
     names = np.ravel(data.attrs.get("channel_names", ())).tolist()
@@ -264,8 +264,8 @@ def _info(data: Any, letters: str, shape: tuple[int, ...]) -> ImageInfo:
 
 
 def _values(data: Any) -> dict[str, Any]:
-    """What the attributes tell of the values: the fields `packed`, `scale`, `missing`, `valid` and
-    `stored` of a source.
+    """Returns the fields `packed`, `scale`, `missing`, `valid` and `stored` of a source, from the
+    attributes.
 
     Source: CF Conventions 1.11, sections 2.5.1 and 8.1; `_Unsigned` is of the NetCDF Users' Guide,
         appendix A.

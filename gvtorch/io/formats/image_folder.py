@@ -1,7 +1,7 @@
-"""A folder of images: TIFF (through tifffile), PNG, JPEG or BMP (through imagecodecs) slices in the
+"""A folder of images: TIFF (with tifffile), PNG, JPEG or BMP (with imagecodecs) slices in the
 natural order of their names.
 
-What an image's header tells is compared with the first one's before it is unpacked.
+The size in an image's header is compared with that of the first image before it is decoded.
 Source: Microsoft, BITMAPINFOHEADER.
 """
 
@@ -35,7 +35,7 @@ _MOST_PIXELS = 2**31
 class SlicesSource(VolumeSource):
     """A folder of slices."""
 
-    files: tuple[str, ...]  # one a slice
+    files: tuple[str, ...]  # one per slice
 
     def read_stored(self, index: Index) -> np.ndarray:
         files = self.files[index[0]]
@@ -56,7 +56,7 @@ class SlicesSource(VolumeSource):
 
 
 def _slices(path: str) -> list[Path]:
-    """The images in a folder, those of the kind that is there most."""
+    """Returns the images in a folder; raises ValueError if they are of several kinds."""
     files: dict[str, list[Path]] = {}
     for file in Path(path).iterdir():
         kind = file.suffix.lower()
@@ -105,7 +105,7 @@ def open_folder(path: str) -> SlicesSource:
 
 
 def _image(file: str) -> np.ndarray:
-    """Unpacks an image."""
+    """Decodes an image."""
     codec = _CODECS.get(Path(file).suffix.lower())
     if codec is None:
         with opened_tiff(file) as (tiff, _):
@@ -122,7 +122,7 @@ def _image(file: str) -> np.ndarray:
 
 
 def _shape(file: str) -> tuple[Any, ...]:
-    """What the header of an image tells: rows and columns first."""
+    """Returns the shape from the header of an image: rows and columns first."""
     if Path(file).suffix.lower() in _TIFF:
         with opened_tiff(file) as (tiff, _):
             return tuple(tiff.series[0].shape)
@@ -138,7 +138,7 @@ def _shape(file: str) -> tuple[Any, ...]:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts s9 before s10."""
+    """Returns a sorting key, by which s9 comes before s10."""
     return [
         (int(part), part) if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
     ]

@@ -1,6 +1,6 @@
-"""LIF of Leica: blocks of numbers that a header in XML describes, mapped and read by region.
+"""Leica LIF: blocks of numbers that are described by an XML header, mapped and read by region.
 
-Source: the LIF file format as Bio-Formats' documentation tells it (blocks, DimensionDescription,
+Source: the LIF file format in the documentation of Bio-Formats (blocks, DimensionDescription,
 ChannelDescription, LUTName).
 """
 
@@ -42,7 +42,7 @@ class LifSource(VolumeSource):
 
 @Format("LIF", ".lif", options=("key",))
 def open_lif(path: str, key: str | None = None) -> LifSource:
-    """Opens an image: its number or name, the only one or the first if left out."""
+    """Opens the image `key` (its number or name), the first one if left out."""
     size = os.stat(path).st_size
     with open(path, "rb") as file:
         root = ElementTree.fromstring(_header(file))
@@ -93,7 +93,7 @@ def _image(
         [told.get(a, (None, None))[0] for a in "xyz"],
         [told.get(a, (None, None))[1] or "m" for a in "xyz"],
     )
-    if unit == "meter":  # as microscopes mean it
+    if unit == "meter":  # micrometres suit microscopes
         x, y, z = (1e6 * side for side in spacing)
         spacing, unit = (x, y, z), "micrometer"
     if unit and told.get("z", (1.0, None))[0] is None:
@@ -142,7 +142,7 @@ def _header(file: IO[bytes]) -> str:
 
 
 def _blocks(file: IO[bytes], size: int) -> dict[str, tuple[int, int]]:
-    """Where the blocks of numbers lie, and their bytes, by their names."""
+    """Returns the offset and the size in bytes of each block of numbers, by its name."""
     found: dict[str, tuple[int, int]] = {}
     while file.tell() < size and len(found) < _MOST_BLOCKS:
         head = file.read(13)

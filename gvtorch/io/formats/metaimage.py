@@ -1,6 +1,6 @@
 """MetaImage, `.mha` and `.mhd`: a header of text lines, and numbers, packed by zlib or not.
 
-World axes are turned to x right, y anterior, z superior (RAS), as of NIfTI: the file's own (LPS)
+World axes are converted to x right, y anterior, z superior (RAS), as in NIfTI: the file's own (LPS)
 are x left, y posterior.
 Source: "MetaIO documentation" (Insight Software Consortium), tags of images; ITK's MetaImageIO.
 """
@@ -35,7 +35,7 @@ _KEPT = {
 
 @Format("MetaImage", ".mha", ".mhd")
 def open_metaimage(path: str) -> VolumeSource:
-    """Opens an image: 3 axes, or 4, the last of which counts times."""
+    """Opens an image of 2 to 4 axes, the fourth of which counts times."""
     header, end = _header(path)
     rank = int(header.get("NDims", 3))
     shape = tuple(int(n) for n in header["DimSize"].split())
@@ -68,14 +68,14 @@ def open_metaimage(path: str) -> VolumeSource:
         return PackedSource(file=data, offset=offset, codec="text", fortran=True, **told)
     if header.get("CompressedData", "False").lower() == "true":
         return PackedSource(file=data, offset=max(offset, 0), codec="zlib", fortran=True, **told)
-    if offset < 0:  # the numbers are the last of the file
+    if offset < 0:  # the numbers are at the end of the file
         need = math.prod(told["shape"]) * np.dtype(kind).itemsize
         offset = max(0, os.stat(data).st_size - need)
     return ArraySource(file=data, offset=offset, fortran=True, **told)
 
 
 def _header(path: str) -> tuple[dict[str, str], int]:
-    """The header's lines by name, up to ElementDataFile, and where they end."""
+    """Returns the header's values by name, up to ElementDataFile, and the offset of its end."""
     with open(path, "rb") as file:
         text = file.read(_MOST_HEADER)
     found: dict[str, str] = {}
@@ -99,7 +99,7 @@ def _header(path: str) -> tuple[dict[str, str], int]:
 def _placed(
     path: str, header: dict[str, str], shape: tuple[int, ...], width: int
 ) -> dict[str, Any]:
-    """Axes and place of the array, whose first axis counts channels if there are several."""
+    """Returns axes and position of the array; its first axis counts channels, if it has several."""
     rank = len(shape)
 
     def numbers(count: int, *names: str) -> np.ndarray | None:
@@ -124,7 +124,7 @@ def _placed(
 
 
 def _info(header: dict[str, str], width: int, rank: int) -> ImageInfo:
-    """What the header tells of the values."""
+    """Returns what the header says of the values."""
     modality, steps = header.get("Modality", ""), header.get("ElementSpacing", "").split()
     step = float(steps[3]) if rank == len(steps) == 4 else 0.0
     color = width == 3 and header["ElementType"].startswith("MET_UCHAR")

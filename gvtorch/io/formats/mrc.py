@@ -1,4 +1,4 @@
-"""MRC and CCP4 maps, through mrcfile: by region, or whole where the file is packed.
+"""MRC and CCP4 maps, whose header mrcfile reads: by region, or whole if the file is packed.
 
 Source: Cheng et al., "MRC2014: extensions to the MRC format header", J. Struct. Biol. 2015.
 """
@@ -22,7 +22,7 @@ _DTYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
 @Format("MRC", ".mrc", ".map", ".rec", ".ccp4", ".mrcs", ".st", ".mrc.gz", ".map.gz", ".mrc.bz2",
         ".map.bz2", library="mrcfile")  # fmt: skip
 def open_mrc(path: str) -> ArraySource:
-    """Opens a map, in angstroms. The maps of a stack are taken for times."""
+    """Opens a map, in angstroms. The maps of a stack become time points."""
     import mrcfile
 
     with warnings.catch_warnings(record=True) as heard:
@@ -68,7 +68,7 @@ def open_mrc(path: str) -> ArraySource:
 
 
 def _place(header: Any) -> tuple[Triple, Triple, str | None]:
-    """Voxel size and place of the first voxel, angstroms, x y z."""
+    """Returns voxel size and position of the first voxel, angstroms, x y z, and their unit."""
     steps, starts = [], []
     names = ("nxstart", "nystart", "nzstart")  # of columns, rows, sections
     order = [int(header[name]) for name in ("mapc", "mapr", "maps")]

@@ -1,9 +1,9 @@
-"""NanoVDB (`.nvdb`, versions 32.*): grids as they lie in memory, packed as a whole or not.
+"""NanoVDB (`.nvdb`, versions 32.*): grids laid out as in memory, packed as a whole or not.
 
-A file is one segment after another: a head, what is told of each grid, then the grids. A grid is
-672 bytes of head (name, transform, class, type), 64 of tree, the root with its tiles, and nodes
-that lie anywhere behind, found by offsets. Each part is laid out as C++ lays out its struct.
-Source: the NanoVDB headers of OpenVDB (NanoVDB.h, PNanoVDB.h, io/IO.h) tell the layout.
+A file is a sequence of segments: a header, the metadata of each grid, then the grids. A grid is a
+header of 672 bytes (name, transform, class, type), 64 bytes of tree, the root with its tiles, and
+nodes anywhere behind, found by offsets. Each part has the layout of its C++ struct.
+Source: the NanoVDB headers of OpenVDB (NanoVDB.h, PNanoVDB.h, io/IO.h).
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _GRIDS = (b"NanoVDB0", b"NanoVDB1")
 _VERSION = 32
 _CODECS = {0: "none", 1: "zlib", 2: "blosc"}
 _CLASSES = {1: "level set", 2: "fog volume", 3: "staggered"}
-_TYPE, _TREE, _ROOT = 636, 672, 736  # bytes before its type, before the tree and its root
-_COUNTS = _TREE + 32  # before the numbers of leaves, lower and upper nodes
+_TYPE, _TREE, _ROOT = 636, 672, 736  # offsets in a grid of its type, its tree and its root
+_COUNTS = _TREE + 32  # offset of the numbers of leaves, lower and upper nodes
 _META = struct.Struct("<4Q2I6d6i3d8I2HI")
 _MOST_GRIDS, _MOST_NAME = 4096, 4096
 _ALIGN = 32
-# By number of the type: its name, dtype of a number, numbers of a value.
+# By number of the type: its name, dtype of a number, numbers per value.
 _TYPES: dict[int, tuple[str, str, int]] = {
     1: ("float", "<f4", 1),
     2: ("double", "<f8", 1),
@@ -69,7 +69,7 @@ _BITS = {"Fp4": 4, "Fp8": 8, "Fp16": 16}
 
 
 class Head(NamedTuple):
-    """What a file tells of a grid, and where it lies."""
+    """The metadata of a grid, and where it lies in its file."""
 
     name: str
     kind: int
@@ -104,7 +104,7 @@ def open_nanovdb(path: str, key: str | None = None) -> SparseSource:
 
 
 def _heads(path: str) -> list[Head]:
-    """All grids of a file."""
+    """Returns the metadata of all grids of a file."""
     found: list[Head] = []
     size = os.stat(path).st_size
     with open(path, "rb") as file:
@@ -137,8 +137,8 @@ def _head(file: Any) -> Head:
 
 
 def _packed(file: Any, head: Head, end: int) -> int:
-    """Bytes that a grid takes in the file: of packed ones writers tell it with or without the
-    length before each part, so it is counted.
+    """Returns the bytes that a grid takes in the file. For packed grids they are counted, because
+    some writers state them with the length before each part, some without.
     """
     if head.codec == "none":
         return head.packed
@@ -156,7 +156,7 @@ def _packed(file: Any, head: Head, end: int) -> int:
 
 
 def _content(path: str, head: Head, most: int = 0) -> Any:
-    """A grid's bytes, mapped or unpacked; no more than its first `most`, if that is cheaper."""
+    """Returns a grid's bytes, mapped or unpacked; if `most` is given, at least its first `most`."""
     with open(path, "rb") as file:
         if head.codec == "none":
             if head.size > head.packed or head.size < _ROOT:
@@ -182,8 +182,8 @@ def _content(path: str, head: Head, most: int = 0) -> Any:
 
 
 def _place(grid: Any, head: Head) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(4, 4) from voxels to the world, and (3,) the first active voxel and what is behind the last
-    one; as the grid's head and its root tell.
+    """Returns (4, 4) from voxels to the world, (3,) the first active voxel and (3,) one past the
+    last, from the header and the root of a grid.
     """
     if len(grid) < _ROOT + 24 or bytes(grid[:8]) not in _GRIDS:
         raise ValueError("a grid does not begin as grids of NanoVDB do")
@@ -200,25 +200,25 @@ def _place(grid: Any, head: Head) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 class NodeFormat(NamedTuple):
-    """Where things lie in the nodes of a type."""
+    """The layout of the nodes of grids with one type of values: offsets and sizes in bytes."""
 
-    tiles: int  # bytes before the root's tiles
-    tile: int  # bytes of one
-    tile_value: int  # bytes before its value
-    entry: int  # bytes of an entry of an upper or lower node
-    entries: tuple[int, int]  # bytes before the entries of an upper, of a lower node
-    values: int  # bytes before the voxels of a leaf
-    leaf: int  # bytes of a leaf; of FpN: without its codes
+    tiles: int  # offset of the tiles in the root
+    tile: int  # size of a tile
+    tile_value: int  # offset of the value in a tile
+    entry: int  # size of an entry of an upper or lower node
+    entries: tuple[int, int]  # offset of the entries in an upper, in a lower node
+    values: int  # offset of the voxels in a leaf
+    leaf: int  # size of a leaf; of FpN: without its codes
 
     @classmethod
     def of(cls, kind: str, dtype: str, width: int) -> NodeFormat:
-        """As a compiler lays out the structs: a value, then smallest, largest, mean, deviation."""
+        """Computes the layout that a compiler gives to the structs of a type of values."""
         item = np.dtype(dtype).itemsize
         value = item * width
         mean = item if dtype == "|b1" else 8 if item == 8 else 4
 
         def behind(start: int, values: int) -> int:
-            """What follows so many values, then mean and deviation, on a border of 32 bytes."""
+            """Returns the offset behind values, mean and deviation, a multiple of 32 bytes."""
             return _up(_up(_up(start, item) + values * value, mean) + 2 * mean, _ALIGN)
 
         at = _up(20, item)
@@ -242,7 +242,7 @@ def _up(n: int, step: int) -> int:
 
 @dataclass(kw_only=True)
 class NanoGrid(SparseGrid):
-    """A grid in memory; `places` are bytes before each node."""
+    """A grid in memory; `places` are the offsets of the nodes in bytes."""
 
     layout: NodeFormat
 
@@ -311,7 +311,7 @@ class NanoGrid(SparseGrid):
         return out
 
     def _voxels(self, place: int) -> np.ndarray:
-        """(512, c) of a leaf."""
+        """Returns (512, c) the voxels of a leaf."""
         begin = place + self.layout.values
         if self.kind in ("Mask", "bool"):
             return bits(self.data, begin, VOXELS)[:, None]
@@ -324,7 +324,7 @@ class NanoGrid(SparseGrid):
 
 
 def _codes(data: Any, at: int, bits: int) -> np.ndarray:
-    """(512,) float32 numbers of so many bits, the lowest bits of a byte first."""
+    """Returns (512,) float32, numbers of `bits` bits each, the lowest bits of a byte first."""
     if bits > 16:
         raise ValueError(f"a leaf has numbers of {bits} bits")
     if bits == 16:
@@ -337,7 +337,7 @@ def _codes(data: Any, at: int, bits: int) -> np.ndarray:
 def _children(
     data: Any, layout: NodeFormat, level: int, places: np.ndarray, origins: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """By node: bytes before each of its children, and their first voxels."""
+    """Yields for each node the offsets of its children, and their first voxels."""
     n, side = COUNTS[level], COUNTS[level + 1] * (8 if level == 0 else 1)
     for place, origin in zip(places.tolist(), origins, strict=True):
         which = np.flatnonzero(bits(data, place + 32 + n**3 // 8, n**3))
@@ -347,7 +347,9 @@ def _children(
 
 
 def _checked(places: np.ndarray, size: int, least: int) -> np.ndarray:
-    """Places of nodes, all of them different and with so many bytes behind."""
+    """Returns the offsets of nodes; raises ValueError unless all differ, are aligned, and have
+    `least` bytes behind them.
+    """
     if len(places) and not (places.min() >= _ROOT and places.max() <= size - least):
         raise ValueError(f"a node lies outside of the grid's {size} bytes")
     if (places % _ALIGN).any():
@@ -358,7 +360,7 @@ def _checked(places: np.ndarray, size: int, least: int) -> np.ndarray:
 
 
 def _check_apart(places: Sequence[np.ndarray], sizes: Sequence[int]) -> None:
-    """Raises ValueError where nodes lie over each other; by level: places, bytes of one."""
+    """Raises ValueError if nodes overlap; by level: their offsets, and the bytes of one node."""
     begin = np.concatenate(places)
     order = np.argsort(begin)
     end = begin + np.repeat(sizes, [len(part) for part in places])

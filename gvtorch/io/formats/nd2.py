@@ -1,4 +1,4 @@
-"""ND2 of Nikon, through nd2: frame by frame."""
+"""Nikon ND2, read with nd2: frame by frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .format import Format, choose
 
 @dataclass(frozen=True, kw_only=True)
 class Nd2Source(VolumeSource):
-    """A position, (t, z, c, y, x, colour)."""
+    """A position of the stage, (t, z, c, y, x, colour)."""
 
     position: int
 
@@ -43,7 +43,7 @@ class Nd2Source(VolumeSource):
 
 @Format("ND2", ".nd2", options=("key",), library="nd2", extra="microscopes")
 def open_nd2(path: str, key: str | None = None) -> Nd2Source:
-    """Opens a position of the stage: its number, the first one if left out."""
+    """Opens the position of the stage of number `key`, the first one if left out."""
     import nd2
 
     with nd2.ND2File(path) as file:
@@ -71,7 +71,7 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
 
 
 def _told(file: Any, sizes: Mapping[str, int]) -> Told:
-    """What the metadata tells: info, spacing, and what is not kept."""
+    """Returns info and spacing from the metadata, and which metadata is not kept."""
     voxel = file.voxel_size()
     spacing, unit = spacing_of([float(side) for side in voxel], ["um"] * 3)
     channels = []

@@ -1,5 +1,5 @@
-"""NIfTI, through nibabel: (x, y, z), then time, then components. Axes along the world's, which are
-x right, y anterior, z superior, are turned to x, y, z.
+"""NIfTI, read with nibabel: (x, y, z), then time, then components. Axes parallel to the world's,
+which are x right, y anterior, z superior, are reordered to x, y, z.
 
 Source: "NIfTI-1 data format", nifti1.h (nifti.nimh.nih.gov), dim, xyzt_units, intent_code, cal_max.
 """
@@ -26,12 +26,12 @@ _LABEL_INTENT = 1002
 
 @dataclass(frozen=True, kw_only=True)
 class NiftiSource(VolumeSource):
-    """A NIfTI image, its values scaled as the header tells."""
+    """A NIfTI image, its values scaled as the header says."""
 
     def read_stored(self, index: Index) -> np.ndarray:
         data = _load(self.path)[0].dataobj
         if self.whole and data.dtype.str == self.stored and (data.slope, data.inter) == (1, 0):
-            # nibabel takes several times the memory.
+            # nibabel would take several times the memory.
             told: dict[str, Any] = {"path": self.path, "axes": self.axes, "stored": self.stored}
             told |= {"shape": data.shape, "offset": data.offset, "fortran": True, "whole": True}
             return ArraySource(file=self.path, **told).read_stored(index)
@@ -42,15 +42,15 @@ class NiftiSource(VolumeSource):
 
 @Format("NIfTI", ".nii", ".nii.gz", library="nibabel")
 def open_nifti(path: str) -> NiftiSource:
-    """Opens an image; its first voxel tells the dtype after scaling."""
+    """Opens an image; its first voxel is read to find the dtype after scaling."""
     image, mended = _load(path)
     shape = tuple(int(n) for n in image.shape)
     packed = path.lower().endswith(".gz")
     need, size = math.prod(shape) * image.dataobj.dtype.itemsize, os.stat(path).st_size
-    if packed and need > MOST_PACKED * size:  # nibabel takes memory for all of it at once
+    if packed and need > MOST_PACKED * size:  # nibabel allocates memory for all of it at once
         raise ValueError(f"{path}: takes {need} bytes, which {size} can't unpack to")
     first = np.asanyarray(image.dataobj[(slice(0, 1),) * len(shape)])
-    if first.dtype.fields is not None:  # colours, the numbers of a voxel side by side
+    if first.dtype.fields is not None:  # colours: a structured dtype of components
         first = _components(first)
         shape = (*shape, *[1] * (4 - len(shape)), first.shape[-1])
     if len(shape) < 3 or math.prod(shape[5:]) != 1:
@@ -75,7 +75,7 @@ def open_nifti(path: str) -> NiftiSource:
 
 
 def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
-    """What the header tells of the values, and what of it is not kept."""
+    """Returns what the header says of the values, and which of it is not kept."""
     header, lost = image.header, []
     try:
         length, period = header.get_xyzt_units()
@@ -114,21 +114,21 @@ def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
 
 
 def _components(data: np.ndarray) -> np.ndarray:
-    """(x, y, z[, t]) colours of named parts -> (x, y, z, t, c)."""
+    """Converts (x, y, z[, t]) colours of a structured dtype to (x, y, z, t, c)."""
     names = data.dtype.names or ()
     parts = np.stack([data[name] for name in names], -1)
     return parts[..., None, :] if parts.ndim == 4 else parts
 
 
 class _HeaderLog(logging.Filter):
-    """Keeps what nibabel tells of a header while one is read, which it would print."""
+    """Collects what nibabel logs about a header while one is read, instead of printing it."""
 
     def __init__(self) -> None:
         super().__init__()
         self.lines = threading.local()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether somebody else reads."""
+        """Returns whether a record may be printed: it is not of a header read in this thread."""
         lines: list[str] | None = getattr(self.lines, "here", None)
         if lines is not None:
             lines.append(record.getMessage())
@@ -139,10 +139,10 @@ _HEARD = _HeaderLog()
 
 
 def _load(path: str) -> tuple[Any, list[str]]:
-    """The image, and what nibabel mended in its header."""
+    """Returns the image, and what nibabel corrected in its header."""
     import nibabel
 
-    nibabel.imageglobals.logger.addFilter(_HEARD)  # once, however often
+    nibabel.imageglobals.logger.addFilter(_HEARD)  # further calls add nothing
     heard: list[str] = []
     _HEARD.lines.here = heard
     try:

@@ -13,7 +13,7 @@ from .format import Format, choose, not_chosen
 
 @Format("NPY", ".npy", ".npy.gz", ".npy.bz2", options=("axes",))
 def open_npy(path: str, axes: str | None = None, member: str = "") -> ArraySource:
-    """Opens an array file, or a member of an archive of them; `axes` as of `ask_axes`."""
+    """Opens an array file, or a member of an archive of them; `axes` as in `ask_axes`."""
     with open_unpacked(path, member) as stream:
         version = np.lib.format.read_magic(stream)
         read_header = {
@@ -41,7 +41,7 @@ def open_npy(path: str, axes: str | None = None, member: str = "") -> ArraySourc
 
 @Format("NPZ", ".npz", options=("key", "axes"))
 def open_npz(path: str, key: str | None = None, axes: str | None = None) -> ArraySource:
-    """Opens the array `key` of an archive; without it, the only one. `axes` as of `ask_axes`."""
+    """Opens the array `key` of an archive, the only one if left out; `axes` as in `ask_axes`."""
     with zipfile.ZipFile(path) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
     if key is None and len(names) > 1:

@@ -1,5 +1,5 @@
-"""NRRD, attached or detached; the header through pynrrd. Axes along the world's are turned to
-x, y, z; which way these point is told (`ImageInfo.space`), they are not turned to another space.
+"""NRRD, attached or detached; pynrrd reads the header. Axes parallel to the world's are reordered
+to x, y, z. The world's axes stay those of the file's space, which `ImageInfo.space` names.
 
 Source: "Definition of NRRD File Format" (teem.sourceforge.net/nrrd/format.html).
 """
@@ -27,7 +27,7 @@ _ENCODINGS = {
     **dict.fromkeys(("gz", "gzip"), "zlib"),
     **dict.fromkeys(("bz2", "bzip2"), "bz2"),
 }
-_MOST_SKIPPED = 1 << 24  # bytes of what is unpacked
+_MOST_SKIPPED = 1 << 24  # bytes of a line, or of unpacked data
 _SPACES = {"ras": "right-anterior-superior", "las": "left-anterior-superior"}
 _SPACES["lps"] = "left-posterior-superior"
 _SPATIAL = ("domain", "space")
@@ -45,7 +45,7 @@ _UNKEPT = ("measurement frame", "old min", "oldmin", "old max", "oldmax")
 
 @Format("NRRD", ".nrrd", ".nhdr", options=("axes",), library="nrrd", package="pynrrd")
 def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
-    """Opens a file; `axes` as of `ask_axes`, the slowest first."""
+    """Opens a file; `axes` as in `ask_axes`, the slowest first."""
     import nrrd
 
     with open(path, "rb") as file:
@@ -94,13 +94,13 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     at = _behind_lines(data_file, at, lines)
     if encoding == "raw":
         need = math.prod(shape) * np.dtype(kind).itemsize
-        begin = max(at, size - need) if skip < 0 else at + skip  # -1: the numbers are its last
+        begin = max(at, size - need) if skip < 0 else at + skip  # -1: numbers are at the end
         return ArraySource(file=data_file, offset=begin, fortran=True, exact=True, **told)
     return PackedSource(file=data_file, offset=at, skip=skip, codec=encoding, fortran=True, **told)
 
 
 def _behind_lines(file: str, at: int, lines: int) -> int:
-    """Where so many lines of a file end that begin at a place."""
+    """Returns the offset behind `lines` lines of a file that begin at `at`."""
     if lines:
         check_regular(file)
         with open(file, "rb") as stream:
@@ -117,14 +117,14 @@ def _behind_lines(file: str, at: int, lines: int) -> int:
 
 
 def _letters(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: str | None) -> str:
-    """What each axis is: "s" of space, "t" times, "c" components."""
+    """Returns the meaning of each axis: "s" space, "t" times, "c" components."""
     rank, kinds = len(shape), [str(kind).lower() for kind in header.get("kinds", ())]
     if rank < 3:
         raise ValueError(f"{path}: expected 3 axes of space, got {rank} axes")
     if axes is None:
         if len(kinds) == rank and set(kinds) - {"???", "none"}:
             found = ["s" if k in _SPATIAL else "t" if k == "time" else "c" for k in kinds]
-        else:  # the axes that have no place, if the header tells of one
+        else:  # axes of space are those with a direction, else those with a step
             places = _directions(header, rank), _steps(header, rank)[0][:, None]
             table = next((one for one in places if np.isfinite(one).any()), np.zeros((rank, 1)))
             found = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
@@ -137,15 +137,15 @@ def _letters(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: st
 
 
 def _directions(header: dict[str, Any], rank: int) -> np.ndarray:
-    """(axes, 3 or 4) steps along each axis, in space and, if told, in time; NaN for none."""
+    """Returns (axes, 3 or 4) a step along each axis in space and, if given, time; NaN for none."""
     told = np.asarray(header.get("space directions", np.zeros((0, 3))), dtype=np.float64)
     fits = told.ndim == 2 and len(told) == rank and told.shape[1] in (3, 4)
     return told if fits else np.full((rank, 3), np.nan)
 
 
 def _numbers(header: dict[str, Any], rank: int, *names: str) -> np.ndarray:
-    """(axes,) what the first field of these names that is there tells of each axis; NaN for
-    nothing.
+    """Returns (axes,) the numbers of the first field of `names` that the header has; NaN if it has
+    none, or not a number for each axis.
     """
     field = next((header[name] for name in names if name in header), np.zeros(0))
     told = np.asarray(field, dtype=np.float64)
@@ -153,11 +153,11 @@ def _numbers(header: dict[str, Any], rank: int, *names: str) -> np.ndarray:
 
 
 def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
-    """(axes,) widths of a step along each axis and (axes,) places of the first values; NaN for
+    """Returns (axes,) the step along each axis and (axes,) the position of its first value; NaN for
     none.
 
-    Source: NRRD format, sections "axis mins" and "centers"; values whose centering is not told are
-        those of cells, as Teem takes them.
+    Source: NRRD format, sections "axis mins" and "centers"; values whose centering is not given
+        count as those of cells, as in Teem.
     """
     low = _numbers(header, rank, "axis mins", "axismins")
     high = _numbers(header, rank, "axis maxs", "axismaxs")
@@ -172,7 +172,7 @@ def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _affine(header: dict[str, Any], letters: str) -> np.ndarray:
-    """(4, 4) place of the three axes of space."""
+    """Returns (4, 4) the affine of the three axes of space."""
     spatial = [axis for axis, letter in enumerate(letters) if letter == "s"]
     directions = _directions(header, len(letters))[spatial, :3]
     spacings, first = (one[spatial] for one in _steps(header, len(letters)))
@@ -186,13 +186,13 @@ def _affine(header: dict[str, Any], letters: str) -> np.ndarray:
         affine[:3, 3] = origin[:3]
     if "space origin" not in header and np.isfinite(first).all():
         affine[:3, 3] = first
-    return affine  # what is told and no number is refused by `place_axes`
+    return affine  # `place_axes` refuses NaN and infinity
 
 
 def _info(
     header: dict[str, Any], letters: str, shape: tuple[int, ...]
 ) -> tuple[ImageInfo, list[str]]:
-    """What the header tells of the values, and what of it is not kept."""
+    """Returns what the header says of the values, and which of it is not kept."""
     own = [str(name) for name in header if str(name).lower() not in _FIELDS]
     lost = [f"the field {name!r}" for name in header if str(name).lower() in _UNKEPT]
     if own:
@@ -229,7 +229,7 @@ def _info(
 def _channels(
     header: dict[str, Any], letters: str, shape: tuple[int, ...]
 ) -> tuple[ChannelInfo, ...]:
-    """Names of the components of kinds that have some."""
+    """Returns the names of the components, if the kind of their axis defines them."""
     kinds = [str(kind).lower() for kind in header.get("kinds", ())]
     at = letters.find("c")
     kind = kinds[at] if 0 <= at < len(kinds) else ""

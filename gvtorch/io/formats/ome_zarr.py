@@ -1,4 +1,4 @@
-"""OME-Zarr images, and stores of `convert`, which are such: a folder or a URL."""
+"""OME-Zarr images, including stores written by `convert`: a folder or a URL."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _store(path: str, key: str | None, _opened: int, time: int) -> Any:
 
 @Format("OME-Zarr", ".zarr", matches=is_zarr, options=("key",))
 def open_ome_zarr(path: str, key: str | None = None) -> OmeZarrSource:
-    """Opens an image, the first one if `key` names none, with all times and channels."""
+    """Opens the image `key`, the first one if left out, with all times and channels."""
     from ..stores.store import Store
 
     store = Store.open(path, image=key)

@@ -1,11 +1,10 @@
 """OpenVDB (`.vdb`, file versions 220 to 224): trees 5-4-3 of numbers, vectors and masks.
 
-A file is a head, what is told of each grid with its place, and the grids: metadata, transform,
-topology (masks, and the tiles of inner nodes), then the values of the leaves one after another.
-`_Topology` walks through all nodes once and keeps where the values of each begin; they are
-unpacked where they are asked for. Inactive values that are not the background's are told in a few
-bytes, see `_Packing`.
-Source: the source code of OpenVDB (io/Archive.cc, io/Compression.h, tree/*.h) tells the format.
+A file is a header, then for each grid a descriptor with its offsets, and the grid: metadata,
+transform, topology (masks, and the tiles of inner nodes), then the values of the leaves one after
+another. `_Topology` visits all nodes once and records where each begins; their values are unpacked
+on demand. Inactive values other than the background are stored in a few bytes, see `_Packing`.
+Source: the source code of OpenVDB (io/Archive.cc, io/Compression.h, tree/*.h).
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ from .format import Format, choose
 
 _MAGIC = 0x56444220
 _VERSIONS = range(220, 225)
-_MASKED = 222  # the version from which on values are packed by masks, and grids tell their packing
+_MASKED = 222  # first version that packs values by masks and stores the compression of each grid
 _MOST_GRIDS, _MOST_TOLD = 4096, 65536
-_MOST_NAME, _MOST_TEXT = 4096, 1 << 20  # bytes of a name, of what metadata are called
+_MOST_NAME, _MOST_TEXT = 4096, 1 << 20  # bytes of a name, of names and types of metadata
 _ZIP, _ACTIVE, _BLOSC = 1, 2, 4
 _TYPES: dict[str, tuple[str, int]] = {
     "float": ("<f4", 1),
@@ -48,7 +47,7 @@ _TYPES: dict[str, tuple[str, int]] = {
     "vec3i": ("<i4", 3),
 }
 _TOLD = {"vec3i": "<3i", "int32": "<i", "int64": "<q", "float": "<f", "double": "<d", "bool": "<?"}
-# How many doubles a transform's map has, and which of them are translation and scale.
+# Number of doubles in a transform's map, and the index of its translation and of its scale.
 _MAPS = {
     "UniformScaleMap": (15, None, 0),
     "ScaleMap": (15, None, 0),
@@ -59,14 +58,14 @@ _MAPS = {
 
 
 class Cursor:
-    """Reads a file's bytes from a place on, up to another or their end."""
+    """Reads bytes one after another, from offset `at` to `end` or to the end of the data."""
 
     def __init__(self, data: Any, at: int = 0, end: int | None = None) -> None:
         self.data, self.at = data, at
         self.end = len(data) if end is None else end
 
     def skip(self, count: int) -> int:
-        """Goes on by so many bytes; returns where they begin."""
+        """Skips `count` bytes; returns the offset at which they begin."""
         begin = self.at
         if count < 0 or begin + count > self.end:
             raise ValueError(f"ends at {self.end}, within {count} bytes from {begin} on")
@@ -79,7 +78,7 @@ class Cursor:
         return bytes(self.data[begin : begin + count])
 
     def numbers(self, layout: str) -> tuple[Any, ...]:
-        """Reads numbers, as `struct` tells them."""
+        """Reads numbers in a layout of `struct`."""
         return struct.unpack(layout, self.take(struct.calcsize(layout)))
 
     def number(self, layout: str) -> Any:
@@ -103,7 +102,7 @@ class Cursor:
         return self.take(length).decode("utf-8", "replace")
 
     def told(self) -> dict[str, Any]:
-        """Reads metadata; of kinds that are not known the values are left out."""
+        """Reads metadata; values of unknown types are left out."""
         found: dict[str, Any] = {}
         count = self.number("<I")
         if count > _MOST_TOLD:
@@ -122,13 +121,13 @@ class Cursor:
 
 @dataclass
 class Entry:
-    """What a file tells of a grid."""
+    """The descriptor and the metadata of a grid."""
 
-    unique: str  # its name, with a number where several share it
-    tree: str  # its kind of tree
+    unique: str  # its name, with a number if several have the same
+    tree: str  # type of its tree
     half: bool
-    parent: str  # whose tree it shares
-    at: int  # where it begins
+    parent: str  # name of the grid whose tree it shares, or ""
+    at: int  # offset at which it begins
     leaves_at: int
     end: int
     compression: int = 0
@@ -138,7 +137,7 @@ class Entry:
 
     @property
     def name(self) -> str:
-        """As users know it: "density", or "density[1]" of the second one."""
+        """Its name for users: "density", or "density[1]" for the second of that name."""
         name, _, number = self.unique.partition("\x1e")
         return f"{name}[{number}]" if number not in ("", "0") else name
 
@@ -151,7 +150,7 @@ def open_openvdb(path: str, key: str | None = None) -> SparseSource:
         names = [entry.name for entry in entries]
         at, lost = choose(path, "grid", names, key, preferred="density")
         entry = entries[at]
-        number = at  # of the grid whose tree it is
+        number = at  # index of the grid that has the tree
         if entry.parent:
             owners = [n for n, other in enumerate(entries) if other.unique == entry.parent]
             if not owners or entries[owners[0]].parent:
@@ -184,7 +183,7 @@ def _mapped(path: str) -> mmap.mmap:
 
 
 def _kind(entry: Entry) -> str:
-    """The kind of values of a grid."""
+    """Returns the type of a grid's values."""
     found = re.fullmatch(r"Tree_(\w+?)_5_4_3", entry.tree)
     if found is None or found[1] not in _TYPES:
         raise ValueError(
@@ -194,7 +193,7 @@ def _kind(entry: Entry) -> str:
 
 
 def _entries(data: Any) -> tuple[int, list[Entry]]:
-    """The version of a file, and what it tells of its grids."""
+    """Returns the version of a file, and the descriptors of its grids."""
     cursor = Cursor(data)
     magic, version = cursor.numbers("<qI")
     if magic != _MAGIC:
@@ -203,7 +202,7 @@ def _entries(data: Any) -> tuple[int, list[Entry]]:
         raise ValueError(
             f"is of file version {version}; {_VERSIONS[0]} to {_VERSIONS[-1]} are known"
         )
-    cursor.skip(8)  # of the library
+    cursor.skip(8)  # version of the library
     with_places = cursor.number("<?")
     packed = cursor.number("<?") if version < _MASKED else False
     cursor.skip(36)  # uuid
@@ -228,12 +227,12 @@ def _entries(data: Any) -> tuple[int, list[Entry]]:
         entry = Entry(unique, tree.removesuffix("_HalfFloat"), half, parent, at, leaves_at, end)
         entry.compression = _ZIP if packed else 0
         entries.append(entry)
-        cursor.at = end  # what is told of the next one
+        cursor.at = end  # the descriptor of the next grid
     return version, entries
 
 
 def _read_head(data: Any, entry: Entry, version: int) -> None:
-    """Adds what stands before a grid's tree: packing, metadata, transform."""
+    """Reads what precedes a grid's tree into `entry`: compression, metadata, transform."""
     cursor = Cursor(data, entry.at, entry.end)
     if version >= _MASKED:
         entry.compression = cursor.number("<I")
@@ -247,7 +246,7 @@ def _read_head(data: Any, entry: Entry, version: int) -> None:
         if scale is not None:
             entry.affine[[0, 1, 2], [0, 1, 2]] = numbers[scale : scale + 3]
     elif kind in ("AffineMap", "UnitaryMap"):
-        entry.affine = cursor.array("<f8", 16).reshape(4, 4).T.copy()  # of row vectors
+        entry.affine = cursor.array("<f8", 16).reshape(4, 4).T.copy()  # the file's is for rows
     else:
         raise ValueError(f"grid {entry.name!r} lies in the world by a {kind}, which is not known")
     entry.tree_at = cursor.at
@@ -255,12 +254,12 @@ def _read_head(data: Any, entry: Entry, version: int) -> None:
 
 @dataclass(frozen=True)
 class _Packing:
-    """How values of a grid's nodes are written.
+    """How the values of a grid's nodes are stored.
 
-    A byte tells what inactive values are; where packing is by active values, only these follow:
-    0: the background; 1: minus the background; 2: one number, which is told; 3: minus the
-    background and the background, 4: a number and the background, 5: two numbers, one for each of
-    which a mask tells; 6: all values are written.
+    A byte says what inactive values are; if only active values are stored (`_ACTIVE`), they follow.
+    0: the background; 1: minus the background; 2: a number, which is stored; 3: minus the
+    background or the background; 4: a stored number or the background; 5: one of two stored
+    numbers; of 3 to 5 a mask says which of the two; 6: all values are stored.
     """
 
     stored: np.dtype  # of the values in the file
@@ -268,10 +267,10 @@ class _Packing:
     width: int
     background: np.ndarray
     compression: int
-    masked: bool  # as of version 222
+    masked: bool  # version 222 or later
 
     def skip(self, cursor: Cursor, active: int, count: int) -> None:
-        """Goes behind the values of a node, of which so many are active."""
+        """Skips the `count` values of a node, of which `active` are active."""
         if self.masked:
             code = cursor.number("<B")
             told = {2: 1, 4: 1, 5: 2}.get(code, 0)
@@ -282,7 +281,7 @@ class _Packing:
         cursor.skip(abs(cursor.number("<q")) if self.compression & (_ZIP | _BLOSC) else size)
 
     def values(self, cursor: Cursor, active: np.ndarray) -> np.ndarray:
-        """Reads the values of a node, (n, c), of which those are active (n,)."""
+        """Reads the values of a node, (n, c); `active`, (n,) bool, says which are active."""
         if not self.masked:
             return self._read(cursor, len(active))
         code = cursor.number("<B")
@@ -328,7 +327,7 @@ class _Packing:
 
 @dataclass(kw_only=True)
 class VdbGrid(SparseGrid):
-    """A grid of a file; `places` tell where the values of each node are."""
+    """A grid of a file; `places` are the offsets of the masks of each node."""
 
     packing: _Packing
 
@@ -364,7 +363,7 @@ class VdbGrid(SparseGrid):
         is_child, active = (cursor.mask(n**3) for _ in range(2))
         if self.packing.masked:
             values = self.packing.values(cursor, active)
-        else:  # those of tiles alone are written
+        else:  # only the values of tiles are stored
             values = np.zeros((n**3, self.packing.width), self.dtype)
             values[~is_child] = self.packing.values(cursor, active[~is_child])
         return values.reshape(n, n, n, -1), ~is_child.reshape(n, n, n)
@@ -386,7 +385,7 @@ class VdbGrid(SparseGrid):
 
 
 class _Topology:
-    """Finds the nodes of a tree, whose root `cursor` has come to."""
+    """Finds the nodes of a tree; `cursor` is at its root."""
 
     def __init__(self, cursor: Cursor, packing: _Packing) -> None:
         self.cursor, self.packing = cursor, packing
@@ -394,8 +393,8 @@ class _Topology:
         self.places: tuple[list[Any], ...] = ([], [], [])
 
     def read(self, kind: str, leaves_at: int) -> dict[str, Any]:
-        """Returns `origins`, `places`, `root_places` and `root_values` of a `VdbGrid`; the values
-        of leaves follow, which is where the file tells that they begin.
+        """Returns `origins`, `places`, `root_places` and `root_values` of a `VdbGrid`; raises
+        ValueError if the leaves do not begin at `leaves_at`, behind the other nodes.
         """
         cursor, packing = self.cursor, self.packing
         tiles, children = cursor.numbers("<2I")
@@ -421,7 +420,7 @@ class _Topology:
         }
 
     def _node(self, level: int, origin: np.ndarray) -> None:
-        """Goes through a node and all below it."""
+        """Visits a node and all below it."""
         cursor, n = self.cursor, COUNTS[level]
         self.origins[level].append(origin[None])
         self.places[level].append(cursor.at)
@@ -439,7 +438,7 @@ class _Topology:
         self.places[2].append(np.unpackbits(masks, axis=1).sum(1, dtype=np.int64))
 
     def _leaves(self, kind: str, active: list[int]) -> np.ndarray:
-        """Where the values of each leaf begin; so many voxels of each are active."""
+        """Returns the offset of each leaf; `active` are the numbers of their active voxels."""
         cursor, places = self.cursor, np.empty(len(active), np.int64)
         for number, count in enumerate(active):
             places[number] = cursor.skip(VOXELS // 8)

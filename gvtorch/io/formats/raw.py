@@ -1,5 +1,5 @@
-"""RAW: numbers alone, x fastest; the file's name or the user tells extent and dtype. A file of any
-ending is one if the user tells its shape.
+"""RAW: numbers without a header, x fastest; the file's name or the user specifies extent and dtype.
+A file of unknown ending is read as RAW if the user specifies its shape.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ def open_raw(
     dtype: str | np.dtype | None = None,
     offset: int | None = None,
 ) -> ArraySource:
-    """Opens a RAW file of (x, y, z) voxels. What is not given is read from its name, as in
-    `scan_512x512x300_int16.raw`, little endian unless that says "be". Where `offset` bytes of a
-    header come first, something may also follow the numbers.
+    """Opens a RAW file of (x, y, z) voxels. A shape or dtype that is left out is read from its
+    name, as in `scan_512x512x300_int16.raw`, little endian unless that says "be". If `offset`, the
+    bytes of a header to skip, is given, other bytes may also follow the numbers.
     """
     named = _NAME.search(Path(path).name.lower())
     if shape is None:

@@ -1,4 +1,4 @@
-"""TIFF, through tifffile: plain, BigTIFF, OME-TIFF and ImageJ's, with times and channels."""
+"""TIFF, read with tifffile: plain, BigTIFF, OME-TIFF and ImageJ's, with times and channels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LOST = {  # by the tag PhotometricInterpretation
 
 @dataclass(frozen=True, kw_only=True)
 class TiffSource(VolumeSource):
-    """A series of packed pages, of which the tiles and strips of a part are unpacked."""
+    """A series of packed pages; reading a part unpacks only the tiles and strips that it needs."""
 
     series: int = 0
 
@@ -50,7 +50,7 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
     """Unpacks a part (rows, columns) or (rows, columns, c) of a page.
 
     Raises:
-        ValueError: The file ends before.
+        ValueError: The file ends too early.
     """
     check_pictures([page, keyframe])
     planes, depth, length, width, samples = keyframe.shaped
@@ -79,7 +79,7 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
 
 
 def _unpacked(page: Any, keyframe: Any, number: int) -> np.ndarray | None:
-    """(rows, columns, c) of a tile or strip; None if it is not written, which stands for zeros."""
+    """Returns (rows, columns, c) of a tile or strip; None if it is not stored: all are zero."""
     offset, size = page.dataoffsets[number], page.databytecounts[number]
     if not size:
         return None
@@ -144,7 +144,7 @@ def _axes(path: str, shape: Sequence[int], axes: str) -> str:
     )
     others = [letter for letter in letters if letter not in "TZYXCS-"]
     if "Z" not in letters and len(others) == 1 and others[0] in "QI":
-        letters, others = letters.replace(others[0], "Z"), []  # pages without a meaning: slices
+        letters, others = letters.replace(others[0], "Z"), []  # pages of unknown meaning: slices
     channels = [letter for letter in letters if letter in "CS"]
     if others or len(channels) > 1 or letters.count("Y") != 1 or letters.count("X") != 1:
         raise ValueError(
@@ -154,7 +154,7 @@ def _axes(path: str, shape: Sequence[int], axes: str) -> str:
 
 
 def _told(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) -> Told:
-    """What the file tells of a series beside its numbers."""
+    """Returns info and spacing of a series, and which metadata is not kept."""
     width = shape[axes.index("c")] if "c" in axes else 1
     if series.kind == "ome":
         return ome_info(file.ome_metadata, number, series.name, width)
@@ -166,7 +166,7 @@ def _told(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) 
         info, spacing, more = imagej_info(file.imagej_metadata, _resolution(file), width)
         return replace(info, channels=channels) if colors else info, spacing, [*more, *lost]
     tags = series.keyframe.tags
-    if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are of printers
+    if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are for printers
         lost.append("the size of a pixel in centimeters: how far pages are apart is not told")
     if tags.valueof("Orientation", 1) != 1:
         lost.append("that its pages are to be shown turned or mirrored")
@@ -174,7 +174,7 @@ def _told(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) 
 
 
 def _resolution(file: Any) -> list[float | None]:
-    """Width and height of a pixel, as ImageJ writes them: pixels per unit, in tags."""
+    """Returns width and height of a pixel, which ImageJ stores as pixels per unit, in tags."""
     tags, sides = file.pages[0].tags, []
     for name in ("XResolution", "YResolution"):
         pixels, units = tags[name].value if name in tags else (1, 1)

@@ -1,7 +1,7 @@
 """VTK images without VTK: XML (`.vti`) and legacy files (`.vtk`, STRUCTURED_POINTS).
 
-Raw numbers are read by region; packed ones block by block, each bounded by what the header tells.
-Point data, or cell data (voxels between the points). Axes may be turned (Direction).
+Raw numbers are read by region; packed ones block by block, each bounded by the size in the header.
+Values are point data, or cell data (voxels between the points). Axes may be rotated (Direction).
 Source: "VTK File Formats" (VTK User's Guide, Kitware), simple legacy and XML formats.
 """
 
@@ -32,13 +32,13 @@ _LONG["vtkidtype"] = "i4"  # which VTK writes as int
 _MOST_HEADER = 1 << 22  # bytes
 _MOST_VALUES = 1 << 33
 _MOST_ARRAYS = 64
-_MOST_LINE = 4096  # bytes that are looked at
+_MOST_LINE = 4096  # bytes of a line that are parsed
 _ARRAYS = ("SCALARS", "VECTORS", "COLOR_SCALARS")
 
 
 @dataclass(frozen=True, kw_only=True)
 class VtkSource(VolumeSource):
-    """An array of an XML file that is packed or written as text."""
+    """An array of an XML file that is packed, or encoded as text."""
 
     encoding: str  # "raw", "base64" or "ascii"
     compressor: str  # "zlib", "lzma", "lz4", or none
@@ -81,7 +81,7 @@ class VtkSource(VolumeSource):
             raise ValueError(f"{self.path}: {need} bytes expected, {sum(sizes)} found")
         if sum(packed) > len(content):
             raise ValueError(f"{self.path}: ends before its {sum(packed)} packed bytes")
-        # The head and the blocks are of one stretch of base64 each.
+        # The table and the blocks are each encoded as one stretch of base64.
         begin = heads if self.encoding == "raw" else -(-heads // 3) * 4
         data, parts, at = _bytes(content[begin:], self.encoding, sum(packed)), [], 0
         for here, unpacked in zip(packed, sizes, strict=True):
@@ -91,7 +91,7 @@ class VtkSource(VolumeSource):
 
 
 def _bytes(content: bytes, encoding: str, count: int) -> bytes:
-    """The first bytes of raw or base64 content."""
+    """Returns the first `count` bytes of raw or base64 content."""
     if encoding == "raw":
         return content[:count]
     return base64.b64decode(content[: -(-count // 3) * 4])[:count]
@@ -110,7 +110,7 @@ def _told(
     array: dict[str, Any],
     lost: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Fields of a source of (z, y, x) or (z, y, x, c) values at points, or in cells."""
+    """Returns the fields of a source of (z, y, x) or (z, y, x, c) values at points, or in cells."""
     size = [max(n - 1, 1) for n in points] if array["cells"] else list(points)
     check_extent(path, size, most=_MOST_VALUES)
     if array["cells"]:
@@ -137,7 +137,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
         content = file.read(_MOST_HEADER)
         file.seek(0, 2)
         end = file.tell()
-    # Looked for in one place: at many that never end it would take their number squared.
+    # Matched at the first tag only: with many tags that never end, time would grow as their square.
     start = content.find(b"<AppendedData")
     appended = (
         re.compile(rb"<AppendedData\b[^>]*>\s*_").match(content, start) if start >= 0 else None
@@ -204,7 +204,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
 
 
 def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
-    """The ImageData of a file, and its only piece."""
+    """Returns the ImageData of a file, and its only piece."""
     image = root.find("ImageData")
     if root.get("type") == "ImageData" and image is None:
         raise ValueError(f"{path}: has no ImageData in it")
@@ -217,7 +217,7 @@ def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
 
 
 def _read_all(path: str, size: int) -> bytes:
-    """A file whose numbers stand among its XML."""
+    """Reads a file whose numbers are inside its XML."""
     if size > 1 << 31:
         raise ValueError(f"{path}: {size} bytes of XML are too many; write it with appended data")
     with open(path, "rb") as file:
@@ -225,7 +225,7 @@ def _read_all(path: str, size: int) -> bytes:
 
 
 def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
-    """The arrays of a piece: at points, then in cells; those that are marked as scalars first."""
+    """Returns the arrays of a piece: those marked as scalars, then others; at points, in cells."""
     found: list[dict[str, Any]] = []
     numbers = {id(item): at for at, item in enumerate(root.iter("DataArray"))}
     for kind in ("PointData", "CellData"):
@@ -250,12 +250,12 @@ def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
 
 
 def _inline(content: bytes, number: int) -> tuple[int, int]:
-    """Where the content of a DataArray begins, by its number in the file, and its length."""
+    """Returns the offset and length of the content of a DataArray, by its number in the file."""
     found: list[list[int]] = []
     parser = expat.ParserCreate()
 
     def ended_tag(_text: str) -> None:
-        """What comes first behind a tag."""
+        """Records where the content behind a tag begins."""
         parser.DefaultHandler = None
         found[-1][0] = parser.CurrentByteIndex
 
@@ -305,9 +305,9 @@ def _open_legacy(path: str, key: str | None) -> VolumeSource:
 def _legacy_parts(
     path: str, content: mmap.mmap, at: int, binary: bool
 ) -> tuple[np.ndarray, list[int], list[dict[str, Any]]]:
-    """Affine, number of points, and the arrays as XML's: at points, then in cells, scalars first.
+    """Returns affine, number of points, and the arrays: at points, in cells, each scalars first.
 
-    In text the lines of numbers are passed over, which say nothing.
+    In text files, lines of numbers are passed over, as they match no keyword.
     """
     affine, points = np.eye(4), [1, 1, 1]
     arrays: list[dict[str, Any]] = []
@@ -346,10 +346,10 @@ def _legacy_type(name: str) -> str:
 def _legacy_array(
     path: str, words: list[str], points: Sequence[int], cells: bool
 ) -> dict[str, Any]:
-    """An array by the line that announces it."""
+    """Returns the description of an array from its header line."""
     kind = words[0].upper()
     if kind == "COLOR_SCALARS":
-        name, dtype, width = words[1].replace("%%", "%"), "u1", int(words[2])  # VTK doubles them
+        name, dtype, width = words[1].replace("%%", "%"), "u1", int(words[2])  # VTK doubles the %
     elif kind not in _ARRAYS:  # of a field
         name, width, dtype = words[0], int(words[1]), _legacy_type(words[3])
     else:
