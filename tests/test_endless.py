@@ -233,6 +233,18 @@ def test_chunks_and_indices_of_other_writers(server, tmp_path, data, kind, how):
     assert np.array_equal(mended(server, read), good)
 
 
+def test_a_server_that_sends_all_of_a_file_and_breaks_off_within_the_part_is_told(server, tmp_path):
+    (tmp_path / "file").write_bytes(bytes(1000))
+    server.bad, server.how = "file", "break"  # 100 bytes come
+    with pytest.raises(OSError, match="cut off: 999900 bytes are missing"):
+        http.read_http(
+            f"{server.url}/file", most=1000, part=slice(50, 500), whole=10**7, seconds=9.0
+        )
+    assert (
+        len(http.read_http(f"{server.url}/file", most=1000, part=slice(50, 90), seconds=9.0)) == 40
+    )
+
+
 @pytest.mark.parametrize("how", ["fast", "index", "stall", "metadata"])
 def test_buckets_are_read_within_bounds(tmp_path, data, how, monkeypatch):
     import tensorstore as ts

@@ -276,6 +276,20 @@ def test_points_come_before_cells_in_legacy_vtk(tmp_path, grid, kind):
     assert np.array_equal(volume.data[..., 0].numpy(), cells)
 
 
+def test_scalars_come_before_other_arrays_in_both_vtk_formats(tmp_path, grid):
+    image = vtk_image(grid, cells=True)
+    array = numpy_support.numpy_to_vtk(np.zeros(image.GetNumberOfPoints(), "f4"), deep=True)
+    array.SetName("at points")
+    image.GetPointData().AddArray(array)
+    for file in (
+        write_vti(tmp_path / "a.vti", image),
+        write_legacy(tmp_path / "a.vtk", image, "Binary"),
+    ):
+        with pytest.warns(UserWarning, match="other arrays"):
+            volume = gv.read_volume(file)
+        assert np.array_equal(volume.data[..., 0].numpy(), grid)
+
+
 def test_other_vtk_files_are_named(tmp_path):
     (tmp_path / "a.vtk").write_bytes(b"# vtk DataFile Version 3.0\nt\nASCII\nDATASET POLYDATA\n\n")
     with pytest.raises(ValueError, match=r"POLYDATA.*expected STRUCTURED_POINTS"):

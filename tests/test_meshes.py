@@ -387,6 +387,7 @@ def test_bad_meshes_are_told_in_a_line():
         ({"faces": far}, "names vertex 8, there are 8"),
         ({"faces": -far}, "names vertex"),
         ({"material": np.full(12, 3)}, "names material 3, there are 1"),
+        ({"material": np.full(12, -2)}, "names material -2, there are 1"),
         ({"vertices": np.zeros((8, 3))}, "all triangles lie in one point"),
         ({"vertices": np.zeros((8, 2))}, "vertices must be (n, 3)"),
         ({"uv": np.zeros((3, 3, 2))}, "uv must be (12, 3, 2)"),

@@ -199,7 +199,8 @@ def _content(
         if useless > _PART or (first > begin and useless > 0):
             del content[:useless]
             begin += useless
-    if answer.length and last is None:  # read1 ends quietly where a server breaks off
+    # `read1` ends without an error where a server breaks off.
+    if answer.length and (last is None or begin + len(content) < last):
         raise OSError(f"cut off: {answer.length} bytes are missing")
     found = content[first:] if first < 0 else content[: None if last is None else last - begin]
     if len(found) > most:

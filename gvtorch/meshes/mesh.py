@@ -85,8 +85,9 @@ class Mesh:
         if bad:
             raise ValueError(f"{self.name}: {bad} corners of triangles are NaN or infinite")
         assert self.material is not None
-        if self.material.min() < 0 or self.material.max() >= len(self.materials):
-            wrong = int(self.material.max())
+        low, high = int(self.material.min()), int(self.material.max())
+        if low < 0 or high >= len(self.materials):
+            wrong = low if low < 0 else high
             raise ValueError(
                 f"{self.name}: a triangle names material {wrong}, there are {len(self.materials)}"
             )

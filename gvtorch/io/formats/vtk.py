@@ -305,7 +305,7 @@ def _open_legacy(path: str, key: str | None) -> VolumeSource:
 def _legacy_parts(
     path: str, content: mmap.mmap, at: int, binary: bool
 ) -> tuple[np.ndarray, list[int], list[dict[str, Any]]]:
-    """Returns affine, number of points, and the arrays: at points, in cells, each scalars first.
+    """Returns affine, number of points, and the arrays in the order of `_xml_arrays`.
 
     In text files, lines of numbers are passed over, as they match no keyword.
     """
@@ -336,7 +336,7 @@ def _legacy_parts(
             arrays.append({**array, "offset": at})
             in_field -= name not in _ARRAYS
             at += array["bytes"] * binary
-    return affine, points, sorted(arrays, key=lambda array: (array["cells"], not array["first"]))
+    return affine, points, sorted(arrays, key=lambda array: (not array["first"], array["cells"]))
 
 
 def _legacy_type(name: str) -> str:
