@@ -177,8 +177,8 @@ class FrameGraph:
 
 
 class LookAhead:
-    """Rays of future pictures, which request what these would miss. Their camera is the picture's,
-    whose numbers stay at one address, `View.numbers`, moved on as it moved since the last frame.
+    """Rays of future pictures, which request what these would miss. Their camera is the picture's
+    (its numbers stay at one address, `View.numbers`), moved on as it moved since the last frame.
 
     There is one of these rays for 4 x 4 pixels of the picture: a brick is wider than that on the
     screen. What they use counts as used and so is kept; their requests are served after the
