@@ -1,7 +1,6 @@
-"""`Aliases`: nodes that share the content of other nodes, their targets, including all levels
-below. An alias has no brick or children of its own: its words are copies of its target's, renewed
-after every write, so that rays need not know of it. What rays miss there is requested at the
-target.
+"""`Aliases`: nodes that share the content of other nodes, their targets, at all levels below. An
+alias has no brick or children of its own: its words are copies of its target's, renewed after every
+write, so that rays know nothing of it. What rays miss there is requested at the target.
 
 A row of the list holds the locs of both nodes and is valid while the nodes have them, so that it
 need not be told when tiles change hands. Where a target is not in the tree, its alias requests the

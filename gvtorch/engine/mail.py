@@ -16,7 +16,7 @@ from torch import Tensor
 Form = Mapping[str, tuple[tuple[int, ...], torch.dtype]]  # shape and dtype of a row's fields
 
 _BUFFERS = 3  # one is filled while the others may still be copied
-_ALIGN = 16  # bytes: fields begin at multiples of it
+_ALIGN = 16  # bytes: alignment of fields
 
 
 class Mail:
