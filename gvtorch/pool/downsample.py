@@ -259,8 +259,8 @@ def _as(values: Grid, name: str, *, copy: bool = False) -> Grid:
 
 
 def _mean(total: Grid, count: int) -> Grid:
-    """Divides sums by a count, integers in float64. Tensors are divided by a tensor: torch replaces
-    a division by a plain number by a product with the reciprocal, which rounds differently.
+    """Divides sums by a count, integers in float64. A tensor is divided by a tensor: torch turns
+    division by a plain number into a product with the reciprocal, which rounds differently.
     """
     if "int" in _name(total):
         total = _as(total, "float64")

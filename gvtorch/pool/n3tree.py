@@ -43,7 +43,7 @@ class N3Tree:
 
     Several threads may render a tree at a time. While they do, or read it, `refresh` in another
     thread raises RuntimeError, and so do they while `refresh` runs. Direct writes into its tensors
-    are not noticed: they must not happen meanwhile.
+    are not guarded: they must not happen meanwhile.
 
     Attributes:
         nodes: The node pool.
