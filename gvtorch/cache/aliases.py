@@ -3,7 +3,7 @@ alias has no brick or children of its own: its words are copies of its target's,
 write, so that rays know nothing of it. What rays miss there is requested at the target.
 
 A row of the list holds the locs of both nodes and is valid while the nodes have them, so that it
-need not be told when tiles change hands. Where a target is not in the tree, its alias requests the
+needs no update when tiles change hands. Where a target is not in the tree, its alias requests the
 children of the target's nearest ancestor.
 """
 

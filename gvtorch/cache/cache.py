@@ -101,7 +101,8 @@ class Cache:
         nodes, bricks: The pools.
         aliases: Nodes that share the content of others.
         lru: The orders of use of tiles (REQUEST_SUBDIVIDE) and of bricks (REQUEST_LOAD). Bricks
-            have one; or, where the pool has coarse slots, one of the other slots and one of these.
+            have one; or, where the pool has coarse slots, one for the others and one for the coarse
+            ones.
         finest: (trees,) int64 depth from which on a tree's bricks need no coarse slots; 0: none
             needs one.
         frame_1: (1,) int32 number of the last picture; what is written counts as used in it.

@@ -125,7 +125,7 @@ class DeviceFrame(RecordedFrame):
         put_rows_of(self._below, torch.where(taken, rank - 1, -1), rows)
 
     def _fill(self, answer: Unchecked, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Loads nodes (k,); returns `Put.counts`, and (1,) that need no brick, (1,) that failed."""
+        """Loads nodes (k,). Returns `Put.counts`, how many need no brick (1,), and failed (1,)."""
         node, batch, given = answer
         bricks = checked_bricks(given, batch.nodes, batch.source.producer, look=False)
         good = _finite([bricks.data, bricks.constants], len(node), node.device)

@@ -175,7 +175,7 @@ class Engine:
         view = self.view("frame", camera, shader, options)
         with self.new_frame(view.options) as stats:
             self.serve_last_frame(stats)  # choose requests, produce, take slots, write, link
-            self.scout(view, stats)  # the same for a few rays that go ahead
+            self.scout(view, stats)  # the same for a few rays that are traced first
             hits = self.trace(view, progress)  # camera to rays to hits; rays mark use and requests
             collected = self.collect_requests_and_use(hits.samples)
             self.read_back(stats, hits, collected)  # for the next frame to serve

@@ -26,7 +26,7 @@ from .stats import Collected, FrameStats, Readbacks
 
 _STRIDE = 4  # pixels between look-ahead rays
 _RAREST = 4  # most frames between two look-aheads
-_LOOKS = 4  # within the frames looked ahead: a tree deepens by a level for each
+_LOOKS = 4  # look-aheads until the camera is there: each deepens a tree by a level
 
 
 class Steps(Protocol):

@@ -33,7 +33,7 @@ class HostFrame(RecordedFrame):
     """Frames of an engine whose producers all answer from the host (`Producer.on_host`).
 
     The nodes that a frame chose reach the host with its counts (`ask`). A thread asks producers for
-    all nodes chosen since its last call, once that is answered: a busy host gets the nodes of
+    all nodes chosen since its last call, once that call is answered: a busy host gets the nodes of
     several frames at once, so that it catches up. If an answer takes longer than `_SOON`, it calls
     without waiting: one slow read delays nothing else. The thread in which an answer arrives checks
     and posts it; the next frame sends all posted answers, and writes them.

@@ -43,8 +43,8 @@ class EngineOptions:
         load_budget: Most bricks made in a frame.
         subdivide_budget: Most node tiles made in a frame.
         time_budget: Most milliseconds of production in a frame; None: no limit.
-        scout_rounds: Most passes of scouts, a few of the rays, before a frame that misses
-            something.
+        scout_rounds: Most passes of scouts, at most a sixteenth of the rays, before a frame that
+            missed something.
         patience: Seconds until an answer that does not come is given up.
         coarse_share: Share of the brick slots that also hold coarse channels, if there are any.
         strict: Whether to raise when something can't be produced.

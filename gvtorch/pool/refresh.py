@@ -354,7 +354,9 @@ def _places(first: Place, count: Place, device: torch.device) -> Tensor:
 def _padded(
     values: np.ndarray, low: Place, first: Place, last: Place, size: int, border: int
 ) -> np.ndarray:
-    """Returns voxels of nodes `first` to `last`, borders repeated, of `values` from `low` on."""
+    """Returns the voxels of nodes `first` to `last` with their borders, from `values`, which begin
+    at voxel `low`; the outermost voxels are repeated.
+    """
     for axis, at in enumerate(low):
         begin, end = first[axis] * size - border - at, last[axis] * size + border - at
         here = max(0, begin)
