@@ -16,12 +16,12 @@ from .base.declared import declared_names
 
 __version__ = "0.1.0"
 
-#: How long OpenMP's threads spin before they sleep. By default they spin for milliseconds, and take
-#: the cores of those that they wait for where other programs run. Read when torch is loaded.
+#: How long OpenMP's threads spin before they sleep. The default, milliseconds, takes cores from the
+#: threads that they wait for where other programs run. Read when torch is loaded.
 if "torch" not in sys.modules and not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
     os.environ["GOMP_SPINCOUNT"] = "2000"
 
-#: Public name -> the module that defines it; an empty text for a room.
+#: Public name -> the module that defines it; empty for a subpackage.
 _HOME: dict[str, str] = {}
 for _node in ast.parse(Path(__file__).with_name("__init__.pyi").read_text("utf-8")).body:
     if isinstance(_node, ast.ImportFrom):

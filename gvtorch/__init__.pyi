@@ -24,7 +24,7 @@ from .pool import (
     NodePool as NodePool,
 )
 
-# Functions of place.
+# Fields: functions of position.
 from .fields import (
     Field as Field,
     Fractal as Fractal,
@@ -44,7 +44,7 @@ from .fields import (
     warp as warp,
 )
 
-# What makes the content of a tree.
+# Producers, which make the content of a tree.
 from .producers import (
     Bricks as Bricks,
     FieldProducer as FieldProducer,
@@ -109,7 +109,7 @@ from .tracing import (
     trace as trace,
 )
 
-# What takes how long.
+# Timings of stages.
 from .base.stage import Trace as Trace
 
 # Streaming a scene larger than memory.

@@ -1,4 +1,4 @@
-"""The cache: pools with an order of use, requests, and which of them are served."""
+"""The cache: pools with an order of use, requests, and the choice of those that are served."""
 
 from .cache import LRU, Cache
 from .requests import KINDS, RequestList, Requests, RequestsByKind, Scheduler

@@ -1,10 +1,10 @@
-"""`Aliases`: nodes that are the same as others, their targets, with all below these. An alias has
-neither brick nor children of its own: its words are copies of its target's, made anew after every
-write, so that rays know nothing of it. What rays miss there is asked for at the target.
+"""`Aliases`: nodes that share the content of other nodes, their targets, at all levels below. An
+alias has no brick or children of its own: its words are copies of its target's, renewed after every
+write, so that rays know nothing of it. What rays miss there is requested at the target.
 
-A row of the list is known to hold by the places that both nodes stand for, so that nothing has to
-be told of tiles that change hands. Where a target is not in the tree, its alias asks for the
-children of the nearest node above it.
+A row of the list holds the locs of both nodes and is valid while the nodes have them, so that it
+needs no update when tiles change hands. Where a target is not in the tree, its alias requests the
+children of the target's nearest ancestor.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from ..base.volume import movable
 from ..ops import unlink
 from ..pool import BrickPool, N3Tree, NodePool
 
-_LONGEST = 64  # aliases of aliases
+_LONGEST = 64  # longest chain of aliases of aliases
 
 
 class AliasRows(NamedTuple):
-    """The aliases that are alive, rising by node."""
+    """The current aliases, sorted by node."""
 
     node: Tensor  # (a,) int64
-    place: Tensor  # (a, 5) int64 number of its tree, and x, y, z, depth
-    goal: Tensor  # (a, 5) those of the target
+    place: Tensor  # (a, 5) int64 number of its tree, and its loc
+    goal: Tensor  # (a, 5) the same of the target
     target: Tensor  # (a,) int64 the target, or the node whose children are asked for
-    target_place: Tensor  # (a, 5) its place, which is not the goal's below another alias
-    exact: Tensor  # (a,) bool, whether it is the target
+    target_place: Tensor  # (a, 5) of `target`; below another alias not the goal's
+    exact: Tensor  # (a,) bool, whether `target` lies at `goal`
 
     def some(self, index: Tensor) -> AliasRows:
-        """Some of them."""
+        """Returns some of the rows."""
         return AliasRows(*(field[index] for field in self))
 
 
@@ -50,7 +50,7 @@ class Aliases:
 
     Attributes:
         trees: Trees by number.
-        rows: What is known of each.
+        rows: The aliases.
     """
 
     rows: AliasRows
@@ -62,7 +62,7 @@ class Aliases:
         self.clear()
 
     def clear(self, tree: int | None = None) -> None:
-        """Forgets those of a tree, or all, and what others show of it."""
+        """Forgets the aliases in a tree, and what others show of that tree; or all."""
         if tree is not None and len(self):
             self.rows = rows = self.rows.some(self.rows.place[:, 0] != tree)
             stale = rows.node[(rows.goal[:, 0] == tree) | (rows.target_place[:, 0] == tree)]
@@ -80,8 +80,8 @@ class Aliases:
         return len(self.rows.node)
 
     def add(self, node: Tensor, tree: int, place: Tensor, goal: Tensor, goal_tree: int) -> None:
-        """Makes (k,) nodes of a tree, at places (k, 4), aliases of what is at `goal` (k, 4) of
-        another tree or of the same; `update` gives them their words.
+        """Makes (k,) nodes of a tree, with locs `place` (k, 4), aliases of the nodes with locs
+        `goal` (k, 4) in another tree or the same; `update` gives them their words.
         """
         known = ~torch.isin(self.rows.node, node)
         own, other = (
@@ -94,7 +94,7 @@ class Aliases:
         self.rows = AliasRows(*(field[order] for field in both))
 
     def update(self) -> None:
-        """Finds targets that are not known any more, and gives all aliases the words of theirs."""
+        """Looks up targets that have gone, and copies the words of all targets to their aliases."""
         if not len(self):
             return
         rows = self.rows.some(self._stand(self.rows.node, self.rows.place))
@@ -107,7 +107,7 @@ class Aliases:
         rows = rows._replace(target=target, exact=exact)
         bare = ~exact & (self.nodes.child_tn.view(-1)[target] == TERMINAL)
         whole = bare & (self.nodes.brick_tn.view(-1)[target] < ABSENT)  # EMPTY and CONSTANT regions
-        stay = ~bare | whole  # others are asked for themselves
+        stay = ~bare | whole  # others are requested in their own place
         rows = rows._replace(exact=exact | whole).some(stay)
         rows = self._followed(rows)
         self.rows = rows._replace(target_place=self._places(rows.target))
@@ -118,8 +118,8 @@ class Aliases:
     def by_target(
         self, asked: Mapping[int, tuple[Tensor, Tensor]]
     ) -> dict[int, tuple[Tensor, Tensor]]:
-        """Returns requests, by kind nodes (k,) and priorities (k,), with targets in the place of
-        their aliases, each once; those that are pending are left out.
+        """Returns requests, by kind nodes (k,) and priorities (k,), with aliases replaced by their
+        targets, each node once; pending ones are left out.
         """
         nodes, priorities, kinds = [], [], []
         for kind, (node, priority) in asked.items():
@@ -139,12 +139,12 @@ class Aliases:
         return found
 
     def keep(self, frame_1: Tensor) -> None:
-        """Stamps the tiles on the way to the targets of aliases that may have been seen in a frame,
-        so that they stay; the host does not wait.
+        """Stamps the tiles on the path from the root to targets of aliases that may have been used
+        in a frame, so that they stay; the host does not wait.
         """
         seen, tile = self._kept
         recording = tile.is_cuda and torch.cuda.is_current_stream_capturing()
-        if not len(tile) or recording:  # what a graph reads stays where it is, and these do not
+        if not len(tile) or recording:  # tensors that a graph reads must stay, and these change
             return
         stamp = self.nodes.stamp_t
         used = torch.where(stamp[seen] == frame_1, frame_1, ABSENT)
@@ -154,13 +154,13 @@ class Aliases:
         return f"Aliases({len(self)}, {int(self.rows.exact.sum())} with their targets)"
 
     def _row(self, node: Tensor) -> tuple[Tensor, Tensor]:
-        """(k,) rows of nodes, and which have one."""
+        """Returns (k,) rows of nodes, and (k,) bool, which nodes have one."""
         held = self.rows.node
         row = torch.searchsorted(held, node).clamp(max=len(held) - 1)
         return row, held[row] == node
 
     def _places(self, node: Tensor) -> Tensor:
-        """(k, 5) trees and places of nodes."""
+        """Returns (k, 5) tree numbers and locs of nodes."""
         number = self.nodes.tree_t[node // self.nodes.nodes_per_tile].to(torch.int64)
         place = torch.zeros((len(node), 4), dtype=torch.int64, device=node.device)
         for known, tree in self.trees.items():
@@ -169,15 +169,15 @@ class Aliases:
         return torch.cat((number[:, None], place), 1)
 
     def _stand(self, node: Tensor, place: Tensor) -> Tensor:
-        """(k,) bool, which nodes are in a tree, at their places."""
+        """Returns (k,) bool, which nodes are in a tree and still have their locs."""
         tile = node // self.nodes.nodes_per_tile
         roots = tile < len(self.trees)
         linked = (self.nodes.parent_t[tile] >= 0) | self.nodes.shared_t[tile] | roots
         return linked & (self._places(node) == place).all(1)
 
     def _followed(self, rows: AliasRows) -> AliasRows:
-        """The rows, with targets that are no aliases; those that lead back to themselves are left
-        out, and asked for themselves.
+        """Returns the rows with targets that are not aliases; those that lead back to themselves
+        are left out, and requested in their own place.
         """
         self.rows, target, exact = rows, rows.target, rows.exact
         if not len(self):
@@ -191,7 +191,7 @@ class Aliases:
         return self._followed(rows.some(~known))
 
     def _copy(self, rows: AliasRows) -> None:
-        """Gives aliases the words of their targets."""
+        """Copies the words, constants and ranges of targets to their aliases."""
         nodes, bricks, node, target = self.nodes, self.bricks, rows.node, rows.target
         for pointer, owner, shared in (
             (nodes.child_tn, nodes.parent_t, nodes.shared_t),
@@ -202,7 +202,7 @@ class Aliases:
             held = words[node] >= 0
             own = held & (owner[slot] == node)  # from before it was an alias
             unlink(pointer, owner, shared, torch.where(own, slot, -1).to(torch.int32))
-            # A target that was away takes back what its aliases kept.
+            # A target that was gone and is back takes over what its aliases kept.
             left = held & ~own & (owner[slot] < 0) & (words[target] == ABSENT)
             words[target[left]] = slot[left].to(torch.int32)
             owner[slot[left]] = target[left].to(torch.int32)
@@ -214,7 +214,7 @@ class Aliases:
             flat[node] = flat[target]
 
     def _copy_pending(self) -> None:
-        """What is on its way for a target is for its aliases: rays need not ask again."""
+        """Copies the pending bits of targets to their aliases, so that rays need not ask again."""
         words, rows = self.nodes.request_tn.view(-1), self.rows
         pending = words[rows.target] & REQUEST_KINDS << REQUEST_PENDING_SHIFT
         above = torch.where(pending & REQUEST_SUBDIVIDE << REQUEST_PENDING_SHIFT != 0, -1, 0)
@@ -223,7 +223,7 @@ class Aliases:
         words[rows.node] |= pending.to(words.dtype)
 
     def _paths(self) -> tuple[Tensor, Tensor]:
-        """(p,) tiles of aliases, and (p,) the tiles on the way to their targets."""
+        """Returns (p,) tiles of aliases, and (p,) the tiles on the path to their targets."""
         per_tile, parent = self.nodes.nodes_per_tile, self.nodes.parent_t
         rows = self.rows
         pairs = torch.stack((rows.node, rows.target), 1) // per_tile

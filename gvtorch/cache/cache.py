@@ -18,11 +18,12 @@ class LRU:
     """The order in which slots of a pool are given away: least recently used first.
 
     Attributes:
-        order: (k,) int32 slots without the locked ones; on CUDA changed in place, for graphs read
-            it, and on the CPU a part of memory a little longer, where it moves on by what is given.
-        unused: How many at the front the last picture did not use; these may be taken.
-        fresh: How many of these, the first, never held anything, so that a frame need not look at
-            them; 0 on CUDA, where the host does not know.
+        order: (k,) int32 slots without the locked ones. On CUDA it is changed in place, because
+            graphs read it; on the CPU it is a window of a slightly larger tensor, which moves on as
+            slots are given.
+        unused: How many slots at the front the last picture did not use; these may be taken.
+        fresh: How many of these, the first ones, never held anything, so that a frame need not look
+            at them; 0 on CUDA, where the host does not know.
     """
 
     def __init__(self, capacity: int, locked: int, device: torch.device) -> None:
@@ -35,7 +36,7 @@ class LRU:
 
     def sort(self, stamp: Tensor, frame: Tensor) -> Tensor:
         """Moves the slots that `frame` (1,) int32 did not use to the front, each part in its old
-        order, by the frames (capacity,) int32 that used each slot last.
+        order; `stamp` (capacity,) int32 is the frame that last used each slot.
 
         Returns:
             (1,) int64 number of unused slots; `unused` is set once the host knows it.
@@ -50,9 +51,9 @@ class LRU:
         return torch.full((1,), self.unused, device=self.order.device)
 
     def give(self, wanted: Tensor, most: Tensor) -> Tensor:
-        """Gives a slot each, from the front, to the first `most` (1,) of the rows where `wanted`
-        (k,) bool, and moves these slots to the back. The host does not wait; once it knows how many
-        they are, it tells `unused`.
+        """Gives slots from the front, one each, to the first `most` (1,) of the rows where `wanted`
+        (k,) is true, and moves these slots to the back. The host does not wait; once it knows their
+        number, the caller subtracts it from `unused`.
 
         Returns:
             (k,) int64 slots; -1 where a row gets none.
@@ -81,7 +82,7 @@ class LRU:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that it takes."""
+        """Bytes of its memory."""
         return self._memory.nbytes
 
     def __len__(self) -> int:
@@ -93,14 +94,15 @@ class LRU:
 
 
 class Cache:
-    """The pools of several trees. The first slots belong to the roots and are never given away. For
-    one thread at a time: that of its engine, or the one that holds `Engine.lock`.
+    """The pools of several trees. The first slots belong to the roots and are never given away.
+    Only one thread may use it at a time: that of its engine, or the one that holds `Engine.lock`.
 
     Attributes:
         nodes, bricks: The pools.
-        aliases: Nodes that are the same as others.
-        lru: The orders of use of tiles (REQUEST_SUBDIVIDE) and of bricks (REQUEST_LOAD): one for
-            all bricks; or, where the pool has coarse slots, one of the others and one of these.
+        aliases: Nodes that share the content of others.
+        lru: The orders of use of tiles (REQUEST_SUBDIVIDE) and of bricks (REQUEST_LOAD). Bricks
+            have one; or, where the pool has coarse slots, one for the others and one for the coarse
+            ones.
         finest: (trees,) int64 depth from which on a tree's bricks need no coarse slots; 0: none
             needs one.
         frame_1: (1,) int32 number of the last picture; what is written counts as used in it.
@@ -121,12 +123,12 @@ class Cache:
         self._no_coarse = torch.zeros(1, dtype=torch.int64, device=device)
 
     def requests(self) -> Tensor:
-        """(t, n) request words of the tiles that ever held something: the others have none."""
+        """Returns (t, n) request words of all tiles that ever held something; others are 0."""
         (lru,) = self.lru[REQUEST_SUBDIVIDE]
         return self.nodes.request_tn[: self.nodes.capacity - lru.fresh]
 
     def memory(self) -> dict[str, int]:
-        """Returns bytes: what the pools hold, and the bookkeeping apart."""
+        """Returns bytes by name: content of either pool, and bookkeeping."""
         nodes, bricks = self.nodes, self.bricks
         content = (*nodes.constants.values(), *nodes.ranges.values())
         node_bytes = sum(words.nbytes for words in (nodes.child_tn, nodes.brick_tn, *content))
@@ -140,7 +142,7 @@ class Cache:
 
         Returns:
             (5,) int64 tiles unused and used, bricks unused and used, and how many of the unused
-            are coarse; `make_room` is told the unused ones, once the host knows them.
+            bricks are coarse; once the host knows the unused ones, they are passed to `make_room`.
         """
         frame, stamps = self.frame_1, (self.nodes.stamp_t, self.bricks.stamp_b)
         self.aliases.keep(frame)
@@ -168,20 +170,19 @@ class Cache:
             lru.unused = unused
 
     def room(self) -> dict[int, list[int]]:
-        """For each kind, how many slots of each of its orders of use may be taken."""
+        """Returns for each kind how many slots of each of its orders of use may be taken."""
         return {kind: [lru.unused for lru in group] for kind, group in self.lru.items()}
 
     def needs_coarse(self, node: Tensor) -> Tensor | None:
-        """Returns which of (k,) nodes need a coarse slot, (k,) bool; None where there are none."""
+        """Returns which of (k,) nodes need a coarse slot, (k,) bool; None if the pool has none."""
         if not self.bricks.coarse:
             return None
         tile, nodes = node // self.nodes.nodes_per_tile, self.nodes
         return nodes.loc_t4[tile, 3] < self.finest[nodes.tree_t[tile].to(torch.int64)]
 
     def mark_pending(self, node: Tensor, kind: int, pending: bool | Tensor = True) -> None:
-        """Marks that answers for (k,) int64 nodes, each once, are on their way: these requests are
-        not listed again. A `pending` of False clears the marks, (k,) bool sets those where it is
-        true.
+        """Marks (k,) int64 nodes, each listed once, as pending, so that these requests are not
+        listed again. A `pending` of False clears the marks, (k,) bool sets those where it is true.
         """
         words, bit = self.nodes.request_tn.view(-1), kind << REQUEST_PENDING_SHIFT
         if isinstance(pending, Tensor):
@@ -190,11 +191,11 @@ class Cache:
             words[node] = words[node] | bit if pending else words[node] & ~bit
 
     def validate(self) -> None:
-        """Raises ValueError unless every slot is where the order, its owner and all pointers say.
+        """Raises ValueError unless orders, owners and pointers agree about every slot.
 
-        Pointers that lead nowhere are found by `N3Tree.validate`. Words of a tile that hangs in no
-        tree count for nothing: one that changes hands when memory runs out keeps its old ones until
-        it is given away again.
+        Pointers that lead nowhere are found by `N3Tree.validate`. Words of a tile that is linked to
+        no tree are ignored: one that changes hands when memory runs out keeps its old ones until it
+        is given away again.
         """
         nodes, bricks = self.nodes, self.bricks
         sizes = (nodes.capacity, bricks.capacity)

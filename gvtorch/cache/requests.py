@@ -1,8 +1,8 @@
 """Requests, the nodes that the rays of a frame wanted subdivided or loaded, and which are served.
 
-Rays write them into the node pool's request words. `RequestList` is what one pass over these words
-leaves on the device, `Requests` its rows of one kind, once the host knows how many there are, and
-`Scheduler` chooses among these by priority and within the budgets, of time as well: `CallCost`.
+Rays write them into the node pool's request words. One pass over these words leaves a `RequestList`
+on the device; `Requests` are its rows of one kind, once the host knows their number; and
+`Scheduler` chooses among these by priority and within budgets, one of which is time (`CallCost`).
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from .cache import Cache
 
 #: The kinds of request by the names that statistics show.
 KINDS = {"load": REQUEST_LOAD, "subdivide": REQUEST_SUBDIVIDE}
-#: Levels below the first by which a tree deepens in a frame at most.
+#: Most levels beyond the first by which a tree deepens in a frame.
 DEEPER = 2
-_PIXEL = 16  # the priority of a node whose voxels are a pixel wide: wider ones are to be subdivided
+_PIXEL = 16  # priority of a node whose voxels are a pixel wide: wider ones are to be subdivided
 _NEWEST = 0.3  # weight of the newest call
-_SPREAD = 0.1  # relative spread of batch sizes from which on the two parts of a cost are told apart
-_PROBE = 1.25  # times as many items are tried where the sizes were all alike
-_LEAST = 0.02  # share of a call's time that its items take at least
-_LEARN_FROM = 64  # items: smaller batches tell more about overhead than about throughput
+_SPREAD = 0.1  # relative spread of batch sizes from which both parts of a cost are fitted
+_PROBE = 1.25  # times as many items are tried if all sizes were alike
+_LEAST = 0.02  # least share of a call's time that is attributed to its items
+_LEARN_FROM = 64  # items: the time of smaller batches is more overhead than throughput
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Requests:
-    """Requests of one kind, one row a node."""
+    """Requests of one kind, one row per node."""
 
     node: Tensor  # (k,) int64
     depth: Tensor  # (k,) int64 of the node
@@ -47,7 +47,7 @@ class Requests:
 
     @classmethod
     def of(cls, cache: Cache, kind: int, node: Tensor, priority: Tensor) -> Requests:
-        """Requests of (k,) nodes of a cache."""
+        """Returns requests of (k,) nodes of a cache."""
         nodes = cache.nodes
         depth = nodes.loc_t4[node // nodes.nodes_per_tile, 3].to(torch.int64)
         coarse = cache.needs_coarse(node) if kind == REQUEST_LOAD else None
@@ -58,8 +58,8 @@ class Requests:
         return self.node.shape[0]
 
     def fitting(self, rank: Tensor, room: Sequence[int]) -> Tensor:
-        """Returns those of the rows `rank` (k,), the most wanted first, that find a slot; `room`
-        tells how many slots there are, and how many coarse ones.
+        """Returns those rows of `rank` (k,), the most wanted first, that find a slot; `room` is the
+        number of slots, and of coarse ones.
         """
         if self.coarse is None:
             return rank[: sum(room)]
@@ -71,16 +71,16 @@ class Requests:
 
 
 def levels_wanted(priority: Tensor, branching: int) -> Tensor:
-    """(DEEPER + 1,) int64 how many subdivisions there are, of priorities (k,), rows of -1 left out,
-    and how many of them want a level more, and two; see `deeper`.
+    """Returns (DEEPER + 1,) int64 how many subdivisions there are, with priorities (k,), -1 for
+    none, and how many of them want at least one more level, and two; see `deeper`.
     """
     widths = [0, *(_PIXEL * branching**level for level in range(1, DEEPER + 1))]
     return torch.stack([priority >= width for width in widths]).sum(1)
 
 
 def deeper(wanted: Sequence[int]) -> int:
-    """By how many levels below the first a frame deepens a tree, as the subdivisions want in the
-    mean; `wanted` as `levels_wanted` tells.
+    """Returns by how many levels beyond the first a frame deepens a tree: the mean of what its
+    subdivisions want. `wanted` is from `levels_wanted`.
     """
     count, *more = wanted
     return round(sum(more) / max(1, count))
@@ -89,12 +89,12 @@ def deeper(wanted: Sequence[int]) -> int:
 def below(
     cache: Cache, tile: Tensor, priority: Tensor, free: Tensor | int
 ) -> tuple[Tensor, Tensor]:
-    """Which of the nodes of tiles (k,), -1 for none, rays will want subdivided, as their `priority`
-    (k,) tells: where they hold data and their voxels are wider than a pixel. None, if all of these
-    would take more than half of the `free` tiles: where room is scarce, what rays ask for has it.
+    """Chooses nodes of tiles (k,), -1 for none, that rays will want subdivided: those that hold
+    data and, by the `priority` (k,) of their tile, have voxels wider than a pixel. Chooses none if
+    they would take more than half of the `free` tiles: scarce room is left to what rays request.
 
     Returns:
-        (k, n) int64 nodes, and which of them, bool.
+        (k, n) int64 nodes, and (k, n) bool, which of them are chosen.
     """
     pool, there = cache.nodes, tile.clamp(min=0)
     child = torch.arange(pool.nodes_per_tile, device=tile.device)
@@ -118,18 +118,18 @@ class RequestList:
 
     @classmethod
     def collect(cls, cache: Cache, capacity: int) -> RequestList:
-        """Takes the requests, at most `capacity` nodes, out of a pool's request words, which are
-        cleared, their pending bits excepted; the host does not wait.
+        """Lists the requests of at most `capacity` nodes and clears the pool's request words,
+        except their pending bits; the host does not wait.
         """
         node, word, count = compact_requests(cache.requests(), capacity)
         return cls(node=node, word=word, count=count)
 
     def by_kind(self, cache: Cache, counts: Mapping[str, int]) -> dict[int, Requests]:
-        """Returns the requests of each kind, those of aliases at their targets. `counts` are the
-        numbers of requests by the name of their kind, on the host already, which so waits only if
-        there are aliases.
+        """Returns the requests of each kind, with aliases replaced by their targets. `counts` are
+        the numbers of requests by the name of their kind, already on the host, so that it waits
+        only if there are aliases.
         """
-        asked, listed = {}, self.word[: sum(counts.values())]  # or less: a node may ask for both
+        asked, listed = {}, self.word[: sum(counts.values())]  # or fewer: a node may request both
         for name, kind in KINDS.items():
             row = torch.nonzero_static((listed & kind).ne(0), size=counts[name])[:, 0]
             node, priority = self.node[row].to(torch.int64), self.word[row] & REQUEST_PRIORITY
@@ -138,8 +138,8 @@ class RequestList:
 
 
 def requests_below(cache: Cache, asked: Requests, branching: int) -> RequestsByKind:
-    """Subdivisions of what has come of subdivisions (k,), where rays will want them; see `below`.
-    Aliases may ask for loads of their targets.
+    """Returns subdivisions of the nodes that subdivisions `asked` (k,) have just made, where rays
+    will want them; see `below`. There are no loads.
     """
     tile = cache.nodes.child_tn.view(-1)[asked.node].to(torch.int64)
     priority = asked.priority // branching
@@ -151,7 +151,7 @@ def requests_below(cache: Cache, asked: Requests, branching: int) -> RequestsByK
 
 
 def _at_targets(cache: Cache, asked: dict[int, tuple[Tensor, Tensor]]) -> dict[int, Requests]:
-    """Requests of nodes (k,) and their priorities by kind, those of aliases at their targets."""
+    """Returns requests of nodes (k,), given with priorities by kind; targets replace aliases."""
     asked = cache.aliases.by_target(asked) if len(cache.aliases) else asked
     return {kind: Requests.of(cache, kind, *rows) for kind, rows in asked.items()}
 
@@ -159,7 +159,7 @@ def _at_targets(cache: Cache, asked: dict[int, tuple[Tensor, Tensor]]) -> dict[i
 def coarser_requests(
     cache: Cache, requests: RequestsByKind, room: Mapping[int, Sequence[int]]
 ) -> RequestsByKind:
-    """Asks for coarser bricks where slots are too few for all requests, so that what gets no slot
+    """Replaces requests by coarser ones where slots are too few for all, so that what gets no slot
     is drawn from a near ancestor and not from the root.
 
     Requests are moved up the tree, the deepest first, until they name at most as many nodes as
@@ -177,7 +177,7 @@ def coarser_requests(
     nodes, most = cache.nodes, room[REQUEST_LOAD]
     node, subdivide = requests[REQUEST_LOAD].node, requests[REQUEST_SUBDIVIDE]
     if len(subdivide) > sum(room[REQUEST_SUBDIVIDE]):
-        node = torch.cat((node, subdivide.node)).unique()  # too deep for the pool
+        node = torch.cat((node, subdivide.node)).unique()  # no room for their children: load these
     while bool((crowded := _crowded(cache, node, most)).any()):
         tile = node // nodes.nodes_per_tile
         depth = torch.where(crowded, nodes.loc_t4[tile, 3], 0)
@@ -186,7 +186,7 @@ def coarser_requests(
             return requests
         parent = nodes.parent_t[tile].to(torch.int64)
         node = torch.where(depth == deepest, parent, node).unique()
-        node = node[node >= 0]  # a shared tile whose owner is gone knows no way up
+        node = node[node >= 0]  # a shared tile without its owner has no known parent
     words = nodes.brick_tn.view(-1)[node]
     pending = nodes.request_tn.view(-1)[node] & REQUEST_LOAD << REQUEST_PENDING_SHIFT
     node = node[(words == ABSENT) & (pending == 0)]
@@ -197,7 +197,7 @@ def coarser_requests(
 
 
 def _crowded(cache: Cache, node: Tensor, room: Sequence[int]) -> Tensor:
-    """(k,) bool, for which nodes there are too few slots of the kind that they need."""
+    """Returns (k,) bool, for which nodes there are too few slots of the kind that they need."""
     coarse = cache.needs_coarse(node)
     if coarse is None:
         return torch.full_like(node, len(node) > sum(room), dtype=torch.bool)
@@ -206,20 +206,21 @@ def _crowded(cache: Cache, node: Tensor, room: Sequence[int]) -> Tensor:
 
 
 class CallCost:
-    """The time of a call with n items as a line, own + n * each, fitted to the last calls; older
-    ones weigh less. The first, which may load what all need, is forgotten at the second.
+    """Running estimate of the time of a producer call with n items as a line, own + n * each,
+    fitted to the last calls; older ones weigh less. The first call, which may include one-time
+    work, is dropped at the second.
 
     Attributes:
-        largest: About as many items as a call had lately.
+        largest: About the largest number of items in recent calls.
     """
 
     def __init__(self) -> None:
-        """Knows nothing yet."""
+        """Starts without any call."""
         self.largest, self._calls = 0.0, 0
         self._weight = self._items = self._time = self._squares = self._products = 0.0
 
     def learn(self, items: int, milliseconds: float) -> None:
-        """Takes note of a call."""
+        """Adds one call to the running estimate."""
         self._calls += 1
         if self._calls == 2:
             self._weight = self._items = self._time = self._squares = self._products = 0.0
@@ -230,12 +231,12 @@ class CallCost:
         self.largest = max(float(items), (1 - _NEWEST) * self.largest)
 
     def fitting(self, milliseconds: float, unknown: int) -> int:
-        """Returns how many items a call of so many milliseconds has, at least 1, and at most twice
-        as many as were tried; `unknown` where there was no call.
+        """Returns how many items fit into a call of this duration, at least 1, and at most twice as
+        many as were tried lately; `unknown` if there was no call yet.
 
-        If a call without items would take most of that time, items get half of it all the same, for
-        many small calls would take longer. If all calls had as many items, a few more are tried:
-        the line cannot be fitted otherwise.
+        If the overhead of a call takes most of that time, items still get half of it, because many
+        small calls would take longer. If all calls had as many items, a few more are tried: the
+        line cannot be fitted otherwise.
         """
         if not self._weight:
             return unknown
@@ -247,7 +248,7 @@ class CallCost:
         return int(min(fitting, max(2 * self.largest, 2.0)))
 
     def _line(self) -> tuple[float, float, bool]:
-        """What a call takes by itself and for each item, and whether the two can be told apart."""
+        """Returns the time of a call itself and of each item, and whether both could be fitted."""
         items, time = self._items / self._weight, self._time / self._weight
         spread = self._squares / self._weight - items * items
         known = spread > (_SPREAD * items) ** 2
@@ -271,9 +272,9 @@ class Scheduler:
     """Orders requests and trims them to budgets.
 
     Attributes:
-        most: For each kind, most items a frame.
-        cost: For each kind, what production takes, as it is learned.
-        spent: For each kind, items that were asked for in this frame, which are off its budget.
+        most: For each kind, most items in a frame.
+        cost: For each kind, the time of production, as learned so far.
+        spent: For each kind, items already asked for in this frame; they count against its budget.
     """
 
     def __init__(
@@ -289,9 +290,9 @@ class Scheduler:
         Args:
             order: Coarse levels first, which shows something everywhere soon, or fine ones; then
                 by size on the screen.
-            loads: Most bricks a frame.
-            subdivisions: Most node tiles a frame.
-            milliseconds: Most time a frame for production, shared by both kinds; None: no limit.
+            loads: Most bricks in a frame.
+            subdivisions: Most node tiles in a frame.
+            milliseconds: Most time in a frame for production, shared by both kinds; None: no limit.
         """
         self.order, self.milliseconds = order, milliseconds
         self.most = {REQUEST_LOAD: loads, REQUEST_SUBDIVIDE: subdivisions}
@@ -300,12 +301,12 @@ class Scheduler:
         self.begin()
 
     def begin(self) -> None:
-        """Starts a frame: its budgets are whole."""
+        """Starts a frame, with full budgets."""
         self.spent = dict.fromkeys(self.most, 0)
 
     def choose(self, requests: RequestsByKind, room: Mapping[int, Sequence[int]]) -> Choice:
-        """Returns which of a frame's requests are served, where `room` tells for each kind how many
-        slots may be taken, and how many coarse ones.
+        """Returns which of a frame's requests are served; `room` is for each kind how many slots
+        may be taken, and how many coarse ones.
         """
         nodes: dict[int, Tensor] = {}
         deferred, exceeded = 0, False
@@ -320,20 +321,20 @@ class Scheduler:
         return Choice(nodes, deferred, exceeded)
 
     def learn(self, kind: int, items: int, milliseconds: float) -> None:
-        """Learns from a batch that took `milliseconds`. Small ones tell little, unless the budget
-        itself made them small.
+        """Learns from a batch that took `milliseconds`. Small ones are ignored as mostly overhead,
+        unless the budget itself made them small.
         """
         if items >= min(_LEARN_FROM, self._budget[kind]) and milliseconds > 0:
             self.cost[kind].learn(items, milliseconds)
 
     def _rank(self, requests: Requests) -> Tensor:
-        """(k,) int64 rows by level, then by size on the screen, then by node: never by chance."""
+        """Returns (k,) int64 rows by level, then size on the screen, then node: a fixed order."""
         level = requests.depth if self.order == "coarse" else -requests.depth
         small = REQUEST_PRIORITY - requests.priority.to(torch.int64)
         return (level * (REQUEST_PRIORITY + 1) + small).argsort(stable=True)
 
     def _in_time(self, kind: int) -> int:
-        """How many items half of the time is enough for."""
+        """Returns how many items fit into half of the time budget."""
         if self.milliseconds is None:
             return self.most[kind]
         return self.cost[kind].fitting(0.5 * self.milliseconds, _LEARN_FROM)

@@ -26,25 +26,25 @@ from .cache import LRU, Cache
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Targets:
-    """Nodes to be written, and the places that they stood for when they were asked for: an answer
-    that comes late may find that a node's tile was given away or moved.
+    """Nodes to be written, and the locs that they had when they were asked for: an answer that
+    comes late may find that a node's tile was given away or reused.
     """
 
     tree: N3Tree
     node: Tensor  # (k,) int64, each once
-    loc: Tensor  # (k, 4) places
+    loc: Tensor  # (k, 4) x, y, z, depth
 
     def __len__(self) -> int:
         """Number of nodes."""
         return len(self.node)
 
     def __getitem__(self, index: slice | Tensor) -> Targets:
-        """Some of the nodes."""
+        """Returns some of the nodes."""
         return Targets(self.tree, self.node[index], self.loc[index])
 
     def lacking(self, cache: Cache, kind: int) -> Tensor:
-        """(k,) bool: the node still stands for its place, and still lacks its children
-        (REQUEST_SUBDIVIDE) or its brick (REQUEST_LOAD).
+        """Returns (k,) bool, which nodes still have their loc, and still lack their children
+        (REQUEST_SUBDIVIDE) or their brick (REQUEST_LOAD).
         """
         pool, tree = cache.nodes, self.tree
         words = pool.brick_tn if kind == REQUEST_LOAD else pool.child_tn
@@ -57,12 +57,12 @@ class Written:
     """What one write did."""
 
     items: int = 0  # tiles, or bricks
-    evicted: int = 0  # of them in slots that held something
+    evicted: int = 0  # of these, those whose slots were occupied
     constant: int = 0  # nodes that turned out to need no brick
     stale: int = 0  # answers whose node is gone, or served already
     unplaced: int = 0  # answers for which no slot was free
-    nbytes: int = 0  # voxels moved into the pool
-    lost: Tensor | None = field(default=None, repr=False)  # (k,) bool, to be asked for again
+    nbytes: int = 0  # bytes of voxels written into the pool
+    lost: Tensor | None = field(default=None, repr=False)  # (k,) bool, may be requested again
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -79,7 +79,7 @@ class Children:
 
 
 def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
-    """Gives nodes their children; see `put_tiles`. The host waits for what came of it."""
+    """Gives nodes their children; see `put_tiles`. The host waits for the outcome."""
     (lru,) = cache.lru[REQUEST_SUBDIVIDE]
     put = put_tiles(cache, targets, children, lru.free())
     done = _outcome(put, targets, lru)
@@ -93,23 +93,23 @@ def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
 
 
 class Put(NamedTuple):
-    """What became of (k,) targets, on the device."""
+    """The outcome of writing (k,) targets, on the device."""
 
-    wanted: Tensor  # (k,) bool, which lacked what was made for them
+    wanted: Tensor  # (k,) bool, which still lacked what was made for them
     slot: Tensor  # (k,) int64 slots that they got, or -1
-    counts: Tensor  # (3,) int64 how many lacked it, how many got a slot, slots that held something
+    counts: Tensor  # (3,) int64 targets that lacked it, targets that got a slot, slots occupied
 
     @classmethod
     def of(cls, wanted: Tensor, slot: Tensor, owner: Tensor) -> Put:
-        """Counts; `owner` (s,) tells which slots held something."""
+        """Adds the counts; `owner` (s,) is -1 for slots that were free before."""
         given = slot >= 0
         held = given & (owner[slot.clamp(min=0)] >= 0)
         return cls(wanted, slot, torch.stack((wanted, given, held)).sum(1))
 
 
 def _outcome(put: Put, targets: Targets, lru: LRU) -> Written:
-    """What became of the targets, after the slots that they took are counted off the unused ones.
-    The host waits for it.
+    """Returns the outcome on the host, which waits for it, and subtracts the slots that were taken
+    from `lru.unused`.
     """
     lasting, items, evicted = put.counts.tolist()
     lru.unused -= items
@@ -120,14 +120,14 @@ def _outcome(put: Put, targets: Targets, lru: LRU) -> Written:
 
 
 def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) -> Put:
-    """Gives nodes, those of index -1 left out, their children: takes tiles, at most `free` (1,),
-    unlinks, writes and links them. The host does not wait, and every shape is that of the targets.
+    """Gives nodes, index -1 left out, their children: takes at most `free` (1,) tiles, unlinks,
+    writes and links them. The host does not wait: every shape follows from that of the targets.
     """
     (lru,), pool, per_tile = cache.lru[REQUEST_SUBDIVIDE], cache.nodes, cache.nodes.nodes_per_tile
     tree, node = targets.tree, targets.node
     wanted = targets.lacking(cache, REQUEST_SUBDIVIDE)
     # A late answer may be for nodes that are no longer used: those whose own tile is among the ones
-    # given away have to wait.
+    # given away get no children now.
     front = lru.order[: len(node)].to(torch.int64)
     most = torch.minimum(wanted.sum(), free)
     leaving = torch.zeros(pool.capacity, dtype=torch.bool, device=node.device)
@@ -167,7 +167,7 @@ def _as_bytes(rows: Tensor) -> Tensor:
 
 
 def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Written:
-    """Gives (k,) nodes their bricks; see `put_bricks`. The host waits for what came of it."""
+    """Gives (k,) nodes their bricks; see `put_bricks`. The host waits for the outcome."""
     first = data if isinstance(data, Mapping) else data[0].data
     coarse = any(cache.bricks.channels[name].coarse for name in first)
     lru = cache.lru[REQUEST_LOAD][coarse]
@@ -184,13 +184,13 @@ def put_bricks(
     free: Tensor,
     coarse: bool = False,
 ) -> Put:
-    """Gives (k,) nodes, those of index -1 left out, their bricks: takes slots, at most `free` (1,),
-    unlinks, writes and links them. The host does not wait.
+    """Gives (k,) nodes, index -1 left out, their bricks: takes at most `free` (1,) slots, unlinks,
+    writes and links them. The host does not wait.
 
     Args:
         cache: The pools.
         targets: The nodes.
-        data: For each channel (k, z, y, x, c), or what is on its way to the device.
+        data: For each channel (k, z, y, x, c), or chunks on their way to the device.
         free: How many slots may be taken.
         coarse: Whether they get coarse slots.
     """
@@ -202,8 +202,8 @@ def put_bricks(
 
 
 def write_slots(cache: Cache, slot: Tensor, node: Tensor, data: Voxels | Sequence[Chunk]) -> None:
-    """Writes voxels (see `put_bricks`) into slots (k,), each once, -1 left out, which lose what
-    they held, and links (k,) int64 nodes to them.
+    """Writes voxels (see `put_bricks`) into slots (k,), each listed once, -1 left out, in place of
+    what they held, and links (k,) int64 nodes to them.
     """
     nodes, pool, slot_k = cache.nodes, cache.bricks, slot.to(torch.int32)
     unlink(nodes.brick_tn, pool.owner_b, pool.shared_b, slot_k)
@@ -232,9 +232,9 @@ def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> None:
 
 
 def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, Tensor]) -> None:
-    """Gives nodes (k,) that have no finer level the ranges of their voxels, borders included: what
-    `classify` told may have been a bound. They are read from the pool: `data` may lie in host
-    memory, behind the bus.
+    """Sets the ranges of nodes (k,) that have no finer level to those of their voxels, borders
+    included, because `classify` may have given mere bounds. The voxels are read from the pool:
+    `data` may lie in host memory, behind the bus.
     """
     nodes = cache.nodes
     finest = nodes.child_tn.view(-1)[node.clamp(min=0)] == TERMINAL
@@ -255,7 +255,7 @@ def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, 
 def uniform(
     cache: Cache, targets: Targets, word: Tensor, constants: Mapping[str, Tensor]
 ) -> Written:
-    """Marks nodes as EMPTY or CONSTANT; see `put_uniform`. The host waits for what came of it."""
+    """Marks nodes as EMPTY or CONSTANT; see `put_uniform`. The host waits for the outcome."""
     lasting = int(put_uniform(cache, targets, word, constants))
     return Written(constant=lasting, stale=len(targets) - lasting)
 
@@ -263,12 +263,12 @@ def uniform(
 def put_uniform(
     cache: Cache, targets: Targets, word: Tensor, constants: Mapping[str, Tensor]
 ) -> Tensor:
-    """Marks (k,) nodes, those of index -1 left out, as EMPTY or CONSTANT, as `word` (k,) int32
-    tells: they need no bricks. `constants` are (k, c) for each channel; 0 for channels that are
-    left out. The host does not wait.
+    """Marks (k,) nodes, index -1 left out, as EMPTY or CONSTANT by `word` (k,) int32: they need no
+    bricks. `constants` are (k, c) for each channel; 0 for channels that are left out. The host does
+    not wait.
 
     Returns:
-        () int64 how many still lacked it.
+        () int64 how many nodes still lacked a brick.
     """
     wanted = targets.lacking(cache, REQUEST_LOAD)
     node, pool = torch.where(wanted, targets.node, -1), cache.nodes
@@ -284,8 +284,8 @@ def put_uniform(
 
 
 def aliases(cache: Cache, targets: Targets, goal: Tensor, goal_tree: int) -> Written:
-    """Makes (k,) nodes aliases of what lies at places `goal` (k, 4) of a tree; nodes that are gone
-    or served already are left alone.
+    """Makes (k,) nodes aliases of the nodes with locs `goal` (k, 4) in tree number `goal_tree`;
+    nodes that are gone or served already are left alone.
     """
     wanted = targets.lacking(cache, REQUEST_LOAD)
     chosen, tree = targets[wanted], targets.tree.number

@@ -1,4 +1,4 @@
-"""`Camera`: one or a batch, of one of the `models`, and the rays through their pixels.
+"""`Camera`: one camera or a batch, of one of the `models`, and the rays through its pixels.
 
 Conventions: camera axes are OpenCV's (x right, y down, z forward); pixel (i, j) covers [i, i + 1)
 x [j, j + 1) of the image plane, its centre is at +0.5 (so do gsplat and nerfstudio; kornia puts
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 Numbers = float | Sequence[float] | Tensor
 Up = str | Sequence[float] | Tensor  # a name of `DIRECTIONS` such as "+z", or (3,) world
-CONE = slice(16, 18)  # of `Camera.numbers`
-_NARROWEST = 1e-12  # degrees of a field of view
-_FILLED = 0.98  # of half the picture's width or height, which a box that fits takes
-_CUT = 0.1  # radians from frame to frame; a camera that turns by more is taken to have jumped
+CONE = slice(16, 18)  # columns of `Camera.numbers`
+_NARROWEST = 1e-12  # narrowest field of view, degrees
+_FILLED = 0.98  # share of half the picture's width or height that a fitted box takes
+_CUT = 0.1  # radians from frame to frame; a camera that turns by more has jumped
 
 
 class Frame(Enum):
@@ -62,13 +62,13 @@ class Camera:
         Ks: (n, 3, 3) float64 intrinsics in pixels; focal lengths are pixels a unit of slope
             (pinhole), a radian (fisheye, panorama), or a world unit or side of the box (ortho).
         radial_coeffs: (n, 4) float64 distortion of a fisheye.
-        max_angle: (n,) float64 radians; a fisheye's rays farther from the axis are closed.
-        window: First row of this camera, which may take a strip only, and number of rows of the
+        max_angle: (n,) float64 radians; a fisheye's rays beyond it have an empty range.
+        window: First row of this camera, which may cover a strip only, and number of rows of the
             whole picture.
-        sample: Which of the samples of its pixels this is; see `Rays.sample`.
+        sample: Number of this sample among those of its pixels; see `Rays.sample`.
         batched: False for one camera whose pictures have no batch dimension.
-        fitted: Half width and height of the whole picture at distance 1 where the distance follows
-            from the box's proportions, once the camera is `placed`; else None.
+        fitted: Half width and height of the whole picture at distance 1 if `placed` is to find the
+            distance from the box's proportions; else None.
     """
 
     sample = 0
@@ -143,18 +143,18 @@ class Camera:
         """Looks at the centre of the scene's box from a sphere around it.
 
         position = centre + distance * L * (sin az cos el, sin el, cos az cos el), L the box's
-        largest side, where +y is up. Else that is turned: +x still runs to the right at azimuth 0
-        (+y, where up is nearly x), so with +z up the eye stands at -y.
+        largest side, where +y is up. For another `up` this is rotated: +x still points to the right
+        at azimuth 0 (+y, where up is nearly x), so with +z up the eye is at -y.
 
         Args:
             azimuth: Degrees; a number, or (n,) for a batch.
             elevation: Degrees, likewise.
-            distance: In largest sides of the box, likewise, > 0; 2.4 if left out.
+            distance: In largest sides of the box, > 0, likewise; 2.4 if left out.
             fov, width, height, model: See `look_at`.
             up: +x, -x, +y, -y, +z, -z, or (3,) world.
-            fit: The distance is that from which the whole box just is in the picture, found when
-                the camera is `placed`. A fisheye or a panorama comes no nearer than where the box
-                spans 90 degrees.
+            fit: Finds the distance from which the whole box just fits into the picture, when the
+                camera is `placed`. A fisheye or a panorama comes no nearer than where the box spans
+                90 degrees.
 
         Raises:
             ValueError: A number is not finite or out of its range, or `fit` and a distance are
@@ -172,9 +172,9 @@ class Camera:
         turn, lift = turn.deg2rad(), lift.deg2rad()
         zero = torch.zeros_like(turn)
         outward = torch.stack((turn.sin() * lift.cos(), lift.sin(), turn.cos() * lift.cos()), -1)
-        sign = torch.where(lift.cos() < -1e-12, -1.0, 1.0)  # beyond a pole up is still up
+        sign = torch.where(lift.cos() < -1e-12, -1.0, 1.0)  # keeps up upward beyond a pole
         right = torch.stack((sign * turn.cos(), zero, -sign * turn.sin()), -1)
-        if not (isinstance(up, str) and up == "+y"):  # whose numbers are as they are
+        if not (isinstance(up, str) and up == "+y"):  # +y needs no rotation
             axes = _axes_around(upward(where, up))
             outward, right = outward @ axes, right @ axes
         view = _viewmat(outward * far[..., None], -outward, right)
@@ -197,8 +197,8 @@ class Camera:
         *,
         up: Up = "+y",
     ) -> Camera:
-        """Looks at a box, (2, 3) world, from where all of it just is in the picture, as `orbit`
-        with `fit` does; the camera stands in the world.
+        """Looks at a box, (2, 3) world, from the distance at which all of it just fits into the
+        picture, as `orbit` with `fit` does; the camera is in world units.
         """
         corners = check.reals("Camera.fit", "box", box, (2, 3))
         if not bool((corners[1] > corners[0]).all()):
@@ -223,17 +223,17 @@ class Camera:
         Args:
             eye: (3,) or (n, 3).
             target: (3,) or (n, 3).
-            up: (3,) or (n, 3), or a name such as "+z"; where it is parallel to the view, -z takes
-                its place (or +y, if up is z).
-            fov: Vertical field of view, degrees; left out, 30 of a pinhole and an orthographic
-                camera, which shows what a pinhole would at the target's distance, and 180 of a
-                fisheye, whose circle is as high as the picture, and of a panorama, which is twice
-                as wide as high.
+            up: (3,) or (n, 3), or a name such as "+z"; where it is parallel to the view, -z is used
+                instead (or +y, if the view is along z).
+            fov: Vertical field of view, degrees. By default 30 for a pinhole and for an
+                orthographic camera, which shows what a pinhole would at the target's distance; 180
+                for a fisheye, whose circle is as high as the picture, and for a panorama, twice as
+                wide as high.
             width, height: Pixels.
             model: Name of the camera model.
 
         Raises:
-            ValueError: A place is not finite, up is zero, or eye and target are the same.
+            ValueError: A position is not finite, up is zero, or eye and target are the same.
         """
         where = "Camera.look_at"
         up = upward(where, up) if isinstance(up, str) else up
@@ -339,8 +339,8 @@ class Camera:
         """Returns the camera in world units, given the (2, 3) box of the scene."""
         if self.frame is Frame.WORLD:
             return self
-        # NumPy, here and in `numbers`: calls of torch take longer, and let go of the interpreter,
-        # for which the frame would queue again and again behind the threads that read a store.
+        # NumPy, here and in `numbers`: calls of torch take longer, and release the GIL, for which
+        # the frame would queue again and again behind the threads that read a store.
         low, high = box.numpy()
         centre, side, Ks = (low + high) / 2, (high - low).max(), self.Ks
         view = self.viewmats.numpy().copy()
@@ -364,8 +364,8 @@ class Camera:
         return self._changed(**parts, frame=Frame.WORLD, fitted=None)
 
     def pixel_width(self, distance: float) -> float:
-        """Returns the world units that a pixel is wide: of a pinhole at a distance along its axis,
-        of an orthographic camera anywhere.
+        """Returns the width of a pixel in world units: of a pinhole at a distance along its axis,
+        of an orthographic camera at any distance.
 
         Raises:
             ValueError: It is a fisheye or a panorama, a batch, or relative to a box.
@@ -377,8 +377,8 @@ class Camera:
         return (1.0 if self.model == "ortho" else distance) / float(self.Ks[0, 0, 0])
 
     def shifted(self, dx: float, dy: float, sample: int | None = None) -> Camera:
-        """Returns the camera whose rays go through (dx, dy) pixels right of and below the centres
-        of the pixels, as another `sample` of these if given.
+        """Returns the camera whose rays pass (dx, dy) pixels to the right of and below the centres
+        of the pixels, with another `sample` number if given.
         """
         Ks = self.Ks.clone()
         Ks[:, :2, 2] -= torch.tensor([dx, dy], dtype=torch.float64)
@@ -390,10 +390,10 @@ class Camera:
         return self.shifted(0, first)._changed(height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
-        """Returns what `pixel_rays` reads; does not wait for the device. (n, 26) float64: rotation
-        to the camera (9), position (3), focal lengths and principal point (2, 2; pixel centres at
-        integers), cone (2), range (2), a fisheye's coefficients (4) and largest angle (1), and the
-        sample (1).
+        """Returns the numbers that `pixel_rays` reads; does not wait for the device. (n, 26)
+        float64: rotation to the camera (9), position (3), focal lengths and principal point (2, 2;
+        pixel centres at integers), cone (2), range (2), a fisheye's coefficients (4) and largest
+        angle (1), and the sample (1).
 
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
@@ -413,14 +413,14 @@ class Camera:
         return upload(torch.from_numpy(numbers), torch.device(device))
 
     def thinned(self, stride: int) -> Camera:
-        """Returns the camera of one ray for stride x stride pixels; see `numbers_ahead`."""
+        """Returns the camera with one ray per stride x stride pixels; see `numbers_ahead`."""
         height, width = (-(-size // stride) for size in (self.height, self.width))
         return self._changed(height=height, width=width, window=(0, height))
 
     def numbers_ahead(self, now: Tensor, before: Tensor, frames: float, stride: int) -> Tensor:
-        """Returns the numbers of the camera `thinned` by a stride, some frames on, given what
-        `numbers` told of the last two frames; see `continued`. Each ray goes through the middle of
-        its pixels, and its cone is as wide as one of them.
+        """Returns the numbers of the camera `thinned` by `stride`, extrapolated by `frames` frames
+        from the `numbers` of the last two frames; see `continued`. Each ray passes through the
+        middle of its pixels, and its cone is as wide as one of them.
         """
         moved = continued(now, before, frames, moving=12, axes=slice(0, 9))
         focal, centre = moved[:, 12:14], moved[:, 14:16]
@@ -428,8 +428,8 @@ class Camera:
         return torch.cat((moved[:, :12], focal / stride, middle, moved[:, 16:]), 1)
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
-        """Returns the rays through the pixel centres of whole rows, the first one and the one after
-        the last counted through the batch, from what `numbers` gave.
+        """Returns the rays through the pixel centres of whole rows, from the result of `numbers`.
+        `rows`: the first one and the one after the last, counted through the batch.
         """
         pixels = PixelRows(numbers, rows, self.width, self.height, self.distorted)
         return MODELS[self.model].rays(pixels)
@@ -438,27 +438,27 @@ class Camera:
         """Returns `Rays.sample` of whole rows, counted as for `pixel_rays`."""
         row = torch.arange(*rows, device=numbers.device)
         column = torch.arange(self.width, device=numbers.device)
-        pictures = numbers[:, -1].view(len(self), -1)[:, 0]  # of rays, each has the number
+        pictures = numbers[:, -1].view(len(self), -1)[:, 0]  # custom: a row per ray, all alike
         sample = pictures[row // self.height].to(torch.int64) << 32
         first = (self.window[0] + row % self.height) * self.width
         return ((sample + first)[:, None] + column).flatten()
 
     def blocks(self, pixels: int) -> Iterator[tuple[int, int]]:
-        """Yields the rows of all pictures in blocks of about so many pixels, at least a row each:
-        first row and the row after the last, as `pixel_rays` takes them.
+        """Yields the rows of all pictures in blocks of about this many pixels, at least one row
+        each: first row and the row after the last, as `pixel_rays` takes them.
         """
         rows, block = len(self) * self.height, max(1, pixels // self.width)
         for first in range(0, rows, block):
             yield first, min(first + block, rows)
 
     def image(self, column: Tensor) -> Tensor:
-        """Returns numbers (r,) or (r, c) of all pixels as a picture (h, w, c), or (n, h, w, c)."""
+        """Returns values (r,) or (r, c) of all pixels as a picture (h, w, c), or (n, h, w, c)."""
         one = (self.height, self.width, -1)
         return column.reshape(len(self), *one) if self.batched else column.reshape(one)
 
     def rays(self, device: torch.device | str = "cpu", rows: tuple[int, int] | None = None) -> Rays:
-        """Returns the rays through pixel centres, camera by camera, row by row, in float64; of all
-        rows if left out, else as `pixel_rays`.
+        """Returns the rays through pixel centres, camera by camera, row by row, in float64; `rows`
+        as for `pixel_rays`, by default all.
 
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
@@ -467,15 +467,15 @@ class Camera:
         return self.pixel_rays(self.numbers(device), rows or everything)
 
 
-_ROWS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # a row a camera
+_ROWS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # one row per camera
 _CORNERS = list(itertools.product((0, 1), repeat=3))
 
 
 def continued(now: Tensor, before: Tensor, frames: float, moving: int, axes: slice) -> Tensor:
-    """Returns the numbers (n, c) float64 of cameras, or of rays, some frames on, given those of now
-    and of a frame ago; does not wait for the device. The first columns are `moving`, and `axes`
-    among these hold unit vectors, three columns each: where one of them turned by more than 0.1
-    radian, that row stays as it is now.
+    """Extrapolates the numbers (n, c) float64 of cameras, or of rays, by `frames` frames, given
+    those of now and of one frame before; does not wait for the device. The first `moving` columns
+    change; `axes` among these hold unit vectors, three columns each: where one of them turned by
+    more than 0.1 radian, that row stays as it is now.
     """
     motion = (now - before)[:, :moving]
     turned = motion[:, axes].unflatten(1, (-1, 3)).square().sum(2).amax(1, keepdim=True)
@@ -489,8 +489,8 @@ def _sum_of_three(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def upward(where: str, up: Up) -> Tensor:
-    """Returns the direction that is up, (3,) float64, of a name such as "+z" or of three numbers;
-    raises ValueError where it is neither, or zero.
+    """Returns the up direction, (3,) float64, from a name such as "+z" or three numbers; raises
+    ValueError where it is neither, or zero.
     """
     if isinstance(up, str):
         if up not in DIRECTIONS:
@@ -505,7 +505,7 @@ def upward(where: str, up: Up) -> Tensor:
 
 
 def _axes_around(up: Tensor) -> Tensor:
-    """(3, 3): where x, y and z of an orbit around +y point to if another direction is up."""
+    """Returns (3, 3), the directions of an orbit's x, y and z axes for another `up`."""
     up = up / up.norm()
     right = torch.zeros_like(up)
     right[int(up[0].abs() > 0.9)] = 1
@@ -515,7 +515,7 @@ def _axes_around(up: Tensor) -> Tensor:
 
 
 def _batch(where: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:
-    """Numbers of one camera (*shape), or of n cameras (n, *shape), broadcast."""
+    """Returns numbers of one camera (*shape), or of n cameras (n, *shape), broadcast."""
     found, sizes = [], []
     for name, (value, shape) in values.items():
         numbers = check.reals(where, name, value)
@@ -552,7 +552,7 @@ def _check_matrices(viewmats: Tensor, Ks: Tensor) -> None:
 
 
 def _viewmat(eye: Tensor, forward: Tensor, right: Tensor) -> Tensor:
-    """World-to-camera matrix (..., 4, 4) from a place and two orthonormal directions."""
+    """World-to-camera matrix (..., 4, 4) from a position and two orthonormal directions."""
     down = torch.linalg.cross(forward, right)
     rotation = torch.stack((right, down, forward), dim=-2)
     view = torch.eye(4, dtype=torch.float64).repeat(*eye.shape[:-1], 1, 1)
@@ -571,7 +571,7 @@ def _aimed(
     model: CameraModel,
     frame: Frame,
 ) -> Camera:
-    """Cameras that look through the middle of the picture; `distance` (...) is the target's."""
+    """Returns cameras with a centred axis; `distance` (...) is that of the target."""
     kind = model_of(where, model)
     fov = kind.fov if fov is None else fov
     check.number(where, "fov", fov, low=0, high=kind.widest, open_low=True)

@@ -1,4 +1,4 @@
-"""`CustomCamera`: pictures along any rays."""
+"""`CustomCamera`: pictures along arbitrary rays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .camera import Camera, Frame, continued
 
 
 class CustomCamera(Camera):
-    """A ray for each pixel, in world units. What is taken with it is a picture like any other."""
+    """An arbitrary ray for each pixel, in world units. Its pictures are like any other."""
 
     model: Any = "custom"
     distorted = False
@@ -25,12 +25,12 @@ class CustomCamera(Camera):
 
         Args:
             rays: n * height * width rays; more than one picture makes a batch.
-            width: Pixels; left out that of the rays, or all of them in one row.
-            height: Pixels; left out all rows.
+            width: Pixels; by default `rays.width`, or else all rays in one row.
+            height: Pixels; by default all rows.
 
         Raises:
             ValueError: The number of rays is no multiple of a picture's pixels, or a shape is
-                wrong, or (looked at on the CPU only) a number is NaN, or a direction is not of unit
+                wrong, or (checked on the CPU only) a number is NaN, or a direction is not of unit
                 length.
         """
         columns: list[Tensor] = []
@@ -84,12 +84,12 @@ class CustomCamera(Camera):
         Args:
             origin: (h, w, 3) or (n, h, w, 3) world units, or what broadcasts to it.
             direction: (h, w, 3) or (n, h, w, 3) of any length but 0.
-            cone: (..., 2) width at the origin and growth per unit distance; left out it is taken
+            cone: (..., 2) width at the origin and growth per unit distance; by default it follows
                 from the differences between neighbouring rays.
-            range: (..., 2) first and last distance; 0 and infinity if left out.
+            range: (..., 2) first and last distance; 0 and infinity by default.
 
         Raises:
-            ValueError: A shape is wrong, or (looked at on the CPU only) a number is NaN, or a
+            ValueError: A shape is wrong, or (checked on the CPU only) a number is NaN, or a
                 direction 0.
         """
         if direction.dim() not in (3, 4) or direction.shape[-1] != 3:
@@ -138,7 +138,7 @@ class CustomCamera(Camera):
         return self
 
     def shifted(self, dx: float, dy: float, sample: int | None = None) -> Camera:
-        """Returns the camera with its rays moved by a part of the step to their neighbours."""
+        """Returns the camera with its rays moved by dx and dy of the step to their neighbours."""
         lines = self._pictures()[..., :6]
         moved = lines + dx * _ray_step(lines, -2) + dy * _ray_step(lines, -3)
         origin, direction = moved.split(3, -1)
@@ -159,15 +159,15 @@ class CustomCamera(Camera):
         return upload(self._rays, torch.device(device))
 
     def thinned(self, stride: int) -> Camera:
-        """Returns the camera of one ray for stride x stride pixels; see `numbers_ahead`."""
+        """Returns the camera with one ray per stride x stride pixels; see `numbers_ahead`."""
         rays = self._pictures()[:, ::stride, ::stride]
         height, width = rays.shape[1:3]
         parts = {"height": height, "width": width, "window": (0, height)}
         return self._changed(_rays=rays.reshape(-1, 11), **parts)
 
     def numbers_ahead(self, now: Tensor, before: Tensor, frames: float, stride: int) -> Tensor:
-        """Returns the numbers of the camera `thinned` by a stride, some frames on, given what
-        `numbers` told of the last two frames; see `continued`.
+        """Returns the numbers of the camera `thinned` by `stride`, extrapolated by `frames` frames
+        from the `numbers` of the last two frames; see `continued`.
         """
 
         def some(numbers: Tensor) -> Tensor:
@@ -177,29 +177,29 @@ class CustomCamera(Camera):
         return continued(some(now), some(before), frames, moving=6, axes=slice(3, 6))
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
-        """Returns the rays of whole rows, from what `numbers` gave."""
+        """Returns the rays of whole rows, from the result of `numbers`."""
         part = numbers[rows[0] * self.width : rows[1] * self.width]
         origin, direction, cone, limits, _ = part.split((3, 3, 2, 2, 1), 1)
         return Rays(origin=origin, direction=direction, cone=cone, range=limits, width=self.width)
 
 
 def as_camera(where: str, camera: Camera | Rays) -> Camera:
-    """Returns a user's camera; rays become one. Raises ValueError if it is neither."""
+    """Returns a user's camera; rays become a `CustomCamera`. Raises ValueError if it is neither."""
     if isinstance(camera, Rays):
         return CustomCamera(camera)
     return instance(where, "camera", camera, Camera)
 
 
 def _neighbour_cones(origin: Tensor, direction: Tensor) -> Tensor:
-    """Cones (..., h, w, 2) from the differences between neighbouring rays, the larger of both axes
-    of the picture. Source: Igehy, "Tracing ray differentials", SIGGRAPH 1999.
+    """Returns cones (..., h, w, 2) from the differences between neighbouring rays, the larger of
+    both axes of the picture. Source: Igehy, "Tracing ray differentials", SIGGRAPH 1999.
     """
     steps = [[_ray_step(f, axis).norm(dim=-1) for axis in (-3, -2)] for f in (origin, direction)]
     return torch.stack([torch.maximum(*pair) for pair in steps], -1)
 
 
 def _ray_step(field: Tensor, axis: int) -> Tensor:
-    """Change of (..., h, w, c) from pixel to pixel: central differences, 0 along a lone row."""
+    """Returns the change of (..., h, w, c) per pixel: central differences, 0 along a lone row."""
     if field.shape[axis] == 1:
         return torch.zeros_like(field)
     return torch.gradient(field, dim=axis)[0]

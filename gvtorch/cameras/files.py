@@ -1,13 +1,13 @@
 """`read_cameras`, `write_cameras`: cameras of other programs: ParaView's .pvcc, `transforms.json`
 as Blender's add-ons and NeRF data sets have it, and COLMAP's text models.
 
-| | axes of a camera | what is kept |
+| | axes of a camera | what is stored |
 |---|---|---|
-| .pvcc | view up, focal point | place, target, up, vertical angle or parallel scale; one camera |
+| .pvcc | view up, focal point | eye, target, up, vertical angle or parallel scale; one camera |
 | .json | x right, y up, z back; camera to world | intrinsics in pixels, also of fisheyes |
 | folder | x right, y down, z forward; world to camera | intrinsics in pixels, also of fisheyes |
 
-Pixel centres lie at +0.5 in all of them, as here. How far from its axis a fisheye sees is in none.
+Pixel centres lie at +0.5 in all of them, as here. None stores the largest angle of a fisheye.
 
 Sources: COLMAP documentation, "Output format"; Mildenhall et al., "NeRF", 2020, released data;
 ParaView, vtkSMCameraConfigurationWriter.
@@ -43,7 +43,7 @@ _PVCC = (
 )
 _DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _FISHEYE = "OPENCV_FISHEYE"
-#: COLMAP's models, by their parameters; those of distorted pinholes are read where all are 0.
+#: Parameters of COLMAP's models; distorted pinholes are read only if all their coefficients are 0.
 _COLMAP = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -62,15 +62,15 @@ def read_cameras(
     Args:
         path: ParaView's .pvcc; a .json of frames with `transform_matrix`; or a folder with COLMAP's
             cameras.txt and images.txt.
-        width: Pixels of a .pvcc, which does not tell; else what is read is scaled to it.
+        width: Pixels of a .pvcc, which does not store them; other cameras are scaled to this size.
         height: Likewise; both or none.
 
     Returns:
-        Each camera, by the name of its picture, in the file's order; "camera" of a .pvcc.
+        Each camera, by the name of its picture, in the file's order; that of a .pvcc is "camera".
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is none of these, is damaged, or a lens is distorted as no model here is.
+        ValueError: The path is none of these, or damaged, or no model supports a lens's distortion.
     """
     path = Path(path)
     if (width is None) != (height is None):
@@ -107,12 +107,12 @@ def write_cameras(
     Args:
         path: .pvcc (of one camera), .json, or a folder for COLMAP's cameras.txt, images.txt and an
             empty points3D.txt, which is made.
-        cameras: A camera, a batch, whose pictures are called 0000.png, 0001.png, ..., or each by
-            the name of its picture; in the world.
-        distance: World units to what a .pvcc turns around; 1 if left out.
+        cameras: A camera, or a batch, whose pictures are called 0000.png, 0001.png, ..., or cameras
+            by the names of their pictures; in world units.
+        distance: World units from the eye to a .pvcc's centre of rotation; 1 if left out.
 
     Raises:
-        ValueError: The ending is another, a model can't be told in the file, or a camera is
+        ValueError: The ending is none of these, the file can't store a model, or a camera is
             relative to a box: call `placed(tree.box)` first.
         FileNotFoundError: The folder around it does not exist.
     """
@@ -144,7 +144,7 @@ def write_cameras(
 
 
 def _scaled(camera: Camera, width: int, height: int) -> Camera:
-    """The camera with pictures of another size; what was in them stays in them."""
+    """Returns the camera with pictures of another size, which show the same."""
     Ks = camera.Ks[0].clone()
     Ks[0] *= width / camera.width
     Ks[1] *= height / camera.height
@@ -233,7 +233,7 @@ def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[
 def _made(
     model: str, view: Tensor, lens: Any, told: Mapping[str, Any], size: tuple[int, int]
 ) -> Camera:
-    """A camera of a model of COLMAP's; `lens` is fx, fy, cx, cy."""
+    """Returns a camera of one of COLMAP's models; `lens` is fx, fy, cx, cy."""
     fx, fy, cx, cy = lens
     Ks = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     bends = [float(told.get(name) or 0) for name in ("k1", "k2", "k3", "k4")]
@@ -265,7 +265,7 @@ def _transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
 
 
 def _lens(camera: Camera) -> tuple[str, dict[str, float]]:
-    """Model and parameters as COLMAP has them."""
+    """Returns COLMAP's model and parameters of a camera."""
     (fx, _, cx), (_, fy, cy), _ = camera.Ks[0].tolist()
     told = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
     if camera.model == "pinhole":
@@ -307,8 +307,8 @@ def _text(path: Path) -> str:
 
 
 def _lines(path: Path, every: int = 1) -> list[str]:
-    """Lines of a text that are no comments; of images.txt every other one: behind each stand the
-    points that were found in it, which may be none.
+    """Returns the lines of a text without comments, in images.txt every other one: each image's
+    line is followed by one with its points, which may be empty.
     """
     if not path.is_file():
         raise ValueError(f"has no {path.name}")

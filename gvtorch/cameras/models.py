@@ -1,5 +1,5 @@
-"""Camera models: from places of the image plane, x = (u - cx) / fx and y = (v - cy) / fy, to rays,
-on the device. Axes are OpenCV's: x right, y down, z forward.
+"""Camera models: from positions on the image plane, x = (u - cx) / fx and y = (v - cy) / fy, to
+rays, on the device. Axes are OpenCV's: x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from ..base.records import Rays
 from ..ops import pinhole_rays
 
 CameraModel = Literal["pinhole", "ortho", "fisheye", "panorama"]
-_NEWTON = 20  # steps; each halves the bracket where Newton's leaves it
-_ROUNDING = 1 + 1e-12  # of the edges of fisheye and panorama
-_NEAREST = math.radians(45)  # half the angle that a box spans from where a wide view shows it
-_CLEAR = 1.02  # of the distance of a parallel camera's eye from the nearest corner
+_NEWTON = 20  # steps; one that leaves the bracket halves it instead
+_ROUNDING = 1 + 1e-12  # tolerance at the edges of fisheye and panorama
+_NEAREST = math.radians(45)  # largest half angle that a fitted box spans in a wide view
+_CLEAR = 1.02  # least eye distance of a parallel camera, over the nearest corner's
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class PixelRows:
     cameras: Tensor  # (n, 26) float64, see `Camera.numbers`
     rows: tuple[int, int]  # the first one and the one after the last, counted through the batch
     width: int
-    height: int  # of a camera
+    height: int  # of one picture
     distorted: bool  # the coefficients of a fisheye are used
 
     @cached_property
@@ -66,14 +66,14 @@ class PixelRows:
         return self.numbers[:, 9:12]
 
     def spread(self, values: Tensor) -> Tensor:
-        """(r, c) of (k, c): one camera's is not copied."""
+        """Repeats (k, c) for all rays, (r, c); values of a single camera are not copied."""
         rays = (self.rows[1] - self.rows[0]) * self.width
         if len(values) == 1:
             return values.expand(rays, -1)
         return values[:, None].expand(-1, self.width, -1).reshape(rays, -1)
 
     def turned(self, local: Tensor) -> Tensor:
-        """(y, w, 3) world directions of those in camera axes."""
+        """Returns (y, w, 3) directions in camera axes as world directions."""
         parts = (local[..., i, None] * self.rotation[:, None, i] for i in range(3))
         return sum(parts, torch.zeros_like(local))
 
@@ -86,8 +86,8 @@ class PixelRows:
         inside: Tensor | None = None,
     ) -> Rays:
         """Returns the rays of all pixels. `direction` is (y, w, 3) or (r, 3), of unit length, and
-        `origin` (y, w, 3), the camera's position if left out; `widening` (y, w) is a factor on the
-        cones, and what is not `inside` (y, w) gets an empty range.
+        `origin` (y, w, 3), by default the camera's position; `widening` (y, w) is a factor on the
+        cones, and pixels that are not `inside` (y, w) get an empty range.
         """
         cone, limits = (self.spread(part) for part in self.numbers[:, 16:20].split(2, 1))
         if widening is not None:
@@ -107,10 +107,10 @@ class Model(ABC):
     """A camera model.
 
     Attributes:
-        fov: Vertical field of view in degrees where none is given.
-        widest: Largest one.
+        fov: Default vertical field of view, degrees.
+        widest: Largest vertical field of view, degrees.
         parallel: Rays are parallel; focal lengths are pixels per world unit, and cones do not grow.
-        bends: It takes radial coefficients and a largest angle to the axis.
+        bends: Radial coefficients and a largest angle to the axis are allowed.
     """
 
     fov = 30.0
@@ -124,17 +124,17 @@ class Model(ABC):
         return length, length
 
     def fit(self, corners: Tensor, half_x: float, half_y: float) -> tuple[Tensor, Tensor]:
-        """Returns from how far the corners of a box are in the picture, and the distance that a
-        parallel camera's focal lengths are divided by, (n,) each. Corners (n, 8, 3) are told from
-        the box's centre, along the camera's axes; they may take half a width and half a height on
-        the image plane at distance 1.
+        """Returns the distance at which all corners of a box are in the picture, and the distance
+        by which a parallel camera's focal lengths are divided, (n,) each. Corners (n, 8, 3) are
+        relative to the box's centre, in camera axes; they may reach `half_x` and `half_y` from the
+        middle of the image plane at distance 1.
         """
         across, depth = self.reach(corners, half_x, half_y), corners[..., 2]
         away = (across - depth).amax(1)
         return away, away
 
     def reach(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
-        """Returns the depth (n, 8) at which corners lie on the edge of what they may take."""
+        """Returns the depth (n, 8) at which corners lie on the edge of what they may reach."""
         x, y, _ = corners.abs().unbind(-1)
         return torch.maximum(x / half_x, y / half_y)
 
@@ -159,7 +159,7 @@ class Ortho(Model):
     parallel = True
 
     def fit(self, corners: Tensor, half_x: float, half_y: float) -> tuple[Tensor, Tensor]:
-        """The eye stands in front of the box, however small the scale is."""
+        """Keeps the eye in front of the box, however small the scale is."""
         scale = self.reach(corners, half_x, half_y).amax(1)
         return torch.maximum(scale, _CLEAR * corners[..., 2].abs().amax(1)), scale
 
@@ -172,7 +172,7 @@ class Ortho(Model):
 
 class Fisheye(Model):
     """Equidistant: the angle to the axis is the distance from the middle. With four coefficients it
-    is the angle t whose t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) is that distance.
+    is the angle t for which t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) is that distance.
 
     Source: Kannala and Brandt, "A generic camera model and calibration method for conventional,
     wide-angle, and fish-eye lenses", PAMI 2006, eq. 6; OpenCV's fisheye model.
@@ -185,7 +185,7 @@ class Fisheye(Model):
         return height / fov, height / fov
 
     def reach(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
-        """All within a cone: a straight edge between two places of it does not leave it."""
+        """Keeps corners within a cone, which is convex: straight edges between them stay inside."""
         return corners[..., :2].norm(dim=-1) / math.tan(min(half_x, half_y, _NEAREST))
 
     def rays(self, pixels: PixelRows) -> Rays:
@@ -211,11 +211,11 @@ class Panorama(Model):
     fov, widest = 180.0, 180.0
 
     def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
-        """A unit of the image plane is a radian; a picture shows twice the angle across."""
+        """A unit of the image plane is a radian; a picture spans twice the angle horizontally."""
         return width / (2 * fov), height / fov
 
     def reach(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
-        """Within a frustum, from which a straight edge does not bulge as from a band of angles."""
+        """Keeps corners within a frustum: straight edges would bulge out of a band of angles."""
         slopes = (math.tan(min(half, _NEAREST)) for half in (half_x, half_y))
         return super().reach(corners, *slopes)
 
@@ -249,7 +249,7 @@ def model_of(where: str, name: str) -> Model:
 
 
 def distort(angle: Tensor, k: Tensor) -> Tensor:
-    """Distance from the middle, in focal lengths, at angles (..., w), by (..., 4) coefficients."""
+    """Returns distances from the middle, focal lengths, at angles (..., w), by (..., 4) `k`."""
     a2, (k1, k2, k3, k4) = angle * angle, k.split(1, -1)
     return angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
 
@@ -261,8 +261,8 @@ def slope(angle: Tensor, k: Tensor) -> Tensor:
 
 
 def undistort(radius: Tensor, k: Tensor, limit: Tensor) -> Tensor:
-    """The angle in [0, limit] whose `distort` is the radius: Newton's steps, and halves of the
-    bracket where they leave it. `distort` must rise up to the limit.
+    """Returns the angle in [0, limit] whose `distort` is the radius: by Newton's steps, and by
+    halving the bracket where they leave it. `distort` must rise up to the limit.
     """
     low, high = torch.zeros_like(radius), limit.expand_as(radius)
     angle = torch.minimum(radius, high)
@@ -276,7 +276,7 @@ def undistort(radius: Tensor, k: Tensor, limit: Tensor) -> Tensor:
 
 
 def last_rising_angle(k: Tensor) -> float:
-    """Largest angle, at most pi, up to which `distort` rises, for (4,) coefficients on the CPU."""
+    """Returns the largest angle up to pi to which `distort` rises, for (4,) `k` on the CPU."""
     import numpy as np
 
     k1, k2, k3, k4 = k.tolist()

@@ -1,10 +1,10 @@
 """`Motion`: poses of a camera along a smooth path, from key frames with times.
 
-A pose is a similarity of space: it turns, shifts and scales the axes of a camera that looks at the
-origin from distance 1. Between two keys it moves as a power of what leads from one to the other: an
-orbit stays a circle around its target, a zoom comes nearer by the same factor each second and ends
-at the target, a shift is straight. Several keys are joined by the cubic curve of the group, which
-passes through every key without a jump of velocity.
+A pose is a similarity transform: it turns, shifts and scales the axes of a camera that looks at the
+origin from distance 1. Between two keys it moves along powers of the transform from one to the
+other: an orbit stays a circle around its target, a zoom comes nearer by the same factor each second
+and ends at the target, a shift is straight. Several keys are joined by the cubic curve of the
+group, which passes through every key without a jump of velocity.
 
 Source: Kim, Kim and Shin, "A general construction scheme for unit quaternion curves with simple
 high order derivatives", SIGGRAPH 1995 (cumulative Bernstein basis), here in the group of
@@ -22,15 +22,16 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-_FASTEST = 2.0  # times the slower of the neighbouring intervals' speeds, at a key
+_FASTEST = 2.0  # largest speed at a key, over that of the slower neighbouring interval
 
 
 class Motion:
     """Poses (4, 4) float64 by time."""
 
     def __init__(self, times: Sequence[float], poses: Sequence[Tensor], closed: bool) -> None:
-        """Takes the keys: times, increasing; poses (4, 4) float64, a rotation times a positive
-        scale and a shift each; whether the last is the first, and the path runs on through it.
+        """Takes the keys: increasing times; poses (4, 4) float64, each a rotation times a positive
+        scale, and a shift; and whether the path is `closed`: its last key is the first, and it
+        continues there.
         """
         self._times, self._poses = list(times), list(poses)
         spans = [b - a for a, b in pairwise(times)]
@@ -66,8 +67,8 @@ class Motion:
 
 
 def _between(before: Tensor, after: Tensor, span_before: float, span_after: float) -> Tensor:
-    """The velocity at a key: that of the parabola through it and its neighbours, slowed down where
-    an interval beside it is slow; so a camera that rests between two keys does rest.
+    """Returns the velocity at a key: that of the parabola through it and its neighbours, limited
+    where an interval next to it is slow, so that a camera that rests between two keys does rest.
     """
     speed = (span_after * before + span_before * after) / (span_before + span_after)
     most = _FASTEST * min(float(before.norm()), float(after.norm()))
@@ -76,8 +77,8 @@ def _between(before: Tensor, after: Tensor, span_before: float, span_after: floa
 
 
 def exponential(step: Tensor) -> Tensor:
-    """Returns the pose (4, 4) to which a velocity (7,), held for 1, leads from the identity: growth
-    (1), turning (3), shift (3).
+    """Returns the pose (4, 4) that a velocity (7,) reaches from the identity in time 1: growth (1),
+    turning (3), shift (3).
     """
     scaled, along = _flow(step)
     pose = torch.eye(4, dtype=step.dtype)
@@ -86,7 +87,7 @@ def exponential(step: Tensor) -> Tensor:
 
 
 def logarithm(pose: Tensor) -> Tensor:
-    """Returns the velocity (7,) whose exponential is the pose; of its turns the shortest."""
+    """Returns the velocity (7,) whose exponential is the pose, with the shortest turn."""
     scale = float(torch.linalg.det(pose[:3, :3])) ** (1 / 3)
     step = pose.new_zeros(7)
     step[0] = math.log(scale)
@@ -96,7 +97,7 @@ def logarithm(pose: Tensor) -> Tensor:
 
 
 def _flow(step: Tensor) -> tuple[Tensor, Tensor]:
-    """The scaled rotation (3, 3) that growth and turning make in the time 1, and its integral."""
+    """Returns the scaled rotation (3, 3) by growth and turning in time 1, and its integral."""
     growth, angle = float(step[0]), float(step[1:4].norm())
     x, y, z = (step[1:4] / angle if angle > 0 else step[1:4]).tolist()
     across = step.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -117,7 +118,7 @@ def _flow(step: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _turn(rotation: Tensor) -> Tensor:
-    """Axis times angle (3,), 0 to pi, of a rotation."""
+    """Returns axis times angle (3,) of a rotation, the angle from 0 to pi."""
     w, *rest = quaternion_of(rotation)
     xyz = rotation.new_tensor(rest)
     length = float(xyz.norm())

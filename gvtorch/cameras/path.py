@@ -22,7 +22,7 @@ _UP, _FOV = (0.0, 1.0, 0.0), 30.0  # of keys that have none
 
 
 class CameraPath:
-    """Cameras by a number that runs from 0 (the first key) to 1 (the last)."""
+    """Cameras along a path, given by a number from 0 (the first key) to 1 (the last)."""
 
     def __init__(
         self,
@@ -35,7 +35,7 @@ class CameraPath:
 
         Args:
             eye: (k, 3) world units, k >= 1.
-            target: (k, 3) world units, what is in the middle of the picture.
+            target: (k, 3) world units, the point in the middle of the picture.
             up: (k, 3); +y if left out.
             fov: (k,) vertical field of view, degrees; 30 if left out.
 
@@ -80,8 +80,8 @@ class CameraPath:
             model: Name of the camera model.
             fov: Degrees; the model's own if left out.
             azimuth, elevation, distance, up: Of the start.
-            fit: (width, height) of pictures in which the whole box is all the way around: finds
-                the distance, which stays the same.
+            fit: (width, height) of pictures that show the whole box all the way around: finds the
+                distance, which stays the same.
 
         Raises:
             ValueError: As `Camera.orbit`.
@@ -106,12 +106,12 @@ class CameraPath:
         cls, path: str | Path, *, up: Up | None = None, fov: float | None = None
     ) -> CameraPath:
         """Reads a list of keys: [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}].
-        `up` and `fov` are of keys that have none; +y and 30 degrees if left out.
+        `up` and `fov` are for keys that have none; +y and 30 degrees if left out.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: The file holds something else, or every key has its own up, or fov, and one
-                is given; the message names the file.
+            ValueError: The file holds something else, or `up` or `fov` is given although every key
+                has its own; the message names the file.
         """
         keys = check.json_file("camera path", path)
         if not isinstance(keys, list) or not all(isinstance(key, Mapping) for key in keys):
@@ -139,7 +139,7 @@ class CameraPath:
         return f"CameraPath({len(self._keys)} keys)"
 
     def camera(self, at: float, width: int, height: int, model: CameraModel = "pinhole") -> Camera:
-        """Returns the camera at a place of the path.
+        """Returns the camera at a position of the path.
 
         Args:
             at: 0 for the first key, 1 for the last; keys are evenly spaced.
@@ -153,13 +153,13 @@ class CameraPath:
         t = place - first
         index = torch.arange(first - 1, first + 3).clamp(0, last)
         a, b, c, d = self._keys[index]
-        # Cubic through b and c, whose slopes there are those of their neighbours' chords.
+        # Cubic through b and c, with the slope at each that of the chord between its neighbours.
         line = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
         eye, target, up, fov = line[:3], line[3:6], line[6:9], float(line[9])
         return Camera.look_at(eye, target, up, fov, width, height, model)
 
 
 def _places(cameras: Camera) -> Tensor:
-    """(n, 3) world places of cameras."""
+    """Returns (n, 3) world positions of cameras."""
     rotation, move = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3:]
     return -(rotation.mT @ move)[..., 0]

@@ -1,6 +1,6 @@
-"""`DeviceFrame`: recorded frames whose producers answer on the device and are recorded, too; the
-host has no part in them. A batch that is not full is padded with the root, whose answers are left
-out.
+"""`DeviceFrame`: recorded frames whose producers answer on the device and are recorded as well, so
+that the host takes no part. A batch that is not full is padded with the root, whose answers are
+discarded.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .stats import FrameStats, Readbacks
 
 
 class Unchecked(NamedTuple):
-    """What a producer gave for a batch, not checked yet."""
+    """A producer's answer to a batch, not checked yet."""
 
     node: Tensor  # (batch,) int64 nodes that were asked for, -1 for none
     batch: RequestBatch
@@ -39,23 +39,23 @@ class DeviceFrame(RecordedFrame):
 
     def __init__(self, production: Production, batch: int, fit: bool) -> None:
         super().__init__(production, batch, fit)
-        # What was made last and is to be subdivided in turn: nodes and their priorities.
+        # (batch, 2) nodes made last that are to be subdivided in turn, and their priorities.
         self._below = self._unused.new_zeros((batch, 2)) - 1
-        self.serve()  # loads what is loaded at first use; nothing is asked for
+        self.serve()  # warm-up before recording; there are no requests yet
         self.deepen()
 
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
-        """Returns, before a frame, whether its requests are to be served. `stale`: another frame
-        was rendered since the last of these; `steady`: the newest that the host knows missed
-        nothing.
+        """Returns, before a frame, whether the listed requests are to be served. `stale`: another
+        frame was rendered since this graph's last one; `steady`: the newest frame that was read
+        back missed nothing.
         """
         if stale:
-            self._requests.zero_()  # what would be served is out of date: the rays ask again
+            self._requests.zero_()  # the listed requests are out of date: the rays ask again
         return not steady
 
     def serve(self) -> None:
-        """Answers the most wanted requests of the last frame. Producers make bricks and classify
-        at the same time; what they answer is written after that.
+        """Serves the requests of the last frame that rank first. Producers fill and classify at the
+        same time; their answers are written after that.
         """
         loads, subdivisions = self.choose()
         bricks, regions = in_branches(
@@ -66,14 +66,14 @@ class DeviceFrame(RecordedFrame):
         self._subdivide(regions, *subdivisions)
 
     def deepen(self) -> None:
-        """Subdivides those nodes that `serve`, or `deepen` before, has just made and that rays will
-        want finer, as the priority of the node above tells, so that no ray has to ask for it.
+        """Subdivides nodes that `serve` or the previous `deepen` has just made, where the priority
+        of the parent shows that rays will want finer ones, so that no ray has to ask for them.
         """
         chosen, priority = self._below.unbind(1)
         self._subdivide(self._answers(REQUEST_SUBDIVIDE, chosen), chosen, priority)
 
     def deeper(self, readbacks: Readbacks) -> int:
-        """What subdivisions wanted in the mean, as far as known; 0 if levels need bricks first."""
+        """Returns how many more levels the last readback wanted on average; 0 if `by_level`."""
         return 0 if self._production.by_level else readbacks.deeper
 
     def _levels(self) -> Tensor:
@@ -83,7 +83,7 @@ class DeviceFrame(RecordedFrame):
         return levels_wanted(wide, branching)
 
     def _answers(self, kind: int, chosen: Tensor) -> list[Unchecked]:
-        """What each tree's producer answers for its own of nodes (batch,)."""
+        """Asks each tree's producer for those of the nodes (batch,) that belong to its tree."""
         number, answers = self.tree_of(chosen), []
         for source in self.trees:
             node = torch.where(number == source.tree.number, chosen, -1)
@@ -105,7 +105,7 @@ class DeviceFrame(RecordedFrame):
             self._made[5:] += failed
 
     def _subdivide(self, answers: Sequence[Unchecked], chosen: Tensor, priority: Tensor) -> None:
-        """Subdivides nodes (batch,), and notes which children to subdivide, too, in order."""
+        """Subdivides nodes (batch,), and lists the children to subdivide next, in order."""
         free = self._unused[:1]
         slot, wide = torch.full_like(chosen, -1), torch.zeros_like(chosen)
         for answer in answers:
@@ -125,7 +125,7 @@ class DeviceFrame(RecordedFrame):
         put_rows_of(self._below, torch.where(taken, rank - 1, -1), rows)
 
     def _fill(self, answer: Unchecked, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Loads nodes (k,): (3,) counts of `Put`, how many need none (1,), how many failed (1,)."""
+        """Loads nodes (k,). Returns `Put.counts`, how many need no brick (1,), and failed (1,)."""
         node, batch, given = answer
         bricks = checked_bricks(given, batch.nodes, batch.source.producer, look=False)
         good = _finite([bricks.data, bricks.constants], len(node), node.device)
@@ -141,7 +141,7 @@ class DeviceFrame(RecordedFrame):
         return put.counts, constant, ((node >= 0) & ~good).sum().view(1)
 
     def _classify(self, answer: Unchecked, free: Tensor) -> tuple[Put, Tensor]:
-        """Subdivides nodes (k,): what became of them, and how many failed (1,)."""
+        """Subdivides nodes (k,); returns the outcome, and how many failed (1,)."""
         node, batch, given = answer
         regions = checked_regions(given, batch.nodes, batch.source.producer, look=False)
         count = len(regions.kind)
@@ -153,7 +153,7 @@ class DeviceFrame(RecordedFrame):
         return put, ((node >= 0) & ~good).sum().view(1)
 
     def _asked(self, source: ProducedTree, kind: int, node: Tensor) -> RequestBatch:
-        """What a producer is asked of nodes (k,); the root where the index is -1."""
+        """Returns the request batch of nodes (k,), with the root where the index is -1."""
         there = torch.where(node >= 0, node, source.tree.root)
         batch = RequestBatch(source, kind, Targets(source.tree, there, source.tree.loc(there)))
         if kind == REQUEST_LOAD and source.producer.needs_parent:
@@ -162,12 +162,12 @@ class DeviceFrame(RecordedFrame):
 
 
 def _only(targets: Targets, node: Tensor, which: Tensor) -> Targets:
-    """The targets, without the padding and without those that are not among `which` (k,)."""
+    """Returns the targets with node -1 for padding and wherever `which` (k,) is false."""
     return replace(targets, node=torch.where(which, node, -1))
 
 
 def _finite(answers: Sequence[Mapping[str, Any]], count: int, device: torch.device) -> Tensor:
-    """(k,) bool, which items hold neither NaN nor infinite values."""
+    """Returns (k,) bool, which items hold neither NaN nor infinite values."""
     good = torch.ones(count, dtype=torch.bool, device=device)
     for by_channel in answers:
         for values in by_channel.values():

@@ -1,5 +1,5 @@
-"""`Engine`: scenes larger than memory, streamed by what the rays ask for. `Engine.frame` is the
-method, stage by stage; the stages follow it.
+"""`Engine`: renders scenes larger than memory, streaming what the rays request. `Engine.frame` is
+the method as one call per stage; the stages are defined below it.
 
 Source: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and
 Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
@@ -57,9 +57,9 @@ from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
 
 Scene = Producer | Mapping[str, Producer]
 
-_MOST_LISTED = 1 << 17  # nodes whose requests one frame lists
-_KEPT = 1000  # frames in a report
-_MOST_PRODUCED = 256 * 10**6  # bytes of voxels produced in one frame
+_MOST_LISTED = 1 << 17  # most nodes whose requests one frame lists
+_KEPT = 1000  # most frames in a report
+_MOST_PRODUCED = 256 * 10**6  # most bytes of voxels produced in one frame
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 
 
@@ -77,25 +77,25 @@ def _alone(method: _Method) -> _Method:
 class Engine:
     """A scene of one or more trees in one pair of pools.
 
-    Several threads may use an engine: they take turns, a picture at a time. To look at its pools
-    from another thread than the one that renders, hold `lock`. Producers are asked by the thread
-    that renders, and by one of its own for each captured frame; they must not render with the
-    engine themselves, nor wait for a thread that does.
+    Several threads may use an engine: they take turns, a picture at a time. A thread that does not
+    render must hold `lock` to look at the pools. Producers are called by the thread that renders,
+    and by one further thread for each captured frame; they must not render with the engine
+    themselves, nor wait for a thread that does.
 
     Attributes:
         lock: Held while a picture is rendered (`threading.RLock`).
-        options: How it was made.
+        options: The options that it was made with.
         trees: Trees and their producers, by name.
         cache: Pools, order of use and requests.
-        scheduler: Which requests are served.
-        production: Serves requests; what is on its way, and what failed.
+        scheduler: Chooses which requests are served.
+        production: Serves requests; knows the answers on their way and the nodes that failed.
         readbacks: The frames whose counts are on their way to the host.
         frames: Number of the last picture.
     """
 
     @explicit(EngineOptions)
     def __init__(self, scene: Scene, **options: Unpack[EngineSettings]) -> None:
-        """Takes the memory and makes the root of every tree.
+        """Allocates the pools and makes the root of every tree.
 
         Args:
             scene: A producer, or one for each tree by name.
@@ -127,10 +127,10 @@ class Engine:
         self.trees = self.production.trees
         self.readbacks = Readbacks()
         self.frames, self._closed = 0, False
-        self._missed: Tensor | None = None  # (r,) bool, of the last picture's rays
+        self._missed: Tensor | None = None  # (r,) bool, which rays of the last picture missed
         self._last: deque[FrameStats] = deque(maxlen=_KEPT)  # for the report
-        self._versions: dict[str, int] = {}  # of what they hold
-        self.recorded: list[HostFrame] = []  # what producers on the host serve, without this frame
+        self._versions: dict[str, int] = {}  # of the content that the trees hold
+        self.recorded: list[HostFrame] = []  # captured, with producers on the host
         try:
             layouts: dict[str, Layout] = {}
             for name, producer in producers.items():
@@ -150,22 +150,23 @@ class Engine:
         progress: Progress = no_progress,
         **options: Unpack[RenderSettings],
     ) -> tuple[Picture, FrameStats]:
-        """Produces what the last picture missed, then renders one from what is there.
+        """Produces what the last picture missed, then renders a picture from what is in the pools.
 
-        While something is missing, a few rays go ahead of the picture, so that the tree grows by
-        more than a level a frame (`EngineOptions.scout_rounds`), and the host waits for them. Else,
-        on CUDA, the host does not wait: the picture is on its way when this returns.
+        While something is missing, a few rays (scouts) are traced before the picture, so that the
+        tree grows by more than a level a frame (`EngineOptions.scout_rounds`), and the host waits
+        for them. Otherwise, on CUDA, it does not wait: the device may still render when this
+        returns.
 
         Args:
-            camera: One camera or a batch; an orbit camera stands around the scene's box. Or rays in
-                world units; see `gvtorch.render`.
+            camera: One camera or a batch; an orbit camera is placed around the scene's box. Or rays
+                in world units; see `gvtorch.render`.
             shader: The transfer function or another shader, or one for each tree by name.
-            progress: Told how many rows of pixels are done.
+            progress: Called with the number of rows of pixels that are done.
             **options: Fields of `RenderOptions`.
 
         Returns:
-            The picture, complete but perhaps coarse, and what it cost. `stats.converged` tells
-            that nothing was missing.
+            The picture, complete but perhaps coarse, and its statistics. `stats.converged` is true
+            if nothing was missing.
 
         Raises:
             ValueError: An argument is of the wrong type or out of its range.
@@ -174,7 +175,7 @@ class Engine:
         view = self.view("frame", camera, shader, options)
         with self.new_frame(view.options) as stats:
             self.serve_last_frame(stats)  # choose requests, produce, take slots, write, link
-            self.scout(view, stats)  # the same for a few rays that go ahead
+            self.scout(view, stats)  # the same for a few rays that are traced first
             hits = self.trace(view, progress)  # camera to rays to hits; rays mark use and requests
             collected = self.collect_requests_and_use(hits.samples)
             self.read_back(stats, hits, collected)  # for the next frame to serve
@@ -183,7 +184,7 @@ class Engine:
     def view(
         self, where: str, camera: Camera | Rays, shader: Shaders, options: RenderSettings
     ) -> View:
-        """Checks what a frame is to show; see `frame`. Errors begin with `where`."""
+        """Checks the arguments of `frame`, and returns its view. Errors begin with `where`."""
         camera = as_camera(where, camera)
         chosen = render_options(where, options, camera)
         trees = {name: source.tree for name, source in self.trees.items()}
@@ -192,7 +193,7 @@ class Engine:
         return View(placed, placed.numbers(self.device), trace, chosen, box)
 
     def _tracers(self, shaders: Shaders, options: RenderOptions, box: Tensor) -> list[TreeTrace]:
-        """What traces rays through each tree of a scene, given its (2, 3) box."""
+        """Returns for each tree what traces rays through it, given the (2, 3) box of the scene."""
         scene = {name: (one.tree, one.producer.channels) for name, one in self.trees.items()}
         by_level, frame_1 = self.production.by_level, self.cache.frame_1
         return tree_traces(
@@ -201,8 +202,8 @@ class Engine:
 
     @contextmanager
     def new_frame(self, options: RenderOptions) -> Iterator[FrameStats]:
-        """Keeps the statistics of the frame that the block renders; the block has the engine for
-        itself. If it raises, only what is on its way stays marked as pending.
+        """Collects the statistics of the frame that the block renders, and keeps other threads out.
+        If the block raises, only nodes whose answers are on their way stay marked as pending.
         """
         with self.lock:
             if self._closed:
@@ -260,14 +261,14 @@ class Engine:
             self.production.write(self.production.late(), stats)
 
     def renew(self) -> None:
-        """Drops the nodes and bricks that producers say have changed (`Producer.changed`), and
-        makes the roots of their trees anew; the host waits for that. The next frames make the rest.
+        """Drops nodes and bricks that producers have reported as changed (`Producer.changed`), and
+        remakes the roots of their trees; the host waits for that. The next frames make the rest.
         """
         changed = [s for n, s in self.trees.items() if s.producer.version != self._versions[n]]
         if not changed:
             return
         self.release()
-        self.readbacks.catch_up(wait=True)  # what they list is no longer asked for
+        self.readbacks.catch_up(wait=True)  # their requests are dropped
         for source in changed:
             self.production.forget(source)
             since, producer = self._versions[source.name], source.producer
@@ -276,23 +277,23 @@ class Engine:
         self._missed = None
 
     def release(self, but: HostFrame | None = None) -> None:
-        """Lets captured frames, `but` one, forget what is on its way to them."""
+        """Drops the answers that are on their way to captured frames, except those of `but`."""
         for one in self.recorded:
             if one is not but:
                 one.release()
 
     def scout(self, view: View, stats: FrameStats) -> None:
-        """Sends rays ahead of the picture: while answers are written at once, some of those that
+        """Traces some rays before the picture: while answers are written at once, some rays that
         missed something are traced again, and what they miss next is served within this frame.
 
-        They have the frame number of the last picture: no slot is given away that it or they used,
-        or that was written since. What is too much for budgets or pools is left to the whole
+        They carry the frame number of the last picture: no slot is given away that it or they used,
+        or that was written since. What exceeds the budgets or the pools is left to the whole
         picture.
         """
         written, hits = 0, None
         for _ in range(self.options.scout_rounds):
             if sum(stats.produced.values()) == written or stats.capacity_exceeded:
-                break  # there is nothing more to see, or no room for it
+                break  # nothing new to see, or no room for more
             written = sum(stats.produced.values())
             if hits is None:
                 hits = empty_hits(self.device, view.options.dtype, view.rays)
@@ -300,20 +301,20 @@ class Engine:
                     hits.missed.copy_(self._missed)
             view.hits(again=(hits, scouts(hits.missed, view.camera.width)))
             collected = self.collect_requests_and_use(hits.samples[:0])
-            counts = Counts(*collected.numbers.tolist())  # what misses something waits anyway
+            counts = Counts(*collected.numbers.tolist())  # waits: this frame misses something
             add(stats.requests, counts.by_kind())
             self.production.serve(collected.requests, counts, stats)
 
     def trace(
         self, view: View, progress: Progress = no_progress, again: Again | None = None
     ) -> Hits:
-        """Traces a picture's rays, all or some of them again, under a frame number of its own."""
+        """Traces a picture's rays, all or some of them `again`, under a new frame number."""
         self.number_picture()
         return view.hits(progress, again=again)
 
     def number_picture(self, on_device: bool = True) -> None:
-        """Gives the next picture its number: what rays stamp with it is in use. The device is told
-        unless it counts for itself.
+        """Gives the next picture its number, with which rays stamp what they use. Recorded frames
+        count on the device themselves; for all others it is written there (`on_device`).
         """
         self.frames += 1
         if on_device:
@@ -322,8 +323,8 @@ class Engine:
             source.tree.frame = self.frames
 
     def collect_requests_and_use(self, samples: Tensor) -> Collected:
-        """Takes the requests of a traced frame, brings the slots into the order of use, and counts
-        both and the sum of (r,) samples; all stays on the device.
+        """Lists the requests of a traced frame and clears their words, sorts the slots by use, and
+        counts both and the sum of (r,) samples; all results stay on the device.
         """
         with stage("requests"):
             most = min(_MOST_LISTED, self.cache.nodes.child_tn.numel())
@@ -335,7 +336,7 @@ class Engine:
             return Collected(requests, torch.cat((requests.count, use, total)))
 
     def read_back(self, stats: FrameStats, hits: Hits, collected: Collected) -> None:
-        """Sends a frame's counts to the host; until they are here no slot may be taken."""
+        """Starts copying a frame's counts to the host; until they arrive no slot may be taken."""
         nodes, bricks = self.cache.nodes, self.cache.bricks
         stats.nodes, stats.bricks = nodes.child_tn.numel(), bricks.capacity
         stats.rays, stats.bytes = len(hits.missed), nodes.nbytes + bricks.nbytes
@@ -361,22 +362,22 @@ class Engine:
         Args:
             camera: One camera, a batch, or rays.
             shader: For all trees, or one for each.
-            mode: interactive: one frame, as `frame` gives it; balanced: `productions` frames, of
-                which the last is shown; converge: until no ray misses anything that can be served.
-                Where the pools are too small for all rays, subsets are traced one after the other,
-                so the pools need only hold what one ray needs and the coarser bricks that stand in
-                for it on the way.
-            productions: Frames of a balanced picture.
-            max_frames: Most frames of a converged picture; `stats.converged` tells whether they
-                were enough.
-            progress: Told how many rays of a converging picture are done.
+            mode: interactive: one frame, as `frame` renders it; balanced: at most `productions`
+                frames, of which the last is shown; converge: until no ray misses anything that can
+                be served. Where the pools are too small for all rays, subsets are traced one after
+                the other, so the pools need only hold what one ray needs and, on the way there, the
+                coarser bricks that stand in for it.
+            productions: Most frames of a balanced picture.
+            max_frames: Most frames of a converged picture; `stats.converged` is false if they were
+                too few.
+            progress: Called with the number of rays of a converging picture that are done.
             **options: Fields of `RenderOptions`.
 
         Returns:
-            The picture; its `stats` are those of the last frame, but milliseconds, produced,
-            evicted and bytes are sums over all frames, and tiles and bricks the most that one frame
-            used. `capacity_exceeded` tells that rays had to be traced in subsets, or that some got
-            nothing.
+            The picture. Its `stats` are those of the last frame, except that times, produced,
+            evicted and uploaded bytes are sums over all frames, and used tiles and bricks the
+            maximum of one frame. `capacity_exceeded`: rays had to be traced in subsets, or some
+            requests found no slot.
 
         Raises:
             ValueError: The mode is unknown, or see `frame`.
@@ -400,13 +401,13 @@ class Engine:
             total = stats.following(total)
             if stats.converged:
                 break
-            if stats.pending and number < most:  # as long as another frame would take
+            if stats.pending and number < most:  # at most as long as a frame takes
                 self.production.wait(limit=stats.milliseconds / 1e3)
         total.frames = number
         return hits, total
 
     def _converge(self, view: View, most: int, progress: Progress) -> tuple[Hits, FrameStats]:
-        """Renders at most `most` frames, each of the rays that still miss something."""
+        """Renders at most `most` frames, each with rays that still miss something."""
         last, ahead = self._missed, most > 1
         if last is not None and len(last) == view.rays:
             ahead = ahead and bool(last.any())  # else this picture will hardly miss anything
@@ -423,7 +424,7 @@ class Engine:
             progress("rays", subsets.done, subsets.count)
             if subsets.over:
                 break
-            if stats.pending:  # another pass would not see more; it may take as long as one
+            if stats.pending:  # more answers are worth the time of a pass
                 self.production.wait(stats.milliseconds / 1e3)
             again = hits, subsets.next
         total.converged, total.capacity_exceeded = subsets.whole, subsets.crowded
@@ -431,7 +432,7 @@ class Engine:
         return hits, total
 
     def _served_frame(self, view: View, again: Again | None = None) -> tuple[Hits, FrameStats]:
-        """A frame whose own requests are served before it ends."""
+        """Renders a frame and serves its own requests before it ends."""
         with self.new_frame(view.options) as stats:
             self.serve_last_frame(stats)
             if again is None:
@@ -456,25 +457,26 @@ class Engine:
         """Records a frame as a CUDA graph, for cameras of this number and size.
 
         Renders a frame first, as `frame` does with the same arguments. A replay reads the layer's
-        tensors where they lie. Where all producers are `on_device`, or all `on_host`, a replay also
-        serves what the ones before missed.
+        tensors at the addresses that they have now. Where all producers are `on_device`, or all
+        `on_host`, a replay also serves what earlier replays missed.
 
         Args:
-            camera: Cameras as those of the replays.
+            camera: Cameras of the number, size and model that replays will have.
             shader: For all trees, or one for each; no `ModuleShader`.
-            batch: Most bricks that a replay makes, and most node tiles of each level, for each
-                tree. Where producers are `on_device`, a tree may deepen by several levels.
-            look_ahead: While the camera moves, a replay also asks for what its picture so many
-                frames on will miss, as far as the motion tells, by a sixteenth of the picture's
-                rays. This is served behind what the picture itself missed. 0: only what is missed.
-            fit: While the pools can't hold what a view uses and asks for, pixels count as wider, so
-                that it is drawn at levels that fit (`FrameStats.coarser` tells how much); else what
-                finds no slot is asked for again in every frame, and drawn from far above.
+            batch: Most bricks that a replay makes, and most node tiles of each level: per tree if
+                producers are `on_host`, in all if `on_device`; then a tree may deepen by several
+                levels.
+            look_ahead: While the camera moves, a replay also requests what the picture this many
+                frames later will miss if the motion continues, with a sixteenth of the picture's
+                rays. The picture's own requests are served first. 0: no look-ahead.
+            fit: While the pools can't hold what a view uses and requests, cones are widened so that
+                it is drawn at levels that fit (`FrameStats.coarser` is the factor). Otherwise nodes
+                that find no slot are requested again in every frame, and drawn from far ancestors.
             **options: Fields of `RenderOptions`.
 
         Raises:
-            ValueError: The engine is on no CUDA device, the layer is on another, a shader is a
-                module, replays do not serve but should `fit`, or see `frame`.
+            ValueError: The engine is not on CUDA, the layer is on another device, a shader is a
+                module, trees overlap, replays do not serve but should `fit`, or see `frame`.
             ProductionError: See `frame`.
         """
         shaders = shader.values() if isinstance(shader, Mapping) else (shader,)
@@ -495,7 +497,7 @@ class Engine:
         check.number("capture", "look_ahead", look_ahead, low=0, high=1000)
         check.instance("capture", "fit", fit, bool)
         again = partial(self.frame, shader=shader, **options)
-        again(camera)  # loads what is loaded at first use
+        again(camera)  # warm-up before recording
         served = make_recorded_frame(self.production, batch, fit)
         if fit and served is None:
             raise ValueError(
@@ -513,33 +515,33 @@ class Engine:
 
     @property
     def changed(self) -> bool:
-        """Whether a producer has told of another content since it was last asked."""
+        """Whether a producer's content has changed since its tree was last renewed."""
         return any(one.producer.version != self._versions[n] for n, one in self.trees.items())
 
     @cached_property
     def box(self) -> Tensor:
-        """(2, 3) float64 world corners around all trees, where no pose turns them."""
+        """(2, 3) float64 world corners around all trees, without any pose."""
         return box_around("Engine", {name: source.tree for name, source in self.trees.items()})
 
     @property
     def failures(self) -> list[Failure]:
-        """The last nodes that could not be produced, by name; `stats.failed` counts all."""
+        """The newest nodes that could not be produced, at most 1000; `stats.failed` counts all."""
         return list(self.production.failures.newest)
 
     @_alone
     def forget_failures(self) -> None:
-        """Lets nodes that could not be produced be asked for again, and servers for their parts."""
+        """Lets failed nodes be requested again, and files that servers refused be read again."""
         ask_again()
         self.production.failures.forget()
         self.production.restore_pending()
 
     def memory(self) -> dict[str, int]:
-        """Returns bytes: what the pools hold, and the bookkeeping apart."""
+        """Returns bytes by name: content of either pool, and bookkeeping."""
         return self.cache.memory()
 
     @_alone
     def report(self) -> Report:
-        """Returns what the last frames took: print it, or `as_dict()` for JSON."""
+        """Returns times and rates of the last frames: print it, or `as_dict()` for JSON."""
         tiles, bricks = self.cache.nodes.parent_t, self.cache.bricks.owner_b
         slots = {"tiles": tiles, "bricks": bricks}
         occupancy = {name: float((owner >= 0).float().mean()) for name, owner in slots.items()}
@@ -547,16 +549,16 @@ class Engine:
 
     @_alone
     def validate(self) -> None:
-        """Raises ValueError unless the pools are in order: see `N3Tree` and `Cache`."""
+        """Raises ValueError unless the pools are consistent: see `N3Tree` and `Cache`."""
         for source in self.trees.values():
             source.tree.validate()
         self.cache.validate()
 
     def close(self) -> None:
-        """Lets go of what is on its way, and of the producers' files and threads, after the frame
-        that another thread renders now.
+        """Waits for the frame that another thread is rendering, then drops all answers on their way
+        and closes the producers' files and threads.
         """
-        self._closed = True  # a picture of many frames ends with this one
+        self._closed = True  # another thread's picture gets no further frame
         with self.lock:
             for one in self.recorded:
                 one.close()

@@ -1,4 +1,4 @@
-"""`FrameGraph`: a frame as CUDA graphs; `LookAhead`: its rays of the pictures to come."""
+"""`FrameGraph`: a frame recorded as CUDA graphs; `LookAhead`: its rays of future pictures."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from .device_frame import DeviceFrame
 from .host_frame import HostFrame
 from .stats import Collected, FrameStats, Readbacks
 
-_STRIDE = 4  # pixels from a ray ahead to the next
-_RAREST = 4  # most frames from one look ahead to the next
-_LOOKS = 4  # until a place that they saw is there: a tree deepens by a level for each
+_STRIDE = 4  # pixels between look-ahead rays
+_RAREST = 4  # most frames between two look-aheads
+_LOOKS = 4  # look-aheads until the camera is there: each deepens a tree by a level
 
 
 class Steps(Protocol):
-    """The steps of a frame: `Engine` has them."""
+    """The steps of a frame, which `Engine` implements."""
 
     device: torch.device
     frames: int
@@ -51,16 +51,16 @@ class Steps(Protocol):
 
 
 class FrameGraph:
-    """A frame as CUDA graphs, which cost the host a call each: one serves, one makes what lies
-    below what was made, one draws, and two look ahead of the camera and finish. `Engine.capture`
+    """A frame recorded as CUDA graphs, each launched by one host call: one serves, one subdivides
+    what was just made, one draws, and two look ahead of the camera and finish. `Engine.capture`
     makes it. Replays take turns with the other frames of the engine; the picture is one buffer, so
     one thread should replay a graph.
 
-    A replay is the frame that `Engine.frame` would render. Where all producers are `on_device`, it
-    also makes what the replay before it missed; where all are `on_host`, these get the list of what
-    a replay missed once it has arrived, and a later one writes what they answered. Else it produces
-    nothing; where `Engine.steady` is false, something was missed or an answer is on its way: then
-    call `Engine.frame` until it is true::
+    A replay renders the frame that `Engine.frame` would render. Where all producers are
+    `on_device`, it also makes what the previous replay missed; where all are `on_host`, they get
+    the list of what a replay missed once it has arrived, and a later replay writes their answers.
+    Otherwise it produces nothing; while `Engine.steady` is false, something was missed or an answer
+    is on its way: then call `Engine.frame` until it is true::
 
         render = graph.replay if engine.steady else partial(engine.frame, shader=shader)
         picture, stats = render(camera)
@@ -74,10 +74,10 @@ class FrameGraph:
         again: Callable[[Camera | Rays], tuple[Picture, FrameStats]],
         look_ahead: float = 0,
     ) -> None:
-        """Records the frame; see `Engine.capture`. `again` renders one that the host serves."""
+        """Records the frame; see `Engine.capture`. `again` renders a frame that the host serves."""
         self._engine, self._served, self._again = engine, served, again
-        self._view = view = replace(view, numbers=view.numbers.clone())  # of a replay's camera
-        self._number = -1  # of its last picture
+        self._view = view = replace(view, numbers=view.numbers.clone())  # written by replays
+        self._number = -1  # of the last replay's picture
         self._ahead = LookAhead(view, look_ahead) if served and look_ahead else None
         graphs = [torch.cuda.CUDAGraph() for _ in range(5)]
         self._serve, self._deepen, self._draw, self._look, self._finish = graphs
@@ -100,7 +100,7 @@ class FrameGraph:
                 self._collected = self._collect()
 
     def _collect(self) -> Collected:
-        """Takes what the picture asked for, and counts."""
+        """Lists the picture's requests, sorts the slots by use, and counts."""
         if self._served is None:
             return self._engine.collect_requests_and_use(self._hits.samples)
         return self._served.finish(self._hits)
@@ -109,13 +109,13 @@ class FrameGraph:
         """Renders a frame; the host does not wait for the device.
 
         Args:
-            camera: As many cameras of the same size as were captured.
+            camera: Cameras of the number, size and model that were captured.
 
         Returns:
-            The picture, which the next replay overwrites, and what it cost; see `Engine.frame`.
+            The picture, which the next replay overwrites, and its statistics; see `Engine.frame`.
 
         Raises:
-            ValueError: The camera differs in number or size, or the engine is closed.
+            ValueError: The camera differs in number, size or model, or the engine is closed.
         """
         camera = as_camera("replay", camera)
         form, own = camera.form, self._view.camera.form
@@ -131,12 +131,12 @@ class FrameGraph:
         """See `replay`."""
         engine, served = self._engine, self._served
         if engine.changed:
-            return self._again(camera)  # which makes the changed trees anew
+            return self._again(camera)  # which renews the changed trees
         if served is not None and (
             engine.readbacks.failed or served.host_needed or len(engine.cache.aliases)
         ):
             served.host_needed = False
-            # The host finds out which nodes fail, and names them; it asks for targets of aliases.
+            # `Engine.frame` names the nodes that fail, and requests targets of aliases.
             return self._again(camera)
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
             stale = engine.frames != self._number
@@ -160,7 +160,7 @@ class FrameGraph:
         return replace(self._picture, stats=stats), stats
 
     def _draw_from(self, camera: Camera, stale: bool) -> None:
-        """Draws what a camera in the world sees; `stale`: other frames came since the last one."""
+        """Draws what a placed camera sees; `stale`: other frames came since the last replay."""
         ahead, numbers = self._ahead, camera.numbers(self._engine.device)
         if ahead is not None:
             ahead.follow(camera, numbers, stale)
@@ -177,21 +177,20 @@ class FrameGraph:
 
 
 class LookAhead:
-    """Rays of the pictures to come, which ask for what these would miss: ahead of a camera whose
-    numbers lie in one place, `View.numbers`.
+    """Rays of future pictures, which request what these would miss. Their camera is the picture's
+    (its numbers stay at one address, `View.numbers`), moved on as it moved since the last frame.
 
-    Their number is a sixteenth of the picture's, one for 4 x 4 pixels: a brick is wider than that
-    on the screen. Their camera is the picture's, moved on as it moved since the frame before. What
-    they use counts as used, so that it stays; what they ask for is served behind what the picture
-    asks for. On a GPU they take as long as their longest ray, not a sixteenth of the picture's
-    time, so they go every few frames only, the more rarely the farther they look.
+    There is one of these rays for 4 x 4 pixels of the picture: a brick is wider than that on the
+    screen. What they use counts as used and so is kept; their requests are served after the
+    picture's. On a GPU they take as long as their longest ray, not a sixteenth of the picture's
+    time, so they are traced only every few frames, more rarely the farther they look ahead.
 
     Attributes:
-        due: Whether they go in this frame: the camera moves, and it is their turn.
+        due: Whether they are traced in this frame: the camera moves, and it is their turn.
     """
 
     def __init__(self, view: View, frames: float) -> None:
-        """Looks some `frames` ahead of a picture's view."""
+        """Prepares rays that look `frames` ahead of a picture's view."""
         self._now, self._camera, self._frames = view.numbers, view.camera, frames
         self._before, self._last = self._now.clone(), view.camera
         self._every = max(1, min(_RAREST, int(frames / _LOOKS)))
@@ -201,8 +200,9 @@ class LookAhead:
         self._view = replace(view, camera=thinned, numbers=self._numbers(), options=options)
 
     def follow(self, camera: Camera, numbers: Tensor, stale: bool) -> None:
-        """Takes the camera of the next picture, in the world, and its numbers, before these are put
-        where the picture reads them. `stale`: other frames were rendered since the last one.
+        """Updates `due` and the last frame's numbers, before those of the next picture's placed
+        camera are written to `View.numbers`. `stale`: other frames were rendered since the last
+        one.
         """
         self._before.copy_(numbers if stale else self._now)
         moves = not (stale or camera.same(self._last))
@@ -210,7 +210,7 @@ class LookAhead:
         self._moves += moves
 
     def hits(self) -> Hits:
-        """Traces; only what the rays used and asked for matters."""
+        """Traces the rays; only their usage stamps and requests matter."""
         self._view.numbers.copy_(self._numbers())
         return self._view.hits()
 
@@ -220,8 +220,8 @@ class LookAhead:
 
 @contextmanager
 def _recorded(graph: torch.cuda.CUDAGraph, device: torch.device) -> Iterator[None]:
-    """Records what the block does on the device. Meanwhile Python collects no garbage: to give
-    back what an old engine held, such as locked host memory, would break the recording off.
+    """Records the block's device work as a graph. Meanwhile Python collects no garbage: freeing
+    what an old engine held, such as locked host memory, would abort the recording.
     """
     collects = gc.isenabled()
     gc.disable()

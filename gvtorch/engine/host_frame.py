@@ -26,17 +26,17 @@ from .recorded import RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
 from .stats import Collected, FrameStats
 
-_SOON = 0.02  # seconds after which a producer that has not answered yet is asked again
+_SOON = 0.02  # seconds after which a late answer no longer delays the next call
 
 
 class HostFrame(RecordedFrame):
     """Frames of an engine whose producers all answer from the host (`Producer.on_host`).
 
-    What a frame chose comes to the host with its counts (`ask`). A thread asks producers for all
-    that was chosen since it last asked, once they have answered that: a busy host is asked for the
-    nodes of several frames at once, so that it catches up. Where an answer takes longer than
-    `_SOON`, it asks without it: one slow read holds nothing up. Answers are checked by the thread
-    that brings them, and posted; the next frame sends what has come, and writes it.
+    The nodes that a frame chose reach the host with its counts (`ask`). A thread asks producers for
+    all nodes chosen since its last call, once that call is answered: a busy host gets the nodes of
+    several frames at once, so that it catches up. If an answer takes longer than `_SOON`, it calls
+    without waiting: one slow read delays nothing else. The thread in which an answer arrives checks
+    and posts it; the next frame sends all posted answers, and writes them.
     """
 
     def __init__(self, production: Production, batch: int, fit: bool) -> None:
@@ -44,25 +44,25 @@ class HostFrame(RecordedFrame):
         device = self._unused.device
         self._mail = [Mail(_boxes(self.cache, one), batch, device) for one in self.trees]
         self._by_tree = {one.tree.number: n for n, one in enumerate(self.trees)}
-        self.turn = 0  # answers to what was asked before the last `release` are dropped
-        self._asked = self._done = 0  # rows, since then
-        self.active = False  # whether frames have been rendered since then
+        self.turn = 0  # counts releases: answers to requests of an earlier turn are dropped
+        self._asked = self._done = 0  # nodes asked for, and failed, since the last `release`
+        self.active = False  # whether frames have been rendered since the last `release`
         self._lock = threading.Lock()
-        self._waiting: dict[Future, tuple[float, RequestBatch]] = {}  # until when
+        self._waiting: dict[Future, tuple[float, RequestBatch]] = {}  # deadlines
         self._chosen: dict[int, list[Tensor]] = {kind: [] for kind in KINDS.values()}
         self._last_asked = dict.fromkeys(KINDS.values(), -math.inf)  # seconds
-        self._going = False  # whether `_ask` is about to run
+        self._going = False  # whether `_ask` is scheduled
         self._asker = ThreadPoolExecutor(1, thread_name_prefix="gvtorch-ask")
 
     @property
     def pending(self) -> int:
-        """Nodes whose answers are on their way."""
+        """Number of nodes whose answers are on their way."""
         return max(0, self._asked - self._done - sum(mail.sent for mail in self._mail))
 
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
-        """Sends, before a frame, the bricks that have come, and returns whether there are any: then
-        the frame is to be served. `stale`: another frame was rendered since the last of these, so
-        the list of unused slots is out of date.
+        """Sends, before a frame, the answers that were posted, and returns whether there are any:
+        then `serve` is to write them. `stale`: another frame was rendered since this graph's last
+        one, so the counts of unused slots are out of date.
         """
         self.active = True
         if stale:
@@ -74,13 +74,13 @@ class HostFrame(RecordedFrame):
         return any(sent)
 
     def release(self) -> None:
-        """Forgets what is on its way, for a frame that the host serves; rays ask for it again."""
+        """Drops the answers on their way, for a frame that the host serves; rays ask again."""
         if not self.active:
             return
         self.active = False
         self._waiting.clear()
-        # An answer in the making is either posted before the lock is held, and dropped below, or
-        # comes after, and is refused because its turn is an old one.
+        # An answer being processed is either posted before the lock is held, and dropped below, or
+        # posted later, and refused because its turn is over.
         with self._lock:
             self.turn += 1
             for chosen in self._chosen.values():
@@ -92,17 +92,17 @@ class HostFrame(RecordedFrame):
         self._production.restore_pending()
 
     def close(self) -> None:
-        """Ends the thread that asks."""
+        """Ends the thread that asks producers."""
         self._asker.shutdown(wait=False, cancel_futures=True)
 
     def serve(self) -> None:
-        """Writes what was sent."""
+        """Writes the answers that were sent."""
         for source, mail in zip(self.trees, self._mail, strict=True):
             self._write(source, mail)
 
     def finish(self, hits: Hits) -> Collected:
         """Ends a frame as `RecordedFrame.finish` does, then chooses the nodes that producers are
-        asked for, marks them as pending, and lets the host read them with the frame's numbers.
+        asked for, marks them as pending, and appends them to the counts that the host reads.
         """
         collected = super().finish(hits)
         words, chosen = self.cache.nodes.request_tn.view(-1), self.choose()
@@ -119,7 +119,7 @@ class HostFrame(RecordedFrame):
         return collected._replace(numbers=torch.cat((collected.numbers, rows.flatten())))
 
     def _write(self, source: ProducedTree, mail: Mail) -> None:
-        """Writes what was sent for one tree; what finds no slot may be asked for again."""
+        """Writes the answers sent for one tree; nodes that found no slot may be requested again."""
         tiles, bricks, bare, again = (
             mail.there[box] for box in ("tiles", "bricks", "bare", "again")
         )
@@ -157,9 +157,9 @@ class HostFrame(RecordedFrame):
         put_rows_of(words, node, words[node.clamp(min=0)] & ~bit[:, None])
 
     def ask(self, turn: int, asked: Tensor) -> int:
-        """Lets a thread ask producers for the nodes that a frame chose: (2 * batch * 6,) int64 on
-        the host, of each kind rows of node, tree and place. Returns how many they are, dropped
-        ones included.
+        """Queues the nodes that a frame chose for the thread that asks producers: (2 * batch * 6,)
+        int64 on the host, for each kind rows of node, tree and loc. Returns the number of nodes,
+        including those dropped because their turn is over.
         """
         rows = asked.view(len(KINDS), -1, 6)
         count = (rows.numpy()[..., 0] >= 0).sum(1).tolist()
@@ -173,16 +173,16 @@ class HostFrame(RecordedFrame):
         return sum(count)
 
     def _go_on(self) -> None:
-        """Lets the thread ask for what was chosen, if anything was."""
+        """Schedules `_ask` if nodes were chosen and it is not scheduled yet."""
         with self._lock:
             if self._going or not any(self._chosen.values()):
                 return
             self._going = True
-        with suppress(RuntimeError):  # it is closed
+        with suppress(RuntimeError):  # the executor is closed
             self._asker.submit(self._ask)
 
     def _ask(self) -> None:
-        """Asks for what was chosen, of each kind that no producer is busy with."""
+        """Asks for the nodes chosen, of each kind that has no recent answer due (`_SOON`)."""
         with self._lock:
             self._going, turn, now = False, self.turn, time.monotonic()
             busy = {batch.kind for _, batch in [*self._waiting.values()]}
@@ -199,7 +199,7 @@ class HostFrame(RecordedFrame):
                     self._submit(RequestBatch(source, kind, targets, turn=turn))
 
     def _submit(self, batch: RequestBatch) -> None:
-        """Asks for a batch; a producer that raised is asked again for each half."""
+        """Asks for a batch; if the producer raises, asks again for each half."""
 
         def arrived(future: Future) -> None:
             there = self._waiting.pop(future, None) is not None  # else it was given up
@@ -219,7 +219,7 @@ class HostFrame(RecordedFrame):
             self._settle(batch, lambda: answer)
 
     def _give_up(self) -> None:
-        """Counts answers as failed that have not come in time."""
+        """Records batches as failed whose answers have not come in time."""
         now = time.monotonic()
         for future, (until, batch) in list(self._waiting.items()):
             if until < now and self._waiting.pop(future, None) is not None:
@@ -234,7 +234,7 @@ class HostFrame(RecordedFrame):
             self._submit(half)
 
     def _settle(self, batch: RequestBatch, answer: Callable[[], Any]) -> None:
-        """Checks an answer and posts it, in whatever thread brings it."""
+        """Checks an answer and posts it, in the thread in which it arrives."""
         try:
             given = answer()
         except CancelledError:
@@ -256,7 +256,7 @@ class HostFrame(RecordedFrame):
             self._fail(batch, str(error), error)
 
     def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
-        """Counts and names a batch's nodes; they stay marked as pending: no ray asks again."""
+        """Records a batch as failed; its nodes stay pending, so that no ray asks again."""
         with self._lock:
             if batch.turn == self.turn:
                 self._done += len(batch)
@@ -294,7 +294,7 @@ class HostFrame(RecordedFrame):
         self._post(batch, "bare", {**rows, "word": word}, fields, good[bare])
 
     def _leave_to_host(self, batch: RequestBatch) -> None:
-        """Lets `Engine.frame` ask again, which can look up what an alias stands for."""
+        """Lets nodes be requested again, for `Engine.frame`, which can find alias targets."""
         self.host_needed = True
         bit = torch.full((len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
         self._post(batch, "again", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
@@ -307,8 +307,8 @@ class HostFrame(RecordedFrame):
         fields: Mapping[str, Mapping[str, Tensor]],
         which: Tensor | slice,
     ) -> None:
-        """Posts some rows: fields, and those that each channel has. A node may be posted once
-        alone, so what was asked before the last `release` is dropped: it may be asked for again.
+        """Posts the rows `which` of fields, with and without channels. A node may be posted only
+        once, so rows of an earlier turn are dropped: their nodes may have been requested again.
         """
         flat = {f"{name}.{channel}": t for name, by in fields.items() for channel, t in by.items()}
         mail = self._mail[self._by_tree[batch.source.tree.number]]
@@ -319,7 +319,7 @@ class HostFrame(RecordedFrame):
 
 
 def _boxes(cache: Cache, source: ProducedTree) -> dict[str, Form]:
-    """What mail for a tree holds."""
+    """Returns the boxes of a tree's mail, and the fields of their rows."""
     words, place = torch.int32, {"loc": ((4,), torch.int64)}
     own, n = source.producer.channels, source.layout.branching**3
     kinds = cache.bricks.channels
@@ -339,6 +339,6 @@ def _boxes(cache: Cache, source: ProducedTree) -> dict[str, Form]:
 
 
 def _named(box: Mapping[str, Tensor], field: str) -> dict[str, Tensor]:
-    """The channels of a field of a box."""
+    """Returns a field of a box by channel."""
     parts = (name.partition(".") for name in box)
     return {channel: box[f"{field}.{channel}"] for name, _, channel in parts if name == field}

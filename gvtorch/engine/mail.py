@@ -1,5 +1,5 @@
-"""`Mail`: rows of answers on their way from the host to a recorded frame. Any thread may post them,
-into pinned memory; a frame sends what has come in one copy, and the host does not wait.
+"""`Mail`: rows of answers on their way from the host to a recorded frame. Any thread may post rows,
+into pinned memory; a frame sends all posted rows in one copy, for which the host does not wait.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from torch import Tensor
 
 Form = Mapping[str, tuple[tuple[int, ...], torch.dtype]]  # shape and dtype of a row's fields
 
-_BUFFERS = 3  # one is filled, the others may be on their way
-_ALIGN = 16  # bytes: where a field begins
+_BUFFERS = 3  # one is filled while the others may still be copied
+_ALIGN = 16  # bytes: alignment of fields
 
 
 class Mail:
-    """Boxes with room for `rows` rows each. A row's field `node` is -1 where the box is not taken.
+    """Boxes with room for `rows` rows each. A row's field `node` is -1 where the row is empty.
 
     Attributes:
         there: For each box, its fields (rows, ...) on the device.
-        sent: How many rows were sent.
+        sent: Number of rows sent since `HostFrame.release` last reset it.
     """
 
     def __init__(self, boxes: Mapping[str, Form], rows: int, device: torch.device) -> None:
-        """Takes the memory."""
+        """Allocates the buffers."""
         self.rows, self.sent = rows, 0
         self._lock = threading.Lock()
         self._queue: deque[tuple[str, Mapping[str, Tensor], int]] = deque()
         self._taken = dict.fromkeys(boxes, 0)
-        self._nodes = rows * len(boxes)  # they lie first
+        self._nodes = rows * len(boxes)  # node fields, at the front of a buffer
         places: dict[tuple[str, str], tuple[int, tuple[int, ...], torch.dtype]] = {}
         end = 8 * self._nodes
         for number, (box, form) in enumerate(boxes.items()):
@@ -55,15 +55,15 @@ class Mail:
             self._empty(buffer)
 
     def post(self, box: str, rows: Mapping[str, Tensor]) -> None:
-        """Leaves rows (k, ...) in host memory for a box; what finds no room goes later."""
+        """Queues rows (k, ...) for a box, in host memory; rows that find no room are sent later."""
         if len(rows["node"]):
             with self._lock:
                 self._queue.append((box, rows, 0))
                 self._fill()
 
     def send(self) -> bool:
-        """Sends what has come, unless all buffers are still on their way; what was sent before must
-        have been taken out (`clear`). Returns whether anything was sent.
+        """Starts copying the posted rows to the device, unless all buffers are still being copied;
+        rows sent before must have been processed (`clear`). Returns whether anything was sent.
         """
         with self._lock:
             following = (self._open + 1) % _BUFFERS
@@ -80,11 +80,11 @@ class Mail:
             return True
 
     def clear(self) -> None:
-        """Takes out what was sent, on the device."""
+        """Empties all boxes on the device."""
         self._empty(self._target)
 
     def forget(self) -> None:
-        """Drops what was not sent yet."""
+        """Drops all rows that were not sent yet."""
         with self._lock:
             self._queue.clear()
             self._begin()
@@ -116,7 +116,7 @@ class Mail:
 def _views(
     buffer: Tensor, places: Mapping[tuple[str, str], tuple[int, tuple[int, ...], torch.dtype]]
 ) -> dict[str, dict[str, Tensor]]:
-    """The fields of each box in a buffer."""
+    """Returns views of the fields of each box in a buffer."""
     made: dict[str, dict[str, Tensor]] = {}
     for (box, name), (begin, shape, dtype) in places.items():
         part = buffer[begin : begin + math.prod(shape) * dtype.itemsize]

@@ -1,5 +1,5 @@
-"""What producers are handed that need the bricks of their nodes' parents (`Producer.needs_parent`):
-a node whose parent has none waits, and the nearest ancestor whose parent has one is asked for.
+"""Bricks of parents, for producers that need them (`Producer.needs_parent`): a node whose parent
+has no brick waits, and its nearest ancestor whose parent has one is loaded first.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from .request_batch import ProducedTree
 
 
 def ready(cache: Cache, node: Tensor, depth: int) -> Tensor:
-    """Returns in place of each of (k,) int64 nodes, or -1, its nearest ancestor, itself included,
+    """Returns for each of (k,) int64 nodes, -1 for none, its nearest ancestor, itself included,
     whose parent has a brick or needs none. `depth` is that of the tree. The host does not wait.
     """
     words = cache.nodes.brick_tn.view(-1)
@@ -27,7 +27,7 @@ def ready(cache: Cache, node: Tensor, depth: int) -> Tensor:
 
 
 def first_ones(node: Tensor) -> Tensor:
-    """Returns nodes (k,) with -1 wherever one comes again. The host does not wait."""
+    """Returns nodes (k,) with -1 in place of every repetition. The host does not wait."""
     held, order = node.sort(stable=True)
     again = torch.zeros_like(held, dtype=torch.bool)
     again[1:] = held[1:] == held[:-1]
@@ -35,8 +35,8 @@ def first_ones(node: Tensor) -> Tensor:
 
 
 def parent_bricks(cache: Cache, source: ProducedTree, node: Tensor) -> dict[str, Tensor]:
-    """Returns for each channel (k, z, y, x, c) the bricks of the parents of nodes (k,), of a root
-    its own; each of them has a brick or is of one value. The host does not wait.
+    """Returns for each channel but coarse ones (k, z, y, x, c) bricks of the parents of nodes (k,),
+    of a root its own; each has a brick or is EMPTY or CONSTANT. The host does not wait.
     """
     parent = _parent(cache, node)
     parent = torch.where(parent >= 0, parent, node)
@@ -54,8 +54,8 @@ def parent_bricks(cache: Cache, source: ProducedTree, node: Tensor) -> dict[str,
 
 
 def unlink_lost(cache: Cache, node: Tensor) -> Tensor:
-    """Returns (k,) bool, which of (k,) nodes can be reached from a root by known parents. The tiles
-    of the others are reached through aliases only: they are unlinked, so that rays ask for them
+    """Returns (k,) bool, which of (k,) nodes lie in tiles with a known parent, or in a root tile.
+    The other tiles are reached through aliases only: they are unlinked, so that rays ask for them
     again where they belong.
     """
     tile = node // cache.nodes.nodes_per_tile
@@ -66,6 +66,6 @@ def unlink_lost(cache: Cache, node: Tensor) -> Tensor:
 
 
 def _parent(cache: Cache, node: Tensor) -> Tensor:
-    """(k,) int64 parents of nodes, -1 for a root and for -1."""
+    """Returns (k,) int64 parents of nodes, -1 for a root and for -1."""
     tile = node.clamp(min=0) // cache.nodes.nodes_per_tile
     return torch.where(node >= 0, cache.nodes.parent_t[tile].to(torch.int64), -1)

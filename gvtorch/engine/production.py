@@ -39,7 +39,7 @@ from .stats import Counts, FrameStats
 
 _MOST_RAISES = 256  # calls in one frame that may raise before whole batches are given up
 _LONGEST = 1e6  # seconds
-_KEPT = 1000  # failures by name; all are counted
+_KEPT = 1000  # most failures kept by name; all are counted
 
 
 class ProductionError(RuntimeError):
@@ -62,7 +62,7 @@ class Failure:
 
 
 class Failures:
-    """All nodes that failed, by place: a node's tile may be given away and come back."""
+    """All nodes that failed, by loc, because a node's tile may be given away and come back."""
 
     def __init__(self, strict: bool) -> None:
         self.strict = strict
@@ -75,12 +75,12 @@ class Failures:
         return len(self._places)
 
     def changed(self) -> bool:
-        """Whether there are others than at the last call."""
+        """Returns whether their number has changed since the last call."""
         before, self._known = self._known, len(self)
         return before != self._known
 
     def add(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
-        """Takes note of a batch's nodes."""
+        """Records the nodes of a batch as failed."""
         tree, text = batch.source.name, " ".join(message.split())
         kind = next(name for name, kind in KINDS.items() if kind == batch.kind)
         for loc in map(tuple, batch.targets.loc.tolist()):
@@ -89,7 +89,7 @@ class Failures:
         self._first = self._first or (self.newest[-1], cause)
 
     def among(self, batch: RequestBatch) -> Tensor | None:
-        """(k,) bool, which nodes of a batch failed before; None if none did."""
+        """Returns (k,) bool, which nodes of a batch failed before; None if none did."""
         if not self._places:
             return None
         name, kind = batch.source.name, batch.kind
@@ -106,7 +106,7 @@ class Failures:
             raise ProductionError(str(failure)) from cause
 
     def forget(self, tree: str | None = None) -> None:
-        """Forgets those of a tree, or all."""
+        """Forgets the failures of a tree, or all."""
         kept = [one for one in self.newest if tree not in (None, one.tree)]
         self.newest.clear()
         self.newest.extend(kept)
@@ -118,8 +118,8 @@ class _Waiting:
     """A batch whose answer is on its way."""
 
     batch: RequestBatch
-    asked: Future  # the producer's
-    future: Future  # of its answer, which may have been sent to the device already
+    asked: Future  # what the producer returned
+    future: Future  # of the same answer, after bricks on the host were checked and sent
     patience: float  # seconds
     since: float  # time.monotonic()
 
@@ -138,13 +138,13 @@ def _outcome(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
 
 
 class Production:
-    """What is on its way from the producers into the pools.
+    """Asks producers for requested nodes, and writes their answers into the pools.
 
     Attributes:
         trees: Trees and their producers, by name.
         by_level: Whether each level needs its bricks before it is subdivided.
-        failures: What failed.
-        staging: The way of bricks from the host to a CUDA device; None where they are there.
+        failures: The nodes that failed.
+        staging: Sends bricks from the host to a CUDA device; None where the pools are on the host.
     """
 
     def __init__(self, cache: Cache, scheduler: Scheduler, by_level: bool, strict: bool) -> None:
@@ -153,7 +153,7 @@ class Production:
         self.failures = Failures(strict)
         self._raised = self._skipped = 0
         self._waiting: list[_Waiting] = []
-        self._held: list[Answered] = []  # the staging ring had no room
+        self._held: list[Answered] = []  # found no room in the staging ring
         self.staging: Staging | None = None
         pool = cache.bricks
         if pool.stamp_b.device.type == "cuda":
@@ -163,7 +163,7 @@ class Production:
 
     @property
     def due(self) -> bool:
-        """Whether an answer has come, or waits for room on the way, or its patience has ended."""
+        """Whether an answer has come, waits for room in the staging ring, or is overdue."""
         return bool(self._held) or any(
             item.future.done() or item.left < 0 for item in self._waiting
         )
@@ -175,7 +175,7 @@ class Production:
         return {kind: sum(len(b) for b in batches if b.kind == kind) for kind in KINDS.values()}
 
     def room(self) -> dict[int, list[int]]:
-        """For each kind, how many free slots no answer on its way needs; see `Cache.room`."""
+        """Returns for each kind how many slots no pending answer needs; see `Cache.room`."""
         room, batches = self.cache.room(), self._under_way()
         for kind, free in room.items():
             for number in range(len(free)):
@@ -184,8 +184,8 @@ class Production:
         return room
 
     def serve(self, listed: RequestList, counts: Counts, stats: FrameStats) -> None:
-        """Lets slots be taken again, chooses requests, asks the producers, and writes the answers
-        that are here at once. Recorded frames choose on the device (`RecordedFrame`).
+        """Makes unused slots available, chooses requests, asks the producers, and writes the
+        answers that come at once. Recorded frames choose on the device (`RecordedFrame`).
         """
         cache, scheduler = self.cache, self.scheduler
         cache.make_room(counts.tiles_unused, counts.bricks_unused, counts.coarse_unused)
@@ -211,8 +211,8 @@ class Production:
             self.write(answers, stats)
 
     def _deepen(self, asked: Requests, stats: FrameStats) -> None:
-        """Subdivides what has come of subdivisions, too, where rays will want it, before they ask:
-        by as many levels as the subdivisions want in the mean.
+        """Subdivides the nodes just made as well, where rays will want finer ones, before they ask:
+        by as many levels as the subdivisions want on average.
         """
         branching = max(source.layout.branching for source in self.trees.values())
         for _ in range(deeper(levels_wanted(asked.priority, branching).tolist())):
@@ -236,7 +236,7 @@ class Production:
                 if kind == REQUEST_LOAD and source.producer.needs_parent:
                     batch = self._with_parents(batch)
                 failed = self.failures.among(batch)
-                if failed is not None:  # before its tile was given away: it is marked again
+                if failed is not None:  # before its tile was given away: mark it again
                     again, batch = batch[failed], batch[~failed]
                     self._mark(again)
                     self._skipped += len(again)
@@ -245,7 +245,7 @@ class Production:
         return answered
 
     def late(self) -> list[Answered]:
-        """Returns the answers that came since the last call; gives up those that do not come."""
+        """Returns the answers that came since the last call; gives up those that are overdue."""
         answered = [*self._held]
         self._held.clear()
         for item in list(self._waiting):
@@ -277,7 +277,7 @@ class Production:
         stats.pending, stats.failed = sum(self.pending.values()), len(self.failures)
 
     def wait(self, more: float = 0.0, limit: float = _LONGEST) -> None:
-        """Waits for an answer, until patience or `limit` seconds end; then `more` for others."""
+        """Waits for one answer, until patience or `limit` seconds end; then `more` for all."""
         if self._waiting and not self._held:
             left = min(item.left for item in self._waiting)
             futures = [item.future for item in self._waiting]
@@ -286,7 +286,7 @@ class Production:
             wait_for(futures, timeout=more)
 
     def restore_pending(self) -> None:
-        """Marks as pending what is on its way, and nothing else."""
+        """Marks the nodes whose answers are on their way as pending, and no others."""
         words = self.cache.nodes.request_tn
         everything = torch.arange(words.numel(), device=words.device)
         for kind in KINDS.values():
@@ -295,7 +295,7 @@ class Production:
             self._mark(batch)
 
     def forget(self, source: ProducedTree) -> None:
-        """Forgets what is on its way for a tree, and what failed there."""
+        """Drops the answers that are on their way to a tree, and forgets its failures."""
         for item in [item for item in self._waiting if item.batch.source is source]:
             item.asked.cancel()
             self._waiting.remove(item)
@@ -303,7 +303,7 @@ class Production:
         self.failures.forget(source.name)
 
     def close(self) -> None:
-        """Forgets what is on its way."""
+        """Drops all answers that are on their way."""
         for item in self._waiting:
             item.asked.cancel()
         self._waiting.clear()
@@ -314,7 +314,7 @@ class Production:
         return f"Production({pending} nodes on their way, {len(self.failures)} failed)"
 
     def _by_tree(self, node: Tensor) -> list[tuple[ProducedTree, Tensor]]:
-        """The nodes of each tree, of those that have any."""
+        """Groups nodes by tree; trees without any are left out."""
         trees = [*self.trees.values()]
         if not len(node):
             return []
@@ -329,8 +329,8 @@ class Production:
         ]
 
     def _with_parents(self, batch: RequestBatch) -> RequestBatch:
-        """The batch with the bricks of its nodes' parents. Nodes whose parents have none wait until
-        they have: ancestors are asked for in their place.
+        """Returns the batch with the bricks of its nodes' parents. Nodes whose parents have no
+        brick wait until they have: ancestors take their place in the batch.
         """
         cache, source = self.cache, batch.source
         batch = batch[parents.unlink_lost(cache, batch.targets.node).nonzero()[:, 0]]
@@ -349,7 +349,7 @@ class Production:
         return replace(asked, parents=bricks)
 
     def _submit(self, batch: RequestBatch) -> list[Answered]:
-        """Asks for a batch; returns what is answered at once."""
+        """Asks for a batch; returns the answers that come at once."""
         start = time.perf_counter()
         answer, raised = _outcome(batch.ask)
         if isinstance(answer, Future):
@@ -364,7 +364,7 @@ class Production:
         return answered
 
     def _sent_ahead(self, batch: RequestBatch, asked: Future) -> Future:
-        """A future that is done once bricks from the host are checked and on their way."""
+        """Returns a future of the answer, after sending bricks on the host to the device."""
         staging = self.staging
         if staging is None or batch.kind != REQUEST_LOAD:
             return asked
@@ -380,7 +380,7 @@ class Production:
         return ahead
 
     def _settle(self, batch: RequestBatch, answer: Any, raised: Exception | None) -> list[Answered]:
-        """Checks an answer; where the producer raised, asks it again for each half of the batch."""
+        """Checks an answer; if the producer raised, asks it again for each half of the batch."""
         if raised is not None:
             self._raised += 1
             if len(batch) == 1 or self._raised > _MOST_RAISES:
@@ -405,7 +405,7 @@ class Production:
     def _write_bricks(
         self, kind: Region, batch: RequestBatch, answer: Any, stats: FrameStats
     ) -> None:
-        """Writes bricks of one kind."""
+        """Writes an answer to loads whose items are written alike; see `by_kind`."""
         if kind is Region.ALIAS:
             goal = upload(answer.alias, batch.targets.node.device)
             written = write.aliases(self.cache, batch.targets, goal, batch.alias_tree(answer))
@@ -425,7 +425,7 @@ class Production:
             self._add_up(batch, write.bricks(self.cache, batch.targets, answer.data), stats)
 
     def _write_shipment(self, batch: RequestBatch, shipment: Shipment, stats: FrameStats) -> None:
-        """Writes voxels that are on their way; holds back those that found no room there."""
+        """Writes bricks on their way to the device; holds back those that found no room."""
         sent, rest = batch[: shipment.sent], batch[shipment.sent :]
         if len(rest):
             self._mark(rest)
@@ -434,7 +434,7 @@ class Production:
             self._add_up(sent, write.bricks(self.cache, sent.targets, shipment.chunks), stats)
 
     def _add_up(self, batch: RequestBatch, written: Written, stats: FrameStats) -> None:
-        """Adds up what a write did; what found no slot may be asked for again."""
+        """Adds a write to `stats`; nodes that found no slot may be requested again."""
         name = "bricks" if batch.kind == REQUEST_LOAD else "tiles"
         stats.produced[name] += written.items
         stats.produced["constant"] += written.constant
@@ -454,6 +454,6 @@ class Production:
         self.cache.mark_pending(batch.targets.node, batch.kind, lacking)
 
     def _fail(self, batch: RequestBatch, message: str, cause: Exception | None = None) -> None:
-        """Counts and names a batch's nodes; they stay marked as pending: no ray asks again."""
+        """Records a batch as failed; its nodes stay pending, so that no ray asks again."""
         self._mark(batch)
         self.failures.add(batch, message, cause)

@@ -1,12 +1,12 @@
-"""Which rays are traced next: `RaySubsets` of a converging picture, `scouts` of the next frame.
+"""Chooses the rays to trace next: `RaySubsets` in a converging picture, `scouts` before a frame.
 
-A ray that missed nothing is done; the others are traced again. At first these are scouts: one of
-16 x 16 pixels while the tree is coarse, then one of 4 x 4: a brick is wider than that on the
-screen, so they miss almost all that the others would, for a sixteenth of the work. Then come all
-that are not done. Where the pools are full of what these rays use and none of them gets done, fewer
-are traced, which frees what the others used: half as many each time nothing moves, twice as many
-after a subset is done. Source: the original engine suspends rays and takes several passes for
-quality; Crassin, PhD thesis 2011.
+A ray that missed nothing is done; the others are traced again. The first passes trace scouts alone:
+one ray per 16 x 16 pixels while the tree is coarse, then per 4 x 4. A brick is wider than that on
+the screen, so scouts miss almost all that the others would, for a sixteenth of the work. Then all
+rays that are not done follow. Where the pools are full of what these rays use and none of them gets
+done, fewer are traced, which frees what the others used: half as many each time nothing changes,
+twice as many after a subset is done. Source: the original engine suspends rays and takes several
+passes for quality; Crassin, PhD thesis 2011.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from torch import Tensor
 
 from .stats import FrameStats
 
-_STRIDES = (16, 4)  # pixels from scout to scout
-_FEW = 16  # if no more than one ray of so many misses something, the next ones are not kept waiting
+_STRIDES = (16, 4)  # pixels between scouts
+_FEW = 16  # if at most one scout in this many is left, the next rays are traced with it
 
 
 class RaySubsets:
@@ -27,14 +27,14 @@ class RaySubsets:
 
     Attributes:
         done: Number of rays that need no more passes.
-        next: (count,) bool, to be traced next.
-        over: Nothing is left to trace, or tracing does not help.
-        crowded: The pools were too small for all rays at once.
+        next: (count,) bool, which rays to trace next.
+        over: True if no ray is left to trace, or tracing does not help.
+        crowded: True if the pools were too small for all rays at once.
     """
 
     def __init__(self, count: int, width: int, device: torch.device, *, ahead: bool) -> None:
-        """Starts with the scouts if `ahead` is true, as something will be missing, else with all
-        rays; `width` is a row's, in pixels.
+        """Starts with scouts if `ahead` is true, because something will be missing, else with all
+        rays; `width` is the number of pixels in a row.
         """
         self.count = count
         self._grids = [_grid(count, width, stride, device) for stride in _STRIDES]
@@ -49,14 +49,14 @@ class RaySubsets:
 
     @property
     def whole(self) -> bool:
-        """Every ray got all that could be served."""
+        """True if every ray got all that could be served."""
         return not self._given_up and self.done == self.count
 
     def update(self, missed: Tensor, stats: FrameStats, failed: int) -> None:
-        """Chooses the next subset, given what the last pass cost, which rays `missed` (count,)
-        something in it, and how many nodes had `failed` before it. Waits for the device.
+        """Chooses the next subset, given the last pass: its `stats`, which rays `missed` (count,)
+        something, and how many nodes had `failed` before it. Waits for the device.
         """
-        # Where nothing could be served, what is missing has failed: these rays are as good as ever.
+        # A converged pass can't be improved: what its rays still miss has failed.
         finished = self.next if stats.converged else self.next & ~missed
         self._open &= ~finished
         left = self.next & self._open
@@ -70,7 +70,7 @@ class RaySubsets:
         if not (moved or just_done or stats.pending):
             if not stats.capacity_exceeded:
                 self.over = remaining == unfinished
-                self.trace_all()  # those that waited for scouts
+                self.trace_all()  # the rays that waited for scouts
                 return
             self.crowded = True
             self._size = remaining // 2
@@ -89,8 +89,8 @@ class RaySubsets:
         self.over = self.done == self.count
 
     def _choose(self, group: Tensor, in_grids: Sequence[int]) -> None:
-        """Lets a group's scouts be traced next, all of the group where they are few; `in_grids`
-        tells how many of the group lie on each grid.
+        """Sets the next pass to a group's rays on the coarsest grid of which more than 1/16 are in
+        the group, else to the whole group; `in_grids` is the number of its rays on each grid.
         """
         for grid, size, here in zip(self._grids, self._sizes, in_grids, strict=True):
             if here * _FEW > size:
@@ -99,19 +99,19 @@ class RaySubsets:
         self.next, self._scouts = group.clone(), 0
 
     def trace_all(self) -> None:
-        """Lets all rays that are not done be traced next: it is the last pass."""
+        """Sets the next pass, the last one, to all rays that are not done."""
         self.next, self._scouts = self._open.clone(), 0
 
 
 def scouts(missed: Tensor, width: int) -> Tensor:
-    """Returns which rays are sent ahead of the next picture, whose rows have `width` pixels: all
-    that `missed` (r,) something where these are at most a sixteenth, else one of 4 x 4 pixels.
+    """Returns (r,) bool, the rays to trace before the next picture, whose rows have `width` pixels:
+    all that `missed` (r,) something if these are at most a sixteenth, else one of 4 x 4 pixels.
     """
     few = missed.sum() * _STRIDES[-1] ** 2 <= len(missed)
     return missed & (few | _grid(len(missed), width, _STRIDES[-1], missed.device))
 
 
 def _grid(count: int, width: int, stride: int, device: torch.device) -> Tensor:
-    """(count,) bool, one of stride x stride pixels."""
+    """Returns (count,) bool, true for one of stride x stride pixels."""
     pixel = torch.arange(count, device=device)
     return (pixel % width % stride == 0) & (pixel // width % stride == 0)

@@ -1,6 +1,5 @@
-"""`RecordedFrame`: what frames that are recorded as CUDA graphs share. Requests are chosen and
-answers written in batches of fixed size, so that every shape is known beforehand; rows that are not
-taken hold node -1.
+"""`RecordedFrame`: base of frames that are recorded as CUDA graphs. Requests are chosen and answers
+written in batches of fixed size, so that every shape is known beforehand; unused rows hold node -1.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ from ..tracing.pixels import View
 from .production import Production
 from .stats import COARSER_UNIT, Collected, Readbacks
 
-_MOST_LISTED = 1 << 14  # nodes whose requests are listed, or as many as a batch holds
-_WIDEN, _NARROW = 1.2, 0.97  # by which cones change from frame to frame at most
+_MOST_LISTED = 1 << 14  # most nodes whose requests are listed, unless a batch holds more
+_WIDEN, _NARROW = 1.2, 0.97  # largest factors by which cones change from frame to frame
 _WIDEST = 64.0
-_ROOMY = 0.85  # of a pool: if less is taken, cones become narrower
+_ROOMY = 0.85  # share of a pool: if less is used, cones become narrower
 
 
 class Chosen(NamedTuple):
@@ -37,35 +36,36 @@ class Chosen(NamedTuple):
 
 
 class RecordedFrame:
-    """What both kinds share. A frame is `draw`, then `look` where its camera moves, then `finish`.
+    """What `DeviceFrame` and `HostFrame` share. A frame is `draw`, then `look` where its camera
+    moves, then `finish`.
 
     Attributes:
         batch: Most bricks, and most node tiles, that are chosen in a frame.
-        host_needed: Whether something came that only `Engine.frame` can deal with.
+        host_needed: Whether an answer came that only `Engine.frame` can handle.
     """
 
     host_needed = False
 
     def __init__(self, production: Production, batch: int, fit: bool) -> None:
-        """Takes the memory of what a frame leaves to the next one. `fit`: see `Engine.capture`."""
+        """Allocates what a frame leaves to the next one. `fit`: see `Engine.capture`."""
         self._production, self.batch = production, batch
         self.trees = [*production.trees.values()]
         self.cache = cache = production.cache
         self._most = min(max(_MOST_LISTED, batch), cache.nodes.request_tn.numel())
         device = cache.frame_1.device
-        # What the last picture asked for, and what the next ones will: nodes and their words.
+        # Requests of the last picture, and of the look-ahead: nodes and their words.
         self._requests = torch.zeros((2, 2, self._most), dtype=torch.int32, device=device)
         self._unused = torch.zeros(2, dtype=torch.int64, device=device)  # tiles, bricks
-        # Since the last frame: tiles and bricks that were made, nodes that need none, tiles and
-        # bricks that were replaced, nodes that failed.
+        # Counts since the last frame: tiles and bricks made, nodes that need none, tiles and bricks
+        # replaced, nodes failed.
         self._made = self._unused.new_zeros(6)
         self._none = self._unused.new_zeros(1)
         self._fit = fit
-        # By how much cones are wider than the camera's, so that a view fits the pools.
+        # Factor by which cones are wider than the camera's, so that a view fits the pools.
         self._coarser = torch.ones(1, dtype=torch.float64, device=device)
 
     def draw(self, view: View, ahead: bool = False) -> Hits:
-        """Traces the picture, and lists what it asks for. `ahead`: `look` may follow."""
+        """Traces the picture, and lists its requests. `ahead`: `look` may follow."""
         self.cache.frame_1.add_(1)
         if self._fit:
             view.numbers[:, CONE].mul_(self._coarser)
@@ -77,7 +77,7 @@ class RecordedFrame:
         return hits
 
     def look(self, trace: Callable[[], Hits]) -> None:
-        """Traces the rays of the next pictures; what they alone ask for is listed apart."""
+        """Traces the look-ahead rays; what they alone request is listed separately."""
         words, node = self.cache.nodes.request_tn.view(-1, 1), self._seen.node.to(torch.int64)
         before = words[node.clamp(min=0)]
         listed = (self._seen.word & REQUEST_KINDS) << REQUEST_PENDING_SHIFT
@@ -87,17 +87,17 @@ class RecordedFrame:
         put_rows_of(words, node, before)
 
     def _list(self, which: int) -> RequestList:
-        """Lists what is asked for by the picture (0) or by the next ones (1)."""
+        """Lists the requests of the picture (0) or of the look-ahead (1)."""
         listed = RequestList.collect(self.cache, self._most)
         torch.stack((listed.node, listed.word), out=self._requests[which])
         return listed
 
     def deeper(self, readbacks: Readbacks) -> int:
-        """Returns how often `DeviceFrame.deepen` is to follow `serve`."""
+        """Returns how many times `DeviceFrame.deepen` is to follow `serve`."""
         return 0
 
     def finish(self, hits: Hits) -> Collected:
-        """Orders slots by use, and counts what the picture used apart from what `look` used."""
+        """Sorts slots by use and counts; slots that only `look` used do not count as used."""
         use, samples = in_branches(
             self.cache.sort_by_use, lambda: hits.samples.sum(dtype=torch.int64).view(1)
         )
@@ -114,10 +114,10 @@ class RecordedFrame:
         return Collected(self._seen, numbers)
 
     def _widen_cones(self, use: Tensor, count: Tensor) -> None:
-        """Makes the next frame's cones wider if the pools can't hold what this one used and asked
-        for, and narrower again, down to the camera's, if there is room. A surface takes bricks as
-        the inverse square of the cones' width. `use` is what `Cache.sort_by_use` tells, `count`
-        what `compact_requests` does: what is pending counts as asked for.
+        """Widens the next frame's cones if the pools can't hold what this one used and requested,
+        and narrows them again, down to the camera's, if there is room. A surface needs bricks in
+        proportion to the inverse square of the cones' width. `use` is from `Cache.sort_by_use`,
+        `count` from `compact_requests`: pending nodes count as requested.
         """
         nodes, bricks = self.cache.nodes.capacity, self.cache.bricks.capacity
         taken = torch.stack(((use[3] + count[2]) / bricks, (use[1] + count[4]) / nodes)).amax()
@@ -126,13 +126,13 @@ class RecordedFrame:
         self._coarser.copy_(narrower.clamp(1.0, _WIDEST))
 
     def _levels(self) -> Tensor:
-        """What `levels_wanted` tells; 0 where no frame deepens a tree by several."""
+        """Returns `levels_wanted` of the requests; 0 where frames deepen by one level only."""
         return self._none.expand(1 + DEEPER)
 
     def choose(self) -> tuple[Chosen, Chosen]:
-        """Returns which loads, and which subdivisions, are served first of the lists, as
-        `Scheduler.choose` takes them: what the picture asked for before the rest, and at most as
-        much as there are slots.
+        """Returns the loads and the subdivisions to serve first, in the order of
+        `Scheduler.choose`: the picture's requests before those of the look-ahead, and at most as
+        many as there are unused slots.
         """
         nodes = self.cache.nodes
         node, priority = choose_requests(
@@ -146,6 +146,6 @@ class RecordedFrame:
         return Chosen(node[0], priority[0]), Chosen(node[1], priority[1])
 
     def tree_of(self, node: Tensor) -> Tensor:
-        """(k,) int32 numbers of the trees of nodes (k,); of any where the index is -1."""
+        """Returns (k,) int32 tree numbers of nodes (k,); any number where the index is -1."""
         nodes = self.cache.nodes
         return nodes.tree_t[node.clamp(min=0) // nodes.nodes_per_tile]

@@ -20,10 +20,10 @@ from .setup import fill_root
 
 
 def renew_tree(cache: Cache, made: ProducedTree, changes: Sequence[Where] | None) -> None:
-    """Makes a tree's root anew. Nodes for which one of `changes` is true are classified again and
-    lose their bricks; those that have no children any more lose the subtree below them. All of the
-    tree is dropped if `changes` is None (not known), if bricks are made of their parents' bricks,
-    if there are aliases, or if the producer can't classify one of these nodes.
+    """Remakes a tree's root. Nodes for which one of `changes` is true are classified again and lose
+    their bricks; those that no longer have children lose the subtree below them. The whole tree is
+    dropped if `changes` is None (not known), if bricks are made from their parents' bricks, if
+    there are aliases, or if the producer can't classify one of these nodes.
     """
     nodes, root = cache.nodes, made.tree.number
     whole = changes is None or made.producer.needs_parent or len(cache.aliases) > 0
@@ -43,8 +43,8 @@ def renew_tree(cache: Cache, made: ProducedTree, changes: Sequence[Where] | None
 
 
 def _renew_parts(cache: Cache, made: ProducedTree, changes: Sequence[Where]) -> bool:
-    """Classifies the changed nodes again, all but the root, and drops their bricks. Returns False,
-    with the tree as it was but for its requests, if the producer fails to classify one.
+    """Classifies the changed nodes again, all but the root, and drops their bricks. Returns False
+    if the producer fails to classify one; then the tree is unchanged except for its requests.
     """
     nodes, n = cache.nodes, made.layout.branching**3
     tile = ((nodes.tree_t == made.tree.number) & (nodes.parent_t >= 0)).nonzero()[:, 0]
@@ -61,7 +61,7 @@ def _renew_parts(cache: Cache, made: ProducedTree, changes: Sequence[Where]) -> 
     try:
         answer = made.wait(batch.ask())
         regions = checked_regions(answer, batch.nodes, made.producer)
-    except Exception:  # all is dropped and asked for again, where a failure is told by node
+    except Exception:  # the tree is dropped, and failures are reported by node
         return False
     if regions.errors or regions.alias is not None:
         return False
@@ -84,7 +84,7 @@ def _renew_parts(cache: Cache, made: ProducedTree, changes: Sequence[Where]) -> 
 
 
 def _drop_all(cache: Cache, number: int) -> None:
-    """Frees all tiles and bricks of a tree but those of its root."""
+    """Frees all tiles and bricks of a tree except those of its root."""
     nodes, bricks = cache.nodes, cache.bricks
     cache.aliases.clear(number)
     own = nodes.tree_t == number

@@ -1,4 +1,4 @@
-"""`RequestBatch`: what a producer is asked, and how its answer is made ready to be written."""
+"""`RequestBatch`: what a producer is asked; and how its answer is prepared for writing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..pool.staging import Shipment, on_host, upload
 from ..producers import Bricks, Layout, Nodes, Producer, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions, count_kinds
 
-#: Kinds of bricks that are written alike, from the first to the last.
+#: First and last `Region` of the kinds of answers that are written in the same way.
 _WRITTEN_ALIKE = (
     (Region.ALIAS, Region.ALIAS),
     (Region.EMPTY, Region.CONSTANT),
@@ -36,7 +36,7 @@ class ProducedTree:
     tree: N3Tree
     producer: Producer
     layout: Layout
-    engine_patience: float  # seconds, of a producer without its own
+    engine_patience: float  # seconds, for producers without their own
 
     @property
     def patience(self) -> float:
@@ -45,7 +45,7 @@ class ProducedTree:
         return self.engine_patience if own is None else own
 
     def wait(self, answer: Any) -> Any:
-        """Returns the producer's answer; waits for one that comes later, as patience goes."""
+        """Returns the producer's answer; waits for a future, at most for `patience`."""
         if not hasattr(answer, "result"):
             return answer
         return answer.result(None if self.patience == math.inf else self.patience)
@@ -66,15 +66,15 @@ class RequestBatch:
     source: ProducedTree
     kind: int
     targets: Targets  # nodes to fill, or to subdivide
-    parents: Mapping[str, Tensor] | None = None  # (k, z, y, x, c) bricks, for who needs them
+    parents: Mapping[str, Tensor] | None = None  # (k, z, y, x, c) bricks, where needed
     coarse: bool = False  # their bricks take coarse slots
-    turn: int | None = None  # of a `HostFrame` that asked: the targets lie in host memory
+    turn: int | None = None  # of the `HostFrame` that asks; targets are then on the host
 
     def __len__(self) -> int:
         return len(self.targets)
 
     def by_slots(self) -> list[RequestBatch]:
-        """The batch; or, where its bricks take both kinds of slots, a batch for each."""
+        """Returns the batch; or, where its bricks take both kinds of slots, a batch for each."""
         channels = self.source.producer.channels.values()
         if not len(self) or self.kind != REQUEST_LOAD or not any(one.coarse for one in channels):
             return [self] if len(self) else []
@@ -88,7 +88,7 @@ class RequestBatch:
         return parts
 
     def halves(self) -> tuple[RequestBatch, RequestBatch]:
-        """The first half, and the rest: asked apart, so that a bad node costs itself alone."""
+        """Returns the first half, and the rest: asked separately, a bad node fails alone."""
         half = len(self) // 2
         return self[:half], self[half:]
 
@@ -102,7 +102,7 @@ class RequestBatch:
 
     @property
     def nodes(self) -> Nodes:
-        """What the producer is asked about; made anew, for `Nodes` keep positions once computed."""
+        """The nodes that the producer is asked for; a new object: `Nodes` caches positions."""
         layout = self.source.layout if self.turn is None else self.source.host_layout
         return Nodes(self.loc, layout, coarse=self.coarse, parents=self.parents)
 
@@ -123,8 +123,8 @@ class RequestBatch:
         return len(self.loc) // len(self)
 
     def failed(self, answer: Regions | Bricks) -> tuple[dict[int, str], Tensor]:
-        """Why nodes failed, by their place in the batch: the first error among a node's items; and
-        (k,) bool, which nodes did not.
+        """Returns why nodes failed, by index in the batch: the first error among a node's items;
+        and (k,) bool, which nodes did not fail.
         """
         found: dict[int, str] = {}
         for index in sorted(answer.errors):
@@ -166,7 +166,7 @@ def brick_words(kind: Tensor) -> Tensor:
 
 
 def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
-    """Turns a producer's regions into the words of tiles, where the regions lie."""
+    """Turns a producer's regions into the words of tiles, on the device of the regions."""
     nodes = batch.nodes
     layout = nodes.layout
     low = nodes.loc[:, :3] * (nodes.scale * layout.brick_size)[:, None]
@@ -175,7 +175,7 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
     leaf = (brick != ABSENT) | (kind == Region.DATA_MAX_DEPTH) | (nodes.depth >= layout.depth)
     child = torch.where(leaf, TERMINAL, ABSENT).to(torch.int32)
     constants, ranges = dict(answer.constants), dict(answer.ranges)
-    for name, words in cache.nodes.constants.items():  # also what another tree left in these tiles
+    for name, words in cache.nodes.constants.items():  # overwrites what other trees left there
         if name not in constants:
             shape = (len(kind), words.shape[-1])
             constants[name] = torch.zeros(shape, dtype=words.dtype, device=kind.device)
@@ -197,7 +197,7 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
 
 
 def _untold_range(cache: Cache, name: str, kind: Tensor, constant: Tensor | None) -> Tensor:
-    """(k, 2, c) a range not told: the constant (k, c) of CONSTANT nodes, else the channel's."""
+    """Returns (k, 2, c) ranges not given: the constant (k, c) of CONSTANT nodes, else `limits`."""
     channel = cache.bricks.channels[name]
     shape, dtype, device = (len(kind), channel.width), channel.dtype, kind.device
     ends = [torch.full(shape, end, dtype=dtype, device=device) for end in channel.limits]
@@ -227,7 +227,7 @@ def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, tuple[RequestBa
 def shipped(
     batch: RequestBatch, answer: Regions | Bricks, staging: Staging | None
 ) -> Regions | Bricks | Shipment:
-    """Sends a checked answer to the device if it is voxels from the host and nothing else."""
+    """Sends a checked answer to the device if it is voxels on the host only; else returns it."""
     if staging is None or not isinstance(answer, Bricks) or not on_host(answer.data):
         return answer
     kind = answer.kind
@@ -237,7 +237,7 @@ def shipped(
 
 
 def send_ahead(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
-    """Sends an answer that is valid voxels from the host alone; any other comes back as it is."""
+    """Sends an answer if it is valid voxels on the host only; else returns it."""
     data = answer.data if isinstance(answer, Bricks) else answer
     if not isinstance(data, Mapping) or not all(
         isinstance(rows, TableRows) or (isinstance(rows, Tensor) and rows.device.type == "cpu")
@@ -247,6 +247,6 @@ def send_ahead(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
     try:
         checked = batch.check(answer)
     except ValueError:
-        return answer  # the frame tells of it
+        return answer  # the frame reports it
     sent = answer if checked.errors else shipped(batch, checked, staging)
     return sent if isinstance(sent, Shipment) else answer

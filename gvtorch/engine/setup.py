@@ -1,4 +1,4 @@
-"""What an engine is made of: its options, pools, and a tree with its root for every producer."""
+"""Sets up an engine: its options, pools, and a tree with its root for every producer."""
 
 from __future__ import annotations
 
@@ -23,29 +23,30 @@ from .host_frame import HostFrame
 from .production import Production, ProductionError
 from .request_batch import ProducedTree
 
-_TILE_BYTES = 16 + 4 * 3 + 1 + 4  # of a tile beside its nodes: NodePool's fields, the order of use
-_BRICK_BYTES = 4 * 3 + 1 + 4  # of a brick beside its voxels
+_TILE_BYTES = 16 + 4 * 3 + 1 + 4  # of a tile besides its nodes: NodePool's fields, order of use
+_BRICK_BYTES = 4 * 3 + 1 + 4  # of a brick besides its voxels
 
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """How the engine keeps its scene. `help(gv.Engine)` shows these texts.
+    """How an engine stores and streams its scene. `help(gv.Engine)` shows these texts.
 
     Attributes:
-        node_pool: Bytes of node words, constants and ranges; a number or a text as in "8 MB". What
-            is kept beside them (`Engine.memory`) is about 50 bytes a tile of 8 nodes.
-        brick_pool: Bytes of voxels, likewise; beside them 17 bytes a brick.
-        device: Where the pools lie and rays are traced.
+        node_pool: Bytes of node words, constants and ranges; a number or a text as in "8 MB".
+            Bookkeeping (`Engine.memory`) takes about 50 bytes more for a tile of 8 nodes.
+        brick_pool: Bytes of voxels, likewise; bookkeeping takes 17 bytes more for a brick.
+        device: Device of the pools, on which rays are traced.
         brick_size: Voxels along a side of a brick, without the border.
-        border: Voxels around a brick; from 1 on no seam shows.
-        loading: straight: to the wanted level; levels: one by one.
+        border: Voxels around a brick; with 1 or more no seam shows.
+        loading: straight: directly to the wanted level; levels: level by level.
         order: coarse or fine: which levels are served first.
-        load_budget: Most bricks a frame.
-        subdivide_budget: Most node tiles a frame.
-        time_budget: Most milliseconds of production a frame; None: no limit.
-        scout_rounds: Rounds of a sixteenth of the rays before a frame that missed something.
+        load_budget: Most bricks made in a frame.
+        subdivide_budget: Most node tiles made in a frame.
+        time_budget: Most milliseconds of production in a frame; None: no limit.
+        scout_rounds: Most passes of scouts, at most a sixteenth of the rays, before a frame that
+            missed something.
         patience: Seconds until an answer that does not come is given up.
-        coarse_share: Share of the brick slots that hold coarse channels, if there are any.
+        coarse_share: Share of the brick slots that also hold coarse channels, if there are any.
         strict: Whether to raise when something can't be produced.
         monitor: Whether to time the stages and remember the last frames, for `report`.
     """
@@ -105,7 +106,7 @@ class EngineSettings(TypedDict, total=False):
 def make_pools(
     producers: Mapping[str, Producer], options: EngineOptions, device: torch.device
 ) -> tuple[NodePool, BrickPool]:
-    """Makes both pools, of as many slots as their bytes hold."""
+    """Makes both pools, with as many slots as their bytes hold."""
     if not producers:
         raise ValueError("Engine: scene must have at least one producer")
     channels = _all_channels(producers)
@@ -140,7 +141,7 @@ def _check_memory(
     branching: int,
     device: torch.device,
 ) -> None:
-    """Raises ValueError if all that an engine will take is more than what is free."""
+    """Raises ValueError if an engine would take more memory than is free."""
     rest = tiles * (_TILE_BYTES + 2 * branching**3) + bricks * _BRICK_BYTES
     caches = sum(producer.host_bytes for producer in producers.values())
     parts = {"node_pool": node_bytes, "brick_pool": brick_bytes, "their bookkeeping": rest}
@@ -170,7 +171,7 @@ def _slots(name: str, given: int | str, slot: int, least: int, coarse: int = 0) 
 
 
 def _all_channels(producers: Mapping[str, Producer]) -> dict[str, Channel]:
-    """The channels of all producers, which must agree on those that they share."""
+    """Returns the channels of all producers, which must agree on those that they share."""
     channels: dict[str, Channel] = {}
     for name, producer in producers.items():
         check.instance("Engine", f"tree {name!r}", producer, Producer)
@@ -239,7 +240,7 @@ def make_tree(
 
 
 def fill_root(cache: Cache, made: ProducedTree) -> None:
-    """Writes the root's content into the first slots, which are the roots'."""
+    """Writes the root's content into its slots, which are reserved for it."""
     nodes, index, producer = cache.nodes, made.tree.root, made.producer
     number = index // nodes.nodes_per_tile
     loc = torch.zeros((1, 4), dtype=torch.int64, device=nodes.child_tn.device)
@@ -276,8 +277,8 @@ def _raise_first(errors: Mapping[int, str]) -> None:
 def make_recorded_frame(
     production: Production, batch: int, fit: bool
 ) -> DeviceFrame | HostFrame | None:
-    """Returns what serves a captured frame; None where producers answer neither all on the device
-    nor all from the host, have coarse channels, or need from the host what their parents hold.
+    """Returns the recorded frame of these producers; None where they answer neither all on the
+    device nor all from the host, have coarse channels, or need parents' bricks on the host.
     """
     producers = [one.producer for one in production.trees.values()]
     if any(channel.coarse for one in producers for channel in one.channels.values()):

@@ -1,6 +1,6 @@
-"""What frames cost: `FrameStats` of one, the `Readback` that completes it, and the `Report` of the
-last ones. On CUDA a frame's counts come by a copy to pinned memory, and the host goes on meanwhile:
-its requests are served once its readback has arrived.
+"""Statistics of frames: `FrameStats` of one, the `Readback` that completes it, and the `Report` of
+the last ones. On CUDA a frame's counts are copied to pinned memory while the host goes on: its
+requests are served once its readback has arrived.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ _AHEAD = 3  # most frames that the host may be ahead of the device
 #: Fields of `FrameStats` that are known when the device has finished the frame.
 _LATE = {"milliseconds", "stages", "samples", "tiles_used", "bricks_used"}
 _LATE |= {"requests", "misses", "overflow", "converged", "ahead", "coarser"}
-COARSER_UNIT = 1 << 20  # what stands for 1 in `Counts.coarser`, a whole number
+COARSER_UNIT = 1 << 20  # 1.0 in `Counts.coarser`, which is fixed-point
 _settling = threading.RLock()  # one thread completes statistics, others wait for it
 
 
 @dataclass(kw_only=True, repr=False)
 class FrameStats(RenderStats):
-    """What a frame of the engine cost, and what it asked for.
+    """What a frame of the engine cost, and what it requested.
 
-    Times, on CUDA those of the device, and what rays used and missed are known when the device has
-    finished the frame: reading one of these fields waits for it; `settle` waits for all. What this
-    frame produced are answers to requests of the frame before and of its own scouts, and answers
-    that came late. Requests and deferred count those of scouts too; use, misses and samples are
-    those of the picture alone.
+    Times (on CUDA the device's) and what rays used and missed are known when the device has
+    finished the frame: reading one of these fields waits for it; `settle` waits for all. `produced`
+    counts answers to requests of the previous frame and of this frame's scouts, and answers that
+    came late. `requests` and `deferred` include those of scouts; use, misses and samples are those
+    of the picture alone.
     """
 
     requests: dict[str, int] = field(default_factory=dict)  # by kind: load, subdivide
-    misses: int = 0  # nodes that rays missed, those whose answer is pending included
-    overflow: int = 0  # nodes with a request that the list had no place for
+    misses: int = 0  # nodes that rays missed, including pending ones
+    overflow: int = 0  # requested nodes that did not fit into the list
     converged: bool = False  # nothing that could be served was missing
-    ahead: int = 0  # nodes that the next pictures will miss; see `Engine.capture`
-    coarser: float = 1.0  # how much wider pixels counted, so that the view fits the pools
+    ahead: int = 0  # nodes that only look-ahead rays missed; see `Engine.capture`
+    coarser: float = 1.0  # factor by which cones were wider, so that the view fits the pools
 
     frame: int = 0  # number of the frame, from 1
     frames: int = 1  # frames that this picture took
@@ -54,15 +54,15 @@ class FrameStats(RenderStats):
         default_factory=lambda: {"tiles": 0, "bricks": 0}
     )
     bytes_uploaded: int = 0  # voxels moved into the brick pool
-    stale: int = 0  # answers that came when their node was gone
-    pending: int = 0  # answers on their way
+    stale: int = 0  # answers whose node was gone, served already, or known to fail
+    pending: int = 0  # nodes whose answers are on their way
     deferred: int = 0  # requests that the budgets put off
     failed: int = 0  # nodes that could not be produced, since the engine was made
-    capacity_exceeded: bool = False  # a request found no slot that this frame had not used itself
+    capacity_exceeded: bool = False  # a request found no slot: all were in use
 
     def __post_init__(self) -> None:
         self._unread: tuple[Callable[[], None], ...] = ()
-        self._begun = False  # a thread completes them now
+        self._begun = False  # a thread is completing them
 
     def __getattribute__(self, name: str) -> Any:
         if name in _LATE and (self._unread or self._begun):
@@ -87,8 +87,8 @@ class FrameStats(RenderStats):
         return self
 
     def following(self, before: FrameStats) -> FrameStats:
-        """Returns the statistics of a picture up to this frame: its own, with the sums of what the
-        frames `before` took, and the most tiles and bricks that one frame used.
+        """Returns the statistics of a picture up to this frame: its own, with times and production
+        summed with the frames `before`, and the maximum of tiles and bricks used in one frame.
         """
         return replace(
             self,
@@ -111,7 +111,7 @@ class FrameStats(RenderStats):
 
     @property
     def miss_rate(self) -> float:
-        """Requested bricks over requested and used ones. A brick on its way counts once."""
+        """Requested bricks over requested and used ones. A pending brick counts once."""
         asked = self.requests.get("load", 0)
         return asked / max(1, asked + self.bricks_used)
 
@@ -130,31 +130,31 @@ class FrameStats(RenderStats):
 
 
 class Counts(NamedTuple):
-    """What the host is told of a frame."""
+    """The counts of a frame that are copied to the host."""
 
-    listed: int  # nodes with a request, as far as the list has places
-    found: int  # nodes with a request
-    misses: int  # and those whose answer is pending
-    load: int  # requests of each kind
+    listed: int  # requested nodes in the list
+    found: int  # requested nodes that are not pending
+    misses: int  # requested nodes, pending or not
+    load: int  # requests of each kind in the list
     subdivide: int
     tiles_unused: int
     tiles_used: int
     bricks_unused: int
     bricks_used: int
-    coarse_unused: int  # of the bricks unused
+    coarse_unused: int  # of the unused bricks
     samples: int
-    # What a frame on the device made; else it is known to the host.
+    # What a recorded frame made; other frames count it on the host.
     tiles: int = 0
     bricks: int = 0
     constant: int = 0
     tiles_evicted: int = 0
     bricks_evicted: int = 0
     failed: int = 0
-    ahead: int = 0  # nodes that the picture did not miss, but will
-    subdivisions: int = 0  # of the picture and of those ahead, if a frame deepens by several levels
-    one_deeper: int = 0  # of these, what wants a level more
+    ahead: int = 0  # nodes that only look-ahead rays missed
+    subdivisions: int = 0  # of picture and look-ahead, if a frame may deepen by several levels
+    one_deeper: int = 0  # of these, those that want one more level
     two_deeper: int = 0
-    coarser: int = COARSER_UNIT  # how much wider cones were than the camera's
+    coarser: int = COARSER_UNIT  # factor by which cones were wider than the camera's
 
     def by_kind(self) -> dict[str, int]:
         """Returns the number of requests by the name of their kind."""
@@ -165,8 +165,8 @@ class Collected(NamedTuple):
     """What a traced frame leaves on the device."""
 
     requests: RequestList
-    numbers: Tensor  # (11,) or (22,) int64 `Counts`, and behind these what `ask` takes
-    ask: Callable[[Tensor], int] | None = None  # told on the host; how many nodes were asked for
+    numbers: Tensor  # (11,) or (22,) int64 `Counts`, then the argument of `ask`
+    ask: Callable[[Tensor], int] | None = None  # called on the host; how many nodes it asked for
 
 
 class Readback:
@@ -175,7 +175,7 @@ class Readback:
     def __init__(
         self, stats: FrameStats, collected: Collected, earlier: Iterable[Readback] = ()
     ) -> None:
-        """Starts the copy. `earlier`: those of frames before, which may not have asked yet."""
+        """Starts the copy. `earlier`: readbacks of earlier frames, which may not have asked yet."""
         self.stats, (self.requests, numbers, self._ask) = stats, collected
         self._earlier = tuple(earlier)
         self._asked: int | None = None
@@ -194,11 +194,11 @@ class Readback:
 
     @property
     def arrived(self) -> bool:
-        """Whether the counts are here."""
+        """Whether the counts have arrived."""
         return self._event is None or self._event.query()
 
     def wait(self) -> Counts:
-        """Returns the counts; waits until they are here."""
+        """Returns the counts; waits until they have arrived."""
         if self._counts is None:
             if self._event is not None:
                 self._event.synchronize()
@@ -206,8 +206,8 @@ class Readback:
         return self._counts
 
     def ask(self) -> int:
-        """Asks for what the device chose, once; returns for how many nodes. Waits."""
-        with _settling:  # of threads that render and threads that settle one asks
+        """Asks producers for the nodes that the device chose, once; returns how many. Waits."""
+        with _settling:  # only one of the threads that render and settle asks
             if self._asked is None:
                 self.wait()
                 ask, numbers = self._ask, self._numbers[len(Counts._fields) :]
@@ -215,8 +215,8 @@ class Readback:
         return self._asked
 
     def converged(self) -> bool:
-        """Whether nothing that could be served was missing; waits until the counts are here."""
-        for one in self._earlier:  # what they ask for is marked as pending, and not found again
+        """Returns whether nothing that could be served was missing; waits for the counts."""
+        for one in self._earlier:  # their nodes are pending, so this frame does not find them
             self.pending |= one.ask() > 0
         self._earlier = ()
         return not (self.wait().found or self.pending)
@@ -238,13 +238,13 @@ class Readbacks(deque[Readback]):
     """The frames whose counts are on their way, oldest first."""
 
     _steady = False
-    # Of the newest frame read back, on the device:
+    # Of the newest frame read back, if it was recorded:
     failed = False  # whether a node failed
-    deeper = 0  # by how many levels below the first the next frame deepens the trees
+    deeper = 0  # by how many levels beyond the first the next frame deepens trees
 
     def catch_up(self, wait: bool) -> Readback | None:
-        """Takes all frames whose counts are here. Waits for those of the others if `wait` is true,
-        if a frame is known to have requests, or if the host is too far ahead. Returns the newest.
+        """Takes all frames whose counts have arrived. Waits for those of the others if `wait` is
+        true, if an arrived frame has requests, or if the host is too far ahead. Returns the newest.
         """
         newest = None
         while self and (
@@ -256,7 +256,7 @@ class Readbacks(deque[Readback]):
         return newest
 
     def take_arrived(self) -> None:
-        """Takes the frames whose counts are here; does not block."""
+        """Takes the frames whose counts have arrived; does not block."""
         while self and self[0].arrived:
             self._take()
 
@@ -286,7 +286,7 @@ class Readbacks(deque[Readback]):
 
 @dataclass(frozen=True, repr=False)
 class Report:
-    """What the last frames took, as a table and as plain values."""
+    """Times and rates of the last frames, as a table and as plain values."""
 
     frames: Collection[FrameStats]  # the oldest first
     occupancy: dict[str, float]  # for each pool, the share of slots that hold something

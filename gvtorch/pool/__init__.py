@@ -1,4 +1,4 @@
-"""Node pool, brick pool, the tree over them, and the way of bricks to the device."""
+"""Node pool, brick pool, the tree over them, and the transfer of bricks to the device."""
 
 from .n3tree import N3Tree
 from .pools import BrickPool, Channel, NodePool

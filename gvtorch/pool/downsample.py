@@ -1,11 +1,11 @@
-"""Reductions of voxels, of which coarse levels and summaries of nodes are made: of arrays on the
+"""Reductions of voxels, from which coarse levels and summaries of nodes are made: of arrays on the
 host, and, with the same bits, of tensors on a device.
 
-`pool_mean` is the filter of a level (docs/design.md, section 2, tells why), `pool_majority` that of
-labels, `pool_directional` that of volumes with six directions, see `Volume.directional`.
+`pool_mean` is the filter of a level (docs/design.md, section 2, explains why), `pool_majority` that
+of labels, `pool_directional` that of volumes with six directions, see `Volume.directional`.
 
-All functions take (z, y, x, c) grids. Each gives the same bits on any part of an array whose
-corner is a multiple of the factor as on the whole, so volumes are also converted part by part.
+All functions take (z, y, x, c) grids. Each gives the same bits on any part of an array whose corner
+is a multiple of the factor as on the whole, so volumes can also be converted part by part.
 Source: Crassin et al., "GigaVoxels", I3D 2009, section 3 (mip-mapped bricks); Williams, "Pyramidal
     parametrics", 1983; Crassin et al., "Interactive indirect illumination using voxel cone
     tracing", CGF 2011 (anisotropic voxels).
@@ -27,13 +27,13 @@ from ..base.volume import DIRECTIONS, to_numpy
 
 Factors = Sequence[int]  # z y x
 Reduction = Literal["min", "max", "mean"]
-#: Arrays; or tensors of a dtype that torch compares and adds up, so not uint16, nor bfloat16.
+#: Arrays; or tensors of a dtype that torch can compare and add up: not uint16, nor bfloat16.
 Grid = TypeVar("Grid", np.ndarray, Tensor)
 
 _ARRAYS = {"min": np.minimum, "max": np.maximum, "mean": np.add}
 _TENSORS = {"min": torch.minimum, "max": torch.maximum, "mean": torch.add}
 _SLAB = 1 << 22  # voxels reduced at a time, so that intermediate arrays stay in a core's cache
-_DEVICE_SLAB = 1 << 27  # likewise on a device: more would take more memory and no less time
+_DEVICE_SLAB = 1 << 27  # the same on a device: more would take more memory and no less time
 
 
 def as_grid(values: Tensor) -> Any:
@@ -45,7 +45,7 @@ def as_grid(values: Tensor) -> Any:
 
 
 def from_grid(values: np.ndarray | Tensor, dtype: torch.dtype) -> Tensor:
-    """Returns what `as_grid` took, in its dtype again."""
+    """Converts a grid back into a tensor of the dtype that `as_grid` took."""
     return torch.as_tensor(values).to(dtype)
 
 
@@ -102,7 +102,7 @@ def pool_majority(
 
 
 def _most_frequent(rows: np.ndarray, background: float | None) -> np.ndarray:
-    """(k,) of rows (k, m), see `pool_majority`."""
+    """Returns (k,) the most frequent values of rows (k, m); see `pool_majority`."""
     columns = np.sort(rows, 1).T
     run = np.ones(len(rows), np.int32)
     best, most = columns[0].copy(), run.copy()
@@ -123,8 +123,8 @@ def pool_directional(
 
     For a direction, each of the block's factor^2 columns along it is composited front to back; the
     mean of the columns is stored. Opacity is stored per reference length at every level: that of a
-    homogeneous voxel which lets as much light through. So a homogeneous medium stays as it is, and
-    so does opacity 1. Sums are float64.
+    homogeneous voxel with the same transmittance. So a homogeneous medium keeps its values, and so
+    does opacity 1. Sums are float64.
 
     Args:
         values: (z, y, x, 24) as `Volume.directional` lays them out.
@@ -151,7 +151,7 @@ def pool_directional(
 
 
 def _of_length(rgba: np.ndarray, lengths: float) -> np.ndarray:
-    """Returns premultiplied colour and alpha of a homogeneous medium over other lengths."""
+    """Converts premultiplied colour and alpha of a homogeneous medium to other lengths."""
     alpha = rgba[..., 3:]
     with np.errstate(divide="ignore"):  # log 0: opaque
         changed = -np.expm1(np.log1p(-alpha) * lengths)
@@ -183,8 +183,8 @@ def extend(values: Grid, axis: int, before: int, after: int) -> Grid:
 
 
 def by_node(values: Grid, how: Reduction, brick_size: int, border: int) -> Grid:
-    """Reduces the voxels (z, y, x, c) of a level by "min", "max" or "mean": those of each node's
-    brick and `border` voxels around, repeated at the level's faces.
+    """Reduces a level's voxels (z, y, x, c) by "min", "max" or "mean" to one per node: those of its
+    brick and of `border` voxels around, repeated at the level's faces.
 
     Returns:
         (gz, gy, gx, c) float32, g = ceil(n / brick_size).
@@ -201,7 +201,7 @@ def by_node(values: Grid, how: Reduction, brick_size: int, border: int) -> Grid:
 def _along(
     values: Grid, axis: int, how: Reduction, size: int, step: int, wide: str | None = None
 ) -> Grid:
-    """Reduces windows, `step` apart, along one axis; sums are of dtype `wide`, or one that does."""
+    """Reduces windows, `step` apart, along one axis; sums are of dtype `wide`, or wide enough."""
     if how == "mean" and wide is None:
         wide = _wide(_name(values), size)
     count = (values.shape[axis] - size) // step + 1
@@ -215,7 +215,7 @@ def _along(
 def _pool(
     values: Grid, factor: int | Sequence[int], reduce: Callable[[Grid, Factors], Grid]
 ) -> Grid:
-    """Runs `reduce`, which takes whole blocks to one voxel each, over slabs of a grid."""
+    """Runs `reduce`, which turns whole blocks into one voxel each, over slabs of a grid."""
     factors = [factor] * 3 if isinstance(factor, int) else list(factor)
     shape = [-(-n // f) for n, f in zip(values.shape[:3], factors, strict=True)]
     shape.append(values.shape[3])
@@ -259,8 +259,8 @@ def _as(values: Grid, name: str, *, copy: bool = False) -> Grid:
 
 
 def _mean(total: Grid, count: int) -> Grid:
-    """Divides sums by a count, integers in float64. For tensors the divisor is a tensor, too: by a
-    plain number torch multiplies with the reciprocal, which rounds otherwise.
+    """Divides sums by a count, integers in float64. A tensor is divided by a tensor: torch turns
+    division by a plain number into a product with the reciprocal, which rounds differently.
     """
     if "int" in _name(total):
         total = _as(total, "float64")
@@ -270,7 +270,7 @@ def _mean(total: Grid, count: int) -> Grid:
 
 
 def _wide(name: str, terms: int) -> str:
-    """Returns the dtype that holds the sum of so many terms of a dtype."""
+    """Returns a dtype that holds the sum of this many terms of a dtype."""
     dtype = np.dtype(name)
     if dtype.kind == "f":
         return "float32" if dtype.itemsize == 2 else "float64"

@@ -41,9 +41,9 @@ class N3Tree:
     scene fills it from its low corner. Tree units are [0, 1] over the root cube; spacing may differ
     by axis, so the cube is a box in the world.
 
-    Several threads may render a tree at a time; `refresh` in one of them while others render or
-    read raises RuntimeError, and so does the reverse. What is written into its tensors by hand is
-    not seen: that must not happen meanwhile.
+    Several threads may render a tree at a time. While they do, or read it, `refresh` in another
+    thread raises RuntimeError, and so do they while `refresh` runs. Direct writes into its tensors
+    are not guarded: they must not happen meanwhile.
 
     Attributes:
         nodes: The node pool.
@@ -54,16 +54,16 @@ class N3Tree:
         extent: Voxels of the finest level along x, y, z.
         box: (2, 3) float64 world corners of the scene, x y z.
         spacing: (x, y, z) world size of a finest voxel.
-        origin: (x, y, z) world place of the centre of voxel 0.
+        origin: (x, y, z) world position of the centre of voxel 0.
         value_range: For each channel, the smallest and largest value of the finest level.
         frame: Number of the last frame traced; usage stamps hold it.
-        labels: For channels that hold labels, (k,) int64 the label that each value stands for, or
-            None: values stand for themselves.
-        made_of: For coarse channels, what they were made of, as plain values.
-        filters: For channels whose coarse levels are no means, their `Volume.filter`.
-        infos: For channels that a volume told more of, its `Volume.info`.
+        labels: For channels that hold labels, (k,) int64 the label of each stored value, or None:
+            the values are the labels.
+        made_of: For coarse channels, what they were made from, as plain values.
+        filters: For channels whose coarse levels are not means, their `Volume.filter`.
+        infos: For channels made from a volume, its `Volume.info`.
         threshold: See `from_volume`.
-        turns: Which threads use it now.
+        turns: Keeps track of the threads that use it.
     """
 
     def __init__(
@@ -82,8 +82,8 @@ class N3Tree:
     ) -> None:
         """Makes a tree over two pools, which trees may share; it writes nothing into them.
 
-        `origin` is the world place of the centre of voxel 0; `branching` is at most the node
-        pool's, which None takes. The others are the attributes.
+        `origin` is the world position of the centre of voxel 0; `branching` is at most the node
+        pool's, which is the default. The others are the attributes.
         """
         self.nodes, self.bricks = nodes, bricks
         self.branching = nodes.branching if branching is None else branching
@@ -141,8 +141,8 @@ class N3Tree:
 
     @property
     def place(self) -> Tensor:
-        """(3, 3) float64, by which kernels bring rays into the tree: the scene's low corner in the
-        world, the world size of the root cube, the scene's high corner in tree units.
+        """(3, 3) float64 that kernels transform rays into the tree with: the scene's low corner in
+        the world, the world size of the root cube, the scene's high corner in tree units.
         """
         if self._place is None or self._place.device != self.device:
             size = torch.tensor(self.spacing, dtype=torch.float64) * self.side
@@ -156,17 +156,17 @@ class N3Tree:
             self.frame += 1
 
     def loc(self, node: Tensor) -> Tensor:
-        """Returns the places (k, 4) int64 x, y, z, depth of nodes (k,) of this tree."""
+        """Returns (k, 4) int64 locs x, y, z, depth of nodes (k,) of this tree."""
         return locate(self.nodes.loc_t4, node, self.branching, self.nodes.nodes_per_tile)
 
     def find(self, loc: Tensor) -> Tensor:
-        """Returns (k,) int64 nodes at places (k, 4) x, y, z, depth; -1 where there is none yet."""
+        """Returns (k,) int64 nodes with locs (k, 4) x, y, z, depth; -1 where there is none yet."""
         node, exact = self.nearest(loc)
         return torch.where(exact, node, -1)
 
     def nearest(self, loc: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns (k,) int64 nodes at places (k, 4) x, y, z, depth, or their nearest ancestors that
-        there are, and (k,) bool whether it is the node itself.
+        """Returns (k,) int64 nodes with locs (k, 4) x, y, z, depth, or their nearest ancestors that
+        exist, and (k,) bool, whether it is the node itself.
         """
         n, node = self.branching, torch.full_like(loc[:, 0], self.root)
         exact = torch.ones_like(node, dtype=torch.bool)
@@ -192,7 +192,7 @@ class N3Tree:
 
     def validate(self) -> None:
         """Raises ValueError unless every pointer leads to a tile or brick that exists, only shared
-        ones are pointed to twice, and each tile's place is that of its parent.
+        ones have several pointers, and the loc of each tile matches its parent's.
         """
         self._check_words()
         child, brick = self.nodes.child_tn, self.nodes.brick_tn
@@ -215,7 +215,7 @@ class N3Tree:
         check.words("N3Tree", "brick_tn", nodes.brick_tn, CONSTANT, most)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Raises ValueError if a pickle holds pointers that lead out of the pools."""
+        """Restores a pickled tree. Raises ValueError if its pointers lead out of the pools."""
         vars(self).update(state)
         self._check_words()
 
@@ -231,8 +231,8 @@ class N3Tree:
         device: torch.device | str = "cpu",
         progress: Progress = no_progress,
     ) -> N3Tree:
-        """Builds the tree of a dense volume, all of it resident: levels by the volume's filter, cut
-        into bricks.
+        """Builds the tree of a dense volume, all of it resident: levels made by the volume's
+        filter, cut into bricks.
 
         A node is CONSTANT where all finest voxels in reach of its brick are equal, EMPTY where
         they are all at most `threshold`; neither has a brick or children.
@@ -244,9 +244,9 @@ class N3Tree:
             border: Voxels around a brick; from 1 on no seam shows.
             branching: N >= 2.
             threshold: Regions with no value above it are EMPTY: they are never drawn, whatever the
-                transfer function. None keeps every value. Not of labels alone.
-            device: Device of the pools. On a CUDA device with room for it the levels are made
-                there, too, with the same bits; but for labels and directional volumes.
+                transfer function. None keeps every value. Not allowed if all channels are labels.
+            device: Device of the pools. On a CUDA device with enough memory the levels are made
+                there, too, with the same bits, except for labels and directional volumes.
             progress: Called with what is made, how many levels of it are done, and of how many.
 
         Raises:
@@ -289,16 +289,16 @@ class N3Tree:
         return tree
 
     def to(self, device: torch.device | str) -> N3Tree:
-        """Returns the tree with its pools on a device; what lies there already is shared."""
+        """Returns the tree with its pools on a device; tensors already there are shared."""
         device, other = check.device("N3Tree.to", device), copy.copy(self)
         other.nodes, other.bricks = self.nodes.to(device), self.bricks.to(device)
         return other
 
     def to_volume(self, channel: str | None = None) -> Volume:
-        """Returns the finest voxels of a channel, the first if none is named, as they are in the
-        bricks now: of a tree that `from_volume` made and nobody edited, the volume that it took.
+        """Returns the finest voxels of a channel, by default the first, as they are in the bricks
+        now. For an unedited tree from `from_volume` they are the original volume.
 
-        Regions that a threshold made EMPTY have the mean of each.
+        Regions that a threshold made EMPTY are filled with their mean.
 
         Raises:
             ValueError: There is no such channel, it is a coarse one, or not all of the tree is in
@@ -317,22 +317,22 @@ class N3Tree:
 
     @torch.no_grad()
     def refresh(self, box: Sequence[Sequence[float]] | Tensor | None = None) -> None:
-        """Makes borders, coarse levels, regions and ranges right after the finest bricks were
-        edited or trained: then bricks, ranges and pictures are those of a tree that `from_volume`
-        makes of `to_volume()`, in every bit.
+        """Recomputes borders, coarse levels, regions and ranges after the finest bricks were edited
+        or trained. Then bricks, ranges and pictures equal, in every bit, those of a tree that
+        `from_volume` makes of `to_volume()`.
 
-        What counts are the voxels of finest bricks inside their borders; all else is overwritten.
-        A region that has no brick, since it was CONSTANT or EMPTY when the tree was built, stays as
-        it is. One that has a brick becomes CONSTANT or EMPTY where its voxels are, and comes back
-        with its brick when they change; bricks that require gradients stay bricks. Coarse
-        channels, such as `Filtered` colours, have to be made anew. It runs on the host.
+        It reads the voxels of the finest bricks without their borders; all else is overwritten. A
+        region without a brick, because it was CONSTANT or EMPTY when the tree was built, stays as
+        it is. One with a brick becomes CONSTANT or EMPTY where its voxels are, and uses its brick
+        again when they change; bricks that require gradients stay bricks. Coarse channels, such as
+        `Filtered` colours, are not updated and have to be made again. It runs on the host.
 
         Args:
             box: (2, 3) world corners, low and high: only voxels that it touches were edited. None:
                 any were.
 
         Raises:
-            ValueError: The box is none, or not all of the tree is in memory, as in an engine.
+            ValueError: The box is malformed, or not all of the tree is in memory, as in an engine.
             RuntimeError: Another thread renders the tree.
         """
         low, high = (0, 0, 0), self.extent
@@ -345,7 +345,7 @@ class N3Tree:
             spans = [(max(0, math.floor(a)), min(n, math.floor(b) + 1)) for a, b, n in sizes]
             low, high = (tuple(end) for end in zip(*spans, strict=True))
             if any(a >= b for a, b in spans):
-                return  # beside the tree
+                return  # outside the tree
         fine = [name for name, one in self.bricks.channels.items() if not one.coarse]
         filters = {name: self.filters.get(name, "mean") for name in fine}
         tables = {name: None if one is None else one.numpy() for name, one in self.labels.items()}
@@ -375,7 +375,7 @@ class N3Tree:
         return name
 
     def levels(self) -> BrickLevels:
-        """Returns what reads and writes voxels of a tree that is in memory as a whole."""
+        """Returns what reads and writes the voxels of a fully resident tree."""
         return BrickLevels(
             nodes=self.nodes,
             bricks=self.bricks,
@@ -386,8 +386,8 @@ class N3Tree:
         )
 
     def warn_if_edited(self, *, learned: bool = False) -> None:
-        """Warns, once for each edit, if bricks were edited and not refreshed since. `learned`: who
-        asks reads bricks that require gradients as they are being trained.
+        """Warns, once for each edit, if bricks were edited and not refreshed since. `learned`: not
+        about bricks that require gradients, which the caller reads as they are trained.
         """
         edited = self.bricks.new_edits(learned)
         if edited:

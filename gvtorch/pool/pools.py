@@ -1,5 +1,5 @@
-"""`NodePool` and `BrickPool`: slots for node tiles and bricks, as flat tensors, a row a slot; and
-`Channel`: what a voxel holds.
+"""`NodePool` and `BrickPool`: slots for node tiles and bricks, as flat tensors, one row per slot;
+and `Channel`: what a voxel holds.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _COMMON = ("extent", "spacing", "origin")  # what the volumes of one tree share
 
 @dataclass(frozen=True)
 class Channel:
-    """What a voxel of a channel holds: `width` numbers of `dtype`. A coarse channel is one that the
-    finest level has not: it adds to what coarse voxels tell of the finest ones below them.
+    """What a voxel of a channel holds: `width` numbers of `dtype`. A coarse channel exists only
+    above the finest level: it says more about the finest voxels below each coarse voxel.
     """
 
     dtype: torch.dtype = torch.float32
@@ -87,8 +87,8 @@ def volumes_by_channel(where: str, volume: Volume | Mapping[str, Volume]) -> dic
 
 
 def checked_threshold(where: str, threshold: Any, volumes: Mapping[str, Volume]) -> float | None:
-    """Returns a user's threshold; raises ValueError where it is no number, or there are no values
-    but labels, whose order means nothing.
+    """Returns a user's threshold; raises ValueError where it is not a number, or where all channels
+    are labels, whose order means nothing.
     """
     if threshold is None:
         return None
@@ -127,7 +127,7 @@ class _Pool:
         return sum(field.nbytes for field in self.fields.values())
 
     def to(self, device: torch.device | str) -> Self:
-        """Returns the pool with its fields on a device; those that lie there are shared."""
+        """Returns the pool with its fields on a device; fields already there are shared."""
         other = copy.copy(self)
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
@@ -157,8 +157,8 @@ _State = tuple[int, int]
 
 
 def _state(voxels: Tensor) -> _State:
-    """Where a tensor lies, and how often it was written in place; of an inference tensor torch does
-    not count that.
+    """Returns a tensor's address and how often it was written in place, or -1 for an inference
+    tensor, of which torch does not count that.
     """
     return (voxels.data_ptr(), -1 if voxels.is_inference() else voxels._version)
 
@@ -168,7 +168,7 @@ class NodePool(_Pool):
 
     Node index = tile * n + child, child = (z * branching + y) * branching + x. A fresh tile's nodes
     have neither children nor brick. Trees of several N may share a pool, whose tiles are then as
-    wide as the widest: n = largest N ** 3. Threads look at an engine's under `Engine.lock`.
+    wide as the widest: n = largest N ** 3. Threads must hold `Engine.lock` to read an engine's.
 
     Attributes:
         branching: N of the widest tree.
@@ -186,7 +186,7 @@ class NodePool(_Pool):
         constants: For each channel that is not coarse (t, n, c): the value of CONSTANT nodes, the
             mean of EMPTY ones.
         ranges: For each of these (t, n, 2, c): smallest and largest value in reach of the node's
-            brick, at all levels; all that the dtype can hold where it is not known.
+            brick, at all levels; the dtype's limits where it is not known.
     """
 
     def __init__(
@@ -197,10 +197,10 @@ class NodePool(_Pool):
         branching: int = 2,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Allocates `capacity` >= 1 free tiles for trees of `branching` >= 2 at most.
+        """Allocates `capacity` >= 1 free tiles for trees with N up to `branching` >= 2.
 
         Raises:
-            ValueError: A number is out of its range, or nodes could not be counted in int32.
+            ValueError: A number is out of its range, or node indices would not fit into int32.
         """
         check.whole("NodePool", "capacity", capacity, low=1)
         check.whole("NodePool", "branching", branching, low=2, high=16)
@@ -241,14 +241,14 @@ class NodePool(_Pool):
 
 class BrickPool(_Pool):
     """Slots for `capacity` bricks of brick_size ** 3 voxels, with `border` voxels around each, in
-    any number of named, typed channels. Threads look at an engine's under `Engine.lock`.
+    any number of named, typed channels. Threads must hold `Engine.lock` to read an engine's pool.
 
     Attributes:
         brick_size: Voxels along a side of a brick, without the border.
         border: Voxels around a brick, copied from its neighbours.
         channels: What each voxel holds, by name.
         coarse: How many slots, the first ones, hold coarse channels as well. All bricks that have
-            such channels lie there, and no others but those of roots.
+            such channels lie there, and no others except those of roots.
         bricks: For each channel (b, z, y, x, c) voxels, sides of brick_size + 2 * border; a coarse
             channel has `coarse` bricks.
         stamp_b: (b,) int32 usage stamp: the last frame in which a ray sampled the brick, or after
@@ -270,8 +270,8 @@ class BrickPool(_Pool):
     ) -> None:
         """Allocates `capacity` free slots, 0 or more.
 
-        `brick_size` is at least 2, `border` 0 to 16; from 1 on, trilinear samples meet without a
-        seam.
+        `brick_size` is at least 2, `border` 0 to 16; with 1 or more, trilinear samples meet without
+        a seam.
 
         Raises:
             ValueError: A number is out of its range, or there is no channel.
@@ -297,7 +297,7 @@ class BrickPool(_Pool):
 
         self.stamp_b, self.born_b, self.owner_b = words(-1), words(0), words(-1)
         self.shared_b = torch.zeros((capacity,), dtype=torch.bool, device=device)
-        self._known: dict[str, _State] = {}  # of channels, when they were looked at last
+        self._known: dict[str, _State] = {}  # by channel, when last checked
         self._edited: set[str] = set()
         self._told: set[str] = set()
 
@@ -309,7 +309,7 @@ class BrickPool(_Pool):
         return self.bricks[channel]
 
     def __setitem__(self, channel: str, voxels: Tensor) -> None:
-        """Puts another tensor in the place of a channel's voxels, such as a parameter."""
+        """Replaces a channel's voxels with another tensor, such as a parameter."""
         held = self[channel]
         check.tensor("BrickPool", channel, voxels, held.shape, held.dtype, held.device)
         if not voxels.is_contiguous():
@@ -317,22 +317,22 @@ class BrickPool(_Pool):
         self.bricks[channel] = voxels
 
     def to(self, device: torch.device | str) -> Self:
-        """See `NodePool`; whether it was edited is known of the other pool as well."""
+        """Returns the pool on a device, with the same channels marked as edited."""
         other = super().to(device)
         other._edited, other._told = set(self.edited()), set(self._told)
         other._known = {name: _state(other.bricks[name]) for name in self._known}
         return other
 
     def in_order(self) -> None:
-        """Notes that ranges, borders and coarse levels are those of the voxels as they are now."""
+        """Marks ranges, borders and coarse levels as up to date with the voxels."""
         fine = (name for name, channel in self.channels.items() if not channel.coarse)
         self._known = {name: _state(self.bricks[name]) for name in fine}
         self._edited.clear()
 
     def edited(self) -> list[str]:
-        """Returns the channels that were written or replaced since they were known to be in order
-        (`in_order`), as far as torch counts it: a write in place through the tensor, a view or a
-        parameter is counted, one through `.data`, NumPy or a pointer is not.
+        """Returns the channels that were written or replaced since `in_order`, as far as torch
+        counts it: a write in place through the tensor, a view or a parameter is counted, one
+        through `.data`, NumPy or a pointer is not.
         """
         for name, known in self._known.items():
             state = _state(self.bricks[name])
@@ -343,7 +343,7 @@ class BrickPool(_Pool):
         return sorted(self._edited)
 
     def new_edits(self, learned: bool = False) -> list[str]:
-        """Returns the edited channels that were not told of before: each edit once. `learned`:
+        """Returns the edited channels that were not returned before: each edit once. `learned`:
         without those that require gradients.
         """
         new = [name for name in self.edited() if name not in self._told]
@@ -353,7 +353,7 @@ class BrickPool(_Pool):
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Lets the block write voxels that come with their ranges: that is no edit."""
+        """Lets the block write voxels and their ranges: this is no edit."""
         self.edited()
         yield
         self._known = {name: _state(self.bricks[name]) for name in self._known}

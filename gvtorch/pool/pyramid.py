@@ -1,5 +1,5 @@
-"""What a tree is built from: the levels of volumes, what the nodes of each level hold, and, for a
-resident tree, which nodes there are.
+"""What a tree is built from: the levels of volumes, summaries of each level's nodes, and, for a
+resident tree, the plan of its nodes.
 
 Every level is made from the level below as it is stored, rounded to its dtype, so a level can also
 be made part by part, out of core, with the same bits; see downsample.py for the filters.
@@ -33,12 +33,12 @@ from .downsample import (
 from .pools import BrickPool, NodePool
 
 _BATCH = {"cpu": 4096, "cuda": 1 << 15}  # bricks cut from a level at a time
-_PEAK = 8  # times a volume's bytes: itself, its levels, what they are made by, and all bricks
+_PEAK = 8  # times a volume's bytes: itself, its levels, temporaries, and all bricks
 
 
 @dataclass(frozen=True)
 class NodeSummary:
-    """What nodes hold in one channel of c components; `...` is any shape, one entry a node."""
+    """What nodes hold in one channel of c components; `...` is any shape, one entry per node."""
 
     low: Tensor  # (..., c) float32 smallest finest-level value in reach of the brick, with border
     high: Tensor  # (..., c) float32 largest
@@ -108,7 +108,7 @@ def volume_levels(
 
 
 def middle_of(how: str) -> Literal["mean", "min"]:
-    """Returns which value stands for a node: a label must be one that is there."""
+    """Returns which reduction represents a node: a mean of labels may be no label."""
     return "min" if how == "majority" else "mean"
 
 
@@ -122,17 +122,17 @@ def coarser(
     *,
     empty: float | None = None,
 ) -> Grid:
-    """Returns a level made of the one before.
+    """Returns a level made from the next finer one.
 
     Args:
-        values: That level, (z, y, x, c), or a part of it that begins at a multiple of `branching`;
-            an array where the filter is not the mean.
+        values: The finer level, (z, y, x, c), or a part of it that begins at a multiple of
+            `branching`; an array where the filter is not the mean.
         how: The volume's filter.
         branching: N.
-        dtype: Of the channel.
-        spacing: Of the volume.
+        dtype: The channel's.
+        spacing: The volume's.
         level: Number of the level that is made, from 1.
-        empty: Of labels, the value of the background.
+        empty: The value of the background, for labels.
     """
     made: Any = values
     if how == "mean":
@@ -165,7 +165,7 @@ def levels_by_depth(
 
 
 def maker_of(volumes: Iterable[Volume], device: torch.device) -> torch.device:
-    """Returns the device on which the levels of volumes are made for pools on a device."""
+    """Returns the device that makes the levels of volumes, given the device of the pools."""
     host, size = torch.device("cpu"), 0
     for volume in volumes:
         if volume.filter != "mean":
@@ -192,7 +192,7 @@ def round_to(values: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 class TreePlan:
-    """Which nodes of a resident tree exist, and their words, worked out before any pool is made, so
+    """Which nodes of a resident tree exist, and their words, computed before any pool is made, so
     that pools get exactly the size they need. A node has a brick and, above the finest level,
     children unless it is CONSTANT or EMPTY; a child exists if its parent has children.
 
@@ -238,7 +238,7 @@ class TreePlan:
             self.child.append(child)
 
     def write_nodes(self, nodes: NodePool, bricks: BrickPool) -> None:
-        """Writes all of the node pool, and which node owns each brick."""
+        """Writes the whole node pool, and the owner of each brick."""
         device = nodes.child_tn.device
         nodes.child_tn[:], nodes.brick_tn[:] = TERMINAL, EMPTY  # also of nodes beyond the extent
         for depth, exists in enumerate(self.exists):
@@ -264,7 +264,7 @@ class TreePlan:
                     movable(words).flatten(0, 1)[node] = rows.to(device)
 
     def write_bricks(self, pool: BrickPool, channel: str, depth: int) -> None:
-        """Cuts the bricks of a depth out of their level; their slots follow one another."""
+        """Cuts the bricks of a depth out of their level, into consecutive slots."""
         has_brick = self.brick[depth] >= 0
         place, slots = has_brick.nonzero(), self.brick[depth][has_brick]
         values = self.levels[channel][depth].values
@@ -274,7 +274,7 @@ class TreePlan:
             pool.bricks[channel][slot : slot + len(part)] = cut
 
     def _node_index(self, depth: int, zyx: Tensor, nodes_per_tile: int) -> Tensor:
-        """Returns (k,) int64 node indices of places (k, 3) z, y, x at a depth."""
+        """Returns (k,) int64 node indices of positions (k, 3) z, y, x at a depth."""
         n = self.branching
         if depth == 0:
             return zyx.new_zeros(len(zyx))

@@ -1,7 +1,7 @@
-"""`BrickLevels`: the levels of a resident tree, read out of its bricks; and what follows from the
-finest bricks, made anew after these were edited: borders, coarse levels, regions and ranges.
+"""`BrickLevels`: reads the levels of a resident tree from its bricks; and, after the finest bricks
+were edited, recomputes what depends on them: borders, coarse levels, regions and ranges.
 
-The filters are those of pyramid.py, so the bits are those of a tree that is built anew.
+The filters are those of pyramid.py, so the bits are those of a newly built tree.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Place = tuple[int, ...]  # voxels or nodes of a level, z y x
 @dataclass(frozen=True, eq=False)
 class BrickLevels:
     """The levels of a tree whose nodes are all in the pools. A node keeps the brick and the tile
-    that it owns, also while its words call it CONSTANT or EMPTY: so regions may change both ways.
+    that it owns even while its words say CONSTANT or EMPTY: so regions may change both ways.
     """
 
     nodes: NodePool
@@ -68,12 +68,12 @@ class BrickLevels:
         return _owned(self.nodes.child_tn, self.nodes.parent_t)
 
     def shape(self, level: int) -> Place:
-        """Returns voxels z y x of a level, counted from the finest."""
+        """Returns the number of voxels z y x of a level; level 0 is the finest."""
         return tuple(-(-size // self.branching**level) for size in self.extent)
 
     def find(self, place_k3: Tensor, level: int) -> tuple[Tensor, Tensor]:
-        """Returns (k,) int64 nodes at places z y x, or their nearest ancestors, and (k,) bool
-        whether it is the node itself.
+        """Returns (k,) int64 nodes at grid positions z y x, or their nearest ancestors, and (k,)
+        bool, whether it is the node itself.
         """
         n, node = self.branching, torch.full_like(place_k3[:, 0], self.root)
         exact = torch.ones_like(node, dtype=torch.bool)
@@ -86,7 +86,7 @@ class BrickLevels:
 
     def read(self, channel: str, level: int, low: Place, high: Place) -> Tensor:
         """Returns voxels low to high (z, y, x, c) of a level, on the CPU. A region without a brick
-        has its constant: for EMPTY ones that is their mean.
+        is filled with its constant: for EMPTY ones that is their mean.
         """
         size, border = self.bricks.brick_size, self.bricks.border
         first = tuple(at // size for at in low)
@@ -117,13 +117,13 @@ class BrickLevels:
         spacing: tuple[float, float, float],
         threshold: float | None,
     ) -> None:
-        """Makes right what follows from the finest voxels low to high (z y x).
+        """Recomputes what depends on the finest voxels low to high (z y x).
 
         Args:
             low: First voxel.
             high: The one after the last.
-            filters: Of each channel, see `Volume.filter`.
-            empty: Of channels of labels, the value of the background.
+            filters: For each channel, see `Volume.filter`.
+            empty: For channels of labels, the value of the background.
             spacing: (x, y, z) of the finest voxels.
             threshold: See `N3Tree.from_volume`.
         """
@@ -131,7 +131,7 @@ class BrickLevels:
             _ChannelLevels(self, name, how, spacing, empty.get(name))
             for name, how in filters.items()
         ]
-        if any(how != "mean" for how in filters.values()):  # constants are no voxels of theirs
+        if any(how != "mean" for how in filters.values()):  # constants are no coarse voxels
             low, high = (0, 0, 0), self.extent
         begin, end = low, high
         levels = []
@@ -152,7 +152,7 @@ class BrickLevels:
             self._write(summaries, node, exact, threshold)
 
     def _nodes_in_reach(self, level: int, begin: Place, end: Place) -> tuple[Place, Place]:
-        """The nodes whose bricks, borders included, hold some of these voxels of a level."""
+        """Returns the nodes (first, after the last) whose bricks with borders hold these voxels."""
         size, border = self.bricks.brick_size, self.bricks.border
         first = tuple(max(0, (at - border) // size) for at in begin)
         ends = zip(end, self.shape(level), strict=True)
@@ -165,7 +165,7 @@ class BrickLevels:
         exact: Tensor,
         threshold: float | None,
     ) -> None:
-        """Writes ranges, constants and words of nodes (k,), those that are there."""
+        """Writes ranges, constants and words of nodes (k,), where they exist."""
         device, pool = node.device, self.nodes
         own = exact & (self.slot_n[node] >= 0)
         learned = any(one.requires_grad for one in self.bricks.bricks.values())
@@ -189,21 +189,21 @@ class BrickLevels:
 
 @dataclass(eq=False)
 class _ChannelLevels:
-    """One channel while it is made anew, level after level, the finest first."""
+    """One channel while its levels are recomputed, one after the other, the finest first."""
 
     tree: BrickLevels
     name: str
     how: str
     spacing: tuple[float, float, float]
     empty: float | None
-    _values: np.ndarray | None = None  # of the level before
+    _values: np.ndarray | None = None  # of the previous level
     _begin: Place = (0, 0, 0)  # their first voxel
 
     def limit(self, reach: Sequence[tuple[int, Place, Place]]) -> None:
-        """Is told, of each level, the nodes (first, after the last) whose ranges are asked for."""
+        """Prepares for the nodes (first, after the last) of each level whose ranges are needed."""
         tree, size, border = self.tree, self.tree.bricks.brick_size, self.tree.bricks.border
         steps = [tree.branching**level for level, _, _ in reach]
-        # From this level on a border is as wide as whole finest bricks: their ranges are enough.
+        # From this level on, a border spans whole finest bricks: their ranges are enough.
         whole = (level for level, step in enumerate(steps) if border * step % size == 0)
         self._by_brick = next(whole, len(steps))
         near = [one for one in reach if 0 < one[0] < self._by_brick]
@@ -228,8 +228,8 @@ class _ChannelLevels:
         node: Tensor,
         exact: Tensor,
     ) -> NodeSummary:
-        """Writes the bricks of the nodes `first` to `last` of a level, of which `begin` to `end`
-        are voxels that change; returns what these nodes (k,) hold, (k, c).
+        """Writes the bricks of a level's nodes `first` to `last`, where its voxels `begin` to `end`
+        have changed; returns the summaries (k, c) of these nodes (k,).
         """
         tree, n = self.tree, self.tree.branching
         size, border, shape = tree.bricks.brick_size, tree.bricks.border, tree.shape(level)
@@ -272,7 +272,7 @@ class _ChannelLevels:
         return NodeSummary(*flat)
 
     def _level(self, level: int, begin: Place, end: Place, low: Place, high: Place) -> np.ndarray:
-        """The voxels low to high of a level, begin to end of them made of the level before."""
+        """Returns voxels low to high of a level, begin to end of them made from the one before."""
         n = self.tree.branching
         if level == 0:
             return to_numpy(self.tree.read(self.name, 0, low, high))
@@ -294,7 +294,7 @@ class _ChannelLevels:
         return values
 
     def _pooled(self, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """The smallest and largest finest value of each voxel of a level, near what changes."""
+        """Returns the smallest and largest finest value of a level's voxels, near what changes."""
         if level == 1:
             self._extremes = (to_numpy(self.tree.read(self.name, 0, self._low, self._high)),) * 2
         low, high = self._extremes
@@ -336,7 +336,7 @@ class _ChannelLevels:
 
 
 def _owned(words: Tensor, owner: Tensor) -> Tensor:
-    """(t * n,) int64: what each node's word points to, or else the slot whose owner it is."""
+    """Returns (t * n,) int64 what each node's word points to, or else the slot that it owns."""
     found = words.flatten().to(torch.int64).clamp(min=-1)
     slot = (owner >= 0).nonzero()[:, 0]
     mine = owner[slot].to(torch.int64)
@@ -346,7 +346,7 @@ def _owned(words: Tensor, owner: Tensor) -> Tensor:
 
 
 def _places(first: Place, count: Place, device: torch.device) -> Tensor:
-    """(k, 3) int64 z y x of a grid, in order."""
+    """Returns (k, 3) int64 z y x of a grid, in order."""
     axes = [torch.arange(a, a + k, device=device) for a, k in zip(first, count, strict=True)]
     return torch.cartesian_prod(*axes).view(-1, 3)
 
@@ -354,7 +354,9 @@ def _places(first: Place, count: Place, device: torch.device) -> Tensor:
 def _padded(
     values: np.ndarray, low: Place, first: Place, last: Place, size: int, border: int
 ) -> np.ndarray:
-    """Of voxels from `low` on those of nodes `first` to `last`, with borders; outermost repeat."""
+    """Returns the voxels of nodes `first` to `last` with their borders, from `values`, which begin
+    at voxel `low`; the outermost voxels are repeated.
+    """
     for axis, at in enumerate(low):
         begin, end = first[axis] * size - border - at, last[axis] * size + border - at
         here = max(0, begin)

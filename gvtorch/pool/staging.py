@@ -3,10 +3,10 @@ bricks that a producer keeps ready in host memory; `mapped`: host memory that th
 
 Bricks are gathered chunk by chunk into a ring of pinned memory, copied on a stream of their own,
 and written into their slots by the stream that renders, which waits for each copy by an event. One
-chunk is gathered, in torch's threads, while the one before is copied. Bricks that lie in pinned
-memory already are copied from where they are.
+chunk is gathered, in torch's threads, while the one before is copied. Bricks already in pinned
+memory are copied from there.
 
-The host waits for nothing: where the ring is full, fewer bricks are sent, and the others later.
+The host never waits: if the ring is full, fewer bricks are sent, and the others later.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from torch import Tensor
 
 from ..base import check
 
-_MOST = 256 * 10**6  # bytes of a ring
-_CHUNKS = (2 * 10**6, 16 * 10**6)  # bytes of a chunk: fewer are all overhead, more overlap less
-_SMALL = 64 * 10**6  # bytes to be mapped: as much is copied, and read at the device's own speed
-_ALIGN = 16  # bytes: where a channel begins in a chunk
+_MOST = 256 * 10**6  # most bytes of a ring
+_CHUNKS = (2 * 10**6, 16 * 10**6)  # bytes of a chunk: smaller is all overhead, larger overlaps less
+_SMALL = 64 * 10**6  # bytes that are copied, not mapped: the device reads its own memory faster
+_ALIGN = 16  # bytes: alignment of channels in a chunk
 _WORDS = {8: torch.int64, 4: torch.int32, 2: torch.int16, 1: torch.uint8}
 
 
 class BrickTable:
-    """Bricks that lie ready in host memory. A producer answers with `table[row]`: the bricks are
-    gathered once, on their way to the device.
+    """Bricks that are ready in host memory. A producer answers with `table[row]`: the bricks are
+    gathered only once, on their way to the device.
     """
 
     def __init__(self, bricks: Tensor) -> None:
-        """Takes over (n, z, y, x, c) bricks on the CPU, borders included.
+        """Wraps (n, z, y, x, c) bricks on the CPU, borders included.
 
         Raises:
-            ValueError: They are no contiguous tensor on the CPU, or hold NaN or infinite values.
+            ValueError: They are not a contiguous tensor on the CPU, or hold NaN or infinite values.
         """
         if bricks.dim() != 5 or bricks.device.type != "cpu" or not bricks.is_contiguous():
             raise ValueError(
@@ -56,7 +56,7 @@ class BrickTable:
         return len(self.bricks)
 
     def __getitem__(self, row: Tensor) -> TableRows:
-        """Names bricks by their (k,) int64 rows; ValueError if one is outside the table."""
+        """Selects bricks by their (k,) int64 rows; ValueError if one is outside the table."""
         row = row.to(device="cpu", dtype=torch.int64)
         if len(row) and (int(row.min()) < 0 or int(row.max()) >= len(self)):
             raise ValueError(f"BrickTable: rows must be 0 to {len(self) - 1}")
@@ -70,7 +70,7 @@ class TableRows:
     """Some bricks of a table, not gathered yet: like a tensor (k, z, y, x, c) on the CPU."""
 
     def __init__(self, table: Tensor, row: Tensor) -> None:
-        """Names rows (k,) int64 of a table (n, z, y, x, c)."""
+        """Selects rows (k,) int64 of a table (n, z, y, x, c)."""
         self.table, self.row = table, row
 
     def __len__(self) -> int:
@@ -134,8 +134,8 @@ class _RingSpan:
     end: int
     copied: Any = None  # CUDA events, None until they are recorded
     read: Any = None
-    chunk: Callable[[], Chunk | None] | None = None  # weak, None until it is sent
-    source: Any = None  # keeps pinned memory alive while it is copied from
+    chunk: Callable[[], Chunk | None] | None = None  # weak reference, None until it is sent
+    source: Any = None  # keeps pinned memory alive while it is copied
 
     def free(self) -> bool:
         if self.chunk is None or (self.copied is not None and not self.copied.query()):
@@ -175,14 +175,14 @@ class Shipment:
 
 
 class Staging:
-    """A ring of pinned memory and one of the same size on the device. Any thread may send."""
+    """A ring buffer in pinned memory and one like it on the device. Any thread may send."""
 
     def __init__(self, payload: int, brick_bytes: int, device: torch.device) -> None:
-        """Chooses sizes for `payload` bytes a frame at most, in bricks of `brick_bytes`; memory is
-        allocated when something is sent first. On the CPU, for tests, nothing is pinned.
+        """Chooses sizes for at most `payload` bytes a frame, in bricks of `brick_bytes`; memory is
+        allocated at the first `send`. On the CPU, for tests, nothing is pinned.
         """
         least, most = _CHUNKS
-        room = brick_bytes + 64 * _ALIGN  # as many channels, and more
+        room = brick_bytes + 64 * _ALIGN  # alignment of up to 64 channels
         self.chunk = max(room, min(most, max(least, payload // 8)))
         self.nbytes = max(4 * self.chunk, min(_MOST, 2 * payload))
         self._device = device
@@ -248,7 +248,7 @@ class Staging:
         return arriving
 
     def _take(self, nbytes: int) -> _RingSpan | None:
-        """Takes the next bytes of the ring; returns None if they are not free."""
+        """Reserves the next bytes of the ring; returns None if they are not free."""
         with self._lock:
             self._allocate()
             while self._spans and self._spans[0].free():
@@ -286,7 +286,7 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 class _Pages:
-    """Host memory that CUDA has locked, in the form in which torch takes memory over."""
+    """Host memory that CUDA has page-locked, in a form that torch can wrap as a tensor."""
 
     def __init__(self, host: Tensor) -> None:
         runtime, start, size = torch.cuda.cudart(), host.data_ptr(), host.nbytes
@@ -295,7 +295,7 @@ class _Pages:
             raise RuntimeError(
                 f"{size / 1e6:.0f} MB of host memory can't be locked (CUDA {failed})"
             )
-        self.host = host  # lives as long
+        self.host = host  # keeps it alive
         self.__cuda_array_interface__: dict[str, Any] = {
             "data": (start, False),
             "shape": (size,),
@@ -306,13 +306,13 @@ class _Pages:
 
 
 def _unlock(start: int) -> None:
-    torch.cuda.synchronize()  # nothing reads there any more
+    torch.cuda.synchronize()  # until nothing reads there any more
     torch.cuda.cudart().cudaHostUnregister(start)
 
 
 def mapped(host: Tensor, device: torch.device) -> Tensor:
     """Returns a tensor on the device with the content of a contiguous one on the host: small ones
-    copied, others where they lie, which stays locked while the result lives.
+    are copied, others mapped in place, and page-locked while the result lives.
 
     Raises:
         RuntimeError: The system does not let that much memory be locked.
@@ -329,5 +329,5 @@ def _is_pinned(rows: Tensor | TableRows) -> bool:
 
 
 def row_bytes(rows: Tensor | TableRows) -> int:
-    """Bytes of one of (k, ...) rows."""
+    """Returns the bytes of one of (k, ...) rows."""
     return math.prod(rows.shape[1:]) * rows.dtype.itemsize
