@@ -56,6 +56,17 @@ def test_help_does_not_import_torch():
     assert "render" in run.stdout and run.stdout.strip().endswith("False")
 
 
+@pytest.mark.parametrize(
+    "file", sorted((ROOT / "gvtorch" / "tools").glob("*.py")), ids=lambda f: f.stem
+)
+def test_no_line_of_an_options_help_ends_early(file):
+    """tyro breaks a comment where a line of it begins with anything but a letter."""
+    lines = file.read_text().splitlines()
+    rows = zip(lines, lines[1:], strict=False)
+    broken = [b for a, b in rows if a[:6] == b[:6] == "    # " and not b[6:7].isalpha()]
+    assert not broken
+
+
 def test_info_tells_backends_and_devices():
     content = json.loads(gvtorch("info", "--json").stdout)
     assert content["backends"]["reference"] == "ready" and content["gvtorch"] == gv.__version__

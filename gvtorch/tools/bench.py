@@ -16,26 +16,26 @@ from tyro.conf import Positional, arg
 class Bench:
     """Measure a workload on this machine, side by side with other renderers."""
 
+    # a workload, or all; without it the workloads are listed
     name: Positional[Annotated[str | None, arg(metavar="NAME")]] = None
-    """a workload, or all; without it the workloads are listed"""
+    # print JSON, an object a line for each workload
     json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """print JSON, an object a line for each workload"""
+    # also keep the JSON there, a file for each workload and machine
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="FOLDER")] = None
-    """also keep the JSON there, a file for each workload and machine"""
+    # cpu, cuda or cuda:1
     device: Annotated[str, arg(metavar="DEVICE")] = "cpu"
-    """cpu, cuda or cuda:1"""
+    # tiny sizes: to see that all works
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
-    """tiny sizes: to see that all works"""
+    # timings of each figure, after one to warm up
     repeats: Annotated[int, arg(metavar="N")] = 7
-    """timings of each figure, after one to warm up"""
+    # a figure that takes longer is made of fewer timings
     seconds: Annotated[float, arg(metavar="S")] = 10.0
-    """a figure that takes longer is made of fewer timings"""
+    # cases that have it in their name
     only: Annotated[str, arg(metavar="TEXT")] = ""
-    """cases that have it in their name"""
+    # which other renderers; none for none, all that are installed if left out
     peers: Annotated[str | None, arg(metavar="NAME,NAME")] = None
-    """which other renderers; none for none, all that are installed if left out"""
+    # keep the pictures that were compared
     pictures: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """keep the pictures that were compared"""
 
     def run(self) -> None:
         from ..bench import WORKLOADS, Unavailable

@@ -42,10 +42,11 @@ from .view import View
 class Info:
     """Show information on this installation, a volume file, or a store."""
 
+    # a volume or a store; without it backends, devices and versions
     path: Positional[Annotated[str | None, arg(metavar="PATH")]] = None
-    """a volume or a store; without it backends, devices and versions"""
+    # print JSON
     json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """print JSON"""
+
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
@@ -89,14 +90,15 @@ class Convert:
     """Convert a volume of any size to a store: OME-Zarr with bordered blocks."""
 
     path: Positional[Annotated[str, arg(metavar="PATH", help=f"the volume: {volume_formats()}")]]
+    # the folder to make
     store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
-    """the folder to make"""
+    # regions with no value above it are not kept as blocks
     threshold: Annotated[float | None, arg(metavar="VALUE")] = None
-    """regions with no value above it are not kept as blocks"""
+    # most that all processes together take, as in "2 GB"; what is free if left out
     memory: Annotated[str | None, arg(metavar="BYTES")] = None
-    """most that all processes together take, as in "2 GB"; what is free if left out"""
+    # tell disk, memory and time, and write nothing
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
-    """tell disk, memory and time, and write nothing"""
+
     making: tyro.conf.OmitArgPrefixes[Making] = Making()
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
@@ -128,21 +130,21 @@ class Convert:
 class Filter:
     """Add filtered colours to a store: `--shader filtered` then shows it correctly from afar."""
 
+    # a store that gvtorch convert made; its voxels are read and stay as they are
     store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
-    """a store that gvtorch convert made; its voxels are read and stay as they are"""
+    # transfer function that the colours are made with, as of gvtorch render; gray if left out
     tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
-    """transfer function that the colours are made with, as of gvtorch render; gray if left out"""
+    # values that it is stretched over, as of gvtorch render
     window: Annotated[str | None, arg(metavar="LO,HI")] = None
-    """values that it is stretched over, as of gvtorch render"""
+    # which number of a voxel is shown
     component: Annotated[int, arg(metavar="N")] = 0
-    """which number of a voxel is shown"""
+    # colours and normals, for --shader filtered-lit
     lit: bool = False
-    """colours and normals, for --shader filtered-lit"""
+    # colours for each of six directions, or their mean; auto: six where a voxel may hide a fifth of
+    # what is behind
     directions: Literal["auto", "six", "one"] = "auto"
-    """colours for each of six directions, or their mean; auto: six where a voxel may hide a fifth
-    of what is behind"""
+    # where it is worked out; CUDA if left out, where it runs
     backend: Literal["cpp", "cuda"] | None = None
-    """where it is worked out; CUDA if left out, where it runs"""
 
     def run(self) -> None:
         from ..io.resources import amount

@@ -30,26 +30,26 @@ def volume_formats() -> str:
 class ReadOptions:
     """How to read the volume, where the file does not say so itself."""
 
+    # RAW, or a file of any ending: voxels; else taken from the name *_XxYxZ_dtype.raw
     shape: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    """RAW, or a file of any ending: voxels; else taken from the name *_XxYxZ_dtype.raw"""
+    # RAW, or a file of any ending: a NumPy dtype, as in int16 or >i2
     dtype: Annotated[str | None, arg(metavar="TYPE")] = None
-    """RAW, or a file of any ending: a NumPy dtype, as in int16 or >i2"""
+    # RAW, or a file of any ending: bytes before the numbers
     offset: Annotated[int | None, arg(metavar="BYTES")] = None
-    """RAW, or a file of any ending: bytes before the numbers"""
+    # voxel size in world units
     spacing: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    """voxel size in world units"""
+    # which of several arrays, series, images or scenes
     key: Annotated[str | None, arg(metavar="NAME")] = None
-    """which of several arrays, series, images or scenes"""
+    # what the axes of an array are, the slowest first, as in tzyx or czyx
     axes: Annotated[str | None, arg(metavar="LETTERS")] = None
-    """what the axes of an array are, the slowest first, as in tzyx or czyx"""
+    # time point, from 0
     time: Annotated[int | None, arg(metavar="N")] = None
-    """time point, from 0"""
+    # voxel axes that do not lie along the world's: resample along these, or keep the voxels
     oblique: Literal["resample", "keep"] | None = None
-    """voxel axes that do not lie along the world's: resample along these, or keep the voxels"""
+    # value for voxels that are NaN or infinite
     nan: Annotated[float | None, arg(metavar="VALUE")] = None
-    """value for voxels that are NaN or infinite"""
+    # values are numbers of things: kept exactly, never blended, and shown by --shader labels
     labels: FlagCreatePairsOff[bool] = False
-    """values are numbers of things: kept exactly, never blended, and shown by --shader labels"""
 
     def read(self, path: str | Path) -> Volume:
         """Reads the volume at `path`."""

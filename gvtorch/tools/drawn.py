@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 class Drawn:
     """What is drawn over the picture."""
 
+    # the colours of values, as the transfer function has them
     bar: FlagCreatePairsOff[bool] = False
-    """the colours of values, as the transfer function has them"""
+    # a length; in perspective it holds at the distance of what is looked at, the middle of the box
+    # unless --state or --keys tell another
     scale_bar: FlagCreatePairsOff[bool] = False
-    """a length; in perspective it holds at the distance of what is looked at, the middle of the box
-    unless --state or --keys tell another"""
+    # lines, \n between them
     annotate: Annotated[str | None, arg(metavar="TEXT")] = None
-    """lines, \\n between them"""
 
     def overlay(
         self, shader: Shader, info: ImageInfo, component: int, camera: Camera, eye: Eye

@@ -39,34 +39,35 @@ class Fly:
     """Fly around or through a volume or a store: a picture a frame, or a film."""
 
     path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    # a film, .mp4, or .gif or .webp, which loop; or a folder for 0000.png, 0001.png, ...
     output: Annotated[Path, arg(aliases=["-o"], metavar="DIR|OUT.mp4")]
-    """a film, .mp4, or .gif or .webp, which loop; or a folder for 0000.png, 0001.png, ..."""
+    # once around, or keys [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}]
     flight: Annotated[str, arg(name="path", metavar="orbit|FILE.json")] = "orbit"
-    """once around, or keys [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}]"""
+    # key frames in place of --path: [{"time": seconds, "state": what gvtorch view saved}, ...],
+    # between which camera, colours, clips and all other numbers run smoothly, and a series shows
+    # the time point nearest to theirs; a film that ends as it begins loops
     keys: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """key frames in place of --path: [{"time": seconds, "state": what gvtorch view saved}, ...],
-    between which camera, colours, clips and all other numbers run smoothly, and a series shows
-    the time point nearest to theirs; a film that ends as it begins loops"""
+    # once around in the look that gvtorch view saved, from its camera on
     state: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """once around in the look that gvtorch view saved, from its camera on"""
+    # an orbit that takes so long: instead of --frames
     turntable: Annotated[float | None, arg(metavar="SECONDS")] = None
-    """an orbit that takes so long: instead of --frames"""
+    # number of pictures; if left out 100, one for each of --times, or as --keys tell
     frames: Annotated[int | None, arg(metavar="N")] = None
-    """number of pictures; if left out 100, one for each of --times, or as --keys tell"""
+    # a film over time: all time points, or those from A to B; the camera stands still where an
+    # orbit starts, unless --turntable, --path FILE.json or --keys move it
     times: Annotated[str | None, arg(metavar="all|A-B")] = None
-    """a film over time: all time points, or those from A to B; the camera stands still where an
-    orbit starts, unless --turntable, --path FILE.json or --keys move it"""
+    # pictures a second of a film, a turntable or keys; 25 if left out
     fps: Annotated[int | None, arg(metavar="N")] = None
-    """pictures a second of a film, a turntable or keys; 25 if left out"""
+    # where an orbit starts: degrees, and largest sides of the box; as of gvtorch render if left
+    # out, and all of the box in each picture
     orbit: Annotated[str | None, arg(metavar="AZ,EL[,DIST]")] = None
-    """where an orbit starts: degrees, and largest sides of the box; as of gvtorch render if left
-    out, and all of the box in each picture"""
+    # what each picture cost, one JSON line a frame
     stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
-    """what each picture cost, one JSON line a frame"""
+    # writes where each picture was taken: a folder for COLMAP, or .json for Blender and NeRF
     poses: Annotated[Path | None, arg(metavar="FOLDER|FILE.json")] = None
-    """writes where each picture was taken: a folder for COLMAP, or .json for Blender and NeRF"""
+    # when which stage of each frame ran, for ui.perfetto.dev
     trace: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """when which stage of each frame ran, for ui.perfetto.dev"""
+
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
     drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
 

@@ -54,65 +54,63 @@ _WHOLE = ("isosurface", "maximum", "minimum", "mean")  # use one value, or a who
 class Look:
     """How the scene is shown."""
 
+    # pinhole, ortho (parallel), fisheye (equidistant) or panorama (equirectangular)
     camera_model: Annotated[CameraModel, arg(metavar="MODEL")] = "pinhole"
-    """pinhole, ortho (parallel), fisheye (equidistant) or panorama (equirectangular)"""
+    # vertical field of view; 30, or 180 of a fisheye or panorama, if left out
     fov: Annotated[float | None, arg(metavar="DEG")] = None
-    """vertical field of view; 30, or 180 of a fisheye or panorama, if left out"""
+    # pixels
     size: Annotated[str, arg(metavar="WxH")] = "512x512"
-    """pixels"""
+    # direction that is up in the picture; if left out +z of patients, whose head is there, else +y
     up: Annotated[str | None, arg(metavar="+z|X,Y,Z")] = None
-    """direction that is up in the picture; if left out +z of patients, whose head is there, else
-    +y"""
+    # transfer function: gray, hot, vessels, bone, tissue, mr, em, cloud or galaxy; ct-bone,
+    # ct-soft, ct-lung or ct-vessels (Hounsfield units); a colour map of matplotlib; a file of
+    # gvtorch, ParaView or 3D Slicer (.json, .vp, .xml), or one preset of it, FILE:NAME; gray if
+    # left out, or the function of a store's filtered colours
     tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
-    """transfer function: gray, hot, vessels, bone, tissue, mr, em, cloud or galaxy; ct-bone,
-    ct-soft, ct-lung or ct-vessels (Hounsfield units); a colour map of matplotlib; a file of
-    gvtorch, ParaView or 3D Slicer (.json, .vp, .xml), or one preset of it, FILE:NAME; gray if left
-    out, or the function of a store's filtered colours"""
+    # values that it is stretched over: LO,HI; P%,P%, percentiles; full, the range; or auto, by the
+    # histogram without its background, as for presets and colour maps if left out
     window: Annotated[str | None, arg(metavar="LO,HI")] = None
-    """values that it is stretched over: LO,HI; P%,P%, percentiles; full, the range; or auto, by the
-    histogram without its background, as for presets and colour maps if left out"""
+    # what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter);
+    # filtered-lit: lit, but right from afar (gvtorch filter --lit); channels: all numbers of a
+    # voxel, each in its colour and window as the file tells, else found; labels: each in its
+    # colour, also if left out where there are labels; colors: those of a mesh, lit where its
+    # normals are stored beside them, also if left out
     shader: ShaderName = "plain"
-    """what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter);
-    filtered-lit: lit, but right from afar (gvtorch filter --lit);
-    channels: all numbers of a voxel, each in its colour and window as the file tells, else found;
-    labels: each in its colour, also if left out where there are labels; colors: those of a mesh,
-    lit where its normals are stored beside them, also if left out"""
+    # of --shader channels: which ones; colour is a name or #RRGGBB, and what is left out or auto is
+    # the file's; opacity as an item: they hide each other, else they are added
     channel: Annotated[str | None, arg(metavar="N:COLOR:LO,HI;...")] = None
-    """of --shader channels: which ones; colour is a name or #RRGGBB, and what is left out or auto
-    is the file's; opacity as an item: they hide each other, else they are added"""
+    # of the isosurface
     value: Annotated[float | None, arg(metavar="VALUE")] = None
-    """of the isosurface"""
+    # distance between samples
     step: Annotated[float, arg(metavar="VOXELS")] = 0.5
-    """distance between samples"""
+    # auto: voxels as wide as a pixel's cone; finest: the data as it is
     lod: Literal["auto", "finest"] = "auto"
-    """auto: voxels as wide as a pixel's cone; finest: the data as it is"""
+    # how much wider than a pixel its cone is; 4/3 if left out. With --samples 16, 0.33 (a quarter
+    # of it) shows the finest detail
     cone_scale: Annotated[float | None, arg(metavar="FACTOR")] = None
-    """how much wider than a pixel its cone is; 4/3 if left out. With --samples 16, 0.33 (a quarter
-    of it) shows the finest detail"""
+    # linear, 0 to 1; R,G,B/R,G,B from top to bottom; transparent; or an environment map, PNG, EXR,
+    # TIFF or NPY
     background: Annotated[str, arg(metavar="R,G,B|FILE")] = "0,0,0"
-    """linear, 0 to 1; R,G,B/R,G,B from top to bottom; transparent; or an environment map, PNG, EXR,
-    TIFF or NPY"""
+    # a ray ends at this alpha; 1 integrates to the end
     stop_alpha: Annotated[float, arg(metavar="ALPHA")] = 0.99
-    """a ray ends at this alpha; 1 integrates to the end"""
+    # what is kept: plane:A,B,C,D where A x + B y + C z + D >= 0; box:X,Y,Z,X,Y,Z (low corner, high
+    # corner); cut:X,Y,Z,X,Y,Z goes; caps draws the cut as a surface; in largest sides of the box,
+    # its centre is 0
     clip: Annotated[str | None, arg(metavar="KIND:NUMBERS;...")] = None
-    """what is kept: plane:A,B,C,D where A x + B y + C z + D >= 0; box:X,Y,Z,X,Y,Z (low corner, high
-    corner); cut:X,Y,Z,X,Y,Z goes; caps draws the cut as a surface; in largest sides of the box,
-    its centre is 0"""
+    # depth of field: diameter of the lens and distance that is sharp, in largest sides of the box
     lens: Annotated[str | None, arg(metavar="APERTURE,FOCUS")] = None
-    """depth of field: diameter of the lens and distance that is sharp, in largest sides of the
-    box"""
+    # of the lit shaders: sun:X,Y,Z,DEGREES (the way it shines, how wide it looks);
+    # lamp:X,Y,Z,RADIUS (world units); sky:R,G,B; shadows:, occlusion:, indirect:, factors; reach:,
+    # of the last two, in largest sides of the box
     lighting: Annotated[str | None, arg(metavar="KIND:NUMBERS;...")] = None
-    """of the lit shaders: sun:X,Y,Z,DEGREES (the way it shines, how wide it looks);
-    lamp:X,Y,Z,RADIUS (world units); sky:R,G,B; shadows:, occlusion:, indirect:, factors; reach:, of
-    the last two, in largest sides of the box"""
+    # which number of a voxel is shown
     component: Annotated[int, arg(metavar="N")] = 0
-    """which number of a voxel is shown"""
+    # side of a brick
     brick_size: Annotated[int, arg(metavar="VOXELS")] = 8
-    """side of a brick"""
+    # voxels around a brick; 1 if left out, 2 of labels, whose slanted faces it smooths
     border: Annotated[int | None, arg(metavar="VOXELS")] = None
-    """voxels around a brick; 1 if left out, 2 of labels, whose slanted faces it smooths"""
+    # what traces the rays
     backend: Literal["auto", "reference", "cpp", "cuda"] = "auto"
-    """what traces the rays"""
 
     def options(self) -> dict[str, Any]:
         """Returns fields of `RenderOptions`."""

@@ -29,14 +29,14 @@ _MESHES = "OBJ, PLY, STL, glTF or OFF, also with .gz behind"
 class Making:
     """How the store is made."""
 
+    # voxels along a side of a block
     block: Literal[32, 64] = 32
-    """voxels along a side of a block"""
+    # processes; one a core if left out, fewer where memory is short
     workers: Annotated[int | None, arg(metavar="N")] = None
-    """processes; one a core if left out, fewer where memory is short"""
+    # of a dask cluster that shares this folder, as in tcp://host:8786
     scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """of a dask cluster that shares this folder, as in tcp://host:8786"""
+    # go on with a half-written store
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """go on with a half-written store"""
 
     def check(self) -> None:
         """Raises ValueError if flags exclude each other."""
@@ -62,23 +62,24 @@ class Voxelize:
     """Voxelize a mesh into a store, of any resolution: OME-Zarr with bordered blocks."""
 
     path: Positional[Annotated[str, arg(metavar="MESH", help=f"the mesh: {_MESHES}")]]
+    # the folder to make
     output: Annotated[Path, arg(aliases=["-o"], metavar="STORE.zarr")]
-    """the folder to make"""
+    # voxels along the mesh's longest side
     resolution: Annotated[int, arg(metavar="N")] = 1024
-    """voxels along the mesh's longest side"""
+    # what a voxel holds, one or several: coverage, the filled share; distance, signed, up to the
+    # band; color, premultiplied linear colour and opacity; normal, the surface's; material, labels.
+    # color and normal together are drawn as they are, lit
     channels: Annotated[str, arg(aliases=["--channel"], metavar="NAME,NAME,...")] = "coverage"
-    """what a voxel holds, one or several: coverage, the filled share; distance, signed, up to the
-    band; color, premultiplied linear colour and opacity; normal, the surface's; material, labels.
-    color and normal together are drawn as they are, lit"""
+    # an image that is laid on all that has texture coordinates
     texture: Annotated[Path | None, arg(metavar="IMAGE")] = None
-    """an image that is laid on all that has texture coordinates"""
+    # how far from the surface distances, colours and normals are told
     band: Annotated[float, arg(metavar="VOXELS")] = 4.0
-    """how far from the surface distances, colours and normals are told"""
+    # of parts that are not closed
     thickness: Annotated[float, arg(metavar="VOXELS")] = 1.0
-    """of parts that are not closed"""
+    # auto: what is closed is a solid, all else a sheet; always: holes are filled; never: all is a
+    # sheet
     solid: Literal["auto", "always", "never"] = "auto"
-    """auto: what is closed is a solid, all else a sheet; always: holes are filled; never: all is a
-    sheet"""
+
     making: tyro.conf.OmitArgPrefixes[Making] = Making()
 
     def run(self) -> None:
@@ -110,26 +111,27 @@ class Splat:
     path: Positional[
         Annotated[str, arg(metavar="POINTS", help="arrays (.npz), PLY, or a FITS table")]
     ]
+    # the folder to make
     output: Annotated[Path, arg(aliases=["-o"], metavar="STORE.zarr")]
-    """the folder to make"""
+    # voxels along the longest side, or along each
     extent: Annotated[str, arg(metavar="N or X,Y,Z", aliases=["--resolution"])] = "1024"
-    """voxels along the longest side, or along each"""
+    # what a voxel holds: the sum of values; or light, the value times the colour, and opacity
     channels: Annotated[Literal["value", "color"], arg(aliases=["--channel"])] = "value"
-    """what a voxel holds: the sum of values; or light, the value times the colour, and opacity"""
+    # of a point, for color
     opacity: Annotated[float, arg(metavar="SHARE")] = 1e-4
-    """of a point, for color"""
+    # world corners; points outside are left out; around all if left out
     box: Annotated[str | None, arg(metavar="X,Y,Z,X,Y,Z")] = None
-    """world corners; points outside are left out; around all if left out"""
+    # columns, as in x,y,z; known by their names if left out, as are the next three
     positions: Annotated[str | None, arg(metavar="NAMES")] = None
-    """columns, as in x,y,z; known by their names if left out, as are the next three"""
+    # columns whose numbers add up
     values: Annotated[str | None, arg(metavar="NAMES")] = None
-    """columns whose numbers add up"""
+    # columns, as in red,green,blue
     colors: Annotated[str | None, arg(metavar="NAMES")] = None
-    """columns, as in red,green,blue"""
+    # how far points reach: a column, or one number for all; if there is none, a voxel each
     radius: Annotated[str | None, arg(metavar="NAME or SIZE")] = None
-    """how far points reach: a column, or one number for all; if there is none, a voxel each"""
+    # that sorting takes, roughly
     memory: Annotated[str, arg(metavar="BYTES")] = "1 GB"
-    """that sorting takes, roughly"""
+
     making: tyro.conf.OmitArgPrefixes[Making] = Making()
 
     def run(self) -> None:

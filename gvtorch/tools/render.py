@@ -35,12 +35,12 @@ STRIPS = (".npy", ".tif")  # written strip by strip: the picture may be larger t
 class Develop:
     """How the picture is developed."""
 
+    # rays a pixel, at places of their own
     samples: Annotated[int, arg(metavar="N")] = 1
-    """rays a pixel, at places of their own"""
+    # curve from scene light to the display
     tone: Literal["none", "reinhard", "aces"] = "none"
-    """curve from scene light to the display"""
+    # the light is multiplied by 2^STOPS
     exposure: Annotated[float, arg(metavar="STOPS")] = 0.0
-    """the light is multiplied by 2^STOPS"""
 
     def wrap(self, render: Callable[[Camera], Picture]) -> Callable[[Camera], Picture]:
         """Returns a function that renders a camera with all samples, tone-mapped."""
@@ -68,25 +68,26 @@ class Render:
     """Render a volume or a store to a picture."""
 
     path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    # the picture: .png, .exr, .tif, .npy or .npz; .png, .tif and .npy may be larger than memory
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
-    """the picture: .png, .exr, .tif, .npy or .npz; .png, .tif and .npy may be larger than memory"""
+    # of a number in the file: 8 or 16 of .png, and 32 (float) of .tif; 32 or 16 of .exr
     bits: Annotated[int | None, arg(metavar="N")] = None
-    """of a number in the file: 8 or 16 of .png, and 32 (float) of .tif; 32 or 16 of .exr"""
+    # float32 color, alpha and depth, int32 samples
     npz: Annotated[Path | None, arg(metavar="OUT.npz")] = None
-    """float32 color, alpha and depth, int32 samples"""
+    # milliseconds, rays, samples, nodes, bricks, bytes; of stores requests and misses too
     stats: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """milliseconds, rays, samples, nodes, bricks, bytes; of stores requests and misses too"""
+    # what gvtorch view saved: camera, shader and all that says how it is shown; a picture of --size
     state: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """what gvtorch view saved: camera, shader and all that says how it is shown; a picture of
-    --size"""
+    # orbit:AZIMUTH,ELEVATION (degrees; +x runs to the right at azimuth 0), from where the whole box
+    # is in the picture; orbit:AZIMUTH,ELEVATION,DISTANCE (largest sides of the box); or
+    # look:ex,ey,ez,tx,ty,tz (world units); file:PATH or file:PATH,NAME, of ParaView (.pvcc),
+    # Blender or NeRF (.json) or COLMAP (a folder); if left out orbit:30,20, of patients from the
+    # front
     camera: Annotated[str | None, arg(metavar="CAMERA")] = None
-    """orbit:AZIMUTH,ELEVATION (degrees; +x runs to the right at azimuth 0), from where the whole
-    box is in the picture; orbit:AZIMUTH,ELEVATION,DISTANCE (largest sides of the box); or
-    look:ex,ey,ez,tx,ty,tz (world units); file:PATH or file:PATH,NAME, of ParaView (.pvcc), Blender
-    or NeRF (.json) or COLMAP (a folder); if left out orbit:30,20, of patients from the front"""
+    # the picture, or what each ray cost: samples, nodes visited; or what it saw: depth of the
+    # nodes, age of the bricks in frames, share of their voxels that is not transparent
     show: Literal["picture", "samples", "nodes", "lod", "age", "fill"] = "picture"
-    """the picture, or what each ray cost: samples, nodes visited; or what it saw: depth of the
-    nodes, age of the bricks in frames, share of their voxels that is not transparent"""
+
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
     develop: tyro.conf.OmitArgPrefixes[Develop] = Develop()
     drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()

@@ -65,8 +65,9 @@ class RenderedScene:
 class SceneFlags:
     """What is shown, and how."""
 
+    # volumes: regions with no value above it are never drawn
     threshold: Annotated[float | None, arg(metavar="VALUE")] = None
-    """volumes: regions with no value above it are never drawn"""
+
     look: tyro.conf.OmitArgPrefixes[Look] = Look()
     streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()

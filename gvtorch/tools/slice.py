@@ -20,34 +20,34 @@ class Slice:
     """Show planes of voxels of a volume or a store, exact to the voxel."""
 
     path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    # the picture: .png, .exr, .tif, .npy or .npz
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
-    """the picture: .png, .exr, .tif, .npy or .npz"""
+    # of a number in the file, as of gvtorch render
     bits: Annotated[int | None, arg(metavar="N")] = None
-    """of a number in the file, as of gvtorch render"""
+    # which way the plane is cut; all: three planes in one picture
     axis: Literal["x", "y", "z", "all"] = "z"
-    """which way the plane is cut; all: three planes in one picture"""
+    # where: 50%, the index of a voxel, or a place such as 12.5mm; for all axes also three, as
+    # in 50%,40%,12
     at: Annotated[str, arg(metavar="PLACE")] = "50%"
-    """where: 50%, the index of a voxel, or a place such as 12.5mm; for all axes also three, as in
-    50%,40%,12"""
+    # which axis is up in the picture; if left out as for patients, see --plain; of data without
+    # such directions -y (rows run down) across z, else +z
     up: Annotated[str | None, arg(metavar="+z")] = None
-    """which axis is up in the picture; if left out as for patients, see --plain; of data without
-    such directions -y (rows run down) across z, else +z"""
+    # patients are shown as radiologists look at them, their right on the left, with letters at the
+    # edges (R right, L left, A front, P back, S head, I feet); plain: without letters
     plain: bool = False
-    """patients are shown as radiologists look at them, their right on the left, with letters at the
-    edges (R right, L left, A front, P back, S head, I feet); plain: without letters"""
+    # pixels along the shortest side of a voxel
     scale: Annotated[float, arg(metavar="PIXELS")] = 1.0
-    """pixels along the shortest side of a voxel"""
+    # stores: level of detail, 0 is the finest
     level: Annotated[int, arg(metavar="N")] = 0
-    """stores: level of detail, 0 is the finest"""
+    # the colours, as of gvtorch render; grays as bright on the display as their values if left out
     tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
-    """the colours, as of gvtorch render; grays as bright on the display as their values if left
-    out"""
+    # values that these are stretched over, as of gvtorch render; auto keeps the background
     window: Annotated[str | None, arg(metavar="LO,HI")] = None
-    """values that these are stretched over, as of gvtorch render; auto keeps the background"""
+    # which number of a voxel is shown
     component: Annotated[int, arg(metavar="N")] = 0
-    """which number of a voxel is shown"""
+    # stores: which image, where there are several
     image: Annotated[str | None, arg(metavar="NAME")] = None
-    """stores: which image, where there are several"""
+
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:

@@ -26,22 +26,22 @@ if TYPE_CHECKING:
 class Streaming:
     """Stores: memory, and how data is loaded."""
 
+    # memory of node tiles
     node_pool: Annotated[str, arg(metavar="BYTES")] = "8 MB"
-    """memory of node tiles"""
+    # memory of bricks, on the device that renders
     brick_pool: Annotated[str, arg(metavar="BYTES")] = "256 MB"
-    """memory of bricks, on the device that renders"""
+    # memory of decoded blocks
     host_cache: Annotated[str, arg(metavar="BYTES")] = "512 MB"
-    """memory of decoded blocks"""
+    # one frame, a few, or until nothing is missing, as if left out
     mode: Literal["interactive", "balanced", "converge"] | None = None
-    """one frame, a few, or until nothing is missing, as if left out"""
+    # most frames of a picture that converges
     max_frames: Annotated[int, arg(metavar="N")] = 1000
-    """most frames of a picture that converges"""
+    # to the wanted level at once, or level by level
     loading: Literal["straight", "levels"] = "straight"
-    """to the wanted level at once, or level by level"""
+    # which image, where a store has several
     image: Annotated[str | None, arg(metavar="NAME")] = None
-    """which image, where a store has several"""
+    # a block that can't be read ends the work
     strict: tyro.conf.FlagCreatePairsOff[bool] = False
-    """a block that can't be read ends the work"""
 
     def store(self, path: str, time: int | None) -> Store:
         """Opens a store at a time point; warns if it has several and none was chosen."""

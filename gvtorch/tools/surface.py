@@ -20,18 +20,19 @@ class Surface:
     block."""
 
     path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    # the mesh, in world units: PLY, or binary glTF
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.ply|OUT.glb")]
-    """the mesh, in world units: PLY, or binary glTF"""
+    # inside is where values are at least this; of labels: the one that is wrapped
     value: Annotated[float, arg(aliases=["--iso"], metavar="VALUE")]
-    """inside is where values are at least this; of labels: the one that is wrapped"""
+    # stores: level of detail, 0 is the finest; each further one has a quarter of the triangles
     level: Annotated[int, arg(metavar="N")] = 0
-    """stores: level of detail, 0 is the finest; each further one has a quarter of the triangles"""
+    # closed where it leaves the box; else it is open there
     caps: bool = True
-    """closed where it leaves the box; else it is open there"""
+    # which number of a voxel
     component: Annotated[int, arg(metavar="N")] = 0
-    """which number of a voxel"""
+    # stores: which image, where there are several
     image: Annotated[str | None, arg(metavar="NAME")] = None
-    """stores: which image, where there are several"""
+
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:

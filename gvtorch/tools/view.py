@@ -39,18 +39,19 @@ class View:
     """Look at a volume or a store in the browser: turn it, and edit how it is shown."""
 
     path: Positional[Annotated[str, arg(metavar="PATH|SCRIPT.py", help=_path_help())]]
+    # what the page saved: camera, shader and all that says how it is shown
     state: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """what the page saved: camera, shader and all that says how it is shown"""
+    # where it stands at first, as of gvtorch render
     camera: Annotated[str | None, arg(metavar="CAMERA")] = None
-    """where it stands at first, as of gvtorch render"""
+    # where pages are served; 0.0.0.0: also to other machines, to those who know the address
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
-    """where pages are served; 0.0.0.0: also to other machines, to those who know the address"""
+    # 0: any that is free
     port: Annotated[int, arg(metavar="N")] = 0
-    """0: any that is free"""
+    # further names under which browsers may reach this machine
     allow: Annotated[str, arg(metavar="NAME,NAME")] = ""
-    """further names under which browsers may reach this machine"""
+    # open it; else the address is only printed
     browser: bool = True
-    """open it; else the address is only printed"""
+
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
 
     def run(self) -> None:
