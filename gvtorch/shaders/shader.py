@@ -246,7 +246,7 @@ class Shader(Checked):
         return self.unlit()
 
     def blocker(self) -> Shader:
-        """Returns the shader for cones that light is blocked along: only its alpha counts."""
+        """Returns the shader that blocks the cones of `Lighting`: only its alpha counts."""
         return self.matter()
 
 
