@@ -143,7 +143,7 @@ class Blend(Field):
         return self.filtered_bounds(center, half, None)
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
-        """Returns the hull of both fields' bounds, or one field's where the mask is known 0 or 1."""
+        """Returns the hull of both fields' bounds; one field's where the mask is known 0 or 1."""
         found = [_known(part, center, half, size) for part in (self.first, self.second)]
         if found[0] is None or found[1] is None:
             return None
