@@ -114,8 +114,8 @@ class Fractal(Distance):
         Args:
             iteration: f.
             constant: c, for a Julia set; left out: the point itself, for a Mandelbrot set.
-            iterations: A point that has not escaped after so many steps is inside. With a step that
-                stretches distances by 8, details of 8^-iterations are resolved.
+            iterations: Number of steps after which a point that has not escaped is inside. A step
+                that stretches distances by 8 resolves details of 8^-iterations.
             bailout: An orbit has escaped when it is this far from the origin.
             colors: Three linear colours: of orbits that come near to the origin, near to a plane
                 of two axes, and to neither.
@@ -203,8 +203,7 @@ class Mandelbulb(Fractal):
         super().__init__(Power(power), **look)  # type: ignore[arg-type]
 
     def box(self) -> Tensor:
-        """Returns a cube of half side 2^(1 / (n - 1)), beyond which |z|^n outgrows |c|: all escape.
-        """
+        """Returns a cube of half side 2^(1 / (n - 1)); beyond it |z|^n outgrows |c|: all escape."""
         power = self.iteration.power
         assert isinstance(power, int)
         return self._within(2.0 ** (1 / (power - 1)))

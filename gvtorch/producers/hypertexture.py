@@ -214,8 +214,7 @@ class Hypertexture(Tally, Producer):
         return data
 
     def _made(self, nodes: Nodes, level: LevelOctaves, shape: nn.Module) -> dict[str, Tensor]:
-        """Returns channels (k, z, y, x, 1) of nodes of a level, for the parts of the shape there.
-        """
+        """Returns channels (k, z, y, x, 1) of nodes of a level; `shape` may be a reduced one."""
         points = nodes.points(self.dtype)
         distance = distances_of(type(self).__name__, shape, points)
         total = distance * (-1 / self.thickness)

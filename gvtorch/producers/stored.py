@@ -285,8 +285,7 @@ class StoredProducer(Producer):
         return replace(found, errors=errors)
 
     def _cells(self, level: int, at: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
-        """Returns (k, 3, c) float32 low, high and mean of cells `at` (k, 3) z y x; errors by row.
-        """
+        """Returns (k, 3, c) float32 low, high, mean of cells `at` (k, 3) z y x; errors by row."""
         store, grid = self.store, self.store.cell_grid(level)
         out = np.zeros((len(at), 3, store.width), np.float32)
         errors: dict[int, str] = {}

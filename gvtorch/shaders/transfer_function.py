@@ -234,8 +234,7 @@ class TransferFunction(Shader):
     def kept(
         self, make: Callable[[TransferFunction, Sampling], ColorTable], sampling: Sampling
     ) -> ColorTable:
-        """Returns the table that `make` computes of the current function; the last few are cached.
-        """
+        """Returns the table `make` computes from the current function; the last few are cached."""
         key = make, self.opacity.tobytes(), self.color.tobytes(), self.reference, sampling
         if key not in self._tables:
             self.check_again()  # points may have been edited in place
