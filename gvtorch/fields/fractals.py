@@ -64,8 +64,8 @@ class Power(Iteration):
 
 
 class Fold(Iteration):
-    """The Mandelbox's step: coordinates beyond 1 are folded back, small vectors inverted in balls
-    of radius 1/2 and 1, and all is scaled.
+    """The Mandelbox's step: folds coordinates beyond -1 and 1 back, inverts small vectors by balls
+    of radius 1/2 and 1, and scales the result.
     """
 
     logarithmic = False

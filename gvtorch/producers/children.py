@@ -58,7 +58,7 @@ class FromChildren(OfProducers):
         self.producer, self.patience = producer, producer.patience
         self.levels = check.whole(where, "levels", levels, low=1, high=10)
         self._kept: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by loc
-        self._known = producer.version  # the version of which these blocks are
+        self._known = producer.version  # the version that these blocks were made from
 
     def parts(self) -> dict[str, Producer]:
         return {"producer": self.producer}

@@ -62,10 +62,10 @@ class FieldProducer(Producer):
             channels: What voxels hold; left out: the field's dtypes, by default float32. In integer
                 channels a value of 1 becomes the largest number of the dtype.
             samples: n of the n^3 values that a voxel is the mean of; left out: `branching`, so that
-                the level above the finest is the mean of the centres of the voxels below it.
+                the level above the finest is the mean of values at the centres of finest voxels.
             threshold: Nodes whose values are all proven not to exceed it are EMPTY. One value for
-                all channels, or by name for the channels that decide; left out: the field's. If
-                there is none, no node is EMPTY.
+                all channels, or by name for those channels that decide; left out: the field's, if
+                it has one, else no node is EMPTY.
             dtype: float32 or float64, of positions; left out: float64 if float32 can't distinguish
                 the finest voxels.
             branching: N.

@@ -115,7 +115,7 @@ class JoinedProducer(OfProducers):
         return Bricks(data=data, kind=kind, constants=constants, errors=_errors(given))
 
     def _kinds(self, nodes: Nodes, kinds: Sequence[Tensor | None]) -> Tensor:
-        """Returns (k,) regions true for all. An ALIAS raises ValueError, on CUDA it becomes -1."""
+        """Returns (k,) regions true for all. An ALIAS raises ValueError; on CUDA it becomes -1."""
         device = nodes.loc.device if self.on_device else torch.device("cpu")
         data = torch.full((len(nodes),), int(Region.DATA), device=device)
         given = torch.stack([data if one is None else one.to(device, torch.int64) for one in kinds])

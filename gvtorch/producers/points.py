@@ -28,7 +28,7 @@ _BATCH = 256  # bricks made at a time
 class PointProducer(Producer):
     """Makes bricks of points. Its channel "value" holds, for each number of a point, the sum over
     the points in a voxel, divided by the volume of the voxel in finest voxels. So a coarse voxel
-    holds the mean of the finest ones, and the total of each level is that of the points.
+    holds the mean of the finest ones, and the integral over each level is the sum over all points.
 
     Attributes:
         points: The points, sorted.

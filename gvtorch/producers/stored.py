@@ -384,8 +384,8 @@ class StoredProducer(Producer):
         return errors
 
     def _read(self, cubes: _Cubes, channel: str, level: int, places: list[Key]) -> list[Found]:
-        """Reads cubes at (z, y, x) of a channel and level, borders included. A cube that fails is
-        an error message; only TimeoutError is raised.
+        """Reads cubes at (z, y, x) of a channel and level, borders included. A cube that fails
+        becomes an error message; raises TimeoutError.
         """
         store, zyx = self.store, np.array(places, np.int64)
         if cubes.blocks:

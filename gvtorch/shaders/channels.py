@@ -265,7 +265,7 @@ def _make_table(
     dtype, device = sampling.dtype, sampling.device
     return ColorTable(
         table_lm4=torch.tensor(table, dtype=dtype, device=device),
-        domain_2=torch.tensor((0.0, 1.0), dtype=dtype, device=device),  # each has its own
+        domain_2=torch.tensor((0.0, 1.0), dtype=dtype, device=device),  # each channel has its own
         opaque_m=torch.tensor(opaque_m, device=device),
     )
 

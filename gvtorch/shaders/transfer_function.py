@@ -187,7 +187,7 @@ class TransferFunction(Shader):
         return json.dumps([{"ColorSpace": "RGB", "Name": name, **item}])
 
     def __repr__(self) -> str:
-        """Returns the numbers of its corner points, and its first and last value."""
+        """Returns how many corner points it has, and its first and last value."""
         low, high, _ = self.corners()
         points = f"{len(self.opacity)} opacities, {len(self.color)} colours"
         return f"TransferFunction({points}, from {low:g} to {high:g})"
@@ -205,7 +205,7 @@ class TransferFunction(Shader):
         low, high = float(values[0]), float(values[-1])
         if high == low:
             high = low + max(1.0, abs(low))
-        return low, high, np.unique((values - low) / (high - low))  # some fall together
+        return low, high, np.unique((values - low) / (high - low))  # some may round to one
 
     def length(self, sampling: Sampling) -> float:
         """Returns the length of the shortest interval in reference lengths; at most 1e300, so that

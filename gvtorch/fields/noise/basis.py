@@ -38,7 +38,7 @@ FEATURES: tuple[Feature, ...] = ("F1", "F2", "F2-F1")
 #: The mean of gradient noise over a cube is about exp(-LOST * (side / cell)^2) times the noise at
 #: its centre: fitted, within 0.03 for cubes of up to 1.5 cells.
 LOST = 0.82
-#: Mean square of gradient noise in space.
+#: Mean square of gradient noise in 3D.
 VARIANCE = 0.0728
 
 #: A noise of one frequency: a function from points, seed and period to values.
