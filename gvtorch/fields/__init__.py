@@ -1,4 +1,4 @@
-"""Fields: functions of place, in torch alone."""
+"""Fields: functions of position, written in torch only."""
 
 from . import noise, sdf
 from .combine import Blend, Mask, Painted, Stack, Warp
@@ -9,7 +9,7 @@ from .fur import Fur
 from .sampled import SampledDistance
 from .solid import Solid
 
-#: What makes a field of fields, by a verb.
+#: Verbs for the classes that combine fields.
 blend, mask, stack, warp = Blend, Mask, Stack, Warp
 
 __all__ = [

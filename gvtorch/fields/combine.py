@@ -1,8 +1,7 @@
-"""Fields made of fields: warped, masked, blended, painted, put side by side.
+"""Fields made of fields: warped, masked, blended, painted, or stacked as channels.
 
-What an interval of the parts tells of the whole is worked out by interval arithmetic (Moore,
-"Interval analysis", 1966). Any of the parts may have numbers that change with time: see
-`Producer.time`.
+Bounds are computed from those of the parts by interval arithmetic (Moore, "Interval analysis",
+1966). Any part may have numbers that change with time: see `Producer.time`.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ class Painted(Changed):
     """A shape coloured by a field of linear red, green and blue, 0 to 1."""
 
     def __init__(self, shape: Distance, colors: nn.Module) -> None:
-        """Takes the shape and what gives (..., 3) colours at points (..., 3)."""
+        """Sets the shape, and the field that returns colours (..., 3) at points (..., 3)."""
         super().__init__(shape)
         self.paint = checked_field("Painted", "colors", colors)
 
@@ -37,16 +36,16 @@ class Painted(Changed):
 
 
 class Warp(Field):
-    """A field asked at points that another field moves."""
+    """A field evaluated at points that another field displaces."""
 
     def __init__(self, field: nn.Module, way: nn.Module, most: float) -> None:
-        """Takes the field, and how far points are moved.
+        """Sets the field and the displacement.
 
         Args:
-            field: What is asked.
-            way: Gives (..., 3) that is added to points (..., 3).
-            most: The way is made shorter where it is longer than this, in world units; so what is
-                proven of a box that is so much wider holds.
+            field: The field that is evaluated.
+            way: Returns displacements (..., 3), which are added to points (..., 3).
+            most: Limit in world units to which longer displacements are shortened; so the field's
+                bounds over a box wider by this are valid.
         """
         super().__init__()
         self.field = checked_field("Warp", "field", field)
@@ -74,11 +73,11 @@ class Warp(Field):
 
 
 class Stack(Field):
-    """Fields side by side, each a channel of its own, or several."""
+    """Several fields as the channels of one."""
 
     def __init__(self, **fields: nn.Module) -> None:
-        """Takes fields by the name that their channel gets; the names of a field that gives several
-        are put behind it, as in "rock_rgba".
+        """Takes fields by the names of their channels. If a field has several channels, their names
+        are appended, as in "rock_rgba".
         """
         super().__init__()
         if not fields:
@@ -92,7 +91,7 @@ class Stack(Field):
         return _flat({name: field(points) for name, field in self.fields.items()})
 
     def filtered(self, points: Tensor, size: Tensor) -> Mapping[str, Tensor]:
-        """What is not prefiltered is taken at the middles of voxels."""
+        """Returns means; fields that are not prefiltered are evaluated at the voxels' centres."""
         return _flat({name: _ask(field, points, size) for name, field in self.fields.items()})
 
     def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
@@ -113,11 +112,11 @@ class Stack(Field):
 
 
 class Blend(Field):
-    """The one field where a mask is 0, the other where it is 1, and a mix between."""
+    """The first field where a mask is 0, the second where it is 1, and a mix in between."""
 
     def __init__(self, first: nn.Module, second: nn.Module, mask: nn.Module) -> None:
         """Takes two fields of the same channels, and a mask of one value, such as the density of a
-        `Solid`; a `Distance` stands for that of its own.
+        `Solid`; a `Distance` is converted to that.
         """
         super().__init__()
         where = type(self).__name__
@@ -131,7 +130,7 @@ class Blend(Field):
         return self._mix(lambda part: part(points))
 
     def filtered(self, points: Tensor, size: Tensor) -> Values:
-        """Mixes means; what is not prefiltered is taken at the middles of voxels."""
+        """Mixes means; fields that are not prefiltered are evaluated at the voxels' centres."""
         return self._mix(lambda part: _ask(part, points, size))
 
     def _mix(self, ask: Callable[[nn.Module], Values]) -> Values:
@@ -144,7 +143,7 @@ class Blend(Field):
         return self.filtered_bounds(center, half, None)
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
-        """What lies between both; one alone where the mask is known to be 0 or 1."""
+        """Returns the hull of both fields' bounds; one field's where the mask is known 0 or 1."""
         found = [_known(part, center, half, size) for part in (self.first, self.second)]
         if found[0] is None or found[1] is None:
             return None
@@ -157,7 +156,7 @@ class Blend(Field):
         return between(found[0], found[1], low, high)
 
     def _shares(self, center: Tensor, half: Tensor, size: Tensor | None) -> Interval:
-        """(k,) what the mask is known to be in boxes; 0 to 1 where nothing is."""
+        """Returns the mask's bounds (k,) in boxes; 0 to 1 if they are unknown."""
         known = _known(self.mask, center, half, size)
         if isinstance(known, Mapping):
             known = next(iter(known.values())) if len(known) == 1 else None
@@ -174,7 +173,7 @@ class Blend(Field):
 
 
 class Mask(Blend):
-    """A field where a mask is 1, and nothing, 0, where it is 0: there nothing is made."""
+    """A field where a mask is 1, and 0 where it is 0: there nothing is made."""
 
     def __init__(self, field: nn.Module, mask: nn.Module) -> None:
         """Takes the field and a mask of one value; see `Blend`."""
@@ -190,10 +189,10 @@ class Mask(Blend):
         return _mixed(torch.zeros_like(values), values, share)
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
-        """0 where the mask is; else between 0 and the field."""
+        """Returns 0 where the mask is 0, the field's bounds where it is 1, else their hull."""
         low, high = self._shares(center, half, size)
         found = _known(self.first, center, half, size)
-        if found is None:  # of a field of one number, what is hidden is known all the same
+        if found is None:  # even without bounds of the field, it is 0 where the mask is
             wild = torch.full_like(center[:, 0], torch.inf)
             found = (-wild, wild)
         if isinstance(found, Mapping):
@@ -206,7 +205,7 @@ def _zero(interval: Interval) -> Interval:
 
 
 def _prefiltered(where: str, parts: Iterable[nn.Module]) -> bool:
-    """Whether any part tells its own means; ValueError where one needs its neighbours for them."""
+    """Returns whether any part is prefiltered; ValueError if one needs a margin for that."""
     fields = [part for part in parts if isinstance(part, Field)]
     if any(field.margin for field in fields):
         raise ValueError(f"{where}: takes no field with a margin, such as a Solid of differences")
@@ -214,14 +213,14 @@ def _prefiltered(where: str, parts: Iterable[nn.Module]) -> bool:
 
 
 def _ask(part: nn.Module, points: Tensor, size: Tensor) -> Values:
-    """The means over voxels, or the values at their middles."""
+    """Returns the means over voxels if the part is prefiltered, else the values at centres."""
     if isinstance(part, Field) and part.prefiltered:
         return part.filtered(points, size)
     return part(points)
 
 
 def _known(part: nn.Module, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
-    """What a part is known to be, of voxels of `size` if there is one."""
+    """Returns bounds of a part's values, or, if prefiltered, of its means over voxels of `size`."""
     if not isinstance(part, Field):
         return None
     if size is None or not part.prefiltered:
@@ -230,12 +229,12 @@ def _known(part: nn.Module, center: Tensor, half: Tensor, size: Tensor | None) -
 
 
 def _near(part: nn.Module, center: Tensor, half: Tensor) -> nn.Module:
-    """A part without what does not matter in boxes; see `Field.near`."""
+    """Returns a part reduced to what matters in boxes; see `Field.near`."""
     return part.near(center, half) if isinstance(part, Field) else part
 
 
 def _alike(parts: Iterable[nn.Module], center: Tensor, half: Tensor) -> Tensor:
-    """(k,) numbers, equal where the same of all parts matters; see `Field.alike`."""
+    """Returns numbers (k,), equal where all parts have equal ones; see `Field.alike`."""
     found = torch.zeros_like(center[:, 0], dtype=torch.int64)
     for part in parts:
         found = found * HASH + (part.alike(center, half) if isinstance(part, Field) else 0)
@@ -243,7 +242,7 @@ def _alike(parts: Iterable[nn.Module], center: Tensor, half: Tensor) -> Tensor:
 
 
 def _single(values: Values) -> Tensor:
-    """(...,) of a field of one number; ValueError where there are several channels."""
+    """Returns the values of the only channel; ValueError if there are several."""
     if isinstance(values, Mapping):
         if len(values) != 1:
             raise ValueError(f"Blend: needs one channel, got {', '.join(values)}")
@@ -252,7 +251,7 @@ def _single(values: Values) -> Tensor:
 
 
 def _flat(by_name: Mapping[str, Any]) -> dict[str, Any]:
-    """Channels of channels under one name."""
+    """Flattens channels within channels: {"a": {"b": x}} becomes {"a_b": x}."""
     flat: dict[str, Any] = {}
     for name, values in by_name.items():
         if isinstance(values, Mapping):
@@ -263,7 +262,7 @@ def _flat(by_name: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _mixed(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
-    """Between two values (...,) or (..., c), by a share (...,), which is taken to 0 to 1."""
+    """Mixes two values (...,) or (..., c) by a share (...,) of the second, clamped to [0, 1]."""
     share = share.clamp(0, 1)
     if first.dim() < share.dim():
         share = share[..., 0]

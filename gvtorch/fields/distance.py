@@ -1,8 +1,8 @@
-"""`Distance`: signed distance fields, negative inside, with a colour and a normal; and the ways to
-combine them. Shapes are in shapes.py, what moves and bends space in spaces.py.
+"""`Distance`: signed distance fields, negative inside, with a colour and a normal; and their
+combinations. Shapes are in shapes.py, deformations of space in spaces.py.
 
-A combination of distances is no distance any more, but still tells how far the surface is at
-least, as long as it is known how fast it changes (`slope`). That proves boxes empty or full.
+The value of a combination is not an exact distance. But as long as a bound is known on how fast it
+changes (`slope`), it still bounds the distance from below, which proves boxes empty or full.
 
 Sources: Hart, "Sphere tracing: a geometric method for the antialiased ray tracing of implicit
     surfaces", The Visual Computer 1996 (Lipschitz bounds, shapes, their combination); Ricci, "A
@@ -24,24 +24,25 @@ from .field import Field, Interval, between, length
 Color = Sequence[float]  # linear red, green, blue, 0 to 1
 WHITE = (0.8, 0.8, 0.8)
 HASH = 0x9E3779B1
-_ROUNDED = 2.0**-16  # of the size of places: values differ by less where float32 rounds them
+_ROUNDED = 2.0**-16  # times the size of coordinates: rounding in float32 changes values by less
 
 
 class Distance(Field):
-    """Base of signed distances. A subclass writes `forward`, and `slope` where the value changes
-    faster than the place.
+    """Base of signed distances. A subclass implements `forward`, and `slope` if the value may
+    change by more than 1 per unit of length.
 
     Attributes:
         exact: Whether the value is the distance itself near the surface, so that its gradient has
             length 1 there.
-        smooth: Whether the surface has a normal nearly everywhere, not rough at every size.
+        smooth: Whether the surface has a normal nearly everywhere; False if it is rough at every
+            scale.
     """
 
     exact: bool = True
     smooth: bool = True
 
     def __init__(self, color: Color = WHITE) -> None:
-        """Takes the colour of the surface."""
+        """Sets the colour of the surface."""
         super().__init__()
         where = type(self).__name__
         red, green, blue = check.triple(where, "color", color)
@@ -58,7 +59,7 @@ class Distance(Field):
         return self(points), self.color.to(points).expand_as(points)
 
     def gradient(self, points: Tensor) -> Tensor:
-        """Returns (..., 3) how the value changes with the place; along it the normal points."""
+        """Returns gradients (..., 3) of the value, which point along the normal."""
         return self.surface_and_gradient(points)[2]
 
     def surface_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -68,13 +69,13 @@ class Distance(Field):
         return value, color, gradient
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        """Returns (k,) float64 how much the value changes at most by unit of length anywhere in
+        """Returns (k,) float64: the most that the value changes per unit of length anywhere in
         boxes center - half to center + half, (k, 3); 1 unless overridden.
         """
         return torch.ones_like(center[:, 0])
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        """The value in the middle, and as far around it as the slope allows; see `Field`."""
+        """Returns the value in the middle plus and minus what the slope allows; see `Field`."""
         middle, most = self(center), self.slope(center, half) * length(half)
         return middle - most, middle + most
 
@@ -97,10 +98,10 @@ class Distance(Field):
 
 
 class Pair(Distance):
-    """Base of what is made of two shapes by `mix`, which never falls where a value rises."""
+    """Base of combinations of two shapes by `mix`, which must not decrease with either value."""
 
     def __init__(self, first: Distance, second: Distance) -> None:
-        """Takes the shapes, with their colours."""
+        """Sets the shapes, which keep their colours."""
         super().__init__()
         where = type(self).__name__
         self.first = check.instance(where, "first", first, Distance)
@@ -109,8 +110,8 @@ class Pair(Distance):
         self.smooth = first.smooth and second.smooth
 
     def mix(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the value made of two values, and the second one's share of the colour, which
-        only rises, or only falls, with either value. Where it is 0 or 1, the value is one of them.
+        """Returns the value that two values combine to, and the second one's share of the colour,
+        which is monotonic in each value. Where it is 0 or 1, the value is the first or the second.
         """
         raise NotImplementedError
 
@@ -126,19 +127,21 @@ class Pair(Distance):
         return torch.maximum(self.first.slope(center, half), self.second.slope(center, half))
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        """What is made of the ends of both intervals, for `mix` never falls."""
+        """Combines the ends of both intervals, which is right because `mix` never decreases."""
         low, high = zip(
             self.first.bounds(center, half), self.second.bounds(center, half), strict=True
         )
         return self.mix(*low)[0], self.mix(*high)[0]
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
-        """One shape's where it alone counts, else what lies between both."""
+        """Returns one shape's intervals where only its colour counts, else the hull of both."""
         own, other = self.first.colors(center, half), self.second.colors(center, half)
         return between(own, other, *self._share(center, half, 0.0))
 
     def _share(self, center: Tensor, half: Tensor, rounded: float) -> Interval:
-        """(k,) the second one's share in boxes, of values that are rounded by a part of places."""
+        """Returns intervals (k,) of the second one's share in boxes; values may be off by rounding,
+        `rounded` times the size of coordinates.
+        """
         slack = rounded * (center.abs() + half).amax(1)
         (a, b), (c, d) = self.first.bounds(center, half), self.second.bounds(center, half)
         shares = self.mix(a - slack, d + slack)[1], self.mix(b + slack, c - slack)[1]
@@ -146,7 +149,7 @@ class Pair(Distance):
         return ends.amin(0), ends.amax(0)
 
     def near(self, center: Tensor, half: Tensor) -> Distance:
-        """One shape where it alone counts in all boxes."""
+        """Returns one shape if only it counts in all boxes, else both, each reduced by `near`."""
         least, most = self._share(center, half, _ROUNDED)
         alone = torch.stack(((most == 0).all(), (least == 1).all())).tolist()
         if alone[0]:
@@ -168,14 +171,14 @@ class Pair(Distance):
 
 
 class Union(Pair):
-    """What lies in either of two shapes."""
+    """The union of two shapes."""
 
     def mix(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         return torch.minimum(first, second), second < first
 
 
 class Intersection(Pair):
-    """What lies in both shapes."""
+    """The intersection of two shapes."""
 
     def mix(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         return torch.maximum(first, second), second > first
@@ -185,10 +188,10 @@ class Intersection(Pair):
 
 
 class SmoothUnion(Pair):
-    """The union, blended where both surfaces are within `width` of each other, colours too."""
+    """The union, blended where both values differ by less than `width`, colours too."""
 
     def __init__(self, first: Distance, second: Distance, width: float) -> None:
-        """Takes the shapes, and how far apart they begin to blend."""
+        """Sets the shapes, and the difference of their values at which they begin to blend."""
         super().__init__(first, second)
         self.width = self.number("width", width, low=0, open_low=True)
         self.exact = False
@@ -202,15 +205,15 @@ class SmoothUnion(Pair):
 
 
 class OfShape(Field):
-    """Base of fields made of one shape, which is asked in boxes `over` those that they are asked
-    in: the same of it matters.
+    """Base of fields made of one shape. `over` maps the boxes in which they are evaluated to those
+    in which the shape is, and so decides which parts of the shape matter.
     """
 
     shape: Distance
 
     def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns boxes (k, 3) that hold all points at which the shape is asked in boxes; the boxes
-        themselves unless overridden.
+        """Returns boxes (k, 3) that hold all points at which the shape is evaluated for the given
+        boxes; these boxes unless overridden.
         """
         return center, half
 
@@ -222,10 +225,10 @@ class OfShape(Field):
 
 
 class Changed(OfShape, Distance):
-    """Base of shapes made of one: with its values, slope and colours, unless overridden."""
+    """Base of modifications of one shape: has its values, slope and colours unless overridden."""
 
     def __init__(self, shape: Distance) -> None:
-        """Takes the shape, with its colour."""
+        """Sets the shape, which keeps its colour."""
         super().__init__()
         self.shape = check.instance(type(self).__name__, "shape", shape, Distance)
         self.exact, self.smooth = shape.exact, shape.smooth
@@ -244,7 +247,7 @@ class Changed(OfShape, Distance):
 
 
 class Negative(Changed):
-    """What lies outside of a shape."""
+    """The complement of a shape: its outside."""
 
     def forward(self, points: Tensor) -> Tensor:
         return -self.shape(points)
@@ -259,7 +262,7 @@ class Negative(Changed):
 
 
 class Difference(Intersection):
-    """What lies in the first shape and not in the second, whose colour the cut has."""
+    """The first shape without the second. Cut faces have the second shape's colour."""
 
     def __init__(self, first: Distance, second: Distance) -> None:
         """Takes the shapes."""
@@ -271,7 +274,7 @@ class SmoothIntersection(Negative):
     """The intersection, blended as `SmoothUnion`."""
 
     def __init__(self, first: Distance, second: Distance, width: float) -> None:
-        """Takes the shapes, and how far apart they begin to blend."""
+        """Sets the shapes and the width of the blend, see `SmoothUnion`."""
         check.instance("SmoothIntersection", "first", first, Distance)
         check.instance("SmoothIntersection", "second", second, Distance)
         super().__init__(SmoothUnion(Negative(first), Negative(second), width))
@@ -286,7 +289,7 @@ class SmoothDifference(SmoothIntersection):
     """The difference, blended as `SmoothUnion`."""
 
     def __init__(self, first: Distance, second: Distance, width: float) -> None:
-        """Takes the shapes, and how far apart they begin to blend."""
+        """Sets the shapes and the width of the blend, see `SmoothUnion`."""
         check.instance("SmoothDifference", "second", second, Distance)
         super().__init__(first, Negative(second), width)
 
@@ -299,12 +302,12 @@ def joint_box(first: Tensor | None, second: Tensor | None) -> Tensor | None:
 
 
 def common(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    """Returns what two (2, 3) boxes have in common; one alone if the other is unknown."""
+    """Returns the intersection of two (2, 3) boxes; the known one if the other is unknown."""
     if first is None or second is None:
         return second if first is None else first
     return torch.stack((torch.maximum(first[0], second[0]), torch.minimum(first[1], second[1])))
 
 
 def grown(box: Tensor | None, by: Tensor | float) -> Tensor | None:
-    """Returns a (2, 3) box whose faces lie further out by a length; None if it is unknown."""
+    """Returns a (2, 3) box with all faces moved outwards by a length; None if it is unknown."""
     return None if box is None else torch.stack((box[0] - by, box[1] + by))

@@ -1,9 +1,8 @@
-"""`Field`: values that are a function of place, such as distances, noise or a small network. Fields
-know no voxels, nodes or bricks; `FieldProducer` makes these of them.
+"""`Field`: values as a function of position, such as distances, noise or a small network. Fields
+know no voxels, nodes or bricks; `FieldProducer` makes these from them.
 
 Source of the intervals: Moore, "Interval analysis", 1966; Snyder, "Interval analysis for computer
-    graphics", SIGGRAPH 1992 (a function that is bounded over a box is sampled only where it
-    matters).
+    graphics", SIGGRAPH 1992 (with bounds over boxes, a function is sampled only where it matters).
 """
 
 from __future__ import annotations
@@ -18,29 +17,29 @@ from torch import Tensor, nn
 
 from ..base import check
 
-#: One value a point (...,), several (..., c), or these by channel.
+#: One value per point (...,), several (..., c), or these by channel.
 Values = Tensor | Mapping[str, Tensor]
 #: Smallest and largest value over each of k boxes, (k,) or (k, c) float64; infinite: not known.
 Interval = tuple[Tensor, Tensor]
-#: An interval; for fields of several channels by name, those that are left out are not known.
+#: An interval; of several channels intervals by name, of which unknown ones are left out.
 Bounds = Interval | Mapping[str, Interval] | None
 
 
 class Field(nn.Module):
-    """Base of fields. A subclass writes `forward`, and `bounds` where it can: what is bounded need
-    not be produced where it is not seen.
+    """Base of fields. A subclass implements `forward`, and `bounds` if it can: bricks whose bounds
+    prove that they show nothing need not be made.
 
     All methods are pure functions of tensors in torch: no shape depends on values and the host
     never waits, so that they can be compiled and recorded. Numbers that may change between
     pictures are buffers (see `number` and `vector`), edited in place.
 
     Attributes:
-        prefiltered: Whether the field knows its own means over voxels: `filtered` is called in
-            place of sampling `forward` several times a voxel.
+        prefiltered: Whether the field can compute means over voxels: `filtered` is then called once
+            a voxel instead of sampling `forward` several times.
         threshold: By channel, the value up to which a voxel shows nothing: where all channels named
             here are proven to stay at or below theirs, nothing is made. None: every value counts.
-        margin: How many voxels beyond its bricks a prefiltered field is asked for, so that `finish`
-            can look at neighbours.
+        margin: How many voxels beyond its bricks a prefiltered field is evaluated, so that `finish`
+            can read neighbours.
         dtypes: By channel, the dtype of voxels that suits it; float32 for others.
     """
 
@@ -56,15 +55,15 @@ class Field(nn.Module):
         raise NotImplementedError(f"{type(self).__name__}: forward is not written")
 
     def filtered(self, points: Tensor, size: Tensor) -> Values:
-        """Returns the means over voxels around points (..., 3), whose sides are `size` (..., 3),
-        which broadcasts with the points. Called if `prefiltered`.
+        """Returns the means over voxels around points (..., 3); `size` (..., 3), the sides of the
+        voxels, broadcasts with the points. Called if `prefiltered`.
         """
         raise NotImplementedError(f"{type(self).__name__}: filtered is not written")
 
     def finish(self, values: Mapping[str, Tensor], size: Tensor) -> Mapping[str, Tensor]:
-        """Returns channels (k, z, y, x, c) made of what `filtered` gave on a grid that is `margin`
-        voxels wider on all sides, by channel (k, z + 2 margin, y + 2 margin, x + 2 margin, c), for
-        voxels of sides `size` (k, 3). Called if there is a margin.
+        """Returns channels (k, z, y, x, c), computed from what `filtered` returned on a grid that
+        is `margin` voxels wider on all sides, (k, z + 2 margin, y + 2 margin, x + 2 margin, c) by
+        channel, for voxels of sides `size` (k, 3). Called if there is a margin.
         """
         raise NotImplementedError(f"{type(self).__name__}: finish is not written")
 
@@ -75,15 +74,15 @@ class Field(nn.Module):
         return None
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor) -> Bounds:
-        """Returns the same for the means over voxels that lie in the boxes, of sides `size` (k, 3)
-        float64 and of all smaller ones. What holds for values holds for their means.
+        """Returns intervals that hold the means over all voxels within the boxes, of sides `size`
+        (k, 3) float64 or smaller. By default those of `bounds`, which hold for means as well.
         """
         return self.bounds(center, half)
 
     def near(self, center: Tensor, half: Tensor) -> Field:
-        """Returns a field of the same values, in every bit, in all of k boxes, (k, 3) float64 each,
-        without the parts that do not matter there; itself unless overridden. Unlike all other
-        methods it looks at values, so the host waits.
+        """Returns a field with bit for bit the same values in all of k boxes, (k, 3) float64 each,
+        but without the parts that do not matter there; itself unless overridden. Unlike all other
+        methods it reads values on the host, which waits for the device.
 
         Source: Keeter, "Massively parallel rendering of complex closed-form implicit surfaces",
             SIGGRAPH 2020 (formulas that are shortened region by region).
@@ -92,12 +91,12 @@ class Field(nn.Module):
 
     def alike(self, center: Tensor, half: Tensor) -> Tensor:
         """Returns (k,) int64 numbers, equal for boxes in which the same parts of the field matter:
-        these are best asked for together; see `near`.
+        such boxes are best evaluated together; see `near`.
         """
         return torch.zeros_like(center[:, 0], dtype=torch.int64)
 
     def replaced(self, **parts: nn.Module) -> Self:
-        """Returns this field with other parts by name, which shares all else with it."""
+        """Returns a copy of this field with some submodules replaced; it shares everything else."""
         other = copy.copy(self)
         other._modules = {**self._modules, **parts}
         return other
@@ -107,10 +106,10 @@ class Field(nn.Module):
         return None
 
     def number(self, name: str, value: Any, **limits: Any) -> Tensor:
-        """Keeps a number as a buffer `name`, () float64, and returns it; `limits` are those of
+        """Stores a number as a buffer `name`, () float64, and returns it; `limits` are those of
         `check.number`.
 
-        A () float64 tensor leaves the dtype of what it is multiplied with as it is.
+        Multiplying with a () float64 tensor does not change the dtype of the other factor.
 
         Raises:
             ValueError: It is not finite, or beyond its limits.
@@ -119,7 +118,8 @@ class Field(nn.Module):
         return self._kept(name, number)
 
     def vector(self, name: str, value: Sequence[float] | Tensor, **limits: Any) -> Tensor:
-        """Keeps x, y, z as a buffer `name`, (3,) float64, and returns it: `.to(points)` before use.
+        """Stores x, y, z as a buffer `name`, (3,) float64, and returns it. Convert it with
+        `.to(points)` before use.
 
         Raises:
             ValueError: They are not three finite numbers, or beyond their limits.
@@ -137,8 +137,8 @@ class Field(nn.Module):
 
 
 def checked_field(where: str, name: str, value: Any) -> nn.Module:
-    """Returns a field, or a module that stands for one. ValueError where it has no forward, as
-    producers have none.
+    """Returns `value` if it is a field or another module with a forward. Raises ValueError if not,
+    as for producers.
     """
     field = check.instance(where, name, value, nn.Module)
     if getattr(field.forward, "__func__", None) is not nn.Module.forward:
@@ -155,13 +155,13 @@ def length(vectors: Tensor) -> Tensor:
 
 
 def tighter(one: Interval, other: Interval) -> Interval:
-    """Returns what two intervals that both hold have in common."""
+    """Returns the intersection of two intervals of the same values."""
     return torch.maximum(one[0], other[0]), torch.minimum(one[1], other[1])
 
 
 def between(first: Interval, second: Interval, low: Tensor, high: Tensor) -> Interval:
-    """Returns what mixes of two values lie in, (k,) or (k, c), by shares between low and high (k,)
-    of the second; one alone where its share is known to be 0 or 1.
+    """Returns the interval, (k,) or (k, c), of mixes of two values in which the second has a share
+    between low and high (k,): one value's interval where the share is 0 or 1, else the hull.
     """
     if first[0].dim() > low.dim():
         low, high = low[:, None], high[:, None]
@@ -174,8 +174,9 @@ def between(first: Interval, second: Interval, low: Tensor, high: Tensor) -> Int
 
 
 def parts_of(center: Tensor, half: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Returns the count^3 parts of each of k boxes, box after box, (k * count^3, 3) each: of many
-    small boxes intervals tell more than of a large one. `joined` makes them intervals of the boxes.
+    """Splits each of k boxes into count^3 parts: returns centres and half sides,
+    (k * count^3, 3) each, box after box. Intervals of small boxes are tighter than that of a large
+    one; `joined` combines them to those of the boxes.
     """
     place = (torch.arange(count, device=center.device, dtype=center.dtype) + 0.5) * 2 / count - 1
     at = torch.stack(torch.meshgrid(place, place, place, indexing="ij"), -1).view(1, -1, 3)
@@ -184,6 +185,6 @@ def parts_of(center: Tensor, half: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def joined(interval: Interval, count: int) -> Interval:
-    """Returns (k,) intervals that hold those of the count^3 parts of each of k boxes."""
+    """Returns (k,) intervals of boxes from those of each box's count^3 parts."""
     low, high = (end.unflatten(0, (-1, count**3)) for end in interval)
     return low.amin(1), high.amax(1)

@@ -1,15 +1,15 @@
-"""Escape-time fractals as distance fields: `Mandelbulb`, `Julia`, `Mandelbox`, or any by its own
-`Iteration`, with a colour by orbit traps.
+"""Escape-time fractals as distance fields: `Mandelbulb`, `Julia`, `Mandelbox`, or user-defined ones
+by an `Iteration`, with a colour by orbit traps.
 
-A point z runs through z -> f(z) + c again and again. Those that stay within `bailout` are the
-fractal. Of those that escape, a distance is estimated from how fast neighbours part.
+The map z -> f(z) + c is applied to a point repeatedly. Points whose orbits stay within `bailout`
+are the fractal. For those that escape, the distance is estimated from how fast orbits diverge.
 
-**What is proven.** The estimate is no bound: for the bulb, whose map stretches more along circles
-of latitude than the number that is used for all directions, it is more than 30 times too large in
-places next to the axis. So intervals do not trust it. They follow the middle of a box, and a radius
-around it that holds the orbits of all points of the box (`Iteration.ranges` bounds how much the map
-stretches there). That bounds where and when they escape, and so the very number that `forward`
-gives, whatever it means.
+**What is proven.** The estimate is no bound: next to the axis of the bulb it is in places more than
+30 times too large, because the map stretches circles of latitude by more than the one factor that
+is used for all directions. So `bounds` does not use it. Instead, it follows the orbit of a box's
+centre, with a radius around it that holds the orbits of all points of the box (`Iteration.ranges`
+bounds how much the map stretches there). That bounds where and when they escape, and so the number
+that `forward` returns, whether or not it is a good estimate.
 
 Sources: those of ops/reference/orbits.py, which follows the orbits; Pickover, "Computers, pattern,
     chaos, and beauty", 1990 (orbit traps).
@@ -28,28 +28,28 @@ from ..ops.reference import orbits as plain
 from .distance import Color, Distance
 from .field import Interval, joined, length, parts_of
 
-_PARTS = 2  # of a box along each axis: more cost as much as the bricks that they save
+_PARTS = 2  # parts of a box along each axis; more would cost as much as the bricks they save
 
 
 class Iteration(nn.Module):
-    """One step of an orbit, without the constant that is added. Points are (3, ...)."""
+    """One step f of an orbit, without the constant that is added. Points are (3, ...)."""
 
-    logarithmic: bool = True  # |z| grows as a power; else by a factor
+    logarithmic: bool = True  # whether |z| grows as a power; else by a factor
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns f(z) and (...,) how far it takes neighbours apart, by unit of their distance."""
+        """Returns f(z), and the factor (...,) by which f stretches distances around z."""
         raise NotImplementedError(f"{type(self).__name__}: forward is not written")
 
     def ranges(self, z: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns what holds in balls around z (3, k) of radii `reach` (k,): the most that f takes
-        points apart, by unit of their distance, and the smallest and largest of `forward`'s second
-        answers, (k,) each. Unless overridden, nothing is known, so nothing is proven.
+        """Returns bounds over balls around z (3, k) of radii `reach` (k,): the most that f really
+        stretches distances, and the smallest and largest factor that `forward` returns, (k,) each.
+        Unless overridden, nothing is known, so nothing is proven.
         """
         return torch.full_like(reach, torch.inf), torch.zeros_like(reach), reach + torch.inf
 
 
 class Power(Iteration):
-    """z^n in spherical coordinates: |z|^n, and both angles n times."""
+    """z^n in spherical coordinates: |z| to the power n, both angles times n."""
 
     def __init__(self, power: int) -> None:
         """Takes n."""
@@ -64,14 +64,14 @@ class Power(Iteration):
 
 
 class Fold(Iteration):
-    """The Mandelbox's step: coordinates beyond 1 are folded back, small vectors inverted in balls
-    of radius 1/2 and 1, and all is scaled.
+    """The Mandelbox's step: folds coordinates beyond -1 and 1 back, inverts small vectors by balls
+    of radius 1/2 and 1, and scales the result.
     """
 
     logarithmic = False
 
     def __init__(self, scale: float) -> None:
-        """Takes the scale; its size must be more than 1."""
+        """Takes the scale; its absolute value must be more than 1."""
         super().__init__()
         self.scale = check.number("Fold", "scale", scale)
         if abs(self.scale) <= 1:
@@ -79,8 +79,8 @@ class Fold(Iteration):
 
     @property
     def side(self) -> float:
-        """Half of a side of the cube in which orbits stay that never escape: 2 (s + 1) / (s - 1)
-        for scales s above 1, 2 below -1.
+        """Half the side of the cube that holds all orbits that never escape: 2 (s + 1) / (s - 1)
+        for scales s above 1, 2 for scales below -1.
         """
         return 2 * (self.scale + 1) / (self.scale - 1) if self.scale > 1 else 2.0
 
@@ -92,11 +92,11 @@ class Fold(Iteration):
 
 
 class Fractal(Distance):
-    """What does not escape; see the head of the file. Outside the value is the estimate, inside -1:
-    there is none.
+    """The points that do not escape; see the head of the file. Outside, the value is the distance
+    estimate; inside, where there is none, -1.
     """
 
-    exact = True  # as far as an estimate is
+    exact = True  # used as if the estimate were exact
     smooth = False
     colors_33: Tensor
 
@@ -109,14 +109,14 @@ class Fractal(Distance):
         bailout: float = 2.0,
         colors: Sequence[Color] = ((0.95, 0.75, 0.4), (0.75, 0.25, 0.15), (0.12, 0.2, 0.35)),
     ) -> None:
-        """Takes the step and what is added.
+        """Sets the iteration and the look.
 
         Args:
             iteration: f.
             constant: c, for a Julia set; left out: the point itself, for a Mandelbrot set.
-            iterations: After so many steps a point that has not escaped is inside. One that takes
-                neighbours apart by 8 resolves details of 8^-iterations.
-            bailout: What gets so far from the origin escapes.
+            iterations: Number of steps after which a point that has not escaped is inside. A step
+                that stretches distances by 8 resolves details of 8^-iterations.
+            bailout: An orbit has escaped when it is this far from the origin.
             colors: Three linear colours: of orbits that come near to the origin, near to a plane
                 of two axes, and to neither.
         """
@@ -141,7 +141,7 @@ class Fractal(Distance):
         return value, torch.lerp(color, one, (1.2 - near[..., None]).clamp(0, 1) ** 2)
 
     def _orbits(self, points: Tensor) -> Tensor:
-        """(3, ...) distances, and how near orbits came to the origin and to a plane of axes."""
+        """Returns (3, ...) distances, and least distances of orbits to origin and axis planes."""
         point = points.reshape(-1, 3).contiguous()
         orbit = self._orbit(point)
         if orbit is None:
@@ -151,7 +151,7 @@ class Fractal(Distance):
         return found.view(3, *points.shape[:-1])
 
     def _orbit(self, like: Tensor) -> ops.Orbit | None:
-        """What the ops take, in the dtype of `like`; None for a step of one's own."""
+        """Returns the arguments of the ops, in the dtype of `like`; None for user-defined steps."""
         step, numbers = self.iteration, (self.constant.to(like), self.bailout.to(like).view(1))
         if type(step) is Power:
             return ops.Orbit(*numbers, "power", step.power, self.iterations, self.julia)
@@ -160,7 +160,7 @@ class Fractal(Distance):
         return None
 
     def _way(self, like: Tensor) -> plain.Way:
-        """The same for any step."""
+        """Returns the arguments of the torch twin, which follows any step."""
         return plain.Way(
             self.iteration,
             self.iteration.ranges,
@@ -171,7 +171,7 @@ class Fractal(Distance):
         )
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        """Not known: the value jumps where an orbit takes one more step."""
+        """Returns a huge slope: the value jumps where an orbit takes one more step."""
         return torch.full_like(center[:, 0], 1e30)
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
@@ -185,12 +185,12 @@ class Fractal(Distance):
         return joined((low, high), _PARTS)
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
-        """Between the darkest and the brightest of each."""
+        """Returns the smallest and largest red, green and blue of the three colours."""
         ends = self.colors_33.to(center)
         return ends.amin(0).expand_as(center), ends.amax(0).expand_as(center)
 
     def _within(self, most: float) -> Tensor:
-        """(2, 3) a cube around the origin."""
+        """Returns the box (2, 3) of a cube around the origin."""
         ends = torch.tensor((-most, most), dtype=torch.float64, device=self.colors_33.device)
         return ends[:, None].expand(2, 3)
 
@@ -199,11 +199,11 @@ class Mandelbulb(Fractal):
     """z^n + c in three dimensions: White and Nylander's bulb."""
 
     def __init__(self, power: int = 8, **look: object) -> None:
-        """Takes n and what `Fractal` takes."""
+        """Takes n and the arguments of `Fractal`."""
         super().__init__(Power(power), **look)  # type: ignore[arg-type]
 
     def box(self) -> Tensor:
-        """Beyond 2^(1 / (n - 1)) all escape: there |z|^n grows by more than |c| takes away."""
+        """Returns a cube of half side 2^(1 / (n - 1)); beyond it |z|^n outgrows |c|: all escape."""
         power = self.iteration.power
         assert isinstance(power, int)
         return self._within(2.0 ** (1 / (power - 1)))
@@ -215,11 +215,11 @@ class Julia(Fractal):
     def __init__(
         self, constant: Sequence[float] = (-0.55, 0.3, -0.25), power: int = 2, **look: object
     ) -> None:
-        """Takes the constant, n, and what `Fractal` takes."""
+        """Takes the constant, n, and the arguments of `Fractal`."""
         super().__init__(Power(power), constant=constant, **look)  # type: ignore[arg-type]
 
     def box(self) -> Tensor:
-        """Beyond a radius R >= 1 with R^n - |c| > R all escape."""
+        """Returns a cube of half side R >= 1 with R^n - |c| > R: all points beyond R escape."""
         power = self.iteration.power
         assert isinstance(power, int)
         most, size = 1.0, float(self.constant.norm())
@@ -229,17 +229,17 @@ class Julia(Fractal):
 
 
 class Mandelbox(Fractal):
-    """Lowe's box: folded, inverted, scaled, moved."""
+    """Lowe's box: each step folds, inverts, scales and translates."""
 
     def __init__(self, scale: float = 2.0, **look: object) -> None:
-        """Takes the scale, beyond -1 and 1, and what `Fractal` takes."""
+        """Takes the scale, below -1 or above 1, and the arguments of `Fractal`."""
         step = Fold(scale)
-        options = {"bailout": 1.8 * step.side, **look}  # the corners are 1.74 sides away
+        options = {"bailout": 1.8 * step.side, **look}  # corners are sqrt(3) = 1.73 `side` away
         super().__init__(step, **options)  # type: ignore[arg-type]
         self._side = step.side + 2 * float(self.bailout) / abs(step.scale) ** self.iterations
 
     def box(self) -> Tensor:
-        """Where all orbits stay that never escape, and a little more for those that have not yet:
-        what is beyond gets further away by the scale in each step.
+        """Returns the cube that holds all orbits that never escape, a little enlarged for those
+        that have not escaped after `iterations`: beyond it, distances grow by |scale| in each step.
         """
         return self._within(self._side)

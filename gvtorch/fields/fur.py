@@ -1,7 +1,7 @@
-"""`Fur`: hairs on a shape, to be coloured by a transfer function alone.
+"""`Fur`: hairs on a shape, as values that a transfer function colours.
 
 Source: Perlin, Hoffert, "Hypertexture", SIGGRAPH 1989 (fur as noise around a surface); how hairs
-    end and fall is our own.
+    end and bend is ours.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from .field import Interval, length
 
 _SKIN = 0.1  # value of skin and roots
 _HALF, _SPREAD = 0.45, 0.7  # height at which hairs end, in lengths: half + spread * noise
-_SHARP = 5.0  # how fast a hair ends, by lengths
+_SHARP = 5.0  # slope with which a hair ends: from 1 to 0 within 1 / 5 of a length
 
 
 class Fur(OfShape):
-    """Value 0 between hairs, and from 0.1 at their roots to 1 at tips one length high. A point
-    belongs to a hair where the noise at its root, the nearest point of the shape, is above its
-    height.
+    """Value 0 between hairs, and from 0.1 at their roots to 1 at tips one length high. A point is
+    in a hair if its height is below a limit that grows with the noise at its root, the nearest
+    point of the shape.
 
-    A voxel has the value in its middle, with the contrast that its size leaves between hairs.
+    A voxel has the value at its centre, with the contrast of noise that is left at its size.
     """
 
     prefiltered = True
@@ -41,13 +41,13 @@ class Fur(OfShape):
         fall: Sequence[float] = (0.0, 0.0, 0.0),
         seed: int = 0,
     ) -> None:
-        """Takes the shape and its hairs.
+        """Sets the shape and its hairs.
 
         Args:
-            shape: What they stand on.
+            shape: The shape that they grow on.
             length: World units.
-            frequency: Hairs a world unit.
-            fall: How far a tip one length high is moved, in lengths; less far down, by the square.
+            frequency: Hairs per world unit.
+            fall: Displacement of a tip one length high, in lengths; below, times height squared.
             seed: Of the noise.
         """
         super().__init__()
@@ -73,7 +73,7 @@ class Fur(OfShape):
         return {"value": inside * (_SKIN + (1 - _SKIN) * height.clamp(0, 1))}
 
     def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
-        """0 above all hairs, the skin's value below all roots, else 0 to 1."""
+        """Returns 0 above all hairs, the skin's value below all roots, else 0 to 1."""
         low, high = self.shape.bounds(center, half)
         reach = _SPREAD * noise.bounds(noise.perlin).high
         above = low > (_HALF + reach) * self.length
@@ -82,6 +82,6 @@ class Fur(OfShape):
         return {"value": (least, torch.where(skin, least, (~above).to(low)))}
 
     def box(self) -> Tensor | None:
-        """Around the shape and its hairs."""
+        """Returns the box around the shape and its hairs."""
         reach = _HALF + _SPREAD * noise.bounds(noise.perlin).high
         return grown(self.shape.box(), reach * self.length)

@@ -2,7 +2,7 @@
 
 Sources: Hart, "Sphere tracing", 1996 (Lipschitz bounds); an interpolated value changes at most as
     fast as its neighbouring voxels differ. Danielsson, "Euclidean distance mapping", Computer
-    Graphics and Image Processing 1980 (the way to the nearest place, handed on in sweeps).
+    Graphics and Image Processing 1980 (vectors to the nearest point, propagated in sweeps).
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ..meshes.voxelizer import Voxelizer
 from .distance import WHITE, Color, Distance
 from .field import Interval, length
 
-_BAND = 3.0  # voxels in which the distance to a mesh is worked out triangle by triangle
+_BAND = 3.0  # voxels around a mesh in which distances are computed from its triangles
 
 
 class SampledDistance(Distance):
-    """Distances between voxels are interpolated; beyond the volume's outermost voxel centres they
-    go on with the distance to these.
+    """Distances interpolated between voxels. Beyond the box of the voxel centres, the distance to
+    this box is added to the value at its nearest point.
 
     Args of the constructor: `volume`, one number a voxel, world units, negative inside.
     """
@@ -39,10 +39,10 @@ class SampledDistance(Distance):
     apart: Tensor
 
     def __init__(self, volume: Volume, *, color: Color = WHITE) -> None:
-        """Takes the volume, whose place in the world is the field's.
+        """Copies the volume, and its position in the world.
 
         Raises:
-            ValueError: It has not one number a voxel, or less than 2 voxels along an axis.
+            ValueError: It does not have one number a voxel, or has less than 2 voxels on an axis.
         """
         super().__init__(color)
         check.instance("SampledDistance", "volume", volume, Volume)
@@ -72,14 +72,14 @@ class SampledDistance(Distance):
         color: Color = WHITE,
     ) -> SampledDistance:
         """Returns the distances to a mesh's surface, negative inside of closed parts: exact within
-        3 voxels of it, and beyond that to about a tenth of a voxel.
+        3 voxels of it, and accurate to about a tenth of a voxel beyond.
 
         Args:
-            mesh: As `read_mesh` gives it.
+            mesh: As `read_mesh` returns it.
             resolution: Voxels along its longest side.
-            reach: How far the volume goes on around it, as a share of that side.
-            solid: Which parts are solids: "auto", closed ones (others are sheets, and a warning
-                tells where a few edges are missing), "always", whose holes are filled, or "never".
+            reach: Margin of the volume around the mesh, as a share of that side.
+            solid: Which parts are solids: "auto", closed ones (others are sheets; warns if only a
+                few edges are missing); "always", all, after filling their holes; or "never".
             color: The surface's.
 
         Raises:
@@ -121,12 +121,13 @@ class SampledDistance(Distance):
         return corners[0] + beyond
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        """Inside that of the steepest cell; outside the distance to the box adds to it."""
+        """Returns the slope of the steepest cell; 1 more for boxes that reach out of the volume."""
         return torch.where(self._inside(center, half), self.steepest, self.steepest + 1)
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        """As far around the value in the middle as the slope allows, or as voxels do: a value is a
-        mean of voxels that lie half a cell's diagonal away on average, at either end.
+        """Returns the value in the middle plus and minus the lesser of two bounds: what the slope
+        allows, and what `_apart` does. The latter adds a cell's diagonal to the distance, because
+        at either end a value is a mean of voxels that are on average half a diagonal away.
         """
         middle, radius = self(center), length(half)
         most = self.apart * (radius + length(self.spacing))
@@ -135,18 +136,18 @@ class SampledDistance(Distance):
         return middle - most, middle + most
 
     def _inside(self, center: Tensor, half: Tensor) -> Tensor:
-        """(k,) bool, which boxes lie in that of the volume."""
+        """Returns (k,) bool: which boxes are within that of the voxel centres."""
         high = self.origin + self.last * self.spacing
         return ((center - half >= self.origin) & (center + half <= high)).all(1)
 
     def box(self) -> Tensor:
-        """The volume's box, of voxel centres."""
+        """Returns the box of the voxel centres."""
         return torch.stack((self.origin, self.origin + self.last * self.spacing))
 
 
 def _steepest(values: Tensor, spacing: Tensor) -> Tensor:
-    """() float64 the largest slope between voxels (z, y, x): along each axis, within a cell of 8
-    voxels it is at most the largest difference along one of the cell's edges.
+    """Returns () float64: the largest slope of values interpolated between voxels (z, y, x). Along
+    each axis, within a cell of 8 voxels, it is at most the largest along one of the cell's edges.
     """
     squares: Tensor | float = 0.0
     for axis in range(3):
@@ -160,15 +161,16 @@ def _steepest(values: Tensor, spacing: Tensor) -> Tensor:
 
 
 def _apart(values: Tensor, spacing: Tensor) -> Tensor:
-    """() float64 how much two voxels differ at most by unit of length between them, however far.
+    """Returns () float64: the most that any two voxels, however far apart, differ per unit of
+    length between them.
 
-    Between the 26 neighbours that is looked up. A way from voxel to voxel by neighbours is at most
-    sqrt(1 + (sqrt 2 - 1)^2 + (sqrt 3 - sqrt 2)^2) = 1.128 times as long as the straight one; sqrt 3
-    times where voxels are no cubes.
+    It is computed between the 26 neighbours. A path through neighbours is at most
+    sqrt(1 + (sqrt 2 - 1)^2 + (sqrt 3 - sqrt 2)^2) = 1.128 times as long as the straight line; sqrt
+    3 times if voxels are not cubes.
     """
     most = torch.zeros((), dtype=torch.float64, device=values.device)
     for step in itertools.product((-1, 0, 1), repeat=3):  # x, y, z
-        if step <= (0, 0, 0):  # as well known from the other end
+        if step <= (0, 0, 0):  # the same pair as from the other end
             continue
         here = [slice(max(-n, 0), min(-n, 0) or None) for n in step[::-1]]
         there = [slice(max(n, 0), min(n, 0) or None) for n in step[::-1]]
@@ -179,12 +181,12 @@ def _apart(values: Tensor, spacing: Tensor) -> Tensor:
 
 
 def _spread(near: Tensor) -> Tensor:
-    """(z, y, x) distances in voxels, of such that are known up to `_BAND`, with their sign beyond.
+    """Completes distances (z, y, x) in voxels of which only the sign is known beyond `_BAND`.
 
-    A voxel's way to the nearest place of the surface is handed on to its neighbours, along each
-    axis there and back; a second round takes it around corners.
+    A voxel's vector to the nearest point of the surface is passed to its neighbours, along each
+    axis in both directions; a second round takes it around corners.
     """
-    known = near.abs() < _BAND - 1.01  # and so are all neighbours
+    known = near.abs() < _BAND - 1.01  # then all neighbours are known, too
     slope = torch.stack(torch.gradient(near))
     slope = slope / torch.linalg.vector_norm(slope, dim=0).clamp(min=1e-6)
     way = torch.where(known, -near * slope, 1e6)

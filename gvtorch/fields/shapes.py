@@ -1,7 +1,7 @@
 """Shapes as signed distances.
 
-Sources: Hart, "Sphere tracing", 1996, appendix (sphere, box, torus, plane); distances to a segment
-    and to a triangle of coordinates are plain geometry.
+Sources: Hart, "Sphere tracing", 1996, appendix (sphere, box, torus, plane). The others without a
+    source are plain geometry.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Sphere(Distance):
         return length(points) - self.radius
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        """The nearest and the farthest point of the box: exact."""
+        """Returns the values at the nearest and the farthest point of the box: exact."""
         away = center.abs()
         near, far = (away - half).clamp(min=0), away + half
         return length(near) - self.radius, length(far) - self.radius
@@ -44,7 +44,7 @@ class Box(Distance):
     def __init__(
         self, size: Sequence[float] = (1.0, 1.0, 1.0), *, round: float = 0.0, color: Color = WHITE
     ) -> None:
-        """Takes its sides and how far its edges are rounded, at most half of the shortest side."""
+        """Takes its sides and the radius of its edges, at most half of the shortest side."""
         super().__init__(color)
         self.size = self.vector("size", size, positive=True)
         self.round = self.number("round", round, low=0, high=float(self.size.min()) / 2)
@@ -54,8 +54,8 @@ class Box(Distance):
         return length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0) - self.round
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        """The nearest and the farthest point of the box: exact, for the value rises with |x|, |y|
-        and |z|.
+        """Returns the values at the nearest and the farthest point of the box: exact, because the
+        value rises with |x|, |y| and |z|.
         """
         away = center.abs()
         return self((away - half).clamp(min=0)), self(away + half)
@@ -65,10 +65,10 @@ class Box(Distance):
 
 
 class Torus(Distance):
-    """A ring around the z axis."""
+    """A torus around the z axis."""
 
     def __init__(self, radius: float = 1.0, tube: float = 0.25, *, color: Color = WHITE) -> None:
-        """Takes the radius of its middle line and that of its tube."""
+        """Takes the radius of its centre line and that of its tube."""
         super().__init__(color)
         self.radius = self.number("radius", radius, low=0, open_low=True)
         self.tube = self.number("tube", tube, low=0, open_low=True)
@@ -83,7 +83,7 @@ class Torus(Distance):
 
 
 class Capsule(Distance):
-    """What is within a radius of a line from one point to another."""
+    """The points within a radius of a line segment."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class Capsule(Distance):
 
 
 class Plane(Distance):
-    """What lies below a plane, against its normal."""
+    """The half-space below a plane: on the side opposite to its normal."""
 
     def __init__(
         self,
@@ -119,7 +119,7 @@ class Plane(Distance):
         *,
         color: Color = WHITE,
     ) -> None:
-        """Takes the normal, of any length but 0, and how far along it the plane lies."""
+        """Takes the normal, of any length but 0, and the plane's height along it."""
         super().__init__(color)
         self.normal = self.vector("normal", normal)
         if not float(self.normal.norm()) > 0:
@@ -131,15 +131,15 @@ class Plane(Distance):
         return (points * self.normal.to(points)).sum(-1) - self.height
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        """The corners nearest to the plane and farthest from it: exact."""
+        """Returns the values at the box's lowest and highest corner: exact."""
         middle, most = self(center), (half * self.normal.abs()).sum(1)
         return middle - most, middle + most
 
 
 class Gyroid(Distance):
-    """One side of Schoen's surface, sin x cos y + sin y cos z + sin z cos x = 0, without end. The
-    value is that sum over sqrt(3), the most that it changes by unit of length, times the length of
-    a radian: at most the distance, at the surface 0.7 to 1 times as much.
+    """One side of Schoen's infinite surface sin x cos y + sin y cos z + sin z cos x = 0. The value
+    is that sum times the length of a radian, divided by sqrt(3), the sum's largest slope: at most
+    the distance, near the surface 0.7 to 1 times the distance.
 
     Source: Schoen, "Infinite periodic minimal surfaces without self-intersections", NASA TN D-5541,
         1970 (the surface; the sum is its usual approximation). The slope: Cauchy's inequality
@@ -149,7 +149,7 @@ class Gyroid(Distance):
     exact = False
 
     def __init__(self, period: float = 1.0, *, color: Color = WHITE) -> None:
-        """Takes the length after which it is the same again, along every axis."""
+        """Takes the period, in world units, along every axis."""
         super().__init__(color)
         self.period = self.number("period", period, low=0, open_low=True)
 
@@ -160,8 +160,8 @@ class Gyroid(Distance):
 
 
 class Menger(Distance):
-    """Menger's sponge in the cube from -1/2 to 1/2: a cube without the middle crosses of its 3^3
-    parts, and so on. The value is at most the distance.
+    """Menger's sponge in the cube from -1/2 to 1/2: of its 3^3 parts those of the central cross are
+    removed, and so on within each of the others. The value is at most the distance.
 
     Source: Menger, "Allgemeine Raeume und Cartesische Raeume", 1926 (the sponge); Quilez, "Menger
         fractal", 2011 (crosses of all sizes by folding space).
@@ -170,7 +170,7 @@ class Menger(Distance):
     exact = True  # next to its faces
 
     def __init__(self, levels: int = 4, *, color: Color = WHITE) -> None:
-        """Takes how often parts are taken out, at most 30."""
+        """Takes the number of times that parts are removed, at most 30."""
         super().__init__(color)
         self.levels = check.whole("Menger", "levels", levels, low=0, high=30)
 
@@ -179,7 +179,7 @@ class Menger(Distance):
         found = length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0)
         cell = 1.0
         for _ in range(self.levels):
-            # From the middle of the cell, along every axis, for cells touch at odd halves.
+            # Distances from the cell's centre along each axis; cells meet at odd halves.
             away = (points - cell * (points / cell).detach().round()).abs()
             found = torch.maximum(found, cell / 6 - away.sort(-1).values[..., 1])
             cell /= 3
@@ -190,5 +190,5 @@ class Menger(Distance):
 
 
 def _mirrored(high: Tensor) -> Tensor:
-    """(2, 3) box from -high to high (3,)."""
+    """Returns the (2, 3) box from -high to high (3,)."""
     return torch.stack((-high, high))

@@ -1,4 +1,4 @@
-"""`Solid`: what a distance field fills, as voxels hold it: density, or colour and normal."""
+"""`Solid`: the inside of a distance field, as voxels: density, or colour and normal."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from .distance import Distance, OfShape
 from .field import Interval, length
 
 _POINT = 1e-30  # side of voxels of no size
-_DEEP = 4.0  # voxels below the surface from which on nothing but its colour is told
+_DEEP = 4.0  # voxels from the surface beyond which normals are 0
 
 
 class Solid(OfShape):
-    """The inside of a shape. A voxel holds the share of it that lies inside, as if the surface were
-    a plane across it: clamp(1/2 - distance / side), the exact share where the plane faces an axis,
-    and right to 0.09 in every direction. So all levels are antialiased, at one evaluation a voxel.
+    """The inside of a shape. A voxel holds the share of it that is inside, with the surface taken
+    as a plane: clamp(1/2 - distance / side), which is exact for planes that face an axis, and
+    within 0.09 for others. So all levels are antialiased, with one evaluation a voxel.
     """
 
     prefiltered = True
@@ -36,34 +36,34 @@ class Solid(OfShape):
 
         Args:
             shape: Its signed distance.
-            colors: Whether there is a channel "rgba", premultiplied linear colour and opacity; else
-                one "density".
-            normals: Whether there is a channel "normal"; left out: with colours. Without it shaders
-                take normals from differences of the opacity.
-            differences: Whether normals are made of the distances of neighbouring voxels, which
-                smooths them, not of derivatives; left out: where the shape is no smooth one.
+            colors: True: a channel "rgba", premultiplied linear colour and opacity; False: a
+                channel "density".
+            normals: Whether there is a channel "normal"; left out: as `colors`. Without it shaders
+                compute normals from differences of the opacity.
+            differences: Whether normals are computed from the distances of neighbouring voxels,
+                which smooths them, instead of by derivatives; left out: if the shape is not smooth.
         """
         super().__init__()
         self.shape = check.instance("Solid", "shape", shape, Distance)
         self.colors, self.normals = colors, colors if normals is None else normals
-        self.exact = shape.exact  # also of what is `near` by: so that bits stay
+        self.exact = shape.exact  # also for the shapes that `near` returns, so no bit changes
         rough = not shape.smooth if differences is None else differences
         self.margin = int(self.normals and rough)
         self.threshold = {"rgba" if colors else "density": 0.0}
 
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:
-        """The values of voxels of no size: 1 inside, 0 outside; normals by derivatives."""
+        """Returns infinitely small voxels: 1 inside, 0 outside; normals by derivatives."""
         size = torch.full_like(points[..., 0], _POINT)
         return self._voxels(points, size, differences=False)
 
     def filtered(self, points: Tensor, size: Tensor) -> Mapping[str, Tensor]:
-        """Returns the channels of voxels with sides (..., 3); the largest counts. With a margin,
-        "normal" holds distances, of which `finish` makes normals.
+        """Returns the channels of voxels with sides (..., 3), of which the largest is used. With a
+        margin, "normal" holds distances, from which `finish` computes normals.
         """
         return self._voxels(points, size.amax(-1).to(points), differences=self.margin > 0)
 
     def _voxels(self, points: Tensor, side: Tensor, differences: bool) -> dict[str, Tensor]:
-        """The channels of voxels with sides (...,); for `differences` see `filtered`."""
+        """Returns channels of voxels with sides (...,); for `differences` see `filtered`."""
         shape, found = self.shape, {}
         if differences or (self.exact and not self.normals):
             value, color = shape.surface(points) if self.colors else (shape(points), None)
@@ -82,8 +82,8 @@ class Solid(OfShape):
         return {**found, "normal": near} if self.normals else found
 
     def finish(self, values: Mapping[str, Tensor], size: Tensor) -> Mapping[str, Tensor]:
-        """Makes normals of central differences of the distance, which are 0 where all neighbours
-        are two voxels away or more.
+        """Computes normals from central differences of the distance; 0 where all neighbours are at
+        least two voxels away from the surface.
         """
         near, inner = values["normal"][..., 0], slice(1, -1)
         across = (
@@ -97,12 +97,12 @@ class Solid(OfShape):
         return {**whole, "normal": ways / longest}
 
     def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
-        """Returns intervals for voxels of no size."""
+        """Returns intervals for infinitely small voxels."""
         return self.filtered_bounds(center, half, torch.full_like(center, _POINT))
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor) -> Mapping[str, Interval]:
-        """Returns intervals for voxels of `size` (k, 3) and all smaller ones: where the surface is
-        at least half a voxel away, it is further than that for smaller voxels as well.
+        """Returns intervals for voxels of `size` (k, 3) and all smaller ones: a surface that is at
+        least half a voxel away is also at least half a smaller voxel away.
         """
         low, high = self.shape.bounds(center, half)
         side = size.amax(-1)
@@ -128,5 +128,5 @@ class Solid(OfShape):
 
 
 def share(distance: Tensor, side: Tensor) -> Tensor:
-    """Returns which share of a voxel, 0 to 1, lies behind a surface at a signed distance."""
+    """Returns the share of a voxel, 0 to 1, that is inside, given its centre's signed distance."""
     return (0.5 - distance / side).clamp(0, 1)

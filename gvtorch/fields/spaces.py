@@ -1,8 +1,8 @@
 """Shapes moved, bent and repeated in space, and their surfaces moved outwards.
 
-Where a space is stretched, the value changes faster than the place, and intervals say so by
-`slope`. Sources: Hart, "Sphere tracing", 1996, sections on Lipschitz bounds of deformations; Barr,
-    "Global and local deformations of solid primitives", SIGGRAPH 1984 (twist).
+Where a deformation stretches space, the value may change by more than 1 per unit of length;
+`slope` bounds it. Sources: Hart, "Sphere tracing", 1996, sections on Lipschitz bounds of
+    deformations; Barr, "Global and local deformations of solid primitives", SIGGRAPH 1984 (twist).
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ Matrix = Sequence[Sequence[float]]
 
 
 class Space(Changed):
-    """Base of shapes that are asked somewhere else: at `place` of a point, in boxes `over`."""
+    """Base of deformed shapes: a point is mapped by `place`, and the shape evaluated there."""
 
     def place(self, points: Tensor) -> Tensor:
-        """Returns the points (..., 3) at which the shape is asked; itself unless overridden."""
+        """Maps points (..., 3) to those at which the shape is evaluated; by default, identity."""
         return points
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
-        """Returns the value at points, given the shape's; it never falls where that rises."""
+        """Returns the value at points, given the shape's; it must not decrease with that."""
         return value
 
     def stretch(self, center: Tensor, half: Tensor) -> Tensor | float:
-        """Returns (k,) how far apart points of boxes come at most, for one unit."""
+        """Returns (k,): the most that `place` stretches distances within boxes."""
         return 1.0
 
     def forward(self, points: Tensor) -> Tensor:
@@ -47,16 +47,16 @@ class Space(Changed):
         return super().slope(center, half) * self.stretch(center, half)
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        """What the shape tells of the place of a box, and the slope."""
+        """Intersects the bounds of the shape over the mapped boxes with those by the slope."""
         low, high = super().bounds(center, half)
         known = self.value(low, center), self.value(high, center)
         return tighter(known, Distance.bounds(self, center, half))
 
 
 class Transform(Space):
-    """A shape turned, scaled and sheared by a matrix, then moved. The value is scaled by the least
-    that the matrix stretches, so it is never more than the distance; where the matrix stretches
-    all directions alike, it is the distance.
+    """A shape turned, scaled and sheared by a matrix, then moved. The value is multiplied by the
+    matrix's smallest singular value, so it is never more than the distance; if the matrix
+    stretches all directions by the same factor, it is the distance.
     """
 
     inverse: Tensor
@@ -68,10 +68,10 @@ class Transform(Space):
         matrix: Matrix | Tensor = ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
         offset: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Takes the shape, the (3, 3) matrix, and where its origin goes.
+        """Sets the shape, the (3, 3) matrix, and the position that the shape's origin is moved to.
 
         Raises:
-            ValueError: The matrix is no matrix, or has no inverse.
+            ValueError: The matrix has another shape or no inverse.
         """
         super().__init__(shape)
         turn = check.reals("Transform", "matrix", matrix, (3, 3))
@@ -103,12 +103,12 @@ class Transform(Space):
 
 
 class Twist(Space):
-    """A shape turned about the z axis, by an angle that grows along it. Space is stretched the more
-    the further from the axis: by about 1 + angle * radius.
+    """A shape turned about the z axis by an angle that grows along the axis. Space is stretched
+    more with the distance from the axis: by about 1 + rate * radius, at most.
     """
 
     def __init__(self, shape: Distance, rate: float) -> None:
-        """Takes the shape and the angle by unit of length, in radians."""
+        """Takes the shape and the angle per unit of length, in radians."""
         super().__init__(shape)
         self.rate = self.number("rate", rate)
         self.exact = False
@@ -124,7 +124,7 @@ class Twist(Space):
         return self.place(center), torch.stack((wide, wide, half[:, 2]), 1)
 
     def stretch(self, center: Tensor, half: Tensor) -> Tensor:
-        """The largest singular value of a shear by rate * radius."""
+        """Returns the largest singular value of a shear by rate * radius."""
         shear = self.rate.abs() * length((center.abs() + half)[:, :2])
         return (shear + (shear * shear + 4).sqrt()) / 2
 
@@ -140,18 +140,18 @@ class Twist(Space):
 
 
 class Repeat(Space):
-    """A shape again and again along the axes. It must lie within its cell, which is `period` wide
-    around the origin: then the nearest of the two cells next to a point along each axis is right.
+    """A shape repeated along the axes. It must lie within its cell, which is `period` wide around
+    the origin: then only the two cells nearest to a point along each axis need be evaluated.
     """
 
     def __init__(
         self, shape: Distance, period: Sequence[float], count: Sequence[int] | None = None
     ) -> None:
-        """Takes the shape, how far apart it is repeated along x, y, z (0: not at all), and how
-        often in all (odd, around the origin); None: without end.
+        """Sets the shape, the distance of its copies along x, y, z (0: not repeated), and how many
+        there are along each axis (odd, centred at the origin); None: infinitely many.
 
         Raises:
-            ValueError: The shape is not known to lie within its cell, or a number is no good.
+            ValueError: The shape is not known to lie within its cell, or a number is invalid.
         """
         super().__init__(shape)
         where = type(self).__name__
@@ -171,14 +171,14 @@ class Repeat(Space):
         self._most = [math.inf if one is None else (one - 1) // 2 for one in counts]
 
     def _cells(self, points: Tensor) -> list[Tensor]:
-        """Points (..., 3) as the two nearest cells along each repeated axis see them."""
+        """Returns points (..., 3) relative to their two nearest cells along each repeated axis."""
         cells = []
         coordinates = points.unbind(-1)
         for sides in itertools.product((0, 1), repeat=len(self._axes)):
             moved = [*coordinates]
             for axis, side in zip(self._axes, sides, strict=True):
                 period, most = self.period[axis], self._most[axis]
-                # torch has no gradient of floor, so a place moves as its point does.
+                # torch has no gradient of floor: it is detached, so the cell's gradient is 1.
                 number = (coordinates[axis] / period).detach().floor() + side
                 moved[axis] = coordinates[axis] - number.clamp(-most, most) * period
             cells.append(torch.stack(moved, -1))
@@ -197,7 +197,7 @@ class Repeat(Space):
         return value, color
 
     def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-        """Boxes (k, 3) that hold what `_cells` makes of the points of boxes."""
+        """Returns boxes (k, 3) that hold the results of `_cells` for all points of boxes."""
         low, high = center - half, center + half
         for axis in self._axes:
             period, most = self.period[axis], self._most[axis]
@@ -219,7 +219,7 @@ class Offset(Space):
     """A shape grown by a length on all sides, which rounds its edges; shrunk if it is negative."""
 
     def __init__(self, shape: Distance, by: float) -> None:
-        """Takes the shape, and how far its surface moves outwards."""
+        """Sets the shape, and the distance by which its surface moves outwards."""
         super().__init__(shape)
         self.by = self.number("by", by)
 
@@ -231,10 +231,10 @@ class Offset(Space):
 
 
 class Shell(Offset):
-    """The surface of a shape, as thick as told; hollow within."""
+    """A hollow shape: a wall of a given thickness, centred at the surface."""
 
     def __init__(self, shape: Distance, thickness: float) -> None:
-        """Takes the shape and how thick its wall is."""
+        """Sets the shape and the thickness of its wall."""
         check.number("Shell", "thickness", thickness, low=0, open_low=True)
         super().__init__(shape, thickness / 2)
 
@@ -242,17 +242,19 @@ class Shell(Offset):
         return value.abs() - self.by
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        """Of an interval around 0, the least is 0."""
+        """Takes the absolute value of the shape's interval; if that contains 0, its least is 0."""
         low, high = self.shape.bounds(center, half)
         least = torch.where((low < 0) & (high > 0), 0.0, torch.minimum(low.abs(), high.abs()))
         return least - self.by, torch.maximum(low.abs(), high.abs()) - self.by
 
 
 class Extrusion(Space):
-    """What a shape looks like at z = 0, along z. Right where it lies alike above and below."""
+    """A shape's cross-section at z = 0, extruded along z. The value is a distance only if the shape
+    is the same above and below that plane.
+    """
 
     def __init__(self, shape: Distance, height: float) -> None:
-        """Takes the shape and how high it gets, around z = 0."""
+        """Sets the shape and its height, centred at z = 0."""
         super().__init__(shape)
         self.height = self.number("height", height, low=0, open_low=True)
 
@@ -272,7 +274,7 @@ class Extrusion(Space):
         return tighter(known, Distance.bounds(self, center, half))
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
-        """The caps' is 1."""
+        """Returns the shape's slope, but at least 1, that of the caps."""
         return super().slope(center, half).clamp(min=1)
 
     def box(self) -> Tensor | None:
@@ -283,18 +285,18 @@ class Extrusion(Space):
         return torch.cat((box[:, :2], ends[:, None]), 1)
 
     def _within(self, value: Tensor, away: Tensor) -> Tensor:
-        """Of a value in the plane, and how far from the plane."""
+        """Combines a 2D distance (`value`) with the distance from the plane (`away`)."""
         beyond = torch.stack((value, away - self.height / 2), -1)
         return length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0)
 
 
 class Revolution(Space):
-    """What a shape looks like at z = 0, around the z axis: its x becomes the distance from the axis
-    less a radius, its y becomes z. Right where the shape lies alike above and below.
+    """A shape's cross-section at z = 0, revolved around the z axis: its x is the distance from the
+    axis minus a radius, its y is z. Right if the shape is the same above and below its plane z = 0.
     """
 
     def __init__(self, shape: Distance, radius: float = 0.0) -> None:
-        """Takes the shape and how far from the axis its origin goes."""
+        """Sets the shape, and the distance of its origin from the axis."""
         super().__init__(shape)
         self.radius = self.number("radius", radius, low=0)
 
@@ -343,6 +345,6 @@ def rotated(shape: Distance, axis: Sequence[float], degrees: float) -> Transform
 
 
 def scaled(shape: Distance, x: float, y: float | None = None, z: float | None = None) -> Transform:
-    """Returns a shape scaled along the axes, by x along all if y and z are left out."""
+    """Returns a shape scaled along the axes; y and z are x if left out."""
     sides = [check.number("scaled", "factor", x if one is None else one) for one in (x, y, z)]
     return Transform(shape, torch.diag(torch.tensor(sides, dtype=torch.float64)))

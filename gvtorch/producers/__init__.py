@@ -1,4 +1,4 @@
-"""Producers: what makes the content of trees."""
+"""Producers: they make the content of trees."""
 
 from .children import FromChildren
 from .field import FieldProducer, cache_field

@@ -1,4 +1,4 @@
-"""Checks of what a producer answered, item by item: a bad one becomes an error, the others stay. An
+"""Checks producers' answers, item by item: a bad item becomes an error, the others are kept. An
 answer of the wrong type, shape or dtype raises ValueError.
 """
 
@@ -21,8 +21,8 @@ Form = TypeVar("Form", bound=Regions | Bricks)
 
 
 def checked_regions(answer: Any, nodes: Nodes, producer: Producer, *, look: bool = True) -> Regions:
-    """Returns a producer's answer to `classify(nodes)` as `Regions` on the layout's device. Without
-    `look` only types and shapes are checked, and the host waits for nothing.
+    """Returns a producer's answer to `classify(nodes)` as `Regions` on the layout's device. With
+    `look` false only types and shapes are checked, not values, and the host does not wait.
     """
     if isinstance(answer, Tensor):
         answer = Regions(kind=answer)
@@ -32,8 +32,8 @@ def checked_regions(answer: Any, nodes: Nodes, producer: Producer, *, look: bool
 
 def checked_bricks(answer: Any, nodes: Nodes, producer: Producer, *, look: bool = True) -> Bricks:
     """Returns a producer's answer to `fill(nodes)` as `Bricks`. Voxels stay where they are, unless
-    some channels lie on the host and others on the device: then all go to the device. For `look`
-    see `checked_regions`.
+    some channels are on the host and others on the device: then all are copied to the device. For
+    `look` see `checked_regions`.
     """
     given = producer.as_bricks(answer)
     bricks = _checked("fill", given, Bricks, "a dict of tensors", nodes, producer, look)
@@ -52,8 +52,8 @@ def count_kinds(kind: Tensor) -> Tensor:
 def regions_of(
     summaries: Mapping[str, NodeSummary], channels: Mapping[str, Channel], threshold: float | None
 ) -> Regions:
-    """Returns what a summary of all channels tells of k nodes: CONSTANT where every channel is
-    uniform, EMPTY where none has a value above the threshold, else DATA.
+    """Returns the regions of k nodes, given summaries of all channels: EMPTY where no channel has a
+    value above the threshold, else CONSTANT where every channel is uniform, else DATA.
     """
     constant = torch.stack([one.is_constant for one in summaries.values()]).all(0)
     empty = torch.stack([one.is_empty(threshold) for one in summaries.values()]).all(0)
@@ -74,7 +74,7 @@ def _checked(
     producer: Producer,
     look: bool,
 ) -> Form:
-    """Returns the answer with a width in every shape, and with errors in place of bad items."""
+    """Returns the answer with a width in every shape, and with an error for each bad item."""
     where = f"{type(producer).__name__}.{method}"
     if not isinstance(answer, form):
         came = type(answer).__name__
@@ -125,7 +125,7 @@ def _refuse_late(
     fields: Sequence[Mapping[str, Tensor | TableRows]],
     device: torch.device,
 ) -> None:
-    """Raises ValueError where an answer that stays on the device needs work of the host."""
+    """Raises ValueError if an answer that must stay on the device needs the host."""
     if answer.alias is not None or answer.errors:
         raise ValueError(f"{where}: a producer that is on_device answers without alias and errors")
     for by_channel in fields:
@@ -165,7 +165,9 @@ def _by_channel(
 def _alias(
     where: str, answer: Regions | Bricks, kind: Tensor, nodes: Nodes, errors: dict[int, str]
 ) -> Tensor:
-    """Returns (k, 4) alias targets; places that are none become errors."""
+    """Returns (k, 4) alias targets; adds an error for each that is not a node of its tree, or lies
+    in the node itself.
+    """
     alias: Any = answer.alias
     layout, name = nodes.layout, answer.alias_tree
     if name is not None:
@@ -187,7 +189,7 @@ def _alias(
     for index in wrong.nonzero()[:, 0].tolist():
         tree = "this tree" if name is None else f"tree {name!r}"
         errors.setdefault(index, f"alias {tuple(alias[index].tolist())} is no node of {tree}")
-    if layout.extent is not nodes.layout.extent:  # of another producer
+    if layout.extent is not nodes.layout.extent:  # the target tree has another producer
         return alias
     loc = nodes.loc.to(alias.device)
     up = layout.branching ** (depth - loc[:, 3]).clamp(0, layout.depth)
@@ -204,9 +206,9 @@ def _refuse_bad(
     fields: Sequence[Mapping[str, Tensor | TableRows]],
     errors: dict[int, str],
 ) -> list[int]:
-    """Adds items of an unknown kind, and those that hold NaN or infinite values, to the errors.
-    Rows of a table are not looked at: `BrickTable` has checked them. Returns how many items are of
-    each kind, zeros where `kind` is None; the host waits for the device once.
+    """Adds an error for each item of an unknown kind or with NaN or infinite values. Rows of a
+    table are not read: `BrickTable` has checked them. Returns how many items are of each kind,
+    zeros if `kind` is None. The host waits for the device once.
     """
     floats = [
         (channel, values)

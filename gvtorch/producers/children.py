@@ -1,4 +1,4 @@
-"""`FromChildren`: coarse levels for producers that know their finest level alone."""
+"""`FromChildren`: coarse levels for producers that can make their finest level only."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from .answer import checked_bricks, checked_regions
 from .nodes import Layout, Nodes, grid_of
 from .producer import Bricks, OfProducers, Producer, Region, Regions, arrived, by_depth, touched
 
-_AT_ONCE = 64  # blocks of a level that are made together, out of N^3 times as many below
+_AT_ONCE = 64  # blocks of a level that are made together, from N^3 times as many below
 
 Blocks = dict[str, np.ndarray]  # for each channel (k, z, y, x, c) without borders
 
 
 class FromChildren(OfProducers):
-    """A producer's finest level, and coarse levels that are the means of what lies below.
+    """A producer's finest level, and coarse levels that are the means of those below.
 
-    A coarse voxel is the mean of the N^3 voxels below it as they are stored, so that pictures are
-    those of a resident tree (`N3Tree.from_volume`) in every bit. That has its price: the root is
-    made of all finest bricks, and what is above them is kept in memory, without borders, at most
-    1 / (N^3 - 1) of the finest level. So this is for trees of a few levels. Where the producer's
-    `classify` tells that nodes are EMPTY or CONSTANT, nothing below is made. Formulas are better
-    sampled more finely, see `FieldProducer`.
+    A coarse voxel is the mean of the N^3 voxels below it as they are stored, so that pictures equal
+    those of a resident tree (`N3Tree.from_volume`) in every bit. This has a price: making the root
+    needs all finest bricks, and all coarser levels are kept in host memory, without borders, at
+    most 1 / (N^3 - 1) of the finest level. So it suits trees of a few levels. Where the producer's
+    `classify` returns EMPTY or CONSTANT, nothing below is made. For formulas, `FieldProducer` with
+    more samples is better.
 
     Attributes:
-        producer: Who knows the finest level. It is asked to `classify` nodes of all levels.
+        producer: Makes the finest level. Its `classify` must serve nodes of all levels.
         levels: The most levels that a tree may have above the finest.
     """
 
     def __init__(self, producer: Producer, levels: int = 5) -> None:
-        """Takes the producer, and how many levels may be made of its finest one.
+        """Sets the producer, and the most levels that may be made of its finest one.
 
         Raises:
-            ValueError: It makes labels, whose means say nothing, or coarse channels, or it needs
-                its parents' bricks. Answers with aliases are refused when they come.
+            ValueError: It makes labels, whose means are meaningless, or coarse channels, or it
+                needs its parents' bricks. Answers with aliases raise when they come.
         """
         where = type(self).__name__
         check.instance(where, "producer", producer, Producer)
@@ -57,14 +57,14 @@ class FromChildren(OfProducers):
         )
         self.producer, self.patience = producer, producer.patience
         self.levels = check.whole(where, "levels", levels, low=1, high=10)
-        self._kept: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by place
-        self._known = producer.version  # they are of this content
+        self._kept: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by loc
+        self._known = producer.version  # the version that these blocks were made from
 
     def parts(self) -> dict[str, Producer]:
         return {"producer": self.producer}
 
     def prepare(self, layout: Layout) -> None:
-        """Refuses trees that are too deep."""
+        """Prepares the producer; raises ValueError if the tree is too deep."""
         if layout.depth > self.levels:
             count = layout.branching ** (3 * layout.depth)
             raise ValueError(
@@ -80,11 +80,11 @@ class FromChildren(OfProducers):
         super().close()
 
     def classify(self, nodes: Nodes) -> Regions | Tensor | Future:
-        """As the producer does."""
+        """Returns the producer's answer."""
         return self.producer.classify(nodes)
 
     def fill(self, nodes: Nodes) -> Bricks | Mapping[str, Tensor] | Tensor | Future:
-        """The producer's bricks of the finest level, and means of what lies below of others."""
+        """Returns the producer's bricks at the finest level; above it, means of the level below."""
         finest = nodes.depth == nodes.layout.depth
         if bool(finest.all()):
             return self.producer.fill(nodes)
@@ -95,7 +95,7 @@ class FromChildren(OfProducers):
         return Bricks(data=self._coarse(nodes))
 
     def _forget(self, layout: Layout) -> None:
-        """Drops the blocks that the producer would make otherwise by now."""
+        """Drops the blocks that have changed since they were made."""
         changes, places = self.producer.changes(self._known), [*self._kept]
         self._known = self.producer.version
         if changes is None or not places:
@@ -106,7 +106,7 @@ class FromChildren(OfProducers):
             del self._kept[places[row]]
 
     def _mixed(self, nodes: Nodes, finest: Tensor) -> Bricks:
-        """Bricks of nodes some of which are of the finest level."""
+        """Returns the bricks of nodes of which some are at the finest level and some above it."""
         fine, coarse = ((mask.nonzero()[:, 0]) for mask in (finest, ~finest))
         own = self._asked(nodes[fine])
         kind = torch.full((len(nodes),), int(Region.DATA))
@@ -125,7 +125,7 @@ class FromChildren(OfProducers):
         return Bricks(data=data, kind=kind, constants=constants, errors=errors)
 
     def _asked(self, nodes: Nodes) -> Bricks:
-        """The producer's answer, checked."""
+        """Returns the producer's answer, checked."""
         found = checked_bricks(arrived(self.producer.fill(nodes)), nodes, self.producer)
         if found.kind is not None:
             self._refuse_alias(found.kind)
@@ -137,7 +137,7 @@ class FromChildren(OfProducers):
             raise ValueError(f"{type(self).__name__}: {who} must answer without alias")
 
     def _coarse(self, nodes: Nodes) -> dict[str, Tensor]:
-        """(k, z, y, x, c) bricks of coarse nodes, borders included."""
+        """Returns the bricks (k, z, y, x, c) of coarse nodes, borders included."""
         layout, loc = nodes.layout, nodes.loc.cpu()
         shape = (len(loc), *(layout.side,) * 3)
         found = {n: np.empty((*shape, c.width), _held(c.dtype)) for n, c in self.channels.items()}
@@ -149,7 +149,7 @@ class FromChildren(OfProducers):
         return {n: from_grid(found[n], c.dtype) for n, c in self.channels.items()}
 
     def _region(self, layout: Layout, depth: int, low: Tensor, size: int) -> Blocks:
-        """size^3 voxels of a level from `low` (k, 3) x y z on; beyond it the outermost repeat."""
+        """Returns size^3 voxels of a level from each `low` (k, 3) x y z; outermost ones repeat."""
         step, brick = layout.branching ** (layout.depth - depth), layout.brick_size
         last = torch.tensor([-(-n // step) - 1 for n in layout.extent])[:, None]
         voxel = (low[:, :, None] + torch.arange(size)).clamp(min=0).minimum(last)
@@ -165,7 +165,7 @@ class FromChildren(OfProducers):
         return {name: values[at] for name, values in blocks.items()}
 
     def _blocks(self, layout: Layout, loc: Tensor) -> Blocks:
-        """The voxels of nodes of one level at places (k, 4)."""
+        """Returns the voxels of nodes (k, 4) of one level; caches them if it is a coarse one."""
         if int(loc[0, 3]) == layout.depth:
             return self._known_blocks(layout, loc)
         keys = [tuple(place) for place in loc.tolist()]
@@ -180,7 +180,7 @@ class FromChildren(OfProducers):
         return {name: np.stack([self._kept[key][name] for key in keys]) for name in self.channels}
 
     def _known_blocks(self, layout: Layout, loc: Tensor) -> Blocks:
-        """The same, of nodes that are made: those of one value hold that."""
+        """Makes the voxels of nodes of one level; where they are uniform, without making bricks."""
         nodes = Nodes(loc.to(layout.device), layout)
         regions = checked_regions(arrived(self.producer.classify(nodes)), nodes, self.producer)
         _raise_first(regions.errors)
@@ -196,19 +196,19 @@ class FromChildren(OfProducers):
         return found
 
     def _means(self, layout: Layout, loc: Tensor) -> Blocks:
-        """Means of the voxels of the level below."""
+        """Returns the means of the voxels of the level below."""
         n, size, depth = layout.branching, layout.brick_size, int(loc[0, 3])
         found = {}
         low = loc[:, :3] * (size * n)
         for name, values in self._region(layout, depth + 1, low, size * n).items():
-            # Blocks lie one behind the other: none of the means reaches into two.
+            # Blocks are stacked along z, and their sides are multiples of N: no mean spans two.
             stacked = values.reshape(-1, *values.shape[2:])
             told = "mean", n, self.channels[name].dtype, layout.spacing, layout.depth - depth
             found[name] = coarser(stacked, *told).reshape(len(loc), size, size, size, -1)
         return found
 
     def _finest(self, nodes: Nodes) -> Blocks:
-        """What the producer makes of finest nodes."""
+        """Returns the producer's voxels of finest nodes, without borders."""
         bricks, border = self._asked(nodes), nodes.layout.border
         _raise_first(bricks.errors)
         size = nodes.layout.brick_size
@@ -227,7 +227,7 @@ class FromChildren(OfProducers):
 def _uniform(
     producer: Producer, constants: Mapping[str, Tensor], count: int, size: int
 ) -> dict[str, np.ndarray]:
-    """(k, z, y, x, c) for each channel, of the constants (k, c) that are told, else 0."""
+    """Returns (k, z, y, x, c) by channel, filled with its constants (k, c), or 0 without them."""
     found = {}
     for name, channel in producer.channels.items():
         found[name] = np.zeros((count, size, size, size, channel.width), _held(channel.dtype))
@@ -237,7 +237,7 @@ def _uniform(
 
 
 def _held(dtype: torch.dtype) -> np.dtype:
-    """The dtype of arrays that hold a channel."""
+    """Returns the NumPy dtype of arrays that hold a channel."""
     return to_numpy(torch.zeros(0, dtype=dtype)).dtype
 
 

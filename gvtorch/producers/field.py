@@ -1,4 +1,4 @@
-"""`FieldProducer`: a function of place as a producer."""
+"""`FieldProducer`: a function of position as a producer."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from ..fields.field import checked_field
 from ..pool import Channel
 from .producer import Bricks, Nodes, Producer, Region, Regions, check_points, clocks_of
 
-_BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
+_BATCH = 64  # bricks made at a time on the CPU, so that intermediate values fit into its caches
 _FEW = 12  # bricks: smaller groups cost more than they save by leaving out parts of a field
-_MARGIN = 1 / 32  # voxels by which boxes are taken wider, so that rounded places lie in them
-_ROUNDED = 2.0**-18  # relative width by which intervals are, for values are rounded too
+_MARGIN = 1 / 32  # voxels by which boxes are widened, so that they contain rounded positions
+_ROUNDED = 2.0**-18  # relative widening of intervals, because values are rounded too
 
 
 class FieldProducer(Producer):
-    """Evaluates a field where rays ask for it: any `Field`, or any module that makes values
-    (..., c), or {channel: (..., c)}, of world positions (..., 3).
+    """Evaluates a field where rays ask for it: any `Field`, or any module that computes values
+    (..., c), or {channel: (..., c)}, from world positions (..., 3).
 
-    A voxel of any level is the mean of `samples`^3 values spread evenly over it; fields that know
-    their own means (`Field.prefiltered`), such as `Solid`, tell them at one evaluation. Regions
-    that the field's bounds prove uniform or invisible are never made.
+    A voxel of any level is the mean of `samples`^3 values spread evenly over it; fields that can
+    compute their means (`Field.prefiltered`), such as `Solid`, are evaluated once. Regions that the
+    field's bounds prove uniform or invisible are never made.
 
     Attributes:
         field: The field.
-        dtype: Of the places that it is asked for.
+        dtype: Of the positions at which it is evaluated.
     """
 
     on_device = True
@@ -53,27 +53,27 @@ class FieldProducer(Producer):
         branching: int = 2,
         value_range: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
-        """Takes the field and where to cut voxels out of it.
+        """Sets the field and the grid of voxels.
 
         Args:
-            field: A field or module; a `Distance` stands for the `Solid` that it bounds.
+            field: A field or module; a `Distance` is converted to the `Solid` that it bounds.
             extent: Voxels of the finest level, (x, y, z), or along the longest side of the box.
-            box: World corners ((x, y, z), (x, y, z)); left out: around what the field says that it
-                fills, 2 voxels wider.
-            channels: What voxels hold; left out: float32, or as the field names it. In channels of
-                integers 1 stands for the largest number of the dtype.
+            box: World corners ((x, y, z), (x, y, z)); left out: the field's box, 2 voxels wider.
+            channels: What voxels hold; left out: the field's dtypes, by default float32. In integer
+                channels a value of 1 becomes the largest number of the dtype.
             samples: n of the n^3 values that a voxel is the mean of; left out: `branching`, so that
-                the level above the finest is the mean of the voxels' middles below it.
-            threshold: What shows nothing is not made: the value up to which no channel is seen, or
-                by name those channels that decide; left out: the field's, or None: all is seen.
-            dtype: float32 or float64, of places; left out: float64 where float32 can't tell the
-                finest voxels apart.
+                the level above the finest is the mean of values at the centres of finest voxels.
+            threshold: Nodes whose values are all proven not to exceed it are EMPTY. One value for
+                all channels, or by name for those channels that decide; left out: the field's, if
+                it has one, else no node is EMPTY.
+            dtype: float32 or float64, of positions; left out: float64 if float32 can't distinguish
+                the finest voxels.
             branching: N.
-            value_range: For each channel its smallest and largest value, where they are known.
+            value_range: Smallest and largest value of each channel for which they are known.
 
         Raises:
-            ValueError: The field fails or gives no values of the shapes above, a channel differs
-                from what it gives, its box is unknown or infinite, or a number is out of its range.
+            ValueError: The field fails or returns no values of the shapes above, a channel has
+                another width, the box is unknown or infinite, or a number is out of its range.
         """
         where = type(self).__name__
         checked_field(where, "field", field)
@@ -109,7 +109,7 @@ class FieldProducer(Producer):
     def _thresholds(
         self, where: str, field: Field | None, threshold: float | Mapping[str, float] | None
     ) -> Mapping[str, float] | None:
-        """By channel, up to where it shows nothing."""
+        """Returns, by channel, the value up to which it shows nothing."""
         if threshold is None:
             return None if field is None else field.threshold
         if not isinstance(threshold, Mapping):
@@ -121,8 +121,8 @@ class FieldProducer(Producer):
         return {n: check.number(where, "threshold", value) for n, value in threshold.items()}
 
     def classify(self, nodes: Nodes) -> Regions:
-        """EMPTY where no channel is proven to pass its threshold, CONSTANT where all are proven to
-        have one value; and the ranges of values that are known.
+        """Returns EMPTY where all channels are proven not to exceed their thresholds, CONSTANT
+        where all are proven to have one value, else DATA; and the known ranges of values.
         """
         layout = nodes.layout
         size = nodes.voxel_size
@@ -145,8 +145,8 @@ class FieldProducer(Producer):
         return Regions(kind=kind, constants=constants, ranges=ranges)
 
     def fill(self, nodes: Nodes) -> Bricks:
-        """Evaluates the field at every voxel, border included. On the CPU in batches of bricks in
-        which the same parts of it matter, and these parts alone.
+        """Evaluates the field at every voxel, border included. On the CPU, bricks are batched by
+        which parts of the field matter in them, and only these parts are evaluated.
         """
         if nodes.loc.device.type != "cpu" or torch.compiler.is_compiling():
             data = self._made(nodes, self.field)
@@ -157,37 +157,37 @@ class FieldProducer(Producer):
                 parts.append(self._made(nodes[rows], field))
             back = torch.cat(order).argsort()
             data = {name: torch.cat([part[name] for part in parts])[back] for name in self.channels}
-        # What is infinite fails like NaN, and is not stored as the largest number.
+        # Infinite values become NaN: they must fail, not be clamped to the largest number.
         known = {name: rows.masked_fill(rows.isinf(), math.nan) for name, rows in data.items()}
         stored = {name: self._stored(name, rows) for name, rows in known.items()}
         whole = [n for n, channel in self.channels.items() if not channel.dtype.is_floating_point]
         if not whole:
             return Bricks(data=stored)
         finite = torch.stack([data[name].isfinite().flatten(1).all(1) for name in whole]).all(0)
-        # Integers can't hold NaN: such bricks fail by a kind that there is none of.
+        # Integers can't hold NaN: such bricks get kind -1, which fails.
         return Bricks(data=stored, kind=torch.where(finite, int(Region.DATA), -1))
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
-        """Where a part of the field that keeps a time matters at either (`Field.near`)."""
+        """Returns where a part of the field with a time matters (`Field.near`) at either time."""
         return moving(self, self.field, nodes, self._beyond, (before, after))
 
     @property
     def _beyond(self) -> float:
-        """Voxels behind a brick's border that the field is asked for."""
+        """How many voxels beyond a brick's border the field is evaluated."""
         return getattr(self.field, "margin", 0) + _MARGIN
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
-        """Returns the values at points (..., 3), for each channel (..., c), without an engine: of
-        the field itself, in the dtype of the points, not filtered and not rounded.
+        """Returns the field's own values at points (..., 3), for each channel (..., c), in the
+        dtype of the points: not filtered and not rounded. Needs no engine.
         """
         where = type(self).__name__
         check_points(f"{where}.at", points)
-        if points.dim() == 1:  # numbers of no axis would be promoted
+        if points.dim() == 1:  # () values would be promoted to the dtype of the field's numbers
             return {name: values[0] for name, values in self.at(points[None]).items()}
         return _by_channel(where, _asked(where, self.field, self.field, points), points)
 
     def _made(self, nodes: Nodes, field: nn.Module) -> dict[str, Tensor]:
-        """Values of the voxels of some bricks, (k, z, y, x, c) by channel."""
+        """Returns the voxels of k bricks, (k, z, y, x, c) by channel, before rounding."""
         where = type(self).__name__
         size = nodes.voxel_size.to(self.dtype)[:, None, None, None]
         if isinstance(field, Field) and field.prefiltered:
@@ -209,7 +209,7 @@ class FieldProducer(Producer):
         return {name: value / len(self.offsets) for name, value in total.items()}
 
     def _bounds(self, center: Tensor, half: Tensor, size: Tensor) -> dict[str, Interval]:
-        """For each channel of which anything is known, its interval, (k, c) each."""
+        """Returns intervals by channel, (k, c) each, for the channels that have known bounds."""
         if not isinstance(self.field, Field):
             return {}
         ask = self.field.filtered_bounds
@@ -224,10 +224,10 @@ class FieldProducer(Producer):
         }
 
     def _stored(self, name: str, values: Tensor) -> Tensor:
-        """Values in a channel's dtype."""
+        """Converts values to a channel's dtype."""
         channel = self.channels[name]
         least, most = channel.limits
-        values = values.float() if values.dtype.itemsize < 4 else values  # halves have less range
+        values = values.float() if values.dtype.itemsize < 4 else values  # float16 has less range
         if channel.dtype.is_floating_point:
             return values.clamp(least, most).to(channel.dtype)
         return (values * most).round().clamp(least, most).to(channel.dtype)
@@ -236,15 +236,15 @@ class FieldProducer(Producer):
 def cache_field(
     field: nn.Module, extent: int | Sequence[int] = 1024, **options: Any
 ) -> FieldProducer:
-    """Returns a producer of any module from positions (..., 3) to values (..., c), or to these by
-    channel, such as a network: the engine keeps what rays ask for. Arguments as `FieldProducer`.
+    """Returns a producer for any module from positions (..., 3) to values (..., c), or to these by
+    channel, such as a network: the engine caches what rays ask for. Arguments as `FieldProducer`.
     """
     return FieldProducer(field, extent, **options)
 
 
 def interval_of(field: nn.Module, name: str, ends: Any, count: int, width: int) -> Interval:
-    """Returns what the `bounds` of a field told of `width` numbers under a name, (k, width) each;
-    ValueError if it is no interval.
+    """Returns the interval that a field's `bounds` returned for a channel of `width` numbers, as
+    (k, width) each, k = `count`; raises ValueError if it is not one.
     """
     where = f"{type(field).__name__}.bounds"
     if not isinstance(ends, tuple) or [isinstance(e, Tensor) for e in ends] != [True, True]:
@@ -263,7 +263,7 @@ def interval_of(field: nn.Module, name: str, ends: Any, count: int, width: int) 
 
 
 def distances_of(where: str, shape: nn.Module, points: Tensor) -> Tensor:
-    """Returns the distances (...,) of a shape at points (..., 3); ValueError if it gives others."""
+    """Returns a shape's distances (...,) at points (..., 3); ValueError for any other result."""
     found = _asked(where, shape, shape, points)
     lead = points.shape[:-1]
     if not isinstance(found, Tensor) or found.shape != lead or not found.dtype.is_floating_point:
@@ -278,9 +278,9 @@ def distances_of(where: str, shape: nn.Module, points: Tensor) -> Tensor:
 def alike(
     field: nn.Module, nodes: Nodes, beyond: float, count: int
 ) -> Iterator[tuple[Tensor, nn.Module]]:
-    """Groups nodes in which the same parts of a field matter, up to `beyond` voxels behind the
-    brick's border. Yields rows of at most `count` nodes, with the field of these parts alone; small
-    groups are joined. Waits for the device.
+    """Groups nodes by which parts of a field matter in them, up to `beyond` voxels beyond the
+    brick's border. Yields indices of at most `count` nodes, and the field reduced to these parts;
+    small groups are joined. Waits for the device.
     """
     if not isinstance(field, Field):
         yield from ((rows, field) for rows in torch.arange(len(nodes)).split(count))
@@ -308,8 +308,8 @@ def alike(
 def moving(
     producer: Producer, field: nn.Module, nodes: Nodes, beyond: float, times: Sequence[float]
 ) -> Tensor:
-    """Returns (k,) bool, in which nodes a part of a producer's field that keeps a time matters at
-    any of some times; for `beyond` see `alike`.
+    """Returns (k,) bool: the nodes in which a part of the producer's field that has a time matters
+    at any of `times`; for `beyond` see `alike`.
     """
     found = torch.zeros_like(nodes.depth, dtype=torch.bool)
     for time in times:
@@ -320,18 +320,18 @@ def moving(
 
 
 def _asked(where: str, field: nn.Module, method: Callable[..., Any], *given: Any) -> Any:
-    """What a method of a field gives; ValueError in one line that names the field if it fails."""
+    """Calls a method of a field; if it fails, raises a ValueError of one line, naming the field."""
     try:
         return method(*given)
     except (MemoryError, torch.OutOfMemoryError):
-        raise  # no fault of the field
+        raise  # not the field's fault
     except Exception as error:
         said = f"{type(error).__name__}: {one_line(error)}"
         raise ValueError(f"{where}: field {type(field).__name__} failed: {said}") from error
 
 
 def _by_channel(where: str, values: Any, points: Tensor) -> dict[str, Tensor]:
-    """Values of a field at points (..., 3) as (..., c) by channel; ValueError if they are not."""
+    """Returns a field's values at points (..., 3) as (..., c) by channel; ValueError if invalid."""
     if isinstance(values, Tensor):
         values = {"value": values}
     if not isinstance(values, Mapping) or not values:
@@ -356,7 +356,7 @@ def _by_channel(where: str, values: Any, points: Tensor) -> dict[str, Tensor]:
 
 
 def _channels_of(where: str, field: nn.Module) -> dict[str, int]:
-    """By channel, how many numbers a field gives: it is asked for 2 x 5 points."""
+    """Returns the width of each channel of a field, found by evaluating it at 2 x 5 points."""
     there = [*field.parameters(), *field.buffers()]
     device = there[0].device if there else torch.device("cpu")
     points = torch.full((2, 5, 3), 0.25, device=device)
@@ -369,7 +369,7 @@ def _channels_of(where: str, field: nn.Module) -> dict[str, int]:
 
 
 def _cut_out(where: str, field: Field | None, extent: int | Sequence[int]) -> tuple[Any, Any]:
-    """Extent and box around what a field fills, 2 voxels wider."""
+    """Returns extent and box of a grid around a field's box, 2 voxels wider on each side."""
     box = None if field is None else field.box()
     if box is None or not bool(torch.isfinite(box).all()) or not bool((box[1] > box[0]).all()):
         raise ValueError(f"{where}: box must be given: the field does not tell where it ends")
@@ -385,6 +385,6 @@ def _cut_out(where: str, field: Field | None, extent: int | Sequence[int]) -> tu
 
 
 def dtype_of_places(box: Sequence[Sequence[float]], spacing: Sequence[float]) -> torch.dtype:
-    """Returns float32 where it tells the finest voxels of a box apart, else float64."""
+    """Returns float32 if it can distinguish the finest voxels of a box, else float64."""
     reach = max(abs(float(end)) for corner in box for end in corner)
     return torch.float32 if reach <= 0.5 * DEEP_VOXELS * min(spacing) else torch.float64

@@ -1,8 +1,8 @@
 """`Hypertexture`: noise around the surface of a shape, made where rays ask for it.
 
 Sources: Perlin, Hoffert, "Hypertexture", SIGGRAPH 1989 (density functions around a soft surface);
-    the GigaVoxels presentation at AFIG 2012 (the formula, and to stop at the octave from which on
-    nothing can change any more). How voxels are filtered is our own.
+    the GigaVoxels presentation at AFIG 2012 (the formula, and stopping at the octave after which
+    nothing can change). The filtering of voxels is ours.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from ..pool import Channel
 from .field import alike, distances_of, dtype_of_places, interval_of, moving
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth, check_points
 
-_BATCH = 64  # bricks that are made at a time on the CPU, whose caches then hold what is between
-_COARSEST = 1.5  # cells a voxel, from which on the mean tells nothing of the noise
-_ROUNDED = 1e-4  # what rounding may add to a sum of octaves, in units of the amplitude
+_BATCH = 64  # bricks made at a time on the CPU, so that intermediate values fit into its caches
+_COARSEST = 1.5  # cells along a voxel; beyond, nothing of the noise is left in a voxel's mean
+_ROUNDED = 1e-4  # most that rounding may add to a sum of octaves, in units of the amplitude
 
 
 class LevelOctaves(NamedTuple):
-    """What the voxels of a level are made with."""
+    """Parameters from which the voxels of a level are made."""
 
-    octaves: list[Octave]  # with amplitudes as the voxels see them
-    left: list[float]  # the most that octave 0, 1, ... and all after it can add
+    octaves: list[Octave]  # with the amplitudes that are left in the means over voxels
+    left: list[float]  # [i]: upper bound of what octave i and all after it can add
     soft: float  # half the width of the step from 0 to 1
     side: float  # of a voxel, world units
 
@@ -40,22 +40,22 @@ class Hypertexture(Tally, Producer):
     """Density around a shape's surface:
 
         density = smoothstep(1/2 - softness, 1/2 + softness)(s),
-        s = -distance / thickness + amplitude * noise(frequency * place),
+        s = -distance / thickness + amplitude * noise(frequency * position),
 
-    where noise is a sum of octaves. An octave is left out where density is 0 or 1 already, whatever
-    it and all after it add, brick by brick; the voxels' bits are the same with and without it. And
-    regions are never made where the distance proves that.
+    where noise is a sum of octaves. In each brick, summation ends as soon as density is 0 or 1 in
+    all voxels whatever the remaining octaves add; this changes no bit. Regions where the distance
+    alone proves that are never made.
 
-    A voxel is about the mean over its cube. Each octave has the weight that is left of it in this
-    mean. What the mean takes away, of noise and of the distance, makes the step from 0 to 1 wider:
-    in place of the smoothstep stands one with the variance of all these together.
+    A voxel is about the mean over its cube. Each octave is weighted by the share of it that is left
+    in this mean. The variance that averaging removes, of noise and of the distance, widens the step
+    from 0 to 1: the smoothstep used has the total variance.
 
-    Channels are "density", and "distance" if asked for: that of the shape, in world units, by which
-    a transfer function may colour (`Isosurface(0.5, colors, color_channel="distance")`).
+    Channels are "density", and "distance" if asked for: that of the shape, in world units, which
+    can be coloured by a transfer function (`Isosurface(0.5, colors, color_channel="distance")`).
 
     Attributes:
-        wanted: Octaves of voxels that a plain sum would have taken so far.
-        made: Those that were evaluated.
+        wanted: Evaluations, octaves times voxels, that a plain sum would have needed so far.
+        made: Evaluations that were actually made.
         skip: Whether octaves are left out; may be changed at any time.
     """
 
@@ -80,24 +80,24 @@ class Hypertexture(Tally, Producer):
         dtype: torch.dtype = torch.float16,
         branching: int = 2,
     ) -> None:
-        """Takes the shape, and how rough it is.
+        """Sets the shape, and the noise around it.
 
         Args:
-            shape: Any distance field, which may change by more than 1 a unit if it tells so.
+            shape: Any distance field; one that changes by more than 1 per unit must declare it.
             extent: Voxels of the finest level, (x, y, z), or along the longest side of the box.
             thickness: World units by which the surface moves where s changes by 1.
             amplitude: Of the first octave, in s.
-            frequency: Cells of the first octave a world unit.
+            frequency: Cells of the first octave per world unit.
             octaves, lacunarity, gain, seed: As in `noise.fbm`.
             softness: Half the width of the step from 0 to 1, in s.
             distances: Whether there is a channel "distance".
             skip: Whether octaves that can't matter are left out.
-            box: World corners; left out: around the shape and what noise adds to it.
+            box: World corners; left out: around the shape and the most that noise adds to it.
             dtype: Of the channels: float16, bfloat16 or float32.
             branching: N.
 
         Raises:
-            ValueError: A number is out of its range, the dtype another, or there is no box.
+            ValueError: A number is out of range, the dtype is another, or the box is unknown.
         """
         where = type(self).__name__
         check.instance(where, "shape", shape, Distance)
@@ -139,20 +139,20 @@ class Hypertexture(Tally, Producer):
         return 1 - self.made / max(self.wanted, 1)
 
     def prepare(self, layout: Layout) -> None:
-        """Works out what the voxels of each level are made with."""
+        """Computes the parameters of each level."""
         sides = [max(layout.spacing) * layout.branching**n for n in range(layout.depth, -1, -1)]
         self._levels = [self._level(side) for side in sides]
         worn = [level.left[0] + level.soft for level in self._levels]
-        # What holds at a node must hold at all finer ones.
+        # A node's region must also be true of all finer nodes below it.
         finer = [max(worn[depth:]) for depth in range(len(worn))]
         self._worn = torch.tensor(finer, dtype=torch.float64, device=layout.device)
 
     def level_of(self, depth: int) -> LevelOctaves:
-        """Returns what the voxels of a depth are made with; known once an engine uses this."""
+        """Returns the parameters of the voxels of a depth; known once an engine uses this."""
         return self._levels[depth]
 
     def _level(self, side: float) -> LevelOctaves:
-        """Returns what voxels of a side, in world units, are made with."""
+        """Returns the parameters of voxels with a side in world units."""
         kept, variance = [], self.softness**2 / 5 + (side / self.thickness) ** 2 / 12
         for one in self.octaves:
             cells = side * one.frequency
@@ -169,7 +169,7 @@ class Hypertexture(Tally, Producer):
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the channels (..., 1) at points (..., 3), of the points' dtype, not filtered."""
         check_points(f"{type(self).__name__}.at", points)
-        if points.dim() == 1:  # numbers of no axis would be promoted
+        if points.dim() == 1:  # () values would be promoted to the dtype of the field's numbers
             return {name: values[0] for name, values in self.at(points[None]).items()}
         distance = distances_of(type(self).__name__, self.shape, points)
         total = distance * (-1 / self.thickness)
@@ -178,7 +178,7 @@ class Hypertexture(Tally, Producer):
         return self._channels(total, distance, self.softness)
 
     def classify(self, nodes: Nodes) -> Regions:
-        """EMPTY and CONSTANT where the distance proves density 0 or 1 whatever the noise is."""
+        """Returns EMPTY or CONSTANT where density is proven 0 or 1 for any noise, else DATA."""
         layout = nodes.layout
         half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border)
         ends = self.shape.bounds(nodes.center, half)
@@ -193,11 +193,11 @@ class Hypertexture(Tally, Producer):
         return Regions(kind=kind, constants={"density": is_full})
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
-        """Where a part of the shape that keeps a time matters at either."""
+        """Returns the nodes in which a part of the shape with a time matters at either time."""
         return moving(self, self.shape, nodes, 0, (before, after))
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
-        """Makes the bricks, level by level, in batches in which the same of the shape matters."""
+        """Makes the bricks, level by level, batched by which parts of the shape matter in them."""
         side = nodes.layout.side
         shape = (len(nodes), side, side, side, 1)
         device = nodes.loc.device
@@ -214,7 +214,7 @@ class Hypertexture(Tally, Producer):
         return data
 
     def _made(self, nodes: Nodes, level: LevelOctaves, shape: nn.Module) -> dict[str, Tensor]:
-        """Channels (k, z, y, x, 1) of nodes of a level, of what of the shape matters there."""
+        """Returns channels (k, z, y, x, 1) of nodes of a level; `shape` may be a reduced one."""
         points = nodes.points(self.dtype)
         distance = distances_of(type(self).__name__, shape, points)
         total = distance * (-1 / self.thickness)
@@ -236,7 +236,7 @@ class Hypertexture(Tally, Producer):
         return self._channels(total, distance, level.soft)
 
     def _channels(self, total: Tensor, distance: Tensor, soft: float) -> dict[str, Tensor]:
-        """The channels (..., 1) out of s and distances (...)."""
+        """Returns the channels (..., 1), computed from s and distances (...)."""
         t = ((total - (0.5 - soft)) / (2 * soft)).clamp(0, 1)
         found = {"density": t * t * (3 - 2 * t), "distance": distance}
         return {name: found[name][..., None] for name in self.channels}

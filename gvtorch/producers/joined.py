@@ -1,5 +1,5 @@
-"""`JoinedProducer`: the channels of several producers of one grid, as one; `StoredChannels`: those
-of a store of several channels.
+"""`JoinedProducer`: joins the channels of several producers of the same grid; `StoredChannels`
+does so for a store of several channels.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from .stored import StoredProducer
 
 
 class JoinedProducer(OfProducers):
-    """Asks several producers for the same nodes; each gives one channel, under a name of its own.
+    """Asks several producers for the same nodes; each makes one of the channels.
 
-    A node is EMPTY where all say so, and CONSTANT where none has voxels for it. Answers with
-    aliases are refused.
+    A node is EMPTY if it is for all producers, and CONSTANT if none has voxels for it. Answers with
+    aliases are rejected.
 
     Attributes:
-        producers: By the name of its channel.
+        producers: By the name of the channel that each makes.
     """
 
     def __init__(self, producers: Mapping[str, Producer]) -> None:
-        """Takes producers of one channel each.
+        """Joins producers of one channel each.
 
         Args:
             producers: By the name that the channel of each gets.
 
         Raises:
-            ValueError: One has several channels, or they differ in extent, place or branching.
+            ValueError: One has several channels, or their extent, place or branching differs.
         """
         where = type(self).__name__
         if not isinstance(producers, Mapping):
@@ -78,12 +78,12 @@ class JoinedProducer(OfProducers):
         return {name: one for name, one in self.producers.items() if isinstance(one, Producer)}
 
     def classify(self, nodes: Nodes) -> Regions | Future:
-        """Asks all."""
+        """Joins the regions of all producers."""
         answers = {name: one.classify(nodes) for name, one in self.parts().items()}
         return _when_all(answers, functools.partial(self._regions, nodes))
 
     def fill(self, nodes: Nodes) -> Bricks | Future:
-        """Asks all."""
+        """Joins the bricks of all producers."""
         answers = {name: one.fill(nodes) for name, one in self.parts().items()}
         return _when_all(answers, functools.partial(self._bricks, nodes))
 
@@ -110,12 +110,12 @@ class JoinedProducer(OfProducers):
         if all(one.kind is None for one in given.values()):
             return Bricks(data=data, errors=_errors(given))
         kind = self._kinds(nodes, [one.kind for one in given.values()])
-        if len(constants) < len(given):  # some tell no constants: their voxels do
+        if len(constants) < len(given):  # without all constants, CONSTANT nodes need their voxels
             kind = torch.where(kind == Region.CONSTANT, int(Region.DATA), kind)
         return Bricks(data=data, kind=kind, constants=constants, errors=_errors(given))
 
     def _kinds(self, nodes: Nodes, kinds: Sequence[Tensor | None]) -> Tensor:
-        """(k,) of regions that hold for all; on CUDA, that of an alias is none that there is."""
+        """Returns (k,) regions true for all. An ALIAS raises ValueError; on CUDA it becomes -1."""
         device = nodes.loc.device if self.on_device else torch.device("cpu")
         data = torch.full((len(nodes),), int(Region.DATA), device=device)
         given = torch.stack([data if one is None else one.to(device, torch.int64) for one in kinds])
@@ -145,13 +145,13 @@ class StoredChannels(JoinedProducer):
 
         Args:
             store: A folder or a URL.
-            channels: Which of them; None takes all.
-            host_cache: Most bytes of decoded blocks kept in host memory, of all together.
-            timeout: As of `StoredProducer`.
-            workers: Number of threads that read a channel, as of `StoredProducer`.
+            channels: Which of them; None reads all.
+            host_cache: Most bytes of decoded blocks kept in host memory, for all channels together.
+            timeout: As in `StoredProducer`.
+            workers: Number of threads that read each channel, as in `StoredProducer`.
 
         Raises:
-            ValueError: It has no such channel, or is no store of several; or see `StoredProducer`.
+            ValueError: It has no such channel, or is not such a store; or see `StoredProducer`.
             OSError: It can't be read.
         """
         known = channel_names(store)
@@ -169,7 +169,7 @@ class StoredChannels(JoinedProducer):
 
 
 def _when_all(answers: Mapping[str, Any], join: Callable[[Mapping[str, Any]], Any]) -> Any:
-    """Joins answers, once all are there if some come later."""
+    """Joins answers: at once, or as a future if any of them is one."""
     late = [one for one in answers.values() if isinstance(one, Future)]
     if not late:
         return join(answers)

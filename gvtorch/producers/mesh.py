@@ -1,4 +1,4 @@
-"""`MeshProducer`: the voxels of a mesh, made while it is looked at."""
+"""`MeshProducer`: voxelizes a mesh on demand."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
 
 class MeshProducer(Producer):
-    """Makes bricks of a mesh at any level, out of its triangles: nothing is made that is not looked
-    at, so the resolution is free. What the finest voxels hold is what `gv.voxelize` writes.
+    """Makes bricks of a mesh at any level from its triangles. Only what is seen is made, so any
+    resolution is possible. The finest voxels are those that `gv.voxelize` writes.
 
-    A store's coarse voxels are means of those below; these are means of 2^3 places in the voxel, at
-    each of which the nearest surface counts as a plane. So coverage and distance differ where
-    several parts of the surface lie in a voxel. Colours and normals are those of the surface within
+    In a store, coarse voxels are means of those below; here they are means of 2^3 positions in the
+    voxel, with a plane in place of the nearest surface. So coverage and distance differ where
+    several parts of the surface are in a voxel. Colours and normals are those of the surface within
     `band` voxels of the level.
     """
 
@@ -39,20 +39,19 @@ class MeshProducer(Producer):
         branching: int = 2,
         **settings: Unpack[GridSettings],
     ) -> None:
-        """Takes a mesh.
+        """Sets the mesh and its grid.
 
         Args:
             mesh: A `Mesh`, or a file that `read_mesh` knows.
             channels: coverage, distance, color, normal, material; see `Voxelizer`.
             branching: N.
             **settings: resolution: finest voxels along its longest side, 1024 if left out. band:
-                finest voxels up to which the nearest place of the surface counts, 4. thickness:
-                finest voxels, of what bounds no solid, 1. solid: "auto", the default: what is
-                closed is a solid; "always": holes are filled before; "never": all is a sheet.
+                distance in finest voxels up to which the nearest surface counts, 4. thickness: in
+                finest voxels, of sheets that bound no solid, 1. solid: "auto", the default: closed
+                parts are solid; "always": holes are filled first; "never": everything is a sheet.
 
         Raises:
-            ValueError: It is none of these, a number is out of its range, a channel unknown, or see
-                `read_mesh`.
+            ValueError: It is no mesh (see `read_mesh`), a channel unknown, or a number invalid.
         """
         check.instance("MeshProducer", "mesh", mesh, Mesh, str, Path)
         mesh = mesh if isinstance(mesh, Mesh) else read_mesh(mesh)
@@ -75,13 +74,15 @@ class MeshProducer(Producer):
         self.voxelizer = grid
 
     def prepare(self, layout: Layout) -> None:
-        """Moves the triangles to where they are worked on."""
+        """Moves the triangles to the layout's device."""
         if layout.device != self.voxelizer.device:
             told: dict[str, Any] = {"channels": self.voxelizer.channels, "device": layout.device}
             self.voxelizer = Voxelizer(self.voxelizer.mesh, **told, **self._settings)
 
     def classify(self, nodes: Nodes) -> Regions:
-        """EMPTY outside and CONSTANT inside, where no triangle comes near any voxel in reach."""
+        """Returns EMPTY outside (CONSTANT if there are distances) and CONSTANT inside, where no
+        triangle is near any voxel in reach; else DATA.
+        """
         grid = self.voxelizer
         low, voxel = _cubes(nodes, grid)
         touched, within = grid.touched(low, nodes.layout.side * voxel, voxel)
@@ -98,7 +99,7 @@ class MeshProducer(Producer):
         coarse = nodes.depth.to(grid.device) < nodes.layout.depth
         if grid.device.type != "cpu":
             return Bricks(data=grid.cubes(low, voxel, side, coarse_k=coarse))
-        # The finest are of one place, which the host may look at here.
+        # Finest voxels are sampled at one position, which is faster; reading `coarse` is free here.
         order = coarse.to(torch.int8).argsort(stable=True)
         fine, rest = order.split([len(order) - int(coarse.sum()), int(coarse.sum())])
         parts = [grid.cubes(low[fine], voxel[fine], side)]
@@ -108,6 +109,6 @@ class MeshProducer(Producer):
 
 
 def _cubes(nodes: Nodes, grid: Voxelizer) -> tuple[Tensor, Tensor]:
-    """Low corners (k, 3) of bricks with their borders, and sizes (k,) of their voxels, float64."""
+    """Returns low corners (k, 3) of bricks with borders, and their voxel sizes (k,), float64."""
     low = nodes.box[:, 0] - nodes.layout.border * nodes.voxel_size
     return low.to(grid.device).contiguous(), nodes.voxel_size[:, 0].to(grid.device)

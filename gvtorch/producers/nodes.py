@@ -1,5 +1,5 @@
-"""`Nodes`: a batch of nodes by place, what a producer is asked about; `Layout`: how a producer's
-world is cut into nodes and bricks.
+"""`Nodes`: a batch of nodes by location, the argument of a producer's methods. `Layout`: how a
+producer's world is divided into nodes and bricks.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from torch import Tensor
 from ..fields.noise import inherit
 from ..pool.pyramid import tree_depth
 
-_ROUNDED = 1 / 32  # of a voxel, by which places may be rounded
+_ROUNDED = 1 / 32  # voxels; tolerance for rounded positions
 
 
 def grid_of(producer: Any) -> dict[str, Any]:
-    """Returns where a producer's content lies, as another of the same place takes it, by name."""
+    """Returns the arguments of `Producer.__init__` that place another producer in the same grid."""
     names = ("extent", "spacing", "origin", "branching")
     return {name: getattr(producer, name) for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """How an engine cuts a producer's world into nodes and bricks."""
+    """How an engine divides a producer's world into nodes and bricks."""
 
     depth: int  # of the finest level; the root's is 0
     branching: int  # N: a node has N^3 children
@@ -34,9 +34,9 @@ class Layout:
     border: int  # voxels around a brick
     extent: tuple[int, int, int]  # finest voxels along x, y, z
     spacing: tuple[float, float, float]  # world size of a finest voxel
-    origin: tuple[float, float, float]  # world place of the centre of voxel 0
+    origin: tuple[float, float, float]  # world position of the centre of voxel 0
     device: torch.device  # of the pools
-    scene: Mapping[str, Layout] = field(default_factory=dict, repr=False, compare=False)  # trees
+    scene: Mapping[str, Layout] = field(default_factory=dict, repr=False, compare=False)  # by tree
 
     @classmethod
     def of(cls, producer: Any, brick_size: int, border: int, device: torch.device) -> Layout:
@@ -46,7 +46,7 @@ class Layout:
         return cls(depth=depth, brick_size=brick_size, border=border, device=device, **place)
 
     def wider(self, by: int) -> Layout:
-        """Returns the layout of bricks with a border that is wider by so many voxels; kept."""
+        """Returns the layout with `by` more border voxels on each side of a brick; cached."""
         if by not in self._wider:
             self._wider[by] = replace(self, border=self.border + by)
         return self._wider[by]
@@ -82,8 +82,8 @@ class Layout:
 
     @functools.cached_property
     def grid(self) -> Tensor:
-        """(s * s * s * 3,) int64: for each x, y, z of each voxel of a brick, its index among the
-        3 * s coordinates along the axes.
+        """(s * s * s * 3,) int64: for x, y, z of each voxel of a brick (in order z, y, x), the
+        index of that coordinate in a flattened (3, s) tensor of coordinates along each axis.
         """
         at = torch.arange(len(self.reach), device=self.device)
         z, y, x = torch.meshgrid(at, at, at, indexing="ij")
@@ -91,16 +91,16 @@ class Layout:
 
 
 class Nodes:
-    """A batch of k nodes of one tree, by place: what a producer is asked about.
+    """A batch of k nodes of one tree, by location: the argument of a producer's methods.
 
     Attributes:
         loc: (k, 4) int64 x, y, z, depth: node x of its level covers voxels x * brick_size to
             (x + 1) * brick_size of that level.
-        layout: How the tree's world is cut: brick size, border, spacing and the like.
-        coarse: Whether their bricks hold coarse channels as well: then all are above the finest
-            level; where a producer has such channels and this is False, all are of the finest.
-        parents: For each channel (k, z, y, x, c) the bricks of their parents, with borders, as they
-            are stored; None unless `Producer.needs_parent`, and of the root, which has none.
+        layout: How the tree's world is divided: brick size, border, spacing and so on.
+        coarse: Whether their bricks also hold coarse channels: then all nodes are above the finest
+            level. If a producer has such channels and this is False, all are at the finest level.
+        parents: The bricks of their parents, (k, z, y, x, c) by channel, with borders, as stored;
+            None unless `Producer.needs_parent`, and for the root, which has no parent.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Nodes:
         coarse: bool = False,
         parents: Mapping[str, Tensor] | None = None,
     ) -> None:
-        """Holds the places."""
+        """See the class."""
         self.loc, self.layout, self.coarse, self.parents = loc, layout, coarse, parents
         self._known: dict[str, Tensor] = {}  # a cache of properties that torch.compile can trace
 
@@ -126,20 +126,20 @@ class Nodes:
         return Nodes(self.loc[index], self.layout, coarse=self.coarse, parents=parents)
 
     def wider(self, by: int) -> Nodes:
-        """Returns the same nodes with a border that is wider by so many voxels: what a producer
-        evaluates where voxels are made of their neighbours.
+        """Returns the same nodes with `by` more border voxels on each side: for producers that
+        evaluate a wider grid because voxels depend on their neighbours.
         """
         return Nodes(self.loc, self.layout.wider(by), coarse=self.coarse) if by else self
 
     @property
     def child(self) -> Tensor:
-        """(k, 3) int64 which child of its parent each is, x y z, 0 to N - 1."""
+        """(k, 3) int64 index of each node among its parent's children, x y z, 0 to N - 1."""
         return self.loc[:, :3] % self.layout.branching
 
     def inherited(self, points: int = 2) -> dict[str, Tensor]:
-        """Returns for each channel (k, z, y, x, c) float32 what `parents` hold where these nodes
-        have their voxels, border included: interpolated from `points` voxels along each axis, see
-        `gv.noise.inherit`; 2 is what renderers read.
+        """Returns the values of `parents` at these nodes' voxels, border included, as
+        (k, z, y, x, c) float32 by channel: interpolated from `points` voxels along each axis, see
+        `gv.noise.inherit`; 2 interpolates as renderers do.
 
         Raises:
             ValueError: There are no parents, or bricks have no border.
@@ -162,7 +162,7 @@ class Nodes:
 
     @property
     def scale(self) -> Tensor:
-        """(k,) float64, finest voxels along a side of one of the node's voxels."""
+        """(k,) float64 side of the nodes' voxels, in finest voxels."""
         if "scale" not in self._known:
             base = torch.full_like(self.loc[:, 3], self.layout.branching, dtype=torch.float64)
             self._known["scale"] = base ** (self.layout.depth - self.loc[:, 3])
@@ -170,7 +170,7 @@ class Nodes:
 
     @property
     def voxel_size(self) -> Tensor:
-        """(k, 3) float64 world size of one of the node's voxels."""
+        """(k, 3) float64 world size of the nodes' voxels."""
         return self.scale[:, None] * self.layout.spacing_3.to(self.loc.device)
 
     @property
@@ -193,7 +193,7 @@ class Nodes:
         return (self.voxel_size * (0.5 * (self.layout.side - 1))).norm(dim=1)
 
     def touch(self, boxes: Tensor) -> Tensor:
-        """Returns (k,) bool, whether bricks, borders included, reach into one of (m, 2, 3) world
+        """Returns (k,) bool: whether bricks, borders included, reach into any of (m, 2, 3) world
         boxes.
         """
         layout, boxes = self.layout, boxes.to(self.loc.device, torch.float64)
@@ -206,14 +206,14 @@ class Nodes:
         """float32 world coordinates of the voxel centres along x (k, 1, 1, s), y (k, 1, s, 1) and
         z (k, s, 1, 1), border included. A function of them broadcasts to (k, z, y, x) and reads a
         hundredth of the memory that `positions` take. In worlds of more than about 2^20 voxels a
-        side float32 can't tell neighbours apart: see `local_axes`.
+        side float32 can't distinguish neighbours: see `local_axes`.
         """
         return _broadcast(self._places)
 
     @property
     def local_axes(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The same from the brick's `center` on: exact at any depth. `center` is float64, so that
-        `nodes.center[:, 0, None, None, None] + x` gives world coordinates in float64.
+        """The same relative to the brick's `center`: exact at any depth. `center` is float64, so
+        `nodes.center[:, 0, None, None, None] + x` is a world coordinate in float64.
         """
         return _broadcast(self._local)
 
@@ -224,7 +224,7 @@ class Nodes:
 
     @property
     def local_positions(self) -> Tensor:
-        """(k, z, y, x, 3) float32, the same from the brick's `center` on: see `local_axes`."""
+        """(k, z, y, x, 3) float32, the same relative to the brick's `center`: see `local_axes`."""
         return self._grid("local_positions", self._local)
 
     def points(self, dtype: torch.dtype) -> Tensor:
@@ -234,7 +234,7 @@ class Nodes:
         return self.positions
 
     def _grid(self, name: str, places: Tensor) -> Tensor:
-        """(k, z, y, x, 3) of (k, 3, s) coordinates along each axis, kept under a name."""
+        """Expands (k, 3, s) coordinates along each axis to (k, z, y, x, 3); cached by name."""
         if name not in self._known:
             side, grid = self.layout.side, self.layout.grid.to(places.device)
             flat = places.flatten(1).index_select(1, grid)
@@ -243,7 +243,7 @@ class Nodes:
 
     @property
     def _local(self) -> Tensor:
-        """(k, 3, s) float32 coordinates along each axis of the voxel centres from `center` on."""
+        """(k, 3, s) float32 coordinates of the voxel centres along each axis, from `center`."""
         middle = 0.5 * (self.layout.brick_size - 1)
         reach = self.layout.reach.to(self.loc.device) - middle
         return (self.voxel_size[:, :, None] * reach).to(torch.float32)
@@ -259,7 +259,7 @@ class Nodes:
         return self._known["places"]
 
     def _world(self, finest: Tensor) -> Tensor:
-        """Brings places (..., 3) from finest voxels to the world."""
+        """Converts positions (..., 3) from finest voxels to world units."""
         layout = self.layout
         return finest * layout.spacing_3.to(finest.device) + layout.origin_3.to(finest.device)
 
@@ -272,6 +272,6 @@ class Nodes:
 
 
 def _broadcast(places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(k, 3, s) coordinates along each axis, so that they broadcast to (k, z, y, x)."""
+    """Reshapes (k, 3, s) coordinates along each axis so that they broadcast to (k, z, y, x)."""
     x, y, z = places.unbind(1)
     return x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]

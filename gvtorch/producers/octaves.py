@@ -1,4 +1,4 @@
-"""`OctaveProducer`: sums of octaves of noise, of which each level adds the finest."""
+"""`OctaveProducer`: sums of octaves of noise, to which each level adds its finest octaves."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from .producer import Nodes, Producer, by_depth
 
 
 class OctaveProducer(Producer):
-    """Bricks of a `gv.noise.SplineSum` or `gv.noise.OctaveSum`, or of what is made of it.
+    """Makes bricks of a `gv.noise.SplineSum` or `gv.noise.OctaveSum`, or of a function of it.
 
-    A level holds the sum of the octaves that its voxels can hold. Where children can't take over
-    what voxels hold as it is, the channel "inherited" has what they can. Cells begin at the low
-    corner of the box.
+    A level holds the sum of the octaves that its voxels can represent. If children can't inherit
+    the voxels' values themselves, the channel "inherited" holds what they inherit. Cells begin at
+    the low corner of the box.
 
     Attributes:
         total: The sum.
-        values: What voxels are made of it by; None: they hold it.
+        values: Function from the sum to voxels; None: voxels hold the sum.
     """
 
     needs_parent = on_device = True
@@ -38,19 +38,19 @@ class OctaveProducer(Producer):
         branching: int = 2,
         value_range: tuple[float, float] | None = None,
     ) -> None:
-        """Takes the sum and where to cut voxels out of it.
+        """Sets the sum and the grid of voxels.
 
         Args:
             total: The sum; a `SplineSum` needs cells that are 2^n voxels wide.
             extent: Voxels of the finest level, one number or (x, y, z).
-            box: World corners ((x, y, z), (x, y, z)), of voxels that are cubes.
-            values: A function of the sum (k, z, y, x) in some nodes, and of these nodes, such as a
-                density: of the same shape. On CUDA it is recorded: it may not wait for the host.
-            branching: N; 2 of a `SplineSum`, whose levels halve their voxels.
-            value_range: Smallest and largest value, where they are known.
+            box: World corners ((x, y, z), (x, y, z)); voxels must be cubes.
+            values: A function of the sum (k, z, y, x) in some nodes, and of these `Nodes`, that
+                returns the same shape, such as a density. On CUDA it must not make the host wait.
+            branching: N; 2 for a `SplineSum`, whose levels halve their voxels.
+            value_range: Smallest and largest value, if they are known.
 
         Raises:
-            ValueError: Voxels are no cubes, N is not 2 of a `SplineSum`, or see `Producer`.
+            ValueError: Voxels are not cubes, N is not 2 for a `SplineSum`, or see `Producer`.
         """
         where = type(self).__name__
         if not isinstance(total, (OctaveSum, SplineSum)):
@@ -73,8 +73,8 @@ class OctaveProducer(Producer):
         self.total, self.values = total, values
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
-        """Adds the finest octaves, level by level: on the CPU of the nodes of each, else of all
-        nodes at every level, for nothing may wait for how many there are of each.
+        """Adds the finest octaves, level by level. On the CPU each level's nodes are computed;
+        elsewhere all nodes at every level, because counting those of a level would block.
         """
         looks = nodes.loc.device.type == "cpu" and not torch.compiler.is_compiling()
         return self._by_level(nodes) if looks else self._at_every_level(nodes)
@@ -100,7 +100,7 @@ class OctaveProducer(Producer):
         return found
 
     def _sums(self, nodes: Nodes, depth: int) -> tuple[Tensor, Tensor]:
-        """What nodes of one level hold, and what their children take over, (k, z, y, x)."""
+        """Returns the values of nodes of one level, and what children inherit, (k, z, y, x)."""
         layout = nodes.layout
         side = self.spacing[0] * float(layout.branching) ** (layout.depth - depth)
         reach = layout.reach.to(nodes.loc.device)

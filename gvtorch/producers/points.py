@@ -1,4 +1,4 @@
-"""`PointProducer`: points with values, such as stars or particles, as voxels that hold their sum.
+"""`PointProducer`: sums the values of points, such as stars or particles, in voxels.
 
 Source: Hockney, Eastwood, "Computer simulation using particles", 1988, section 5 (shape functions;
 nearest grid point for points without a radius).
@@ -22,13 +22,13 @@ from ..points.splat import Cubes, ranges, values
 from ..pool import Channel
 from .producer import Nodes, Producer, Region, Regions, by_depth
 
-_BATCH = 256  # bricks worked on at a time
+_BATCH = 256  # bricks made at a time
 
 
 class PointProducer(Producer):
-    """Makes bricks of points. Its channel is "value": for each number of a point's the sum over the
-    points in a voxel, per finest voxel, so that a voxel of a coarse level holds the mean, and all
-    levels have one sum, that of the points.
+    """Makes bricks of points. Its channel "value" holds, for each number of a point, the sum over
+    the points in a voxel, divided by the volume of the voxel in finest voxels. So a coarse voxel
+    holds the mean of the finest ones, and the integral over each level is the sum over all points.
 
     Attributes:
         points: The points, sorted.
@@ -49,22 +49,22 @@ class PointProducer(Producer):
         dtype: torch.dtype = torch.float32,
         drawn: bool = False,
     ) -> None:
-        """Takes the points.
+        """Sets the points and the grid of voxels; sorts the points if they are not sorted.
 
         Args:
-            positions: (n, 3) x, y, z in the world; or `Points`; or `SortedPoints`, or the folder
-                that holds them, which have values, radius, extent, box and branching of their own.
-            values: (n,) or (n, c) numbers that add up, such as mass, luminosity, or premultiplied
+            positions: (n, 3) world x, y, z; or `Points`; or `SortedPoints`, or the folder that
+                holds them, which define values, radius, extent, box and branching themselves.
+            values: (n,) or (n, c) additive numbers, such as mass, luminosity, or premultiplied
                 colour and opacity; 1 each if left out.
             extent: Voxels of the finest level, (x, y, z), or along the longest side of the box.
-            radius: (n,) or one number: how far points reach along each axis, in the world. 0, or
-                left out: a point is wholly in one voxel.
-            box: World corners ((x, y, z), (x, y, z)); points outside are left out. Around all
-                points, as far as they reach, if left out.
+            radius: (n,) or one number: extent of a point to either side along each axis, world
+                units. 0, or left out: a point is in one voxel only.
+            box: World corners ((x, y, z), (x, y, z)); points outside are ignored. If left out,
+                around all points and their radii.
             branching: N.
             dtype: Of the voxels: float16, bfloat16 or float32.
-            drawn: The finest level is without the points that are narrower than its voxels:
-                `gv.point_layer` draws them where it would be looked at.
+            drawn: True leaves points narrower than its voxels out of the finest level:
+                `gv.point_layer` draws them where that level would be used.
 
         Raises:
             ValueError: A tensor is of the wrong shape, empty or not finite, no point lies in the
@@ -93,10 +93,10 @@ class PointProducer(Producer):
             branching=grid.branching,
         )
         self.points, self.drawn = found, drawn
-        self._told = False  # of sums that the channel can't hold
+        self._told = False  # whether the warning about sums that the channel can't hold was shown
 
     def classify(self, nodes: Nodes) -> Regions:
-        """EMPTY where no point reaches into the brick, and the ranges of values."""
+        """Returns EMPTY where no point reaches into the brick, else DATA; and the value ranges."""
         channel = self.channels["value"]
         kind = torch.full((len(nodes),), int(Region.EMPTY))
         ends = torch.zeros((len(nodes), 2, channel.width), dtype=torch.float64)
@@ -105,12 +105,12 @@ class PointProducer(Producer):
             some, low, high = (torch.from_numpy(part) for part in found)
             kind[rows[some]] = int(Region.DATA)
             ends[rows] = torch.stack((low, high), 1)
-        # What is rounded to the channel's dtype may pass the ends by a part of 2^-7 (bfloat16).
+        # Values rounded to the channel's dtype may exceed the ends by a relative 2^-7 (bfloat16).
         stored = (ends * (1 + 2.0**-7)).clamp(*channel.limits).to(channel.dtype)
         return Regions(kind=kind, ranges={"value": stored})
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
-        """Adds up the points in each voxel, border included; beyond the box there is nothing."""
+        """Sums the points in each voxel, border included; voxels beyond the box are 0."""
         channel = self.channels["value"]
         shape = (len(nodes), *(nodes.layout.side,) * 3, channel.width)
         out = torch.empty(shape, dtype=channel.dtype)
@@ -121,7 +121,7 @@ class PointProducer(Producer):
         return {"value": out}
 
     def _warn_of(self, sums: Tensor) -> None:
-        """Tells once where sums are larger than the channel can hold."""
+        """Warns once if sums are larger than the channel can hold."""
         (low, high), dtype = self.channels["value"].limits, self.channels["value"].dtype
         least, most = (float(end) for end in torch.aminmax(sums)) if sums.numel() else (0.0, 0.0)
         if not self._told and (least < low or most > high):
@@ -138,7 +138,7 @@ class PointProducer(Producer):
 
 
 def _by_level(nodes: Nodes) -> Iterator[tuple[Tensor, Cubes]]:
-    """Yields rows of nodes of one level, a batch at a time, and their voxels, borders included."""
+    """Yields indices of a batch of nodes of one level, and their cubes of voxels with borders."""
     layout, loc = nodes.layout, nodes.loc.cpu()
     for depth, here in by_depth(loc):
         for rows in here.split(_BATCH):

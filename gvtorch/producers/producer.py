@@ -1,5 +1,5 @@
-"""`Producer`: makes the content of a tree, and the records that it is asked and answers with. It
-knows nodes by place only, never pools and slots.
+"""`Producer`, which makes the content of a tree, and the records of its answers. A producer knows
+nodes by their location only, never pools and slots.
 
 Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2011, chapter 7 (a
     producer may decline).
@@ -28,10 +28,10 @@ from ..pool.pools import phrase
 from ..pool.staging import TableRows, Voxels, on_device
 from .nodes import Layout, Nodes
 
-#: Tells which of k nodes have changed, in their own voxels or in those below them: (k,) bool.
+#: Returns (k,) bool: which of k nodes have changed, in their own voxels or in those below them.
 Where = Callable[[Nodes], Tensor]
-_numbers = itertools.count(1)  # of changes of all producers: a later one has a larger number
-_REMEMBERED = 64  # changes; before these, everything may have changed
+_numbers = itertools.count(1)  # versions, shared by all producers: a later change has a larger one
+_REMEMBERED = 64  # changes that are kept; if more are asked for, everything may have changed
 
 
 class Region(IntEnum):
@@ -41,20 +41,20 @@ class Region(IntEnum):
     CONSTANT = 1  # one value everywhere, also in its children
     DATA = 2  # voxels; its children may hold more detail
     DATA_MAX_DEPTH = 3  # voxels; its children hold no more detail and are never asked for
-    ALIAS = 4  # the same as another node, the alias target, with all below it
+    ALIAS = 4  # the same as another node (the alias target), including everything below it
 
 
 def by_depth(loc: Tensor) -> Iterator[tuple[int, Tensor]]:
-    """Yields each depth of nodes at places (k, 4), and which of them it has, (m,); waits for the
-    device.
+    """Yields each depth among locs (k, 4), and the indices (m,) of the nodes at that depth; waits
+    for the device.
     """
     for depth in loc[:, 3].unique().tolist():
         yield depth, (loc[:, 3] == depth).nonzero()[:, 0]
 
 
 def _between(bricks: Tensor, row: Tensor, place: Tensor) -> Tensor:
-    """(p, c) float32 values between the eight voxels of bricks (k, z, y, x, c) around places (p, 3)
-    of bricks (p,).
+    """Returns (p, c) float32 values of bricks (k, z, y, x, c): trilinear, at positions `place`
+    (p, 3), in voxels, of bricks `row` (p,).
     """
     low = place.floor().clamp(max=bricks.shape[1] - 2)
     share, low = (place - low).to(torch.float32), low.to(torch.int64)
@@ -68,10 +68,10 @@ def _between(bricks: Tensor, row: Tensor, place: Tensor) -> Tensor:
 
 
 class Answer:
-    """What a producer answers: tensors, a row for each of k items, most of them by channel."""
+    """Base of answers of producers: tensors with a row for each of k items, mostly by channel."""
 
     def rows(self, row: Tensor) -> Self:
-        """The items that `row` (m,) names, errors left out."""
+        """Returns the items with indices `row` (m,), without errors."""
 
         def some(value: Any) -> Any:
             if isinstance(value, TableRows):
@@ -81,7 +81,7 @@ class Answer:
         return self.each(some, errors={})
 
     def each(self, change: Callable[[Any], Any], **others: Any) -> Self:
-        """The answer with all tensors and rows of tables changed, and with `others` as fields."""
+        """Returns the answer with `change` applied to all tensors and rows, and fields `others`."""
 
         def changed(value: Any) -> Any:
             if isinstance(value, Mapping):
@@ -97,13 +97,13 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Regions(Answer):
-    """Answer of `classify`: what each of k nodes holds. Constants and ranges go by channel."""
+    """Answer of `classify`: what each of k nodes holds. Constants and ranges are by channel."""
 
     kind: Tensor  # (k,) of `Region`
     constants: Mapping[str, Tensor] = field(default_factory=dict)  # (k, c), see `Region.CONSTANT`
     ranges: Mapping[str, Tensor] = field(default_factory=dict)  # (k, 2, c) smallest, largest value
-    alias: Tensor | None = None  # (k, 4) int64 places of alias targets; other rows are not read
-    alias_tree: str | None = None  # name of the tree that they are of; None: this one
+    alias: Tensor | None = None  # (k, 4) int64 locs of alias targets, read where kind is ALIAS
+    alias_tree: str | None = None  # name of the tree of the alias targets; None: this one
     errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # by item, why it failed
 
 
@@ -111,10 +111,10 @@ class Regions(Answer):
 class Bricks(Answer):
     """Answer of `fill`: the voxels of k bricks, or why a brick has none.
 
-    Voxels may lie on the engine's device or in host memory; from there they are sent through pinned
-    memory while the engine renders. Bricks that lie ready are best named by the rows of a
-    `BrickTable`. Tensors in pinned memory are copied from where they are a little later, so they
-    must not be changed any more.
+    Voxels may be on the engine's device or in host memory, from which they are sent through pinned
+    memory while the engine renders. For bricks that already exist in host memory, rows of a
+    `BrickTable` are the fastest answer. Tensors in pinned memory are not copied at once, so they
+    must not be changed afterwards.
     """
 
     data: Voxels  # for each channel (k, z, y, x, c), border included
@@ -127,22 +127,22 @@ class Bricks(Answer):
 
 @runtime_checkable
 class CoarseColors(Protocol):
-    """What makes a coarse channel: `Filtered`, which stands on the same floor, has this form."""
+    """Interface that makes a coarse channel; that of `Filtered`, which can't be imported here."""
 
     other: str | None  # name of the channel
-    component: int | None  # which number of a voxel it is made of
+    component: int | None  # index of the number of a voxel that it is made of
 
     @property
     def made_of(self) -> Mapping[str, Any]:
-        """What it is made of, as plain values."""
+        """All inputs that it depends on, as plain values."""
 
     def colors(self, spacing: tuple[float, float, float]) -> Channel:
-        """Returns the channel, for voxels of this size."""
+        """Returns dtype and width of the channel, for voxels of this size."""
 
     def levels(
         self, volume: Volume, branching: int, depth: int, device: torch.device, width: int
     ) -> Iterator[Tensor]:
-        """Yields (z, y, x, width) of the coarse levels, the finest of them first, on the CPU."""
+        """Yields (z, y, x, width) of each coarse level, the finest of them first, on the CPU."""
 
 
 def check_filtered(where: str, value: Any) -> None:
@@ -153,27 +153,28 @@ def check_filtered(where: str, value: Any) -> None:
 
 
 class Producer(torch.nn.Module):
-    """Base of producers. A subclass writes `fill`, which makes the bricks of a batch of nodes, and
-    where that saves work `classify`, which tells what nodes hold.
+    """Base of producers. A subclass implements `fill`, which makes the bricks of a batch of nodes,
+    and, if it saves work, `classify`, which returns what nodes hold.
 
-    One engine uses a producer, and asks it from one thread at a time: the one that renders, or that
-    of a captured frame. Its futures may be done in any thread.
+    A producer is used by one engine, from one thread at a time: the one that renders, or that of a
+    captured frame. Its futures may be completed in any thread.
 
     Attributes:
         patience: Seconds after which an answer that has not come counts as failed; None: the
             engine's.
-        layout: Set by the engine that uses this producer; None while none does.
-        on_device: Whether `classify` and `fill` take and give tensors of the engine's device alone,
-            and never make the host wait or copy from its memory, so that `Engine.capture` can
-            record them. They are then asked for batches of one size, which the root fills up.
-        on_host: Whether they take places on the host (`Nodes.loc`), and give tensors there or
-            futures soon: a captured frame then asks them while the device renders.
-        needs_parent: Whether `fill` is to be handed the bricks of the nodes' parents
-            (`Nodes.parents`): a node whose parent has no brick then waits until it has. Engines on
-            CUDA record this where the producer is `on_device`.
-        host_bytes: Host memory that it may fill while it is used.
-        made_of: For coarse channels, what they are made of: shaders compare it with what they need.
-        version: Number of the content, which rises: see `changed`.
+        layout: Set by the engine that uses this producer; otherwise None.
+        on_device: Whether `classify` and `fill` take and return only tensors on the engine's
+            device, and never make the host wait or copy from host memory, so that `Engine.capture`
+            can record them. Batches then have a fixed size and are padded with the root.
+        on_host: Whether both take locs on the host (`Nodes.loc`), and soon return tensors there or
+            futures: a captured frame then calls them while the device renders.
+        needs_parent: Whether `fill` needs the bricks of the nodes' parents (`Nodes.parents`): a
+            node then waits until its parent has a brick. Engines on CUDA also record this if the
+            producer is `on_device`.
+        host_bytes: Bytes of host memory that it may fill while it is used.
+        made_of: For coarse channels, all inputs that they depend on: shaders compare them with what
+            they need.
+        version: Number of the content, which increases with each change: see `changed`.
         extent, spacing, origin, branching, channels, value_range, labels: See `__init__`.
     """
 
@@ -198,19 +199,19 @@ class Producer(torch.nn.Module):
         value_range: Mapping[str, tuple[float, float]] | None = None,
         labels: Mapping[str, Tensor | None] | None = None,
     ) -> None:
-        """Tells where the content lies.
+        """Sets where the content lies, and what voxels hold.
 
         Args:
             extent: Voxels of the finest level, one number or (x, y, z).
             channels: What a voxel holds, by name; one float32 "value" if left out.
-            box: World corners ((x, y, z), (x, y, z)) that the extent fills; takes the place of
-                spacing and origin.
+            box: World corners ((x, y, z), (x, y, z)) that the extent fills; replaces spacing and
+                origin.
             spacing: World size of a finest voxel, one number or (x, y, z).
-            origin: World place of the centre of voxel 0.
+            origin: World position of the centre of voxel 0.
             branching: N >= 2.
-            value_range: For each channel its smallest and largest value, where they are known.
-            labels: For channels that hold labels, (k,) int64 the label that each value stands for,
-                rising; None: values stand for themselves. Coarse voxels then hold a label, too.
+            value_range: Smallest and largest value of each channel for which they are known.
+            labels: For channels that hold labels: (k,) int64, increasing, the label of each value;
+                None: values are the labels. Coarse voxels of such channels hold labels, too.
 
         Raises:
             ValueError: A number is out of its range.
@@ -251,16 +252,16 @@ class Producer(torch.nn.Module):
         self._changes: deque[tuple[int, Where | None]] = deque(maxlen=_REMEMBERED)
 
     def prepare(self, layout: Layout) -> None:
-        """Is called once by the engine, before anything else, with how it cuts the world."""
+        """Prepares for nodes of a layout. The engine calls it once, before any other method."""
 
     def classify(self, nodes: Nodes) -> Regions | Tensor | Future:
-        """Tells what k nodes hold; all DATA unless overridden.
+        """Returns what k nodes hold; all DATA unless overridden.
 
-        DATA is always right and costs memory. EMPTY and CONSTANT must be true of all that lies in
-        reach of the node's brick, border included, and of the bricks of all nodes below it.
+        DATA is always correct but costs memory. EMPTY and CONSTANT must be true of everything
+        within the node's brick, border included, and within the bricks of all nodes below it.
 
         Returns:
-            `Regions`, or their (k,) kinds alone, now or as a future.
+            `Regions`, or only their (k,) kinds; either at once or as a future.
         """
         return torch.full((len(nodes),), Region.DATA, device=nodes.loc.device)
 
@@ -270,20 +271,20 @@ class Producer(torch.nn.Module):
         Coarse levels must be pre-filtered: a voxel is the mean over the space that it covers.
 
         Returns:
-            `Bricks`, or their voxels {channel: (k, z, y, x, c)} alone, or those of the only channel
-            there is, now or as a future. Coarse channels (`Channel.coarse`) are there if
-            `nodes.coarse` is true, and only then.
+            `Bricks`, or only their voxels {channel: (k, z, y, x, c)}, or one tensor if there is one
+            channel; either at once or as a future. Coarse channels (`Channel.coarse`) must be
+            included if `nodes.coarse` is true, and only then.
         """
         raise NotImplementedError(f"{type(self).__name__}: fill is not written")
 
     def changed(self, where: Where | Tensor | Sequence[Any] | None = None) -> None:
-        """Tells that the content is another one from now on, such as at another time: the engine
-        drops what it holds of it and asks again, from its next frame on.
+        """Declares that the content has changed, for example to another time: in its next frame the
+        engine drops what it holds of the changed nodes, and asks for them again.
 
         Args:
-            where: World corners (2, 3) or (m, 2, 3) of boxes, beyond which all voxels stay, those
-                of coarse levels too where they lie beyond; or a function that tells of `Nodes`
-                which (k,) bool have changed, they or what lies below. Left out: everything.
+            where: World corners (2, 3) or (m, 2, 3) of boxes; voxels of all levels that lie outside
+                of them must be unchanged. Or a function of `Nodes` that returns (k,) bool: which
+                have changed, themselves or anything below them. Left out: everything.
 
         Raises:
             ValueError: Corners are not finite, or of another shape.
@@ -300,21 +301,22 @@ class Producer(torch.nn.Module):
         self._changes.append((self.version, where))
 
     def changes(self, since: int) -> list[Where] | None:
-        """Returns what tells the nodes that have changed since a version; None: any may have."""
+        """Returns functions that find the nodes changed since a version; None: any may have."""
         new = [where for number, where in self._changes if number > since]
         known = [where for where in new if where is not None]
         return known if 0 < len(known) == len(new) < _REMEMBERED else None
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
-        """Returns (k,) bool, which nodes differ between two times: in a voxel of their own, borders
+        """Returns (k,) bool: which nodes differ between two times, in a voxel of their own, borders
         included, or in one below them. Unless overridden all do, if any part has a time.
         """
         return torch.full_like(nodes.depth, hasattr(self, "time"), dtype=torch.bool)
 
     @property
     def time(self) -> float:
-        """The time of the parts that have one, such as a field or another producer: a buffer `time`
-        (`Field.number`). Setting it makes anew what `differs`. AttributeError if none has.
+        """The time of all parts that have a buffer `time` (`Field.number`), such as fields or other
+        producers. Setting it calls `changed` for the nodes in `differs`. AttributeError if no part
+        has a time.
         """
         return float(self._clocks()[0])
 
@@ -330,7 +332,7 @@ class Producer(torch.nn.Module):
 
     @contextmanager
     def at_time(self, time: float) -> Iterator[None]:
-        """Lets the block look at another time, which is no change."""
+        """Sets another time within a `with` block, without calling `changed`."""
         clocks = self._clocks()
         own = [float(clock) for clock in clocks]
         try:
@@ -347,12 +349,12 @@ class Producer(torch.nn.Module):
         return clocks
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
-        """Returns the values at world points (..., 3), for each channel (..., c) float32, as
-        renderers read them: between the eight nearest voxels of the finest level. Needs no engine;
+        """Returns the values at world points (..., 3), for each channel (..., c) float32,
+        interpolated between the eight nearest finest voxels as renderers do. Needs no engine;
         without one, this prepares the producer for bricks of 8^3.
 
         Raises:
-            ValueError: Points are not that, or a brick can't be made.
+            ValueError: Points have another shape or are not finite, or a brick can't be made.
         """
         check_points(f"{type(self).__name__}.at", points)
         if self.layout is None:
@@ -373,8 +375,8 @@ class Producer(torch.nn.Module):
         return found
 
     def bricks_at(self, loc: Tensor, layout: Layout) -> dict[str, Tensor]:
-        """For each channel (k, z, y, x, c) the bricks of nodes of one level at places (k, 4); what
-        these need of their parents is made first. ValueError where one can't be made.
+        """Returns, by channel, the bricks (k, z, y, x, c) of nodes `loc` (k, 4) of one level; makes
+        those of their parents first if they are needed. Raises ValueError if one can't be made.
         """
         parents = None
         if self.needs_parent and bool((loc[:, 3] > 0).all()):
@@ -390,13 +392,13 @@ class Producer(torch.nn.Module):
         return {name: on_device(rows, loc.device).view(shape) for name, rows in answer.data.items()}
 
     def as_bricks(self, answer: Any) -> Any:
-        """Returns what `fill` gave as `Bricks`; what is none of its answers stays what it is."""
+        """Wraps an answer of `fill` in `Bricks`; returns `Bricks` and invalid answers unchanged."""
         if isinstance(answer, Tensor) and len(self.channels) == 1:
             answer = dict.fromkeys(self.channels, answer)
         return Bricks(data=answer) if isinstance(answer, Mapping) else answer
 
     def close(self) -> None:
-        """Closes files and ends threads; does nothing unless overridden."""
+        """Closes files and stops threads; does nothing unless overridden."""
 
     def __repr__(self) -> str:
         extent = "x".join(str(n) for n in self.extent)
@@ -405,24 +407,24 @@ class Producer(torch.nn.Module):
 
 
 class OfProducers(Producer):
-    """Base of producers that ask others: these change, are prepared and closed with it."""
+    """Base of producers made of other producers: prepares, changes and closes all of them."""
 
     def parts(self) -> dict[str, Producer]:
-        """Returns those that it asks, by name."""
+        """Returns the producers that it is made of, by name."""
         raise NotImplementedError
 
     @property
     def version(self) -> int:  # type: ignore[override]
-        """Rises with that of each."""
+        """The latest version of any part."""
         return max(one.version for one in self.parts().values())
 
     def changed(self, where: Any = None) -> None:
-        """See `Producer.changed`; all have changed."""
+        """See `Producer.changed`; calls it for all parts."""
         for one in self.parts().values():
             one.changed(where)
 
     def changes(self, since: int) -> list[Where] | None:
-        """Wherever any has changed."""
+        """See `Producer.changes`; returns the changes of all parts."""
         new = [one.changes(since) for one in self.parts().values() if one.version > since]
         known = [changes for changes in new if changes is not None]
         if len(known) < len(new):
@@ -430,18 +432,18 @@ class OfProducers(Producer):
         return [*dict.fromkeys(where for changes in known for where in changes)]  # each once
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
-        """Where any differs."""
+        """Returns (k,) bool: the nodes in which any part with a time differs."""
         parts = [*self.parts().values()]
         timed = [one for one in parts if hasattr(one, "time")] or parts
         return torch.stack([one.differs(nodes, before, after) for one in timed]).any(0)
 
     def prepare(self, layout: Layout) -> None:
-        """Prepares all."""
+        """Prepares all parts."""
         for one in self.parts().values():
             one.prepare(layout)
 
     def close(self) -> None:
-        """Closes all."""
+        """Closes all parts."""
         for one in self.parts().values():
             one.close()
 
@@ -455,15 +457,15 @@ def check_points(where: str, points: Any) -> None:
 
 
 def clocks_of(module: torch.nn.Module) -> list[Tensor]:
-    """Returns the numbers `time` of all parts that have one."""
+    """Returns the buffers `time` of all parts that have one."""
     return [one for name, one in module.named_buffers() if name.rpartition(".")[2] == "time"]
 
 
 def touched(changes: Sequence[Where], nodes: Nodes) -> Tensor:
-    """Returns (k,) bool, which nodes any of some changes concerns."""
+    """Returns (k,) bool: which nodes any of the changes affects."""
     return torch.stack([where(nodes) for where in changes]).any(0)
 
 
 def arrived(answer: Any) -> Any:
-    """Returns a producer's answer; waits for one that comes later."""
+    """Returns a producer's answer; waits for it if it is a future."""
     return answer.result() if isinstance(answer, Future) else answer

@@ -1,6 +1,6 @@
-"""`StoredProducer`: bricks from a store on disk or behind a URL, read while the engine goes on. A
+"""`StoredProducer`: bricks from a store on disk or at a URL, read while the engine continues. A
 block of the store holds many bricks, so blocks are kept in a bounded host cache. Cells (smallest,
-largest and mean value of 8^3 voxels) tell which nodes need no bricks before any voxel is read.
+largest and mean value of 8^3 voxels) show which nodes need no bricks before any voxel is read.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from .answer import regions_of
 from .nodes import Layout, Nodes
 from .producer import Bricks, CoarseColors, Producer, Region, Regions, check_filtered
 
-_TILE = 32  # cells along a side of what is read at once
-_GROUP_BYTES = 32 * 10**6  # of cubes held at a time beside the cache
+_TILE = 32  # cells along a side of the cubes in which cells are read
+_GROUP_BYTES = 32 * 10**6  # of cubes that are held at a time in addition to the cache
 _CHANNEL = "value"
 
 
@@ -39,8 +39,8 @@ Read = Callable[[list[Key]], dict[Key, Found]]
 
 
 class HostCache:
-    """Arrays by key; beyond `limit` bytes the least recently used are dropped. What several threads
-    ask for at once is read by one of them.
+    """Arrays by key; beyond `limit` bytes the least recently used are dropped. If several threads
+    ask for a key at the same time, one of them reads it.
     """
 
     def __init__(self, limit: int) -> None:
@@ -50,8 +50,8 @@ class HostCache:
         self._lock = threading.Lock()
 
     def get(self, keys: Sequence[Key], read: Read) -> list[Found]:
-        """Returns for each key, given once, an array, or a text that says why there is none. `read`
-        is called with the keys that are neither kept nor being read; texts are not kept.
+        """Returns an array for each of the (distinct) keys, or an error message. `read` is called
+        with the keys that are neither cached nor being read; messages are not cached.
         """
         found: dict[Key, Found] = {}
         mine: list[Key] = []
@@ -90,9 +90,9 @@ class _Cubes:
     bricks with their border fit into them, else regions of about that size.
     """
 
-    blocks: bool
+    blocks: bool  # whether cubes are the store's blocks
     brick_size: int  # voxels along a side of a brick
-    bricks: int  # along a side of a cube
+    bricks: int  # bricks along a side of a cube
     border: int  # voxels around a cube
 
     @classmethod
@@ -109,7 +109,7 @@ class _Cubes:
 
 
 def _coarse_channel(store: Store, filtered: CoarseColors) -> dict[str, Channel]:
-    """The channel of a shader's filtered colours; ValueError if the store has others or none."""
+    """Returns the channel of a shader's filtered colours; ValueError if the store lacks them."""
     check_filtered("StoredProducer", filtered)
     if not store.all_channels:
         raise ValueError(
@@ -127,8 +127,8 @@ def _coarse_channel(store: Store, filtered: CoarseColors) -> dict[str, Channel]:
 
 
 class StoredProducer(Producer):
-    """Streams a `gvtorch convert` store, or any OME-Zarr image. Its channel is "value". Pickled, it
-    opens its store again in the other process."""
+    """Streams a `gvtorch convert` store, or any OME-Zarr image. Its channel is "value". Unpickling
+    it, as in another process, opens the store again."""
 
     patience = float("inf")  # reads end by themselves, after `timeout`
     on_host = True
@@ -149,17 +149,17 @@ class StoredProducer(Producer):
 
         Args:
             store: An open store, a folder or a URL.
-            host_cache: Most bytes of decoded blocks and cells kept in host memory; each thread that
-                reads holds up to 64 MB more.
+            host_cache: Most bytes of decoded blocks and cells kept in host memory; each reading
+                thread holds up to 64 MB more.
             timeout: Seconds after which a read counts as failed.
-            workers: Number of threads that read; left out, one of a folder and 4 of a URL. One
-                reads many chunks at once; more of them wait for one another's Python, and hold up
-                the frames.
+            workers: Number of reading threads; left out, 1 for a folder and 4 for a URL. One thread
+                reads many chunks at once; several compete for Python's interpreter lock, and slow
+                down frames.
             image: Which image, see `Store.open`.
             time: Which time point.
-            channels: Which channels, as components of "value"; None takes all.
+            channels: Which channels, as components of "value"; None reads all.
             filtered: A `Filtered` shader whose colours the store holds (`Filtered.stored`): coarse
-                bricks bring them along, to be rendered with this shader.
+                bricks include them; render with this shader.
 
         Raises:
             ValueError: A number is out of its range, the store has no such colours, or see
@@ -196,13 +196,13 @@ class StoredProducer(Producer):
         self._begin()
 
     def _begin(self) -> None:
-        """Makes what a process has for itself: its cache and its threads."""
+        """Creates the parts that processes don't share: cache and threads."""
         self._cache, self._closed = HostCache(self.host_bytes), threading.Event()
         self._threads = ThreadPoolExecutor(self.workers, thread_name_prefix="gvtorch-store")
         self._process = os.getpid()
 
     def _submit(self, work: Callable[[Nodes], Any], nodes: Nodes) -> Future:
-        """Lets a thread work; threads that were made before a fork are not in the child."""
+        """Runs `work` in a thread. After a fork, creates new threads first: the child has none."""
         if os.getpid() != self._process:
             self._begin()
 
@@ -217,12 +217,12 @@ class StoredProducer(Producer):
         return {name: value for name, value in vars(self).items() if name not in own}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Opens the store again, in this process."""
+        """Opens the store again, with a new cache and new threads."""
         super().__setstate__(state)
         self._begin()
 
     def prepare(self, layout: Layout) -> None:
-        """Checks that bricks can be cut out of blocks, where the store has coarse channels."""
+        """Checks that bricks can be cut out of blocks, if there are coarse channels."""
         cut = _Cubes.of(self.store, layout).blocks and layout.depth < self.store.levels
         if len(self.channels) > 1 and not cut:
             sizes = [n for n in (8, 16, 32, 64) if self.store.block % n == 0]
@@ -233,31 +233,31 @@ class StoredProducer(Producer):
             )
 
     def classify(self, nodes: Nodes) -> Regions | Future:
-        """Tells later what the cells say; all DATA at once if the store has none."""
+        """Returns a future of the regions by the cells; all DATA at once if the store has none."""
         if not self.store.has_blocks:
             return Regions(kind=torch.full((len(nodes),), Region.DATA))
         return self._submit(self._classify, nodes)
 
     def fill(self, nodes: Nodes) -> Future:
-        """Reads and cuts bricks, later."""
+        """Returns a future of bricks, which are read and cut in a thread."""
         return self._submit(self._fill, nodes)
 
     def close(self) -> None:
-        """Ends the threads without waiting for reads that run."""
+        """Stops the threads without waiting for reads in progress."""
         self._closed.set()
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     def _classify(self, nodes: Nodes) -> Regions:
-        """Joins the cells that each node's brick reaches into, border included."""
+        """Combines the cells that each node's brick, border included, reaches into."""
         layout, store = nodes.layout, self.store
         loc = nodes.loc.cpu().numpy()
         level, zyx = layout.depth - loc[:, 3], loc[:, 2::-1]
-        beyond = max(0, layout.border - store.border)  # cells tell of `store.border` voxels around
+        beyond = max(0, layout.border - store.border)  # cells include `store.border` voxels around
         first = (zyx * layout.brick_size - beyond) // store.cell
         last = -(-((zyx + 1) * layout.brick_size + beyond) // store.cell)
         low, high, mean = np.zeros((3, len(loc), store.width), np.float32)
         if store.info.labels:
-            mean[:] = np.inf  # the smallest label takes the place of the mean
+            mean[:] = np.inf  # of labels, the smallest is used instead of the mean
         low[:], high[:] = self.channels[_CHANNEL].limits
         count = np.zeros((len(loc), 1), np.float32)
         errors: dict[int, str] = {}
@@ -285,7 +285,7 @@ class StoredProducer(Producer):
         return replace(found, errors=errors)
 
     def _cells(self, level: int, at: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
-        """Returns (k, 3, c) float32 low, high, mean of cells (k, 3) z y x; errors by row."""
+        """Returns (k, 3, c) float32 low, high, mean of cells `at` (k, 3) z y x; errors by row."""
         store, grid = self.store, self.store.cell_grid(level)
         out = np.zeros((len(at), 3, store.width), np.float32)
         errors: dict[int, str] = {}
@@ -346,8 +346,9 @@ class StoredProducer(Producer):
         level: int,
         layout: Layout,
     ) -> dict[int, str]:
-        """Writes bricks (m, 3) z y x of a channel and a level into rows (m,) of `out`, cut from one
-        group of cubes after the other; returns errors by row. After a timeout no more are read.
+        """Cuts bricks at (m, 3) z y x of a channel and level from cubes, one group after the other,
+        and writes them to rows (m,) of `out`; returns errors by row. After a timeout nothing more
+        is read.
         """
         cubes = _Cubes.of(self.store, layout)
         places, parts = rows_by_place(zyx // cubes.bricks)
@@ -383,7 +384,9 @@ class StoredProducer(Producer):
         return errors
 
     def _read(self, cubes: _Cubes, channel: str, level: int, places: list[Key]) -> list[Found]:
-        """Reads cubes (z, y, x) of a channel and a level, borders included; raises TimeoutError."""
+        """Reads cubes at (z, y, x) of a channel and level, borders included. A cube that fails
+        becomes an error message; raises TimeoutError.
+        """
         store, zyx = self.store, np.array(places, np.int64)
         if cubes.blocks:
             if channel == _CHANNEL:
@@ -406,7 +409,7 @@ class StoredProducer(Producer):
     def _fill_coarser(
         self, out: np.ndarray, rows: np.ndarray, zyx: np.ndarray, level: int, layout: Layout
     ) -> dict[int, str]:
-        """Makes bricks of a level coarser than the store's last one, which is a few voxels wide."""
+        """Makes bricks of a level coarser than the store's coarsest, which is a few voxels wide."""
         last = self.store.levels - 1
         shape = self.store.level_extent(last)[::-1]
         try:

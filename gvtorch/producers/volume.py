@@ -23,10 +23,10 @@ _BATCH = 4096  # bricks cut from a level at a time
 
 
 class VolumeProducer(Producer):
-    """Cuts bricks out of the levels of a volume; the same bits as `N3Tree.from_volume`.
+    """Cuts bricks out of the levels of a volume; bit for bit those of `N3Tree.from_volume`.
 
     Attributes:
-        volumes: What it cuts, by channel.
+        volumes: The volumes, by channel.
     """
 
     def __init__(
@@ -38,20 +38,19 @@ class VolumeProducer(Producer):
         filtered: CoarseColors | None = None,
         branching: int = 2,
     ) -> None:
-        """Takes a volume, which becomes channel "value", or one for each channel.
+        """Sets the volume, which becomes channel "value", or one volume for each channel.
 
         Args:
-            volume: One volume, or one by channel name, all of one extent, spacing and origin; held
-                in host memory.
+            volume: One volume, or several by channel name, all of one extent, spacing and origin;
+                kept in host memory.
             threshold: Regions with no value above it are EMPTY; None keeps every value.
-            hold: What is held in memory (sizes: where N is 2). "voxels": all levels, 8 / 7 of the
-                volume. "bricks": all bricks of all levels, with their borders, as well (2.2 times
-                the volume for 8^3 and a border of 1); answers then come many times as fast.
-                "mapped": a copy of all levels, in host memory that the engine's CUDA device reads
-                in place: it cuts bricks by itself, the host has no part in it, and
-                `Engine.capture` records it.
-            filtered: A `Filtered` shader: coarse bricks hold colours for it as well, made of the
-                first channel; to be rendered with this shader.
+            hold: What is kept in memory (sizes are for N = 2). "voxels": all levels, 8 / 7 of the
+                volume. "bricks": in addition all bricks of all levels, with borders (2.2 times the
+                volume for 8^3 and a border of 1), which makes answers many times faster.
+                "mapped": a copy of all levels in host memory that the engine's CUDA device reads
+                directly: it cuts bricks itself, without the host, and `Engine.capture` records it.
+            filtered: A `Filtered` shader: coarse bricks also hold its colours, made of the first
+                channel; render with this shader.
             branching: N.
 
         Raises:
@@ -83,15 +82,15 @@ class VolumeProducer(Producer):
         self.volumes, self._threshold, self._hold = volumes, threshold, hold
         self._filtered = filtered
         self.on_device, self.on_host = hold == "mapped", hold != "mapped"
-        self._values: dict[str, list[Tensor]] = {}  # by channel, of each level, the root's first
-        self._tables: dict[str, BrickTable] = {}  # by channel, depth after depth, in order z, y, x
+        self._values: dict[str, list[Tensor]] = {}  # by channel, a tensor a level, the root's first
+        self._tables: dict[str, BrickTable] = {}  # by channel, by depth and then z, y, x
         self._voxels: dict[str, Tensor] = {}  # by channel (v, c), in the same order
-        self._nodes: dict[str, Tensor] = {}  # by channel (n, 3, c): low, high, mean, likewise
-        self._grids = torch.empty(0)  # (d, 4) of each depth: first node, nodes along z, y, x
-        self._sizes = torch.empty(0)  # (d, 4) of each depth: first voxel, voxels along z, y, x
+        self._nodes: dict[str, Tensor] = {}  # by channel (n, 3, c) low, high, mean, in that order
+        self._grids = torch.empty(0)  # (d, 4) for each depth: first node, nodes along z, y, x
+        self._sizes = torch.empty(0)  # (d, 4) for each depth: first voxel, voxels along z, y, x
 
     def prepare(self, layout: Layout) -> None:
-        """Makes all levels, and all bricks if they are to be held."""
+        """Makes all levels, and all bricks if `hold` is "bricks"."""
         cuts = (layout.branching, layout.brick_size, layout.border)
         by_channel = levels_by_depth(self.volumes, layout.depth, *cuts)
         values = {name: [one.values for one in levels] for name, levels in by_channel.items()}
@@ -115,22 +114,22 @@ class VolumeProducer(Producer):
         self._grids = self._grids.to(there)
         self._sizes = _numbered([level.values.shape[:3] for level in levels]).to(there)
         self._nodes = {name: mapped(rows, there) for name, rows in summaries.items()}
-        while values:  # one by one, for each is copied
+        while values:  # one by one, and freed, since each is copied
             name, own = values.popitem()
-            if own:  # see above
+            if own:  # a tree of one brick has no coarse ones
                 rows = [movable(level).flatten(0, 2) for level in own]
                 self._voxels[name] = mapped(torch.cat(rows), there)
 
     def classify(self, nodes: Nodes) -> Regions:
-        """CONSTANT where all finest voxels in reach are equal, EMPTY where none is above the
-        threshold.
+        """Returns EMPTY where no finest voxel in reach is above the threshold, else CONSTANT where
+        all are equal, else DATA.
         """
         row = self._row(nodes)
         found = {name: NodeSummary(*rows[row].unbind(1)) for name, rows in self._nodes.items()}
         return regions_of(found, self.channels, self._threshold)
 
     def fill(self, nodes: Nodes) -> Bricks:
-        """Cuts the bricks, or names their rows where they are held."""
+        """Cuts the bricks, or returns rows of the table if `hold` is "bricks"."""
         layout = nodes.layout
         held = {name: c for name, c in self.channels.items() if nodes.coarse or not c.coarse}
         if self._hold == "bricks":
@@ -152,7 +151,7 @@ class VolumeProducer(Producer):
         return Bricks(data=data)
 
     def _row(self, nodes: Nodes) -> Tensor:
-        """(k,) int64 which node of all levels; beyond the volume the nearest at its face."""
+        """Returns (k,) int64 indices of nodes among those of all levels; outside, the nearest's."""
         loc = nodes.loc.to(self._grids.device)
         first, high, deep, wide = self._grids[loc[:, 3]].unbind(1)
         z, y, x = (
@@ -162,7 +161,9 @@ class VolumeProducer(Producer):
         return first + (z * deep + y) * wide + x
 
     def _voxel(self, nodes: Nodes) -> Tensor:
-        """(k, s, s, s) int64 which voxels of all levels, as `cut_bricks` cuts them."""
+        """Returns (k, s, s, s) int64 indices of voxels among those of all levels, of the bricks
+        that `cut_bricks` cuts.
+        """
         layout, loc = nodes.layout, nodes.loc.to(self._sizes.device)
         first, *sizes = self._sizes[loc[:, 3], :, None, None, None].unbind(1)
         reach = torch.arange(layout.side, device=loc.device) - layout.border
@@ -176,20 +177,20 @@ class VolumeProducer(Producer):
 
 
 def _rows_of(level: Level) -> Tensor:
-    """(n, 3, c) low, high and mean of the nodes of a level."""
+    """Returns (n, 3, c): low, high and mean of the nodes of a level."""
     own = level.nodes
     return torch.stack((own.low, own.high, own.mean), 3).flatten(0, 2)
 
 
 def _numbered(sizes: Sequence[Sequence[int]]) -> Tensor:
-    """(d, 4) int64 of grids (z, y, x), one behind the other: the first entry, then the sizes."""
+    """Returns (d, 4) int64 for concatenated grids (z, y, x): index of the first entry, sizes."""
     grids = torch.tensor([[*size] for size in sizes])
     count = grids.prod(1, keepdim=True)
     return torch.cat((count.cumsum(0) - count, grids), 1)
 
 
 def _all_bricks(values: list[Tensor], levels: list[Level], layout: Layout) -> Tensor:
-    """(n, s, s, s, c) the bricks of a channel, level after level, in the order z, y, x."""
+    """Returns (n, s, s, s, c): the bricks of a channel, by level and then z, y, x."""
     places = [torch.cartesian_prod(*map(torch.arange, one.grid)) for one in levels[: len(values)]]
     shape = (sum(map(len, places)), *(layout.side,) * 3, values[0].shape[3])
     bricks, begin = torch.empty(shape, dtype=values[0].dtype), 0

@@ -1,4 +1,4 @@
-"""Shaders: what turns the values along a ray into colour."""
+"""Shaders: they turn the values along a ray into colour."""
 
 from .built_in import *  # noqa: F403
 from .built_in import __all__ as _built_in

@@ -1,8 +1,8 @@
-"""The built-in shaders: what each reads, and what it tells the kernel.
+"""The built-in shaders: which channels each reads, and which arguments it passes to the kernel.
 
-A shader stands in four files, once in each: its struct in cpp_ext/csrc/shaders, listed in
-shaders.h, which tells what it does with an interval; its torch twin in ops/reference/shaders.py;
-its kind, and the record of numbers of its own, in ops/shading.py; and its class here.
+A shader has one entry in each of four files: its struct in cpp_ext/csrc/shaders, listed in
+shaders.h, which defines what it does with an interval; its torch twin in ops/reference/shaders.py;
+its kind, and the record of numbers that only it has, in ops/shading.py; and its class here.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ _WHITE = TransferFunction.from_points([(0, 1)])
 _COLOR = a_triple(low=0, high=1)
 _PROJECTIONS = {name: name for name in ("maximum", "minimum", "mean")}
 _PROJECTIONS |= {"max": "maximum", "min": "minimum"}
-# Of a `WideIsosurface`: rows of its table; width of its ramp in intervals, at which penumbras agree
-# best; and of a distance field's ramp in voxels at most.
+# For `WideIsosurface`: rows of its table; width of its ramp in intervals, fitted so that penumbras
+# agree best; largest width of a distance field's ramp in voxels.
 _ROWS, _RAMP, _WIDEST = 1025, 3.0, 16
-_OPAQUE = 1e-20  # a reference length by which the least opacity is whole
+_OPAQUE = 1e-20  # a reference length so short that any opacity above 0 becomes 1
 
 
 class Lit(LitShader):
-    """The transfer function, lit by Blinn and Phong on both sides of a surface.
+    """The transfer function with Blinn-Phong lighting on both sides of a surface.
 
     Attributes:
-        in_the_way: What the cones of `Lighting` are blocked by; None: the transfer function.
+        in_the_way: Shader whose alpha blocks the cones of `Lighting`; None: the transfer function.
     """
 
     kind = "Lit"
@@ -80,10 +80,10 @@ class Lit(LitShader):
 
         Args:
             transfer: The transfer function.
-            shadows: Whether each sample stands in the shadow of what lies before its light.
-            in_the_way: What the cones of `Lighting` are blocked by, such as a `Filtered` of the
-                same function: these cones are wide, and means let through too much. None: the
-                transfer function.
+            shadows: Whether matter between a sample and the light shadows the sample.
+            in_the_way: Shader whose alpha blocks the cones of `Lighting`, such as a `Filtered` of
+                the same function: these cones are wide, and mean values let too much light through.
+                None: the transfer function.
             **light: `normals`, `light`, `ambient`, `diffuse`, `specular`, `shininess`, `octaves`
                 and `anisotropy` of `LitShader`.
         """
@@ -95,8 +95,8 @@ class Lit(LitShader):
 
 
 class PreIntegrated(Shader):
-    """The transfer function, integrated over what lies between two samples: thin shells in the
-    function need no finer steps.
+    """The transfer function, integrated over the values between two samples, so that thin peaks of
+    the function need no finer steps.
     """
 
     kind = "PreIntegrated"
@@ -111,9 +111,9 @@ class PreIntegrated(Shader):
 
 
 class StoredColor(LitShader):
-    """Colour and opacity as each voxel holds them: a channel of 4 numbers, linear red, green, blue
-    and opacity per reference length. Integers stand for 0 to 1. Or 24 numbers, these for each of
-    six directions, as `Volume.directional` makes them: a ray sees those that it goes along.
+    """Colour and opacity stored in each voxel: a channel of 4 numbers, linear red, green, blue and
+    opacity per reference length; integers are scaled to 0 to 1. Or 24 numbers, 4 for each of six
+    directions, as `Volume.directional` makes them: a ray sees those of the directions it follows.
     """
 
     kind = "StoredColor"
@@ -140,13 +140,15 @@ class StoredColor(LitShader):
 
         Args:
             channel: The channel.
-            reference: World units; the smallest spacing if left out, and for six directions.
-            premultiplied: Whether colours are stored times opacity, as they are for six directions.
-                Then coarse levels keep the colours of what is opaque; else air's colour mixes in.
-            lit: Whether it is lit; always where `normals` are named, and with shadows.
+            reference: World units for which opacity is given; the smallest spacing if left out, and
+                always for six directions.
+            premultiplied: Whether colours are stored multiplied by opacity, as they always are for
+                six directions. Coarse levels then keep the colours of opaque voxels; otherwise the
+                colours of transparent ones mix in.
+            lit: Whether it is lit; always true with `normals`, and with shadows.
             shadows: As in `Lit`.
-            **light: As in `Lit`; without `normals`, they are the gradient's of the opacity (towards
-                +x, where there are six directions).
+            **light: As in `Lit`; without `normals`, the normal is the gradient of the opacity (of
+                that towards +x, where there are six directions).
 
         Raises:
             ValueError: A number is out of its range.
@@ -194,8 +196,9 @@ class StoredColor(LitShader):
 
 
 class Isosurface(LitShader):
-    """The first place where the value passes a level, opaque and lit. It is filled with what is not
-    below the level: that is seen where the scene's box cuts it, and from within.
+    """The first point of a ray where the value crosses a level, drawn opaque and lit. The solid is
+    where the value is not below the level; it is filled, so its inside is seen where the scene's
+    box cuts it, and by rays that begin in it.
     """
 
     kind = "Isosurface"
@@ -223,17 +226,17 @@ class Isosurface(LitShader):
         filled: bool = True,
         **light: Any,
     ) -> None:
-        """Takes the level and how the surface looks.
+        """Sets the level and how the surface looks.
 
         Args:
             value: The level, in data units.
             color: Linear red, green, blue, or a transfer function of the second channel's value.
-                None: as that channel holds it, in 4 numbers a voxel (see `StoredColor`).
-            color_channel: Name of the second channel, for a transfer function or None.
-            color_component: Which number of it, for a transfer function.
-            premultiplied: Whether colours are stored multiplied by their opacity.
-            filled: False: a hollow shell, whose inner side a ray sees that begins within. So it is
-                where a `Clip` without caps cuts it.
+                None: the colour stored in that channel, 4 numbers a voxel (see `StoredColor`).
+            color_channel: Name of the second channel, if `color` is a transfer function or None.
+            color_component: Index of the number that the transfer function reads from it.
+            premultiplied: Whether stored colours are multiplied by their opacity.
+            filled: False: a hollow shell, whose inner side is seen by rays that begin inside. A
+                `Clip` without caps always draws the surface so.
             **light: As in `Lit`.
 
         Raises:
@@ -305,8 +308,8 @@ class Isosurface(LitShader):
 
 
 class DistanceField(Isosurface):
-    """The surface of a signed distance field: where the distance is `offset`, 0 if left out. Inside
-    the distance is smaller.
+    """The surface of a signed distance field: where the distance is `offset`, by default 0. The
+    inside is where it is smaller.
     """
 
     distance = True
@@ -318,22 +321,22 @@ class DistanceField(Isosurface):
         offset: Number = 0.0,
         **look: Any,
     ) -> None:
-        """Takes how the surface looks, see `Isosurface`; `offset` is in the field's own unit."""
+        """See `Isosurface` for how the surface looks; `offset` is in the unit of the field."""
         super().__init__(offset, color, **look)
 
 
 class WideIsosurface(Shader):
-    """An isosurface as cones wider than a voxel see it. They read means, and a mean tells which
-    share of the cone the surface fills: opacity is a ramp around the level, wider for longer
+    """An isosurface for cones wider than a voxel. These read mean values, from which the share of
+    the cone that the solid fills is estimated: opacity is a ramp around the level, wider for longer
     intervals, so that shadows are soft.
 
-    In a distance field matter lies below the level, and the value changes by 1 per unit of length.
-    Else matter lies above, and the value is taken to rise from half of the level to three halves
-    over four voxels.
+    In a distance field the solid lies below the level, and the value changes by 1 per unit of
+    length. Otherwise it lies above, and the value is assumed to rise from half of the level to
+    three halves over four voxels.
     """
 
     def __init__(self, surface: Isosurface, color: Triple | None) -> None:
-        """Takes the surface and its colour; None where its alpha alone counts."""
+        """Copies the surface's level and channels; `color` is None if only its alpha counts."""
         self.kind = None if color is None else "Lit"
         self.channel, self.component = surface.channel, surface.component
         self.normals = surface.normals
@@ -341,8 +344,8 @@ class WideIsosurface(Shader):
         self.color = (0.0, 0.0, 0.0) if color is None else color
 
     def table(self, sampling: Sampling) -> ColorTable:
-        """See `Shader`; made on the device of the level. What is farther from the level than
-        `most_1`, in data units, can be skipped.
+        """See `Shader`; computed on the device, where the level may be a tensor. Values more than
+        `most_1` (data units) away from the level, outside of the solid, can be skipped.
         """
         dtype, device = sampling.dtype, sampling.device
         value_1 = pack((self.level,), dtype, device)
@@ -352,14 +355,15 @@ class WideIsosurface(Shader):
         else:
             most_1 = value_1.abs() / 2
             slope_1 = most_1 / (2 * sampling.smallest_spacing)
-        most_1 = torch.maximum(most_1, 1e-5 * value_1.abs().clamp(min=1))  # else no ramp but a jump
+        most_1 = torch.maximum(most_1, 1e-5 * value_1.abs().clamp(min=1))  # else the ramp is a jump
         length_l = sampling.step * 2 ** torch.arange(sampling.levels, dtype=dtype, device=device)
         half_l = torch.minimum((_RAMP / 2 * slope_1 * length_l).clamp(min=1e-30), most_1)
         away_m = most_1 * torch.linspace(-1, 1, _ROWS, dtype=dtype, device=device)
         inside_m = -away_m if self.distance else away_m
         table = pack((self.color, 0.0), dtype, device).expand(sampling.levels, _ROWS, 4).clone()
         share_lm = (0.5 + inside_m / (2 * half_l[:, None])).clamp(0, 1)
-        # A cone that grazes a surface meets it in several intervals: each takes the fourth root.
+        # A cone that grazes a surface meets it in several intervals: each lets through the fourth
+        # root of the transmittance.
         table[:, :, 3] = 1 - (1 - share_lm).sqrt().sqrt()
         seen_m = (table[:, :, 3] > 0).any(0)
         return ColorTable(
@@ -370,9 +374,9 @@ class WideIsosurface(Shader):
 
 
 class Projection(Shader):
-    """The maximum, minimum or mean of the value along each ray, coloured by the transfer function's
-    colours and opaque. `Hits.features` (r, 1) holds the value itself (0 beside the box), depth
-    where the extreme is or, for the mean, where the ray enters.
+    """The maximum, minimum or mean of the values along each ray, in the colours of the transfer
+    function and opaque. `Hits.features` (r, 1) holds the value itself (0 where a ray misses the
+    box); depth is that of the extreme or, for the mean, where the ray enters.
     """
 
     kind = "Projection"
@@ -388,7 +392,7 @@ class Projection(Shader):
         which: Literal["maximum", "minimum", "mean", "max", "min"],
         transfer: TransferFunction,
     ) -> None:
-        """Takes which one, and the colours.
+        """Sets which projection to show, and its colours.
 
         Raises:
             ValueError: There is no such projection.
@@ -408,8 +412,8 @@ class Projection(Shader):
 
 
 class Features(Shader):
-    """All numbers of a channel, composited front to back with the transfer function's alpha: they
-    come out as `Hits.features` (r, c). Any number of them.
+    """All c numbers of a channel, composited front to back with the transfer function's alpha and
+    returned as `Hits.features` (r, c). c may be any number.
     """
 
     kind = "Features"
@@ -419,7 +423,7 @@ class Features(Shader):
     }
 
     def __init__(self, transfer: TransferFunction, channel: str) -> None:
-        """Takes the transfer function of the density, and the name of the features' channel."""
+        """Sets the transfer function of the density, and the name of the channel of features."""
         self.transfer, self.other = transfer, channel
 
     def feature_count(self, tree: N3Tree) -> int:
@@ -427,8 +431,8 @@ class Features(Shader):
 
 
 class GradientMagnitude(Shader):
-    """The transfer function, its optical depth multiplied by the gradient's length over `full`, 1
-    at most: boundaries show, and what lies between them clears.
+    """The transfer function with its optical depth multiplied by min(1, gradient length / `full`):
+    boundaries show, and homogeneous regions between them become transparent.
 
     Source: Levoy, "Display of surfaces from volume data", IEEE CG&A 1988 (opacity by gradient).
     """
@@ -441,7 +445,7 @@ class GradientMagnitude(Shader):
     }
 
     def __init__(self, transfer: TransferFunction, full: Number | None = None) -> None:
-        """Takes the transfer function, and the gradient at which its opacity is whole.
+        """Sets the transfer function, and the gradient from which it has its full opacity.
 
         Args:
             transfer: The transfer function.
@@ -459,7 +463,7 @@ class GradientMagnitude(Shader):
         return GradientMagnitudeNumbers(domain if self.full is None else self.full)
 
 
-#: Shaders of one channel by name, made of a transfer function and a level: `gvtorch render
+#: Makers of single-channel shaders by name, from a transfer function and a level: `gvtorch render
 #: --shader` offers them, and `gvtorch bench shaders` measures them.
 BY_NAME: Mapping[str, Callable[[TransferFunction, float], Shader]] = {
     "plain": lambda transfer, _: transfer,

@@ -1,4 +1,4 @@
-"""`Channels`: several numbers of a voxel, each in its own colour, composited at each sample."""
+"""`Channels`: several numbers of a voxel, each in its own colour, combined at each sample."""
 
 from __future__ import annotations
 
@@ -22,39 +22,39 @@ from .transfer_function import TransferFunction
 
 Mode = Literal["additive", "opacity"]
 
-#: Of channels whose colour is not told, by their place; the first is blue, and light enough to see.
+#: Default colours by a channel's index in the list; the first is a blue light enough to be seen.
 DISTINCT = (
     *("#2850ff", "#00ff00", "#ff0000", "#ff00ff", "#00ffff", "#ffff00", "#ff8000", "#ffffff"),
     *("#8000ff", "#80ff00", "#ff0080", "#0080ff", "#00ff80", "#ff8080", "#80c0ff", "#ffd080"),
 )
 
-MOST = len(DISTINCT)  # channels of a picture
-_RAMP = 16  # straight parts in which opacity rises
+MOST = len(DISTINCT)  # channels in one picture
+_RAMP = 16  # linear pieces that approximate the quadratic rise of opacity
 _OPACITY = 0.5
-_OPAQUE = 1024.0  # halvings that stand for an opacity of 1
-_MOST_ROWS = 2**22  # of a table, whose places a float32 has to tell
+_OPAQUE = 1024.0  # halvings of light that represent an opacity of 1
+_MOST_ROWS = 2**22  # of a table, so that float32 can index its rows
 _WINDOW = (50.0, 99.9)  # percentiles of the values
 
 
 @dataclass(kw_only=True)
 class ChannelLook:
     """How one channel is shown: by a transfer function, or by a colour and a window. Attributes may
-    be edited: the next picture is made with them.
+    be edited: the next picture uses them.
 
-    Within the window colour rises evenly from black and opacity with the square, so that what is
-    dark is thin; beyond it both stay. What is below the window has no opacity.
+    Within the window colour rises linearly from black, and opacity quadratically, so that dark
+    regions are thin; above the window both are constant. Below it opacity is 0.
 
     Attributes:
-        transfer: The transfer function; then there is no colour, window or opacity.
-        color: Linear red, green, blue in [0, 1], or a name or #RRGGBB in sRGB; None: one by the
-            channel's place in the list, blue, green, red, magenta, cyan, yellow, ...; white where
-            it is the only one.
-        window: Values at which it begins to show and is brightest, in data units.
-        component: Which number of a voxel; None: that of the channel's place.
+        transfer: The transfer function; if given, colour, window and opacity must be None.
+        color: Linear red, green, blue in [0, 1], or a name or #RRGGBB in sRGB; None: by the
+            channel's index in the list, blue, green, red, magenta, cyan, yellow, ...; white if it
+            is the only one.
+        window: (low, high) in data units: values at which it begins to show, and is brightest.
+        component: Index of the number of a voxel; None: the channel's index in the list.
         visible: Whether it is shown.
-        opacity: At the window's upper end, of an interval as long as the smallest spacing; 0.5 if
+        opacity: At the window's upper end, over an interval as long as the smallest spacing; 0.5 if
             left out.
-        name: For people.
+        name: Name for display.
     """
 
     transfer: TransferFunction | None = None
@@ -68,11 +68,11 @@ class ChannelLook:
     __repr__ = check.brief
 
     def function(self, place: int, count: int) -> TransferFunction:
-        """Returns its transfer function, where it is the channel at a place of so many.
+        """Returns its transfer function, if it is the channel at index `place` of `count` channels.
 
         Raises:
-            ValueError: A number is out of its range, the window is not told, or the look has more
-                than a transfer function.
+            ValueError: A number is out of its range, the window is missing, or the look has a
+                transfer function and also a colour, window or opacity.
         """
         where = f"Channels: channel {place}" + (f" ({self.name})" if self.name else "")
         if self.transfer is not None:
@@ -96,28 +96,28 @@ class ChannelLook:
 
 
 class Channels(Shader):
-    """Up to 16 numbers of a voxel, each with a look of its own, composited together at each sample.
+    """Up to 16 numbers of a voxel, each with its own look, combined at each sample.
 
-    An interval of length l through values v_i: channel i has by its function the colour c_i, and
+    In an interval of length l with values v_i, the function of channel i yields the colour c_i and
     the opacity a_i over its reference length r_i, so it halves the light
-    h_i = -log2(1 - a_i) l / r_i times. Of all channels
+    h_i = -log2(1 - a_i) l / r_i times. Over all channels
 
         additive:  H = max(h_1, h_2, ...)
         opacity:   H = h_1 + h_2 + ...
 
     and the interval's alpha is 1 - 2^-H, its premultiplied colour alpha (h_1 c_1 + ...) / H. Both
-    solve emission and absorption: steps and levels of detail change no more than which places are
-    sampled. One channel alone is in either mode what its transfer function shows. Where several
+    modes solve emission and absorption: steps and levels of detail only change which positions are
+    sampled. A single channel is drawn as by its transfer function in either mode. Where several
     are dense, "additive" adds their colours, as red and green make yellow, and they hide what is
-    behind them no more than the densest does alone: colours may go above 1, which the picture's
-    tone step clips. With "opacity" they are matter in one place: colours are a mean, weighted by
-    h_i, and all of them hide what is behind.
+    behind them only as much as the densest alone: colours may exceed 1, and are clipped by the
+    picture's tone step. In "opacity" they are matter that shares the same space: colours are a mean
+    weighted by h_i, and all of them hide what is behind.
 
-    Numbers of one channel of the pool, in any order. From afar means are read, as of other shaders:
-    it has no `Filtered`.
+    The numbers are those of one channel of the pool, in any order. Coarse levels hold means, as for
+    other shaders; there is no `Filtered` variant.
 
     Attributes:
-        looks: The looks, in order; the list may be edited, too.
+        looks: The looks, in order; the list itself may also be edited.
         mode: "additive" or "opacity".
     """
 
@@ -130,15 +130,15 @@ class Channels(Shader):
         *,
         channel: str | None = None,
     ) -> None:
-        """Takes the looks; a transfer function is a look that has no more.
+        """Sets the looks; a transfer function is short for a look with only that.
 
         Args:
             looks: 1 to 16 of them.
-            mode: How they are composited.
+            mode: How they are combined.
             channel: Name of the pool's channel; None: that of the options.
 
         Raises:
-            ValueError: They are too many, no looks, or out of their ranges.
+            ValueError: There are too many or none, one is no look, or a number is out of its range.
         """
         self.looks = [
             ChannelLook(transfer=one) if isinstance(one, TransferFunction) else one for one in looks
@@ -156,18 +156,18 @@ class Channels(Shader):
         components: Sequence[int] | None = None,
         opacity: float | None = None,
     ) -> Self:
-        """Returns the looks that an image tells of its channels: names, colours, windows, and which
-        are shown. Where it tells no colour, see `ChannelLook`; a window that it does not tell is
-        from the median to the 99.9th percentile of the values, of which some are looked at.
+        """Returns a shader with the looks in an image's metadata: names, colours, windows, and
+        which channels are shown. Colours that are missing there are the defaults of `ChannelLook`;
+        missing windows go from the median to the 99.9th percentile of a subset of the values.
 
         Args:
             image: A volume or a store.
-            mode: How they are composited.
-            components: Which of its channels, in which order; None: all.
+            mode: How they are combined.
+            components: Indices of the image's channels to show, in order; None: all.
             opacity: See `ChannelLook`.
 
         Raises:
-            ValueError: There are more than 16, or one of `components` is not there.
+            ValueError: There are more than 16, or the image lacks one of `components`.
         """
         if not isinstance(image, Volume | Store):
             kind = type(image).__name__
@@ -202,11 +202,11 @@ class Channels(Shader):
 
     @property
     def component(self) -> int:  # type: ignore[override]
-        """The last number of a voxel that it reads: the op checks that it is there."""
+        """The highest index that it reads from a voxel: the op checks that voxels have it."""
         return max((component for component, _ in self._shown()), default=0)
 
     def table(self, sampling: Sampling) -> ColorTable:
-        """Returns the head and the rows of all channels, see csrc/shaders/channels.h."""
+        """Returns the header and the rows of all channels, see csrc/shaders/channels.h."""
         shown = self._shown()
         functions = [(c, f.opacity.tobytes(), f.color.tobytes(), f.reference) for c, f in shown]
         key = (self.mode, *functions, sampling)
@@ -215,7 +215,7 @@ class Channels(Shader):
         return self._tables[key]
 
     def _shown(self) -> list[tuple[int, TransferFunction]]:
-        """Component and transfer function of each channel that is shown, as they are now."""
+        """Returns component and current transfer function of each visible channel."""
         where, looks = "Channels", self.looks
         check.one_of(where, "mode", self.mode, get_args(Mode))
         if not 1 <= len(looks) <= MOST:
@@ -231,7 +231,7 @@ class Channels(Shader):
         return shown
 
     def __repr__(self) -> str:
-        """Tells the looks, a few words each."""
+        """Returns the mode and each look's name or component."""
         looks = ", ".join(
             look.name or f"{place if look.component is None else look.component}"
             for place, look in enumerate(self.looks)
@@ -265,13 +265,13 @@ def _make_table(
     dtype, device = sampling.dtype, sampling.device
     return ColorTable(
         table_lm4=torch.tensor(table, dtype=dtype, device=device),
-        domain_2=torch.tensor((0.0, 1.0), dtype=dtype, device=device),  # each has its own
+        domain_2=torch.tensor((0.0, 1.0), dtype=dtype, device=device),  # each channel has its own
         opaque_m=torch.tensor(opaque_m, device=device),
     )
 
 
 def window_of(where: str, window: Sequence[float]) -> tuple[float, float]:
-    """Returns a window's ends; raises ValueError where it is none."""
+    """Returns (low, high) of a window; raises ValueError if it is not one."""
     if not isinstance(window, Sequence) or len(window) != 2:
         raise ValueError(f"{where}: window must be (low, high), got {window!r}")
     low, high = (check.number(where, "window", end) for end in window)
@@ -281,6 +281,6 @@ def window_of(where: str, window: Sequence[float]) -> tuple[float, float]:
 
 
 def channel_color(where: str, color: Triple | str) -> Triple:
-    """Returns a colour as linear RGB; names are those of lookup tables."""
+    """Returns a colour as linear RGB; names are those of microscopy lookup tables (`COLORS`)."""
     named = {name: f"#{to_hex(one)}" for name, one in COLORS.items()}
     return named_color(where, color, named)

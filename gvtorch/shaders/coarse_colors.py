@@ -1,6 +1,7 @@
-"""What a transfer function makes of the finest voxels, for each voxel of the coarse levels: columns
-of them along each axis, coloured and composited, and of the columns the mean. For lit matter so are
-the second moments of the normals, which tell which way surfaces face and how rough they are.
+"""Computes filtered colours for the voxels of coarse levels. The finest voxels below such a voxel
+are coloured by the transfer function and composited in columns along each axis, then columns are
+averaged. For lit matter the second moments of the normals, which describe the orientation and
+roughness of surfaces, are averaged in the same way.
 """
 
 from __future__ import annotations
@@ -18,24 +19,24 @@ from ..base.stage import Progress
 from ..base.volume import Volume, movable
 from .shader import ColorTable
 
-_TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # whose columns are worked out at a time
-_LEAST = 0.001  # weight of a column that no light comes to
-_HIDDEN = 0.5  # of the light beside it: a voxel to which less comes is hidden
-_FAINT = 32  # over which the moments of its normals count; as in csrc/shaders/light.h
+_TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # finest voxels that are processed at a time
+_LEAST = 0.001  # weight of a column that no light reaches
+_HIDDEN = 0.5  # a voxel with less than this share of its neighbours' light is hidden
+_FAINT = 32  # divides the moments of normals that no light reaches; as in csrc/shaders/light.h
 _DIRECTIONS = 6
-#: Numbers of a voxel as seen along a direction: premultiplied colour and alpha; then, of lit
+#: Numbers of a voxel seen along one direction: premultiplied colour and alpha; then, for lit
 #: matter, the mean products xx xy xz yy yz zz of the components of its normals, premultiplied.
 PLAIN, LIT = 4, 10
 
 
 class FinestVoxels(Protocol):
-    """The finest voxels, which may be more than memory holds."""
+    """The finest voxels, which need not fit into memory."""
 
     shape: tuple[int, int, int]  # z, y, x
-    across: int  # voxels that are read at once on either side of what they are read along
+    across: int  # voxels; side of the slabs that are read at once, on the two axes across columns
 
     def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
-        """Returns a box (z, y, x) on the CPU; beyond the field its outermost voxels repeat."""
+        """Returns a box (z, y, x) on the CPU; beyond the field the outermost voxels repeat."""
 
 
 class VolumeField:
@@ -61,22 +62,22 @@ class VolumeField:
 
 def write_colors(
     field: FinestVoxels,
-    tables: Sequence[ColorTable],  # along x, y, z: of intervals of half a voxel
+    tables: Sequence[ColorTable],  # for columns along x, y, z: alpha over half a voxel
     spacing: tuple[float, float, float],
     branching: int,
     out: Sequence[Tensor],
-    progress: Progress,  # told ("filtered", voxels done, voxels in all)
+    progress: Progress,  # called with ("filtered", voxels done, voxels in all)
     *,
     all_light: bool,
 ) -> None:
     """Writes the colours of the coarse levels, the finest of them first, (z, y, x, 6 * (n + 1))
-    float16 each: n numbers, PLAIN or LIT, of its voxels as seen along +x -x +y -y +z -z, for a
-    length of the smallest spacing; and which share of the light came to them.
+    float16 each: for each of the directions +x -x +y -y +z -z, the n numbers (PLAIN or LIT) of a
+    voxel seen in it, over a length of the smallest spacing, and the share of light that reached it.
 
-    With `all_light` columns count by all the light that comes to them from outside, so that a row
-    of voxels lets through what its columns do together. For translucent matter, of which a ray that
-    goes obliquely sees much the same. In opaque matter it may see what no light comes to along an
-    axis: else light is lost in the voxel before only.
+    Columns are weighted by light. With `all_light` it is dimmed by everything between a column and
+    the outside, so that a row of voxels transmits as much as its columns do together. This suits
+    translucent matter, which looks much the same to an oblique ray. In opaque matter an oblique ray
+    may see what no light reaches along an axis: there light is dimmed by the voxel in front only.
     """
     done, total = 0, 3 * math.prod(field.shape)
     numbers = out[0].shape[-1] // _DIRECTIONS if out else 0
@@ -112,9 +113,9 @@ def _see_along(
     levels: int,
     all_light: bool,
 ) -> Iterator[tuple[int, int, int, Tensor]]:
-    """Yields what is seen along an axis of the field: a coarse level, two places across, and of the
-    voxels that begin there the weighted sums (2, c + 1, n, a, b), forwards and backwards: c numbers
-    (see `LIT`) and weight. Each voxel comes once.
+    """Yields blocks of coarse voxels, each voxel once, seen along an axis of the field: the level
+    (0: finest coarse one), the block's first indices a, b across the axis, and weighted sums
+    (2, c + 1, n, a, b), seen forwards and backwards: c numbers (see `LIT`) and the weight.
     """
     device = painter.table.table_lm4.device
     length = field.shape[along]
@@ -124,7 +125,7 @@ def _see_along(
     while tile * branching <= max(across) and length * (tile * branching) ** 2 <= most:
         tile *= branching
     whole = [branching ** (level + 1) for level in range(levels)]  # finest voxels along a side
-    coarse = {  # sums of columns of a tile, where a voxel is wider than a tile
+    coarse = {  # for levels whose voxels are wider than a tile: sums of each tile's columns
         level: torch.zeros(
             (2, painter.width + 1, -(-length // side), *(-(-n // tile) for n in across)),
             device=device,
@@ -135,7 +136,7 @@ def _see_along(
     for a, b, part in _parts(field, along, tile):
         values = part.to(device).to(torch.float32)
         empty = not _shows(values, painter.table)
-        if empty:  # as few intervals as make a voxel of the first level
+        if empty:  # the fewest intervals that make up a voxel of level 0
             high, wide = (2 * n - 4 for n in part.shape[1:])
             columns = _Columns.empty(painter.width - 1, (2 * branching, high, wide), device)
         else:
@@ -156,11 +157,12 @@ def _see_along(
 
 
 def _fill_hidden(seen: Tensor, device: torch.device) -> None:
-    """Gives voxels to which hardly any light comes what is seen beside them: (2, n, a, b, c + 1),
-    the last number is the light.
+    """Blends the colours of neighbours into voxels that hardly any light reaches. In `seen`,
+    (2, n, a, b, c + 1), the last number is the light.
 
-    Only rays that pass between them and others see them, and read half of each: along the rim of a
-    solid half of what is within, interval after interval, so that from afar solids would grow.
+    Hidden voxels are only seen by rays that pass between them and visible ones, and blend both
+    halves: along the rim of a solid such a ray reads half of its inside in each interval, so that
+    solids would grow from afar.
     """
     most, (high, wide) = _TILE_VOXELS[device.type], seen.shape[2:4]
     rows = min(high, max(1, most // wide))
@@ -172,7 +174,7 @@ def _fill_hidden(seen: Tensor, device: torch.device) -> None:
             sums = known[..., :-1] * known[..., -1:]
             sums = torch.cat((sums, known[..., -1:]), -1)
             count = part.shape[2]
-            missing = count + 1 - known.shape[2]  # behind the last row there is nothing
+            missing = count + 1 - known.shape[2]  # 1 where no row follows
             near = _beside(torch.cat((before, _padded(sums, 2, 0, missing)), 2), 2)
             near = _beside(_padded(near, 3, 1, 1), 3)
             before, sums = sums[:, :, count - 1 : count], sums[:, :, :count]
@@ -183,21 +185,21 @@ def _fill_hidden(seen: Tensor, device: torch.device) -> None:
 
 
 def _padded(values: Tensor, axis: int, before: int, behind: int) -> Tensor:
-    """Puts zeros before and behind along an axis."""
+    """Pads an axis with zeros."""
     sides = [0, 0] * (values.dim() - axis - 1) + [before, behind]
     return torch.nn.functional.pad(values, sides)
 
 
 def _beside(values: Tensor, axis: int) -> Tensor:
-    """Returns means of three neighbours each along an axis, the middle one counts twice."""
+    """Returns means of three neighbours along an axis, the middle one weighted twice."""
     count = values.shape[axis] - 2
     first, middle, last = (values.narrow(axis, at, count) for at in range(3))
     return 0.25 * first + 0.5 * middle + 0.25 * last
 
 
 def _parts(field: FinestVoxels, along: int, tile: int) -> Iterator[tuple[int, int, Tensor]]:
-    """Yields the field in columns along an axis, tile by tile: where a tile begins across, and its
-    values (n, a + 2, b + 2) with a neighbour on each side. They are read in slabs of many tiles.
+    """Yields the field in columns along an axis, tile by tile: a tile's first indices across the
+    axis, and its values (n, a + 2, b + 2) with a neighbour on each side. Reads slabs of many tiles.
     """
     slab = tile * max(1, field.across // tile)
     size, sides = field.shape, [axis for axis in range(3) if axis != along]
@@ -213,7 +215,7 @@ def _parts(field: FinestVoxels, along: int, tile: int) -> Iterator[tuple[int, in
 
 
 def _shows(part: Tensor, table: ColorTable) -> bool:
-    """Whether any value between the smallest and the largest of a part has an opacity."""
+    """Returns whether any value between a part's smallest and largest has an opacity."""
     last = len(table.opaque_m) - 1
     low, high = table.domain_2.tolist()
     ends = (torch.stack(part.aminmax()) - low) * (last / (high - low))
@@ -223,9 +225,9 @@ def _shows(part: Tensor, table: ColorTable) -> bool:
 
 
 def _finer(part: Tensor, slope: int | None = None) -> Tensor:
-    """Samples (n, a + 2, b + 2) values, with neighbours on the sides, twice as finely: returns
-    (2n, 2a, 2b), a quarter of a voxel on either side of the centres. Or, there, their differences
-    along an axis, from half a voxel before to half a voxel behind.
+    """Resamples (n, a + 2, b + 2) values, which have neighbours on the sides, twice as finely:
+    returns (2n, 2a, 2b) values a quarter of a voxel on either side of the voxel centres. Or, if
+    `slope` is an axis, differences along it, over half a voxel on either side of these positions.
     """
     last = len(part) - 1
     index = torch.arange(last + 1, device=part.device)
@@ -246,20 +248,20 @@ def _between(here: Tensor, before: Tensor, behind: Tensor, axis: int, slope: int
 
 @dataclass(frozen=True)
 class _Columns:
-    """Intervals of columns along the first axis of (n, a, b)."""
+    """Columns of n intervals each, along the first axis of (n, a, b)."""
 
-    front: Tensor  # (c, n, a, b) premultiplied colour, and moments, as seen from the front
-    back: Tensor  # (c, n, a, b) and from behind
+    front: Tensor  # (c, n, a, b) premultiplied colour, and moments, seen from the front
+    back: Tensor  # (c, n, a, b) the same seen from behind
     clear: Tensor  # (n, a, b) transmittance
 
     @classmethod
     def empty(cls, numbers: int, shape: tuple[int, ...], device: torch.device) -> _Columns:
-        """Returns intervals of nothing."""
+        """Returns intervals that hold nothing."""
         color = torch.zeros((numbers, *shape), device=device)
         return cls(color, color, torch.ones(shape, device=device))
 
     def joined(self, count: int) -> _Columns:
-        """Makes one of every `count` intervals; the last is repeated where there are too few."""
+        """Composites every `count` intervals into one; the last is repeated if some are missing."""
         length = len(self.clear)
         if length % count:
             index = torch.arange(-(-length // count) * count, device=self.clear.device)
@@ -276,8 +278,8 @@ class _Columns:
         return _Columns(ahead, behind, passes)
 
     def weighted(self, all_light: bool) -> Tensor:
-        """Returns (2, c + 2, n, a, b) colour, alpha, moments and 1, from both sides, times the
-        light that comes to each interval; see `write_colors`.
+        """Returns (2, c + 2, n, a, b) colour, alpha, moments and 1, seen from both sides, times the
+        light that reaches each interval; see `write_colors`.
         """
         whole = torch.ones_like(self.clear[:1])
         before = torch.cat((whole, self.clear[:-1]))
@@ -297,9 +299,9 @@ class _Columns:
 
 
 def _surfaces(color: Tensor, alpha: Tensor, light: Tensor, step: int) -> Tensor:
-    """Returns the moments of intervals (c - 3, n, a, b), weighted with light. To what lies within
-    solid matter no light comes, but places between it and the surface are seen: there it is as the
-    last interval before to which light comes, and counts little beside what other directions see.
+    """Returns the moments of intervals (c - 3, n, a, b), weighted by light. Rays also blend in the
+    inside of solids, which no light reaches: there an interval takes the moments of the last one
+    before it that light reaches, over `_FAINT`, so that those of other directions count more.
     """
     index = torch.arange(len(alpha), device=alpha.device)[:, None, None]
     comes = light > 2 * _LEAST
@@ -315,20 +317,20 @@ def _surfaces(color: Tensor, alpha: Tensor, light: Tensor, step: int) -> Tensor:
 
 @dataclass(frozen=True)
 class _Painter:
-    """Makes intervals of values."""
+    """Turns values into coloured intervals."""
 
     table: ColorTable
-    sizes: Sequence[float] | None  # of a voxel along each axis of the values, if normals count
-    along: int  # the field's axis that comes first
+    sizes: Sequence[float] | None  # of a voxel along each axis of the values; None: no normals
+    along: int  # the axis (z, y, x) of the field that is the first axis of the values
 
     @property
     def width(self) -> int:
-        """Numbers of an interval: see `LIT`."""
+        """How many numbers an interval has: PLAIN or LIT."""
         return PLAIN if self.sizes is None else LIT
 
     def colored(self, part: Tensor) -> _Columns:
-        """Returns what intervals of half a voxel show of (n, a + 2, b + 2) values, with neighbours
-        on the sides.
+        """Returns intervals of half a voxel, coloured from (n, a + 2, b + 2) values, which have
+        neighbours on the sides.
         """
         values = _finer(part)
         low, high = self.table.domain_2
@@ -344,7 +346,7 @@ class _Painter:
         return _Columns(seen, seen, 1 - numbers[3])
 
     def moments(self, part: Tensor, sizes: Sequence[float]) -> list[Tensor]:
-        """Returns the products of the components of unit normals; 0 where there is no gradient."""
+        """Returns the products xx xy xz yy yz zz of unit normals; 0 where there is no gradient."""
         slopes = [_finer(part, axis) / sizes[axis] for axis in range(3)]
         most = torch.stack([one.abs() for one in slopes]).amax(0)
         scaled = [one / torch.where(most > 0, most, 1.0) for one in slopes]
@@ -368,13 +370,14 @@ def _pooled(values: Tensor, block: int) -> Tensor:
 
 
 def without_light(colors: Tensor) -> Tensor:
-    """Returns (..., 6 * n) of the (..., 6 * (n + 1)) that `write_colors` writes."""
+    """Drops the shares of light: returns (..., 6 * n) of `write_colors`' (..., 6 * (n + 1))."""
     return colors.unflatten(-1, (_DIRECTIONS, -1))[..., :-1].flatten(-2)
 
 
 def mean_of_directions(colors: Tensor) -> Tensor:
-    """Returns (..., n) of (..., 6 * n), of the same dtype. Their moments are over _FAINT: light
-    comes to all of such matter, and the trace then tells which share of it has a normal.
+    """Returns the mean (..., n) of (..., 6 * n), of the same dtype. Moments are divided by _FAINT,
+    which the shader multiplies their trace by: light reaches all of such matter, so the product is
+    the share of it that has a normal.
     """
     first, *others = colors.split(colors.shape[-1] // _DIRECTIONS, -1)
     total = first.float()
@@ -386,7 +389,7 @@ def mean_of_directions(colors: Tensor) -> Tensor:
 
 
 def _of_length(colors: Tensor, lengths: float) -> Tensor:
-    """Returns numbers (2, c, ...) of homogeneous matter over other lengths."""
+    """Rescales numbers (2, c, ...) of homogeneous matter to another length."""
     if lengths == 1:
         return colors
     alpha = colors[:, 3:4]

@@ -1,4 +1,4 @@
-"""Colours by name and as #RRGGBB, and distinct colours for any numbers; as linear light."""
+"""Linear colours from names and #RRGGBB, and distinct colours for integers such as labels."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ NAMED = {
 }
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / the golden ratio
 _MIXED = np.uint64(2**16)
-_APART = 0x57AE147AE147B001  # 2^64 * 0.3425: so the first 64 colours lie farthest apart
+_APART = 0x57AE147AE147B001  # 2^64 * 0.3425: this makes the first 64 colours differ most
 
 
 def linear_color(
     where: str, value: Any, named: Mapping[str, str] = NAMED
 ) -> tuple[float, float, float]:
     """Returns a colour as linear red, green, blue: one of the names or #RRGGBB, which are sRGB, or
-    three numbers in [0, 1], which are linear; raises ValueError where it is neither.
+    three numbers in [0, 1], which are linear; raises ValueError if it is neither.
     """
     if not isinstance(value, str):
         color = check.triple(where, "colour", value)
@@ -46,11 +46,11 @@ def linear_color(
 
 
 def distinct_colors(numbers: np.ndarray) -> np.ndarray:
-    """Returns (k, 3) float64 linear colours of numbers (k,) int64, always the same of a number.
+    """Returns (k, 3) float64 linear colours of numbers (k,) int64; the same for the same number.
 
-    Hues of numbers that follow one another lie a golden ratio of the circle apart, so any few of
-    them differ; lightness and chroma go around in another rhythm. Large numbers seldom follow one
-    another but may be multiples of one: from 2^16 on they are mixed first.
+    Hues of consecutive numbers are a golden ratio of the circle apart, so that any few of them
+    differ; lightness and chroma vary with another period. Large numbers are seldom consecutive but
+    may have a common divisor: from 2^16 on their bits are mixed first.
 
     Source: Ottosson, "A perceptual color space for image processing", 2020 (OKLab); Steele, Lea,
         Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014 (the mixing).
@@ -67,14 +67,14 @@ def distinct_colors(numbers: np.ndarray) -> np.ndarray:
 
 
 def _mixed(whole: np.ndarray) -> np.ndarray:
-    """(k,) uint64 of which every bit depends on all bits of a number."""
+    """Returns (k,) uint64 hashes: every bit depends on all bits of a number."""
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         whole = (whole ^ (whole >> np.uint64(shift))) * np.uint64(factor)
     return whole ^ (whole >> np.uint64(31))
 
 
 def _from_oklab(lightness: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(k, 3) linear RGB, clipped to [0, 1]."""
+    """Returns (k, 3) linear RGB, clipped to [0, 1]."""
     long = (lightness + 0.3963377774 * a + 0.2158037573 * b) ** 3
     medium = (lightness - 0.1055613458 * a - 0.0638541728 * b) ** 3
     short = (lightness - 0.0894841775 * a - 1.2914855480 * b) ** 3

@@ -1,7 +1,7 @@
-"""`CompiledShader`: a shader of one's own in C++, a small header, at the speed of the fused ones.
+"""`CompiledShader`: a user-defined shader, a small C++ header, as fast as the fused shaders.
 
-What a header holds is told in cpp_ext/csrc/user_shader.h; how it is compiled and where the result
-is kept, in cpp_ext/user.py.
+cpp_ext/csrc/user_shader.h describes what the header must hold; cpp_ext/user.py compiles it and
+caches the result.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ Uniforms = MutableMapping[str, Number] | Tensor
 
 
 class CompiledShader(LitShader):
-    """A struct of a C++ header as a shader: compiled once, and kept by its content.
+    """A shader made of a struct in a C++ header. It is compiled once and cached by its content.
 
-    It goes wherever a fused shader goes. Uniforms, transfer function, light and material may be
-    edited between frames: nothing is compiled for that.
+    It can be used wherever a fused shader can. Uniforms, transfer function, light and material may
+    be edited between frames without recompiling.
 
     Attributes:
-        header: The file, as a full path.
+        header: Absolute path of the header.
         op: Name of its op in `torch.ops.gvtorch_user`.
     """
 
@@ -54,22 +54,22 @@ class CompiledShader(LitShader):
         other_component: int = 0,
         **light: Any,
     ) -> None:
-        """Compiles the struct for the CPU, which takes seconds where the cache does not hold it,
-        and loads it. It is compiled for CUDA where it first meets a tree on CUDA.
+        """Compiles the struct for the CPU, which takes seconds unless it is cached, and loads it.
+        It is compiled for CUDA when it is first used with a tree on CUDA.
 
         Args:
-            header: The header.
+            header: Path of the header.
             name: The name of a `template <class T> struct` in it, with its namespaces.
-            uniforms: Its numbers, by name; a float, a tensor of one number each. Or all in a (k,)
-                tensor, which is read where it lies; a struct without names takes any k.
+            uniforms: Its numbers by name, each a float or a tensor of one number; or all of them in
+                one (k,) tensor, read in each frame. A struct without named uniforms takes any k.
             transfer: The transfer function that `look_up` and `hides` read.
             channel, component, other, other_component: See `Shader`.
             **light: As in `Lit`, for structs that use `light`.
 
         Raises:
-            CompileError: The compiler refuses it; holds what the compiler says, as it is.
-            RuntimeError: There is no compiler, the header changes meanwhile, or the cache's folder
-                can't be written, or is not the user's own.
+            CompileError: The compiler rejects it; holds the compiler's output unchanged.
+            RuntimeError: There is no compiler, the header changes while it is compiled, or the
+                cache folder can't be written or is owned by another user.
             ValueError: There is no such file, or uniforms are not those that the struct names.
         """
         super().__init__(**light)
@@ -87,19 +87,19 @@ class CompiledShader(LitShader):
         add_user_op(self.op)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Compiles or finds it again in a process that has not loaded it."""
+        """Restores a pickled shader: loads its op, compiling it if it is not in the cache."""
         self.__dict__.update(state)
         self._take(user.reload(self._compiled))
 
     @property
     def libraries(self) -> list[Path]:
-        """What is loaded for it, CPU and CUDA: `torch.ops.load_library` loads them in a process
-        that only runs an archive or an exported program.
+        """The shared libraries of its op, CPU and CUDA. A process that only runs an archive or an
+        exported program loads them with `torch.ops.load_library`.
         """
         return user.libraries(self.op)
 
     def feature_count(self, tree: N3Tree) -> int:
-        """As many as the struct tells."""
+        """Returns the struct's `kFeatures`, or the width of the second channel if that is -1."""
         if self._compiled.features >= 0:
             return self._compiled.features
         if self.other is None:
@@ -107,19 +107,19 @@ class CompiledShader(LitShader):
         return tree.bricks.channels[self.other].width
 
     def parameter_tensor(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
-        """Returns (20 + k,): that of every shader, and the uniforms as they are now."""
+        """Returns (20 + k,): the 20 numbers of any shader, then the current uniforms."""
         fixed = super().parameter_tensor(tree, dtype).reshape(-1)
         numbers = self._numbers()
         return torch.cat((fixed, pack(numbers, dtype, tree.device))) if numbers else fixed
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
-        """See `Shader`; compiles for CUDA where the tree lies there, and raises as `__init__`."""
+        """See `Shader`; compiles for CUDA if the tree is there, and raises as `__init__` does."""
         if tree.device.type == "cuda":
             user.load_cuda(self._compiled)
         return super().shading(where, tree)
 
     def _numbers(self) -> list[Any]:
-        """The uniforms in the struct's order, checked."""
+        """Returns the uniforms in the struct's order, checked."""
         names, given = self._compiled.uniforms, self.uniforms
         if isinstance(given, Tensor):
             parts: dict[str, Any] = {"uniforms": given}

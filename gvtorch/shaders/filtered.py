@@ -1,18 +1,18 @@
-"""`Filtered`: the transfer function, lit or not, right from afar too.
+"""`Filtered`: the transfer function, lit or not, that is also right from afar.
 
-The function of a mean is not the mean of the function, and a mean forgets what stands behind what.
-So each voxel of a coarse level holds what the function makes of the finest voxels below it, seen
-along the axes: for each column of them its colour and alpha, and of the columns the mean, weighted
-with the light that comes to them. Cracks stay open, and walls closed; hidden voxels take on what is
-seen beside them, so that solids hardly grow. Where matter is lit, so are the second moments of its
-normals: they have no sign, as light has none that falls on both sides of a surface, and they tell
-how rough a surface is. Light and material stay free.
+The function of a mean is not the mean of the function, and a mean loses the order of depth. So each
+voxel of a coarse level stores colours instead of a value: the finest voxels below it are coloured
+by the function and composited in columns along the axes, and the columns' colours and alphas are
+averaged, weighted by the light that reaches them. Cracks stay open, and walls closed; hidden voxels
+take on the colours of neighbours, so that solids hardly grow. Lit matter also stores the mean
+second moments of its normals. They have no sign, which suits lighting on both sides of a surface,
+and they describe how rough it is. Light and material can still be changed.
 
 Source: Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF 2011
 (voxels by direction); Younesy, Möller, Carr, "Improving the quality of multi-resolution volume
-rendering", EuroVis 2006 (why); Olano, Baker, "LEAN mapping", I3D 2010, and Heitz, Dupuy, Crassin,
-Dachsbacher, "The SGGX microflake distribution", SIGGRAPH 2015 (moments of normals). The weight,
-what hidden voxels hold and the sums over moments are ours; docs/from_afar.md measures them.
+rendering", EuroVis 2006 (motivation); Olano, Baker, "LEAN mapping", I3D 2010, and Heitz, Dupuy,
+Crassin, Dachsbacher, "The SGGX microflake distribution", SIGGRAPH 2015 (moments of normals). The
+weights, the colours of hidden voxels and the sums over moments are ours; see docs/from_afar.md.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ from .coarse_colors import (
 from .shader import Sampling, Shader
 from .transfer_function import TransferFunction
 
-#: What `finer` gives. The finest voxels are not filtered: the sharper what they show, the larger
-#: should pixels be that still take coarse ones, so the smaller is this.
+#: Results of `finer`. The finest voxels are not filtered: the sharper their detail, the smaller
+#: must the pixels be that are drawn from them, and so must this factor.
 _FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
-_OPAQUE = 0.2  # alpha of a finest voxel from which on directions matter
+_OPAQUE = 0.2  # colours are stored by direction if a finest voxel can have a higher alpha
 _TIMEOUT = 3600.0  # seconds for one read of local data
 _BATCH = 4096  # bricks cut at a time
 
 
 def _to_filter(owner: Any, name: str, value: Any) -> TransferFunction | Lit:
-    """Checks what is to be filtered."""
+    """Checks that a value is a shader that can be filtered."""
     where = kind_of(owner)
     if not isinstance(value, TransferFunction | Lit):
         got = type(value).__name__
@@ -72,15 +72,15 @@ def _to_filter(owner: Any, name: str, value: Any) -> TransferFunction | Lit:
 
 
 class Filtered(Shader):
-    """The transfer function, and for coarse bricks the colours that it makes of the finest voxels
-    below them, a channel of their own. Near by it draws as the transfer function does; from afar
-    it shows about what many rays a pixel would. `Filtered.of` makes both.
+    """The transfer function for finest bricks, and for coarse bricks a channel of colours that it
+    makes of the finest voxels below them. From near it draws as the transfer function does; from
+    afar about as many rays a pixel would. `Filtered.of` makes shader and channel.
 
-    Or the transfer function as `Lit` shows it: then coarse bricks tell of the normals, too, and
-    highlights widen. Light and material may be edited at any time.
+    Given a `Lit`, coarse bricks also store the normals' moments, and highlights widen with
+    distance. Light and material may be edited at any time.
 
-    Levels are chosen twice as fine as for other shaders, whose wide cones have to filter; 1.75
-    times of lit matter, 1.6 where colours differ by direction.
+    Levels are chosen twice as fine as for other shaders, which rely on wide cones to filter; 1.75
+    times as fine for lit matter, 1.6 times where colours differ by direction.
     """
 
     kind = "Filtered"
@@ -97,15 +97,15 @@ class Filtered(Shader):
         *,
         directions: bool | None = None,
     ) -> None:
-        """Tells the transfer function, and where its colours lie.
+        """Sets the transfer function, and the channel of its colours.
 
         Args:
-            transfer: The transfer function, or a `Lit` with one. Where colours were made of
-                another one, or it is edited, tracing raises ValueError: they have to be made anew.
+            transfer: The transfer function, or a `Lit` with one. If it is edited, or the colours
+                were made with another one, tracing raises ValueError until they are recomputed.
             channel: Name of the channel that holds the colours.
-            component: Which number of a voxel the function takes.
-            directions: Whether colours are made for each of six directions, or their mean, which
-                takes a sixth of the memory. None: where a voxel may hide a fifth of what is behind.
+            component: Index of the number of a voxel that the function reads.
+            directions: True: colours for each of six directions; False: their mean, which takes a
+                sixth of the memory. None: True if a voxel may hide over a fifth of what is behind.
         """
         self.transfer, self.other = transfer, channel
         self.component, self._directions = component, directions
@@ -122,19 +122,19 @@ class Filtered(Shader):
         directions: bool | None = None,
         progress: Progress = no_progress,
     ) -> Self:
-        """Works the colours out on the device of a resident tree, and keeps them as a channel of
-        it: (b, z, y, x, n or 6 * n) float16 for its first b bricks, those above the finest level.
-        n is 4: premultiplied linear colour, and the alpha of a voxel; of lit matter 10: also the
-        moments of its normals. What a tree's threshold made EMPTY counts here as it is. Working
-        takes 16 to 27 bytes a finest voxel on the device, the channel included; lit, twice that.
+        """Computes the colours on the device of a resident tree, and adds them to it as a channel:
+        (b, z, y, x, n or 6 * n) float16 for its first b bricks, those above the finest level. n is
+        4: premultiplied linear colour, and the alpha of a voxel; for lit matter 10: also the
+        moments of its normals. Values that the tree's threshold made EMPTY are not left out.
+        Needs 16 to 27 bytes a finest voxel on the device, including the channel; lit, twice that.
 
         Args:
-            tree: What `N3Tree.from_volume` made of the volume.
+            tree: The tree that `N3Tree.from_volume` made of the volume.
             volume: The volume.
             transfer: The transfer function, or a `Lit`.
-            channel: Name of the channel, which replaces one of this name.
+            channel: Name of the channel; an existing one of this name is replaced.
             component, directions: See `Filtered`.
-            progress: Told ("filtered", voxels done, voxels in all).
+            progress: Called with ("filtered", voxels done, voxels in all).
 
         Raises:
             ValueError: Tree and volume do not belong together, or an argument is out of its range.
@@ -179,21 +179,21 @@ class Filtered(Shader):
         device: torch.device | str = "cpu",
         progress: Progress = no_progress,
     ) -> Self:
-        """Works the colours out for a store, out of core, and writes them into it as a coarse
-        channel, which `StoredProducer(store, filtered=shader)` streams. The store's own voxels are
-        read and stay as they are. While they are made, files of 9 bytes a finest voxel (lit, 19)
-        lie in the store's folder; the colours themselves compress well.
+        """Computes the colours of a store, out of core, and writes them into it as a coarse
+        channel, which `StoredProducer(store, filtered=shader)` streams. The store's voxels are not
+        changed. Meanwhile temporary files of 9 bytes a finest voxel (lit, 19) are in the store's
+        folder; the colours themselves compress well.
 
         Args:
             store: A store that `convert` made, in a folder.
             transfer: The transfer function, or a `Lit`.
-            channel: Name of the colours; those of this name are replaced.
+            channel: Name of the channel of colours; an existing one of this name is replaced.
             component, directions: See `Filtered`.
-            device: Where the work is done.
-            progress: Told ("filtered", voxels done, voxels in all), then of "writing".
+            device: Device on which colours are computed.
+            progress: Called with ("filtered", voxels done, voxels in all), then with "writing".
 
         Raises:
-            ValueError: It is no such store, or an argument is out of its range.
+            ValueError: It is not such a store, or an argument is out of its range.
             OSError: It can't be read or written.
         """
         opened = store if isinstance(store, Store) else Store.open(store)
@@ -217,8 +217,8 @@ class Filtered(Shader):
 
     @classmethod
     def stored(cls, store: Store | str | Path, channel: str = "filtered") -> Self:
-        """Returns the shader whose colours a store holds, with the function they were made with; in
-        a `Lit` with a headlight, where they tell of normals.
+        """Returns the shader for the colours in a store, with the function that made them, which is
+        in a `Lit` with a headlight if the colours include normals.
 
         Raises:
             ValueError: The store has no such colours, or they are damaged.
@@ -253,12 +253,12 @@ class Filtered(Shader):
 
     @property
     def numbers(self) -> int:
-        """How many numbers tell what is seen of a voxel along one direction."""
+        """How many numbers a voxel has along one direction: PLAIN or LIT."""
         return LIT if isinstance(self.transfer, Lit) else PLAIN
 
     @property
     def made_of(self) -> dict[str, Any]:
-        """What the colours depend on, as JSON."""
+        """All inputs that the colours depend on, as JSON."""
         function = self.function
         told = {
             "opacity": function.opacity.tolist(),
@@ -269,7 +269,7 @@ class Filtered(Shader):
         return told if self.numbers == PLAIN else {**told, "normals": True}
 
     def colors(self, spacing: tuple[float, float, float]) -> Channel:
-        """Returns the channel that holds the colours of voxels of this size."""
+        """Returns dtype and width of the channel of colours, for voxels of this size."""
         directions = self._directions
         if directions is None:
             one_voxel = Sampling(smallest_spacing=min(spacing), step=min(spacing))
@@ -286,8 +286,8 @@ class Filtered(Shader):
         width: int,
         progress: Progress = no_progress,
     ) -> Iterator[Tensor]:
-        """Yields the colours of a volume's coarse levels, (z, y, x, width) float16 on the CPU, the
-        finest of them first, worked out on a device; see `of`. The width is that of `colors`.
+        """Computes the colours of a volume's coarse levels on a device, see `of`, and yields them,
+        finest level first, as (z, y, x, width) float16 on the CPU. The width is that of `colors`.
         """
         field = VolumeField(volume, self.component or 0)
         sides = [branching ** (level + 1) for level in range(depth)]
@@ -299,7 +299,7 @@ class Filtered(Shader):
             yield self.kept(colors, width).cpu()
 
     def kept(self, colors: Tensor, width: int) -> Tensor:
-        """Returns what a channel of a width holds of what `write` wrote."""
+        """Converts numbers that `write` wrote to those of a channel of a width."""
         seen = without_light(colors)
         return seen if seen.shape[-1] == width else mean_of_directions(seen)
 
@@ -312,7 +312,7 @@ class Filtered(Shader):
         device: torch.device,
         progress: Progress = no_progress,
     ) -> None:
-        """Writes colours of coarse levels into tensors, also mapped ones; see `write_colors`."""
+        """Writes colours of coarse levels to (possibly mapped) tensors; see `write_colors`."""
         tables = [
             self.transfer.table(
                 Sampling(smallest_spacing=min(spacing), step=side / 2, device=device)
@@ -363,7 +363,7 @@ class Filtered(Shader):
 class _StoreField:
     """One number of the finest voxels of a store."""
 
-    across = 64  # as wide as its chunks
+    across = 64  # the side of its chunks
 
     def __init__(self, store: Store, component: int) -> None:
         self._store, self._component = store, component

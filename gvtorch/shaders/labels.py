@@ -1,4 +1,4 @@
-"""`Labels`: volumes whose voxels hold numbers of things, as segmentations do."""
+"""`Labels`: shows volumes whose voxels hold the numbers of objects, as segmentations do."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from .lights import LitShader
 from .shader import ColorTable, Sampling
 
 BACKGROUND = 0
-_MOST_ROWS = 2**24  # of a table: float32 keeps their numbers apart
-_KEPT = 8  # tables, and names of rows
+_MOST_ROWS = 2**24  # of a table, so that float32 can index its rows
+_KEPT = 8  # cached tables and label tensors
 _Made = TypeVar("_Made")
 
 
 class Labels(LitShader):
-    """Labels in colours of their own. A place shows the label of its nearest voxel: where two
-    voxels meet, that of the upper one. Labels are never mixed; where two levels of detail blend,
-    their colours do. `Hits.label` and `Picture.label` tell what is seen.
+    """Shows each label in its own colour. A sample has the label of its nearest voxel; on the face
+    between two voxels, that of the one with the higher index. Labels are never mixed; where two
+    levels of detail blend, their colours do. `Hits.label` and `Picture.label` hold what is seen.
 
-    It reads a channel of labels (`Volume(..., labels=True)`). Lit, the normal of a place is made of
-    the voxels around that are not of its label, as many to each side as bricks have for a border, 1
-    to 3: of a ball it is off by 11 degrees in the mean with a border of 1, by 4 with 2, by 2 with
-    3. Where there are none, a place is lit as if it faced the light.
+    It reads a channel of labels (`Volume(..., labels=True)`). If lit, the normal of a sample points
+    to the voxels around it that have another label, looking as many voxels to each side as the
+    border of bricks is wide, 1 to 3: for a ball it is off by 11 degrees on average with a border of
+    1, by 4 with 2, by 2 with 3. Without such voxels a sample is lit as if it faced the light.
 
-    Attributes may be edited, also in place: the next picture is made with them.
+    Attributes may be edited, also in place: the next picture uses them.
 
     Attributes:
-        colors: By label, or in the order 0, 1, 2, ...; distinct ones for labels that are left out.
-        opacity: Of all labels, or by label (1 for those that are left out), per reference length.
+        colors: By label, or in the order 0, 1, 2, ...; other labels get distinct colours.
+        opacity: Of all labels, or by label (1 for those left out), per reference length.
         visible: The labels that are shown; None: all but 0, the background; "all": all.
         reference: World units, or None for the smallest spacing.
         lit: Whether they are lit.
@@ -61,11 +61,11 @@ class Labels(LitShader):
         """See the class.
 
         Args:
-            colors: By label, or in the order 0, 1, 2, ...; distinct ones for labels that are left
-                out: linear red, green, blue, or a name or #RRGGBB in sRGB. An array (k, 3) of uint8
-                holds sRGB.
-            opacity: Of all labels, or by label (1 for those that are left out), in [0, 1]; labels
-                of 0 are not there at all.
+            colors: By label, or in the order 0, 1, 2, ...; each is linear red, green, blue, or a
+                name or #RRGGBB in sRGB. An array (k, 3) of uint8 holds sRGB. Labels left out get
+                distinct colours.
+            opacity: Of all labels, or by label (1 for those left out), in [0, 1]; labels with
+                opacity 0 are treated as not present.
             visible: The labels that are shown; None: all but 0, the background; "all": all.
             channel: Name of the channel of labels; None: that of the options.
             reference: World units for which opacity is given; None: the smallest spacing.
@@ -73,12 +73,12 @@ class Labels(LitShader):
             **light: `light`, `ambient`, `diffuse`, `specular` and `shininess` of `LitShader`.
 
         Raises:
-            ValueError: A number is out of its range, or a colour unknown.
+            ValueError: A number is out of its range, or a colour is unknown.
         """
         if "normals" in light:
             raise ValueError("Labels: normals are those of the labels, got normals")
         super().__init__(**{"ambient": 0.3, "diffuse": 0.7, "specular": 0.15, **light})
-        if isinstance(visible, Iterator):  # which could be gone through once
+        if isinstance(visible, Iterator):  # it could be iterated only once
             visible = [*visible]
         self.colors, self.opacity, self.visible = colors, opacity, visible
         self.channel, self.reference, self.lit = channel, reference, lit
@@ -86,7 +86,7 @@ class Labels(LitShader):
         self._look()
 
     def __repr__(self) -> str:
-        """Tells what differs from the defaults."""
+        """Returns the arguments that differ from the defaults."""
         given = {"colors": self.colors, "visible": self.visible}
         parts = [f"{name}={check.shown(one)}" for name, one in given.items() if one is not None]
         if isinstance(self.opacity, Mapping) or self.opacity < 1:
@@ -113,7 +113,7 @@ class Labels(LitShader):
 
     def blocker(self) -> Labels:
         bare = copy(self)
-        bare.lit = False  # normals take their time
+        bare.lit = False  # normals would only cost time
         return bare
 
     def table(self, sampling: Sampling) -> ColorTable:
@@ -137,17 +137,17 @@ class Labels(LitShader):
         return self._once(tree, channel, (tree.device,), make)
 
     def _once(self, tree: N3Tree, channel: str, key: Any, make: Callable[[], _Made]) -> _Made:
-        """Returns what is made of a tree's labels; the last few are kept, also by copies."""
+        """Returns what `make` returns for a tree's labels; caches the last few, also for copies."""
         labels = tree.labels[channel]
         key = (id(labels), tree.value_range.get(channel), key)
         if key not in self._kept:
             if len(self._kept) == _KEPT:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = labels, make()  # as long as the labels live, their id is theirs
+            self._kept[key] = labels, make()  # the reference to `labels` keeps their id unique
         return self._kept[key][1]
 
     def _look(self) -> _Look:
-        """Colours, opacities and visibility as they are now, checked."""
+        """Returns the current colours, opacities and visibility, checked."""
         if self.reference is not None:
             check.number("Labels", "reference", self.reference, low=0, open_low=True)
         return _Look(self.colors, self.opacity, self.visible)
@@ -170,8 +170,8 @@ class Labels(LitShader):
 
 
 def label_rows(tree: N3Tree, channel: str) -> tuple[float, np.ndarray]:
-    """Returns the smallest value of a channel of labels, and (m,) int64 the labels of this value
-    and of those that follow; raises ValueError if they are not known.
+    """Returns the smallest value of a channel of labels, and (m,) int64: the labels of this value
+    and the m - 1 values after it. Raises ValueError if they are not known, or are too many.
     """
     labels = tree.labels[channel]
     if labels is not None:
@@ -193,11 +193,11 @@ def label_rows(tree: N3Tree, channel: str) -> tuple[float, np.ndarray]:
 
 
 class _Look:
-    """How each label looks; `key` is equal as long as it looks the same."""
+    """How each label looks; two looks with equal `key` are the same."""
 
     def __init__(self, colors: Any, opacity: Any, visible: Any) -> None:
         where = "Labels"
-        self.first = np.zeros((0, 3))  # of labels 0, 1, ...
+        self.first = np.zeros((0, 3))  # colours of labels 0, 1, ...
         self.colors: dict[int, tuple[float, float, float]] = {}
         if isinstance(colors, Mapping):
             self.colors = {_label(n): linear_color(where, color) for n, color in colors.items()}
@@ -220,7 +220,7 @@ class _Look:
         )
 
     def colors_of(self, labels: np.ndarray) -> np.ndarray:
-        """(m, 3) of labels (m,), rising."""
+        """Returns colours (m, 3) of labels (m,), which must be sorted."""
         found = distinct_colors(labels)
         told = (labels >= 0) & (labels < len(self.first))
         found[told] = self.first[labels[told]]
@@ -228,7 +228,9 @@ class _Look:
         return found
 
     def opacities(self, labels: np.ndarray) -> np.ndarray:
-        """(m,) per reference length of labels (m,), rising; 0 where they are not visible."""
+        """Returns opacities (m,) per reference length of labels (m,), which must be sorted; 0 for
+        those that are not visible.
+        """
         found = np.full(len(labels), self.opacity)
         _put(found, labels, self.own_opacity)
         if self.visible is not None:
@@ -240,7 +242,7 @@ class _Look:
 
 
 def _put(rows: np.ndarray, labels: np.ndarray, told: Mapping[int, Any]) -> None:
-    """Writes the values `told` of labels into their rows; labels without a row are left out."""
+    """Writes values by label (`told`) into the labels' rows; ignores labels without a row."""
     if not told:
         return
     wanted = np.fromiter(told, np.int64, len(told))
@@ -261,7 +263,7 @@ def _alpha(where: str, value: Any) -> float:
 
 
 def _in_order(where: str, colors: Any) -> np.ndarray:
-    """(k, 3) colours of labels 0, 1, ..."""
+    """Returns colours (k, 3) of labels 0, 1, ..."""
     if isinstance(colors, Tensor):
         colors = colors.detach().cpu().numpy()
     if isinstance(colors, np.ndarray):

@@ -1,7 +1,7 @@
-"""Lights, and the base of the shaders that are lit.
+"""Lights, and `LitShader`, the base of the shaders that are lit.
 
-Each number may be a float or a tensor, and may be edited between frames, which checks it; tensors
-are read when a frame is traced, so nothing is built again.
+Each number may be a float or a tensor, and may be set between frames, which checks it; tensors
+are read when a frame is traced, so nothing is rebuilt.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from ..ops.shading import LightKind, Number, ShadeParameters, Triple, shader_num
 from ..pool import N3Tree
 from .shader import Shader
 
-#: Width of a cone over that of the light's disc; fitted, below 1 because prefiltering widens what
-#: the cone meets.
+#: Width of a shadow cone relative to the light's disc; fitted, and below 1 because prefiltering
+#: widens occluders.
 CONE_OF_DISC = 0.35
 
 
 def a_number(low: float = -inf, high: float = inf) -> Check:
-    """A check for a finite number in [low, high], or a tensor of one. A tensor on CUDA is not
-    looked at, since that would block.
+    """A check for a finite number in [low, high], or a tensor of one. The value of a CUDA tensor is
+    not checked, since reading it would block.
     """
 
     def checked(owner: Any, name: str, value: Any) -> Any:
@@ -51,8 +51,8 @@ def a_number(low: float = -inf, high: float = inf) -> Check:
 
 
 def a_triple(low: float = -inf, high: float = inf, zero: bool = True) -> Check:
-    """A check for three finite numbers in [low, high], or a tensor of them, as `a_number`; `zero`
-    tells whether all may be 0.
+    """A check for three finite numbers in [low, high], or a tensor of them (see `a_number`); all
+    three may be 0 if `zero` is true.
     """
 
     def checked(owner: Any, name: str, value: Any) -> Any:
@@ -81,18 +81,18 @@ class Headlight(Checked):
     checks: ClassVar[Mapping[str, Check]] = {"color": a_triple(low=0)}
 
     def parameters(self) -> ShadeParameters:
-        """Returns what the kernel is told of the light; its material is to be added."""
+        """Returns the kernel's parameters of the light, without those of a material."""
         self.check_again()
         return ShadeParameters(light_color=self.color)
 
 
 @dataclass
 class DirectionalLight(Checked):
-    """A light far away."""
+    """A light at infinity."""
 
-    direction: Triple  # the way it shines, world; of any length but 0
+    direction: Triple  # in which it shines, world axes; any length but 0
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
-    angle: Number = 0.0  # how wide it looks, degrees, for soft shadows; the sun: 0.53
+    angle: Number = 0.0  # angular diameter in degrees, for soft shadows; the sun: 0.53
 
     checks: ClassVar[Mapping[str, Check]] = {
         "direction": a_triple(zero=False),
@@ -114,11 +114,11 @@ class DirectionalLight(Checked):
 
 @dataclass
 class PointLight(Checked):
-    """A light at a place. Its strength does not fall with the distance."""
+    """A light at a point. Its strength does not fall off with distance."""
 
     position: Triple  # world
     color: Triple = (1.0, 1.0, 1.0)  # linear RGB
-    radius: Number = 0.0  # of the ball that shines, world units, for soft shadows
+    radius: Number = 0.0  # of the luminous sphere, world units, for soft shadows
 
     checks: ClassVar[Mapping[str, Check]] = {
         "position": a_triple(),
@@ -137,7 +137,7 @@ Light = Headlight | DirectionalLight | PointLight
 
 
 _MATERIAL = ("ambient", "diffuse", "specular", "shininess", "octaves", "anisotropy")
-#: Beyond, float32 can't tell the transmittances of thick clouds from 0 (see `Light.faintest`).
+#: With more, the transmittances of thick clouds become 0 in float32 (see `Light.faintest`).
 MOST_OCTAVES = 5
 
 
@@ -146,9 +146,9 @@ class LitShader(Shader):
     * light) + specular * cosine^shininess * light.
 
     Attributes:
-        shadows: Whether a cone goes from each sample to the light: matter on the way takes from
-            diffuse light and highlight. A `Headlight` throws no shadows.
-        shadowed_kind: Its `kind` with shadows; None: it can't have any.
+        shadows: Whether a cone is traced from each sample to the light: matter along it dims
+            diffuse light and highlight. A `Headlight` casts no shadows.
+        shadowed_kind: Its `kind` with shadows; None: it does not support shadows.
     """
 
     shadows = False
@@ -172,21 +172,21 @@ class LitShader(Shader):
         octaves: int = 0,
         anisotropy: Number = 0.0,
     ) -> None:
-        """Takes light and material.
+        """Sets light and material.
 
         Args:
-            normals: Name of a channel of 3 numbers that holds normals (unsigned integers stand for
-                -1 to 1); the gradient's if left out.
+            normals: Name of a channel of 3 numbers that holds normals (unsigned integers are scaled
+                to -1 to 1); if left out, normals are gradients.
             light: A `Headlight` if left out.
             ambient: Factor of the base colour.
             diffuse: Factor of base colour, light and cosine.
             specular: Factor of the highlight.
             shininess: Exponent of the highlight.
-            octaves: Above 0, of `Lit` and `StoredColor`: a medium that scatters light, with its own
-                shadows, without normals and highlight. 1 counts light scattered once; each octave
-                more, up to 5, stands for about twice as many scatterings. The base colour is the
-                albedo, and the light's colour times `diffuse` its irradiance / 4 pi.
-            anisotropy: Mean cosine of scattering: 0 to all sides, towards 1 forwards, as clouds do.
+            octaves: For `Lit` and `StoredColor`. Above 0: a medium that scatters light, with its
+                own shadows, without normals and highlight. 1 counts light scattered once; each
+                further octave, up to 5, models about twice as many scatterings. The base colour is
+                the albedo, and the light's colour times `diffuse` its irradiance / 4 pi.
+            anisotropy: Mean cosine of scattering: 0 is isotropic; near 1 is forward, as in clouds.
 
         Raises:
             ValueError: A number is not in its range.
@@ -217,7 +217,7 @@ class LitShader(Shader):
 
 
 def check_light(what: str, value: Any) -> Light:
-    """Returns a light; raises ValueError unless it is one."""
+    """Returns `value` if it is a light; raises ValueError otherwise."""
     if not isinstance(value, Light):
         raise ValueError(
             f"{what} must be a Headlight, DirectionalLight or PointLight, "

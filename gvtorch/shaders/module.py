@@ -1,7 +1,7 @@
 """`ModuleShader`: any `nn.Module` as a shader, for whatever torch can compute and differentiate.
 
-Slower than a shader in the kernel, by an order of magnitude and more. tracing/tracer.py tells
-how rays are walked for it.
+It is at least an order of magnitude slower than a shader in the kernel. tracing/tracer.py walks
+the rays for it.
 """
 
 from __future__ import annotations
@@ -17,29 +17,30 @@ from ..base.checked import Check, instance_of, or_none, whole_between
 from .shader import ColorTable, Sampling, Shader
 from .transfer_function import TransferFunction
 
-#: Samples of a ray that are shaded at once; so the fewest of `ModuleShader.samples`.
+#: Samples of one ray that are shaded at once; therefore the minimum of `ModuleShader.samples`.
 PART_SAMPLES = 64
 _HIDES_NOTHING = TransferFunction.from_points([(0, 1)])
 
 
 class ModuleShader(Shader, torch.nn.Module):
     """A module as a shader: `module(values, positions, directions, lengths)` returns colour and
-    opacity of samples. Itself an `nn.Module` that holds the other: `parameters()`, `state_dict()`
-    and `.to(device)` are those of the module.
+    opacity of samples. The shader is itself an `nn.Module` with the given one as its submodule:
+    `parameters()`, `state_dict()` and `.to(device)` reach the given module.
 
-    The module gets, for k samples, `values` (k, c) of all channels side by side in data units,
-    `positions` (k, 3) and `directions` (k, 3) in world units, and `lengths` (k, 1) of the intervals
-    that the samples stand for, in world units. It returns linear RGB (k, 3), not premultiplied,
-    and the alpha (k, 1) of those lengths, in [0, 1]. Its parameters lie on the tree's device.
+    For k samples the module gets `values` (k, c) of all channels, concatenated, in data units;
+    `positions` (k, 3) and `directions` (k, 3) in world units; and `lengths` (k, 1), the world
+    lengths of the samples' intervals. It returns linear RGB (k, 3), not premultiplied, and the
+    alpha (k, 1) over those lengths, in [0, 1]. Its parameters must be on the tree's device.
 
-    Pictures have gradients by the parameters, and by bricks that are floats and require them.
-    Then all samples stay in memory until the backward pass; without gradients (`torch.no_grad`)
-    memory is bounded by `samples`.
+    Pictures have gradients with respect to the parameters, and to floating-point bricks that
+    require them. All samples then stay in memory until the backward pass; without gradients
+    (`torch.no_grad`) memory is bounded by `samples`.
 
     Attributes:
         module: The module.
-        channels: Names of the channels it reads; none: that of `RenderOptions.channel`.
-        hidden_by: A transfer function: what it shows nothing of is neither sampled nor requested.
+        channels: Names of the channels it reads; empty: that of `RenderOptions.channel`.
+        hidden_by: A transfer function; nodes in which it shows nothing are neither sampled nor
+            requested.
         samples: About how many samples are shaded at once; None: 2^20 on the CPU and 2^24 on CUDA,
             where each batch waits for the device.
     """
@@ -63,8 +64,8 @@ class ModuleShader(Shader, torch.nn.Module):
         hidden_by: TransferFunction | None = None,
         samples: int | None = None,
     ) -> None:
-        """See the class; raises ValueError where the module can't be called, or a number is out of
-        its range.
+        """See the class; raises ValueError if the module is not callable or a number is out of its
+        range.
         """
         super().__init__()
         if channels is not None and not len(channels):
@@ -77,17 +78,17 @@ class ModuleShader(Shader, torch.nn.Module):
         return f"ModuleShader({name}, channels={self.channels})"
 
     def table(self, sampling: Sampling) -> ColorTable:
-        """See `Shader`: that of `hidden_by`, of which only what it hides counts."""
+        """Returns the table of `hidden_by`, of which only the values it hides matter."""
         return (self.hidden_by or _HIDES_NOTHING).table(sampling)
 
     def forward(
         self, values: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Returns colour (k, 3) and alpha (k, 1) of samples, checked.
+        """Returns the module's colour (k, 3) and alpha (k, 1) of samples, checked.
 
         Raises:
-            ValueError: The module gives something of another shape or dtype, a colour that is not
-                finite, or no alpha.
+            ValueError: The module returns something of another shape or dtype, a colour that is not
+                finite, or an alpha outside of [0, 1].
         """
         made = self.module(values, positions, directions, lengths)
         if not (isinstance(made, Sequence) and len(made) == 2):
@@ -117,15 +118,15 @@ def _names(channels: Any) -> tuple[str, ...]:
 
 
 class TransferModule(torch.nn.Module):
-    """A transfer function as a module, whose rows are parameters: the twin of the kernel's.
+    """A transfer function as a module with its rows as parameters; equivalent to the kernel's.
 
     Attributes:
-        rows: (m, 4) linear RGB and opacity per reference length, at even distances of values.
+        rows: (m, 4) linear RGB and opacity per reference length, at evenly spaced values.
     """
 
     def __init__(self, shader: TransferFunction, spacing: float) -> None:
-        """Copies a transfer function; `spacing`, the smallest of the volume in world units, is
-        opacity's reference length where the function has none of its own.
+        """Copies a transfer function; `spacing`, the smallest of the volume in world units, is the
+        reference length of opacity if the function has none.
         """
         super().__init__()
         self.reference = float(shader.reference or spacing)
@@ -138,7 +139,7 @@ class TransferModule(torch.nn.Module):
         return f"TransferModule(rows={check.shown(self.rows)}, from {self.low:g})"
 
     def shows(self, values: Tensor) -> Tensor:
-        """Bool of the same shape: a value has an opacity."""
+        """Returns which values have an opacity, a bool tensor of the same shape."""
         place = ((values - self.low) * self.scale).clamp(0, len(self.rows) - 1)
         opaque = self.rows[:, 3] > 0
         return opaque[place.floor().long()] | opaque[place.ceil().long()]
@@ -146,7 +147,7 @@ class TransferModule(torch.nn.Module):
     def forward(
         self, values: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Colour (k, 3) and alpha (k, 1) of the first value."""
+        """Returns colour (k, 3) and alpha (k, 1) of the first channel's first number."""
         last = len(self.rows) - 1
         place = ((values[:, :1] - self.low) * self.scale).clamp(0, last)
         row = place.long().clamp(max=last - 1)

@@ -1,8 +1,8 @@
-"""Transfer functions of other programs: presets of ParaView and 3D Slicer as opacity (v, a) and
-colour (v, r, g, b), linear light.
+"""Transfer functions of other programs: reads presets of ParaView and 3D Slicer as opacity (v, a)
+and colour (v, r, g, b), linear light.
 
-Theirs is sRGB, and ParaView's runs through other colour spaces between its points: it is sampled
-finely enough that straight lines follow.
+Their colours are sRGB, and ParaView interpolates in other colour spaces: such curves are sampled
+finely enough for linear interpolation.
 
 Source: Moreland, "Diverging color maps for scientific visualization", ISVC 2009 (Msh).
 """
@@ -25,24 +25,24 @@ from ..base.declared import did_you_mean
 from ..base.messages import one_line
 from .presets import RAMP, SAMPLES, Pair, Points, converted, linear
 
-_GRID = 2**14  # cells of the grid on which the points of files lie, which makes short tables
-_PARTS = 16  # of the way between two colours, at least
-_FEW = 2048  # parts in all which files of few colours may have
-_SRGB_PARTS = 32  # of the way from black to white, along which sRGB is taken as straight
-_BENT = 128  # parts of a curve of opacities
-_STRAIGHT, _SUDDEN = 0.01, 0.99  # sharpnesses of VTK's, below and above which nothing is bent
-_UNSATURATED = 0.05  # radians of Msh
-_APART = 0.33 * math.pi  # hues between which the way goes through white, as VTK has it
+_GRID = 2**14  # cells of the grid that points are moved to, which keeps tables short
+_PARTS = 16  # least parts between two colours, if the grid is fine enough
+_FEW = 2048  # parts in all, if there are few colours
+_SRGB_PARTS = 32  # linear pieces from black to white that approximate sRGB
+_BENT = 128  # parts of a curve between two opacities
+_STRAIGHT, _SUDDEN = 0.01, 0.99  # VTK sharpness: below it is linear, above a step, else a curve
+_UNSATURATED = 0.05  # saturation in Msh, radians
+_APART = 0.33 * math.pi  # colours with hues farther apart are mixed through white, as in VTK
 
 
-@np.errstate(all="ignore")  # what is beyond numbers is refused
+@np.errstate(all="ignore")  # infinities and NaN are rejected later
 def read_preset(path: str | Path, name: str | None) -> tuple[Pair, float | None, bool]:
-    """Reads a preset of ParaView (.json) or 3D Slicer (.vp, .vp.json, or one by its name of an .xml
-    such as its presets.xml).
+    """Reads a preset of ParaView (.json) or 3D Slicer (.vp, .vp.json, or an .xml with several named
+    presets, such as its presets.xml).
 
     Returns:
-        The points, the length that opacities are given for if the file tells it, and whether the
-        values are only relative, as ParaView's are.
+        The points; the reference length of opacities, None if the file has none; and whether the
+        values are only relative, as in ParaView.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -102,7 +102,7 @@ def _chosen(file: Path, found: Mapping[str, Any], name: str | None) -> Any:
 
 
 def _of_vp(text: str) -> Mapping[str, Any]:
-    """Nine lines: interpolation, shade, diffuse, ambient, specular, its power, and three lists."""
+    """Parses nine lines: interpolation, shade, diffuse, ambient, specular, power, three lists."""
     lines = [line for line in text.splitlines() if line.strip()]
     if len(lines) < 9:
         raise ValueError(f"a .vp file has 9 lines, this one {len(lines)}")
@@ -111,7 +111,7 @@ def _of_vp(text: str) -> Mapping[str, Any]:
 
 
 def _slicer(file: Path, told: Mapping[str, Any]) -> Pair:
-    """Points of texts that hold how many numbers follow, and these."""
+    """Parses points from strings that hold a count and as many numbers."""
     opacity = _counted(told["scalarOpacity"], 2)
     gradient = _counted(told.get("gradientOpacity", "4 0 1 255 1"), 2)
     _tell_lost(file, gradient, shaded=str(told.get("shade", "0")) not in ("0", "false"))
@@ -154,7 +154,7 @@ def _of_paraview(file: Path, item: Mapping[str, Any]) -> Pair:
     if space in ("Lab/CIEDE2000", "LabCIEDE2000"):
         warnings.warn(f"{file}: not kept: ColorSpace {space!r}, taken as 'Lab'", stacklevel=4)
         space = "Lab"
-    if space == "CIELAB":  # of one map that ParaView ships, and itself reads so
+    if space == "CIELAB":  # one map that ParaView ships has it, and ParaView reads it as RGB
         space = "RGB"
     known = ("RGB", "HSV", "Lab", "Diverging", "Step")
     if space not in known:
@@ -168,7 +168,7 @@ def _of_paraview(file: Path, item: Mapping[str, Any]) -> Pair:
 
 
 def paraview_item(opacity: np.ndarray, color: np.ndarray) -> dict[str, list[float]]:
-    """Returns "RGBPoints" and "Points" of ParaView, of opacities (k, 2) and colours (m, 4)."""
+    """Returns ParaView's "RGBPoints" and "Points" for opacities (k, 2) and colours (m, 4)."""
     encoded = partial(converted, "linear_rgb_to_rgb")
     nodes, ways = [color[0]], np.abs(np.diff(encoded(color[:, 1:]), axis=0)).max(1)
     for first, last, way in zip(color[:-1], color[1:], ways, strict=True):
@@ -182,7 +182,7 @@ def paraview_item(opacity: np.ndarray, color: np.ndarray) -> dict[str, list[floa
 
 
 def _opacities(nodes: np.ndarray) -> np.ndarray:
-    """(k, 2) of nodes (v, a), or (v, a, midpoint, sharpness) as VTK has them."""
+    """Returns points (k, 2) from nodes (v, a), or (v, a, midpoint, sharpness) as in VTK."""
     nodes = nodes[np.argsort(nodes[:, 0], kind="stable")]
     if nodes.shape[1] == 2:
         return nodes
@@ -191,7 +191,7 @@ def _opacities(nodes: np.ndarray) -> np.ndarray:
         middle = _inside(midpoint)
         places = np.array([0, *_around(middle)])
         if _STRAIGHT <= sharp <= _SUDDEN:
-            half = np.arange(_BENT // 2) / (_BENT // 2)  # as many on either side of the midpoint
+            half = np.arange(_BENT // 2) / (_BENT // 2)  # the same number before and after midpoint
             places = np.concatenate((half * middle, middle + half * (1 - middle)))
         shares = _share(places, middle, sharp)
         points += list(zip(v + places * (w - v), a + shares * (b - a), strict=True))
@@ -207,9 +207,9 @@ def _around(middle: float) -> tuple[float, float]:
 
 
 def _share(place: np.ndarray, middle: float, sharp: float) -> np.ndarray:
-    """Share of the way, by VTK's definition: half at the midpoint; at sharpness 0 along straight
-    lines, at 1 all at once, else time is bent towards the midpoint, then a cubic with slopes that
-    fall as it gets sharper.
+    """Returns the weight of the second node, 0 to 1, by VTK's definition: 1/2 at the midpoint. At
+    sharpness 0 it is piecewise linear, at 1 a step; in between, positions are bent towards the
+    midpoint, and go through a cubic whose end slopes fall with sharpness.
     """
     s = np.where(place < middle, 0.5 * place / middle, 0.5 + 0.5 * (place - middle) / (1 - middle))
     if sharp < _STRAIGHT:
@@ -227,8 +227,8 @@ def _share(place: np.ndarray, middle: float, sharp: float) -> np.ndarray:
 def _points(
     opacity: np.ndarray, nodes: np.ndarray, space: str = "RGB", *, wrap: bool = False
 ) -> Pair:
-    """Opacity and linear colour on one grid, from sRGB nodes, which may have a midpoint and a
-    sharpness too.
+    """Returns opacity and linear colour on one grid. `nodes` are (value, sRGB), and may also have a
+    midpoint and a sharpness.
     """
     if not len(nodes) or not len(opacity):
         raise ValueError("holds no points")
@@ -250,7 +250,7 @@ def _points(
         values.append(first[0] + share * (last[0] - first[0]))
         if bend:
             share = _share(share, _inside(bend[0]), bend[1])
-        if space == "Step":  # the upper node's colour, from the lower on
+        if space == "Step":  # the upper node's colour begins right at the lower node
             values[-1], share = np.array([first[0], last[0]]), np.ones(2)
         colors.append(_between(first[1:4], last[1:4], share, space, wrap))
     light = linear(np.concatenate(colors).clip(0, 1))
@@ -259,7 +259,7 @@ def _points(
 
 
 def _on_grid(points: np.ndarray, low: float, step: float) -> Points:
-    """Points moved to the grid; where several meet, the first and last make a ramp."""
+    """Moves points to the grid; of several at one position the first and last become a ramp."""
     kept: list[tuple[float, ...]] = []
     last = -1
     places = np.rint((points[:, 0] - low) / step).astype(int)
@@ -267,7 +267,7 @@ def _on_grid(points: np.ndarray, low: float, step: float) -> Points:
         zip(places, points[:, 1:].tolist(), strict=True), lambda p: p[0]
     ):
         rows = [row for _, row in run]
-        jump = rows[0] != rows[-1] and last < at  # else one row, so that curves don't fall behind
+        jump = rows[0] != rows[-1] and last < at  # else one row, so that curves don't shift upwards
         for row in (rows[0], rows[-1]) if jump else rows[-1:]:
             last = max(int(at), last + 1)
             kept.append((low + last * step, *row))
@@ -277,7 +277,7 @@ def _on_grid(points: np.ndarray, low: float, step: float) -> Points:
 def _between(
     first: np.ndarray, last: np.ndarray, share: np.ndarray, space: str, wrap: bool
 ) -> np.ndarray:
-    """(k, 3) sRGB on the way from one colour to another."""
+    """Returns (k, 3) sRGB, interpolated between two colours in a colour space."""
     t = share[:, None]
     if space in ("RGB", "Step"):
         return first + t * (last - first)
@@ -292,11 +292,11 @@ def _between(
     a, b = (converted("rgb_to_lab", color) for color in (first, last))
     mixed = a + t * (b - a) if space == "Lab" else _diverging(a, b, share)
     light = converted("lab_to_rgb", mixed, clip=False)
-    return light / light.max(1, keepdims=True).clip(1)  # as VTK brings back what is too bright
+    return light / light.max(1, keepdims=True).clip(1)  # scales down what is too bright, as VTK
 
 
 def _diverging(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(k, 3) Lab on Moreland's way between two colours: through white, if their hues differ."""
+    """Returns (k, 3) Lab, interpolated by Moreland's method: through white if hues differ much."""
     ends = [_msh(first), _msh(last)]
     (m1, s1, h1), (m2, s2, h2) = ends
     apart = abs(h1 - h2)
@@ -312,14 +312,14 @@ def _diverging(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.nda
 
 
 def _msh(lab: np.ndarray) -> np.ndarray:
-    """Polar Lab: magnitude, saturation and hue, which are angles."""
+    """Returns Lab in polar coordinates: magnitude, and saturation and hue as angles."""
     m = float(np.linalg.norm(lab))
     s = math.acos(float(lab[0]) / m) if m > 1e-3 else 0.0
     return np.array([m, s, math.atan2(lab[2], lab[1]) if s > 1e-3 else 0.0])
 
 
 def _msh_mix(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Straight in Msh; an unsaturated end takes a hue that turns away from the other's."""
+    """Mixes linearly in Msh; an unsaturated end takes the other's hue, turned away from it."""
     a, b = first.copy(), last.copy()
     spun = False
     for gray, other in ((a, b), (b, a)):
@@ -330,6 +330,6 @@ def _msh_mix(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.ndarr
                 spin = s * math.sqrt(gray[0] ** 2 - m**2) / (m * math.sin(s))
                 gray[2] = h + spin if h > -0.3 * math.pi else h - spin
     way = b - a
-    if not spun:  # of dark colours the turn may be more than one around
-        way[2] = (way[2] + math.pi) % (2 * math.pi) - math.pi  # the shorter one
+    if not spun:  # a spun hue of a dark colour may be more than a full turn away
+        way[2] = (way[2] + math.pi) % (2 * math.pi) - math.pi  # the shorter way around
     return a + share[:, None] * way

@@ -1,4 +1,4 @@
-"""Points of transfer functions by name: opacity (v, a) and colour (v, r, g, b), linear light."""
+"""Preset transfer functions, as points: opacity (v, a) and colour (v, r, g, b), linear light."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..base.declared import did_you_mean
 Points = Sequence[Sequence[float]]
 Pair = tuple[Points, Points]  # opacity and colour
 
-#: Over [0, 1], which stands for a window of the data.
+#: Over [0, 1], to be stretched over a window of the data.
 PRESETS: dict[str, Pair] = {
     "gray": ([(0, 0), (0.05, 0), (1, 0.5)], [(0, 0, 0, 0), (1, 1, 1, 1)]),
     "hot": (
@@ -33,12 +33,12 @@ PRESETS: dict[str, Pair] = {
         [(0, 0), (0.3, 0), (0.45, 0.03), (0.6, 0.2), (0.8, 0.8), (1, 0.9)],
         [(0, 0.4, 0.15, 0.1), (0.3, 0.8, 0.4, 0.25), (0.6, 0.95, 0.75, 0.5), (1, 1, 1, 0.95)],
     ),
-    # Magnetic resonance: noise is dark, grey and white matter lie close together.
+    # Magnetic resonance: noise is dark; the values of grey and white matter are close together.
     "mr": (
         [(0, 0), (0.12, 0), (0.3, 0.05), (0.55, 0.3), (0.8, 0.75), (1, 0.9)],
         [(0, 0.1, 0.04, 0.04), (0.3, 0.4, 0.17, 0.13), (0.6, 0.75, 0.55, 0.45), (1, 1, 0.97, 0.9)],
     ),
-    # Electron microscopy: what is stained is dark, so the low values are matter.
+    # Electron microscopy: stained matter is dark, so low values are opaque.
     "em": (
         [(0, 0.95), (0.2, 0.7), (0.4, 0.1), (0.55, 0), (1, 0)],
         [(0, 1, 0.9, 0.7), (0.2, 0.75, 0.55, 0.35), (0.4, 0.3, 0.35, 0.5), (1, 0.05, 0.06, 0.1)],
@@ -93,15 +93,16 @@ CT_PRESETS: dict[str, Pair] = {
         ],
     ),
 }
-#: The preset in Hounsfield units that shows the same as one over a window.
+#: The presets in Hounsfield units that show the same tissue as one over a window.
 IN_HU = {"bone": "ct-bone", "tissue": "ct-soft", "vessels": "ct-vessels"}
 
 SAMPLES = 256  # of a colour map
 
 
 def named(name: str) -> Pair:
-    """Returns a preset's points: of one over a window over [0, 1], as are matplotlib's colour maps,
-    whose opacity is that of gray; raises ValueError where there is none.
+    """Returns the points of a preset or of a colour map of matplotlib, which gets the opacity of
+    "gray". Values are in [0, 1], but in Hounsfield units for `CT_PRESETS`. Raises ValueError if the
+    name is unknown.
     """
     known = {**PRESETS, **CT_PRESETS}
     if check.instance("preset", "name", name, str) in known:
@@ -119,13 +120,13 @@ def named(name: str) -> Pair:
 
 
 def display_grays() -> Pair:
-    """Returns grays over [0, 1] whose sRGB number is the value."""
+    """Returns grays over [0, 1] whose sRGB value is the data value."""
     places = np.arange(SAMPLES) / (SAMPLES - 1)
     return RAMP, np.column_stack((places, linear(np.repeat(places[:, None], 3, 1)))).tolist()
 
 
 def _colormaps() -> tuple[Mapping[str, Callable[..., Any]], str]:
-    """Matplotlib's colour maps, and what a message tells of them."""
+    """Returns matplotlib's colour maps, and the words for them in an error message."""
     try:
         from matplotlib import colormaps
     except ImportError:
@@ -134,7 +135,7 @@ def _colormaps() -> tuple[Mapping[str, Callable[..., Any]], str]:
 
 
 def converted(name: str, colors: np.ndarray, **options: bool) -> np.ndarray:
-    """Colours (..., 3) through a conversion of kornia, in float64."""
+    """Converts colours (..., 3) by a function of kornia, in float64."""
     import kornia.color
 
     planes = torch.from_numpy(np.array(colors, np.float64)).reshape(-1, 3).T[None, :, :, None]
@@ -144,5 +145,5 @@ def converted(name: str, colors: np.ndarray, **options: bool) -> np.ndarray:
 
 
 def linear(colors: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB (k, 3)."""
+    """Converts sRGB (k, 3) to linear light."""
     return converted("rgb_to_linear_rgb", colors).clip(0, 1)

@@ -1,5 +1,5 @@
-"""`Shader`: what every shader tells the tracer, and the effects around it; and the tables that the
-kernels read, rows of colour and alpha at even distances of the value.
+"""`Shader`, the base of all shaders: what the tracer and the effects around it ask a shader for.
+And `ColorTable`, which the kernels read: rows of colour and alpha at evenly spaced values.
 """
 
 from __future__ import annotations
@@ -19,40 +19,40 @@ from ..ops import ShadeArguments
 from ..ops.shading import Number, ShadeParameters, Triple, pack, shader_number
 from ..pool import N3Tree
 
-_MOST_BYTES = 64 * 2**20  # of a table in float32
+_MOST_BYTES = 64 * 2**20  # limit for a table in float32
 _CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """How rays are cut into intervals; in which dtype, and on which device they are traced."""
+    """How rays are cut into intervals, and the dtype and device they are traced in."""
 
-    smallest_spacing: float  # world units; opacity's reference length where none was given
+    smallest_spacing: float  # world units; the default reference length of opacity
     step: float  # world length of the shortest interval
-    levels: int = 1  # lengths of intervals, each twice the one before
+    levels: int = 1  # number of interval lengths: step * 2^l for l = 0 to levels - 1
     dtype: torch.dtype = torch.float32
     device: torch.device = _CPU
 
     def fitting(self, rows: int) -> int:
-        """Returns for how many lengths a table is made, where each takes this many rows: fewer than
-        `levels` where the table would take more than 64 MB.
+        """Returns how many interval lengths a table has if each takes `rows` rows: `levels`, or as
+        many (at least 1) as keep the table within 64 MB in float32.
         """
         return max(1, min(self.levels, _MOST_BYTES // (16 * rows)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColorTable:
-    """Colour and alpha by value, for each length of interval; linear between rows."""
+    """Colour and alpha by value, for each interval length; linear between rows."""
 
     table_lm4: Tensor  # (l, m, 4) linear RGB, alpha of an interval of step * 2^l; or (l, m, m, 4)
-    domain_2: Tensor  # (2,) value of the first row, of the last row
-    opaque_m: Tensor  # (m,) int32, how many rows up to this one have an opacity
+    domain_2: Tensor  # (2,) values of the first and the last row
+    opaque_m: Tensor  # (m,) int32, how many rows up to and including this one have an opacity
 
     @classmethod
     def of(
         cls, table: np.ndarray, domain: tuple[float, float], seen_m: np.ndarray, sampling: Sampling
     ) -> ColorTable:
-        """Moves a table that was made in float64 to where rays are traced."""
+        """Converts a float64 table, and which of its rows are visible, to dtype and device."""
         dtype, device = sampling.dtype, sampling.device
         return cls(
             table_lm4=torch.tensor(table, dtype=dtype, device=device),
@@ -63,35 +63,36 @@ class ColorTable:
 
 @dataclass(frozen=True, kw_only=True)
 class CutSurface:
-    """What a cut through the inside of a surface shows: its own colour, unlit."""
+    """How a clip's cut through the inside of a surface is drawn: in its own colour, unlit."""
 
     level: Number  # the value at the surface
-    below: bool  # inside is where the value is below the level, else where it is not
-    value: Shader  # gives the value in front as a feature, in white
-    color: Triple  # linear RGB, times what `colors` shows
-    colors: Shader | None  # shows the colour of another channel's value; None: that is white
+    below: bool  # True: inside is where the value is below the level; False: at or above it
+    value: Shader  # returns the value at the cut as a feature, coloured white
+    color: Triple  # linear RGB, multiplied by what `colors` shows
+    colors: Shader | None  # shows the colour of another channel's value; None: white
 
 
 class Shader(Checked):
     """What turns the values along a ray into colour. Attributes may be edited: they are checked and
-    converted as by the constructor, the next picture is made with them, and nothing is compiled.
-    Threads may share one while none edits it.
+    converted as by the constructor, and the next picture uses them; nothing is recompiled.
+    Threads may share a shader as long as none edits it.
 
     Attributes:
-        kind: Name of its C++ struct, which the op `shade_rays` runs; None: its table is all, and
-            the op `trace_rays` draws it.
-        op: Name of a user's op, which runs in place of `shade_rays`.
-        transfer: The transfer function of its colours; None: they are white and opaque.
+        kind: Name of its C++ struct, which the op `shade_rays` runs; None: the shader is nothing
+            but its table, and the op `trace_rays` draws it.
+        op: Name of a user's op that runs instead of `shade_rays`.
+        transfer: The transfer function of its colours; None: white and opaque.
         channel: Name of the channel whose value it reads; None: that of the options.
-        component: Which number of it; None: that of the options.
-        normals: Name of a channel of 3 numbers that holds normals; None: the gradient's.
+        component: Index of the number read from that channel; None: that of the options.
+        normals: Name of a channel of 3 numbers that holds normals; None: gradients are the normals.
         other: Name of a second channel that it reads, or None.
-        other_component: Which number of it colours a surface.
-        reads_coarse: The second channel may be a coarse one, which only coarse bricks have.
-        reads_labels: It reads a channel of labels; others would blend them.
-        whole_ray: It must see a ray in one go: what cuts rays into pieces refuses it.
-        uses_torch: Its colours are made in torch, outside of the kernel. The host waits for the
-            device meanwhile, so it is not recorded as a CUDA graph.
+        other_component: Index of the second channel's number that colours a surface.
+        reads_coarse: Whether the second channel may be a coarse one, which only coarse bricks have.
+        reads_labels: Whether it reads a channel of labels; other shaders would blend them.
+        whole_ray: Whether it must see each ray in one pass: options that cut rays into pieces
+            refuse it.
+        uses_torch: Whether its colours are computed in torch, outside of the kernel. The host then
+            waits for the device, so it can't be recorded as a CUDA graph.
     """
 
     kind: str | None = None
@@ -116,43 +117,43 @@ class Shader(Checked):
     }
 
     def __repr__(self) -> str:
-        """Tells its channels, and what it is made of."""
+        """Returns the class name with its channels and parts."""
         names = ("channel", "normals", "transfer", "value", "which", "color", "other", "light")
         given = {name: getattr(self, name, None) for name in names}
         parts = [f"{name}={check.shown(one)}" for name, one in given.items() if one is not None]
         return f"{type(self).__name__}({', '.join(parts)})"
 
     def table(self, sampling: Sampling) -> ColorTable:
-        """Returns the colours as the kernel reads them."""
+        """Returns the colours as a table, the form in which the kernel reads them."""
         if self.transfer is None:
             return one_color((1.0, 1.0, 1.0), sampling)
         return self.transfer.table(sampling)
 
     def table_of(self, tree: N3Tree, channel: str, sampling: Sampling) -> ColorTable:
-        """Returns `table`, as a channel of a tree needs it."""
+        """Returns `table` adapted to one channel of a tree; the same for all but `Labels`."""
         return self.table(sampling)
 
     def label_names(self, tree: N3Tree, channel: str) -> Tensor | None:
-        """Returns (1 + m,) int64: -1, and the label of each row of the table, on the tree's device;
-        its one feature then is a row of these. None: it shows no labels.
+        """Returns (1 + m,) int64 on the tree's device: -1, then the label of each row of the table.
+        The shader's only feature is then an index into it. None: the shader shows no labels.
         """
         return None
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Names of the channels that it names itself."""
+        """Names of the channels that the shader itself sets, without those left to the options."""
         return tuple(n for n in (self.channel, self.normals, self.other) if n is not None)
 
     def finer(self, tree: N3Tree) -> float:
-        """Returns by what factor levels are finer than the pixel cone asks for: their voxels count
-        as so many times as large.
+        """Returns the factor by which the shader wants levels finer than the pixel cone asks for;
+        to get them, the tracer counts voxels as that many times larger.
         """
         return 1.0
 
-    # What `shade_rays` is told.
+    # Arguments of `shade_rays`.
 
     def own_numbers(self, tree: N3Tree) -> Sequence[Number]:
-        """Returns the shader's own numbers, a record of `ops.shading`; most have none."""
+        """Returns the numbers of this kind of shader, a record of `ops.shading`; most have none."""
         return ()
 
     def material(self) -> ShadeParameters:
@@ -160,12 +161,12 @@ class Shader(Checked):
         return ShadeParameters()
 
     def feature_count(self, tree: N3Tree) -> int:
-        """Returns how many numbers `Hits.features` has."""
+        """Returns the width c of `Hits.features` (r, c)."""
         return 0
 
     def parameter_tensor(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
-        """Returns `parameter_54` of `shade_rays`, with lights and materials as they are now; what
-        the host sees of them is checked.
+        """Returns `parameter_54` of `shade_rays` from the current light and material, after
+        checking again all values that the host can read without blocking.
         """
         self.check_again()
         scale, offset = 1.0, 0.0
@@ -180,11 +181,11 @@ class Shader(Checked):
         return parameters.pack(dtype, tree.device)
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
-        """Returns what `shade_rays` reads of the shader beside its table; None: `trace_rays` draws
-        the table, which is all.
+        """Returns the arguments of `shade_rays` that this shader adds to its table and parameters;
+        None: `trace_rays` draws it from the table alone.
 
         Raises:
-            ValueError: A channel that it names is not there, or of the wrong width.
+            ValueError: The tree has no channel of a name that it uses, or one of another width.
         """
         channels = tree.bricks.channels
         for name in self.channels:
@@ -204,7 +205,7 @@ class Shader(Checked):
             last = channels[self.other].width - 1
             check.whole(where, "component of the colour", self.other_component, low=0, high=last)
         bricks, constants = dict(tree.bricks.bricks), tree.nodes.constants
-        if tree.depth == 0:  # the root is of the finest level
+        if tree.depth == 0:  # the root is the finest level, so there are no coarse bricks
             bricks |= {name: bricks[name][:0] for name, one in channels.items() if one.coarse}
         return ShadeArguments(
             shader=0 if self.op else shader_number(self.kind),
@@ -216,41 +217,41 @@ class Shader(Checked):
             other_component=self.other_component,
         )
 
-    # What the effects around it are told; ValueError where that asks for a light it has not.
+    # For the effects around it. They raise ValueError if they need normals and there are none.
 
     @property
     def projection(self) -> Literal["maximum", "minimum", "mean"] | None:
-        """Which value along a ray it shows, so that pieces of the ray are put together accordingly;
+        """Which value along a ray it shows. Results of a ray's pieces are joined by this rule;
         None: they are composited.
         """
         return None
 
     def cut_surface(self) -> CutSurface | None:
-        """Returns what a cut through its inside shows; None: it is a volume, and shows itself."""
+        """Returns how a cut through the inside is drawn; None: a volume, drawn as anywhere else."""
         return None
 
     def opened(self) -> Shader:
-        """Returns the shader for a cut without a cap: it shows surfaces from inside, too."""
+        """Returns the shader for clips without caps: it also shows surfaces from inside."""
         return self
 
     def unlit(self) -> Shader:
-        """Returns the shader without its light, for light by cones: base colours, and normals."""
+        """Returns the shader without its light, for `Lighting`: base colours and normals."""
         raise ValueError(
             "render: lighting needs normals: the shader must be Lit, StoredColor, Isosurface or "
             f"DistanceField, got {type(self).__name__}"
         )
 
     def matter(self) -> Shader:
-        """Returns what a wide cone meets: base colours, alpha, and normals."""
+        """Returns the shader for wide cones of indirect light: base colours, alpha, normals."""
         return self.unlit()
 
     def blocker(self) -> Shader:
-        """Returns what stands in the way of light: only its alpha counts."""
+        """Returns the shader that blocks the cones of `Lighting`: only its alpha counts."""
         return self.matter()
 
 
 def one_color(color: Triple, sampling: Sampling) -> ColorTable:
-    """Returns the table of one opaque colour, linear RGB."""
+    """Returns a table in which every value has one opaque colour, given in linear RGB."""
     row = pack((color, 1.0), sampling.dtype, sampling.device)
     return ColorTable(
         table_lm4=row.expand(sampling.levels, 2, 4).contiguous(),
@@ -260,7 +261,7 @@ def one_color(color: Triple, sampling: Sampling) -> ColorTable:
 
 
 def interval_levels(root_voxel: float, step: float) -> int:
-    """Returns how many lengths of intervals a tree needs: up to that of a voxel of its root."""
+    """Returns how many interval lengths a tree needs, up to the side of a voxel of its root."""
     return max(1, math.ceil(math.log2(root_voxel / step)) + 1)
 
 
@@ -274,5 +275,5 @@ def check_shader(where: str, name: str, value: Any) -> None:
 
 
 def number_of_one(dtype: torch.dtype) -> float:
-    """Returns the stored number that stands for 1."""
+    """Returns the stored number that means 1: 1.0 of floats, the largest value of integers."""
     return 1.0 if dtype.is_floating_point else float(torch.iinfo(dtype).max)

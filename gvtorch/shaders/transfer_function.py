@@ -1,7 +1,7 @@
 """`TransferFunction`: value -> linear RGB and opacity, piecewise linear; and its tables.
 
-Opacity is given per reference length: a slab that long, filled with the value, has that alpha. The
-colour of a value is its own (not premultiplied); the renderer composites premultiplied.
+Opacity is given per reference length: it is the alpha of a slab of that thickness filled with the
+value. Colours are not premultiplied here; the renderer composites premultiplied.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from .preset_files import paraview_item, read_preset
 from .presets import CT_PRESETS, Points, named
 from .shader import ColorTable, Sampling, Shader
 
-_LARGEST = 1e300  # values and lengths, so that their differences are numbers
-_KEPT = 8  # tables of a function
+_LARGEST = 1e300  # limit of values and lengths, so that their differences are finite
+_KEPT = 8  # cached tables of a function
 _FOREIGN = {"RGBPoints", "volumeProperties"}  # keys of other programs' files
 # Cells of a table.
 _FEWEST_CELLS = 2**10
-_FEWEST_SAMPLED = 2**12  # where corners fall beside rows
-_CELLS_APART = 16  # two corners that fall beside rows, at least
-_MANY_CELLS = 2**16  # at most, where corners fall on rows and there could be fewer
+_FEWEST_SAMPLED = 2**12  # fewest where corners fall between rows
+_CELLS_APART = 16  # least distance of two corners that fall between rows
+_MANY_CELLS = 2**16  # most with all corners on rows, unless only these make the table possible
 _MOST_CELLS = 2**20
-_FEWEST_PAIRED, _MOST_PAIRED = 128, 256  # of a side of an integrated table
-_FEWEST_PARTS, _MOST_PARTS = 8, 4096  # in which each of these is integrated
+_FEWEST_PAIRED, _MOST_PAIRED = 128, 256  # along a side of an integrated table
+_FEWEST_PARTS, _MOST_PARTS = 8, 4096  # parts in which each of these cells is integrated
 
 
 class TransferFunction(Shader):
-    """Two piecewise linear functions of a value in data units; constant beyond their end points.
-    The plain shader, and a part of most others. Attributes may be edited: the next picture is made
-    with them (a `TreeTracer` or a captured frame keeps those it was made with).
+    """Two piecewise linear functions of a value in data units, constant beyond their end points. By
+    itself it is the plain shader; it is a part of most others. Attributes may be edited: the next
+    picture uses them (a `TreeTracer` or a captured frame keeps those it was made with).
 
     Attributes:
         opacity: (k, 2) float64 points (value, alpha per reference length).
         color: (k, 4) float64 points (value, linear r, g, b).
         reference: World units, or None for the smallest spacing of what is rendered.
-        relative: Whether values have no meaning before the function is `stretched` over data.
+        relative: Whether its values have no meaning until the function is `stretched` over data.
     """
 
     opacity: np.ndarray
@@ -80,7 +80,7 @@ class TransferFunction(Shader):
     def from_points(
         cls, opacity: Points, color: Points = ((0, 1, 1, 1),), reference: float | None = None
     ) -> TransferFunction:
-        """Does the same as the class itself."""
+        """Same as calling the class."""
         return cls(opacity, color, reference)
 
     @classmethod
@@ -89,7 +89,7 @@ class TransferFunction(Shader):
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It is no such JSON, or its points are refused by `from_points`.
+            ValueError: It is not such JSON, or `from_points` rejects its points.
         """
         content = check.json_file("transfer function file", path)
         if not isinstance(content, dict) or "opacity" not in content:
@@ -106,9 +106,9 @@ class TransferFunction(Shader):
 
     @classmethod
     def from_file(cls, path: str | Path, name: str | None = None) -> TransferFunction:
-        """Reads what `save` wrote, or a preset of another program: ParaView's .json, 3D Slicer's
-        .vp, .vp.json or presets.xml. Their colours are sRGB and become linear; what is not kept
-        (shading, opacity by gradient) is told in a warning. ParaView's values are often only
+        """Reads a file of `save`, or a preset of another program: ParaView's .json, 3D Slicer's
+        .vp, .vp.json or presets.xml. Their colours are converted from sRGB to linear; a warning
+        lists what is lost (shading, opacity by gradient). ParaView's values are often only
         relative: `stretched` fits them to data.
 
         Args:
@@ -117,11 +117,11 @@ class TransferFunction(Shader):
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It is no such file, has no such preset, or its points are refused.
+            ValueError: It is not such a file, has no such preset, or its points are rejected.
         """
         if str(path).endswith(".json") and Path(path).is_file():
             content = check.json_file("transfer function file", path)
-            told = content.keys() if isinstance(content, dict) else ()  # of ours, if it is broken
+            told = content.keys() if isinstance(content, dict) else ()  # then from_json raises
             if not isinstance(content, list) and _FOREIGN.isdisjoint(told):
                 if name is not None:
                     raise ValueError(f"{path}: holds one function, without a name: leave it out")
@@ -138,9 +138,9 @@ class TransferFunction(Shader):
     def preset(
         cls, name: str, low: float | None = None, high: float | None = None
     ) -> TransferFunction:
-        """Returns a named function, stretched over the values [low, high], as `gv.window` finds
-        them: gray, hot, vessels, bone, tissue, mr, em, cloud, galaxy, or any colour map of
-        matplotlib. Those in Hounsfield units, ct-bone, ct-soft, ct-lung, ct-vessels, keep their own
+        """Returns a named function, stretched over the values [low, high], which `gv.window` can
+        find: gray, hot, vessels, bone, tissue, mr, em, cloud, galaxy, or any colour map of
+        matplotlib. Those in Hounsfield units, ct-bone, ct-soft, ct-lung, ct-vessels, keep their
         values if none are given.
 
         Raises:
@@ -154,8 +154,8 @@ class TransferFunction(Shader):
         return function.stretched(low, high)
 
     def stretched(self, low: float, high: float) -> TransferFunction:
-        """Returns the function with its first corner point moved to `low` and its last to `high`;
-        where these are equal, a little is added to `high`.
+        """Returns the function with its first corner point moved to `low` and its last to `high`,
+        which is raised a little unless it is above `low`.
         """
         where = "TransferFunction.stretched"
         low, high = (check.number(where, n, v) for n, v in (("low", low), ("high", high)))
@@ -169,7 +169,7 @@ class TransferFunction(Shader):
         return type(self)(parts[0].tolist(), parts[1].tolist(), self.reference)
 
     def save(self, path: str | Path) -> None:
-        """Writes the .json that `from_file` reads; ValueError if the path ends otherwise."""
+        """Writes the .json that `from_file` reads; ValueError if the path has another ending."""
         if Path(path).suffix != ".json":
             raise ValueError(f"TransferFunction.save: path must end in .json, got {str(path)!r}")
         write_whole(Path(path), self.to_json() + "\n")
@@ -180,14 +180,14 @@ class TransferFunction(Shader):
         return json.dumps({**content, "reference": self.reference} if self.reference else content)
 
     def to_paraview(self, name: str = "gvtorch") -> str:
-        """Returns the text of a preset of ParaView (.json), as its colour map editor imports it.
-        Its colours are sRGB, in which ours are not straight: points between follow them.
+        """Returns the text of a ParaView preset (.json), as its colour map editor imports it. Its
+        colours are sRGB, in which linear ramps are curves: points are added to follow them.
         """
         item = paraview_item(self.opacity, self.color)
         return json.dumps([{"ColorSpace": "RGB", "Name": name, **item}])
 
     def __repr__(self) -> str:
-        """Tells its corner points by number, and its values from first to last."""
+        """Returns how many corner points it has, and its first and last value."""
         low, high, _ = self.corners()
         points = f"{len(self.opacity)} opacities, {len(self.color)} colours"
         return f"TransferFunction({points}, from {low:g} to {high:g})"
@@ -198,18 +198,18 @@ class TransferFunction(Shader):
         return np.stack([*channels, np.interp(value, *self.opacity.T)], axis=-1)
 
     def corners(self) -> tuple[float, float, np.ndarray]:
-        """Returns the first and last value of a table, and (k,) where the corner points lie between
-        them, 0 to 1.
+        """Returns the first and last value of a table, and (k,) positions of the corner points
+        between them, 0 to 1.
         """
         values = np.unique(np.concatenate((self.opacity[:, 0], self.color[:, 0])))
         low, high = float(values[0]), float(values[-1])
         if high == low:
             high = low + max(1.0, abs(low))
-        return low, high, np.unique((values - low) / (high - low))  # some fall together
+        return low, high, np.unique((values - low) / (high - low))  # some may round to one
 
     def length(self, sampling: Sampling) -> float:
-        """Returns the length of the shortest interval in reference lengths; an endless one is as
-        long as numbers go, for what is clear stays so.
+        """Returns the length of the shortest interval in reference lengths; at most 1e300, so that
+        an infinite length of a transparent value is still transparent.
         """
         return min(sampling.step / (self.reference or sampling.smallest_spacing), _LARGEST)
 
@@ -220,11 +220,11 @@ class TransferFunction(Shader):
 
     def table(self, sampling: Sampling) -> ColorTable:
         """Returns the function as the kernel reads it: rows at even distances over a domain. The
-        last tables are kept: asking again costs nothing.
+        last few tables are cached.
 
-        Rows are laid so that every corner point falls on one, where that takes no more than 2^16
-        cells; else so densely that corners are at least 16 cells apart. There are at least 1,024
-        cells. Between rows, colour and alpha are linear.
+        Rows are placed so that every corner point falls on one, if that takes no more than 2^16
+        cells; otherwise so densely that corners are at least 16 cells apart. There are at least
+        1,024 cells. Between rows, colour and alpha are linear.
 
         Raises:
             ValueError: Two points are too close to each other.
@@ -234,7 +234,7 @@ class TransferFunction(Shader):
     def kept(
         self, make: Callable[[TransferFunction, Sampling], ColorTable], sampling: Sampling
     ) -> ColorTable:
-        """Returns a table of the function as it is now; the last few are kept."""
+        """Returns the table `make` computes from the current function; the last few are cached."""
         key = make, self.opacity.tobytes(), self.color.tobytes(), self.reference, sampling
         if key not in self._tables:
             self.check_again()  # points may have been edited in place
@@ -271,12 +271,12 @@ class TransferFunction(Shader):
 
 
 def integrated_table(transfer: TransferFunction, sampling: Sampling) -> ColorTable:
-    """Integrates a transfer function over pairs of values, in float64: what an interval shows whose
-    values run linearly from one in front to another behind. A cell of the table is the mean of the
-    function over it, so a peak thinner than a cell keeps its opacity.
+    """Integrates a transfer function over pairs of values, in float64: the colour of an interval in
+    which the value changes linearly from the one in front to the one behind. Within each cell of
+    the table the function is replaced by its mean, so a peak thinner than a cell keeps its opacity.
 
     Returns:
-        (l, m, m, 4): premultiplied colour and alpha by the value in front and behind.
+        (l, m, m, 4): premultiplied colour and alpha by the values in front and behind.
 
     Source: Engel, Kraus, Ertl, "High-quality pre-integrated volume rendering using
     hardware-accelerated pixel shading", Graphics Hardware 2001.
@@ -295,8 +295,8 @@ def integrated_table(transfer: TransferFunction, sampling: Sampling) -> ColorTab
     rows = transfer(low + (high - low) * np.arange(cells + 1) / cells)
     lengths = transfer.lengths(sampling, sampling.fitting(len(rows) ** 2))
     table = np.stack([_pairs(rows, thickness, color, length) for length in lengths])
-    # Whatever reaches into a cell is asked for both its ends, so one of them may tell of it: not
-    # the first or last row, which also stand for all that lies beyond the domain.
+    # A range that reaches into a cell is tested with both of the cell's rows, so it is enough to
+    # mark one of them: not the first or last row, which also represent values beyond the domain.
     seen = rows[:, 3] > 0
     seen[1:-1] |= thickness[:-1] > 0
     seen[-2] |= thickness[-1] > 0
@@ -304,7 +304,7 @@ def integrated_table(transfer: TransferFunction, sampling: Sampling) -> ColorTab
 
 
 def _pairs(rows: np.ndarray, thickness: np.ndarray, color: np.ndarray, length: float) -> np.ndarray:
-    """(m, m, 4) of intervals of one length."""
+    """Returns (m, m, 4) for intervals of one length."""
     count = len(rows)
     out = np.zeros((count, count, 4))
     same = np.arange(count)
@@ -312,7 +312,7 @@ def _pairs(rows: np.ndarray, thickness: np.ndarray, color: np.ndarray, length: f
         alpha = -np.expm1(length * np.log1p(-rows[:, 3]))
     out[same, same] = np.concatenate((rows[:, :3] * alpha[:, None], alpha[:, None]), 1)
     for apart in range(1, count):
-        kept = np.exp(-thickness * (length / apart))  # of one cell on the way
+        kept = np.exp(-thickness * (length / apart))  # transmittance of each cell in between
         shown = np.concatenate((color, np.ones((len(color), 1))), 1) * (1 - kept)[:, None]
         low = np.arange(count - apart)
         for turned in (False, True):
@@ -327,7 +327,7 @@ def _pairs(rows: np.ndarray, thickness: np.ndarray, color: np.ndarray, length: f
 
 
 def _cells(places: np.ndarray) -> int | None:
-    """A number of cells of [0, 1] fine enough for corners at these places; None: there is none."""
+    """Returns how many cells of [0, 1] suit corners at these positions; None: too close corners."""
     exact = _common_cells(places, _MOST_CELLS, tolerance=1e-9)
     gap = float(np.diff(places, append=2.0).min())
     dense = max(_FEWEST_SAMPLED, 2 ** math.ceil(math.log2(_CELLS_APART / max(gap, 1e-9))))
@@ -337,8 +337,8 @@ def _cells(places: np.ndarray) -> int | None:
 
 
 def _common_cells(places: Iterable[float], most: int, tolerance: float = math.inf) -> int | None:
-    """Returns the fewest cells of [0, 1] at whose ends all places lie; None: it takes more than
-    `most`, or a place is off by more than `tolerance`.
+    """Returns the fewest equal cells of [0, 1] with all positions on cell ends; None: it takes more
+    than `most`, or a position is off by more than `tolerance`.
     """
     cells = 1
     for place in places:

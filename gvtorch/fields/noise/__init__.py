@@ -1,5 +1,5 @@
-"""Noise as functions of place: `gv.noise.perlin(points)` and others. It is deterministic by seed,
-periodic on request, of float32 or float64, and its bounds are known.
+"""Noise as functions of position: `gv.noise.perlin(points)` and others. It is determined by its
+seed, periodic on request, float32 or float64, and its bounds are known.
 """
 
 from .basis import LOST, VARIANCE, Bounds, bounds, cellular, perlin, simplex, value

@@ -1,15 +1,14 @@
-"""Noises of one frequency: gradient, value, simplex and cellular noise, what they take, and what is
-known of them beforehand. Each is a function of points alone, the same on every device and in every
-run.
+"""Noises of one frequency: gradient, value, simplex and cellular noise, their arguments, and their
+bounds. Each is a function of points alone, the same on every device and in every run.
 
-Bounds of gradient and simplex noise: each corner's gradient is chosen apart from the others, so the
-largest value at a place is the sum over corners of weight * largest ramp, and the steepest slope
-along u that of gradient . (weight * u + (derivative of weight along u) * offset), each by the best
-of the twelve gradients. The largest sums over all places and directions were searched numerically
-(40,000 starts, 60 rounds of narrowing, float64), and are rounded up. The steepest gradient noise is
-at a cell's centre along an axis, where the sum is 11/4 in the plane and 15/4 in space. Gradients
-that reach the sums occur, as all combinations do, so no smaller bounds hold. The steepest value
-noise rises by 2 from one side of a cell to the other, and in the middle 15/8 as fast as a line.
+Bounds of gradient and simplex noise: corners' gradients are chosen independently, so the largest
+value at a point is the sum over corners of weight * largest ramp, and the steepest slope along u
+is that of gradient . (weight * u + (derivative of weight along u) * offset), each with the best of
+the twelve gradients. The largest sums over all points and directions were searched numerically
+(40,000 starts, 60 rounds of narrowing, float64), and are rounded up. Gradient noise is steepest at
+a cell's centre along an axis, where the sum is 11/4 in the plane and 15/4 in space. All
+combinations of gradients occur, so the sums are reached, and no smaller bounds hold. The steepest
+value noise rises by 2 from one side of a cell to the other, in the middle 15/8 as fast as a line.
 
 Sources: Perlin, "Improving noise", SIGGRAPH 2002; Perlin, "Noise hardware", SIGGRAPH course notes
     2001, and Gustavson, "Simplex noise demystified", 2005 (simplex noise); Gustavson, McEwan,
@@ -32,17 +31,17 @@ from ...ops import noise
 
 #: Points (..., n), or n coordinates that broadcast to one shape.
 Points = Tensor | Sequence[Tensor]
-#: A whole period for each axis, or one for all; None: not periodic.
+#: An integer period for each axis, or one for all; None: not periodic.
 Period = int | Sequence[int] | None
 Feature = Literal["F1", "F2", "F2-F1"]
 FEATURES: tuple[Feature, ...] = ("F1", "F2", "F2-F1")
-#: The mean of gradient noise over a cube follows the noise in its middle by
-#: exp(-LOST * (side / cell)^2): fitted to within 0.03 for cubes of up to 1.5 cells.
+#: The mean of gradient noise over a cube is about exp(-LOST * (side / cell)^2) times the noise at
+#: its centre: fitted, within 0.03 for cubes of up to 1.5 cells.
 LOST = 0.82
-#: Mean square of gradient noise in space.
+#: Mean square of gradient noise in 3D.
 VARIANCE = 0.0728
 
-#: A noise of one frequency: points, seed and period to values.
+#: A noise of one frequency: a function from points, seed and period to values.
 Basis = Callable[..., Tensor]
 
 
@@ -52,15 +51,15 @@ def perlin(points: Points, *, seed: int = 0, period: Period = None) -> Tensor:
     Args:
         points: (..., 2) or (..., 3) float32 or float64, or 2 or 3 tensors x, y (, z) that
             broadcast. Coordinates beyond 2^29 count as 0; float32 has no fractions beyond 2^23.
-        seed: Another noise for each.
-        period: After how many cells the noise repeats, one for all axes or one for each.
+        seed: Each seed gives another noise.
+        period: Number of cells after which the noise repeats, one for all axes or one for each.
 
     Returns:
-        (...) of the same dtype, within `bounds(perlin, n)`. The plane z = 0 of space is no noise of
-        the plane's seed: points of two coordinates have lattices of their own.
+        (...) of the same dtype, within `bounds(perlin, n)`. Points of two coordinates have another
+        lattice, so 2D noise is not the plane z = 0 of 3D noise of the same seed.
 
     Raises:
-        ValueError: Points or period are not that.
+        ValueError: Points or period are invalid.
     """
     return at_points("noise.perlin", "perlin", points, seed, period)
 
@@ -74,18 +73,18 @@ def value(points: Points, *, seed: int = 0, period: Period = None) -> Tensor:
 
 def simplex(points: Points, *, seed: int = 0, period: Period = None) -> Tensor:
     """Simplex noise: ramps at the corners of triangles or tetrahedra, each fading out over its own
-    neighbourhood; fewer corners than `perlin` has, and no axes that the eye finds.
+    neighbourhood; it has fewer corners than `perlin`, and no visible alignment with axes.
 
     Args:
         points, seed: As in `perlin`.
-        period: As in `perlin`, in space alone, and multiples of 3: it takes three steps along an
-            axis to bring the simplices onto themselves. In the plane no number of steps does.
+        period: As in `perlin`, but only in 3D, and multiples of 3: three steps along an axis map
+            the simplices onto themselves. In 2D no number of steps does.
 
     Returns:
         (...) of the same dtype, within -1 to 1.
 
     Raises:
-        ValueError: Points or period are not that.
+        ValueError: Points or period are invalid.
     """
     place = as_points("noise.simplex", points)
     if place.shape[-1] == 2 and period is not None:
@@ -108,18 +107,17 @@ def cellular(
         points, seed, period: As in `perlin`.
         feature: "F1", the distance to the nearest point; "F2", to the second nearest; "F2-F1",
             which is 0 on the walls between the neighbourhoods of points.
-        jitter: How far points stray in their cells: 0 leaves them in the middle, 1 lets them stray
-            all over the cell.
-        reach: How many cells around its own are searched. All points nearer than `reach` are found,
-            so distances are taken as `reach` where they are more. That makes them continuous. With
-            2 the nearest and the second nearest are the true ones, and 5^n cells are looked at
-            instead of 3^n.
+        jitter: 0 puts each point in the middle of its cell, 1 anywhere in the cell.
+        reach: How many cells to each side of a point's own are searched. All points nearer than
+            `reach` are found, and larger distances are replaced by `reach`, which makes the result
+            continuous. With 2 the nearest and the second nearest are always the true ones, and 5^n
+            cells are searched instead of 3^n.
 
     Returns:
         (...) of the points' dtype, in cells.
 
     Raises:
-        ValueError: An argument is not that.
+        ValueError: An argument is invalid.
     """
     where = "noise.cellular"
     check.number(where, "jitter", jitter, low=0, high=1)
@@ -129,10 +127,10 @@ def cellular(
 
 
 def as_points(where: str, points: Points) -> Tensor:
-    """Returns points (..., n) of 2 or 3 coordinates, floats.
+    """Returns points as one tensor (..., n) of floats, n = 2 or 3.
 
     Raises:
-        ValueError: They are not that.
+        ValueError: They have another shape or dtype.
     """
     axes = (points,) if isinstance(points, Tensor) else tuple(points)
     n = len(axes)
@@ -152,7 +150,7 @@ def periods(where: str, period: Period, n: int, multiple: int = 1) -> tuple[int,
     """Returns the period along each of n axes; 0: none.
 
     Raises:
-        ValueError: One is no positive multiple of `multiple`.
+        ValueError: One is not a positive multiple of `multiple`.
     """
     if period is None:
         return (0,) * n
@@ -169,7 +167,7 @@ def periods(where: str, period: Period, n: int, multiple: int = 1) -> tuple[int,
 def at_points(
     where: str, kind: str, points: Points, seed: int, period: Period, **options: Any
 ) -> Tensor:
-    """Returns (...) the noise of a kind at points (..., n); `options` are those of `ops.noise`."""
+    """Returns noise (...) of a kind at points (..., n); `options` are those of `ops.noise`."""
     place = as_points(where, points)
     n = place.shape[-1]
     every = periods(where, period, n, multiple=3 if kind == "simplex" else 1)
@@ -178,8 +176,8 @@ def at_points(
 
 
 class Bounds(NamedTuple):
-    """Of a function of place: its least and largest value, and the most that it changes over a
-    distance of 1 (its Lipschitz constant).
+    """Bounds of a function of position: its smallest and largest value, and the most that it
+    changes over a distance of 1 (its Lipschitz constant).
     """
 
     low: float
@@ -199,11 +197,11 @@ _KNOWN = {
 
 def bounds(basis: Basis, n: int = 3) -> Bounds:
     """Returns the bounds of a noise in n = 2 or 3 dimensions: of `perlin`, `value`, `simplex`,
-    `cellular`, or one of them with arguments by `functools.partial`. Rounding may pass them by
-    2^-20.
+    `cellular`, or one of them with arguments by `functools.partial`. Rounded values may exceed them
+    by 2^-20.
 
     Raises:
-        ValueError: Nothing is known of the noise.
+        ValueError: The noise is another function, whose bounds are unknown.
     """
     options: dict[str, Any] = {}
     while isinstance(basis, partial):

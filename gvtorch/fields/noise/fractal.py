@@ -1,4 +1,4 @@
-"""Sums of octaves of a noise, and places moved by noise.
+"""Sums of octaves of a noise, and points displaced by noise.
 
 Source: Perlin, "An image synthesizer", SIGGRAPH 1985 (turbulence); Musgrave, in Ebert et al.,
     "Texturing and modeling: a procedural approach", 3rd edition 2003, chapter 16 (fractal sums,
@@ -18,7 +18,7 @@ from torch import Tensor
 from ...base import check
 from .basis import Basis, Bounds, Period, Points, as_points, bounds, periods, perlin
 
-#: Seeds of the octaves of a sum, and of the components of a warp, are so far apart.
+#: Differences between the seeds of a sum's octaves, and between those of a warp's components.
 _NEXT_OCTAVE, _NEXT_AXIS = 0x10001, 0x3000007
 
 
@@ -42,14 +42,14 @@ class Octave(NamedTuple):
 
 
 class Tally:
-    """Counts what was evaluated; what a unit is, its user says.
+    """Counts evaluations, in a unit that the subclass defines.
 
-    Nothing is counted while torch compiles: it takes an attribute for a constant, and a function
-    that changes one would be compiled anew at each call.
+    Nothing is counted while torch compiles: it treats attributes as constants, and would recompile
+    a function that changes one at each call.
 
     Attributes:
         made: Units that were evaluated so far.
-        wanted: Those that were asked for, whether they had to be evaluated or not.
+        wanted: Units that were asked for, whether they had to be evaluated or not.
     """
 
     made = wanted = 0
@@ -86,17 +86,17 @@ def fbm(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
 
     Args:
         points: As in `perlin`.
-        **settings: octaves: how many, 1 to 64; 6 if left out. lacunarity, 2, and gain, 0.5: of an
-            octave to the one before. basis: the noise that is summed: `perlin`, the default,
-            `value`, `simplex`, `cellular`, or your own function of points, `seed` and `period`.
-            seed: of the first octave, 0; each has its own. period: of the first octave, in its
-            cells; the lacunarity must then be a whole number.
+        **settings: octaves: how many, 1 to 64; 6 if left out. lacunarity, 2, and gain, 0.5: ratios
+            of an octave's frequency and amplitude to those of the one before. basis: the noise that
+            is summed: `perlin`, the default, `value`, `simplex`, `cellular`, or your own function
+            of points, `seed` and `period`. seed: of the first octave, 0; each has its own. period:
+            of the first octave, in its cells; the lacunarity must then be a whole number.
 
     Returns:
         (...) of the points' dtype, within `fbm_bounds`.
 
     Raises:
-        ValueError: An argument is not that.
+        ValueError: An argument is invalid.
     """
     where = "noise.fbm"
     layers = _layers(where, points, **settings)
@@ -104,7 +104,7 @@ def fbm(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
 
 
 def turbulence(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
-    """The sum of the absolute values of octaves: creases where they pass 0, as in flames and
+    """The sum of the absolute values of octaves: it has creases where they pass 0, as in flames and
     marble. Arguments, result and errors are those of `fbm`.
     """
     where = "noise.turbulence"
@@ -118,14 +118,14 @@ def ridged(points: Points, *, sharpness: float = 2.0, **settings: Unpack[SumSett
 
     Args:
         points: As in `perlin`.
-        sharpness: An octave's weight is the one before times this, at most 1.
-        **settings: As in `fbm`; noises lie in -1 to 1.
+        sharpness: An octave's weight is the octave before times this, at most 1.
+        **settings: As in `fbm`; the noise must be within -1 to 1.
 
     Returns:
         (...) of the points' dtype, from 0 to the sum of the amplitudes.
 
     Raises:
-        ValueError: An argument is not that.
+        ValueError: An argument is invalid.
     """
     where = "noise.ridged"
     check.number(where, "sharpness", sharpness, low=0)
@@ -142,19 +142,19 @@ def ridged(points: Points, *, sharpness: float = 2.0, **settings: Unpack[SumSett
 
 
 def warp(points: Points, *, amplitude: float = 1.0, **settings: Unpack[SumSettings]) -> Tensor:
-    """Domain warp: points moved by a vector of noise, to be handed to another function of place.
+    """Domain warp: points displaced by a vector of noise, as arguments of another function.
 
     Args:
         points: As in `perlin`.
         amplitude: The noises, one for each axis, are multiplied by this.
-        **settings: As in `fbm`, but for 1 octave if left out.
+        **settings: As in `fbm`, but octaves is 1 if left out.
 
     Returns:
-        (..., n) points. A function of slope s has a slope of at most
-        s * (1 + amplitude * sqrt(n) * slope of the noise) of them.
+        (..., n) points. A function of slope s, evaluated at these points, has a slope of at most
+        s * (1 + amplitude * sqrt(n) * slope of the noise).
 
     Raises:
-        ValueError: An argument is not that.
+        ValueError: An argument is invalid.
     """
     place = as_points("noise.warp", points)
     check.number("noise.warp", "amplitude", amplitude)
@@ -173,10 +173,10 @@ def fbm_bounds(
     basis: Basis = perlin,
     n: int = 3,
 ) -> Bounds:
-    """Returns the bounds of `fbm` in n dimensions; those of an octave times its amplitude add up.
+    """Returns the bounds of `fbm` in n dimensions: the sum of its octaves' bounds.
 
     Raises:
-        ValueError: An argument is not that, or nothing is known of the noise.
+        ValueError: An argument is invalid, or the bounds of the noise are unknown.
     """
     one = bounds(basis, n)
     series = octaves_of("noise.fbm_bounds", octaves, lacunarity, gain, 0)
@@ -186,7 +186,7 @@ def fbm_bounds(
 
 
 def _sum(where: str, parts: Iterable[Tensor]) -> Tensor:
-    """Adds octaves up, one after another; raises ValueError if the basis gave no tensors."""
+    """Adds up octaves, one after another; raises ValueError if the basis returned no tensors."""
     return check.instance(where, "basis", functools.reduce(operator.add, parts), Tensor)
 
 

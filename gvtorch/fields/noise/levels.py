@@ -1,22 +1,22 @@
-"""Octaves by level: the sum of the coarse octaves in a brick, interpolated from its parent's brick,
-so that a level evaluates fine octaves alone.
+"""Octaves by level: the sum of the coarse octaves in a brick is interpolated from its parent's
+brick, so that a level evaluates fine octaves only.
 
-The centres of a child's voxels are never those of its parent's, so what a child takes over is
+The centres of a child's voxels are never those of its parent's, so inherited values must be
 interpolated. Gradient noise has two continuous derivatives, so the error falls with the third power
-of (voxel / cell), whatever the order. Of one octave of amplitude 1, by the parent's voxels a cell,
-6 points along each axis, 600 bricks:
+of (voxel / cell), whatever the order of interpolation. Errors for one octave of amplitude 1, by the
+parent's voxels per cell, with 6 points along each axis, over 600 bricks:
 
     voxels a cell   2     4     8       16      32      64
     largest         1.3   0.09  5.3e-3  6.5e-4  6.0e-5  7.2e-6
     mean square     0.13  0.01  5.7e-4  5.4e-5  4.4e-6  4.6e-7
 
-If an octave were taken over from the first level that holds it, at 2 voxels a cell, it would be
-lost. So each is evaluated until its cells are `settled` voxels wide, and taken over from then on:
-at 16, with about the error of storing float16, to which each further level adds an eighth. A level
-then evaluates 4 octaves, however many there are before them.
+An octave that is inherited right from the first level that holds it, at 2 voxels a cell, would be
+lost. So each is evaluated until its cells are `settled` voxels wide, and inherited from then on: at
+16, with about the error of storing float16, to which each further level adds an eighth. A level
+then evaluates 4 octaves, however many coarser ones there are.
 
-Source: Lagrange's interpolation; the original engine's sample of noise that is inherited from the
-    parent's brick gave the idea.
+Source: Lagrange's interpolation; the idea is from the original engine's example of noise that is
+    inherited from the parent's brick.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ from ...base import check
 from .basis import as_points, perlin
 from .fractal import Octave, Tally, octaves_of
 
-#: Interpolated from so many voxels along each axis.
+#: Voxels along each axis that a value is interpolated from.
 POINTS = 6
 
 
 def inherit(
     parents: Tensor, child: Tensor, *, border: int = 1, branching: int = 2, points: int = POINTS
 ) -> Tensor:
-    """Returns values at the voxels of children, borders included, out of their parents' bricks.
+    """Interpolates values at the voxels of children, borders included, from their parents' bricks.
 
     Args:
-        parents: (k, z, y, x) float32 or float64 bricks with their borders, cubes.
-        child: (k, 3) int64 which child each is, x y z, 0 to branching - 1.
+        parents: (k, z, y, x) float32 or float64 cubic bricks with their borders.
+        child: (k, 3) int64 index of each child in its parent, x y z, 0 to branching - 1.
         border: Voxels around a brick, 1 at least.
         branching: N.
         points: Voxels that a value is interpolated from along each axis.
 
     Returns:
-        (k, z, y, x) of the same dtype: exact, but for rounding, where values are a polynomial of
+        (k, z, y, x) of the same dtype: exact, except for rounding, if values are a polynomial of
         degree `points` - 1 along each axis; see above for noise.
 
     Raises:
@@ -74,12 +74,12 @@ def inherit(
 
 
 class OctaveSum(Tally):
-    """The sum of `fbm` in bricks of any level, of those octaves that its voxels can hold.
+    """The sum of `fbm` in bricks of any level, of those octaves that its voxels can represent.
 
     Attributes:
         octaves: All of them.
-        made: Octaves of voxels that were evaluated so far.
-        wanted: Those that a plain sum would have taken.
+        made: Evaluations, octaves times voxels, so far.
+        wanted: Evaluations that a plain sum would have needed.
     """
 
     def __init__(
@@ -93,13 +93,13 @@ class OctaveSum(Tally):
         hold: float = 2.0,
         settled: float = 16.0,
     ) -> None:
-        """Takes the sum.
+        """Sets the octaves.
 
         Args:
-            frequency: Cells of the first octave a world unit.
+            frequency: Cells of the first octave per world unit.
             octaves, lacunarity, gain, seed: As in `fbm`.
-            hold: Voxels a cell from which on a level has an octave.
-            settled: Voxels a cell from which on children take it over; infinite: never.
+            hold: Least width of an octave's cells, in voxels, for a level to include it.
+            settled: Least width of its cells, in voxels, for children to inherit it; inf: never.
 
         Raises:
             ValueError: A number is out of its range.
@@ -112,7 +112,7 @@ class OctaveSum(Tally):
         self.octaves = octaves_of(where, octaves, lacunarity, gain, seed, frequency)
 
     def held(self, side: float) -> list[Octave]:
-        """Returns the octaves that voxels of a side, in world units, can hold."""
+        """Returns the octaves that voxels of a side, in world units, can represent."""
         return self._wide(side, self.hold)
 
     def bricks(
@@ -125,15 +125,16 @@ class OctaveSum(Tally):
         border: int = 1,
         branching: int = 2,
     ) -> tuple[Tensor, Tensor]:
-        """Returns the sum in k bricks of a level, and the part of it that their children may take
-        over, both (k, z, y, x).
+        """Returns the sum in k bricks of a level, and the part of it that their children may
+        inherit, (k, z, y, x) each.
 
         Args:
-            axes: x, y, z: (k, s) float32 or float64 world places of voxel centres, with borders.
+            axes: x, y, z: (k, s) float32 or float64 world coordinates of voxel centres, with
+                borders.
             side: Of the level's voxels, world units.
-            parents: (k, z, y, x) what the parents' children may take over; None: all octaves are
+            parents: (k, z, y, x) the second result for the parents' bricks; None: all octaves are
                 evaluated here.
-            child: (k, 3) which children these bricks are, see `inherit`.
+            child: (k, 3) index of each brick among its parent's children, see `inherit`.
             border, branching: As in `inherit`.
         """
         above = self._wide(side * branching, self.settled)
@@ -149,11 +150,11 @@ class OctaveSum(Tally):
         return settled + self._evaluated(axes, held[len(calm) :]), settled
 
     def _wide(self, side: float, voxels: float) -> list[Octave]:
-        """The octaves whose cells are at least so many voxels wide."""
+        """Returns the octaves whose cells are at least `voxels` voxels of a side wide."""
         return [one for one in self.octaves if side * one.frequency * voxels <= 1 + 1e-9]
 
     def _evaluated(self, axes: Sequence[Tensor], octaves: Sequence[Octave]) -> Tensor:
-        """The sum of octaves, (k, z, y, x); zeros if there are none."""
+        """Returns the sum of octaves, (k, z, y, x); zeros if there are none."""
         x, y, z = axes
         total = x.new_zeros((len(x), z.shape[1], y.shape[1], x.shape[1]))
         axes = (x[:, None, None, :], y[:, None, :, None], z[:, :, None, None])
@@ -168,7 +169,7 @@ class OctaveSum(Tally):
 def _weights(
     side: int, border: int, branching: int, points: int, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """(N, s, s): by child and its voxel along an axis, the weights of the parent's voxels."""
+    """Returns (N, s, s): by child and its voxel along an axis, the weights of parent voxels."""
     size = side - 2 * border
     children = []
     for child in range(branching):

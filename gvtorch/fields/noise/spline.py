@@ -1,17 +1,17 @@
-"""`SplineSum`: octaves by level in which nothing is computed twice and nothing is lost.
+"""`SplineSum`: sums of octaves in which levels inherit exactly, and no octave is evaluated twice.
 
-What a child takes over of gradient noise is interpolated, and so never quite right (`levels.py`).
-Splines are: a quadratic B-spline over the voxels of a level is one over the voxels of the next
-finer level as well, and its new coefficients are the old ones, interpolated linearly at the centres
-of the new voxels (Chaikin: 3/4 of the nearer, 1/4 of the other, along each axis). So an octave is a
-spline whose coefficients are random numbers, one a voxel of the first level that can hold it, and
-voxels hold the sum of all coefficients so far:
+Gradient noise inherited from a parent's brick is interpolated, and so only approximate
+(`levels.py`). Splines are inherited exactly: a quadratic B-spline over the voxels of a level is
+also one over the voxels of the next finer level, whose coefficients are the old ones, interpolated
+linearly at the centres of the new voxels (Chaikin: 3/4 of the nearer, 1/4 of the other, along each
+axis). So an octave is a spline whose coefficients are random numbers, one for each voxel of the
+first level that can represent it, and voxels hold the sum of all coefficients so far:
 
     sum of a level = sum of the level above, interpolated + gain^octave * random numbers
 
-A voxel's sum depends neither on the brick that it is in nor on who computed the level above, in
-every bit, so it is also the direct sum's, and bricks agree where they meet. As levels go on, the
-numbers in the voxels become the spline itself; a level holds it up to what finer octaves add.
+A voxel's sum depends neither on its brick nor on how the level above was computed: it is bit for
+bit that of a direct summation, and bricks agree where they meet. With finer levels the coefficients
+converge to the spline itself; a level's sum lacks only what finer octaves add.
 
 Sources: Chaikin, "An algorithm for high speed curve generation", 1974; Lane, Riesenfeld, "A
     theoretical development for the computer generation and display of piecewise polynomial
@@ -31,28 +31,28 @@ from ...base import check
 from ...ops.reference import noise as twin
 from .fractal import Octave, Tally, octaves_of
 
-_APART = 1e-6  # relative, by which a level's voxels may differ from an octave's cells
+_APART = 1e-6  # relative tolerance between the side of a level's voxels and of an octave's cells
 
 
 class SplineSum(Tally):
-    """A sum of octaves in bricks of any level: each is added in the level whose voxels are its
-    cells, in float32. Levels halve their voxels (N = 2).
+    """A sum of octaves in bricks of any level, in float32: each octave is added in the level whose
+    voxels are as wide as its cells. Levels halve their voxels (N = 2).
 
     Attributes:
         octaves: All of them.
         made: Random numbers that were made so far.
-        wanted: Those that the same bricks would have taken without parents.
+        wanted: Random numbers that the same bricks would have needed without parents.
     """
 
     def __init__(
         self, *, frequency: float = 1.0, octaves: int = 12, gain: float = 0.5, seed: int = 0
     ) -> None:
-        """Takes the sum.
+        """Sets the octaves.
 
         Args:
-            frequency: Cells of the first octave a world unit; each next one has twice as many.
+            frequency: Cells of the first octave per world unit; each next one has twice as many.
             octaves: How many, 1 to 64.
-            gain: Of an octave's amplitude to the one before.
+            gain: Ratio of an octave's amplitude to that of the one before.
             seed: Of the first octave; each has its own.
 
         Raises:
@@ -62,7 +62,7 @@ class SplineSum(Tally):
         self.octaves = octaves_of(where, octaves, 2.0, gain, seed, frequency)
 
     def held(self, side: float) -> list[Octave]:
-        """Returns the octaves that voxels of a side, in world units, can hold."""
+        """Returns the octaves that voxels of a side, in world units, can represent."""
         return [one for one in self.octaves if side * one.frequency <= 1 + _APART]
 
     def bricks(
@@ -75,9 +75,9 @@ class SplineSum(Tally):
         border: int = 1,
         branching: int = 2,
     ) -> tuple[Tensor, Tensor]:
-        """Returns the sum in k bricks of a level, twice, (k, z, y, x) float32. Arguments are those
-        of `OctaveSum.bricks`; places begin at a corner of the grids of all levels, such as the low
-        corner of the box.
+        """Returns the sum in k bricks of a level, (k, z, y, x) float32, twice: children inherit the
+        sum itself. Arguments are those of `OctaveSum.bricks`; coordinates are relative to a common
+        corner of the grids of all levels, such as the low corner of the box.
 
         Raises:
             ValueError: No octave's cells are as wide as the level's voxels, or N is not 2.
@@ -102,7 +102,7 @@ class SplineSum(Tally):
         return found, found
 
     def _alone(self, low: Sequence[Tensor], size: int, side: float) -> Tensor:
-        """The sum in k cubes of voxels, from the coarsest octave on."""
+        """Returns the sum in k cubes of voxels, from the coarsest octave on, without parents."""
         if not self.held(2 * side):
             none = torch.zeros((len(low[0]), size, size, size), device=low[0].device)
             return self._added(none, low, side)
@@ -111,7 +111,7 @@ class SplineSum(Tally):
         return self._added(_finer(coarse, above, low, size), low, side)
 
     def _added(self, values: Tensor, low: Sequence[Tensor], side: float) -> Tensor:
-        """Values with the octave of the level, if it has one."""
+        """Returns the values plus the octave that begins at this level, if there is one."""
         for one in self.octaves:
             if abs(side * one.frequency - 1) < 2 * _APART:
                 reach = torch.arange(values.shape[1], device=values.device)
@@ -126,7 +126,7 @@ class SplineSum(Tally):
         return values
 
     def _numbers(self, size: int, side: float) -> int:
-        """How many random numbers a brick takes without parents."""
+        """Returns how many random numbers a brick needs without parents."""
         count = 0
         while held := self.held(side):
             count += size**3 if abs(side * held[-1].frequency - 1) < 2 * _APART else 0
@@ -135,8 +135,9 @@ class SplineSum(Tally):
 
 
 def _finer(values: Tensor, above: Sequence[Tensor], low: Sequence[Tensor], size: int) -> Tensor:
-    """(k, z, y, x) size^3 voxels from `low` on, x y z (k,) each, out of those of the level above
-    from `above` on. The same products and sums for a voxel, wherever it lies.
+    """Returns (k, z, y, x): size^3 voxels from corner `low` (x, y, z: (k,) each), interpolated from
+    those of the level above, from corner `above`. The operations for a voxel do not depend on its
+    brick.
     """
     reach = torch.arange(size, device=values.device)
     for axis in range(3):
