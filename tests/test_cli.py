@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import itertools
 import json
 import shlex
 import shutil
@@ -62,7 +63,7 @@ def test_help_does_not_import_torch():
 def test_no_line_of_an_options_help_ends_early(file):
     """tyro breaks a comment where a line of it begins with anything but a letter."""
     lines = file.read_text().splitlines()
-    rows = zip(lines, lines[1:], strict=False)
+    rows = itertools.pairwise(lines)
     broken = [b for a, b in rows if a[:6] == b[:6] == "    # " and not b[6:7].isalpha()]
     assert not broken
 
