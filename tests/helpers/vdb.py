@@ -109,9 +109,7 @@ class VdbWriter:
             tree, leaves = (b"", b"") if grid.parent else self.tree(grid)
             at = len(out) + 24
             ends = at + len(head) + len(tree)
-            begin = (
-                0 if grid.parent else ends
-            )  # of leaves; OpenVDB writes 0 where a tree is shared
+            begin = 0 if grid.parent else ends  # of leaves; OpenVDB writes 0 where a tree is shared
             out += struct.pack("<3q", at, begin, ends + len(leaves)) + head + tree + leaves
         path.write_bytes(out)
         return path
