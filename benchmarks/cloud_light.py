@@ -1,8 +1,8 @@
-"""How near `octaves` of scattering come to the truth: pictures of clouds beside those of a path
-tracer in NumPy, which follows light through every scattering.
+"""How close `octaves` of scattering come to the ground truth: pictures of clouds are compared with
+those of a path tracer in NumPy, which follows light through every scattering event.
 
-The path tracer finds collisions by delta tracking and lets the sun in at each of them by ratio
-tracking (both without bias); directions are drawn from Henyey and Greenstein's phase function.
+The path tracer finds collisions by delta tracking, and estimates the sunlight at each of them by
+ratio tracking (both unbiased); directions are drawn from Henyey and Greenstein's phase function.
 Sources: Woodcock et al., ANL-7050, 1965; Novak, Selle, Jarosz, "Residual ratio tracking", SIGGRAPH
 Asia 2014; Henyey, Greenstein, "Diffuse radiation in the galaxy", ApJ 93, 1941.
 """
@@ -32,7 +32,7 @@ class Cloud:
     to_sun: np.ndarray = field(default_factory=lambda: np.array((0.0, 0.0, 1.0)))
 
     def at(self, places: np.ndarray) -> np.ndarray:
-        """(k,) extinction at places (k, 3): trilinear, 0 outside."""
+        """Returns (k,) extinction at places (k, 3): trilinear, 0 outside."""
         size = np.array(self.density.shape)
         inside = ((places > 0) & (places < size - 1)).all(1)
         p = np.clip(places, 0, size - 1.001)
@@ -52,14 +52,14 @@ class Cloud:
         return np.where(inside, near + fx * (far - near), 0)
 
     def exits(self, places: np.ndarray, ways: np.ndarray) -> np.ndarray:
-        """(k,) distances from places to where ways leave the box."""
+        """Returns (k,) distances from places to where rays along `ways` leave the box."""
         size = np.array(self.density.shape) - 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = np.maximum((0 - places) / ways, (size - places) / ways)
         return np.nanmin(np.where(ways == 0, np.inf, ends), 1)
 
     def enters(self, places: np.ndarray, ways: np.ndarray) -> np.ndarray:
-        """(k,) distances to where ways enter the box; beyond `exits` where they miss it."""
+        """Returns (k,) distances to where rays enter the box; beyond `exits` if they miss it."""
         size = np.array(self.density.shape) - 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
             begins = np.minimum((0 - places) / ways, (size - places) / ways)
@@ -67,12 +67,12 @@ class Cloud:
 
 
 def phase(g: float, cosine: np.ndarray) -> np.ndarray:
-    """Henyey and Greenstein's function, its mean over all directions 1."""
+    """Returns Henyey and Greenstein's function, scaled to mean 1 over all directions."""
     return (1 - g * g) / (1 + g * g - 2 * g * cosine) ** 1.5
 
 
 def scatter(ways: np.ndarray, g: float, rng: np.random.Generator) -> np.ndarray:
-    """(k, 3) directions after a scattering."""
+    """Returns random directions (k, 3) after a scattering event."""
     u, turn = rng.random(len(ways)), 2 * np.pi * rng.random(len(ways))
     if abs(g) < 1e-3:
         cosine = 2 * u - 1
@@ -80,7 +80,7 @@ def scatter(ways: np.ndarray, g: float, rng: np.random.Generator) -> np.ndarray:
         cosine = (1 + g * g - ((1 - g * g) / (1 - g + 2 * g * u)) ** 2) / (2 * g)
     sine = np.sqrt(np.maximum(1 - cosine**2, 0))
     x, y, z = ways.T
-    sign = np.where(z >= 0, 1.0, -1.0)  # a frame without branches
+    sign = np.where(z >= 0, 1.0, -1.0)  # an orthonormal frame, without branches
     a = -1 / (sign + z)
     b = x * y * a
     one = np.stack((1 + sign * x * x * a, sign * b, -sign * x), 1)
@@ -92,7 +92,7 @@ def scatter(ways: np.ndarray, g: float, rng: np.random.Generator) -> np.ndarray:
 def track(
     cloud: Cloud, places: np.ndarray, ways: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(k,) distances to the next collision, and whether there is one before the box ends."""
+    """Returns (k,) distances to the next collision, and whether there is one inside the box."""
     most = float(cloud.density.max())
     ends, t = cloud.exits(places, ways), np.zeros(len(places))
     hit = np.zeros(len(places), bool)
@@ -108,7 +108,7 @@ def track(
 
 
 def clearness(cloud: Cloud, places: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(k,) estimates of the share of sunlight that comes to places, by ratio tracking."""
+    """Returns (k,) estimates of the share of sunlight that reaches places, by ratio tracking."""
     most = float(cloud.density.max())
     ways = np.broadcast_to(cloud.to_sun, places.shape)
     ends, t, clear = cloud.exits(places, ways), np.zeros(len(places)), np.ones(len(places))
@@ -127,7 +127,7 @@ def clearness(cloud: Cloud, places: np.ndarray, rng: np.random.Generator) -> np.
 def path_trace(
     cloud: Cloud, eyes: np.ndarray, ways: np.ndarray, samples: int, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Light that comes along rays (r, 3) from a sun of irradiance 4 pi.
+    """Estimates the light that comes along rays (r, 3) from a sun of irradiance 4 pi.
 
     Returns:
         (r,) radiance, and (r,) its standard error.
@@ -144,7 +144,7 @@ def path_trace(
 def _paths(
     cloud: Cloud, eyes: np.ndarray, ways: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """(r,) one sample of each ray."""
+    """Returns (r,) radiance, estimated by one path of each ray."""
     light, begin = np.zeros(len(eyes)), cloud.enters(eyes, ways)
     which = np.flatnonzero(begin < cloud.exits(eyes, ways))
     place, way = eyes[which] + begin[which, None] * ways[which], ways[which]
@@ -154,17 +154,17 @@ def _paths(
         which, place, way = which[hit], (place + t[:, None] * way)[hit], way[hit]
         weight *= cloud.albedo
         cosine = way @ cloud.to_sun
-        # the way is against the light's: a ray that goes on towards the sun is scattered forwards
+        # `way` is opposite to the light's: a ray that continues towards the sun scatters forwards
         light[which] += weight * phase(cloud.g, cosine) * clearness(cloud, place, rng)
         way = scatter(way, cloud.g, rng)
     return light
 
 
-# --- pictures beside each other
+# --- comparison of pictures
 
 
 def noisy(side: int = 48, seed: int = 7) -> np.ndarray:
-    """(x, y, z) a round cloud of noise, 0 to 1, zero at the faces."""
+    """Returns the density (x, y, z) of a round cloud of noise, 0 to 1, zero at the faces."""
     axis = (torch.arange(side) - (side - 1) / 2) / (side / 2)
     places = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
     rough = gv.noise.fbm(3 * places, octaves=4, seed=seed)
@@ -175,7 +175,7 @@ def noisy(side: int = 48, seed: int = 7) -> np.ndarray:
 
 
 def from_file(path: Path, side: int = 64) -> np.ndarray:
-    """(x, y, z) density of a volume, 0 to 1, of means so coarse that no side is longer."""
+    """Returns a volume's density (x, y, z), 0 to 1, averaged to at most `side`, with a border."""
     volume = gv.read_volume(path).data[..., 0].permute(2, 1, 0).float()[None, None]
     step = -(-max(volume.shape) // side)
     size = [-(-n // step) * step for n in volume.shape[2:]]
@@ -187,7 +187,7 @@ def from_file(path: Path, side: int = 64) -> np.ndarray:
 
 
 def shader(cloud: Cloud, octaves: int) -> gv.Lit:
-    """The cloud, as voxels of its extinction are lit."""
+    """Returns the shader of a tree whose voxels hold the cloud's extinction."""
     most = float(cloud.density.max())
     values = [most * n / 256 for n in range(257)]
     albedo = (cloud.albedo,) * 3
@@ -200,8 +200,8 @@ def shader(cloud: Cloud, octaves: int) -> gv.Lit:
 
 
 def compare(cloud: Cloud, pixels: int, samples: int, octaves: list[int]) -> dict[int, list[float]]:
-    """By number of octaves: mean light over that of the path tracer, and the rms difference over
-    the path tracer's mean light, its noise taken off; of pixels where something is. 0: its noise.
+    """Returns by number of octaves: mean light, and rms difference without the path tracer's noise,
+    both relative to the path tracer's mean light; of pixels with alpha > 0.05. 0: the noise.
     """
     tree = gv.N3Tree.from_volume(gv.Volume(cloud.density.transpose(2, 1, 0).copy()))
     camera = gv.Camera.orbit(30, 10, 1.3, fov=40, width=pixels * 4 // 3, height=pixels)
@@ -218,7 +218,7 @@ def compare(cloud: Cloud, pixels: int, samples: int, octaves: list[int]) -> dict
     return found
 
 
-#: Where the sun stands, from the camera's side.
+#: Directions to the sun: right, up, away from the camera.
 SUNS = {"behind the eye": (0.5, 0.4, -0.8), "above": (0.2, 0.95, -0.1), "ahead": (-0.4, 0.3, 0.85)}
 
 
@@ -241,7 +241,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    """Compares all."""
+    """Compares all clouds, and prints the table."""
     shapes = {"noise": noisy()} | {path.stem: from_file(path) for path in settings.files}
     heads = [f"octaves {n}" for n in settings.octaves]
     print("| cloud | extinction | albedo | g | sun | paths' noise |", " | ".join(heads), "|")
@@ -263,7 +263,7 @@ def main(settings: Settings) -> None:
 
 
 def eye_to_world(way: np.ndarray) -> np.ndarray:
-    """(3,) unit vector in the world, of one to the right, up and away from the camera."""
+    """Returns a unit vector (3,) in the world, from (right, up, away from the camera)."""
     camera = gv.Camera.orbit(30, 10, 1.3, width=3, height=3).placed(
         torch.tensor([[-1.0] * 3, [1.0] * 3], dtype=torch.float64)
     )

@@ -1,9 +1,9 @@
 """Compares the speed of two checkouts: each workload of `gvtorch bench` runs in both in turn, and
-the fastest of the rounds counts, so that what else the machine does falls away.
+the fastest of the rounds counts, so that other load on the machine matters less.
 
     python benchmarks/compare.py ../before . march frame --device cuda
 
-Both folders hold built libraries. Peers are left out. Prints Markdown, the slowest row first.
+Both folders must hold built libraries. Peers are left out. Prints Markdown, the slowest row first.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""How right a scan is from afar: means of the values, and `gv.Filtered`, beside 256 rays a pixel.
+"""How accurate a scan is from afar: mean values and `gv.Filtered`, against 256 rays a pixel.
 
     python benchmarks/far_away.py ../shared/data/volumes --picture docs/images/far_away.png
     ... --lit --only stent,tooth --picture docs/images/far_away_lit.png
 
-Orthographic pictures, obliquely through each scan, at several voxels a pixel. Light is the mean of
-ours over the truth's; PSNR (peak 1, linear light) and SSIM (window 7) are those of pixels where
-either shows something. Prints Markdown.
+Orthographic pictures, obliquely through each scan, at several voxels a pixel. Light is our mean
+relative to the ground truth's; PSNR (peak 1, linear light) and SSIM (window 7) are over pixels
+where either shows something. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from tyro.conf import Positional
 import gvtorch as gv
 from gvtorch.pictures.files import write_image
 
-#: File, then corner points of a translucent and an opaque function; None stands for the least
-#: value, opacities are those of a voxel.
+#: File; least and greatest value and opacity per voxel of a translucent function; the values
+#: between which an opaque one rises.
 SCANS = {
     "aneurism": ("aneurism_256x256x256_uint8.raw.gz", (20, 255, 0.15), (60, 70)),
     "VisMale": ("vismale_128x256x256_uint8.raw.gz", (20, 255, 0.06), (120, 130)),
@@ -35,9 +35,9 @@ SCANS = {
     "brain": ("mni_icbm152_t1_197x233x189_uint8.nii.gz", (40, 255, 0.05), (185, 195)),
 }
 SUN = gv.DirectionalLight((-0.6, 0.7, 1.0))  # shines from above, right of the eye
-PARTS = 16  # rays a pixel of the truth, along each side
-STILL = 4  # and of a still picture
-SCALE = 5  # pixels of the file for one of a picture
+PARTS = 16  # rays of the ground truth along each side of a pixel
+STILL = 4  # and those of a still picture
+SCALE = 5  # magnification of the saved picture
 
 
 @dataclass
@@ -59,7 +59,7 @@ class Settings:
 
 
 def functions(scan: str) -> dict[str, gv.TransferFunction]:
-    """The two transfer functions of a scan."""
+    """Returns the two transfer functions of a scan."""
     _, (low, high, most), (clear, solid) = SCANS[scan]
     ramp = [(low, 0.5, 0.2, 0.1), ((low + high) / 2, 0.9, 0.7, 0.4), (high, 1, 1, 1)]
     skin = [(clear, 0.8, 0.4, 0.25), (2 * solid, 1, 0.9, 0.7)]
@@ -70,7 +70,7 @@ def functions(scan: str) -> dict[str, gv.TransferFunction]:
 
 
 def parallel(tree: gv.N3Tree, pixel: float, parts: int) -> gv.Rays:
-    """Rays through the whole tree, parts^2 a pixel, each as wide as its part."""
+    """Returns parallel rays through the tree, parts^2 a pixel, each as wide as its part."""
     real = {"dtype": torch.float64}
     way = torch.nn.functional.normalize(torch.tensor([0.37, 0.23, 1.0], **real), dim=0)
     across = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], **real), way)
@@ -92,7 +92,7 @@ def parallel(tree: gv.N3Tree, pixel: float, parts: int) -> gv.Rays:
 def draw(
     tree: gv.N3Tree, shader: gv.Shader, pixel: float, parts: int = 1, lod: str = "auto"
 ) -> tuple[Tensor, int]:
-    """(h, w, 4) linear premultiplied colour and alpha, and how many samples it took."""
+    """Returns (h, w, 4) linear premultiplied colour and alpha, and the number of samples."""
     rays = parallel(tree, pixel, parts)
     hits = gv.trace(tree, rays, shader, lod=lod)
     side = math.isqrt(len(rays.origin)) // parts
@@ -102,7 +102,7 @@ def draw(
 
 
 def compare(found: Tensor, truth: Tensor) -> str:
-    """Light, PSNR and SSIM."""
+    """Returns light, PSNR and SSIM as text."""
     shown = (truth[..., 3] > 1e-3) | (found[..., 3] > 1e-3)
     error = float((found - truth)[..., :3][shown].square().mean())
     planes = (one[..., :3].movedim(-1, 0)[None].float() for one in (found, truth))

@@ -1,18 +1,18 @@
-"""Miss rate of a fly-through: a moving camera, one frame a picture, and (on CUDA, if asked for)
-rays ahead of it.
+"""Miss rate of a fly-through: a moving camera, one frame a picture, and (on CUDA, optionally) rays
+that request bricks ahead of it.
 
-The protocol is that of the original's Mandelbulb flight; the volume is a made-up one of the same
-kind: a solid with holes at every scale, so that rays end at surfaces and new ones come into view.
-The rate is bricks asked for over bricks asked for and bricks used, summed over the flight;
-"fitting" is the same over the frames whose view, with all that it asks for, is not larger than the
-pool, for what does not fit is asked for again in every frame; "unserved" is the share of nodes that
-were not there yet, those on their way counted again in each frame. Bricks of 8^3 and a border hold
-1,000 bytes here, and 4,000 in the original: its 512 MB are 128 MB here. How fast the camera moves
-decides: 1,200 frames are 20 s at 60 frames a second.
+The protocol is that of the original GigaVoxels' Mandelbulb flight; the volume is a synthetic one of
+the same kind: a solid with holes at every scale, so that rays end at surfaces and new ones come
+into view. The miss rate is bricks requested / (bricks requested + bricks used), summed over the
+flight. "Fitting" is the same over frames whose view, with all that it requests, fits into the pool;
+what does not fit is requested again in every frame. "Unserved" is the share of nodes whose data was
+missing; pending ones count again in each frame. Bricks of 8^3 and a border hold 1,000 bytes here,
+and 4,000 in the original: its 512 MB are 128 MB here. Rates depend on the camera's speed: 1,200
+frames are 20 s at 60 frames a second.
 
-With `--source formula` the solid is computed brick by brick on the device that renders, with
-`--source mandelbulb` it is the original's own scene, the bulb of power 8, whose voxels are 4 bytes
-as in the original. On CUDA each frame is one graph (`Engine.capture`), with `--no-graph` it is
+With `--source formula` the solid is computed brick by brick on the device that renders; with
+`--source mandelbulb` it is the original's scene, the bulb of power 8, whose voxels are 4 bytes as
+in the original. On CUDA each frame is one graph (`Engine.capture`); with `--no-graph` it is
 `Engine.frame`.
 """
 
@@ -72,8 +72,8 @@ class Settings:
 
 
 class Worn(gv.Producer):
-    """The worn sphere (`worn_planes`), computed where it is wanted. Coarse voxels are those of a
-    solid whose edges are as soft as they are wide.
+    """The worn sphere (`worn_planes`), computed on demand. At coarse levels, the solid's edges are
+    softer in proportion to the width of a voxel.
     """
 
     on_device = True
@@ -81,12 +81,12 @@ class Worn(gv.Producer):
 
     def __init__(self, side: int) -> None:
         super().__init__(side, channels={"value": gv.Channel(torch.uint8)})
-        #: By how much a value of the finest level changes at most from voxel to voxel.
+        #: Largest change of a value from one voxel of the finest level to the next.
         self.steepest = 5.1 * (1 + self.wear * sum(2 * k * weight for k, weight in self.octaves))
 
     def value(self, places, voxel):
-        """Values of places x, y, z, which broadcast, in voxels of a width; below 0 and above 255
-        they are cut off.
+        """Returns values at places x, y, z, which broadcast, for voxels of a width; the caller
+        clamps them to 0..255.
         """
         x, y, z = (2 / (self.extent[0] - 1) * place - 1 for place in places)
         inside = 0.9 - (x * x + y * y + z * z).sqrt()
@@ -118,26 +118,26 @@ def write_volume(file: Path, side: int) -> None:
 
 
 def mandelbulb(side: int) -> gv.Producer:
-    """The bulb of power 8, its colours by orbit traps."""
+    """Returns a producer of the bulb of power 8, coloured by orbit traps."""
     colors = {"rgba": gv.Channel(torch.uint8, 4)}
     solid = gv.Solid(gv.Mandelbulb(8, iterations=6), normals=False)
     return gv.FieldProducer(solid, side, channels=colors)
 
 
 def flight(middle: float, half: float) -> CameraPath:
-    """From afar to the surface, along it, into a hole, and out again, around a solid whose box has
-    this middle and half this side.
+    """Returns a path from afar to the surface, along it, into a hole, and out again, around a solid
+    whose box has this middle and half this side.
     """
     keys = [(0, 0.2, 3.4), (0.6, 0.3, 2.0), (0.9, 0.4, 1.3), (1.15, 0.5, 0.5), (1.2, 0.3, -0.4)]
     keys += [(0.9, -0.2, -0.8), (0.4, -0.5, -1.1), (-0.3, -0.4, -1.3), (-1.0, 0.2, -1.6)]
     eyes = np.array(keys) * half + middle
     ahead = np.vstack((eyes[1:], eyes[-1:]))
-    targets = 0.5 * middle + 0.5 * ahead  # between the middle and the way
+    targets = 0.5 * middle + 0.5 * ahead  # between the middle and the next eye
     return CameraPath(eyes.tolist(), targets.tolist(), fov=[45.0] * len(keys))
 
 
 def scene(settings: Settings) -> tuple[gv.Shader, list[gv.Camera]]:
-    """What is seen of the solid, and from where."""
+    """Returns the shader and the cameras of the flight."""
     if settings.source == "mandelbulb":
         shader: gv.Shader = gv.Isosurface(127.5, None, color_channel="rgba", premultiplied=True)
         shader.channel, shader.component = "rgba", 3  # the surface is where the opacity is a half
@@ -152,15 +152,15 @@ def scene(settings: Settings) -> tuple[gv.Shader, list[gv.Camera]]:
 
 
 def source(settings: Settings, store: Path) -> gv.Producer:
-    """What is flown through."""
+    """Returns the producer of the scene."""
     if settings.source == "store":
         return gv.StoredProducer(store, workers=settings.workers)
     return mandelbulb(settings.side) if settings.source == "mandelbulb" else Worn(settings.side)
 
 
 def compile_batches(producer: gv.Producer, batch: int) -> None:
-    """Compiles what makes so many bricks, and what classifies the children of so many nodes; other
-    batches are made as ever.
+    """Compiles `fill` for batches of this size, and `classify` for the children of as many nodes;
+    batches of other sizes run eagerly.
     """
 
     def compiled(eager: Callable[[gv.Nodes], Any], size: int) -> Callable[[gv.Nodes], Any]:
@@ -172,24 +172,24 @@ def compile_batches(producer: gv.Producer, batch: int) -> None:
 
 
 def quantiles(times: list[float]) -> list[str]:
-    """Median and 99th percentile of milliseconds."""
+    """Returns the median and the 99th percentile of milliseconds."""
     return [f"{sorted(times)[math.ceil(q * len(times)) - 1]:.2f}" for q in (0.5, 0.99)]
 
 
 def fits(stats: gv.FrameStats) -> bool:
-    """Whether the pool holds a frame's view with all that it asked for."""
+    """Returns whether the pool can hold a frame's view with all that it requested."""
     return stats.bricks_used + stats.requests["load"] + stats.overflow < stats.bricks
 
 
 def miss_rate(all_stats: list[gv.FrameStats]) -> str:
-    """Bricks asked for over bricks asked for and used, over frames."""
+    """Returns bricks requested / (bricks requested + bricks used), summed over frames."""
     asked = sum(stats.requests["load"] for stats in all_stats)
     used = sum(stats.bricks_used for stats in all_stats)
     return f"{asked / max(1, used + asked):.2%}"
 
 
 def fly_resident(store: Path, settings: Settings, console: Console) -> list[str]:
-    """The same pictures of a tree that is all in memory; returns a row of the table."""
+    """Renders the same pictures from a resident tree; returns a row of the table."""
     tree = gv.N3Tree.from_volume(gv.read_volume(store), device=settings.device)
     shader, cameras = scene(settings)
     pictures = [gv.render(tree, c, shader) for c in track(cameras, "resident", console=console)]
@@ -206,7 +206,7 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
     options = {"brick_pool": pool, "node_pool": "64 MB", "loading": settings.loading}
     options["brick_size"] = settings.brick_size
     with gv.Engine(producer, device=settings.device, **options) as engine:
-        engine.render(cameras[0], shader)  # the flight begins with what its first view needs
+        engine.render(cameras[0], shader)  # the flight begins with its first view loaded
         if engine.device.type == "cuda" and settings.graph:
             how = {"batch": settings.batch, "look_ahead": settings.look_ahead, "fit": settings.fit}
             draw = engine.capture(cameras[0], shader, **how).replay

@@ -1,5 +1,5 @@
-"""Draws what `gvtorch bench NAME -o docs/performance` kept, and writes the tables between the
-markers of docs/performance/tables.md. Records of quick sizes are left out.
+"""Plots the records that `gvtorch bench NAME -o docs/performance` saved, and writes their tables
+between the markers of docs/performance/tables.md. Records of quick sizes are left out.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def section(folder: str, name: str, record: dict[str, Any], drawn: bool) -> str:
 
 
 def write_between_markers(page: Path, text: str) -> None:
-    """Puts text in the place of what stands between the markers.
+    """Replaces the text between the markers.
 
     Raises:
         ValueError: A marker is missing.
@@ -58,7 +58,7 @@ def write_between_markers(page: Path, text: str) -> None:
 
 
 def draw(file: Path, record: dict[str, Any]) -> bool:
-    """Draws a record; tells whether matplotlib is here to do it."""
+    """Plots a record; returns False if matplotlib is not installed."""
     try:
         import matplotlib
     except ImportError:
@@ -74,8 +74,8 @@ def draw(file: Path, record: dict[str, Any]) -> bool:
 
 
 def _bars(pyplot: Any, record: dict[str, Any]) -> Any:
-    """Milliseconds of every row, or where rows move bytes gigabytes a second, from smallest to
-    largest repeat; on a logarithmic axis where some are far apart.
+    """Plots the milliseconds of every row, or gigabytes a second if all rows move bytes, with the
+    range of the repeats; on a logarithmic axis where rows differ more than 20 times.
     """
     rows = record["rows"][::-1]
     names = list(dict.fromkeys(row["who"] for row in record["rows"]))
@@ -102,7 +102,7 @@ def _bars(pyplot: Any, record: dict[str, Any]) -> Any:
 
 
 def _sweep(pyplot: Any, record: dict[str, Any]) -> Any:
-    """For each scene milliseconds and memory over the brick size, a line for each border."""
+    """Plots, for each scene, milliseconds and memory over the brick size, a line per border."""
     scenes = list(dict.fromkeys(row["scene"] for row in record["rows"]))
     figure, grid = pyplot.subplots(
         *(2, len(scenes)), figsize=(4 * len(scenes), 6), constrained_layout=True, squeeze=False
@@ -127,7 +127,7 @@ def _sweep(pyplot: Any, record: dict[str, Any]) -> Any:
 
 
 def main(settings: Settings) -> None:
-    """Draws and writes all."""
+    """Draws all plots and writes the page."""
     records = read(settings.records)
     if not records:
         sys.exit(f"plots: no records in {settings.records}; `make bench` makes them")

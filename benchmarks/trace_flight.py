@@ -1,6 +1,6 @@
-"""What host and device do in frames of a flight through a store, as a picture: above the stages of
-some frames (`gv.Trace`, whose file Perfetto shows as well), below the kernels of one frame on the
-device, by what they are for (`torch.profiler`; CUDA).
+"""Plots what host and device do in frames of a flight through a store: above, the stages of some
+frames (`gv.Trace`, whose file Perfetto shows as well); below, the kernels of one frame on the
+device, grouped by purpose (`torch.profiler`; CUDA).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from matplotlib import pyplot
 
 import gvtorch as gv
 
-# A kernel is of the first kind whose word its name holds.
+# A kernel belongs to the first kind of which its name contains a word.
 KINDS = {
     "march": ("ShadeRay", "HideShaded"),
     "order of use": ("SplitByUse", "PackUse", "FlagUse"),
@@ -50,12 +50,12 @@ class Settings:
 
 
 def kind_of(kernel: str) -> str:
-    """What a kernel is for."""
+    """Returns the kind that a kernel belongs to."""
     return next(kind for kind, words in KINDS.items() if any(word in kernel for word in words))
 
 
 def fly(settings: Settings, store: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Events of the frames and of one frame's kernels."""
+    """Returns the trace events of the frames, and those of one frame's kernels."""
     flight = settings.flight
     shader, cameras = fly_through.scene(flight)
     producer = fly_through.source(flight, store)
@@ -81,19 +81,19 @@ def fly(settings: Settings, store: Path) -> tuple[list[dict[str, Any]], list[dic
 
 
 def is_march(kernel: str) -> bool:
-    """Whether a kernel traces rays, and does not look at nodes alone."""
+    """Returns whether a kernel traces rays through bricks, and not only through nodes."""
     return "ShadeRay" in kernel and "HideShaded" not in kernel
 
 
 def last_frame(events: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What the device did from the end of the march before the last to the end of the last."""
+    """Returns the device's events from the end of the last march but one to the end of the last."""
     ours = [e for e in events if e.get("cat") in ("kernel", "gpu_memcpy", "gpu_memset")]
     begin, end = sorted(e["ts"] + e["dur"] for e in ours if is_march(e["name"]))[-2:]
     return [event for event in ours if begin <= event["ts"] <= end]
 
 
 def draw(stages: list[dict[str, Any]], kernels: list[dict[str, Any]], output: Path) -> None:
-    """Draws both."""
+    """Draws the stages above, the kernels below."""
     figure, (above, below) = pyplot.subplots(2, 1, figsize=(11, 6.5), constrained_layout=True)
     tracks = {e["tid"]: e["args"]["name"] for e in stages if e["ph"] == "M"}
     spans = [e for e in stages if e["ph"] == "X" and (e["tid"] or e["name"] != "read")]

@@ -29,7 +29,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    """Pinhole; beside it an orthographic camera and a fisheye, above a panorama."""
+    """Renders the pinhole at the left; at the right orthographic and fisheye above a panorama."""
     tree = gv.N3Tree.from_volume(
         gv.read_volume(DATA / "stent_256x128x128_int16.npz"), device=settings.device
     )

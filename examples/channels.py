@@ -10,8 +10,8 @@ from torch.nn.functional import conv3d, interpolate, normalize
 
 import gvtorch as gv
 
-X, Y, Z, EACH = 576, 384, 56, 40  # voxels; fibres of each kind in one of 20 cells
-LOOKS = [  # as `omero` metadata would tell them
+X, Y, Z, EACH = 576, 384, 56, 40  # voxels; fibres of each kind in each of 20 cells
+LOOKS = [  # as `omero` metadata would specify them
     gv.ChannelLook(name="nuclei", color="#4f80ff", window=(10, 200), opacity=0.22),
     gv.ChannelLook(name="actin", color="#ff2560", window=(15, 220), opacity=0.3),
     gv.ChannelLook(name="microtubules", color="#20ff9a", window=(15, 230), opacity=0.35),
@@ -29,7 +29,7 @@ class Settings:
 
 
 def fibres(at: Tensor, way: Tensor, steps: int, curl: float, width: float, high: Tensor) -> Tensor:
-    """(z, y, x) fibres that wind from places (k, 3): x, y, and the part of the cell's height."""
+    """Returns (z, y, x) winding fibres that start `at` (k, 3): x, y, fraction of cell height."""
     spots = torch.zeros(1, 1, Z, Y, X)
     for _ in range(steps):
         way = normalize(way + curl * (rand(way.shape) - 0.5), dim=1)
@@ -44,7 +44,7 @@ def fibres(at: Tensor, way: Tensor, steps: int, curl: float, width: float, high:
 
 
 def cells() -> Tensor:
-    """(z, y, x, 4) nuclei, actin, microtubules and mitochondria."""
+    """Returns (z, y, x, 4) nuclei, actin, microtubules and mitochondria."""
     row, column = torch.arange(20) // 5, torch.arange(20) % 5
     middle = torch.stack((128.0 * column + 60 * (row % 2) - 22, 112.0 * row - 6, 0 * row + 0.5), 1)
     middle, turn = middle + rand(20, 3) * torch.tensor([44, 44, 0]), 3.14 * rand(20, 1, 1)
@@ -55,7 +55,7 @@ def cells() -> Tensor:
     away = (((u / 92) ** 2 + (v / 62) ** 2).sqrt() + wobble).amin(0)
     high = (6 + 36 * torch.exp(-((away / 0.7) ** 2))) * ((1.2 - away) * 9).clamp(0, 1)
     rough = interpolate(rand(1, 1, 16, 64, 64), (Z, Y, X), mode="trilinear")[0, 0]
-    core = ((u / 26) ** 2 + (v / 18) ** 2).amin(0) + ((z - 17) / 12) ** 2  # 1: a nucleus's skin
+    core = ((u / 26) ** 2 + (v / 18) ** 2).amin(0) + ((z - 17) / 12) ** 2  # nuclei: below 1
     start, ways = middle.repeat(EACH, 1), rand(20 * EACH, 3) - 0.5
     along = torch.stack((turn.cos(), turn.sin(), 0 * turn), 1)[:, :, 0, 0].repeat(EACH, 1)
     near, wide = (start + (rand(ways.shape) - 0.5) * torch.tensor([s, s, 0.7]) for s in (24, 104))

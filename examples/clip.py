@@ -14,7 +14,7 @@ import gvtorch as gv
 SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
 EYE, TARGET, UP = (-280.0, -200.0, 190.0), (66.0, 60.0, 132.0), (0.0, 0.0, 1.0)
 LEVEL = 160.0  # bone, and blood with contrast agent
-CUT = (1.0, 0.0, 0.0, -72.0)  # keeps where x >= 72
+CUT = (1.0, 0.0, 0.0, -72.0)  # keeps the side where x >= 72
 SUN = gv.DirectionalLight((0.5, 1.0, -0.8), (1.2, 1.1, 0.95))
 SKY = gv.Gradient((0.06, 0.08, 0.12), (0.012, 0.014, 0.02))
 COLOR = [

@@ -1,4 +1,4 @@
-"""A cloud in the evening sun, its light scattered many times: of `gv.noise`, or of a file."""
+"""A cloud in the evening sun with multiple scattering, made of `gv.noise` or read from a file."""
 
 import math
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ SUN = gv.DirectionalLight((-0.78, -0.48, 0.4), (1.9, 1.12, 0.58), angle=15.0)
 SKY = gv.Gradient((0.012, 0.04, 0.16), (0.5, 0.24, 0.17))
 PUFFS = ((-0.85, -0.2, 0.0, 0.45), (-0.3, 0.1, 0.1, 0.6), (0.35, 0.2, -0.1, 0.62),
          (0.9, -0.1, 0.05, 0.42), (0.1, -0.2, 0.35, 0.5))  # fmt: skip
-THICK = 40.0  # extinction across half of the cloud, where it is densest
+THICK = 40.0  # optical depth of half the longest side at full density
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Settings:
 
 
 def cloud(voxels: int) -> gv.Volume:
-    """Density of puffs that noise makes rough, flat below."""
+    """Returns the density of puffs roughened by noise, flat below."""
     step = 3.2 / voxels
     axes = [torch.arange(-half, half, step) for half in (0.8, 1.0, 1.6)]
     z, y, x = torch.meshgrid(*axes, indexing="ij")

@@ -27,7 +27,7 @@ class Settings:
 
 
 def cloud(voxels: int) -> gv.Volume:
-    """Density of round puffs that noise makes rough, flat below."""
+    """Returns the density of round puffs roughened by noise, flat below."""
     step = 2.4 / voxels
     axes = [torch.arange(-half, half, step) for half in (0.8, 1.2, 1.0)]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
@@ -43,7 +43,7 @@ def cloud(voxels: int) -> gv.Volume:
 def main(settings: Settings) -> None:
     """Renders both pictures."""
     density = cloud(settings.voxels)
-    # Normals of length 0: droplets scatter light to all sides.
+    # Normals of length 0, because droplets scatter light in all directions.
     none = torch.zeros((*density.data.shape[:3], 3), dtype=torch.int8)
     channels = {"density": density, "none": gv.Volume(none, density.spacing)}
     tree = gv.N3Tree.from_volume(channels, device=settings.device)

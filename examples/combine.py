@@ -19,7 +19,7 @@ VIEW = (-0.9, -3.3, 1.1), (0, 0, 0), (0, 0, 1), 35
 
 
 class Of(torch.nn.Module):
-    """A function of points and of modules, which go along to the engine's device."""
+    """A function of points and of submodules, which move to the engine's device with it."""
 
     def __init__(self, function: Callable[..., torch.Tensor], *parts: torch.nn.Module) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class Settings:
 
 
 def world() -> torch.nn.Module:
-    """Channels: "shape", whose surface is at 1/2, and "side", which colours it."""
+    """Returns a field of two channels: "shape", whose surface is at 1/2, and "side", its colour."""
     cells = gv.sdf.Shell(gv.sdf.Gyroid(0.55), 0.06)
     gyroid = Of(lambda p, shape: (0.5 - 12 * shape(p)).clamp(0, 1), cells)
     stone = Of(lambda p: (0.6 + 2 * gv.noise.fbm(1.8 * p, octaves=5, seed=3)).clamp(0, 1))

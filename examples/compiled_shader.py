@@ -1,5 +1,5 @@
-"""Your own shader in C++, ink.h: vessels in pen and ink; beside them by a transfer function
-and with other uniforms. It is compiled once; uniforms may change with every frame.
+"""Your own shader in C++, ink.h: vessels in pen and ink; at the right, a transfer function and the
+ink with other uniforms. It is compiled once; uniforms may change with every frame.
 """
 
 import dataclasses

@@ -1,5 +1,5 @@
 """What a picture costs, as images: samples and nodes of each ray, and level, age and fill of the
-bricks it saw, after a camera has turned around a streamed scan."""
+bricks that it read, after a camera has turned around a streamed scan."""
 
 import dataclasses
 from dataclasses import dataclass

@@ -24,7 +24,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    """Renders one picture, with some rays a pixel."""
+    """Renders one picture, with `samples` rays per pixel."""
     volume = gv.read_volume(DATA / "stent_256x128x128_int16.npz")
     tree = gv.N3Tree.from_volume(volume, brick_size=8, device=settings.device)
     print(tree)

@@ -1,5 +1,5 @@
-"""Four places in Menger's sponge, down to a billionth of its size: 3^21 cells a side, and a pool
-for 24,000 bricks of 9^3. Cells of every size look alike, and so should the pictures."""
+"""Four views into Menger's sponge, down to some billionths of its size: 3^21 cells a side, in a
+pool of 24,000 bricks of 9^3. Cells of every size look alike, and so should the pictures."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ HAZE = torch.tensor([0.78, 0.85, 0.92])
 
 class Menger(gv.Producer):
     """The sponge in the unit cube: a voxel of any level is solid if it is a cell of the sponge.
-    Each brick is 9^3 cells, so that digits in base 3 tell all."""
+    A brick is 9^3 cells, so that the base-3 digits of a voxel's index decide."""
 
     def classify(self, nodes):
         beside = torch.cartesian_prod(*(torch.arange(-1, 2, device=nodes.loc.device),) * 3)
@@ -33,7 +33,7 @@ class Menger(gv.Producer):
 
 
 def solid(x, y, z, digits):
-    """Whether cells of a grid of 3^digits a side are the sponge's: nowhere are two digits 1."""
+    """Returns which cells of a grid of 3^digits a side are solid: at no position two digits 1."""
     side = 3**digits
     found = (torch.minimum(torch.minimum(x, y), z) >= 0) & (x < side) & (y < side) & (z < side)
     for _ in range(int(digits.max())):
@@ -43,7 +43,7 @@ def solid(x, y, z, digits):
 
 
 def camera(level: float, size: int) -> gv.Camera:
-    """Stands in the hole of a cell of the grid 3^level, or in a corridor to the next one."""
+    """Returns a camera in the hole of a cell of the grid 3^level, or on the way to the next."""
     whole = int(level)
     part, target = 1.5 * (1 - 3 ** (whole - level)), torch.tensor([0.25, 0.75, 0.25]).double()
     eye = ((target * 3**whole).floor() + 0.5) / 3**whole
@@ -54,10 +54,10 @@ def camera(level: float, size: int) -> gv.Camera:
 
 
 def picture(engine: gv.Engine, level: float, size: int) -> gv.Picture:
-    """A place of the flight in the sun, and in a haze as thin as the place is large."""
+    """Renders a stop of the flight in sunlight, and in a haze that is thinner in larger views."""
     near = 3.0**-level
     light = gv.Lighting(lights=[SUN], reach=0.25 * near, **SHADE)
-    for part, cone_scale in ((4, 0.9), (1, 4.5)):  # nearly all is made for a small picture
+    for part, cone_scale in ((4, 0.9), (1, 4.5)):  # a small picture loads nearly all
         view = camera(level, size // part)
         found = engine.render(view, STONE, lighting=light, cone_scale=cone_scale)
     clear = torch.exp(-found.depth / (2.2 * near)) * found.alpha
@@ -66,7 +66,7 @@ def picture(engine: gv.Engine, level: float, size: int) -> gv.Picture:
 
 
 def main(output: Path = Path("deep_zoom.png"), size: int = 720, device: str = "cpu") -> None:
-    """Goes from place to place with one pool."""
+    """Renders all stops with one pool."""
     sponge = Menger(9 * 3**19, box=((0, 0, 0), (1, 1, 1)), branching=3)
     pool = {"brick_size": 9, "brick_pool": "128 MB", "load_budget": 4096}
     with gv.Engine(sponge, device=device, **pool) as engine:

@@ -1,6 +1,6 @@
-"""Depth of field: a pinhole, and a lens of three apertures; `--pinholes 256` compares the widest
-with the mean of as many pinhole pictures from all over it, which takes minutes on a CPU. Voxels
-hold colour and opacity, so that a wide cone reads the mean of what is seen."""
+"""Depth of field: a pinhole, and a lens with three apertures. `--pinholes 256` compares the widest
+with the mean of 256 pinhole pictures from all over the lens, which takes minutes on a CPU. Voxels
+hold colour and opacity, so that a wide cone reads the mean of what it sees."""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ import gvtorch as gv
 SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
 OPACITY = [(20, 0), (60, 0.04), (255, 0.25)]
 COLOR = [(20, 0.6, 0.1, 0.05), (120, 0.9, 0.5, 0.3), (255, 1, 1, 0.8)]
-FOCUS, APERTURES = 0.8, (0.03, 0.07, 0.15)  # largest sides of the box
+FOCUS, APERTURES = 0.8, (0.03, 0.07, 0.15)  # in largest sides of the box
 
 
 @dataclass
@@ -31,7 +31,7 @@ class Settings:
 
 
 def seen(volume: gv.Volume, function: gv.TransferFunction) -> gv.Volume:
-    """Premultiplied colour and opacity of every voxel."""
+    """Returns premultiplied colour and opacity of every voxel."""
     rgba = torch.from_numpy(function(volume.data[..., 0].numpy()))
     rgba[..., :3] *= rgba[..., 3:]
     return gv.Volume(rgba.half(), spacing=volume.spacing, origin=volume.origin)
@@ -40,7 +40,7 @@ def seen(volume: gv.Volume, function: gv.TransferFunction) -> gv.Volume:
 def thin_lens(
     tree: gv.N3Tree, camera: gv.Camera, shader: gv.StoredColor, aperture: float, pinholes: int
 ):
-    """(h, w, 3) mean colour of rays from all over the lens through each pixel's point in focus."""
+    """Returns (h, w, 3): mean colour of rays from all over the lens to each pixel's focal point."""
     placed = camera.placed(tree.box)
     rays, side = placed.rays(tree.device), float((tree.box[1] - tree.box[0]).max())
     right, down = placed.viewmats[0, :2, :3].to(tree.device)

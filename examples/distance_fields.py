@@ -1,6 +1,6 @@
-"""A lantern out of distance fields: shapes united, cut, hollowed, twisted and blended.
+"""A lantern made of distance fields: shapes united, cut, hollowed, twisted and blended.
 
-400^3 voxels, of which only those near the surface are made: the rest is proven empty or full.
+400^3 voxels, of which only those near the surface are computed: the rest is proven empty or full.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ SKY = gv.Gradient((0.05, 0.07, 0.1), (0.32, 0.3, 0.28))
 
 
 def lantern() -> sdf.Distance:
-    """The shapes, z up."""
+    """Returns the shapes, z up."""
     lace = sdf.Shell(sdf.Gyroid(0.46, color=IVORY), 0.035)
     ball = (lace & sdf.Shell(sdf.Sphere(0.92, color=IVORY), 0.09)) | sdf.Sphere(0.55, color=CLAY)
     rings = sdf.Torus(0.95, 0.06, color=BRASS) | sdf.rotated(

@@ -1,6 +1,6 @@
 """A spiral galaxy of points: a bulge, an old disc, young arms, nebulae, and dust that hides them.
 
-Its light spans some 10^6 (from voxel to voxel) and is tone-mapped.
+The brightness of its voxels spans a factor of about 10^6, and is tone-mapped.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import tyro
 
 import gvtorch as gv
 
-ARMS, WINDING, LENGTH, EXTENT = 2, 3.1, 0.27, 512  # the disc fades by 1/e along the length
+ARMS, WINDING, LENGTH, EXTENT = 2, 3.1, 0.27, 512  # the disc fades by 1/e over LENGTH
 
 
 @dataclass
@@ -25,8 +25,8 @@ class Settings:
 
 
 def disc(count: int, thick: float, lag: float, arm: float, clump: float) -> torch.Tensor:
-    """About (n, 3) places, the denser the nearer to an arm that lags behind by an angle, and where
-    noise that is wound up like the arms is high.
+    """Returns about `count` positions (n, 3), denser near arms that lag behind by the angle `lag`,
+    and where noise that is wound like the arms is high.
     """
     radius = 0.02 - LENGTH * (1 - 0.99 * torch.rand(3 * count)).log()
     angle, wound = 6.2832 * torch.rand(len(radius)), WINDING * (radius / 0.1).log()
@@ -41,7 +41,7 @@ def disc(count: int, thick: float, lag: float, arm: float, clump: float) -> torc
 
 
 def ball(count: int, size: float) -> torch.Tensor:
-    """(n, 3) places around the middle, the denser the nearer."""
+    """Returns (n, 3) positions, denser towards the middle."""
     way = torch.nn.functional.normalize(torch.randn(count, 3), dim=1)
     return way * size * torch.randn(count, 1).abs() ** 2 * torch.tensor([1.0, 0.75, 1.0])
 
@@ -51,7 +51,7 @@ def main(settings: Settings) -> None:
     torch.manual_seed(11)
     many, middles = settings.stars, disc(600, 0.006, 0.0, 6.0, 2.5)
     nebulae = middles.repeat_interleave(24, 0) + 0.007 * torch.randn(24 * len(middles), 3)
-    parts = (  # places, linear colour, light of a point, its opacity, how far it reaches
+    parts = (  # positions, linear colour, and of each point: light, opacity, radius
         (ball(many // 16, 0.065), (1.0, 0.70, 0.40), 0.28, 1e-3, 0.025),
         (disc(many // 10, 0.018, 0.0, 0.4, 0.2), (1.0, 0.76, 0.52), 0.18, 1e-3, 0.05),
         (disc(many // 3, 0.008, 0.0, 3.0, 1.6), (0.34, 0.55, 1.0), 0.09, 1e-3, 0.014),
@@ -61,7 +61,7 @@ def main(settings: Settings) -> None:
         (ball(many // 4, 0.12), (1.0, 0.82, 0.6), 0.005, 1e-4, 0.0),
     )
     rows = []
-    for place, color, light, opacity, radius in parts:  # most stars are faint, and few are not
+    for place, color, light, opacity, radius in parts:  # most stars are faint, few are bright
         bright = light * torch.rand(len(place), 1) ** (0 if radius else -0.9)
         rest = torch.tensor([opacity, radius]).expand(len(place), 2)
         rows.append(torch.cat((place, bright * torch.tensor(color), rest), 1))

@@ -1,5 +1,5 @@
-"""The stars around a galaxy, whose tides draw satellites out to streams: surfaces of equal density.
-They are made here, or come from a file of log-scaled density, such as hdz2000_128_uint8.npy.bz2."""
+"""Surfaces of equal star density around a galaxy, whose tides stretch satellites into streams. The
+stars are made here, or a file has the log-scaled density, such as hdz2000_128_uint8.npy.bz2."""
 
 import bz2
 from dataclasses import dataclass
@@ -35,10 +35,10 @@ class Settings:
 
 
 def streams(stars: int, steps: int = 700, step: float = 0.02) -> torch.Tensor:
-    """(n, 3) places of the stars of 40 satellites after some turns in the potential of a galaxy,
+    """Returns (n, 3) positions of the stars of 40 satellites after some orbits in the potential
     ln(0.1 + x^2 + y^2 + z^2 / 0.8) / 2 (Binney, Tremaine, "Galactic Dynamics", 2008, 2.71)."""
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(6))
-    of = (40 * torch.linspace(0, 1, stars) ** 2).long().clamp(max=39)  # more in some than in others
+    of = (40 * torch.linspace(0, 1, stars) ** 2).long().clamp(max=39)  # satellites differ in size
     place = 0.4 * normal(40, 3)[of] + 0.03 * normal(stars, 3)
     speed = 0.5 * normal(40, 3)[of] + 0.04 * normal(stars, 3)
     flat = torch.tensor([1.0, 1.0, 1 / 0.8])
@@ -50,7 +50,7 @@ def streams(stars: int, steps: int = 700, step: float = 0.02) -> torch.Tensor:
 
 
 def made(stars: int = 200_000, side: int = 128) -> torch.Tensor:
-    """The logarithm of the stars' density, side^3 uint8."""
+    """Returns the logarithm of the stars' density, side^3 uint8."""
     points = gv.Points(streams(stars), radius=0.05)
     producer = gv.PointProducer(points, extent=side, box=((-1, -1, -1), (1, 1, 1)))
     axis = (torch.arange(side) + 0.5) / side * 2 - 1

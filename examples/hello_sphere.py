@@ -16,7 +16,7 @@ NIGHT = gv.Gradient((0.001, 0.001, 0.002), (0.003, 0.005, 0.012))
 
 
 class Bands(torch.nn.Module):
-    """Linear red, green and blue: bands that a noise bends."""
+    """Linear red, green and blue of bands that are bent by noise."""
 
     def forward(self, points):
         bend = gv.noise.fbm(gv.noise.warp(points * points.new_tensor([1.4, 4.2, 1.4])))

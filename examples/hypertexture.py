@@ -1,6 +1,6 @@
-"""Hypertexture: a weathered rock, whose distance and normals noise perturbs, coloured by a transfer
-function of the distance; and fur, which a transfer function alone makes of noise. Both are made
-where rays ask for it, around any shape: --mesh takes a closed mesh, --volume signed distances.
+"""Hypertexture: a weathered rock, its distance and normals perturbed by noise, and coloured by a
+transfer function of the distance; and fur, which a transfer function alone makes from noise. Both
+are computed where rays request voxels, around any shape: that of --mesh, or that of --volume.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ import gvtorch as gv
 SUN = gv.DirectionalLight((-0.7, -0.75, -0.65), (1.5, 1.3, 1.05), angle=3)
 SKY = gv.Gradient((0.16, 0.22, 0.31), (0.68, 0.72, 0.72))
 STONE = [(-0.1, 0.06, 0.04, 0.03), (-0.05, 0.28, 0.2, 0.13), (0.03, 0.55, 0.49, 0.41)]
-LIMBS = (  # of a hare: where each begins and ends, and its radius
+LIMBS = (  # of a hare: start, end and radius of each
     *(((-0.1, -0.15, 0), (0.35, -0.12, 0), 0.46), ((-0.55, 0.35, 0), (-0.68, 0.32, 0), 0.27)),
     *(((-0.52, 0.6, z), (-0.36, 1.12, 2 * z), 0.1) for z in (-0.15, 0.15)),
     *(((-0.4, -0.5, z), (-0.68, -0.53, z), 0.12) for z in (-0.22, 0.22)),
@@ -33,7 +33,7 @@ class Settings:
     output: Path = Path("hypertexture.png")
     size: int = 720
     extent: int = 384
-    mesh: Path | None = None  # whose largest side is scaled to 2, y up
+    mesh: Path | None = None  # closed, y up; its largest side is scaled to 2
     volume: Path | None = None  # of signed distances
     device: str = "cpu"
 
@@ -49,7 +49,7 @@ def main(settings: Settings) -> None:
     elif settings.volume is not None:
         shape = gv.SampledDistance(gv.read_volume(settings.volume))
     rough = {"thickness": 0.075, "frequency": 6, "gain": 0.55, "softness": 0.12}
-    # Offset by as much as density 1/2 lies below the surface.
+    # Grown by the depth at which density 1/2 lies below the surface.
     grown = gv.sdf.Offset(shape, 0.03)
     rock = gv.Hypertexture(grown, settings.extent, octaves=6, distances=True, **rough)
     fur = gv.Fur(shape, length=0.11, frequency=36, fall=(-0.12, -0.5, -0.05))

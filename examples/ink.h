@@ -1,4 +1,4 @@
-// Pen and ink: boundaries are drawn, darkest where they are seen edge-on, and what is far fades into the paper.
+// Pen and ink: boundaries are drawn, darkest where they are seen edge-on; distant ones fade into the paper.
 // Source: Ebert, Rheingans, "Volume illustration: non-photorealistic rendering of volume models", Visualization 2000:
 // boundary enhancement, silhouettes, distance colour blending.
 #pragma once

@@ -1,5 +1,5 @@
-"""A ball of cells, cut open: labels of 64 bits, each in a colour of its own, and one picked. Cells
-are what is nearest to their nuclei, with a gap between; a nucleus is a label, too.
+"""A ball of cells, cut open: 64-bit labels, each in its own colour, and one of them picked. A cell
+is the region nearest to its nucleus, with gaps between cells; each nucleus has a label, too.
 """
 
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ import tyro
 
 import gvtorch as gv
 
-FIRST, NUCLEUS = 720_575_940_000_000_000, 1_000_000  # labels: of cells, and so much more of nuclei
-CELLS, REACH = 360, 0.2  # no voxel of a cell is so far from its nucleus, in sides of the box
-GAP, RADIUS, CORE = 0.012, 0.47, 0.42  # in sides of the box; CORE of a cell's own size
+FIRST, NUCLEUS = 720_575_940_000_000_000, 1_000_000  # first label; nucleus minus cell
+CELLS, REACH = 360, 0.2  # REACH: more than the radius of any cell, in sides of the box
+GAP, RADIUS, CORE = 0.012, 0.47, 0.42  # in sides of the box; CORE relative to a cell's size
 BONE, SKY = (0.86, 0.80, 0.66), gv.Gradient((0.030, 0.036, 0.052), (0.004, 0.005, 0.008))
 SUN = gv.DirectionalLight((0.55, -1.0, -0.75), (1.25, 1.16, 1.0), angle=7)
 LIGHT = gv.Lighting(ambient=(0.62, 0.72, 0.95), occlusion=0.9, reach=0.12, cones=5, frame="box")
@@ -32,16 +32,16 @@ class Settings:
 
 
 def tissue(side: int) -> gv.Volume:
-    """Cells in a ball whose places were spread evenly, (side)^3 labels in int64."""
+    """Returns side^3 int64 labels of cells that are spread evenly in a ball."""
     places = torch.rand((40 * CELLS, 3), generator=torch.Generator().manual_seed(4)) - 0.5
     places = places[places.norm(dim=1) < RADIUS]
     centre = places[:CELLS]
-    for _ in range(12):  # Lloyd: each centre goes to the middle of its neighbourhood
+    for _ in range(12):  # Lloyd: each centre moves to the mean of its neighbourhood
         nearest = torch.cdist(places, centre).argmin(1)
         middle = torch.zeros_like(centre).index_add(0, nearest, places)
         centre = middle / nearest.bincount(minlength=len(centre)).clamp(min=1)[:, None]
     size = torch.cdist(centre, centre).fill_diagonal_(torch.inf).min(1).values / 2  # of each cell
-    near, far = torch.full((2, side, side, side), torch.inf)  # squares: of the nearest two centres
+    near, far = torch.full((2, side, side, side), torch.inf)  # squared distances to two centres
     cell, other = torch.zeros((2, side, side, side), dtype=torch.int64)
     axis = (torch.arange(side) + 0.5) / side - 0.5
     for number, middle in enumerate(centre):
@@ -52,7 +52,7 @@ def tissue(side: int) -> gv.Volume:
         other[part] = torch.where(apart < a, cell[part], other[part].where(apart >= b, number))
         far[part] = torch.where(apart < a, a, torch.minimum(apart, b))
         cell[part], near[part] = torch.where(apart < a, number, cell[part]), apart.minimum(a)
-    wall = (far - near) / 2 / (centre[cell] - centre[other]).norm(dim=-1)  # how far it is
+    wall = (far - near) / 2 / (centre[cell] - centre[other]).norm(dim=-1)  # distance to it
     depth = RADIUS - sum(one**2 for one in torch.meshgrid(axis, axis, axis, indexing="ij")).sqrt()
     inside = (wall > GAP / 2) & (depth > -0.3 * wall.clamp(max=0.08))
     number = FIRST + cell + NUCLEUS * (near.sqrt() < CORE * size[cell])
@@ -60,7 +60,7 @@ def tissue(side: int) -> gv.Volume:
 
 
 def main(settings: Settings) -> None:
-    """Renders the cells, and tells which one lies in the middle of the picture."""
+    """Renders the cells, and prints which label is in the middle of the picture."""
     volume = tissue(settings.side)
     tree = gv.N3Tree.from_volume(volume, 10, border=3, device=settings.device)
     nuclei = [label for label in volume.label_values.tolist() if label >= FIRST + NUCLEUS]

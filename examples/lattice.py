@@ -1,5 +1,5 @@
-"""A ball of gyroid lattice, as a printer would make it of porcelain: thin shells within a shell,
-with occlusion and one bounce of light, photographed on a sheet of paper.
+"""A ball of gyroid lattice, like a 3D print in porcelain: thin shells within a shell, with ambient
+occlusion and one bounce of light, on a slate foot.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ VIEW = (2.1, -4.3, 2.5), (0, 0, -0.12), (0, 0, 1), 28
 
 
 def lattice() -> sdf.Distance:
-    """The shapes, z up: one lattice within another around a core, a part of them cut away."""
+    """Returns the shapes, z up: a lattice within a lattice around a core, a part cut away."""
     foot = sdf.Extrusion(sdf.Sphere(1.7, color=SLATE), 0.12)
     parts = sdf.Sphere(0.27, color=CORE) | sdf.moved(foot, z=-1.06)
     for radius, depth, period, wall, color in BALLS:

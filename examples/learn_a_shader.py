@@ -13,7 +13,7 @@ from torch.nn.functional import mse_loss
 import gvtorch as gv
 
 SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
-ROWS, RATE, SHOWN = 24, 0.2, (5, 9, 15, 30, 120)  # a picture is made after so many steps
+ROWS, RATE, SHOWN = 24, 0.2, (5, 9, 15, 30, 120)  # SHOWN: steps that get a picture
 SKY = gv.Gradient((0.002, 0.003, 0.006), (0.012, 0.016, 0.028))
 
 
@@ -32,7 +32,7 @@ class Learned(torch.nn.Module):
         return look[:, :3].sigmoid(), 1 - torch.exp(-look[:, 3:].exp() * lengths)
 
     def transfer(self) -> gv.TransferFunction:
-        """What it has learned, for the compiled kernel."""
+        """Returns the learned function for the compiled kernel."""
         values = torch.linspace(0, 255, 256)[:, None]
         color, opacity = (x.detach().cpu() for x in self(values.to(self.rows), None, None, 1.0))
         points = [torch.cat((values, part), 1).tolist() for part in (opacity, color)]
@@ -41,7 +41,7 @@ class Learned(torch.nn.Module):
 
 @dataclass
 class Settings:
-    """Learns from views of the bundled aneurism; shows a new one as it is learned, and the aim."""
+    """Learns from views of the bundled aneurism; renders another one at times, and the target."""
 
     output: Path = Path("learn_a_shader.png")
     size: int = 720
@@ -49,7 +49,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    """Learns, and renders a view that is not learned from."""
+    """Learns, and renders a view that training does not use."""
     tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=settings.device)
     target, module = gv.TransferFunction.preset("vessels", 0, 255), Learned().to(tree.device)
     small = max(8, settings.size // 22)

@@ -1,5 +1,5 @@
-"""A small network learns a shape from samples; what it knows is streamed as voxels.
-Any module from places to values is a world: after 20, 80 and 240 steps, and the aim."""
+"""A small network learns a shape from samples, and is streamed as voxels: after 20, 80 and 240
+steps, and the target. Any module that maps positions to values can be streamed like this."""
 
 from copy import deepcopy
 from dataclasses import replace

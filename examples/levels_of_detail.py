@@ -1,5 +1,5 @@
 """Level of detail: the same scan from ever farther away, with the samples and bricks of each
-picture; and one picture of many of it, in an avenue that goes into the distance."""
+picture; and one picture of many copies of it, in an avenue that goes into the distance."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    """Renders each camera alone for its figures, then the avenue."""
+    """Renders each distance to print its statistics, then the avenue."""
     tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=settings.device)
     shader = gv.TransferFunction.preset("vessels", *tree.value_range["value"])
     side = settings.size * 16 // 45

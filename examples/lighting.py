@@ -16,7 +16,7 @@ SUN = gv.DirectionalLight((-1.0, -1.2, -0.8), (1.25, 1.1, 0.9), angle=4)
 SHINE = {"ambient": 0.5, "diffuse": 0.75, "specular": 0.2, "shininess": 30}
 VESSELS = gv.Isosurface(50, (0.85, 0.35, 0.25), light=SUN, **SHINE)
 SKY, EVENING = (0.75, 0.9, 1.15), gv.Gradient((0.2, 0.25, 0.34), (0.03, 0.035, 0.05))
-SIDE, WALL, SOFT = 96, 5.0, 3.0  # voxels: of the room, its walls, and the fade of surfaces
+SIDE, WALL, SOFT = 96, 5.0, 3.0  # voxels: the room, its walls, and soft edges of surfaces
 WHITE, RED, GREEN, BRASS = (0.8, 0.8, 0.8), (0.8, 0.1, 0.06), (0.12, 0.55, 0.1), (0.85, 0.7, 0.45)
 LAMP = gv.PointLight((46.0, 82.0, 66.0), (1.0, 0.95, 0.85), radius=7.0)
 MATT = {"ambient": 1.0, "diffuse": 1.0, "specular": 0.0}
@@ -34,7 +34,7 @@ class Settings:
 
 
 def room() -> gv.Volume:
-    """Premultiplied colour and opacity of walls, a block and a ball."""
+    """Returns premultiplied colour and opacity of walls, a block and a ball."""
     place = torch.arange(SIDE, dtype=torch.float32)
     z, y, x = torch.meshgrid(place, place, place, indexing="ij")
     u, v = (math.cos(a) * (x - 32) + math.sin(a) * (z - 34) for a in (0.35, 0.35 + math.pi / 2))

@@ -1,5 +1,5 @@
-"""A flight to the Mandelbulb's surface, from 2^-4 to 2^-30 of the box away from it, as a film: on a
-GPU it is flown live, one graph a frame, in a pool of fixed size.
+"""A film of a flight to the Mandelbulb's surface, from a distance of 2^-4 to 2^-30 of the box. On a
+GPU each frame is one replay of a captured CUDA graph, in a pool of fixed size.
 """
 
 import time
@@ -17,19 +17,19 @@ import gvtorch as gv
 
 @dataclass
 class Settings:
-    """Films the flight, and keeps its last picture."""
+    """Films the flight, and saves its last picture."""
 
     output: Path = Path("mandelbulb_film.png")
     film: Path = Path("mandelbulb_film.mp4")
     size: int = 360
     frames: int = 600
-    cone_scale: float = 2.0  # pixels that a voxel is wide
-    budget: int = 4096  # most bricks a frame
+    cone_scale: float = 2.0  # width of a voxel in pixels
+    budget: int = 4096  # bricks per frame, at most
     device: str = "cpu"
 
 
 def main(settings: Settings) -> None:
-    """Loads what is seen level by level, so that every place has a brick, then flies."""
+    """Loads the first view level by level, so that every ray finds a brick, then flies."""
     route, took = ways(), []
     size = settings.size * 16 // 9 // 2 * 2, settings.size
     pools = {"brick_pool": "512 MB", "load_budget": settings.budget, "loading": "levels"}
@@ -39,7 +39,7 @@ def main(settings: Settings) -> None:
     ):
         camera, shader = look(route, 4.0, *size, engine.device)
         options = {"cone_scale": settings.cone_scale}
-        engine.render(camera, shader, **options)  # where it begins
+        engine.render(camera, shader, **options)  # loads the first view
         draw = partial(engine.frame, shader=shader, **options)
         if engine.device.type == "cuda":
             draw = engine.capture(camera, shader, batch=settings.budget, fit=True, **options).replay

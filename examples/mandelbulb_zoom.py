@@ -1,4 +1,4 @@
-"""Four places on the way into the Mandelbulb, to 10^-6 of it; mandelbulb_film.py flies on."""
+"""Four stops of a flight into the Mandelbulb, down to 10^-6 of it; mandelbulb_film.py flies on."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,16 +17,16 @@ COLORS = ((1.0, 0.7, 0.3), (0.6, 0.13, 0.06), (0.05, 0.13, 0.3))  # of three orb
 
 @dataclass
 class Settings:
-    """Renders four places of the way, side by side."""
+    """Renders the four stops, side by side."""
 
     output: Path = Path("mandelbulb_zoom.png")
     size: int = 720
-    cone_scale: float = 4.5  # pixels that a voxel is wide: below 1 it is as sharp as it gets
+    cone_scale: float = 4.5  # width of a voxel in pixels; below 1 adds no sharpness
     device: str = "cpu"
 
 
 def ways() -> torch.Tensor:
-    """By level the direction from the place to the eye, with most room around it."""
+    """Returns (32, 3): for each level, the direction from PLACE to an eye with much room around."""
     shape, random = gv.Mandelbulb(8, iterations=20), torch.Generator().manual_seed(0)
     some, chosen = normalize(torch.randn((2000, 3), generator=random).double()), [PLACE]
     for level in range(32):
@@ -36,8 +36,8 @@ def ways() -> torch.Tensor:
 
 
 def look(ways: torch.Tensor, level: float, width: int, height: int, device: str):
-    """From 2^-level of the box away; the bulb as a surface a quarter of a voxel outside of it,
-    where opacity changes smoothly: inside it is 1.
+    """Returns a camera at 2^-level of the box from PLACE, and a shader that draws a surface a
+    quarter of a voxel outside of the bulb, where opacity changes smoothly: inside it is 1.
     """
     way = torch.lerp(ways[int(level)], ways[int(level) + 1], level % 1)
     eye, up = PLACE + BOX * 0.5**level * normalize(way, dim=0), torch.tensor([0, 0, 1]).double()
@@ -50,14 +50,14 @@ def look(ways: torch.Tensor, level: float, width: int, height: int, device: str)
 
 
 def bulb(iterations: int, device: str, **options) -> gv.Engine:
-    """An engine for it; each iteration adds details that are an eighth as large."""
+    """Returns an engine for the bulb; each iteration adds details that are an eighth as large."""
     solid = gv.Solid(gv.Mandelbulb(8, iterations=iterations, colors=COLORS), normals=False)
     producer = gv.FieldProducer(solid, 2**33, box=((-BOX / 2,) * 3, (BOX / 2,) * 3))
     return gv.Engine(producer, device=device, **options)
 
 
 def main(settings: Settings) -> None:
-    """Renders the places, each small before large: that loads most of what is seen."""
+    """Renders each stop, small before large: the small picture loads most of what is seen."""
     route, pictures, scale = ways(), [], settings.cone_scale
     haze = torch.tensor([0.16, 0.22, 0.3])
     for level in track((1.0, 7.0, 13.0, 20.0)):

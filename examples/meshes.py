@@ -13,7 +13,7 @@ SUN = gv.DirectionalLight((-0.8, -1.0, -0.55), (1.35, 1.2, 0.98), angle=4)
 LIGHT = gv.Lighting(ambient=(0.5, 0.58, 0.72), occlusion=0.9, cones=6, reach=0.12, frame="box")
 AROUND = {"lighting": LIGHT, "background": gv.Gradient((0.13, 0.23, 0.40), (0.52, 0.55, 0.55))}
 VIEW, GRASS = ((0.5, 1.15, 3.3), (0, 0.45, 0), (0, 1, 0), 30), (0.2, 0.34, 0.09, 1)
-#: File, texture, height, degrees around y, place x and z.
+#: File, texture, height, degrees around y, position x and z.
 PARTS = (
     ("building_castle_blue.gltf", None, 1.25, 20, -0.05, -0.25),
     ("trees_B_large.gltf", None, 0.50, 0, -0.85, 0.0),
@@ -24,7 +24,7 @@ PARTS = (
 
 @dataclass
 class Settings:
-    """Renders meshes by their voxels."""
+    """Renders meshes as voxels."""
 
     output: Path = Path("meshes.png")
     size: int = 720  # height of the picture
@@ -33,7 +33,7 @@ class Settings:
 
 
 def part(file: str, texture: str | None, height: float, turn: float, x: float, z: float) -> gv.Mesh:
-    """A mesh of a height, turned, that stands at (x, 0, z)."""
+    """Reads a mesh, scales it to a height, turns it by degrees, and puts it at (x, 0, z)."""
     mesh = gv.read_mesh(FOLDER / file, texture=texture and FOLDER / texture)
     low, high = mesh.bounds
     foot = np.array(((low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2))
@@ -43,7 +43,7 @@ def part(file: str, texture: str | None, height: float, turn: float, x: float, z
 
 
 def meadow(radius: float, count: int = 96) -> gv.Mesh:
-    """A round plate from y = -0.05 to a little above 0."""
+    """Returns a round plate from y = -0.05 to a little above 0."""
     turn = np.arange(count) * 2 * np.pi / count
     ring = radius * np.stack((np.cos(turn), 0 * turn, np.sin(turn)), 1)
     top, low, a = (0, 0.004, 0), (0, -0.05, 0), np.arange(count)
@@ -56,7 +56,7 @@ def meadow(radius: float, count: int = 96) -> gv.Mesh:
 
 
 def joined(meshes: list[gv.Mesh]) -> gv.Mesh:
-    """Meshes of one material each as one."""
+    """Joins meshes of one material each into one."""
     corners, uv = (np.concatenate([getattr(m, n) for m in meshes]) for n in ("corners", "uv"))
     material = np.repeat(np.arange(len(meshes)), [len(one.faces) for one in meshes])
     faces, looks = np.arange(len(corners) * 3).reshape(-1, 3), (*(m.materials[0] for m in meshes),)

@@ -1,5 +1,5 @@
 """Triangles and voxels in one picture: VTK's OpenGL draws rings and a disk that cross a scan. It
-takes our camera; its colours and depth buffer come back as a layer, on the GPU if both use it."""
+uses our camera; its colours and depth buffer come back as a layer, on the GPU if both use it."""
 
 import math
 import sys
@@ -19,15 +19,15 @@ if sys.platform == "linux" and not (find_library("EGL") or find_library("OSMesa"
     sys.exit("mixed_triangles needs OpenGL: a GPU's driver with EGL, or Mesa's EGL or OSMesa")
 
 SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
-EYE, TARGET, UP = (-120.0, -300.0, -30.0), (68.0, 62.0, 126.0), (1.0, 0.3, 0.0)  # it lies
+EYE, TARGET, UP = (-120.0, -300.0, -30.0), (68.0, 62.0, 126.0), (1.0, 0.3, 0.0)  # lying
 SKY = gv.Gradient((0.05, 0.07, 0.11), (0.008, 0.009, 0.014))
 RINGS = [(82, 58, 205), (80, 60, 170), (79, 58, 135), (76, 54, 100)]  # centres, around the vessel
 DISK, BLUE, GREEN = (64, 64, 58), (0.3, 0.5, 0.9), (0.2, 0.75, 0.55)
 
 
 def rasterise(parts, camera: gv.Camera, near: float, far: float, device="cpu") -> gv.Layer:
-    """Draws (source, place, colour) for the pixels of a camera in world units."""
-    vtk.vtkObject.GlobalWarningDisplayOff()  # else it warns of each display it did not find
+    """Draws parts (source, position, colour) with VTK for a camera in world units, as a layer."""
+    vtk.vtkObject.GlobalWarningDisplayOff()  # else it warns of each display not found
     renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
     window.SetOffScreenRendering(True)
     window.SetMultiSamples(0)  # a pixel has one depth

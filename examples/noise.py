@@ -1,4 +1,4 @@
-"""Eight balls, each raised and coloured by a noise of `gv.noise`."""
+"""Eight balls, each displaced and coloured by one noise of `gv.noise`."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,7 +15,7 @@ SEA = [(0.01, 0.03, 0.12), (0.02, 0.25, 0.45), (0.45, 0.8, 0.8), (1.0, 0.95, 0.8
 FIRE = [(0.06, 0.01, 0.02), (0.5, 0.05, 0.02), (1.0, 0.45, 0.05), (1.0, 0.95, 0.6)]
 MOSS = [(0.03, 0.06, 0.03), (0.15, 0.28, 0.06), (0.55, 0.5, 0.25), (0.95, 0.92, 0.85)]
 WALLS = partial(noise.cellular, feature="F2-F1")
-#: Name: noise, cells a unit, the values of the first and the last colour, colours.
+#: Name: noise, cells per unit length, the values of the first and the last colour, colours.
 BALLS = {
     "perlin": (noise.perlin, 5, (-0.6, 0.6), SEA),
     "simplex": (noise.simplex, 4, (-0.8, 0.8), SEA),
@@ -29,7 +29,7 @@ BALLS = {
 
 
 class Ball(gv.Field):
-    """Premultiplied colour and opacity of a ball that noise raises."""
+    """Premultiplied colour and opacity of a ball that is displaced by noise."""
 
     def __init__(self, noise, frequency, ends, colors):
         super().__init__()
@@ -38,7 +38,7 @@ class Ball(gv.Field):
         self.prefiltered, self.threshold = True, {"rgba": 0.0}
 
     def filtered(self, points, size):
-        """Noise is that in the middle of a voxel; the edge is three voxels wide."""
+        """Evaluates noise in the middle of each voxel; the edge is three voxels wide."""
         noise, (low, high) = self.noise(points * self.frequency), self.ends
         share = ((noise - low) / (high - low)).clamp(0, 1)
         gap = 0.88 + 0.1 * share - points.norm(dim=-1)
@@ -49,7 +49,7 @@ class Ball(gv.Field):
         return {"rgba": torch.cat((color * alpha, alpha), -1)}
 
     def bounds(self, center, half):
-        """Nothing lies beyond the radius 1."""
+        """Returns the least and greatest values: both are 0 beyond the radius 1."""
         near = (center.abs() - half).clamp(min=0).norm(dim=1, keepdim=True) < 1
         return {"rgba": (torch.zeros(len(near), 4).to(center), near.to(center).expand(-1, 4))}
 

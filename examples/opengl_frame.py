@@ -1,5 +1,5 @@
 """A frame drawn by OpenGL and gvtorch: OpenGL draws a ball, voxels join it, and OpenGL adds the
-edges of the box, which voxels and ball hide. On an NVIDIA GPU no picture passes through the host.
+edges of the box, behind voxels and ball. On an NVIDIA GPU no picture passes through the host.
 """
 
 import sys
@@ -19,7 +19,7 @@ except ImportError as error:
     sys.exit(f"opengl_frame needs moderngl: pip install moderngl ({error})")
 
 SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
-EYE, TARGET, UP = (-170.0, -290.0, 30.0), (62.0, 62.0, 128.0), (1.0, 0.3, 0.0)  # it lies
+EYE, TARGET, UP = (-170.0, -290.0, 30.0), (62.0, 62.0, 128.0), (1.0, 0.3, 0.0)  # lying
 BALL, RADIUS, TEAL, SIDES = (82.0, 46.0, 130.0), 30.0, (0.05, 0.55, 0.4), 192
 SUN, GOLD, NIGHT = torch.tensor([(0.6, -0.7, -0.3), (0.9, 0.5, 0.1), (0.01, 0.013, 0.022)])
 EDGES = torch.tensor([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
@@ -32,7 +32,7 @@ void main() { result = vec4(tint, 1); }"""
 
 
 def ball() -> Tensor:
-    """(k, 6) place and colour of a strip of triangles that winds from pole to pole."""
+    """Returns (k, 6): position and colour of a triangle strip that winds from pole to pole."""
     turn = (torch.arange(-SIDES, SIDES**2 + 1)[:, None] / SIDES + torch.arange(2)).flatten()
     u, v = 2 * torch.pi * turn, torch.pi * (turn / SIDES).clamp(0, 1)
     normals = torch.stack((v.sin() * u.cos(), v.sin() * u.sin(), v.cos()), 1)
@@ -41,7 +41,7 @@ def ball() -> Tensor:
 
 
 def main(output: Path = Path("opengl_frame.png"), size: int = 720, device: str = "cpu") -> None:
-    """Draws with OpenGL, with voxels, and with OpenGL again; four pixels for each that is saved."""
+    """Draws with OpenGL, with voxels, and with OpenGL again, at twice the saved resolution."""
     width, height = size * 16 // 9 * 2, size * 2
     camera = gv.Camera.look_at(EYE, TARGET, UP, 28, width, height)
     projection, modelview = gv.opengl.matrices(camera, near=100, far=1000)

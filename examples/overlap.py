@@ -1,6 +1,6 @@
-"""Two volumes in the same space: a CT scan, and a coarse map of uptake as from a PET scanner, which
-has voxels of another size, at another place and turned. They are composited by sample, so that each
-is seen through the other. The uptake is made up: what is full of contrast agent, blurred.
+"""Two volumes in the same space: a CT scan, and a coarse map of uptake as from a PET scanner, whose
+grid differs in voxel size, position and orientation. They are composited sample by sample, so that
+each is seen through the other. The uptake is made up: regions with contrast agent, blurred.
 """
 
 import math
@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool3d, grid_sample
 import gvtorch as gv
 
 SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
-COARSE = 4  # CT voxels along a side of one of the uptake's
+COARSE = 4  # side of an uptake voxel, in CT voxels
 TILT = 20  # degrees by which the uptake's axes are turned about x
 BONE = gv.TransferFunction(
     opacity=[(150, 0), (260, 0.03), (420, 0.2), (1000, 0.8)],
@@ -27,7 +27,7 @@ UPTAKE = gv.TransferFunction(
 
 
 def pose_about(middle: torch.Tensor) -> torch.Tensor:
-    """(4, 4) from the uptake's axes to the world, about a place that stays where it is."""
+    """Returns the pose (4, 4) from the uptake's axes to the world: a turn about `middle`."""
     cos, sin = math.cos(math.radians(TILT)), math.sin(math.radians(TILT))
     pose = torch.eye(4, dtype=torch.float64)
     pose[1:3, 1:3] = torch.tensor([[cos, -sin], [sin, cos]])
@@ -45,7 +45,7 @@ def uptake_of(scan: gv.Volume) -> tuple[gv.Volume, torch.Tensor]:
             blurred = avg_pool3d(blurred, kernel, 1, [side // 2 for side in kernel])
     extent = torch.tensor(scan.extent, dtype=torch.float64)
     middle = (extent - 1) / 2
-    pose, count = pose_about(middle), (1.3 * extent / COARSE).long()  # it is turned, and wider
+    pose, count = pose_about(middle), (1.3 * extent / COARSE).long()  # wider, because it is turned
     origin = middle - (count - 1) / 2 * COARSE
     axes = [o + COARSE * torch.arange(int(n)) for o, n in zip(origin, count, strict=True)]
     own = torch.stack(torch.meshgrid(*axes[::-1], indexing="ij")[::-1], -1)  # x, y, z
@@ -57,7 +57,7 @@ def uptake_of(scan: gv.Volume) -> tuple[gv.Volume, torch.Tensor]:
 
 
 def main(output: Path = Path("overlap.png"), size: int = 1280, device: str = "cpu") -> None:
-    """Renders both."""
+    """Renders both volumes into one picture."""
     scan = gv.read_volume(SCAN)
     uptake, pose = uptake_of(scan)
     trees = {

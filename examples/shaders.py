@@ -29,7 +29,7 @@ class Settings:
 
 
 def channels(scan: gv.Volume, transfer: gv.TransferFunction) -> dict[str, gv.Volume]:
-    """The scan; its voxels' colours and normals; the distance to a helix."""
+    """Returns the scan, its voxels' colours and normals, and the distance to a helix."""
     value = scan.data[..., 0].float()
     normal = torch.nn.functional.normalize(-torch.stack(torch.gradient(value)[::-1], -1), dim=-1)
     z, y, x = torch.meshgrid(*(torch.arange(float(n)) for n in value.shape), indexing="ij")

@@ -1,5 +1,5 @@
-"""A scan as a radiologist's sheet: the picture in space, three slices in line with it, the colours
-of values, lengths and notes. Thin lines show in each slice where the two others lie.
+"""A scan as a radiologist's sheet: a 3D picture and three slices, with a colour bar, scale bars and
+notes. Thin lines show in each slice where the two others lie.
 """
 
 from dataclasses import replace
@@ -13,7 +13,7 @@ import gvtorch as gv
 
 DATA = Path(__file__).parent / "data"
 AT = (72, 47, 128)  # the voxel in which the slices meet
-SPAN = (0, 900)  # of the slices' grays
+SPAN = (0, 900)  # values from black to white in slices
 EYE, UP = (-190.0, -240.0, 190.0), (0.0, 0.0, 1.0)
 SKY = gv.Gradient((0.012, 0.018, 0.03), (0.002, 0.002, 0.004))
 LINE = torch.tensor((0.9, 0.45, 0.05))
@@ -27,7 +27,7 @@ def main(output: str = "sheet.png", device: str = "cpu", size: int = 720) -> Non
     scale = (size - gap) / (nz + ny)  # pixels a voxel
     sheet = torch.full((size, size * 16 // 9, 3), 0.002)
     wide, high = round(nx * scale), round(nz * scale)
-    first, below = sheet.shape[1] - 2 * wide - gap, high + gap  # where the slices begin
+    first, below = sheet.shape[1] - 2 * wide - gap, high + gap  # column and row where they begin
     for axis, left, top, lines in (
         ("y", first, 0, (AT[0] / nx, 1 - AT[2] / nz)),
         ("x", first + wide + gap, 0, (AT[1] / ny, 1 - AT[2] / nz)),
@@ -48,7 +48,7 @@ def main(output: str = "sheet.png", device: str = "cpu", size: int = 720) -> Non
     flat = replace(picture, color=sheet, alpha=torch.ones_like(sheet[..., :1]))
     distance = (torch.tensor(EYE) - torch.tensor(AT)).norm()
     text = f"CT angiogram, abdominal aorta with a stent\n{nx} x {ny} x {nz} voxels"
-    if size >= 240:  # smaller, nothing could be read
+    if size >= 240:  # text would be unreadable below that
         bar = gv.ColorBar(colors=colors, low=140, high=1000, title="CT value")
         pixel = {"pixel": camera.pixel_width(float(distance)), "unit": "voxels"}
         over = gv.Overlay(first - gap, size, bar=bar, text=text, **pixel)

@@ -1,5 +1,5 @@
-"""The stars around the Sun: voxels that hold their light where they are far, points where they are
-near. They are those of a catalogue (positions in parsecs, luminosities, B-V), or made up.
+"""The stars around the Sun: far stars as voxels that hold their light, near ones as points. They
+come from a catalogue (positions in parsecs, luminosities, B-V), or are made up.
 
     python examples/stars.py --catalog hyg_stars.npz
 """
@@ -12,7 +12,7 @@ import tyro
 
 import gvtorch as gv
 
-OPACITY, VIVID = 0.02, 1.5  # of a star in a voxel; colours to this power
+OPACITY, VIVID = 0.02, 1.5  # opacity of a star in its voxel; exponent of its colour
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Settings:
 
 
 def made_up(count: int = 60_000) -> tuple[gv.Points, np.ndarray]:
-    """Stars as far as they would be seen, the brighter the farther, and their B-V."""
+    """Returns stars within the distance at which they are visible, and their B-V."""
     random = np.random.default_rng(4)
     luminosity = 0.5 * random.random(count) ** -0.9
     away = np.minimum(90 * np.sqrt(luminosity), 900) * random.random(count) ** 0.5
@@ -40,8 +40,8 @@ def made_up(count: int = 60_000) -> tuple[gv.Points, np.ndarray]:
 
 
 def star_color(index: np.ndarray) -> np.ndarray:
-    """(n, 3) linear colours by B-V: the temperature by Ballesteros (2012), and Planck's law at the
-    wavelengths of red, green and blue, beside the Sun's.
+    """Returns (n, 3) linear colours from B-V: the temperature by Ballesteros (2012), and Planck's
+    law at the wavelengths of red, green and blue, relative to the Sun's light.
     """
     at = np.clip(index, -0.35, 2.0)
     kelvin = np.r_[5800, 4600 * (1 / (0.92 * at + 1.7) + 1 / (0.92 * at + 0.62))]

@@ -1,4 +1,4 @@
-"""Voxels of a hare as triangles at three levels of detail, which become voxels again when seen."""
+"""A hare's voxels as triangles at three levels of detail, which are rendered as voxels again."""
 
 from dataclasses import dataclass
 from functools import partial, reduce
@@ -12,14 +12,14 @@ import tyro
 import gvtorch as gv
 
 sdf = gv.sdf
-LIMBS = (  # of a hare: where each begins and ends, and its radius
+LIMBS = (  # of a hare: start, end and radius of each
     *(((-0.1, -0.15, 0), (0.35, -0.12, 0), 0.46), ((-0.55, 0.35, 0), (-0.68, 0.32, 0), 0.27)),
     *(((-0.52, 0.6, z), (-0.36, 1.12, 2 * z), 0.12) for z in (-0.15, 0.15)),
     *(((-0.4, -0.5, z), (-0.68, -0.53, z), 0.13) for z in (-0.22, 0.22)),
     *(((0.35, -0.45, z), (-0.02, -0.52, z), 0.17) for z in (-0.3, 0.3)),
     ((0.82, -0.02, 0), (0.86, 0.02, 0), 0.16),
 )
-#: Level: where its hare sits, and its colour.
+#: Level: x position and colour of its hare.
 HARES = {3: (-2.3, (0.05, 0.26, 0.34)), 2: (0.0, (0.75, 0.4, 0.08)), 0: (2.3, (0.62, 0.1, 0.05))}
 FLOOR, PLATE = (0.2, 0.21, 0.23), ((9.0, 0.13, 4.0), (0, -0.735, 0))  # its size and middle
 SUN = gv.DirectionalLight((0.9, -1.0, -0.75), (1.5, 1.22, 0.9), angle=8)
@@ -39,7 +39,7 @@ class Settings:
 
 
 def hare(voxels: int) -> gv.N3Tree:
-    """Which part of each voxel the hare fills, and means of these."""
+    """Returns a tree of the fraction of each voxel that the hare fills, and of means of these."""
     shape = gv.Solid(reduce(partial(sdf.SmoothUnion, width=0.12), starmap(sdf.Capsule, LIMBS)))
     step = 2.6 / voxels
     axis = (torch.arange(voxels) + 0.5) * step - 1.3
@@ -66,7 +66,7 @@ def main(settings: Settings) -> None:
     fine = {"reference": 0.3 * producer.spacing[0], "premultiplied": True, "normals": "normal"}
     look = gv.StoredColor("color", **fine, ambient=1, diffuse=1, specular=0.08, shininess=30)
     with gv.Engine(producer, device=settings.device) as engine:
-        for part, mode in ((4, "converge"), (1, "interactive")):  # a small picture asks for all
+        for part, mode in ((4, "converge"), (1, "interactive")):  # the small picture loads all
             size = settings.size * 16 // 9 // part, settings.size // part
             camera = gv.Camera.look_at((-1.6, 2.2, 8.5), (0, 0.12, 0), (0, 1, 0), 27, *size)
             options = {"lighting": LIGHT, "background": WALL, "cone_scale": 1.2 / part}

@@ -1,4 +1,4 @@
-"""Mountains in the evening sun: octaves of noise, less of them where the ground is steep."""
+"""Mountains in the evening sun: octaves of noise, damped where the ground is steep."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ noise, tensor, normalize = gv.noise, torch.tensor, torch.nn.functional.normalize
 BOX, EXTENT = ((-4.0, 0.0, -8.0), (4.0, 1.6, 2.0)), (1229, 246, 1536)  # y up
 EYE, TARGET = (0.0, 1.05, 2.6), (0.1, 0.7, -1.6)
 SUN = gv.DirectionalLight((0.86, -0.3, 0.42), (4.0, 2.1, 0.95), angle=2)
-DAY = gv.DirectionalLight((-0.3, -1.0, -0.2), (0.2, 0.36, 0.8), angle=60)  # all of the blue sky
+DAY = gv.DirectionalLight((-0.3, -1.0, -0.2), (0.2, 0.36, 0.8), angle=60)  # the whole blue sky
 LIGHT = gv.Lighting(lights=(SUN, DAY), ambient=(0.07, 0.1, 0.18))
 SNOW, ROCK, GRASS = tensor([(0.9, 0.92, 0.95), (0.23, 0.2, 0.19), (0.17, 0.16, 0.09)])
 APART = tensor([(0.0, 0.0), (0.01, 0.0), (0.0, 0.01)])

@@ -28,7 +28,7 @@ class Settings:
 
 
 def wall() -> gv.Volume:
-    """Premultiplied colour and opacity of two disks, one behind the other, with round windows."""
+    """Returns premultiplied colour and opacity of two disks with windows, one behind the other."""
     y, x = torch.meshgrid(*(torch.arange(SIDE) - (SIDE - 1) / 2,) * 2, indexing="ij")
     away, turn = torch.hypot(x, y), torch.atan2(y, x)
     petal = torch.remainder(turn, torch.pi / 4) - torch.pi / 8

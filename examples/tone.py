@@ -1,4 +1,4 @@
-"""From scene light to the display: a picture before a bright sky, clipped, with Reinhard's curve
+"""From scene light to the display: a picture with a bright sky, clipped, with Reinhard's curve
 and with a filmic one; and a transparent PNG. All with 8 rays a pixel.
 """
 
@@ -26,7 +26,7 @@ class Settings:
 
 
 def sky(height: int = 768) -> torch.Tensor:
-    """An equirectangular map: dusk, a sun twelve times as bright as white, clouds, and the sea."""
+    """Returns an equirectangular map: dusk, a sun twelve times as bright as white, clouds, sea."""
     up = torch.linspace(1, -1, height)[:, None, None]
     across = torch.linspace(-1, 1, 2 * height)[None, :, None]
     above = up.abs()  # the sea mirrors the sky

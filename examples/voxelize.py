@@ -1,4 +1,4 @@
-"""Triangles become voxels while they are looked at: a knot on a plate, or a mesh of yours."""
+"""Triangles become voxels where they are looked at: a knot on a plate, or a mesh of yours."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ ALONG, AROUND, PLATE = 640, 48, np.array((0.42, 0.41, 0.40))
 
 @dataclass
 class Settings:
-    """Renders a mesh by its voxels."""
+    """Renders a mesh as voxels."""
 
     output: Path = Path("voxelize.png")
     size: int = 720  # height of the picture
@@ -27,7 +27,7 @@ class Settings:
 
 
 def knot_on_plate() -> gv.Mesh:
-    """A rope along the torus knot (2, 3), red to gold to blue, and a ring below it: two solids."""
+    """Returns two solids: a rope along the torus knot (2, 3), red to gold to blue; a ring below."""
     t, a = (np.arange(n) * 2 * np.pi / n for n in (ALONG, AROUND))
     t, a = t[:, None, None], a[None, :, None]
     x, y, z, wide = np.cos(2 * t), np.sin(3 * t), np.sin(2 * t), 1 + 0.42 * np.cos(3 * t)
@@ -50,7 +50,7 @@ def knot_on_plate() -> gv.Mesh:
 
 
 def grid(points: np.ndarray, paint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of a grid (n, m, 3) that is closed both ways: corners, and their colours."""
+    """Returns corners and colours of the triangles of a grid (n, m, 3) that wraps both ways."""
     color = np.concatenate((paint + 0 * points, np.ones_like(points[..., :1])), -1)
     found = []
     for one in (points, color):

@@ -1,4 +1,4 @@
-"""Fixtures, and a summary that tells how many tests ran on each backend."""
+"""Fixtures, and a summary that states how many tests ran on each backend."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests by hypothesis come first: in processes that had run thousands of others, Python 3.11's
-    interpreter was seen to loop for ever in hypothesis' own code, at its first instruction.
+    """Moves tests by hypothesis to the front: in processes that had run thousands of other tests,
+    Python 3.11's interpreter was seen to loop forever at the first instruction of hypothesis' code.
     """
     items.sort(
         key=lambda item: not getattr(getattr(item, "obj", None), "is_hypothesis_test", False)
@@ -64,7 +64,7 @@ def compiled(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Where compiled shaders are kept: each is compiled once for all tests, and none stays."""
+    """A temporary cache folder of compiled shaders: each is compiled once for all tests."""
     with pytest.MonkeyPatch.context() as patch:
         base = tmp_path_factory.getbasetemp()
         folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
@@ -74,7 +74,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def quick(cache: Path) -> str:
-    """A compiler that does not optimise, one for all processes: what it compiled is kept."""
+    """A compiler that does not optimise, shared by all processes so that they share its cache."""
     folder = cache.parent / "quick"
     if not folder.exists():
         made = cache.parent / f"quick-{os.getpid()}"
@@ -117,7 +117,7 @@ def stent() -> gv.Volume:
 
 @pytest.fixture(scope="session")
 def blobs() -> gv.Volume:
-    """A small smooth volume of no special extent, with empty space around: float32, anisotropic."""
+    """A small smooth float32 volume with odd extents, anisotropic voxels and empty space around."""
     z, y, x = np.mgrid[0:37, 0:29, 0:45].astype(np.float32)
     value = np.zeros_like(x)
     for cx, cy, cz, r in ((14, 10, 12, 7), (30, 18, 22, 9), (22, 14, 30, 4)):
@@ -136,7 +136,7 @@ def channels(blobs) -> dict[str, gv.Volume]:
     normal = torch.nn.functional.normalize(normal, dim=-1) * 0.5 + 0.5
     place = blobs.spacing, blobs.origin
     six = gv.Volume(rgba, *place).directional()
-    six.data = six.data * torch.linspace(0.6, 1.0, 24).to(six.data)  # no two of them are equal
+    six.data = six.data * torch.linspace(0.6, 1.0, 24).to(six.data)  # all six differ
     return {
         "value": blobs,
         "rgba": gv.Volume((rgba * 255).round().to(torch.uint8), *place),
@@ -160,7 +160,7 @@ def session():
 
 @pytest.fixture(scope="module")
 def chromium():
-    """The browser; a skip that the summary tells of where there is none."""
+    """The browser; without one, a skip that the summary reports."""
     if reason := browser.absent():
         pytest.skip(f"browser: {reason}")
     with browser.running() as found:
@@ -177,7 +177,7 @@ def viewer():
 
 @pytest.fixture
 def tab(chromium, viewer):
-    """Its page in the browser, which must not have complained in the end."""
+    """The viewer's page in the browser; fails if the page has logged errors or warnings."""
     made = browser.Tab(chromium, viewer.url)
     made.until("app?.state")
     made.final()
@@ -188,8 +188,8 @@ def tab(chromium, viewer):
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Notes the backends of a test, which its report takes along, from whatever process; skips it
-    where it is marked for CUDA and there is none.
+    """Adds a test's backends to the properties of its report, which workers send to the main
+    process; skips it if it is marked for CUDA and there is none.
     """
     values = getattr(item, "callspec", None)
     names = {
@@ -225,18 +225,18 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    """With GVTORCH_REQUIRE=cpp,opengl,io a run in which no test passed on the C++ backend or in
-    OpenGL has failed, and so has one whose tests were skipped because a format's, the video's, the
-    cluster's or the rasteriser's library is missing.
+    """With GVTORCH_REQUIRE=cpp,opengl,io, fails a run in which no test passed on the C++ backend or
+    in OpenGL, or in which a library of a format, the video, the cluster or the rasteriser is
+    missing.
     """
     if hasattr(session.config, "workerinput"):
-        return  # one of several processes
+        return  # a worker: the main process decides
     if session.exitstatus == 0 and _missing():
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 def _missing() -> list[str]:
-    """What must run, and did not."""
+    """Returns what GVTORCH_REQUIRE names and did not run."""
     libraries = (
         "nibabel nrrd tifffile imagecodecs astropy OpenEXR av PIL matplotlib distributed zarr "
         "yaozarrs ome_zarr_models vtk moderngl aiohttp anywidget h5py jupyterlab trimesh pydicom "

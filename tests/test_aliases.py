@@ -31,7 +31,7 @@ def world(cells: int = CELLS, seed: int = 0) -> gv.Volume:
 
 
 class Cells(gv.VolumeProducer):
-    """Tells that all cells are one of them."""
+    """A volume of equal cells, all but one of which are aliases of that one."""
 
     later = False
 
@@ -41,7 +41,7 @@ class Cells(gv.VolumeProducer):
         self.filled = self.asked = 0
 
     def same(self, nodes):
-        """Places of alias targets, and which nodes are aliases."""
+        """Returns the locs of alias targets, and which nodes are aliases."""
         depth = nodes.layout.depth - (CELL // nodes.layout.brick_size).bit_length() + 1
         loc = nodes.loc.cpu()
         is_cell = (loc[:, 3] == depth) & (loc[:, :3] != self.one).any(1)
@@ -85,7 +85,7 @@ def views(size=24):
 )
 @pytest.mark.parametrize("one", [(0, 0, 0), (3, 1, 2)])
 def test_equal_cells_are_made_once(backend, loading, by_fill, one):
-    """Not more bricks than one cell has, and the pictures of the resident tree, in every bit."""
+    """It takes no more bricks than one cell; pictures equal the resident tree's in every bit."""
     volume, device = world(), DEVICES[backend]
     tree = gv.N3Tree.from_volume(volume, 4, threshold=0.0, device=device)
     options = {"brick_size": 4, "brick_pool": "16 MB", "loading": loading, "device": device}
@@ -107,7 +107,7 @@ def test_equal_cells_are_made_once(backend, loading, by_fill, one):
 
 @pytest.mark.backend("cpp")
 def test_a_target_that_no_ray_sees_is_made_and_stays():
-    """The camera sees one cell alone, the one that it is the same as lies behind it."""
+    """The camera sees only one cell; the cell that it is an alias of lies behind the camera."""
     volume = world()
     producer = Cells(volume, (0, 0, 0), threshold=0.0)
     end = CELL * (CELLS - 0.5)
@@ -127,7 +127,7 @@ def test_a_target_that_no_ray_sees_is_made_and_stays():
 
 
 class Chain(gv.Producer):
-    """Eight octants, told to be the same as others by a table; brightness by what fills them."""
+    """Eight octants, some of them aliases of others by a table; each fill has its brightness."""
 
     def __init__(self, same: dict[int, tuple[int, int, int, int]], extent=32) -> None:
         super().__init__(extent)
@@ -151,7 +151,7 @@ class Chain(gv.Producer):
 
 
 def at(engine, loc):
-    """Brick words of nodes at places, -9 where there is none."""
+    """Returns the brick words of the nodes at locs, -9 where there is no node."""
     node = engine.trees["scene"].tree.find(torch.tensor(loc))
     words = engine.cache.nodes.brick_tn.view(-1)
     return torch.where(node >= 0, words[node.clamp(min=0)], -9).tolist()
@@ -262,8 +262,8 @@ def test_a_sponge_of_one_tile_is_cut_as_whole_numbers_tell():
 
 
 class Forest(gv.Producer):
-    """Cells of 32^3 voxels: each third is what another tree holds, others are half empty and half
-    made of small copies.
+    """Cells of 32^3 voxels: a third are aliases of another tree's root, the others are half empty
+    and half made of small copies of it.
     """
 
     def __init__(self, tree: str | None, goal=(0, 0, 0, 0), branching: int = 2) -> None:
@@ -282,7 +282,7 @@ class Forest(gv.Producer):
         return {"value": torch.zeros((len(nodes), *(nodes.layout.side,) * 3))}
 
     def whole(self, plant: gv.VolumeProducer) -> gv.Volume:
-        """The same as voxels."""
+        """Returns the scene as a volume."""
         small, large = (level[..., 0].cpu() for level in plant._values["value"][-2:])
         found = torch.zeros((128, 128, 128))
         for z, y, x in itertools.product(range(8), repeat=3):
@@ -298,7 +298,7 @@ class Forest(gv.Producer):
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_a_forest_is_made_of_another_producers_tree(backend):
-    """Instances cost no bricks, and follow when what they are copies of is another."""
+    """Instances cost no bricks, and follow when their target changes."""
     options = {"brick_size": 4, "brick_pool": "4 MB", "device": DEVICES[backend]}
     plant = gv.VolumeProducer(world(1), threshold=0.0)
     forest = Forest("plant")
@@ -358,8 +358,8 @@ def test_replays_are_left_to_the_host_while_there_are_aliases():
 
 
 def flight(seed: int, volume: gv.Volume, tree: gv.N3Tree, device: torch.device) -> tuple[bool, int]:
-    """Flies once, with faults and renewals; returns whether its last picture was whole: then it is
-    the resident one. And how many tiles and bricks were given away.
+    """Flies once, with faults and renewals; returns whether its last picture was complete (then it
+    equals the resident tree's), and how many tiles and bricks were evicted.
     """
     pick = random.Random(seed)
     one = tuple(pick.randrange(CELLS) for _ in range(3))

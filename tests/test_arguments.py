@@ -19,7 +19,7 @@ WALKED = ("count_segments", "write_segments")
 
 
 def fields(record: type) -> list[tuple[str, str]]:
-    """Names and types of a record, in the words of a schema."""
+    """Returns names and types of a record, spelled as in a schema."""
     return [
         (name, f"Optional[{TYPES[get_args(hint)[0]]}]" if get_args(hint) else TYPES[hint])
         for name, hint in get_type_hints(record).items()

@@ -1,4 +1,4 @@
-"""Workloads: each runs and gives finite figures, peers agree, what is missing is named."""
+"""Workloads: each runs and returns finite figures, peers agree, and missing ones are named."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gvtorch.tools.bench import Bench
 
 QUICK = {"quick": True, "repeats": 1}
 CPU = Settings(device=torch.device("cpu"), **QUICK)
-#: What the rows of a workload must tell, beside the times.
+#: Columns that the rows of a workload must have in addition to times.
 FIGURES = {
     "march": {"samples", "samples_per_second", "rays_per_second", "op_ms", "rms_difference"},
     "first_hit": {"rays_per_second", "max_difference", "mean_difference", "times"},
@@ -47,13 +47,13 @@ FIGURES = {
 
 
 def figures(value) -> list[float]:
-    """All numbers inside a row."""
+    """Returns all numbers inside a row."""
     if isinstance(value, dict):
         return [number for item in value.values() for number in figures(item)]
     return [] if value is None or isinstance(value, (str, bool)) else [value]
 
 
-@pytest.mark.filterwarnings("default")  # of torch.compile's own making
+@pytest.mark.filterwarnings("default")  # torch.compile's own warnings
 @pytest.mark.parametrize("name", bench.WORKLOADS)
 def test_a_workload_gives_finite_figures_as_json(name, compiled, monkeypatch, quick):
     monkeypatch.setenv("CXX", quick)
@@ -238,7 +238,7 @@ def test_the_command_prints_json_and_plots_write_the_page(tmp_path):
 
 @pytest.mark.backend("browser")
 def test_a_hand_in_a_browser_sees_its_jump(chromium, viewer):
-    """Pictures while it drags, and after a jump of the pointer one that shows it."""
+    """Pictures arrive while the mouse drags, and one that shows the jump of the pointer."""
     page = browser.Page(chromium, viewer.url, pages.PAGES["gvtorch"][1], (320, 200))
     try:
         shown = page.page.evaluate("() => document.querySelector('.gv-picture').clientWidth")

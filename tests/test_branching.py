@@ -1,5 +1,5 @@
-"""Producers of every kind in trees of any N: the finest voxels do not depend on it, coarse ones are
-means of them, and what is told of regions holds.
+"""Producers of every kind in trees of any N: the finest voxels do not depend on N, coarse ones are
+their means, and what `classify` states of regions is true.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Waves(torch.nn.Module):
 
 
 class Ball(gv.Producer):
-    """A producer of one's own."""
+    """A user-defined producer."""
 
     def __init__(self, branching):
         super().__init__(EXTENT, box=BOX, branching=branching)
@@ -77,7 +77,7 @@ def mesh(branching):
     )
 
 
-#: By kind how it is made, and how far voxels above the finest level may be from their means.
+#: Kind: how it is made, and how far voxels above the finest level may be from their means.
 KINDS = {
     "own": (Ball, None),
     "field": (field, 0.02),
@@ -101,7 +101,7 @@ def layout_of(producer: Producer) -> Layout:
 
 
 def places(layout: Layout, depth: int) -> torch.Tensor:
-    """(k, 4) of all nodes of a level that lie in the world, in the order z, y, x."""
+    """Returns the locs (k, 4) of all nodes of a level within the extent, in the order z, y, x."""
     step = layout.brick_size * layout.branching ** (layout.depth - depth)
     z, y, x = (torch.arange(-(-n // step)) for n in layout.extent[::-1])
     zyx = torch.cartesian_prod(z, y, x)
@@ -109,7 +109,7 @@ def places(layout: Layout, depth: int) -> torch.Tensor:
 
 
 def level(producer: Producer, layout: Layout, depth: int) -> dict[str, torch.Tensor]:
-    """By channel (z, y, x, c) all voxels of a level, those beyond the extent left out."""
+    """Returns by channel (z, y, x, c) all voxels of a level within the extent."""
     loc = places(layout, depth)
     z, y, x = (loc[:, :3].amax(0) + 1).flip(0).tolist()
     scale = layout.branching ** (layout.depth - depth)
@@ -123,7 +123,7 @@ def level(producer: Producer, layout: Layout, depth: int) -> dict[str, torch.Ten
 
 
 def means(values: torch.Tensor, n: int) -> torch.Tensor:
-    """Of n^3 voxels each, of whole cubes alone."""
+    """Returns the means of cubes of n^3 voxels, of complete cubes only."""
     z, y, x = (size // n for size in values.shape[:3])
     cubes = values[: z * n, : y * n, : x * n].reshape(z, n, y, n, x, n, -1)
     return cubes.mean((1, 3, 5))
@@ -160,7 +160,7 @@ def test_voxels_are_right_in_trees_of_any_n(kind, branching):
 @pytest.mark.parametrize("branching", [2, 3, 4])
 @pytest.mark.parametrize("kind", KINDS)
 def test_regions_hold_in_trees_of_any_n(kind, branching):
-    """What is told of a node is true of all finest voxels in it."""
+    """What `classify` states of a node is true of all finest voxels in it."""
     producer = KINDS[kind][0](branching)
     layout = layout_of(producer)
     fine = level(producer, layout, layout.depth)

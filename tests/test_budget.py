@@ -1,4 +1,4 @@
-"""The watch over the time that a header takes: it ends the work of its thread, and nothing else."""
+"""The time limit for reading a header: it ends the work of its own thread, and nothing else."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from gvtorch.io import budget
 
 
 class _Slow:
-    """A lock that is long in coming, once its watcher has had its turn."""
+    """A lock that its reader gets only after 0.4 s, so that the watching thread comes first."""
 
     def __init__(self, lock: threading.Lock) -> None:
         self._lock, self._reader = lock, threading.get_ident()
 
     def __enter__(self) -> None:
         if threading.get_ident() == self._reader:
-            end = time.monotonic() + 0.4  # an exception that comes meanwhile is raised here
+            end = time.monotonic() + 0.4  # the watcher's exception is raised here
             while time.monotonic() < end:
                 pass
         self._lock.acquire()
@@ -30,7 +30,7 @@ class _Slow:
 
 
 def test_nothing_is_raised_behind_a_budget(tmp_path, monkeypatch):
-    """Also where a second exception comes while the first is on its way out."""
+    """Also if a second exception arrives while the first one propagates."""
     monkeypatch.setattr(budget, "SECONDS", 0.1)
     (tmp_path / "a.npy").write_bytes(b"")
     made = budget._Watch.__init__
@@ -66,13 +66,13 @@ def test_a_budget_ends_the_work_of_its_thread_alone(tmp_path, monkeypatch):
             while True:
                 try:
                     sum(range(1000))
-                except Exception:  # as libraries do
+                except Exception:  # as some libraries do
                     pass
     assert thread.is_alive()
     ended.set()
     thread.join()
     with budget.header_budget(str(tmp_path / "a.npy")):
-        time.sleep(0.5)  # to wait takes nothing
+        time.sleep(0.5)  # waiting takes no processor time
     begin = time.process_time()
     while time.process_time() - begin < 0.5:
         sum(range(1000))

@@ -63,8 +63,8 @@ def test_compact_requests_lists_open_requests_and_keeps_pending_ones(
 def test_requests_are_chosen_by_list_level_and_size(
     backend, data, listed, batch, coarse_first, room
 ):
-    """Few levels and sizes, so that many are alike and their order decides; in the pool of 10 tiles
-    some nodes are not.
+    """There are few levels and sizes, so that many requests tie and their order decides; some nodes
+    lie outside the pool of 10 tiles.
     """
     device, place = DEVICES[backend], torch.zeros((10, 4), dtype=torch.int32)
     place[:, 3] = torch.tensor(data.draw(st.lists(st.integers(0, 2), min_size=10, max_size=10)))
@@ -101,7 +101,7 @@ def test_requests_are_chosen_by_list_level_and_size(
 @fixed
 @given(data=st.data(), size=st.integers(1, 60))
 def test_lru_equals_a_python_list_over_random_traces(backend, data, size):
-    """Frames use slots at random and take some: the model is a list, used slots moved back."""
+    """Frames use random slots and take some; the model is a list whose used slots move back."""
     device = DEVICES[backend]
     order = torch.arange(size, dtype=torch.int32, device=device)
     stamp = torch.full((size,), -1, dtype=torch.int32, device=device)
@@ -118,8 +118,8 @@ def test_lru_equals_a_python_list_over_random_traces(backend, data, size):
 
 
 def owned_slots(data, nodes: int, slots: int) -> tuple[list[int], list[int], list[bool]]:
-    """Pointers, owners and flags as a pool has them: an owner points to its slot, any other node
-    only to shared ones.
+    """Draws pointers, owners and shared flags as a pool has them: an owner points to its slot, any
+    other node only to shared slots.
     """
     shared = data.draw(st.lists(st.booleans(), min_size=slots, max_size=slots))
     owners = data.draw(st.permutations(range(nodes)))[:slots]
@@ -261,7 +261,7 @@ def test_put_rows_writes_rows_into_slots(backend, data, slots, width):
 
 
 def a_pool(data, branching: int, tiles: int) -> dict[str, torch.Tensor]:
-    """Tiles at random, with more nodes a tile than the tree has children, as wider trees leave."""
+    """Draws random tiles, with more nodes a tile than N^3, as a pool for wider trees has."""
     per_tile = branching**3 + data.draw(st.sampled_from([0, 5]))
     generator = torch.Generator().manual_seed(data.draw(st.integers(0, 2**20)))
 
@@ -343,9 +343,9 @@ def test_kernels_equal_twins_on_a_large_pool(compiled):
     actual = ops.lacking(*there, 1, 0, 2, backend=compiled)
     assert torch.equal(actual.cpu(), expected) and 0 < int(expected.sum()) < len(node)
 
-    for listed in (3000, 30_000):  # which are compared, which are sorted
+    for listed in (3000, 30_000):  # few are compared, many are sorted
         asked = torch.randint(0, tiles * per_tile, (2, 2, listed), generator=generator).int()
-        asked[:, 1] &= LOAD | SUBDIVIDE | 15  # of few sizes
+        asked[:, 1] &= LOAD | SUBDIVIDE | 15  # few sizes
         asked[0, 0, 2000:] = -1
         given = asked, pool[1], torch.tensor([900, 5000])
         for order_ in (True, False):

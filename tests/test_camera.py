@@ -1,4 +1,4 @@
-"""Cameras: where they stand, what their rays hit, and other people's conventions."""
+"""Cameras: their positions, what their rays hit, and the conventions of other libraries."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_up_is_plus_y_beyond_the_pole():
 
 @pytest.mark.parametrize("up", [*DIRECTIONS, (1.0, 2.0, -0.5)])
 def test_orbits_around_any_axis_are_turned_ones(up):
-    """The eye is as far above the plane around that axis, its picture upright; right is +x."""
+    """The eye's elevation is about that axis, and the picture is upright; right is +x."""
     angles = torch.linspace(-180, 180, 13), 25.0, 2.0
     camera = gv.Camera.orbit(*angles, 30, 9, 9, up=up).placed(BOX)
     axis = torch.tensor(up, dtype=torch.float64) if isinstance(up, tuple) else None
@@ -136,7 +136,7 @@ def test_orbits_around_any_axis_are_turned_ones(up):
 
 
 def test_up_plus_y_has_the_bits_it_had():
-    """By name; in numbers it is a rotation by nothing."""
+    """The name gives the default's bits; a vector is a rotation by nothing, up to rounding."""
     plain = gv.Camera.orbit([10, 200, -30], [20, 95, 0], 1.7)
     named = gv.Camera.orbit([10, 200, -30], [20, 95, 0], 1.7, up="+y")
     assert plain.same(named)
@@ -149,7 +149,7 @@ def test_up_plus_y_has_the_bits_it_had():
 
 
 def seen_corners(camera: gv.Camera, box: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where the corners of a box are in the picture, -1 to 1 in x and y, and their depths."""
+    """Returns the corners of a box in the picture, -1 to 1 in x and y, and their depths."""
     corners = torch.stack([box[at, (0, 1, 2)] for at in itertools.product((0, 1), repeat=3)])
     view, K = camera.viewmats[0], camera.Ks[0]
     x, y, z = (corners @ view[:3, :3].T + view[:3, 3]).unbind(1)
@@ -185,7 +185,7 @@ def test_a_fitted_box_is_whole_and_fills_the_picture(data):
     assert at.abs().max() < 0.985 and depth.min() > 0
     if model in ("pinhole", "ortho"):
         assert at.abs().max() > 0.95
-    else:  # no nearer than where the box spans 90 degrees
+    else:  # not closer than where the box spans 90 degrees
         half = (fov or 180) / 2
         wide = half * size[0] / size[1] if model == "fisheye" else 2 * half
         x, y, z = _corners_along(placed, box)
@@ -195,7 +195,7 @@ def test_a_fitted_box_is_whole_and_fills_the_picture(data):
         else:
             filled = torch.maximum(x / spans[0], y / spans[1]) / z
         assert float(filled.max()) == pytest.approx(1)
-    # The same in strips and for the samples of a pixel: what is fitted is the whole picture.
+    # Strips and samples of a pixel give the same: the whole picture is fitted.
     strip = camera.strip(3, 7).placed(box)
     assert torch.equal(strip.viewmats, placed.viewmats)
     assert torch.equal(camera.shifted(0.3, -0.2).placed(box).viewmats, placed.viewmats)
@@ -219,7 +219,7 @@ def test_a_path_around_a_box_keeps_it_whole_and_its_distance(model, up):
     assert max(most) < 1 and max(most) > 0.95
     eyes = torch.cat([centre_of(camera) for camera in cameras])
     far = (eyes - BOX.mean(0)).norm(dim=1)
-    assert far.max() / far.min() < 1.002  # an open curve: its ends bend
+    assert far.max() / far.min() < 1.002  # not exactly: the curve is open
     axis = "xyz".index(up[1])
     assert (eyes[:, axis] - eyes[0, axis]).abs().max() < 1e-9
 
@@ -289,7 +289,7 @@ def test_a_thinned_camera_looks_through_the_middle_of_its_pixels_ahead_of_the_mo
 
 @pytest.mark.parametrize("cameras", [1, 3])
 def test_pinhole_rays_are_the_twin_s(compiled, cameras):
-    """In every bit, for one camera and for a batch, of all rows and of some."""
+    """In every bit, for one camera and for a batch, for all rows and for some."""
     camera = gv.Camera.orbit([0, 40, 80][:cameras], 10, [2.0, 1.0, 3.0][:cameras], 30, 41, 23)
     camera = camera.placed(BOX).shifted(0.3, -4.7)
     numbers = camera.numbers(DEVICES[compiled])

@@ -1,5 +1,5 @@
-"""Cameras of other programs: what is written comes back, and places fall on the pixels where those
-programs put them.
+"""Camera files of other programs: what is written is read back, and points fall on the pixels where
+those programs draw them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ POINTS = torch.tensor([TARGET, (0, 0, 0), (1, 1, 1), (-1, 0.5, 2)], dtype=torch.
 
 
 def seen(camera: gv.Camera, points: torch.Tensor = POINTS) -> torch.Tensor:
-    """(p, 2) columns and rows of places, by the matrices; a fisheye's by its formula."""
+    """Returns (p, 2): columns and rows of points, by the matrices; a fisheye's by its formula."""
     local = points @ camera.viewmats[0, :3, :3].T + camera.viewmats[0, :3, 3]
     flat = local[:, :2] if camera.model == "ortho" else local[:, :2] / local[:, 2:]
     if camera.model == "fisheye":
@@ -35,7 +35,7 @@ def seen(camera: gv.Camera, points: torch.Tensor = POINTS) -> torch.Tensor:
 
 
 def askew(model: str = "pinhole") -> gv.Camera:
-    """A camera whose axis is not in the middle, of pixels that are not square."""
+    """Returns a camera with an off-centre axis and pixels that are not square."""
     view = gv.Camera.look_at(EYE, TARGET, UP).viewmats[0]
     Ks = torch.tensor([[70.0, 0, 33.5], [0, 65, 20.25], [0, 0, 1]], dtype=torch.float64)
     bends = (0.05, -0.01, 0.002, 0.0005) if model == "fisheye" else None
@@ -85,7 +85,7 @@ def test_cameras_come_back(tmp_path, model, name):
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho"])
 def test_paraview_sees_what_we_see(tmp_path, model):
-    """VTK's own camera, set to the numbers in the file, puts places on the same pixels."""
+    """VTK's camera, set to the numbers in the file, maps points to the same pixels."""
     camera = gv.Camera.look_at(EYE, TARGET, UP, 40, 64, 48, model)
     file = tmp_path / "c.pvcc"
     gv.write_cameras(file, camera, distance=7.0)

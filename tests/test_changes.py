@@ -1,5 +1,5 @@
-"""Content that changes in a part of its box: what lies elsewhere stays in the pools, and all is as
-if it had always been so.
+"""Content that changes in a part of its box: what lies elsewhere stays in the pools, and the result
+is as if the content had always been the new one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ROUGH = {"thickness": 0.1, "frequency": 4.0, "octaves": 2, "box": BOX}
 
 
 class Bead(sdf.Distance):
-    """A ball that rises in the edge of a plate."""
+    """A ball that rises at the edge of a plate."""
 
     def __init__(self, time=0.0):
         super().__init__()
@@ -31,7 +31,7 @@ class Bead(sdf.Distance):
 
 
 def ground():
-    """What stays: what lies behind x = -0.5, and a plate that the bead sticks in."""
+    """Returns what stays: matter beyond x = -0.5, and the plate that the bead sits in."""
     return sdf.Plane((1, 0, 0), -0.5) | sdf.Box((0.1, 0.4, 1.8))
 
 
@@ -44,7 +44,7 @@ def density(shape):
 
 
 class Steps(gv.Producer):
-    """Two boxes of 8^3 finest voxels in nothing; the second one's value may be set."""
+    """Two boxes of 8^3 finest voxels in empty space; the second one's value may be set."""
 
     def __init__(self, value=0.5):
         super().__init__(64)
@@ -93,7 +93,7 @@ MADE = {
 
 
 def content(engine):
-    """For each node of a tree by place: what it holds, and its voxels."""
+    """Returns for each node of a tree, by its loc, its region and its voxels."""
     (source,) = engine.trees.values()
     nodes, bricks, found = engine.cache.nodes, engine.cache.bricks, {}
     tile = (nodes.parent_t >= 0).nonzero()[:, 0]
@@ -158,7 +158,7 @@ def test_a_world_may_become_empty_and_come_back():
 
 
 class Failing(Steps):
-    """Can't tell what nodes hold while its value is 0."""
+    """`classify` fails while its value is 0."""
 
     def classify(self, nodes):
         if self.value == 0 and len(nodes) > 1:
@@ -187,7 +187,7 @@ def test_where_it_has_changed_is_known_as_far_as_it_was_told():
     known = one.version
     other.changed(torch.stack((box, box + 2)))
     assert len(both.changes(0)) == 2 and len(both.changes(known)) == 1
-    both.time = 0.5  # clocks that did not agree
+    both.time = 0.5  # their clocks differed
     assert both.changes(known) is None
     known = both.version
     both.time = 0.7
@@ -202,7 +202,7 @@ def test_where_it_has_changed_is_known_as_far_as_it_was_told():
 
 @pytest.mark.parametrize("name", ["stack", "blend", "mask", "warp", "smooth"])
 def test_what_matters_near_boxes_has_the_same_bits(name):
-    """`Field.near`, of which it is told what stays."""
+    """Bricks made with `Field.near`, which drops distant parts, equal those of the whole field."""
     made = MADE[name](0.2)
     layout = Layout.of(made, 4, 1, torch.device("cpu"))
     axis = torch.arange(8)

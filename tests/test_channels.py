@@ -1,4 +1,4 @@
-"""Channels of one image: against a dense marcher, closed forms, the looks, and the command line."""
+"""Channels of one image: a dense marcher, closed forms, channel looks, and the command line."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def looks() -> list[gv.ChannelLook]:
 
 
 def blobs(width: int = 3, extent=(23, 31, 19)) -> np.ndarray:
-    """(z, y, x, c) smooth numbers from 0 to 255."""
+    """Returns (z, y, x, c) smooth numbers from 0 to 255."""
     coarse = torch.rand((1, width, 5, 5, 5), generator=torch.Generator().manual_seed(width))
     field = torch.nn.functional.interpolate(coarse, size=extent[::-1], mode="trilinear")[0]
     return ((field - 0.5) * 1.6 + 0.5).clamp(0, 1).movedim(0, -1).numpy() * 255
 
 
 def dense(data, rays, mode, step):
-    """Color (r, 3) and alpha (r,) by the formula, in float64: no tree, no table, no skipping."""
+    """Returns color (r, 3) and alpha (r,) by the formula, in float64, without tree or table."""
     eye, direction = rays
     box = box_of(data.shape[:3], SPACING, ORIGIN)
     with np.errstate(divide="ignore"):
@@ -93,7 +93,7 @@ def test_the_picture_is_that_of_a_dense_marcher(backend, mode, dtype):
 
 
 def ways(tree: gv.N3Tree, rays: gv.Rays) -> np.ndarray:
-    """(r,) lengths of rays within a tree's box."""
+    """Returns the lengths (r,) of rays within a tree's box."""
     low, high = tree.box.cpu().numpy()
     origin, direction = rays.origin.cpu().numpy(), rays.direction.cpu().numpy()
     with np.errstate(divide="ignore"):
@@ -105,7 +105,7 @@ def ways(tree: gv.N3Tree, rays: gv.Rays) -> np.ndarray:
 @pytest.mark.parametrize("regions", ["one value", "bricks"])
 @pytest.mark.parametrize("mode", MODES)
 def test_no_step_and_no_level_changes_even_matter(backend, mode, regions):
-    """Closed form, from any distance; a region of one value, and bricks that are not quite."""
+    """Closed form, from any distance, for a CONSTANT region, and for bricks that nearly are."""
     values = (25.0, 105.0, 52.0)  # thin
     data = np.broadcast_to(np.array(values, np.float32), (24, 24, 24, 3)).copy()
     if regions == "bricks":
@@ -143,7 +143,7 @@ def test_a_channel_alone_is_its_transfer_function(backend, mode):
 
 
 def test_what_is_added_keeps_its_brightness_and_what_is_mixed_does_not(backend):
-    """Red and green matter in one place: yellow, or half as bright."""
+    """Red and green matter at one position: yellow, or half as bright."""
     data = np.full((9, 9, 9, 2), 100, np.uint8)
     tree = gv.N3Tree.from_volume(gv.Volume(data), 4, device=DEVICES[backend])
     two = [gv.ChannelLook(color=c, window=(0, 100), opacity=0.9) for c in ("red", "green")]
@@ -181,7 +181,7 @@ def test_every_dtype_and_width(compiled, dtype, width):
 
 @pytest.mark.backend("cpp")
 def test_a_node_is_left_out_where_no_channel_shows_anything():
-    """Each channel shows one end of the box; what shows nothing is neither read nor sampled."""
+    """Each channel is visible at one end of the box; nodes between are neither read nor sampled."""
     data = np.zeros((16, 16, 64, 2), np.uint8)
     data += np.random.default_rng(2).integers(0, 9, data.shape, dtype=np.uint8)
     data[:, :, :14, 0] += 100
@@ -333,7 +333,7 @@ def test_a_store_tells_windows_by_a_coarse_level(tmp_path):
 
 @pytest.mark.backend("cpp")
 def test_any_window_has_a_table():
-    """Its corner points lie on rows, however their numbers round."""
+    """Its corner points lie on rows of the table, however their numbers round."""
     tree = gv.N3Tree.from_volume(gv.Volume(blobs(1, (5, 5, 5))), 4)
     numbers = np.random.default_rng(4).uniform(-3, 3, (40, 2))
     for low, length in numbers.tolist():
@@ -402,7 +402,7 @@ def test_a_component_that_is_not_there_is_one_clear_error(compiled):
 
 @pytest.mark.backend("cpp")
 def test_a_table_that_leads_nowhere_reads_nothing_else():
-    """The op's memory is safe whatever numbers a table holds."""
+    """The op reads no other memory, whatever numbers a table holds."""
     from gvtorch.tracing.tracer import Tracer
 
     tree = gv.N3Tree.from_volume(gv.Volume(blobs(3)), 4)
@@ -423,7 +423,7 @@ def test_a_table_that_leads_nowhere_reads_nothing_else():
 
 @pytest.fixture(scope="module")
 def two_channels(tmp_path_factory):
-    """Two balls, each in a channel of its own, as a file and as a store."""
+    """Two balls, each in its own channel, as a file and as a store."""
     folder = tmp_path_factory.mktemp("channels")
     z, y, x = np.mgrid[0:20, 0:20, 0:32]
     balls = [4000 * (np.hypot(np.hypot(x - c, y - 10), z - 10) < 7) for c in (8, 23)]

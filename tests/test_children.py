@@ -1,4 +1,4 @@
-"""Coarse levels that are made of children, for producers that know the finest level alone."""
+"""Coarse levels made from children, for producers that can make only the finest level."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def noise(shape, dtype=torch.float32, seed=0):
 
 
 class Finest(gv.VolumeProducer):
-    """A volume of which no one knows coarse levels."""
+    """A volume's producer that can make only the finest level."""
 
     later = False
 
@@ -44,7 +44,7 @@ class Finest(gv.VolumeProducer):
 
 
 def every_brick(producer, layout):
-    """(k, z, y, x, c) by channel of all nodes of each depth that lie in the volume."""
+    """Returns by channel (k, z, y, x, c) the bricks of all nodes of each depth in the volume."""
     for depth in range(layout.depth + 1):
         step = layout.branching ** (layout.depth - depth) * layout.brick_size
         grid = [range(-(-n // step)) for n in layout.extent]
@@ -66,7 +66,7 @@ def every_brick(producer, layout):
 )
 @pytest.mark.parametrize("threshold", [None, 0.0])
 def test_coarse_levels_are_the_means_of_what_lies_below(shape, branching, dtypes, threshold):
-    """In every bit those of levels that are made of the whole volume."""
+    """They equal, in every bit, the levels that are made from the whole volume."""
     volumes = {str(n): gv.Volume(noise(shape, dtype, n)) for n, dtype in enumerate(dtypes)}
     fine = Finest(volumes, branching, threshold=threshold)
     whole = gv.VolumeProducer(volumes, threshold=threshold, branching=branching)
@@ -112,7 +112,7 @@ def test_finest_bricks_are_made_once_for_all_coarse_levels():
 
 
 def test_what_is_known_to_be_empty_is_not_made():
-    """And what has changed is."""
+    """But what has changed is made."""
 
     class Ball(gv.Producer):
         filled, value = 0, 1.0
@@ -152,7 +152,7 @@ def test_a_mixed_batch_is_as_its_parts():
 
 
 def root_of(producer):
-    """Regions and brick of a root and its first child."""
+    """Returns the regions and bricks of a root and its first child."""
     layout = Layout.of(producer, 4, 1, torch.device("cpu"))
     producer.prepare(layout)
     nodes = Nodes(torch.tensor([[0, 0, 0, 0], [0, 0, 0, 1]]), layout)

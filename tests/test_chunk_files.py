@@ -1,5 +1,5 @@
-"""Files of chunks that are no such files: Blosc that would make gigabytes, files of any length,
-pipes, folders. Each costs its chunk alone, in one line.
+"""Invalid files of chunks: Blosc that would unpack to gigabytes, files of any length, pipes,
+folders. Each costs only its own chunk, and is reported in one line.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def n5() -> dict[str, Any]:
     return {"driver": "n5", "metadata": {**about, "compression": packed}}
 
 
-KINDS = {  # and where the first chunk of a file that has one begins
+KINDS = {  # kind of array, and the offset of the first chunk in its file
     "zarr2": (zarr2(), 0),
     "zarr2 F, folders": (zarr2(order="F", dimension_separator="/"), 0),
     "zarr3": (zarr3(CHUNK, LITTLE, BLOSC), 0),
@@ -76,7 +76,7 @@ KINDS = {  # and where the first chunk of a file that has one begins
 
 @pytest.fixture(params=KINDS)
 def stored(request, tmp_path) -> Path:
-    """An array of every kind, empty."""
+    """An empty array of each kind."""
     kind = KINDS[request.param][0]
     spec = {**kind, "kvstore": {"driver": "file", "path": f"{tmp_path}/a/"}}
     ts.open(spec, create=True).result()
@@ -98,7 +98,7 @@ def box(place: tuple[int, ...]) -> tuple[slice, ...]:
 
 
 def swell(folder: Path, at: int) -> Path:
-    """Lets the only chunk tell that it holds a gigabyte."""
+    """Makes the header of the only chunk claim that it holds a gigabyte."""
     (file,) = (path for path in folder.rglob("*") if path.is_file() and path.name not in HEADS)
     content = bytearray(file.read_bytes())
     assert 120 <= struct.unpack_from("<I", content, at + 4)[0] <= 124
@@ -127,7 +127,7 @@ def test_a_chunk_that_swells_costs_itself(stored, request, place, remote, tmp_pa
                 f'Error opening "a": {relay.through(f"{root}/a/").spec["base_url"]}'
                 f"{file.relative_to(stored)}: "
             )
-        if kind == "shards, turned":  # a look at all chunks of a file
+        if kind == "shards, turned":  # all chunks of a file are checked
             return
         others = [other for other in np.ndindex(3, 3, 2) if other != place]
         for other in others:

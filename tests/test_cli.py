@@ -26,7 +26,7 @@ def test_the_version_is_told():
 
 
 def test_a_process_of_its_own(small, tmp_path):
-    """All other tests run commands within their process."""
+    """All other tests run commands within the test process."""
     for path, status, said in ((small, 0, 0), (tmp_path / "none.nrrd", 2, 1)):
         command = [sys.executable, "-m", "gvtorch", "info", str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -35,7 +35,7 @@ def test_a_process_of_its_own(small, tmp_path):
 
 @pytest.mark.parametrize("stream", ["full", "out", "err"])
 def test_standard_output_that_is_full_or_closed(stream):
-    """A closed one leaves its number to the next file that is opened."""
+    """The number of a closed stream is used by the next file that is opened."""
     end = {"full": ">/dev/full", "out": ">&-", "err": "2>&-"}[stream]
     for word, good in (("--version", 0), ("none", 2)):
         command = f"exec {shlex.quote(sys.executable)} -m gvtorch {word} {end}"
@@ -165,7 +165,7 @@ def test_raw_options(tmp_path):
 
 @pytest.mark.backend("cpp")
 def test_cost_pictures(small, tmp_path):
-    """Each is another picture; the NPZ and the statistics stay those of the picture."""
+    """Each cost gives another picture; the NPZ and the statistics stay those of the picture."""
     found = {}
     for show in ("picture", "samples", "nodes", "lod", "age", "fill"):
         out, npz = tmp_path / f"{show}.png", tmp_path / f"{show}.npz"
@@ -286,7 +286,7 @@ def test_flags_clip_and_blur(small, tmp_path):
 
 
 def test_flags_give_light(small, tmp_path):
-    """Each item takes light away, or brings some."""
+    """Each item removes light, or adds some."""
     mean = {}
     sun = "sun:1,-1,0,3"
     for name, light in (
@@ -325,7 +325,7 @@ def test_package_runs_as_a_module():
 
 @pytest.mark.backend("cpp")
 def test_a_store_renders_as_its_volume_does(scan_store, tmp_path):
-    """Through a pool of a few bricks, in every mode, with what it cost."""
+    """Through a pool of a few bricks, in every mode, with its cost."""
     arrays = {}
     look = ("--size", "64x48", "--tf", "gray", "--camera", "orbit:30,20,1.5")
     small_pool = ("--brick-pool", "40 kB", "--node-pool", "20 kB", "--loading", "levels")
@@ -469,7 +469,7 @@ def test_mistakes_with_stores_get_one_line(scan_store, tmp_path, make, message):
 
 
 def test_patients_stand_upright_and_face_the_camera(tmp_path):
-    """A nose on an upright head: at its front, and nearer to the camera than the head."""
+    """A nose on an upright head is at its front, and nearer to the camera than the head."""
     nibabel = pytest.importorskip("nibabel")
     z, y, x = np.meshgrid(*[np.arange(40)] * 3, indexing="ij")
     head = np.hypot(x - 20, y - 18) < 9
@@ -490,7 +490,7 @@ def test_patients_stand_upright_and_face_the_camera(tmp_path):
 
 
 def test_what_is_left_out_is_told(tmp_path):
-    """Channels that are not shown, and a picture in which nothing is."""
+    """Warnings name channels that are not shown, and a picture that shows nothing."""
     tifffile = pytest.importorskip("tifffile")
     data = np.random.default_rng(0).integers(0, 99, (5, 2, 9, 9)).astype(np.uint8)
     names = {"axes": "ZCYX", "Channel": {"Name": ["DAPI", "actin"]}}

@@ -23,7 +23,7 @@ def keys_file(folder: Path, text: str) -> Path:
 
 @pytest.mark.backend("cpp")
 def test_films_of_a_volume_loop(small, tmp_path):
-    """GIF and WebP of a RAW file: each picture is the one that `render` gives from there."""
+    """GIF and WebP of a RAW file: each picture equals that of `render` with the same camera."""
     from PIL import Image, ImageSequence
 
     picture = tmp_path / "a.npz"
@@ -75,7 +75,7 @@ def test_the_first_picture_of_a_flight_is_whole(scan_store, tmp_path):
 
 @pytest.mark.backend("cpp")
 def test_up_turns_orbits_flights_and_keys(small, tmp_path):
-    """And the default shows the whole ball, in the middle."""
+    """By default the whole ball is visible, in the middle."""
     seen = {}
     for up in (None, "+y", "+z", "0,0,1", "-x"):
         file = tmp_path / "a.npz"

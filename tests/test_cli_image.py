@@ -109,7 +109,7 @@ def test_a_mistake_gets_one_line(small, tmp_path, args, message):
 
 @pytest.fixture
 def others(small, tmp_path):
-    """A volume, what says how it was shown, and a folder of pictures that is a volume."""
+    """A volume, a file of how it was shown, and a volume as a folder of pictures."""
     np.save(tmp_path / "v.npy", gv.read_volume(small).data[..., 0].numpy())
     (tmp_path / "s.json").write_text('{"component": 0, "camera": {"eye": [9, 9, 9]}}')
     ViewState(shader=gv.TransferFunction.preset("hot", 0, 200)).save(tmp_path / "t.json")

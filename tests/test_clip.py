@@ -1,4 +1,4 @@
-"""`Clip`: which pieces of a ray are kept, that the rest costs nothing, and caps."""
+"""`Clip`: which pieces of a ray it keeps, that the rest costs nothing, and its caps."""
 
 from __future__ import annotations
 
@@ -99,8 +99,8 @@ EVEN = gv.Volume(torch.full((37, 29, 45), 0.5), (1.0, 0.8, 1.5), (5.0, -3.0, 2.0
 
 @functools.cache
 def closed_form(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """(r,) alphas and depths of a medium that takes a hundredth of the light in a unit: alpha
-    follows from the length that is kept, depth from where that length is enough.
+    """Returns alphas and depths (r,) of a medium that absorbs a hundredth of the light per unit:
+    alpha follows from the length that is kept, depth from where that length suffices.
     """
     tree = gv.N3Tree.from_volume(EVEN, 8)
     rays, step = camera_rays(tree, 20, distance=1.2), 0.01
@@ -137,7 +137,7 @@ def test_a_medium_of_one_value_has_its_closed_form(backend, name, lod):
 
 @pytest.mark.parametrize("name", CLIPS)
 def test_nothing_that_is_clipped_is_sampled_or_asked_for(blobs, backend, name):
-    """By stamps of bricks and tiles, and by the nodes that have a request."""
+    """Checked by the stamps of bricks and tiles, and by the nodes that have a request."""
     clip = dataclasses.replace(CLIPS[name], caps=True)
     tree = gv.N3Tree.from_volume(blobs, 2)
     thin = gv.TransferFunction.from_points([(0, 0.001), (1, 0.002)])
@@ -162,8 +162,8 @@ def test_nothing_that_is_clipped_is_sampled_or_asked_for(blobs, backend, name):
 
 
 def wholly_clipped(tree: gv.N3Tree, clip: gv.Clip) -> set[int]:
-    """Nodes whose box, a hair smaller, lies beyond a plane, in a box that is cut away, or, for each
-    box that is kept, beyond a face of it.
+    """Returns the nodes whose box, slightly shrunk, lies beyond a plane, in a box that is cut away,
+    or outside of every box that is kept, beyond one of its faces.
     """
     n, size = tree.branching, np.array(tree.spacing) * tree.side
     loc, child = tree.nodes.loc_t4.numpy()[:, None], np.arange(n**3)
@@ -184,7 +184,7 @@ def wholly_clipped(tree: gv.N3Tree, clip: gv.Clip) -> set[int]:
 
 
 def beside(box, corners: np.ndarray) -> np.ndarray:
-    """(t, n) whether all corners (t, n, 8, 3) of a node lie beyond one face of the box."""
+    """Returns (t, n): true if all corners (t, n, 8, 3) of a node lie beyond one face of the box."""
     if len(box) == 2:
         (low, high), own = np.array(box), corners
     else:
@@ -210,7 +210,7 @@ CUT = gv.Clip(planes=[(0, 0, -1, 20.0)], caps=True, cap_light=0.6)  # what lies 
 
 @pytest.mark.parametrize("opacity", [1.0, 0.25])
 def test_a_cap_has_the_colour_of_the_cut_and_faces_the_eye(backend, opacity):
-    """Lambert, with the light at the eye, on a plane: colour * (1 - s + s cos), at the cut."""
+    """Lambert shading with a headlight on a plane, at the cut: colour * (1 - s + s cos)."""
     data = torch.zeros(32, 32, 32)
     data[:, :, 16:] = 1.0  # empty on the left, solid on the right
     tree = gv.N3Tree.from_volume(gv.Volume(data), 8, device=DEVICES[backend])
@@ -243,7 +243,7 @@ def test_a_cap_has_the_colour_of_the_cut_and_faces_the_eye(backend, opacity):
 
 
 def test_a_cap_has_features_and_a_normal(backend):
-    """All of a solid whose second channel holds 7 and 3: a cap shows them, and faces the eye."""
+    """A solid's second channel holds 7 and 3: its cap shows them, and its normal faces the eye."""
     value = torch.rand(24, 24, 24, generator=torch.Generator().manual_seed(5)) * 0.1 + 0.5
     pair = torch.tensor([7.0, 3.0]).expand(24, 24, 24, 2)
     volumes = {"value": gv.Volume(value), "pair": gv.Volume(pair)}
@@ -264,7 +264,7 @@ def test_a_cap_has_features_and_a_normal(backend):
 @pytest.mark.parametrize("opacity", [1.0, 0.5])
 @pytest.mark.parametrize("kind", ["isosurface", "by function", "by voxel", "distance field"])
 def test_a_cut_through_a_surface_is_filled(backend, kind, opacity):
-    """Half a ball of radius 11, from before the cut: a disc, and the far half's inside behind."""
+    """Half a ball of radius 11, seen from the cut: a disc, and behind it the inside of the ball."""
     axis = torch.arange(40.0) - 19.5
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     radius = (x * x + y * y + z * z).sqrt()
@@ -306,7 +306,7 @@ def test_a_cut_through_a_surface_is_filled(backend, kind, opacity):
 
 
 def test_what_is_not_cut_has_no_cap(backend):
-    """The camera looks at faces of the volume, and the cut is on its far side."""
+    """The camera looks at faces of the volume, and the cut is on the far side."""
     tree = gv.N3Tree.from_volume(gv.Volume(torch.rand(16, 16, 16)), 8, device=DEVICES[backend])
     clip = gv.Clip(planes=[(0, 0, 1, -4.0)])
     camera = gv.Camera.orbit(10, 10, 2.2, 30, 12, 12)
@@ -319,7 +319,7 @@ def test_what_is_not_cut_has_no_cap(backend):
 
 
 def test_the_face_that_is_shaded_is_the_one_that_was_crossed():
-    """A corner is cut away: each ray that goes through it leaves it by one of three faces."""
+    """A corner is cut away: each ray through it leaves it by one of three faces."""
     clip = gv.Clip(without=[((0, 0, 0), (2, 2, 2))], frame="box")
     clipped = Clipped(lambda _: None, clip, UNIT, step=0.1, depth_alpha=0.1)
     origin = torch.tensor([[1.0, 0.9, 1.1]], dtype=torch.float64).expand(64, 3)
@@ -360,7 +360,7 @@ def test_the_engine_loads_only_what_is_kept(blobs, compiled):
 
 
 def test_a_clip_is_for_each_of_several_trees(blobs, compiled):
-    """Two volumes side by side, cut by one plane: the same as each alone, put side by side."""
+    """Two volumes side by side, cut by one plane, look as each one alone."""
     other = gv.Volume(blobs.data, blobs.spacing, (60.0, -3.0, 2.0))
     scene = {"one": gv.VolumeProducer(blobs), "two": gv.VolumeProducer(other)}
     camera = gv.Camera.look_at((55, 10, 190), (55, 8, 29), fov=40, width=48, height=24)

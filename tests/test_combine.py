@@ -14,7 +14,7 @@ BOX = ((-1, -1, -1), (1, 1, 1))
 
 
 class Ramp(Field):
-    """Rises along x, from 0 at -1 to 1 at 1, clamped to a part of that."""
+    """Rises along x, from 0 at -1 to 1 at 1, clamped to a part of that range."""
 
     def __init__(self, low=0.0, high=1.0):
         super().__init__()
@@ -93,7 +93,7 @@ def test_combinations_are_what_their_words_say():
 
 
 def test_a_mask_hides_what_it_hides():
-    """A plain module behind a solid: its mean is taken where the solid is, elsewhere none is."""
+    """A plain module masked by a solid: it is averaged where the solid is, and only there."""
     network = torch.nn.Linear(3, 2)
     field = gv.mask(network, gv.Solid(gv.sdf.Sphere(0.7), colors=False))
     producer = gv.FieldProducer(field, 64, box=BOX, threshold=0)
@@ -139,7 +139,7 @@ def test_another_time_is_made_anew_and_is_as_if_it_had_always_been():
 
 @pytest.mark.backend("cpp")
 def test_only_the_tree_that_changed_is_made_anew():
-    """Two trees in one pool: what the other holds stays."""
+    """Two trees in one pool: what the unchanged one holds stays."""
     still = gv.FieldProducer(Ramp(-9, 9), 32, box=((2, -1, -1), (4, 1, 1)))
     moving = gv.FieldProducer(Pulse(), 32, box=BOX, threshold=0.0)
     view = gv.Camera.look_at((1.5, 0, 9), (1.5, 0, 0), (0, 1, 0), 40, 32, 32)
@@ -176,7 +176,7 @@ def test_a_producer_is_no_field(make, where):
 
 
 class Growing(gv.sdf.Sphere):
-    """A ball whose radius is the time."""
+    """A ball whose radius is its time."""
 
     def __init__(self):
         super().__init__(0.5)
@@ -262,7 +262,7 @@ def test_a_time_is_a_number():
 
 
 def test_a_network_becomes_a_producer():
-    """Any module: here one whose values are known at the voxels' middles."""
+    """Any module can: here one whose values at the voxels' centres are known."""
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(3, 16), torch.nn.Tanh(), torch.nn.Linear(16, 2))
     producer = gv.cache_field(network, 16, box=BOX, samples=1)
@@ -273,7 +273,7 @@ def test_a_network_becomes_a_producer():
 
 @pytest.mark.backend("cpp")
 def test_producers_of_any_kind_tell_values_at_points(blobs):
-    """Trilinear between voxels, as a dense interpolation by torch gives."""
+    """Trilinear between voxels, equal to a dense interpolation by torch."""
     points = torch.rand(500, 3).double() * 60 - 5
     producer = gv.VolumeProducer(blobs)
     found = producer.at(points)["value"][:, 0]

@@ -1,5 +1,5 @@
-"""`CompiledShader`: a user's C++ is as good as what is built in, is kept by its content, and its
-mistakes are shown as the compiler tells them.
+"""`CompiledShader`: a user's C++ equals the built-in shaders, its library is cached by content, and
+its mistakes are shown in the compiler's words.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CAMERA = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
 
 @pytest.fixture(scope="module")
 def channels(blobs) -> dict[str, gv.Volume]:
-    """The blobs with four numbers and a normal in each voxel."""
+    """The blobs, with a four-component colour and a normal in each voxel."""
     values = torch.rand(*blobs.data.shape[:3], 7, generator=torch.Generator().manual_seed(3))
     place = blobs.spacing, blobs.origin
     normal = gv.Volume(2 * values[..., :3] - 1, *place)
@@ -47,7 +47,7 @@ def tree(channels) -> gv.N3Tree:
 
 @pytest.fixture(autouse=True)
 def no_optimising(monkeypatch, quick) -> None:
-    """Optimised code, as users have it, is compared to this in test_user_packets.py."""
+    """Compiles without optimisation; test_user_packets.py compares that with optimised code."""
     monkeypatch.setenv("CXX", quick)
 
 
@@ -56,7 +56,7 @@ def mine(name: str, **options) -> gv.CompiledShader:
 
 
 def assert_same(compiled: str, actual: dict, expected: dict, names) -> None:
-    """In every bit on the CPU; on CUDA another kernel may round otherwise, but for integers."""
+    """Asserts equal bits on the CPU; on CUDA another kernel may round floats differently."""
     for name in names:
         if compiled == "cpp" or not expected[name].is_floating_point():
             assert torch.equal(actual[name], expected[name]), name
@@ -68,7 +68,7 @@ def assert_same(compiled: str, actual: dict, expected: dict, names) -> None:
 FIELDS = ("color", "alpha", "depth", "samples", "missed")
 
 
-# --- what it draws
+# --- pictures
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -110,7 +110,7 @@ def test_sums_of_ones_own_and_hiding(tree, compiled):
 
 
 def test_ends_and_surfaces(tree, compiled):
-    """The place found is the end of the interval in which the built-in finds the crossing."""
+    """Its depth is the end of the interval in which the built-in shader finds the crossing."""
     rays = camera_rays(tree, 24, distance=1.2)
     options = {"lod": "finest", "step": 0.5}
     actual, _ = run(tree, compiled, rays, mine("FirstEnd", uniforms={"level": 0.5}), **options)
@@ -127,7 +127,7 @@ def test_ends_and_surfaces(tree, compiled):
 def bands_as_module(
     eye: torch.Tensor, density: float, width: float, fade: float
 ) -> gv.ModuleShader:
-    """The same formulas in torch, from places instead of distances."""
+    """The same formulas in torch, by positions instead of distances."""
 
     def shade(values, positions, directions, lengths):
         light = torch.exp(-(positions - eye.to(positions)).norm(dim=1, keepdim=True) * fade)
@@ -254,7 +254,7 @@ def test_opcheck_and_memory_safety(tree, compiled, name, dtype):
 
 
 def made(header: Path) -> Path:
-    """The library, from the cache or anew; of a compiler that only includes, a text."""
+    """Returns the library, cached or new; with a compiler that only preprocesses, a text file."""
     return user.compiled(user.ShaderSource.read(header, "Own"), ())
 
 
@@ -263,7 +263,7 @@ def built(folder: Path) -> list[str]:
 
 
 def red(shader: gv.CompiledShader) -> float:
-    """What it shows of a block of ones."""
+    """Returns the red that it draws for a block of ones."""
     tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)
     return float(gv.render(tree, gv.Camera.orbit(width=1, height=1), shader).color[0, 0, 0])
 
@@ -271,7 +271,7 @@ def red(shader: gv.CompiledShader) -> float:
 def in_processes(
     count: int, given: Path, make: str = "gv.CompiledShader(given, 'Own')"
 ) -> list[str]:
-    """Loads `Own` of a header in processes at the same time; the red that each shows."""
+    """Loads `Own` of a header in several processes at once; returns the red that each draws."""
     code = (
         f"import pickle, sys; sys.path.insert(0, {str(TESTS)!r})\n"
         "import gvtorch as gv\n"
@@ -285,8 +285,8 @@ def in_processes(
 
 @pytest.mark.backend("cpp")
 def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path, monkeypatch):
-    """A compiler that counts its calls: two at once give one library, a third makes none; what
-    changes the meaning makes another.
+    """The compiler counts its calls: two processes at once make one library, a third makes none;
+    changes of the meaning make another one.
     """
     count = tmp_path / "calls"
     compiler = quick_compiler(tmp_path, f"echo call >> {count}")
@@ -410,8 +410,8 @@ def test_mistakes_have_one_clear_message(tree, tmp_path):
 
 @pytest.mark.backend("cpp")
 def test_a_damaged_library_is_compiled_again(tmp_path, monkeypatch):
-    """Nothing, a part (which the loader dies of), and all but the last byte of it are left; of a
-    compiler that copies what it made once.
+    """The file is cut to nothing, to half (which crashes the loader), and by its last byte; the
+    compiler copies a library that was made once.
     """
     made = user.compiled(user.ShaderSource.read(HEADER, "mine::Plain"), ()).read_bytes()[:-32]
     (tmp_path / "made.so").write_bytes(made)
@@ -456,7 +456,7 @@ def test_only_its_owner_writes_to_the_folder_of_libraries(tmp_path, monkeypatch)
 
 @pytest.mark.backend("cpp")
 def test_what_the_loader_refuses_is_told_in_its_words(tmp_path, monkeypatch):
-    """A compiler that writes no library; a folder of which nothing may be run does the same."""
+    """The compiler writes no library; a folder mounted noexec has the same effect."""
     header, compiler = write(tmp_path, ADD.replace("COLOR", "0.5")), tmp_path / "c++"
     compiler.write_text(
         '#!/bin/sh\nfor word; do case $word in *.so) echo no > "$word"; esac; done\n'
@@ -469,7 +469,7 @@ def test_what_the_loader_refuses_is_told_in_its_words(tmp_path, monkeypatch):
 
 @pytest.mark.backend("cpp")
 def test_a_header_that_changes_meanwhile_is_not_kept(tmp_path, monkeypatch):
-    """Else what it said last would be found under what it said first."""
+    """Otherwise its last content would be found under its first."""
     header = write(tmp_path, ADD.replace("COLOR", "0.5"))
     monkeypatch.setenv("CXX", only_included(tmp_path, f"echo '// more' >> {header}"))
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
@@ -494,7 +494,7 @@ def test_folders_of_headers_that_the_environment_names_count(tmp_path, monkeypat
 
 @pytest.mark.backend("cpp")
 def test_what_is_included_otherwise_counts_as_well(tmp_path, monkeypatch):
-    """By a macro, over two lines, and in brackets: no stale library is used."""
+    """Included by a macro, over two lines, or in brackets: no stale library is used."""
     header = write(tmp_path, ADD.replace("COLOR", "kA + kB + kC"))
     ways = '#define FILE_A "a.h"\n#include FILE_A\n#include \\\n"b.h"\n#include <c.h>\n'
     header.write_text(ways + header.read_text())
@@ -516,7 +516,7 @@ def test_what_is_included_otherwise_counts_as_well(tmp_path, monkeypatch):
 
 @pytest.mark.backend("cpp")
 def test_what_another_process_has_noted_meanwhile_is_no_change(tmp_path, monkeypatch):
-    """Two that compile at once: one has told of a file before the other is through."""
+    """Two compile at once: one has noted an included file before the other has finished."""
     header = write(tmp_path, ADD)
     part = tmp_path / "part.h"
     part.write_text("")
@@ -539,7 +539,7 @@ def test_what_another_process_has_noted_meanwhile_is_no_change(tmp_path, monkeyp
 
 @pytest.mark.backend("cpp")
 def test_no_name_of_a_user_comes_to_a_shell(tmp_path, monkeypatch):
-    """nvcc hands its arguments to a shell; a compiler here does so as well."""
+    """nvcc passes its arguments to a shell; the compiler of this test does so, too."""
     real, compiler = shutil.which(compilers.find_cxx()[0]), tmp_path / "c++"
     compiler.write_text(f'#!/bin/sh\neval "{real} $* -E"\n')
     compiler.chmod(0o755)

@@ -1,4 +1,4 @@
-"""`composite`: sums of samples along rays, their early end, and their gradients."""
+"""`composite`: sums of samples along rays, early termination, and gradients."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_composite_is_the_sum_over_the_ray(backend, stop_alpha):
 @pytest.mark.parametrize("stop_alpha", [0.6, 1.0])
 def test_composite_passes_gradcheck(backend, stop_alpha):
     alpha, feature, offset, clear = packed(device=DEVICES[backend])
-    alpha[3] = 1.0  # opaque: nothing is divided by 1 - alpha
+    alpha[3] = 1.0  # opaque: 1 - alpha must not be a divisor
     leaves = [t.requires_grad_() for t in (alpha, feature, clear)]
 
     def add(alpha, feature, clear):

@@ -40,7 +40,7 @@ ELSEWHERE = {
     "CZI",
     "ND2",
     "LIF",
-}  # formats that tests of their own convert
+}  # formats that other tests convert
 SHAPE = (9, 20, 300)  # z y x: two shards along x
 
 
@@ -60,7 +60,7 @@ def raw(tmp_path, data) -> Path:
 
 
 def source_files(folder: Path) -> dict[str, Path]:
-    """One small volume in every format, in every way that is read differently."""
+    """Writes one small volume in every format, in every variant that is read differently."""
     import nibabel
     import nrrd
     import tifffile
@@ -219,11 +219,11 @@ def test_what_does_not_fit_is_told_with_numbers(tmp_path, raw, monkeypatch):
 
 
 class Crash(Exception):
-    """Stands for anything that ends a conversion."""
+    """Any error that ends a conversion."""
 
 
 def crash_after(monkeypatch, count: int, error: Exception) -> list[tuple[int, ...]]:
-    """Lets so many tasks run, then fails; returns the list of those that ran."""
+    """Lets `count` tasks run, then raises; returns the list of those that ran."""
     ran: list[tuple[int, ...]] = []
     original = shard.write_shard
 

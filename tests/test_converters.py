@@ -1,4 +1,4 @@
-"""Several converters of one target; journals and files that are not what was written."""
+"""Several converters of one target; damaged journals, and files that have changed since."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_converter_that_starts_at_the_same_time_leaves_a_finished_store_alone(
     original, before = conversion.plan_of, {}
 
     def plan(*given):
-        """The other one starts later and is done first."""
+        """Lets the other converter start later and finish first."""
         if not before:
             before["running"] = b""
             convert(gv.Volume(other), target)
@@ -87,7 +87,7 @@ def test_the_lock_of_a_target_that_went_away_is_taken_anew(tmp_path, monkeypatch
 
     def flock(*given):
         if not turns:
-            shutil.rmtree(target)  # the one before removed it, with the lock that this one opened
+            shutil.rmtree(target)  # as another converter may, with the lock file that is open here
         turns.append(given)
         return original(*given)
 
@@ -125,7 +125,7 @@ def test_resume_of_a_finished_store_says_so(tmp_path, raw, data):
 
 @pytest.fixture
 def begun(tmp_path, raw, monkeypatch) -> Path:
-    """A store of which three tasks are done."""
+    """A half-written store, of which three tasks are done."""
     original, ran = shard.write_shard, []
 
     def write(task, level, place):
@@ -162,7 +162,7 @@ def test_a_damaged_line_of_the_journal_has_its_task_done_again(begun, raw, data,
     lines = journal.read_text().splitlines(keepends=True)
     assert len(lines) == 3
     lines[1] = {
-        "cut": lines[1][:-20],  # the next line hangs on it
+        "cut": lines[1][:-20],  # the next line joins it
         "changed": lines[1].replace('"voxels": ', '"voxels": 1'),
         "nonsense": "[" * 10**5 + "\n",
         "empty": "\n",
@@ -175,7 +175,7 @@ def test_a_damaged_line_of_the_journal_has_its_task_done_again(begun, raw, data,
 
 
 def test_the_journal_is_there_as_a_whole_at_any_time(begun, raw, data, monkeypatch):
-    """A crash while it is written anew loses nothing that is done."""
+    """A crash while it is rewritten loses nothing that is done."""
     before = (begun / WORK / "journal.jsonl").read_bytes()
 
     def crash(*_):
@@ -208,7 +208,7 @@ def copied(whole, tmp_path) -> Path:
 
 
 def refusals(target: Path) -> list[str]:
-    """What is said of reading the first time point in each of three ways."""
+    """Returns the errors of reading the first time point in each of three ways."""
     try:
         store = Store.open(target)
     except (ValueError, OSError) as error:

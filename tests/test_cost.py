@@ -1,4 +1,4 @@
-"""Cost pictures: what they count is what the kernel counts, and closed forms."""
+"""Cost pictures: their counts equal the kernel's, and closed forms."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ AROUND = {
 
 @pytest.mark.parametrize("name", [*AROUND, "lens, clip and layer"])
 def test_what_is_put_around_rays_is_counted(blobs, compiled, name):
-    """The samples are the picture's. Where something is cut away fewer nodes are visited; through
-    a translucent layer the same matter is seen.
+    """The samples are the picture's. Where a clip cuts, fewer nodes are visited; through a
+    translucent layer the same matter is seen.
     """
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     soft = gv.TransferFunction.from_points([(0, 0), (0.2, 0), (1, 0.6)])
@@ -71,7 +71,7 @@ def _level(counted: gv.Cost) -> float:
 
 
 def test_nodes_are_counted_up_to_where_a_ray_ends(blobs, compiled):
-    """A haze ends nowhere: all nodes of the walk. A wall ends sooner."""
+    """A haze ends no ray: all nodes of the walk count. A wall ends rays sooner."""
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     haze = gv.TransferFunction.from_points([(0, 0.001), (1, 0.002)])
     wall = gv.TransferFunction.from_points([(0, 1), (1, 1)])
@@ -130,7 +130,7 @@ def test_age_counts_frames_since_a_brick_was_written(blobs, compiled):
         assert seen.min() > 5 - 1e-4 and seen.max() < engine.frames
         other = gv.Camera.orbit(-150, 20, 1.3, width=24, height=24)
         assert sum(engine.frame(other, SHADER)[1].produced.values()) == 0
-        for _ in range(4):  # the host may be ahead of the counts of the frame before
+        for _ in range(4):  # the host may be ahead of the previous frame's counts
             _, stats = engine.frame(other, SHADER)
             if stats.produced["bricks"]:
                 break

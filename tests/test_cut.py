@@ -23,7 +23,7 @@ def level(shape: tuple[int, ...], dtype: torch.dtype, seed: int = 0) -> torch.Te
 
 
 def by_padding(values: torch.Tensor, place: torch.Tensor, size: int, border: int) -> np.ndarray:
-    """Bricks from a level that is padded far enough on all sides."""
+    """Cuts bricks from a level that is padded far enough on all sides."""
     far = (int(place.abs().max()) + 2) * size + border if len(place) else 0
     padded = np.pad(values.double().numpy(), ((far, far),) * 3 + ((0, 0),), mode="edge")
     side = size + 2 * border

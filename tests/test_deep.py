@@ -1,5 +1,5 @@
-"""Deep worlds: 2^33 voxels a side, seen from 10^-9 of the box away. Pictures beside closed forms,
-and backends beside each other.
+"""Deep worlds: 2^33 voxels a side, seen from 10^-9 of the box away. Pictures are compared with
+closed forms, and backends with each other.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def engine(world: gv.Producer, **options) -> gv.Engine:
 
 
 def camera_above(place, normal, size=32, height=NEAR, **how) -> gv.Camera:
-    """A camera `height` above a place of a surface, that looks along it and down."""
+    """Returns a camera `height` above a point of a surface, looking along the surface and down."""
     place, normal = (torch.tensor(v, dtype=torch.float64) for v in (place, normal))
     normal = normal / normal.norm()
     side = torch.linalg.cross(normal, torch.tensor([0.1, 0.7, 0.7], dtype=torch.float64))
@@ -42,7 +42,7 @@ def camera_above(place, normal, size=32, height=NEAR, **how) -> gv.Camera:
 
 
 def ball_meets(rays: gv.Rays, radius: float):
-    """Distances, and outer normals there."""
+    """Returns the distances to a ball, and the outward normals there."""
     origin, direction = rays.origin.double(), rays.direction.double()
     along = (origin * direction).sum(1)
     over = (origin * origin).sum(1) - radius * radius
@@ -52,7 +52,7 @@ def ball_meets(rays: gv.Rays, radius: float):
 
 
 def torus_meets(rays: gv.Rays, ring: float, tube: float):
-    """The same by sphere tracing from the eye, outside and near, and Newton's method."""
+    """Returns the same of a torus, by sphere tracing from the eye and Newton's method."""
     origin, direction = rays.origin.double(), rays.direction.double()
     gap = torus(ring, tube)
     t = torch.zeros_like(origin[:, 0])
@@ -66,7 +66,7 @@ def torus_meets(rays: gv.Rays, ring: float, tube: float):
 
 
 def pixels_beside(picture, rays, t, normal):
-    """(r,) how many pixels the surface lies beside where it should, across the ray; -1: no hit."""
+    """Returns (r,): the surface's displacement across the ray, in pixels; -1: no hit."""
     depth = picture.depth.flatten().double()
     cosine = -(normal * rays.direction.double()).sum(1)
     beside = (depth - t).abs() * cosine / (rays.cone[:, 1].double() * t)
@@ -101,7 +101,7 @@ def test_a_surface_is_where_it_should_be(branching, depth, shape):
 
 @pytest.mark.parametrize("height", [1e-3, 1e-6, NEAR])
 def test_a_camera_outside_the_box(height):
-    """It looks at the scene's far face from far and near; rays begin where they enter."""
+    """It looks at the scene's face from far and near; rays begin where they enter the box."""
     world = Solid(lambda x, y, z: (0.999999 - x) + 0 * y * z, 30, filled=False)
     camera = camera_above((1.0, 0.2, 0.3), (1, 0, 0), height=height)
     rays = camera.rays()
@@ -117,7 +117,7 @@ def test_a_camera_outside_the_box(height):
 def test_a_sponge_is_cut_as_whole_numbers_tell():
     """Menger's, N = 3, depth 19: rays meet the cells that exact arithmetic meets."""
     depth, place = 19, torch.tensor([0.25, 0.75, 0.25], dtype=torch.float64)
-    size = 3.0**-17  # of the cell in whose hole the eye stands: nine of the smallest cells
+    size = 3.0**-17  # of the cell in whose hole the eye is: nine of the smallest cells
     low = (place / size).floor() * size
     eye, target = (low + size * torch.tensor(v) for v in ([0.5, 0.47, 0.52], [0.2, 0.85, 0.3]))
     camera = gv.Camera.look_at(
@@ -131,7 +131,7 @@ def test_a_sponge_is_cut_as_whole_numbers_tell():
         depth_r = scene.render(camera, SURFACE).depth.flatten().double()
     beside = (depth_r - t).abs() / (rays.cone[:, 1].double() * t)
     assert (depth_r < torch.inf).all()
-    # Edges are rounded by half a voxel; on the faces, the other rays, they agree.
+    # Edges are rounded by half a voxel; rays that hit faces agree.
     assert (beside < 0.1).float().mean() > 0.75, beside.quantile(0.75)
 
 
@@ -139,7 +139,7 @@ def test_a_fractal_is_the_same_in_float64():
     up = torch.tensor([0.3, -0.4, 0.86], dtype=torch.float64)
     up = up / up.norm()
     near, far = 0.2, 1.2
-    for _ in range(80):  # where the bulb begins, from outside
+    for _ in range(80):  # finds the bulb's surface from outside
         middle = 0.5 * (near + far)
         outside = bool(bulb(*(middle * up)) < -1e-13)
         near, far = (near, middle) if outside else (middle, far)
@@ -165,7 +165,7 @@ LOOKS = {"plain": LIT.transfer, "lit": LIT, "surface": SURFACE, "shadowed": SHAD
 
 @pytest.fixture(scope="module", params=DEEP, ids=lambda p: f"{p[0]}^{p[1]}")
 def deep(request):
-    """A tree of a scene that an engine has, and the rays of its camera."""
+    """A tree of a scene in an engine, and the rays of its camera."""
     branching, depth = request.param
     camera = camera_above((0.288, 0.384, 0.64), (0.36, 0.48, 0.8), size=8)
     world = Solid(ball(0.8), depth, branching)
@@ -209,7 +209,7 @@ def test_segments_and_samples_are_equal(compiled, deep):
 
 
 def test_single_and_double_agree(compiled, deep):
-    """Shadows too: a cone to the light begins at a place that is as exact as the eye's."""
+    """Shadows, too: a cone to the light begins at a position as precise as the eye's."""
     tree, rays = deep
     for name, look in LOOKS.items():
         single, _ = run(tree, compiled, rays, look)
@@ -219,7 +219,7 @@ def test_single_and_double_agree(compiled, deep):
 
 
 def test_a_sponge_zoomed_in_is_itself():
-    """No jitter, no crack: each 81st part of Menger's sponge is the sponge, down to 10^-7."""
+    """No jitter, no cracks: Menger's sponge, magnified 81 times, is the sponge, down to 10^-7."""
     place = torch.tensor([0.25, 0.75, 0.25], dtype=torch.float64)
     pictures = []
     with engine(Menger(19, 21), brick_size=9, brick_pool="64 MB") as scene:
@@ -247,7 +247,7 @@ def test_a_sponge_zoomed_in_is_itself():
 
 
 def test_counting_goes_on_from_a_new_base(blobs, compiled):
-    """Behind 2^23 intervals of one length: the same segments, and no interval is left out."""
+    """After 2^23 intervals of one length: the same segments, and no interval is skipped."""
     tree = gv.N3Tree.from_volume(blobs, 4)
     rays = camera_rays(tree, 6, distance=1.3)
     found = []
@@ -271,7 +271,7 @@ def test_counting_goes_on_from_a_new_base(blobs, compiled):
 
 
 def test_a_ray_of_more_intervals_than_a_float_counts():
-    """A haze of 2^26 intervals, which no base counts, takes what its closed form takes."""
+    """A haze of 2^26 intervals, too many for one base, absorbs what its closed form says."""
     world = Solid(lambda x, y, z: 1 + 0 * (x + y + z), 22)  # full
     rays = gv.Rays(
         origin=torch.tensor([[-2.0, 0.1, 0.1]], dtype=torch.float64),

@@ -1,5 +1,5 @@
-"""The Mandelbulb from near: pictures of a tree of 2^33 voxels a side beside its formula, stepped
-along each ray in NumPy, in float64.
+"""The Mandelbulb from nearby: pictures of a tree of 2^33 voxels a side, compared with its formula,
+stepped along each ray in NumPy, in float64.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ WAY = np.array([0.5, 0.32, 0.81])
 
 
 def gap(points: np.ndarray) -> np.ndarray:
-    """Distance estimate (...,) of points (..., 3), 0 inside: z^8 + c by angles."""
+    """Returns distance estimates (...,) of points (..., 3), 0 inside: z^8 + c by angles."""
     c = np.moveaxis(np.asarray(points, np.float64), -1, 0)
     z, apart = c.copy(), np.ones(c.shape[1:])
     radius = np.sqrt((z * z).sum(0))
@@ -33,7 +33,7 @@ def gap(points: np.ndarray) -> np.ndarray:
 
 
 def surface_place() -> np.ndarray:
-    """Where a line from outside first meets the bulb."""
+    """Returns where a line from outside first meets the bulb."""
     outside, inside = 1.3, 0.2
     for _ in range(6):
         along = np.linspace(outside, inside, 2001)
@@ -43,7 +43,7 @@ def surface_place() -> np.ndarray:
 
 
 def camera(place: np.ndarray, level: int, size: int) -> gv.Camera:
-    """2^-level of the box away from the place, where there is most room."""
+    """Returns a camera 2^-level of the box away from `place`, where there is most room."""
     ways = np.random.default_rng(0).normal(size=(500, 3))
     eyes = place + BOX * 0.5**level * ways / np.linalg.norm(ways, axis=1, keepdims=True)
     eye = eyes[gap(eyes).argmax()]
@@ -51,8 +51,8 @@ def camera(place: np.ndarray, level: int, size: int) -> gv.Camera:
 
 
 def first_below(rays: gv.Rays, share: float, cone: np.ndarray, end: float) -> np.ndarray:
-    """(r,) distances at which rays first come nearer to the bulb than a share of their cones, as
-    wide as `cone` a unit of distance; +inf: none before `end`.
+    """Returns the distances (r,) at which rays first come nearer to the bulb than a share of their
+    cones, which are `cone` wide per unit of distance; +inf: none before `end`.
     """
     origin, direction = rays.origin.double().numpy(), rays.direction.double().numpy()
     t, found = np.full(len(origin), 1e-3 * end), np.full(len(origin), np.inf)
@@ -71,13 +71,13 @@ def first_below(rays: gv.Rays, share: float, cone: np.ndarray, end: float) -> np
 
 @pytest.fixture(scope="module")
 def bulb():
-    """An engine of a fixed pool, and the place on the surface."""
+    """An engine with a fixed pool, and a point of the surface."""
     with opened("24 MB") as engine:
         yield engine, surface_place()
 
 
 def opened(bricks: str) -> gv.Engine:
-    """An engine of a fixed pool."""
+    """Opens an engine with a fixed pool."""
     solid = gv.Solid(gv.Mandelbulb(8, iterations=STEPS), colors=False)
     producer = gv.FieldProducer(solid, 2**33, box=((-BOX / 2,) * 3, (BOX / 2,) * 3))
     assert producer.dtype == torch.float64
@@ -85,8 +85,8 @@ def opened(bricks: str) -> gv.Engine:
 
 
 def seen_from_near(engine: gv.Engine, place: np.ndarray, level: int, size: int) -> gv.Picture:
-    """A picture. Where estimates fall from a cone's width to a fiftieth of it lies what is drawn:
-    nothing before, and no hole behind.
+    """Renders a picture, and asserts that the drawn surface lies where estimates fall from a cone's
+    width to a fiftieth of it: nothing is in front of that, and no hole is behind.
     """
     scale, view = 2.0, camera(place, level, size)
     picture = engine.render(view, gv.Isosurface(0.25), cone_scale=scale)
@@ -117,8 +117,8 @@ def test_a_picture_from_near_is_that_of_the_formula(bulb, level):
 
 @pytest.mark.backend("cpp")
 def test_a_flight_through_all_levels_is_that_of_the_formula():
-    """From 2^-4 to 2^-30 of the box with a pool that holds a part of what is seen on the way, in
-    memory that stays as it is; back at the beginning, the picture has the bits that it had.
+    """From 2^-4 to 2^-30 of the box, with a pool that holds a part of what is seen on the way, and
+    constant memory; back at the start, the picture has the same bits as before.
     """
     place, made = surface_place(), 0
     with opened("2 MB") as engine:
@@ -137,7 +137,7 @@ def test_a_flight_through_all_levels_is_that_of_the_formula():
 
 @pytest.mark.backend("cpp")
 def test_single_and_double_see_the_same_from_near(bulb):
-    """No jitter: rays in float32 that begin 10^-8 of the box away meet what those in float64 do."""
+    """No jitter: float32 rays that begin 10^-8 of the box away meet what float64 rays do."""
     engine, place = bulb
     view = camera(place, 27, 16)
     look = gv.Isosurface(0.25)

@@ -1,4 +1,4 @@
-"""What every kind of producer holds, level by level, beside means of 16^3 places in each voxel."""
+"""Voxels of every kind of producer, level by level, against means of 16^3 points in each voxel."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ SIDE, BOX = 64, ((-1.1,) * 3, (1.1,) * 3)
 FINEST = 2.2 / SIDE
 COUNT = 200  # voxels of a level
 PLACES = 16  # along each axis, in a voxel
-#: How far the share of 16^3 places that a plane leaves behind it may be from its volume: half a
-#: layer, where it lies along one.
+#: Largest difference between the share of 16^3 points behind a plane and the exact volume: half a
+#: layer, if the plane is parallel to the layers.
 COUNTED = 0.5 / PLACES
-#: `Solid` takes the surface for a plane across an axis: right to this in every direction.
+#: `Solid` treats the surface as a plane across an axis; this is its error in other directions.
 PLANE = 0.09
 RADIUS = 0.7
 
@@ -39,7 +39,7 @@ class Voxels(NamedTuple):
 
     @property
     def places(self) -> Tensor:
-        """(k, 16^3, 3) places spread over them."""
+        """(k, 16^3, 3) points spread over them."""
         at = (torch.arange(PLACES, dtype=torch.float64) + 0.5) / PLACES
         return self.low[:, None] + self.side * torch.cartesian_prod(at, at, at)
 
@@ -49,8 +49,8 @@ class Voxels(NamedTuple):
 
 
 class Case(NamedTuple):
-    """A producer, what its voxels hold by another way, and the largest error and its root of the
-    mean square, of a voxel of a side.
+    """A producer, an independent reference of its voxels, and bounds by a voxel's side: the largest
+    error, and the root mean square error.
     """
 
     make: Callable[[], gv.Producer]
@@ -59,12 +59,12 @@ class Case(NamedTuple):
 
 
 def both(most: float, share: float) -> tuple[float, float]:
-    """The largest error, and a share of it as the root of the mean square."""
+    """Returns the largest error, and a share of it as the root mean square error."""
     return most, share * most
 
 
 def means(voxels: Voxels) -> dict[str, Tensor]:
-    """Of the producer's values at places, unfiltered."""
+    """Returns the means of the producer's unfiltered values at the points."""
     found = voxels.producer.at(voxels.places)
     return {name: values.double().mean(1) for name, values in found.items()}
 
@@ -84,8 +84,8 @@ def field(make: Callable[[], torch.nn.Module]) -> Callable[[], gv.Producer]:
 
 
 def solid(shape: Callable[[], gv.fields.Distance], bent: float) -> Case:
-    """Of a surface whose curvature is `bent` at most: within a voxel it leaves its plane by no more
-    than bent / 2 times half its diagonal squared, on average over a square by bent / 12 of it.
+    """Returns the case of a surface whose curvature is at most `bent`: in a voxel it leaves its
+    plane by at most bent / 2 (half the diagonal)^2, on average over a square by bent / 12 side^2.
     """
 
     def bounds(side):
@@ -96,7 +96,7 @@ def solid(shape: Callable[[], gv.fields.Distance], bent: float) -> Case:
 
 
 def painted_means(voxels: Voxels) -> dict[str, Tensor]:
-    """With the ball's normals in closed form, where voxels that are seen hold any."""
+    """As `means`, with the ball's normals in closed form, where visible voxels have any."""
     away = voxels.middle.norm(dim=1, keepdim=True)
     depth = (RADIUS - away) / voxels.side
     normal = torch.where((depth > -0.5) & (depth < 3.9), 127 * voxels.middle / away, math.nan)
@@ -104,7 +104,7 @@ def painted_means(voxels: Voxels) -> dict[str, Tensor]:
 
 
 def painted_bounds(side: float) -> dict[str, tuple[float, float]]:
-    """The colour is that of the middle."""
+    """Bounds for colours that are evaluated only in the middle of a voxel."""
     alpha, rms = solid(sdf.Sphere, 1 / RADIUS).bounds(side)["density"]
     return {
         "rgba": (alpha + STEEP * side / 2, rms + STEEP * side / 12**0.5),
@@ -120,17 +120,17 @@ def rough() -> gv.Producer:
 
 
 def variances(octaves, side: float):
-    """For each octave the variance of its noise, the share of it in means, and cells a voxel."""
+    """Yields for each octave: variance of its noise, share of it in means, and cells a voxel."""
     for one in octaves:
         share = math.exp(-noise.LOST * (side * one.frequency) ** 2)
         yield one.amplitude**2 * noise.VARIANCE, share, side * one.frequency
 
 
 def rough_bounds(side: float) -> dict[str, tuple[float, float]]:
-    """In s, each octave is taken as its middle times its share in place of its mean: apart by a
-    variance of 2 share^2 (1 - share) at most, and of share^2 where it is not taken. The distance is
-    by side^2 / 12 radii larger in the mean. The slope of the step from 0 to 1, over its half width,
-    is 0.55 in the root of the mean square; and a step and a ramp of one variance are 0.036 apart.
+    """In s, each octave is its value in the middle times its share, instead of its mean: they
+    differ by a variance of at most 2 share^2 (1 - share), or share^2 if the octave is left out. The
+    mean distance is larger by side^2 / 12 radii. The slope of the step from 0 to 1, over its half
+    width, has a root mean square of 0.55; a step and a ramp of equal variance differ by 0.036.
     """
     spread = soft = 0.0
     for variance, share, cells in variances(rough().octaves, side):
@@ -149,14 +149,14 @@ SUM = noise.OctaveSum(frequency=1.5, octaves=6, gain=0.6)
 
 
 def octave_means(voxels: Voxels) -> dict[str, Tensor]:
-    """Of all octaves, whatever the level; cells begin at the low corner of the box."""
+    """Returns means of all octaves at every level; cells begin at the low corner of the box."""
     points = (voxels.places - torch.tensor(BOX[0])) * 1.5
     return {"value": noise.fbm(points, octaves=6, gain=0.6).mean(1, keepdim=True)}
 
 
 def octave_bounds(side: float) -> dict[str, tuple[float, float]]:
-    """What a level holds has the variance of its middles, the means have less: they are apart by
-    the difference at most; of what it does not hold, by what means have.
+    """Octaves of a level have the variance of their values in the middle, means have less: they
+    differ by at most the difference; for octaves not in the level, by the variance of the means.
     """
     apart = 0.0
     for variance, share, cells in variances(SUM.octaves, side):
@@ -176,7 +176,7 @@ def turned_box(channel: str) -> Callable[[], gv.Producer]:
 
 
 def box_means(voxels: Voxels) -> dict[str, Tensor]:
-    """By the planes of its sides, and by the distance to the nearest of its points."""
+    """Returns coverage by the planes of the box, or distance by its nearest point."""
     producer = voxels.producer
     q = (voxels.places @ TURN.T).abs() - HALF
     if "coverage" in producer.channels:
@@ -187,15 +187,15 @@ def box_means(voxels: Voxels) -> dict[str, Tensor]:
 
 
 def box_distance_bounds(side: float) -> dict[str, tuple[float, float]]:
-    """Distances change by 1 a unit at most, so a mean over a cube is within 0.48 of its side of
-    the value in its middle; above the finest level there are 2^3 of them.
+    """Distances change by at most 1 per unit, so the mean over a cube is within 0.48 sides of the
+    value in its middle; above the finest level, 2^3 middles are averaged.
     """
     most = 0.48 * side / (2 if side > 1.01 * turned_box("coverage")().spacing[0] else 1)
     return {"distance": both(most, 0.25)}
 
 
 def scattered() -> tuple[Tensor, Tensor, Tensor]:
-    """Places, values and radii of points."""
+    """Returns positions, values and radii of points."""
     random = torch.Generator().manual_seed(3)
     place = 0.3 * torch.randn((300, 3), generator=random).double().clamp(-3, 3)
     sizes = torch.tensor([0.0, 0.01, 0.04, 0.1], dtype=torch.float64)
@@ -204,7 +204,7 @@ def scattered() -> tuple[Tensor, Tensor, Tensor]:
 
 
 def point_sums(voxels: Voxels) -> dict[str, Tensor]:
-    """The share of each point along each axis."""
+    """Returns sums of points, by the share of each point along each axis."""
     low = voxels.low.numpy()
     total = np.zeros((len(low), 2))
     for at, value, reach in zip(*(one.numpy() for one in scattered()), strict=True):
@@ -220,7 +220,7 @@ def random_volume() -> gv.Volume:
 
 
 def volume_means(voxels: Voxels) -> dict[str, Tensor]:
-    """Of the finest voxels in each."""
+    """Returns the means of the finest voxels in each."""
     values, n = random_volume().data.double().view((SIDE,) * 3), round(voxels.side / FINEST)
     first = ((voxels.low - BOX[0][0]) / FINEST).round().long()
     x, y, z = (first[:, axis, None] + torch.arange(n) for axis in range(3))
@@ -228,7 +228,7 @@ def volume_means(voxels: Voxels) -> dict[str, Tensor]:
     return {"value": held.flatten(1).mean(1, keepdim=True)}
 
 
-#: The channels of a joined producer, and whose they are.
+#: Channels of a joined producer, and the case each one comes from.
 PARTS = {"ball": "ball", "volume": "volume", "rough": "hypertexture"}
 
 
@@ -251,7 +251,7 @@ def joined_bounds(side: float) -> dict[str, tuple[float, float]]:
 CASES = {
     "ball": solid(lambda: sdf.Sphere(RADIUS), 1 / RADIUS),
     "torus": solid(lambda: sdf.Torus(0.6, 0.25), 1 / 0.25),
-    # Values are no distances there; they change their slope by 2^2 / 0.7 of it a unit at most.
+    # Its values are not distances; their slope changes by at most 2^2 / 0.7 of itself per unit.
     "flattened": solid(
         lambda: sdf.Transform(
             sdf.Sphere(RADIUS), ((1, 0, 0), (0, 1, 0), (0, 0, 0.5)), (0.1, 0.0, 0.1)
@@ -263,7 +263,7 @@ CASES = {
         painted_means,
         painted_bounds,
     ),
-    # Two places along an axis: the error of the midpoint rule on halves, and that of 16 places.
+    # Two points along an axis: the midpoint rule's error on halves, plus that of 16 points.
     "module": Case(
         field(Stripes),
         means,
@@ -271,7 +271,7 @@ CASES = {
     ),
     "hypertexture": Case(rough, means, rough_bounds),
     "octaves": Case(lambda: gv.OctaveProducer(SUM, SIDE, box=BOX), octave_means, octave_bounds),
-    # Shares are exact, and rounded to a number of 255.
+    # Shares are exact, but rounded to multiples of 1 / 255.
     "mesh": Case(
         turned_box("coverage"), box_means, lambda side: {"coverage": (0.5 + 255 * COUNTED, 1.0)}
     ),
@@ -291,7 +291,7 @@ CASES = {
 
 
 def held(producer: gv.Producer, nodes: gv.Nodes, at: Tensor) -> dict[str, Tensor]:
-    """For each channel (k, c) a voxel z, y, x, (k, 3), of each node as a tree would hold it."""
+    """Returns by channel (k, c): one voxel `at` (k, 3), z y x, of each node, as a tree holds it."""
     found = producer.classify(nodes)
     regions = found if isinstance(found, gv.Regions) else gv.Regions(kind=found)
     rows, (z, y, x) = torch.arange(len(nodes)), (at + nodes.layout.border).unbind(1)
@@ -307,8 +307,8 @@ def held(producer: gv.Producer, nodes: gv.Nodes, at: Tensor) -> dict[str, Tensor
 
 @pytest.mark.parametrize("name", CASES)
 def test_every_level_is_the_mean_of_the_formula(name):
-    """Voxels of nodes by chance, three quarters of them where there is more than one value: the
-    largest error, and the root of the mean square by the number of those between two values.
+    """Random voxels, three quarters of them in nodes with more than one value: the largest error,
+    and the root mean square, over the number of voxels between the least and the largest value.
     """
     case, random = CASES[name], torch.Generator().manual_seed(1)
     producer = case.make()

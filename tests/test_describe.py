@@ -1,4 +1,4 @@
-"""What `gvtorch info` tells of a volume is never an error."""
+"""`gvtorch info` describes every volume without an error."""
 
 from __future__ import annotations
 

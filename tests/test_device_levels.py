@@ -1,4 +1,4 @@
-"""Levels that are made on a device: the bits of those that NumPy makes on the host."""
+"""Levels that are made on a device have the bits of those that NumPy makes on the host."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.backend("cuda"))]
 
 
 def random_data(dtype: str, shape: tuple[int, ...], seed: int = 3) -> torch.Tensor:
-    """Numbers over a dtype's whole range, many of them equal."""
+    """Returns numbers over a dtype's whole range, many of them equal."""
     of = getattr(torch, dtype)
     drawn = torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     drawn[: shape[0] // 2] = (drawn[: shape[0] // 2] * 4).floor() / 4
@@ -73,7 +73,7 @@ def test_grids_come_back_as_they_went(dtype):
 
 
 def parts(tree: gv.N3Tree) -> dict[str, torch.Tensor]:
-    """All words and voxels of a tree, on the host."""
+    """Returns all words and voxels of a tree, on the host."""
     pools = {f"nodes.{name}": value for name, value in vars(tree.nodes).items()}
     pools |= {f"bricks.{name}": value for name, value in vars(tree.bricks).items()}
     found = {}

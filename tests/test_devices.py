@@ -15,7 +15,7 @@ FIELDS = ("color", "alpha", "depth", "samples")
 
 
 def traced() -> list[torch.Tensor]:
-    """A picture of voxels of each size, with levels that blend, on the CPU."""
+    """Returns pictures of voxels of each size, with blended levels, on the CPU."""
     values = torch.rand(40, 40, 40, generator=torch.Generator().manual_seed(4))
     found = []
     for dtype, factor in ((torch.uint8, 255), (torch.float16, 1), (torch.float32, 1)):
@@ -73,7 +73,7 @@ def test_cuda_streams(blobs):
     stream = torch.cuda.Stream()
     with torch.cuda.stream(stream):
         torch.cuda._sleep(10**8)
-        late = rays.origin + 0  # made on this stream, behind the sleep
+        late = rays.origin + 0  # made on this stream, after the sleep
         moved = gv.Rays(origin=late, direction=rays.direction, cone=rays.cone, range=rays.range)
         actual = gv.trace(tree, moved, SHADER)
     stream.synchronize()

@@ -1,4 +1,4 @@
-"""Colours and opacities seen from six directions, against filters and rays worked out apart."""
+"""Colours and opacities seen from six directions, against independent filters and rays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIZES = {"brick_size": 4, "border": 1}
 
 
 def wall(side: int, at: int, spacing=(1.0, 1.0, 1.0)) -> gv.Volume:
-    """An opaque wall of two voxels across x: red at `at`, green behind it."""
+    """Returns an opaque wall of two voxels across x: red at `at`, green behind it."""
     rgba = torch.zeros((side, side, side, 4))
     rgba[:, :, at] = torch.tensor((*RED, 1.0))
     rgba[:, :, at + 1] = torch.tensor((*GREEN, 1.0))
@@ -28,7 +28,7 @@ def wall(side: int, at: int, spacing=(1.0, 1.0, 1.0)) -> gv.Volume:
 
 
 def straight(device: str, direction, cone: float, box: torch.Tensor, grid: int = 3) -> gv.Rays:
-    """Rays of one direction and one width through places around the box's centre."""
+    """Returns rays of one direction and one width through points around the box's centre."""
     along = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
     side = (box[1] - box[0]).max()
     shift = torch.cartesian_prod(*(torch.linspace(-0.2, 0.2, grid).double() for _ in "xyz")) * side
@@ -37,7 +37,7 @@ def straight(device: str, direction, cone: float, box: torch.Tensor, grid: int =
 
 
 def shoot(volume: gv.Volume, backend: str, direction, cone: float, branching: int = 2, **options):
-    """Hits of straight rays of one width, float64."""
+    """Returns the hits of straight rays of one width, in float64."""
     tree = gv.N3Tree.from_volume(volume, **SIZES, branching=branching, device=DEVICES[backend])
     rays = straight(DEVICES[backend], direction, cone, tree.box)
     options |= {"backend": backend, "dtype": torch.float64, "cone_scale": 1.0, "stop_alpha": 1.0}
@@ -49,7 +49,7 @@ def shoot(volume: gv.Volume, backend: str, direction, cone: float, branching: in
 
 
 def composited(rgba: np.ndarray, lengths: float) -> np.ndarray:
-    """(4,) premultiplied colour and alpha of voxels (k, 4), front to back, one by one."""
+    """Returns (4,): premultiplied colour and alpha of voxels (k, 4), composited front to back."""
     color, clear = np.zeros(3), 1.0
     for red, green, blue, opacity in rgba:
         alpha = 1 - (1 - opacity) ** lengths
@@ -170,7 +170,7 @@ def test_a_homogeneous_medium_is_that_of_one_direction(backend, branching):
 
 @pytest.mark.parametrize("direction", [(1, 0.5, 0.3), (-1, 2, 0.3), (0.2, -0.5, -3), (-1, -1, 1)])
 def test_a_ray_sees_the_three_directions_that_it_goes_along(backend, direction):
-    """Numbers of six directions that differ in the finest voxels too; none is seen along +x."""
+    """The six directions differ in the finest voxels, too; nothing is visible along +x."""
     random = np.random.default_rng(2)
     data = random.uniform(0, 0.3, (8, 8, 8, 24)).astype(np.float32)
     data[..., :4] = 0

@@ -1,4 +1,4 @@
-"""Every link of the docs leads to a file that is there, and to a heading of it."""
+"""Every link of the docs leads to an existing file and heading."""
 
 import re
 from pathlib import Path

@@ -1,5 +1,5 @@
-"""Attributes of shaders and lights are checked and converted when they are edited, as when the
-object is made.
+"""Attributes of shaders and lights are checked and converted when they are edited, as they are in
+the constructor.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Servers that never stop within a chunk, as fast as they can or a byte at a time, stall, break off
-or send another part than was asked for: that costs the nodes of that chunk, and no more memory than
-a chunk can take.
+"""Servers that send a chunk without an end, fast or a byte at a time, that stall, break off or send
+another part than was requested: this costs only the nodes of that chunk, and no more memory than a
+chunk can take.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Server(WebServer):
         self.shift = 0
 
     def handle_error(self, *_: object) -> None:
-        pass  # readers go away
+        pass  # readers close the connection
 
     @property
     def url(self) -> str:
@@ -117,14 +117,14 @@ def server(tmp_path, monkeypatch) -> Iterator[Server]:
 
 
 def mended(server: Server, read: Callable[[], Any]) -> Any:
-    """What a read gives when the server is well again, and is not remembered as what it was."""
+    """Returns what a read gives once the server works again and its failure is forgotten."""
     server.bad = ""
     for _ in range(40):
         http.ask_again()
         try:
             return read()
         except OSError:
-            time.sleep(0.5)  # of requests that are on their way
+            time.sleep(0.5)  # until pending requests have ended
     return read()
 
 
@@ -134,7 +134,7 @@ def resident() -> int:
 
 @contextlib.contextmanager
 def little_memory() -> Iterator[None]:
-    """The process stays small meanwhile."""
+    """Asserts that the process stays small within the block."""
     before, most, over = resident(), [0], threading.Event()
 
     def look() -> None:

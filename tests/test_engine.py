@@ -1,4 +1,4 @@
-"""The engine: a picture from small pools is the picture of the whole; pools stay in order."""
+"""The engine: a picture from small pools equals that of a resident tree; pools stay valid."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_small_pool_gives_the_picture_of_the_whole(request, compiled, scan, pr
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("lod", ["auto", "finest"])
 def test_many_views_from_one_small_pool(aneurism, lod):
-    """Bricks come and go between views; each converged picture is that of the whole tree."""
+    """Bricks are replaced between views; each converged picture equals the resident tree's."""
     tree = gv.N3Tree.from_volume(aneurism)
     views = [camera(32, azimuth=a, distance=d) for a, d in ((0, 0.5), (80, 0.7), (200, 0.4))]
     whole = [gv.render(tree, view, VESSELS, lod=lod) for view in views]
@@ -76,7 +76,7 @@ def test_many_views_from_one_small_pool(aneurism, lod):
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 @pytest.mark.parametrize("pool", ["brick_pool", "node_pool"])
 def test_where_pools_are_too_small_rays_take_turns(aneurism, compiled, loading, pool):
-    """Converged pictures are those of the whole tree, though no frame can hold all they need."""
+    """Converged pictures equal the resident tree's, though no frame can hold all their bricks."""
     device, view = DEVICES[compiled], camera(64, distance=1.2)
     whole = gv.render(gv.N3Tree.from_volume(aneurism, device=device), view, VESSELS)
     slots, size = (working_set(whole), 1000) if pool == "brick_pool" else (tiles(whole), 8 * 11)
@@ -93,7 +93,7 @@ def test_where_pools_are_too_small_rays_take_turns(aneurism, compiled, loading, 
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 @pytest.mark.parametrize("pool", ["brick_pool", "node_pool"])
 def test_a_frame_from_too_small_pools_is_complete_and_coarser(aneurism, compiled, loading, pool):
-    """Whole frames, until nothing moves any more: the error falls as the pool grows."""
+    """Frames are drawn until the pools no longer change: the error falls as the pool grows."""
     device, view = DEVICES[compiled], camera(64, distance=1.2)
     whole = gv.render(gv.N3Tree.from_volume(aneurism, device=device), view, VESSELS)
     slots, size = (working_set(whole), 1000) if pool == "brick_pool" else (tiles(whole), 8 * 11)
@@ -160,7 +160,7 @@ def test_pools_stay_in_order_over_random_frames(blobs, data):
 
 
 def test_scouts_are_few():
-    """All that missed something, if they are a sixteenth, else one of 4 x 4 pixels."""
+    """Scouts are all rays that missed something if these are at most a sixteenth, else 1 of 4x4."""
     missed = torch.zeros(8, 16, dtype=torch.bool)
     missed[3, 1:9] = True
     assert torch.equal(scouts(missed.flatten(), 16), missed.flatten())
@@ -171,7 +171,7 @@ def test_scouts_are_few():
 
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 def test_scouts_save_frames(aneurism, compiled, loading):
-    """The same picture from the same bricks; what each round asked for adds up."""
+    """The same picture from the same bricks; the requests of all rounds add up."""
     device, view = DEVICES[compiled], camera(96, distance=1.2)
     whole = gv.render(gv.N3Tree.from_volume(aneurism, device=device), view, VESSELS)
     frames, bricks = [], []
@@ -195,8 +195,8 @@ def test_scouts_save_frames(aneurism, compiled, loading):
 
 
 class Watched(Checked):
-    """Looks after every round of a frame: what was written within the frame is still there, and so
-    is what scouts used.
+    """Asserts after every round of a frame that nothing was evicted that was written within the
+    frame or used by scouts.
     """
 
     def __init__(self, *args, **options):
@@ -231,7 +231,7 @@ class Watched(Checked):
 
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 def test_scouts_take_nothing_that_is_in_use(blobs, compiled, loading):
-    """From pools of a few slots; budgets hold for all rounds of a frame together."""
+    """In pools of a few slots; budgets apply to all rounds of a frame together."""
     pick = random.Random(5)
     shader = gv.TransferFunction.preset("gray", 0, 1)
     rounds = evicted = 0
@@ -257,7 +257,7 @@ def test_scouts_take_nothing_that_is_in_use(blobs, compiled, loading):
 @given(seed=st.integers(0, 1000), loading=st.sampled_from(["straight", "levels"]))
 @pytest.mark.backend("cpp")
 def test_twins_and_kernels_drive_the_engine_alike(blobs, seed, loading):
-    """The same frames through the reference and the C++ backend leave the same pools."""
+    """The same frames, by the reference and the C++ backend, leave the same pools."""
     pick = random.Random(seed)
     views = [
         camera(8, azimuth=pick.uniform(0, 360), distance=pick.choice([0.3, 1.2, 4.0]))
@@ -331,7 +331,7 @@ def test_the_nearer_tree_hides_the_farther_one():
 
 
 def test_pools_are_honoured_to_the_byte():
-    """Content up to the bytes asked for, less than a slot below; bookkeeping at most 3.1 %."""
+    """They hold the requested bytes to within one slot; bookkeeping adds at most 3.1 %."""
 
     class Colour(gv.Producer):
         def fill(self, nodes):
@@ -353,7 +353,7 @@ def test_pools_are_honoured_to_the_byte():
 
 @pytest.mark.backend("cpp")
 def test_a_wandering_camera_leaves_memory_flat(blobs):
-    """2,000 frames: nothing piles up, and the pools are in order at the end."""
+    """After 2,000 frames nothing has piled up, and the pools are valid."""
     pick = random.Random(7)
     shader = gv.TransferFunction.preset("gray", 0, 1)
     options = {"brick_size": 4, "brick_pool": 60 * 6**3 * 4, "node_pool": 40 * 8 * 20}
@@ -371,7 +371,7 @@ def test_a_wandering_camera_leaves_memory_flat(blobs):
                 live.append(sum(isinstance(one, torch.Tensor) for one in gc.get_objects()))
                 pages.append(int(Path("/proc/self/statm").read_text().split()[1]))
         engine.validate()
-        assert len(live) == 4 and max(live) - live[0] <= 8, live  # what others left may go
+        assert len(live) == 4 and max(live) - live[0] <= 8, live  # others' garbage may be freed
         assert (pages[-1] - pages[0]) * 4096 < 20e6, "resident memory is flat"
         assert evicted > 100 and len(engine.production.failures) == 0
 
@@ -467,7 +467,7 @@ def test_stages_show_in_the_profiler_and_cost_nothing_without_listeners(blobs):
 @pytest.mark.parametrize("branching", [2, 3, 4])
 @pytest.mark.parametrize("dtype", ["uint16", "int8", "int16", "float16", "bfloat16"])
 def test_every_dtype_and_branching_streams_the_same_bits(dtype, branching):
-    """The second number of a second channel, through pools that must give bricks away."""
+    """The second component of a second channel, through pools that must evict bricks."""
     z, y, x = np.mgrid[-1:1:40j, -1:1:30j, -1:1:50j]
     kind = getattr(torch, dtype)
     ball = torch.from_numpy(np.clip(1 - x * x - y * y - z * z, 0, 1) * 100).to(kind)

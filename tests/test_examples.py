@@ -11,7 +11,7 @@ import pytest
 from helpers import ROOT
 from helpers.opengl import IN_OPENGL
 
-SHORT = {"mandelbulb_film": ["--frames", "4"]}  # what makes them fit a test
+SHORT = {"mandelbulb_film": ["--frames", "4"]}  # options that make them short
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
@@ -26,12 +26,12 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
     ],
 )
 def test_example_writes_a_picture(example, tmp_path, monkeypatch, capsys):
-    """Within this process: each would import torch."""
+    """Runs within this process, because a new one would have to import torch."""
     if example.stem in IN_OPENGL and (reason := IN_OPENGL[example.stem]()):
         pytest.skip(reason)
     out = tmp_path / "picture.png"
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(example.parent))  # as where a script is run
+    monkeypatch.syspath_prepend(str(example.parent))  # as when a script is run
     given = ["--size", "48", "--output", str(out), *SHORT.get(example.stem, ())]
     monkeypatch.setattr(sys, "argv", [str(example), *given])
     runpy.run_path(str(example), run_name="__main__")
@@ -47,7 +47,7 @@ def test_example_writes_a_picture(example, tmp_path, monkeypatch, capsys):
     ],
 )
 def test_an_example_tells_what_to_install(tmp_path, example, package, message):
-    (tmp_path / f"{package}.py").write_text("raise ImportError('none')")  # shadows what there is
+    (tmp_path / f"{package}.py").write_text("raise ImportError('none')")  # shadows the package
     command = [sys.executable, str(ROOT / "examples" / f"{example}.py")]
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", str(ROOT))])
     run = subprocess.run(

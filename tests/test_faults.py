@@ -1,6 +1,6 @@
-"""Faults at every call: open, read, write, fsync, rename and asking for memory fail in turn while a
-volume is converted, streamed, rendered, and a picture is written. Nothing is lost, nothing hangs,
-and what went wrong is told in one line.
+"""Faults at every call: open, read, write, fsync, rename and memory allocation fail in turn while a
+volume is converted, streamed and rendered, and a picture is written. Nothing is lost, nothing
+hangs, and the error is one line.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def no_memory() -> Exception:
 
 
 class Faults:
-    """Lets the call of one number fail; counts them."""
+    """Counts calls, and lets the one with a given number fail."""
 
     def __init__(self, number: int, made: Callable[[], Exception] | None = None) -> None:
         self.number, self.calls = number, 0
@@ -67,7 +67,7 @@ class Faults:
 
 
 class Operations(TorchDispatchMode):
-    """Lets the tensor operation of one number find no memory; counts them."""
+    """Counts tensor operations, and lets the one with a given number run out of memory."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ class Operations(TorchDispatchMode):
         return op(*args, **(named or {}))
 
 
-#: By which files of gvtorch's own are written: open, fsync, rename, remove.
+#: The calls by which gvtorch writes its own files: open, fsync, rename, remove.
 WRITES: Calls = [
     *((pathlib.Path, "open"), (pathlib.Path, "replace"), (os, "fsync"), (pathlib.Path, "mkdir")),
     *((shard, "write"), (shard, "finish_write"), (shard, "shard_files")),
@@ -120,7 +120,7 @@ def test_a_conversion_goes_on_after_a_fault_at_any_call(tmp_path, monkeypatch, k
             broken += 1
             if target.exists() and not (target / "zarr.json").exists():
                 with pytest.raises((ValueError, OSError)):
-                    Store.open(target)  # what is half-written is never opened
+                    Store.open(target)  # a half-written store can't be opened
         if not (target / "zarr.json").exists():
             convert(raw, target, workers=1, resume=True)
         assert_holds(Store.open(target), data)
@@ -130,8 +130,8 @@ def test_a_conversion_goes_on_after_a_fault_at_any_call(tmp_path, monkeypatch, k
 
 
 def test_power_that_fails_before_any_file_is_on_disk(tmp_path):
-    """What was renamed without being synced may be empty after a loss of power, and what was synced
-    is there: of store and journal nothing is trusted that was not.
+    """After a loss of power, files that were renamed without a sync may be empty, and synced ones
+    are there: of store and journal, only synced files are trusted.
     """
     data = noise((12, 14, 300, 1))
     raw = tmp_path / "a_300x14x12_uint8.raw"
@@ -196,7 +196,7 @@ def test_reads_that_fail_cost_their_nodes_alone(tmp_path, kind):
 
 @pytest.mark.backend("cpp")
 def test_a_frame_that_finds_no_memory_leaves_the_pools_in_order(blobs):
-    """Each operation on tensors in turn; the next frames are those of an engine without a fault."""
+    """Each tensor operation fails in turn; the next frames equal those of a faultless engine."""
     pools: dict[str, Any] = {"brick_size": 4, "brick_pool": 150 * 6**3 * 4, "node_pool": 9600}
     views = [gv.Camera.orbit(azimuth, 20, 0.8, None, 16, 12) for azimuth in (0, 90)]
     tree = gv.N3Tree.from_volume(blobs, 4)
@@ -219,7 +219,7 @@ def test_a_frame_that_finds_no_memory_leaves_the_pools_in_order(blobs):
             engine.validate()
         if operations.calls <= number:
             break
-        step = max(step, operations.calls // 60)  # one in 45 falls where a tile changes hands
+        step = max(step, operations.calls // 60)  # one in 45 falls where a tile is replaced
         number += step
     assert failed > 8
 

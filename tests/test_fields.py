@@ -1,4 +1,4 @@
-"""What producers make of fields."""
+"""Producers of fields: their bricks, regions and ranges."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ sdf = gv.sdf
 
 
 def test_a_solid_holds_the_share_of_each_voxel():
-    """Against 10^3 points a voxel: exact where the plane faces an axis, elsewhere to 0.09."""
+    """Against 10^3 points per voxel: exact where the plane faces an axis, elsewhere to 0.09."""
     producer = gv.FieldProducer(gv.Solid(ball(), colors=False), 32, box=((-1,) * 3, (1,) * 3))
     nodes = nodes_of(producer, 3)
     density = producer.fill(nodes).data["density"][..., 0]
@@ -41,8 +41,8 @@ class Waves(Field):
 
 @pytest.mark.parametrize("branching", [2, 3])
 def test_a_coarse_level_is_the_mean_of_what_lies_below(branching):
-    """One level above the finest: exactly the mean of the voxels' middles below. Further up: as far
-    as `samples` resolve the field."""
+    """One level above the finest, exactly the mean of the values in the middles of the voxels
+    below; further up, as far as `samples` resolve the field."""
     extent = 4 * branching**3
     fine = gv.FieldProducer(
         Waves(), extent, box=((-1,) * 3, (1,) * 3), branching=branching, samples=1
@@ -68,7 +68,7 @@ def test_a_coarse_level_is_the_mean_of_what_lies_below(branching):
 
 @pytest.mark.backend("cpp")
 def test_a_field_is_rendered_as_its_dense_volume():
-    """All bricks by the engine, finest level, against a resident tree of the same values."""
+    """The engine's bricks of the finest level, against a resident tree of the same values."""
     field, box = gv.sdf.Box((1.0, 0.8, 0.6), round=0.2), ((-0.8,) * 3, (0.8,) * 3)
     producer = gv.FieldProducer(gv.Solid(field, colors=False), 32, box=box)
     places = (torch.arange(32) + 0.5) / 32 * 1.6 - 0.8
@@ -161,7 +161,7 @@ def test_bad_fields_are_named(call, message):
 
 
 class Odd(sdf.Distance):
-    """Tells nonsense in one of its methods, as it is told itself."""
+    """Returns a wrong value, given as an option, from one of its methods."""
 
     def __init__(self, method, answer):
         super().__init__()
@@ -204,7 +204,7 @@ def test_memory_that_is_short_is_no_fault_of_a_field(error):
 
 
 class Torn(gv.Field):
-    """Fails from a place on, or in what it tells of boxes, with two lines."""
+    """Fails beyond a position, or in its bounds of boxes, with a message of two lines."""
 
     def __init__(self, end, bounded=False):
         super().__init__()
@@ -245,7 +245,7 @@ def test_a_brick_that_a_field_can_not_make_is_one_line():
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.uint8])
 def test_nan_of_a_field_costs_its_bricks_alone(dtype):
-    """Places with x > 1/2 give NaN: their bricks are named, the others are drawn."""
+    """Positions with x > 1/2 give NaN: their bricks are named, the others are drawn."""
 
     def half(points):
         x = points[..., 0]
@@ -267,7 +267,7 @@ def test_nan_of_a_field_costs_its_bricks_alone(dtype):
 
 
 class Bounded(Field):
-    """A field that tells whatever interval it is given."""
+    """A field that returns the interval it is given."""
 
     def __init__(self, interval, box=None):
         super().__init__()
@@ -305,7 +305,7 @@ def test_bad_intervals_are_named(interval, message):
 
 
 def test_what_is_unknown_is_no_error():
-    """Infinite intervals tell nothing, and boxes without end must be given another."""
+    """Infinite intervals are valid but state nothing; infinite boxes must be replaced."""
     unknown = gv.FieldProducer(Bounded(lambda x: (x - math.inf, x + math.inf)), 64, box=BOX)
     assert (unknown.classify(nodes_of(unknown, 1)).kind == gv.Region.DATA).all()
     for box in (torch.full((2, 3), math.nan), torch.tensor([[-math.inf] * 3, [1.0] * 3])):
@@ -315,7 +315,7 @@ def test_what_is_unknown_is_no_error():
 
 @pytest.mark.parametrize("colors", [False, True])
 def test_producers_of_fields_compile_whole(colors):
-    """Nothing breaks the graph: neither gradients nor intervals ask the host."""
+    """Nothing breaks the graph: neither gradients nor intervals read values on the host."""
     shape = sdf.SmoothUnion(ball(), block(), 0.2) - sdf.Sphere(0.4)
     producer = gv.FieldProducer(gv.Solid(shape, colors=colors), 64)
     nodes = nodes_of(producer, 2)
@@ -325,7 +325,7 @@ def test_producers_of_fields_compile_whole(colors):
         regions = producer.classify(asked)
         return producer.fill(asked).data, regions.kind, regions.ranges
 
-    expected = ask(nodes.loc)  # the layout keeps what it makes once
+    expected = ask(nodes.loc)  # the layout caches what it makes
     compiled = torch.compile(ask, fullgraph=True, dynamic=False, backend="aot_eager")
     data, kind, ranges = compiled(nodes.loc)
     assert torch.equal(kind, expected[1])
@@ -340,7 +340,7 @@ def test_values_at_points_need_no_engine():
 
 
 def test_deep_voxels_are_told_apart():
-    """2^33 voxels a side: places are float64 by themselves, and values those of the field there."""
+    """2^33 voxels a side: positions are float64, and values those of the field there."""
     bulb = gv.Mandelbulb(8, iterations=20)
     producer = gv.FieldProducer(bulb, 2**33)
     assert producer.dtype == torch.float64
@@ -348,7 +348,7 @@ def test_deep_voxels_are_told_apart():
     layout = Layout.of(producer, 8, 1, torch.device("cpu"))
     ways = torch.nn.functional.normalize(random_points(400), dim=1)
     near, far = torch.zeros(400, 1).double(), torch.full((400, 1), 1.3).double()
-    for _ in range(50):  # onto the surface: the middle is inside, the end is not
+    for _ in range(50):  # bisects to the surface: `middle` is inside, the end outside
         middle = (near + far) / 2
         inside = bulb(ways * middle)[:, None] < 0
         near, far = torch.where(inside, middle, near), torch.where(inside, far, middle)

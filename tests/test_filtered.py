@@ -1,5 +1,5 @@
-"""`Filtered`: the transfer function seen from afar. Every backend gives the twin's bits, and the
-picture is that of 256 rays a pixel.
+"""`Filtered`: transfer functions seen from afar. Every backend gives the twin's bits, and pictures
+equal those of 256 rays a pixel.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def all_shaded() -> list[torch.Tensor]:
 
 
 def shaded(backend: str) -> list[torch.Tensor]:
-    """Of the plain function and of a lit one."""
+    """Returns all that traces of a plain and a lit function write."""
     found, lamp = [], gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))
     for look in (SHADER, gv.Lit(SHADER, light=lamp)):
         for directions in (True, False):
@@ -87,8 +87,8 @@ def test_from_afar_it_shows_what_many_fine_rays_show(look, way, pixel):
 
 
 def test_a_row_of_voxels_lets_through_what_its_columns_do_together():
-    """Of translucent matter, along each axis; of opaque matter columns count by the voxel before,
-    and as if they were independent of what is further away a row hides too much.
+    """For translucent matter, along each axis. In opaque matter, columns count by the voxel before;
+    treated as independent of what is further away, a row would hide too much.
     """
     generator = torch.Generator().manual_seed(5)
     plane = torch.rand((16, 16), generator=generator)  # columns along z, some denser than others
@@ -107,7 +107,7 @@ def test_a_row_of_voxels_lets_through_what_its_columns_do_together():
             for one in rows
         ]
     finest = through[False][0]
-    assert not torch.allclose(finest[:2], finest[4:], rtol=0.05)  # an axis is unlike another
+    assert not torch.allclose(finest[:2], finest[4:], rtol=0.05)  # axes differ
     for all_light, before in zip(through[False][1:], through[True][1:], strict=True):
         torch.testing.assert_close(all_light, finest, rtol=0.02, atol=0)
         assert (before[4:] < 0.97 * finest[4:]).all()
@@ -119,11 +119,11 @@ def test_a_row_of_voxels_lets_through_what_its_columns_do_together():
     [
         ((0.0, 0.0, 1.0), (0.02, 0.05, 0.07)),
         ((0.37, 0.23, 1.0), (0.05, 0.07, 0.06)),
-        ((1.0, 1.0, 1.0), (0.10, 0.14, 0.16)),  # of an axis' colours each counts a third
+        ((1.0, 1.0, 1.0), (0.10, 0.14, 0.16)),  # each axis' colours count a third
     ],
 )
 def test_a_solid_ball_covers_a_disc_from_afar(way, most):
-    """Its rim hardly grows: hidden voxels hold what is seen beside them."""
+    """Its rim hardly grows, because hidden voxels hold the colours of visible neighbours."""
     radius, place = 36.0, torch.arange(96) - 47.5
     z, y, x = torch.meshgrid(place, place, place, indexing="ij")
     inside = radius - (x * x + y * y + z * z).sqrt()
@@ -225,7 +225,7 @@ def test_a_tree_of_one_brick_has_no_colours():
 @pytest.mark.parametrize("hold", ["voxels", "bricks", "mapped"])
 @pytest.mark.parametrize("directions", [True, False])
 def test_streamed_equals_resident(compiled, directions, hold):
-    """From pools that hold all, and from pools with room for a part of the bricks."""
+    """In pools that hold all bricks, and in pools that hold a part."""
     device = "cuda" if compiled == "cuda" else "cpu"
     volume = matter()
     tree = gv.N3Tree.from_volume(volume, 4, device=device)
@@ -256,7 +256,7 @@ def test_streamed_equals_resident(compiled, directions, hold):
 
 @pytest.mark.backend("cpp")
 def test_two_trees_share_coarse_slots():
-    """One with filtered colours, one of a single brick, one without."""
+    """Of trees with filtered colours, with a single brick, and without such colours."""
     volume, small = matter(), gv.Volume(torch.rand(4, 4, 4), (9.0, 9.0, 9.0))
     shader, other = gv.Filtered(SHADER), gv.Filtered(SHADER)
     scene = {
@@ -298,7 +298,7 @@ def test_a_streamed_function_may_not_be_edited_nor_another_number_drawn():
             engine.render(camera, shader)
     mist = gv.TransferFunction([(0, 0), (1, 0.1)])
     producer = gv.VolumeProducer(volume, filtered=gv.Filtered(mist, component=1))
-    mist.opacity[1, 1] = 0.9  # past the alpha from which on directions would be kept
+    mist.opacity[1, 1] = 0.9  # beyond the alpha that would need directions
     with gv.Engine(producer) as engine:
         assert engine.render(camera, gv.Filtered(mist, component=1)).stats.converged
 

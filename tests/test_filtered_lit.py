@@ -1,5 +1,5 @@
-"""`Filtered` of a `Lit`: lit matter from afar. Every backend gives the twin's bits, the picture is
-that of many rays a pixel, and light and material stay free.
+"""`Filtered` of a `Lit`: lit matter from afar. Every backend gives the twin's bits, pictures equal
+those of many rays a pixel, and light and material may change.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def test_close_by_it_is_the_lit_transfer_function():
         assert torch.equal(getattr(near, field), getattr(lit, field)), field
 
 
-#: Scan, what is shown of it, voxels a pixel, light; then the least PSNR and the most that the mean
-#: light may be beside the truth's.
+#: Scan, transfer function, voxels a pixel, light; least PSNR, and largest relative error of the
+#: mean light.
 CASES = [
     ("stent", "translucent", 2.0, gv.Headlight(), 40, 0.05),
     ("stent", "translucent", 8.0, SUN, 40, 0.08),
@@ -87,7 +87,7 @@ def test_from_afar_it_shows_what_many_fine_rays_show(scan, look, pixel, light, l
 
 @pytest.mark.backend("cpp")
 def test_highlights_of_rough_matter_widen():
-    """A ball of rough matter: a highlight of as much light as that of many fine rays, and no
+    """A ball of rough matter has a highlight with as much light as that of many fine rays, and not
     sharper.
     """
     n = 96

@@ -1,5 +1,5 @@
-"""Filtered colours in stores: streamed from disk they have the bits of a resident tree, and what is
-missing or damaged is told.
+"""Filtered colours in stores: streamed from disk they have the bits of a resident tree, and missing
+or damaged parts are reported.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ OPAQUE = gv.TransferFunction([(100, 0), (120, 0.9)], [(100, 1, 0.3, 0.1), (250, 
 
 
 def matter(dtype: torch.dtype = torch.uint8, width: int = 1) -> gv.Volume:
-    """Rough matter beside a region of zeros, more than one block wide, of odd extent."""
+    """Returns rough matter and a region of zeros, more than one block wide, of odd extent."""
     generator = torch.Generator().manual_seed(2)
     coarse = torch.rand((width, 1, 9, 10, 11), generator=generator)
     value = torch.nn.functional.interpolate(coarse, size=(51, 39, 77), mode="trilinear")[:, 0]
@@ -130,12 +130,12 @@ def test_broken_off_work_leaves_the_store_as_it_was(store):
 
 
 def test_one_at_a_time_and_nothing_is_forgotten(store):
-    """Channels made through one open store, by two makers at once, and under a reader's eyes."""
+    """Channels are added through one open store, by two writers at once, and during reading."""
     opened, old = gv.Store.open(store), gv.Store.open(store)
     gv.Filtered.add_to(opened, MISTY, channel="mist")
     shader = gv.Filtered.add_to(opened, OPAQUE)
     assert sorted(gv.Store.open(store).coarse) == sorted(opened.coarse) == ["filtered", "mist"]
-    gv.Filtered.add_to(old, MISTY, channel="late")  # it was opened before the others were made
+    gv.Filtered.add_to(old, MISTY, channel="late")  # opened before the other channels were added
     assert sorted(gv.Store.open(store).coarse) == ["filtered", "late", "mist"]
 
     def meanwhile(what: str, done: int, total: int) -> None:
@@ -144,7 +144,7 @@ def test_one_at_a_time_and_nothing_is_forgotten(store):
 
     gv.Filtered.add_to(store, MISTY, channel="two", progress=meanwhile)
     with gv.Engine(gv.StoredProducer(opened, filtered=shader)) as engine:
-        gv.Filtered.add_to(store, OPAQUE)  # anew: the reader of the old ones is told
+        gv.Filtered.add_to(store, OPAQUE)  # replaced: readers of the old ones get an error
         engine.render(gv.Camera.orbit(width=24, height=24, distance=3.0), shader)
         assert any("filtered.0" in failure.message for failure in engine.failures)
 
@@ -257,7 +257,7 @@ def test_the_command_line(store, tmp_path):
     assert done.returncode == 2 and "gvtorch filter" in done.stderr
     done = gvtorch("filter", store, "--tf", "hot", "--directions", "six")
     assert done.returncode == 0 and "of colours in" in done.stdout, done.stderr
-    for given in ((), ("--tf", "hot")):  # the function that the store tells
+    for given in ((), ("--tf", "hot")):  # the function that the store records
         done = gvtorch("render", store, "--shader", "filtered", *far, *given)
         assert done.returncode == 0, done.stderr
         volume = matter()

@@ -1,4 +1,4 @@
-"""Views that the pools can't hold, in frames that serve themselves; on CUDA also as one graph."""
+"""Views that the pools can't hold, in frames served on the device; on CUDA also as one graph."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_views_that_fit_again_are_as_asked_for(backend):
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_views_fit_where_producers_answer_from_the_host(backend):
-    """There what is on its way counts as well, which is not asked for again."""
+    """There, pending bricks count as well, because they are not requested again."""
     axis = torch.linspace(-1, 1, 96)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     waves = 0.5 + 0.5 * torch.sin(9 * x) * torch.sin(8 * y) * torch.sin(7 * z)

@@ -1,4 +1,4 @@
-"""Films of key frames: states between states, and the camera's way through its keys."""
+"""Films of key frames: states between states, and the camera's path through its keys."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def place(eye: Eye) -> np.ndarray:
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.floats(-3, 3), min_size=7, max_size=7))
 def test_a_pose_is_the_exponential_of_its_logarithm(numbers):
-    """And powers of it are those of the matrix, by torch's own exponential."""
+    """Its powers equal those of the matrix, by torch's exponential."""
     step = torch.tensor(numbers, dtype=torch.float64)
     step[1:4] *= 0.95 * math.pi / max(float(step[1:4].norm()), 3.0)
     pose = exponential(step)
@@ -61,7 +61,7 @@ def test_half_turns_and_none_have_a_logarithm(turn):
 
 
 def test_keys_are_exact_and_an_orbit_is_a_circle():
-    """Four keys of uneven times at one angular speed: the camera is where a turntable has it."""
+    """Four keys at uneven times with one angular speed: the camera is where a turntable's is."""
     times = (0.0, 1.0, 2.5, 4.0)
     keys = [(time, shown(orbit(60 * time, 5.0, (3.0, 2.0, 1.0)))) for time in times]
     flight = gv.Flight(keys)
@@ -74,7 +74,7 @@ def test_keys_are_exact_and_an_orbit_is_a_circle():
 
 
 def test_a_zoom_comes_nearer_by_the_same_factor_and_ends_at_its_target():
-    """From 3 to 3e-9, and on the way there all the time."""
+    """From a distance of 3 to 3e-9, looking at the target all the time."""
     end = (0.3, 0.2, 0.1)
     flight = gv.Flight([(0, shown(orbit(0, 3.0))), (9, shown(orbit(50, 3e-9, end)))])
     for second in range(1, 9):
@@ -84,7 +84,7 @@ def test_a_zoom_comes_nearer_by_the_same_factor_and_ends_at_its_target():
 
 
 def test_no_velocity_jumps():
-    """Differences on both sides of a key agree, of the camera and of every number."""
+    """Differences on both sides of a key agree, for the camera and for every number."""
     clip = [gv.Clip(planes=[(1, 0, 0, d)], boxes=[((d, 0, 0), (d + 1, 2, 3))]) for d in range(5)]
     cameras = [
         Eye(eye=(0, 1, 9), target=(0, 0, 0)),
@@ -165,7 +165,7 @@ def test_points_of_a_function_slide_or_the_function_fades():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_what_lies_between_states_is_a_state(seed):
-    """Windows, boxes and points keep their order whatever the keys are."""
+    """Windows, boxes and points keep their order, whatever the keys are."""
     rng = np.random.default_rng(seed)
     count, keys = int(rng.integers(2, 6)), []
 
@@ -212,7 +212,7 @@ def test_what_has_no_between_switches_at_its_key():
 
 
 def test_a_flight_comes_back_from_its_file(tmp_path):
-    """Keys that leave something out have what the key before has."""
+    """Keys that leave something out inherit it from the key before."""
     keys = [(0, shown(step=0.25)), (1.5, shown(orbit(30))), (4, shown(orbit(80)))]
     gv.Flight(keys).save(tmp_path / "keys.json")
     again = gv.Flight.read(tmp_path / "keys.json", shown(shader=gv.Isosurface(1)))
@@ -234,7 +234,7 @@ def test_a_flight_comes_back_from_its_file(tmp_path):
 
 @pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (1.0, 2.0, -0.5)])
 def test_a_turntable_goes_around_once(up):
-    """At any time it is the first camera turned by torch's own exponential."""
+    """At any time the camera is the first one, turned by torch's exponential."""
     first = Eye(eye=(1, 2, 5), target=(0.5, 0, 0), up=up, fov=20)
     flight = gv.Flight.turntable(shown(first), 8)
     assert flight.closed and flight.seconds == 8 and flight.at(8).camera == first
@@ -254,7 +254,7 @@ def test_a_turntable_goes_around_once(up):
 
 @pytest.mark.backend("cpp")
 def test_a_saved_view_is_turned(small, tmp_path):
-    """Its first picture is the one that was saved; what the view tells no flag tells again."""
+    """Its first picture is the saved one; flags may not repeat what the view specifies."""
     state = shown(Eye(eye=(60, 20, 8), target=(12, 10, 8), up=(0, 0, 1)), step=0.4)
     state.save(tmp_path / "v.json")
     saved, film = ("--state", tmp_path / "v.json", "--size", "40x30"), tmp_path / "f"
@@ -327,7 +327,7 @@ def test_wrong_flights_are_refused(make, message):
 
 @pytest.mark.backend("cpp")
 def test_a_film_of_keys_is_streamed_as_it_is_resident(scan_store, tmp_path):
-    """And each picture is the one that Python makes of the state between the keys."""
+    """Each picture equals the one that Python renders from the state between the keys."""
     volume = gv.read_volume(scan_store.with_name("ball.npy"), spacing=(1, 1, 2))
     tree = gv.N3Tree.from_volume(volume)
     middle = tuple(tree.box.mean(0).tolist())

@@ -1,4 +1,4 @@
-"""Plain Zarr of zarr-python and xarray, N5 of tensorstore; raw files of any ending."""
+"""Plain Zarr by zarr-python and xarray, N5 by tensorstore; raw files with any ending."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ CT = "1.2.840.10008.5.1.4.1.1.2"
 
 @pytest.fixture(autouse=True)
 def same_locale() -> Iterator[None]:
-    """GDCM leaves the C locale behind, in which Python opens text as ASCII."""
+    """Restores the locale: GDCM leaves the C locale, in which Python opens text as ASCII."""
     before = locale.setlocale(locale.LC_ALL)
     yield
     locale.setlocale(locale.LC_ALL, before)
@@ -42,7 +42,7 @@ def write_series(
     direction: tuple[float, ...] = (1, 0, 0, 0, 1, 0, 0, 0, 1),
     depths: list[float] | None = None,
 ) -> Path:
-    """Writes (z, y, x) slices through SimpleITK, named so that names say nothing of their order."""
+    """Writes (z, y, x) slices by SimpleITK; their names do not reveal their order."""
     folder.mkdir(parents=True, exist_ok=True)
     image = itk.GetImageFromArray(data)
     image.SetSpacing(SPACING)
@@ -68,7 +68,7 @@ def write_series(
             "0020|0013": str(z + 1),
             "0020|0032": "\\".join(f"{v:.6f}" for v in place),
             "0020|0037": "\\".join(f"{v:.6f}" for v in (*axes[:, 0], *axes[:, 1])),
-            "0018|0050": "9",  # thickness is not how far slices are apart
+            "0018|0050": "9",  # thickness differs from the distance of slices
             **(tags or {}),
         }
         one = image[:, :, z]
@@ -96,7 +96,7 @@ def test_a_series_of_gdcm(tmp_path, data, packed):
     for path in (folder, next(folder.iterdir())):
         volume = gv.read_volume(path)
         assert volume.extent == SHAPE[::-1]
-        # x and y of RAS run against those of LPS.
+        # x and y of RAS are opposite to those of LPS.
         assert np.array_equal(volume.data[..., 0].numpy(), stored[:, ::-1, ::-1])
         assert volume.spacing == pytest.approx(SPACING)
         low = (10 - 11 * SPACING[0], -20 - 8 * SPACING[1], 5)
@@ -200,7 +200,7 @@ def dataset(**told: object):
 
 
 def enhanced(data: np.ndarray):
-    """A multi-frame image whose frames lie in the file from the last to the first."""
+    """Returns a multi-frame image whose frames are stored from the last to the first."""
     found = dataset(NumberOfFrames=len(data), Rows=data.shape[1], Columns=data.shape[2])
     shared, measures, place = pydicom.Dataset(), pydicom.Dataset(), pydicom.Dataset()
     measures.PixelSpacing = [0.75, 0.5]
@@ -231,7 +231,7 @@ def test_enhanced_images(tmp_path, data):
 
 
 def test_deflated_files(tmp_path, data):
-    """All of such a file but its first group is packed; these are smaller than their images."""
+    """All of such a file but its first group is packed; it is smaller than its image."""
     data = np.abs(data) // 16 * 16
     several = enhanced(data)
     several.file_meta.TransferSyntaxUID = "1.2.840.10008.1.2.1.99"
@@ -260,7 +260,7 @@ def test_color_and_images_without_a_place(tmp_path):
 
 
 def test_a_modality_s_table_is_told(tmp_path, data):
-    """It is not looked up, so that the values are no Hounsfield units."""
+    """The table is not applied, so the values are not Hounsfield units."""
     table = pydicom.Dataset()
     table.LUTDescriptor, table.ModalityLUTType, table.LUTData = [3, 0, 16], "HU", bytes(6)
     found = dataset(Rows=data.shape[1], Columns=data.shape[2], Modality="CT")
@@ -317,7 +317,7 @@ def test_broken_files_give_one_line(tmp_path, data):
 @pytest.mark.parametrize("samples", [1, 3])
 @pytest.mark.parametrize("dtype", ["u1", "<u2"])
 def test_run_lengths_are_unpacked_no_further_than_the_frame(tmp_path, samples, dtype):
-    """Segments that go on, lie behind the end, or are too short."""
+    """Segments that do not end, lie behind the end, or are too short."""
     imagecodecs = pytest.importorskip("imagecodecs")
     image = noise((5, 7, samples), np.dtype(dtype).name)
     bits = 8 * image.dtype.itemsize

@@ -1,4 +1,4 @@
-"""MetaImage of SimpleITK, MRC of mrcfile, VTK images of VTK."""
+"""MetaImage by SimpleITK, MRC by mrcfile, VTK images by VTK."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def grid() -> np.ndarray:
 
 
 def assert_parts(path: str | Path, **options) -> gv.Volume:
-    """Asserts that regions are those of the whole, which it returns."""
+    """Asserts that regions equal parts of the whole volume; returns it."""
     volume, source = gv.read_volume(path, **options), open_source(path, **options)
     z, y, x = volume.data.shape[:3]
     part = source.read_region((1, 2, 3), (z - 2, y - 1, x))
@@ -130,7 +130,7 @@ def test_broken_maps_give_one_line(tmp_path, grid):
 
 
 def vtk_image(grid: np.ndarray, name: str = "density", cells: bool = False):
-    """An image of VTK of (z, y, x) or (z, y, x, c) values, and another array beside."""
+    """Returns a VTK image of (z, y, x) or (z, y, x, c) values, with a second array."""
     found = vtk.vtkImageData()
     size = [n + cells for n in grid.shape[2::-1]]
     found.SetExtent(2, size[0] + 1, 0, size[1] - 1, 0, size[2] - 1)
@@ -239,14 +239,14 @@ def write_legacy(file: Path, image, kind: str) -> Path:
     ],
 )
 def test_names_of_numbers(dtype, names):
-    """As NRRD, MetaImage, VTK and PLY spell them."""
+    """As spelled by NRRD, MetaImage, VTK and PLY."""
     assert {number_type(name) for name in names.split(", ")} == {dtype}
 
 
 @pytest.mark.parametrize("kind", ["Binary", "ASCII"])
 @pytest.mark.parametrize("dtype", ["uint8", "int8", "uint64", "ids"])
 def test_kinds_of_numbers_of_legacy_vtk(tmp_path, kind, dtype):
-    """VTK writes unsigned char as colours, in text as shares of 255; and its ids as int."""
+    """VTK writes unsigned char as colours, in text as fractions of 255; and its ids as int."""
     grid = noise((3, 4, 5), "uint8" if dtype == "ids" else dtype)
     image = vtk_image(grid)
     if dtype == "ids":
@@ -262,7 +262,7 @@ def test_kinds_of_numbers_of_legacy_vtk(tmp_path, kind, dtype):
 
 @pytest.mark.parametrize("kind", ["Binary", "ASCII"])
 def test_points_come_before_cells_in_legacy_vtk(tmp_path, grid, kind):
-    """As in XML, whatever the file has first; VTK itself writes cells first."""
+    """As in XML, in whatever order the file has them; VTK itself writes cells first."""
     image = vtk_image(grid)
     cells = np.arange(6 * 8 * 11, dtype="f4").reshape(6, 8, 11)
     array = numpy_support.numpy_to_vtk(cells.ravel(), deep=True)
@@ -330,7 +330,7 @@ def test_broken_vtk_gives_one_line(tmp_path, grid, kind):
 
 
 def vti_of_text(path, arrays: str, before: str = ""):
-    """A VTK image of 3 x 3 x 3 points whose numbers stand in the XML."""
+    """Writes a VTK image of 3 x 3 x 3 points whose numbers are inline in the XML."""
     extent = "0 2 0 2 0 2"
     path.write_text(
         f'<VTKFile type="ImageData"><ImageData WholeExtent="{extent}">{before}'
@@ -351,7 +351,7 @@ ARRAY = '<DataArray type="UInt8" Name="{}" format="ascii">{}</DataArray>'
     ],
 )
 def test_numbers_of_vtk_are_found_behind_others(tmp_path, before):
-    """ParaView writes the time before the image."""
+    """ParaView writes the time before the image's array."""
     path = vti_of_text(tmp_path / "a.vti", ARRAY.format("a>b", NUMBERS), before)
     assert gv.read_volume(path).data.ravel().tolist() == list(range(27))
 
@@ -367,7 +367,7 @@ def test_numbers_of_vtk_are_found_behind_others(tmp_path, before):
     ],
 )
 def test_words_of_vtk_that_are_other_numbers_are_refused(tmp_path, numbers, told):
-    """300 once was 44."""
+    """300 was once read as 44."""
     with pytest.raises(ValueError, match=rf"a\.vti: .*{told}"):
         gv.read_volume(vti_of_text(tmp_path / "a.vti", ARRAY.format("a", numbers)))
 

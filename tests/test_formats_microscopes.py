@@ -1,5 +1,5 @@
-"""CZI of pylibCZIrw; LIF files of this test, which readlif reads likewise; ND2 through a stand-in
-for nd2, since nothing writes such files.
+"""CZI by pylibCZIrw; LIF files written here, which readlif reads the same; ND2 through a mock of
+nd2, because no library writes such files.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def test_broken_czi_gives_one_line(tmp_path, five):
 
 
 def write_lif(file: Path, images: dict[str, np.ndarray]) -> Path:
-    """Writes (t, c, z, y, x) images, channels next to slices, as the format has them."""
+    """Writes (t, c, z, y, x) images, with channels inside of slices, as the format has them."""
     elements, blocks = "", b""
     for number, (name, data) in enumerate(images.items()):
         t, c, z, y, x = data.shape
@@ -161,7 +161,7 @@ def test_broken_lif_gives_one_line(tmp_path, five):
 
 
 class StandIn:
-    """What of `nd2.ND2File` the reader uses: frames (c, y, x) of times, positions and slices."""
+    """The part of `nd2.ND2File` that the reader uses: frames (c, y, x) of times, positions, z."""
 
     data = np.stack([noise((2, 4, 3, 20, 30), "uint16") + p for p in range(2)], 1)  # t p z c y x
 

@@ -1,4 +1,4 @@
-"""Files behind URLs: servers with and without validators, what is kept, and what goes wrong."""
+"""Files behind URLs: servers with and without validators, what is cached, and what goes wrong."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gvtorch.io.stores.store import Store
 
 
 class Server(WebServer):
-    """Serves a few files, without byte ranges, and counts what it sent."""
+    """Serves a few files without byte ranges, and counts what it sends."""
 
     files: dict[str, bytes]
     tag: str | None = '"one"'
@@ -211,7 +211,7 @@ def test_what_is_the_url_of_a_file(url, is_file):
 
 
 class Endless(http.server.BaseHTTPRequestHandler):
-    """Answers with what never ends, as fast as it can or a byte at a time."""
+    """Answers without an end, as fast as it can or a byte at a time."""
 
     pause = 0.0
 

@@ -1,4 +1,4 @@
-"""TIFF: OME-TIFF, BigTIFF and ImageJ's, with all that they tell; and folders of images."""
+"""TIFF: OME-TIFF, BigTIFF and ImageJ's, with all their metadata; and folders of images."""
 
 from __future__ import annotations
 

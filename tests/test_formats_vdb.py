@@ -1,5 +1,5 @@
-"""OpenVDB and NanoVDB: files of OpenVDB, Houdini and NanoVDB, what `warp` reads of them and
-writes, and files that the tests write in every kind of numbers, packing and version.
+"""OpenVDB and NanoVDB: files by OpenVDB, Houdini and NanoVDB, what `warp` reads from them and
+writes, and files that the tests write in every number type, packing and version.
 """
 
 from __future__ import annotations
@@ -65,14 +65,14 @@ def test_level_sets_of_nanovdb(name, voxels, background, inside, checksum):
 
 
 def test_torus_of_nanovdb_is_a_torus():
-    """The closed form, where the file's transform puts it."""
+    """It equals the closed form, where the file's transform puts it."""
     volume = gv.read_volume(shared("vdb/torus.nvdb"))
     values = volume.data[..., 0].numpy()
     z, y, x = (np.arange(n) for n in values.shape)
     places = np.stack(np.meshgrid(z, y, x, indexing="ij")[::-1], -1) * volume.spacing
     places += np.array(volume.origin) - np.array((1.0, 2.0, 3.0))
     band = np.abs(values) < 0.25
-    axis = int(np.argmin([np.ptp(places[band][:, n]) for n in range(3)]))  # around which it turns
+    axis = int(np.argmin([np.ptp(places[band][:, n]) for n in range(3)]))  # the torus's axis
     flat = np.delete(places, axis, -1)
     ring = (np.ptp(flat[values < 0], axis=0).mean() - np.ptp(places[values < 0][:, axis])) / 2
     tube = np.hypot(np.linalg.norm(flat, axis=-1) - ring, places[..., axis])
@@ -89,7 +89,7 @@ def test_vectors_of_nanovdb_are_channels(tmp_path):
 
 
 def test_warp_reads_the_same(tmp_path):
-    """In a process of its own: what warp reads of three files, voxel by voxel."""
+    """In another process: what warp reads from three files, voxel by voxel."""
     pytest.importorskip("warp", reason="the peer warp-lang is not installed")
     program = """
 import sys, numpy as np, warp as wp
@@ -158,16 +158,16 @@ def test_half_floats(tmp_path, kind):
     found = open_source(path).grid().fill((0, 0, 0), (8, 8, 8)).reshape(512, -1)
     halves = grid.leaves[(0, 0, 0)][0].astype(np.float16).astype(np.float32)
     assert np.array_equal(found[active], halves[active])
-    assert np.array_equal(found[~active], np.full_like(found[~active], 0.1))  # told in full
+    assert np.array_equal(found[~active], np.full_like(found[~active], 0.1))  # written in full
 
 
 def test_tiles_and_far_away_boxes(tmp_path):
-    """Tiles of the root, of uppers and of lowers; what no leaf needs takes no memory."""
+    """Tiles of the root, of uppers and of lowers; what has no leaf takes no memory."""
     grid = Grid("float", -1.0, name="fog")
     grid.leaves[(8, 0, 0)] = np.arange(512, dtype="f4")[:, None], np.ones(512, bool)
     grid.tiles = ({(-8192, 0, 4096): 2.0}, {(256, 128, 0): 3.0}, {(16, 8, 0): 4.0})
     path = VdbWriter().write(tmp_path / "a.vdb", grid)
-    source = open_source(path)  # no box is told: that of all nodes and tiles
+    source = open_source(path)  # without a box in the file: that of all nodes and tiles
     assert source.low == (-8192, 0, 0) and source.extent == (8192 + 384, 4096, 8192)
     for low in (
         (-8200, -4, 4090),
@@ -210,7 +210,7 @@ def test_several_grids_and_shared_trees(tmp_path):
 
 
 def test_transforms(tmp_path):
-    turned = np.zeros((4, 4))  # of row vectors: i goes along -y, j along z, k along x
+    turned = np.zeros((4, 4))  # for row vectors: i maps to -y, j to z, k to x
     turned[0, 1], turned[1, 2], turned[2, 0], turned[3] = -2, 3, 4, (5, 6, 7, 1)
     maps = {
         "TranslationMap": (struct.pack("<3d", 1, 2, 3), (1, 1, 1), (1, 2, 3)),

@@ -1,28 +1,29 @@
-"""The bits of 230 random scenes, as `golden_scenes.json` keeps them.
+"""The bits of 230 random scenes, as hashes in `golden_scenes.json`.
 
-The scenes are those of `helpers/golden_scenes.py`, rendered through the public interface alone, so
-that files behind it can move. A change that is to keep all bits keeps the hashes; one that is to
-change some writes them anew::
+The scenes are those of `helpers/golden_scenes.py`, rendered only through the public interface, so
+that files behind it can move. A change that must keep all bits keeps the hashes; one that is meant
+to change some rewrites them::
 
     python tests/test_golden_scenes.py --write
 
-Hashes are of raw bytes, in groups: "picture" is the floats that come back, "counts" all that was
-counted, with the marks in the pools, and "library" the floats that torch rounds.
+Hashes are of raw bytes, in groups: "picture" is the floats that are returned, "counts" everything
+that was counted, with the marks in the pools, and "library" the floats whose last bits depend on
+torch.
 
-Most of a picture is the same on every processor, for the kernels are made so. Before them, cameras,
-tables and lights are computed in float64 by torch and numpy, whose sines, logarithms and matrix
-products differ by an ulp from machine to machine; rounded to float32, as a traced ray or a table's
-row is, they agree, all but surely. So
+Most of a picture is the same on every processor, because the kernels are written for that. Before
+them, cameras, tables and lights are computed in float64 by torch and numpy, whose sines, logarithms
+and matrix products differ by an ulp from machine to machine; rounded to float32, as a traced ray or
+a table's row is, they almost surely agree. Therefore
 
-- what is traced in float64 is hashed as float32. Some scenes need no such function on their way
-  (rays made here by + - * / and roots; surfaces and projections, whose alpha is 0 or 1; no
-  highlight): these are hashed as they are, in float64 too.
-- `TransferModule`, alone and within `gv.cost`, takes logarithms in the dtype of the samples, so it
-  is traced in float64.
-- what torch computes after the kernel, in float32 or in so many steps that an ulp shows, is the
-  group "library": normals of light that is put together from pieces, depths of modules, colours by
-  `gv.Lighting`. It is compared on the CPU alone, and only where torch's functions have the bits
-  that they had when the file was written (`library`).
+- pictures traced in float64 are hashed as float32. Some scenes need no such function (rays made
+  here by + - * / and roots; surfaces and projections, whose alpha is 0 or 1; no highlight): these
+  are hashed as they are, also in float64.
+- `TransferModule`, alone and within `gv.cost`, computes logarithms in the dtype of the samples, so
+  it is traced in float64.
+- what torch computes after the kernel, in float32 or in so many steps that an ulp is visible, is
+  the group "library": normals composited from several pieces, depths of modules, colours by
+  `gv.Lighting`. It is compared only on the CPU, and only where torch's functions give the bits that
+  they gave when the file was written (`library`).
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ Found = dict[str, list[Any]]
 
 @torch.no_grad()
 def traced(s: Settings, backend: str) -> Found:
-    """The picture's floats, and all that was counted."""
+    """Returns the picture's floats, and everything that was counted."""
     device = "cuda" if backend == "cuda" else "cpu"
     if s["way"] in ("engine", "levels"):
         return _streamed(s, backend, device)
@@ -103,7 +104,7 @@ def traced(s: Settings, backend: str) -> Found:
 
 
 def _wide(request_tn: torch.Tensor) -> torch.Tensor:
-    """Request words as hashes have them: int32, priorities of 16 bits."""
+    """Returns request words as they are hashed: int32, priorities of 16 bits."""
     words = request_tn.to(torch.int32)
     priority = words & PRIORITY
     top = torch.where(priority == PRIORITY, 0xFFFF, priority)
@@ -122,7 +123,7 @@ def _parts(s: Settings, *pictures: gv.Picture) -> Found:
 
 
 def by_torch(s: Settings) -> set[str]:
-    """The images whose last bits torch decides, not the kernels."""
+    """Returns the images whose last bits depend on torch, not on the kernels."""
     if s["hashed"] == "float32":
         return set()
     pieces = "lens" in s or s.get("caps") or s.get("clip") in ("boxes", "without")
@@ -133,7 +134,7 @@ def by_torch(s: Settings) -> set[str]:
 
 
 def _module(s: Settings, tree: gv.N3Tree, camera: gv.Camera | gv.Rays, shader: Any) -> Found:
-    """Through a `TreeTracer`."""
+    """Traces a scene with a `TreeTracer`."""
     names = ("component", "step", "stop_alpha", "depth_alpha", "cone_scale")
     tracer = gv.TreeTracer(tree, shader, channel="value", **{name: s[name] for name in names})
     rays = camera.placed(tree.box).rays() if isinstance(camera, gv.Camera) else camera
@@ -146,7 +147,7 @@ def _module(s: Settings, tree: gv.N3Tree, camera: gv.Camera | gv.Rays, shader: A
 
 
 def _streamed(s: Settings, backend: str, device: str) -> Found:
-    """Through an engine of small pools: its first frame, and the converged picture."""
+    """Renders with an engine of small pools: its first frame, and the converged picture."""
     low, high = box_of(s)
     scene = {"one": volumes(s)}
     if s["two_trees"]:
@@ -184,7 +185,7 @@ def _streamed(s: Settings, backend: str, device: str) -> Found:
 
 
 def digest(parts: Iterable[Any], hashed: str) -> str:
-    """16 hex digits of what came back, bytes and shapes."""
+    """Returns 16 hex digits of the bytes and shapes of what was returned."""
     total = hashlib.sha256()
     for part in parts:
         found = str(part).encode()
@@ -197,7 +198,7 @@ def digest(parts: Iterable[Any], hashed: str) -> str:
 
 
 def hashes(seed: int, backend: str) -> dict[str, str]:
-    """A scene's hash for each group that is not empty."""
+    """Returns a scene's hash for each group that is not empty."""
     s = settings(seed)
     found = traced(s, backend)
     return {group: digest(parts, s["hashed"]) for group, parts in found.items() if parts}
@@ -205,7 +206,7 @@ def hashes(seed: int, backend: str) -> dict[str, str]:
 
 @cache
 def library() -> str:
-    """A hash of what torch's functions give here."""
+    """Returns a hash of what torch's functions give on this machine."""
     x = torch.from_numpy(numbers(1, 999, 3))
     square = x[:3].T @ x[:3]
     functions = ("sin", "cos", "tan", "asin", "log2", "exp2", "log1p", "expm1", "sqrt")
@@ -218,14 +219,14 @@ def library() -> str:
 
 
 def quick(s: Settings) -> bool:
-    """Whether the torch twin takes little time for a scene; it knows no `TreeTracer`."""
+    """Returns whether the torch twin is fast for a scene; it does not support `TreeTracer`."""
     if s["way"] == "tracer" or "shadows" in s["look"] or "lighting" in s:
         return False
     return s["way"] not in ("engine", "levels") or s["look"] in ("transfer", "maximum")
 
 
 def promised(s: Settings, backend: str) -> bool:
-    """Whether a backend has the bits of `cpp`, and is tried: the twin with every other scene."""
+    """Returns whether a backend has the bits of `cpp` and is tested: the twin in every second."""
     if backend == "cpp":
         return True
     return s["dtype"] == "float32" and (backend == "cuda" or (quick(s) and s["seed"] % 2 == 0))
@@ -256,7 +257,7 @@ def test_every_bit_is_as_it_was(backend, group):
 
 
 def test_every_setting_is_drawn():
-    """No option is left to chance: each is there a few times."""
+    """Every option occurs at least a few times."""
     scenes = [settings(seed) for seed in range(SCENES)]
     known = {
         **{"look": (*LOOKS, *LATER), "way": WAYS, "camera": CAMERAS, "light": LIGHTS},

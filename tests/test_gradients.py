@@ -1,5 +1,5 @@
-"""Gradients that would be lost raise, by one rule, in eager, scripted, compiled and exported
-programs; nothing raises where none are recorded.
+"""Gradients that would be lost raise an error, by one rule, in eager, scripted, compiled and
+exported programs; nothing raises where no gradients are recorded.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ MODES = {"eager": lambda tracer: tracer, "script": scripted, "compile": compiled
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("what", [*COLUMNS, "bricks_bzyxc", "table_lm4", "parameter_54"])
 def test_one_rule_in_every_mode(tree, name, mode, what):
-    """Rays, voxels, tables and the shader's numbers."""
+    """For rays, voxels, tables and the shader's numbers."""
     if what == "parameter_54" and name == "plain":
         pytest.skip("the plain shader has no numbers")
     tracer, given = gv.TreeTracer(tree, SHADERS[name]), columns(rays_of(tree))

@@ -1,4 +1,4 @@
-"""What makes objects handy: options that `help` shows, arrays of pictures, `.to`."""
+"""Conveniences of objects: options that `help` shows, arrays of pictures, `.to`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RECORDS = [(gv.RenderOptions, RenderSettings), (gv.EngineOptions, EngineSettings
 
 @pytest.mark.parametrize(("record", "typed"), RECORDS)
 def test_options_stand_once(record, typed):
-    """Text and default in the record; type checkers read the same names and types."""
+    """Documentation and default are in the record; type checkers see the same names and types."""
     types_of = {field.name: field.type for field in dataclasses.fields(record)}
     declared = {name: one.__forward_arg__ for name, one in typed.__annotations__.items()}
     assert declared == types_of and option_texts(record).keys() == types_of.keys()
@@ -115,7 +115,7 @@ def test_a_picture_is_shown_where_there_is_a_viewer(picture, monkeypatch):
 
 
 class Net(torch.nn.Module):
-    """A net as users write them: a tracer, and a layer of its own."""
+    """A network as users write it: a tracer, and a layer."""
 
     def __init__(self, tracer: gv.TreeTracer) -> None:
         super().__init__()
@@ -150,7 +150,7 @@ def test_a_net_may_change_its_dtype_around_a_tracer(blobs, shader, change):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("shader", [GRAY, gv.Lit(GRAY), gv.Projection("max", GRAY)])
 def test_a_tracer_takes_rays_of_any_leading_shape(blobs, shader):
-    """Those of a camera, in the shape of its picture: it gives the pictures of `render`."""
+    """With a camera's rays, in the shape of its picture, it returns the pictures of `render`."""
     tree = gv.N3Tree.from_volume(blobs)
     tracer = gv.TreeTracer(tree, shader)
     scripted = torch.jit.script(tracer)

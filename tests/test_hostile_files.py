@@ -1,5 +1,5 @@
-"""Small files that tell of more than a machine has, or never end: each is refused in one line, with
-little memory and time, and `convert` says what `read_volume` says.
+"""Small files that claim more than a machine has, or never end: each is refused in one line, with
+little memory and time, and `convert` reports what `read_volume` reports.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import gvtorch as gv
 from gvtorch.io import budget, reading
 from gvtorch.io.picture_size import picture_size
 
-MEMORY = 1500 << 20  # bytes of address space beyond what the libraries take
+MEMORY = 1500 << 20  # bytes of address space beyond what the libraries use
 SECONDS = 8  # of processor time a file
 
 READER = """
@@ -57,7 +57,7 @@ for path in paths:
         told.append(time.process_time() - begin)
     print(json.dumps(told), flush=True)
 """
-HONEST = ("cards.fits", "tiles.tif")  # wasteful, and right
+HONEST = ("cards.fits", "tiles.tif")  # wasteful, but valid
 
 
 def test_files_that_eat_a_machine_are_refused(tmp_path):
@@ -126,7 +126,7 @@ def test_meshes_and_points_unpack_to_no_more_than_free_memory(tmp_path, monkeypa
 
 
 def fits_table(columns: list[str], rows: int, width: int, data: bytes) -> bytes:
-    """A FITS file of an empty image and a table, whose header tells what it is told to."""
+    """Returns a FITS file of an empty image and a table with the given header values."""
     cards = ["XTENSION= 'BINTABLE'", "BITPIX  = 8", "NAXIS   = 2", f"NAXIS1  = {width}"]
     cards += [f"NAXIS2  = {rows}", "PCOUNT  = 0", "GCOUNT  = 1", f"TFIELDS = {len(columns)}"]
     for at, kind in enumerate(columns, 1):
@@ -172,7 +172,7 @@ def test_a_packed_table_of_points_eats_no_memory(tmp_path, what, monkeypatch):
 
 
 def test_a_name_does_not_tell_how_fits_is_packed(tmp_path):
-    """Values of a packed file, once they were the packed bytes themselves."""
+    """A packed file's values were once read from the packed bytes themselves."""
     fits = pytest.importorskip("astropy.io.fits")
     data = np.random.default_rng(0).integers(0, 255, (20, 20, 20), np.uint8)
     fits.PrimaryHDU(data).writeto(tmp_path / "b.fits")
@@ -189,7 +189,7 @@ def test_a_name_does_not_tell_how_fits_is_packed(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.pvcc", "a.json", "a.ply", "a.obj.gz", "a.npz"])
 def test_a_pipe_is_no_file_of_cameras_meshes_or_points(tmp_path, name):
-    """Reading one would wait for ever."""
+    """Reading a pipe would wait forever."""
     os.mkfifo(tmp_path / name)
     readers = [gv.read_cameras, gv.CameraPath.from_json, gv.TransferFunction.from_file]
     readers += [gv.read_mesh] * name.startswith(("a.ply", "a.obj"))
@@ -200,7 +200,7 @@ def test_a_pipe_is_no_file_of_cameras_meshes_or_points(tmp_path, name):
 
 
 def gltf(**other: object) -> dict[str, object]:
-    """A triangle in glTF, in which something is other."""
+    """Returns a triangle in glTF, in which some fields are replaced."""
     places = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
     content = base64.b64encode(places + np.arange(3, dtype="<u4").tobytes()).decode()
     own = {"uri": f"data:application/octet-stream;base64,{content}", "byteLength": 48}
@@ -230,7 +230,7 @@ ACCESSORS = {
 
 @pytest.mark.parametrize("name", ACCESSORS)
 def test_what_a_gltf_tells_of_is_there(tmp_path, name):
-    """Trimesh makes zeros of numbers that it does not find: 24 GB, or another picture."""
+    """Trimesh replaces missing data by zeros: 24 GB, or another picture."""
     pytest.importorskip("trimesh")
     file = tmp_path / "a.gltf"
     indices = {**POSITIONS, "bufferView": 1, "componentType": 5125, "type": "SCALAR"}
@@ -248,7 +248,7 @@ def test_what_a_gltf_tells_of_is_there(tmp_path, name):
 @pytest.mark.filterwarnings("ignore:Image size")
 @pytest.mark.parametrize("kind", ["obj", "--texture"])
 def test_textures_that_eat_a_machine_are_refused(tmp_path, kind):
-    """160 kB of pixels that unpack to 676 MB, and more while they do; twenty of them."""
+    """160 kB of pixels unpack to 676 MB, and need more meanwhile; a file has twenty of them."""
     pytest.importorskip("trimesh")
     (tmp_path / "a.png").write_bytes(hostile.png(13000, 13000))
     names, texture = [f"m{n}" for n in range(20)], None
@@ -279,7 +279,7 @@ def test_a_mesh_reads_no_more_than_memory_takes(tmp_path, monkeypatch):
 
 
 def test_a_ply_of_fewer_than_no_rows_is_refused(tmp_path):
-    """Points once were the bytes of its header."""
+    """Bytes of its header were once read as points."""
     names = "".join(f"property float {axis}\n" for axis in "xyz")
     head = f"element a -4\nproperty float b\nelement vertex 3\n{names}end_header\n"
     file = tmp_path / "a.ply"
@@ -290,7 +290,7 @@ def test_a_ply_of_fewer_than_no_rows_is_refused(tmp_path):
 
 @pytest.mark.parametrize("kind", ["external", "virtual", "link", "soft link", "behind another"])
 def test_hdf5_reads_regular_files_beside_it(tmp_path, kind):
-    """A pipe has no end, and other folders are not a file's to name."""
+    """A pipe has no end, and a file must not name other folders."""
     h5py = pytest.importorskip("h5py")
     data = np.arange(512, dtype=np.uint8).reshape(8, 8, 8)
     os.mkfifo(tmp_path / "pipe")
@@ -331,7 +331,7 @@ def test_hdf5_reads_regular_files_beside_it(tmp_path, kind):
 def picture_in_tiff(
     folder: Path, packed: bytes, number: int, *, color: bool = False, tiled: bool = True
 ) -> Path:
-    """A TIFF of 16 x 16 whose only tile, or strip, is a packed picture."""
+    """Writes a TIFF of 16 x 16 whose only tile, or strip, is a packed picture."""
     place = [(322, 3, 1, 16), (323, 3, 1, 16), (324, 4, 1, 0), (325, 4, 1, len(packed))]
     strip = [(278, 3, 1, 16), (279, 4, 1, len(packed))]
     tags = [(256, 3, 1, 16), (257, 3, 1, 16), (259, 3, 1, number), (277, 3, 1, 1 + 2 * color)]
@@ -352,7 +352,7 @@ def picture_in_tiff(
 )  # fmt: skip
 @pytest.mark.parametrize("tiled", [True, False])
 def test_a_picture_larger_than_its_tile_is_refused(tmp_path, codec, number, tiled):
-    """It was unpacked whole, and cropped to a strip."""
+    """It was once unpacked as a whole, and cropped to a strip."""
     imagecodecs = pytest.importorskip("imagecodecs")
     color = codec == "webp"
     encode = getattr(imagecodecs, f"{codec}_encode")
@@ -368,7 +368,7 @@ def test_a_picture_larger_than_its_tile_is_refused(tmp_path, codec, number, tile
 
 
 def test_a_strip_of_jpeg_is_no_taller_than_it_says(tmp_path):
-    """By as much as whole blocks take; so many rows were left out in silence."""
+    """Not even by a whole block: such rows were once dropped silently."""
     imagecodecs = pytest.importorskip("imagecodecs")
     packed = imagecodecs.jpeg_encode(np.full((24, 16), 7, np.uint8))
     with pytest.raises(ValueError, match="picture of 24 rows and 16 columns, more than its 16 and"):
@@ -376,7 +376,7 @@ def test_a_strip_of_jpeg_is_no_taller_than_it_says(tmp_path):
 
 
 def test_a_film_in_a_tile_is_refused(tmp_path):
-    """Its pictures would be unpacked one after the other, however many."""
+    """All its pictures would be unpacked, one after the other."""
     imagecodecs = pytest.importorskip("imagecodecs")
     film = np.arange(5 * 16 * 16, dtype=np.uint8).reshape(5, 16, 16)
     for some, usual in ((film[:1], True), (film, False)):
@@ -389,7 +389,7 @@ def test_a_film_in_a_tile_is_refused(tmp_path):
 
 
 def in_parts(codestream: bytes) -> bytes:
-    """JPEG XL in boxes, the first of which ends within the header."""
+    """Returns JPEG XL in boxes, the first of which ends within the header."""
     if codestream[:2] != b"\xff\x0a":
         return codestream
     parts = (b"\0\0\0\0" + codestream[:5], b"\x80\0\0\x01" + codestream[5:])
@@ -410,9 +410,9 @@ def test_forged_heads_of_pictures_tell_no_size():
     codestream = other.index(b"jp2c") - 4
     first = one.index(b"jp2c") - 4
     assert picture_size(one) == (16, 16) and picture_size(other) == (4000, 4000)
-    # The size is that of the codestream, whatever the header before tells of it.
+    # The size is that of the codestream, whatever the header before claims.
     assert picture_size(one[:first] + other[codestream:]) == (4000, 4000)
-    # A box of 64 bits' length, and one without an end.
+    # A box with a length of 64 bits, and one without an end.
     wide = struct.pack(">I4sQ", 1, b"free", 16 + 40) + one[first : first + 40]
     assert picture_size(one[:first] + wide + other[codestream:]) == (4000, 4000)
     endless = struct.pack(">I4s", 0, b"free") + one[first:]
@@ -421,7 +421,7 @@ def test_forged_heads_of_pictures_tell_no_size():
 
 @pytest.mark.parametrize("name", ["NDTiff.index", "a_MMStack_1.ome.tif"])
 def test_a_stack_of_micromanager_reads_its_own_folder(tmp_path, name):
-    """Its index names files, and files of a like name are opened."""
+    """Its index names files, and files of similar names are opened."""
     text = b'{"MajorVersion": 3}\0'
     (tmp_path / "in").mkdir()
     file = tmp_path / "in" / "a_MMStack.ome.tif"
@@ -441,8 +441,8 @@ def test_a_stack_of_micromanager_reads_its_own_folder(tmp_path, name):
 
 @pytest.mark.parametrize("kind", ["mhd", "nhdr", "ome.tif"])
 def test_what_a_header_names_is_a_regular_file(tmp_path, kind):
-    """A pipe has no end. Headers of detached data may name any folder's: that is what they are for;
-    OME-XML names files of its own folder.
+    """A pipe has no end. Headers of detached data may name files of any folder, which is their
+    purpose; OME-XML may name only files of its own folder.
     """
     data = np.arange(64, dtype=np.uint8).reshape(4, 4, 4)
     (tmp_path / "in").mkdir()
@@ -478,7 +478,7 @@ def test_what_a_header_names_is_a_regular_file(tmp_path, kind):
 
 
 def test_a_small_packed_nifti_takes_no_memory(tmp_path):
-    """100 bytes once took two gigabytes before they were found to be too few."""
+    """100 bytes once took two gigabytes before they were recognised as too few."""
     nibabel = pytest.importorskip("nibabel")
     head = bytearray(nibabel.Nifti1Image(np.zeros((4, 4, 4), np.uint8), np.eye(4)).to_bytes())
     struct.pack_into("<3h", head, 42, 2000, 2000, 500)
@@ -491,7 +491,7 @@ def test_a_small_packed_nifti_takes_no_memory(tmp_path):
 @pytest.mark.parametrize("kind", ["mha", "nrrd"])
 @pytest.mark.parametrize("number", [300, -1, 10**30])
 def test_text_holds_only_numbers_of_its_type(tmp_path, kind, number):
-    """300 was read as 44."""
+    """300 was once read as 44."""
     heads = {
         "mha": "NDims = 3\nDimSize = 4 4 4\nElementType = MET_UCHAR\nBinaryData = False\n"
         "ElementDataFile = LOCAL\n",
@@ -511,7 +511,7 @@ def test_nrrd_of_an_unknown_order_of_bytes_is_refused(tmp_path):
 
 
 def test_names_of_axes_lead_to_no_other_folder(tmp_path):
-    """Places along an axis are read from the array of its name beside, and only there."""
+    """Coordinates of an axis are read only from the array of its name in the same folder."""
     zarr = pytest.importorskip("zarr")
     for folder, name, step in (("in", "z", 3), ("", "z", 5)):
         along = zarr.create_array(tmp_path / folder / name, shape=(4,), dtype="f4")

@@ -1,5 +1,5 @@
-"""Pictures as input, forged: each is read right or refused in one line, with little memory, and
-nothing is written to the terminal by the libraries that read them.
+"""Forged pictures as input: each is read correctly or refused in one line, with little memory, and
+the libraries that read them write nothing to the terminal.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from helpers.damage import break_file
 import gvtorch as gv
 from gvtorch.io.picture_size import jpeg_ends
 
-MEMORY = 1 << 30  # bytes of address space beyond what the libraries take
+MEMORY = 1 << 30  # bytes of address space beyond what the libraries use
 
 READER = """
 import json, resource, sys
@@ -74,7 +74,7 @@ def honest(folder: Path) -> dict[str, Path]:
 
 
 def forged(content: dict[str, bytes]) -> dict[str, bytes]:
-    """By name; none is a picture."""
+    """Returns files by name, none of which is a valid picture."""
     files = {}
     for columns, rows in ((2**31 - 1, 2**31 - 1), (30_000, 30_000), (1, 2**31 - 1), (0, 5)):
         for bits, kind in ((8, 2), (16, 6), (16, 0)):
@@ -101,7 +101,7 @@ def forged(content: dict[str, bytes]) -> dict[str, bytes]:
 
 
 def test_forged_pictures_are_refused_in_a_line(tmp_path):
-    """A PNG of 69 bytes ended the process; a ZIP as NPY was a traceback, an EXR three lines."""
+    """A PNG of 69 bytes once ended the process, a ZIP as NPY gave a traceback, an EXR 3 lines."""
     whole = honest(tmp_path)
     content = {end: path.read_bytes() for end, path in whole.items()}
     paths = [*whole.values()]
@@ -146,7 +146,7 @@ def test_floats_of_pictures_beyond_float32_are_infinite_without_a_warning(tmp_pa
 
 @pytest.mark.parametrize("kind", ["jpg", "png", "bmp"])
 def test_a_slice_that_is_cut_is_told_by_its_name(tmp_path, kind):
-    """Of a JPEG that lacked its end the rest was gray, without a word."""
+    """The missing end of a JPEG was once read as gray, without a warning."""
     codecs = pytest.importorskip("imagecodecs")
     encode = getattr(codecs, {"jpg": "jpeg8_encode"}.get(kind, f"{kind}_encode"))
     rng = np.random.default_rng(1)
@@ -171,7 +171,7 @@ def test_only_the_end_of_its_own_scans_ends_a_jpeg():
     codecs = pytest.importorskip("imagecodecs")
     pixels = np.random.default_rng(1).integers(0, 256, (30, 40, 3), dtype=np.uint8)
     small, whole = codecs.jpeg8_encode(pixels[:8, :8].copy()), codecs.jpeg8_encode(pixels)
-    beside = b"\xff\xe1" + struct.pack(">H", len(small) + 2) + small  # a thumbnail, with its end
+    beside = b"\xff\xe1" + struct.pack(">H", len(small) + 2) + small  # thumbnail with an end marker
     with_thumbnail = whole[:2] + beside + whole[2:]
     assert jpeg_ends(whole) and jpeg_ends(with_thumbnail) and jpeg_ends(whole + b"more")
     assert np.array_equal(codecs.jpeg8_decode(with_thumbnail), codecs.jpeg8_decode(whole))

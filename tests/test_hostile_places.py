@@ -1,5 +1,5 @@
-"""Places of volumes beyond what numbers tell: the same one line from every format and command, and
-no warning of NumPy before it.
+"""Volumes at positions that float64 can't resolve: the same one-line error from every format and
+command, without a NumPy warning before it.
 """
 
 from __future__ import annotations
@@ -114,9 +114,9 @@ def test_places_beyond_numbers_are_one_line(tmp_path, kind):
                 told = float(np.float32(number)) if kind == "nii" else number
             if (place[0] is spacing and abs(told) < 1e15) or (place[0] is not spacing and
                                                              1e-60 <= told <= 1e60):  # fmt: skip
-                continue  # honest
+                continue  # valid
             if kind == "nii" and place[0] is not spacing and told <= 0:
-                continue  # nibabel mends it, see below
+                continue  # nibabel repairs it, see below
             path = write(tmp_path, place)
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
@@ -130,7 +130,7 @@ def test_places_beyond_numbers_are_one_line(tmp_path, kind):
 
 @pytest.mark.parametrize("far", [1e16, 1e20, 1e300, 1e308])
 def test_voxels_that_float64_does_not_tell_apart_are_refused_everywhere(tmp_path, far):
-    """`info` and `convert` took them; `render` saw nothing, or told of its camera."""
+    """`info` and `convert` once accepted them; `render` showed nothing, or blamed its camera."""
     path = vti(tmp_path, ((1.0, 1.0, 1.0), (far, 0.0, 0.0)))
     np.save(tmp_path / "a.npy", VOXELS.reshape(4, 5, 6))
     moved = (tmp_path / "a.npy", "--spacing", f"{1 / far:g},1,1")

@@ -1,5 +1,5 @@
-"""Full disks, numbers that no float holds, values at the ends of their types: one line each, and
-nothing lost.
+"""Full disks, numbers beyond float's range, values at the ends of their types: one line each, and
+nothing is lost.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ KINDS = ("png", "exr", "npz", "npy", "tif")
 
 @contextmanager
 def full_disk(size: int) -> Iterator[None]:
-    """No file may become longer: writing fails as on a full disk, in any library."""
+    """Limits the size of files: writing beyond it fails as on a full disk, in any library."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -141,14 +141,14 @@ CALLS = {
     "voxels": lambda one: gv.N3Tree.from_volume(_volume()).bricks[one],
     "whole": lambda one: gv.Volume(torch.zeros(4, 4, 4)).describe(one),
 }
-FINE = {  # what each takes
+FINE = {  # valid arguments of each
     **dict.fromkeys(("colors", "span", "percent", "info"), (type(None),)),
     "place": (int, torch.Tensor),
     "channels": (type(None), dict),
     "whole": (int,),
     "options": (type(None), str),
 }
-NAMED = {  # and None, the first channel
+NAMED = {  # and None: the first channel
     "options": lambda one: gv.RenderOptions(channel=one),
     "shader": lambda one: gv.render(_tree(), VIEW, gv.Channels([gv.ChannelLook()], channel=one)),
     "volume": lambda one: _tree().to_volume(one),
@@ -167,7 +167,7 @@ def _tree() -> gv.N3Tree:
 
 @pytest.mark.parametrize("name", [*CALLS, *NAMED])
 def test_objects_of_a_wrong_class_have_one_clear_line(name):
-    """No AttributeError of the first use, and no "ambiguous" truth of tensors."""
+    """Instead of an AttributeError at first use, or the "ambiguous" truth value of tensors."""
     call = {**CALLS, **NAMED}[name]
     for wrong in WRONG:
         if type(wrong) in FINE.get(name, (type(None),) if name in NAMED else ()):
@@ -248,7 +248,7 @@ ESCAPES = "\x1b]0;name\x07\x1b[2J\x9b31m\nline \\[bold] [red]"
 
 
 def test_no_name_gives_commands_to_a_terminal(tmp_path, capfd):
-    """Names of files, and what stands in them, come from anyone."""
+    """Names of files and their contents are untrusted."""
     volume, store = tmp_path / f"{ESCAPES}.npy", tmp_path / f"{ESCAPES}.zarr"
     np.save(volume, np.arange(512, dtype=np.uint16).reshape(8, 8, 8))
     for name in ("a", ESCAPES):
@@ -275,7 +275,7 @@ def test_a_table_takes_what_looks_like_markup(capfd):
 
 @pytest.mark.parametrize("kind", ["png", "npy", "mp4", "json", "ply"])
 def test_no_link_that_was_planted_is_written_through(tmp_path, picture, monkeypatch, kind):
-    """Neither in the place of a draft, whose name somebody guessed, nor of the file itself."""
+    """Neither at the guessed name of a temporary file, nor at the file itself."""
     victim, file = tmp_path / "victim", tmp_path / f"a.{kind}"
     victim.write_bytes(b"mine")
 
@@ -298,7 +298,7 @@ def test_no_link_that_was_planted_is_written_through(tmp_path, picture, monkeypa
 
 
 def _as_anybody() -> None:
-    """Takes from root what lets it write into folders that may not be written."""
+    """Drops the capabilities by which root may write into read-only folders."""
     for right in (1, 2):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
         ctypes.CDLL(None).prctl(24, right, 0, 0, 0)  # PR_CAPBSET_DROP
 
@@ -372,7 +372,7 @@ def test_a_full_disk_leaves_the_figures_of_a_flight_as_they_were(tmp_path, small
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_disk_that_is_full_at_the_very_end_is_told(tmp_path, picture, kind):
-    """The last bytes of a .npy were lost without a word, and the old picture with them."""
+    """The last bytes of a .npy were once lost silently, and the old picture with them."""
     file = tmp_path / f"a.{kind}"
     picture.save(file)
     whole = file.read_bytes()
@@ -383,7 +383,7 @@ def test_a_disk_that_is_full_at_the_very_end_is_told(tmp_path, picture, kind):
         assert file.read_bytes() == b"old" and [*tmp_path.iterdir()] == [file]
     with full_disk(len(whole)):
         picture.save(file)
-    assert file.read_bytes() == whole or kind == "npz"  # which holds the time
+    assert file.read_bytes() == whole or kind == "npz"  # it contains the time
 
 
 def test_points_and_arrays_on_a_disk_that_is_full_at_the_very_end_are_told(tmp_path):
@@ -402,7 +402,7 @@ def test_points_and_arrays_on_a_disk_that_is_full_at_the_very_end_are_told(tmp_p
 
 @pytest.mark.parametrize("size", [0, 300, 3000, 9000])
 def test_a_full_disk_is_told_with_the_file_that_is_too_long(tmp_path, size):
-    """Of a store's own files, which nobody named, the error named none."""
+    """For files within a store, which no user had named, the error once named none."""
     rng = np.random.default_rng(1)
     np.save(tmp_path / "a.npy", rng.integers(0, 256, (64, 64, 64), dtype=np.uint8))
     np.savez(tmp_path / "p.npz", positions=rng.random((500, 3)))

@@ -1,4 +1,4 @@
-"""OpenVDB and NanoVDB files that are forged: read as they tell, or refused in one line."""
+"""Forged OpenVDB and NanoVDB files: read as they say, or refused in one line."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def whole_leaf() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("x", [1, -3, 4, 4095])
 def test_entries_of_a_root_lie_on_its_grid(tmp_path, x):
-    """Others were read into leaves beside their places."""
+    """Others were once read into leaves at wrong positions."""
     path = tmp_path / "a.vdb"
     grid = Grid("float", 0.0, leaves={(4096, 0, 0): whole_leaf()})
     good = VdbWriter().write(path, grid).read_bytes()
@@ -76,7 +76,7 @@ def test_entries_of_a_root_lie_on_its_grid(tmp_path, x):
 
 
 def test_a_shared_tree_is_of_the_same_kind(tmp_path):
-    """One of vectors was read from a tree of numbers, three voxels at a time."""
+    """A vector grid was once read from a tree of scalars, three voxels at a time."""
     owner = Grid("float", 7, told=BOX, name="heat", leaves={(0, 0, 0): whole_leaf()})
     for kind in ("vec3s", "double", "int32", "mask"):
         path = tmp_path / f"{kind}.vdb"
@@ -90,13 +90,13 @@ def test_a_shared_tree_is_of_the_same_kind(tmp_path):
 
 
 def test_places_of_grids_and_leaves_are_in_order(tmp_path):
-    """Grids over one another, or leaves told elsewhere, gave other values without a word."""
+    """Overlapping grids, or wrong offsets of leaves, once gave other values silently."""
     path = tmp_path / "a.vdb"
     two = [Grid("float", 7, name=n, leaves={(0, 0, 0): whole_leaf()}) for n in ("a", "b")]
     good = VdbWriter(packing=0).write(path, *two).read_bytes()
     second = good.index(b"\1\0\0\0b\x10\0\0\0Tree_float")
     first = good.index(b"\1\0\0\0a\x10\0\0\0Tree_float")
-    places = [first + 29, second + 29]  # of three numbers each
+    places = [first + 29, second + 29]  # offsets of three numbers each
     told = [struct.unpack_from("<3q", good, place) for place in places]
     assert told[0][2] == second and told[1][2] == len(good)
 
@@ -120,7 +120,7 @@ def test_places_of_grids_and_leaves_are_in_order(tmp_path):
 
 
 def test_a_background_of_nan_is_no_voxel(tmp_path):
-    """All tiles were taken for others than the background: 4096^3 voxels for a leaf."""
+    """All tiles were once treated as not background: 4096^3 voxels for a leaf."""
     grid = Grid(
         "float", np.nan, leaves={(8, 0, 0): whole_leaf()}, tiles=({(4096, 0, 0): np.nan}, {}, {})
     )
@@ -135,7 +135,7 @@ def test_a_background_of_nan_is_no_voxel(tmp_path):
 
 @pytest.mark.parametrize("number", [1e308, 1e200, np.inf, -np.inf, np.nan, 1e50, 1e20])
 def test_places_beyond_numbers_are_one_line(tmp_path, number):
-    """Numpy's warnings came before it; `info` took places that `render` refused."""
+    """Numpy's warnings once preceded it; `info` accepted positions that `render` refused."""
     maps = {
         "TranslationMap": struct.pack("<3d", number, 2, 3),
         "ScaleMap": struct.pack("<15d", 1, number, 3, *(0,) * 12),
@@ -146,7 +146,7 @@ def test_places_beyond_numbers_are_one_line(tmp_path, number):
     }
     for name, content in maps.items():
         if number < (1e100 if name == "AffineMap" else 1e60 if "Scale" in name else 0):
-            continue  # large, and told
+            continue  # large, but valid
         grid = Grid("float", 0.0, leaves={(8, 0, 0): whole_leaf()}, map=(name, content))
         path = VdbWriter().write(tmp_path / "a.vdb", grid)
         reason = r"degenerate|must be finite|within|spacing must be"
@@ -159,7 +159,7 @@ def test_places_beyond_numbers_are_one_line(tmp_path, number):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_thin_boxes_take_no_more_than_they_hold(tmp_path, axis):
-    """Whole leaves around a line of voxels took 64 times of it: 16 GB for a file of 12 kB."""
+    """Whole leaves around a line of voxels once took 64 times as much: 16 GB for a 12 kB file."""
     high = [3, 5, 1]
     high[axis] = 1_000_003
     box = {
@@ -232,7 +232,7 @@ def test_hostile_files_of_nanovdb(tmp_path):
 
 
 def test_nodes_of_nanovdb_are_those_that_the_grid_tells_of(tmp_path):
-    """Each gave other values without a word: another type's, half of the tree, tiles nowhere."""
+    """Each once gave wrong values silently: another type's, half of the tree, misplaced tiles."""
     content, (number, _) = nano_grid("float", np.random.default_rng(1))
     _, head, _, tile, _, size, entries, lower_size, *_ = NANO["float"]
     path, root = tmp_path / "a.nvdb", 736 + head
@@ -274,7 +274,7 @@ def test_codes_that_are_no_numbers_are_voxels_that_are_none(tmp_path):
 
 @pytest.mark.parametrize("compressor", ["lz4", "zstd", "blosclz"])
 def test_only_the_first_block_of_blosc_is_unpacked_for_a_head(tmp_path, compressor):
-    """A file of 33 KB took 2 GB: all its blocks lay at one place."""
+    """A file of 33 KB once took 2 GB, because all its blocks had the same offset."""
     content, (number, box) = nano_grid("float", np.random.default_rng(1))
     large = content + bytes(64 << 20)
     path = nano_file(tmp_path / "a.nvdb", ("a", number, large), codec=2, compressor=compressor)
@@ -285,7 +285,7 @@ def test_only_the_first_block_of_blosc_is_unpacked_for_a_head(tmp_path, compress
     assert path.stat().st_size < 2 << 20 and taken < 4 << 20
     check(path, box)
     good = path.read_bytes()
-    at = good.index(b"a\0") + 2 + 8  # behind the name and the part's length
+    at = good.index(b"a\0") + 2 + 8  # after the name and the part's length
     for place, number, message in (
         (8, 2**31 - 1, "blosc_decompress"),
         (16, 2**31 - 1, "at byte 2147483647"),
@@ -304,11 +304,11 @@ def test_only_the_first_block_of_blosc_is_unpacked_for_a_head(tmp_path, compress
     ],
 )
 def test_roots_of_nanovdb_hold_few_entries_each_at_its_place(tmp_path, at, content, message):
-    """Of millions at one place each part that was read looked at all."""
+    """With millions of them at one position, every part that was read visited all."""
     data, (number, _) = nano_grid("float", np.random.default_rng(3))
     head = 736 + NANO["float"][1]
     size = NANO["float"][3]
-    if at is None:  # the tile lies where the first upper node does
+    if at is None:  # the tile is at the position of the first upper node
         at, content = head + 2 * size, data[head : head + 8]
     data = data[:at] + content + data[at + len(content) :]
     file = nano_file(tmp_path / "a.nvdb", ("density", number, data))

@@ -25,14 +25,14 @@ def tree(blobs):
 
 @pytest.fixture
 def clear(tree):
-    """A transparent picture: some pixels empty, some nearly opaque."""
+    """A picture without background: some pixels empty, some nearly opaque."""
     picture = gv.render(tree, gv.Camera.orbit(**VIEW), HAZE, background=None)
     assert picture.transparent and picture.alpha.min() == 0 and picture.alpha.max() > 0.4
     return picture
 
 
 def made(color: torch.Tensor, alpha: torch.Tensor | None = None) -> gv.Picture:
-    """A picture of a given colour; transparent where alpha is given."""
+    """Returns a picture of a given colour; transparent if alpha is given."""
     one = torch.ones_like(color[..., :1])
     return gv.Picture(
         color=color,
@@ -46,7 +46,7 @@ def made(color: torch.Tensor, alpha: torch.Tensor | None = None) -> gv.Picture:
 
 
 def srgb(x: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1."""
+    """Returns sRGB of linear values (IEC 61966-2-1)."""
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
 
 
@@ -88,8 +88,8 @@ def test_an_image_stands_behind_pixel_by_pixel(tree, clear):
 
 
 def test_an_environment_is_what_a_panorama_takes(backend):
-    """Seen through a panorama along -z, each pixel is its texel; through any other camera, the
-    texel in the ray's direction."""
+    """Seen by a panorama camera along -z, each pixel is its texel; by any other camera, the texel
+    in the ray's direction."""
     empty = gv.N3Tree.from_volume(gv.Volume(torch.zeros(4, 4, 4)), device=DEVICES[backend])
     image = torch.rand(12, 24, 3)
     sky = gv.Environment(image)
@@ -104,7 +104,7 @@ def test_an_environment_is_what_a_panorama_takes(backend):
 def test_an_environment_blends_between_texels_and_around(backend):
     device = DEVICES[backend]
     image = torch.zeros(2, 4, 3)
-    image[:, 0], image[:, 3] = 1.0, 3.0  # beside the seam, which lies in +z
+    image[:, 0], image[:, 3] = 1.0, 3.0  # next to the seam, which lies in +z
     sky = gv.Environment(image)
     directions = torch.tensor(
         [[0, 0, 1.0], [1, 0, 1], [-1, 0, 1], [0, 1, 0], [0, 0, -1]], device=device

@@ -1,4 +1,4 @@
-"""Reading volumes: every format, and every way a file can be wrong."""
+"""Reading volumes: every format, and many ways in which a file can be wrong."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EXTENT = (5, 4, 3)  # x y z
 
 
 def grid(dtype="int16") -> np.ndarray:
-    """(z, y, x) values that tell their place."""
+    """Returns (z, y, x) values that encode their position."""
     z, y, x = np.mgrid[0:3, 0:4, 0:5]
     return (100 * z + 10 * y + x - 50).astype(dtype)
 
@@ -103,7 +103,7 @@ def test_nifti_axes_come_out_along_the_world(tmp_path):
 
 @pytest.mark.parametrize("kind", ["nii.gz", "npy.gz", "npz"])
 def test_packed_files_take_memory_once(tmp_path, kind):
-    """Not as they are unpacked, and again as they are read."""
+    """Not twice, for unpacking and for reading."""
     data = np.arange(100 * 200 * 200, dtype=np.int16).reshape(100, 200, 200)
     file = tmp_path / f"a.{kind}"
     if kind == "nii.gz":

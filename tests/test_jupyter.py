@@ -28,7 +28,7 @@ view""",
 
 
 def notebook() -> str:
-    """The cells as a file of Jupyter's."""
+    """Returns the cells as a Jupyter notebook."""
     told = {"metadata": {}, "outputs": [], "execution_count": None, "cell_type": "code"}
     cells = [{"id": f"cell{n}", "source": text, **told} for n, text in enumerate(CELLS)]
     kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
@@ -38,7 +38,7 @@ def notebook() -> str:
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Iterator[str]:
-    """The address of a JupyterLab that keeps all it writes in a folder of the test's."""
+    """The address of a JupyterLab that writes everything in the test's folder."""
     (tmp_path / "view.ipynb").write_text(notebook())
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -82,11 +82,11 @@ def test_a_cell_shows_the_live_page(chromium, lab):
         prompt, tried = cells.first.locator(".jp-InputPrompt"), [time.monotonic()]
 
         def shown() -> int:
-            busy = asked.count()  # which kernel? since it had not started yet
+            busy = asked.count()  # dialogs "which kernel?", as it had not started
             if busy:
                 asked.first.click()
             late = time.monotonic() > tried[0] + 5 and prompt.inner_text() == "[ ]:"
-            if busy or late:  # nothing heard the key
+            if busy or late:  # the key was not handled
                 run(0)
                 tried[0] = time.monotonic()
             return tab.page.locator(".gv-picture").count()

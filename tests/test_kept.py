@@ -1,7 +1,7 @@
 """Stores and archives that earlier versions wrote are read by this one, with the same content.
 
-tests/data/kept was written by version 0.1.0. Files of later formats are added, none is written
-anew.
+tests/data/kept was written by version 0.1.0. Files of later formats are added, none is ever
+rewritten.
 """
 
 from __future__ import annotations

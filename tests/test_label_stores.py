@@ -74,7 +74,7 @@ def test_converting_labels_resumes_without_finding_them_again(tmp_path, monkeypa
         gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", **given)
     with pytest.raises(ValueError, match="was begun with"):
         gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", resume=True, nan=0, **given)
-    monkeypatch.setattr(label_source, "distinct", None)  # to call it would fail
+    monkeypatch.setattr(label_source, "distinct", None)  # calling it would fail
     store = gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", resume=True, **given)
     assert np.array_equal(kept(gv.read_volume(tmp_path / "a.zarr")), data)
     assert store.label_values.tolist() == np.unique(data).tolist()
@@ -159,7 +159,7 @@ def test_the_command_line_shows_labels(tmp_path):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("dtype", ["uint32", "uint8"])
 def test_label_images_that_another_library_wrote(tmp_path, dtype):
-    """By zarr, with one level: coarser ones are made by majority; wide ones are indexed."""
+    """By zarr, with one level: coarser levels are made by majority; wide labels are indexed."""
     zarr = pytest.importorskip("zarr")
     data = (cells((40, 36, 44), 12) * (2**28 - 1 if dtype == "uint32" else 21)).astype(dtype)
     group = zarr.open_group(tmp_path / "cells.zarr", mode="w", zarr_format=3)

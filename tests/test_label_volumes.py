@@ -1,4 +1,4 @@
-"""Label volumes: numbers of any width are kept, and coarse levels hold the most frequent."""
+"""Label volumes: labels of any width are kept, and coarse levels hold the most frequent label."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_majority_is_that_of_every_block(factor, dtype, background):
 
 
 def test_a_sheet_one_voxel_thick_stays():
-    """Half of each block is background, at every level: ties go to what is there."""
+    """Half of each block is background, at every level: ties are won by the foreground."""
     data = np.zeros((32, 32, 32), np.int64)
     data[13] = WIDE
     volume = gv.Volume(data, labels=True)

@@ -1,5 +1,5 @@
-"""Pictures of labels: sampled by the nearest voxel, never blended, lit and picked; against a dense
-marcher that shares nothing with them.
+"""Pictures of labels: sampled at the nearest voxel, never blended, lit and picked; against an
+independent dense marcher.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def balls(a: int, b: int) -> gv.Volume:
 
 
 def dense(data, rays, colors, alphas, reference, step, depth_alpha=0.1):
-    """Nearest voxels along rays, float64: colour, alpha, label by the depth rule (-1: none), depth,
-    and how near any sample comes to a face between voxels, in voxels. `colors` and `alphas` have a
-    row for each number in `data` (z, y, x).
+    """Marches rays by nearest voxels in float64; returns colour, alpha, label by the depth rule
+    (-1: none), depth, and the least distance of a sample from a face between voxels, in voxels.
+    `colors` and `alphas` have a row for each number in `data` (z, y, x).
     """
     eye, direction = rays
     spacing, origin = np.array(SPACING), np.array(ORIGIN)
@@ -82,8 +82,8 @@ SCENES = {
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("name", SCENES)
 def test_a_picture_is_that_of_a_dense_nearest_marcher(backend, name, dtype):
-    """Exactly: in float64 at every pixel; in float32 wherever no sample comes within 1e-4 of a face
-    between two voxels, which is where rounding may take it across.
+    """In float64 at every pixel; in float32 wherever no sample comes within 1e-4 of a face between
+    two voxels, because rounding may move it across.
     """
     data = SCENES[name]()
     count = int(data.max()) + 1
@@ -122,7 +122,7 @@ def test_a_picture_is_that_of_a_dense_nearest_marcher(backend, name, dtype):
 
 
 def test_a_face_between_two_voxels_belongs_to_the_upper_one(backend):
-    """Also where two bricks, and where bricks and regions of one label meet."""
+    """Also where two bricks meet, or a brick and a region of one label."""
     data = np.arange(24).reshape(1, 1, 24).repeat(24, 0).repeat(24, 1)
     data[:, :, 16:] = 16
     tree = gv.N3Tree.from_volume(gv.Volume(data + WIDE, labels=True), 4, device=DEVICES[backend])
@@ -136,7 +136,7 @@ def test_a_face_between_two_voxels_belongs_to_the_upper_one(backend):
 @pytest.mark.parametrize("brick", [2, 4, 8])
 @pytest.mark.parametrize("distance", [0.8, 2.0, 7.0])
 def test_no_pixel_shows_a_label_that_is_not_there(backend, brick, distance):
-    """Between 1 and 3 interpolation meets 2, which is green; so does the mean of a coarse level."""
+    """Interpolating 1 and 3 would give 2, which is green, as would the mean in a coarse level."""
     data = cells((24, 20, 28), 30) % 2 * 2 + 1
     colors = {1: RED, 2: GREEN, 3: BLUE}
     tree = gv.N3Tree.from_volume(gv.Volume(data, labels=True), brick, device=DEVICES[backend])
@@ -165,7 +165,7 @@ def test_labels_beyond_float32_stay_apart(backend):
 
 
 def test_what_shows_no_visible_label_is_not_sampled(compiled):
-    """Also where the labels beside it are visible: 5 is hidden, 4 and 6 are not."""
+    """Also where numerically close labels are visible: 5 is hidden, 4 and 6 are not."""
     data = np.full((32, 32, 32), 5)
     data[0, 0, 0], data[-1, -1, -1] = 4, 6
     tree = gv.N3Tree.from_volume(gv.Volume(data, labels=True), 4, device=DEVICES[compiled])
@@ -228,7 +228,7 @@ def test_colours_in_every_form():
 
 
 def test_colours_of_few_labels_differ():
-    """In sRGB, pairwise; and a label has its colour whatever else there is."""
+    """In sRGB, pairwise; a label's colour does not depend on the other labels."""
     colors = distinct_colors(np.arange(1, 13))
     srgb = np.where(colors <= 0.0031308, 12.92 * colors, 1.055 * colors ** (1 / 2.4) - 0.055)
     apart = np.linalg.norm(srgb[:, None] - srgb[None], axis=-1) + 9 * np.eye(12)
@@ -244,7 +244,7 @@ def test_colours_of_few_labels_differ():
 
 @pytest.mark.parametrize(("border", "mean"), [(1, 13), (2, 6), (3, 4), (4, 4)])
 def test_normals_are_those_of_a_smooth_boundary(compiled, border, mean):
-    """Of a ball of 14 voxels, whose voxels are cubes: the wider the border, the smoother."""
+    """For a ball of 14 voxels: the wider the border, the smoother its normals."""
     grid = np.stack(np.meshgrid(*[np.arange(32.0)] * 3, indexing="ij"), -1)[..., ::-1]
     data = (np.linalg.norm(grid - 15.5, axis=-1) < 14).astype(np.int64) * WIDE
     volume = gv.Volume(data, labels=True)
@@ -263,7 +263,7 @@ def test_normals_are_those_of_a_smooth_boundary(compiled, border, mean):
 
 
 def test_within_a_label_there_is_no_normal(backend):
-    """And no rounding that looks like one: a box of one label is lit evenly."""
+    """And rounding does not look like one: a box of one label is lit evenly."""
     data = cells((24, 24, 24), 6) + WIDE
     tree = gv.N3Tree.from_volume(gv.Volume(data, labels=True), 4, device=DEVICES[backend])
     rays = camera_rays(tree, 24, distance=1.5)
@@ -296,7 +296,7 @@ def scene() -> gv.N3Tree:
 
 
 def label_at(tree: gv.N3Tree, place: torch.Tensor) -> torch.Tensor:
-    """The labels of the voxels (of the finest level) in which world places (r, 3) lie."""
+    """Returns the labels of the finest voxels in which world positions (r, 3) lie."""
     data = cells((24, 22, 26), 14).astype(np.int64) * WIDE
     voxel = ((place - tree.box[0]) / torch.tensor(SPACING).double()).floor().long()
     x, y, z = (voxel[:, a].clamp(0, n - 1) for a, n in enumerate((26, 22, 24)))
@@ -313,7 +313,7 @@ def test_the_label_is_that_of_the_place_at_the_depth(scene, backend):
 
 
 def test_what_lies_behind_thin_labels_is_picked_by_the_depth_rule(scene, backend):
-    """With an alpha of 0.1 the depth is somewhere within; the label is of that interval."""
+    """The depth is where alpha reaches 0.1, within the labels; the label is of that interval."""
     rays = camera_rays(scene, 24, distance=1.2)
     options = {"lod": "finest", "depth_alpha": 0.5, "step": 0.25}
     hits, _ = run(scene, backend, rays, gv.Labels(opacity=0.1, lit=False), **options)
@@ -370,7 +370,7 @@ def test_a_layer_hides_labels_and_lets_them_through(scene, compiled):
 
 
 def test_several_trees_tell_the_nearest_label(compiled):
-    """Their tables differ; so do the rows that the kernel gives."""
+    """Their tables differ, and so do the rows that the kernel returns."""
     one, two = balls(WIDE, 5), balls(9, 2**40)
     two = gv.Volume(two.data, origin=(0, 0, 40), info=one.info)
     two.label_values = torch.tensor([0, 9, 2**40])
@@ -436,7 +436,7 @@ def test_streamed_is_resident_in_every_bit(scene, compiled, hold):
                 assert torch.equal(getattr(picture, name), getattr(resident, name)), name
 
 
-# --- what a shader is told
+# --- options of the shader
 
 
 def test_other_shaders_do_not_blend_labels(scene):
@@ -477,7 +477,7 @@ def test_bad_arguments_have_one_clear_message(make, message):
 
 
 def test_a_producer_of_labels(compiled):
-    """A user's own, which tells what its values stand for."""
+    """A user-defined producer, which states the labels of its values."""
 
     class Slabs(gv.Producer):
         def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Voxels mixed with another renderer's colour and depth, against closed forms, a dense marcher and
+"""Voxels combined with another renderer's colour and depth, against closed forms, a marcher and
 analytically rasterised planes.
 """
 
@@ -36,7 +36,7 @@ def fog() -> gv.Volume:
 
 @pytest.mark.parametrize("alpha", [None, 0.0, 0.4, 1.0])
 def test_a_homogeneous_medium_has_its_closed_form(backend, fog, alpha):
-    """exp(-length) before the layer, the layer, exp(-length) behind it; any depth for any pixel."""
+    """exp(-length) before the layer, the layer, exp(-length) behind it; depths vary by pixel."""
     device = DEVICES[backend]
     tree = gv.N3Tree.from_volume(fog, device=device)
     view = camera(24, distance=1.8).placed(tree.box)
@@ -142,7 +142,7 @@ def test_normals_count_by_what_each_part_takes_of_the_light(compiled, blobs):
 
 
 def behind_nodes(tree: gv.N3Tree, place: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
-    """(t, n) bool, nodes that lie wholly behind a plane."""
+    """Returns (t, n) bool: true for nodes that lie completely behind a plane."""
     words = tree.nodes.child_tn
     loc = tree.loc(torch.arange(words.numel()))
     size = tree.place[1] / float(tree.branching) ** loc[:, 3:].double()
@@ -191,7 +191,7 @@ def test_nothing_behind_an_opaque_layer_is_used_or_asked_for(blobs, backend_name
 
 
 def test_depth_goes_out(compiled, fog):
-    """Depth is that of the voxels, as far as a ray sees them; nearest is that of both."""
+    """`depth` is that of the voxels, as far as rays see them; `nearest` includes the layer."""
     tree = gv.N3Tree.from_volume(fog, device=DEVICES[compiled])
     view = gv.Camera.look_at((11.5, 11.5, 60), (11.5, 11.5, 0), fov=10, width=8, height=8)
     shader = gv.TransferFunction.from_points([(0, 0.5)])
@@ -235,7 +235,7 @@ def test_batches_and_blocks_of_rays_change_nothing(monkeypatch, blobs):
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 @pytest.mark.parametrize("alpha", [None, 0.4])
 def test_streamed_pictures_are_those_of_the_whole(compiled, blobs, alpha, loading):
-    """Passes over the rays that missed something, from pools with room for half of the bricks."""
+    """In several passes over rays that missed something, in pools for half of the bricks."""
     device = DEVICES[compiled]
     tree = gv.N3Tree.from_volume(blobs, 4, device=device)
     view = camera(48, distance=1.2).placed(tree.box)
@@ -268,7 +268,7 @@ def test_tensors_are_read_where_they_lie(blobs):
     dark = gv.render(tree, view, GRAY, layer=layer).color
     color += 1
     assert (gv.render(tree, view, GRAY, layer=layer).color - dark).max() > 0.99
-    depth[:12] = math.nan  # what is written later is not checked: nothing is there
+    depth[:12] = math.nan  # later edits are not checked: NaN counts as no layer
     plain, picture = gv.render(tree, view, GRAY), gv.render(tree, view, GRAY, layer=layer)
     for name in (*PARTS, "nearest"):
         assert torch.equal(getattr(picture, name)[:12], getattr(plain, name)[:12]), name
@@ -282,7 +282,7 @@ def test_on_cuda_nobody_waits_and_a_graph_reads_the_layer(blobs, alpha):
         depth = screen(view, middle(blobs), (0, 0, 1)).to(engine.device)
         layer = layer_of(depth, None if alpha is None else torch.full_like(depth, alpha))
         engine.render(view, GRAY)
-        for move in (5, -5):  # what rays that begin there need is loaded, too
+        for move in (5, -5):  # bricks for rays that begin there are loaded, too
             depth += move
             engine.render(view, GRAY, layer=layer)
         graph = engine.capture(view, GRAY, layer=layer)

@@ -31,7 +31,7 @@ FLOORS = [
     {"bench"},
     {"tools"},
 ]
-#: At the door: what hands names on.
+#: Files that only re-export names.
 DOOR = {"__init__.py", "__main__.py"}
 
 
@@ -44,7 +44,7 @@ def floor(name: str) -> int:
 
 
 def imported(path: Path) -> set[tuple[str, ...]]:
-    """Dotted names that a file imports, also inside functions and for type checkers."""
+    """Returns the dotted names that a file imports, also inside functions and for type checkers."""
     names: set[tuple[str, ...]] = set()
     here = path.relative_to(PACKAGE.parent).with_suffix("").parts[:-1]
     for node in ast.walk(ast.parse(path.read_text())):
@@ -62,7 +62,7 @@ def imported_rooms(path: Path) -> set[str]:
 
 
 def imported_files(path: Path) -> set[Path]:
-    """Files of the package that a file imports: a module, or where a name comes from."""
+    """Returns the package's files that a file imports: modules, or those that define a name."""
     files = set()
     for name in imported(path):
         for parts in (name, name[:-1]):
@@ -111,7 +111,7 @@ def test_kernel_headers_know_no_torch():
 
 
 def test_nothing_else_runs_in_a_circle():
-    """Headers of C++, and the modules of the page, which a notebook gets as one."""
+    """C++ headers, and the modules of the page, which a notebook gets as one file."""
     csrc, page = PACKAGE / "cpp_ext" / "csrc", PACKAGE / "viewer" / "page"
     headers = {file: csrc for file in csrc.rglob("*.h")}
     modules = {file: page for file in page.glob("*.js")}
@@ -142,9 +142,9 @@ def test_kernel_headers_include_only_downward():
 
 
 def named_elsewhere(path: Path, name: str) -> bool:
-    """Whether something may have the name of another thing: an op and its twin that of the function
-    which they serve, a shader's twin that of the shader; a command, a workload and a message are
-    named by what users and pages type; peers have one interface.
+    """Returns whether a name may be used twice: by an op, its twin and the function that they
+    serve, or by a shader and its twin; commands, workloads and messages have the names that users
+    and pages type; peers have one interface.
     """
     home = path.relative_to(PACKAGE).parts
     return (
@@ -157,7 +157,7 @@ def named_elsewhere(path: Path, name: str) -> bool:
 
 
 def test_no_two_things_share_a_name():
-    """Of classes, and of functions that other files may import."""
+    """Checks classes, and functions that other files may import."""
     homes: dict[str, list[str]] = {}
     for path in modules():
         for node in ast.parse(path.read_text()).body:

@@ -1,4 +1,4 @@
-"""`ThinLens`: the cone, beside a thin lens of many rays, and what it costs."""
+"""`ThinLens`: the cone, compared with a thin lens of many rays, and its cost."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FOCUS = 2.0  # sides of the box
 
 
 def scene(side: int = 96) -> gv.Volume:
-    """Balls before, in and behind the focus of a camera that looks along -z."""
+    """Returns balls in front of, in and behind the focus of a camera that looks along -z."""
     z, y, x = np.mgrid[0:side, 0:side, 0:side].astype(np.float32) / side * 2 - 1
     value = np.zeros_like(x)
     for cx, cy, cz, r in ((-0.5, -0.3, -0.7, 0.22), (0.1, 0, 0, 0.25), (0.5, 0.4, 0.7, 0.22)):
@@ -46,7 +46,7 @@ def medium(opacity: float) -> gv.TransferFunction:
 
 
 def thin_lens(tree, camera, shader, aperture: float, rays_a_pixel: int) -> torch.Tensor:
-    """Mean of pinhole pictures from places all over the lens, all through the point in focus."""
+    """Returns the mean of pinhole pictures from points all over the lens, with one focus."""
     placed = camera.placed(tree.box)
     rays, rotation = placed.rays(), placed.viewmats[0, :3, :3]
     side = float((tree.box[1] - tree.box[0]).max())
@@ -73,7 +73,7 @@ def similarity(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def grains(side: int = 96, count: int = 150) -> gv.Volume:
-    """Small balls all over the box."""
+    """Returns small balls all over the box."""
     generator = np.random.default_rng(1)
     z, y, x = np.mgrid[0:side, 0:side, 0:side].astype(np.float32) / side * 2 - 1
     value = np.zeros_like(x)
@@ -102,7 +102,7 @@ def test_moderate_blur_agrees_with_256_rays_through_the_lens(opacity, aperture):
 
 @pytest.mark.backend("cpp")
 def test_stored_colours_blur_as_a_lens_does_where_matter_is_opaque():
-    """What is filtered is what is seen: a transfer function of mean densities is another thing."""
+    """Only stored colours, because a transfer function of mean densities gives other colours."""
     volume, view = grains(), gv.Camera.orbit(20, 15, FOCUS, 26, 96, 96)
     colors = [(0, 0.2, 0.4, 1), (128, 1, 0.3, 0.2), (255, 1, 0.9, 0.5)]
     function = gv.TransferFunction.from_points([(20, 0), (60, 0.1), (255, 0.5)], colors)
@@ -157,7 +157,7 @@ def test_the_cone_is_the_pixels_and_the_circle_of_confusion():
 
 @pytest.mark.backend("cpp")
 def test_what_is_in_focus_stays_sharp_and_what_is_not_blurs(tree):
-    """Edges of three slabs, 10 % to 90 %: as wide as the disc of confusion is, or a third of it."""
+    """Edges of three slabs, 10 % to 90 %, are as wide as the disc of confusion, or a third."""
     side, size = 96, 192
     pixel = 2 * math.tan(math.radians(16)) / size  # a distance of 1
     for z, shift in ((0.06, 0.44), (0.5, 0.0), (0.94, -0.44)):
@@ -189,7 +189,7 @@ def test_compiled_equals_reference_through_a_lens(blobs, compiled, aperture):
 
 
 def test_more_blur_needs_fewer_bricks_and_samples(compiled):
-    """The engine never loads what the blur hides."""
+    """The engine never loads details that the blur hides."""
     used, samples, pictures = [], [], []
     for aperture in (0.0, 0.1, 0.4, 1.6):
         lens = gv.ThinLens(aperture=aperture, focus=1.2, frame="box")

@@ -19,7 +19,7 @@ FLOOR, SIZE = 8.0, 64
 
 
 def places(size: int = SIZE) -> np.ndarray:
-    """x, y, z of the voxels of a cube."""
+    """Returns x, y, z of the voxels of a cube."""
     return np.moveaxis(grid((size,) * 3), -1, 0)
 
 
@@ -28,21 +28,21 @@ def tree_of(distance: np.ndarray, backend: str) -> gv.N3Tree:
 
 
 def down(x, height: float, z, device: str, width: float = 0.5) -> gv.Rays:
-    """Rays down from a height at places (x, z)."""
+    """Returns rays down from a height at positions (x, z)."""
     x, z = np.broadcast_arrays(np.asarray(x, float), z)
     origin = torch.tensor(np.stack((x, np.full_like(x, height), z), -1))
     return rays_along(origin, [0.0, -1.0, 0.0], width, device)
 
 
 def light_on(tree, rays, shader, backend, *, plain=None, **lighting) -> np.ndarray:
-    """(r, 3) colours."""
+    """Returns the lit colours (r, 3) of rays."""
     options = {"backend": backend, "lighting": gv.Lighting(**lighting), **(plain or {})}
     return gv.trace(tree, rays, shader, **options).color.cpu().double().numpy()
 
 
 @pytest.fixture
 def backend(compiled: str) -> str:
-    """What is compiled: the twin, which is equal (test_lighting_frames.py), takes minutes."""
+    """Compiled backends only: the twin, which equals them (test_lighting_frames.py), is slow."""
     return compiled
 
 
@@ -109,7 +109,7 @@ def test_a_ray_that_begins_behind_something_has_its_share_of_the_light(backend):
 
 
 def test_translucent_matter_is_lit_where_it_is_seen(blobs, backend):
-    """Where colour and gradient do not change along a ray, light by sample and by pixel agree."""
+    """Where colour and gradient are constant along a ray, lighting per sample and pixel agree."""
     ramp = np.linspace(0, 1, 24, dtype=np.float32)[:, None, None] * np.ones((1, 20, 20), np.float32)
     tree = gv.N3Tree.from_volume(gv.Volume(ramp), 4, device=DEVICES[backend])
     transfer = gv.TransferFunction.from_points([(0, 0), (1, 0.3)], [(0, 0.9, 0.6, 0.3)])
@@ -146,7 +146,7 @@ def over_floor(
 def sun_seen(
     at: np.ndarray, targets: np.ndarray, centre: np.ndarray = CENTRE, radius: float = RADIUS
 ) -> np.ndarray:
-    """(p,) share of unit directions (p, m, 3) from places (p, 3) that the ball does not block."""
+    """Returns (p,): share of unit directions (p, m, 3) from points that the ball does not block."""
     away = at - centre
     b = (targets * away[:, None]).sum(-1)
     c = (away**2).sum(-1)[:, None] - radius**2
@@ -160,7 +160,7 @@ def disc(count: int = 4000) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shadow_of(light, x: np.ndarray, *body) -> np.ndarray:
-    """What is seen of a light that stands right above the ball, from (x, FLOOR, 32)."""
+    """Returns the visible share of a light right above the ball, from (x, FLOOR, 32)."""
     at = np.stack((x, np.full_like(x, FLOOR), np.full_like(x, 32.0)), -1)
     u, v = disc()
     if isinstance(light, gv.DirectionalLight):
@@ -179,7 +179,7 @@ def shadow_of(light, x: np.ndarray, *body) -> np.ndarray:
 
 
 def crossing(x: np.ndarray, seen: np.ndarray, share: float) -> float:
-    """Where a share of the light is reached for good, between two places."""
+    """Returns the x, interpolated, from which on more than a share of the light is visible."""
     last = int(np.nonzero(seen < share)[0].max())
     a, b = seen[last], seen[last + 1]
     return float(x[last] + (share - a) / (b - a) * (x[last + 1] - x[last]))
@@ -194,8 +194,8 @@ LIGHTS = {
 
 @pytest.mark.parametrize("name", LIGHTS)
 def test_umbra_and_penumbra_of_a_ball(backend, name):
-    """Where 10%, 50% and 90% of the light come in, to less than a voxel. What one cone grazes is
-    guessed, see `solid.py`; 16 narrow ones for the same disc leave the edges where they are.
+    """Where 10%, 50% and 90% of the light arrive, to less than a voxel. What one cone grazes is
+    estimated, see `solid.py`; 16 narrow cones for the same disc give the same edges.
     """
     tree, shader = over_floor(backend)
     light, x = LIGHTS[name], np.linspace(32, 56, 97)
@@ -216,7 +216,7 @@ def test_umbra_and_penumbra_of_a_ball(backend, name):
 
 
 def test_a_wide_sun_behind_a_ball(backend):
-    """20 degrees wide; the ball has a radius of 12 and lies 40 above the floor."""
+    """The sun is 20 degrees wide; the ball has a radius of 12 and is 40 above the floor."""
     body, x = (np.array([32.0, FLOOR + 40, 32.0]), 12.0), np.linspace(32, 60, 113)
     tree, shader = over_floor(backend, "distance", *body)
     light = gv.DirectionalLight((0, -1, 0), angle=20.0)
@@ -232,8 +232,8 @@ def test_a_wide_sun_behind_a_ball(backend):
 
 @pytest.mark.parametrize("degrees", [60.0, 45.0, 30.0])
 def test_a_low_sun_casts_its_shadow_where_it_should(backend, degrees):
-    """Cones begin above the place that is seen, but on its way to the sun: to half a voxel, seen
-    from there.
+    """Cones begin above the visible point, but in the direction of the sun: the shadow is right to
+    half a voxel, seen from the sun.
     """
     sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
     x, y, z = places()
@@ -282,7 +282,7 @@ def test_a_light_without_a_size_casts_a_hard_shadow(backend, kind, far):
 @pytest.mark.parametrize("width", [0.5, 2.0, 8.0])
 @pytest.mark.parametrize("gap", [1.0, 4.0])
 def test_a_lamp_below_a_ceiling_is_not_in_its_shadow(backend, width, gap):
-    """A cone begins above the place that is seen, but ends at the lamp."""
+    """A cone begins above the visible point, but ends at the lamp."""
     _, y, _ = places()
     distance, lamp = np.minimum(y - FLOOR, 50 - y), (32.0, 50 - gap, 32.0)
     x = np.array([32.0, 36.0, 44.0])
@@ -368,16 +368,16 @@ def test_a_lamp_inside_matter_lights_nothing(backend):
 
 
 def segment(height: np.ndarray) -> np.ndarray:
-    """Part of the unit disc beyond a chord: what a wall blocks of a cosine-weighted hemisphere, if
-    directions count that reach it within 1 (Nusselt's analogue).
+    """Returns the part of the unit disc beyond a chord: what a wall blocks of a cosine-weighted
+    hemisphere, counting directions that reach it within 1 (Nusselt's analogue).
     """
     s = np.clip(height, -1, 1)
     return (np.arccos(s) - s * np.sqrt(1 - s * s)) / np.pi
 
 
 def open_sky(x: np.ndarray, z: np.ndarray | None, reach: float) -> np.ndarray:
-    """(p,) share of the sky seen from a floor, x off one wall and z off another; what lies beyond
-    half of the reach takes half.
+    """Returns (p,): the share of the sky seen from a floor, x off one wall and z off another; walls
+    beyond half of the reach block half.
     """
     seen = np.zeros(len(x))
     u, v = disc(100_000)
@@ -392,7 +392,7 @@ def open_sky(x: np.ndarray, z: np.ndarray | None, reach: float) -> np.ndarray:
 
 
 def corner(walls: int, backend: str, kind: str = "distance") -> tuple[gv.N3Tree, gv.Shader]:
-    """A floor, and one wall or two on it."""
+    """Returns a floor with one wall or two on it, and its shader."""
     x, y, z = places()
     distance = y - FLOOR
     for axis in (x, z)[:walls]:
@@ -409,9 +409,9 @@ def corner(walls: int, backend: str, kind: str = "distance") -> tuple[gv.N3Tree,
 @pytest.mark.parametrize("kind", ["distance", "density", "medium"])
 @pytest.mark.parametrize("walls", [0, 1, 2])
 def test_occlusion_at_an_edge_and_in_a_corner(backend, kind, walls):
-    """An edge leaves 1/2 of the sky, a corner of three planes 1/4. Sixteen cones stand for
-    all ways, and each meets a wall or does not: they are right to 0.07 beside a wall, to 0.1 beside
-    two. A floor alone is not darkened.
+    """An edge leaves 1/2 of the sky, a corner of three planes 1/4. Sixteen cones sample all
+    directions, and each meets a wall or does not: they are right to 0.07 next to one wall, to 0.1
+    next to two. A floor alone is not darkened.
     """
     tree, shader = corner(walls, backend, kind)
     reach, away = 16.0, np.array([1.6, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 13.0, 18.0, 24.0])

@@ -78,7 +78,7 @@ def test_a_streamed_picture_is_the_resident_one(blobs, compiled, surface, look):
 
 
 def test_what_is_seen_only_in_a_shadow_is_streamed_at_its_coarser_level(compiled):
-    """A ball outside the picture, whose shadow falls into it."""
+    """The ball is outside the picture, but its shadow falls into it."""
     x, y, z = np.moveaxis(grid((128,) * 3), -1, 0)
     body = np.sqrt((x - 40) ** 2 + (y - 96) ** 2 + (z - 40) ** 2) - 12
     value = np.clip(0.5 - np.minimum(body, y - FLOOR) / 2, 0, 1).astype(np.float32)
@@ -103,7 +103,7 @@ def test_what_is_seen_only_in_a_shadow_is_streamed_at_its_coarser_level(compiled
 
 
 def brick_depths(tree: gv.N3Tree, centre: np.ndarray, reach: float) -> set[int]:
-    """Depths of the bricks that lie within reach of a place, those of the root left out."""
+    """Returns the depths of bricks within reach of a point, except those of the root."""
     depths: set[int] = set()
     n, size = tree.branching, np.array(tree.spacing) * tree.side
     bricks, place = tree.nodes.brick_tn.cpu(), tree.nodes.loc_t4.cpu()

@@ -1,4 +1,4 @@
-"""What is told to be taken is taken: pools with all that lies beside them, and conversions."""
+"""Memory budgets hold: of pools with all their bookkeeping, and of conversions."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_host_caches_count_as_well(tmp_path, monkeypatch):
 
 
 def planned(monkeypatch, source, target, **options) -> int:
-    """The number of workers that a conversion would take."""
+    """Returns the number of workers that a conversion would use."""
     plans = []
 
     def stop(_target, _needs):

@@ -1,4 +1,4 @@
-"""Stores of several channels: written, broken off and resumed, streamed together, drawn lit."""
+"""Stores of several channels: written, interrupted and resumed, streamed together, drawn lit."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def store(tmp_path_factory, mesh) -> Path:
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """A digest of every file of a folder."""
+    """Returns a digest of every file of a folder."""
     files = (file for file in folder.rglob("*") if file.is_file())
     return {
         str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""Files of meshes: what trimesh wrote comes back; and `gvtorch voxelize`, a mesh to a store."""
+"""Files of meshes: what trimesh wrote is read back; and `gvtorch voxelize`, a mesh to a store."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_an_obj_s_material_may_let_light_through(tmp_path, told, opacity):
 
 
 def star(count: int, seed: int) -> np.ndarray:
-    """(n, 2) corners around the middle, counter-clockwise, at any distance from it."""
+    """Returns (n, 2) corners around the middle, counter-clockwise, at random distances from it."""
     angle = 2 * np.pi * np.arange(count) / count
     far = np.random.default_rng(seed).uniform(0.1, 1, count)
     return np.stack((far * np.cos(angle), far * np.sin(angle)), -1)
@@ -115,7 +115,7 @@ def star(count: int, seed: int) -> np.ndarray:
 @pytest.mark.parametrize("count", [4, 5, 9, 60])
 @pytest.mark.parametrize("clockwise", [False, True])
 def test_polygons_that_are_not_convex_are_cut_within_themselves(tmp_path, count, clockwise):
-    """Their triangles have the polygon's area, and face its way: those of a fan overlap."""
+    """Their triangles have the polygon's area and orientation; those of a fan would overlap."""
     flat = star(count, 3)[::-1] if clockwise else star(count, 3)
     tilt = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
     tilt *= np.sign(np.linalg.det(tilt))
@@ -242,7 +242,7 @@ def test_missing_files_and_far_ones_are_told(tmp_path):
 
 
 def test_damaged_files_are_told(tmp_path):
-    """Whatever bytes change: a mesh, or one line."""
+    """Whatever bytes change, the result is a mesh, or a one-line error."""
     file = tmp_path / "a.glb"
     as_trimesh(meshes.torus(1.0, 0.4, (8, 6))).export(file)
     good = file.read_bytes()

@@ -1,4 +1,4 @@
-"""Holes: winding numbers of what is open, against libigl, and what fills holes."""
+"""Holes: winding numbers of open meshes, against libigl, and filling of holes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def without(mesh: gv.Mesh, *faces: int) -> gv.Mesh:
 
 
 def cut(mesh: gv.Mesh, height: float) -> gv.Mesh:
-    """The triangles below a height."""
+    """Returns the triangles below a height."""
     return mesh.only(np.flatnonzero(mesh.corners[:, :, 2].max(1) < height))
 
 
@@ -32,7 +32,7 @@ def winding_number(mesh: gv.Mesh, points: Any) -> np.ndarray:
 
 
 def test_a_plane_hole_is_half_wound_around():
-    """A box without its lid: 1 far inside less the solid angle of the lid, 1/2 on it."""
+    """A box without its lid: 1 minus the solid angle of the lid inside, 1/2 on the lid."""
     box = meshes.box((-1, -1, -1), (1, 1, 1))
     lid = np.flatnonzero((box.corners[:, :, 2] == 1).all(1))
     opened = without(box, *lid)
@@ -79,7 +79,7 @@ def test_filling_closes_what_has_holes():
 
 
 def test_a_plane_hole_is_filled_by_its_plane():
-    """Half a ball, of which the disc is missing; also inside out."""
+    """Half a ball whose flat disc is missing; also inside out."""
     ball = meshes.sphere(4)
     half = cut(ball, 1e-9)
     for one in (half, meshes.of_corners(half.corners[:, ::-1].copy())):
@@ -90,7 +90,7 @@ def test_a_plane_hole_is_filled_by_its_plane():
 
 
 def test_triangles_that_face_the_other_way_are_turned():
-    """Also where most of a part was listed after them, and apart from it in another part."""
+    """Also if most of their part is listed after them, and if they belong to another part."""
     ball = meshes.sphere(3)
     for away in ([5], [0, 1, 2, 77], np.arange(0, 512, 7)):
         wrong = ball.turned(np.array(away))
@@ -138,8 +138,8 @@ def test_fillings_have_the_colours_around_them():
 
 
 def test_the_bunny_s_inside_is_where_libigl_winds_around_it():
-    """The filled bunny against igl's winding number of the open one, and its volume against the
-    bunny that others closed.
+    """The filled bunny is compared with igl's winding number of the open one, and its volume with
+    that of a published closed bunny.
     """
     igl = pytest.importorskip("igl", reason="the peer libigl is not installed")
     opened = gv.read_mesh(shared("meshes/stanford_bunny.obj.gz"))
@@ -172,7 +172,7 @@ def test_solid_tells_what_is_filled():
 
 
 def test_a_pole_that_is_computed_again_is_the_same_place():
-    """sin(pi) is 1e-16: the usual ball of latitudes is closed all the same."""
+    """sin(pi) is 1e-16 in float64: the usual sphere of latitudes counts as closed nevertheless."""
     rings = 24
     polar, around = np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 48, endpoint=False)
     polar, around = polar[:, None], around[None]

@@ -1,4 +1,4 @@
-"""Colours of files as voxels: several materials, wide textures, colours of vertices."""
+"""Colours of mesh files as voxels: several materials, wide textures, vertex colours."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def linear(value: float) -> float:
 
 
 def straight(mesh: gv.Mesh, place: tuple[float, float, float], resolution: int = 96) -> list[float]:
-    """Colour at a place on the surface, not premultiplied."""
+    """Returns the colour at a point of the surface, not premultiplied."""
     grid = Voxelizer(mesh, resolution=resolution, channels=("color",))
     at = [round((p - o) / grid.spacing) for p, o in zip(place, grid.origin, strict=True)]
     low = [n - 1 for n in at[::-1]]
@@ -29,7 +29,7 @@ def straight(mesh: gv.Mesh, place: tuple[float, float, float], resolution: int =
 
 
 def test_parts_of_a_gltf_have_materials_of_their_own(tmp_path):
-    """A wide texture, a tall one, and a factor without any, side by side in one file."""
+    """A wide texture, a tall one, and only a colour factor, side by side in one file."""
     scene = trimesh.Scene()
     wide = np.zeros((2, 512, 3), np.uint8)
     wide[:, :256], wide[:, 256:] = (255, 0, 0), (0, 0, 255)
@@ -90,7 +90,7 @@ def test_materials_of_an_obj_have_their_colours(tmp_path):
 
 
 def test_textures_repeat():
-    """Texture coordinates beyond 0 to 1, also of large numbers and below 0."""
+    """Texture coordinates outside of [0, 1], also large and negative ones."""
     texture = np.zeros((4, 4, 4), np.uint8)
     texture[..., 3], texture[:, :2, 0], texture[:, 2:, 1] = 255, 255, 255
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)

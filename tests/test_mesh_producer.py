@@ -12,7 +12,7 @@ from gvtorch.meshes.voxelizer import Voxelizer
 from gvtorch.producers import Layout, Nodes, Region
 
 CPU = torch.device("cpu")
-#: How far voxels may be apart, and which share of them farther.
+#: Tolerance of voxels, and the share of voxels that may exceed it.
 BOUNDS = {
     "coverage": (1, 2e-4),
     "distance": (1e-5, 2e-4),
@@ -36,7 +36,7 @@ def mesh() -> gv.Mesh:
 
 @pytest.fixture(scope="module")
 def world(mesh):
-    """A producer of all channels, its layout, and its finest voxels as the store has them."""
+    """A producer of all channels, its layout, and its finest voxels as a store has them."""
     producer = gv.MeshProducer(mesh, resolution=100, channels=ALL)
     layout = Layout.of(producer, 8, 1, CPU)
     producer.prepare(layout)
@@ -46,14 +46,14 @@ def world(mesh):
 
 
 def cut(voxels: torch.Tensor, nodes: Nodes) -> torch.Tensor:
-    """Bricks with border out of finest voxels, clamped at the faces as a volume's are."""
+    """Cuts bricks with border out of finest voxels, clamped at the faces as a volume's are."""
     from gvtorch.ops import cut_bricks
 
     return cut_bricks(voxels.contiguous(), nodes.loc[:, [2, 1, 0]].contiguous(), 8, 1)
 
 
 def inner(nodes: Nodes, voxels: torch.Tensor) -> torch.Tensor:
-    """(k, s, s, s) whether a voxel of a finest brick lies in the volume."""
+    """Returns (k, s, s, s): true for voxels of finest bricks that lie in the volume."""
     size = torch.tensor(voxels.shape[:3])
     at = nodes.loc[:, [2, 1, 0], None] * 8 + torch.arange(-1, 9)
     there = (at >= 0) & (at < size[:, None])
@@ -68,14 +68,14 @@ def test_finest_bricks_hold_the_store_s_voxels(world):
     for name, expected in voxels.items():
         found, wanted = (one[there].double() for one in (made[name], cut(expected, nodes)))
         apart = (found - wanted).abs().amax(1)
-        # Cubes begin elsewhere, so that float32 rounds otherwise: between two triangles that are
-        # equally far, the other one tells the normal.
+        # Cubes begin elsewhere, so float32 rounds differently: of two triangles at equal distance,
+        # the other one may give the normal.
         bound, share = BOUNDS[name]
         assert (apart > bound).double().mean() < share, name
 
 
 def test_regions_are_proved_at_every_level(world):
-    """EMPTY and CONSTANT nodes hold one value in reach, as made and in the finest voxels."""
+    """EMPTY and CONSTANT nodes hold one value, in their bricks and in the finest voxels."""
     producer, layout, voxels = world
     alone = gv.MeshProducer(producer.voxelizer.mesh, resolution=100)
     seen = []
@@ -105,9 +105,9 @@ def test_regions_are_proved_at_every_level(world):
 
 
 def test_a_coarse_voxel_is_nearly_the_mean_below(world):
-    """One level up to rounding; farther up as far as planes in an eighth of a voxel tell."""
+    """One level up to rounding; further up, as exact as planes in eighths of a voxel are."""
     producer, layout, voxels = world
-    bounds = {  # by scale: mean and largest difference of the coverage, of distances in voxels
+    bounds = {  # scale: mean and largest difference of coverage, and of distances in voxels
         2: (2.5e-4, 1 / 255, 1e-5, 1e-4),
         4: (1.2e-3, 0.06, 0.02, 0.2),
         8: (5e-3, 0.08, 0.09, 0.5),
@@ -133,8 +133,8 @@ def test_a_coarse_voxel_is_nearly_the_mean_below(world):
 
 
 def test_bricks_of_all_levels_are_made_together(world):
-    """As on a device, where nobody looks which are coarse: the bits of those made level by level,
-    in one call without a look at a value.
+    """As on a device, where the host does not check which are coarse: one call that reads no value
+    gives the bits of bricks that are made level by level.
     """
     producer, layout, _ = world
     assert producer.on_device
@@ -151,7 +151,7 @@ def test_bricks_of_all_levels_are_made_together(world):
 
 
 def test_the_volume_stays_from_level_to_level():
-    """Of a solid, to a thousandth, as far up as voxels are rounded no more than that."""
+    """For a solid, to a thousandth, up to the level at which rounding of voxels is larger."""
     ball = meshes.sphere(4)
     producer = gv.MeshProducer(ball, resolution=128)
     layout = Layout.of(producer, 8, 1, CPU)
@@ -164,7 +164,7 @@ def test_the_volume_stays_from_level_to_level():
 
 
 def test_coverage_of_solids_is_the_mean_below_at_every_level():
-    """To rounding, of parts that are thinner than voxels, too: one place tells as much as eight."""
+    """Except for rounding, also for parts thinner than voxels: one sample equals eight."""
     mesh = meshes.joined(meshes.torus(1.0, 0.3, (40, 20)), meshes.box((-1, -1, 0.5), (1, 1, 0.52)))
     producer = gv.MeshProducer(mesh, resolution=64)
     layout = Layout.of(producer, 8, 1, CPU)
@@ -184,7 +184,7 @@ def test_coverage_of_solids_is_the_mean_below_at_every_level():
 
 
 def test_streamed_is_the_resident_tree_of_its_voxels(world):
-    """Of the finest level, drawn from small pools."""
+    """At the finest level, with small pools."""
     producer, _, voxels = world
     place = producer.spacing, producer.origin
     tree = gv.N3Tree.from_volume({"coverage": gv.Volume(voxels["coverage"], *place)}, 8)
@@ -202,7 +202,7 @@ def test_streamed_is_the_resident_tree_of_its_voxels(world):
 
 
 def test_deep_levels_are_made_where_one_looks():
-    """2^26 voxels along a side: a brick of the finest level, against the triangle's plane there."""
+    """2^26 voxels along a side: a finest brick is compared with the plane of its triangle."""
     ball = meshes.of_corners(meshes.sphere(2).corners)
     producer = gv.MeshProducer(ball, resolution=2**26, channels=("distance",))
     layout = Layout.of(producer, 8, 1, CPU)

@@ -1,4 +1,4 @@
-"""Meshes: what bounds a solid, distances, lists of triangles, volumes and areas of their voxels."""
+"""Meshes: which parts bound a solid, distances, search of triangles, volume and area in voxels."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SHARED = {
 
 
 def places(mesh: gv.Mesh, count: int, seed: int = 0, wider: float = 0.2) -> np.ndarray:
-    """Places in the mesh's box and around it."""
+    """Returns random points in the mesh's box and around it."""
     low, high = mesh.bounds
     size = (high - low).max()
     random = np.random.default_rng(seed).random((count, 3))
@@ -31,7 +31,7 @@ def places(mesh: gv.Mesh, count: int, seed: int = 0, wider: float = 0.2) -> np.n
 
 
 def sums(mesh: gv.Mesh, resolution: int, **told) -> float:
-    """Sum of the coverage of all voxels, in world units."""
+    """Returns the sum of the coverage of all voxels, in world units."""
     grid = Voxelizer(mesh, resolution=resolution, **told)
     covered = grid.region((0, 0, 0), grid.extent[::-1])["coverage"]
     return float(covered.double().sum()) / 255 * grid.spacing**3
@@ -63,7 +63,7 @@ def test_a_turned_triangle_opens_its_part():
 
 
 def test_copies_needles_and_points_do_no_harm():
-    """The same bits come out, in whatever order the bad ones stand."""
+    """The result has the same bits, wherever the degenerate triangles are listed."""
     ball = meshes.sphere(3)
     a, b, _ = ball.vertices[ball.faces[7]]
     bad = np.array([[a, a, a], [a, b, b], [a, b, a]])
@@ -97,7 +97,7 @@ def test_triangles_back_to_back_are_a_sheet():
 
 
 def test_an_edge_of_three_faces_bounds_no_solid():
-    """A box with a fin: all of it is a shell, as thick as it is told."""
+    """A box with a fin: all of it becomes a shell of the given thickness."""
     fin = np.array([[[-1, -0.7, -0.4], [1, -0.7, -0.4], [0, -1.5, -0.9]]])
     mesh = meshes.joined(meshes.box((-1, -0.7, -0.4), (1, 0.7, 0.4)), meshes.of_corners(fin))
     producer = gv.MeshProducer(mesh, resolution=128)
@@ -126,8 +126,8 @@ def test_signed_distance_of_a_box_in_closed_form():
 
 @pytest.mark.parametrize("name", SHARED)
 def test_signed_distance_is_libigl_s(name):
-    """At 10^5 places (of the open bunny 10^4); the sign against igl's winding number of what is
-    closed: by the fast one, which comes nowhere near 1/2, and of 2000 places by the exact one.
+    """At 10^5 points (open bunny: 10^4); the sign against igl's winding number of closed parts: the
+    fast one, which is nowhere near 1/2, and at 2000 points the exact one.
     """
     igl = pytest.importorskip("igl", reason="the peer libigl is not installed")
     mesh = gv.read_mesh(shared(SHARED[name]))
@@ -149,8 +149,8 @@ def test_signed_distance_is_libigl_s(name):
 
 @pytest.mark.parametrize("name", ["spot", "castle"])
 def test_the_channel_of_distances_is_libigl_s(name):
-    """20,000 voxels within the band, to 10^-5 of a voxel: of distances of up to 8 of them float32
-    tells 10^-6 apart.
+    """20,000 voxels within the band, to 10^-5 of a voxel: float32 resolves distances of up to 8
+    voxels to 10^-6.
     """
     igl = pytest.importorskip("igl", reason="the peer libigl is not installed")
     mesh = gv.read_mesh(shared(SHARED[name]))
@@ -178,7 +178,7 @@ def test_nested_and_crossing_parts_have_whole_winding_numbers():
 
 
 def test_rays_through_edges_and_corners_count_once():
-    """Places whose rays meet edges and corners exactly: a grid through a box's own corners."""
+    """Points whose rays meet edges and corners exactly: a grid through a box's corners."""
     mesh = meshes.box((0, 0, 0), (1, 1, 1))
     at = torch.linspace(-0.5, 1.5, 9, dtype=torch.float64)
     point = torch.cartesian_prod(at + 0.125, at, at)
@@ -194,8 +194,8 @@ def test_rays_through_edges_and_corners_count_once():
 
 @pytest.fixture(scope="module")
 def searched() -> tuple[gv.Mesh, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A mesh, (40, 3) corners of cubes of 8^3 places, these (p, 3), and their (p,) distances to the
-    nearest triangle, found by force.
+    """A mesh, corners (40, 3) of cubes of 8^3 points, these points (p, 3), and their distances (p,)
+    to the nearest triangle by brute force.
     """
     mesh = meshes.joined(meshes.torus(1.0, 0.4, (24, 12)), meshes.sheet(3, 2.0))
     low = torch.from_numpy(places(mesh, 40, 3))
@@ -209,7 +209,7 @@ def searched() -> tuple[gv.Mesh, torch.Tensor, torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("reach", [0.05, torch.inf])
 @pytest.mark.parametrize("detail", [0.0, 1.0])
 def test_the_search_misses_no_triangle(searched, reach, detail):
-    """20,000 places, one by one and packed: the nearest triangle is the one found by force."""
+    """20,000 points, one by one and packed: the nearest triangle is that of brute force."""
     mesh, low, place, exact = searched
     geometry = Geometry(mesh)
     geometry.detail = detail
@@ -219,13 +219,13 @@ def test_the_search_misses_no_triangle(searched, reach, detail):
     distance, face = 0.1 * found.distance.view(-1), found.nearest.view(-1).long()
     assert (distance[near] - exact[near]).abs().max() < 1e-5
     assert (face[exact > reach * (1 + 1e-5)] == -1).all() and near.sum() > 300
-    # The weights tell the place itself.
+    # The weights give the position itself.
     at = (found.weight.view(-1, 3, 1) * geometry.corner[face.clamp(min=0)]).sum(1)
     assert ((at - place).norm(dim=1) - exact)[near].abs().max() < 1e-5
 
 
 def distance_to(corner: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """(p, f) distances by the plane's projection, and by dense places along edges otherwise."""
+    """Returns distances (p, f) by projection on the plane, or by dense points along edges."""
     a, b, c = corner.unbind(1)
     normal = torch.linalg.cross(b - a, c - a)
     unit = normal / normal.norm(dim=1, keepdim=True)
@@ -241,7 +241,7 @@ def distance_to(corner: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
 
 
 def test_boxes_that_nothing_touches_hold_nothing():
-    """10^5 random boxes: where none is found, all the box is farther than the reach."""
+    """10^5 random boxes: if no triangle is found, all of the box is beyond the reach."""
     mesh = meshes.torus(1.0, 0.4, (24, 12))
     geometry = Geometry(mesh)
     generator = torch.Generator().manual_seed(2)
@@ -260,7 +260,7 @@ def test_boxes_that_nothing_touches_hold_nothing():
     random = torch.rand(bare.shape, generator=generator, dtype=torch.float64)
     inner = (geometry.signed_distance(bare + (2 * random - 1) * size)).abs()
     assert (inner > 0.02).all()
-    # The test can fail: some boxes are bare by little.
+    # The test is tight: some boxes are only just empty.
     assert (geometry.signed_distance(bare).abs() - size[:, 0] < 0.05).sum() > 100
 
 
@@ -273,14 +273,14 @@ def test_volume_of_solids_is_right_to_a_thousandth():
 
 
 def test_area_of_sheets_is_right_to_a_hundredth():
-    """Open parts are as thick as they are told."""
+    """Open parts get the given thickness."""
     ball = meshes.sphere(5)
     half = ball.only(np.flatnonzero(ball.corners[:, :, 2].min(1) > 0))
     for mesh in (half, meshes.sheet(4)):
         for thickness in (1.0, 2.0):
             grid = Voxelizer(mesh, resolution=256)
             thick = thickness * grid.spacing
-            rim = 0.25 * np.pi * thick**2 / 2 * 4  # a border is round: half a disc along it
+            rim = 0.25 * np.pi * thick**2 / 2 * 4  # borders are round: half a disc along them
             found = sums(mesh, 256, thickness=thickness)
             assert found == pytest.approx(meshes.area(mesh) * thick, rel=0.01, abs=2 * rim)
 
@@ -292,7 +292,7 @@ def test_volume_of_scanned_meshes(name):
 
 
 def test_volume_of_the_closed_parts_of_a_castle():
-    """Two, which cross: one by one."""
+    """Two parts that cross, each one alone."""
     mesh = gv.read_mesh(shared(SHARED["castle"]))
     geometry = Geometry(mesh)
     closed = meshes.parts(mesh.only(geometry.kept.numpy()[geometry.solid.numpy()]))
@@ -302,7 +302,7 @@ def test_volume_of_the_closed_parts_of_a_castle():
 
 
 def test_area_of_an_open_scan():
-    """The bunny as it was scanned, with its holes; and closed, as a shell."""
+    """The bunny as it was scanned, with holes; and closed, as a shell."""
     for name in ("open bunny", "bunny"):
         mesh = gv.read_mesh(shared(SHARED[name]))
         grid = Voxelizer(mesh, resolution=160, solid="never")

@@ -1,5 +1,5 @@
-"""Units, channels, shapes and what is told beside: from files of other libraries into `ImageInfo`,
-into stores, and back; and what is not kept is named in a line.
+"""Units, channels, shapes and other metadata: from files of other libraries into `ImageInfo`, into
+stores, and back; what is not kept is named in a line.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def test_simpleitk_writes_nifti_that_comes_back(tmp_path):
         volume, told = read(tmp_path / f"a.{ending}")
         assert not told and volume.spacing == (0.5, 1.5, 2.5)
         found = volume.data[..., 0].numpy()
-        if ending == "nrrd":  # in the file's own space
+        if ending == "nrrd":  # in the file's space
             assert volume.info.space == "left-posterior-superior"
             assert volume.origin == (10, 20, 30) and np.array_equal(found, data)
-        else:  # x right, y anterior: both run the other way
+        else:  # x right, y anterior: both have the opposite sign
             assert volume.info.unit == "millimeter"
             assert volume.origin == (-10 - 6 * 0.5, -20 - 5 * 1.5, 30)
             assert np.array_equal(found, data[:, ::-1, ::-1])
@@ -105,7 +105,7 @@ def test_colours_of_nifti(tmp_path):
     [("cell", (0.5, 1, 2), (1.25, 2.5, 4)), ("node", (2 / 3, 1.2, 2.4), (1, 2, 3))],
 )
 def test_ends_of_axes_of_nrrd(tmp_path, centers, spacing, origin):
-    """Of cells they are their outer sides, of nodes the places of the first and the last one."""
+    """For cells these are the outer sides, for nodes the positions of the first and last one."""
     told = f"axis mins: 1 2 3\naxis maxs: 3 8 15\ncenters: {centers} {centers} {centers}\n"
     head = f"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 4 6 6\nencoding: raw\n{told}\n"
     (tmp_path / "a.nrrd").write_bytes(head.encode() + bytes(144))

@@ -1,5 +1,5 @@
-"""OME-NGFF metadata: units, channels, times and what lies beside an image come back as they were
-written, here and by other libraries.
+"""OME-NGFF metadata: units, channels, times and associated data of an image are read back as they
+were written, by gvtorch and by other libraries.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ infos = st.builds(
     dtype=st.sampled_from(["uint8", "int16", "float32"]),
 )
 def test_what_ngff_holds_comes_back(tmp_path, info, times, spacing, origin, dtype):
-    """A store, the same converted again, and a volume read from it tell what went in."""
+    """A store, its conversion, and a volume read from it have the original metadata."""
     import yaozarrs
 
     from gvtorch.io.source import MemorySource
@@ -117,7 +117,7 @@ TOLD = (
 
 
 def test_an_image_that_yaozarrs_wrote(tmp_path):
-    """0.5: five axes with units, `omero`, labels beside it, and several series in a file."""
+    """0.5: five axes with units, `omero`, labels, and several series in a file."""
     from yaozarrs import v05
     from yaozarrs.write.v05 import write_bioformats2raw, write_image
 
@@ -197,7 +197,7 @@ def test_an_image_that_ome_zarr_models_wrote(tmp_path):
 
 
 def with_omero(folder: Path, omero: object, version: int) -> Path:
-    """Two channels, written by zarr-python."""
+    """Writes an image of two channels with zarr-python."""
     data = noise((6, 7, 8, 2), "uint16").transpose(3, 0, 1, 2)
     write_foreign(folder, [data], "czyx", [[1.0] * 4], version=version)
     file = folder / (".zattrs" if version == 2 else "zarr.json")
@@ -330,7 +330,7 @@ def test_the_command_line_tells_and_names_components(tmp_path, capsys):
 
 
 def holders(value: Any) -> list[tuple[Any, Any]]:
-    """Every place of a JSON value, as what holds it and where."""
+    """Returns every position in a JSON value, as its container and key."""
     found = []
     for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
         found.append((value, key))
@@ -340,7 +340,7 @@ def holders(value: Any) -> list[tuple[Any, Any]]:
 
 
 def test_metadata_broken_anywhere_is_one_line(tmp_path):
-    """Every value of an image's metadata is replaced by ones that do not belong there."""
+    """Every value of an image's metadata is replaced by invalid ones."""
     info = ImageInfo(unit="meter", channels=TOLD, time_step=2.0, quantity="HU")
     data = noise((9, 9, 9, 2))
     convert(gv.Volume(data, info=info), tmp_path / "own.zarr")

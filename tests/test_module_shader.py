@@ -1,5 +1,5 @@
-"""`ModuleShader`: a transfer function as a module draws what the kernel draws; modules see what
-they are told they see; gradients reach parameters and voxels.
+"""`ModuleShader`: a transfer function as a module draws what the kernel draws; modules get the
+documented inputs; gradients reach parameters and voxels.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from helpers.traces import SHADER
 import gvtorch as gv
 from gvtorch.tracing.tracer import Tracer
 
-SOFT = gv.TransferFunction.from_points(  # never quite opaque: a power of 0 has no slope
+SOFT = gv.TransferFunction.from_points(  # never fully opaque: a power of 0 has no slope
     opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 0.95)],
     color=[(0, 1, 0, 0), (0.5, 0.2, 0.8, 0.1), (1, 1, 1, 1)],
 )
@@ -61,7 +61,7 @@ def test_a_module_equals_the_fused_one_on_scans(aneurism, stent, compiled):
 @pytest.mark.parametrize("lod", ["auto", "finest"])
 @pytest.mark.parametrize("lit", [False, True])
 def test_stored_colours_and_normals_as_module_equal_the_fused_ones(blobs, compiled, lod, lit):
-    """The formulas of `StoredColor`, with Blinn's and Phong's light, in torch."""
+    """The formulas of `StoredColor`, with Blinn-Phong light, in torch."""
     generator, device = torch.Generator().manual_seed(4), DEVICES[compiled]
     place = blobs.spacing, blobs.origin
     shape = blobs.data.shape[:3]
@@ -96,7 +96,7 @@ def test_stored_colours_and_normals_as_module_equal_the_fused_ones(blobs, compil
 
 @torch.no_grad()
 def test_a_module_streams_what_the_fused_shader_streams(blobs, compiled):
-    """The same bricks are asked for, and the converged pictures are the same."""
+    """The same bricks are requested, and the converged pictures are the same."""
     camera = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
     found = {}
     for name in ("fused", "module"):
@@ -129,7 +129,7 @@ def test_modules_and_transfer_functions_share_a_scene(blobs):
 
 @torch.no_grad()
 def test_the_module_sees_places_directions_and_lengths(blobs, backend):
-    """A module that knows where it is draws a ball that no voxel holds."""
+    """A module that uses positions draws a ball that no voxel holds."""
     volume = gv.Volume(torch.rand(16, 16, 16, generator=torch.Generator().manual_seed(0)))
     tree = gv.N3Tree.from_volume(volume, 8, device=DEVICES[backend])
     centre, seen = tree.box.mean(0).to(tree.device), []
@@ -155,7 +155,7 @@ def test_the_module_sees_places_directions_and_lengths(blobs, backend):
 
 @torch.no_grad()
 def test_a_far_camera_costs_no_precision(blobs):
-    """Places come from where the ray enters the box: float32 would lose them out there."""
+    """Positions are computed from where the ray enters the box: float32 is too coarse outside."""
     volume = gv.Volume(torch.ones(8, 8, 8))
     tree, found = gv.N3Tree.from_volume(volume, 8), []
 
@@ -191,7 +191,7 @@ def test_several_channels_stand_side_by_side(blobs, compiled):
 
 
 def test_gradients_reach_parameters_and_voxels(blobs, compiled):
-    """Against differences of the picture."""
+    """Against finite differences of the picture."""
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     camera = gv.Camera.orbit(width=8, height=8, distance=1.3)
     module = gv.TransferModule(SOFT, min(tree.spacing)).to(tree.device)
@@ -311,7 +311,7 @@ def test_a_frame_with_a_module_is_not_captured(blobs):
 
 
 def test_a_module_shader_is_a_module(blobs, compiled):
-    """Optimisers, `state_dict` and `.to` reach the module that it holds; functions go as well."""
+    """Optimisers, `state_dict` and `.to` reach the module inside; plain functions work as well."""
     tree = gv.N3Tree.from_volume(blobs, 8, device=DEVICES[compiled])
     shader = twin(SOFT, tree.spacing).to(tree.device)
     (rows,) = shader.parameters()

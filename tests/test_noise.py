@@ -1,4 +1,4 @@
-"""`gv.noise` against point by point NumPy, its bounds, periods and bits."""
+"""`gv.noise`: against NumPy, point by point; its bounds, periods and bits."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_noise_is_that_of_plain_numpy(name, n):
     )
     narrow = ALL[name](points.float(), seed=5)
     assert narrow.dtype == torch.float32
-    # float32 knows places to 2^-20 here; that times the slope, and the rounding of the sums.
+    # float32 resolves positions to 2^-20 here; that times the slope, plus rounding of the sums.
     slope = noise.bounds(ALL[name], n).slope
     assert (narrow - found).abs().max() < slope * n * 2.0**-20
 
@@ -86,7 +86,7 @@ def test_periods_are_exact(name, n):
     random = torch.Generator().manual_seed(1)
     shift = torch.randint(-4, 5, points.shape, generator=random) * torch.tensor(period)
     here, there = (ALL[name](one, period=period) for one in (points, points + shift))
-    if name == "simplex":  # the skew rounds otherwise there
+    if name == "simplex":  # the skew rounds differently there
         torch.testing.assert_close(here, there, atol=1e-11, rtol=0)
     else:
         assert torch.equal(here, there)
@@ -113,7 +113,7 @@ def test_sums_repeat_with_the_period_of_their_first_octave(n):
     ],
 )
 def test_fractal_sums_are_those_of_plain_numpy(name, own):
-    """At 10^3 points; weights of ridges are cut to 1 by the one sharpness, hardly by the other."""
+    """At 10^3 points; one sharpness clamps the weights of ridges to 1, the other hardly does."""
     points = random_points(1000, 3)
     options = {"octaves": 3, "lacunarity": 1.9, "gain": 0.6, "seed": 3, **own}
     expected = [getattr(numpy_noise, name)(point, **options) for point in points.tolist()]
@@ -130,7 +130,7 @@ def test_bounds_hold_at_a_million_points(name, n):
     for seed in range(10):
         values = ALL[name](random_points(100_000, n, torch.float32, 2000.0), seed=seed)
         assert low - 2.0**-20 <= values.min() and values.max() <= high + 2.0**-20
-    # No much tighter bound would do.
+    # A much tighter bound would be wrong.
     assert values.max() > 0.6 * high
 
 
@@ -152,7 +152,7 @@ def test_slopes_hold_at_a_million_points(name, n):
 
 @pytest.mark.parametrize(("n", "height", "slope"), [(2, 1.0, 2.75), (3, 1.0363538, 3.75)])
 def test_bounds_of_gradient_noise_are_met_by_the_best_gradients(n, height, slope):
-    """At the places where the search found the largest sums over corners of the best gradient."""
+    """At the points where a search found the largest sums over corners with the best gradients."""
     half = torch.full((n,), 0.5, dtype=torch.float64)
     top = torch.tensor([0.48149221, 0.64474330, 0.5], dtype=torch.float64) if n == 3 else half
     edges = torch.tensor([numpy_noise.edge(word << 6) for word in range(2**26) if not word % 99991])
@@ -189,7 +189,7 @@ def test_bounds_of_sums_hold():
 
 
 def test_bits_are_those_that_they_always_were():
-    """On every device and in every version: places by whole numbers, hashed with their values."""
+    """On every device and in every version: points of whole numbers, hashed with their values."""
     at = torch.arange(3 * 4096, dtype=torch.float32).view(-1, 3)
     points = (at * 0.37109375) % 17 - 8.5
     words = [getattr(noise, name)(points, seed=9) for name in ("perlin", "value", "cellular")]
@@ -218,8 +218,8 @@ def test_seeds_are_noises_apart():
 
 
 def test_hashes_of_neighbours_share_nothing():
-    """Each bit that is used is set half of the time, and flips half of the time from one lattice
-    point to the next.
+    """Each used bit is set half of the time, and flips half of the time from one lattice point to
+    the next.
     """
     at = torch.arange(-32, 32, dtype=torch.int32)
     x, y, z = (twin.scramble(at, salt) for salt in twin.salts(4))
@@ -243,7 +243,7 @@ def test_gradient_noise_has_the_gradients_of_autograd():
 
 @pytest.mark.parametrize("name", ["perlin", "simplex", "cellular", "fbm", "warp"])
 def test_noise_compiles_to_one_graph(name):
-    """Without a break where the host would look at values, and to the same bits on the CPU."""
+    """Without graph breaks for values read on the host, and with the same bits on the CPU."""
     points, plain = random_points(3000, 3, torch.float32), getattr(noise, name)
     compiled = torch.compile(plain, fullgraph=True, backend="aot_eager")
     assert torch.equal(compiled(points, seed=3), plain(points, seed=3))

@@ -20,7 +20,7 @@ dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 
 def some_points(count: int, n: int, dtype=torch.float32, size: float = 300.0) -> torch.Tensor:
-    """Points all over the place, on the lattice, next to it on both sides, and both zeros."""
+    """Returns random points, lattice points, their neighbours on both sides, and both zeros."""
     random = torch.Generator().manual_seed(3)
     points = (torch.rand((count, n), generator=random, dtype=torch.float64) - 0.5) * size
     points[:200] = points[:200].round()
@@ -64,7 +64,7 @@ def test_what_is_no_number_stays_so(compiled, kind):
 @pytest.mark.parametrize("instructions", ["baseline", "avx2"])
 @pytest.mark.backend("cpp")
 def test_all_instruction_sets_give_the_same_bits(instructions):
-    """The widest that this machine has are those of the tests above."""
+    """The other tests use the widest instruction set of the machine."""
     code = (
         "import torch; from gvtorch.ops import noise; "
         "p = torch.arange(3999, dtype=torch.float32).view(-1, 3) * 0.37109375 - 300; "
@@ -85,7 +85,7 @@ def test_all_instruction_sets_give_the_same_bits(instructions):
 
 @dtypes
 def test_coordinates_that_32_bits_cannot_count_are_0(backend, dtype):
-    """So a sum's octaves, of whatever frequency, stay within their bounds."""
+    """Therefore octaves of any frequency stay within their bounds."""
     points = some_points(500, 3, dtype).to(DEVICES[backend])
     far = points.clone()
     far[::2, 0] = torch.tensor([2.0**29, -(2.0**40), 1e30, torch.inf, -torch.inf]).repeat(50)
@@ -133,7 +133,7 @@ def test_gradients_are_those_of_the_twin_and_none_is_lost(compiled):
 
 
 def test_a_noisy_shape_has_normals():
-    """Distances with noise in them, whose normals are gradients."""
+    """Its distances contain noise, and its normals are their gradients."""
 
     class Bumpy(gv.sdf.Distance):
         exact = False

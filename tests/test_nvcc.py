@@ -1,5 +1,5 @@
-"""Users' shaders by nvcc, which needs no card to compile: what is kept, what counts as changed, and
-that no name of a user comes to the shell to which nvcc hands its arguments.
+"""Users' shaders compiled by nvcc, which needs no GPU for that: what is cached, what counts as
+changed, and that no user-given name gets to the shell to which nvcc passes its arguments.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ARCHS = ("90",)
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch) -> Path:
-    """A cache of its own, and an nvcc that does not optimise."""
+    """A separate cache, and an nvcc that does not optimise."""
     nvcc = tmp_path / "nvcc"
     nvcc.write_text(f'#!/bin/sh\nexec {compilers.find_nvcc()} "$@" -O0 -Xptxas=-O0\n')
     nvcc.chmod(0o755)
@@ -29,7 +29,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 
 def test_what_only_cuda_includes_counts_and_no_name_comes_to_a_shell(tmp_path, cache, monkeypatch):
-    """A file that is included by a macro, and in the code for CUDA alone."""
+    """A file that is included by a macro, and only in CUDA code."""
     folder = tmp_path / "a b;touch $(touch beside)`touch beside`"
     folder.mkdir()
     header = write(folder, ADD.replace("COLOR", "kColor"), "own $(touch here);'\".h")

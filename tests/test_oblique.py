@@ -1,4 +1,4 @@
-"""Voxel axes that do not lie along the world's: resampled along these, or kept."""
+"""Voxel axes that are not parallel to the world's: resampled along these, or kept."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIZE = (14, 11, 9)  # voxels along the stored axes
 
 
 def turn(degrees: tuple[float, float, float]) -> np.ndarray:
-    """Rotation about x, then y, then z."""
+    """Returns the rotation about x, then y, then z."""
     made = np.eye(3)
     for axis, angle in enumerate(np.radians(degrees)):
         cos, sin = np.cos(angle), np.sin(angle)
@@ -44,13 +44,13 @@ def affine_of(degrees, spacing=(1.0, 1.0, 1.0), origin=(5.0, -7.0, 11.0)) -> np.
 
 
 def world_of(affine: np.ndarray, size=SIZE) -> np.ndarray:
-    """(i, j, k, 3) places of the stored voxels in the world."""
+    """Returns (i, j, k, 3): world positions of the stored voxels."""
     index = np.stack(np.meshgrid(*map(np.arange, size), indexing="ij"), -1)
     return index @ affine[:3, :3].T + affine[:3, 3]
 
 
 def centers(volume: gv.Volume) -> np.ndarray:
-    """(z, y, x, 3) places of a volume's voxels in the world, (x, y, z)."""
+    """Returns (z, y, x, 3): world positions (x, y, z) of a volume's voxels."""
     axes = [
         np.arange(n) * s + o
         for n, s, o in zip(volume.extent, volume.spacing, volume.origin, strict=True)
@@ -60,7 +60,7 @@ def centers(volume: gv.Volume) -> np.ndarray:
 
 
 def inner_index(volume: gv.Volume, affine: np.ndarray) -> np.ndarray:
-    """(z, y, x, 3) where its voxels lie among the stored ones, (i, j, k)."""
+    """Returns (z, y, x, 3): positions of its voxels in stored indices (i, j, k)."""
     return (centers(volume) - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
 
 
@@ -76,7 +76,7 @@ def read(path: Path, **options) -> gv.Volume:
 
 
 def assert_is_ramp(volume: gv.Volume, affine: np.ndarray, size, slope) -> None:
-    """Inside the stored centres the values are those of a linear function of the world."""
+    """Asserts that inside the stored centres values are a linear function of the world."""
     at = inner_index(volume, affine)
     inside = ((at >= 0) & (at <= np.array(size) - 1)).all(-1)
     expected = centers(volume) @ slope + 3
@@ -125,7 +125,7 @@ def test_as_torch_interpolates(tmp_path):
 
 
 def test_as_simpleitk_resamples(tmp_path):
-    """Another library reads the same file, and is asked for the same world points."""
+    """Another library reads the same file at the same world positions."""
     sitk = pytest.importorskip("SimpleITK")
     affine = affine_of((25, 5, -40), (0.9, 1.1, 1.5))
     data = np.random.default_rng(4).integers(-900, 900, SIZE).astype(np.int16)
@@ -235,7 +235,7 @@ def test_labels_are_never_blended(tmp_path):
 
 
 def test_only_what_is_needed_is_read(tmp_path, monkeypatch):
-    """A region's share of the inner source, and all of it once for a packed file."""
+    """Only a region's part of the inner source; all of it, once, for a packed file."""
     data = np.random.default_rng(0).integers(0, 99, (64, 64, 64)).astype(np.int16)
     path = save(tmp_path / "a.nii", data, affine_of((0, 0, 30)))
     with warnings.catch_warnings():

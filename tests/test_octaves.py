@@ -1,4 +1,4 @@
-"""Octaves by level: what children take over of their parents' bricks, against the direct sum."""
+"""Octaves by level: what children inherit from their parents' bricks, against the direct sum."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ noise = gv.noise
 
 
 def axes_of(corner: torch.Tensor, side: float) -> list[torch.Tensor]:
-    """Places of the voxels of bricks of 8^3 and a border of 1, from their (k, 3) low corners on."""
+    """Returns voxel positions of 8^3 bricks with a border of 1, by their (k, 3) low corners."""
     reach = (torch.arange(-1, 9, dtype=torch.float64) + 0.5) * side
     return [corner[:, axis, None] + reach for axis in range(3)]
 
 
 def descent(total, levels, count=40, side=1 / 16, seed=0):
-    """From `count` random bricks down: by level its axes, voxel side, sums and what is settled."""
+    """Descends from `count` random bricks: by level, axes, voxel side, sums and settled octaves."""
     random = torch.Generator().manual_seed(seed)
     corner = torch.randint(-9, 9, (count, 3), generator=random) * 8.0 * side
     parents = child = None
@@ -79,7 +79,7 @@ def test_a_level_evaluates_four_octaves_however_many_there_are():
         made, before = total.made - before, total.made
         held = len(total.held(side))
         assert held == min(depth + 4, 14)
-        # Those whose cells are 2, 4, 8 and, for the last time, 16 voxels wide.
+        # Octaves whose cells are 2, 4, 8 and, for the last time, 16 voxels wide.
         assert made == min(4, 14 - depth) * found.numel()
     assert total.made < 0.45 * total.wanted
 

@@ -80,7 +80,7 @@ def test_compiles_without_graph_breaks(tracer, rays):
 
 @pytest.mark.backend("cpp")
 def test_compiles_with_the_default_backend(blobs):
-    """Inductor compiles what stands around the op and calls the op itself."""
+    """Inductor compiles the code around the op, and calls the op itself."""
     tree = gv.N3Tree.from_volume(blobs, 4)
     tracer = gv.TreeTracer(tree, SHADER)
     rays = world_rays(tree.box, 33, "cpu")
@@ -129,7 +129,7 @@ def test_module_equals_render(blobs, compiled):
 
 @pytest.mark.parametrize("scale", [None, 3.0])
 def test_module_traces_a_camera_s_rays_as_the_renderer_does(blobs, compiled, scale):
-    """At the level of detail that their cones ask for."""
+    """At the level of detail that their cones require."""
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     rays = camera_rays(tree, 16, distance=3.0).to(tree.device)
     given = {} if scale is None else {"cone_scale": scale}
@@ -159,7 +159,7 @@ def test_memory_stays_safe_without_the_python_checks(blobs, compiled):
 
 @pytest.mark.backend("cpp")
 def test_a_cpp_process_without_python_loads_the_archive(blobs, tmp_path):
-    """Compiles tests/cpp/render.cpp against libtorch alone and compares what it prints."""
+    """Compiles tests/cpp/render.cpp against libtorch only, and compares what it prints."""
     compiler = shutil.which("g++") or pytest.fail("g++ is needed, as for the extension itself")
     tree = gv.N3Tree.from_volume(blobs, 4)
     tracer = gv.TreeTracer(tree, SHADER)

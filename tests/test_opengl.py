@@ -20,7 +20,7 @@ EYES = torch.tensor([[3.0, 2.0, 5.0], [-4.0, 1.0, 2.0]])
 
 
 def off_centre(batched: bool = False) -> gv.Camera:
-    """A camera whose principal point and focal lengths are no special ones."""
+    """Returns a camera with an off-centre principal point and unequal focal lengths."""
     eyes = EYES if batched else EYES[0]
     camera = gv.Camera.look_at(eyes, (0.5, 0, 0), fov=35, width=23, height=14)
     K = camera.Ks.clone()
@@ -31,7 +31,7 @@ def off_centre(batched: bool = False) -> gv.Camera:
 
 
 def pipeline(projection, modelview, points, clip_depth):
-    """(k, 3) points as OpenGL's window coordinates of 23 x 14 pixels: x right, y up, depth."""
+    """Returns OpenGL's window coordinates (k, 3) of points in 23 x 14 pixels: x, y up, depth."""
     clip = torch.cat((points, torch.ones_like(points[:, :1])), 1) @ (projection @ modelview).mT
     ndc = clip[:, :3] / clip[:, 3:]
     size = torch.tensor([23, 14], dtype=torch.float64)
@@ -44,8 +44,8 @@ def pipeline(projection, modelview, points, clip_depth):
 @pytest.mark.parametrize("reversed_z", [False, True])
 @pytest.mark.parametrize("clip_depth", ClipDepth)
 def test_opengl_draws_what_our_rays_see(clip_depth, reversed_z, far):
-    """A place on the ray of a pixel falls on that pixel's centre, with the depth that the helper
-    tells; to float64's rounding."""
+    """A point on the ray of a pixel is drawn at that pixel's centre, with the depth that
+    `window_depth` gives; to float64's rounding."""
     camera = off_centre()
     projection, modelview = matrices(
         camera, 0.25, far, clip_depth=clip_depth, reversed_z=reversed_z
@@ -172,7 +172,7 @@ def test_what_is_wrong_is_named():
 
 @pytest.fixture(scope="module")
 def vtk():
-    """The example, which draws with VTK; a skip where that can't draw."""
+    """The example that draws with VTK; skips the test where VTK can't draw."""
     if reason := no_vtk():
         pytest.skip(reason)
     sys.path.insert(0, str(ROOT / "examples"))
@@ -183,7 +183,7 @@ def vtk():
 
 
 def square(vtk, corners):
-    """Two triangles between three corners and the fourth that follows from them: source, place and
+    """Returns two triangles of a parallelogram with three given corners: source, position and
     colour.
     """
     plane = vtk.vtk.vtkPlaneSource()
@@ -195,7 +195,7 @@ def square(vtk, corners):
 
 @pytest.mark.backend("opengl")
 def test_vtk_draws_our_pixels_at_our_distances(vtk):
-    """A tilted square: which pixels it covers, and how far it is, told by its plane."""
+    """A tilted square: the pixels that it covers, and its distances, computed from its plane."""
     camera = gv.Camera.look_at((30, 20, 80), (3, -2, 1), fov=30, width=200, height=150)
     K = camera.Ks.clone()
     K[:, 0, 2] += 13.25

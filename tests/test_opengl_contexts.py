@@ -23,7 +23,7 @@ CORE, COMPATIBILITY = 1, 2
 
 @functools.cache
 def _egl():
-    """EGL, and a display on which contexts need no surface."""
+    """Returns EGL, and a display on which contexts need no surface."""
     opengl_context().__enter__()
     egl = ctypes.CDLL("libEGL.so.1")
     for name in ("eglGetCurrentDisplay", "eglCreateContext"):
@@ -54,13 +54,13 @@ def use(context: ctypes.c_void_p | None) -> None:
 def device(request):
     if request.param == "cuda" and (reason := unavailable()["cuda"]):
         pytest.skip(f"backend cuda: {reason}")
-    opengl_context()  # and EGL's display, which others may have ended
+    opengl_context()  # and EGL's display, which others may have terminated
     yield request.param
     use(None)
 
 
 def target(functions: gl.Functions) -> tuple[int, int, int]:
-    """Binds a new framebuffer of colour and depth; gives back the names."""
+    """Binds a new framebuffer with colour and depth; returns the names."""
     names = [functions.make("Textures") for _ in range(2)]
     layouts = [(gl.RGBA32F, gl.RGBA), (gl.DEPTH_COMPONENT32F, gl.DEPTH_COMPONENT)]
     frame = functions.make("Framebuffers")
@@ -128,7 +128,7 @@ def test_a_context_that_shares_objects_is_as_good(device):
     functions = gl.Functions("test")
     frames = [target(functions) for _ in range(4)]
     assert_passes(exchange)
-    for frame, color, _ in frames:  # framebuffers are nobody else's
+    for frame, color, _ in frames:  # framebuffers are not shared
         functions.BindFramebuffer(gl.READ_FRAMEBUFFER, frame)
         where = (gl.READ_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.ATTACHED_NAME)
         assert functions.parameter("GetFramebufferAttachmentParameteriv", *where) == color
@@ -157,7 +157,7 @@ def test_threads_have_exchanges_of_their_own(device):
 
 
 def set_odd(functions: gl.Functions) -> None:
-    """Has every fragment fail and every pixel become another, as only old OpenGL can."""
+    """Sets old OpenGL state by which all fragments fail and all pixels change."""
     functions._take(gl._system("test"), {"AlphaFunc": "-uf", "PolygonStipple": "-p"})
     for switch in gl._LEGACY_SWITCHES:
         functions.Enable(switch)

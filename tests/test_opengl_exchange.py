@@ -1,6 +1,6 @@
 """Pictures between OpenGL and torch: in a real context without a window (EGL), a GPU's or Mesa's.
 
-moderngl, which keeps its own record of the context, draws and reads beside us.
+moderngl, which tracks the context's state itself, draws and reads in the same context.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ DEPTHS = {  # internal formats, with their attachments
 
 @pytest.fixture
 def context():
-    """A context that is current, with no framebuffer bound and no switch on."""
+    """A current context, with no framebuffer bound and no capability enabled."""
     made = opengl_context()
     made.__enter__()
     made.screen and made.screen.use()
@@ -56,7 +56,7 @@ def exchange(context, device, shared):
 
 
 def scene(context, kind="f1", depth=None):
-    """A framebuffer with a picture and a depth of random numbers, and both, rows down."""
+    """Returns a framebuffer with random colours and depths, and both as tensors, top row first."""
     generator = torch.Generator().manual_seed(5)
     numbers = torch.rand(HEIGHT, WIDTH, 4, generator=generator)
     data = {
@@ -83,13 +83,13 @@ def test_colours_come_as_they_are_stored(context, exchange, kind):
     assert torch.equal(got.cpu(), color)
     frame.clear(0.2, 0.4, 0.6, 1.0)
     again = exchange.read_color()
-    assert torch.equal(got.cpu(), color)  # what was given back is nobody else's
+    assert torch.equal(got.cpu(), color)  # what was returned is not shared
     expected = torch.tensor([0.2, 0.4, 0.6, 1.0])
     torch.testing.assert_close(again.cpu(), expected.expand_as(again), rtol=2e-3, atol=0)
 
 
 def depth_frame(context, name):
-    """A framebuffer of only a depth, of one of OpenGL's formats; the functions that made it."""
+    """Returns a framebuffer of only depth in an OpenGL format, and the functions that made it."""
     functions = gl.Functions("test")
     stored, attachment, _ = DEPTHS[name]
     layout = {0x88F0: (0x84F9, 0x84FA), 0x8CAD: (0x84F9, 0x8DAD)}
@@ -112,7 +112,7 @@ def test_depths_go_there_and_come_back_in_every_format(context, exchange, name):
     depth_frame(context, name)
     exchange.draw(color.to(exchange.device), z.to(exchange.device))
     got = exchange.read_depth().cpu()
-    tolerance = 1.01 * DEPTHS[name][2]  # which way numbers are rounded is the driver's choice
+    tolerance = 1.01 * DEPTHS[name][2]  # drivers may round either way
     error = float((got - z).abs().max())
     print(f"depth of {name} bits: off by {error:.1e}")
     assert got.shape == z.shape and error <= tolerance
@@ -132,7 +132,7 @@ FORMATS = {  # internal formats, with the bits of red, green, blue and alpha
 @everywhere
 @pytest.mark.parametrize("name", FORMATS)
 def test_colours_keep_the_bits_of_their_format(context, exchange, name):
-    """What is missing is 0, alpha 1."""
+    """Missing components are 0, alpha 1."""
     functions = gl.Functions("test")
     stored, *bits = FORMATS[name]
     texture, frame = functions.make("Textures"), functions.make("Framebuffers")
@@ -152,7 +152,7 @@ def test_colours_keep_the_bits_of_their_format(context, exchange, name):
     functions.Disable(0x8DB9)
     for channel, kept in enumerate(bits):
         expected = color[..., channel] if kept else torch.full((HEIGHT, WIDTH), channel // 3.0)
-        step = 1.01 / (2**kept - 1) if kept else 0  # rounded or cut off, as the driver likes
+        step = 1.01 / (2**kept - 1) if kept else 0  # drivers may round or truncate
         torch.testing.assert_close(got[..., channel], expected, rtol=0, atol=step)
 
 
@@ -198,7 +198,7 @@ def test_what_is_drawn_is_what_is_read(context, exchange, dtype, channels):
 
 @everywhere
 def test_what_is_drawn_later_is_tested_against_it(context, exchange):
-    """A triangle over all pixels at half the depth, over a depth that rises from left to right."""
+    """A triangle at depth 1/2 over all pixels, on a depth that rises from left to right."""
     scene(context)
     z = torch.linspace(0, 1, WIDTH).expand(HEIGHT, WIDTH)[..., None].to(exchange.device)
     exchange.draw(torch.zeros(HEIGHT, WIDTH, 3, device=exchange.device), z)
@@ -227,7 +227,7 @@ def test_textures_are_there_for_shaders_of_ones_own(context, exchange):
 
 
 def state(functions: gl.Functions) -> dict[int, list[int]]:
-    """Whatever of a context's state an exchange touches."""
+    """Returns all of a context's state that an exchange touches."""
     several = {gl.VIEWPORT: 4}
     queries = [*gl._STORE, *gl._BUFFERS.values(), *gl.FRAMES.values(), *several, gl.PROGRAM]
     queries += [gl.VERTEX_ARRAY, gl.DEPTH_MASK, gl.DEPTH_FUNC, gl.POLYGON_MODE, gl.ACTIVE_TEXTURE]
@@ -248,7 +248,7 @@ def state(functions: gl.Functions) -> dict[int, list[int]]:
 
 
 def make_plain(functions: gl.Functions, odd, on) -> None:
-    """Sets a context's state to what it is at first."""
+    """Sets a context's state to its initial values."""
     for number in odd:
         functions.PixelStorei(number, 0 if number not in (0x0CF5, 0x0D05) else 4)
     for switch in on:
@@ -268,7 +268,7 @@ def make_plain(functions: gl.Functions, odd, on) -> None:
 
 @everywhere
 def test_the_contexts_state_stays(context, exchange):
-    """Everything is set to something odd first; what is drawn and read is the same all the same."""
+    """All state is set to unusual values first; what is drawn and read does not change."""
     frame, color, z = scene(context)
     functions = gl.Functions("test")
     buffer = context.buffer(reserve=64)
@@ -336,7 +336,7 @@ def test_a_layer_drawn_by_opengl_is_the_layer_of_its_distances(context, exchange
     exchange.draw(picture.color, gv.opengl.window_depth(picture.nearest, projection))
     assert (
         float((exchange.read_color()[..., :3] - picture.color).abs().max()) <= 0.6 / 255
-    )  # blending hardware rounds coarsely
+    )  # blending hardware is imprecise
     back = gv.opengl.ray_distance(exchange.read_depth(), projection)
     near = (picture.nearest < 20).cpu()
     torch.testing.assert_close(

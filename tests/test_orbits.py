@@ -29,7 +29,7 @@ dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 
 def wide(form: str) -> float:
-    """Side of a cube in which orbits do this and that."""
+    """Returns the side of a cube in which some orbits escape and others do not."""
     return 12.0 if form.startswith("box") else 3.0
 
 
@@ -40,8 +40,8 @@ def given(form: str, dtype: torch.dtype, device: str) -> Orbit:
 
 
 def some_points(count: int, dtype: torch.dtype, size: float) -> torch.Tensor:
-    """Points all over the place, on the axis and on planes, at the origin, tiny and far ones, and
-    those that are no numbers.
+    """Returns random points, points on the axis and on planes, the origin, tiny and far points, and
+    some with NaN.
     """
     random = torch.Generator().manual_seed(5)
     points = (torch.rand((count, 3), generator=random, dtype=torch.float64) - 0.5) * size
@@ -56,7 +56,7 @@ def some_points(count: int, dtype: torch.dtype, size: float) -> torch.Tensor:
 
 def bits(values: torch.Tensor) -> torch.Tensor:
     values = values.cpu()
-    values = torch.where(values.isnan(), 0.0, values)  # a NaN has many
+    values = torch.where(values.isnan(), 0.0, values)  # NaN has many bit patterns
     return values.view(torch.int32 if values.dtype == torch.float32 else torch.int64)
 
 
@@ -112,7 +112,7 @@ def test_logarithm(dtype):
 
 @dtypes
 def test_square_roots_are_rounded_once_whoever_follows(dtype):
-    """NumPy's where nothing follows them; what records or derives sees operations of torch."""
+    """By NumPy where no autograd or tracing is active; otherwise torch's operations are seen."""
     value = torch.rand((500, 3), dtype=dtype, generator=torch.Generator().manual_seed(3)) + 0.01
     expected = torch.from_numpy(np.sqrt(value.numpy()))
     slope = 0.5 / expected

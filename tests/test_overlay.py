@@ -1,4 +1,4 @@
-"""What is drawn over pictures: colours, lengths, text, in strips as in whole; PNG row by row."""
+"""Overlays: colour bars, scale bars, text, in strips as in whole pictures; PNG row by row."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def black(width: int = 320, height: int = 240, light: float = 0.0) -> gv.Picture
 @pytest.mark.parametrize("count", [3, 4])
 @pytest.mark.parametrize("rows", [1, 7, 64])
 def test_png_rows_come_back(tmp_path, bits, count, rows):
-    """As Pillow, or for 16 bits another decoder, reads them: noise, a gradient and one colour."""
+    """Read by Pillow, or for 16 bits another decoder: noise, a gradient and one colour."""
     from imagecodecs import png_decode
 
     rng = np.random.default_rng(bits + count)
@@ -56,7 +56,7 @@ def test_png_rows_come_back(tmp_path, bits, count, rows):
 
 
 def test_a_scale_bar_is_as_long_as_it_says():
-    """Its white line, in pixels, by the width of a pixel: 1, 2 or 5 times a power of ten."""
+    """Its white line, in pixels, times the pixel's width, is 1, 2 or 5 times a power of ten."""
     for pixel, unit, expected in ((0.11, "micrometer", 5.0), (0.3, None, 20.0), (7e-4, "mm", 0.05)):
         drawn = gv.Overlay(320, 240, pixel=pixel, unit=unit).over(black()).color.numpy()
         white = (drawn > 0.99).all(-1)
@@ -155,7 +155,7 @@ def test_letters_that_the_font_lacks_are_told():
 
 @pytest.mark.backend("cpp")
 def test_render_and_fly_draw(scan_store, tmp_path, monkeypatch):
-    """In one piece, in strips, and in the pictures of a flight: the same pixels."""
+    """Whole, in strips, and in the pictures of a flight: the same pixels."""
     flags = ("--size", "200x160", "--tf", "hot", "--bar", "--scale-bar", "--annotate", "ball")
     still = (*flags, "--camera", "orbit:30,20,2")
     run = gvtorch("render", scan_store, "-o", tmp_path / "a.png", *still)
@@ -196,7 +196,7 @@ def test_nothing_seen_is_told_of_strips_too(small, tmp_path):
 
 
 def test_a_small_picture_has_room_or_says_so():
-    """Also where places of ticks are no sums of powers of two."""
+    """Also where positions of ticks are not sums of powers of two."""
     fits = 0
     for width, height in itertools.product(range(8, 80, 9), range(6, 60, 3)):
         for low, high in ((0.0, 255.0), (0.0, 1.0), (-1e-3, 3.7)):

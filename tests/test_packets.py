@@ -15,7 +15,7 @@ import gvtorch as gv
 
 
 def looks(*components: int) -> list[gv.ChannelLook]:
-    """Windows of channels of 8 bits, with or without a sign."""
+    """Returns looks of 8-bit channels, signed or unsigned."""
     return [gv.ChannelLook(window=(9.0 * c + 2, 120 - c), component=c) for c in components]
 
 
@@ -43,7 +43,7 @@ SHADERS = {
 }
 
 
-#: By shader and N; where N is 3 a tree is deep.
+#: Shader and N; trees with N = 3 are deep.
 CASES = [(name, 2) for name in SHADERS]
 CASES += [
     (name, 3) for name in ("plain", "lit by a lamp", "stored colour", "isosurface", "maximum")
@@ -61,7 +61,7 @@ def expected(name: str, branching: int) -> list[Tensor]:
 
 @pytest.fixture(scope="module")
 def of_instructions(tmp_path_factory) -> dict[str, dict[str, list[Tensor]]]:
-    """What each instruction set gives, by its name and the shader's."""
+    """The results by instruction set, then by shader."""
     folder = tmp_path_factory.mktemp("packets")
     return {name: result(start(all_shaded, folder, name)) for name in INSTRUCTIONS}
 
@@ -88,7 +88,7 @@ def test_bricks_beyond_2_gib_are_read_as_others_are(name, dtype):
     bricks, voxels = tree.bricks, tree.bricks.bricks["value"]
     used = bricks.capacity
     first = 2**31 // voxels[0].nbytes + 1
-    # Pages that nobody touches take no memory.
+    # Pages that are never touched take no memory.
     far = np.zeros((first + used, *voxels.shape[1:]), voxels.numpy().dtype)
     far[first:] = voxels.numpy()
     bricks.bricks["value"] = torch.from_numpy(far)

@@ -1,4 +1,4 @@
-"""Producers that are handed the bricks of their nodes' parents, and octaves by level as one."""
+"""Producers that need the bricks of their nodes' parents, such as octaves by level."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def view(size=20, azimuth=30.0, away=0.8):
 
 
 class Grown(gv.Producer):
-    """Each level adds its own number to what its parents hold, and a half of what these hold more
-    in one eighth: a voxel tells the way to it.
+    """Each node adds a number, which depends on its loc, to 0.9 of its parent's values, so that a
+    voxel's value identifies its path from the root.
     """
 
     needs_parent = True
@@ -45,7 +45,7 @@ class Grown(gv.Producer):
 
 
 class Later(Grown):
-    """The same from threads."""
+    """The same, answered from threads."""
 
     on_device = False
 
@@ -58,7 +58,7 @@ class Later(Grown):
 
 
 def expected(producer: Grown, loc: list[int], layout: Layout) -> torch.Tensor:
-    """The brick of one node, from the root on, by trilinear interpolation in NumPy."""
+    """Returns the brick of one node, from the root down, by trilinear interpolation in NumPy."""
     brick = None
     for depth in range(loc[3] + 1):
         own = [c >> (loc[3] - depth) for c in loc[:3]]
@@ -100,7 +100,7 @@ def test_children_are_handed_what_their_parents_hold(backend, kind):
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_small_pools_end_in_the_same_picture(backend):
-    """Parents that were given away are made again, and so are theirs."""
+    """Parents that were evicted are made again, and so are their parents."""
     options = {"brick_size": 4, "device": DEVICES[backend]}
     with gv.Engine(Grown(128, box=BOX), brick_pool="16 MB", **options) as engine:
         views = [view(16, azimuth, away) for azimuth in (0, 120) for away in (0.3, 1.5)]
@@ -189,7 +189,7 @@ def test_without_parents_there_is_nothing_to_inherit():
 
 
 class Alone(gv.OctaveProducer):
-    """The direct sum: nothing is taken over."""
+    """The direct sum: nothing is inherited."""
 
     needs_parent = False
 
@@ -199,7 +199,7 @@ def spline(octaves=7, extent=256, **options) -> gv.noise.SplineSum:
 
 
 def dense(total: gv.noise.SplineSum, side: int, hashed) -> np.ndarray:
-    """The sum in side^3 voxels and 2 around, by subdivision of whole levels in float64."""
+    """Returns the sum in side^3 voxels and 2 around, by subdividing whole levels in float64."""
     found = None
     for number, octave in enumerate(total.octaves):
         cells = side >> (len(total.octaves) - 1 - number)
@@ -217,7 +217,7 @@ def dense(total: gv.noise.SplineSum, side: int, hashed) -> np.ndarray:
 
 @pytest.mark.parametrize("octaves", [1, 4, 6])
 def test_voxels_hold_the_direct_sum(octaves):
-    """Against whole levels in float64, of the same random numbers."""
+    """Against whole levels in float64, with the same random numbers."""
     total, side = spline(octaves, 32), 32
     unit = gv.noise.SplineSum(frequency=1.0, octaves=1)
 
@@ -230,7 +230,7 @@ def test_voxels_hold_the_direct_sum(octaves):
     reach = (torch.arange(-2, side + 2, dtype=torch.float64)[None] + 0.5) * (2 / side)
     found, same = total.bricks([reach] * 3, 2 / side)
     assert found.shape == (1, 36, 36, 36) and same is found
-    inner = (slice(2, -2),) * 3  # beyond the face whole levels lack their coarse neighbours
+    inner = (slice(2, -2),) * 3  # whole levels lack coarse neighbours beyond their faces
     np.testing.assert_allclose(found[0].numpy()[inner], whole[inner], atol=3e-7, rtol=0)
     assert 0.1 < found.std() < 1.0
 
@@ -250,14 +250,14 @@ def test_streamed_octaves_are_the_direct_sum_in_every_bit(backend):
     for found in pictures[1:]:
         for one, other in zip(found, pictures[0], strict=True):
             assert torch.equal(one.color, other.color) and torch.equal(one.depth, other.depth)
-    if backend == "cpp":  # on CUDA, where nothing waits, each level is looked at for all nodes
+    if backend == "cpp":  # CUDA must not wait, so it evaluates each level for all nodes
         assert made[1] < 0.7 * made[0], "numbers that were not made again"
     assert producer.at(torch.tensor([0.1, 0.2, 0.3]))["value"].shape == (1,)
 
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_recorded_frames_make_octaves(backend):
-    """Of nodes of all levels at once, without waiting, in the same bits."""
+    """For nodes of all levels at once, without waiting, with the same bits."""
     options = {"brick_size": 8, "brick_pool": "64 MB", "device": DEVICES[backend]}
     with gv.Engine(gv.OctaveProducer(spline(), 256, box=BOX), **options) as engine:
         expected = engine.render(view(32), LOOK)
@@ -277,11 +277,11 @@ def test_recorded_frames_make_octaves(backend):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("total", [spline(5, 64), gv.noise.OctaveSum(frequency=2.0, octaves=5)])
 def test_octaves_are_made_without_a_look_at_values(total):
-    """torch.compile finds nothing that waits; roots and children, with parents and without."""
+    """torch.compile finds no read on the host, for roots and children, with or without parents."""
     producer = gv.OctaveProducer(total, 64, box=BOX)
     layout = Layout.of(producer, 8, 1, torch.device("cpu"))
     loc = torch.tensor([[0, 0, 0, 0], [1, 0, 1, 1], [3, 2, 0, 2], [5, 1, 7, 3], [4, 1, 7, 3]])
-    assert len(layout.reach) == 10  # kept from here on; a lock that can't be compiled is around it
+    assert len(layout.reach) == 10  # cached from here on; its lock can't be compiled
     random = torch.Generator().manual_seed(3)
     shape = (len(loc), *(layout.side,) * 3, 1)
     parents = {name: torch.rand(shape, generator=random) for name in producer.channels}
@@ -310,7 +310,7 @@ def test_bricks_agree_where_they_meet_in_every_bit():
 
 
 def test_a_level_makes_one_octave_and_gradient_noise_four():
-    """Nothing twice; the sums take what a sum without parents would make beside."""
+    """Nothing is evaluated twice; a sum without parents would evaluate more octaves."""
     counts = {}
     for name, total in (
         ("spline", spline(12, 8 << 11)),

@@ -1,4 +1,4 @@
-"""A store opens behind whatever path the system finds it by, and leaves nothing beside itself."""
+"""A store opens by any path by which the system finds it, and leaves no files next to itself."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_up_a_folder_and_through_links(tmp_path, data, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path / "work")
     for path in (
         *("../scan.zarr", "../link.zarr", "..//scan.zarr/", "./../work/../scan.zarr"),
-        "elsewhere/../../scan.zarr",  # the link's own parent, which is not its folder here
+        "elsewhere/../../scan.zarr",  # the parent of the link's target
     ):
         assert_holds(Store.open(path), data)
         main(["info", path])
@@ -98,7 +98,7 @@ TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 
     "name", [b"\xff\xfe", b"back\\s", b"a b?*#%41", b"new\nline", b"../in", b"link"]
 )
 def test_every_command_takes_any_path(tmp_path, data, name, monkeypatch, capsys):
-    """Bytes that are no UTF-8, marks of shells and URLs, ".." and links, in folder and file."""
+    """Bytes that are not UTF-8, special characters of shells and URLs, ".." and links."""
     folder = tmp_path / os.fsdecode(b"in" if name.startswith(b"..") else name)
     if name == b"link":
         (tmp_path / "real").mkdir()
@@ -142,7 +142,7 @@ def test_every_command_takes_any_path(tmp_path, data, name, monkeypatch, capsys)
 
 
 def test_links_to_names_that_are_no_text_go_with_the_process(tmp_path, data):
-    """Its own process and its workers; what it prints goes to a terminal that knows no bytes."""
+    """In a separate process and its workers, which print to a terminal that can't show bytes."""
     bad = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.zarr")
     np.save(tmp_path / "in.npy", data)
     (tmp_path / "tmp").mkdir()
@@ -189,7 +189,7 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize(("workers", "delay"), [(1, 0.5), (2, 0.0), (2, 1.0)])
 def test_ctrl_c_ends_in_one_line_that_tells_how_to_go_on(tmp_path, workers, delay):
-    """At two workers it comes while these start, which takes them seconds."""
+    """With two workers it arrives while these start, which takes seconds."""
     data = noise((300, 280, 270, 1)) if workers > 1 else noise((9, 20, 600, 1))
     source, target = tmp_path / "my scan.npy", tmp_path / "a.zarr"
     np.save(source, data)
@@ -227,7 +227,7 @@ main()
 
 
 def test_ctrl_c_while_a_command_starts_says_nothing():
-    """Most of a short command is imports: a few moments of the seconds before it does anything."""
+    """Most of a short command's time is imports: tries several moments before it does anything."""
     for delay in (0.02, 0.1, 0.3):
         process = subprocess.Popen(
             [sys.executable, "-c", STARTING, "render", "none.npy", "-o", "none.png"],
@@ -244,7 +244,7 @@ def test_ctrl_c_while_a_command_starts_says_nothing():
 
 
 def test_ctrl_c_within_an_import_that_swallows_it_comes_behind_it(tmp_path, monkeypatch):
-    """As numpy.f2py does, which a command imports by way of others."""
+    """As numpy.f2py does, which a command imports indirectly."""
     (tmp_path / "swallowing.py").write_text(
         "import signal\n"
         "try:\n    signal.raise_signal(signal.SIGINT)\nexcept BaseException:\n    pass\n"

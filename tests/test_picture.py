@@ -1,4 +1,4 @@
-"""Pictures against a dense marcher written apart (helpers/marcher.py), and against closed forms."""
+"""Pictures against an independent dense marcher (helpers/marcher.py), and against closed forms."""
 
 from __future__ import annotations
 
@@ -155,15 +155,15 @@ def test_border_zero_shows_the_seam_that_borders_remove(compiled):
 
 
 def ball(radius: float, n: int = 64, value: float = 1.0) -> gv.Volume:
-    """A ball with a one-voxel ramp at its face, the ramp's middle at the radius."""
+    """Returns a ball with a one-voxel ramp at its face, the ramp's middle at the radius."""
     z, y, x = np.mgrid[0:n, 0:n, 0:n] - (n - 1) / 2
     distance = np.sqrt(x**2 + y**2 + z**2)
     return gv.Volume((np.clip(radius - distance + 0.5, 0, 1) * value).astype(np.float32))
 
 
 def chord(camera: gv.Camera, volume: gv.Volume, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Length of each pixel's ray inside the ball, and the distance of its near side (NaN beside
-    it).
+    """Returns the length of each pixel's ray inside the ball, and the distance of its near side
+    (NaN for a miss).
     """
     tree = gv.N3Tree.from_volume(volume)
     rays = camera.placed(tree.box).rays()
@@ -188,8 +188,8 @@ def test_homogeneous_ball_follows_beer_and_lambert(backend):
     )
     length, _ = chord(camera, volume, radius)
     expected = 1 - (1 - opacity) ** length
-    # Near the rim a ray runs along the face, where voxels, not the renderer, decide what the ball
-    # is.
+    # Near the rim a ray runs along the face, where the error is that of the voxels, not of the
+    # renderer.
     grazing = (length < 1.5 * radius) & (chord(camera, volume, radius + 1.5)[0] > 0)
     error = np.abs(picture.alpha.cpu()[..., 0].numpy() - expected)[~grazing]
     assert error.max() < 1e-3 and expected.max() > 0.2
@@ -224,7 +224,7 @@ def test_depth_of_an_opaque_sphere(backend, step):
     picture = gv.render(tree, camera, shader, backend=backend, lod="finest", step=step)
     length, near = chord(camera, volume, radius)
     depth = picture.depth.cpu()[..., 0].numpy()
-    facing = length > 12  # along a grazing ray a fraction of a voxel of the data is many
+    facing = length > 12  # on grazing rays, a fraction of a voxel across is many along
     assert np.abs(depth - near)[facing].max() < 0.5
     beside = chord(camera, volume, radius + 1.5)[0] == 0
     assert np.isinf(depth[beside]).all() and facing.sum() > 20 and beside.sum() > 20
@@ -240,7 +240,7 @@ def test_auto_lod_is_close_to_the_finest_and_cheaper(aneurism, compiled):
 
 
 def test_levels_blend_without_a_step(compiled):
-    """As the cone widens through three levels, what a ray sees changes smoothly."""
+    """As the cone widens through three levels, a ray's colour changes smoothly."""
     z, y, x = np.mgrid[0:64, 0:64, 0:64] - 31.5
     volume = gv.Volume(np.exp(-(x**2 + y**2 + z**2) / (2 * 7.0**2)).astype(np.float32))
     tree = gv.N3Tree.from_volume(volume, 8, device=DEVICES[compiled])
@@ -395,7 +395,7 @@ def test_odd_extents_and_spacings_agree_with_the_dense_marcher(extent, spacing):
 
 
 class Operations(TorchDispatchMode):
-    """Counts the operations of torch."""
+    """Counts torch operations."""
 
     calls = 0
 
@@ -405,8 +405,8 @@ class Operations(TorchDispatchMode):
 
 
 def test_a_picture_takes_few_operations_of_torch(blobs, compiled):
-    """Each costs microseconds: 23 on the CPU are a tenth of a millisecond, and 2 for bare rays. A
-    GPU takes some more to send the camera.
+    """Each costs microseconds: 23 on the CPU, a tenth of a millisecond, and 2 for given rays. A GPU
+    needs some more to upload the camera.
     """
     tree = gv.N3Tree.from_volume(blobs, device=DEVICES[compiled])
     camera = gv.Camera.orbit(**PLACE, width=64, height=64)
@@ -414,7 +414,7 @@ def test_a_picture_takes_few_operations_of_torch(blobs, compiled):
     shader = gv.TransferFunction.preset("gray", 0, 1)
     more = 0 if compiled == "cpp" else 10
     for show, seen, most in ((gv.render, camera, 24), (gv.trace, rays, 3)):
-        show(tree, seen, shader)  # lays tables ready
+        show(tree, seen, shader)  # prepares the tables
         with Operations() as operations:
             show(tree, seen, shader)
         assert 1 < operations.calls <= most + more

@@ -1,4 +1,4 @@
-"""Rays in pieces, and cones that narrow: every backend, against one go and against a plain loop."""
+"""Rays in pieces, and narrowing cones: every backend, against whole rays and a plain loop."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from gvtorch.tracing.trees import TreeTrace, trace_trees
 
 @pytest.fixture(scope="module")
 def noise() -> gv.Volume:
-    """No two voxels alike: nothing is EMPTY, CONSTANT or hidden."""
+    """All voxels differ, so nothing is EMPTY, CONSTANT or hidden."""
     generator = torch.Generator().manual_seed(3)
     return gv.Volume(0.05 + 0.1 * torch.rand(40, 40, 40, generator=generator))
 
 
 def narrowing(rays: gv.Rays, near: float, end: float) -> gv.Rays:
-    """The rays with cones that are `near` wide at their origin and 0 at distance `end`."""
+    """Returns the rays with cones that are `near` wide at the origin and 0 at distance `end`."""
     cone = torch.tensor([near, -near / end], dtype=torch.float64).expand(len(rays.origin), 2)
     return dataclasses.replace(rays, cone=cone.contiguous())
 
@@ -59,7 +59,7 @@ def test_narrowing_cones_ask_for_the_same(blobs, compiled, seed):
 
 @pytest.mark.parametrize("growth", [-0.2, -0.05, 0.0, 0.08])
 def test_intervals_are_as_long_as_the_cone_is_wide_where_they_start(noise, backend, growth):
-    """Every interval of a ray through noise is a sample: they are counted by a plain loop."""
+    """Every interval of a ray through noise is a sample; a plain loop counts them."""
     tree = gv.N3Tree.from_volume(noise, 4)
     shader = gv.TransferFunction.from_points([(0, 0.001), (1, 0.002)])
     near = 9.0 if growth < 0 else 1.0
@@ -108,7 +108,7 @@ def test_a_ray_in_pieces_is_the_ray_in_one_go(blobs, backend, dtype):
     both = whole.depth.isfinite() & joined.depth.isfinite()
     assert both.sum() > 40 and (whole.depth.isfinite() != joined.depth.isfinite()).sum() <= 1
     assert (whole.depth - joined.depth)[both].abs().max() < 1e-3
-    # A cut may fall a rounding beside the interval's end, which then is a sample of its own.
+    # By rounding, a cut may miss an interval's end; the sliver is then an extra sample.
     assert (whole.samples - joined.samples).abs().max() <= 5
     assert whole.alpha.max() > 0.95, "some rays must end early"
 
@@ -145,7 +145,7 @@ def test_a_wrong_share_is_one_clear_error(blobs, clear):
 
 @pytest.mark.parametrize("name", SHADERS)
 def test_every_shader_is_cut_by_planes_and_boxes(channels, compiled, name):
-    """A plane ends rays where the plane's own formula does, and several pieces are the twin's."""
+    """A plane ends rays where its formula says, and several pieces equal the twin's."""
     tree, shader = gv.N3Tree.from_volume(channels, 4), SHADERS[name]
     rays = camera_rays(tree, 10, distance=1.3)
     plane = (0.6, 0.0, -0.8, 8.0)
@@ -169,7 +169,7 @@ def test_every_shader_is_cut_by_planes_and_boxes(channels, compiled, name):
 
 @pytest.mark.parametrize("which", ["maximum", "minimum", "mean"])
 def test_a_projection_is_that_of_all_that_is_kept(blobs, compiled, which):
-    """Against places along each ray, a hundredth of a voxel apart; caps are refused."""
+    """Against points along each ray, a hundredth of a voxel apart; caps are refused."""
     density = 1 - blobs.data if which == "minimum" else blobs.data
     tree = gv.N3Tree.from_volume(gv.Volume(density, blobs.spacing, blobs.origin), 4)
     ramp = gv.TransferFunction.from_points([(0, 0)], [(0, 0, 0, 0), (1, 1, 0.5, 0.2)])
@@ -229,7 +229,7 @@ def test_a_projection_in_pieces_is_streamed_and_waits_for_nobody(blobs, compiled
 
 
 def test_normals_of_three_trees_are_the_mean_by_the_light_that_each_takes():
-    """Boxes one behind the other along z, met in reverse by rays that go back."""
+    """Boxes in a row along z, met in reverse order by rays in the opposite direction."""
     generator = torch.Generator().manual_seed(5)
     boxes = [torch.tensor([[0.0, 0, z], [1, 1, z + 1]]) for z in (0, 2, 4)]
     hits = [
@@ -285,7 +285,7 @@ LEFT_OUT = {
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("name", LEFT_OUT)
 def test_rays_that_the_cpu_leaves_out_change_no_bit(channels, monkeypatch, name):
-    """Those without a second piece, that begin at no cut, or whose pixels show nothing."""
+    """Rays without a second piece, that do not begin at a cut, or whose pixels show nothing."""
     tree, pictures, left_out = gv.N3Tree.from_volume(channels), [], []
     light = gv.Lighting(occlusion=0.8, indirect=0.5, cones=3, reach=0.2, frame="box")
     cut = gv.Clip(without=[((0, 0, 0), (0.6, 0.6, 0.6))], frame="box", caps=True)

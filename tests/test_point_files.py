@@ -1,4 +1,4 @@
-"""Files of points: what other libraries wrote comes back; damage and doubt get one line; stores."""
+"""Files of points: those of other libraries, errors and warnings in one line, and stores."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def write_ply(path, layout="binary_little_endian"):
-    """x y z, mass as double, colours as bytes, radius; a camera before, faces behind."""
+    """Writes x y z, mass as double, colours as bytes, radius; a camera before, faces after."""
     names = [("x", "float"), ("y", "float"), ("z", "float"), ("mass", "double")]
     names += [(name, "uchar") for name in ("red", "green", "blue")] + [("radius", "float32")]
     order = ORDERS.get(layout, "<")

@@ -1,4 +1,4 @@
-"""Points drawn as points: their light is that of their voxels, on the way too, and is hidden."""
+"""Points drawn as points: they have their voxels' light, also in transition, and can be hidden."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def star(place, light=(1.0, 0.5, 0.25), **options) -> gv.PointProducer:
 
 
 def total_light(producer, engine, away, place) -> np.ndarray:
-    """(3,) light of all pixels times the squared distance, of an eye at a distance from a star; the
-    mean over eyes that look past it by parts of a pixel."""
+    """Returns (3,): the light of all pixels times the squared distance from a star, as the mean
+    over eyes that look past it by fractions of a pixel."""
     way, total = np.array([0.48, 0.6, 0.64]), np.zeros(3)
     eye = tuple(np.array(place) + away * way)
     straight = gv.Camera.look_at(eye, place, fov=40, width=SIZE, height=SIZE)
@@ -51,7 +51,7 @@ def test_a_star_keeps_its_light_from_voxels_to_a_point(place):
             for away in (0.05, 0.5, 0.9, 1.0, 1.15, 1.35, 1.5, 1.7, 1.85, 2.0, 2.2, 3.0)
         }
     for away, light in found.items():
-        # Beyond, voxels alone are seen, and the middle of one is not the star's place.
+        # Beyond, only voxels are seen, and their middle is not the star's position.
         assert np.allclose(light, 1, atol=0.02 if away < 2 else 0.08), (away, light)
 
 

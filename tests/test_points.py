@@ -1,4 +1,4 @@
-"""Points as voxels: beside dense sums at every level, proofs, pictures, bad input."""
+"""Points as voxels: against dense sums at every level, proofs, pictures, bad input."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CPU = torch.device("cpu")
 
 
 def some_points(count: int = 4000, width: int = 2) -> tuple[torch.Tensor, torch.Tensor]:
-    """Clusters away from the faces; most regions hold nothing."""
+    """Returns clusters away from the faces; most regions are empty."""
     random = torch.Generator().manual_seed(3)
     middle = torch.rand((12, 3), generator=random) * 1.4 - 0.7
     place = middle[torch.randint(0, 12, (count,), generator=random)]
@@ -27,7 +27,7 @@ def some_points(count: int = 4000, width: int = 2) -> tuple[torch.Tensor, torch.
 
 
 def some_radii(count: int = 4000) -> torch.Tensor:
-    """None, below a voxel of 1/32, some voxels, many; inside of the box."""
+    """Returns radii of 0, below a voxel of 1/32, of some voxels and of many, inside the box."""
     random = torch.Generator().manual_seed(4)
     radius = torch.tensor([0.0, 0.01, 0.04, 0.1])[
         torch.randint(0, 4, (count,), generator=random)
@@ -39,8 +39,8 @@ def some_radii(count: int = 4000) -> torch.Tensor:
 def dense(
     place: torch.Tensor, value: torch.Tensor, side: int, radius: torch.Tensor | None = None
 ) -> np.ndarray:
-    """(z, y, x, c) sums of the points in voxels: a histogram, or a product of sums of four uniform
-    random numbers (Irwin, Hall) for each point."""
+    """Returns (z, y, x, c): sums of the points in voxels, by a histogram, or by the density of sums
+    of four uniform random numbers (Irwin, Hall) along each axis."""
     if radius is None:
         parts = [
             np.histogramdd(
@@ -137,7 +137,7 @@ def test_what_is_proven_holds_for_all_below(branching, side, wide):
             bare = regions.kind[owner] == gv.Region.EMPTY
             assert not voxels[bare].any()
         empty += int((regions.kind == gv.Region.EMPTY).sum())
-    assert empty > 100 or wide  # a point of radius 3 is everywhere
+    assert empty > 100 or wide  # a point of radius 3 reaches everywhere
 
 
 def test_empty_regions_are_proven_beside_wide_points_too():

@@ -24,7 +24,7 @@ BACKENDS = [pytest.param(b, marks=pytest.mark.backend(b)) for b in DEVICES]
 
 
 def matrix_of(degrees=DEGREES, shift=(30.0, -12.0, 7.0), mirrored: bool = False) -> np.ndarray:
-    """(4, 4) a turn about x, then y, then z, and a shift."""
+    """Returns (4, 4): a rotation about x, then y, then z, and a shift."""
     made = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0, 1.0])
     for axis, angle in enumerate(np.radians(degrees)):
         a, b = [n for n in range(3) if n != axis]
@@ -48,14 +48,14 @@ def turned(matrix: np.ndarray, ways: torch.Tensor) -> torch.Tensor:
 
 
 def rays_in_the_world(matrix: np.ndarray, rays: gv.Rays) -> gv.Rays:
-    """Rays that see from the world what `rays` see in the tree's own axes."""
+    """Returns rays that see in the world what `rays` see in the tree's axes."""
     own = rays.to(dtype=torch.float64)
     origin = turned(matrix, own.origin) + torch.from_numpy(matrix[:3, 3])
     return replace(own, origin=origin, direction=turned(matrix, own.direction))
 
 
 def light_in_the_world(matrix: np.ndarray, shader: gv.Shader) -> gv.Shader:
-    """The shader with its light turned with the tree."""
+    """Returns the shader, its light turned with the tree."""
     light = getattr(shader, "light", None)
     if isinstance(light, gv.DirectionalLight):
         light = replace(light, direction=(matrix[:3, :3] @ light.direction).tolist())
@@ -73,7 +73,7 @@ def camera(tree: gv.N3Tree, size: int = 20) -> gv.Rays:
 
 
 def assert_same_picture(found: gv.Hits, expected: gv.Hits, matrix: np.ndarray, **near) -> None:
-    """But for the normals, which are turned with the tree."""
+    """Asserts equal hits, except for the normals, which are turned with the tree."""
     for name in ("color", "alpha", "depth", "features"):
         one, other = (getattr(hits, name) for hits in (found, expected))
         if other is not None:
@@ -87,13 +87,13 @@ def assert_same_picture(found: gv.Hits, expected: gv.Hits, matrix: np.ndarray, *
 
 
 def some(hits: gv.Hits, which: torch.Tensor) -> gv.Hits:
-    """Those of some rays (r,) bool."""
+    """Returns the hits of some rays, (r,) bool."""
     return replace(
         hits, **{n: t[which.to(t.device)] for n, t in vars(hits).items() if t is not None}
     )
 
 
-NEAR = {"atol": 1e-9, "rtol": 1e-9}  # in float64; of light, which is float32 in no other way
+NEAR = {"atol": 1e-9, "rtol": 1e-9}  # for float64
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -108,7 +108,7 @@ def test_a_tree_that_is_turned_is_seen_by_a_camera_that_is_turned(channels, name
         world = rays_in_the_world(matrix, rays).to(tree.device)
         lit = light_in_the_world(matrix, shader)
         found = gv.trace(tree, world, lit, pose=matrix, **options)
-        same = (found.samples == own.samples).cpu()  # a ray may graze a face, but for rounding
+        same = (found.samples == own.samples).cpu()  # by rounding, a ray may graze a face
         assert same.float().mean() > 0.95
         assert_same_picture(*(some(hits, same) for hits in (found, own)), matrix, **NEAR)
 
@@ -123,7 +123,7 @@ SUN = gv.DirectionalLight((1.0, -1.0, -2.0))
 
 @pytest.mark.backend("cpp")
 def test_clip_lens_and_lighting_stay_in_the_world(tree):
-    """They are given in world units, whatever the pose; here they are turned with it."""
+    """They are in world units, whatever the pose; here they are turned with the tree."""
     rays, matrix = camera(tree), matrix_of()
     world = rays_in_the_world(matrix, rays)
     middle = tree.box.mean(0).numpy()
@@ -239,7 +239,7 @@ def test_a_box_that_is_turned_lies_in_the_box_around_it():
 
 
 def test_voxels_that_are_kept_tell_how_to_turn_them(tmp_path):
-    """The pose of a file's oblique voxels brings them to where the file says they lie."""
+    """The pose of a file's oblique voxels moves them to the positions that the file states."""
     nibabel = pytest.importorskip("nibabel")
     for mirrored in (False, True):
         affine = matrix_of(mirrored=mirrored) @ np.diag([0.7, 1.0, 1.6, 1.0])

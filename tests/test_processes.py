@@ -51,7 +51,7 @@ def test_producers_are_pickled(store, name):
     with gv.Engine(producer) as engine:
         expected = engine.render(VIEW, look)
         assert expected.alpha.max() > 0
-        again = copy.deepcopy(other)  # an engine has not prepared it yet
+        again = copy.deepcopy(other)  # before an engine has prepared it
     for one in (other, again):
         with gv.Engine(one) as engine:
             assert torch.equal(engine.render(VIEW, look).color, expected.color)
@@ -101,7 +101,7 @@ WORKERS = """
     ("method", "inside"), [("spawn", "outside"), ("fork", "inside"), ("fork", "outside")]
 )
 def test_workers_of_data_loaders(store, tmp_path, method, inside):
-    """A forked worker opens its own store; one that was opened before is told in a line."""
+    """A forked worker opens its own store; using one that was opened before is a one-line error."""
     file = tmp_path / "workers.py"
     file.write_text(textwrap.dedent(WORKERS))
     run = subprocess.run(
@@ -117,7 +117,7 @@ def test_workers_of_data_loaders(store, tmp_path, method, inside):
 
 @pytest.mark.filterwarnings("ignore:.*fork")
 def test_a_forked_child_has_threads_of_its_own(store):
-    """Those of before the fork are gone: an answer would never come."""
+    """The threads of before the fork are gone: an answer would never arrive."""
     producer = gv.StoredProducer(store)
     with gv.Engine(producer) as engine:
         engine.render(VIEW, GRAY)

@@ -86,7 +86,7 @@ def test_a_brick_may_turn_out_constant_or_empty():
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 def test_a_node_may_be_the_same_as_another_even_as_its_own_ancestor(loading):
-    """The graph has cycles: one tile and one brick draw every level of the sponge."""
+    """The graph has cycles: one tile and one brick suffice for every level of the sponge."""
     sponge = Sponge()
     options = {"brick_size": 4, "node_pool": "20 kB", "brick_pool": "20 kB", "loading": loading}
     shader = gv.TransferFunction.from_points([(0, 0), (20 / 27, 1)])
@@ -102,7 +102,7 @@ def test_a_node_may_be_the_same_as_another_even_as_its_own_ancestor(loading):
 
 @pytest.mark.backend("cpp")
 def test_eviction_clears_every_pointer_to_a_shared_tile():
-    """The sponge beside a ball whose bricks and tiles push it out of the pools."""
+    """The sponge, next to a ball whose bricks and tiles evict it from the pools."""
     scene = {"sponge": Sponge(3), "ball": Ball(256)}
     view = gv.Camera.look_at((0.5, 0.5, 4), (0.5, 0.5, 0.5), (0, 1, 0), 20, 40, 40)
     away = gv.Camera.look_at((0, 0, 1.4), (-0.9, 0.2, -1), (0, 1, 0), 20, 40, 40)
@@ -140,7 +140,7 @@ def test_bad_producers_are_named(call, message):
 
 
 class Gray(Ball):
-    """Answers with the voxels of its only channel, and counts what is outside."""
+    """Returns only a tensor for its only channel, and counts the nodes outside."""
 
     def fill(self, nodes):
         return super().fill(nodes)["value"]
@@ -183,8 +183,8 @@ def test_validate_finds_a_tile_in_the_wrong_place(blobs):
 
 @pytest.mark.backend("cpp")
 def test_constants_do_not_depend_on_what_was_there_before(blobs):
-    """A producer that gives EMPTY nodes no constant shares pools with one that gives some: what it
-    shows is the same before and after."""
+    """A producer without constants for EMPTY nodes shares pools with one that has some: its picture
+    is the same before and after."""
 
     class Bare(Ball):
         def classify(self, nodes):
@@ -206,7 +206,7 @@ def test_constants_do_not_depend_on_what_was_there_before(blobs):
 
 
 class Twins(Ball):
-    """The right half of the finest level is the same as the left one, by `fill`."""
+    """`fill` makes the right half of the finest level an alias of the left one."""
 
     how = "now"
 
@@ -235,7 +235,7 @@ class Twins(Ball):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("how", ["now", "later"])
 def test_a_brick_may_be_the_same_as_one_that_is_not_here(how):
-    """The camera sees the right half alone: its bricks are made from the left one's places."""
+    """The camera sees only the right half: its bricks are made at the left half's positions."""
     view = gv.Camera.look_at((0.6, 0.1, 2.5), (0.6, 0.1, 0), (0, 1, 0), 14, 24, 24)
     twins = Twins()
     twins.how = how

@@ -1,4 +1,4 @@
-"""Production: late answers, answers that fail, and frames that are broken off."""
+"""Production: late answers, answers that fail, and interrupted frames."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ REASONS = {
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("how", REASONS)
 def test_what_fails_is_named_and_takes_nobody_with_it(how):
-    """The picture stays complete, coarser where bricks failed; each failure is named once."""
+    """The picture stays complete, but coarser where bricks failed; each failure is named once."""
     view = CORNER
     with gv.Engine(Ball(), **SIZE) as whole, gv.Engine(Broken(how), patience=0.2, **SIZE) as engine:
         expected = whole.render(view, GRAY, lod="finest")
@@ -173,7 +173,7 @@ def test_the_root_is_waited_for_as_long_as_the_producer_says(patience):
 
 @pytest.mark.backend("cpp")
 def test_an_answer_for_a_node_that_is_gone_is_dropped():
-    """Futures that come after their tile was evicted do no harm."""
+    """Futures that finish after their tile was evicted do no harm."""
     slow = ThreadPoolExecutor(1)
 
     class Slow(Ball):
@@ -218,8 +218,8 @@ def test_pending_requests_are_not_listed_twice(backend):
 
 @pytest.mark.backend("cpp")
 def test_late_answers_never_land_in_the_wrong_place():
-    """Tiles come late, when their nodes are in no use, into pools of a few tiles: a node's own tile
-    may be the one that is given away for another node of the same answer."""
+    """Tiles arrive late, when their nodes are not in use, in pools of a few tiles: the tile that
+    holds a node may be evicted for another node of the same answer."""
     volume = gv.Volume(torch.rand((64, 64, 64), generator=torch.Generator().manual_seed(0)))
     tree = gv.N3Tree.from_volume(volume, 4)
     haze = gv.TransferFunction.from_points([(0, 0.0), (1, 0.02)])
@@ -293,7 +293,7 @@ def test_a_producer_that_always_raises_is_not_asked_for_ever():
 
 
 class Unready(Future):
-    """Done when it is looked at for the second time."""
+    """Is done when it is checked for the second time."""
 
     def __init__(self, answer):
         super().__init__()
@@ -310,8 +310,8 @@ class Unready(Future):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("later", [False, True])
 def test_a_frame_that_is_broken_off_loses_nothing(later):
-    """Ctrl-C in the middle of production, as in a notebook: the next picture is whole. Where
-    answers are late, bricks are here and tiles are being looked at."""
+    """Ctrl-C in the middle of production, as in a notebook: the next picture is complete. If
+    answers are late, bricks have arrived and tiles are being checked."""
     broken = []
 
     class Stopped(Ball):
@@ -345,7 +345,7 @@ def test_a_frame_that_is_broken_off_loses_nothing(later):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32])
 def test_loaded_bricks_narrow_the_ranges_of_nodes_without_children(dtype):
-    """`classify` tells bounds; once a brick is there, its voxels tell, borders included."""
+    """`classify` gives bounds; once a brick is loaded, its voxels, with borders, give the range."""
 
     class Loose(Ball):
         def fill(self, nodes):
@@ -370,7 +370,7 @@ def test_loaded_bricks_narrow_the_ranges_of_nodes_without_children(dtype):
 
 
 class Clocked(Ball):
-    """Takes 6 ms a call and a hundredth of one for each node, on a clock of its own."""
+    """Takes 6 ms a call and 0.01 ms for each node, on a simulated clock."""
 
     def __init__(self):
         super().__init__(64)
@@ -389,7 +389,7 @@ class Clocked(Ball):
 
 
 def test_a_time_budget_does_not_stick_at_one_node_a_frame(monkeypatch):
-    """Where a call by itself takes more of a frame than production has, batches grow."""
+    """If the fixed cost of a call exceeds production's share of a frame, batches grow."""
     producer = Clocked()
     monkeypatch.setattr("gvtorch.engine.production.time.perf_counter", lambda: producer.now)
     sizes = {**SIZE, "brick_pool": "16 MB", "node_pool": "2 MB"}

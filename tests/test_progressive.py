@@ -21,7 +21,7 @@ PARTS = ("color", "alpha", "depth")
 
 
 def supersampled(tree, size: int, across: int, backend: str) -> torch.Tensor:
-    """Colour and alpha through `across`^2 rays a pixel on a grid, whose cones are the pixels'."""
+    """Returns colour and alpha by a grid of `across`^2 rays a pixel, with the pixels' cones."""
     camera = gv.Camera.orbit(distance=1.6, width=size * across, height=size * across)
     fine = gv.render(tree, camera, GRAY, backend=backend, cone_scale=across * 4 / 3)
     both = torch.cat((fine.color, fine.alpha), -1).double().cpu()
@@ -118,7 +118,7 @@ def test_a_camera_that_moves_begins_anew(blobs, model):
 
 @pytest.mark.backend("cpp")
 def test_frames_that_miss_something_do_not_stay_in_the_mean(blobs):
-    """A stalled store, then one that answers: the mean is that of complete frames alone."""
+    """A stalled store, then one that answers: the mean is over complete frames only."""
     tree = gv.N3Tree.from_volume(blobs, 4)
     camera = gv.Camera.orbit(distance=1.0, width=24, height=20)
     whole = [gv.render(tree, camera.shifted(*jitter(k)), GRAY) for k in range(24)]
@@ -257,7 +257,7 @@ print(peak() - before)
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.npy"])
 def test_memory_is_bounded_whatever_the_size(tmp_path, name):
-    """Of 2048^2 pixels the layers alone, once, take 100 MB."""
+    """The layers of 2048^2 pixels alone would take 100 MB."""
     command = [sys.executable, "-c", MEASURE, "2048", name]
     run = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
     assert float(run.stdout) < 60

@@ -28,12 +28,12 @@ WIDTH, HEIGHT = 14, 10
 
 
 def view() -> torch.Tensor:
-    """World-to-camera of a camera that stands askew."""
+    """Returns world-to-camera of a camera in a general pose."""
     return gv.Camera.look_at((3, 2, 5), (0.5, 0.2, -1), (0.1, 1, 0.3)).viewmats[0]
 
 
 def askew(model: str, **options) -> gv.Camera:
-    """A camera whose numbers are all different."""
+    """Returns a camera whose parameters all differ."""
     f = {"pinhole": (11.0, 13.0), "ortho": (2.0, 2.5), "fisheye": (4.0, 4.5), "panorama": (2.2, 3)}
     fx, fy = f[model]
     K = torch.tensor([[fx, 0, 6.6], [0, fy, 5.3], [0, 0, 1]], dtype=torch.float64)
@@ -41,7 +41,7 @@ def askew(model: str, **options) -> gv.Camera:
 
 
 def local_ray(model: str, x: float, y: float) -> tuple[list[float], list[float]]:
-    """Origin and direction in camera axes, a pixel at a time."""
+    """Returns the origin and direction of one pixel in camera axes."""
     r = math.hypot(x, y)
     if model == "pinhole":
         return [0, 0, 0], [part / math.sqrt(x * x + y * y + 1) for part in (x, y, 1)]
@@ -78,8 +78,8 @@ def test_rays_follow_the_formula_of_their_model(model):
 @pytest.mark.parametrize("bent", [False, True])
 @pytest.mark.parametrize("model", MODELS)
 def test_cones_are_as_wide_as_pixels_are_apart(model, bent):
-    """The larger singular value of the derivative of the ray by the pixel's place, by differences
-    of a thousandth of a pixel. A pinhole's cone is that of the axis."""
+    """The larger singular value of the derivative of the ray by the pixel's position, by
+    differences of a thousandth of a pixel. A pinhole's cone is that of the axis."""
     if bent and model != "fisheye":
         pytest.skip("only a fisheye is bent")
     camera = askew(model, radial_coeffs=BEND) if bent else askew(model)
@@ -204,7 +204,7 @@ def test_a_batch_is_its_cameras_one_by_one(blobs, compiled, model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_one_set_of_numbers_serves_every_camera_of_a_form(model):
-    """What a graph does: the numbers of another camera are copied to where the first one's lie."""
+    """As in a CUDA graph: another camera's numbers are copied over those of the first one."""
     bend = {"radial_coeffs": BEND} if model == "fisheye" else {}
     first, other = askew(model, **bend), askew(model, **bend)
     other = other.shifted(0.3, -2)
@@ -224,7 +224,7 @@ def test_an_orthographic_orbit_is_a_pinhole_from_afar():
     angle = 2 * math.degrees(math.atan(2.4 * math.tan(math.radians(15)) / far))
     pinhole = gv.Camera.orbit(30, 20, far, angle, 16, 12).placed(box).rays()
     rays = near.rays()
-    # Both cross the plane through the middle of the box at the same places.
+    # Both cross the plane through the middle of the box at the same points.
     points = [
         one.origin
         + ((box.mean(0) - one.origin) * rays.direction).sum(1, keepdim=True)

@@ -1,4 +1,4 @@
-"""What all producers of formulas, meshes and points promise: what is proven empty or full is so in
+"""Guarantees of all producers of formulas, meshes and points: what is proven empty or full is so in
 every voxel, values lie in their ranges, and a level is the mean of the one below it.
 """
 
@@ -21,7 +21,7 @@ ROUGH = {"thickness": 0.15, "frequency": 3.0, "octaves": 4, "softness": 0.1, "bo
 
 
 def sampled():
-    """A ball of distances, as a volume."""
+    """Returns the sampled distance to a ball."""
     axis = torch.linspace(-1, 1, 41)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     away = torch.stack((x, y, z), -1).norm(dim=-1) - 0.7
@@ -29,21 +29,21 @@ def sampled():
 
 
 class Stripes(torch.nn.Module):
-    """A plain module: colours of which nothing is known."""
+    """A plain module: colours without bounds."""
 
     def forward(self, points):
         return 0.5 + 0.5 * (9 * points).sin()
 
 
 class Sway(torch.nn.Module):
-    """A way of at most 0.1."""
+    """A displacement of at most 0.1."""
 
     def forward(self, points):
         return 0.05 * (7 * points.roll(1, -1)).sin()
 
 
 def scattered():
-    """Points of all sizes, from none to many voxels, in clumps."""
+    """Returns points of all sizes, from 0 to many voxels, in clumps."""
     random = torch.Generator().manual_seed(3)
     place = 0.25 * torch.randn((500, 3), generator=random).double().clamp(-3, 3)
     sizes = torch.tensor([0.0, 0.005, 0.02, 0.1], dtype=torch.float64)
@@ -107,15 +107,15 @@ def voxels(producer, nodes):
 
 
 def shown_by(producer) -> dict[str, float]:
-    """By channel that is seen, the value up to which it shows nothing."""
+    """Returns by visible channel the value up to which it shows nothing."""
     if isinstance(producer, gv.FieldProducer):
         return producer.threshold or {}
     return {name: 0.0 for name in ("density", "coverage", "value") if name in producer.channels}
 
 
 def check_proofs(producer, regions, ends) -> None:
-    """What regions tell of nodes against the least and the largest voxel in their reach, two (k, c)
-    by channel.
+    """Checks the regions of nodes against the least and the largest voxel in their reach, two
+    (k, c) by channel.
     """
     kind, shown = regions.kind, shown_by(producer)
     assert shown or not (kind == gv.Region.EMPTY).any()
@@ -133,8 +133,8 @@ def check_proofs(producer, regions, ends) -> None:
 
 
 def halved(cells: torch.Tensor, of: Callable, reach: bool) -> torch.Tensor:
-    """The least or the largest of 2^3 cells (z, y, x, c), or of the 4^3 in reach of a brick of two
-    cells and a border of 1; beyond the level there are none.
+    """Returns the least or the largest of 2^3 cells (z, y, x, c), or of the 4^3 in reach of a brick
+    of two cells and a border of 1; cells beyond the level are ignored.
     """
     for axis in range(3):
         first, last = cells.narrow(axis, 0, 1), cells.narrow(axis, -1, 1)
@@ -149,12 +149,12 @@ def halved(cells: torch.Tensor, of: Callable, reach: bool) -> torch.Tensor:
 
 
 def each(ends, reach: bool):
-    """The least of the least cells, the largest of the largest."""
+    """Returns the least of the least cells, and the largest of the largest."""
     return halved(ends[0], torch.minimum, reach), halved(ends[1], torch.maximum, reach)
 
 
 def whole_level(producer, depth: int, brick_size: int) -> dict[str, torch.Tensor]:
-    """For each channel (z, y, x, c) all voxels of a level, made in bricks of a size."""
+    """Returns by channel (z, y, x, c) all voxels of a level, made in bricks of a size."""
     producer.prepare(Layout.of(producer, brick_size, 1, torch.device("cpu")))
     nodes, n = nodes_of(producer, depth, brick_size=brick_size), 2**depth
     found = {}
@@ -166,8 +166,7 @@ def whole_level(producer, depth: int, brick_size: int) -> dict[str, torch.Tensor
 
 def test_no_voxel_is_dropped(name):
     """Brute force: all nodes of all depths to 6, in bricks of 2^3, against all voxels of the finest
-    level in their reach. What is called EMPTY or CONSTANT is, in every voxel, and every value is in
-    its range.
+    level in their reach. EMPTY and CONSTANT hold for every voxel, and every value is in its range.
     """
     producer = PRODUCERS[name]()
     levels, told = whole_level(producer, 3, 16), dict.fromkeys(gv.Region, 0)
@@ -204,8 +203,8 @@ def test_no_brick_is_dropped(name):
 
 @pytest.mark.parametrize("octaves", [1, 4])
 def test_noise_passes_no_proof_in_random_boxes(octaves):
-    """10^5 nodes of all levels, two thirds of them about where the proof of EMPTY or CONSTANT
-    begins to hold: 32 values of each by the formula.
+    """10^5 nodes of all levels, two thirds of them near the limit at which they are proven EMPTY or
+    CONSTANT: 32 values of each by the formula.
     """
     rough = {**ROUGH, "frequency": 60.0, "octaves": octaves, "dtype": torch.float32}
     producer, random = gv.Hypertexture(ball(), 2**12, **rough), torch.Generator().manual_seed(9)
@@ -235,7 +234,7 @@ NOT_FIELDS = {*ALL, "mesh", "distances to a mesh", "points"}
 
 @pytest.mark.parametrize("name", [name for name in PRODUCERS if name not in NOT_FIELDS])
 def test_intervals_of_fields_hold_in_random_boxes(name):
-    """10^5 boxes, 12 values of each; of prefiltered fields for voxels of any size."""
+    """10^5 boxes, 12 values of each; for prefiltered fields, with voxels of any size."""
     producer = PRODUCERS[name]()
     center, half = random_boxes(BOXES)
     random = torch.Generator().manual_seed(8)
@@ -253,15 +252,15 @@ def test_intervals_of_fields_hold_in_random_boxes(name):
         by_name = found if isinstance(found, dict) else {"value": found}
         ends = known if isinstance(known, dict) else {"value": known}
         for channel, interval in ends.items():
-            if channel != "normal":  # `finish` makes them of distances
+            if channel != "normal":  # `finish` computes them from distances
                 low, high = (end[at].view(len(at), 1, -1) for end in interval)
                 value = by_name[channel].view(len(at), 12, -1)
                 assert (value >= low - 1e-9).all() and (value <= high + 1e-9).all(), channel
 
 
 def test_a_level_is_the_mean_of_the_one_below(name):
-    """As far as filters tell what voxels hold of what is smaller than they are: of the variation of
-    a level a tenth, at the root a third. The Mandelbox is dust at every scale: a third everywhere.
+    """As far as filters can predict details below a voxel: to a tenth of a level's variation, at
+    the root to a third. The Mandelbox is dust at every scale: a third everywhere.
     """
     error = 0.3 if name == "mandelbox" else 0.03
     producer = PRODUCERS[name]()
@@ -274,7 +273,7 @@ def test_a_level_is_the_mean_of_the_one_below(name):
         children = number.reshape(-1)
         fine = voxels(producer, below[children])
         for channel, bricks in voxels(producer, nodes).items():
-            if channel.endswith("normal"):  # a direction: of a mean of colours, no mean itself
+            if channel.endswith("normal"):  # a unit direction is not a mean
                 continue
             # 2^3 bricks of 4^3 cells of 2^3 voxels
             cells = fine[channel].float().view(len(nodes), 2, 2, 2, 4, 2, 4, 2, 4, 2, -1)

@@ -1,5 +1,5 @@
-"""Frames that are served on the device, in batches of fixed size: on the CPU step by step, and on
-CUDA as one graph, which the host never waits for.
+"""Frames whose requests are served on the device, in batches of fixed size: on the CPU step by
+step, and on CUDA as one graph, for which the host never waits.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def test_a_volume_that_the_device_reads_in_place_is_recorded(backend, monkeypatc
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_joined_producers_are_recorded_where_all_are(backend):
-    """Two channels, of which one has EMPTY regions and one has none."""
+    """Two channels, of which only one has EMPTY regions."""
 
     def joined() -> gv.JoinedProducer:
         return gv.JoinedProducer({"a": Ball(64), "b": Ball(64, kinds=True)})
@@ -103,7 +103,7 @@ def test_joined_producers_are_recorded_where_all_are(backend):
 
 
 def on_the_host(blobs, tmp_path, which: str) -> gv.Producer:
-    """A producer that answers from the host: at once, by rows of a table, or later."""
+    """Returns a producer that answers from the host: at once, by rows of a table, or later."""
     if which == "store":
         return gv.StoredProducer(convert(blobs, tmp_path))
     return gv.VolumeProducer(blobs, hold=which)
@@ -132,9 +132,9 @@ def test_producers_on_the_host_answer_while_frames_go_on(
         assert stats.converged and made > 8
         engine.validate()
         assert frames.served.pending == 0
-        picture, _ = engine.frame(camera, LOOK)  # the host goes on from there
+        picture, _ = engine.frame(camera, LOOK)  # the host continues from there
         assert torch.equal(picture.color, expected.color)
-        frames.frame()  # what it knew of slots is out of date
+        frames.frame()  # its record of slots is stale
         engine.validate()
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
@@ -156,12 +156,12 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
         while not frames.frame()[1].requests["load"]:
             asker._asker.submit(int).result()
         Slow.gate.clear()
-        frames.frame()  # asks for these, and is held up
+        frames.frame()  # requests these, and is held up
         engine.release()
         for _ in range(2):
-            frames.frame()  # asks again
+            frames.frame()  # requests them again
         Slow.gate.set()
-        asker._asker.submit(int).result()  # both answers are here
+        asker._asker.submit(int).result()  # both answers have arrived
         for _ in range(3):
             frames.frame()
             engine.validate()  # no node has two slots
@@ -194,9 +194,9 @@ def test_a_busy_producer_is_asked_for_several_frames_at_once(blobs, backend, slo
             frames.look_from(view(24, angle))
             for _ in range(6):
                 listed += frames.frame()[1].requests["load"] > 0
-                frames.served._asker.submit(int).result()  # what it was told of is asked for
+                frames.served._asker.submit(int).result()  # until its requests are passed on
         assert listed > 3
-        if slow:  # it is not waited for
+        if slow:  # it does not wait for answers
             assert len(late) > 3
         else:
             assert len(late) == 1
@@ -252,7 +252,7 @@ def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, 
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_aliases_are_left_to_the_host(blobs, backend):
-    """Such a node is asked for again by a frame that the host serves."""
+    """Such a node is requested again by a frame that the host serves."""
 
     class Twice(gv.VolumeProducer):
         def fill(self, nodes):
@@ -279,7 +279,7 @@ def test_aliases_are_left_to_the_host(blobs, backend):
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_a_pool_that_is_too_small_gives_away_what_is_used_least(backend):
-    """Flown around with a pool of a few hundred bricks: the way back is whole."""
+    """A flight around with a pool of a few hundred bricks; back at the start, all is complete."""
     with gv.Engine(Ball(), brick_pool="1 MB", node_pool="60 kB", device=DEVICES[backend]) as engine:
         evicted = 0
         for angle in (0, 50, 100, 180, 270, 0):
@@ -325,7 +325,7 @@ def test_what_the_host_would_have_to_see_to_is_refused():
 
 
 def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, gv.FrameStats]:
-    """Nodes that a turning camera missed, and what its last view shows in the end."""
+    """Returns the number of nodes that a turning camera missed, and its final view."""
     missed, looks = 0, 0
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
         engine.render(view(64, 0), LOOK)
@@ -358,7 +358,7 @@ def test_rays_ahead_of_a_moving_camera_ask_for_what_it_would_miss(look_ahead, fe
 
 @pytest.mark.backend("cpp")
 def test_what_the_picture_misses_comes_before_what_the_next_ones_will():
-    """And is counted as without rays ahead."""
+    """The picture's misses are counted as without look-ahead rays."""
     told = []
     for look_ahead in (0, 5):
         with gv.Engine(Ball(1024), brick_pool="64 MB") as engine:
@@ -379,7 +379,7 @@ def test_what_the_picture_misses_comes_before_what_the_next_ones_will():
 @pytest.mark.parametrize("backend", COMPILED)
 @pytest.mark.parametrize("branching, loading", [(2, "straight"), (3, "straight"), (2, "levels")])
 def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
-    """Where rays want it so: a look at the ball's depths from afar does not, nor a last level."""
+    """If rays need it: views from afar do not, nor is there more below the last level."""
     device = DEVICES[backend]
     options = {"brick_pool": "64 MB", "loading": loading, "device": device}
     with gv.Engine(Ball(1024, branching), **options) as engine:
@@ -404,7 +404,7 @@ def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_a_frame_deepens_by_no_more_than_its_most(backend):
-    """Whatever rays ahead of the camera ask for, of which a frame may want far more than itself."""
+    """Whatever look-ahead rays request, which may be far more than the frame itself requests."""
     for priority, most in (([1024] * 3 + [-1] * 500, DEEPER), ([0, 16, 32, -1], 0), ([-1], 0)):
         assert deeper(levels_wanted(torch.tensor(priority), 2).tolist()) == most
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
@@ -418,7 +418,7 @@ def test_a_frame_deepens_by_no_more_than_its_most(backend):
 
 
 class Unsaid(Ball):
-    """The same, but not said to answer on the device."""
+    """The same, but without `on_device`."""
 
     on_device = False
 
@@ -426,7 +426,7 @@ class Unsaid(Ball):
 def flown(
     engine: gv.Engine, path: list[gv.Camera], batch: int, look_ahead: float = 0
 ) -> tuple[Any, gv.Picture, gv.FrameStats, int]:
-    """Replays a flight without a wait of the host, then its last view until it is whole; also
+    """Replays a flight without the host waiting, then its last view until it is complete; also
     returns how many nodes were missed on the flight.
     """
     graph = engine.capture(path[0], LOOK, batch=batch, look_ahead=look_ahead)
@@ -448,7 +448,7 @@ PATH = [view(96, 1.5 * number) for number in range(61)]
 
 
 def winding(number: int) -> gv.Camera:
-    """A view of a long flight that comes to new places all the time."""
+    """Returns a view of a long flight that sees new parts all the time."""
     height, distance = 50 * math.sin(number / 40), 0.85 + 0.3 * math.cos(number / 90)
     return gv.Camera.orbit(1.7 * number, height, distance, None, 96, 96)
 
@@ -487,7 +487,7 @@ def test_a_long_flight_does_not_wait(blobs, tmp_path, scene, look_ahead, backend
 
 @pytest.mark.backend("cuda")
 def test_a_flight_is_replayed_without_the_host():
-    """The graph makes what it misses, and comes to the picture of the host."""
+    """The graph loads what it misses, and converges to the host's picture."""
     with gv.Engine(Ball(1024), brick_pool="64 MB", device="cuda") as engine:
         graph, picture, _, missed = flown(engine, PATH, 256)
         assert sum(graph.replay(PATH[-1])[1].settle().produced.values()) == 0
@@ -521,7 +521,7 @@ def test_a_node_that_fails_in_a_replay_is_named_by_the_host():
 
 
 def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
-    """Recorded, they are branches of the graph: each replay sees what came before all of them."""
+    """Recorded, they are branches of the graph; each replay sees the state before all of them."""
     device = torch.device(DEVICES[compiled])
     many, few = torch.zeros(1 << 20, device=device), torch.zeros(3, device=device)
 
@@ -547,7 +547,7 @@ def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
 
 @pytest.mark.backend("cuda")
 def test_garbage_of_other_engines_does_not_end_a_recording(blobs, monkeypatch):
-    """Locked memory that only garbage holds is given back by whatever thread collects garbage."""
+    """Page-locked memory of garbage is freed by whichever thread runs the garbage collector."""
     monkeypatch.setattr(staging, "_SMALL", 0)
     garbage: list[Any] = [staging.mapped(torch.zeros(1 << 20), torch.device("cuda"))]
     garbage.append(garbage)
@@ -576,8 +576,8 @@ def test_garbage_of_other_engines_does_not_end_a_recording(blobs, monkeypatch):
 
 @pytest.mark.parametrize("chosen", [0, 2])
 def test_what_the_frame_before_asks_for_is_on_its_way(chosen):
-    """Its rays marked nodes as pending, so the next frame does not find them; and it may be settled
-    before the host has asked for any.
+    """The earlier frame's rays marked nodes as pending, so the next frame does not report them; and
+    it may be settled before the host has requested any.
     """
     asked = []
 

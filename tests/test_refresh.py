@@ -1,4 +1,4 @@
-"""Trees whose bricks were edited: `to_volume`, `refresh`, and the warning where it is due."""
+"""Trees whose bricks were edited: `to_volume`, `refresh`, and the warning if it is missing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PLACE = {"spacing": (1.1, 0.9, 1.3), "origin": (0.1, -3.7, 1e6 / 3)}
 
 
 def patchy(extent, dtype=torch.float32, seed=0, channels=1) -> torch.Tensor:
-    """(z, y, x, c) with regions of one value, large and small."""
+    """Returns (z, y, x, c) with large and small regions of one value."""
     x, y, z = extent
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.randint(
@@ -37,7 +37,7 @@ def equal(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 
 def nodes_of(tree: gv.N3Tree) -> dict[tuple[int, ...], int]:
-    """Index of each node that rays can reach, by its place."""
+    """Returns the index of each node that rays can reach, by its loc."""
     found, front = {}, [((0, 0, 0, 0), tree.root)]
     n, per_tile = tree.branching, tree.nodes.nodes_per_tile
     child = tree.nodes.child_tn.flatten().tolist()
@@ -55,7 +55,7 @@ def nodes_of(tree: gv.N3Tree) -> dict[tuple[int, ...], int]:
 
 
 def assert_same_trees(actual: gv.N3Tree, expected: gv.N3Tree) -> None:
-    """The same nodes, of the same content; only slots may lie elsewhere."""
+    """Asserts the same nodes with the same content; only slots may differ."""
     mine, theirs = nodes_of(actual), nodes_of(expected)
     assert mine.keys() == theirs.keys()
     place = list(mine)
@@ -117,7 +117,7 @@ def test_a_tree_gives_its_volume_back_and_is_in_order(
 def test_a_refreshed_tree_is_one_built_anew(
     extent, branching, brick_size, border, dtype, threshold, whole, seed
 ):
-    """All voxels that bricks hold may be edited, also to be of one value or not any more."""
+    """All voxels in bricks may be edited, also so that regions become constant or cease to be."""
     generator = torch.Generator().manual_seed(seed)
     dense = torch.rand(*extent[::-1], 1, generator=generator) * 100 + 50  # bricks everywhere
     build = {"branching": branching, "threshold": threshold}
@@ -164,7 +164,7 @@ def test_pictures_after_a_refresh_are_those_of_a_tree_built_anew(extent, compile
     write_finest(tree, 8 * dense + patchy(extent))
     with pytest.warns(UserWarning, match="render: bricks of value were edited, .* tree.refresh()"):
         stale = gv.render(tree, camera(), SOFT)
-    gv.render(tree, camera(), SOFT)  # told once
+    gv.render(tree, camera(), SOFT)  # warns once
     tree.refresh()
     anew = gv.N3Tree.from_volume(tree.to_volume(), 8, device=device)
     for options in ({}, {"lod": "finest"}):
@@ -279,7 +279,7 @@ def test_mistakes_are_named(blobs):
         with pytest.raises(ValueError) as caught:
             call()
         assert message in str(caught.value) and "\n" not in str(caught.value)
-    tree.refresh([(1e6, 1e6, 1e6), (2e6, 2e6, 2e6)])  # beside the tree: nothing to do
+    tree.refresh([(1e6, 1e6, 1e6), (2e6, 2e6, 2e6)])  # outside of the tree: nothing to do
 
 
 def test_a_tree_moves_and_keeps_what_is_known_of_it(blobs, compiled):

@@ -1,4 +1,4 @@
-"""Every public object tells of itself in one short line, by shapes, not by contents."""
+"""The repr of every public object is one short line, with shapes instead of contents."""
 
 from __future__ import annotations
 

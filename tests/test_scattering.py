@@ -1,5 +1,5 @@
 """Octaves of scattering: against their sum in closed form, and against a path tracer in NumPy
-(benchmarks/cloud_light.py), which is itself held against closed forms.
+(benchmarks/cloud_light.py), which is itself tested against closed forms.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def phase(g: float, cosine: float) -> float:
     ],
 )
 def test_octaves_in_a_homogeneous_medium(backend, octaves, g, dtype):
-    """A ray across a cube stands equally deep below its lit face all along: there each octave is
+    """A ray across a cube has a constant depth below the lit face: there each octave is
     0.55^n albedo^(1 + 2n) phase(0.6^n g) transmittance^(1 / 2^n).
     """
     volume = gv.Volume(np.ones((SIDE,) * 3, np.float32))
@@ -94,7 +94,7 @@ def test_light_from_ahead_goes_on(backend):
 
 
 def test_one_octave_to_all_sides_is_a_medium_without_normals():
-    """What normals of zero length gave before, without that channel."""
+    """It equals `shadows=True` with a channel of zero normals, which it does not need."""
     value = np.random.default_rng(2).uniform(0, 1, (12, 12, 12)).astype(np.float32)
     zero = np.zeros((12, 12, 12, 3), np.float32)
     tree = gv.N3Tree.from_volume({"value": gv.Volume(value), "none": gv.Volume(zero)}, 4)
@@ -102,14 +102,14 @@ def test_one_octave_to_all_sides_is_a_medium_without_normals():
     look = {"light": gv.DirectionalLight(SUN), "ambient": 0.2, "specular": 0.0}
     rays = camera_rays(tree, 12)
     bare = gv.trace(tree, rays, gv.Lit(ramp, normals="none", shadows=True, **look))
-    # further towards the light, for its octaves' sake: what is beyond 0.01 of it
+    # Octaves follow light further, below a share of 0.01.
     fine = gv.trace(tree, rays, gv.Lit(ramp, octaves=1, **look))
     torch.testing.assert_close(fine.color, bare.color, rtol=1e-5, atol=1e-6)
     assert torch.equal(fine.samples, bare.samples)
 
 
 def test_thick_clouds_do_not_end_at_the_first_shadow(backend):
-    """What single scattering takes for black, the fifth octave still sees: light is followed on."""
+    """Where single scattering is black, the fifth octave is not: light is followed further."""
     volume = gv.Volume(np.ones((SIDE,) * 3, np.float32))
     tree = gv.N3Tree.from_volume(volume, 4, device=DEVICES[backend])
     dense = gv.TransferFunction([(0, 1 - np.exp(-3.0))], [(0, 1, 1, 1)], 1.0)
@@ -138,7 +138,7 @@ def test_what_is_refused():
 
 
 def test_the_path_tracer_keeps_energy(script):
-    """What a ball that absorbs nothing sends to all sides is what it takes from the sun."""
+    """A ball that absorbs nothing sends out as much light as it gets from the sun."""
     places = np.stack(np.meshgrid(*(np.arange(14) - 6.5,) * 3, indexing="ij"), -1)
     ball = (0.5 * (np.linalg.norm(places, axis=-1) < 5)).astype(np.float32)
     rng, count, reach = np.random.default_rng(0), 30000, 8
@@ -162,7 +162,7 @@ def test_the_path_tracer_with_hardly_any_albedo_scatters_once(script):
     density = np.zeros((18, 18, 18), np.float32)
     density[1:-1, 1:-1, 1:-1] = 0.2
     for g in (0.0, 0.5):
-        cloud = script.Cloud(density, 1e-4, g)  # the sun stands along +z, seen from there
+        cloud = script.Cloud(density, 1e-4, g)  # the sun is along +z, seen from there
         eye, way = np.array([[8.5, 8.5, 30.0]]), np.array([[0.0, 0.0, -1.0]])
         light, error = script.path_trace(cloud, *(np.repeat(a, 4000, 0) for a in (eye, way)), 2)
         depth = 0.2 * 16  # a ramp of one voxel at either end

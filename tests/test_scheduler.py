@@ -1,4 +1,4 @@
-"""The order of use, and which requests are served."""
+"""The LRU order, and which requests are served."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_time_budget_learns_what_fits():
     room = {LOAD: [5000], SUBDIVIDE: [5000]}
     first, deferred, _ = scheduler.choose(asked, room)
     assert 0 < len(first[LOAD]) < 1000 and deferred == 1000 - len(first[LOAD])
-    scheduler.learn(LOAD, 10, 1e-6)  # too few to tell
+    scheduler.learn(LOAD, 10, 1e-6)  # too few to learn from
     scheduler.learn(LOAD, 64, 1000.0)  # a slow start
     assert len(scheduler.choose(asked, room)[0][LOAD]) == 1
     for _ in range(40):
@@ -89,7 +89,7 @@ def test_the_time_budget_learns_what_fits():
 
 
 def served_with(cost, frames: int, milliseconds: float = 8.0) -> list[int]:
-    """Bricks a frame where a batch of n takes cost(n) ms and rays always ask for more."""
+    """Returns bricks per frame if a batch of n takes cost(n) ms and rays always request more."""
     scheduler, counts = Scheduler(milliseconds=milliseconds), []
     asked, room = requests([0] * 4000, [1] * 4000), {LOAD: [5000], SUBDIVIDE: [5000]}
     for _ in range(frames):
@@ -100,8 +100,8 @@ def served_with(cost, frames: int, milliseconds: float = 8.0) -> list[int]:
 
 
 def test_a_call_s_own_cost_does_not_make_batches_small():
-    """A call of 6 ms and a hundredth for each brick, where bricks have 4 ms of a frame: one a frame
-    would take 6.01 ms, 200 take 8. A slow first call does not matter for long.
+    """A call takes 6 ms and 0.01 ms per brick, and bricks have 4 ms of a frame: one a frame would
+    take 6.01 ms, 200 take 8. A slow first call does not matter for long.
     """
     for first in (1.0, 100.0):
         calls = iter([first] + [1.0] * 100)
@@ -110,7 +110,7 @@ def test_a_call_s_own_cost_does_not_make_batches_small():
 
 
 def test_batches_are_as_large_as_the_time_allows():
-    """With a cost of one's own and without; slow bricks come one or two a frame."""
+    """With a fixed cost and without; slow bricks are served one or two a frame."""
     for own, each in ((0.0, 0.02), (1.0, 0.02), (0.0, 0.5), (2.0, 0.1)):
         counts = served_with(lambda n, own=own, each=each: own + each * n, 60)
         took = [own + each * n for n in counts[20:]]
@@ -120,7 +120,7 @@ def test_batches_are_as_large_as_the_time_allows():
 
 
 def test_each_kind_of_slot_serves_its_own_requests():
-    """Where coarse bricks need slots of their own, the most wanted of each kind are served."""
+    """If coarse bricks need separate slots, the highest priorities of each kind are served."""
     coarse = torch.tensor([True, False, True, False, True, False])
     asked = requests([0] * 6, [9, 8, 7, 6, 5, 4], coarse)
     room = {LOAD: [1, 2], SUBDIVIDE: [0]}

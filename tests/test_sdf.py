@@ -49,7 +49,7 @@ def test_fractals_are_those_of_numpy(name):
 
 
 class Burning(gv.Iteration):
-    """A step of one's own: the bulb's of n = 2, of coordinates without their signs."""
+    """A user-defined step: the bulb's with n = 2, of the coordinates' absolute values."""
 
     def __init__(self):
         super().__init__()
@@ -60,7 +60,7 @@ class Burning(gv.Iteration):
 
 
 class Mine(gv.Iteration):
-    """A step that gvtorch knows, as one of one's own."""
+    """A built-in step, as a user-defined one."""
 
     def __init__(self, step):
         super().__init__()
@@ -96,7 +96,7 @@ def test_values_are_those_of_numpy(named):
 
 
 def test_intervals_hold_in_random_boxes(shape):
-    """10^5 boxes: no value at 27 points of each lies beyond, and the slope is never passed."""
+    """10^5 boxes: no value at 27 points of each is outside, and no slope is exceeded."""
     center, half = random_boxes(BOXES)
     low, high = shape.bounds(center, half)
     steep = shape.slope(center, half)
@@ -151,7 +151,7 @@ def test_shapes_have_the_colour_of_what_is_nearer():
 
 @pytest.mark.parametrize("name", ALL)
 def test_what_matters_near_a_box_has_the_same_bits(name):
-    """Values, colours and gradients of float32, in boxes of the size of some bricks and of all."""
+    """Float32 values, colours and gradients, in boxes of various sizes up to the whole."""
     shape = ALL[name][0]()
     size = 7.0 if name == "mandelbox" else 1.2
     random = torch.Generator().manual_seed(4)

@@ -1,5 +1,5 @@
-"""Segments, their samples, and compositing: compiled equals the twin, and all of it equals what
-`trace_rays` draws.
+"""Segments, their samples, and compositing: compiled backends equal the twin, and the results equal
+what `trace_rays` draws.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MARKS = ("request_tn", "stamp_t", "stamp_b")
 def tracing(
     tree, backend, rays, shader=SHADER, *, stop_alpha=0.99, hides=True, **options
 ) -> tuple[RayArguments, TraceArguments]:
-    """Arguments of `trace_rays` for rays through a clean copy of a tree."""
+    """Returns arguments of `trace_rays` for rays through a clean copy of a tree."""
     copy = on(tree, DEVICES[backend])
     copy.frame += 1
     chosen = gv.RenderOptions(backend=backend, stop_alpha=stop_alpha, **options)
@@ -55,7 +55,7 @@ def tensors(segments) -> dict[str, torch.Tensor]:
 
 
 def assert_same_walk(tree, compiled, rays, *, hides=True, limit=0, by_node=False, **options):
-    """Segments, marks and samples of the twin and of a kernel."""
+    """Asserts that segments, marks and samples of the twin and of a kernel are equal."""
     found = []
     for backend in ("reference", compiled):
         given, traced = tracing(tree, backend, rays, hides=hides, **options)
@@ -117,7 +117,7 @@ def test_missing_nodes_give_equal_segments_and_requests(
 @pytest.mark.parametrize("lod", ["finest", "auto"])
 @pytest.mark.parametrize("distance", [0.2, 1.3, 6.0])
 def test_segments_are_what_trace_rays_samples(blobs, backend, lod, distance):
-    """Same number of samples, same marks, same requests, in a tree of which a part is missing."""
+    """Same number of samples, same marks, same requests, in a tree with missing parts."""
     tree = forget(gv.N3Tree.from_volume(blobs, 4), 0.3, 7)
     rays = camera_rays(tree, distance=distance)
     given, drawn = tracing(tree, backend, rays, stop_alpha=1.0, lod=lod)
@@ -140,7 +140,7 @@ def test_segments_are_what_trace_rays_samples(blobs, backend, lod, distance):
 
 
 def table_colors(values_k, level_k, table) -> torch.Tensor:
-    """(k, 4) rows of a transfer function's table, by its own formula."""
+    """Returns rows (k, 4) of a transfer function's table, by its formula."""
     low, high = table.domain_2
     last = table.table_lm4.shape[1] - 1
     place = ((values_k - low) / (high - low) * last).clamp(0, last)
@@ -154,7 +154,7 @@ def table_colors(values_k, level_k, table) -> torch.Tensor:
 @pytest.mark.parametrize("lod", ["finest", "auto"])
 @pytest.mark.parametrize("limit", [0, 16])
 def test_sampled_and_composited_segments_are_the_picture(blobs, backend, lod, limit):
-    """The whole open road beside the fused one, whole and by parts."""
+    """The pipeline of separate ops against the fused one, at once and in parts."""
     tree = gv.N3Tree.from_volume(blobs, 8)
     rays = camera_rays(tree, distance=1.3)
     given, traced = tracing(tree, backend, rays, lod=lod)
@@ -208,7 +208,7 @@ def test_parts_of_a_walk_are_the_walk(blobs, backend):
 
 
 def test_distances_cover_the_box(blobs, backend):
-    """One node, nothing hidden: a ray's segments reach from where it enters to where it leaves."""
+    """One node, nothing hidden: a ray's segments reach from its entry to its exit."""
     noise = gv.Volume(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)))
     tree = gv.N3Tree.from_volume(noise, 8)
     rays = camera_rays(tree, 8, distance=3, azimuth=0, elevation=0)
@@ -234,7 +234,7 @@ def test_distances_cover_the_box(blobs, backend):
 
 
 def test_gradient_by_bricks_and_constants(blobs, compiled):
-    """Sampling is linear in voxels: the gradient equals the twin's, which autograd makes."""
+    """Sampling is linear in voxels: the gradient equals the twin's, which is autograd's."""
     tree = gv.N3Tree.from_volume(blobs, 4)
     rays = camera_rays(tree, 16, distance=1.5)
     grads = []
@@ -310,7 +310,7 @@ def test_opcheck(walk):
 
 
 class Emission(torch.nn.Module):
-    """Samples and composites segments: what scripts, compiles and exports."""
+    """Samples and composites segments; it is scripted, compiled and exported."""
 
     def forward(
         self,
@@ -409,7 +409,7 @@ def test_bad_arguments_of_sampling_and_compositing(blobs):
 
 
 def test_samples_that_name_nothing_are_zero(walk):
-    """Memory stays safe whatever the words are."""
+    """Memory accesses stay in bounds, whatever the words are."""
     *_, segments, samples = walk
     some = samples.segment.clone()
     some[0], some[1] = -1, 10**6

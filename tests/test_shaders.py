@@ -33,7 +33,7 @@ GOLDEN = {
 
 @pytest.fixture(scope="module")
 def trees(channels) -> dict[int, gv.N3Tree]:
-    """By their branching."""
+    """Trees by N."""
     return {n: gv.N3Tree.from_volume(channels, 4, branching=n) for n in (2, 3)}
 
 
@@ -45,7 +45,7 @@ def tree(trees) -> gv.N3Tree:
 @pytest.mark.parametrize("lod", ["finest", "auto"])
 @pytest.mark.parametrize("name", SHADERS)
 def test_compiled_equals_reference(tree, compiled, name, lod):
-    few = "shadows" in name or lod == "finest"  # the twin takes its time
+    few = "shadows" in name or lod == "finest"  # the twin is slow
     for distance in (1.3,) if few else (0.2, 1.3, 6.0):
         rays = camera_rays(tree, 6 if few else 10, distance=distance)
         found, _, actual = assert_equal(tree, compiled, rays, SHADERS[name], lod=lod)
@@ -140,7 +140,7 @@ def test_what_ranges_hide_changes_no_bit(channels, name, threshold):
 
 @pytest.mark.parametrize("name", SHADERS)
 def test_rays_that_have_lost_light_bring_back_the_rest(tree, compiled, name):
-    """The twin's, too, which `test_pieces` compares."""
+    """Also for the twin, which `test_pieces` compares."""
     rays = camera_rays(tree, 16, distance=1.6)
     dimmed = replace(rays, transmittance=torch.full((len(rays.origin),), 0.25))
     options = gv.RenderOptions(stop_alpha=1.0, backend=compiled)
@@ -152,7 +152,7 @@ def test_rays_that_have_lost_light_bring_back_the_rest(tree, compiled, name):
 
 
 def test_a_surface_has_the_colour_that_its_voxels_hold(tree, compiled):
-    """Each number beside a function that gives it as a grey; and multiplied by the opacity."""
+    """Each component against a function that draws it as grey; also premultiplied by opacity."""
     rays, flat = camera_rays(tree, 16), {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0}
     ramp = gv.TransferFunction.from_points([(0, 1)], [(0, 0, 0, 0), (255, 1, 1, 1)])
     stored = gv.Isosurface(0.4, None, color_channel="rgba", **flat)
@@ -165,7 +165,7 @@ def test_a_surface_has_the_colour_that_its_voxels_hold(tree, compiled):
     times, _ = run(tree, compiled, rays, gv.Isosurface(
         0.4, None, color_channel="premultiplied", premultiplied=True, **flat
     ))  # fmt: skip
-    apart = (times["color"] - found["color"]).abs()  # voxels count by their opacity there
+    apart = (times["color"] - found["color"]).abs()  # there, voxels are weighted by opacity
     assert apart.max() < 0.1 and apart.mean() < 0.01
     with pytest.raises(ValueError, match="stored colour needs 4 numbers a voxel, 'normal' has 3"):
         run(tree, compiled, rays, gv.Isosurface(0.4, None, color_channel="normal"))
@@ -220,8 +220,8 @@ NUMBERS = {  # before, after
 
 @pytest.mark.parametrize("edited", NUMBERS)
 def test_each_parameter_is_a_tensor_that_may_be_edited(tree, compiled, edited):
-    """The next frame is, to the bit, what a new shader with those numbers draws. The colour lies in
-    a frame's table; all else is read as rays are traced.
+    """The next frame equals, to the bit, that of a new shader with those numbers. The colour is
+    copied to a frame's table; everything else is read while rays are traced.
     """
     tree, rays = on(tree, DEVICES[compiled]), camera_rays(tree, 16).to(DEVICES[compiled])
     numbers = {n: torch.tensor(before, device=tree.device) for n, (before, _) in NUMBERS.items()}
@@ -238,7 +238,7 @@ def test_each_parameter_is_a_tensor_that_may_be_edited(tree, compiled, edited):
 @pytest.mark.parametrize("which", ["opacity", "color"])
 @pytest.mark.parametrize("kind", [None, gv.Lit, gv.PreIntegrated])
 def test_an_edited_transfer_function_is_the_next_picture_s(tree, compiled, kind, which):
-    """As a new one of those points draws it, without another tree."""
+    """It equals that of a new function with those points, without another tree."""
     points = {"opacity": [(0, 0), (1, 0.4)], "color": [(0, 1, 0, 0), (1, 0.2, 0.6, 1)]}
     tree, camera = on(tree, DEVICES[compiled]), gv.Camera.orbit(width=16, height=16, distance=1.3)
     function = gv.TransferFunction.from_points(**points)
@@ -268,7 +268,7 @@ def test_an_engine_draws_the_same(channels, name):
 
 @pytest.mark.parametrize("name", SHADERS)
 def test_golden_image(tree, name):
-    """64 x 64 of colour and alpha; the largest error is printed."""
+    """64 x 64 pixels of colour and alpha; prints the largest error."""
     camera = gv.Camera.orbit(width=64, height=64, distance=1.4)
     picture = gv.render(tree, camera, SHADERS[name])
     expected = torch.from_numpy(GOLDEN[name].astype(np.float32))
@@ -314,7 +314,7 @@ def test_script_compile_and_export(tree, compiled, name):
 
 @pytest.mark.parametrize("name", SHADERS)
 def test_opcheck(tree, compiled, name):
-    """In one dtype after the other; in both, test_op_contract.py checks the other op."""
+    """In one dtype per shader, alternating; test_op_contract.py checks the other op in both."""
     tree = on(tree, DEVICES[compiled])
     dtype = (torch.float32, torch.float64)[[*SHADERS].index(name) % 2]
     rays, traced, shading, parameters = op_arguments(tree, SHADERS[name], dtype)
@@ -394,7 +394,7 @@ def test_every_shader_is_a_shader():
 
 
 def test_a_kind_has_a_struct_a_twin_and_a_class():
-    """One name in csrc/shaders, in its twin and among the built-in classes."""
+    """It has one name in csrc/shaders, in its twin and among the built-in classes."""
     assert [*TWINS] == [*SHADER_KINDS]
     folder = cpp_ext.SOURCES / "shaders"
     structs = "".join(path.read_text() for path in folder.glob("*.h"))
@@ -413,7 +413,7 @@ def test_a_kind_has_a_struct_a_twin_and_a_class():
 
 @pytest.mark.parametrize("name", built_in.BY_NAME)
 def test_every_named_shader_draws(tree, name):
-    """What the command line offers needs but a transfer function and a level."""
+    """The shaders of the command line need only a transfer function and a level."""
     shader = built_in.BY_NAME[name](SHADER, 0.5)
     picture = gv.render(tree, gv.Camera.orbit(width=16, height=16, distance=1.4), shader)
     assert picture.alpha.max() > 0.3 and picture.color.max() > 0.1
@@ -429,8 +429,8 @@ def test_what_effects_ask_of_a_shader_without_a_light():
 
 @pytest.mark.parametrize("kind", ["isosurface", "distance field"])
 def test_a_surface_is_filled(backend, kind):
-    """Half a ball under the box's high face: its cut is seen from above, matter from within; the
-    inner side of a hollow one.
+    """Half a ball under the box's top face: from above its cut is seen, from within its matter; in
+    a hollow one, the inner side.
     """
     place = torch.arange(40.0)
     z, y, x = torch.meshgrid(place[:28], place, place, indexing="ij")

@@ -60,7 +60,7 @@ def test_an_offset_moves_the_surface_and_what_misses_stays_clear(backend):
 
 
 def test_normals_show_no_seam_at_brick_faces(backend):
-    """The tree in bricks of 4 gives the normals of one brick."""
+    """A tree with bricks of 4 gives the normals of one single brick."""
     rays = parallel(25, 9.0, DEVICES[backend])
     shader = gv.DistanceField()
     many, one = (shoot(ball(backend, brick_size=s), rays, shader, backend) for s in (4, 64))
@@ -111,7 +111,7 @@ def test_phong_on_a_sphere(backend, kind, stored):
 
 @pytest.mark.parametrize("shader", [gv.Lit, gv.PreIntegrated])
 def test_without_light_or_gradient_the_plain_function_is_the_limit(backend, shader):
-    """Ambient alone leaves the colours; values that do not change along a ray integrate to the
+    """Ambient light alone keeps the colours; values that are constant along a ray integrate to the
     function itself.
     """
     transfer = gv.TransferFunction.from_points([(0, 0), (1, 0.3)], [(0, 1, 0, 0), (1, 0, 1, 1)])
@@ -135,7 +135,7 @@ SHELLS = gv.TransferFunction.from_points(
 
 def test_thin_shells_do_not_alias_at_step_1(backend):
     """Along a ramp of slope s, a shell from 0.4 to 0.42 is 0.02 / s long, whatever the step: its
-    alpha is 1 - 0.1^(length / reference), but for its soft edges.
+    alpha is 1 - 0.1^(length / reference), except for its soft edges.
     """
     slope = 0.05  # a value's change per world unit: the shell is 0.4 long, the step 1
     ramp = (np.arange(40, dtype=np.float32) * slope)[:, None, None] * np.ones(
@@ -147,7 +147,7 @@ def test_thin_shells_do_not_alias_at_step_1(backend):
     fine = np.linspace(0.4, 0.42, 100001)
     density = -np.log1p(-SHELLS(fine)[:, 3]) / 0.1
     alpha = -np.expm1(-density.mean() * 0.02 / (slope * cosine))
-    # With no absorption to speak of beside the shell, all of its light arrives.
+    # There is hardly any absorption outside of the shell, so all of its light arrives.
     expected = alpha * np.array([1, 0.5, 0.1])
     smooth = shoot(tree, rays, gv.PreIntegrated(SHELLS), backend, step=1.0, stop_alpha=1.0)
     plain = shoot(tree, rays, SHELLS, backend, step=1.0, stop_alpha=1.0)
@@ -161,8 +161,8 @@ def test_thin_shells_do_not_alias_at_step_1(backend):
 
 
 def test_an_interval_that_leaves_the_table_counts_its_parts(backend):
-    """A shell passed in a small part of an interval has the alpha of that part, and what is beyond
-    the function's end points has that of the rest.
+    """A shell that takes a small part of an interval has the alpha of that part, and values beyond
+    the function's end points have that of the rest.
     """
     slope = 0.3
     ramp = (np.arange(24, dtype=np.float32) * slope)[:, None, None] * np.ones(
@@ -183,7 +183,7 @@ def test_an_interval_that_leaves_the_table_counts_its_parts(backend):
 
 
 def test_pre_integration_on_a_step_function(backend):
-    """Opaque red above 0.5, clear below: along a ramp the alpha of what lies above is closed."""
+    """Opaque red above 0.5, clear below: along a ramp, alpha has a closed form."""
     step = gv.TransferFunction.from_points(
         [(0, 0), (0.5, 0), (0.5001, 0.2), (1, 0.2)], [(0, 1, 0, 0)]
     )

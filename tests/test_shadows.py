@@ -1,4 +1,4 @@
-"""Shadows inside a medium, one cone a sample, against closed forms and a dense marcher."""
+"""Shadows inside a medium, one cone per sample, against closed forms and a dense marcher."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ INSIDE = gv.PointLight((15.0, 6.0, 14.0))
 
 
 def fog(seed: int, side: int = 16) -> np.ndarray:
-    """(z, y, x) of noise with a hole, float32."""
+    """Returns (z, y, x) float32 noise with a hole."""
     value = np.random.default_rng(seed).uniform(0, 1, (side, side, side)).astype(np.float32)
     value[:, 9:, :7] = 0
     return value
 
 
 def tree_of(value: np.ndarray, backend: str, branching: int = 2) -> gv.N3Tree:
-    """Density, colours of that opacity, and normals that are none: every place faces the light."""
+    """Returns density, colours of that opacity, and zero normals, which always face the light."""
     place = SPACING, ORIGIN
     zero = np.zeros((*value.shape, 3), np.float32)
     rgba = np.concatenate((zero + 1, value[..., None]), -1)
@@ -37,7 +37,7 @@ def tree_of(value: np.ndarray, backend: str, branching: int = 2) -> gv.N3Tree:
 
 
 def rays_through(box: np.ndarray, device: str, count: int = 12) -> gv.Rays:
-    """Rays from all sides to places in a box."""
+    """Returns rays from all sides to points in a box."""
     random = np.random.default_rng(3)
     target = box[0] + random.uniform(0.2, 0.8, (count, 3)) * (box[1] - box[0])
     along = random.normal(size=(count, 3))
@@ -47,7 +47,7 @@ def rays_through(box: np.ndarray, device: str, count: int = 12) -> gv.Rays:
 
 
 def to_light(light, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(k, 3) ways and (k,) distances from places to a light."""
+    """Returns directions (k, 3) and distances (k,) from points to a light."""
     if isinstance(light, gv.DirectionalLight):
         way = -np.array(light.direction) + 0 * place
         return way / np.linalg.norm(way, axis=1, keepdims=True), np.full(len(place), np.inf)
@@ -57,7 +57,7 @@ def to_light(light, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def seen(value, rays, light, transfer, step) -> np.ndarray:
-    """(r,) light of single rays: marched densely, and from each sample to the light."""
+    """Returns the light (r,) of rays, marched densely, also from each sample to the light."""
     box, out = box_of(value.shape, SPACING, ORIGIN), []
     spacing, origin = np.array(SPACING), np.array(ORIGIN)
     for eye, d in zip(rays.origin.cpu().numpy(), rays.direction.cpu().numpy(), strict=True):
@@ -109,8 +109,8 @@ def test_each_sample_stands_in_the_shadow_of_what_lies_before_its_light(backend,
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_light_decays_with_depth_in_a_homogeneous_medium(backend, dtype):
-    """exp(-extinction * depth): a ray straight across stands equally deep all along, and so does
-    one node of one value.
+    """exp(-extinction * depth): a ray straight across has a constant depth, also in one node of one
+    value.
     """
     tree = tree_of(np.full((16, 16, 16), 0.5, np.float32), backend)
     low, high = tree.box
@@ -141,7 +141,7 @@ def test_light_decays_with_depth_in_a_homogeneous_medium(backend, dtype):
 
 
 def test_a_shadow_of_a_wide_light_is_softer_and_coarser(backend):
-    """A slab, half of which lies below a plate: the plate's edge is the shadow's."""
+    """Half of a slab lies below a plate, whose edge is the edge of the shadow."""
     value = np.zeros((32, 32, 32), np.float32)
     value[4:8] = 1.0  # what the shadow falls on
     value[24:26, :, :16] = 1.0
@@ -194,7 +194,7 @@ def test_a_surface_has_no_shadows_per_sample():
 
 
 def test_what_is_only_seen_in_a_shadow_is_streamed_too():
-    """The thing that throws the shadow stands beside the picture."""
+    """The object that throws the shadow is outside of the picture."""
     value = np.zeros((64, 64, 64), np.float32)
     value[4:8] = 1.0
     value[44:48, 24:40, 20:40] = 1.0

@@ -26,14 +26,14 @@ def store(volume, tmp_path_factory):
 
 
 def numbers(picture: gv.Picture) -> np.ndarray:
-    """sRGB numbers of a gray picture."""
+    """Returns the sRGB numbers of a gray picture."""
     pixels = picture.to_srgb8().numpy()
     assert (pixels[..., :1] == pixels).all()
     return pixels[..., 0]
 
 
 def test_a_voxel_is_its_own_number(volume, store):
-    """Across each axis; across z rows run down, else z is up, in pixels as long as voxels."""
+    """Across each axis; across z, rows run down, else z is up; pixels are as long as voxels."""
     zyx = volume.data[..., 0].numpy()
     for data in (volume, store):
         cut = {a: numbers(gv.slice_picture(data, a, 3, span=(0, 255))) for a in "xyz"}
@@ -159,7 +159,7 @@ def test_flags_that_do_nothing_or_are_wrong(volume, tmp_path, flags, message):
 
 
 def patient(space: str | None) -> gv.Volume:
-    """Numbers that tell a voxel's place: z, y, x."""
+    """Returns a volume whose numbers encode a voxel's position: z, y, x."""
     values = np.arange(48 * 50 * 52, dtype=np.float32).reshape(48, 50, 52)
     return gv.Volume(values, info=gv.ImageInfo(space=space))
 
@@ -168,7 +168,7 @@ RAS, LPS = "right-anterior-superior", "left-posterior-superior"
 
 
 def test_patients_are_seen_as_radiologists_see_them():
-    """Front, or head, up; their right on the left, in a sagittal plane their front."""
+    """Front, or head, up; the patient's right on the left, in a sagittal plane the front."""
     values = patient(RAS).data[..., 0].numpy()
     for space, data in ((RAS, values), (LPS, values[:, ::-1, ::-1])):  # the same patient
         volume = gv.Volume(data.copy(), info=gv.ImageInfo(space=space))

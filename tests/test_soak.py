@@ -1,5 +1,5 @@
-"""Random flights: pools, budgets, producers and faults as they come. The pools stay in order,
-memory stays flat, and once all is well again the picture is the resident one, in every bit.
+"""Random flights with random pools, budgets, producers and faults. The pools stay valid, memory
+stays flat, and once all faults are over the picture equals the resident one in every bit.
 
 `make soak FRAMES=100000` flies longer than the tests do.
 """
@@ -32,7 +32,7 @@ FAULTS = ("raises", "nan", "errors", "never")
 
 
 class Faulty(gv.VolumeProducer):
-    """Fails now and then while `fault` says how."""
+    """Fails now and then in the way that `fault` says."""
 
     def __init__(self, volume: gv.Volume, pick: random.Random, hold: str) -> None:
         super().__init__(volume, hold=hold)
@@ -57,7 +57,7 @@ class Faulty(gv.VolumeProducer):
 
 
 class Spots(torch.nn.Module):
-    """A ball with spots, with NaN in it while `spoiled` is not 0."""
+    """A ball with spots, which contains NaN while `spoiled` is not 0."""
 
     spoiled: torch.Tensor
 
@@ -72,7 +72,7 @@ class Spots(torch.nn.Module):
 
 
 class Spotted(gv.FieldProducer):
-    """Made on the device; gives NaN while there is a `fault`."""
+    """Makes bricks on the device; returns NaN while there is a `fault`."""
 
     def __init__(self, branching: int) -> None:
         super().__init__(Spots(), 40, box=((-1, -1, -1), (1, 1, 1)), branching=branching)
@@ -129,8 +129,8 @@ Resident = Callable[[gv.Producer, gv.Camera], gv.Picture]
 
 @contextmanager
 def resident(blobs: gv.Volume, store: Path, device: torch.device) -> Iterator[Resident]:
-    """What shows all that a producer makes: the tree of a volume, and else an engine that
-    has room for it. A store's cells are wider than bricks here, so it has other CONSTANT regions.
+    """The reference pictures of producers: by the tree of a volume, else by an engine with enough
+    room. A store's cells are wider than bricks here, so it has other CONSTANT regions.
     """
     size: dict[str, Any] = {"device": device, "brick_size": 4}
     trees = {n: gv.N3Tree.from_volume(blobs, branching=n, **size) for n in (2, 3)}
@@ -149,7 +149,7 @@ def resident(blobs: gv.Volume, store: Path, device: torch.device) -> Iterator[Re
 
     try:
         for one in others:
-            show(one, gv.Camera.orbit(30, 20, 0.8, None, 12, 10))  # takes all memory that it needs
+            show(one, gv.Camera.orbit(30, 20, 0.8, None, 12, 10))  # allocates all that it needs
         yield show
     finally:
         for engine in engines:
@@ -159,8 +159,8 @@ def resident(blobs: gv.Volume, store: Path, device: torch.device) -> Iterator[Re
 def flight(
     seed: int, blobs: gv.Volume, store: Path, show: Resident, device: torch.device
 ) -> tuple[int, bool]:
-    """Flies once with an engine of its own; returns its number of frames, and whether its last
-    picture was whole: then it is the resident one.
+    """Flies once with a new engine; returns its number of frames, and whether its last picture was
+    complete: then it equals the resident one.
     """
     pick = random.Random(seed)
     producer = random_producer(pick, blobs, store)
@@ -198,7 +198,7 @@ def flight(
 
 
 def memory(device: torch.device) -> tuple[int, int]:
-    """Bytes of the process, and of tensors on a CUDA device."""
+    """Returns the bytes of the process, and of tensors on a CUDA device."""
     gc.collect()
     on_device = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
     return resident_bytes(), on_device
@@ -206,15 +206,15 @@ def memory(device: torch.device) -> tuple[int, int]:
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_random_flights_end_in_the_resident_picture(blobs, tmp_path, backend, monkeypatch):
-    monkeypatch.setattr(staging, "_SMALL", 0)  # bytes: all that is mapped is read in place
+    monkeypatch.setattr(staging, "_SMALL", 0)  # bytes: everything mapped is read in place
     device = torch.device(DEVICES[backend])
     store = tmp_path / "store"
     convert(blobs, store)
-    begin = random.randrange(10**9) if FRAMES > 10_000 else 0  # long runs side by side differ
+    begin = random.randrange(10**9) if FRAMES > 10_000 else 0  # parallel long runs differ
     frames = flights = compared = 0
     after_a_fifth: tuple[int, int] | None = None
     with resident(blobs, store, device) as show:
-        while frames < FRAMES or flights < 20:  # few flights tell little
+        while frames < FRAMES or flights < 20:  # few flights prove little
             flown, whole = flight(begin + flights, blobs, store, show, device)
             frames, flights, compared = frames + flown, flights + 1, compared + whole
             if after_a_fifth is None and frames > FRAMES // 5:

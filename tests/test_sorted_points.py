@@ -1,4 +1,4 @@
-"""Points on disk: sorted in little memory, the same as in memory, whole or not at all."""
+"""Points on disk: sorted with little memory, equal to points in memory, complete or absent."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The op `splat`: twin, C++ and CUDA in every bit; beside integrals that are worked out otherwise;
-sums; hostile input."""
+"""The op `splat`: twin, C++ and CUDA in every bit; against independently computed integrals; sums;
+hostile input."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def whole(*values: object) -> Tensor:
 def some(
     cubes: int = 5, side: int = 6, width: int = 3, rows: int = 200, runs: int = 30, seed: int = 1
 ) -> Given:
-    """Cubes anywhere, lists of any length that share rows, points in and outside, at edges, of all
-    kinds of radii; spans that are empty, run backwards or leave the table.
+    """Returns cubes anywhere, lists of any length that share rows, points inside, outside and at
+    edges, of all kinds of radii; spans that are empty, run backwards or leave the table.
     """
     random = torch.Generator().manual_seed(seed)
 
@@ -72,7 +72,7 @@ def some(
         return torch.cat((whole(0), inner, whole(runs)))[: cubes + 1], spans
 
     edge = real(cubes, 3, 1) + 0.05 * torch.arange(side + 1)
-    edge[..., -1] = edge[..., -2]  # cut off at a box: a voxel without a size
+    edge[..., -1] = edge[..., -2]  # clipped at a box: a voxel without extent
     center = 1.5 * real(rows, 3)
     if cubes:
         center[::7] = edge[ints(0, cubes, len(center[::7])), :, ints(0, side + 1, 1)[0]]
@@ -131,7 +131,7 @@ def test_each_kind_alone_is_the_twin_and_lists_may_be_empty(compiled, kind):
 @pytest.mark.parametrize("instructions", ["baseline", "avx2"])
 @pytest.mark.backend("cpp")
 def test_all_instruction_sets_give_the_same_bits(instructions, tmp_path):
-    """The widest that this machine has are those of the tests above."""
+    """The other tests use the widest instruction set of the machine."""
     given = some()
     torch.save(list(given), tmp_path / "given.pt")
     code = (
@@ -152,7 +152,7 @@ def test_all_instruction_sets_give_the_same_bits(instructions, tmp_path):
 
 
 def one_point(radius: float, side: int = 8, center: tuple = (0.31, -0.12, 0.07)) -> Given:
-    """A cube of side 2 around the origin, and a point of value 1 and 2 in it."""
+    """Returns a cube of side 2 around the origin, and a point with the values 1 and 2 in it."""
     edge = torch.linspace(-1, 1, side + 1, dtype=REAL).expand(1, 3, -1).contiguous()
     none = (whole(0, 0), torch.zeros((0, 2), dtype=torch.int64), torch.zeros((0, 3)).long())
     own = (whole(0, 1), whole((0, 1)), torch.tensor([center], dtype=REAL))
@@ -162,7 +162,7 @@ def one_point(radius: float, side: int = 8, center: tuple = (0.31, -0.12, 0.07))
 
 @pytest.mark.parametrize("radius", [0.03, 0.4, 3.0])
 def test_a_voxel_holds_the_integral_of_the_spline(backend, radius):
-    """By the rule of midpoints over the density, and by another closed form, of four uniform random
+    """By the midpoint rule over the density, and by another closed form, of four uniform random
     numbers (Irwin, Hall)."""
     center = (0.31, -0.12, 0.07)
     given = one_point(radius, center=center)
@@ -204,7 +204,7 @@ def test_a_point_without_a_radius_is_wholly_in_the_upper_voxel_at_an_edge(backen
 
 
 def test_lists_are_added_up_in_their_order(backend):
-    """Of 1e16, 1 and -1e16 only some orders keep the 1."""
+    """Adding 1e16, 1 and -1e16 keeps the 1 only in some orders."""
     given = one_point(0.0)
     numbers = torch.tensor([[1e16], [1.0], [-1e16]], dtype=REAL)
     places = given._replace(
@@ -225,7 +225,7 @@ def test_lists_are_added_up_in_their_order(backend):
 
 
 def test_rows_far_out_and_numbers_that_are_none_stay_where_they_are(compiled):
-    """Whatever stands in tables and lists: no place in memory is made of it."""
+    """No value in tables and lists leads to an invalid memory address."""
     given = some()
     far = 2**63 - 1
     given.narrow_b[1], given.narrow_b[2] = -far - 1, far

@@ -1,5 +1,5 @@
-"""Staging: bricks from the host on their way to the device. The ring itself is tested on the CPU
-as well, where copies are done at once."""
+"""Staging: upload of bricks from the host to the device. The ring itself is tested on the CPU as
+well, where copies finish at once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gvtorch.pool.staging import wide_rows
 
 
 def landed(shipment, channel="value") -> torch.Tensor:
-    """All bricks of a shipment; its bytes are given back."""
+    """Returns all bricks of a shipment, and releases its bytes."""
     pieces = []
     for chunk in shipment.chunks:
         with chunk as data:
@@ -103,7 +103,7 @@ def test_what_nobody_reads_any_more_gives_its_bytes_back(device):
         assert shipment.sent > 4000
         if device.type == "cuda":
             torch.cuda.synchronize()
-        del shipment  # a frame that was broken off
+        del shipment  # an interrupted frame
 
 
 def test_a_brick_larger_than_a_chunk_has_a_ring_of_its_size(device):
@@ -120,7 +120,7 @@ def test_pinned_bricks_are_copied_from_where_they_are(device):
     bricks = voxels(5000).pin_memory()
     shipment = ring.send({"value": bricks, "pageable": voxels(5000, seed=3)})
     expected = bricks.clone()
-    del bricks  # what is copied from lives until then
+    del bricks  # the source of the copy lives until then
     junk = [torch.full((2_500_000,), 7, dtype=torch.uint8).pin_memory() for _ in range(4)]
     assert shipment.sent == len(expected) - len(shipment.rest["value"]) > 1000 and len(junk) == 4
     assert torch.equal(landed(shipment), expected[: shipment.sent])
@@ -165,7 +165,7 @@ SIDE = 50  # bricks along a side: 125,000
 
 
 class Numbered(gv.Producer):
-    """Bricks in which every voxel tells whose it is, in two channels."""
+    """Bricks in which every voxel identifies its node, in two channels."""
 
     where, patience = "host", 0.5
 
@@ -199,7 +199,7 @@ THREAD = ThreadPoolExecutor(1)
 
 
 def grown(producer, device, **options) -> gv.Engine:
-    """An engine in whose tree all tiles are there and no brick but the root's."""
+    """Returns an engine whose tree has all tiles and no brick except the root's."""
     pools = {"node_pool": "40 MB", "brick_pool": f"{(SIDE**3 + 100) * 5} kB"}
     engine = gv.Engine(producer, device=device, **{**pools, **options})
     nodes = engine.cache.nodes
@@ -221,7 +221,7 @@ def linked(engine) -> torch.Tensor:
 
 
 def finest(engine) -> torch.Tensor:
-    """Nodes of the finest level that lack their bricks."""
+    """Returns nodes of the finest level that lack their bricks."""
     nodes, depth = engine.cache.nodes, engine.trees["scene"].layout.depth
     lacks = (nodes.brick_tn == config.ABSENT).flatten() & linked(engine)
     lacks &= (nodes.loc_t4[:, 3] == depth).repeat_interleave(nodes.nodes_per_tile)
@@ -229,7 +229,7 @@ def finest(engine) -> torch.Tensor:
 
 
 def serve(engine, node, kind) -> gv.FrameStats:
-    """What a frame does for requests, without its rays."""
+    """Serves requests as a frame does, without tracing rays."""
     stats = gv.FrameStats()
     engine.production.write(engine.production.late(), stats)
     engine.production.write(engine.production.ask({kind: node}), stats)
@@ -309,7 +309,7 @@ def batches(nodes) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("where", ["host", "later"])
 def test_what_finds_no_room_is_held_until_a_later_frame(device, where):
-    """A payload of many rings in one frame: the ring takes what it has room for."""
+    """A payload many times larger than the ring, in one frame: the ring takes what fits."""
     with grown(Numbered(), device, load_budget=1000) as engine:
         if device.type == "cpu":
             engine.production.staging = Staging(5_000_000, 5000, device)

@@ -30,7 +30,7 @@ def cuda() -> str:
 
 @pytest.fixture
 def traced(monkeypatch):
-    """Lists for each pass over a camera's rays whether it was one over scouts."""
+    """Records for each pass over a camera's rays whether it was one over scouts."""
     passes: list[bool] = []
     trace = View.hits
 
@@ -44,7 +44,7 @@ def traced(monkeypatch):
 
 @pytest.fixture
 def slow(monkeypatch):
-    """Counts that have not come when they are looked at; lists which of them were waited for."""
+    """Readbacks that never arrive by themselves; records which of them were waited for."""
     waited: list[Readback] = []
     wait = Readback.wait
 
@@ -59,7 +59,7 @@ def slow(monkeypatch):
 
 
 class Noted(gv.VolumeProducer):
-    """Notes which nodes it was asked for."""
+    """Records which nodes it was asked for."""
 
     def __init__(self, volume):
         super().__init__(volume)
@@ -93,8 +93,8 @@ def test_a_frame_serves_what_the_one_before_missed(blobs):
 
 @pytest.mark.backend("cpp")
 def test_frames_go_on_where_counts_do_not_come(slow, blobs):
-    """Only a host that is too far ahead waits, for the oldest frame; as that one missed something,
-    the newest list is waited for and served, and it alone.
+    """Only a host that is too far ahead waits, for the oldest frame; because that one missed
+    something, it also waits for the newest list, and serves only that.
     """
     left, right = (camera(8, azimuth=azimuth, distance=0.6) for azimuth in (0, 180))
     asked = []
@@ -129,7 +129,7 @@ def test_pictures_converge_where_counts_do_not_come(slow, aneurism, loading):
 
 @pytest.mark.backend("cpp")
 def test_a_stalled_producer_stalls_no_frame(slow, blobs):
-    """Answers that do not come make nobody wait for counts either; those that come are written."""
+    """The host does not wait for counts of late answers either; those that arrive are written."""
     producer = Held(blobs)
     with gv.Engine(producer, brick_size=4) as engine:
         for _ in range(20):
@@ -144,13 +144,13 @@ def test_a_stalled_producer_stalls_no_frame(slow, blobs):
         _, stats = engine.frame(camera(8), GRAY)
         assert sum(stats.produced.values()) > 0
         producer.hold = False
-        producer.go()  # what was asked for meanwhile
+        producer.go()  # answers the requests made meanwhile
         assert engine.render(camera(8), GRAY).stats.converged
 
 
 @pytest.mark.backend("cpp")
 def test_scouts_go_only_where_something_was_written(traced, blobs):
-    """Neither in a steady frame nor while a store is stalled: answers are not waited for."""
+    """Neither in a steady frame nor while a store is stalled: the frame does not wait for it."""
     producer = Held(blobs)
     with gv.Engine(producer, brick_size=4) as engine:
         for _ in range(10):
@@ -234,7 +234,7 @@ def test_a_steady_frame_on_cuda_waits_for_nobody(cuda, blobs, monitor, trees):
         for view in [*views, *views]:
             expected.append(engine.render(view, GRAY, background=background))
             assert expected[-1].stats.converged
-        for view in views:  # what is loaded or uploaded once, is
+        for view in views:  # one-time loads and uploads are done
             engine.frame(view, GRAY, background=background)
         with nobody_waits():
             frames = [engine.frame(view, GRAY, background=background) for view in views * 3]
@@ -275,7 +275,7 @@ def test_a_replayed_graph_on_cuda_is_the_frame(cuda, blobs, trees):
 
 @pytest.mark.backend("cuda")
 def test_a_graph_on_cuda_tells_when_it_is_not_steady(cuda, aneurism):
-    """A camera that comes nearer: replays while all is there, frames where something is missed."""
+    """As a camera approaches, frames are replays while all is loaded, else ordinary frames."""
     tree = gv.N3Tree.from_volume(aneurism, device=cuda)
     with gv.Engine(gv.VolumeProducer(aneurism), device=cuda) as engine:
         engine.render(camera(distance=6.0), VESSELS)

@@ -1,4 +1,4 @@
-"""Reading stores: our own, bit for bit, and any other OME-Zarr image; and all that can be wrong."""
+"""Reading stores: ours, bit for bit, and any other OME-Zarr image; and everything that can fail."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def whole(tmp_path_factory, data) -> Path:
 
 @pytest.fixture
 def damaged(tmp_path, whole) -> Path:
-    """A copy to be damaged."""
+    """A copy for damaging."""
     return Path(shutil.copytree(whole, tmp_path / "damaged.zarr"))
 
 
@@ -267,7 +267,7 @@ def test_what_is_no_store_is_refused(tmp_path, whole):
 
 
 def pyramid(data_zyxc: np.ndarray, count: int) -> list[np.ndarray]:
-    """Levels of factor 2, finest first."""
+    """Returns levels of factor 2, finest first."""
     levels = [data_zyxc]
     for _ in range(count - 1):
         levels.append(pool_mean(levels[-1], 2))
@@ -327,7 +327,7 @@ def test_scales_that_leave_z_alone(tmp_path):
 
 
 def test_scales_that_dropped_a_last_voxel(tmp_path):
-    """Many writers halve 45 to 22: beyond the last voxel the outermost repeats."""
+    """Many writers halve 45 to 22: beyond that, the outermost voxel is repeated."""
     data = noise((45, 45, 45, 1))
     half = pool_mean(data[:44, :44, :44], 2)
     write_foreign(

@@ -27,7 +27,7 @@ VIEW = camera(distance=1.4)
 
 @pytest.fixture(scope="session")
 def cloud() -> gv.Volume:
-    """Smooth noise in a ball, nothing around it; no extent is a multiple of anything."""
+    """Smooth noise in a ball, empty space around it; extents are multiples of nothing."""
     generator = torch.Generator().manual_seed(5)
     coarse = torch.rand((1, 1, 9, 8, 11), generator=generator)
     fine = torch.nn.functional.interpolate(coarse, (75, 67, 90), mode="trilinear")[0, 0]
@@ -88,7 +88,7 @@ def test_any_brick_size_and_border_can_be_streamed(whole, cloud, brick_size, bor
         picture = engine.render(view, GRAY)
         assert picture.stats.converged and picture.stats.failed == 0
     expected = gv.render(gv.N3Tree.from_volume(cloud, brick_size, border), view, GRAY)
-    # Where a brick is no whole number of cells, fewer regions are known to be uniform.
+    # If a brick is not a whole number of cells, fewer regions are known to be uniform.
     assert (picture.color - expected.color).abs().max() < 1e-4
     assert expected.alpha.max() > 0.3
 
@@ -105,7 +105,7 @@ def test_a_threshold_is_kept_by_the_store(tmp_path, cloud):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 def test_the_order_in_which_reads_come_back_does_not_matter(whole, cloud, monkeypatch, loading):
-    """Every read is late by chance, in four threads."""
+    """Every read has a random delay, in four threads."""
     resident = gv.render(gv.N3Tree.from_volume(cloud), VIEW, GRAY)
     pick = random.Random(11)
     for name in ("read_blocks", "read_cells"):
@@ -129,7 +129,7 @@ def test_the_order_in_which_reads_come_back_does_not_matter(whole, cloud, monkey
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("channels", [None, [2, 0]])
 def test_channels_of_a_store_are_components(tmp_path, cloud, channels):
-    """Three channels on disk, all or two of them in an order of one's own."""
+    """Three channels on disk; all or two of them are read, in a chosen order."""
     values = cloud.data[..., 0]
     three = torch.stack((values // 4, values // 2, values), -1)
     volume = gv.Volume(three, cloud.spacing, cloud.origin)
@@ -258,7 +258,7 @@ def test_strict_raises_the_first_fault(store):
 
 @pytest.mark.backend("cpp")
 def test_a_store_that_errors_now_and_then_recovers(whole, monkeypatch):
-    """Every third read fails once; what failed is asked for again when told so."""
+    """Every third read fails once; failed bricks are requested again after `forget_failures`."""
     with gv.Engine(gv.StoredProducer(whole)) as engine:
         expected = engine.render(VIEW, GRAY)
     read, calls = Store.read_blocks, []
@@ -284,7 +284,7 @@ def test_a_store_that_errors_now_and_then_recovers(whole, monkeypatch):
 
 @pytest.mark.backend("cpp")
 def test_a_store_that_stalls_does_not_hang(served, whole):
-    """A server that takes its time from one moment on."""
+    """A server becomes slow at some moment."""
     with gv.Engine(gv.StoredProducer(f"{served}/{whole.name}", timeout=0.3), patience=5) as engine:
         for _ in range(2):
             engine.frame(camera(16, distance=1.4), GRAY)
@@ -329,8 +329,8 @@ def test_a_foreign_image_is_streamed_as_well(tmp_path, cloud):
 
 @pytest.mark.backend("cpp")
 def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
-    """A generated volume of 1 GiB, converted in less than 2 GB: pools of a sixteenth give the
-    picture of pools that hold all.
+    """A generated volume of 1 GiB, converted in less than 2 GB: pools of a sixteenth give the same
+    picture as pools that hold everything.
     """
     raw = np.lib.format.open_memmap(
         tmp_path / "big.npy", mode="w+", dtype=np.uint8, shape=(1024,) * 3

@@ -1,4 +1,4 @@
-"""Isosurfaces: closed forms, no cracks across blocks, files that come back."""
+"""Isosurfaces: closed forms, no cracks across blocks, files that are read back."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gvtorch.meshes import contour as cells
 
 
 def ball(n: int = 40, radius: float = 14.3, *, spacing=(1.0, 1.0, 1.0), middle=None) -> gv.Volume:
-    """Distance inside a ball, in voxels; positive within."""
+    """Returns the signed distance to a ball, in voxels; positive inside."""
     middle = [0.5 * n + 0.21] * 3 if middle is None else middle
     z, y, x = np.ogrid[:n, :n, :n]
     away = np.sqrt((x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2)
@@ -38,7 +38,7 @@ def euler_number(mesh: gv.Mesh) -> int:
 
 
 def assert_closed(mesh: gv.Mesh) -> None:
-    """Each edge is gone along once each way, so it has two triangles that face the same side."""
+    """Asserts that each edge occurs once in each direction: in two triangles of one orientation."""
     ways = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     there, back = (np.sort(w[:, 0] * len(mesh.vertices) + w[:, 1]) for w in (ways, ways[:, ::-1]))
     assert np.array_equal(there, back) and (np.diff(there) > 0).all()
@@ -46,7 +46,7 @@ def assert_closed(mesh: gv.Mesh) -> None:
 
 
 def triangles(mesh: gv.Mesh) -> np.ndarray:
-    """Corners of all triangles in an order of their own: each begins with its lowest corner."""
+    """Returns the corners of all triangles in a canonical order: the lowest corner first."""
     first = np.array([np.lexsort(three.T[::-1])[0] for three in mesh.corners])
     turned = (first[:, None] + np.arange(3)) % 3
     rows = mesh.corners[np.arange(len(first))[:, None], turned].reshape(-1, 9)
@@ -82,7 +82,7 @@ def test_a_torus_has_a_hole_and_a_shell_two_sides():
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 9), st.sampled_from([2, 3, 64]), st.booleans())
 def test_noise_is_wrapped_without_cracks(seed, side, block, whole):
-    """All kinds of cells and of neighbours, in blocks of a few; whole numbers are the value."""
+    """All kinds of cells and neighbours, in small blocks; whole numbers often equal the level."""
     rng = np.random.default_rng(seed)
     shape = rng.integers(2, side + 1, 3)
     data = rng.integers(0, 3, shape) if whole else rng.normal(size=shape)
@@ -99,7 +99,7 @@ def test_noise_is_wrapped_without_cracks(seed, side, block, whole):
 
 
 def test_every_kind_of_cell_occurs_and_is_cut_whole():
-    """As many triangles as its loops have corners beyond two; all loops pass all crossed edges."""
+    """Loops of n corners make n - 2 triangles, and together they pass all crossed edges."""
     found = cells._tables()
     for kind in range(256):
         loops = cells._loops(kind)
@@ -111,7 +111,7 @@ def test_every_kind_of_cell_occurs_and_is_cut_whole():
 
 
 def test_vertices_are_those_of_another_marching_cubes():
-    """VTK puts the same vertices on the same edges; triangles differ in saddles."""
+    """VTK puts the same vertices on the same edges; triangles may differ at saddles."""
     pytest.importorskip("vtkmodules")
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkCommonDataModel import vtkImageData
@@ -211,7 +211,7 @@ def test_a_label_is_wrapped(tmp_path, wide):
 @pytest.mark.parametrize("ending", ["ply", "glb"])
 @pytest.mark.parametrize("origin", [0.0, 3e6])
 def test_files_come_back(tmp_path, monkeypatch, ending, origin):
-    """As trimesh reads them; places far from the origin keep their digits."""
+    """As trimesh reads them; positions far from the origin keep their precision."""
     trimesh = pytest.importorskip("trimesh")
     monkeypatch.setattr(surface, "_BLOCK", 16)
     volume = ball(30, 9.4)

@@ -1,5 +1,5 @@
-"""Several threads on one engine, one tree, one store: what goes together gives the pictures of one
-thread; what does not raises at once.
+"""Several threads on one engine, one tree, one store: what is allowed concurrently gives the
+pictures of one thread; what is not raises at once.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ VIEWS = [
 
 @pytest.fixture(autouse=True)
 def often() -> Iterator[None]:
-    """Threads change as often as they can."""
+    """Makes Python switch threads as often as possible."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     yield
@@ -72,7 +72,7 @@ def test_threads_that_share_an_engine_render_what_each_asks_for(blobs, producer)
 
 @pytest.mark.backend("cpp")
 def test_captured_frames_answer_while_another_thread_renders(blobs):
-    """Answers come in threads of their own; no lock that a frame holds keeps them from it."""
+    """Answers come from other threads; no lock that a frame holds blocks them."""
     with gv.Engine(Late(blobs), **POOLS) as engine:
         engine.trees["scene"].producer.on_host = True
         frames = Frames(engine, VIEWS[0], GRAY, 64)
@@ -190,7 +190,7 @@ def test_trees_are_still_copied_and_pickled(blobs):
 
 
 def test_what_threads_may_do_with_an_object_is_told_where_it_is_described():
-    """And in the table of docs/robustness.md, a row an object."""
+    """In the class's docstring and in the table of docs/robustness.md, one row per object."""
     table = (ROOT / "docs" / "robustness.md").read_text(encoding="utf-8").split("## Processes")[0]
     for kind in (gv.Engine, gv.N3Tree, gv.Store, gv.TreeTracer, gv.Camera, gv.Volume, gv.Producer,
                  gv.Progressive, gv.Video):  # fmt: skip

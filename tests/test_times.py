@@ -24,7 +24,7 @@ TIMES = 3
 
 @pytest.fixture(scope="module")
 def data() -> np.ndarray:
-    """(t, z, y, x) values, another range at each time."""
+    """(t, z, y, x) values with another range at each time."""
     return np.stack([noise((20, 37, 150, 1), seed=n)[..., 0] // (TIMES - n) for n in range(TIMES)])
 
 
@@ -311,7 +311,7 @@ def test_info_of_channels_and_times_together(tmp_path):
 
 @pytest.mark.parametrize("kind", ["npy", "zarr"])
 def test_a_film_over_time(tmp_path, kind):
-    """A picture of each time point, from where an orbit starts; more pictures are spread evenly."""
+    """One picture per time point, from the start of an orbit; more pictures are spread evenly."""
     data = np.zeros((4, 6, 8, 10), np.uint8)
     for moment, values in enumerate(data):
         values[:, :, 2 * moment : 2 * moment + 2] = 200
@@ -349,7 +349,7 @@ def test_a_film_over_time(tmp_path, kind):
 
 
 def test_keys_of_a_film_tell_the_time_point(tmp_path):
-    """The nearest to the time of the keys, which runs smoothly from one to the next."""
+    """It is the nearest to the keys' time, which is interpolated smoothly."""
     data = np.zeros((4, 6, 8, 10), np.uint8)
     for moment, values in enumerate(data):
         values[:, :, 2 * moment : 2 * moment + 2] = 200

@@ -1,4 +1,4 @@
-"""Traces for Perfetto and ranges of NVTX, of the stages' names."""
+"""Traces for Perfetto and NVTX ranges, which have the stages' names."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_bad_paths_are_named(tmp_path, path, message):
 
 @pytest.mark.backend("cpp")
 def test_a_flight_is_traced(scan_store, tmp_path):
-    """Every stage of the frames' figures is there as often as frames have it, and takes as long."""
+    """Every stage occurs as often, and takes as long, as the frames' statistics say."""
     run = gvtorch(
         *("fly", scan_store, "-o", tmp_path / "f", "--frames", "3", "--size", "40x32"),
         *("--trace", tmp_path / "t.json", "--stats", tmp_path / "s.jsonl"),
@@ -107,7 +107,7 @@ def test_pictures_are_the_same_while_traced(blobs, tmp_path):
 
 
 def test_ranges_of_nvtx_have_the_stages_names(blobs, monkeypatch):
-    """Under NVIDIA's tools; here with a library that only writes down what it is told."""
+    """As under NVIDIA's tools, but with a library that only records its calls."""
     told: list[str] = []
 
     @contextmanager

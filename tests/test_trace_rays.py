@@ -1,4 +1,4 @@
-"""`trace_rays`: the compiled backends equal the torch twin, bit by bit in integers."""
+"""`trace_rays`: the compiled backends equal the torch twin; integers exactly."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def test_logarithm_and_power_are_accurate():
 
 @pytest.mark.backend("reference")
 def test_logarithm_power_and_light_taken_are_accurate_in_float64():
-    """Beside torch's, which are right to about an ulp, 2.2e-16."""
+    """Against torch's, which are right to about an ulp, 2.2e-16."""
     wide = torch.float64
     x = torch.cat(
         (torch.logspace(-300, 300, 20001, dtype=wide), torch.linspace(0.5, 2, 20001).to(wide))
@@ -330,8 +330,8 @@ def test_trace_checks_what_it_is_given(blobs):
 def test_transparent_ranges_ask_for_nothing_and_change_no_bit(
     blobs, share, seed, low, lod, by_level
 ):
-    """What a node's range shows to be transparent is not requested; the picture of a tree whose
-    ranges are unknown is the same in every bit, and it asks for more."""
+    """Nodes whose range is transparent are not requested; a tree with unknown ranges gives the same
+    picture in every bit, and requests more."""
     shader = gv.TransferFunction.from_points([(low, 0), (low + 0.1, 0.3)], [(0, 1, 0, 0)])
     known = forget(gv.N3Tree.from_volume(blobs, 4), share, seed)
     unknown = on(known, "cpu")
@@ -348,7 +348,7 @@ def test_transparent_ranges_ask_for_nothing_and_change_no_bit(
 
 
 def run_by_level(tree, rays, shader, lod, by_level):
-    """The hits and request words of the twin and of the kernel, which must be equal."""
+    """Returns hits and request words; asserts that the twin's and the kernel's are equal."""
     found = []
     for backend in ("reference", "cpp"):
         copy = on(tree, "cpu")
@@ -383,7 +383,7 @@ def test_level_by_level_asks_for_a_brick_before_its_children(blobs, backend):
 
 
 def test_trees_of_smaller_branching_share_wider_tiles(blobs, compiled):
-    """A pool as wide as N=3 holds an N=2 tree: same picture, same marks."""
+    """A pool for N=3 holds an N=2 tree: same picture, same marks."""
     narrow = gv.N3Tree.from_volume(blobs, 4)
     nodes = gv.NodePool(narrow.nodes.capacity, narrow.bricks.channels, branching=3)
     wide = gv.N3Tree(

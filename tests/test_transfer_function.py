@@ -30,7 +30,7 @@ def table_of(function, spacing=1.0, step=1.0, levels=1, dtype=torch.float32):
 
 
 def look_up(function: gv.TransferFunction, value: np.ndarray) -> np.ndarray:
-    """What the kernel does with the table, in float64."""
+    """Looks values up in the table as the kernel does, in float64."""
     table = table_of(function, dtype=torch.float64)
     rows = table.table_lm4[0].numpy()
     low, high = table.domain_2.tolist()
@@ -141,7 +141,7 @@ def test_presets_stretch_over_the_data(name):
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1."""
+    """Returns sRGB of linear values (IEC 61966-2-1)."""
     root = 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
     return np.where(linear <= 0.0031308, 12.92 * linear, root)
 
@@ -266,8 +266,8 @@ EVALUATED = json.loads(PARAVIEW.with_name("paraview_values.json").read_text("utf
 
 @pytest.mark.parametrize("name", EVALUATED)
 def test_presets_that_paraview_wrote_are_what_it_evaluates(name):
-    """ParaView 5.11 exported the presets, and its own functions gave value, red, green, blue and
-    opacity at 40 places of each, which are no corners.
+    """ParaView 5.11 exported the presets, and evaluated red, green, blue and opacity at 40 values
+    of each, none of which is a point of the function.
     """
     values, *color, alpha = np.array(EVALUATED[name]).T
     found = gv.TransferFunction.from_file(PARAVIEW, name)(values)
@@ -287,14 +287,14 @@ def test_categories_among_presets_of_paraview_are_told(tmp_path):
 
 
 def test_a_space_that_paraview_does_not_know_but_ships_is_straight(tmp_path):
-    """Its "Blue - Green - Orange" says CIELAB, which ParaView takes as RGB."""
+    """Its "Blue - Green - Orange" says CIELAB, which ParaView interprets as RGB."""
     function = paraview(tmp_path, ColorSpace="CIELAB", RGBPoints=COOL_WARM)
     found = srgb(function(np.array([2.5]))[:, :3])
     np.testing.assert_allclose(found, [[0.34975, 0.2275, 0.602]], atol=0.004)
 
 
 def test_a_narrow_curve_stays_in_its_place(tmp_path):
-    """It has more parts than the grid of points has cells there."""
+    """The curve has more parts than the table has cells there."""
     vtk = pytest.importorskip("vtkmodules.vtkCommonDataModel")
     points = [0, 0.1, 0.5, 0, 100, 0.7, 0.3, 0.1, 104, 0.3, 0.5, 0, 3000, 0.5, 0.5, 0]
     expected = vtk.vtkPiecewiseFunction()
@@ -323,7 +323,7 @@ def mrml(name: str, **texts: str) -> str:
 
 
 def test_presets_of_slicer(tmp_path):
-    """As .vp, as .vp.json, and by name out of many."""
+    """As .vp, as .vp.json, and by name from a file of many."""
     (tmp_path / "a.vp").write_text("\n".join(LINES) + "\n")
     both = mrml("CT-One") + mrml("CT-Two", shade="1", scalarOpacity="4 0 0 1 1")
     (tmp_path / "presets.xml").write_text(f"<MRML>{both}</MRML>")
@@ -355,7 +355,7 @@ def test_presets_of_slicer(tmp_path):
 
 @pytest.mark.parametrize("name", ["hot", "viridis", "galaxy", "ct-vessels"])
 def test_what_is_saved_for_paraview_comes_back(tmp_path, name):
-    """Opacities as they are, colours to what an eye can't tell."""
+    """Opacities exactly, colours up to invisible differences."""
     function = gv.TransferFunction.preset(name, -100.0, 900.0)
     (tmp_path / "a.json").write_text(function.to_paraview(name))
     back = gv.TransferFunction.from_file(tmp_path / "a.json", name)
@@ -499,7 +499,7 @@ def test_missing_file_and_preset():
 
 
 def test_points_a_rounding_apart_are_drawn_or_told_in_a_line():
-    """An opacity's value and a colour's may differ in their last bit, and fall together."""
+    """The values of an opacity and of a colour point may differ in their last bit, or be equal."""
     for value in (1.0, 1e6, 3.0000000000000004):
         near = float(np.nextafter(value, 0))
         transfer = gv.TransferFunction(

@@ -23,7 +23,7 @@ def random_volume(extent, dtype=torch.float32, seed=0, channels=1):
 
 
 def coarse_by_hand(data: np.ndarray, n: int) -> np.ndarray:
-    """One level of the pyramid, voxel by voxel: the mean of the voxels below, the last one
+    """Returns one level of the pyramid, voxel by voxel: means of the voxels below, the last one
     repeated."""
     shape = [-(-size // n) for size in data.shape]
     out = np.zeros(shape)
@@ -38,7 +38,7 @@ def coarse_by_hand(data: np.ndarray, n: int) -> np.ndarray:
 
 @pytest.mark.parametrize("how", ["mean", "majority"])
 def test_each_level_is_made_once(how, monkeypatch):
-    """Of the level below: values by the volume's filter, and the ends of ranges."""
+    """From the level below: values by the volume's filter, and the ends of ranges."""
     made: dict[str, list[tuple[int, ...]]] = {}
     for name in ("coarser", "pool_min", "pool_max"):
         pool = getattr(pyramid, name)
@@ -75,7 +75,7 @@ def test_integer_levels_are_rounded_once():
 
 
 def node_at(tree: gv.N3Tree, depth: int, xyz: tuple[int, int, int]) -> int | None:
-    """Index of a node by its place, or None where the tree ends above it."""
+    """Returns the index of a node by its loc; None where the tree ends above it."""
     node = tree.root
     n, dim = tree.branching, tree.nodes.nodes_per_tile
     for level in range(1, depth + 1):
@@ -143,8 +143,8 @@ def test_uniform_regions_take_no_brick():
 
 
 def test_threshold_never_hides_a_thin_bright_detail():
-    """EMPTY is decided by the largest finest voxel, not by the coarse mean, which a thin line
-    hardly moves."""
+    """EMPTY depends on the largest finest voxel, not on the coarse mean, which a thin line hardly
+    changes."""
     data = torch.zeros((32, 32, 32), dtype=torch.uint8)
     data[:, 17, 17] = 200
     tree = gv.N3Tree.from_volume(gv.Volume(data), 4, threshold=100)

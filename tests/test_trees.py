@@ -1,4 +1,4 @@
-"""Several trees in one picture: beside a dense marcher in NumPy, which knows no trees."""
+"""Several trees in one picture, against a dense marcher in NumPy, which has no trees."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COLD = gv.TransferFunction([(0, 0), (0.2, 0), (1, 0.4)], [(0, 0, 0.1, 0.4), (1, 
 
 
 def blob(extent: tuple[int, int, int], spacing, origin, at, width: float) -> gv.Volume:
-    """A smooth ball: (z, y, x) values of a Gaussian at a place of the world."""
+    """Returns a smooth ball: (z, y, x) values of a Gaussian at a world position."""
     axes = [o + s * np.arange(n) for n, s, o in zip(extent, spacing, origin, strict=True)]
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
     square = (x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2
@@ -24,7 +24,7 @@ def blob(extent: tuple[int, int, int], spacing, origin, at, width: float) -> gv.
 
 @pytest.fixture(scope="module")
 def volumes() -> dict[str, gv.Volume]:
-    """Two volumes of another spacing and place each, which overlap in part."""
+    """Two volumes with different spacing and position, which overlap partly."""
     return {
         "ct": blob((24, 20, 28), (1.0, 1.2, 0.9), (0.0, 0.0, 0.0), (12, 11, 12), 7.0),
         "pet": blob((9, 8, 10), (2.3, 2.1, 2.0), (7.0, 5.0, -3.0), (16, 12, 8), 6.0),
@@ -32,7 +32,7 @@ def volumes() -> dict[str, gv.Volume]:
 
 
 def about(middle, turn: np.ndarray) -> np.ndarray:
-    """(4, 4) a turn about a place."""
+    """Returns (4, 4): a rotation about a point."""
     made = np.eye(4)
     made[:3, :3], made[:3, 3] = turn, middle - turn @ middle
     return made
@@ -45,8 +45,8 @@ def view(size: int = 24) -> gv.Camera:
 def value_at(
     volume: gv.Volume, place: np.ndarray, pose: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Trilinear values (k,) at world places (k, 3), the outermost voxels repeated to the box's
-    faces, and whether these lie in the box, which stands in the world by a pose (4, 4).
+    """Returns trilinear values (k,) at world positions (k, 3), the outermost voxels repeated to the
+    box's faces, and whether they lie in the box, which has a pose (4, 4).
     """
     data = volume.data[..., 0].double().numpy()
     own = (place - pose[:3, 3]) @ pose[:3, :3]
@@ -87,7 +87,7 @@ def dense(
     return color, 1 - clear
 
 
-#: Where the second volume stands: its axes along the world's, and turned about its middle.
+#: Poses of the second volume: axes along the world's, and turned about its middle.
 POSES = {
     "straight": np.eye(4),
     "turned": about((16.0, 12.0, 8.0), np.array([[2, -2, 1], [1, 2, 2], [-2, -1, 2]]) / 3),
@@ -144,7 +144,7 @@ def test_the_order_of_trees_does_not_matter(volumes):
 
 @pytest.mark.backend("cpp")
 def test_a_medium_twice_in_the_same_place_has_twice_the_extinction(volumes):
-    """The ends of intervals fall together but for rounding; the slivers between them go nowhere."""
+    """The ends of intervals coincide up to rounding; the slivers between must not matter."""
     volume = volumes["ct"]
     trees = {name: gv.N3Tree.from_volume(volume, 8) for name in ("a", "b")}
     for lod in ("auto", "finest"):
@@ -159,7 +159,7 @@ def test_a_medium_twice_in_the_same_place_has_twice_the_extinction(volumes):
 
 @pytest.mark.backend("cpp")
 def test_depth_is_where_both_together_pass_it(volumes):
-    """In finer and finer steps the depth comes to that of the dense marcher's light."""
+    """As steps get finer, the depth converges to that of the dense marcher's light."""
     both = {"ct": WARM, "pet": COLD}
     fine = pictures(volumes, both, step=0.02, lod="finest", stop_alpha=1)
     usual = pictures(volumes, both)
@@ -182,7 +182,7 @@ def test_depth_is_where_both_together_pass_it(volumes):
 
 @pytest.mark.backend("cpp")
 def test_a_surface_among_media_ends_the_ray_for_all(volumes):
-    """The surface hides what is behind it, and what is in front dims it."""
+    """The surface hides what is behind it, and is dimmed by what is in front of it."""
     trees = {name: gv.N3Tree.from_volume(volumes[name], 8) for name in volumes}
     surface = gv.Isosurface(0.6)
     found = gv.render(trees, view(), {"ct": surface, "pet": COLD}, lod="finest", step=0.1)
@@ -252,7 +252,7 @@ def test_streamed_trees_that_overlap_equal_resident_ones(volumes, brick_pool, po
 
 @pytest.mark.backend("cpp")
 def test_rays_that_have_ended_ask_for_nothing_behind(volumes):
-    """An opaque ball around the middle: what lies behind it in the other tree is not loaded."""
+    """An opaque ball in the middle: what lies behind it in the other tree is not loaded."""
     solid = gv.TransferFunction([(0.2, 0), (0.25, 1)])
     faint = gv.TransferFunction([(0, 0.01)])
     big = gv.Volume(np.random.default_rng(1).random((64, 64, 64), np.float32), (0.4,) * 3)
@@ -292,7 +292,7 @@ def test_mistakes_are_told_in_a_line(volumes, make, told):
 
 @pytest.mark.backend("cpp")
 def test_what_some_blocks_of_rays_lack_is_nothing(volumes, monkeypatch):
-    """Features of rays that meet nothing are 0, in a block of their own, too."""
+    """Features of rays that meet nothing are 0, also if a block has only such rays."""
     monkeypatch.setattr(pixels, "_WATCHED", 32)
     trees = {
         name: gv.N3Tree.from_volume(
@@ -321,7 +321,7 @@ def test_pre_integrated_media_overlap_as_others_do(volumes):
 
 
 def test_labels_are_told_among_media(volumes):
-    """A segmentation of the smooth ball in another volume: its labels, as without the other."""
+    """A segmentation in another volume's smooth ball has the labels that it has alone."""
     values = volumes["ct"].data[..., 0]
     numbers = (values > 0.3).long() * 700_000_000_001 + (values > 0.7).long()
     labels = gv.Volume(numbers, volumes["ct"].spacing, volumes["ct"].origin, labels=True)
@@ -344,7 +344,7 @@ def test_labels_are_told_among_media(volumes):
 
 @pytest.mark.backend("cpp")
 def test_of_surfaces_the_nearest_is_seen(volumes):
-    """Also where one takes its colour of a transfer function without any opacity."""
+    """Also where one has colours of a transfer function without opacity."""
     trees = {name: gv.N3Tree.from_volume(volumes[name], 8) for name in volumes}
     hue = gv.TransferFunction([(0, 0)], [(0, 1, 0, 0), (1, 0, 0, 1)])
     shaders = {"ct": gv.Isosurface(0.5, hue, color_channel="value"), "pet": gv.Isosurface(0.4)}

@@ -1,4 +1,4 @@
-"""The tutorial's Python runs, page by page, as it stands there."""
+"""The tutorial's Python code runs, page by page, as it is printed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 @pytest.mark.parametrize("page", [pytest.param(page, id=page.stem) for page in PAGES])
 @pytest.mark.filterwarnings("default", "error::UserWarning")
 def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
-    """Within this process: each would import torch."""
+    """Runs within this process, because a new one would have to import torch."""
     blocks = BLOCK.findall(page.read_text())
     assert len(blocks) >= 2
     script = tmp_path / "page.py"

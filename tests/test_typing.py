@@ -1,5 +1,5 @@
-"""Type checkers see gvtorch's types from another folder, in a strict project, where it is installed
-in place: its editable install is a path, not a finder that only Python can ask.
+"""Type checkers see gvtorch's types from another folder, in a strict project, with an editable
+install, because that is a path, not an import hook that only Python can use.
 """
 
 from __future__ import annotations
@@ -43,6 +43,6 @@ def test_a_strict_project_sees_the_types(tmp_path):
 
 
 def test_an_editable_install_is_a_path():
-    """setuptools writes a path where the folder of packages is named, and a finder elsewhere."""
+    """setuptools writes a path if the folder of packages is specified, else an import hook."""
     tool = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     assert tool["package-dir"] == {"": "."} and (ROOT / "gvtorch" / "py.typed").is_file()

@@ -1,5 +1,5 @@
-"""A user's C++ goes in packets on the CPU: each bit is that of its rays one by one, for all
-instruction sets.
+"""User-defined C++ shaders run in packets on the CPU: each bit equals that of rays one by one, for
+all instruction sets.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SHADERS = {
 
 
 def shader(name: str, folder: Path | None = None) -> gv.CompiledShader:
-    """In packets; with a folder, a header in it has the rays go one by one."""
+    """Returns a shader that runs in packets; with a folder, from a header there, ray by ray."""
     struct, options = SHADERS[name]
     header = ROOT / "examples" / "ink.h" if struct == "Ink" else HEADER
     if folder is not None:
@@ -51,7 +51,7 @@ def shader(name: str, folder: Path | None = None) -> gv.CompiledShader:
 
 
 def given(name: str, folder: Path | None = None) -> list[Tensor]:
-    """All that its traces write; where N is 3 trees are deep, and with one brick no packet goes."""
+    """Returns all that its traces write; N = 3 makes deep trees, and one brick no packets."""
     own, found = shader(name, folder), []
     for branching in (2, 4, 3):
         found += shaded(own, "cpp", branching)
@@ -63,11 +63,11 @@ def given(name: str, folder: Path | None = None) -> list[Tensor]:
     return [*found, *hits.values(), *marks.values()]
 
 
-OPTIMISED = ["ink"]  # as users have it here: 11 s to compile
+OPTIMISED = ["ink"]  # compiled as users have it: 11 s
 
 
 def all_given() -> dict[str, list[Tensor]]:
-    """Of the shaders that the environment names, compiled quickly but for some."""
+    """Returns that of the shaders named in the environment; only some are compiled optimised."""
     found = {}
     for name in os.environ["SHADERS"].split(";"):
         with pytest.MonkeyPatch.context() as patch:
@@ -95,7 +95,7 @@ def test_every_bit_is_that_of_rays_one_by_one(tmp_path, monkeypatch, quick, set_
 
 @pytest.mark.backend("cpp")
 def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch, quick):
-    """The library that users have holds the packet, the one of this file's other header does not;
+    """The usual library contains the packet code, that of this file's ray-by-ray header does not;
     float64 is the same in both.
     """
     own = shader("ink")
@@ -112,7 +112,7 @@ def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch, quick)
 
 @pytest.mark.backend("cpp")
 def test_a_folder_serves_several_instruction_sets(tmp_path, monkeypatch):
-    """Each has a library of its own, of one op."""
+    """Each has its own library, of one op."""
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path))
     monkeypatch.setenv("CXX", only_included(tmp_path))
     source = user.ShaderSource.read(write(tmp_path, ADD), "Own")

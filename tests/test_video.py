@@ -1,4 +1,4 @@
-"""Films: what is written comes back."""
+"""Films: what is written is read back."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WIDTH, HEIGHT = 48, 32
 
 
 def picture(number: int, height: int = HEIGHT) -> gv.Picture:
-    """A gradient, and a bright square that moves."""
+    """Returns a gradient with a bright square that moves."""
     y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, WIDTH), indexing="ij")
     color = torch.stack((x, y, 0.3 * torch.ones_like(x)), -1)
     color[4:12, 6 * number : 6 * number + 8] = 0.95

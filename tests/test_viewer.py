@@ -1,4 +1,4 @@
-"""Sessions and their pages, without a server and a browser."""
+"""Sessions and their pages, without a server or a browser."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ pytestmark = pytest.mark.backend("cpp")
 
 
 def test_a_page_gets_the_picture_that_python_makes(session):
-    """Coarse at once, then all samples: what `gv.Progressive` makes of a resident tree, but for
-    what JPEG takes."""
+    """Coarse at once, then all samples: as `gv.Progressive` renders a resident tree, except for
+    JPEG's losses."""
     page = Page(session, 96, 64)
     head, seen = page.final()
     first, data = page.pictures[0]
@@ -62,7 +62,7 @@ def test_pictures_stop_when_nothing_changes_and_go_on_when_something_does(sessio
 
 
 def test_at_most_one_picture_is_on_its_way(session):
-    """A page that does not answer gets no second picture, and holds up nobody else."""
+    """A page that does not acknowledge gets no second picture, and does not delay others."""
     slow, page = Page(session, acks=False), Page(session)
     slow.until(lambda: slow.pictures)
     camera = page.camera
@@ -123,7 +123,7 @@ def test_a_change_is_seen_by_all_and_a_wrong_one_by_nobody(session):
 
 
 def test_a_state_that_can_not_be_drawn_gives_way_to_the_last_that_could(session):
-    """It has the right form, but the tree has no such channel."""
+    """It is well-formed, but the tree has no such channel."""
     page = Page(session)
     _, before = page.final()
     page.send(
@@ -157,7 +157,7 @@ def test_what_is_hit_histograms_presets_and_stills(session):
     page.until(lambda: len(page.of("picked")) == 2)
     hit, missed = page.of("picked")
     assert missed["place"] is None and hit["purpose"] == "focus"
-    if hit["place"] is None:  # the ball is beside the middle
+    if hit["place"] is None:  # the ball is not in the middle
         rows, columns = np.nonzero(page.final()[1].max(-1) > 120)
         page.send("pick", x=float(columns.mean() / 64), y=float(rows.mean() / 48))
         hit = page.next("picked", 2)
@@ -205,7 +205,7 @@ def test_figures_and_cost_pictures(session):
 
 
 class Broken(gv.Producer):
-    """A store that dies: what is not made yet fails from then on."""
+    """A store that goes away: from then on, bricks that are not yet made fail."""
 
     alive = True
 
@@ -242,7 +242,7 @@ def test_a_scene_that_dies_is_told_and_the_picture_goes_on():
 
 @dataclass
 class Settings:
-    """What a scene is made of."""
+    """The settings of a scene."""
 
     radius: float = field(default=10.0, metadata={"range": (1, 20)})
     hollow: bool = False
@@ -328,7 +328,7 @@ def test_anything_can_be_looked_at(kind, scan_store, tmp_path):
     finally:
         session.close()
     if kind == "engine":
-        what.frame(gv.Camera.orbit(width=8, height=8), FUNCTION)  # it stays its owner's
+        what.frame(gv.Camera.orbit(width=8, height=8), FUNCTION)  # its owner may go on using it
         what.close()
     with pytest.raises(ValueError, match="view: takes an Engine"):
         new_session(object())
@@ -365,7 +365,7 @@ def test_a_thousand_moves_leave_nothing_behind(session):
 
 
 def test_a_surface_is_handed_over_as_a_file(session, monkeypatch, tmp_path):
-    """That of `gvtorch surface`, told of while it is made; what can't be is one line."""
+    """It equals that of `gvtorch surface`; progress is reported, and errors are one line."""
     page = Page(session)
     page.final()
     monkeypatch.setattr(export, "_EVERY", 0.0)

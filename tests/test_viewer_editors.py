@@ -1,4 +1,4 @@
-"""What the page's editors ask of a session: slices, time, node boxes, labels, files of presets."""
+"""Requests of the page's editors: slices, time, node boxes, labels, files of presets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TIMES = 3
 
 
 def sliced(page: Page, **slices) -> tuple[dict, np.ndarray]:
-    """Changes the slices, and waits for the picture at rest with planes through that place."""
+    """Changes the slices, and waits for the final picture with planes through that position."""
     page.send("change", state={"slices": slices})
 
     def come() -> bool:
@@ -45,7 +45,7 @@ def cut_out(image: np.ndarray, place: list[int]) -> np.ndarray:
 
 
 def test_slices_are_those_of_slice_picture_beside_the_picture(session):
-    """Every plane to the last bit, before JPEG; the picture is that of its part alone."""
+    """Every plane to the last bit, before JPEG; the 3D picture equals one of its part's size."""
     page, volume = Page(session, 404, 304), bright_ball()
     page.final()
     head, seen = sliced(page, at=[25.2, 19.0, 14.9])
@@ -75,7 +75,7 @@ def test_slices_are_those_of_slice_picture_beside_the_picture(session):
 
 
 def test_edges_of_a_plane_are_where_the_page_is_told(session):
-    """The brightest voxel of the ball lies where the told edges put it."""
+    """The brightest voxel of the ball is where the edges sent to the page put it."""
     page = Page(session, 804, 604)
     page.final()
     middle = [0.65 * 40 - 0.5, 0.5 * 40 - 0.5, 0.4 * 40 - 0.5]
@@ -216,7 +216,7 @@ def test_what_has_no_voxels_has_no_slices(session):
 
 
 def test_render_makes_the_picture_of_a_state_with_slices_and_cost(tmp_path):
-    """`gvtorch render --state` and the page's own still of the same state, to the last bit."""
+    """`gvtorch render --state` equals the page's still of the same state, to the last bit."""
     volume = bright_ball()
     np.save(tmp_path / "ball.npy", volume.data[..., 0].numpy())
     common = {
@@ -322,7 +322,7 @@ def test_a_time_point_that_can_not_be_read_is_told_and_the_one_before_stays(beat
 
         session.scene.reopen = reopen
         page.send("change", state={"time": 1})
-        _, still = page.moved(page.camera)  # pictures go on meanwhile
+        _, still = page.moved(page.camera)  # pictures continue meanwhile
         assert np.array_equal(still, before)
         go.set()
         assert page.next("error", 0)["text"] == "time 1: the disk is gone"
@@ -516,7 +516,7 @@ def test_named_presets_show_what_they_are_for(name):
 
 @pytest.mark.parametrize("kind", ["producer", "stored", "store"])
 def test_producers_that_hold_voxels_have_slices(kind, scan_store, tmp_path):
-    """Of a store, `gvtorch render --state` makes the page's own still."""
+    """For a store, `gvtorch render --state` also equals the page's still."""
     volume = bright_ball()
     what = {
         "producer": lambda: gv.VolumeProducer(volume),

@@ -24,7 +24,7 @@ def differs(one: np.ndarray, other: np.ndarray) -> int:
 
 
 def middle(tab: Tab, axis: str, x: float = 0.5, y: float = 0.5) -> tuple[float, float]:
-    """A place in the picture of a plane, in the page."""
+    """Returns a point of the picture of a plane, in page coordinates."""
     left, top, width, height = tab.app(f"app.slices.layout.{axis}.image")
     box, ratio = tab.page.locator(".gv-stage").bounding_box(), tab.app("app.view.ratio")
     return (box["x"] + (left + x * width) / ratio, box["y"] + (top + y * height) / ratio)
@@ -62,13 +62,13 @@ def test_slices_are_moved_by_click_drag_and_wheel(tab, viewer):
     tab.until(lambda: abs(viewer.state.slices.at[1] - 31.5) < 0.6)
     assert abs(viewer.state.slices.at[2] - 23.5) < 0.6
     camera, steps = tab.app("app.camera.eye"), tab.app("app.history.done.length")
-    assert 4 <= steps <= 7  # on a busy machine the wheel rests in between
-    for _ in range(steps - 1):  # all but that there are slices
+    assert 4 <= steps <= 7  # on a busy machine the wheel pauses in between
+    for _ in range(steps - 1):  # all except that slices are shown
         tab.page.get_by_label("Undo").click()
     tab.until("app.state.slices.at.every((one) => one === 19.5)")
     tab.page.get_by_label("Redo").click()
     tab.until(lambda: abs(viewer.state.slices.at[0] - 25.5) < 0.5)
-    # The picture in its part is turned as before; the planes stay.
+    # The picture in its part of the canvas can be turned as before; the planes stay.
     area = tab.app("app.view.area")
     box = tab.page.locator(".gv-stage").bounding_box()
     start = (box["x"] + area["left"] + area["width"] / 2, box["y"] + area["top"] + 60)
@@ -93,7 +93,7 @@ def test_a_double_click_beside_planes_looks_at_what_is_hit(tab):
 
 
 def handle(tab: Tab, kind: str) -> tuple[float, float]:
-    """Where a handle is in the page."""
+    """Returns the position of a handle in the page."""
     x, y, ratio = tab.app(
         f"[...app.view.handles.find((h) => h.kind === '{kind}').at, app.view.ratio]"
     )
@@ -216,7 +216,7 @@ def test_a_clock_has_a_slider(chromium):
 
 
 def strokes(tab: Tab) -> int:
-    """How many pixels are drawn over the picture."""
+    """Returns how many pixels are drawn over the picture."""
     return tab.page.evaluate(
         """() => { const c = document.querySelector(".gv-over");
         const all = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
@@ -260,7 +260,7 @@ def test_costs_lie_over_the_picture(tab, viewer):
 
 
 def choose(tab: Tab, path) -> None:
-    """Loads a file of a transfer function."""
+    """Chooses a file of a transfer function in the page."""
     with tab.page.expect_file_chooser() as chooser:
         tab.page.get_by_label("Load a transfer function").click()
     chooser.value.set_files(path)
@@ -316,7 +316,7 @@ def test_presets_of_files_and_of_ones_own(tab, viewer, tmp_path):
 
 
 def test_every_edit_is_undone_and_done_again(tab, viewer, tmp_path):
-    """Of the state, the camera's fields, memory, and a state that was loaded."""
+    """Edits of the state, the camera's fields, memory, and a loaded state."""
     first = viewer.session.ask(viewer.state.to_json)
     for section in ("Sampling", "Camera", "Memory"):
         tab.open(section)
@@ -354,7 +354,7 @@ def test_every_edit_is_undone_and_done_again(tab, viewer, tmp_path):
 
 
 def test_views_become_the_keys_of_a_film(tab, viewer, tmp_path):
-    """What `gvtorch fly --keys` reads; keys are shown, moved, taken away, undone and loaded."""
+    """`gvtorch fly --keys` reads them; keys are shown, moved, removed, undone and loaded."""
     tab.open("Film")
     tab.page.get_by_text("add this view").click()
     first = tab.app("app.camera")
@@ -376,7 +376,7 @@ def test_views_become_the_keys_of_a_film(tab, viewer, tmp_path):
         assert np.allclose(flight.at(time).camera.eye, camera["eye"])
     tab.page.get_by_title("Show this key").first.click()
     tab.until(lambda: tab.app("app.camera.eye") == first["eye"])
-    times.nth(1).fill("0")  # the first has it
+    times.nth(1).fill("0")  # the first key has it
     times.nth(1).press("Enter")
     tab.until("!!document.querySelector('.gv-note.gv-bad')")
     assert times.nth(1).input_value() == "3.5"
@@ -393,7 +393,7 @@ def test_views_become_the_keys_of_a_film(tab, viewer, tmp_path):
 
 
 def test_every_shader_becomes_every_other(tab):
-    """What they have in common is kept; what only shares a name is not."""
+    """Common fields are kept; fields that only share a name are not."""
     row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
     names = row.locator("option").all_inner_texts()
     assert len(names) > 6 and tab.app("app.state.shader.kind") == "TransferFunction"
@@ -417,8 +417,8 @@ TOUCH = """() => {
 
 
 def test_every_control_of_every_shader_is_touched(tab, viewer):
-    """Each says again what it shows: no code of the page breaks; and a number that is typed where
-    there is no slider is taken.
+    """Each control sends the value that it shows: no code of the page fails; and a number that is
+    typed where there is no slider is accepted.
     """
     row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
     for name in row.locator("option").all_inner_texts():
@@ -435,8 +435,8 @@ def test_every_control_of_every_shader_is_touched(tab, viewer):
     tab.until(lambda: viewer.session.ask(lambda: viewer.state.shader).value == 123.5)
 
 
-# Chooses every shader, then of each list what it offers (of others than the shader's: the last),
-# each from there anew; returns what was refused.
+# Chooses every shader, then the options of each list (of other lists than the shader's: the last),
+# each starting from that shader; returns what was refused.
 CHOOSE = """async () => {
   const app = document.querySelector(".gv").app, refused = [];
   const pause = (ms) => new Promise((done) => setTimeout(done, ms));
@@ -478,7 +478,7 @@ CHOOSE = """async () => {
 
 
 def test_nothing_is_offered_that_is_refused(chromium):
-    """Of a scene with a second channel, of which surfaces may have their colours."""
+    """In a scene with a second channel, by which surfaces may be coloured."""
     data = np.random.default_rng(1).random((12, 12, 12, 4), np.float32)
     channels = {"value": gv.Volume(data[..., 0]), "stored": gv.Volume(data)}
     state = gv.ViewState(
@@ -494,8 +494,8 @@ def test_nothing_is_offered_that_is_refused(chromium):
 
 
 def test_another_shader_leaves_out_what_it_does_not_take(tab, viewer):
-    """Lighting goes, in one line, and comes back when the choice is undone. A surface in a scene of
-    one channel can have no other's colours.
+    """Lighting is removed, reported in one line, and returns when the choice is undone. A surface
+    in a scene of one channel can't be coloured by another.
     """
     row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
     row.select_option(label="Lit")
@@ -520,7 +520,7 @@ def test_another_shader_leaves_out_what_it_does_not_take(tab, viewer):
 
 
 def test_a_surface_is_saved_by_its_buttons(tab, viewer, tmp_path):
-    """Both kinds of files; a level that there is none of is refused in one line."""
+    """Both kinds of files; a level without a surface is refused in one line."""
     row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
     row.select_option(label="Isosurface")
     tab.until("app.state.shader.kind === 'Isosurface'")

@@ -1,6 +1,6 @@
-"""What a page may not send: wrong messages by the thousand, each answered with one line; and scenes
-that die while they are looked at: a store that goes away, a server that stops in the middle of a
-chunk, and code that raises.
+"""Wrong messages of a page by the thousand, each answered with one line; and scenes that fail while
+they are viewed: a store that goes away, a server that stops in the middle of a chunk, and code that
+raises.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from gvtorch.viewer.view import new_session
 
 pytestmark = pytest.mark.backend("cpp")
 COUNT = 100_000 if os.environ.get("GVTORCH_FUZZ") else 20_000  # messages; `make fuzz` sends more
-#: Of each message one that is right.
+#: One valid message of each kind.
 GOOD: dict[str, dict[str, Any]] = {
     "hello": {"width": 640, "height": 480, "rate": 30},
     "move": {"camera": {"eye": [0, 0, 9], "target": [0, 0, 0]}, "moving": True, "sent": 1.5},
@@ -52,7 +52,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "surface": {"value": 0.5, "format": "ply", "level": 0},
     "do": {"what": "fit"},
 }
-#: What each type never is.
+#: Values that each type never has.
 NEVER: dict[Any, tuple[Any, ...]] = {
     int: ("7", 1.5, True, None, [], {}, [3], 10**400, "", 1e300),
     float: ("7", True, [], {}, [0.5], 10**400, "nan"),
@@ -63,7 +63,7 @@ NEVER: dict[Any, tuple[Any, ...]] = {
 
 
 def wrong_value(rng: np.random.Generator, hint: Any) -> Any:
-    """A value that the hint of a message's field does not allow."""
+    """Returns a value that the type hint of a message's field does not allow."""
     parts = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     kinds = {get_origin(one) or one for one in parts}
     if kinds & {Literal}:
@@ -74,7 +74,7 @@ def wrong_value(rng: np.random.Generator, hint: Any) -> Any:
 
 
 def damaged_state(rng: np.random.Generator, state: dict[str, Any]) -> dict[str, Any]:
-    """A state with a wrong number, name or shape somewhere."""
+    """Returns a state with a wrong number, name or shape somewhere."""
     content = json.loads(state["text"])
     place, way = content, []
     while isinstance(place, dict) and place:
@@ -95,7 +95,7 @@ def damaged_state(rng: np.random.Generator, state: dict[str, Any]) -> dict[str, 
 
 
 def wrong_message(rng: np.random.Generator, state: dict[str, Any]) -> str | bytes:
-    """A message that no page sends."""
+    """Returns a message that no page sends."""
     kind = [*GOOD][rng.integers(len(GOOD))]
     fields = dict(GOOD[kind])
     hints = schema.arguments(MESSAGES[kind])
@@ -154,7 +154,7 @@ def test_wrong_messages_are_each_refused_with_a_line_and_the_view_goes_on(sessio
         kinds[type(message).__name__] += 1
         session.receive(rude, message)
         if number % 2000 == 0:
-            session.ask(lambda: None)  # so that not all wait at once
+            session.ask(lambda: None)  # so that not all are queued at once
     session.ask(lambda: None, 600)
     assert told["refused"] == COUNT == len(lines) and min(kinds.values()) > COUNT / 20
     assert all(line and "\n" not in line and len(line) < 4000 for line in lines)
@@ -166,11 +166,11 @@ def test_wrong_messages_are_each_refused_with_a_line_and_the_view_goes_on(sessio
     assert np.abs(after.astype(int) - before).max() <= 2
 
 
-# Scenes that die.
+# Scenes that fail.
 
 
 def goes_on(page: Page, session: Session, angle: float = 0.3) -> None:
-    """Pictures come, also of another camera, and questions are answered."""
+    """Asserts that pictures arrive, also of another camera, and that questions are answered."""
     _, seen = page.moved(turned(page.camera, angle))
     assert seen.max() > 0
     page.send("histogram", in_view=True)
@@ -180,14 +180,14 @@ def goes_on(page: Page, session: Session, angle: float = 0.3) -> None:
 
 @pytest.fixture
 def stored(tmp_path):
-    """A store that is finer than its first picture."""
+    """A store with finer levels than its first picture needs."""
     np.save(tmp_path / "a.npy", noise((96, 96, 96, 1))[..., 0])
     convert(tmp_path / "a.npy", tmp_path / "a.zarr")
     return tmp_path / "a.zarr"
 
 
 def near(page: Page, session: Session) -> dict[str, Any]:
-    """A camera that sees finest voxels."""
+    """Returns a camera that sees finest voxels."""
     box = session.scene.box
     centre = box.mean(0)
     eye = centre + 0.6 * (box[1] - centre)
@@ -213,7 +213,7 @@ def test_a_store_that_is_deleted_is_told_and_the_picture_goes_on(stored):
 
 
 class Stalling(Handler):
-    """Sends half of each chunk, then nothing more, as long as it is told to."""
+    """Sends half of each chunk, then nothing more, while `stalls` is true."""
 
     stalls = False
     over = threading.Event()
@@ -245,10 +245,10 @@ class Stalling(Handler):
 
 @pytest.mark.parametrize("refused", [False, True])
 def test_a_server_that_stops_in_a_chunk_is_told_and_asked_again(stored, monkeypatch, refused):
-    """While a chunk is waited for, or after it was given up for half a minute."""
+    """While a chunk is waited for, or after reading it was suspended for half a minute."""
     monkeypatch.setattr(
         "gvtorch.io.http.REFUSED", 1e6
-    )  # so it would never be asked again by itself
+    )  # so it would never be retried automatically
     monkeypatch.setattr(Stalling, "over", threading.Event())
     server = WebServer(("127.0.0.1", 0), partial(Stalling, directory=str(stored.parent)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -269,7 +269,7 @@ def test_a_server_that_stops_in_a_chunk_is_told_and_asked_again(stored, monkeypa
         assert seen.max() > 0
         goes_on(page, session)
         monkeypatch.setattr("gvtorch.io.http.STALL", 20.0)
-        Stalling.stalls = False  # those that wait for it get nothing more
+        Stalling.stalls = False  # requests that wait for it get nothing more
         page.send("do", what="retry")
         page.send("move", camera=there, moving=False)
         (client,) = session.clients.values()
@@ -285,7 +285,7 @@ def test_a_server_that_stops_in_a_chunk_is_told_and_asked_again(stored, monkeypa
 
 
 class Raising(gv.Producer):
-    """Code with a mistake in it."""
+    """Code with a bug."""
 
     def __init__(self) -> None:
         super().__init__(64)

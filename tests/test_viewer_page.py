@@ -1,4 +1,4 @@
-"""The page in a real browser: what hands do to it, and what it asks of the world."""
+"""The page in a real browser: mouse and keyboard, and the requests that it makes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.backend("browser")
 STAGE = (340.0, 210.0)  # the middle of the picture, in the page
 
 
-#: What anywidget does: hands the module a model and an element.
+#: As anywidget does, passes a model and an element to the module.
 _MODEL = """async (text) => {
   const url = URL.createObjectURL(new Blob([text], { type: "text/javascript" }));
   const takers = [];
@@ -35,7 +35,7 @@ _MODEL = """async (text) => {
 
 
 def test_the_page_asks_for_nothing_outside(tab, viewer):
-    """Each of its modules, its style and one websocket, all of its own server."""
+    """Only its modules, its style and one websocket, all from its own server."""
     hosts = {urlsplit(url).netloc for url in tab.requests}
     assert hosts == {f"127.0.0.1:{viewer.server.port}"}
     asked = {urlsplit(url).path.lstrip("/") for url in tab.requests}
@@ -58,7 +58,7 @@ def test_the_page_asks_for_nothing_outside(tab, viewer):
 
 
 def test_the_canvas_shows_what_render_makes_of_the_saved_state(tab, tmp_path):
-    """A screenshot equals `gvtorch render --state` to what JPEG takes."""
+    """A screenshot equals `gvtorch render --state`, except for JPEG's losses."""
     tab.drag(STAGE, (400, 180))
     tab.page.mouse.wheel(0, -200)
     tab.page.wait_for_timeout(300)
@@ -195,7 +195,7 @@ def test_the_crop_box_is_moved_by_its_handles(tab, viewer):
 
 
 def test_every_shader_and_section_has_controls_that_work(tab, viewer):
-    """Each shader that is offered draws; numbers, flags, colours and choices reach the server."""
+    """Each offered shader draws; numbers, flags, colours and choices reach the server."""
     for section in ("Light and lens", "Sampling", "Camera", "Memory", "Monitor"):
         tab.open(section)
     for name in ("Lit", "Isosurface", "Projection", "Gradient magnitude", "Pre integrated"):
@@ -282,7 +282,7 @@ def test_a_view_that_ends_is_told(chromium):
         tab.final()
         viewer.close()
         tab.until("app.root.classList.contains('gv-lost')")
-        told = tab.page.locator(".gv-note").inner_text()  # a busy machine may not say goodbye
+        told = tab.page.locator(".gv-note").inner_text()  # a busy machine may not report the end
         assert told.startswith(("The view was closed", "The view is gone"))
     finally:
         tab.close()
@@ -290,7 +290,7 @@ def test_a_view_that_ends_is_told(chromium):
 
 
 def test_the_notebook_mounts_the_same_page(chromium):
-    """The module that anywidget loads, with a model that hands messages to a session as the widget
+    """The module that anywidget loads, with a model that passes messages to a session as the widget
     does."""
     session = new_session(bright_ball(), BANDS)
     context = chromium.new_context(viewport={"width": 720, "height": 420})
@@ -329,7 +329,7 @@ def test_the_notebook_mounts_the_same_page(chromium):
 
 
 def test_channels_and_labels_have_controls(chromium):
-    """Colour, window and switch of a channel; a scene of labels shows without a function."""
+    """Colour, window and switch of a channel; a scene of labels is drawn without a function."""
     z, y, x = np.mgrid[0:16, 0:16, 0:16]
     two = gv.Volume(np.stack((x * 16, y * 16), -1).astype(np.uint8))
     shader = gv.Channels([gv.ChannelLook(window=(40.0, 250.0), color="red", name="tubulin"),

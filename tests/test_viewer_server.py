@@ -1,4 +1,4 @@
-"""The server of a view: what it serves, to whom, and the ways to start one."""
+"""The server of a view: what it serves, to whom, and how it is started."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def server(session):
 
 
 def with_socket(server: Server, what, **options):
-    """Runs a coroutine of a page's websocket."""
+    """Runs a coroutine with a page's websocket."""
 
     async def run():
         async with aiohttp.ClientSession() as client:
@@ -50,7 +50,7 @@ def with_socket(server: Server, what, **options):
 def get(server: Server, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
     async def run():
         async with aiohttp.ClientSession() as client:
-            url = URL(f"http://127.0.0.1:{server.port}{path}", encoded=True)  # as it stands
+            url = URL(f"http://127.0.0.1:{server.port}{path}", encoded=True)  # not normalised
             async with client.get(url, headers=headers, allow_redirects=False) as answer:
                 return answer.status, dict(answer.headers), await answer.read()
 
@@ -58,7 +58,7 @@ def get(server: Server, path: str, **headers: str) -> tuple[int, dict[str, str],
 
 
 async def first_pictures(ws):
-    """Says hello, and answers pictures until one is final."""
+    """Says hello, and acknowledges pictures until one is final."""
     await ws.send_json({"type": "hello", "width": 48, "height": 32})
     texts = []
     async for message in ws:
@@ -120,7 +120,7 @@ def test_nothing_but_the_page_is_read(server):
     ],
 )
 def test_strangers_are_refused(server, params, headers):
-    """Without the token, from another site's page, or under a name that is not this machine's."""
+    """Without the token, from another site's page, or under a host name of another machine."""
 
     async def nothing(ws):
         return None
@@ -134,7 +134,7 @@ def test_strangers_are_refused(server, params, headers):
 
 
 def test_friends_are_let_in(server, session):
-    """Through a forwarded port, and under names that were allowed."""
+    """Through a forwarded port, and under host names that were allowed."""
     for host in ("localhost:9999", "127.0.0.1", "[::1]:80", f"LOCALHOST:{server.port}"):
         headers = {"Host": host, "Origin": f"http://{host}"}
         texts, *_ = with_socket(server, first_pictures, headers=headers)
@@ -153,7 +153,7 @@ def test_friends_are_let_in(server, session):
 
 
 def test_a_rude_page_harms_nobody(server, session):
-    """Wrong messages by the thousand, a message too large, and a page that goes in the middle."""
+    """Wrong messages by the thousand, a message too large, and a page that leaves in the middle."""
 
     async def rude(ws):
         rng, refused = np.random.default_rng(3), 0
@@ -279,7 +279,7 @@ def seen_whole(page: Page) -> bool:
 
 
 def test_a_closed_view_lets_go_of_its_pools_at_once():
-    """They may fill a GPU: they do not wait until Python looks for circles."""
+    """They may fill a GPU, so they must not wait for Python's cyclic garbage collector."""
     gc.collect()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""The state of a view: JSON to and from the objects that Python uses, and what a page may send."""
+"""The state of a view: JSON to and from Python's objects, and what a page may send."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_what_json_leaves_out_or_can_not_tell_stays():
 
 
 def test_every_field_of_a_dataclass_is_in_the_state():
-    """The state is made from the dataclasses: who adds an option finds it there, without a list."""
+    """The state is derived from the dataclasses: a new option is in it without a list of names."""
     told = gv.ViewState(shader=HOT, options=OPTIONS).to_json()["options"]
     own = set(vars(gv.RenderOptions())) - {
         "layer",
@@ -120,7 +120,7 @@ def test_wrong_states_are_refused_in_one_line(content, message):
 
 
 def test_an_eye_sees_what_its_camera_sees():
-    """Rays of the camera, of its `Eye`, and back; an orthographic one stands before the box."""
+    """Rays of the camera, of its `Eye`, and back; an orthographic one is in front of the box."""
     box = torch.tensor([(0.0, 0, 0), (2, 3, 4)], dtype=torch.float64)
     for camera in (
         gv.Camera.orbit(40, 25, 2.0, width=20, height=10),
@@ -143,7 +143,7 @@ def test_an_eye_sees_what_its_camera_sees():
 
 
 def test_render_takes_a_saved_state(tmp_path):
-    """`gvtorch render --state` makes what Python makes of the same objects, to the last bit."""
+    """`gvtorch render --state` equals Python's rendering of the same objects, to the last bit."""
     volume = bright_ball()
     np.save(tmp_path / "ball.npy", volume.data[..., 0].numpy())
     options = gv.RenderOptions(
@@ -216,7 +216,7 @@ def test_whatever_comes_is_a_message_or_a_line(text):
 @settings(max_examples=1000, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_a_state_with_one_wrong_place_is_refused_or_another_state(data):
-    """One number, name or object of a good state is replaced by anything."""
+    """One number, name or object of a valid state is replaced by anything."""
     shader = data.draw(st.sampled_from(SHADERS))
     content = gv.ViewState(shader=shader, options=OPTIONS, camera=EYE).to_json()
     place, parent, key = content, None, None
@@ -256,7 +256,7 @@ def test_hostile_messages():
 
 
 def test_damaged_messages_are_refused_or_messages():
-    """Good messages with a few bytes changed, cut or doubled."""
+    """Valid messages with a few bytes changed, cut or doubled."""
     rng = np.random.default_rng(11)
     state = gv.ViewState(shader=SHADERS[1], options=OPTIONS, camera=EYE).to_json()
     good = [

@@ -16,8 +16,8 @@ from gvtorch.ops.reference.voxelize import box_share
 
 
 def cubes(side: int = 8, device="cpu", each: int = 40):
-    """Cubes of voxels near and far, some out of reach, one left out, in random triangles, some of
-    which have no area, some of which stand twice.
+    """Returns cubes of voxels near and far, some out of reach, one left out, and random triangles,
+    some of which have no area, some of which occur twice.
     """
     generator = torch.Generator().manual_seed(side)
     middle = torch.rand((each, 1, 3), generator=generator) * (side + 4) - 2
@@ -40,14 +40,14 @@ def cubes(side: int = 8, device="cpu", each: int = 40):
 def known(
     given, detail: float = 0.0, shares: bool = True, weights: bool = True, wide: bool = False
 ):
-    """Arguments of the bare op."""
+    """Returns arguments of the bare op."""
     return (*given, detail, shares, weights, wide)
 
 
 @pytest.mark.parametrize("side", [1, 3, 8, 10, 16, 20])
 @pytest.mark.parametrize("detail", [0.0, 0.9])
 def test_compiled_is_the_twin_in_every_bit(compiled, side, detail):
-    """Also where voxels are looked at one by one, as they are where triangles are small."""
+    """Also where voxels are searched one by one, as for small triangles."""
     given = cubes(side, DEVICES[compiled])
     expected = voxelize(*given, weights=True, backend="reference")
     found = voxelize(*given, weights=True, detail=detail, backend=compiled)
@@ -70,7 +70,7 @@ def test_float64_agrees_to_rounding(compiled):
 
 
 def test_a_large_hierarchy_is_gone_through(compiled):
-    """5,000 triangles, five levels of boxes, against all of them."""
+    """5,000 triangles in five levels of boxes, against brute force."""
     given = cubes(6, DEVICES[compiled], each=5000)
     expected = voxelize(*given, backend="reference")
     for one, other in zip(voxelize(*given, backend=compiled), expected, strict=True):
@@ -107,7 +107,7 @@ def test_share_of_planes_along_the_axes():
 
 @pytest.mark.parametrize("solid", [True, False])
 def test_a_plane_fills_its_exact_share(backend, solid):
-    """Of every voxel that it cuts, to 1/64: counted at 32^3 places in each."""
+    """For every voxel that it cuts, to 1/64: counted at 32^3 points in each."""
     normal = torch.nn.functional.normalize(torch.tensor([0.36, -0.48, 0.8]), dim=0)
     u = torch.nn.functional.normalize(torch.linalg.cross(normal, torch.tensor([1.0, 0, 0])), dim=0)
     v = torch.linalg.cross(normal, u)
@@ -141,7 +141,7 @@ def test_a_plane_fills_its_exact_share(backend, solid):
 
 
 def filled(mesh: gv.Mesh, backend, side: int = 8, solid: bool = True, wide: bool = False):
-    """Shares of a cube of voxels of side 1 that begins at 0 (side, side, side)."""
+    """Returns shares (side, side, side) of a cube of voxels of side 1 that begins at 0."""
     faces = torch.from_numpy(mesh.corners)
     hierarchy = Hierarchy(faces)
     size = torch.tensor([[1.0, 1.0, 2.0]], dtype=torch.float64)
@@ -154,8 +154,8 @@ def filled(mesh: gv.Mesh, backend, side: int = 8, solid: bool = True, wide: bool
 
 @pytest.mark.parametrize("wide", [False, True])
 def test_a_box_along_the_axes_fills_the_product_of_its_sides(backend, wide):
-    """Edges, corners and a box within a voxel; faces on those of voxels, where rounding decides
-    nothing.
+    """Edges, corners and a box within a voxel; faces on those of voxels, where rounding must not
+    matter.
     """
     at = torch.arange(8, dtype=torch.float64)
     for low, high in (
@@ -175,7 +175,7 @@ def test_a_box_along_the_axes_fills_the_product_of_its_sides(backend, wide):
 
 
 def test_a_turned_box_fills_what_lies_in_its_six_planes(compiled):
-    """Counted at 32^3 places a voxel; where an edge or a corner passes, too."""
+    """Counted at 32^3 points per voxel, also where an edge or a corner passes."""
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(4))).Q.double()
     half, middle = torch.tensor([3.1, 2.2, 0.4]).double(), torch.tensor([4.1, 3.9, 4.2]).double()
     corners = torch.from_numpy(meshes.box(tuple(-half), tuple(half)).corners) @ turn + middle
@@ -192,8 +192,8 @@ def test_a_turned_box_fills_what_lies_in_its_six_planes(compiled):
 
 
 def test_the_volume_of_a_solid_is_kept_in_voxels_of_any_size(compiled):
-    """Of a ball of 8192 triangles, eight of them in a voxel or a thousand; of two that cross, a
-    voxel holds at most all of itself.
+    """For a ball of 8192 triangles, eight of them in a voxel or a thousand; for two that cross, a
+    voxel's share is at most 1.
     """
     ball = meshes.of_corners(meshes.sphere(5).corners * 3.7 + 4.03)
     for scale in (1, 0.5, 0.125):

@@ -1,4 +1,4 @@
-"""How the libraries of a wheel are compiled; .ci/run builds one and looks at its tag."""
+"""How the libraries of a wheel are compiled; .ci/run builds a wheel and checks its tag."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Windows: what of the data is shown, by its histogram."""
+"""Windows: the range of values that is shown, from the data's histogram."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FILES = [
     "tooth_103x94x161_uint8.raw.gz",
     "vismale_128x256x256_uint8.raw.gz",
 ]
-#: Presets that show all of a thing; `bone` and `tissue` show what is dense in some.
+#: Presets that show whole objects; `bone` and `tissue` show only dense parts.
 SENSIBLE = ["gray", "hot", "vessels", "viridis"]
 DENSE = ["mni", "stent", "tooth", "vismale"]
 
@@ -33,8 +33,8 @@ def noise(shape: tuple[int, ...] = (20, 30, 40)) -> np.ndarray:
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("name", FILES)
 def test_every_shared_volume_shows_at_once(name):
-    """Between 5 % (by other presets 3 %) and 90 % of the pixels have something, of those where the
-    box is more, but not all; and it is bright.
+    """More than 5 % (other presets than gray: 3 %) and less than 90 % of all pixels show something,
+    and 5 to 95 % of those that the box covers; and the picture is bright.
     """
     volume = gv.read_volume(shared(f"volumes/{name}"))
     tree = gv.N3Tree.from_volume(volume)
@@ -67,7 +67,7 @@ def test_a_hot_voxel_changes_nothing_much():
 @pytest.mark.parametrize("air", [0.0, -1000.0, 3.7])
 @pytest.mark.parametrize("spread", [0.0, 5.0])
 def test_the_background_is_left_out(air, spread):
-    """Of 1,000 values of things over 23,000 of air, whether that is one number or noise."""
+    """With 1,000 values of matter and 23,000 of air, whether air is one number or noise."""
     data = air + spread * noise()
     flat = data.ravel()
     flat[::24] = air + np.linspace(100, 300, 1000)
@@ -105,7 +105,7 @@ def test_every_dtype(dtype):
 
 
 def test_a_volume_and_its_store_have_one_window(tmp_path, monkeypatch):
-    """Also where only a coarse level, or boxes of what lies on disk, are looked at."""
+    """Also where only a coarse level, or boxes of a file, are sampled."""
     data = np.abs(noise((50, 60, 70)))
     np.save(tmp_path / "a.npy", data)
     store = gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", workers=1)

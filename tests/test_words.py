@@ -1,5 +1,5 @@
-"""Words that lead out of the pools, and numbers by which rays would leave the tree or never end:
-kernels take them for absent, and what brings words from outside is refused.
+"""Pool words that lead out of the pools, and numbers by which rays would leave the tree or never
+end: kernels treat them as absent, and loading such words is refused.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FAR = (2**31 - 1, 2**30, 10**6)
 
 
 def spoilt(tree: gv.N3Tree, seed: int, absent: bool = False) -> gv.N3Tree:
-    """A copy in which a third of the words lead out of the pools, or are absent instead."""
+    """Returns a copy in which a third of the words lead out of the pools, or are absent."""
     copy = on(tree, "cpu")
     generator = torch.Generator().manual_seed(seed)
     for words, count in (
@@ -68,7 +68,7 @@ def test_words_below_all_that_are_known_end_a_tree_and_hide_nothing(blobs, backe
 @pytest.mark.parametrize("high", [1e6, -5.0, torch.nan])
 @pytest.mark.parametrize("branching", [2, 3])
 def test_a_scene_does_not_reach_out_of_its_root_cube(blobs, backend, branching, high):
-    """Rays that were led there would ask for nodes of no tile, an interval at a time."""
+    """Rays led there would request nodes of no tile, one interval at a time."""
     tree = gv.N3Tree.from_volume(blobs, 4, branching=branching, device=DEVICES[backend])
     rays, given = arguments(tree, 4)
     found = []
@@ -81,7 +81,7 @@ def test_a_scene_does_not_reach_out_of_its_root_cube(blobs, backend, branching, 
 
 
 def test_a_cone_that_is_no_number_ends_its_ray(blobs, backend):
-    """No node would answer for more than one of its intervals, of which there may be millions."""
+    """Each node lookup would be valid for only one interval, of which there may be millions."""
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[backend])
     rays, given = arguments(tree, 4)
     rays, given = rays._replace(cone_r2=rays.cone_r2 * torch.nan), given._replace(step=1e-4)

@@ -1,4 +1,4 @@
-"""Workloads whose speed is kept: what they do, how they are run and what they give.
+"""The workloads of `gvtorch bench`: what each measures, and how it is run.
 
 Nothing here needs torch until a workload runs, so that the command line can list them at once.
 """
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .record import Record, Settings
 
-#: What each workload does; it is the function of that name in the module of `_HOME`.
+#: What each workload does; the function of that name is in the module given by `_HOME`.
 WORKLOADS = {
     "march": "rays through resident trees: fog, shell, clouds and a scan, beside peers",
     "first_hit": "the first opaque voxel of a thin shell, 1920x1080, beside peers",
@@ -43,7 +43,7 @@ _HOME = {
 
 
 class Unavailable(ValueError):
-    """A workload needs what is not here."""
+    """A workload needs something that is not available here."""
 
 
 def run(name: str, settings: Settings) -> Record:

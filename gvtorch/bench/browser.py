@@ -1,8 +1,8 @@
-"""A hand that drags in a browser, and what the browser shows meanwhile.
+"""Drags the mouse in a browser, and measures when the page shows the result.
 
-The same for every page: playwright moves the mouse in a Chromium without a window, and in each of
-the browser's frames a script in the page keeps a thumbnail of the picture where it has changed. So
-times are those from a pointer event to pixels in the page, to one frame of the browser.
+Every page is measured alike: playwright moves the mouse in a headless Chromium, and in each frame
+of the browser a script in the page stores a thumbnail of the picture if it has changed. Times
+therefore run from a pointer event to pixels in the page, exact to one frame of the browser.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import numpy as np
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 _HELD = 1 / 60  # seconds between two moves of the mouse
 _QUIET = 3.0  # seconds without a change, after which a new page is at rest
-_PATIENCE = 60.0  # seconds until a page must rest
+_PATIENCE = 60.0  # seconds within which a page must come to rest
 _THUMB = (48, 27)
 
-#: Keeps [milliseconds, thumbnail] of each picture that differs from the one before, and the time of
-#: the last move. WebGL must keep what it drew until it is looked at.
+#: Stores [milliseconds, thumbnail] of each picture that differs from the one before, and the time
+#: of the last move. WebGL must preserve its drawing buffer, because it is read later.
 _PROBE = """
 (() => {
   const open = HTMLCanvasElement.prototype.getContext;
@@ -61,14 +61,14 @@ _PROBE = """
 
 
 def absent() -> str:
-    """Tells why no browser can run here; nothing if one can."""
+    """Returns why no browser can run here; an empty string if one can."""
     if importlib.util.find_spec("playwright") is None:
         return "playwright is not installed"
     return "" if executable() else f"none of {', '.join(_NAMES)} is on the path"
 
 
 def executable() -> str | None:
-    """Returns where Chromium is."""
+    """Returns the path of Chromium; None if there is none."""
     return next(filter(None, map(shutil.which, _NAMES)), None)
 
 
@@ -84,17 +84,17 @@ def running() -> Iterator[Any]:
 
 
 class Seen(NamedTuple):
-    """What a hand saw."""
+    """What was measured while the mouse dragged."""
 
     waited: list[float]  # milliseconds from each jump to the first picture that shows it
-    rate: float  # pictures a second while it dragged
+    rate: float  # pictures a second during the long drag
 
 
 class Page:
-    """A page whose picture has a size, and the hand in it."""
+    """A page in the browser, its picture of a given size, and the mouse that drags in it."""
 
     def __init__(self, browser: Any, url: str, selector: str, size: tuple[int, int]) -> None:
-        """Opens it, and waits until its picture is there and rests."""
+        """Opens the page, and waits until its picture is shown and has come to rest."""
         self.size, self.quiet = size, _QUIET
         window = {"width": max(size[0], 640), "height": max(size[1], 400)}
         self.context = browser.new_context(viewport=window)
@@ -107,7 +107,7 @@ class Page:
         self._rest()
 
     def _fit(self, selector: str) -> None:
-        """Makes the window as large as the picture and what stands beside it."""
+        """Resizes the window so that the picture gets its size beside the page's other parts."""
         width, height = self.size
         for _ in range(2):
             box = self._largest(selector)
@@ -118,20 +118,20 @@ class Page:
         self.middle = box["x"] + width / 2, box["y"] + height / 2
 
     def _largest(self, selector: str) -> Any:
-        """Waits for an element, and returns where the largest one lies."""
+        """Waits for an element of a selector, and returns the rectangle of the largest one."""
         script = f"""() => [...document.querySelectorAll({selector!r})]
             .map((one) => one.getBoundingClientRect().toJSON())
             .sort((a, b) => b.width * b.height - a.width * a.height)
             .find((one) => one.width > 0)"""
         found = self.page.wait_for_function(script, timeout=1e3 * _PATIENCE).json_value()
-        self.page.wait_for_timeout(300)  # so that it has grown to its place
+        self.page.wait_for_timeout(300)  # until its layout is final
         return self.page.evaluate(script) or found
 
     def _watch(self, on: bool) -> None:
         self.page.evaluate("on => { gvProbe.on = on; gvProbe.seen = gvProbe.seen.slice(-1); }", on)
 
     def _rest(self, moved: float = 0.0) -> None:
-        """Waits until the picture has changed since a time, and then not for a while."""
+        """Waits until the picture has changed after `moved` (ms), then not for `quiet` seconds."""
         end = time.monotonic() + _PATIENCE
         last = "(gvProbe.seen.at(-1)?.[0] ?? Infinity)"
         quiet = f"{last} > {moved} && performance.now() - {last} > {1e3 * self.quiet}"
@@ -141,7 +141,7 @@ class Page:
             self.page.wait_for_timeout(50)
 
     def drag(self, seconds: float, jumps: int) -> Seen:
-        """Drags for a while, then some times for a short while with a jump at the end."""
+        """Drags for some seconds, then `jumps` times for 0.4 s with a jump at the end."""
         (x, y), mouse = self.middle, self.page.mouse
         mouse.move(x, y)
         mouse.down()
@@ -167,8 +167,8 @@ class Page:
             time.sleep(max(0.0, start + n * _HELD - time.perf_counter()))
 
     def _jump(self, x: float, y: float) -> float:
-        """Moves the mouse at once, and returns after how many milliseconds a picture first was
-        nearer to the one at the end than to the one before.
+        """Moves the mouse in one step; returns the milliseconds until a picture is first more
+        similar to the final one than to the one before the jump.
         """
         self.page.mouse.move(x, y)
         moved = self.page.evaluate("gvProbe.moved")

@@ -1,4 +1,4 @@
-"""The cache's ops alone, beside what torch has for the same: `lru` and `compact`."""
+"""The cache's ops alone, compared with torch's ops for the same task: `lru` and `compact`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from ..base.constants import REQUEST_KINDS, REQUEST_LOAD
 from ..ops import compact_requests, lru_partition
 from .record import Record, clock
 
-_REQUESTS = 1000  # of all nodes
+_REQUESTS = 1000  # nodes with a request
 
 
 def lru(record: Record) -> None:
-    """Slots in the order of their last use, half of them used in this frame."""
+    """Sorts slots by their last use; half of them were used in this frame."""
     settings, device = record.settings, record.settings.device
     slots = 1 << (12 if settings.quick else 20)
     case = f"{slots:,} slots, half used"
@@ -44,7 +44,7 @@ def lru(record: Record) -> None:
 
 
 def compact(record: Record) -> None:
-    """Few requests out of many request words, which are cleared. Each call has words of its own."""
+    """Lists few requests out of many request words, which it clears; each call has other words."""
     settings = record.settings
     nodes = 1 << (12 if settings.quick else 23)
     case = f"{nodes:,} nodes, {_REQUESTS:,} requests"

@@ -13,7 +13,7 @@ from .. import opengl as gl
 from . import Unavailable
 from .record import Record, Settings, Timing, spread, synchronize
 
-#: Formats of colours, by moderngl's names and ours.
+#: Colour formats, as moderngl's dtype and torch's.
 _FORMATS = {
     "RGBA8": ("f1", torch.uint8),
     "RGBA16F": ("f2", torch.float16),
@@ -22,7 +22,7 @@ _FORMATS = {
 
 
 def opengl(record: Record) -> None:
-    """Colours and depth out of OpenGL and into it: in shared buffers and through the host."""
+    """Reads colours and depth from OpenGL and draws them, in shared buffers and by the host."""
     settings = record.settings
     size = (64, 48) if settings.quick else (1920, 1080)
     context = _context()
@@ -43,7 +43,7 @@ def opengl(record: Record) -> None:
 
 
 def _measure(record: Record, context: Any, name: str, ways: list[gl.Exchange]) -> None:
-    """Draws and reads random pictures of a format, each way."""
+    """Draws and reads random pictures of a format through each exchange of `ways`."""
     settings, (width, height) = record.settings, (ways[0].width, ways[0].height)
     kind, dtype = _FORMATS[name]
     generator = torch.Generator().manual_seed(1)
@@ -77,7 +77,7 @@ def _measure(record: Record, context: Any, name: str, ways: list[gl.Exchange]) -
 
 
 def _context() -> Any:
-    """A context without a window; raises Unavailable where there is none."""
+    """Returns an OpenGL context without a window; raises Unavailable where there is none."""
     try:
         import moderngl
 
@@ -90,7 +90,7 @@ def _context() -> Any:
 
 
 def _clock(run: Callable[[], object], settings: Settings, context: Any) -> tuple[Timing, float]:
-    """Times calls until OpenGL and torch are done, and their median until they return, ms."""
+    """Returns the time until OpenGL and torch are done, and the median until a call returns, ms."""
     times, host = [], []
     for _ in range(settings.repeats + 1):  # the first warms up
         context.finish()

@@ -1,5 +1,5 @@
-"""The engine with its cache: `frame`, steady and from a cold start, `deep`, of a surface in a deep
-tree, and `stream`, bricks from host memory into the pool.
+"""The engine with its cache: `frame` (steady and from a cold start), `deep` (a surface in a deep
+tree) and `stream` (bricks from host memory into the pool).
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from ..tracing import render
 from .record import Record, Settings, Timing, clock, spread, synchronize
 from .scenes import BenchScene, scan_or_fog, worn
 
-#: Stages of a frame that are the cache's: what a resident tree has no need of.
+#: Stages of a frame that belong to the cache: a resident tree does not need them.
 CACHE = ("requests", "lru", "schedule", "produce", "write", "count")
-_MOST = 1000  # frames until something must have converged
+_MOST = 1000  # frames within which a view must converge
 _POOLS = {"node_pool": "16 MB", "brick_pool": "384 MB"}  # hold all of 512^3 uint8
 _Frame = tuple[Picture, FrameStats]
-_Way = Callable[[Engine], Callable[[], list[Any]]]  # what is not timed gives what is
+_Way = Callable[[Engine], Callable[[], list[Any]]]  # untimed setup; returns the timed call
 _QUICK = {"node_pool": "1 MB", "brick_pool": "2 MB"}
 
 
 def frame(record: Record) -> None:
-    """Steady frames beside a resident tree, then cold starts."""
+    """Measures steady frames, compared with a resident tree, then cold starts."""
     quick = record.settings.quick
     width, height = (24, 16) if quick else (1920, 1080)
     scene = scan_or_fog(32 if quick else 256, record.note)
@@ -49,7 +49,7 @@ def frame(record: Record) -> None:
 
 
 def deep(record: Record) -> None:
-    """Steady frames of a thin shell from close by, in a tree of this patch and in a large one."""
+    """Measures steady frames of a patch of a thin shell, in a tree of the patch and a wider one."""
     settings = record.settings
     size = (1920, 1080) if settings.device.type == "cuda" else (480, 270)
     patch, size = (64, (24, 16)) if settings.quick else (4096, size)
@@ -59,13 +59,13 @@ def deep(record: Record) -> None:
     shell = sdf.Shell(sdf.Sphere(radius), 3.0)
     shader = TransferFunction.from_points([(0.3, 0), (0.6, 1)])
     target = (half, half, math.sqrt(radius**2 - 2 * half**2))
-    boxes = {  # nodes of both lie alike
+    boxes = {  # nodes of both trees are aligned
         patch: ((0.0, 0.0, 6.0 * patch), (patch, patch, 7.0 * patch)),
         16 * patch: ((-8.0 * patch,) * 3, (8.0 * patch,) * 3),
     }
     for view, way in (("from above", (0.0, 0.01, 0.4)), ("obliquely", (0.0, -0.28, 0.28))):
         eye = [at + patch * step for at, step in zip(target, way, strict=True)]
-        camera = Camera.look_at(eye, target, (0, 1, 0), size[1] / 36, *size)  # voxels as pixels
+        camera = Camera.look_at(eye, target, (0, 1, 0), size[1] / 36, *size)  # pixel-sized voxels
         first, median = torch.empty(0), 0.0
         for wide, box in boxes.items():
             case, who = f"shell, {view}, {size[0]}x{size[1]}", f"a tree of {wide}^3"
@@ -123,7 +123,7 @@ def _steady(record: Record, scene: BenchScene, size: tuple[int, int]) -> None:
 def _captured(
     record: Record, case: str, engine: Engine, camera: Camera, shader: TransferFunction
 ) -> None:
-    """The same frame as a CUDA graph, and the cache's part of it as a graph of its own."""
+    """Measures the same frame as a CUDA graph, and its cache stages as a separate graph."""
     settings, calls = record.settings, 20
     graph = engine.capture(camera, shader)
     timing = clock(lambda: graph.replay(camera), settings, calls=calls)
@@ -161,7 +161,7 @@ def _stages(stats: list[FrameStats]) -> dict[str, Any]:
 
 
 def converging(see: Callable[[], _Frame]) -> Iterator[_Frame]:
-    """Yields frames, up to one that misses nothing, or too many."""
+    """Yields frames up to the first that has converged, at most `_MOST`."""
     for _ in range(_MOST):
         picture, stats = see()
         yield picture, stats
@@ -178,9 +178,9 @@ def _converge(engine: Engine, camera: Camera, shader: TransferFunction) -> torch
 
 
 def _cold(record: Record, scene: BenchScene, size: tuple[int, int], budget: int) -> None:
-    """From an engine that holds the root alone to a picture that misses nothing: frame after frame,
-    each of them whole, and by `Engine.render`, which shows the last one alone; on CUDA by a graph
-    as well, of a volume that the device reads in place.
+    """Measures the time from an engine that holds only the root to a picture that misses nothing:
+    by `Engine.frame`, which draws every frame, and by `Engine.render`, which returns only the last;
+    on CUDA also by a captured graph, with a volume that the device reads in place.
     """
     settings, camera = record.settings, scene.camera(*size)
     side = scene.volume.extent[0]
@@ -197,7 +197,7 @@ def _cold(record: Record, scene: BenchScene, size: tuple[int, int], budget: int)
         graph = engine.capture(camera, scene.shader, batch=budget)
         for tree in engine.trees.values():
             tree.producer.changed()
-        engine.renew()  # all that was made goes, but the root
+        engine.renew()  # drops all bricks and tiles but the root
         return lambda: [stats for _, stats in converging(partial(graph.replay, camera))]
 
     ways: dict[str, tuple[Literal["voxels", "mapped"], _Way]] = {
@@ -237,10 +237,10 @@ def _cold(record: Record, scene: BenchScene, size: tuple[int, int], budget: int)
 
 
 class Ready(Producer):
-    """Bricks that lie in host memory already: `fill` hands out rows of one tensor."""
+    """A producer whose bricks are already in host memory: `fill` returns rows of one tensor."""
 
     def __init__(self, side: int, pinned: bool) -> None:
-        """Makes as many rows as one frame may ask for."""
+        """Makes as many rows as one frame may request."""
         super().__init__(side, channels={"value": Channel(torch.uint8)})
         rows = torch.arange(_ROWS, dtype=torch.int32).remainder(251).to(torch.uint8)
         bricks = rows[:, None, None, None, None].expand(_ROWS, 10, 10, 10, 1).contiguous()
@@ -254,20 +254,20 @@ _ROWS, _REPLAYED = 1 << 16, 1 << 18
 
 
 class ReadyThere(Ready):
-    """The same, in host memory that the device reads in place, as it records."""
+    """`Ready` with rows in host memory that the device reads in place, for recorded frames."""
 
     on_device = True
 
     def __init__(self, side: int, device: torch.device) -> None:
-        """Locks the rows' memory, as many as a replay may ask for."""
+        """Page-locks and maps as many rows as a replay may request."""
         super().__init__(side, pinned=False)
         self.bricks = mapped(self.bricks.repeat(_REPLAYED // _ROWS, 1, 1, 1, 1), device)
 
 
 def stream(record: Record) -> None:
-    """All bricks of a scene, which its producer has ready, into an engine's pool; time is that of
-    the stages produce and write, of recorded frames all that serves. Beside it, one large copy from
-    the same kind of memory.
+    """Measures how fast all bricks of a scene, which its producer has ready, get into an engine's
+    pool: the time of the stages produce and write, or of recorded frames the stage serve. For
+    comparison, one large copy from the same kind of memory.
     """
     settings = record.settings
     side = 64 if settings.quick else 512
@@ -317,7 +317,7 @@ _POURED = (
 
 
 def _pouring(side: int) -> dict[str, Any]:
-    """Options of an engine that takes all bricks of a scene."""
+    """Returns the options of an engine that may load all bricks of a scene at once."""
     pools = _POOLS if side > 64 else _QUICK
     return {"load_budget": _ROWS, "subdivide_budget": _ROWS, **pools}
 
@@ -333,8 +333,8 @@ def _copy_rate(record: Record, pinned: bool) -> tuple[Timing, float, int]:
 
 
 def _pour(side: int, pinned: bool, device: torch.device) -> list[tuple[float, int]]:
-    """Returns milliseconds of producing and writing, and bytes moved, until all is there: of the
-    frames that moved any, and of those that made no tiles besides.
+    """Returns (milliseconds of produce and write, bytes moved) until the view has converged: over
+    the frames that moved any bytes, and over those of them that made no tiles.
     """
     milliseconds, moved = [0.0, 0.0], [0, 0]
     with Engine(Ready(side, pinned), device=device, **_pouring(side)) as engine:
@@ -350,8 +350,8 @@ def _pour(side: int, pinned: bool, device: torch.device) -> list[tuple[float, in
 
 
 def _replay(there: ReadyThere, device: torch.device) -> tuple[float, int]:
-    """Returns milliseconds of serving and bytes moved, as `_pour`, by recorded frames: of those
-    that moved any.
+    """Returns (milliseconds of serve, bytes moved), as `_pour`, over the recorded frames that made
+    any bricks.
     """
     with Engine(there, device=device, **_pouring(there.extent[0])) as engine:
         graph = engine.capture(*_POURED, batch=_REPLAYED, lod="finest", step=2.0)

@@ -12,12 +12,12 @@ from .frames import converging
 from .record import Record, clock
 from .scenes import worn
 
-_APERTURES = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8)  # largest sides of the box
-_FOCUS = 0.9  # a little before the middle
+_APERTURES = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8)  # in largest sides of the box
+_FOCUS = 0.9  # likewise; a little in front of the box's middle
 
 
 def lens(record: Record) -> None:
-    """Steady frames of the worn sphere from near by, and what is loaded until then."""
+    """Measures steady frames of the worn sphere from nearby, and what is loaded before them."""
     settings = record.settings
     side, (width, height) = (32, (24, 16)) if settings.quick else (512, (1280, 720))
     settings.tell("lens: making the worn sphere")

@@ -1,5 +1,5 @@
-"""Rays through resident trees, beside peers that render the same picture: `march`, `first_hit`,
-`calls` of little work, and `bricks`, the sweep of brick sizes.
+"""Rays through resident trees, compared with peers that render the same picture: `march`,
+`first_hit`, `calls` (little work per call) and `bricks` (a sweep of brick sizes).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Size = tuple[int, int]
 
 
 def march(record: Record) -> None:
-    """All scenes at two sizes, the finest level and levels by cone, and the peers."""
+    """Measures all scenes at two sizes, with the finest level and levels by cone, and the peers."""
     quick = record.settings.quick
     sizes = [(24, 16)] if quick else [(512, 512), (1920, 1080)]
     peers = find(record)
@@ -56,7 +56,7 @@ def march(record: Record) -> None:
 
 
 def first_hit(record: Record) -> None:
-    """A shell that is opaque at once: a ray ends in the first voxel it meets."""
+    """Measures a shell so opaque that a ray ends in the first voxel it meets."""
     quick = record.settings.quick
     size = (24, 16) if quick else (1920, 1080)
     scene = replace(shell_sparse(32 if quick else 256), name="first hit")
@@ -67,7 +67,7 @@ def first_hit(record: Record) -> None:
 
 
 def calls(record: Record) -> None:
-    """Pictures of a thin shell that are so small that the call itself shows."""
+    """Measures pictures of a thin shell so small that the overhead of a call dominates."""
     settings = record.settings
     count, small = (3, 8) if settings.quick else (1000, 64)
     scene = shell_sparse(32 if settings.quick else 64)
@@ -106,7 +106,7 @@ def calls(record: Record) -> None:
 
 
 def bricks(record: Record) -> None:
-    """The finest level of three scenes for every brick size and border."""
+    """Measures the finest level of three scenes for every brick size and border."""
     quick, device = record.settings.quick, record.settings.device
     size = (24, 16) if quick else (512, 512)
     for name in ("fog dense", "shell sparse", "aneurism"):
@@ -183,14 +183,14 @@ def _compare(
 def _tracing(
     tree: N3Tree, scene: BenchScene, camera: Camera, lod: str, device: torch.device
 ) -> Callable[[], Hits]:
-    """Returns the call that is timed; rays are made before."""
+    """Returns the call that is timed; its rays are made here."""
     rays = camera.rays(device)
     options: Any = {"lod": lod, "step": scene.step, "stop_alpha": _STOP}
     return lambda: trace(tree, rays, scene.shader, **options)
 
 
 def rates(hits: Hits | Picture, timing: Timing) -> dict[str, Any]:
-    """Returns samples, and samples and rays per second, of what one call took."""
+    """Returns the samples of one call, and its samples and rays per second."""
     samples = int(hits.samples.sum(dtype=torch.int64))
     return {
         "samples": samples,
@@ -205,7 +205,7 @@ def rgba(hits: Hits | Picture) -> Tensor:
 
 
 def difference(picture: Tensor, other: Tensor) -> dict[str, float]:
-    """Returns how far two pictures of one shape are apart, over all their numbers."""
+    """Returns the largest, mean and rms difference of two pictures of one shape."""
     apart = (picture - other).double().abs()
     return {
         "max_difference": float(apart.max()),
@@ -215,7 +215,7 @@ def difference(picture: Tensor, other: Tensor) -> dict[str, float]:
 
 
 def op_milliseconds(run: Callable[[], object], settings: Settings) -> float | None:
-    """Median milliseconds inside the op of a fused shader; None where none is called."""
+    """Returns median milliseconds inside the op of a fused shader; None if none is called."""
     with _OpTimer(settings.device) as watch:
         began = time.perf_counter()
         for _ in range(settings.repeats):
@@ -226,7 +226,7 @@ def op_milliseconds(run: Callable[[], object], settings: Settings) -> float | No
 
 
 class _OpTimer(TorchDispatchMode):
-    """Takes the time of a fused shader's op whenever it is called."""
+    """Times a fused shader's op whenever it is called."""
 
     def __init__(self, device: torch.device) -> None:
         super().__init__()
@@ -245,7 +245,7 @@ class _OpTimer(TorchDispatchMode):
 
 
 def _tree_bytes(scene: BenchScene, brick_size: int, border: int) -> int:
-    """At most: all bricks of all levels, and the float32 pyramid that they are cut from."""
+    """Returns an upper bound: all bricks of all levels, and the float32 pyramid they come from."""
     x, y, z = scene.volume.extent
     brick = (brick_size + 2 * border) ** 3
     cells = -(-x // brick_size) * -(-y // brick_size) * -(-z // brick_size)

@@ -1,4 +1,4 @@
-"""Noise at points, beside its twin, NumPy and libraries of noise: `noise`."""
+"""Noise at points, compared with its twin, NumPy and noise libraries: `noise`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CHUNK = 1 << 13  # points at a time, so that NumPy's temporaries stay in the ca
 
 
 def noise(record: Record) -> None:
-    """Points all over 100 cells a side."""
+    """Evaluates noise at random points in a cube of 100 cells a side."""
     settings = record.settings
     count = {"cpu": 1 << 20, "cuda": 1 << 25}[settings.device.type] >> (8 * settings.quick)
     points = 100 * torch.rand((count, 3), generator=torch.Generator().manual_seed(5))
@@ -35,7 +35,7 @@ def noise(record: Record) -> None:
 
 
 def _points(record: Record, case: str, points: torch.Tensor) -> None:
-    """The same points by everyone; peers have hashes of their own, so values can't be compared."""
+    """Measures all at the same points; peers hash differently, so values can't be compared."""
     device = record.settings.device
     on_device, in_numpy = points.to(device), points.numpy()
     _add(record, case, "op", len(points), lambda: gv_noise.perlin(on_device))
@@ -66,7 +66,7 @@ def _points(record: Record, case: str, points: torch.Tensor) -> None:
 
 
 def perlin_numpy(points: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Improved noise of (n, 3) points as the paper tells it, by a permuted table of 3 * 256."""
+    """Returns improved noise at (n, 3) points as in the paper, by a permutation table, 3 * 256."""
     cell = np.floor(points).astype(np.int64)
     offset = points - cell
     x, y, z = (cell & 255).T

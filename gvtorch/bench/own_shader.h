@@ -1,4 +1,4 @@
-// What workload `shaders` measures as a user's own header: the plain transfer function.
+// The user-defined shader that workload `shaders` measures: the plain transfer function.
 #pragma once
 
 #include "user_shader.h"

@@ -43,13 +43,13 @@ class Ripples(Producer):
 
 
 def ripples(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """Returns (..., 1) uint8 values at places that broadcast."""
+    """Returns (..., 1) uint8 values at positions whose coordinates broadcast."""
     radius = (x * x + y * y + z * z).sqrt()
     return (127.5 + 127.5 * torch.sin(40 * radius)).to(torch.uint8)[..., None]
 
 
 def library() -> dict[str, Producer]:
-    """One of each kind, about a box of 2 units, by name."""
+    """Returns one producer of each kind by name, in boxes of about 2 units."""
     bulb = Solid(Mandelbulb(8, iterations=6), normals=False)
     ball, lace = sdf.Sphere(0.9), sdf.Shell(sdf.Gyroid(0.46), 0.035)
     octaves = noise.SplineSum(frequency=4.0, octaves=8)
@@ -73,8 +73,8 @@ class _Clouds(torch.nn.Module):
 
 
 def produce(record: Record) -> None:
-    """`fill` of bricks of 8^3 and a border of 1, at random places of the finest level that are
-    neither empty nor constant.
+    """Measures `fill` of bricks of 8^3 and a border of 1, at random nodes of the finest level that
+    are neither empty nor constant.
     """
     settings = record.settings
     for name, producer in library().items():
@@ -93,7 +93,7 @@ def produce(record: Record) -> None:
 
 
 def some_nodes(producer: Producer, most: int, device: torch.device) -> Nodes:
-    """Random nodes of the finest level that have data, at most so many."""
+    """Returns at most `most` random nodes of the finest level that have data."""
     layout = Layout.of(producer, 8, 1, device)
     producer.prepare(layout)
     generator = torch.Generator().manual_seed(3)
@@ -117,7 +117,7 @@ def some_nodes(producer: Producer, most: int, device: torch.device) -> Nodes:
 
 
 def _both(record: Record, case: str, producer: Producer, nodes: Nodes, compiles: bool) -> None:
-    """Eager, then compiled, which takes a compiler many seconds."""
+    """Measures `fill` eager, then compiled; compiling takes many seconds."""
     settings = record.settings
 
     def eager() -> Tensor:

@@ -1,6 +1,4 @@
-"""What a workload is told (`Settings`), how it takes times (`clock`), and what it gives
-(`Record`).
-"""
+"""A workload's settings (`Settings`), its timer (`clock`), and its results (`Record`)."""
 
 from __future__ import annotations
 
@@ -22,13 +20,13 @@ from .. import __version__
 from ..base import check
 from ..ops.trace import choose_backend
 
-#: What else does the same, by the names of `--peers`, and what must be installed for it.
+#: Peers by their names in `--peers`, and the package that must be installed for each.
 PEERS = {
     "grid_sample": "torch",
     "warp": "warp-lang",
     "drjit": "drjit",
     "vtk": "vtk",
-    "tensorstore": "zarr",  # which writes the chunks that are read
+    "tensorstore": "zarr",  # zarr writes the chunks that tensorstore reads
     "zarr": "zarr",
     "pyfastnoiselite": "pyfastnoiselite",
     "pyfastnoisesimd": "pyfastnoisesimd",
@@ -37,7 +35,7 @@ PEERS = {
     "viser": "viser",
     "trame": "trame-vtk",
 }
-_DISTURBED = 0.05  # share of the cores that others may take unnoticed
+_DISTURBED = 0.05  # share of the cores that other processes may use without a note
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,13 +43,13 @@ class Settings:
     """How workloads are run."""
 
     device: torch.device
-    quick: bool = False  # tiny sizes: to see that all works, no figures to keep
-    repeats: int = 7  # of each figure
-    seconds: float = 10.0  # a figure whose repeats take longer is made of fewer, one at least
+    quick: bool = False  # tiny sizes, to see that all works; the figures mean nothing
+    repeats: int = 7  # timings of each figure
+    seconds: float = 10.0  # after this time no further repeat of a figure begins
     peers: tuple[str, ...] | None = None  # None: all that are installed
-    only: str = ""  # cases whose name holds it
+    only: str = ""  # run only cases whose name contains it
     pictures: Path | None = None  # a folder for the pictures that were compared
-    tell: Callable[[str], None] = lambda _: None  # told what is done now
+    tell: Callable[[str], None] = lambda _: None  # called with each step's name
 
     def __post_init__(self) -> None:
         check.whole("bench", "repeats", self.repeats, low=1)
@@ -68,7 +66,7 @@ class Timing:
     low: float
     high: float
     repeats: int
-    last: Any = None  # what the last call gave
+    last: Any = None  # what the last call returned
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the columns of a row."""
@@ -83,12 +81,12 @@ def clock(
     calls: int = 1,
     prepare: Callable[[], object] | None = None,
 ) -> Timing:
-    """Times a call after one to warm up: CUDA events on the device, else the wall clock.
+    """Times a call, after one to warm up, by CUDA events on a CUDA device, else by wall clock.
 
     Args:
-        run: What is timed.
+        run: The call to time.
         settings: Device, repeats, seconds.
-        calls: Calls in a row that are timed together; the figures are of one.
+        calls: Number of calls in a row that are timed together; the figures are per call.
         prepare: Called before each timing, and not timed.
     """
     device = settings.device
@@ -121,7 +119,7 @@ def spread(milliseconds: list[float], last: Any = None) -> Timing:
 
 
 def once(run: Callable[[], Any], device: torch.device, calls: int = 1) -> tuple[float, Any]:
-    """Returns the milliseconds of some calls in a row, and what the last one gave."""
+    """Returns the milliseconds of `calls` calls together, and what the last one returned."""
     if device.type == "cuda":
         first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         with torch.cuda.device(device):
@@ -150,7 +148,7 @@ class Record:
 
     Attributes:
         workload: Its name.
-        rows: A row for each case and who did it, of plain values; None where there is no figure.
+        rows: A row of plain values for each case and `who` ran it; None where there is no figure.
         peers: For each peer that was wanted, "ran" or why it did not.
         notes: What a reader must know, a sentence each.
     """
@@ -162,7 +160,7 @@ class Record:
         self.notes: list[str] = []
 
     def wants(self, case: str) -> bool:
-        """Tells whether a case is to be run."""
+        """Returns whether a case is to be run."""
         return self.settings.only in case
 
     def add(self, case: str, who: str, timing: Timing | None = None, **figures: Any) -> None:
@@ -171,13 +169,13 @@ class Record:
         )
 
     def beside_first(self, case: str, timing: Timing) -> dict[str, float]:
-        """Returns how many times as long it took as the case's first row; nothing of the first."""
+        """Returns `times`: the time relative to the case's first row; nothing for that row."""
         first = next((row for row in self.rows if row["case"] == case), None)
         return {} if first is None else {"times": timing.median / first["ms"]}
 
     def has_peer(self, name: str, module: str = "", why_not: str = "") -> bool:
-        """Tells whether a peer is wanted and can run, which is kept in `peers`; `module` is what it
-        needs, if that has another name, `why_not` what else stands in its way.
+        """Returns whether a peer is wanted and can run, and stores the result in `peers`; `module`
+        is the module it needs if its name differs, `why_not` another reason why it can't run.
         """
         if self.settings.peers is not None and name not in self.settings.peers:
             return False
@@ -186,7 +184,7 @@ class Record:
         return self.peers[name] == "ran"
 
     def note(self, sentence: str) -> None:
-        """Takes a note, once."""
+        """Adds a sentence to the notes, unless it is there already."""
         if sentence not in self.notes:
             self.notes.append(sentence)
 
@@ -204,7 +202,7 @@ class Record:
 
 @contextmanager
 def elsewhere(record: Record) -> Iterator[None]:
-    """Notes it where other processes took a part of the cores while a workload ran (Linux)."""
+    """Adds a note if other processes used much of the cores while a workload ran (Linux)."""
     start, busy, own = time.perf_counter(), _busy_seconds(), _own_seconds()
     yield
     others = _busy_seconds() - busy - (_own_seconds() - own)
@@ -217,7 +215,7 @@ def elsewhere(record: Record) -> Iterator[None]:
 
 
 def _busy_seconds() -> float:
-    """What all processes took of all cores since the machine started; 0 where it is not told."""
+    """Returns the CPU seconds of all processes since the machine started; 0 if not known."""
     try:
         user, nice, system, _idle, _wait, irq, softirq, steal, *_ = (
             int(ticks) for ticks in Path("/proc/stat").read_text().split("\n")[0].split()[1:]
@@ -228,12 +226,12 @@ def _busy_seconds() -> float:
 
 
 def _own_seconds() -> float:
-    """What this process and its children that ended took."""
+    """Returns the CPU seconds of this process and of its children that have ended."""
     return sum(os.times()[:4])
 
 
 def machine(device: torch.device) -> dict[str, Any]:
-    """Names what a workload runs on."""
+    """Returns the name of the device, the backend, and the versions of torch and gvtorch."""
     known = {"torch": torch.__version__, "gvtorch": __version__}
     backend = choose_backend("auto", device)
     if device.type == "cuda":

@@ -1,4 +1,4 @@
-"""What is rendered: made-up volumes and a bundled scan, all uint8 cubes with voxels of 1 world
+"""The scenes: synthetic volumes and a bundled scan, all uint8 cubes with voxels of 1 world
 unit, each with its transfer function and camera.
 """
 
@@ -22,13 +22,13 @@ SCAN = Path(__file__).parents[2] / "examples" / "data" / "aneurism_256x256x256_u
 
 @dataclass(frozen=True, kw_only=True)
 class BenchScene:
-    """A volume and how it is shown."""
+    """A volume, and the options it is rendered with."""
 
     name: str
     volume: Volume
     shader: TransferFunction
     step: float = 0.5
-    surface: float = 128.0  # the value at which shaders that look for a surface find one
+    surface: float = 128.0  # isovalue of shaders that draw a surface
 
     @property
     def box(self) -> Tensor:
@@ -37,12 +37,12 @@ class BenchScene:
         return torch.stack((torch.full_like(high, -0.5), high))
 
     def camera(self, width: int, height: int) -> Camera:
-        """From two box lengths away, in the world."""
+        """Returns a camera two box lengths away, in world units."""
         return Camera.orbit(30, 20, 2.0, 30, width, height).placed(self.box)
 
 
 def _grid(side: int) -> tuple[Tensor, Tensor, Tensor]:
-    """z, y, x in [-1, 1]."""
+    """Returns z, y, x in [-1, 1] of a cube of voxels."""
     axis = torch.linspace(-1, 1, side)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     return z, y, x
@@ -85,7 +85,7 @@ def shell_sparse(side: int) -> BenchScene:
 
 
 def shell_dense(side: int) -> BenchScene:
-    """The sphere in values that the transfer function does not show: every brick exists."""
+    """The thin sphere among transparent values that vary, so that every brick exists."""
     z, y, x = np.ogrid[0:side, 0:side, 0:side]
     faint = torch.from_numpy((7 * x + 13 * y + 29 * z) % 16 + 1)
     return BenchScene(
@@ -94,8 +94,8 @@ def shell_dense(side: int) -> BenchScene:
 
 
 def clouds(side: int) -> BenchScene:
-    """Clouds of which 68 % of the voxels are transparent, stepped by whole voxels: the setting of
-    a figure that is known of VTK.
+    """Clouds with 68 % transparent voxels, at steps of a whole voxel: settings for which a figure
+    of VTK is known.
     """
     z, y, x = _grid(side)
     field = torch.zeros_like(x)
@@ -113,10 +113,10 @@ def clouds(side: int) -> BenchScene:
 
 
 def aneurism(side: int) -> BenchScene:
-    """The bundled scan; of smaller sides every so many voxels of it.
+    """The bundled scan, subsampled to about `side` voxels.
 
     Raises:
-        FileNotFoundError: The checkout with the scan is not here.
+        FileNotFoundError: The scan's file is missing; it comes with the source.
     """
     data = read_volume(SCAN).data[..., 0]
     every = max(1, data.shape[0] // side)
@@ -126,7 +126,7 @@ def aneurism(side: int) -> BenchScene:
 
 
 def scan_or_fog(side: int, note: Callable[[str], None] | None = None) -> BenchScene:
-    """The scan; fog where it is not here, which is noted."""
+    """Returns the scan; where its file is missing, fog, and calls `note` with the reason."""
     try:
         return aneurism(side)
     except FileNotFoundError:
@@ -136,8 +136,8 @@ def scan_or_fog(side: int, note: Callable[[str], None] | None = None) -> BenchSc
 
 
 def worn_planes(side: int) -> Iterator[np.ndarray]:
-    """A sphere worn by gyroids of five scales, a solid with holes, as uint8 planes (y, x) from low
-    z to high.
+    """Yields a sphere eroded by gyroids of five scales, a solid with holes, as uint8 planes (y, x)
+    from low z to high.
     """
     line = np.linspace(-1, 1, side, dtype=np.float32)
     y, x = line[:, None], line[None, :]

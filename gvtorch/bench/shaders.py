@@ -1,4 +1,4 @@
-"""`shaders`: steady frames of each shader, beside the plain transfer function of the same scene."""
+"""`shaders`: steady frames of each shader, relative to a simpler one in the same scene."""
 
 from __future__ import annotations
 
@@ -38,21 +38,21 @@ from .march import Size, difference, op_milliseconds, rates, rgba
 from .record import Record, clock
 from .scenes import BenchScene, aneurism, fog_dense, worn
 
-_WIDE = 16  # numbers of the widest channel
+_WIDE = 16  # components of the widest channel
 _OWN = Path(__file__).with_name("own_shader.h")
 SUN = DirectionalLight((1.0, -2.0, -1.5), angle=4.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShaderCase:
-    """A shader with its options, and the look that its time is a ratio of."""
+    """A shader with its options (a look), and the name of the look that it is compared with."""
 
     name: str
     shader: Callable[[BenchScene], Shader]
     options: Mapping[str, Any] = field(default_factory=dict)  # of `RenderOptions`
     beside: str = "plain"
-    twin: bool = False  # both must draw the same picture
-    slow: bool = False  # left out of scenes with but one channel
+    twin: bool = False  # must draw the same picture as `beside`
+    slow: bool = False  # left out of scenes with only one channel
     compiles: bool = False  # left out where there is no compiler
 
 
@@ -79,8 +79,8 @@ def _cones(name: str, *, occlusion: float = 0.0, indirect: float = 0.0) -> Shade
     )
 
 
-#: What is measured, each behind the look that it stands beside. Left out where a scene has not the
-#: channels that a shader names.
+#: The measured looks, each after the look in its `beside`. A look is left out of scenes that lack
+#: a channel of its shader.
 LOOKS = (
     *(ShaderCase(name=name, shader=partial(_named, name)) for name in BY_NAME),
     _cones("shadow"),
@@ -111,13 +111,13 @@ LOOKS = (
 
 @torch.no_grad()
 def shaders(record: Record) -> None:
-    """Each look of three scenes as resident trees, and of the first in the engine."""
+    """Measures each look in resident trees of three scenes, and in the engine for the first."""
     settings = record.settings
     side, size = 256, (512, 512)
     if settings.quick:
         side, size = 32, (24, 16)
     elif settings.device.type == "cuda":
-        size = (1920, 1080)  # fewer rays would not fill it
+        size = (1920, 1080)  # fewer rays would not fill the GPU
     for make in (aneurism, fog_dense, worn):  # mostly empty, all sampled, rays that end soon
         try:
             scene = make(side)
@@ -216,7 +216,7 @@ def _measure(
             prepare(shader, **options)
         run = partial(frame, shader, **options)
         timing = clock(run, record.settings)
-        shown = timing.last  # a module's takes long, and is not made again
+        shown = timing.last  # not rendered again: a module takes long
         medians[look.name], pictures[look.name] = timing.median, rgba(shown)
         figures = {"beside": look.beside, "times": timing.median / medians[look.beside]}
         figures |= rates(shown, timing)
@@ -229,13 +229,13 @@ def _measure(
 
 
 def _compiles(device: torch.device) -> bool:
-    """Whether a header can be compiled for a device."""
+    """Returns whether a header can be compiled for a device."""
     host = shutil.which(compilers.find_cxx()[0])
     return bool(host and (device.type == "cpu" or compilers.find_nvcc()))
 
 
 def _wanted(record: Record, case: str) -> list[ShaderCase]:
-    """The looks of a case that are asked for, and those that they stand beside."""
+    """Returns the looks of a case that are wanted, and those that they are compared with."""
     names = {look.name for look in LOOKS if record.wants(f"{case}, {look.name}")}
     for look in reversed(LOOKS):
         if look.name in names:
@@ -244,7 +244,7 @@ def _wanted(record: Record, case: str) -> list[ShaderCase]:
 
 
 def _channels(scene: BenchScene) -> dict[str, Volume]:
-    """Normals, colours and numbers of a scene's voxels: all is even where its value is."""
+    """Returns normals, colours and numbers computed from voxel values: constant where these are."""
     value = scene.volume.data[..., 0].float()
     normal = torch.nn.functional.normalize(torch.stack(torch.gradient(value)[::-1], -1), dim=-1)
     color = torch.from_numpy(scene.shader(value.numpy()))

@@ -1,8 +1,8 @@
-"""Stores: `convert`, a volume file to a store, and `blocks`, random bordered blocks out of one,
-beside what Zarr does without stored borders in the same run.
+"""Stores: `convert` (a volume file to a store) and `blocks` (random bordered blocks out of one,
+compared in the same run with Zarr without stored borders).
 
-The volume is made up: waves and noise in a ball, zero around it. The peers keep aligned chunks of
-the same voxels and gather each bordered block from them and their neighbours.
+The volume is synthetic: waves and noise in a ball, zero around it. The peers store aligned chunks
+of the same voxels, and gather each bordered block from a chunk and its neighbours.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Reader = Callable[[np.ndarray], object]
 
 
 def convert(record: Record) -> None:
-    """A RAW file to a store, all cores; the file lies in the page cache."""
+    """Converts a RAW file to a store on all cores; the file is in the page cache."""
     settings = record.settings
     side = 64 if settings.quick else 1024
     case = f"{side}^3 uint8"
@@ -40,7 +40,7 @@ def convert(record: Record) -> None:
 
 
 def blocks(record: Record) -> None:
-    """Random blocks that hold data, so many at once."""
+    """Reads random blocks that hold data, in calls of 64 to 4096 blocks."""
     settings = record.settings
     side = 64 if settings.quick else 1024
     counts = (8,) if settings.quick else (64, 256, 1024, 4096)
@@ -87,7 +87,7 @@ def _raw(folder: Path, side: int) -> Path:
 
 
 def _readers(record: Record, folder: Path, store: Store) -> Iterator[tuple[str, Reader]]:
-    """Who reads, ours first, and how."""
+    """Yields the name of each reader, ours first, and its function of block indices (k, 3)."""
     yield "gvtorch", lambda zyx: store.read_blocks(0, zyx)
     peers = [name for name in ("tensorstore", "zarr") if record.has_peer(name, "zarr")]
     if not peers:
@@ -126,7 +126,7 @@ def _write_aligned(path: Path, store: Store) -> None:
 
 
 def _gather(read: Callable[[tuple[slice, ...]], Any], zyx: np.ndarray, side: int) -> list[Any]:
-    """Reads bordered blocks as regions; those at the volume's faces come out smaller."""
+    """Reads bordered blocks as regions; those at the volume's faces are smaller."""
     low = np.maximum(zyx * _BLOCK - 1, 0)
     high = np.minimum((zyx + 1) * _BLOCK + 1, side)
     return [read(tuple(map(slice, a, b))) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
@@ -135,8 +135,8 @@ def _gather(read: Callable[[tuple[slice, ...]], Any], zyx: np.ndarray, side: int
 def clock_store(
     record: Record, case: str, path: Path, make: Callable[[], Store], **amounts: int
 ) -> None:
-    """Times how a store is made at a path, again and again, and takes a row with its memory and
-    disk, and with how much of each of the `amounts` that is in a second.
+    """Times `make`, which writes a store at a path, repeatedly; adds a row with its memory and disk
+    use, and with each of the `amounts` per second.
     """
     settings, times, most = record.settings, list[float](), 0
     began = time.perf_counter()
@@ -158,8 +158,8 @@ def clock_store(
 
 
 class Memory:
-    """Largest memory of this process and its children together, while it runs, and the first that
-    was seen (Linux).
+    """Samples the memory of this process and its children together while it is entered; `most` and
+    `first` are the largest and the first sample, in bytes (Linux).
     """
 
     def __init__(self) -> None:

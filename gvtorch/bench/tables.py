@@ -15,12 +15,12 @@ def columns(record: dict[str, Any]) -> list[str]:
 
 
 def heading(name: str) -> str:
-    """Returns a field's name for people."""
+    """Returns a field's name as a column's heading."""
     return name.replace("_per_second", " / s").replace("_", " ")
 
 
 def cell(name: str, value: Any) -> str:
-    """Returns a figure for people: rates and bytes with prefixes, shares in percent."""
+    """Returns a figure as text: rates and bytes with prefixes, shares in percent."""
     if value is None or isinstance(value, (bool, str)):
         return {"True": "yes", "False": "no", "None": ""}.get(str(value), str(value))
     if name.endswith("share"):
@@ -54,14 +54,14 @@ def markdown(record: dict[str, Any]) -> str:
 
 
 def title(record: dict[str, Any]) -> str:
-    """Returns what was run, and where."""
+    """Returns workload, machine and torch's version in a line."""
     machine = record["machine"]
     sizes = ", quick sizes" if record["quick"] else ""
     return f"{record['workload']}, {machine['name']}, torch {machine['torch']}{sizes}"
 
 
 def file_name(record: dict[str, Any]) -> str:
-    """Returns the name under which a record is kept: one a workload and machine."""
+    """Returns the file name of a record: one for each workload and machine."""
     name = "".join(c if c.isalnum() else "-" for c in record["machine"]["name"].lower())
     machine = "-".join(part for part in name.split("-") if part)
     return f"{record['workload']}.{machine}{'.quick' if record['quick'] else ''}.json"

@@ -1,4 +1,5 @@
-"""The viewer: pictures a second, and from the hand to the picture, beside peers: `view`."""
+"""`view`: the viewer's pictures a second, and its latency from a camera move to the picture,
+compared with peers."""
 
 from __future__ import annotations
 
@@ -19,12 +20,12 @@ from .peers.pages import DIFFERS, NEEDS, PAGES, Site, served
 from .record import Record, spread
 from .scenes import BenchScene, scan_or_fog
 
-_RATES = (25.0, 60.0)  # pictures a second that are wanted
-_HELD = 1 / 60  # seconds between camera messages, as of a hand that drags
+_RATES = (25.0, 60.0)  # requested pictures a second
+_HELD = 1 / 60  # seconds between camera messages, as when a user drags
 
 
 def view(record: Record) -> None:
-    """A page that turns a scan for some seconds over a websocket of this machine."""
+    """Measures a client that turns a scan for some seconds over a local websocket."""
     try:
         import aiohttp  # noqa: F401
         import PIL  # noqa: F401
@@ -73,7 +74,7 @@ def _p95(times: list[float]) -> float:
 
 
 def _beside(record: Record, scene: BenchScene, sizes: tuple[tuple[int, int], ...]) -> None:
-    """The pages of peers and ours in a browser, turned by the same hand."""
+    """Measures our page and those of peers in a browser, dragged in the same way."""
     settings = record.settings
     why = browser.absent()
     peers = [name for name, module in NEEDS.items() if record.has_peer(name, module, why)]
@@ -115,9 +116,9 @@ def _beside(record: Record, scene: BenchScene, sizes: tuple[tuple[int, int], ...
 
 
 async def _page(url: str, size: tuple[int, int], rate: float, seconds: float) -> tuple[Any, ...]:
-    """Looks at a view as a page does: waits until it rests, then turns it. Returns milliseconds of
-    each picture, of the first one and of the first at full resolution, shares of the pixels, and
-    seconds.
+    """Acts as a page does: waits until the picture is final, then turns the camera. Returns the
+    milliseconds of each picture, of the first one and of the first at full resolution, the share of
+    the pixels that each picture has, and the seconds of turning.
     """
     import aiohttp
     from PIL import Image
@@ -179,7 +180,7 @@ async def _page(url: str, size: tuple[int, int], rate: float, seconds: float) ->
 
 
 def _around(eye: dict[str, Any], angle: float) -> list[float]:
-    """The eye turned about +y through the target."""
+    """Returns the eye, turned about +y through the target."""
     x, y, z = (a - b for a, b in zip(eye["eye"], eye["target"], strict=True))
     c, s = math.cos(angle), math.sin(angle)
     turned = (c * x + s * z, y, c * z - s * x)

@@ -1,7 +1,7 @@
-"""Meshes to voxels: `voxelize`, triangles to a region of a grid and to a store, beside other
-libraries in the same run.
+"""`voxelize`: triangles to voxels in memory and to a store, compared with other libraries in the
+same run.
 
-The mesh is made up: a sphere with bumps, of as many triangles as are asked for.
+The mesh is synthetic: a sphere with bumps, of a chosen number of triangles.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from ..meshes.voxelizer import Voxelizer
 from .record import Record, clock
 from .storage import clock_store
 
-_PART = 512  # voxels along a side of the regions that are asked for
+_PART = 512  # voxels along a side of the regions that are computed at once
 
 
 def voxelize(record: Record) -> None:
-    """Coverage of 100,000 triangles: all finest voxels into memory, and a store of all levels."""
+    """Computes the coverage of 100,000 triangles: all finest voxels in memory, then a store."""
     settings = record.settings
     faces, side = (2_000, 64) if settings.quick else (100_000, 1024)
     mesh = bumps(faces)
@@ -49,7 +49,7 @@ def voxelize(record: Record) -> None:
 
 
 def _volume(grid: Voxelizer) -> float:
-    """Makes all finest voxels, part by part; their volume."""
+    """Computes all finest voxels, part by part; returns the volume that they cover."""
     total = torch.zeros((), dtype=torch.int64, device=grid.device)
     x, y, z = grid.extent
     for k in range(0, z, _PART):
@@ -69,8 +69,8 @@ def _store(record: Record, case: str, mesh: Mesh, side: int) -> None:
 
 
 def _peers(record: Record, mesh: Mesh, side: int) -> None:
-    """Signed distances of all voxels near the surface, and of as many places, which igl is asked
-    for; a filled grid of as many voxels, which trimesh makes.
+    """Compares coverage of all voxels (gvtorch) with a filled grid of as many voxels (trimesh) and
+    signed distances at every 64th voxel's centre (igl).
     """
     settings = record.settings
     case = f"{len(mesh.faces):,} triangles, {side}^3 beside peers"
@@ -105,7 +105,7 @@ def _peers(record: Record, mesh: Mesh, side: int) -> None:
 
 
 def bumps(faces: int) -> Mesh:
-    """A sphere with bumps of two sizes, of about so many triangles, closed."""
+    """Returns a closed sphere with bumps of two sizes, of about `faces` triangles."""
     rows = max(4, round((faces / 4) ** 0.5))
     columns = 2 * rows
     a, b = np.meshgrid(

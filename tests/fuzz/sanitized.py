@@ -1,11 +1,11 @@
-"""Builds the CPU library with sanitizers, and runs tests with it in the place of the other.
+"""Builds the CPU library with sanitizers, and runs tests with it in place of the usual one.
 
     python tests/fuzz/sanitized.py address tests/test_words.py ...
 
-The package is copied into build/sanitized-KINDS, so that the usual library stays as it is. It is
-compiled for baseline x86-64 alone (instruction sets share their source), at -O1, with
-AddressSanitizer's checks as calls, and of UndefinedBehaviorSanitizer's those are left out that it
-makes as well: three minutes of a processor, where all of them in line at -O3 take half an hour.
+The package is copied into build/sanitized-KIND, so that the usual library stays as it is. It is
+compiled only for baseline x86-64 (instruction sets share their source), at -O1, with
+AddressSanitizer's checks as calls, and without UndefinedBehaviorSanitizer's checks that duplicate
+them: this takes three minutes of a processor, all of them inline at -O3 half an hour.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ UNDEFINED = (
 )
 KINDS = {"address": ("address", *UNDEFINED), "thread": ("thread",)}
 CALLS = {"address": " -fno-sanitize-recover=all --param asan-instrumentation-with-call-threshold=0"}
-# What must be loaded first: AddressSanitizer looks for the library's `throw` when it starts.
+# Libraries to preload: AddressSanitizer looks for the C++ library's `throw` when it starts.
 LIBRARIES = {"address": ("libasan.so", "libstdc++.so.6"), "thread": ("libtsan.so",)}
-# torch's OpenMP is not compiled with ThreadSanitizer, which does not see its barriers: threads are
-# Python's there, and each does its loops alone.
+# torch's OpenMP is not compiled with ThreadSanitizer, which therefore misses its barriers: there,
+# only Python's threads run, and each runs its loops alone.
 THREADS = {"address": "2", "thread": "1"}
 
 
 def options(kind: str, log: Path) -> dict[str, str]:
     """Returns the environment that the sanitizers read; they write to files that begin with `log`,
-    for pytest keeps what a test prints.
+    because pytest captures what a test prints.
     """
     unknown = f"suppressions={ROOT / 'tests/fuzz/tsan.txt'}:ignore_noninstrumented_modules=1"
     return {
@@ -47,13 +47,13 @@ def options(kind: str, log: Path) -> dict[str, str]:
 
 
 def found(name: str) -> str:
-    """Returns the path of a library of the compiler's."""
+    """Returns the path of a library that comes with the compiler."""
     call = ["g++", f"-print-file-name={name}"]
     return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def main(kind: str, *tests: str) -> int:
-    """Returns pytest's exit status, or 1 if the sanitizers have told anything."""
+    """Returns pytest's exit status, or 1 if the sanitizers have reported anything."""
     folder = ROOT / "build" / f"sanitized-{kind}"
     package = folder / "gvtorch"
     shutil.copytree(

@@ -1,7 +1,7 @@
 """Broken input by the thousand: readers, metadata of stores, JSON of every kind, arguments of ops.
 
-Each input is made from a seed. In the tests a few run; `make fuzz MINUTES=60` goes on with seeds
-that no run had before. An input that breaks something is kept in `found` and tried in every run.
+Each input is made from a seed. A plain run tries a few; `make fuzz MINUTES=60` tries random seeds
+for that long. An input that breaks something is stored in `found` and tried in every run.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ FEW = 40  # inputs of each kind in a plain run
 FOUND = Path(__file__).parent / "found"
 SLOW = 10.0  # seconds of processor time that one input may take
 MEMORY = 2 * 10**9  # bytes that it may take
-TOLD = (ValueError, OSError)  # how input is refused
+TOLD = (ValueError, OSError)  # errors by which input is refused
 
 
 def broken(content: bytes, pick: random.Random) -> bytes:
-    """Cuts, changes, repeats and swaps bytes; numbers become others that are at the ends."""
+    """Cuts, changes and repeats bytes, and overwrites some with extreme numbers."""
     made = bytearray(content)
     for _ in range(pick.choice((1, 2, 8))):
         at = pick.randrange(len(made)) if made else 0
@@ -62,9 +62,9 @@ Attempt = Callable[[random.Random], tuple[str, Callable[[], bytes], str]]
 
 
 def first_fault(kind: str, attempt: Attempt) -> str:
-    """Runs `attempt` for seeds; it returns what went wrong, or "", what gives the input, and the
-    input's name. Returns what went wrong first, or took too long or too much memory, or "". A
-    signal ends the tests.
+    """Runs `attempt` for seeds; it returns what went wrong or "", a function that returns the
+    input, and the input's name. Returns the first fault, also of time or memory, or "". A crash
+    ends the tests.
     """
     begun, seed = time.monotonic(), 0
     begin = random.randrange(10**9) if SECONDS else 0
@@ -87,12 +87,12 @@ def first_fault(kind: str, attempt: Attempt) -> str:
 
 
 def most_memory() -> int:
-    """The most bytes that this process ever held."""
+    """Returns the peak memory of this process in bytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def outcome(call: Callable[[], Any], *told: type[BaseException]) -> str:
-    """What a call should not have done, or ""."""
+    """Returns which error a call raised wrongly, or ""."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -104,7 +104,7 @@ def outcome(call: Callable[[], Any], *told: type[BaseException]) -> str:
     return ""
 
 
-FREE = 2 * 10**8  # bytes: a sparse grid of a few kB may tell of any box, and is read if it fits
+FREE = 2 * 10**8  # bytes: a sparse grid of a few kB may claim a huge box, and is read if it fits
 
 
 @pytest.fixture(autouse=True)
@@ -116,11 +116,11 @@ def short_budget(monkeypatch):
 # --- readers
 
 
-Whole = dict[str, tuple[bytes, Callable[[Path], Any]]]  # what a file holds, and its reader
+Whole = dict[str, tuple[bytes, Callable[[Path], Any]]]  # a file's content, and its reader
 
 
 def volumes(folder: Path) -> Whole:
-    """A small file of every format of volumes that can be written here."""
+    """Writes a small file in every volume format that can be written here."""
     data = (np.arange(4 * 5 * 6).reshape(4, 5, 6) % 200).astype(np.uint8)
     np.save(folder / "a.npy", data)
     np.savez_compressed(folder / "a.npz", a=data)
@@ -158,7 +158,7 @@ def read_by(folder: Path, read: Callable[[Path], Any]) -> Whole:
 
 
 def meshes(folder: Path) -> Whole:
-    """Triangles, of every format that trimesh writes."""
+    """Writes triangles in every format that trimesh can write."""
     import trimesh
 
     mesh = trimesh.creation.box()
@@ -170,7 +170,7 @@ def meshes(folder: Path) -> Whole:
 
 
 def images(folder: Path) -> Whole:
-    """A picture in every format that is read again."""
+    """Writes a picture in every format that can be read back."""
     tree = gv.N3Tree.from_volume(gv.Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2)))
     look = gv.TransferFunction.preset("hot", 0, 7)
     made = gv.render(tree, gv.Camera.orbit(width=9, height=7), look)
@@ -193,7 +193,7 @@ def points(folder: Path) -> Whole:
 
 
 def looks(folder: Path) -> Whole:
-    """Cameras, paths of cameras, states of a view, key frames."""
+    """Writes cameras, camera paths, states of a view, key frames."""
     camera = gv.Camera.look_at((1, 2, 3), (0, 0, 0), width=8, height=6)
     for name in ("cameras.json", "camera.pvcc"):
         gv.write_cameras(folder / name, camera)
@@ -259,7 +259,7 @@ def test_metadata_of_stores(tmp_path):
 
 
 def value(pick: random.Random, depth: int = 0) -> Any:
-    """Any JSON value, with numbers at the ends."""
+    """Returns a random JSON value, with extreme numbers."""
     kind = pick.randrange(9 if depth < 4 else 6)
     if kind < 6:
         ends = (0, -1, 2**63, 10**400, 1e308, -1e-320, 0.5)
@@ -269,7 +269,7 @@ def value(pick: random.Random, depth: int = 0) -> Any:
 
 
 def changed(content: Any, pick: random.Random) -> Any:
-    """A value with one of its parts replaced."""
+    """Returns a JSON value with a random part replaced."""
     if isinstance(content, (dict, list)) and content and pick.random() < 0.8:
         keys = sorted(content) if isinstance(content, dict) else list(range(len(content)))
         made: Any = dict(content) if isinstance(content, dict) else list(content)
@@ -320,8 +320,8 @@ def random_tensor(pick: random.Random) -> torch.Tensor:
 
 
 def test_arguments_of_ops(blobs):
-    """Of an op called well, some arguments are replaced: it returns, or raises RuntimeError; what
-    it reads and writes is its own, which `make asan` watches.
+    """Some arguments of a valid op call are replaced: it returns, or raises RuntimeError; it must
+    not read or write out of bounds, which `make asan` checks.
     """
     from helpers.traces import SHADER, arguments, packed
 
@@ -359,7 +359,7 @@ def test_arguments_of_ops(blobs):
                     other = flat[: old.numel()].view(old.shape).to(old.dtype)
                 values[at] = other
             elif values[at] is not None:
-                small = (-1, 0, 1, 7, 0.0, float("nan"), 1e-4)  # a step of 1e-9 is work asked for
+                small = (-1, 0, 1, 7, 0.0, float("nan"), 1e-4)  # 1e-9 would be a step of much work
                 values[at] = (
                     type(values[at])(pick.choice(small))
                     if isinstance(values[at], float)
@@ -377,7 +377,7 @@ FILES = sorted(file for file in FOUND.iterdir() if file.name.startswith(("reader
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
 def test_what_was_found_is_mended(file, tmp_path):
-    """Each is named by what it is, its seed, and the name that it had."""
+    """Files are named by kind, seed, and the name of the input."""
     kind, _, name = file.name.split("-", 2)
     copy = tmp_path / name
     copy.write_bytes(file.read_bytes())

@@ -1,4 +1,4 @@
-"""What several test files share. Test files import from here, never from one another."""
+"""Code that several test files share. Test files import from here, never from one another."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ ROOT = Path(__file__).parents[2]
 TESTS = ROOT / "tests"
 DATA = ROOT / "examples" / "data"
 SHARED = ROOT.parent / "shared" / "data"
-#: By backend.
+#: Device of each backend.
 DEVICES = {"reference": "cpu", "cpp": "cpu", "cuda": "cuda"}
-#: How the reason of a skip begins that the summary tells of.
+#: A skip whose reason begins like this is listed in the summary.
 ABSENT = "shared test data is not here: "
 
 
 def shared(path: str) -> Path:
-    """A file of the shared test data, or a skip that the summary tells of."""
+    """Returns a file of the shared test data, or skips the test, which the summary reports."""
     file = SHARED / path
     if not file.exists():
         pytest.skip(ABSENT + path)
@@ -32,13 +32,13 @@ def shared(path: str) -> Path:
 
 
 def resident_bytes() -> int:
-    """Memory that this process holds."""
+    """Returns the resident memory of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def gvtorch(*args: object, cwd: str | Path = ".") -> subprocess.CompletedProcess[str]:
-    """Runs the command line within this process, with the warnings that a process of its own has:
-    that would import torch for each call.
+    """Runs the command line within this process (another would import torch for each call), with
+    the default warnings of a new process.
     """
     out, error = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
     status = 0
@@ -61,8 +61,8 @@ def gvtorch(*args: object, cwd: str | Path = ".") -> subprocess.CompletedProcess
 
 
 def run(capsys, *args: object) -> tuple[int, str, str]:
-    """Runs the command line within this process, with the tests' own warnings, which are errors:
-    exit status, output and errors.
+    """Runs the command line within this process, with the tests' warning filters, which raise
+    errors; returns exit status, output and errors.
     """
     try:
         main([str(arg) for arg in args])

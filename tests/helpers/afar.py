@@ -1,4 +1,4 @@
-"""Matter to be seen from afar, and pictures of it beside many fine rays."""
+"""Volumes to be seen from afar, and their pictures, to compare with many fine rays a pixel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from helpers.trees import forget
 
 
 def matter(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> gv.Volume:
-    """Rough and smooth matter, between a region of zeros and one of another single value."""
+    """Returns a volume of rough and smooth values, with a region of zeros and a constant one."""
     generator = torch.Generator().manual_seed(4)
     coarse = torch.rand((1, 1, 12, 12, 12), generator=generator)
     value = torch.nn.functional.interpolate(coarse, size=(37, 33, 41), mode="trilinear")[0, 0]
@@ -25,7 +25,7 @@ def matter(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> gv.Volume:
 def filtered(
     look: gv.TransferFunction | gv.Lit, branching: int = 2, **options
 ) -> tuple[gv.N3Tree, gv.Filtered]:
-    """Matter in a tree with colours for its coarse voxels; options of `matter` and `Filtered`."""
+    """Returns `matter` as a tree, and its `Filtered` shader; takes the options of both."""
     volume = matter(**{name: options.pop(name) for name in ("spacing",) if name in options})
     tree = gv.N3Tree.from_volume(volume, 4, branching=branching, threshold=0.0)
     return tree, gv.Filtered.of(tree, volume, look, **options)
@@ -34,8 +34,8 @@ def filtered(
 def assert_same_bits(
     tree: gv.N3Tree, backend: str, distance: float, shader: gv.Shader, **options
 ) -> dict[str, torch.Tensor]:
-    """The twin's hits of rays from a distance, through the tree and through one with holes; they
-    are those of a backend, in float32 on the CPU in every bit.
+    """Asserts that a backend's hits from a distance equal the twin's, in the tree and in a copy
+    with holes; in float32 on the CPU in every bit. Returns the twin's hits of the copy.
     """
     rays = camera_rays(tree, 14, distance=distance)
     for which in (tree, forget(tree, 0.3, 5)):
@@ -47,7 +47,7 @@ def assert_same_bits(
 
 
 def walls() -> gv.Volume:
-    """Walls one and a half voxels thick, upright and slanted, threads, and a ball of noise."""
+    """Returns a volume of thin upright and slanted walls, a thread, and a ball of noise."""
     n = 96
     z, y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float32),) * 3, indexing="ij")
     inside = (x > 15) & (x < 60) & (y > 15) & (y < 80) & (z > 15) & (z < 80)
@@ -60,14 +60,14 @@ def walls() -> gv.Volume:
 
 
 def rays(origin: torch.Tensor, direction: torch.Tensor, cone: torch.Tensor) -> gv.Rays:
-    """Rays without an end."""
+    """Returns rays with a range of [0, 1e9]."""
     limits = torch.tensor([[0.0, 1e9]], dtype=torch.float64).expand(len(origin), 2)
     columns = (one.contiguous() for one in (origin, direction, cone, limits))
     return gv.Rays(**dict(zip(("origin", "direction", "cone", "range"), columns, strict=True)))
 
 
 def parallel(tree: gv.N3Tree, way: tuple[float, float, float], pixel: float, parts: int) -> gv.Rays:
-    """Rays of an orthographic picture through a whole tree, parts^2 a pixel, as wide as a part."""
+    """Returns orthographic rays through a whole tree: parts^2 a pixel, each as wide as a part."""
     forward = torch.nn.functional.normalize(torch.tensor(way, dtype=torch.float64), dim=0)
     right = torch.nn.functional.normalize(
         torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]).double(), forward), dim=0
@@ -91,7 +91,7 @@ def picture(
     parts: int = 1,
     lod: str = "auto",
 ) -> torch.Tensor:
-    """(h, w, 4) means over the parts^2 rays of each pixel."""
+    """Returns (h, w, 4): the means over the parts^2 rays of each pixel."""
     given = parallel(tree, way, pixel, parts)
     hits = gv.trace(tree, given, shader, lod=lod)
     side = math.isqrt(len(given.origin)) // parts
@@ -100,7 +100,7 @@ def picture(
 
 
 def compare(found: torch.Tensor, truth: torch.Tensor) -> tuple[float, float]:
-    """Light over the truth's, and PSNR over pixels that show something."""
+    """Returns light relative to the truth's, and PSNR over pixels that show something."""
     shown = (truth[..., 3] > 1e-3) | (found[..., 3] > 1e-3)
     error = float((found - truth)[..., :3][shown].square().mean())
     return float(found[..., :3].mean() / truth[..., :3].mean()), -10 * math.log10(error)

@@ -1,4 +1,4 @@
-"""A browser without a window: Chromium of the system, driven by playwright."""
+"""A headless browser: Chromium of the system, driven by playwright."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Tab", "absent", "executable", "running"]
 
 
 class Tab:
-    """A page in the browser, and all that it complained of or asked for."""
+    """A page in the browser, its errors and warnings (`complaints`), and its requests."""
 
     def __init__(self, browser: Any, url: str, **options: Any) -> None:
         options = {"viewport": {"width": 1000, "height": 420}, **options}
@@ -37,7 +37,7 @@ class Tab:
             self.complaints.append(message.text)
 
     def app(self, script: str) -> Any:
-        """What an expression of the page's `app` is."""
+        """Returns the value of an expression of the page's `app`."""
         return self.page.evaluate(
             f"() => {{ const app = document.querySelector('.gv').app; return {script}; }}"
         )
@@ -53,12 +53,12 @@ class Tab:
             self.page.wait_for_timeout(30)
 
     def final(self) -> np.ndarray:
-        """Waits for a picture at rest that shows what was asked for; (h, w, 3) uint8."""
+        """Waits for the final picture of all changes so far; returns (h, w, 3) uint8."""
         self.until("!!app && !app.before && !app.asked && app.view.head?.final")
         return self.pixels()
 
     def pixels(self) -> np.ndarray:
-        """(h, w, 3) uint8 of the canvas."""
+        """Returns the canvas as (h, w, 3) uint8."""
         size, data = self.page.evaluate(
             """() => {
               const c = document.querySelector(".gv-picture");

@@ -1,4 +1,4 @@
-"""Clips of every kind, and what they keep: straight from their definition."""
+"""Clips of every kind, and which positions they keep, computed directly from the definition."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import gvtorch as gv
 
 
 def turned(degrees: float, size: float, centre: tuple[float, float, float]) -> torch.Tensor:
-    """The matrix of a cube that is turned about z and then about x."""
+    """Returns the matrix of a cube that is turned about z and then about x."""
     a = math.radians(degrees)
     about_z = torch.tensor(
         [[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]]
@@ -27,7 +27,7 @@ def turned(degrees: float, size: float, centre: tuple[float, float, float]) -> t
 
 
 def inside(box, places: np.ndarray) -> np.ndarray:
-    """Whether (k, 3) places lie in a box: straight from its definition."""
+    """Returns which (k, 3) positions lie in a box, directly from its definition."""
     if len(box) == 2:
         low, high = np.array(box)
         return ((places >= low) & (places <= high)).all(1)
@@ -50,7 +50,7 @@ CLIPS = {
 
 
 def shown(clip: gv.Clip, places: np.ndarray) -> np.ndarray:
-    """Whether (k, 3) places are kept."""
+    """Returns which (k, 3) positions are kept."""
     seen = np.ones(len(places), dtype=bool)
     for *normal, offset in clip.planes:
         seen &= places @ np.array(normal) + offset >= 0

@@ -1,4 +1,4 @@
-"""Shaders of users, and compilers that are quick or listened to."""
+"""User-defined shaders, and compilers that are fast or only preprocess."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HEADER = TESTS / "cpp" / "user_shaders.h"
 
 
 def quick_compiler(folder: Path, *before: str) -> str:
-    """A compiler that does not optimise, after some lines of shell."""
+    """Writes a compiler that does not optimise, after some lines of shell; returns its path."""
     real, file = shutil.which(compilers.find_cxx()[0]), folder / "c++"
     file.write_text("\n".join(("#!/bin/sh", *before, f'exec {real} "$@" -O0\n')))
     file.chmod(0o755)
@@ -24,7 +24,7 @@ def quick_compiler(folder: Path, *before: str) -> str:
 
 
 def users_shader(header: Path, struct: str, **options) -> gv.CompiledShader:
-    """A user's shader: where several processes of tests want the same, one compiles it."""
+    """Makes a user's shader; if several test processes want the same one, only one compiles it."""
     what = "\0".join((os.environ.get("CXX", ""), struct, str(header), header.read_text()))
     name = hashlib.sha256(what.encode()).hexdigest()
     with Path(os.environ["GVTORCH_CACHE"]).with_name(f"{name}.lock").open("w") as lock:
@@ -33,12 +33,12 @@ def users_shader(header: Path, struct: str, **options) -> gv.CompiledShader:
 
 
 def only_included(folder: Path, *before: str) -> str:
-    """A compiler that writes what a real one would compile, and notes what that is made of."""
+    """Writes a compiler that only preprocesses: it lists included files, but compiles nothing."""
     return quick_compiler(folder, *before, 'set -- "$@" -E')
 
 
 def write(folder: Path, body: str, name: str = "own.h") -> Path:
-    """A header with a struct `Own` around `body`, without packets, which take twice as long."""
+    """Writes a header with a struct `Own` around `body`, without packets, which compile slowly."""
     path = folder / name
     path.write_text(
         '#define GV_RAY_BY_RAY\n#include "user_shader.h"\n'

@@ -1,4 +1,4 @@
-"""Breaks files in many ways, and reads the pieces in a process that may crash."""
+"""Damages files in many ways, and reads them in another process, which may crash."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 WAYS = 50
 _SECONDS = 240
-_MEMORY = 3 << 30  # bytes of address space beyond what the libraries take
+_MEMORY = 3 << 30  # bytes of address space beyond what the libraries use
 
 _READER = """
 import json, resource, sys, warnings
@@ -39,7 +39,7 @@ for path in paths:
 
 
 def break_file(content: bytes, number: int) -> bytes:
-    """Cuts a file (even numbers) or changes some of its bytes, most of them near its begin."""
+    """Cuts a file (even numbers), or changes some of its bytes, mostly near its beginning."""
     chance = random.Random(number)
     if number % 2 == 0:
         return content[: chance.randrange(len(content))]
@@ -51,8 +51,8 @@ def break_file(content: bytes, number: int) -> bytes:
 
 
 def outcomes(path: Path, folder: Path, **options: Any) -> list[tuple[str, str]]:
-    """Breaks a file, or one file of a folder, in 50 ways; returns "read" or "refused" and the
-    message of each, the first of them that of the whole file.
+    """Reads a file, or folder, and 50 copies of which a file is damaged; returns for each "read",
+    "refused" or an error's name, and the message. The first is of the undamaged file.
 
     Raises:
         AssertionError: The process crashed or did not end.
@@ -85,8 +85,8 @@ def outcomes(path: Path, folder: Path, **options: Any) -> list[tuple[str, str]]:
 
 
 def assert_told(path: Path, folder: Path, least: int = 15, **options: Any) -> None:
-    """Asserts that the whole file is read, and that every broken one is read or refused in a line
-    that names it; at least so many are refused.
+    """Asserts that the whole file is read, and that every damaged one is read or refused with a
+    one-line message that names it; at least `least` are refused.
     """
     (first, message), *rest = outcomes(path, folder, **options)
     assert first == "read", message

@@ -1,7 +1,7 @@
 """Random scenes, each made from its seed, through the public interface alone.
 
-`settings` draws all that a scene is, as plain values; the functions after it make the objects. What
-it draws is the same on every machine, and so is what it makes, but for what gvtorch computes.
+`settings` draws everything that defines a scene, as plain values; the functions after it make the
+objects. Draws and objects are the same on every machine, except for what gvtorch computes.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ LOOKS = (
     *("isosurface", "coloured isosurface", "distance field", "maximum", "minimum", "mean"),
     *("features", "module", "transfer module", "plain"),
 )
-FIRST, LATER = 200, ("channels",) * 10 + ("labels",) * 20  # of the scenes from that number on
+FIRST, LATER = 200, ("channels",) * 10 + ("labels",) * 20  # scenes from number FIRST on
 SCENES = FIRST + len(LATER)
 WAYS = (
     *("render", "render", "render", "holes", "holes"),
     *("engine", "engine", "levels", "tracer", "cost"),
 )
-SPANS = {  # of the values, by dtype
+SPANS = {  # range of the values, by dtype
     "uint8": (0, 255),
     "int8": (-100, 100),
     "int16": (-1000, 3000),
@@ -52,11 +52,11 @@ LIT = ("lit", "lit by normals", "lit with shadows", *STORED, *SURFACES, "labels"
 MODULES = ("module", "transfer module")
 
 
-# --- what a scene is
+# --- the settings of a scene
 
 
 class Dice:
-    """Draws settings. Of `random`, only what is promised to stay the same is used."""
+    """Draws settings. Uses only the parts of `random` that are guaranteed to stay the same."""
 
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed).random
@@ -79,13 +79,13 @@ class Dice:
 
 @cache
 def settings(seed: int) -> Settings:
-    """All that a scene is made of, as plain values."""
+    """Returns everything that defines a scene, as plain values."""
     dice = Dice(seed)
     look, way = LOOKS[seed % len(LOOKS)], WAYS[seed // len(LOOKS) % len(WAYS)]
     if seed >= FIRST:
         look = LATER[seed - FIRST]
-        way = WAYS[seed % (len(WAYS) - (look == "labels"))]  # which have no cost
-    if way == "cost" and look != "transfer":  # what it takes: transfer functions
+        way = WAYS[seed % (len(WAYS) - (look == "labels"))]  # `cost` does not support labels
+    if way == "cost" and look != "transfer":  # it supports only transfer functions
         look, way = ("plain", way) if seed % 3 == 0 else (look, "render")
     if way == "tracer" and look in MODULES:
         way = "engine"
@@ -115,7 +115,7 @@ def settings(seed: int) -> Settings:
 
 
 def _volume(dice: Dice, look: str, way: str) -> Settings:
-    """Extent, place, bricks and channels."""
+    """Draws extent, position, bricks and channels."""
     brick = dice.pick(4, 4, 8, 8, 16)
     most = {4: 30, 8: 44, 16: 60}[brick] if way in ("engine", "levels") else 44
     dtype = dice.pick(*SPANS)
@@ -152,7 +152,7 @@ def _volume(dice: Dice, look: str, way: str) -> Settings:
 
 
 def _shader(dice: Dice, s: Settings, raw: bool) -> Settings:
-    """The transfer function, in parts of the values' span, light and material."""
+    """Draws the transfer function (values as fractions of their range), light and material."""
     count, even = dice.whole(2, 5), dice.chance(0.7) or s["look"] == "pre-integrated"
     cells = 16 if even else 997
     places = sorted({dice.whole(0, cells) for _ in range(count)} | {cells})
@@ -175,7 +175,7 @@ def _shader(dice: Dice, s: Settings, raw: bool) -> Settings:
 
 
 def _view(dice: Dice, raw: bool) -> Settings:
-    """The camera."""
+    """Draws the camera."""
     found: Settings = {
         "camera": "rays" if raw else dice.pick(*CAMERAS),
         "size": (dice.whole(16, 28), dice.whole(12, 22)),
@@ -196,7 +196,7 @@ def _view(dice: Dice, raw: bool) -> Settings:
 
 
 def _extras(dice: Dice, s: Settings) -> Settings:
-    """What the options put around a shader, where it takes that."""
+    """Draws the options (clip, lens, lighting, layer, background) that the shader supports."""
     look, found = s["look"], {}
     whole = look in PROJECTIONS
     if dice.chance(0.3):
@@ -215,13 +215,13 @@ def _extras(dice: Dice, s: Settings) -> Settings:
     if dice.chance(0.25):
         found["layer"] = dice.pick("opaque", "opaque" if whole else "translucent")
     found["background"] = dice.pick("black", "color", "gradient", "image", "none")
-    if found["background"] == "gradient":  # CUDA divides by other numbers of rows an ulp beside it
+    if found["background"] == "gradient":  # CUDA's division by other heights is off by an ulp
         found["size"] = (s["size"][0], 16)
     return found
 
 
 def described(s: Settings) -> str:
-    """One line that tells of a scene."""
+    """Returns one line that describes a scene."""
     return ", ".join(f"{name}={value}" for name, value in s.items())
 
 
@@ -229,13 +229,13 @@ def described(s: Settings) -> str:
 
 
 def numbers(seed: int, *shape: int) -> np.ndarray:
-    """Numbers in [0, 1), of a bit generator whose stream is promised to stay the same."""
+    """Returns numbers in [0, 1) of a bit generator whose stream is guaranteed to stay the same."""
     raw = np.random.PCG64(seed).random_raw(math.prod(shape))
     return (raw >> np.uint64(11)).astype(np.float64).reshape(shape) * 2.0**-53
 
 
 def smooth(seed: int, extent: tuple[int, int, int], width: int) -> np.ndarray:
-    """(z, y, x, c) numbers in [0, 1] between those of a lattice of 5^3, by + and * alone."""
+    """Interpolates (z, y, x, c) numbers in [0, 1] from a lattice of 5^3, using only + and *."""
     field = numbers(seed, 5, 5, 5, width)
     for axis, count in enumerate(reversed(extent)):
         place = np.arange(count) * (4 / max(1, count - 1))
@@ -247,7 +247,7 @@ def smooth(seed: int, extent: tuple[int, int, int], width: int) -> np.ndarray:
 
 
 def tensor(values: np.ndarray, dtype: str) -> Tensor:
-    """Values in a channel's dtype, rounded once."""
+    """Returns values in a channel's dtype, rounded once."""
     if dtype == "bfloat16":
         return torch.from_numpy(values.astype(np.float32)).to(torch.bfloat16)
     if "int" in dtype:
@@ -256,7 +256,7 @@ def tensor(values: np.ndarray, dtype: str) -> Tensor:
 
 
 def volumes(s: Settings, shift: float = 0.0) -> dict[str, gv.Volume]:
-    """The channels that a scene's shader reads; `shift` moves them along x."""
+    """Returns the channels that a scene's shader reads; `shift` moves them along x."""
     seed, extent, look = s["seed"], s["extent"], s["look"]
     field = smooth(10 * seed, extent, s["width"])
     value = ((field - 0.5) * 1.8 + 0.5).clip(0, 1) + 0.06 * (numbers(10 * seed + 1, *field.shape))
@@ -306,7 +306,7 @@ def volumes(s: Settings, shift: float = 0.0) -> dict[str, gv.Volume]:
 
 
 class Ink(torch.nn.Module):
-    """A module whose bits no library decides: it knows only + - * / and comparisons."""
+    """A module whose bits depend on no library: it uses only + - * / and comparisons."""
 
     def __init__(self, low: float, high: float) -> None:
         super().__init__()
@@ -391,7 +391,7 @@ def shader_of(s: Settings) -> Any:
 
 
 def box_of(s: Settings) -> tuple[np.ndarray, np.ndarray]:
-    """World corners of the scene."""
+    """Returns the world corners of the scene."""
     extent, spacing, origin = (np.array(s[n], np.float64) for n in ("extent", "spacing", "origin"))
     low = origin - 0.5 * spacing
     return low, low + extent * spacing
@@ -427,7 +427,7 @@ def camera_of(s: Settings) -> gv.Camera | gv.Rays:
 
 
 def _own_rays(s: Settings, eye: np.ndarray, target: np.ndarray) -> gv.Camera | gv.Rays:
-    """Rays made here, through a window and from places that differ a little."""
+    """Returns custom rays through a window, from origins that differ a little."""
     width, height = s["size"]
     forward = unit(target - eye)
     right = unit(np.array((forward[1], -forward[0] - 0.2, 0.1)))
@@ -489,7 +489,7 @@ def clip_of(s: Settings) -> gv.Clip:
 
 
 def pixels_of(s: Settings) -> tuple[int, ...]:
-    """Shape of the scene's picture."""
+    """Returns the shape of the scene's picture."""
     width, height = s["size"]
     if s["camera"] == "rays" and not s["rows"]:
         return (1, width * height)
@@ -510,7 +510,7 @@ def layer_of(s: Settings) -> gv.Layer:
 
 
 def options_of(s: Settings) -> dict[str, Any]:
-    """Fields of `gv.RenderOptions`."""
+    """Returns fields of `gv.RenderOptions`."""
     low, high = box_of(s)
     side = float((high - low).max())
     found: dict[str, Any] = {n: s[n] for n in ("lod", "step", "stop_alpha", "depth_alpha")}
@@ -524,7 +524,7 @@ def options_of(s: Settings) -> dict[str, Any]:
         found["lens"] = gv.ThinLens(aperture=aperture * unit_, focus=focus * unit_, frame=frame)
     if "lighting" in s:
         cones = {"shadow_cones": 3, "shadows": 0.8}
-        few = {"cones": 2 + s["seed"] % 4}  # what they see must fit in small pools
+        few = {"cones": 2 + s["seed"] % 4}  # what the cones read must fit in small pools
         light = few | {"occlusion": 0.8}
         around = few | {"indirect": 0.7, "ambient": (0.5, 0.6, 0.7)}
         what = {

@@ -1,5 +1,5 @@
-"""Small files whose headers tell of more than a machine has, or never end; each with its reader's
-ending.
+"""Small files whose headers claim more data than a machine has, or that never end; each with the
+file ending of its reader.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ Tag = tuple[int, int, int, int | bytes]  # number, type, count, value
 
 
 def tiff(tags: Sequence[Tag] = (), *, following: int = 0, pixels: int = 64) -> bytes:
-    """A TIFF of 8 x 8 bytes, with some of its tags given; `following` is where its next page is
-    said to lie.
+    """Returns a TIFF of 8 x 8 bytes, with some of its tags replaced; `following` is the offset that
+    it claims for its next page.
     """
     known: dict[int, Tag] = {
         number: (number, 3, 1, value)
@@ -71,7 +71,7 @@ def fits(cards: Sequence[str], data: bytes = b"") -> bytes:
 
 
 def png(width: int, height: int) -> bytes:
-    """A black picture of any size, of bytes that tell as little of it."""
+    """Returns a black picture of any size, compressed to few bytes."""
 
     def part(kind: bytes, content: bytes) -> bytes:
         check = zlib.crc32(kind + content).to_bytes(4, "big")
@@ -83,14 +83,14 @@ def png(width: int, height: int) -> bytes:
 
 
 def zeros(megabytes: int) -> bytes:
-    """So many zeros as one stream of gzip, a thousandth as long; it has no end."""
+    """Returns a gzip stream of so many megabytes of zeros, a thousandth as long, without an end."""
     engine = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
     block = engine.compress(bytes(1 << 20)) + engine.flush(zlib.Z_FULL_FLUSH)
     return b"\x1f\x8b\x08\0\0\0\0\0\0\x03" + block * megabytes
 
 
 def tiff_files() -> dict[str, bytes]:
-    """By name, TIFFs whose tags, pages or descriptions tell of too much."""
+    """Returns by name TIFFs whose tags, pages or descriptions claim too much data."""
     told = "ImageJ=1.53k\nimages={0}\nslices={0}\nhyperstack=true\n"
     return {
         "cycle.tif": tiff(following=8),
@@ -130,7 +130,7 @@ def tiff_files() -> dict[str, bytes]:
 
 
 def nrrd_files() -> dict[str, bytes]:
-    """By name, NRRDs of sizes, skips and streams without an end."""
+    """Returns by name NRRDs with huge sizes and skips, wrong fields, and streams without an end."""
     return {
         "lines.nrrd": nrrd(f"encoding: raw\nline skip: {HUGE}", bytes(64)),
         "bytes.nrrd": nrrd(f"encoding: raw\nbyte skip: {HUGE}", bytes(64)),
@@ -149,7 +149,7 @@ def nrrd_files() -> dict[str, bytes]:
 
 
 def fits_files() -> dict[str, bytes]:
-    """By name, FITS files of too many axes or cards, and such as unpack without an end."""
+    """Returns by name FITS files of too many axes or cards, and some that unpack without an end."""
     axes = [f"NAXIS{n}  = {10**7}" for n in (1, 2, 3)]
     cube = ["BITPIX  = 8", "NAXIS   = 3", *(f"NAXIS{n}  = 4" for n in (1, 2, 3))]
     flat = ["BITPIX  = 8", "NAXIS   = 1", f"NAXIS1  = {10**10}", "EXTEND  = T"]
@@ -166,7 +166,7 @@ def fits_files() -> dict[str, bytes]:
 
 
 def write_all(folder: Path) -> list[Path]:
-    """Writes the files; returns their paths, and those of two pipes without an end."""
+    """Writes the files; returns their paths, and those of pipes and a device without an end."""
     shape = b"{'descr': '|u1', 'fortran_order': False, 'shape': (1000000, 1000000, 1000000), }"
     files = {**tiff_files(), **nrrd_files(), **fits_files()}
     files["shape.npy"] = b"\x93NUMPY\x01\0v\0" + shape.ljust(117) + b"\n"

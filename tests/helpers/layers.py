@@ -1,4 +1,4 @@
-"""Planes that a formula draws, and balls that they cut: colour and depth of another renderer."""
+"""Planes drawn by a formula, as colour and depth of another renderer, and balls that they cut."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ BLUE = (0.1, 0.2, 0.8)
 
 
 def screen(view: gv.Camera, place: torch.Tensor, normal: tuple[float, float, float]):
-    """(h, w, 1) distance at which the rays of a camera meet the plane through `place`, +inf where
-    they do not.
+    """Returns (h, w, 1) distances at which the rays of a camera meet the plane through `place`;
+    +inf where they do not.
     """
     rays, normal = view.rays(), torch.tensor(normal, dtype=torch.float64)
     along = ((place - rays.origin) @ normal) / (rays.direction @ normal)
@@ -21,13 +21,13 @@ def screen(view: gv.Camera, place: torch.Tensor, normal: tuple[float, float, flo
 
 
 def layer_of(depth: torch.Tensor, alpha: torch.Tensor | None = None, color=BLUE) -> gv.Layer:
-    """One straight colour at a depth."""
+    """Returns a layer of one straight colour at a depth."""
     plain = depth.new_tensor(color).expand(*depth.shape[:-1], 3)
     return gv.Layer(plain if alpha is None else plain * alpha, depth, alpha)
 
 
 def ball(radius: float, size: int) -> gv.Volume:
-    """Signed distance to a sphere around the world's origin, positive inside; voxels are 1 wide."""
+    """Returns the signed distance to a sphere at the origin, positive inside; voxels are 1 wide."""
     place = torch.arange(size) - (size - 1) / 2
     z, y, x = torch.meshgrid(place, place, place, indexing="ij")
     origin = (-(size - 1) / 2,) * 3
@@ -38,9 +38,9 @@ SOLID = gv.TransferFunction.from_points([(-1e-3, 0), (1e-3, 1)], [(0, 1, 0, 0)],
 
 
 def seam_error(picture: gv.Picture, view: gv.Camera, height: float, radius: float) -> float:
-    """How many pixels the seam of a ball and the plane z = height is off: the farthest from the
-    seam's circle of all pixels that show the wrong one. A ray meets the plane inside the ball where
-    its ball was entered before.
+    """Returns by how many pixels the seam of a ball and the plane z = height is off: the largest
+    distance from the seam's circle of a pixel that shows the wrong one. A pixel must show the ball
+    where its ray meets the plane inside of it.
     """
     rays = view.rays()
     along = (height - rays.origin[:, 2]) / rays.direction[:, 2]

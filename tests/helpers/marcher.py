@@ -1,5 +1,5 @@
-"""A dense marcher that shares nothing with gvtorch but the camera's convention: NumPy, float64, no
-tree, no skipping.
+"""A dense marcher that shares only the camera's convention with gvtorch: NumPy, float64, no tree,
+no skipping.
 
 Samples lie in the middle of intervals of one length, counted from where the ray enters the
 volume's box; the last interval is cut at the far side.
@@ -36,7 +36,7 @@ def box_of(shape_zyx, spacing, origin):
 
 
 def trilinear(data, index_xyz):
-    """Value at fractional voxel indices, clamped to the outermost centres."""
+    """Returns values at fractional voxel indices, clamped to the outermost centres."""
     n = np.array(data.shape[::-1])
     p = np.clip(index_xyz, 0, n - 1)
     i = np.minimum(p.astype(int), np.maximum(n - 2, 0))

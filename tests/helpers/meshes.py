@@ -11,7 +11,7 @@ import gvtorch as gv
 
 
 def sphere(steps: int = 5, radius: float = 1.0) -> gv.Mesh:
-    """An octahedron whose triangles are cut into four, `steps` times, and put on a sphere."""
+    """Returns an octahedron subdivided `steps` times and projected on a sphere."""
     points = [*np.eye(3), *-np.eye(3)]
     faces = []
     for x, y, z in itertools.product((0, 3), (1, 4), (2, 5)):
@@ -28,7 +28,7 @@ def sphere(steps: int = 5, radius: float = 1.0) -> gv.Mesh:
 
 
 def torus(ring: float = 1.0, tube: float = 0.4, counts: tuple[int, int] = (96, 48)) -> gv.Mesh:
-    """A torus around z; vertices lie on it."""
+    """Returns a torus around z; its vertices lie on the exact surface."""
     a, b = (np.arange(n) * 2 * math.pi / n for n in counts)
     a, b = np.meshgrid(a, b, indexing="ij")
     wide = ring + tube * np.cos(b)
@@ -50,7 +50,7 @@ def box(low=(0.0, 0.0, 0.0), high=(1.0, 0.7, 0.4)) -> gv.Mesh:
 
 
 def sheet(count: int = 1, size: float = 1.0) -> gv.Mesh:
-    """A square across a diagonal direction, which is no solid."""
+    """Returns a square in a slanted plane, which encloses no volume."""
     u = np.array((1.0, 0.4, -0.2)) / np.linalg.norm((1.0, 0.4, -0.2))
     v = np.cross(u, (0.1, 0.3, 1.0))
     v /= np.linalg.norm(v)
@@ -62,19 +62,19 @@ def sheet(count: int = 1, size: float = 1.0) -> gv.Mesh:
 
 
 def of_corners(corners: np.ndarray) -> gv.Mesh:
-    """Triangles, each with corners of its own."""
+    """Returns a mesh of triangles that share no vertices."""
     return gv.Mesh(
         vertices=corners.reshape(-1, 3), faces=np.arange(len(corners) * 3).reshape(-1, 3)
     )
 
 
 def joined(*meshes: gv.Mesh) -> gv.Mesh:
-    """Several meshes as one."""
+    """Joins several meshes into one."""
     return of_corners(np.concatenate([mesh.corners for mesh in meshes]))
 
 
 def volume(mesh: gv.Mesh) -> float:
-    """By the divergence theorem."""
+    """Returns the enclosed volume, by the divergence theorem."""
     a, b, c = mesh.corners.transpose(1, 0, 2)
     return float((a * np.cross(b, c)).sum() / 6)
 
@@ -85,7 +85,7 @@ def area(mesh: gv.Mesh) -> float:
 
 
 def parts(mesh: gv.Mesh) -> list[gv.Mesh]:
-    """Those that hang together by corners at one place."""
+    """Returns the components that are connected by corners at equal positions."""
     _, corner = np.unique(mesh.corners.reshape(-1, 3), axis=0, return_inverse=True)
     corner = corner.reshape(-1, 3)
     label, before = np.arange(corner.max() + 1), None

@@ -1,4 +1,4 @@
-"""Noises point by point in plain NumPy and float64: what `gv.noise` is tested against."""
+"""Noise, point by point in plain NumPy and float64: the reference for tests of `gv.noise`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ WORD = 0xFFFFFFFF
 
 
 def signed_shift(word: int, by: int) -> int:
-    """Shift to the right of 32 bits that keeps the sign."""
+    """Returns the arithmetic right shift of a 32-bit word."""
     value = word - 2**32 if word >= 2**31 else word
     return (value >> by) & WORD
 
@@ -38,7 +38,7 @@ def join(first: int, second: int) -> int:
 
 
 def lattice_hash(place, seed, period=None) -> int:
-    """Hash of a lattice point (x, y) or (x, y, z)."""
+    """Returns the hash of a lattice point (x, y) or (x, y, z)."""
     every = period or (None,) * len(place)
     place = [one if p is None else one % p for one, p in zip(place, every, strict=True)]
     words = [scramble(one, seed, axis) for axis, one in enumerate(place)]
@@ -49,7 +49,7 @@ def lattice_hash(place, seed, period=None) -> int:
 
 
 def edge(word: int) -> tuple[float, float, float]:
-    """The middle of a cube's edge that a hash chooses."""
+    """Returns the middle of the cube's edge that a hash chooses."""
     first = -1.0 if word >> 6 & 1 else 1.0
     second = -1.0 if word >> 7 & 1 else 1.0
     part = signed_shift(word, 8)
@@ -92,7 +92,7 @@ def value(point, seed=0, period=None) -> float:
 
 
 def simplex(point, seed=0, period=None) -> float:
-    """The sum over all corners near the point, however far from its own simplex."""
+    """Sums over all corners near the point, not only those of the simplex that contains it."""
     n = len(point)
     skew, back = ((3**0.5 - 1) / 2, (3 - 3**0.5) / 6) if n == 2 else (1 / 3, 1 / 6)
     middle = [round(one + skew * sum(point)) for one in point]
@@ -112,7 +112,7 @@ def simplex(point, seed=0, period=None) -> float:
 
 
 def cellular(point, feature="F1", jitter=1.0, reach=1, seed=0, period=None) -> float:
-    """Sorted distances to the points of all cells near, cut at `reach`."""
+    """Returns distances to the nearest points of all cells nearby, clamped to `reach`."""
     cell = [math.floor(one) for one in point]
     found = []
     for step in itertools.product(range(-3, 4), repeat=len(point)):
@@ -134,7 +134,7 @@ NEXT_OCTAVE, NEXT_AXIS = 0x10001, 0x3000007
 
 
 def layers(point, octaves, lacunarity, gain, seed) -> list[tuple[float, float]]:
-    """Amplitude and noise of each octave."""
+    """Returns amplitude and noise of each octave."""
     found = []
     for octave in range(octaves):
         place = [one * lacunarity**octave for one in point]
@@ -151,7 +151,7 @@ def turbulence(point, octaves=6, lacunarity=2.0, gain=0.5, seed=0) -> float:
 
 
 def ridged(point, octaves=6, lacunarity=2.0, gain=0.5, sharpness=2.0, seed=0) -> float:
-    """Musgrave's: a signal's weight is the one before, as sharp as told and cut to 0 to 1."""
+    """Musgrave's: a signal's weight is the one before, times `sharpness` and clamped to [0, 1]."""
     total, weight = 0.0, 1.0
     for amplitude, one in layers(point, octaves, lacunarity, gain, seed):
         signal = weight * (1 - abs(one)) ** 2

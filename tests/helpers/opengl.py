@@ -1,4 +1,4 @@
-"""Whether OpenGL is here, and its context without a window."""
+"""Whether OpenGL is available, and a context without a window."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ _context = []
 
 
 def opengl_context():
-    """moderngl's context without a window, current, or a skip. One a process, until VTK closes a
-    window: that ends EGL's display, for all who have it.
+    """Makes moderngl's windowless context current and returns it, or skips the test. Each process
+    has one, until VTK closes a window, which terminates EGL's display for all its users.
     """
     moderngl = pytest.importorskip("moderngl")
     if _context:
@@ -32,13 +32,13 @@ def opengl_context():
 
 @functools.cache
 def no_vtk() -> str:
-    """Why VTK can't draw here, or nothing. Without OpenGL it ends its process, so another tries."""
+    """Returns why VTK can't draw, or "". Tried in another process: without OpenGL, VTK aborts."""
     code = "import vtk; w = vtk.vtkRenderWindow(); w.SetOffScreenRendering(True); w.Render()"
     return _why_not("vtk", code)
 
 
 def _no_moderngl() -> str:
-    """Why moderngl can't draw here without a window, or nothing."""
+    """Returns why moderngl can't draw here without a window, or an empty string."""
     code = "import moderngl; moderngl.create_context(standalone=True, backend='egl')"
     return _why_not("moderngl", code)
 
@@ -50,5 +50,5 @@ def _why_not(package: str, code: str) -> str:
     return f"{package} finds no OpenGL" if run.returncode else ""
 
 
-#: Examples that draw with OpenGL, and why they can't.
+#: Examples that draw with OpenGL, and the function that returns why they can't.
 IN_OPENGL = {"mixed_triangles": no_vtk, "opengl_frame": _no_moderngl}

@@ -1,4 +1,4 @@
-"""Rays that the CPU traces in packets, for each instruction set in a process of its own."""
+"""Rays that the CPU traces in packets, in a separate process for each instruction set."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Run(NamedTuple):
 def start(
     function: Callable[[], object], folder: Path, instructions: str, **environment: str
 ) -> Run:
-    """Calls a function of a test file in a process of its own."""
+    """Calls a function of a test file in a new process, which saves what it returns."""
     module, name, file = function.__module__, function.__name__, folder / f"{instructions}.pt"
     code = (
         f"import sys, torch; sys.path.insert(0, {str(TESTS)!r}); from {module} import {name};"
@@ -42,7 +42,7 @@ def start(
 
 
 def result(run: Run):
-    """The tensors that the function returned."""
+    """Returns the tensors that the function returned."""
     assert run.process.wait(timeout=600) == 0
     return torch.load(run.file, weights_only=True)
 
@@ -57,7 +57,7 @@ LAMP = gv.PointLight((10.0, 50.0, 30.0))
 
 @cache
 def scene(branching: int = 2) -> gv.N3Tree:
-    """Rough and smooth matter, between a region of zeros and one of another single value."""
+    """Returns a tree of rough and smooth values, with a region of zeros and a constant one."""
     generator = torch.Generator().manual_seed(4)
     coarse = torch.rand((1, 5, 12, 12, 12), generator=generator)
     numbers = torch.nn.functional.interpolate(coarse, size=(37, 37, 37), mode="trilinear")[0]
@@ -79,14 +79,14 @@ def scene(branching: int = 2) -> gv.N3Tree:
 
 
 def cut(rays: gv.Rays) -> gv.Rays:
-    """Rays that begin within the box, each elsewhere, with a part of their light, and end there."""
+    """Returns rays that begin and end within the box, each elsewhere, with reduced light."""
     first = torch.linspace(30.0, 45.0, len(rays.origin), dtype=torch.float64)
     limits = torch.stack((first, first + 17.3), 1)
     return replace(rays, range=limits, transmittance=torch.linspace(0.05, 1.0, len(first)).double())
 
 
 def shaded(shader: gv.Shader, backend: str, branching: int = 2) -> list[Tensor]:
-    """All that a shader's traces write."""
+    """Returns everything that a shader's traces write."""
     tree, found = scene(branching), []
     holes = forget(tree, 0.3, 5)
     for which, size, options in (

@@ -1,4 +1,4 @@
-"""Pictures: where tests stand, what they see, and how two pictures are held side by side."""
+"""Cameras and shaders of tests, and comparison of two pictures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def assert_same_picture(actual: gv.Picture, expected: gv.Picture) -> None:
 
 
 def assert_close_picture(actual: gv.Picture, expected: gv.Picture, *, tolerance=1e-4) -> None:
-    """Two pictures that are equal but for rounding."""
+    """Asserts that two pictures are equal except for rounding."""
     assert expected.alpha.max() > 0.5, "the test must see something"
     assert (actual.color - expected.color).abs().max() < tolerance
     assert (actual.alpha - expected.alpha).abs().max() < tolerance

@@ -8,8 +8,8 @@ import numpy as np
 
 
 def share_below(edges: np.ndarray, center: float | np.ndarray, reach: float) -> np.ndarray:
-    """The share of a point below places along an axis: of the sum of four uniform random numbers
-    (Irwin, Hall), `reach` to either side; all at once where that is 0.
+    """Returns the share of a point's kernel below positions on an axis. The kernel is the density
+    of a sum of four uniform numbers (Irwin, Hall), `reach` to either side; a step if that is 0.
     """
     if reach == 0:
         return (edges > center).astype(float)

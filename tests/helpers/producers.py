@@ -1,4 +1,4 @@
-"""Producers that are early, late or broken, and an engine that looks after itself."""
+"""Producers that answer at once, late or out of order, and an engine that checks its frames."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Ball(gv.Producer):
 
 
 class Sponge(gv.Producer):
-    """The Menger sponge: 3^3 children, 7 of them holes, 20 the same as the whole. One tile."""
+    """The Menger sponge: of 3^3 children, 7 are holes, 20 aliases of the whole. Needs one tile."""
 
     def __init__(self, levels=4):
         super().__init__(4 * 3**levels, branching=3, box=((0, 0, 0), (1, 1, 1)))
@@ -47,7 +47,7 @@ class Sponge(gv.Producer):
 
 
 class Held(gv.VolumeProducer):
-    """Keeps its answers back until `go`, which gives them in an order of its own."""
+    """Holds its answers back until `go`, which gives them in random order."""
 
     def __init__(self, volume, seed=0):
         super().__init__(volume)
@@ -100,8 +100,8 @@ class Late(gv.VolumeProducer):
 
 
 class Checked(gv.Engine):
-    """Looks after every frame at what the frame may have done: what the picture before used is
-    still there.
+    """Asserts after every frame that the pools are valid, and that no slot was taken that the last
+    picture used.
     """
 
     def frame(self, *args, **options):

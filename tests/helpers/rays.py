@@ -1,4 +1,4 @@
-"""Rays of cameras, and of directions that tests choose."""
+"""Rays of cameras, and along given directions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import gvtorch as gv
 def rays_along(
     origin: Tensor, direction: Tensor | Sequence[float], cone: float = 0.0, device: str = "cpu"
 ) -> gv.Rays:
-    """Rays from places (r, 3) without an end, in one direction or one for each, of one width."""
+    """Returns endless rays from `origin` (r, 3), along one direction or one each, of one width."""
     flat = torch.zeros((len(origin), 2), dtype=torch.float64)
     unit = torch.nn.functional.normalize(torch.as_tensor(direction).double(), dim=-1)
     rays = gv.Rays(

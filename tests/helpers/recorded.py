@@ -1,4 +1,4 @@
-"""Frames that serve themselves, as `Engine.capture` records them, and a ball to look at."""
+"""Frames that serve their requests on the device, as `Engine.capture` records, and a ball."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LOOK = gv.TransferFunction.from_points(
 
 
 class Ball(gv.Producer):
-    """A ball with bands; what lies outside is EMPTY, with `kinds` only once it is filled."""
+    """A ball with bands; nodes outside are EMPTY: from `classify`, or with `kinds` from `fill`."""
 
     on_device = True
 
@@ -57,7 +57,7 @@ def view(size: int = 48, angle: float = 30) -> gv.Camera:
 
 
 class Frames:
-    """Frames of an engine, served on the device: without a graph, so that the CPU runs them."""
+    """Frames of an engine as they are recorded, but without a CUDA graph, so that a CPU can run."""
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class Frames:
         self.camera = camera.placed(self.view.box)
 
     def whole(self, most: int = 200, pause: float = 0.0) -> tuple[gv.Hits, gv.FrameStats]:
-        """Frames, with pauses of so many seconds, until one misses nothing."""
+        """Draws frames, with pauses in seconds, until one misses nothing; returns that one."""
         for _ in range(most):
             hits, stats = self.frame()
             time.sleep(pause)
@@ -121,7 +121,7 @@ Replay = Callable[[gv.Camera], tuple[Tensor, gv.FrameStats]]
 
 
 def stepped(engine: gv.Engine, camera: gv.Camera, look: gv.Shader, **options: Any) -> Replay:
-    """Returns what gives the colour (r, 3) of a frame by `Frames`, and its statistics."""
+    """Returns a function that draws a frame by `Frames`: colour (r, 3) and statistics."""
     frames = Frames(engine, camera, look, **options)
 
     def step(camera: gv.Camera) -> tuple[Tensor, gv.FrameStats]:
@@ -133,7 +133,7 @@ def stepped(engine: gv.Engine, camera: gv.Camera, look: gv.Shader, **options: An
 
 
 def recorded(engine: gv.Engine, camera: gv.Camera, look: gv.Shader, **options: Any) -> Replay:
-    """The same, on CUDA of a graph, whose replays overwrite the colour."""
+    """As `stepped`, but on CUDA by a captured graph, whose replays overwrite the colour."""
     if engine.device.type != "cuda":
         return stepped(engine, camera, look, **options)
     graph = engine.capture(camera, look, **options)

@@ -1,4 +1,4 @@
-"""A server of HTTP that answers many at once, without a wait of its own."""
+"""An HTTP server that answers many requests at once, without delays."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from http.server import ThreadingHTTPServer
 
 
 class WebServer(ThreadingHTTPServer):
-    """The sixth of connections that come at once is not left to knock again after a second, and an
-    end is seen at once, not within half a second.
+    """With a longer queue, the sixth simultaneous connection need not retry after a second; with a
+    shorter poll, a shutdown is noticed at once, not within half a second.
     """
 
     daemon_threads = True

@@ -1,4 +1,4 @@
-"""The fused shaders, with a channel for each in the fixture `channels`."""
+"""The fused shaders, which read channels of the fixture `channels`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SHADERS = {
     "surface of stored colour": gv.Isosurface(
         0.4, None, color_channel="premultiplied", premultiplied=True
     ),
-    "distance field": gv.DistanceField(offset=0.3, filled=False),  # of what is no distance
+    "distance field": gv.DistanceField(offset=0.3, filled=False),  # `value` is not a distance
     "maximum": gv.Projection("maximum", SHADER),
     "minimum": gv.Projection("minimum", SHADER),
     "mean": gv.Projection("mean", SHADER),

@@ -1,4 +1,4 @@
-"""Balls, parallel rays and lights for closed forms of shading."""
+"""Balls, parallel rays and lights whose shading has a closed form."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ RADIUS, CENTRE = 11.0, np.array([16.0, 15.0, 17.0])
 
 
 def grid(extent, spacing=(1.0, 1.0, 1.0)) -> np.ndarray:
-    """(z, y, x, 3) world places of voxel centres."""
+    """Returns (z, y, x, 3): world positions of voxel centres."""
     nx, ny, nz = extent
     z, y, x = np.mgrid[0:nz, 0:ny, 0:nx].astype(np.float64)
     return np.stack((x, y, z), -1) * np.array(spacing)
 
 
 def ball(backend: str, spacing=SPACING, brick_size: int = 4, **more: gv.Volume) -> gv.N3Tree:
-    """The signed distance to a sphere, float32, cut into many bricks."""
+    """Returns a tree of the signed distance to a sphere, float32, in many small bricks."""
     place = grid((33, 39, 27), spacing)
     distance = np.linalg.norm(place - CENTRE, axis=-1) - RADIUS
     volume = gv.Volume(distance.astype(np.float32), spacing)
@@ -32,7 +32,7 @@ def ball(backend: str, spacing=SPACING, brick_size: int = 4, **more: gv.Volume) 
 
 
 def parallel(count: int, reach: float, device: str, direction=(0.3, -0.2, 1.0)) -> gv.Rays:
-    """Parallel rays through a disc around the sphere's centre."""
+    """Returns parallel rays through a disc around the sphere's centre."""
     along = torch.tensor(direction, dtype=torch.float64)
     along = along / along.norm()
     right = torch.linalg.cross(along, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
@@ -47,7 +47,7 @@ def parallel(count: int, reach: float, device: str, direction=(0.3, -0.2, 1.0)) 
 
 
 def sphere(rays: gv.Rays, radius: float = RADIUS) -> tuple[np.ndarray, np.ndarray]:
-    """Distance to the sphere's near side, and the outward normals there."""
+    """Returns the distance to the sphere's near side, and the outward normals there."""
     origin, along = rays.origin.cpu().numpy(), rays.direction.cpu().numpy()
     b = ((origin - CENTRE) * along).sum(1)
     c = ((origin - CENTRE) ** 2).sum(1) - radius**2
@@ -56,7 +56,7 @@ def sphere(rays: gv.Rays, radius: float = RADIUS) -> tuple[np.ndarray, np.ndarra
 
 
 def phong(normal, to_light, eye, base, light, ambient, diffuse, specular, shininess):
-    """Blinn and Phong in NumPy."""
+    """Returns Blinn-Phong shading, by NumPy."""
     half = to_light + eye
     half = half / np.linalg.norm(half, axis=1, keepdims=True)
     facing = np.maximum(0, (normal * to_light).sum(1))[:, None]

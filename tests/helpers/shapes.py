@@ -1,4 +1,4 @@
-"""Shapes and fractals beside their values in NumPy; boxes, points in them, and nodes of levels."""
+"""Shapes and fractals with NumPy references; boxes, points in them, and all nodes of a level."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def np_sphere(p, radius=0.7):
 
 
 def np_box(p, size=(1.0, 0.6, 0.8), round=0.1):
-    """The farthest face inside, the nearest point of the inner box outside."""
+    """Inside, by the nearest face; outside, by the nearest point of the inner box."""
     half = np.array(size) / 2 - round
     nearest = np.clip(p, -half, half)
     outside = np.sqrt(((p - nearest) ** 2).sum(-1))
@@ -39,7 +39,7 @@ def block():
 
 
 def np_torus(p, radius=0.6, tube=0.2):
-    """The nearest of the ring's middle points is at the same angle."""
+    """By the nearest point of the ring's centre line, which is at the same angle."""
     angle = np.arctan2(p[:, 1], p[:, 0])
     ring = radius * np.stack((np.cos(angle), np.sin(angle), 0 * angle), 1)
     return np.linalg.norm(p - ring, axis=1) - tube
@@ -58,7 +58,7 @@ def np_gyroid(p, period=1.3):
 
 
 def np_cylinder(p, radius=0.4, half=0.5):
-    """The nearest point of the solid, or the nearest wall from within."""
+    """By the nearest point of the solid, or from within the nearest wall."""
     rho = np.hypot(p[:, 0], p[:, 1])
     outside = np.hypot(np.maximum(rho - radius, 0), np.maximum(np.abs(p[:, 2]) - half, 0))
     return np.where(outside > 0, outside, np.maximum(rho - radius, np.abs(p[:, 2]) - half))
@@ -70,7 +70,7 @@ def np_square_ring(p, radius=0.6):
 
 
 def np_repeated(p, counts=(4, 1, 0)):
-    """The nearest of all of them."""
+    """By the nearest of all copies."""
     found = np.full(len(p), np.inf)
     for x in range(-counts[0], counts[0] + 1):
         for y in range(-counts[1], counts[1] + 1):
@@ -86,7 +86,7 @@ def np_twisted(p, rate=1.5):
 
 
 def np_sponge(p, levels=3):
-    """The largest of a cube and of bars along all axes, of all sizes."""
+    """The maximum of a cube and of negated bars along all axes, of all sizes."""
     found = np_box(p, (1, 1, 1), 0)
     for cell in 3.0 ** -np.arange(levels):
         x, y, z = np.abs((p + cell / 2) % cell - cell / 2).T
@@ -116,7 +116,7 @@ def capsule():
     return sdf.Capsule((-0.3, 0.1, 0.2), (0.4, -0.2, 0.5), 0.25, color=BLUE)
 
 
-#: By name: the shape, and its value by NumPy.
+#: Name: the shape, and its value by NumPy.
 SHAPES = {
     "sphere": (ball, np_sphere),
     "box": (block, np_box),
@@ -168,7 +168,7 @@ SHAPES = {
 
 
 def np_escape(p, step, constant, iterations, bailout, estimate):
-    """A point at a time."""
+    """Iterates one point at a time; -1 where it does not escape."""
     found = np.full(len(p), -1.0)
     for row, point in enumerate(p):
         z, apart, c = point, 1.0, point if constant is None else np.array(constant)
@@ -204,7 +204,7 @@ def np_log(r, apart):
     return r * np.log(r) / (2 * apart)
 
 
-#: By name: the fractal, and its value by NumPy.
+#: Name: the fractal, and its value by NumPy.
 FRACTALS = {
     "bulb": (
         lambda: gv.Mandelbulb(8, iterations=6),
@@ -231,12 +231,12 @@ def random_points(count, side=4.0, seed=0):
     return side * (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5)
 
 
-#: How many boxes bounds are tried in.
+#: Number of boxes in which bounds are tested.
 BOXES = 100_000
 
 
 def random_boxes(count, seed=1):
-    """Centres and half sides, from large to tiny, most of them near the origin."""
+    """Returns centres and half sides, from large to tiny, most of them near the origin."""
     generator = torch.Generator().manual_seed(seed)
     half = 10 ** (-3 * torch.rand(count, 1, generator=generator, dtype=torch.float64))
     shape = 0.2 + torch.rand(count, 3, generator=generator, dtype=torch.float64)
@@ -244,7 +244,7 @@ def random_boxes(count, seed=1):
 
 
 def inside(center, half, count, seed=3):
-    """(k, count, 3) points of boxes: their corners, and others by chance."""
+    """Returns (k, count, 3) points of boxes: their corners, and random ones."""
     corners = torch.cartesian_prod(*(torch.tensor([-1.0, 1.0], dtype=torch.float64),) * 3)
     generator = torch.Generator().manual_seed(seed)
     others = 2 * torch.rand(len(center), count - 8, 3, generator=generator).double() - 1
@@ -253,7 +253,7 @@ def inside(center, half, count, seed=3):
 
 
 def nodes_of(producer, depth, brick_size=4, border=1):
-    """All nodes of a level."""
+    """Returns all nodes of a level."""
     layout = Layout.of(producer, brick_size, border, torch.device("cpu"))
     axis = torch.arange(producer.branching**depth)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")

@@ -1,4 +1,4 @@
-"""Stores: random volumes with constant regions, images of other writers, and a web server."""
+"""Stores: random volumes with constant regions, images by other writers, and a web server."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .servers import WebServer
 
 
 def read(path: Path, **options) -> tuple[gv.Volume, list[str]]:
-    """A volume, and the lines that reading it told."""
+    """Reads a volume; returns it, and the warnings of reading it."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         volume = gv.read_volume(path, **options)
@@ -33,7 +33,7 @@ def read(path: Path, **options) -> tuple[gv.Volume, list[str]]:
 
 @contextmanager
 def stopped_at(monkeypatch: pytest.MonkeyPatch, number: int) -> Iterator[None]:
-    """Lets the block's conversions on disk stop at the shard of a number, as by Ctrl-C."""
+    """Stops conversions on disk within the block at the number-th shard, as by Ctrl-C."""
     original, places = shard.write_shard, []
 
     def stop(job, level, place):
@@ -49,7 +49,7 @@ def stopped_at(monkeypatch: pytest.MonkeyPatch, number: int) -> Iterator[None]:
 
 
 def noise(shape: tuple[int, ...], dtype: str = "uint8", seed: int = 0) -> np.ndarray:
-    """(z, y, x, c) values with constant regions among them."""
+    """Returns (z, y, x, c) random values with constant regions among them."""
     rng = np.random.default_rng(seed)
     low, high = (0, 255) if dtype.startswith("u") else (-120, 120)
     data = (rng.random(shape) * (high - low) + low).astype(dtype)
@@ -60,7 +60,7 @@ def noise(shape: tuple[int, ...], dtype: str = "uint8", seed: int = 0) -> np.nda
 
 
 def block_of(level: np.ndarray, at: np.ndarray, block: int) -> np.ndarray:
-    """A block with its border, cut out of a whole level."""
+    """Returns a block with its border, cut out of a whole level."""
     places = [
         np.arange(n * block - 1, (n + 1) * block + 1).clip(0, size - 1)
         for n, size in zip(at, level.shape[:3], strict=True)
@@ -69,7 +69,7 @@ def block_of(level: np.ndarray, at: np.ndarray, block: int) -> np.ndarray:
 
 
 def assert_holds(store: Store, data: np.ndarray) -> None:
-    """The store has the bits of the pyramid that is built in memory."""
+    """Asserts that the store has the bits of the pyramid that is built in memory."""
     sizes = {"branching": 2, "brick_size": store.cell, "border": store.border}
     levels = list(volume_levels(gv.Volume(data), store.levels, **sizes))
     for number, level in enumerate(levels):
@@ -124,7 +124,7 @@ def write_foreign(
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Serves a folder with byte ranges, as servers of such data do; chunks late if told so."""
+    """Serves a folder with byte ranges, as data servers do; chunks after `delay` seconds."""
 
     delay = 0.0
 
@@ -152,7 +152,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 
 @contextmanager
 def serving(folder: Path) -> Iterator[str]:
-    """The URL of a folder, for a while."""
+    """Serves a folder within the block; yields its URL."""
     handler = functools.partial(Handler, directory=str(folder))
     server = WebServer(("127.0.0.1", 0), handler)
     thread = threading.Thread(target=server.serve_forever, daemon=True)

@@ -1,4 +1,4 @@
-"""All that tracing writes, on one backend and beside another."""
+"""Everything that tracing writes on a backend, and comparison of two backends."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHADER = gv.TransferFunction.from_points(
 
 
 def run(tree, backend, rays, shader=SHADER, **options):
-    """Everything `trace_rays` writes, on the CPU."""
+    """Traces rays; returns hits and marks (everything `trace_rays` writes), moved to the CPU."""
     device = DEVICES[backend]
     copy = on(tree, device)
     moved = rays.to(device)
@@ -33,8 +33,8 @@ def run(tree, backend, rays, shader=SHADER, **options):
 
 
 def assert_equal(tree, backend, rays, shader=SHADER, **options):
-    """Hits and marks of the twin and of a backend: integers exactly, floats to rounding. Returns
-    the twin's, and the backend's hits.
+    """Asserts that a backend's hits and marks equal the twin's: integers exactly, floats except for
+    rounding. Returns the twin's hits and marks, and the backend's hits.
     """
     expected, expected_marks = run(tree, "reference", rays, shader, **options)
     actual, marks = run(tree, backend, rays, shader, **options)
@@ -52,7 +52,7 @@ def assert_equal(tree, backend, rays, shader=SHADER, **options):
 
 
 def changed(records: tuple, change: dict) -> list:
-    """Records with some fields replaced."""
+    """Returns records with some fields replaced."""
     return [
         record._replace(**{name: value for name, value in change.items() if name in record._fields})
         for record in records
@@ -62,7 +62,7 @@ def changed(records: tuple, change: dict) -> list:
 def arguments(
     tree: gv.N3Tree, rays: int, shader: gv.TransferFunction = SHADER, dtype=torch.float32
 ) -> tuple[RayArguments, TraceArguments]:
-    """Arguments of the op for parallel rays through the middle of a tree."""
+    """Returns arguments of the op for parallel rays through the middle of a tree."""
     device = tree.device
     real = {"dtype": torch.float64, "device": device}
     size = tree.box[1] - tree.box[0]
@@ -80,7 +80,7 @@ def arguments(
 
 
 def op_arguments(tree, shader, dtype) -> list:
-    """The checked function's arguments for the rays of a camera."""
+    """Returns the checked function's arguments for the rays of a camera."""
     rays = camera_rays(tree, 3).to(tree.device)
     tracer = Tracer(tree, shader, gv.RenderOptions(dtype=dtype))
     records = [RayArguments.of(rays)._replace(width=0), tracer.arguments, tracer.shading]

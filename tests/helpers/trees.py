@@ -1,4 +1,4 @@
-"""Trees as tests need them: fresh copies, trees with holes, volumes of several channels."""
+"""Copies of trees: on a device with cleared marks, and with holes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gvtorch.base import constants as config
 
 
 def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
-    """A copy of the tree whose marks are clean, on a device."""
+    """Returns a copy of the tree on a device, with requests and usage stamps cleared."""
     nodes = gv.NodePool(
         tree.nodes.capacity, tree.bricks.channels, branching=tree.branching, device=device
     )
@@ -20,7 +20,7 @@ def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
         border=tree.bricks.border,
         device=device,
     )
-    for name, voxels in tree.bricks.bricks.items():  # some channels are those of the first bricks
+    for name, voxels in tree.bricks.bricks.items():  # coarse channels have fewer slots
         bricks.bricks[name] = torch.empty_like(voxels, device=device)
     half = 0.5 * torch.tensor(tree.spacing, dtype=torch.float64)
     origin = tuple((tree.box[0] + half).tolist())
@@ -38,7 +38,7 @@ def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
 
 
 def forget(tree: gv.N3Tree, share: float, seed: int) -> gv.N3Tree:
-    """A copy in which a share of the bricks and of the tiles is not there yet."""
+    """Returns a copy in which a share of the bricks and of the tiles is absent."""
     copy = on(tree, "cpu")
     generator = torch.Generator().manual_seed(seed)
     for words, absent in (

@@ -1,4 +1,4 @@
-"""Writes grids as OpenVDB and NanoVDB files, from what is told of the formats; see the heads of
+"""Writes grids as OpenVDB and NanoVDB files, by the descriptions of the formats at the heads of
 gvtorch/io/formats/openvdb.py and nanovdb.py.
 """
 
@@ -16,15 +16,15 @@ import numpy as np
 from gvtorch.io.reading import open_source
 
 SIDE = {0: 32, 1: 16}  # entries along a side of an upper and of a lower node
-REACH = (4096, 128, 8)  # voxels along a side of what the root, an upper and a lower node hold
+REACH = (4096, 128, 8)  # voxels along a side of an entry of the root, an upper and a lower node
 ZIP, ACTIVE, BLOSC = 1, 2, 4
 Place = tuple[int, int, int]
 
 
 @dataclass
 class Grid:
-    """A grid: leaves are (512, c) values and (512,) bool, whether they are active; tiles lie in the
-    root (0), in uppers (1) and in lowers (2): a value (c,) by the first voxel.
+    """A grid: leaves are (512, c) values and (512,) bool, true where active; tiles of the root (0),
+    of uppers (1) and of lowers (2) are a value (c,) by their first voxel.
     """
 
     kind: str
@@ -39,18 +39,18 @@ class Grid:
 
     @property
     def dtype(self) -> np.dtype:
-        """Of a number."""
+        """Dtype of one component."""
         kinds = {"float": "f4", "double": "f8", "int32": "i4", "int64": "i8", "bool": "?"}
         kinds |= {"mask": "?", "vec3s": "f4", "vec3d": "f8", "vec3i": "i4"}
         return np.dtype(kinds[self.kind])
 
     def value(self, value: Any) -> np.ndarray:
-        """(c,) of a value."""
+        """Returns a value as (c,)."""
         width = 3 if self.kind.startswith("vec3") else 1
         return np.broadcast_to(np.asarray(value, self.dtype), (width,))
 
     def dense(self, low: Place, high: Place) -> np.ndarray:
-        """(i, j, k, c) of a box: tiles, and leaves over them."""
+        """Returns the voxels (i, j, k, c) of a box: tiles, overwritten by leaves."""
         out = np.empty((*np.subtract(high, low), len(self.value(0))), self.dtype)
         out[...] = self.value(self.background)
 
@@ -73,18 +73,18 @@ class Grid:
 
 
 def text(content: str) -> bytes:
-    """A string."""
+    """Returns a string as OpenVDB writes it."""
     return struct.pack("<I", len(content)) + content.encode()
 
 
 def told(entries: dict[str, tuple[str, bytes]]) -> bytes:
-    """Metadata."""
+    """Returns metadata as OpenVDB writes it."""
     parts = [text(n) + text(k) + struct.pack("<I", len(v)) + v for n, (k, v) in entries.items()]
     return struct.pack("<I", len(parts)) + b"".join(parts)
 
 
 def bits(flags: np.ndarray) -> bytes:
-    """A mask, its first bit the lowest of the first byte."""
+    """Returns a mask; its first bit is the lowest of the first byte."""
     return np.packbits(np.asarray(flags, bool), bitorder="little").tobytes()
 
 
@@ -93,7 +93,7 @@ class VdbWriter:
 
     def __init__(self, version: int = 224, packing: int = ACTIVE) -> None:
         self.version, self.packing = version, packing
-        self.codes: set[int] = set()  # how inactive values were told
+        self.codes: set[int] = set()  # codes of inactive values that were used
 
     def write(self, path: Path, *grids: Grid, places: bool = True) -> Path:
         """Writes a file."""
@@ -109,15 +109,13 @@ class VdbWriter:
             tree, leaves = (b"", b"") if grid.parent else self.tree(grid)
             at = len(out) + 24
             ends = at + len(head) + len(tree)
-            begin = (
-                0 if grid.parent else ends
-            )  # of leaves; OpenVDB tells none where a tree is shared
+            begin = 0 if grid.parent else ends  # of leaves; OpenVDB writes 0 where a tree is shared
             out += struct.pack("<3q", at, begin, ends + len(leaves)) + head + tree + leaves
         path.write_bytes(out)
         return path
 
     def tree(self, grid: Grid) -> tuple[bytes, bytes]:
-        """Topology, and values of leaves."""
+        """Returns the topology, and the values of leaves."""
         places = [set(grid.leaves) | set(grid.tiles[2]), set(grid.tiles[1])]
         lowers = sorted({tuple(n // 128 * 128 for n in place) for place in places[0]})
         uppers = sorted({tuple(n // 4096 * 4096 for n in place) for place in (*lowers, *places[1])})
@@ -138,7 +136,7 @@ class VdbWriter:
         return out, leaves
 
     def node(self, grid: Grid, level: int, origin: Place, children: list[Place]) -> bytes:
-        """Masks and tiles of an upper (0) or a lower node."""
+        """Returns masks and tiles of an upper (0) or a lower (1) node."""
         n, side = SIDE[level], REACH[level + 1]
         active, values = np.zeros(n**3, bool), np.tile(grid.value(grid.background), (n**3, 1))
         is_child = active.copy()
@@ -156,7 +154,7 @@ class VdbWriter:
         return bits(is_child) + bits(active) + self.values(grid, values, active)
 
     def leaf(self, grid: Grid, place: Place) -> bytes:
-        """The values of a leaf."""
+        """Returns the values of a leaf."""
         values, active = grid.leaves[place]
         head = bits(active)
         if grid.kind in ("mask", "bool"):
@@ -167,7 +165,7 @@ class VdbWriter:
         return head + self.values(grid, values, active)
 
     def values(self, grid: Grid, values: np.ndarray, active: np.ndarray) -> bytes:
-        """Values of a node; how the inactive ones are told follows from what they are."""
+        """Returns the values of a node; the code of the inactive ones follows from their values."""
         back = grid.value(grid.background)
         minus = ~back if back.dtype.kind == "b" else -back
         code, extra = 6, b""
@@ -194,7 +192,7 @@ class VdbWriter:
         return struct.pack("<B", code) + extra + self.numbers(grid, written)
 
     def numbers(self, grid: Grid, values: np.ndarray) -> bytes:
-        """Numbers, packed."""
+        """Returns numbers, packed."""
         content = np.ascontiguousarray(values.astype("f2") if grid.half else values).tobytes()
         if (self.version < 222 and not self.packing) or not self.packing & (ZIP | BLOSC):
             return content
@@ -210,8 +208,9 @@ class VdbWriter:
         return struct.pack("<q", len(packed)) + packed
 
 
-#: Of NanoVDB's PNanoVDB.h: bytes of a root, before its tiles' values, of a tile; before the entries
-#: of an upper and a lower, of both, of an entry; before a leaf's values, of a leaf.
+#: From NanoVDB's PNanoVDB.h: the type's number; bytes of a root, before a tile's value, of a tile;
+#: before an upper's entries, of an upper, the same of a lower, of an entry; before a leaf's values,
+#: of a leaf.
 NANO = {
     "float": (1, 64, 20, 32, 8256, 270400, 1088, 33856, 8, 96, 2144),
     "double": (2, 96, 24, 32, 8256, 270400, 1088, 33856, 8, 128, 4224),
@@ -242,7 +241,7 @@ NANO_DTYPES = {
 def _nano_leaf(
     kind: str, rng: np.random.Generator, steps: int | None
 ) -> tuple[bytes, np.ndarray, bytes]:
-    """A leaf's values as it holds them, as (512, c) or (512,), and what stands before codes."""
+    """Returns a leaf's values as bytes and as (512, c) or (512,), and its header before codes."""
     dtype, width = _numbers(kind)
     if steps:
         codes = rng.integers(0, 2**steps, 512)
@@ -262,9 +261,9 @@ def _numbers(kind: str) -> tuple[np.dtype, int]:
 
 
 def nano_grid(kind: str, rng: np.random.Generator, bits_of_leaf: int = 8) -> tuple[bytes, Any]:
-    """A NanoVDB grid of two leaves at (-8, 0, 0) and (0, 8, 16), and tiles at (0, 0, 16), of 8
-    voxels, (128, 0, 0), of 128, and (8192, 0, 0), of 4096; and its (16, 16, 24, c) voxels from
-    (-8, 0, 0) on.
+    """Returns a NanoVDB grid of two leaves at (-8, 0, 0) and (0, 8, 16), and tiles at (0, 0, 16),
+    of 8 voxels, (128, 0, 0), of 128, and (8192, 0, 0), of 4096; and the number of its type with its
+    (16, 16, 24, c) voxels from (-8, 0, 0) on.
     """
     number, root, tile_value, tile, up, upper, low, lower, entry, values, leaf = NANO[kind]
     dtype, width = _numbers(kind)
@@ -364,7 +363,7 @@ BOX = {
 
 
 def leaf_values(grid: Grid, rng: np.random.Generator) -> None:
-    """Adds leaves whose inactive values are told in each of the seven ways, and tiles."""
+    """Adds leaves whose inactive values use each of the seven codes, and tiles."""
     width = len(grid.value(0))
     back = grid.value(grid.background)
     minus = ~back if grid.dtype.kind == "b" else -back
@@ -386,7 +385,7 @@ def leaf_values(grid: Grid, rng: np.random.Generator) -> None:
 
 
 def check(path, expected, **options) -> None:
-    """A grid is read as it was written, whole and in parts."""
+    """Asserts that a grid is read as it was written, whole and in parts."""
     source = open_source(path, **options)
     found = source.read_times(0, 1)[0]
     wanted = expected.transpose(2, 1, 0, 3)

@@ -1,4 +1,4 @@
-"""Pages without a browser: what a view sends, kept for tests to look at."""
+"""Pages without a browser, which store what a view sends, for tests to inspect."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ import torch
 import gvtorch as gv
 from gvtorch.viewer.session import Session
 
-SOON = 60.0  # seconds until something must have come, on the slowest machine
+SOON = 60.0  # time limit in seconds for an answer, on the slowest machine
 
 
 class Page:
-    """Joins a session, keeps what comes, and answers pictures as a browser does."""
+    """Joins a session, stores what it sends, and acknowledges pictures as a browser does."""
 
     def __init__(self, session: Session, width: int = 64, height: int = 48, acks: bool = True):
         self.session, self.acks = session, acks
@@ -62,13 +62,13 @@ class Page:
         return [one for one in self.told if one["type"] == kind]
 
     def next(self, kind: str, after: int | None = None) -> dict[str, Any]:
-        """The next text of a type, after so many."""
+        """Waits for the next message of a type after the first `after`; returns it."""
         count = len(self.of(kind)) if after is None else after
         self.until(lambda: len(self.of(kind)) > count)
         return self.of(kind)[count]
 
     def final(self, soon: float = SOON) -> tuple[dict[str, Any], np.ndarray]:
-        """The picture at rest: head and (h, w, 3) uint8."""
+        """Waits for the final picture; returns its head and (h, w, 3) uint8."""
         self.until(lambda: self.pictures and self.pictures[-1][0]["final"], soon)
         head, data = self.pictures[-1]
         return head, pixels(data)
@@ -76,7 +76,7 @@ class Page:
     def moved(
         self, camera: dict[str, Any], moving: bool = False
     ) -> tuple[dict[str, Any], np.ndarray]:
-        """Moves the camera and waits for the picture at rest from there."""
+        """Moves the camera and waits for the final picture from there."""
         self.send("move", camera=camera, moving=moving)
         eye = camera["eye"]
         self.until(
@@ -91,20 +91,20 @@ class Page:
 
 
 def split(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The head of a picture's message, and the picture."""
+    """Returns the head of a picture's message, and the picture."""
     (size,) = struct.unpack("<I", data[:4])
     return json.loads(data[4 : 4 + size]), data[4 + size :]
 
 
 def pixels(data: bytes) -> np.ndarray:
-    """(h, w, 3) of a JPEG or PNG."""
+    """Returns (h, w, 3) of a JPEG or PNG."""
     from PIL import Image
 
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
 
 def bright_ball(n: int = 40) -> gv.Volume:
-    """A ball beside the middle, so that turning it shows."""
+    """Returns a ball away from the middle, so that turning it is visible."""
     z, y, x = np.mgrid[0:n, 0:n, 0:n].astype(np.float32) / n - 0.5
     ball = np.clip(1 - 4 * np.sqrt((x - 0.15) ** 2 + y**2 + (z + 0.1) ** 2), 0, 1)
     return gv.Volume((255 * ball).astype(np.uint8))
@@ -117,7 +117,7 @@ BANDS = gv.TransferFunction(
 
 
 def turned(camera: dict, angle: float) -> dict:
-    """The camera turned around its target and +y."""
+    """Returns the camera, turned around its target about +y."""
     away = np.subtract(camera["eye"], camera["target"])
     c, s = np.cos(angle), np.sin(angle)
     away = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ away
@@ -125,7 +125,7 @@ def turned(camera: dict, angle: float) -> dict:
 
 
 class Grown(torch.nn.Module):
-    """A ball whose radius is the time."""
+    """A ball whose radius is `time`."""
 
     def __init__(self) -> None:
         super().__init__()

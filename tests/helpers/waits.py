@@ -1,4 +1,4 @@
-"""What must not wait for the device."""
+"""A check that the host does not wait for the device."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import torch
 
 @contextmanager
 def nobody_waits(mode: str = "error", device: str = "cuda") -> Iterator[None]:
-    """Lets a wait of the host for a CUDA device be an error, or a warning, within the block; on
-    the CPU it does nothing.
+    """Makes it an error, or a warning, if the host waits for a CUDA device within the block; does
+    nothing on the CPU.
     """
     if torch.device(device).type != "cuda":
         yield

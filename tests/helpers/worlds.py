@@ -1,4 +1,4 @@
-"""Worlds of formulas, as deep as float64 can tell, and what rays meet in them, told otherwise."""
+"""Worlds of formulas, as deep as float64 resolves, and independent answers of what rays meet."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from torch import Tensor
 
 import gvtorch as gv
 
-Gap = Callable[[Tensor, Tensor, Tensor], Tensor]  # from float64 places to how far they lie inside
+Gap = Callable[[Tensor, Tensor, Tensor], Tensor]  # float64 positions to depths inside
 
 
 class Solid(gv.Producer):
-    """Matter with a soft border, eight voxels wide, of every level: 0.5 on the surface. `gap` is a
-    distance, or less than it.
+    """Matter whose edge fades over eight voxels at every level: 0.5 on the surface. `gap` is the
+    distance from the surface, positive inside, or a lower bound of it.
     """
 
     def __init__(self, gap: Gap, depth: int, branching: int = 2, *, filled: bool = True) -> None:
@@ -48,8 +48,8 @@ def torus(ring: float, tube: float) -> Gap:
 
 
 def bulb(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """Mandelbulb of power 8: minus a bound of the distance (Hart, Sandin, Kauffman, "Ray tracing
-    deterministic 3-D fractals", SIGGRAPH 1989).
+    """Mandelbulb of power 8: minus a lower bound of the distance (Hart, Sandin, Kauffman, "Ray
+    tracing deterministic 3-D fractals", SIGGRAPH 1989).
     """
     x, y, z = (1.2 * c for c in torch.broadcast_tensors(x, y, z))
     a, b, c, slope = x, y, z, torch.ones_like(x)
@@ -67,7 +67,7 @@ def bulb(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
 
 class Menger(gv.Producer):
     """The Menger sponge on [0, 1]^3, whose smallest holes are cells of a grid of 3^cells a side: a
-    voxel of any level is solid if it is a cell of the sponge, or lies in one of the smallest.
+    voxel of any level is solid if it is a solid cell, or lies in one of the smallest solid cells.
     """
 
     def __init__(self, depth: int, cells: int) -> None:
@@ -86,7 +86,7 @@ class Menger(gv.Producer):
         return {"value": self.solid(*places, nodes.loc[:, 3, None, None, None] + 2).float()}
 
     def solid(self, x: Tensor, y: Tensor, z: Tensor, digits: Tensor) -> Tensor:
-        """Whether the sponge holds cells of a grid of 3^digits a side."""
+        """Returns which cells of a grid of 3^digits a side are solid."""
         full = torch.ones_like(x + y + z, dtype=torch.bool)
         up = 3 ** (digits - self.cells).clamp(min=0)
         for axis in (x, y, z):
@@ -99,13 +99,13 @@ class Menger(gv.Producer):
 
 
 def meets_menger(origin: Tensor, direction: Tensor, cells: int) -> float:
-    """Distance at which a ray of float64 numbers that begins in the sponge's box meets a cell of
-    the grid of 3^cells a side, from cube to empty cube in whole numbers; +inf: none.
+    """Returns the distance at which a float64 ray that begins in the sponge's box meets a solid
+    cell of the grid of 3^cells a side, +inf if none; steps from cube to empty cube in integers.
     """
     side = 3**cells
     start = [Fraction(float(c)) * side for c in origin]
     whole = [math.floor(c) for c in start]
-    part = [float(c - w) for c, w in zip(start, whole, strict=True)]  # the eye's place in its cell
+    part = [float(c - w) for c, w in zip(start, whole, strict=True)]  # position in the eye's cell
     way = [float(d) * side for d in direction]
     cell, t = list(whole), 0.0
     while all(0 <= c < side for c in cell):

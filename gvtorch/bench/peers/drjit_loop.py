@@ -24,7 +24,7 @@ class Marcher(Peer):
 
     @classmethod
     def refuses(cls, device: torch.device) -> str:
-        """It needs LLVM, and is asked on the CPU only."""
+        """Returns why it can't run: it needs LLVM, and is compared on the CPU only."""
         if device.type != "cpu":
             return "compared on the CPU only"
         if not _LLVM:
@@ -32,7 +32,7 @@ class Marcher(Peer):
         return ""
 
     def __init__(self, task: Task) -> None:
-        """Takes voxels, rays and table into Dr.Jit's arrays."""
+        """Copies voxels, rays and table to Dr.Jit's arrays."""
         dr.set_thread_count(torch.get_num_threads())
         voxels = task.scene.volume.data.float().numpy()
         wrap, linear = dr.WrapMode.Clamp, dr.FilterMode.Linear

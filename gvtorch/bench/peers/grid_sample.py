@@ -18,7 +18,7 @@ class Marcher(Peer):
     differs = "the same samples; torch on the same threads, nothing is skipped"
 
     def __init__(self, task: Task) -> None:
-        """Takes the volume as float32 and the rays in the units of grid_sample."""
+        """Converts the volume to float32, and the rays to grid_sample's coordinates."""
         volume, device = task.scene.volume, task.device
         self.data = volume.data[..., 0].float().to(device)[None, None]
         n = torch.tensor(volume.extent, dtype=torch.float64, device=device)

@@ -1,7 +1,7 @@
-"""Pages that turn the bench's scan, each served by a process of its own: ours, viser's and trame's.
+"""Pages that show the bench's scan, each served by its own process: ours, viser's and trame's.
 
-Each function of `PAGES` takes a pipe, into which it puts the address of its page, and ends with its
-process. A peer is used as its own examples use it; `DIFFERS` tells what it does otherwise.
+Each function of `PAGES` sends the address of its page into a pipe, and serves until its process
+ends. A peer is used as in its own examples; `DIFFERS` states how its page differs from ours.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ import torch
 
 from ..scenes import BenchScene, scan_or_fog
 
-_RATE = 25.0  # pictures a second that are wanted while the camera moves
-_STARTS = 120.0  # seconds in which a page must be there
+_RATE = 25.0  # requested pictures a second while the camera moves
+_STARTS = 120.0  # seconds within which a page must be served
 
 
 @dataclass(frozen=True, kw_only=True)
 class Site:
-    """What is served."""
+    """What a page shows, and what renders it."""
 
     side: int  # voxels a side of the scan
     size: tuple[int, int]  # (width, height) pixels of the picture
     device: str  # where gvtorch renders
-    threads: int  # that the CPU has for it
+    threads: int  # CPU threads of the page's process
 
 
 def gvtorch_page(site: Site, ready: Connection) -> None:
-    """Our viewer, as `gvtorch view` serves it."""
+    """Serves our viewer, as `gvtorch view` does."""
     from ...viewer.server import Server
     from ...viewer.view import new_session
 
@@ -68,8 +68,8 @@ def _viser(site: Site, ready: Connection) -> tuple[Any, BenchScene]:
 
 
 def viser_pictures(site: Site, ready: Connection) -> None:
-    """viser's page with gvtorch's pictures behind it, each rendered whole where the page's camera
-    was last.
+    """Serves viser's page with gvtorch's pictures as background, each rendered at full resolution
+    from the latest camera of the page.
     """
     from ...cameras import Camera
     from ...pool import N3Tree
@@ -102,7 +102,7 @@ def viser_pictures(site: Site, ready: Connection) -> None:
 
 
 def viser_mesh(site: Site, ready: Connection) -> None:
-    """viser's page that draws the scan's surface itself, by WebGL."""
+    """Serves viser's page, which draws the scan's surface itself, by WebGL."""
     from ...io.surface import extract_surface
 
     server, scene = _viser(site, ready)
@@ -112,8 +112,8 @@ def viser_mesh(site: Site, ready: Connection) -> None:
 
 
 def trame_page(site: Site, ready: Connection) -> None:
-    """trame's remote view of VTK's volume renderer on the CPU, which renders fewer pixels while an
-    interactor is at work.
+    """Serves trame's remote view of VTK's volume renderer on the CPU, which renders fewer pixels
+    while the user interacts.
     """
     from trame.app import get_server
     from trame.ui.html import DivLayout
@@ -147,16 +147,16 @@ def trame_page(site: Site, ready: Connection) -> None:
     )
 
 
-#: What must be installed for a page of a peer.
+#: The module that each peer's page needs.
 NEEDS = {"viser": "viser", "trame": "trame_vtk"}
-#: What serves each page, and the element of the page that shows the picture.
+#: The function that serves each page, and the selector of the element that shows the picture.
 PAGES = {
     "gvtorch": (gvtorch_page, "canvas.gv-picture"),
     "viser": (viser_pictures, "canvas"),
     "viser mesh": (viser_mesh, "canvas"),
     "trame": (trame_page, "img, canvas"),
 }
-#: What a reader must know of each.
+#: How each page differs, for the notes of a record.
 DIFFERS = {
     "gvtorch": "fewer pixels while the camera moves, for 25 pictures a second",
     "viser": "has no volumes: gvtorch's pictures, whole, as the background of its page",
@@ -186,6 +186,6 @@ def served(who: str, site: Site) -> Iterator[str]:
 
 def _serve(who: str, site: Site, ready: Connection) -> None:
     torch.set_num_threads(site.threads)
-    logging.disable()  # a page that is closed is no news
+    logging.disable()  # closed pages are not reported
     with contextlib.redirect_stdout(io.StringIO()):
         PAGES[who][0](site, ready)

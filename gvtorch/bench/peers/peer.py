@@ -1,4 +1,4 @@
-"""What a peer is asked, what it answers, and which peers can run."""
+"""The task of a peer (`Task`), its interface (`Peer`), and which peers can run (`find`)."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ class Task:
 
 
 class Peer(ABC):
-    """A renderer, made ready for a task; what making takes is not timed."""
+    """A renderer that is prepared for a task; its construction is not timed."""
 
-    #: What it renders otherwise than the task says, and where it runs, in a sentence.
+    #: How its picture differs from what the task specifies, and where it runs, in a sentence.
     differs: str
 
     @classmethod
     def refuses(cls, device: torch.device) -> str:
-        """Tells why it can't run on a device, or nothing."""
+        """Returns why it can't run on a device; an empty string if it can."""
         return ""
 
     @abstractmethod
     def __init__(self, task: Task) -> None:
-        """Takes the scene to where it is rendered."""
+        """Copies the scene to where it is rendered."""
 
     @abstractmethod
     def render(self) -> None:
-        """Renders once, all of what is timed."""
+        """Renders once; only this call is timed."""
 
     @abstractmethod
     def picture(self) -> Tensor:
@@ -61,8 +61,8 @@ class Peer(ABC):
 
 
 def spans(task: Task) -> Tensor:
-    """(r, 2) distances at which the rays enter and leave the scene's box, float64; the first is
-    not below 0, and not below the last where a ray misses the box.
+    """Returns (r, 2) float64 distances at which the rays enter and leave the scene's box: none is
+    below 0, and both are equal where a ray misses the box.
     """
     box = task.scene.box.to(task.device)
     a, b = ((corner - task.rays.origin) / task.rays.direction for corner in box)
@@ -71,8 +71,8 @@ def spans(task: Task) -> Tensor:
 
 
 def bake(shader: TransferFunction, step: float, rows: int) -> np.ndarray:
-    """Samples a transfer function over [0, 255]: (rows, 4) float64 colour, not premultiplied, and
-    opacity of a step in world units; 255 k + 1 rows hit every value that is a multiple of 1 / k.
+    """Samples a transfer function over [0, 255]. Returns (rows, 4) float64: colour, not
+    premultiplied, and opacity of one step (world units); 255 k + 1 rows hit all multiples of 1 / k.
     """
     table = shader(np.linspace(0, 255, rows))
     with np.errstate(divide="ignore"):
@@ -81,7 +81,7 @@ def bake(shader: TransferFunction, step: float, rows: int) -> np.ndarray:
 
 
 def find(record: Record) -> dict[str, type[Peer]]:
-    """Returns the renderers that can run; the record tells why others can't."""
+    """Returns the renderers that can run; stores in the record why others can't."""
     wanted = record.settings.peers
     ready = {}
     for name, module in _HOME.items():

@@ -1,7 +1,8 @@
-"""VTK's `vtkFixedPointVolumeRayCastMapper`: threads of fixed-point arithmetic on the CPU, blocks
-that show nothing skipped.
+"""VTK's `vtkFixedPointVolumeRayCastMapper`: multithreaded fixed-point arithmetic on the CPU, which
+skips transparent blocks.
 
-The mapper's own steps are called, which need no display: the picture is taken from its memory.
+The mapper's steps are called directly, because they need no display: the picture is read from its
+memory.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Marcher(Peer):
         return "" if device.type == "cpu" else "runs on the CPU only"
 
     def __init__(self, task: Task) -> None:
-        """Hands volume, functions and camera to VTK."""
+        """Passes volume, transfer function and camera to VTK."""
         vtkObject.GlobalWarningDisplayOff()
         scene, camera = task.scene, task.camera
         self.width, self.height, self.extent = camera.width, camera.height, scene.volume.extent
@@ -88,7 +89,7 @@ class Marcher(Peer):
         self.renderer.ResetCameraClippingRange()
 
     def render(self) -> None:
-        """Takes the mapper's steps: image, tables, rays."""
+        """Runs the mapper's steps: image, tables, rays."""
         last = [n - 1 for n in self.extent]
         box = [0, last[0], 0, last[1], 0, last[2]]
         self.mapper.PerImageInitialization(self.renderer, self.volume, 0, [0.0] * 3, [1.0] * 3, box)
@@ -97,7 +98,7 @@ class Marcher(Peer):
         self.mapper.RenderSubVolume()
 
     def picture(self) -> Tensor:
-        """Copies the part of the mapper's image that is in use to its place, top row first."""
+        """Returns the picture, top row first; the used part of the mapper's image is put in it."""
         image = self.mapper.GetRayCastImage()
         (width, height), (x, y) = image.GetImageInUseSize(), image.GetImageOrigin()
         stride, rows = image.GetImageMemorySize()

@@ -1,6 +1,6 @@
 """A marcher on Warp's NanoVDB volumes: one thread a ray, trilinear samples of a sparse grid.
 
-`from __future__ import annotations` is left out, for Warp reads the types of its kernels.
+`from __future__ import annotations` is left out, because Warp reads the types of its kernels.
 """
 
 # mypy: disable-error-code="valid-type"
@@ -70,7 +70,7 @@ class Marcher(Peer):
     )
 
     def __init__(self, task: Task) -> None:
-        """Makes the grid out of the leaves that hold something, edges repeated by one voxel."""
+        """Makes the grid from the leaves that are not all zero; edge voxels are repeated once."""
         self.device = str(task.device)
         voxels = task.scene.volume.data[..., 0].numpy()
         tiles = wp.array(_tiles(voxels), dtype=int, device=self.device)
@@ -111,7 +111,7 @@ class Marcher(Peer):
 
 
 def _tiles(voxels: np.ndarray) -> np.ndarray:
-    """(k, 3) int32 first voxels x, y, z of the leaves that hold something but zeros."""
+    """Returns (k, 3) int32: first voxel x, y, z of each leaf that is not all zero."""
     around = [(_TILE, _TILE + -n % _TILE) for n in voxels.shape]
     edges = np.pad(np.pad(voxels, 1, mode="edge"), [(a - 1, b - 1) for a, b in around])
     z, y, x = (n // _TILE for n in edges.shape)
