@@ -16,25 +16,25 @@ from tyro.conf import Positional, arg
 class Bench:
     """Measure a workload on this machine, side by side with other renderers."""
 
-    # a workload, or all; without it the workloads are listed
+    # workload to run, or all; if left out: list the workloads
     name: Positional[Annotated[str | None, arg(metavar="NAME")]] = None
-    # print JSON, an object a line for each workload
+    # print JSON, one line per workload
     json: tyro.conf.FlagCreatePairsOff[bool] = False
-    # also keep the JSON there, a file for each workload and machine
+    # also write the JSON to this folder, a file for each workload and machine
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="FOLDER")] = None
-    # cpu, cuda or cuda:1
+    # device to measure: cpu, cuda or cuda:N
     device: Annotated[str, arg(metavar="DEVICE")] = "cpu"
-    # tiny sizes: to see that all works
+    # run with tiny sizes, to check that everything works
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
-    # timings of each figure, after one to warm up
+    # timings per figure, after one to warm up
     repeats: Annotated[int, arg(metavar="N")] = 7
-    # a figure that takes longer is made of fewer timings
+    # time limit per figure, in seconds; slow figures use fewer timings, at least one
     seconds: Annotated[float, arg(metavar="S")] = 10.0
-    # cases that have it in their name
+    # run only cases with this in their name
     only: Annotated[str, arg(metavar="TEXT")] = ""
-    # which other renderers; none for none, all that are installed if left out
+    # other renderers to compare with; none: gvtorch alone; if left out: all that are installed
     peers: Annotated[str | None, arg(metavar="NAME,NAME")] = None
-    # keep the pictures that were compared
+    # write the compared pictures to this folder
     pictures: Annotated[Path | None, arg(metavar="FOLDER")] = None
 
     def run(self) -> None:

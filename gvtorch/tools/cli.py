@@ -42,7 +42,7 @@ from .view import View
 class Info:
     """Show information on this installation, a volume file, or a store."""
 
-    # a volume or a store; without it backends, devices and versions
+    # volume or store to describe; if left out: backends, devices, formats and versions
     path: Positional[Annotated[str | None, arg(metavar="PATH")]] = None
     # print JSON
     json: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -89,14 +89,14 @@ class Info:
 class Convert:
     """Convert a volume of any size to a store: OME-Zarr with bordered blocks."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH", help=f"the volume: {volume_formats()}")]]
-    # the folder to make
+    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    # folder to create
     store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
-    # regions with no value above it are not kept as blocks
+    # leave out blocks with no value above this
     threshold: Annotated[float | None, arg(metavar="VALUE")] = None
-    # most that all processes together take, as in "2 GB"; what is free if left out
+    # most memory of all processes together, as in "2 GB"; if left out: all that is free
     memory: Annotated[str | None, arg(metavar="BYTES")] = None
-    # tell disk, memory and time, and write nothing
+    # print the estimated disk space, memory and time, and write nothing
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
 
     making: tyro.conf.OmitArgPrefixes[Making] = Making()
@@ -130,20 +130,20 @@ class Convert:
 class Filter:
     """Add filtered colours to a store: `--shader filtered` then shows it correctly from afar."""
 
-    # a store that gvtorch convert made; its voxels are read and stay as they are
+    # store that gvtorch convert made; its voxels are not changed
     store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
-    # transfer function that the colours are made with, as of gvtorch render; gray if left out
+    # transfer function to make the colours with, as in gvtorch render; if left out: gray
     tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
-    # values that it is stretched over, as of gvtorch render
+    # values that the transfer function is stretched over, as in gvtorch render
     window: Annotated[str | None, arg(metavar="LO,HI")] = None
-    # which number of a voxel is shown
+    # index of the number that the transfer function reads, for voxels with several
     component: Annotated[int, arg(metavar="N")] = 0
-    # colours and normals, for --shader filtered-lit
+    # store normals as well, for --shader filtered-lit
     lit: bool = False
-    # colours for each of six directions, or their mean; auto: six where a voxel may hide a fifth of
-    # what is behind
+    # store colours for each of six directions, or one mean of them, a sixth of the size; auto: six
+    # if a voxel may hide over a fifth of what is behind it
     directions: Literal["auto", "six", "one"] = "auto"
-    # where it is worked out; CUDA if left out, where it runs
+    # where colours are computed; if left out: cuda if available, else cpp
     backend: Literal["cpp", "cuda"] | None = None
 
     def run(self) -> None:

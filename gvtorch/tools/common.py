@@ -23,32 +23,35 @@ def volume_formats() -> str:
     """Returns what a volume may be, for help texts."""
     from ..io.formats import format_names
 
-    return f"{format_names()}; an OME-Zarr image is a folder or a URL"
+    return f"file, folder or URL; formats: {format_names()}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
     """How to read the volume, where the file does not say so itself."""
 
-    # RAW, or a file of any ending: voxels; else taken from the name *_XxYxZ_dtype.raw
+    # voxels of a RAW file, or one of unknown ending; if left out: from its name *_XxYxZ_dtype.raw
     shape: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    # RAW, or a file of any ending: a NumPy dtype, as in int16 or >i2
+    # NumPy dtype of such a file, as in int16 or >i2; if left out: from its name
     dtype: Annotated[str | None, arg(metavar="TYPE")] = None
-    # RAW, or a file of any ending: bytes before the numbers
+    # length of such a file's header, which is skipped; if left out: 0
     offset: Annotated[int | None, arg(metavar="BYTES")] = None
-    # voxel size in world units
+    # voxel size in world units; if left out: as the file says, or 1
     spacing: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    # which of several arrays, series, images or scenes
+    # array, series, image or scene to read, by name or number, if there are several
     key: Annotated[str | None, arg(metavar="NAME")] = None
-    # what the axes of an array are, the slowest first, as in tzyx or czyx
+    # axes of an array whose file does not name them: one letter of t, c, z, y, x for each, slowest
+    # first, as in tzyx or czyx
     axes: Annotated[str | None, arg(metavar="LETTERS")] = None
-    # time point, from 0
+    # index of the time point, from 0; if left out: the first, or all for gvtorch convert
     time: Annotated[int | None, arg(metavar="N")] = None
-    # voxel axes that do not lie along the world's: resample along these, or keep the voxels
+    # if voxel axes are not parallel to the world's: resample along the world's axes, or keep the
+    # voxels and use their axes instead; if left out: resample
     oblique: Literal["resample", "keep"] | None = None
-    # value for voxels that are NaN or infinite
+    # value that replaces NaN and infinite voxels; if left out: they are an error
     nan: Annotated[float | None, arg(metavar="VALUE")] = None
-    # values are numbers of things: kept exactly, never blended, and shown by --shader labels
+    # voxel values are label numbers: kept exactly, never blended, and shown with --shader labels;
+    # if left out: only if the file says so
     labels: FlagCreatePairsOff[bool] = False
 
     def read(self, path: str | Path) -> Volume:

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 class Drawn:
     """What is drawn over the picture."""
 
-    # the colours of values, as the transfer function has them
+    # draw a colour bar of the transfer function
     bar: FlagCreatePairsOff[bool] = False
-    # a length; in perspective it holds at the distance of what is looked at, the middle of the box
-    # unless --state or --keys tell another
+    # draw a scale bar; in perspective it holds at the distance of what the camera looks at, the
+    # middle of the box unless --state or --keys set another
     scale_bar: FlagCreatePairsOff[bool] = False
-    # lines, \n between them
+    # write text at the upper left; lines are separated by \n
     annotate: Annotated[str | None, arg(metavar="TEXT")] = None
 
     def overlay(

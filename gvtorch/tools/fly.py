@@ -39,33 +39,35 @@ class Fly:
     """Fly around or through a volume or a store: a picture a frame, or a film."""
 
     path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
-    # a film, .mp4, or .gif or .webp, which loop; or a folder for 0000.png, 0001.png, ...
+    # film to write, .mp4, or .gif or .webp, which loop; or a folder for 0000.png, 0001.png, ...
     output: Annotated[Path, arg(aliases=["-o"], metavar="DIR|OUT.mp4")]
-    # once around, or keys [{"eye": [x, y, z], "target": [x, y, z], "up": ..., "fov": ...}]
+    # camera path: orbit (once around), or a file of keys [{"eye": [x, y, z], "target": [x, y,
+    # z], "up": ..., "fov": ...}, ...]
     flight: Annotated[str, arg(name="path", metavar="orbit|FILE.json")] = "orbit"
-    # key frames in place of --path: [{"time": seconds, "state": what gvtorch view saved}, ...],
-    # between which camera, colours, clips and all other numbers run smoothly, and a series shows
-    # the time point nearest to theirs; a film that ends as it begins loops
+    # key frames instead of --path: [{"time": seconds, "state": what gvtorch view saved}, ...];
+    # camera, colours, clips and all other numbers change smoothly between them, a series shows the
+    # nearest time point, and a film that ends as it begins loops
     keys: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    # once around in the look that gvtorch view saved, from its camera on
+    # view that gvtorch view saved: orbit once around in its look, starting at its camera
     state: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    # an orbit that takes so long: instead of --frames
+    # duration of one orbit, instead of --frames
     turntable: Annotated[float | None, arg(metavar="SECONDS")] = None
-    # number of pictures; if left out 100, one for each of --times, or as --keys tell
+    # number of pictures; if left out: 100, one for each of --times, or as many as the times
+    # in --keys need
     frames: Annotated[int | None, arg(metavar="N")] = None
-    # a film over time: all time points, or those from A to B; the camera stands still where an
-    # orbit starts, unless --turntable, --path FILE.json or --keys move it
+    # film over time: all time points, or those from A to B; the camera stands still where an orbit
+    # starts, unless --turntable, --path FILE.json, --state or --keys move it
     times: Annotated[str | None, arg(metavar="all|A-B")] = None
-    # pictures a second of a film, a turntable or keys; 25 if left out
+    # pictures per second of a film, --turntable or --keys; if left out: 25
     fps: Annotated[int | None, arg(metavar="N")] = None
-    # where an orbit starts: degrees, and largest sides of the box; as of gvtorch render if left
-    # out, and all of the box in each picture
+    # start of an orbit: azimuth and elevation in degrees, distance in largest sides of the box; if
+    # left out: as in gvtorch render; without DIST the whole box is in each picture
     orbit: Annotated[str | None, arg(metavar="AZ,EL[,DIST]")] = None
-    # what each picture cost, one JSON line a frame
+    # write what each picture cost, one line of JSON per picture
     stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
-    # writes where each picture was taken: a folder for COLMAP, or .json for Blender and NeRF
+    # write the camera of each picture: a folder for COLMAP, or .json for Blender and NeRF
     poses: Annotated[Path | None, arg(metavar="FOLDER|FILE.json")] = None
-    # when which stage of each frame ran, for ui.perfetto.dev
+    # write a trace of the stages of each frame, for ui.perfetto.dev
     trace: Annotated[Path | None, arg(metavar="FILE.json")] = None
 
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()

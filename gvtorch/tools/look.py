@@ -56,60 +56,66 @@ class Look:
 
     # pinhole, ortho (parallel), fisheye (equidistant) or panorama (equirectangular)
     camera_model: Annotated[CameraModel, arg(metavar="MODEL")] = "pinhole"
-    # vertical field of view; 30, or 180 of a fisheye or panorama, if left out
+    # vertical field of view in degrees; if left out: 30, or 180 for fisheye and panorama
     fov: Annotated[float | None, arg(metavar="DEG")] = None
-    # pixels
+    # width and height of the picture in pixels
     size: Annotated[str, arg(metavar="WxH")] = "512x512"
-    # direction that is up in the picture; if left out +z of patients, whose head is there, else +y
+    # up direction in the picture: +x, -x, +y, -y, +z, -z or X,Y,Z; if left out: +z, the head, for
+    # scans of patients, else +y
     up: Annotated[str | None, arg(metavar="+z|X,Y,Z")] = None
     # transfer function: gray, hot, vessels, bone, tissue, mr, em, cloud or galaxy; ct-bone,
-    # ct-soft, ct-lung or ct-vessels (Hounsfield units); a colour map of matplotlib; a file of
-    # gvtorch, ParaView or 3D Slicer (.json, .vp, .xml), or one preset of it, FILE:NAME; gray if
-    # left out, or the function of a store's filtered colours
+    # ct-soft, ct-lung or ct-vessels (in Hounsfield units); a matplotlib colour map; or a file of
+    # gvtorch, ParaView or 3D Slicer (.json, .vp, .xml), with FILE:NAME for one preset in it; if
+    # left out: gray, or the function of a store's filtered colours
     tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
-    # values that it is stretched over: LO,HI; P%,P%, percentiles; full, the range; or auto, by the
-    # histogram without its background, as for presets and colour maps if left out
+    # values that the transfer function is stretched over: LO,HI; percentiles P%,P%; full (the whole
+    # range); or auto (by the histogram, without its background); if left out: auto, except for ct-
+    # presets and files with values of their own
     window: Annotated[str | None, arg(metavar="LO,HI")] = None
-    # what is made of the values; filtered: plain, but right from afar (stores: gvtorch filter);
-    # filtered-lit: lit, but right from afar (gvtorch filter --lit); channels: all numbers of a
-    # voxel, each in its colour and window as the file tells, else found; labels: each in its
-    # colour, also if left out where there are labels; colors: those of a mesh, lit where its
-    # normals are stored beside them, also if left out
+    # plain: transfer function alone; lit: with lighting; preintegrated: plain, but keeps thin peaks
+    # of the function; isosurface: surface at --value; maximum, minimum, mean: of the values along
+    # each ray; gradient: boundaries; filtered, filtered-lit: as plain and lit, but correct from
+    # afar (stores need gvtorch filter, or gvtorch filter --lit); channels: all numbers of a voxel,
+    # see --channel; labels: one colour each, the default for labels; colors: those stored for a
+    # mesh, lit (by its normals, if stored), the default for these
     shader: ShaderName = "plain"
-    # of --shader channels: which ones; colour is a name or #RRGGBB, and what is left out or auto is
-    # the file's; opacity as an item: they hide each other, else they are added
+    # channels to show with --shader channels: number or name, colour (a name or #RRGGBB) and
+    # window; parts left out or auto come from the file, or are chosen; the item opacity makes
+    # channels hide each other instead of adding up
     channel: Annotated[str | None, arg(metavar="N:COLOR:LO,HI;...")] = None
-    # of the isosurface
+    # value of the surface, for --shader isosurface
     value: Annotated[float | None, arg(metavar="VALUE")] = None
-    # distance between samples
+    # distance between samples along a ray, in voxels of the finest level
     step: Annotated[float, arg(metavar="VOXELS")] = 0.5
-    # auto: voxels as wide as a pixel's cone; finest: the data as it is
+    # auto: level whose voxels are as wide as a pixel's cone; finest: the finest level everywhere
     lod: Literal["auto", "finest"] = "auto"
-    # how much wider than a pixel its cone is; 4/3 if left out. With --samples 16, 0.33 (a quarter
-    # of it) shows the finest detail
+    # factor that widens a pixel's cone: larger values use coarser voxels; if left out: 4/3;
+    # with --samples 16, 0.33 (a quarter of it) shows the finest detail
     cone_scale: Annotated[float | None, arg(metavar="FACTOR")] = None
-    # linear, 0 to 1; R,G,B/R,G,B from top to bottom; transparent; or an environment map, PNG, EXR,
-    # TIFF or NPY
+    # linear colour, 0 to 1; R,G,B/R,G,B (top to bottom); transparent; or an environment map (PNG,
+    # EXR, TIFF or NPY)
     background: Annotated[str, arg(metavar="R,G,B|FILE")] = "0,0,0"
-    # a ray ends at this alpha; 1 integrates to the end
+    # alpha at which a ray ends; 1 integrates to the end
     stop_alpha: Annotated[float, arg(metavar="ALPHA")] = 0.99
-    # what is kept: plane:A,B,C,D where A x + B y + C z + D >= 0; box:X,Y,Z,X,Y,Z (low corner, high
-    # corner); cut:X,Y,Z,X,Y,Z goes; caps draws the cut as a surface; in largest sides of the box,
-    # its centre is 0
+    # region to keep: plane:A,B,C,D keeps where A x + B y + C z + D >= 0; box:X,Y,Z,X,Y,Z (low
+    # corner, high corner) keeps a box; cut:X,Y,Z,X,Y,Z removes one; caps fills the cut with a
+    # surface; in largest sides of the scene's box, from its centre
     clip: Annotated[str | None, arg(metavar="KIND:NUMBERS;...")] = None
-    # depth of field: diameter of the lens and distance that is sharp, in largest sides of the box
+    # depth of field: diameter of the lens and distance in focus, in largest sides of the scene's
+    # box
     lens: Annotated[str | None, arg(metavar="APERTURE,FOCUS")] = None
-    # of the lit shaders: sun:X,Y,Z,DEGREES (the way it shines, how wide it looks);
-    # lamp:X,Y,Z,RADIUS (world units); sky:R,G,B; shadows:, occlusion:, indirect:, factors; reach:,
-    # of the last two, in largest sides of the box
+    # for lit shaders: sun:X,Y,Z,DEGREES (direction of its light, angular diameter);
+    # lamp:X,Y,Z,RADIUS (world units); sky:R,G,B (ambient light); shadows: and
+    # occlusion: (strength, 0 to 1); indirect: (factor); reach: (of the last two, in largest sides
+    # of the scene's box)
     lighting: Annotated[str | None, arg(metavar="KIND:NUMBERS;...")] = None
-    # which number of a voxel is shown
+    # index of the number to show, for voxels with several
     component: Annotated[int, arg(metavar="N")] = 0
-    # side of a brick
+    # voxels along a side of a brick
     brick_size: Annotated[int, arg(metavar="VOXELS")] = 8
-    # voxels around a brick; 1 if left out, 2 of labels, whose slanted faces it smooths
+    # voxels of overlap around a brick; if left out: 1, or 2 for labels, to smooth slanted faces
     border: Annotated[int | None, arg(metavar="VOXELS")] = None
-    # what traces the rays
+    # implementation that traces the rays; auto: cuda if available, else cpp, else reference
     backend: Literal["auto", "reference", "cpp", "cuda"] = "auto"
 
     def options(self) -> dict[str, Any]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from ..io.stores.store import Store
 
-_MESHES = "OBJ, PLY, STL, glTF or OFF, also with .gz behind"
+_MESHES = "OBJ, PLY, STL, glTF or OFF, also compressed (.gz)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,11 +31,12 @@ class Making:
 
     # voxels along a side of a block
     block: Literal[32, 64] = 32
-    # processes; one a core if left out, fewer where memory is short
+    # number of processes; if left out: one per core, fewer if memory is short
     workers: Annotated[int | None, arg(metavar="N")] = None
-    # of a dask cluster that shares this folder, as in tcp://host:8786
+    # address of a dask scheduler, as in tcp://host:8786, whose workers see the store's folder under
+    # the same path
     scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    # go on with a half-written store
+    # continue a half-written store
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
 
     def check(self) -> None:
@@ -61,23 +62,23 @@ class Making:
 class Voxelize:
     """Voxelize a mesh into a store, of any resolution: OME-Zarr with bordered blocks."""
 
-    path: Positional[Annotated[str, arg(metavar="MESH", help=f"the mesh: {_MESHES}")]]
-    # the folder to make
+    path: Positional[Annotated[str, arg(metavar="MESH", help=f"mesh: {_MESHES}")]]
+    # folder to create
     output: Annotated[Path, arg(aliases=["-o"], metavar="STORE.zarr")]
-    # voxels along the mesh's longest side
+    # voxels along the mesh's longest side, including a margin of 2 at either end
     resolution: Annotated[int, arg(metavar="N")] = 1024
-    # what a voxel holds, one or several: coverage, the filled share; distance, signed, up to the
-    # band; color, premultiplied linear colour and opacity; normal, the surface's; material, labels.
-    # color and normal together are drawn as they are, lit
+    # what to store in each voxel, one or several: coverage (share that is filled),
+    # distance (signed, in world units, up to --band), color (premultiplied linear colour and
+    # opacity), normal (of the nearest surface), material (labels); gvtorch render draws color
+    # directly, lit by normal if it is stored too
     channels: Annotated[str, arg(aliases=["--channel"], metavar="NAME,NAME,...")] = "coverage"
-    # an image that is laid on all that has texture coordinates
+    # image that replaces all textures and colours; the mesh needs texture coordinates
     texture: Annotated[Path | None, arg(metavar="IMAGE")] = None
-    # how far from the surface distances, colours and normals are told
+    # distance up to which voxels take distance, colour and normal from the nearest surface
     band: Annotated[float, arg(metavar="VOXELS")] = 4.0
-    # of parts that are not closed
+    # thickness of sheets, the parts that are not solid
     thickness: Annotated[float, arg(metavar="VOXELS")] = 1.0
-    # auto: what is closed is a solid, all else a sheet; always: holes are filled; never: all is a
-    # sheet
+    # auto: closed parts are solid, others sheets; always: fill holes first; never: only sheets
     solid: Literal["auto", "always", "never"] = "auto"
 
     making: tyro.conf.OmitArgPrefixes[Making] = Making()
@@ -109,27 +110,28 @@ class Splat:
     """Accumulate points in the voxels of a store, of any extent: OME-Zarr with bordered blocks."""
 
     path: Positional[
-        Annotated[str, arg(metavar="POINTS", help="arrays (.npz), PLY, or a FITS table")]
+        Annotated[str, arg(metavar="POINTS", help="points: arrays (.npz), PLY, or a FITS table")]
     ]
-    # the folder to make
+    # folder to create
     output: Annotated[Path, arg(aliases=["-o"], metavar="STORE.zarr")]
-    # voxels along the longest side, or along each
+    # voxels along the longest side of the box, or along x, y and z
     extent: Annotated[str, arg(metavar="N or X,Y,Z", aliases=["--resolution"])] = "1024"
-    # what a voxel holds: the sum of values; or light, the value times the colour, and opacity
+    # value: store the sum of the values; color: store light (value times colour) and opacity
     channels: Annotated[Literal["value", "color"], arg(aliases=["--channel"])] = "value"
-    # of a point, for color
+    # opacity of each point, for color
     opacity: Annotated[float, arg(metavar="SHARE")] = 1e-4
-    # world corners; points outside are left out; around all if left out
+    # world corners of the grid; points outside are skipped; if left out: a box around all points
     box: Annotated[str | None, arg(metavar="X,Y,Z,X,Y,Z")] = None
-    # columns, as in x,y,z; known by their names if left out, as are the next three
+    # columns of the positions, as in x,y,z; if left out: found by their usual names
     positions: Annotated[str | None, arg(metavar="NAMES")] = None
-    # columns whose numbers add up
+    # columns of the values to add up; if left out: found by name, else 1 for each point
     values: Annotated[str | None, arg(metavar="NAMES")] = None
-    # columns, as in red,green,blue
+    # columns of the colours, as in red,green,blue; if left out: found by name
     colors: Annotated[str | None, arg(metavar="NAMES")] = None
-    # how far points reach: a column, or one number for all; if there is none, a voxel each
+    # radius of the points in world units, a column or one number for all; if left out: found by
+    # name, else each point lies in one voxel
     radius: Annotated[str | None, arg(metavar="NAME or SIZE")] = None
-    # that sorting takes, roughly
+    # approximate memory for sorting the points
     memory: Annotated[str, arg(metavar="BYTES")] = "1 GB"
 
     making: tyro.conf.OmitArgPrefixes[Making] = Making()

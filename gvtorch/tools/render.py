@@ -35,11 +35,11 @@ STRIPS = (".npy", ".tif")  # written strip by strip: the picture may be larger t
 class Develop:
     """How the picture is developed."""
 
-    # rays a pixel, at places of their own
+    # rays per pixel, at different positions in it
     samples: Annotated[int, arg(metavar="N")] = 1
-    # curve from scene light to the display
+    # tone mapping curve, from scene light to the display
     tone: Literal["none", "reinhard", "aces"] = "none"
-    # the light is multiplied by 2^STOPS
+    # multiply the light by 2^STOPS
     exposure: Annotated[float, arg(metavar="STOPS")] = 0.0
 
     def wrap(self, render: Callable[[Camera], Picture]) -> Callable[[Camera], Picture]:
@@ -68,24 +68,29 @@ class Render:
     """Render a volume or a store to a picture."""
 
     path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
-    # the picture: .png, .exr, .tif, .npy or .npz; .png, .tif and .npy may be larger than memory
+    # picture to write: .png, .exr, .tif, .npy or .npz; .png, .tif and .npy may exceed memory
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
-    # of a number in the file: 8 or 16 of .png, and 32 (float) of .tif; 32 or 16 of .exr
+    # bits of each number: 8 or 16 for .png; 8, 16 or 32 (float) for .tif; 32 or 16 (float)
+    # for .exr; if left out: the first of these
     bits: Annotated[int | None, arg(metavar="N")] = None
-    # float32 color, alpha and depth, int32 samples
+    # also write arrays: float32 color, alpha and depth, int32 samples; normal, features and label
+    # where they exist
     npz: Annotated[Path | None, arg(metavar="OUT.npz")] = None
-    # milliseconds, rays, samples, nodes, bricks, bytes; of stores requests and misses too
+    # write statistics: milliseconds, rays, samples, nodes, bricks, bytes; for stores also requests
+    # and misses
     stats: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    # what gvtorch view saved: camera, shader and all that says how it is shown; a picture of --size
+    # view that gvtorch view saved: sets camera, shader and everything else about the look
+    # but --size
     state: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    # orbit:AZIMUTH,ELEVATION (degrees; +x runs to the right at azimuth 0), from where the whole box
-    # is in the picture; orbit:AZIMUTH,ELEVATION,DISTANCE (largest sides of the box); or
-    # look:ex,ey,ez,tx,ty,tz (world units); file:PATH or file:PATH,NAME, of ParaView (.pvcc),
-    # Blender or NeRF (.json) or COLMAP (a folder); if left out orbit:30,20, of patients from the
-    # front
+    # orbit:AZIMUTH,ELEVATION (degrees; at azimuth 0, +x points to the right), at the distance from
+    # which the whole box is in the picture; orbit:AZIMUTH,ELEVATION,DISTANCE (in largest sides of
+    # the box); look:ex,ey,ez,tx,ty,tz (eye and target in world units); or file:PATH or
+    # file:PATH,NAME (ParaView .pvcc, Blender or NeRF .json, COLMAP folder); if left out:
+    # orbit:30,20, for scans of patients from the front
     camera: Annotated[str | None, arg(metavar="CAMERA")] = None
-    # the picture, or what each ray cost: samples, nodes visited; or what it saw: depth of the
-    # nodes, age of the bricks in frames, share of their voxels that is not transparent
+    # the picture, or for each pixel: samples taken, nodes visited, lod (mean depth of nodes seen),
+    # age (frames since their bricks were made), fill (share of their voxels that is not
+    # transparent)
     show: Literal["picture", "samples", "nodes", "lod", "age", "fill"] = "picture"
 
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()

@@ -65,7 +65,7 @@ class RenderedScene:
 class SceneFlags:
     """What is shown, and how."""
 
-    # volumes: regions with no value above it are never drawn
+    # volumes only: never draw regions with no value above this
     threshold: Annotated[float | None, arg(metavar="VALUE")] = None
 
     look: tyro.conf.OmitArgPrefixes[Look] = Look()

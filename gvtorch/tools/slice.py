@@ -20,32 +20,32 @@ class Slice:
     """Show planes of voxels of a volume or a store, exact to the voxel."""
 
     path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
-    # the picture: .png, .exr, .tif, .npy or .npz
+    # picture to write: .png, .exr, .tif, .npy or .npz
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
-    # of a number in the file, as of gvtorch render
+    # bits of each number, as in gvtorch render
     bits: Annotated[int | None, arg(metavar="N")] = None
-    # which way the plane is cut; all: three planes in one picture
+    # axis that the plane is perpendicular to; all: three planes in one picture
     axis: Literal["x", "y", "z", "all"] = "z"
-    # where: 50%, the index of a voxel, or a place such as 12.5mm; for all axes also three, as
-    # in 50%,40%,12
+    # position along the axis: 50%, the index of a voxel, or a world position such as 12.5mm;
+    # with --axis all also three, as in 50%,40%,12
     at: Annotated[str, arg(metavar="PLACE")] = "50%"
-    # which axis is up in the picture; if left out as for patients, see --plain; of data without
-    # such directions -y (rows run down) across z, else +z
+    # axis that points up in the picture of one plane; if left out: as radiologists view
+    # patients (see --plain); for other data -y (rows run down) across z, else +z
     up: Annotated[str | None, arg(metavar="+z")] = None
-    # patients are shown as radiologists look at them, their right on the left, with letters at the
-    # edges (R right, L left, A front, P back, S head, I feet); plain: without letters
+    # leave out the letters at the edges (R right, L left, A front, P back, S head, I feet) of scans
+    # of patients, which are shown as radiologists view them: the right side on the left
     plain: bool = False
     # pixels along the shortest side of a voxel
     scale: Annotated[float, arg(metavar="PIXELS")] = 1.0
-    # stores: level of detail, 0 is the finest
+    # level of detail of a store; 0 is the finest
     level: Annotated[int, arg(metavar="N")] = 0
-    # the colours, as of gvtorch render; grays as bright on the display as their values if left out
+    # colours, as in gvtorch render; if left out: visually even grays
     tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
-    # values that these are stretched over, as of gvtorch render; auto keeps the background
+    # values that the colours span, as in gvtorch render; auto includes the background
     window: Annotated[str | None, arg(metavar="LO,HI")] = None
-    # which number of a voxel is shown
+    # index of the number to show, for voxels with several
     component: Annotated[int, arg(metavar="N")] = 0
-    # stores: which image, where there are several
+    # image of a store to show, by name or number, if there are several
     image: Annotated[str | None, arg(metavar="NAME")] = None
 
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()

@@ -26,21 +26,21 @@ if TYPE_CHECKING:
 class Streaming:
     """Stores: memory, and how data is loaded."""
 
-    # memory of node tiles
+    # memory for node tiles
     node_pool: Annotated[str, arg(metavar="BYTES")] = "8 MB"
-    # memory of bricks, on the device that renders
+    # memory for bricks, on the device that renders
     brick_pool: Annotated[str, arg(metavar="BYTES")] = "256 MB"
-    # memory of decoded blocks
+    # main memory for decoded blocks
     host_cache: Annotated[str, arg(metavar="BYTES")] = "512 MB"
-    # one frame, a few, or until nothing is missing, as if left out
+    # interactive: one frame; balanced: up to 4; converge (if left out): until nothing is missing
     mode: Literal["interactive", "balanced", "converge"] | None = None
-    # most frames of a picture that converges
+    # most frames of a picture with --mode converge
     max_frames: Annotated[int, arg(metavar="N")] = 1000
-    # to the wanted level at once, or level by level
+    # straight: load the wanted level directly; levels: level by level, from coarse to fine
     loading: Literal["straight", "levels"] = "straight"
-    # which image, where a store has several
+    # image to show, by name or number, if the store has several
     image: Annotated[str | None, arg(metavar="NAME")] = None
-    # a block that can't be read ends the work
+    # stop with an error if a block can't be read; otherwise that part is drawn coarser
     strict: tyro.conf.FlagCreatePairsOff[bool] = False
 
     def store(self, path: str, time: int | None) -> Store:

@@ -20,17 +20,17 @@ class Surface:
     block."""
 
     path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
-    # the mesh, in world units: PLY, or binary glTF
+    # mesh to write, in world units: PLY, or binary glTF
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.ply|OUT.glb")]
-    # inside is where values are at least this; of labels: the one that is wrapped
+    # surface around values of at least this; for labels: the label to enclose
     value: Annotated[float, arg(aliases=["--iso"], metavar="VALUE")]
-    # stores: level of detail, 0 is the finest; each further one has a quarter of the triangles
+    # level of detail of a store; 0 is the finest, each next one has a quarter of the triangles
     level: Annotated[int, arg(metavar="N")] = 0
-    # closed where it leaves the box; else it is open there
+    # close the surface where it leaves the box; otherwise it is open there
     caps: bool = True
-    # which number of a voxel
+    # index of the number to use, for voxels with several
     component: Annotated[int, arg(metavar="N")] = 0
-    # stores: which image, where there are several
+    # image of a store to read, by name or number, if there are several
     image: Annotated[str | None, arg(metavar="NAME")] = None
 
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()

@@ -29,7 +29,7 @@ _NAMES = ("scene", "shader", "camera", "options")  # that a script may set
 def _path_help() -> str:
     """Returns what PATH may be; evaluated for this command only, since formats load torch."""
     script = (
-        "a Python file that sets scene (what gv.view takes) and perhaps shader, camera, options"
+        "a Python file that sets scene (what gv.view takes) and optionally shader, camera, options"
     )
     return f"a volume: {volume_formats()}; or {script}"
 
@@ -39,17 +39,17 @@ class View:
     """Look at a volume or a store in the browser: turn it, and edit how it is shown."""
 
     path: Positional[Annotated[str, arg(metavar="PATH|SCRIPT.py", help=_path_help())]]
-    # what the page saved: camera, shader and all that says how it is shown
+    # view that the page saved: sets camera, shader and everything else about the look
     state: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    # where it stands at first, as of gvtorch render
+    # initial camera, as in gvtorch render
     camera: Annotated[str | None, arg(metavar="CAMERA")] = None
-    # where pages are served; 0.0.0.0: also to other machines, to those who know the address
+    # address to serve the page at; 0.0.0.0: also to other machines, if they know the full address
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
-    # 0: any that is free
+    # port to serve the page at; 0: any free one
     port: Annotated[int, arg(metavar="N")] = 0
-    # further names under which browsers may reach this machine
+    # further host names under which browsers may reach this machine
     allow: Annotated[str, arg(metavar="NAME,NAME")] = ""
-    # open it; else the address is only printed
+    # open the page in a browser; otherwise only print its address
     browser: bool = True
 
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
