@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
+
+from .common import Switch, option
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,25 +18,25 @@ class Bench:
     """Measure a workload on this machine, side by side with other renderers."""
 
     # workload to run, or all; if left out: list the workloads
-    name: Positional[Annotated[str | None, arg(metavar="NAME")]] = None
+    name: Positional[Annotated[str | None, option(metavar="NAME")]] = None
     # print JSON, one line per workload
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    json: Switch = False
     # also write the JSON to this folder, a file for each workload and machine
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FOLDER")] = None
+    output: Annotated[Path | None, option(aliases=["-o"], metavar="FOLDER")] = None
     # device to measure: cpu, cuda or cuda:N
-    device: Annotated[str, arg(metavar="DEVICE")] = "cpu"
+    device: Annotated[str, option(metavar="DEVICE")] = "cpu"
     # run with tiny sizes, to check that everything works
-    quick: tyro.conf.FlagCreatePairsOff[bool] = False
+    quick: Switch = False
     # timings per figure, after one to warm up
-    repeats: Annotated[int, arg(metavar="N")] = 7
+    repeats: Annotated[int, option(metavar="N")] = 7
     # time limit per figure, in seconds; slow figures use fewer timings, at least one
-    seconds: Annotated[float, arg(metavar="S")] = 10.0
+    seconds: Annotated[float, option(metavar="S")] = 10.0
     # run only cases with this in their name
-    only: Annotated[str, arg(metavar="TEXT")] = ""
+    only: Annotated[str, option(metavar="TEXT")] = ""
     # other renderers to compare with; none: gvtorch alone; if left out: all that are installed
-    peers: Annotated[str | None, arg(metavar="NAME,NAME")] = None
+    peers: Annotated[str | None, option(metavar="NAME,NAME")] = None
     # write the compared pictures to this folder
-    pictures: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    pictures: Annotated[Path | None, option(metavar="FOLDER")] = None
 
     def run(self) -> None:
         from ..bench import WORKLOADS, Unavailable

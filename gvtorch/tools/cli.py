@@ -23,13 +23,13 @@ from types import FrameType
 from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..base.declared import did_you_mean
 from ..base.messages import one_line, printable
 from ..io.stores.ngff import is_zarr
 from .bench import Bench
-from .common import Bar, ReadOptions, flags_given, refuse_for_store, volume_formats
+from .common import Bar, ReadOptions, Switch, flags_given, option, refuse_for_store, volume_formats
 from .fly import Fly
 from .making import Making, Splat, Voxelize, told_store
 from .render import Render
@@ -43,9 +43,9 @@ class Info:
     """Show information on this installation, a volume file, or a store."""
 
     # volume or store to describe; if left out: backends, devices, formats and versions
-    path: Positional[Annotated[str | None, arg(metavar="PATH")]] = None
+    path: Positional[Annotated[str | None, option(metavar="PATH")]] = None
     # print JSON
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    json: Switch = False
 
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
@@ -89,15 +89,15 @@ class Info:
 class Convert:
     """Convert a volume of any size to a store: OME-Zarr with bordered blocks."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    path: Positional[Annotated[str, option(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     # folder to create
-    store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
+    store: Positional[Annotated[Path, option(metavar="STORE.zarr")]]
     # leave out blocks with no value above this
-    threshold: Annotated[float | None, arg(metavar="VALUE")] = None
+    threshold: Annotated[float | None, option(metavar="VALUE")] = None
     # most memory of all processes together, as in "2 GB"; if left out: all that is free
-    memory: Annotated[str | None, arg(metavar="BYTES")] = None
+    memory: Annotated[str | None, option(metavar="BYTES")] = None
     # print the estimated disk space, memory and time, and write nothing
-    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    dry_run: Switch = False
 
     making: tyro.conf.OmitArgPrefixes[Making] = Making()
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
@@ -131,20 +131,20 @@ class Filter:
     """Add filtered colours to a store: `--shader filtered` then shows it correctly from afar."""
 
     # store that gvtorch convert made; its voxels are not changed
-    store: Positional[Annotated[Path, arg(metavar="STORE.zarr")]]
+    store: Positional[Annotated[Path, option(metavar="STORE.zarr")]]
     # transfer function to make the colours with, as in gvtorch render; if left out: gray
-    tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
+    tf: Annotated[str | None, option(metavar="FILE|PRESET")] = None
     # values that the transfer function is stretched over, as in gvtorch render
-    window: Annotated[str | None, arg(metavar="LO,HI")] = None
+    window: Annotated[str | None, option(metavar="LO,HI")] = None
     # index of the number that the transfer function reads, for voxels with several
-    component: Annotated[int, arg(metavar="N")] = 0
+    component: Annotated[int, option(metavar="N")] = 0
     # store normals as well, for --shader filtered-lit
     lit: bool = False
     # store colours for each of six directions, or one mean of them, a sixth of the size; auto: six
     # if a voxel may hide over a fifth of what is behind it
     directions: Literal["auto", "six", "one"] = "auto"
     # where colours are computed; if left out: cuda if available, else cpp
-    backend: Literal["cpp", "cuda"] | None = None
+    backend: Annotated[Literal["cpp", "cuda"] | None, option(metavar="{cpp,cuda}")] = None
 
     def run(self) -> None:
         from ..io.resources import amount

@@ -19,6 +19,19 @@ if TYPE_CHECKING:
     from ..io.stores.store import Store
 
 
+def option(**options: Any) -> Any:
+    """Returns tyro's `arg` for a flag whose help names its default only if there is one."""
+    return arg(help_behavior_hint=_default, **options)
+
+
+def _default(value: str) -> str:
+    return "" if value in ("None", "False", "''") else f"(default: {value})"
+
+
+#: A flag that is given or not: there is no --no-NAME.
+Switch = Annotated[FlagCreatePairsOff[bool], option()]
+
+
 def volume_formats() -> str:
     """Returns what a volume may be, for help texts."""
     from ..io.formats import format_names
@@ -31,28 +44,28 @@ class ReadOptions:
     """How to read the volume, where the file does not say so itself."""
 
     # voxels of a RAW file, or one of unknown ending; if left out: from its name *_XxYxZ_dtype.raw
-    shape: Annotated[str | None, arg(metavar="X,Y,Z")] = None
+    shape: Annotated[str | None, option(metavar="X,Y,Z")] = None
     # NumPy dtype of such a file, as in int16 or >i2; if left out: from its name
-    dtype: Annotated[str | None, arg(metavar="TYPE")] = None
+    dtype: Annotated[str | None, option(metavar="TYPE")] = None
     # length of such a file's header, which is skipped; if left out: 0
-    offset: Annotated[int | None, arg(metavar="BYTES")] = None
+    offset: Annotated[int | None, option(metavar="BYTES")] = None
     # voxel size in world units; if left out: as the file says, or 1
-    spacing: Annotated[str | None, arg(metavar="X,Y,Z")] = None
+    spacing: Annotated[str | None, option(metavar="X,Y,Z")] = None
     # array, series, image or scene to read, by name or number, if there are several
-    key: Annotated[str | None, arg(metavar="NAME")] = None
+    key: Annotated[str | None, option(metavar="NAME")] = None
     # axes of an array whose file does not name them: one letter of t, c, z, y, x for each, slowest
     # first, as in tzyx or czyx
-    axes: Annotated[str | None, arg(metavar="LETTERS")] = None
+    axes: Annotated[str | None, option(metavar="LETTERS")] = None
     # index of the time point, from 0; if left out: the first, or all for gvtorch convert
-    time: Annotated[int | None, arg(metavar="N")] = None
+    time: Annotated[int | None, option(metavar="N")] = None
     # if voxel axes are not parallel to the world's: resample along the world's axes, or keep the
     # voxels and use their axes instead; if left out: resample
-    oblique: Literal["resample", "keep"] | None = None
+    oblique: Annotated[Literal["resample", "keep"] | None, option(metavar="{resample,keep}")] = None
     # value that replaces NaN and infinite voxels; if left out: they are an error
-    nan: Annotated[float | None, arg(metavar="VALUE")] = None
+    nan: Annotated[float | None, option(metavar="VALUE")] = None
     # voxel values are label numbers: kept exactly, never blended, and shown with --shader labels;
     # if left out: only if the file says so
-    labels: FlagCreatePairsOff[bool] = False
+    labels: Switch = False
 
     def read(self, path: str | Path) -> Volume:
         """Reads the volume at `path`."""

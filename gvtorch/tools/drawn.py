@@ -6,9 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import FlagCreatePairsOff, arg
-
-from .common import flags_given
+from .common import Switch, flags_given, option
 
 if TYPE_CHECKING:
     from ..base.image_info import ImageInfo
@@ -23,12 +21,12 @@ class Drawn:
     """What is drawn over the picture."""
 
     # draw a colour bar of the transfer function
-    bar: FlagCreatePairsOff[bool] = False
+    bar: Switch = False
     # draw a scale bar; in perspective it holds at the distance of what the camera looks at, the
     # middle of the box unless --state or --keys set another
-    scale_bar: FlagCreatePairsOff[bool] = False
+    scale_bar: Switch = False
     # write text at the upper left; lines are separated by \n
-    annotate: Annotated[str | None, arg(metavar="TEXT")] = None
+    annotate: Annotated[str | None, option(metavar="TEXT")] = None
 
     def overlay(
         self, shader: Shader, info: ImageInfo, component: int, camera: Camera, eye: Eye

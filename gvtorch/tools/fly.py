@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..base.declared import declared_names
 from ..base.digits import whole_number
 from ..base.messages import printable
 from ..base.whole_file import write_whole
 from ..io.stores.ngff import is_zarr
-from .common import Bar, check_outputs, flags_given, size, volume_formats
+from .common import Bar, check_outputs, flags_given, option, size, volume_formats
 from .drawn import Drawn
 from .look import first_orbit, parse_camera, parse_orbit, stance
 from .scene import RenderedScene, SceneFlags
@@ -38,37 +38,37 @@ _FILMS = tuple(declared_names("pictures.video", "FILMS"))
 class Fly:
     """Fly around or through a volume or a store: a picture a frame, or a film."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    path: Positional[Annotated[str, option(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     # film to write, .mp4, or .gif or .webp, which loop; or a folder for 0000.png, 0001.png, ...
-    output: Annotated[Path, arg(aliases=["-o"], metavar="DIR|OUT.mp4")]
+    output: Annotated[Path, option(aliases=["-o"], metavar="DIR|OUT.mp4")]
     # camera path: orbit (once around), or a file of keys [{"eye": [x, y, z], "target": [x, y,
     # z], "up": ..., "fov": ...}, ...]
-    flight: Annotated[str, arg(name="path", metavar="orbit|FILE.json")] = "orbit"
+    flight: Annotated[str, option(name="path", metavar="orbit|FILE.json")] = "orbit"
     # key frames instead of --path: [{"time": seconds, "state": what gvtorch view saved}, ...];
     # camera, colours, clips and all other numbers change smoothly between them, a series shows the
     # nearest time point, and a film that ends as it begins loops
-    keys: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    keys: Annotated[Path | None, option(metavar="FILE.json")] = None
     # view that gvtorch view saved: orbit once around in its look, starting at its camera
-    state: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    state: Annotated[Path | None, option(metavar="FILE.json")] = None
     # duration of one orbit, instead of --frames
-    turntable: Annotated[float | None, arg(metavar="SECONDS")] = None
+    turntable: Annotated[float | None, option(metavar="SECONDS")] = None
     # number of pictures; if left out: 100, one for each of --times, or as many as the times
     # in --keys need
-    frames: Annotated[int | None, arg(metavar="N")] = None
+    frames: Annotated[int | None, option(metavar="N")] = None
     # film over time: all time points, or those from A to B; the camera stands still where an orbit
     # starts, unless --turntable, --path FILE.json, --state or --keys move it
-    times: Annotated[str | None, arg(metavar="all|A-B")] = None
+    times: Annotated[str | None, option(metavar="all|A-B")] = None
     # pictures per second of a film, --turntable or --keys; if left out: 25
-    fps: Annotated[int | None, arg(metavar="N")] = None
+    fps: Annotated[int | None, option(metavar="N")] = None
     # start of an orbit: azimuth and elevation in degrees, distance in largest sides of the box; if
     # left out: as in gvtorch render; without DIST the whole box is in each picture
-    orbit: Annotated[str | None, arg(metavar="AZ,EL[,DIST]")] = None
+    orbit: Annotated[str | None, option(metavar="AZ,EL[,DIST]")] = None
     # write what each picture cost, one line of JSON per picture
-    stats: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
+    stats: Annotated[Path | None, option(metavar="FILE.jsonl")] = None
     # write the camera of each picture: a folder for COLMAP, or .json for Blender and NeRF
-    poses: Annotated[Path | None, arg(metavar="FOLDER|FILE.json")] = None
+    poses: Annotated[Path | None, option(metavar="FOLDER|FILE.json")] = None
     # write a trace of the stages of each frame, for ui.perfetto.dev
-    trace: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    trace: Annotated[Path | None, option(metavar="FILE.json")] = None
 
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
     drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import arg
-
 from ..base.declared import declared_names
-from .common import flags_given, numbers
+from .common import flags_given, numbers, option
 from .parse import (
     check_component,
     chosen_transfer,
@@ -55,23 +53,23 @@ class Look:
     """How the scene is shown."""
 
     # pinhole, ortho (parallel), fisheye (equidistant) or panorama (equirectangular)
-    camera_model: Annotated[CameraModel, arg(metavar="MODEL")] = "pinhole"
+    camera_model: Annotated[CameraModel, option(metavar="MODEL")] = "pinhole"
     # vertical field of view in degrees; if left out: 30, or 180 for fisheye and panorama
-    fov: Annotated[float | None, arg(metavar="DEG")] = None
+    fov: Annotated[float | None, option(metavar="DEG")] = None
     # width and height of the picture in pixels
-    size: Annotated[str, arg(metavar="WxH")] = "512x512"
+    size: Annotated[str, option(metavar="WxH")] = "512x512"
     # up direction in the picture: +x, -x, +y, -y, +z, -z or X,Y,Z; if left out: +z, the head, for
     # scans of patients, else +y
-    up: Annotated[str | None, arg(metavar="+z|X,Y,Z")] = None
+    up: Annotated[str | None, option(metavar="+z|X,Y,Z")] = None
     # transfer function: gray, hot, vessels, bone, tissue, mr, em, cloud or galaxy; ct-bone,
     # ct-soft, ct-lung or ct-vessels (in Hounsfield units); a matplotlib colour map; or a file of
     # gvtorch, ParaView or 3D Slicer (.json, .vp, .xml), with FILE:NAME for one preset in it; if
     # left out: gray, or the function of a store's filtered colours
-    tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
+    tf: Annotated[str | None, option(metavar="FILE|PRESET")] = None
     # values that the transfer function is stretched over: LO,HI; percentiles P%,P%; full (the whole
     # range); or auto (by the histogram, without its background); if left out: auto, except for ct-
     # presets and files with values of their own
-    window: Annotated[str | None, arg(metavar="LO,HI")] = None
+    window: Annotated[str | None, option(metavar="LO,HI")] = None
     # plain: transfer function alone; lit: with lighting; preintegrated: plain, but keeps thin peaks
     # of the function; isosurface: surface at --value; maximum, minimum, mean: of the values along
     # each ray; gradient: boundaries; filtered, filtered-lit: as plain and lit, but correct from
@@ -82,39 +80,39 @@ class Look:
     # channels to show with --shader channels: number or name, colour (a name or #RRGGBB) and
     # window; parts left out or auto come from the file, or are chosen; the item opacity makes
     # channels hide each other instead of adding up
-    channel: Annotated[str | None, arg(metavar="N:COLOR:LO,HI;...")] = None
+    channel: Annotated[str | None, option(metavar="N:COLOR:LO,HI;...")] = None
     # value of the surface, for --shader isosurface
-    value: Annotated[float | None, arg(metavar="VALUE")] = None
+    value: Annotated[float | None, option(metavar="VALUE")] = None
     # distance between samples along a ray, in voxels of the finest level
-    step: Annotated[float, arg(metavar="VOXELS")] = 0.5
+    step: Annotated[float, option(metavar="VOXELS")] = 0.5
     # auto: level whose voxels are as wide as a pixel's cone; finest: the finest level everywhere
     lod: Literal["auto", "finest"] = "auto"
     # factor that widens a pixel's cone: larger values use coarser voxels; if left out: 4/3;
     # with --samples 16, 0.33 (a quarter of it) shows the finest detail
-    cone_scale: Annotated[float | None, arg(metavar="FACTOR")] = None
+    cone_scale: Annotated[float | None, option(metavar="FACTOR")] = None
     # linear colour, 0 to 1; R,G,B/R,G,B (top to bottom); transparent; or an environment map (PNG,
     # EXR, TIFF or NPY)
-    background: Annotated[str, arg(metavar="R,G,B|FILE")] = "0,0,0"
+    background: Annotated[str, option(metavar="R,G,B|FILE")] = "0,0,0"
     # alpha at which a ray ends; 1 integrates to the end
-    stop_alpha: Annotated[float, arg(metavar="ALPHA")] = 0.99
+    stop_alpha: Annotated[float, option(metavar="ALPHA")] = 0.99
     # region to keep: plane:A,B,C,D keeps where A x + B y + C z + D >= 0; box:X,Y,Z,X,Y,Z (low
     # corner, high corner) keeps a box; cut:X,Y,Z,X,Y,Z removes one; caps fills the cut with a
     # surface; in largest sides of the scene's box, from its centre
-    clip: Annotated[str | None, arg(metavar="KIND:NUMBERS;...")] = None
+    clip: Annotated[str | None, option(metavar="KIND:NUMBERS;...")] = None
     # depth of field: diameter of the lens and distance in focus, in largest sides of the scene's
     # box
-    lens: Annotated[str | None, arg(metavar="APERTURE,FOCUS")] = None
+    lens: Annotated[str | None, option(metavar="APERTURE,FOCUS")] = None
     # for lit shaders: sun:X,Y,Z,DEGREES (direction of its light, angular diameter);
     # lamp:X,Y,Z,RADIUS (world units); sky:R,G,B (ambient light); shadows: and
     # occlusion: (strength, 0 to 1); indirect: (factor); reach: (of the last two, in largest sides
     # of the scene's box)
-    lighting: Annotated[str | None, arg(metavar="KIND:NUMBERS;...")] = None
+    lighting: Annotated[str | None, option(metavar="KIND:NUMBERS;...")] = None
     # index of the number to show, for voxels with several
-    component: Annotated[int, arg(metavar="N")] = 0
+    component: Annotated[int, option(metavar="N")] = 0
     # voxels along a side of a brick
-    brick_size: Annotated[int, arg(metavar="VOXELS")] = 8
+    brick_size: Annotated[int, option(metavar="VOXELS")] = 8
     # voxels of overlap around a brick; if left out: 1, or 2 for labels, to smooth slanted faces
-    border: Annotated[int | None, arg(metavar="VOXELS")] = None
+    border: Annotated[int | None, option(metavar="VOXELS")] = None
     # implementation that traces the rays; auto: cuda if available, else cpp, else reference
     backend: Literal["auto", "reference", "cpp", "cuda"] = "auto"
 

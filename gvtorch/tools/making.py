@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..base.messages import printable
-from .common import Bar, numbers
+from .common import Bar, Switch, numbers, option
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -32,12 +32,12 @@ class Making:
     # voxels along a side of a block
     block: Literal[32, 64] = 32
     # number of processes; if left out: one per core, fewer if memory is short
-    workers: Annotated[int | None, arg(metavar="N")] = None
+    workers: Annotated[int | None, option(metavar="N")] = None
     # address of a dask scheduler, as in tcp://host:8786, whose workers see the store's folder under
     # the same path
-    scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    scheduler: Annotated[str | None, option(metavar="ADDRESS")] = None
     # continue a half-written store
-    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    resume: Switch = False
 
     def check(self) -> None:
         """Raises ValueError if flags exclude each other."""
@@ -62,22 +62,22 @@ class Making:
 class Voxelize:
     """Voxelize a mesh into a store, of any resolution: OME-Zarr with bordered blocks."""
 
-    path: Positional[Annotated[str, arg(metavar="MESH", help=f"mesh: {_MESHES}")]]
+    path: Positional[Annotated[str, option(metavar="MESH", help=f"mesh: {_MESHES}")]]
     # folder to create
-    output: Annotated[Path, arg(aliases=["-o"], metavar="STORE.zarr")]
+    output: Annotated[Path, option(aliases=["-o"], metavar="STORE.zarr")]
     # voxels along the mesh's longest side, including a margin of 2 at either end
-    resolution: Annotated[int, arg(metavar="N")] = 1024
+    resolution: Annotated[int, option(metavar="N")] = 1024
     # what to store in each voxel, one or several: coverage (share that is filled),
     # distance (signed, in world units, up to --band), color (premultiplied linear colour and
     # opacity), normal (of the nearest surface), material (labels); gvtorch render draws color
     # directly, lit by normal if it is stored too
-    channels: Annotated[str, arg(aliases=["--channel"], metavar="NAME,NAME,...")] = "coverage"
+    channels: Annotated[str, option(aliases=["--channel"], metavar="NAME,NAME,...")] = "coverage"
     # image that replaces all textures and colours; the mesh needs texture coordinates
-    texture: Annotated[Path | None, arg(metavar="IMAGE")] = None
+    texture: Annotated[Path | None, option(metavar="IMAGE")] = None
     # distance up to which voxels take distance, colour and normal from the nearest surface
-    band: Annotated[float, arg(metavar="VOXELS")] = 4.0
+    band: Annotated[float, option(metavar="VOXELS")] = 4.0
     # thickness of sheets, the parts that are not solid
-    thickness: Annotated[float, arg(metavar="VOXELS")] = 1.0
+    thickness: Annotated[float, option(metavar="VOXELS")] = 1.0
     # auto: closed parts are solid, others sheets; always: fill holes first; never: only sheets
     solid: Literal["auto", "always", "never"] = "auto"
 
@@ -110,29 +110,29 @@ class Splat:
     """Accumulate points in the voxels of a store, of any extent: OME-Zarr with bordered blocks."""
 
     path: Positional[
-        Annotated[str, arg(metavar="POINTS", help="points: arrays (.npz), PLY, or a FITS table")]
+        Annotated[str, option(metavar="POINTS", help="points: arrays (.npz), PLY, or a FITS table")]
     ]
     # folder to create
-    output: Annotated[Path, arg(aliases=["-o"], metavar="STORE.zarr")]
+    output: Annotated[Path, option(aliases=["-o"], metavar="STORE.zarr")]
     # voxels along the longest side of the box, or along x, y and z
-    extent: Annotated[str, arg(metavar="N or X,Y,Z", aliases=["--resolution"])] = "1024"
+    extent: Annotated[str, option(metavar="N or X,Y,Z", aliases=["--resolution"])] = "1024"
     # value: store the sum of the values; color: store light (value times colour) and opacity
-    channels: Annotated[Literal["value", "color"], arg(aliases=["--channel"])] = "value"
+    channels: Annotated[Literal["value", "color"], option(aliases=["--channel"])] = "value"
     # opacity of each point, for color
-    opacity: Annotated[float, arg(metavar="SHARE")] = 1e-4
+    opacity: Annotated[float, option(metavar="SHARE")] = 1e-4
     # world corners of the grid; points outside are skipped; if left out: a box around all points
-    box: Annotated[str | None, arg(metavar="X,Y,Z,X,Y,Z")] = None
+    box: Annotated[str | None, option(metavar="X,Y,Z,X,Y,Z")] = None
     # columns of the positions, as in x,y,z; if left out: found by their usual names
-    positions: Annotated[str | None, arg(metavar="NAMES")] = None
+    positions: Annotated[str | None, option(metavar="NAMES")] = None
     # columns of the values to add up; if left out: found by name, else 1 for each point
-    values: Annotated[str | None, arg(metavar="NAMES")] = None
+    values: Annotated[str | None, option(metavar="NAMES")] = None
     # columns of the colours, as in red,green,blue; if left out: found by name
-    colors: Annotated[str | None, arg(metavar="NAMES")] = None
+    colors: Annotated[str | None, option(metavar="NAMES")] = None
     # radius of the points in world units, a column or one number for all; if left out: found by
     # name, else each point lies in one voxel
-    radius: Annotated[str | None, arg(metavar="NAME or SIZE")] = None
+    radius: Annotated[str | None, option(metavar="NAME or SIZE")] = None
     # approximate memory for sorting the points
-    memory: Annotated[str, arg(metavar="BYTES")] = "1 GB"
+    memory: Annotated[str, option(metavar="BYTES")] = "1 GB"
 
     making: tyro.conf.OmitArgPrefixes[Making] = Making()
 

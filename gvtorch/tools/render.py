@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..base.messages import printable
 from ..base.whole_file import write_whole
-from .common import Bar, check_outputs, flags_given, size, volume_formats
+from .common import Bar, check_outputs, flags_given, option, size, volume_formats
 from .drawn import Drawn
 from .look import parse_camera
 from .scene import RenderedScene, SceneFlags
@@ -36,11 +36,11 @@ class Develop:
     """How the picture is developed."""
 
     # rays per pixel, at different positions in it
-    samples: Annotated[int, arg(metavar="N")] = 1
+    samples: Annotated[int, option(metavar="N")] = 1
     # tone mapping curve, from scene light to the display
     tone: Literal["none", "reinhard", "aces"] = "none"
     # multiply the light by 2^STOPS
-    exposure: Annotated[float, arg(metavar="STOPS")] = 0.0
+    exposure: Annotated[float, option(metavar="STOPS")] = 0.0
 
     def wrap(self, render: Callable[[Camera], Picture]) -> Callable[[Camera], Picture]:
         """Returns a function that renders a camera with all samples, tone-mapped."""
@@ -67,27 +67,27 @@ class Develop:
 class Render:
     """Render a volume or a store to a picture."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    path: Positional[Annotated[str, option(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     # picture to write: .png, .exr, .tif, .npy or .npz; .png, .tif and .npy may exceed memory
-    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
+    output: Annotated[Path, option(aliases=["-o"], metavar="OUT.png")]
     # bits of each number: 8 or 16 for .png; 8, 16 or 32 (float) for .tif; 32 or 16 (float)
     # for .exr; if left out: the first of these
-    bits: Annotated[int | None, arg(metavar="N")] = None
+    bits: Annotated[int | None, option(metavar="N")] = None
     # also write arrays: float32 color, alpha and depth, int32 samples; normal, features and label
     # where they exist
-    npz: Annotated[Path | None, arg(metavar="OUT.npz")] = None
+    npz: Annotated[Path | None, option(metavar="OUT.npz")] = None
     # write statistics: milliseconds, rays, samples, nodes, bricks, bytes; for stores also requests
     # and misses
-    stats: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    stats: Annotated[Path | None, option(metavar="FILE.json")] = None
     # view that gvtorch view saved: sets camera, shader and everything else about the look
     # but --size
-    state: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    state: Annotated[Path | None, option(metavar="FILE.json")] = None
     # orbit:AZIMUTH,ELEVATION (degrees; at azimuth 0, +x points to the right), at the distance from
     # which the whole box is in the picture; orbit:AZIMUTH,ELEVATION,DISTANCE (in largest sides of
     # the box); look:ex,ey,ez,tx,ty,tz (eye and target in world units); or file:PATH or
     # file:PATH,NAME (ParaView .pvcc, Blender or NeRF .json, COLMAP folder); if left out:
     # orbit:30,20, for scans of patients from the front
-    camera: Annotated[str | None, arg(metavar="CAMERA")] = None
+    camera: Annotated[str | None, option(metavar="CAMERA")] = None
     # the picture, or for each pixel: samples taken, nodes visited, lod (mean depth of nodes seen),
     # age (frames since their bricks were made), fill (share of their voxels that is not
     # transparent)

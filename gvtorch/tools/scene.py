@@ -11,10 +11,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
-from tyro.conf import arg
 
 from ..io.stores.ngff import is_zarr
-from .common import Bar, ReadOptions, flags_given, refuse_for_store
+from .common import Bar, ReadOptions, flags_given, option, refuse_for_store
 from .look import Look
 from .streaming import Streaming, tell_failures
 
@@ -66,7 +65,7 @@ class SceneFlags:
     """What is shown, and how."""
 
     # volumes only: never draw regions with no value above this
-    threshold: Annotated[float | None, arg(metavar="VALUE")] = None
+    threshold: Annotated[float | None, option(metavar="VALUE")] = None
 
     look: tyro.conf.OmitArgPrefixes[Look] = Look()
     streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()

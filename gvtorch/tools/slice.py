@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..base.messages import printable
-from .common import Bar, ReadOptions, check_outputs, open_data, volume_formats
+from .common import Bar, ReadOptions, check_outputs, open_data, option, volume_formats
 from .parse import chosen_transfer, parse_window
 from .render import KINDS
 
@@ -19,34 +19,34 @@ from .render import KINDS
 class Slice:
     """Show planes of voxels of a volume or a store, exact to the voxel."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    path: Positional[Annotated[str, option(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     # picture to write: .png, .exr, .tif, .npy or .npz
-    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.png")]
+    output: Annotated[Path, option(aliases=["-o"], metavar="OUT.png")]
     # bits of each number, as in gvtorch render
-    bits: Annotated[int | None, arg(metavar="N")] = None
+    bits: Annotated[int | None, option(metavar="N")] = None
     # axis that the plane is perpendicular to; all: three planes in one picture
     axis: Literal["x", "y", "z", "all"] = "z"
     # position along the axis: 50%, the index of a voxel, or a world position such as 12.5mm;
     # with --axis all also three, as in 50%,40%,12
-    at: Annotated[str, arg(metavar="PLACE")] = "50%"
+    at: Annotated[str, option(metavar="PLACE")] = "50%"
     # axis that points up in the picture of one plane; if left out: as radiologists view
     # patients (see --plain); for other data -y (rows run down) across z, else +z
-    up: Annotated[str | None, arg(metavar="+z")] = None
+    up: Annotated[str | None, option(metavar="+z")] = None
     # leave out the letters at the edges (R right, L left, A front, P back, S head, I feet) of scans
     # of patients, which are shown as radiologists view them: the right side on the left
     plain: bool = False
     # pixels along the shortest side of a voxel
-    scale: Annotated[float, arg(metavar="PIXELS")] = 1.0
+    scale: Annotated[float, option(metavar="PIXELS")] = 1.0
     # level of detail of a store; 0 is the finest
-    level: Annotated[int, arg(metavar="N")] = 0
+    level: Annotated[int, option(metavar="N")] = 0
     # colours, as in gvtorch render; if left out: visually even grays
-    tf: Annotated[str | None, arg(metavar="FILE|PRESET")] = None
+    tf: Annotated[str | None, option(metavar="FILE|PRESET")] = None
     # values that the colours span, as in gvtorch render; auto includes the background
-    window: Annotated[str | None, arg(metavar="LO,HI")] = None
+    window: Annotated[str | None, option(metavar="LO,HI")] = None
     # index of the number to show, for voxels with several
-    component: Annotated[int, arg(metavar="N")] = 0
+    component: Annotated[int, option(metavar="N")] = 0
     # image of a store to show, by name or number, if there are several
-    image: Annotated[str | None, arg(metavar="NAME")] = None
+    image: Annotated[str | None, option(metavar="NAME")] = None
 
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 

@@ -7,10 +7,8 @@ import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-from tyro.conf import arg
-
 from ..base.messages import one_line
+from .common import Switch, option
 from .look import Look
 
 if TYPE_CHECKING:
@@ -27,21 +25,24 @@ class Streaming:
     """Stores: memory, and how data is loaded."""
 
     # memory for node tiles
-    node_pool: Annotated[str, arg(metavar="BYTES")] = "8 MB"
+    node_pool: Annotated[str, option(metavar="BYTES")] = "8 MB"
     # memory for bricks, on the device that renders
-    brick_pool: Annotated[str, arg(metavar="BYTES")] = "256 MB"
+    brick_pool: Annotated[str, option(metavar="BYTES")] = "256 MB"
     # main memory for decoded blocks
-    host_cache: Annotated[str, arg(metavar="BYTES")] = "512 MB"
+    host_cache: Annotated[str, option(metavar="BYTES")] = "512 MB"
     # interactive: one frame; balanced: up to 4; converge (if left out): until nothing is missing
-    mode: Literal["interactive", "balanced", "converge"] | None = None
+    mode: Annotated[
+        Literal["interactive", "balanced", "converge"] | None,
+        option(metavar="{interactive,balanced,converge}"),
+    ] = None
     # most frames of a picture with --mode converge
-    max_frames: Annotated[int, arg(metavar="N")] = 1000
+    max_frames: Annotated[int, option(metavar="N")] = 1000
     # straight: load the wanted level directly; levels: level by level, from coarse to fine
     loading: Literal["straight", "levels"] = "straight"
     # image to show, by name or number, if the store has several
-    image: Annotated[str | None, arg(metavar="NAME")] = None
+    image: Annotated[str | None, option(metavar="NAME")] = None
     # stop with an error if a block can't be read; otherwise that part is drawn coarser
-    strict: tyro.conf.FlagCreatePairsOff[bool] = False
+    strict: Switch = False
 
     def store(self, path: str, time: int | None) -> Store:
         """Opens a store at a time point; warns if it has several and none was chosen."""

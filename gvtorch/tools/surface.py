@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..base.messages import printable
-from .common import Bar, ReadOptions, check_outputs, open_data, volume_formats
+from .common import Bar, ReadOptions, check_outputs, open_data, option, volume_formats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,19 +19,19 @@ class Surface:
     """Make triangles of the surface around values, or around a label; a store is read block by
     block."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH", help=f"a volume: {volume_formats()}")]]
+    path: Positional[Annotated[str, option(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     # mesh to write, in world units: PLY, or binary glTF
-    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT.ply|OUT.glb")]
+    output: Annotated[Path, option(aliases=["-o"], metavar="OUT.ply|OUT.glb")]
     # surface around values of at least this; for labels: the label to enclose
-    value: Annotated[float, arg(aliases=["--iso"], metavar="VALUE")]
+    value: Annotated[float, option(aliases=["--iso"], metavar="VALUE")]
     # level of detail of a store; 0 is the finest, each next one has a quarter of the triangles
-    level: Annotated[int, arg(metavar="N")] = 0
+    level: Annotated[int, option(metavar="N")] = 0
     # close the surface where it leaves the box; otherwise it is open there
     caps: bool = True
     # index of the number to use, for voxels with several
-    component: Annotated[int, arg(metavar="N")] = 0
+    component: Annotated[int, option(metavar="N")] = 0
     # image of a store to read, by name or number, if there are several
-    image: Annotated[str | None, arg(metavar="NAME")] = None
+    image: Annotated[str | None, option(metavar="NAME")] = None
 
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..io.stores.ngff import is_zarr
-from .common import Bar, flags_given, volume_formats
+from .common import Bar, flags_given, option, volume_formats
 from .look import parse_camera
 from .scene import SceneFlags
 
@@ -38,17 +38,17 @@ def _path_help() -> str:
 class View:
     """Look at a volume or a store in the browser: turn it, and edit how it is shown."""
 
-    path: Positional[Annotated[str, arg(metavar="PATH|SCRIPT.py", help=_path_help())]]
+    path: Positional[Annotated[str, option(metavar="PATH|SCRIPT.py", help=_path_help())]]
     # view that the page saved: sets camera, shader and everything else about the look
-    state: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    state: Annotated[Path | None, option(metavar="FILE.json")] = None
     # initial camera, as in gvtorch render
-    camera: Annotated[str | None, arg(metavar="CAMERA")] = None
+    camera: Annotated[str | None, option(metavar="CAMERA")] = None
     # address to serve the page at; 0.0.0.0: also to other machines, if they know the full address
-    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
+    host: Annotated[str, option(metavar="ADDRESS")] = "127.0.0.1"
     # port to serve the page at; 0: any free one
-    port: Annotated[int, arg(metavar="N")] = 0
+    port: Annotated[int, option(metavar="N")] = 0
     # further host names under which browsers may reach this machine
-    allow: Annotated[str, arg(metavar="NAME,NAME")] = ""
+    allow: Annotated[str, option(metavar="NAME,NAME")] = ""
     # open the page in a browser; otherwise only print its address
     browser: bool = True
 
