@@ -382,7 +382,7 @@ def test_small_cameras_share_calls(monkeypatch):
         (lambda: gv.Camera.orbit(width=0), "width must be an int >= 1"),
         (lambda: gv.Camera.orbit(height=2.5), "height must be an int"),
         (lambda: gv.Camera.orbit("north"), "azimuth must be numbers"),
-        (lambda: gv.Camera.look_at((0, 0, 0), (0, 0, 0)), "the same place"),
+        (lambda: gv.Camera.look_at((0, 0, 0), (0, 0, 0)), "the same position"),
         (
             lambda: gv.Camera.look_at((0, 0), (0, 0, 0)),
             r"eye must be \(3,\) or \(n, 3\), got \(2,\)",

@@ -88,6 +88,8 @@ def test_paraview_sees_what_we_see(tmp_path, model):
     """VTK's camera, set to the numbers in the file, maps points to the same pixels."""
     camera = gv.Camera.look_at(EYE, TARGET, UP, 40, 64, 48, model)
     file = tmp_path / "c.pvcc"
+    with pytest.raises(ValueError, match="distance must be finite and > 0"):
+        gv.write_cameras(file, camera, distance=0)
     gv.write_cameras(file, camera, distance=7.0)
     found = gv.read_cameras(file, width=64, height=48)["camera"]
     assert_same(found, camera)
@@ -181,7 +183,7 @@ def test_damaged_and_unknown_files_are_one_line(tmp_path):
         ("d.pvcc", "can't be read as cameras"),
         ("e.txt", "must end in .pvcc or .json or be a folder"),
         ("empty", "has no cameras.txt"),
-        ("f.pvcc", "does not tell the size of the picture"),
+        ("f.pvcc", "does not give the size of the picture"),
         ("no.json", "cameras not found"),
     ):
         with pytest.raises((ValueError, FileNotFoundError)) as caught:
@@ -196,7 +198,7 @@ def test_damaged_and_unknown_files_are_one_line(tmp_path):
         ("a.pvcc", gv.Camera.look_at([EYE, UP], TARGET), ".pvcc holds one camera, got 2"),
         ("a.json", gv.Camera.look_at(EYE, TARGET, model="ortho"), "pinhole and fisheye"),
         ("a.json", gv.Camera.orbit(), "must be one camera in the world"),
-        ("a.json", {"a b": askew()}, "no blanks"),
+        ("a.json", {"a b": askew()}, "must not contain blanks"),
         ("a.json", {}, "there are no cameras"),
         ("a.txt", askew(), "must end in .pvcc or .json or be a folder"),
         ("no/a.json", askew(), "folder not found"),
@@ -229,7 +231,7 @@ def test_flights_tell_their_cameras_and_render_takes_them(small, tmp_path):
         assert run.returncode == 2 and message in run.stderr, run.stderr
     for more, message in (
         (("--poses", tmp_path / "a.txt"), "--poses must be a folder or end in .json"),
-        (("--poses", tmp_path / "m", "--camera-model", "ortho"), "not of ortho"),
+        (("--poses", tmp_path / "m", "--camera-model", "ortho"), "not ortho"),
     ):
         run = gvtorch("fly", small, "-o", tmp_path / "g", "--frames", "1", *more)
         assert run.returncode == 2 and message in run.stderr and not (tmp_path / "g").exists()

@@ -157,7 +157,7 @@ def test_what_is_no_file_of_a_chunk_is_told(stored, what):
     else:
         with file.open("wb") as out:
             out.truncate(1 << 33)
-    wanted = "takes 8589934592 bytes, more than the" if what == "long" else "is no regular file"
+    wanted = "takes 8589934592 bytes, more than the" if what == "long" else "is not a regular file"
     with pytest.raises(http.Endless, match=f"{file.relative_to(stored)}: {wanted}"):
         read(array).result(timeout=5)
     assert not read(array[box((2, 2, 1))]).result().any()
@@ -186,7 +186,7 @@ def test_blosc_inside_another_codec_is_refused(tmp_path):
     place = {"driver": "file", "path": f"{tmp_path}/a/"}
     spec = {**zarr3(CHUNK, LITTLE, BLOSC, packed), "kvstore": place}
     ts.open(spec, create=True).result().write(1).result()
-    with pytest.raises(ValueError, match="a: Blosc lies inside gzip, where what it makes can't"):
+    with pytest.raises(ValueError, match="a: Blosc lies inside gzip, where its output can't"):
         gv.read_volume(tmp_path / "a", axes="zyx")
 
 

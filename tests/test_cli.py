@@ -515,6 +515,6 @@ def test_info_counts_labels(tmp_path):
     for flags in ((), ("--labels",)):
         run = gvtorch("info", tmp_path / "a.npy", *flags)
         assert run.returncode == 0 and "2, 7 to 2000000001" in run.stdout
-        assert ("told as labels" in run.stderr) == (not flags)
+        assert ("shown as labels" in run.stderr) == (not flags)
     gvtorch("convert", tmp_path / "a.npy", tmp_path / "a.zarr", "--labels", "--workers", 1)
     assert "2, 7 to 2000000001" in gvtorch("info", tmp_path / "a.zarr").stdout

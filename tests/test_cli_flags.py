@@ -124,7 +124,7 @@ OWN_KEYS = '[{"eye": [1, 2, 3], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 20}
         ),
         (
             lambda t: ["fly", "S", "-o", t / "f", "--turntable", "2", "--frames", "3"],
-            "--turntable and --frames both tell how many",
+            "--turntable and --frames both set the number",
         ),
         (
             lambda t: ["fly", "S", "-o", t / "f", "--turntable", "2", "--path", "k.json"],

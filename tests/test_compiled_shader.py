@@ -365,7 +365,7 @@ def test_mistakes_have_one_clear_message(tree, tmp_path):
         (lambda: gv.CompiledShader(None, "A"), "header must be a path, got None"),
         (lambda: gv.CompiledShader("a\0.h", "A"), r"header must be a path, got 'a\x00.h'"),
         (lambda: gv.CompiledShader(user.SOURCES / "user_shader.h", "A"), "has the name of the hea"),
-        (lambda: gv.CompiledShader(sys.executable, "A"), "is no text"),
+        (lambda: gv.CompiledShader(sys.executable, "A"), "is not a text file"),
         (lambda: gv.CompiledShader(HEADER, "A" * 129), "of at most 128 letters, got 'AAA"),
         (
             lambda: gv.CompiledShader(HEADER, "mine::Bands; int x"),
@@ -473,7 +473,7 @@ def test_a_header_that_changes_meanwhile_is_not_kept(tmp_path, monkeypatch):
     header = write(tmp_path, ADD.replace("COLOR", "0.5"))
     monkeypatch.setenv("CXX", only_included(tmp_path, f"echo '// more' >> {header}"))
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
-    with pytest.raises(RuntimeError, match=r"own.h has changed: make the shader anew"):
+    with pytest.raises(RuntimeError, match=r"own.h has changed: create the shader again"):
         gv.CompiledShader(header, "Own")
     assert built(tmp_path / "cache") == []
 
@@ -533,7 +533,7 @@ def test_what_another_process_has_noted_meanwhile_is_no_change(tmp_path, monkeyp
     assert before.op in user.compiled(before, (), before.op).name, "one that is loaded keeps its op"
     part.write_text("int changed;")
     assert before.unchanged(), "which knew nothing of it"
-    with pytest.raises(RuntimeError, match=r"own.h has changed: make the shader anew"):
+    with pytest.raises(RuntimeError, match=r"own.h has changed: create the shader again"):
         after.unchanged()
 
 
@@ -592,5 +592,5 @@ def test_it_is_unpickled_in_another_process(tmp_path):
 @pytest.mark.backend("cpp")
 def test_cuda_gets_no_other_content_than_the_cpu_has(tmp_path):
     edited = replace(user.load_op(HEADER, "mine::Plain"), header=write(tmp_path, ADD))
-    with pytest.raises(RuntimeError, match=r"own.h has changed: make the shader anew"):
+    with pytest.raises(RuntimeError, match=r"own.h has changed: create the shader again"):
         user.load_cuda(edited)

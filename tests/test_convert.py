@@ -172,7 +172,7 @@ def test_nothing_is_overwritten(tmp_path, raw):
     assert before == after
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
-    with pytest.raises(FileExistsError, match="exists and is no store"):
+    with pytest.raises(FileExistsError, match="exists and is not a store"):
         convert(raw, tmp_path / "mine")
     with pytest.raises(FileNotFoundError, match="folder not found"):
         convert(raw, tmp_path / "no" / "a.zarr")
@@ -193,7 +193,7 @@ def test_arguments_are_checked_before_the_work(tmp_path, raw):
             convert(raw, target, **options)
     with pytest.raises(FileNotFoundError, match="volume not found"):
         convert(tmp_path / "none.raw", target)
-    with pytest.raises(ValueError, match="bfloat16 has no place in a store"):
+    with pytest.raises(ValueError, match="bfloat16 can't be stored"):
         convert(gv.Volume(gv.Volume(np.zeros((2, 2, 2))).data.bfloat16()), target)
     assert not target.exists()
 
@@ -248,7 +248,7 @@ def test_a_broken_conversion_goes_on_where_it_was(tmp_path, raw, data, monkeypat
     message = rf"half-written: 1 of 8 shards are done; gvtorch convert {raw} {target} --resume"
     with pytest.raises(ValueError, match=message):
         Store.open(target)
-    with pytest.raises(FileExistsError, match="half-written; --resume"):
+    with pytest.raises(FileExistsError, match="half-written; continue with --resume"):
         convert(raw, target)
     with pytest.raises(ValueError, match="was begun with threshold None, now it is 5"):
         convert(raw, target, threshold=5, resume=True)

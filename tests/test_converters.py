@@ -75,7 +75,7 @@ def test_a_converter_does_not_take_over_what_another_has_begun(tmp_path, raw, da
 
     with monkeypatch.context() as patch:
         patch.setattr(conversion, "plan_of", plan)
-        with pytest.raises(FileExistsError, match="half-written; --resume"):
+        with pytest.raises(FileExistsError, match="half-written; continue with --resume"):
             convert(raw, target)
     assert_holds(convert(raw, target, resume=True), data)
 

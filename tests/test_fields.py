@@ -134,7 +134,7 @@ def test_infinite_values_fail_and_halves_do_not():
             lambda: gv.cache_field(torch.nn.Linear(2, 1), box=BOX),
             "FieldProducer: field Linear failed: RuntimeError: mat1 and mat2 shapes cannot be mult",
         ),
-        (lambda: gv.FieldProducer(Waves()), "box must be given: the field does not tell"),
+        (lambda: gv.FieldProducer(Waves()), "box must be given: the field does not say"),
         (
             lambda: gv.FieldProducer(Waves(), box=((0, 0, 0), (1, 1, math.inf))),
             "box must be finite",
@@ -309,7 +309,7 @@ def test_what_is_unknown_is_no_error():
     unknown = gv.FieldProducer(Bounded(lambda x: (x - math.inf, x + math.inf)), 64, box=BOX)
     assert (unknown.classify(nodes_of(unknown, 1)).kind == gv.Region.DATA).all()
     for box in (torch.full((2, 3), math.nan), torch.tensor([[-math.inf] * 3, [1.0] * 3])):
-        with pytest.raises(ValueError, match="box must be given: the field does not tell where"):
+        with pytest.raises(ValueError, match="box must be given: the field does not say where"):
             gv.FieldProducer(Bounded(lambda x: None, box), 64)
 
 

@@ -352,7 +352,7 @@ def test_a_coarse_channel_is_for_those_who_know_it():
 def test_mistakes_are_told():
     volume = matter()
     tree = gv.N3Tree.from_volume(volume, 4)
-    with pytest.raises(ValueError, match="of one place"):
+    with pytest.raises(ValueError, match="must have one placement"):
         gv.Filtered.of(tree, gv.Volume(torch.zeros(8, 8, 8)), SHADER)
     with pytest.raises(ValueError, match="component must be"):
         gv.Filtered.of(tree, volume, SHADER, component=1)

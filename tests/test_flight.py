@@ -267,7 +267,7 @@ def test_a_saved_view_is_turned(small, tmp_path):
     assert len({one.tobytes() for one in pictures}) == 4 and all(one.std() > 5 for one in pictures)
     for flags in (("--orbit", "1,2"), ("--fov", "20"), ("--step", "1"), ("--tf", "hot")):
         run = gvtorch("fly", small, "-o", tmp_path / "no", *saved, *flags)
-        assert run.returncode == 2 and f"--state tells what {flags[0]} does" in run.stderr
+        assert run.returncode == 2 and f"--state sets what {flags[0]} sets" in run.stderr
     for content in ("[]", "{", '{"shader": 7}'):
         (tmp_path / "bad.json").write_text(content)
         run = gvtorch("fly", small, "-o", tmp_path / "no", "--state", tmp_path / "bad.json")
@@ -299,7 +299,7 @@ def test_flags_that_the_keys_tell_are_refused(small, tmp_path):
     (tmp_path / "k.json").write_text(json.dumps([{"time": 0, "state": state}]))
     for flags in (("--turntable", "2"), ("--orbit", "1,2"), ("--fov", "20"), ("--step", "1")):
         run = gvtorch("fly", small, "-o", tmp_path / "f", "--keys", tmp_path / "k.json", *flags)
-        assert run.returncode == 2 and f"--keys tells what {flags[0]} does" in run.stderr
+        assert run.returncode == 2 and f"--keys sets what {flags[0]} sets" in run.stderr
     run = gvtorch("fly", small, "-o", tmp_path / "f", "--keys", tmp_path / "no.json")
     assert run.returncode == 2 and "key frames not found" in run.stderr
 

@@ -176,5 +176,5 @@ def test_masked_values_are_not_there():
     assert nothing.data.numpy().dtype == np.uint8
     with pytest.raises(ValueError, match="int64 values reach 100000059"):
         gv.as_volume(np.ma.MaskedArray(data + 10**8, gaps), nan=0)
-    with pytest.raises(ValueError, match="masked arrays: fill them before"):
+    with pytest.raises(ValueError, match="masked arrays: fill them first"):
         gv.as_volume(dask.from_array(masked, chunks=2), axes="zyx")

@@ -141,8 +141,8 @@ def test_several_series_are_asked_about(tmp_path, data):
     ("depths", "message"),
     [
         ([0, 1, 2, 4, 5, 6], r"1 slice is missing after slice 3 of 6: the next lies 2 mm"),
-        ([0, 1, 2.5, 4, 4.5, 6], "not evenly apart: 0.5 to 1.5 mm"),
-        ([0, 1, 2, 2, 3, 4], "slices are there 1 to 2 times"),
+        ([0, 1, 2.5, 4, 4.5, 6], "not evenly spaced: 0.5 to 1.5 mm"),
+        ([0, 1, 2, 2, 3, 4], "slices occur 1 to 2 times"),
     ],
 )
 def test_slices_that_are_not_even_are_refused(tmp_path, data, depths, message):

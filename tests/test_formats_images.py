@@ -361,7 +361,7 @@ def test_numbers_of_vtk_are_found_behind_others(tmp_path, before):
     [
         (NUMBERS.replace("26", "300"), "numbers that uint8 does not"),
         (NUMBERS.replace("26", "-1"), "numbers that uint8 does not"),
-        (NUMBERS.replace("26", "2_6"), "words that are no numbers"),
+        (NUMBERS.replace("26", "2_6"), "words that are not numbers"),
         (NUMBERS + " 27", "27 numbers expected, got more"),
         ("1", "27 numbers expected, got 1 bytes"),
     ],

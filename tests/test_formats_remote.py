@@ -161,7 +161,7 @@ def test_without_a_network_the_copy_is_used(server, grid, monkeypatch):
         raise OSError("no route to host")
 
     monkeypatch.setattr("urllib.request.urlopen", fail)
-    with pytest.warns(UserWarning, match=r"no answer \(no route to host\); the copy of before"):
+    with pytest.warns(UserWarning, match=r"no answer \(no route to host\); using the cached copy"):
         gv.read_volume(url)
     with pytest.raises(OSError, match="can't be downloaded: no route to host"):
         gv.read_volume(f"{server.url}/other.npy")
@@ -174,7 +174,7 @@ def test_a_data_set_of_a_file_behind_a_url(tmp_path, server, grid):
     server.files["/a.h5"] = (tmp_path / "a.h5").read_bytes()
     volume = gv.read_volume(f"{server.url}/a.h5:/g/a")
     assert np.array_equal(volume.data[..., 0].numpy(), grid)
-    with pytest.raises(ValueError, match="its numbers lie in a file beside it"):
+    with pytest.raises(ValueError, match="its numbers are in another file next to it"):
         gv.read_volume(f"{server.url}/a.mhd")
 
 

@@ -84,7 +84,7 @@ def test_vectors_of_nanovdb_are_channels(tmp_path):
     volume = gv.read_volume(shared("vdb/test_vec_grid.nvdb"))
     assert volume.data.shape == (21, 21, 21, 3) and volume.spacing == (0.25,) * 3
     assert float(volume.data.min()) == -240 and float(volume.data.double().mean()) == 0
-    with pytest.raises(ValueError, match="grid 'grid-0' holds OnIndex, which is no grid"):
+    with pytest.raises(ValueError, match="grid 'grid-0' holds OnIndex, not a grid"):
         gv.read_volume(shared("vdb/test_index_grid.nvdb"))
 
 

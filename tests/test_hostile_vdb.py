@@ -39,7 +39,7 @@ def test_hostile_files_of_openvdb(tmp_path):
     leaf_values(grid, np.random.default_rng(3))
     path = tmp_path / "a.vdb"
     good = VdbWriter().write(path, grid).read_bytes()
-    refused(path, b"\0" * 100, "does not begin as VDB files do")
+    refused(path, b"\0" * 100, "does not start like a VDB file")
     refused(path, good[:8] + struct.pack("<I", 219) + good[12:], "is of file version 219")
     refused(path, good[:-700], "in a file of")
     huge = {name: (kind, struct.pack("<3i", *(n,) * 3)) for (name, (kind, _)), n in
@@ -54,7 +54,7 @@ def test_hostile_files_of_openvdb(tmp_path):
     lonely = Grid("float", 7, told=BOX, parent="other")
     refused(path, VdbWriter().write(path, lonely).read_bytes(), "shares the tree of 'other'")
     stream = VdbWriter().write(path, grid, places=False).read_bytes()
-    refused(path, stream, "a stream that does not tell where its grids lie")
+    refused(path, stream, "a stream without the positions of its grids")
 
 
 def whole_leaf() -> tuple[np.ndarray, np.ndarray]:
@@ -227,7 +227,7 @@ def test_hostile_files_of_nanovdb(tmp_path):
     refused(path, changed(736 + 24, "<I", 2**31), "a root of")
     refused(path, changed(736 + 64 + 8, "<q", 2**40), "a node lies outside of the grid")
     first, second = struct.unpack_from("<q", content, 808)[0], 736 + 64 + 32 + 8
-    refused(path, changed(second, "<q", first), "several places of the tree share a node")
+    refused(path, changed(second, "<q", first), "several positions of the tree share a node")
     refused(path, changed(736, "<6i", *(0,) * 3, *(-9,) * 3), "has no active voxel")
 
 
@@ -246,11 +246,11 @@ def test_nodes_of_nanovdb_are_those_that_the_grid_tells_of(tmp_path):
         struct.pack_into(layout, out, at, value)
         return nano_file(path, ("a", kind, bytes(out))).read_bytes()
 
-    refused(path, forged(0, "<B", content[0], NANO["int16"][0]), "of type 1, its file tells of 3")
+    refused(path, forged(0, "<B", content[0], NANO["int16"][0]), "of type 1, its file declares 3")
     for count in (0, 1):
-        refused(path, forged(736 + 24, "<I", count), "nodes, leaves first; it tells of")
+        refused(path, forged(736 + 24, "<I", count), "nodes, leaves first; it declares")
     for at in range(3):
-        refused(path, forged(672 + 32 + 4 * at, "<I", 9), "nodes, leaves first; it tells of")
+        refused(path, forged(672 + 32 + 4 * at, "<I", 9), "nodes, leaves first; it declares")
     (key,) = struct.unpack_from("<Q", content, root)
     for bit in (20, 41, 62, 63):
         refused(path, forged(root, "<Q", key | 1 << bit), "of no voxel's place")
@@ -300,7 +300,7 @@ def test_only_the_first_block_of_blosc_is_unpacked_for_a_head(tmp_path, compress
     ("at", "content", "message"),
     [
         (736 + 24, struct.pack("<I", 10_000_000), "a root of 10000000 entries"),
-        (None, b"", "two entries of the root lie at one place"),
+        (None, b"", "two entries of the root have one position"),
     ],
 )
 def test_roots_of_nanovdb_hold_few_entries_each_at_its_place(tmp_path, at, content, message):

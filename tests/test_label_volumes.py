@@ -69,7 +69,7 @@ def test_whole_floats_are_labels_and_nan_can_be_replaced():
 
 
 def test_what_does_not_fit_is_one_clear_error():
-    with pytest.raises(ValueError, match=r"below 2\^63, got 9223372036854775808: number them anew"):
+    with pytest.raises(ValueError, match=r"below 2\^63, got 9223372036854775808: renumber them"):
         gv.Volume(np.full((2, 2, 2), 2**63, np.uint64), labels=True)
     with pytest.raises(ValueError, match="holds 16777217 labels or more, at most 16777216 fit"):
         base.check_count("Volume", 2**24 + 1)

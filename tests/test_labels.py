@@ -454,7 +454,7 @@ def test_other_shaders_do_not_blend_labels(scene):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: gv.Labels({1: "reddish"}), "'reddish' is no colour; known: #RRGGBB, black"),
+        (lambda: gv.Labels({1: "reddish"}), "'reddish' is not a colour; known: #RRGGBB, black"),
         (lambda: gv.Labels({1.5: RED}), "a label must be a whole number below 2^63, got 1.5"),
         (lambda: gv.Labels({1: (0, 0, 2)}), "colour must be finite and >= 0 and <= 1"),
         (lambda: gv.Labels("red"), "colors must be by label, or a list, got 'red'"),

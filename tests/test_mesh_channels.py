@@ -113,7 +113,7 @@ def test_what_a_store_has_not_is_told(store, tmp_path):
         gv.StoredChannels(store, ("distance",))
     plain = tmp_path / "plain.zarr"
     gv.voxelize(meshes.box(), plain, resolution=16)
-    with pytest.raises(ValueError, match="no store of several channels"):
+    with pytest.raises(ValueError, match="not a store of several channels"):
         gv.StoredChannels(plain)
 
 
@@ -165,7 +165,7 @@ def test_what_another_converter_has_begun_stays(tmp_path, mesh, manifest, channe
     begun.parent.mkdir(parents=True)
     begun.write_text("{}")
     for resume in (False, True):
-        with pytest.raises(FileExistsError, match="exists and is no store"):
+        with pytest.raises(FileExistsError, match="exists and is not a store"):
             gv.voxelize(mesh, target, resolution=20, channels=channels, resume=resume)
     assert begun.read_text() == "{}"
 

@@ -184,15 +184,15 @@ def stl(claimed: int) -> bytes:
         ("a.obj", b"", "a.obj"),
         ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "a.obj"),
-        ("a.stl", stl(1_000_000_000), "tells of 1000000000 triangles"),
+        ("a.stl", stl(1_000_000_000), "declares 1000000000 triangles"),
         (
             "a.ply",
             b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\n"
             b"property float y\nproperty float z\nelement face 1000000000\n"
             b"property list uchar int vertex_indices\nend_header\n",
-            "tells of 1000000000 triangles",
+            "declares 1000000000 triangles",
         ),
-        ("a.off", b"OFF 3 1000000000 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "tells of 1000000000"),
+        ("a.off", b"OFF 3 1000000000 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "declares 1000000000"),
         ("a.gltf", b'{"asset": {"version": "2.0"}', "can't be read as gltf"),
         ("a.glb", bytes(64), "can't be read as glb"),
         ("a.obj.gz", b"no gzip", "can't be unpacked"),
@@ -230,7 +230,7 @@ def test_missing_files_and_far_ones_are_told(tmp_path):
     with pytest.raises(ValueError, match=r"names none\.png, which is not there"):
         gv.read_mesh(file)
     write_textured(tmp_path, "../dots.png")
-    with pytest.raises(ValueError, match=r"names \.\./dots\.png, which lies in another folder"):
+    with pytest.raises(ValueError, match=r"names \.\./dots\.png, which is in another folder"):
         gv.read_mesh(file)
     write_textured(tmp_path, "http://localhost:1/dots.png")
     with pytest.raises(ValueError, match="nothing is fetched"):

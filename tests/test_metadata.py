@@ -202,7 +202,11 @@ def test_shapes_of_numpy_files(tmp_path, shape, axes, extent, width):
     [
         ((3, 7, 8, 9), None, "'zyxc', 'czyx' or 'tzyx'"),
         ((4, 7, 8, 3), None, "'zyxc', 'czyx' or 'tzyx'"),
-        ((20, 8, 9, 64), None, r"what are the axes of shape \(20, 8, 9, 64\)\? Tell with axes"),
+        (
+            (20, 8, 9, 64),
+            None,
+            r"what are the axes of shape \(20, 8, 9, 64\)\? Name them with axes",
+        ),
         ((20, 8, 9, 5), None, "'zyxc'"),
         ((2, 3, 7, 8, 9), None, "'tczyx'"),
         ((8, 9), None, "'yx'"),

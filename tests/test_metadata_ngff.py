@@ -246,7 +246,7 @@ def test_damaged_channels_are_named_and_do_not_keep_it_shut(tmp_path, change, me
     assert message in line and "\n" not in line and volume.info.channels[1] == TOLD[1]
     for omero, wanted in (
         ([], "holds no list of channels"),
-        ({"channels": [first]}, "what is told of 1 channels, where there are 2"),
+        ({"channels": [first]}, "metadata of 1 channels, where there are 2"),
     ):
         with_omero(folder, omero, 3)
         volume, (line,) = read(folder)

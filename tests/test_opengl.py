@@ -150,7 +150,7 @@ def test_what_is_wrong_is_named():
     skewed[0, 1], flat[2, 3], mirrored[1, 1] = 0.1, 0, -1
     ortho = torch.diag(torch.tensor([1.0, 1, -1, 1]))
     for call, message in (
-        (lambda: matrices(gv.Camera.orbit(), 0.1), "matrices: an orbit camera has no place yet"),
+        (lambda: matrices(gv.Camera.orbit(), 0.1), "matrices: an orbit camera has no position yet"),
         (lambda: matrices(camera, 0), "near must be finite and > 0"),
         (lambda: matrices(camera, 2, 1), "far must be finite and > 2"),
         (lambda: matrices(camera, 1, math.nan), "far must be finite"),
@@ -160,7 +160,7 @@ def test_what_is_wrong_is_named():
         (lambda: window_depth(image, projection[None]), r"distance must be \(1, h, w, 1\)"),
         (lambda: ray_distance(image, projection[:3]), r"projection must be \(4, 4\)"),
         (lambda: ray_distance(image, skewed), "projection must be finite, without skew"),
-        (lambda: ray_distance(image, flat), "tell depths apart"),
+        (lambda: ray_distance(image, flat), "keep depths apart"),
         (lambda: ray_distance(image, mirrored), "by more than 0"),
         (lambda: ray_distance(image, projection * math.nan), "projection must end in the row"),
         (lambda: gv.opengl.camera(ortho, modelview, 2, 2), "must be perspective"),

@@ -144,7 +144,7 @@ def test_damage_gets_one_line_that_names_the_file(tmp_path, name):
     [
         ("format ascii 1.0\nelement vertex 99999999999\nproperty float x", "it has"),
         ("format ascii 1.0\nelement vertex 2\nproperty list uchar int x", "have lists"),
-        ("format ascii 1.0\nelement face 2\nproperty float x", "stand behind face"),
+        ("format ascii 1.0\nelement face 2\nproperty float x", "come after face"),
         ("element vertex 2\nproperty float x", "no format"),
         ("format ascii 1.0", "no vertices"),
         ("format ascii 1.0\nelement vertex 2\nproperty quad x", "quad"),

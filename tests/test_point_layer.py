@@ -109,6 +109,8 @@ def test_points_of_a_pixel_add_up_and_have_a_mean_distance():
         (lambda c: gv.point_layer(None, c), "producer must be a PointProducer"),
         (lambda c: gv.point_layer(star((0, 0, 0)), gv.Camera.orbit(model="ortho")), "pinhole"),
         (lambda c: gv.point_layer(star((0, 0, 0)), c, size=0), "size must be"),
+        (lambda c: gv.point_layer(star((0, 0, 0)), c, reference=0), "reference must be"),
+        (lambda c: gv.point_layer(star((0, 0, 0)), c, cone_scale=-1), "cone_scale must be"),
     ],
 )
 def test_what_can_t_be_drawn_is_told(call, message):

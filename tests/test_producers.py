@@ -177,7 +177,7 @@ def test_nodes_that_fail_are_told_with_the_picture():
 def test_validate_finds_a_tile_in_the_wrong_place(blobs):
     tree = gv.N3Tree.from_volume(blobs, 4)
     tree.nodes.loc_t4[3, 0] += 1
-    with pytest.raises(ValueError, match="a tile's place is not that of its parent"):
+    with pytest.raises(ValueError, match="a tile's loc does not match its parent"):
         tree.validate()
 
 

@@ -395,7 +395,10 @@ def test_graphs_on_cuda_replay_every_model(blobs, model):
             lambda: gv.Camera(torch.eye(4), torch.zeros(3, 3), 4, 4, model="ortho"),
             "positive focal lengths",
         ),
-        (lambda: gv.CustomCamera(askew("pinhole").rays(), 9, 9), "140 rays are no pictures of 9x9"),
+        (
+            lambda: gv.CustomCamera(askew("pinhole").rays(), 9, 9),
+            "140 rays do not make pictures of 9x9",
+        ),
         (
             lambda: gv.CustomCamera(
                 gv.Rays(

@@ -259,7 +259,7 @@ def test_colours_of_a_refreshed_tree_are_made_anew(blobs):
     shader = gv.Filtered.of(tree, blobs, bone)
     tree.bricks["value"][-5:] *= 0.5
     tree.refresh()
-    with pytest.raises(ValueError, match="make them anew"):
+    with pytest.raises(ValueError, match="make them again"):
         gv.render(tree, camera(8), shader)
     gv.render(tree, camera(8), gv.Filtered.of(tree, tree.to_volume(), bone))
 

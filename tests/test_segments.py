@@ -366,7 +366,7 @@ def test_the_walk_compiles_and_exports(walk):
         ({"domain_2": torch.zeros(2).int()}, "domain_2 must be (2,) float32"),
         ({"state_r3": torch.zeros(4, 2)}, "state_r3 must be (4, 3) float32"),
         ({"limit": -1}, "limit must be an int >= 0"),
-        ({"width": 3}, "4 rays are no whole rows of 3 pixels"),
+        ({"width": 3}, "4 rays are not whole rows of 3 pixels"),
         ({"step": math.nan}, "step must be finite"),
         ({"component": 1}, "component must be an int >= 0 and <= 0"),
         ({"backend": "opengl"}, "backend must be auto, reference, cpp or cuda"),

@@ -204,9 +204,9 @@ def test_letters_stand_at_the_edges_and_nowhere_else():
 @pytest.mark.parametrize(
     ("space", "options", "message"),
     [
-        (None, {"radiological": True}, "does not tell where its axes point"),
-        ("right-left-superior", {"radiological": True}, "does not tell where its axes point"),
-        (RAS, {"radiological": True, "up": "+y"}, "an up of their own"),
+        (None, {"radiological": True}, "does not say where its axes point"),
+        ("right-left-superior", {"radiological": True}, "does not say where its axes point"),
+        (RAS, {"radiological": True, "up": "+y"}, "a fixed up"),
         (RAS, {"letters": True}, "letters are for radiological planes"),
     ],
 )

@@ -122,9 +122,9 @@ def test_regions_beyond_the_volume_repeat_its_faces(whole, data):
     assert (store.read_region(0, (-9, -9, -9), (-8, -8, -8)) == data[0, 0, 0]).all()
     with pytest.raises(ValueError, match="low < high"):
         store.read_region(0, (0, 0, 0), (0, 1, 1))
-    with pytest.raises(ValueError, match="leaves the grid"):
+    with pytest.raises(ValueError, match="lies outside the grid"):
         store.read_blocks(0, np.array([[0, 0, 3]]))
-    with pytest.raises(ValueError, match="leaves the grid"):
+    with pytest.raises(ValueError, match="lies outside the grid"):
         store.read_cells(0, (0, 0, 0), (99, 1, 1))
     with pytest.raises(ValueError, match="level must be an int >= 0 and <= 4"):
         store.read_region(5, (0, 0, 0), (1, 1, 1))

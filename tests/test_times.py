@@ -368,8 +368,8 @@ def test_keys_of_a_film_tell_the_time_point(tmp_path):
     found = [played.index(one) for one in played]
     assert len(found) == 5 and len(set(found)) == 3 and found == sorted(found)
     for last, flags, message in (
-        (2, ("--time", 1), "--keys tells what --time does"),
-        (2, ("--times", "all"), "--keys tells what --times does"),
+        (2, ("--time", 1), "--keys sets what --time sets"),
+        (2, ("--times", "all"), "--keys sets what --times sets"),
         (9, (), "time must be from 0 to 3 of"),
     ):
         run = fly(last, *flags)

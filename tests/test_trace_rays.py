@@ -268,7 +268,7 @@ def test_logarithm_power_and_light_taken_are_accurate_in_float64():
         ({"opaque_m": torch.zeros(3)}, "opaque_m must be"),
         ({"range_tn2c": torch.zeros(3)}, "range_tn2c must be"),
         ({"frame_1": torch.zeros(1)}, "frame_1 must be (1,) int32"),
-        ({"width": 3}, "4 rays are no whole rows of 3 pixels"),
+        ({"width": 3}, "4 rays are not whole rows of 3 pixels"),
         ({"cone_scale": -1.0}, "cone_scale must be"),
         ({"direction_r3": torch.zeros(3, 4).double().T}, "direction_r3 must be contiguous"),
         ({"branching": 1}, "branching must be an int >= 2"),

@@ -426,7 +426,7 @@ def test_what_is_lost_is_told(tmp_path):
         ("a.vp", "\n".join([*LINES[:6], "2 nan 1", *LINES[7:]]), None, "must be finite"),
         ("a.vp", "\n".join([*LINES[:6], "2 1 7", *LINES[7:]]), None, r"must lie in \[0, 1\]"),
         ("a.vp", "\n".join(LINES), "CT", "holds one preset, without a name: leave 'CT' out"),
-        ("a.xml", "<MRML><", None, "no such file as its ending tells"),
+        ("a.xml", "<MRML><", None, "not a file of the kind that its ending says"),
         (
             "a.xml",
             "<MRML></MRML>",
@@ -442,7 +442,7 @@ def test_what_is_lost_is_told(tmp_path):
             None,
             "ColorSpace must be one",
         ),
-        ("a.json", '{"volumeProperties": []}', None, "no such file as its ending tells"),
+        ("a.json", '{"volumeProperties": []}', None, "not a file of the kind that its ending says"),
         ("a.json", '{"color": []}', None, 'expected an object with "opacity"'),
         ("a.txt", "", None, "not a JSON file"),
     ],

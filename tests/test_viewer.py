@@ -248,7 +248,16 @@ class Settings:
     hollow: bool = False
 
 
+class Hollow(gv.Producer):
+    """Its root can't be made."""
+
+    def fill(self, nodes):
+        raise OSError("nothing is there")
+
+
 def ball(settings: Settings) -> gv.Producer:
+    if settings.hollow:
+        return Hollow(64)
     shape = gv.sdf.Sphere(settings.radius)
     return gv.FieldProducer(gv.Solid(shape), 64, box=((-20, -20, -20), (20, 20, 20)))
 
@@ -269,6 +278,10 @@ def test_fields_of_a_dataclass_and_parameters_of_a_module_become_controls():
         assert "radius: must be a number" in page.next("refused", 0)["text"]
         page.send("set", name="weight", value=1)
         assert "no parameter 'weight'" in page.next("refused", 1)["text"]
+        page.send("set", name="hollow", value=True)
+        assert "nothing is there" in page.next("refused", 2)["text"]
+        page.send("set", name="radius", value=10.0)  # the scene still works
+        page.until(lambda: np.array_equal(page.final()[1], before))
     finally:
         session.close()
 

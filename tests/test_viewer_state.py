@@ -69,7 +69,7 @@ def test_what_json_leaves_out_or_can_not_tell_stays():
     changed = state.changed({"options": {"stop_alpha": 0.75}})
     assert (changed.options.stop_alpha, changed.options.step) == (0.75, 0.3)
     assert changed.options.background is options.background
-    with pytest.raises(ValueError, match="JSON can't tell"):
+    with pytest.raises(ValueError, match="JSON can't represent"):
         gv.ViewState(shader=HOT).changed({"options": {"lens": {"kept": "a lens"}}})
 
 
@@ -166,9 +166,9 @@ def test_render_takes_a_saved_state(tmp_path):
     seen = pixels((tmp_path / "a.png").read_bytes())
     assert np.array_equal(seen, expected) and seen.std() > 5
     for flags, message in (
-        (("--tf", "hot"), "--state tells what --tf does"),
-        (("--camera", "orbit:1,2"), "--state tells what --camera does"),
-        (("--samples", "4"), "--state tells what --samples does"),
+        (("--tf", "hot"), "--state sets what --tf sets"),
+        (("--camera", "orbit:1,2"), "--state sets what --camera sets"),
+        (("--samples", "4"), "--state sets what --samples sets"),
     ):
         run = gvtorch(
             *("render", tmp_path / "ball.npy", "-o", tmp_path / "b.png"),

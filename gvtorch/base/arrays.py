@@ -72,7 +72,7 @@ class ArrayLike:
         if isinstance(given, np.ma.MaskedArray):
             given = _filled(where, given)
         elif isinstance(getattr(given, "_meta", None), np.ma.MaskedArray):
-            raise ValueError(f"{where}: its parts are masked arrays: fill them before")
+            raise ValueError(f"{where}: its parts are masked arrays: fill them first")
         shape = tuple(int(n) for n in given.shape)
         dtype = np.dtype(str(given.dtype)) if not isinstance(given.dtype, np.dtype) else given.dtype
         if dtype.kind not in "biuf":
@@ -220,7 +220,7 @@ def _described(
             steps[at], even = even_steps(values)
             units[at] = str(places.attrs.get("units", "")) or None
             if not even:
-                lost.append(f"that places along {name} are not evenly apart")
+                lost.append(f"that coordinates along {name} are not evenly spaced")
     return names, steps, units, lost
 
 

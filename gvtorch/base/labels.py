@@ -35,7 +35,7 @@ def as_whole(where: str, values: np.ndarray) -> np.ndarray:
         raise ValueError(f"{where}: labels must be whole numbers, got {values.dtype}")
     if values.dtype == np.uint64 and values.size and int(values.max()) > np.iinfo(np.int64).max:
         raise ValueError(
-            f"{where}: labels must be below 2^63, got {int(values.max())}: number them anew"
+            f"{where}: labels must be below 2^63, got {int(values.max())}: renumber them"
         )
     return values
 

@@ -64,7 +64,7 @@ def ask_axes(path: str, shape: Sequence[int], axes: str | None = None) -> str:
     if which is None:
         raise ValueError(f"{path}: expected 2 to 5 axes, got shape {sizes}")
     raise ValueError(
-        f"{path}: what are the axes of shape {sizes}? Tell with axes (--axes), a letter each: "
+        f"{path}: what are the axes of shape {sizes}? Name them with axes (--axes), a letter each: "
         f"{which}"
     )
 

@@ -243,7 +243,7 @@ class Camera:
         forward = target_ - eye_
         length = forward.norm(dim=-1, keepdim=True)
         if bool((length == 0).any()):
-            raise ValueError(f"{where}: eye and target are the same place, {eye!r}")
+            raise ValueError(f"{where}: eye and target are at the same position, {eye!r}")
         forward = forward / length
         right = torch.linalg.cross(forward, up_)
         along_z = forward[..., 2:3].abs() > 0.9
@@ -399,7 +399,9 @@ class Camera:
             ValueError: The camera is relative to a box: call `placed(box)` first.
         """
         if self.frame is not Frame.WORLD:
-            raise ValueError("Camera.rays: an orbit camera has no place yet, call placed(tree.box)")
+            raise ValueError(
+                "Camera.rays: an orbit camera has no position yet, call placed(tree.box)"
+            )
         view, intrinsics = self.viewmats.numpy(), self.Ks.numpy()
         rotation, translation = view[:, :3, :3], view[:, :3, 3]
         focal, centre = intrinsics[:, (0, 1), (0, 1)], intrinsics[:, :2, 2] - 0.5

@@ -55,7 +55,8 @@ class CustomCamera(Camera):
         self.window = (0, self.height)
         if count % (self.width * self.height):
             raise ValueError(
-                f"CustomCamera: {count} rays are no pictures of {self.width}x{self.height} pixels"
+                f"CustomCamera: {count} rays do not make pictures of "
+                f"{self.width}x{self.height} pixels"
             )
         columns.append(torch.zeros_like(columns[0][:, :1]))
         self._rays = torch.cat([column.to(torch.float64) for column in columns], 1)  # (r, 11)

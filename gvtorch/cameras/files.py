@@ -74,7 +74,7 @@ def read_cameras(
     """
     path = Path(path)
     if (width is None) != (height is None):
-        raise ValueError("read_cameras: width and height go together")
+        raise ValueError("read_cameras: give both width and height, or neither")
     if not (path.is_file() or path.is_dir()):  # a pipe may never end
         raise FileNotFoundError(f"cameras not found: {path}")
     readers = {".pvcc": _read_pvcc, ".json": _read_transforms}
@@ -100,7 +100,7 @@ def read_cameras(
 
 
 def write_cameras(
-    path: str | Path, cameras: Camera | Mapping[str, Camera], *, distance: float | None = None
+    path: str | Path, cameras: Camera | Mapping[str, Camera], *, distance: float = 1.0
 ) -> None:
     """Writes cameras for another program: see `read_cameras`.
 
@@ -109,7 +109,7 @@ def write_cameras(
             empty points3D.txt, which is made.
         cameras: A camera, or a batch, whose pictures are called 0000.png, 0001.png, ..., or cameras
             by the names of their pictures; in world units.
-        distance: World units from the eye to a .pvcc's centre of rotation; 1 if left out.
+        distance: World units from the eye to a .pvcc's centre of rotation.
 
     Raises:
         ValueError: The ending is none of these, the file can't store a model, or a camera is
@@ -124,13 +124,13 @@ def write_cameras(
         if camera.frame is Frame.BOX or len(camera) != 1:
             raise ValueError(f"{where}: {name!r} must be one camera in the world, got {camera}")
         if not name or any(letter.isspace() for letter in name):
-            raise ValueError(f"{where}: names must have no blanks, got {name!r}")
+            raise ValueError(f"{where}: names must not contain blanks, got {name!r}")
     if not cameras:
         raise ValueError(f"{where}: there are no cameras")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{where}: folder not found: {path.parent}")
     if path.suffix == ".pvcc":
-        far = check.number(where, "distance", distance or 1.0, low=0, open_low=True)
+        far = check.number(where, "distance", distance, low=0, open_low=True)
         write_whole(path, _pvcc(cameras, far))
     elif path.suffix == ".json":
         write_whole(path, json.dumps(_transforms(cameras), indent=1) + "\n")
@@ -164,7 +164,7 @@ def _read_pvcc(path: Path, width: int | None, height: int | None) -> dict[str, C
         found[one.attrib["name"]] = values
     eye, target, up = (found[name][:3] for name, _ in _PVCC[:3])
     if width is None or height is None:
-        raise ValueError("does not tell the size of the picture: give width and height")
+        raise ValueError("does not give the size of the picture: give width and height")
     if not found.get("CameraParallelProjection", [0])[0]:
         fov = found["CameraViewAngle"][0]
         return {"camera": Camera.look_at(eye, target, up, fov, width, height)}
@@ -218,7 +218,7 @@ def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[
         view[:3, :3], view[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
         x, y = (int(told.get(k) or size or 0) for k, size in (("w", width), ("h", height)))
         if not x or not y:
-            raise ValueError("does not tell the size of the pictures: give width and height")
+            raise ValueError("does not give the size of the pictures: give width and height")
         fx = told["fl_x"] if "fl_x" in told else 0.5 * x / math.tan(told["camera_angle_x"] / 2)
         fy = told.get("fl_y", fx)
         cx, cy = told.get("cx", x / 2), told.get("cy", y / 2)
@@ -273,7 +273,7 @@ def _lens(camera: Camera) -> tuple[str, dict[str, float]]:
     if camera.model == "fisheye":
         bends = camera.radial_coeffs[0].tolist()
         return _FISHEYE, told | dict(zip(("k1", "k2", "k3", "k4"), bends, strict=True))
-    raise ValueError(f"write_cameras: pinhole and fisheye can be told, got {camera.model}")
+    raise ValueError(f"write_cameras: only pinhole and fisheye can be written, got {camera.model}")
 
 
 # COLMAP.
@@ -303,7 +303,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
-        raise ValueError("is no text") from None
+        raise ValueError("is not a text file") from None
 
 
 def _lines(path: Path, every: int = 1) -> list[str]:

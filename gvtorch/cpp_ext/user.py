@@ -104,7 +104,7 @@ class ShaderSource:
             now = self.read(self.header, self.name)
             if now.more == self.more and set(self.noted) <= set(now.noted):
                 return now
-        raise RuntimeError(f"CompiledShader: {self.header} has changed: make the shader anew")
+        raise RuntimeError(f"CompiledShader: {self.header} has changed: create the shader again")
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def load_op(header: str | os.PathLike[str], name: str) -> UserShader:
     if path.name == "user_shader.h":
         raise ValueError(f"CompiledShader: {path} has the name of the header that it includes")
     if b"\0" in path.read_bytes():
-        raise ValueError(f"CompiledShader: {path} is no text")
+        raise ValueError(f"CompiledShader: {path} is not a text file")
     if not (isinstance(name, str) and _NAME.fullmatch(name)):
         raise ValueError(
             "CompiledShader: name must be that of a C++ struct, of at most 128 letters, "

@@ -52,7 +52,7 @@ class Distance(Field):
 
     def forward(self, points: Tensor) -> Tensor:
         """Returns (...,) signed distances at points (..., 3)."""
-        raise NotImplementedError(f"{type(self).__name__}: forward is not written")
+        raise NotImplementedError(f"{type(self).__name__}: forward is not implemented")
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Returns distances (...,) and linear colours (..., 3) at points (..., 3)."""

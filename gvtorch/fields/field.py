@@ -52,20 +52,20 @@ class Field(nn.Module):
         """Returns the values at points (..., 3), float32 or float64, in world units: (...,),
         (..., c), or these by channel, of the dtype of the points.
         """
-        raise NotImplementedError(f"{type(self).__name__}: forward is not written")
+        raise NotImplementedError(f"{type(self).__name__}: forward is not implemented")
 
     def filtered(self, points: Tensor, size: Tensor) -> Values:
         """Returns the means over voxels around points (..., 3); `size` (..., 3), the sides of the
         voxels, broadcasts with the points. Called if `prefiltered`.
         """
-        raise NotImplementedError(f"{type(self).__name__}: filtered is not written")
+        raise NotImplementedError(f"{type(self).__name__}: filtered is not implemented")
 
     def finish(self, values: Mapping[str, Tensor], size: Tensor) -> Mapping[str, Tensor]:
         """Returns channels (k, z, y, x, c), computed from what `filtered` returned on a grid that
         is `margin` voxels wider on all sides, (k, z + 2 margin, y + 2 margin, x + 2 margin, c) by
         channel, for voxels of sides `size` (k, 3). Called if there is a margin.
         """
-        raise NotImplementedError(f"{type(self).__name__}: finish is not written")
+        raise NotImplementedError(f"{type(self).__name__}: finish is not implemented")
 
     def bounds(self, center: Tensor, half: Tensor) -> Bounds:
         """Returns intervals that hold `forward` everywhere in boxes center - half to center + half,

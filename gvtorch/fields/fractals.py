@@ -38,7 +38,7 @@ class Iteration(nn.Module):
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Returns f(z), and the factor (...,) by which f stretches distances around z."""
-        raise NotImplementedError(f"{type(self).__name__}: forward is not written")
+        raise NotImplementedError(f"{type(self).__name__}: forward is not implemented")
 
     def ranges(self, z: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Returns bounds over balls around z (3, k) of radii `reach` (k,): the most that f really

@@ -38,7 +38,7 @@ def check_regular(path: str | Path) -> None:
     """Raises ValueError for a pipe, a device or a socket, which may never end."""
     mode = os.stat(path).st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise ValueError(f"{path}: is no regular file")
+        raise ValueError(f"{path}: is not a regular file")
 
 
 def check_beside(path: str, other: str) -> None:
@@ -48,7 +48,7 @@ def check_beside(path: str, other: str) -> None:
     folder = os.path.realpath(os.path.dirname(path))
     place = os.path.join(folder, other)
     if os.path.commonpath([folder, os.path.realpath(place)]) != folder:
-        raise ValueError(f"{path}: names {other}, which lies in another folder")
+        raise ValueError(f"{path}: names {other}, which is in another folder")
     if os.path.lexists(place):
         check_regular(place)
 

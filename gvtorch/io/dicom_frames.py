@@ -58,7 +58,7 @@ def frames_of(header: Any, count: int) -> list[DicomFrame]:
     shared = _first(header.get("SharedFunctionalGroupsSequence"))
     each = header.get("PerFrameFunctionalGroupsSequence") or ()
     if each and len(each) != count:
-        raise ValueError(f"{header.filename}: tells of {len(each)} frames and holds {count}")
+        raise ValueError(f"{header.filename}: declares {len(each)} frames and holds {count}")
     offsets = [float(v) for v in _list(header.get("GridFrameOffsetVector"))]
     found = []
     for number in range(count):
@@ -103,7 +103,7 @@ def _frame(header: Any, groups: list[Any], number: int) -> DicomFrame:
         moments["InstanceNumber"] = number
     numbers = [*spacing, *position, *orientation, *(v for v in (slope, intercept) if v is not None)]
     if not all(math.isfinite(v) for v in numbers) or len(spacing) != 2:
-        raise ValueError(f"{header.filename}: place, spacing or rescaling is no number")
+        raise ValueError(f"{header.filename}: position, spacing or rescaling is not a number")
     return DicomFrame(
         file=header.filename,
         number=number,
@@ -152,7 +152,7 @@ def order_frames(where: str, frames: Sequence[DicomFrame]) -> Ordered:
     elif first.between is None:
         lost.append("how thick its only slice is: it is 1 thick here")
     if apart is not None and apart not in (*_IN_TIME, *_APART[:2]):
-        lost.append(f"{count} images of each slice differ in {apart}: they are taken for times")
+        lost.append(f"{count} images of each slice differ in {apart}: they are read as time points")
     return ordered, affine, lost, _moments(ordered, apart)
 
 
@@ -162,7 +162,7 @@ def _directions(where: str, frame: DicomFrame) -> tuple[np.ndarray, np.ndarray]:
     rows, columns = told[:3], told[3:]
     lengths = np.linalg.norm(rows), np.linalg.norm(columns)
     if not np.allclose(lengths, 1, atol=1e-2) or abs(rows @ columns) > 1e-2:
-        raise ValueError(f"{where}: Image Orientation {told.tolist()} is no pair of directions")
+        raise ValueError(f"{where}: Image Orientation {told.tolist()} is not a pair of directions")
     return rows / lengths[0], columns / lengths[1]
 
 
@@ -200,8 +200,8 @@ def _times(where: str, slices: list[list[DicomFrame]]) -> tuple[int, str | None]
         return 1, None
     if len(counts) > 1:
         raise ValueError(
-            f"{where}: slices are there {counts[0]} to {counts[-1]} times; expected each of "
-            f"{len(slices)} places equally often"
+            f"{where}: slices occur {counts[0]} to {counts[-1]} times; expected each of "
+            f"{len(slices)} positions equally often"
         )
 
     def differs(name: str) -> bool:
@@ -209,7 +209,7 @@ def _times(where: str, slices: list[list[DicomFrame]]) -> tuple[int, str | None]
 
     name = next(filter(differs, _APART), None)
     if name is None:
-        raise ValueError(f"{where}: {counts[0]} images of each slice, which nothing tells apart")
+        raise ValueError(f"{where}: {counts[0]} images of each slice, which nothing distinguishes")
     for one in slices:
         one.sort(key=lambda frame: frame.moments.get(name, 0.0))
     return counts[0], name
@@ -242,8 +242,8 @@ def _step(where: str, places: np.ndarray, normal: np.ndarray) -> np.ndarray:
                 f"the next lies {gaps[at]:.4g} mm further, others {usual:.4g} mm"
             )
         raise ValueError(
-            f"{where}: slices are not evenly apart: {gaps.min():.4g} to {gaps.max():.4g} mm; "
-            "resample them, or put those that are into a folder of their own"
+            f"{where}: slices are not evenly spaced: {gaps.min():.4g} to {gaps.max():.4g} mm; "
+            "resample them, or put those that are into a separate folder"
         )
     step: np.ndarray = (places[-1] - places[0]) / (len(places) - 1)
     beside = places - (places[0] + np.arange(len(places))[:, None] * step)

@@ -159,7 +159,7 @@ def _check_gltf(ending: str, content: bytes) -> None:
     header = json.loads(content)
     for view in header.get("bufferViews", ()):
         if min(view.get("byteOffset", 0), view["byteLength"]) < 0:
-            raise ValueError("a part of a buffer lies before its begin")
+            raise ValueError("a part of a buffer lies before its start")
     for number, one in enumerate(header.get("accessors", ())):
         if "bufferView" not in one or "sparse" in one:
             raise ValueError(f"accessor {number} is sparse or packed by an extension")
@@ -195,10 +195,10 @@ def _check_claims(path: Path, ending: str, content: bytes) -> None:
         return
     if claimed > len(content) // _FACE_BYTES:
         raise ValueError(
-            f"{path}: tells of {claimed} triangles or vertices in {len(content)} bytes: damaged"
+            f"{path}: declares {claimed} triangles or vertices in {len(content)} bytes: damaged"
         )
     if claimed > MOST_FACES:
-        raise ValueError(f"{path}: at most {MOST_FACES} triangles, it tells of {claimed}")
+        raise ValueError(f"{path}: at most {MOST_FACES} triangles, it declares {claimed}")
 
 
 class _Beside:
@@ -217,7 +217,7 @@ class _Beside:
         file = (self._folder / plain).resolve()
         inside = file.is_relative_to(self._folder.resolve())
         if not inside or not file.is_file():
-            where = "is not there" if inside else "lies in another folder"
+            where = "is not there" if inside else "is in another folder"
             # An OBJ may name a material library that was not kept: the mesh is white then.
             if not plain.lower().endswith(".mtl"):
                 self.missing = f"names {plain}, which {where}"
@@ -258,7 +258,9 @@ def _joined(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh:
         own, places = np.asarray(part.faces, np.int64), np.asarray(part.vertices, np.float64)
         if own.min() < 0 or own.max() >= len(places):
             wrong = own.min() if own.min() < 0 else own.max()
-            raise ValueError(f"{path}: a triangle names vertex {wrong}, there are {len(places)}")
+            raise ValueError(
+                f"{path}: a triangle refers to vertex {wrong}, there are {len(places)}"
+            )
         faces.append(own + before)
         vertices.append(places)
         before += len(places)

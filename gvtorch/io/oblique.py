@@ -145,7 +145,7 @@ def straighten(
     if oblique == "keep":
         pose = _pose(affine[:, :3] / lengths, np.array(source.origin if place is None else place))
         hint = "" if pose is None else "; info.pose turns them (gv.render(..., pose=...))"
-        warnings.warn(f"{name}: kept, and taken for the world's axes{hint}", stacklevel=3)
+        warnings.warn(f"{name}: kept, and treated as the world's axes{hint}", stacklevel=3)
         info = dataclasses.replace(source.info, pose=pose)
         return dataclasses.replace(source, oblique=None, info=info)
     extent, spacing, origin, to_inner = _grid(affine, source.extent)

@@ -75,7 +75,7 @@ def text_numbers(
             raise ValueError(f"{path}: {count} numbers expected, got more")
         del words[count - done :]
         if b"_" in b"".join(words):  # which int() and float() would ignore
-            raise ValueError(f"{path}: holds words that are no numbers")
+            raise ValueError(f"{path}: holds words that are not numbers")
         numbers: list[Any] = [float(word) if wide else int(word) for word in words]
         if numbers and not wide:
             ends = np.iinfo(kind)
@@ -99,7 +99,7 @@ def _words(stream: IO[bytes]) -> Iterator[list[bytes]]:
         words = (rest + text).split()
         rest = words.pop() if words and text and not text[-1:].isspace() else b""
         if len(rest) > _READ:
-            raise ValueError(f"a word of more than {_READ} bytes is no number")
+            raise ValueError(f"a word of more than {_READ} bytes is not a number")
         yield words
 
 
@@ -116,7 +116,7 @@ def unpack_block(codec: str, packed: Any, need: int) -> bytes:
     else:
         told = int.from_bytes(packed[4:8], "little"), int.from_bytes(packed[12:16], "little")
         if codec == "blosc" and (len(packed) < 16 or told != (need, len(packed))):
-            raise ValueError(f"a block of {need} bytes expected, its head tells of {told[0]}")
+            raise ValueError(f"a block of {need} bytes expected, its header declares {told[0]}")
         codecs = need_library(f"what is packed by {codec}", "imagecodecs")
         found = bytes(getattr(codecs, f"{codec}_decode")(bytes(packed), out=need))
     if len(found) != need:
@@ -131,7 +131,7 @@ def is_packed_fits(path: str) -> bool:
     with open(path, "rb") as file:
         begin = file.read(6)
     if begin != b"SIMPLE" and not begin.startswith(b"\x1f\x8b"):
-        raise ValueError(f"{path}: is no FITS file")
+        raise ValueError(f"{path}: is not a FITS file")
     return begin != b"SIMPLE"
 
 

@@ -180,10 +180,10 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
         skipped = 0
         for name, count, kinds in elements:
             if count < 0:
-                raise ValueError(f"it tells of {count} of {name}")
+                raise ValueError(f"it declares {count} of {name}")
             if name != "vertex":
                 if kinds is None or layout == "ascii":
-                    raise ValueError(f"its vertices stand behind {name}")
+                    raise ValueError(f"its vertices come after {name}")
                 skipped += count * np.dtype(kinds).itemsize
                 continue
             if kinds is None:
@@ -198,7 +198,7 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
                 lines_of = itertools.islice(file, count)
                 table = np.loadtxt(lines_of, np.float64, ndmin=2, usecols=range(len(kinds)))
                 if len(table) != count:
-                    raise ValueError(f"{count} vertices are told, {len(table)} are there")
+                    raise ValueError(f"{count} vertices are declared, {len(table)} are there")
                 return {n: table[:, i].astype(k[1:]) for i, (n, k) in enumerate(kinds)}
             rows = np.memmap(path, dtype, "r", start + skipped, (count,))
             return {column: rows[column] for column, _ in kinds}
@@ -225,9 +225,9 @@ def _ply_header(
             elif (kind := number_type(words[1])) is not None:
                 kinds.append((words[2], layout + kind))
             else:
-                raise ValueError(f"{words[1]!r} is no type of numbers")
+                raise ValueError(f"{words[1]!r} is not a number type")
     if not layout:
-        raise ValueError("its header tells no format")
+        raise ValueError("its header has no format")
     return ("ascii" if layout == "=" else layout), elements
 
 

@@ -74,7 +74,7 @@ def fetch(url: str) -> Path:
         ImportError: A library is missing.
     """
     if url.lower().split("?")[0].endswith(_DETACHED):
-        raise ValueError(f"{url}: its numbers lie in a file beside it: download both")
+        raise ValueError(f"{url}: its numbers are in another file next to it: download both")
     folder = cache_folder("downloads") / hashlib.sha256(url.encode()).hexdigest()[:32]
     kept = _kept(folder)
     opener = _open_http if urlsplit(url).scheme in ("http", "https") else _open_fsspec
@@ -85,7 +85,7 @@ def fetch(url: str) -> Path:
     except OSError as error:
         if kept is None:
             raise OSError(f"{url}: can't be downloaded: {_reason(error)}") from None
-        warnings.warn(f"{url}: no answer ({_reason(error)}); the copy of before", stacklevel=3)
+        warnings.warn(f"{url}: no answer ({_reason(error)}); using the cached copy", stacklevel=3)
         answer = None
     if answer is None:
         assert kept is not None

@@ -57,7 +57,7 @@ class SparseGrid(ABC):
             )
         cells = places // SIDES[0] + (1 << 20)
         if len(np.unique(cells @ np.array((1 << 42, 1 << 21, 1)))) < len(cells):
-            raise ValueError("two entries of the root lie at one place")
+            raise ValueError("two entries of the root have one position")
 
     @classmethod
     @abstractmethod

@@ -87,7 +87,7 @@ def _check_told(path: str, text: str) -> None:
             counts[name] = max(counts.get(name, 1), int(count or 1))
     for total in (counts.pop("PlaneCount"), math.prod(counts.values())):
         if total > _MOST_LISTED:
-            raise ValueError(f"{path}: tells of {total} planes, at most {_MOST_LISTED} are read")
+            raise ValueError(f"{path}: declares {total} planes, at most {_MOST_LISTED} are read")
 
 
 def check_pictures(pages: Iterable[Any]) -> None:
@@ -117,7 +117,7 @@ def _checked(frame: Any, decode: Callable[..., Any]) -> Callable[..., Any]:
         heads = [packed, more.get("jpegtables"), more.get("jpegheader")]
         sizes = [size for head in heads if head and (size := picture_size(head)) is not None]
         if packed and not sizes and not is_jpeg:
-            raise ValueError(f"tile {number} is no picture whose size can be read")
+            raise ValueError(f"tile {number} is not a picture whose size can be read")
         for columns, rows in sizes:
             if columns > wide or rows > tall:
                 raise ValueError(

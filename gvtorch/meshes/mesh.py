@@ -78,7 +78,7 @@ class Mesh:
         if low < 0 or high >= len(self.vertices):
             wrong = low if low < 0 else high
             raise ValueError(
-                f"{self.name}: a triangle names vertex {wrong}, there are {len(self.vertices)}"
+                f"{self.name}: a triangle refers to vertex {wrong}, there are {len(self.vertices)}"
             )
         used = self.vertices[self.faces.ravel()] if len(self.vertices) else self.vertices
         bad = int((~np.isfinite(used)).any(1).sum())
@@ -89,7 +89,8 @@ class Mesh:
         if low < 0 or high >= len(self.materials):
             wrong = low if low < 0 else high
             raise ValueError(
-                f"{self.name}: a triangle names material {wrong}, there are {len(self.materials)}"
+                f"{self.name}: a triangle refers to material {wrong}, "
+                f"there are {len(self.materials)}"
             )
         if not (self.bounds[1] > self.bounds[0]).any():
             raise ValueError(f"{self.name}: all triangles lie in one point")

@@ -110,7 +110,7 @@ class Voxelizer:
         mesh = filled(mesh) if solid == "always" else mesh
         if "material" in channels and len(mesh.materials) > 255:
             raise ValueError(
-                f"{mesh.name}: {len(mesh.materials)} materials, a uint8 tells 255 apart"
+                f"{mesh.name}: {len(mesh.materials)} materials, a uint8 distinguishes 255"
             )
         low, high = mesh.bounds
         size = (high - low).max()

@@ -59,7 +59,7 @@ def matrices(
     """
     where = "opengl.matrices"
     if camera.frame is not Frame.WORLD:
-        raise ValueError(f"{where}: an orbit camera has no place yet, call placed(tree.box)")
+        raise ValueError(f"{where}: an orbit camera has no position yet, call placed(tree.box)")
     check.number(where, "near", near, low=0, open_low=True)
     if far != math.inf:
         check.number(where, "far", far, low=near, open_low=True)
@@ -244,6 +244,6 @@ def _projection(where: str, projection: Tensor) -> tuple[Tensor, bool]:
     if not bool(good & (p[:, 0, 0] > 0).all() & (p[:, 1, 1] > 0).all()):
         raise ValueError(
             f"{where}: projection must be finite, without skew or rotation, scale x and y by "
-            f"more than 0 and tell depths apart, got {matrix.tolist()}"
+            f"more than 0 and keep depths apart, got {matrix.tolist()}"
         )
     return matrix, orthographic

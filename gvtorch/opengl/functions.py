@@ -349,7 +349,7 @@ def _system(where: str) -> Loader:
     if found:
         raise RuntimeError(f"{where}: {_NO_CONTEXT}")
     raise RuntimeError(
-        f"{where}: found no OpenGL library; hand over load=..., such as glfw.get_proc_address"
+        f"{where}: found no OpenGL library; pass load=..., such as glfw.get_proc_address"
     )
 
 

@@ -39,7 +39,7 @@ def check_rays(where: str, rays: RayArguments) -> dict[str, int]:
     sizes = check.tensors(where, rays.origin_r3.device, fields)
     check.whole(where, "width", rays.width, low=0)
     if rays.width and sizes["r"] % rays.width:
-        raise ValueError(f"{where}: {sizes['r']} rays are no whole rows of {rays.width} pixels")
+        raise ValueError(f"{where}: {sizes['r']} rays are not whole rows of {rays.width} pixels")
     return sizes
 
 

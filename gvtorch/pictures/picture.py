@@ -74,7 +74,7 @@ class Picture:
         uint8, (h, w, 3), or (h, w, 4) with straight alpha if the picture is transparent.
         """
         if copy is False:
-            raise ValueError("Picture: an array of it is always made anew: copy must not be False")
+            raise ValueError("Picture: its array is always a copy: copy must not be False")
         pixels = display_pixels(self.color, self.alpha if self.transparent else None, 8)
         return pixels if dtype is None else pixels.astype(dtype)
 

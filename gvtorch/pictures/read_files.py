@@ -73,7 +73,7 @@ def _check_size(path: Path, shape: tuple[int, ...], itemsize: int, worth: int = 
     count = math.prod(shape)
     if count < 1 or (worth and count * itemsize > worth):
         size = path.stat().st_size
-        raise ValueError(f"tells of {shape} numbers, which {size} bytes can't unpack to")
+        raise ValueError(f"declares {shape} numbers, which {size} bytes can't unpack to")
     if 8 * _COPIES * count > (free := memory_free()):
         needed = amount(8 * _COPIES * count)
         raise ValueError(f"{shape} numbers take {needed} of memory, {amount(free)} are free")
@@ -141,13 +141,13 @@ def _check_exr(path: Path) -> None:
         raise ValueError("has several parts or deep pixels; expected one picture")
     told = dict(_attributes(head))
     if "dataWindow" not in told or "channels" not in told:
-        raise ValueError("damaged: its header tells no extent or no channels")
+        raise ValueError("damaged: its header has no extent or no channels")
     left, low, right, high = struct.unpack("<4i", told["dataWindow"])
     count = sum(1 for _ in _channels(told["channels"]))
     lines, size = high - low + 1, path.stat().st_size
     shape = (lines, right - left + 1, count)
     if min(shape) < 1 or lines // 256 * 8 > size:
-        raise ValueError(f"damaged: tells of {shape} numbers in {size} bytes")
+        raise ValueError(f"damaged: declares {shape} numbers in {size} bytes")
     _check_size(path, shape, 1, MOST_PACKED * size * 4)
 
 

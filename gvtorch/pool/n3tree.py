@@ -207,7 +207,7 @@ class N3Tree:
         above = self.loc(parent[tile])
         above[:, 3] += 1
         if not torch.equal(places[tile], above):
-            raise ValueError("N3Tree: a tile's place is not that of its parent")
+            raise ValueError("N3Tree: a tile's loc does not match its parent")
 
     def _check_words(self) -> None:
         nodes, most = self.nodes, self.bricks.capacity - 1

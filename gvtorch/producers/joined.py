@@ -156,7 +156,7 @@ class StoredChannels(JoinedProducer):
         """
         known = channel_names(store)
         if not known:
-            raise ValueError(f"{store}: is no store of several channels: take StoredProducer")
+            raise ValueError(f"{store}: is not a store of several channels: use StoredProducer")
         names = known if channels is None else tuple(channels)
         for name in names:
             if name not in known:

@@ -275,7 +275,7 @@ class Producer(torch.nn.Module):
             channel; either at once or as a future. Coarse channels (`Channel.coarse`) must be
             included if `nodes.coarse` is true, and only then.
         """
-        raise NotImplementedError(f"{type(self).__name__}: fill is not written")
+        raise NotImplementedError(f"{type(self).__name__}: fill is not implemented")
 
     def changed(self, where: Where | Tensor | Sequence[Any] | None = None) -> None:
         """Declares that the content has changed, for example to another time: in its next frame the

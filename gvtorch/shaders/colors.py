@@ -40,7 +40,7 @@ def linear_color(
     text = named.get(value.lower(), value)
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
         names = ", ".join(named)
-        raise ValueError(f"{where}: {value!r} is no colour; known: #RRGGBB, {names}")
+        raise ValueError(f"{where}: {value!r} is not a colour; known: #RRGGBB, {names}")
     red, green, blue = array_from_srgb(np.array(from_hex(text[1:]))).tolist()
     return (red, green, blue)
 

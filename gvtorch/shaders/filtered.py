@@ -143,7 +143,7 @@ class Filtered(Shader):
         check.whole("Filtered", "component", component, low=0, high=volume.width - 1)
         shader = cls(transfer, channel, component, directions=directions)
         if (volume.extent, volume.spacing) != (tree.extent, tree.spacing):
-            raise ValueError(f"Filtered: tree and volume must be of one place: {tree}, {volume}")
+            raise ValueError(f"Filtered: tree and volume must have one placement: {tree}, {volume}")
         if channel == tree.channel_names[0]:
             raise ValueError(f"Filtered: channel {channel!r} is that of the values")
         owner_b = tree.bricks.owner_b
@@ -345,7 +345,7 @@ class Filtered(Shader):
         if tree.made_of.get(str(self.other), self.made_of) != self.made_of:
             raise ValueError(
                 f"{where}: the colours {self.other!r} were made of another function or component, "
-                "or it was edited: make them anew (Filtered.of, Filtered.add_to, or a new producer)"
+                "or it was edited: make them again (Filtered.of, Filtered.add_to, a new producer)"
             )
         one = self.numbers
         known = tree.bricks.channels.get(str(self.other), Channel(width=one))

@@ -181,7 +181,7 @@ def label_rows(tree: N3Tree, channel: str) -> tuple[float, np.ndarray]:
     if known is None and kind.is_floating_point:
         raise ValueError(
             f"Labels: channel {channel!r} is {str(kind).removeprefix('torch.')} without a known "
-            "range: its producer must tell value_range or labels"
+            "range: its producer must set value_range or labels"
         )
     low, high = known or (torch.iinfo(kind).min, torch.iinfo(kind).max)
     if high - low >= _MOST_ROWS:

@@ -75,12 +75,16 @@ def read_preset(path: str | Path, name: str | None) -> tuple[Pair, float | None,
         found = {str(item.get("Name", number)): item for number, item in enumerate(items)}
         maps = {key: item for key, item in found.items() if "RGBPoints" in item}
         if name in found.keys() - maps or not maps:  # ParaView's lists may hold both kinds
-            raise ValueError("holds colours of categories (IndexedColors), which are no function")
+            raise ValueError(
+                "holds colours of categories (IndexedColors), which are not a function"
+            )
         return _of_paraview(file, _chosen(file, maps, name)), None, True
     except OverflowError:
         raise ValueError(f"{file}: holds a number that is too large") from None
     except (KeyError, TypeError, IndexError, ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file}: no such file as its ending tells: {error!r}") from None
+        raise ValueError(
+            f"{file}: not a file of the kind that its ending says: {error!r}"
+        ) from None
     except ValueError as error:
         told = one_line(error)
         raise ValueError(told if told.startswith(str(file)) else f"{file}: {told}") from None

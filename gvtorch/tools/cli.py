@@ -74,7 +74,7 @@ class Info:
                 except ValueError as error:
                     if "--labels" not in str(error):
                         raise
-                    warnings.warn(f"{error}; told as labels", stacklevel=2)
+                    warnings.warn(f"{error}; shown as labels", stacklevel=2)
                     source = open_source(self.path, most=MAX_VOXELS, **options | {"labels": True})
                     content = volume_of(source, nan).describe()
             if source.times > 1:

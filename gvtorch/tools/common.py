@@ -136,7 +136,7 @@ def refuse_for_store(source: ReadOptions, *known: str) -> None:
     """
     flags = [flag for flag in flags_given(source) if flag not in ("--time", *known)]
     if flags:
-        raise ValueError(f"{flags[0]} is for volume files; a store tells it itself")
+        raise ValueError(f"{flags[0]} is for volume files; a store has it in its metadata")
 
 
 def open_data(path: str, source: ReadOptions, *, image: str | None, level: int) -> Volume | Store:

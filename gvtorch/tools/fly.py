@@ -213,7 +213,7 @@ class Fly:
         if all(state.time == 0 for _, state in flight.keys):
             return [(None, range(frames))]
         if self.scene.source.time is not None:
-            raise ValueError(f"{self._flag} tells what --time does: leave one out")
+            raise ValueError(f"{self._flag} sets what --time sets: leave one out")
         steps = max(1, frames - 1 + flight.closed)
         shown = [round(flight.along(n / steps).time) for n in range(frames)]
         count = self._times_there()
@@ -239,7 +239,7 @@ class Fly:
     def _moments(self) -> range:
         """Returns the time points that `--times` selects."""
         if self.scene.source.time is not None:
-            raise ValueError("--times and --time both tell which: leave one out")
+            raise ValueError("--times and --time both choose time points: leave one out")
         count = self._times_there()
         first, last = (whole_number(n) for n in (self.times or "").partition("-")[::2])
         if self.times == "all":
@@ -265,7 +265,9 @@ class Fly:
             frames = most if self.frames is None else self.frames
             return check.whole("fly", "--frames", frames, low=1), fps
         if self.frames is not None:
-            raise ValueError("--turntable and --frames both tell how many pictures: leave one out")
+            raise ValueError(
+                "--turntable and --frames both set the number of pictures: leave one out"
+            )
         if self.flight != "orbit":
             raise ValueError("--turntable goes once around: not with --path FILE.json")
         seconds = check.number("fly", "--turntable", self.turntable, low=0, open_low=True)
@@ -296,7 +298,7 @@ class Fly:
             models = [s.camera.model for _, s in self._flight().keys if s.camera is not None]
         other = next((one for one in models if one not in ("pinhole", "fisheye")), None)
         if other is not None:
-            raise ValueError(f"--poses tells of pinhole and fisheye, not of {other}")
+            raise ValueError(f"--poses can write pinhole and fisheye, not {other}")
 
     def _check_saved(self) -> None:
         """Raises ValueError if a flag sets what the saved states set."""
@@ -319,7 +321,7 @@ class Fly:
             flags.append("--times")
         flags += self.scene.look.told_by(first)
         if flags:
-            raise ValueError(f"{self._flag} tells what {flags[0]} does: leave one out")
+            raise ValueError(f"{self._flag} sets what {flags[0]} sets: leave one out")
 
     @property
     def _flag(self) -> str:

@@ -295,7 +295,7 @@ def _camera_of_file(text: str, look: Look, width: int, height: int) -> Camera:
     model = None if look.camera_model == "pinhole" else look.camera_model
     for flag, value in (("--fov", look.fov), ("--up", look.up), ("--camera-model", model)):
         if value is not None:
-            raise ValueError(f"--camera file: tells what {flag} does: leave one out")
+            raise ValueError(f"--camera file: sets what {flag} sets: leave one out")
     path, comma, name = text.rpartition(",")
     if not comma or Path(text).exists():
         path, name = text, ""

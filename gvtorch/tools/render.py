@@ -140,7 +140,7 @@ class Render:
         flags = self.scene.look.told_by(state) + flags_given(self.develop)
         flags += ["--camera"] * (self.camera is not None) + ["--show"] * (self.show != "picture")
         if flags:
-            raise ValueError(f"--state tells what {flags[0]} does: leave one out")
+            raise ValueError(f"--state sets what {flags[0]} sets: leave one out")
 
     def _check(self) -> None:
         """Raises ValueError or FileNotFoundError for wrong flags before the volume is read."""

@@ -84,7 +84,7 @@ class View:
         flags = self.scene.look.told_by(state)
         flags += ["--camera"] * (self.camera is not None and "camera" in state)
         if flags:
-            raise ValueError(f"--state tells what {flags[0]} does: leave one out")
+            raise ValueError(f"--state sets what {flags[0]} sets: leave one out")
 
     def _opened(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
         """Returns the scene, its shader, its camera, and fields of `RenderOptions`."""
@@ -140,7 +140,7 @@ class View:
         flags += ["--camera"] * (self.camera is not None)
         flags += ["--threshold"] * (self.scene.threshold is not None)
         if flags:
-            raise ValueError(f"{flags[0]} is for files: the script tells")
+            raise ValueError(f"{flags[0]} is for files: the script sets it")
         if not Path(self.path).is_file():
             raise FileNotFoundError(f"script not found: {self.path}")
         sys.path.insert(0, str(Path(self.path).resolve().parent))

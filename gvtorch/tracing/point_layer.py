@@ -53,6 +53,9 @@ def point_layer(
     if camera.model != "pinhole" or camera.batched:
         raise ValueError(f"{where}: the camera must be one pinhole camera, got {camera!r}")
     check.number(where, "size", size, low=0.5, high=64)
+    check.number(where, "cone_scale", cone_scale, low=0, open_low=True)
+    if reference is not None:
+        check.number(where, "reference", reference, low=0, open_low=True)
     points, grid = producer.points, producer.points.grid
     placed = camera.placed(torch.tensor([grid.low, grid.high], dtype=torch.float64))
     view, K = placed.viewmats[0].numpy(), placed.Ks[0].numpy()
@@ -61,7 +64,9 @@ def point_layer(
     finest = float(grid.spacing_3.max())
     growth = cone_scale / min(K[0, 0], K[1, 1])
     reach = finest * grid.branching / growth
-    voxel_light = float(np.prod(grid.spacing_3)) / (reference or float(grid.spacing_3.min()))
+    voxel_light = float(np.prod(grid.spacing_3)) / (
+        float(grid.spacing_3.min()) if reference is None else reference
+    )
     height, width = placed.height, placed.width
     total = np.zeros((height * width, 5))  # of a pixel: light, opacity, light * distance
     found = narrow_near(points, eye, reach + grid.branching * 2 * finest)

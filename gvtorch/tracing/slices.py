@@ -91,7 +91,7 @@ def slice_picture(
             raise ValueError(f"{where}: span must be the values of black and white, got {span!r}")
         colors = TransferFunction(*display_grays()).stretched(*ends)
     elif span is not None:
-        raise ValueError(f"{where}: span is for grays; colors have values of their own")
+        raise ValueError(f"{where}: span is for grays; colors have their own values")
     elif not callable(colors) or isinstance(colors, type):
         kind = type(colors).__name__
         raise ValueError(f"{where}: colors must be a function of values or Labels, got a {kind}")
@@ -122,10 +122,10 @@ def _views(
             raise ValueError(f"{where}: letters are for radiological planes")
         return {n: PlaneView("", above) for n, above in UP.items()}
     if up is not None:
-        raise ValueError(f"{where}: radiological planes have an up of their own")
+        raise ValueError(f"{where}: radiological planes have a fixed up")
     views = radiological_views(space)
     if not views:
-        raise ValueError(f"{where}: the data does not tell where its axes point (info.space)")
+        raise ValueError(f"{where}: the data does not say where its axes point (info.space)")
     return views if letters else {n: one._replace(letters="") for n, one in views.items()}
 
 
@@ -268,7 +268,7 @@ def _pixels(count: int, size: float) -> np.ndarray:
     pixels = max(1, round(count * size))
     if pixels > _MOST:
         raise ValueError(
-            f"slice_picture: {pixels} pixels are more than {_MOST}: take a smaller scale"
+            f"slice_picture: {pixels} pixels are more than {_MOST}: use a smaller scale"
         )
     return ((np.arange(pixels) + 0.5) * (count / pixels)).astype(np.int64)
 

@@ -92,6 +92,5 @@ class Parameters:
         before = getattr(self.record, name)
         record = replace(self.record, **{name: decode(name, hint, value, before)})
         producer = self._make(record)
-        scene.remake = lambda _: producer
-        scene.resize()
+        scene.resize(lambda _: producer)
         self.record, self.producer = record, producer

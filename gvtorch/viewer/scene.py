@@ -39,6 +39,7 @@ BINS = 256  # of a histogram, at most
 _MOST_BOXES = 1500  # most boxes of nodes that are sent to a page
 _LOOKED_AT = 1 << 20  # values that are checked for being whole numbers
 EngineScene = Producer | Mapping[str, Producer]
+Remake = Callable[[Volume | Store | None], EngineScene]
 _BUDGET = 40.0  # milliseconds of production a frame, so that none takes long
 
 
@@ -51,7 +52,7 @@ class Scene:
     tree: N3Tree | None = None  # resident
     data: Volume | Store | None = None  # that it shows, if known
     #: Makes the producer of `data` again; None: the engine belongs to the caller.
-    remake: Callable[[Volume | Store | None], EngineScene] | None = None
+    remake: Remake | None = None
     times: int = 1  # time points of the series that `data` is one of
     reopen: Callable[[int], Volume | Store] | None = None  # at another time; from any thread
     time: float = 0.0  # shown now: the number of a time point, or the time of producers' clocks
@@ -243,23 +244,25 @@ class Scene:
         if self.engine is not None:
             self.engine.forget_failures()
 
-    def resize(self, **options: Any) -> None:
-        """Recreates the engine with other `EngineOptions`; its data is loaded again.
+    def resize(self, remake: Remake | None = None, **options: Any) -> None:
+        """Recreates the engine with other `EngineOptions`, or with what `remake` makes instead; its
+        data is loaded again.
 
         Raises:
             ValueError: The engine belongs to the caller, or refuses the options; it is then
                 recreated with the old ones.
         """
         if self.engine is None or self.remake is None:
-            raise ValueError("view: the engine was handed in: its memory is its owner's to set")
+            raise ValueError("view: the engine was passed in: its owner sets its memory")
         before = self.engine.options
         wanted = replace(before, **options)
         self.engine.close()
         try:
-            self.engine = Engine(self.remake(self.data), **vars(wanted))
+            self.engine = Engine((remake or self.remake)(self.data), **vars(wanted))
         except (ValueError, RuntimeError):
             self.engine = Engine(self.remake(self.data), **vars(before))
             raise
+        self.remake = remake or self.remake
 
     def settled(self, picture: Picture) -> bool:
         """Returns whether a picture shows all data that can be loaded."""

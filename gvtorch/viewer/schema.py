@@ -179,7 +179,9 @@ def decode(where: str, hint: Any, content: Any, now: Any = None, depth: int = 0)
         if now is not None:
             return now
         if hint is not Any:  # Any: JSON as it is
-            raise ValueError(f"{where}: JSON can't tell what was here: {content['kept']!r:.200}")
+            raise ValueError(
+                f"{where}: JSON can't represent what was here: {content['kept']!r:.200}"
+            )
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     problems = []
     for choice in sorted(choices, key=lambda one: not _fits(one, content)):

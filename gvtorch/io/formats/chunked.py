@@ -130,7 +130,7 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
                     values = Deadline(_TIMEOUT).wait(begin_read(places, files), str(beside))
                     steps[at], even = even_steps(values)
                     units[at] = str(_attributes(str(beside)).get("units", "")) or None
-                    lost += [] if even else [f"that places along {name} are not evenly apart"]
+                    lost += [] if even else [f"that coordinates along {name} are not evenly spaced"]
     letters = letters or ask_axes(path, shape, axes)
     place, moments = place_named(letters, shape, steps, units)
     quantity = attributes.get("units")

@@ -62,7 +62,7 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
 
     with open(path, "rb") as file:
         if file.read(10) != b"ZISRAWFILE":
-            raise ValueError("does not begin as a CZI file does")
+            raise ValueError("does not start like a CZI file")
     with czi.open_czi(path) as file:
         box = file.total_bounding_box
         scenes = file.scenes_bounding_rectangle
@@ -77,7 +77,7 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
     more = {n: b - a for n, (a, b) in box.items() if n not in "TCZXYSM" and b - a > 1}
     if more:
         told = ", ".join(f"{name} {size}" for name, size in more.items())
-        raise ValueError(f"{path}: has axes beside T, C, Z, Y, X: {told}")
+        raise ValueError(f"{path}: has axes other than T, C, Z, Y, X: {told}")
     if len(kinds) != 1 or kinds[0] not in _DTYPES:
         raise ValueError(f"{path}: pixels are {', '.join(map(str, kinds))}; expected one kind")
     stored, colors = _DTYPES[kinds[0]]

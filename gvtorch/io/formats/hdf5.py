@@ -229,7 +229,7 @@ def _axes(
         if scale is not None and scale.shape == shape[at : at + 1] and scale.dtype.kind in "iuf":
             steps[at], even = even_steps(scale[()])
             if not even:
-                lost.append(f"that places along {names[at]} are not evenly apart")
+                lost.append(f"that coordinates along {names[at]} are not evenly spaced")
     tags = _tags(data)
     if len(tags) == rank:
         names = [str(tag.get("key", "")) for tag in tags]

@@ -115,7 +115,7 @@ def _image(file: str) -> np.ndarray:
 
     packed = Path(file).read_bytes()
     if codec == "jpeg8" and not jpeg_ends(packed):
-        raise ValueError(f"{file}: is cut: the picture has no end")
+        raise ValueError(f"{file}: is truncated: the picture has no end")
     with told_as(ValueError, file, f"can't be read as {codec.rstrip('8').upper()}"):
         found = np.asarray(getattr(imagecodecs, f"{codec}_decode")(packed))
     return found[..., 0] if found.ndim == 3 and found.shape[2] == 1 else found
@@ -133,7 +133,7 @@ def _shape(file: str) -> tuple[Any, ...]:
     elif (size := picture_size(head)) is not None:
         columns, rows = size
     else:
-        raise ValueError(f"{file}: is no PNG, JPEG or BMP image")
+        raise ValueError(f"{file}: is not a PNG, JPEG or BMP image")
     return (rows, columns)
 
 

@@ -82,7 +82,7 @@ def _image(
         places = [int(channel.get("BytesInc", 0)) for channel in channels]
         steps = {b - a for a, b in itertools.pairwise(places)}
         if len(steps) != 1:
-            raise ValueError(f"{path}: channels do not lie evenly apart")
+            raise ValueError(f"{path}: channels are not evenly spaced")
         shape, strides = [len(channels), *shape], [steps.pop(), *strides]
         letters = "c" + letters
     offset, held = _block(element, blocks) or (0, 0)
@@ -137,7 +137,7 @@ def _block(element: Any, blocks: dict[str, tuple[int, int]]) -> tuple[int, int] 
 def _header(file: IO[bytes]) -> str:
     magic, _, mark, count = struct.unpack("<IIBI", file.read(13))
     if magic != 0x70 or mark != 0x2A or count > _MOST_HEADER:
-        raise ValueError("does not begin as a LIF file does")
+        raise ValueError("does not start like a LIF file")
     return file.read(2 * count).decode("utf-16-le")
 
 

@@ -60,7 +60,7 @@ def open_metaimage(path: str) -> VolumeSource:
     }
     file = header["ElementDataFile"].strip()
     if file.upper() == "LIST" or "%" in file:
-        raise ValueError(f"{path}: its slices lie in files of their own (ElementDataFile = {file})")
+        raise ValueError(f"{path}: its slices are in separate files (ElementDataFile = {file})")
     is_here = file.upper() == "LOCAL"
     data = path if is_here else str(Path(path).parent / file)
     offset = end if is_here else int(header.get("HeaderSize", 0))
@@ -91,7 +91,7 @@ def _header(path: str) -> tuple[dict[str, str], int]:
         if match[1] == "ElementDataFile":
             for name in ("DimSize", "ElementType"):
                 if name not in found:
-                    raise ValueError(f"the header tells no {name}")
+                    raise ValueError(f"the header has no {name}")
             return found, at
     raise ValueError("no MetaImage: the header has no ElementDataFile")
 

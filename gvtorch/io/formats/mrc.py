@@ -49,9 +49,9 @@ def open_mrc(path: str) -> ArraySource:
     if stack:
         each = int(found["mz"])
         if sizes[0] % each:
-            raise ValueError(f"{path}: a stack of {sizes[0]} slices is no whole number of maps")
+            raise ValueError(f"{path}: a stack of {sizes[0]} slices is not a whole number of maps")
         sizes, letters = [sizes[0] // each, each, *sizes[1:]], "t" + letters
-        lost.append(f"that its {sizes[0]} maps are separate: they are taken for times")
+        lost.append(f"that its {sizes[0]} maps are separate: they are read as time points")
     return ArraySource(
         path=path,
         file=path,

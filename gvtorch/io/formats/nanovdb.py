@@ -89,7 +89,7 @@ def open_nanovdb(path: str, key: str | None = None) -> SparseSource:
     if head.kind not in _TYPES:
         kind = _REFUSED.get(head.kind, f"type {head.kind}")
         raise ValueError(
-            f"{path}: grid {head.name!r} holds {kind}, which is no grid of numbers here"
+            f"{path}: grid {head.name!r} holds {kind}, not a grid of numbers that can be read"
         )
     _, dtype, width = _TYPES[head.kind]
     affine, low, high = _place(_content(path, head, _ROOT + 24), head)
@@ -189,7 +189,7 @@ def _place(grid: Any, head: Head) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise ValueError("a grid does not begin as grids of NanoVDB do")
     (kind,) = struct.unpack_from("<I", grid, _TYPE)
     if kind != head.kind:
-        raise ValueError(f"grid {head.name!r} is of type {kind}, its file tells of {head.kind}")
+        raise ValueError(f"grid {head.name!r} is of type {kind}, its file declares {head.kind}")
     affine = np.eye(4)
     affine[:3, :3] = np.frombuffer(grid, "<f8", 9, 384).reshape(3, 3)
     affine[:3, 3] = np.frombuffer(grid, "<f8", 3, 528)
@@ -263,7 +263,7 @@ class NanoGrid(SparseGrid):
         keys = table["key"][:, None] >> np.array((42, 21, 0), np.uint64)
         keys[:, 1:] &= np.uint64(2**21 - 1)
         if (keys >> np.uint64(20)).any():
-            raise ValueError("a key of the root is of no voxel's place")
+            raise ValueError("a key of the root is not a voxel's position")
         corners = (keys.astype(np.int64) << 44 >> 44) * 4096  # 20 bits, signed
         inner = table["child"] != 0
         found = [_checked(_ROOT + table["child"][inner], len(data), layout.entries[0])]
@@ -283,7 +283,7 @@ class NanoGrid(SparseGrid):
         _check_apart(found, sizes)
         counts, told = [len(places) for places in found], struct.unpack_from("<3I", data, _COUNTS)
         if counts != [*told[::-1]]:
-            raise ValueError(f"the tree has {counts[::-1]} nodes, leaves first; it tells of {told}")
+            raise ValueError(f"the tree has {counts[::-1]} nodes, leaves first; it declares {told}")
         return cls(
             dtype=np.dtype(dtype),
             background=np.ndarray((width,), dtype, data, _ROOT + _up(28, np.dtype(dtype).itemsize)),
@@ -355,7 +355,7 @@ def _checked(places: np.ndarray, size: int, least: int) -> np.ndarray:
     if (places % _ALIGN).any():
         raise ValueError(f"a node lies at no multiple of {_ALIGN} bytes")
     if len(np.unique(places)) != len(places):
-        raise ValueError("several places of the tree share a node")
+        raise ValueError("several positions of the tree share a node")
     return places
 
 
@@ -365,4 +365,4 @@ def _check_apart(places: Sequence[np.ndarray], sizes: Sequence[int]) -> None:
     order = np.argsort(begin)
     end = begin + np.repeat(sizes, [len(part) for part in places])
     if (end[order][:-1] > begin[order][1:]).any():
-        raise ValueError("nodes of the tree lie over each other")
+        raise ValueError("nodes of the tree overlap")

@@ -50,7 +50,7 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
         sizes: Mapping[str, int] = dict(file.sizes)
         more = {n: size for n, size in sizes.items() if n not in "TPZCYXS" and size > 1}
         if more:
-            raise ValueError(f"{path}: has axes beside T, P, Z, C, Y, X: {more}")
+            raise ValueError(f"{path}: has axes other than T, P, Z, C, Y, X: {more}")
         position, others = choose(path, "position", range(sizes.get("P", 1)), key)
         dtype = np.dtype(file.dtype).str
         info, spacing, lost = _told(file, sizes)

@@ -87,7 +87,7 @@ def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
     if len(shape) > 3 and shape[3] > 1:
         step, origin = float(header["pixdim"][4]), float(header["toffset"])
         if time_unit(period) is None and period != "unknown":
-            lost.append(f"the fourth axis counts {period}, and is taken for time")
+            lost.append(f"the fourth axis counts {period}, and is read as time")
         step = step if math.isfinite(step) and step > 0 else None
         origin = origin if math.isfinite(origin) else 0.0
     if int(header["qform_code"]) > 0 and int(header["sform_code"]) > 0:

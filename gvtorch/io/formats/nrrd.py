@@ -62,7 +62,7 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
         known = ", ".join(sorted(_ENCODINGS))
         raise ValueError(f"{path}: encoding {header['encoding']!r} is unknown; known: {known}")
     if np.dtype(kind).itemsize > 1 and encoding != "text" and "endian" not in header:
-        raise ValueError(f"{path}: endian is not told, and its numbers have several bytes")
+        raise ValueError(f"{path}: endian is missing, and its numbers have several bytes")
     if header.get("endian", "little") not in ("little", "big"):
         raise ValueError(f"{path}: endian {header['endian']!r} is neither little nor big")
     letters = _letters(path, header, shape, axes)

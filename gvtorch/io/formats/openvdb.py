@@ -197,7 +197,7 @@ def _entries(data: Any) -> tuple[int, list[Entry]]:
     cursor = Cursor(data)
     magic, version = cursor.numbers("<qI")
     if magic != _MAGIC:
-        raise ValueError("does not begin as VDB files do")
+        raise ValueError("does not start like a VDB file")
     if version not in _VERSIONS:
         raise ValueError(
             f"is of file version {version}; {_VERSIONS[0]} to {_VERSIONS[-1]} are known"
@@ -209,7 +209,7 @@ def _entries(data: Any) -> tuple[int, list[Entry]]:
     cursor.told()
     count = cursor.number("<i")
     if not with_places:
-        raise ValueError("is a stream that does not tell where its grids lie; write it as a file")
+        raise ValueError("is a stream without the positions of its grids; write it as a file")
     if not 0 <= count <= _MOST_GRIDS:
         raise ValueError(f"has {count} grids")
     entries = []
@@ -248,7 +248,7 @@ def _read_head(data: Any, entry: Entry, version: int) -> None:
     elif kind in ("AffineMap", "UnitaryMap"):
         entry.affine = cursor.array("<f8", 16).reshape(4, 4).T.copy()  # the file's is for rows
     else:
-        raise ValueError(f"grid {entry.name!r} lies in the world by a {kind}, which is not known")
+        raise ValueError(f"grid {entry.name!r} is placed in the world by an unknown {kind}")
     entry.tree_at = cursor.at
 
 
@@ -304,7 +304,7 @@ class _Packing:
 
     def _written(self, code: int, active: int, count: int) -> int:
         if code > 6:
-            raise ValueError(f"a node's values are packed in an unknown way ({code})")
+            raise ValueError(f"a node's values are packed by an unknown method ({code})")
         return active if self.compression & _ACTIVE and code != 6 else count
 
     def _read(self, cursor: Cursor, count: int) -> np.ndarray:

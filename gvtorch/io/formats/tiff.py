@@ -167,7 +167,7 @@ def _told(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) 
         return replace(info, channels=channels) if colors else info, spacing, [*more, *lost]
     tags = series.keyframe.tags
     if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are for printers
-        lost.append("the size of a pixel in centimeters: how far pages are apart is not told")
+        lost.append("the size of a pixel in centimeters: the distance between pages is missing")
     if tags.valueof("Orientation", 1) != 1:
         lost.append("that its pages are to be shown turned or mirrored")
     return ImageInfo(channels=channels), (1.0, 1.0, 1.0), lost

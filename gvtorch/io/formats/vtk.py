@@ -209,7 +209,7 @@ def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
     if root.get("type") == "ImageData" and image is None:
         raise ValueError(f"{path}: has no ImageData in it")
     if root.tag != "VTKFile" or image is None:
-        raise ValueError(f"{path}: is no ImageData, but {root.get('type', root.tag)!r}")
+        raise ValueError(f"{path}: is not ImageData, but {root.get('type', root.tag)!r}")
     pieces = image.findall("Piece")
     if len(pieces) != 1:
         raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
@@ -286,7 +286,7 @@ def _open_legacy(path: str, key: str | None) -> VolumeSource:
     ):
         lines = content[:4096].split(b"\n", 4)
         if len(lines) < 5 or not lines[0].startswith(b"# vtk DataFile"):
-            raise ValueError(f"{path}: is no legacy VTK file")
+            raise ValueError(f"{path}: is not a legacy VTK file")
         if lines[3].split() != [b"DATASET", b"STRUCTURED_POINTS"]:
             found = lines[3][:60].decode("latin-1")
             raise ValueError(f"{path}: {found!r}; expected STRUCTURED_POINTS")
@@ -356,7 +356,7 @@ def _legacy_array(
         name, dtype = words[1], _legacy_type(words[2])
         width = 3 if kind == "VECTORS" else int(words[3]) if len(words) > 3 else 1
     if not dtype:
-        raise ValueError(f"{path}: {' '.join(words)[:80]!r} is no array of numbers")
+        raise ValueError(f"{path}: {' '.join(words)[:80]!r} is not an array of numbers")
     check_extent(path, (*points, width), most=_MOST_VALUES)
     count = math.prod(max(n - 1, 1) if cells else n for n in points) * width
     size = np.dtype(dtype).itemsize

@@ -53,7 +53,7 @@ def check_file(path: str, most: int) -> int | None:
     except (OSError, ValueError):
         return None  # if this is an error, tensorstore reports it
     if not stat.S_ISREG(found.st_mode):
-        raise Endless("is no regular file")
+        raise Endless("is not a regular file")
     if found.st_size > most:
         raise Endless(f"takes {found.st_size} bytes, more than the {most} that fit")
     return found.st_size
@@ -334,7 +334,7 @@ def _of_zarr3(about: dict[str, Any]) -> dict[str, Any]:
         codecs = inner["codecs"]
     *before, last = [name for name in _names(codecs) if name != "crc32c"]
     if "blosc" in before:
-        raise Endless(f"Blosc lies inside {last}, where what it makes can't be looked at")
+        raise Endless(f"Blosc lies inside {last}, where its output can't be checked")
     begin = f"c{separator}" if plain else ""
     return {**shard, "begin": begin, "separator": separator, "file": file, "blosc": last == "blosc"}
 

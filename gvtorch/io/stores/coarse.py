@@ -139,7 +139,7 @@ def _write_blocks(
             size = [min(_CUBE, n - a) for a, n in zip(low, values.shape, strict=False)]
             blocks = _blocks(store.layout, values, low, size, keep)
             at = [a // store.layout.block for a in low]
-            finish_write(write(store.root, spec, at, blocks), store.location, "make it anew")
+            finish_write(write(store.root, spec, at, blocks), store.location, "make it again")
             done += math.prod(size)
             progress("writing", done, total)
     write_json(place / "zarr.json", group({}))

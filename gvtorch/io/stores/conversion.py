@@ -137,7 +137,7 @@ def _check_finished(
         if before != now:
             raise ValueError(
                 f"{store.location}: is finished, with {name} {before!r}, now it is {now!r}; remove "
-                "the store to make it anew"
+                "the store to make it again"
             )
 
 
@@ -199,13 +199,13 @@ def _told_how_to_go_on(plan: Plan) -> Iterator[None]:
     except BrokenExecutor:
         raise OSError(
             f"{target}: a worker process ended (killed, out of memory, or started by a script "
-            f'that converts outside of `if __name__ == "__main__":`); {command} goes on'
+            f'that converts outside of `if __name__ == "__main__":`); {command} continues it'
         ) from None
     except KeyboardInterrupt:
         done = unfinished.count_done(target)
         raise KeyboardInterrupt(
             f"{target}: interrupted, {done} of {plan.settings['tasks']} shards are done; "
-            f"{command} goes on"
+            f"{command} continues it"
         ) from None
 
 

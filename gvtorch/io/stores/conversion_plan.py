@@ -105,7 +105,7 @@ def source_of(
                 "is rendered with N3Tree.from_volume or VolumeProducer"
             )
         if str(source.data.dtype).removeprefix("torch.") not in DTYPES:
-            raise ValueError(f"{source.name}: {source.data.dtype} has no place in a store")
+            raise ValueError(f"{source.name}: {source.data.dtype} can't be stored")
         told = {"path": source.name, "info": source.info}
         told |= {"spacing": source.spacing, "origin": source.origin}
         found = at_place(

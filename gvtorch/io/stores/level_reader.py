@@ -96,7 +96,7 @@ def keep_channels(image: MultiscaleImage, sizes: dict[str, int], chosen: slice |
     """Reduces the channel metadata to the chosen channels; drops it if it doesn't fit the array."""
     told, width = image.info.channels, sizes.get("c", 1)
     if told and len(told) != width:
-        image.lost.append(f"what is told of {len(told)} channels, where there are {width}")
+        image.lost.append(f"metadata of {len(told)} channels, where there are {width}")
         told = ()
     if sizes.get("-", 1) > 1:
         other = f"an axis that is none of t, c, z, y, x: the first of {sizes['-']} is read"

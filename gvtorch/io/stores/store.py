@@ -306,7 +306,9 @@ class Store:
         _check_box(low, high)
         grid = self.cell_grid(level)
         if min(low) < 0 or any(b > n for b, n in zip(high, grid, strict=True)):
-            raise ValueError(f"read_cells: {low} to {high} leaves the grid {grid} of level {level}")
+            raise ValueError(
+                f"read_cells: {low} to {high} lies outside the grid {grid} of level {level}"
+            )
         return self._read_cells(level, low, high, Deadline(timeout))[..., self._channels]
 
     def _read_cells(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
@@ -332,7 +334,9 @@ class Store:
         zyx = np.asarray(zyx, np.int64).reshape(-1, 3)
         grid = self.block_grid(level)
         if zyx.size and (zyx.min() < 0 or (zyx >= grid).any()):
-            raise ValueError(f"read_blocks: a place leaves the grid {grid} of level {level}")
+            raise ValueError(
+                f"read_blocks: a position lies outside the grid {grid} of level {level}"
+            )
         deadline, layout = Deadline(timeout), self.layout
         shape = (len(zyx), *[layout.stored] * 3)
         if not self.has_blocks:
@@ -371,7 +375,9 @@ class Store:
         """
         channel, grid = self.coarse[name], self.block_grid(level)
         if level == 0 or (zyx.size and (zyx.min() < 0 or (zyx >= grid).any())):
-            raise ValueError(f"read_coarse: a place leaves the grid {grid} of level {level}")
+            raise ValueError(
+                f"read_coarse: a position lies outside the grid {grid} of level {level}"
+            )
         deadline = Deadline(timeout)
         place = f"{self.coarse_folder}/{channel.folder(name)}"
         spec = self.layout.coarse(level, place, channel.width)
@@ -536,7 +542,7 @@ def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline)
     chunked = _as_told(where, spec, begin_open(root, spec), deadline)
     labels: np.ndarray = deadline.wait(begin_read(*chunked), name)
     if not (labels[1:] > labels[:-1]).all():
-        raise ValueError(f"{name}: damaged: labels must rise")
+        raise ValueError(f"{name}: damaged: labels must be ascending")
     return labels
 
 

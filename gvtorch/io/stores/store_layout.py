@@ -344,7 +344,7 @@ class CoarseChannel:
                 and _is_whole(own.get("generation"), 0, 2**31)
             ):
                 raise ValueError(
-                    f"{where}: damaged: gvtorch/coarse tells {brief(own)} of {brief(name)}"
+                    f"{where}: damaged: gvtorch/coarse has {brief(own)} for {brief(name)}"
                 )
             found[name] = cls(**{field.name: own[field.name] for field in dataclasses.fields(cls)})
         return found

@@ -87,14 +87,14 @@ def is_begun(target: Path, *, resume: bool, manifest: str = _MANIFEST) -> bool:
     if (folder / manifest).exists():
         if not resume:
             raise FileExistsError(
-                f"{target}: half-written; --resume (resume=True) goes on with it, or remove it"
+                f"{target}: half-written; continue with --resume (resume=True), or remove it"
             )
         return True
     empty = target.is_dir() and {entry.name for entry in target.iterdir()} <= {WORK}
     if empty and not any(folder.glob("*.json")):
         return False
     if target.exists():
-        raise FileExistsError(f"{target}: exists and is no store; choose a new name")
+        raise FileExistsError(f"{target}: exists and is not a store; choose a new name")
     if not target.absolute().parent.is_dir():
         raise FileNotFoundError(f"folder not found: {target.absolute().parent}")
     return False
