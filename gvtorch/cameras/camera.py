@@ -148,8 +148,8 @@ class Camera:
 
         Args:
             azimuth: Degrees; a number, or (n,) for a batch.
-            elevation: Degrees, likewise.
-            distance: In largest sides of the box, > 0, likewise; 2.4 if left out.
+            elevation: Degrees; a number or (n,).
+            distance: In largest sides of the box, > 0; a number or (n,); 2.4 if left out.
             fov, width, height, model: See `look_at`.
             up: +x, -x, +y, -y, +z, -z, or (3,) world.
             fit: Finds the distance from which the whole box just fits into the picture, when the
@@ -218,7 +218,7 @@ class Camera:
         height: int = 512,
         model: CameraModel = "pinhole",
     ) -> Camera:
-        """Stands at `eye` and looks at `target`, in world units.
+        """Looks from `eye` at `target`, in world units.
 
         Args:
             eye: (3,) or (n, 3).

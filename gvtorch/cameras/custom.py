@@ -139,7 +139,7 @@ class CustomCamera(Camera):
         return self
 
     def shifted(self, dx: float, dy: float, sample: int | None = None) -> Camera:
-        """Returns the camera with its rays moved by dx and dy of the step to their neighbours."""
+        """Returns the camera with its rays moved by dx and dy times the step to a neighbour."""
         lines = self._pictures()[..., :6]
         moved = lines + dx * _ray_step(lines, -2) + dy * _ray_step(lines, -3)
         origin, direction = moved.split(3, -1)

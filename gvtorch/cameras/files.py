@@ -63,7 +63,7 @@ def read_cameras(
         path: ParaView's .pvcc; a .json of frames with `transform_matrix`; or a folder with COLMAP's
             cameras.txt and images.txt.
         width: Pixels of a .pvcc, which does not store them; other cameras are scaled to this size.
-        height: Likewise; both or none.
+        height: As `width`; give both or none.
 
     Returns:
         Each camera, by the name of its picture, in the file's order; that of a .pvcc is "camera".

@@ -21,7 +21,7 @@ CameraModel = Literal["pinhole", "ortho", "fisheye", "panorama"]
 _NEWTON = 20  # steps; one that leaves the bracket halves it instead
 _ROUNDING = 1 + 1e-12  # tolerance at the edges of fisheye and panorama
 _NEAREST = math.radians(45)  # largest half angle that a fitted box spans in a wide view
-_CLEAR = 1.02  # least eye distance of a parallel camera, over the nearest corner's
+_CLEAR = 1.02  # least distance of an ortho camera from the box's centre, over the nearest corner's
 
 
 @dataclass(frozen=True)
@@ -249,13 +249,13 @@ def model_of(where: str, name: str) -> Model:
 
 
 def distort(angle: Tensor, k: Tensor) -> Tensor:
-    """Returns distances from the middle, focal lengths, at angles (..., w), by (..., 4) `k`."""
+    """Returns distances from the middle, in focal lengths, of angles (..., w); `k` is (..., 4)."""
     a2, (k1, k2, k3, k4) = angle * angle, k.split(1, -1)
     return angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
 
 
 def slope(angle: Tensor, k: Tensor) -> Tensor:
-    """Derivative of `distort` by the angle."""
+    """Returns the derivative of `distort` by the angle."""
     a2, (k1, k2, k3, k4) = angle * angle, k.split(1, -1)
     return 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + a2 * 9 * k4)))
 
@@ -276,7 +276,7 @@ def undistort(radius: Tensor, k: Tensor, limit: Tensor) -> Tensor:
 
 
 def last_rising_angle(k: Tensor) -> float:
-    """Returns the largest angle up to pi to which `distort` rises, for (4,) `k` on the CPU."""
+    """Returns the largest angle, at most pi, up to which `distort` rises; `k`: (4,) on the CPU."""
     import numpy as np
 
     k1, k2, k3, k4 = k.tolist()

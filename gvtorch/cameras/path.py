@@ -78,7 +78,7 @@ class CameraPath:
         Args:
             box: World.
             model: Name of the camera model.
-            fov: Degrees; the model's own if left out.
+            fov: Degrees; the model's default if left out.
             azimuth, elevation, distance, up: Of the start.
             fit: (width, height) of pictures that show the whole box all the way around: finds the
                 distance, which stays the same.

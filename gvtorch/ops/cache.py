@@ -38,8 +38,8 @@ Branching = Annotated[int, range(2, 2**15)]  # N of a tree
 def compact_requests(
     request_tn: Requests, capacity: Positive, *, backend: Backend = "auto"
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Lists at most `capacity` requests, except kinds that are pending, and clears all request
-    words but their pending bits. Mutates `request_tn`.
+    """Lists at most `capacity` nodes with requests, without the kinds that are pending, and clears
+    all request words but their pending bits. Mutates `request_tn`.
 
     Returns:
         node_k (capacity,) node indices, rising, -1 behind them; word_k (capacity,) kinds and
@@ -72,8 +72,8 @@ def choose_requests(
     *,
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Chooses the requests to serve, ordered by list, then level, then size on the screen, then
-    their order in the list.
+    """Chooses the requests to serve, ordered by list, then level, then size on the screen (largest
+    first), then their order in the list.
 
     Returns:
         node_2b (2, batch) int64 nodes to load, and nodes to subdivide, the most wanted first, -1
@@ -234,7 +234,7 @@ def link_tiles(
     node_j: Longs,  # the j nodes
     loc_j4: Longs,  # their locs
     row_k: Longs,  # rows of the nodes that get tiles, each once
-    tile_k: Words,  # the tiles, each once, none the tile of one of the nodes; -1 names none
+    tile_k: Words,  # the tiles, each once, none that contains one of the j nodes; -1 names none
     tree: int,  # number of the tree
     frame_1: Words,  # number of the last picture: the tiles count as used in it
     *,

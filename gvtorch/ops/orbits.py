@@ -27,7 +27,7 @@ class Orbit(NamedTuple):
 
     def check(self, where: str, like: Tensor, fields: list[tuple[str, Tensor, str]]) -> None:
         """Raises ValueError unless all tensors have the dtype and device of `like` and their
-        shapes, and numbers are in range. `fields`: names, tensors and shapes of an op's points.
+        shapes, and numbers are in range. `fields`: name, tensor and shape of each other argument.
         """
         if like.dtype not in (torch.float32, torch.float64):
             got = check.describe(like)
@@ -42,7 +42,7 @@ class Orbit(NamedTuple):
         check.whole(where, "iterations", self.iterations, low=1, high=1000)
 
     def arguments(self) -> tuple[Any, ...]:
-        """Returns the arguments of the compiled ops that follow their points."""
+        """Returns the arguments of the compiled ops that come after the points or balls."""
         number = KINDS.index(self.kind)
         return (*self[:2], number, float(self.amount), self.iterations, self.julia)
 

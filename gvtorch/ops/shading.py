@@ -116,7 +116,7 @@ class ShadeParameters(NamedTuple):
     diffuse: Number = 0.0  # factor of base colour, light and cosine
     specular: Number = 0.0  # factor of the highlight
     shininess: Number = 1.0  # exponent of the highlight
-    light_growth: Number = 0.0  # of cones to the light, per unit length; of a point light: width
+    light_growth: Number = 0.0  # of cones to the light, per unit length; point light: its width
     own: Sequence[Number] | Tensor = ()  # up to four shader-specific numbers: a record above
     normal_scale: Number = 1.0  # a stored normal is number * scale + offset
     normal_offset: Number = 0.0

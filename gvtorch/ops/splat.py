@@ -85,13 +85,13 @@ def shares(edge_ke: Tensor, center_k: Tensor, radius_k: Tensor) -> Tensor:
     away = edge_ke - center_k[:, None]
     most = torch.where(away > 0, 2.0, -2.0).to(away)
     scale = divide(2.0, larger(radius_k, torch.full_like(radius_k, SMALLEST)), radius_k)
-    knots = clamp(away * scale[:, None], -2.0, 2.0)  # at whole numbers
+    knots = clamp(away * scale[:, None], -2.0, 2.0)  # the spline's knots are integers
     away = torch.where(radius_k[:, None] > 0, knots, most)
     far = larger(away, -away)
     rest = 2 - far
     square = rest * rest
     inner = 0.5 - far * (2 / 3 - far * far * (1 / 3 - far * 0.125))
-    tail = torch.where(far > 1, square * square * (1 / 24), inner)  # beyond it
+    tail = torch.where(far > 1, square * square * (1 / 24), inner)  # integral beyond `far`
     below = torch.where(away < 0, tail, 1 - tail)
     return below[:, 1:] - below[:, :-1]
 

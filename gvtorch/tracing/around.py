@@ -106,7 +106,7 @@ def _clipped(
 def _slab(
     surface: CutSurface | None, tracer: Tracer, options: RenderOptions, trace: TraceRays
 ) -> TraceRays | None:
-    """Returns the tracer of the intervals behind cuts; None: the one that traces everything."""
+    """Returns the tracer of the intervals behind cuts; None: `trace` traces them, too."""
     if surface is not None:
         return _surface_slab(surface, tracer, options)
     if tracer.names is None:

@@ -71,7 +71,7 @@ def behind(rays: Rays, front: Hits) -> Rays:
 
 def if_few(some: Tensor) -> Tensor | None:
     """Returns the indices where `some` (r,) is true if they are less than half, on the CPU; else
-    None: tracing more of them alone saves no time, and on the GPU the host would wait.
+    None: for more of them a separate trace saves no time, and on the GPU the host would wait.
     """
     if some.device.type != "cpu":
         return None

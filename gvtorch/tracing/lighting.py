@@ -64,7 +64,7 @@ class Lighting:
     occlusion: float = 0.0  # share of the ambient light that matter nearby can block, 0 to 1
     indirect: float = 0.0  # factor of the light that comes from lit matter nearby
     cones: int = 16  # over the hemisphere, for occlusion and indirect light
-    reach: float | None = None  # distance of occlusion and indirect light; None: a quarter box
+    reach: float | None = None  # of occlusion and indirect light; None: a quarter of the box's side
     frame: Frame | str = Frame.WORLD  # of reach: world units, or largest sides of the scene's box
     ambient: Triple = (1.0, 1.0, 1.0)  # light from all directions, linear RGB
 
@@ -166,7 +166,7 @@ class Lighted:
     def _points(
         self, rays: Rays, hits: Hits, tally: _Tally, headlight: Tensor | None = None
     ) -> _Points:
-        """Returns the points that the eye's rays hit, or, if `headlight` is given, cones."""
+        """Returns the points that the eye's rays hit, or, given a `headlight`, those of cones."""
         origin, direction, cone = RayArguments.of(rays)[:3]
         depth = hits.depth[:, 0].to(torch.float64)
         seen = depth < torch.inf

@@ -276,7 +276,7 @@ class View:
         return replace(rays, sample=self.camera.pixel_samples(self.numbers, rows))
 
     def _some_rays(self, top: int, which: Tensor) -> Rays:
-        """Returns the rays of the pixels `which` (k,), which rise and count from row `top`."""
+        """Returns the rays of the pixels `which` (k,), rising indices counted from row `top`."""
         width = self.camera.width
         ends = torch.stack((which[0], which[-1])).tolist() if len(which) else (0, -1)
         first, last = (end // width for end in ends)
@@ -310,7 +310,7 @@ def _write(hits: Hits, pixels: Pixels, part: Hits, count: int) -> None:
 
 
 def empty_hits(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:
-    """Allocates the hits of a picture before any ray is traced: all rays count as missing."""
+    """Allocates the hits of a picture before any ray is traced: each ray counts as `missed`."""
     color, alpha, depth = (
         torch.empty((pixels, width), dtype=dtype, device=device) for width in (3, 1, 1)
     )

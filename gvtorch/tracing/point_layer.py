@@ -60,7 +60,7 @@ def point_layer(
     placed = camera.placed(torch.tensor([grid.low, grid.high], dtype=torch.float64))
     view, K = placed.viewmats[0].numpy(), placed.Ks[0].numpy()
     eye = -view[:3, 3] @ view[:3, :3]
-    # The blend of levels: 0 where a pixel is as wide as a finest voxel, 1 where as the next one's.
+    # The blend of levels: 0 where a pixel is as wide as a finest voxel, 1 as one of the next level.
     finest = float(grid.spacing_3.max())
     growth = cone_scale / min(K[0, 0], K[1, 1])
     reach = finest * grid.branching / growth

@@ -128,6 +128,6 @@ def world_box(own: Tensor, pose: Pose | None) -> Tensor:
 
 
 def _turned(rows: Sequence[Sequence[float]], columns: Sequence[Tensor]) -> Tensor:
-    """Returns (r, 3) products of a matrix and columns (r,); the fixed order makes bits equal."""
+    """Returns (r, 3) products of a matrix and columns (r,), in one order: equal bits everywhere."""
     x, y, z = columns
     return torch.stack([a * x + b * y + c * z for a, b, c in rows], 1)

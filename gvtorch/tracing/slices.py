@@ -62,8 +62,8 @@ def slice_picture(
         at: Position: a share of the extent, 0 to 1 or "50%"; an int, the index of a voxel of the
             finest level; or world units, "12.5mm". For all axes one, or three (x, y, z).
         span: The values shown black and white, with visually even grays between them: if it is
-            (0, 255), a voxel of 8 bits is shown as the sRGB number of its value. If left out, what
-            `window` finds, with the background.
+            (0, 255), the values of 8-bit voxels are their sRGB numbers. If left out, what `window`
+            finds, with the background.
         colors: Instead of grays, the colours of values (not their opacity): a transfer function,
             `Labels`, or another function from values (...) to linear red, green, blue (..., 3).
         component: Which number of a voxel.

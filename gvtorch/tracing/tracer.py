@@ -43,8 +43,8 @@ class Tracer:
         frame_1: Tensor | None = None,
     ) -> None:
         """Prepares the op's arguments; see `trace` and, for `by_level`, `TraceArguments`. `frame_1`
-        (1,) int32 is the frame's number, if it is on the device already. Raises ValueError if the
-        shader is none, the channel unknown, the step too short, or the backend can't be used.
+        (1,) int32 is the frame's number, if it is on the device already. Raises ValueError if there
+        is no shader, the channel is unknown, the step too short, or the backend can't be used.
         """
         check_shader("render", "shader", shader)
         choose_backend(options.backend, tree.device)
@@ -187,8 +187,8 @@ def _check_labels(tree: N3Tree, shader: Shader, channel: str) -> None:
 
 
 def _check_step(tree: N3Tree, step: float, options: RenderOptions) -> None:
-    """Raises ValueError where distances are too coarse for the ends of intervals to differ. With
-    cones they allow more of them: these are as long as cones are wide, far above rounding.
+    """Raises ValueError if a step is so short that rounding makes ends of intervals equal. Cones
+    allow more intervals: each is about as long as its cone is wide, far above the rounding.
     """
     length = math.dist(*tree.box.tolist())
     most, hint = 2**46, "take a longer step"
@@ -213,7 +213,7 @@ class Batch:
     listed: ops.Samples
 
     def values(self, channels: Sequence[str] = ()) -> Tensor:
-        """Returns (k, c) values of channels side by side; if none is named, of the tracer's."""
+        """Returns (k, c) values of channels side by side, by default of the tracer's one."""
         found, tree = [], self.tracer.tree
         for name in channels or (self.tracer.channel,):
             arguments = self.tracer.arguments._replace(

@@ -148,7 +148,7 @@ class TreeTracer(torch.nn.Module):
     def _load_from_state_dict(
         self, state: dict[str, Any], prefix: str, _told: Any, strict: bool, *lists: list[str]
     ) -> None:
-        """Loads nothing and reports an error where words point outside the pools."""
+        """Loads nothing, and reports an error, if words point outside the pools."""
         try:
             _check_words(state, prefix)
         except ValueError as error:
@@ -243,7 +243,7 @@ class TreeTracer(torch.nn.Module):
 
 
 def _check_words(tensors: Mapping[str, Any], prefix: str) -> None:
-    """Raises ValueError where words point outside the pools in `tensors`."""
+    """Raises ValueError if words in `tensors` point outside the pools there."""
     names = ("child_tn", "brick_tn", "bricks_bzyxc")
     given: list[Any] = [tensors.get(prefix + name) for name in names]
     if not all(isinstance(one, Tensor) for one in given):

@@ -34,7 +34,7 @@ from .options import RenderOptions
 from .pose import poses_of, world_box
 from .tracer import Batch, Tracer
 
-_PARTS = 8  # traced one after the other where trees overlap, so ended rays request no more behind
+_PARTS = 8  # of a stretch where trees overlap, front to back: ended rays request nothing behind
 _RAYS = {"cpu": 1 << 14, "cuda": 1 << 18}  # composited by sample at once
 _SLIVER = 1e-3  # steps: ends of intervals that are closer count as one
 _MOST_ALPHA = 1 - 1e-9  # of a sample: the extinction of an opaque one would be infinite
@@ -150,7 +150,7 @@ def _in_order(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
 
 
 def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
-    """Returns (r, 3) the trees' mean normal, nearest first, by the light each takes, or None."""
+    """Returns (r, 3) mean normals, weighted by the light each tree absorbs; None if none exist."""
     taken = [one.normal * one.alpha for one in ranked if one.normal is not None]
     if not taken:
         return None
@@ -434,7 +434,7 @@ def _cut(trees: Sequence[TreeTrace], rays: Rays) -> tuple[_Pieces, Tensor]:
 
 
 def _joined(ray: Tensor, place: Tensor, covered: Tensor, sliver: float) -> _Pieces:
-    """Makes pieces from the sorted ends (k,) of intervals; `covered` (k, m): trees behind each."""
+    """Makes pieces from the sorted ends (k,) of intervals; `covered` (k, m): trees just behind."""
     same = ray[1:] == ray[:-1]
     near, far = place[:-1], place[1:]
     kept = (same & covered[:-1].any(1) & (far - near > sliver)).nonzero()[:, 0]

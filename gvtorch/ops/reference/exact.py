@@ -21,7 +21,7 @@ def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
 
 
 def divide(a: Tensor | float, b: Tensor | float, like: Tensor) -> Tensor:
-    """Returns a / b, rounded once: where a or b is a number, torch multiplies by a reciprocal."""
+    """Returns a / b, rounded once. Given a number, torch itself multiplies by a reciprocal."""
     return torch.div(torch.as_tensor(a).to(like), torch.as_tensor(b).to(like).expand(like.shape))
 
 
@@ -156,7 +156,7 @@ def exp2_exact(value: Tensor) -> Tensor:
 
 
 def taken_by(halvings: Tensor) -> Tensor:
-    """Returns 1 - 2^-halvings, the light that is absorbed; exact where that is little."""
+    """Returns 1 - 2^-halvings, the share of light that is absorbed; accurate if small, too."""
     thin = halvings < 0.5
     near = torch.where(thin, halvings, 0.0)
     return torch.where(thin, _exp2_slope(-near) * near, 1 - exp2_exact(-halvings))

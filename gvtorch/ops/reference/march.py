@@ -59,7 +59,7 @@ class Visit(NodePair):
         return cls(holder, holder, zero, zero, zero, word, no, zero, no, no)
 
     def stays(self, at: Intervals) -> Tensor:
-        """Returns (r,) bool: the interval's middle is still in the node, wants the same levels."""
+        """Returns (r,) bool: the interval's middle is in the node and wants the same levels."""
         middle = at.middle
         cone = at.beam.cone(middle)
         fits = torch.where(
@@ -98,8 +98,8 @@ class Probe:
         return torch.stack(slopes, 1)
 
     def blend(self, t: Tensor, ask: Callable[[Holder], Tensor]) -> Tensor:
-        """Returns (r,) or (r, c): `ask` of the node blended with `ask` of its parent, whose weight
-        grows from 0 where the cone is as wide as the node's voxels to 1 where as its parent's.
+        """Returns (r,) or (r, c): `ask` of the fine node, blended with `ask` of the coarse one,
+        whose weight grows from 0 where the cone is `voxel` wide to 1 where it is `above` wide.
         """
         nodes = self.nodes
         two, value = nodes.fine.node != nodes.coarse.node, ask(nodes.fine)

@@ -25,7 +25,7 @@ Step = Callable[[Tensor], tuple[Tensor, Tensor]]
 #: distances in the ball, and the smallest and largest of the factors of `Step`, (k,) each.
 Ranges = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
-INSIDE = 1.0  # the fractal's inside gets minus this as its distance: no estimate is known
+INSIDE = 1.0  # minus this, in units of the points, is the distance inside: no estimate is known
 FAR = 1e3  # a ball of orbits that grows to this radius is given up: nothing is known of it
 
 
@@ -109,8 +109,8 @@ def orbits(point_p3: Tensor, way: Way) -> Tensor:
 
 
 def orbit_bounds(center_k3: Tensor, reach_k: Tensor, way: Way) -> Tensor:
-    """Iterates the centre of balls, and a radius that contains the orbits of all of their points;
-    see `ops.orbit_bounds`.
+    """Iterates the centres of balls, and for each a radius within which the orbits of all points of
+    the ball are; see `ops.orbit_bounds`.
     """
     z, reach, bailout = center_k3.mT, reach_k, way.bailout_1
     constant, push, add = z, reach, 1.0
@@ -118,7 +118,7 @@ def orbit_bounds(center_k3: Tensor, reach_k: Tensor, way: Way) -> Tensor:
         constant, push, add = way.constant_3[:, None], torch.zeros_like(reach), 0.0
     low_apart = high_apart = torch.ones_like(reach)
     low, high = torch.full_like(reach, math.inf), torch.full_like(reach, -math.inf)
-    inside = torch.ones_like(reach, dtype=torch.bool)  # whether any point may not have escaped yet
+    inside = torch.ones_like(reach, dtype=torch.bool)  # some point may not have escaped yet
     lost = ~inside
     for turn in range(way.iterations + 1):
         radius = sqrt_exact(_squared(z))
@@ -145,7 +145,7 @@ def orbit_bounds(center_k3: Tensor, reach_k: Tensor, way: Way) -> Tensor:
 
 
 def _estimate(radius: Tensor, apart: Tensor, way: Way) -> Tensor:
-    """Returns distance estimates of orbits at a radius, whose neighbours are stretched apart."""
+    """Returns distance estimates of orbits at `radius`; `apart`: their neighbours' stretch."""
     return 0.5 * radius * log_exact(radius) / apart if way.logarithmic else radius / apart
 
 

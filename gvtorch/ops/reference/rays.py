@@ -99,7 +99,7 @@ class Beam(Rows):
         return self.cone_near + self.cone_growth * t
 
     def along(self, t: Tensor) -> Tensor:
-        """Returns (r, 3) float64 positions at distances t (r,), exact to float64 in deep trees."""
+        """Returns (r, 3) float64 positions at distances t (r,), computed in float64 if deep."""
         near = (self.origin + t[:, None] * self.direction).double()
         exact = self.place + t[:, None].double() * self.direction.double()
         return torch.where(self.deep[:, None], exact, near)
@@ -122,7 +122,7 @@ class Beam(Rows):
 
 def is_deep(a: TraceArguments) -> bool:
     """Returns whether positions are computed in float64: where the root cube has more than 2^18
-    voxels a side, or N is no power of two, so that corners of nodes are no float32.
+    voxels a side, or N is no power of two, so that float32 can't hold corners of nodes.
     """
     brick = a.bricks_bzyxc.shape[1] - 2 * a.border
     power = a.branching & (a.branching - 1) == 0
@@ -204,7 +204,7 @@ class Intervals:
         short, long = self.level > 0, self.level < top
         fits = (~short | ~(width < self.length)) & (~long | ~(width >= self.length + self.length))
         level = (width[:, None] >= self.length_l[1:]).sum(1)
-        full = self.count >= MAX_INTERVALS  # a float counts no more from one base
+        full = self.count >= MAX_INTERVALS  # as many as are counted from one base
         self.start = torch.where(
             move & full & ~(self.start > self.base), self.beam.last, self.start
         )

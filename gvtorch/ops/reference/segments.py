@@ -14,7 +14,7 @@ from .march import NodePair, Piece, Probe, Transfer, Visitor, Walk
 from .rays import Beam
 from .tree import ChannelBricks, Levels
 
-_PIECE = -1  # level of an interval of any length
+_PIECE = -1  # level of an odd interval
 
 
 @dataclass
@@ -25,7 +25,7 @@ class SegmentWriter(Visitor):
 
     walk: Walk
     limit: int  # a ray pauses between two nodes once it has this many samples; 0: never
-    by_node: bool  # only where no two nodes blend, a region counts as being of one value
+    by_node: bool  # a region counts as being of one value only where no two nodes blend
 
     def __post_init__(self) -> None:
         real = self.walk.at.start[:0]

@@ -53,7 +53,7 @@ class Shade(Plain):
         self.normal = torch.zeros_like(self.light.along)  # (r, 3) sum
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """Returns false if shading varies: with shadows, or stored normals and a point light."""
+        """As `Visitor.same`; false for shadows, and for stored normals with a point light."""
         same = torch.ones_like(fine, dtype=torch.bool)
         for channel in (self.channel, *self.light.normals[:1], *self.others[:1]):
             numbers = channel.constant_nc

@@ -182,13 +182,13 @@ class ChannelBricks:
         """Returns every number of another channel of the same nodes; () where that is None."""
         if bricks is None:
             return ()
-        if constants is None:  # a coarse channel, whose constants are never read
+        if constants is None:  # a coarse channel, whose constants are never used
             constants = bricks.new_zeros((1, len(self.constant_nc), bricks.shape[4]))
         other = replace(self, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
         return tuple(replace(other, component=c) for c in range(bricks.shape[4]))
 
     def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Returns (r,) smallest and largest values in reach of the nodes' bricks, at all levels."""
+        """Returns (r,) smallest and largest values in reach of bricks of the nodes and below."""
         low, high = self.range_n2c[node, :, self.component].to(real).unbind(1)
         return low, high
 

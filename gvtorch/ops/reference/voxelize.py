@@ -150,8 +150,8 @@ def _weights(place_p3: Tensor, corner_p33: Tensor) -> Tensor:
 
 
 def _ahead(place_p3: Tensor, corner_f33: Tensor, solid_f: Tensor) -> Tensor:
-    """Returns (p,) int64 winding numbers: each triangle hit by a ray along +x adds 1 if its normal
-    points along x, else -1.
+    """Returns (p,) int64 winding numbers: each triangle of a solid that a ray along +x hits adds 1
+    if its normal points along x, else -1.
     """
     where, way = pierced(place_p3[:, None], corner_f33)
     return (way * solid_f * (where > place_p3[:, :1]).long()).sum(1)
@@ -193,7 +193,7 @@ def _coverage(
     gap: Tensor, away: Tensor, winding: Tensor, row: Tensor, solid_f: Tensor, half: Tensor
 ) -> Tensor:
     """Returns (p,) the filled share of voxels that no solid's surface cuts: 1 inside, 0 outside;
-    where a sheet's triangle is nearest, the part within `half` of a thickness of the plane at its
+    where a sheet's triangle is nearest, the part up to `half` its thickness from the plane at its
     nearest point.
     """
     inside = (winding != 0).to(gap.dtype)
