@@ -168,7 +168,7 @@ def coarser_requests(
     Args:
         cache: The pools.
         requests: All requests of a frame.
-        room: For each kind, how many slots may be taken, coarse ones apart: see `Cache.room`.
+        room: For each kind, how many slots may be taken, coarse ones separately: see `Cache.room`.
 
     Returns:
         The subdivisions as they are, and loads of the coarser nodes; or `requests` unchanged if
@@ -306,7 +306,7 @@ class Scheduler:
 
     def choose(self, requests: RequestsByKind, room: Mapping[int, Sequence[int]]) -> Choice:
         """Returns which of a frame's requests are served; `room` is for each kind how many slots
-        may be taken, coarse ones apart: see `Cache.room`.
+        may be taken, coarse ones separately: see `Cache.room`.
         """
         nodes: dict[int, Tensor] = {}
         deferred, exceeded = 0, False

@@ -182,7 +182,7 @@ class HostFrame(RecordedFrame):
             self._asker.submit(self._ask)
 
     def _ask(self) -> None:
-        """Asks for the chosen nodes; of a kind with an answer due, `_SOON` after its last call."""
+        """Asks for chosen nodes; of a kind with an answer due, only `_SOON` after its last call."""
         with self._lock:
             self._going, turn, now = False, self.turn, time.monotonic()
             busy = {batch.kind for _, batch in [*self._waiting.values()]}

@@ -117,7 +117,7 @@ class RecordedFrame:
         """Widens the next frame's cones if the pools can't hold what this one used and requested,
         and narrows them again, down to the camera's, if there is room. A surface needs bricks in
         proportion to the inverse square of the cones' width. `use` is from `Cache.sort_by_use`,
-        `count` from `compact_requests`: pending nodes count as requested.
+        `count` from `compact_requests`: every requested node, pending or not, may need a brick.
         """
         nodes, bricks = self.cache.nodes.capacity, self.cache.bricks.capacity
         taken = torch.stack(((use[3] + count[2]) / bricks, (use[1] + count[4]) / nodes)).amax()
