@@ -1,5 +1,5 @@
 """`ArrayLike`: arrays of other libraries (xarray, dask, zarr, h5py, NumPy, and any object with
-`__array__`, `__array_interface__` or `__dlpack__`), by duck typing: no library is imported.
+`__array__`, `__array_interface__` or `__dlpack__`), by duck typing: only NumPy is imported.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def as_volume(
         return given
     if isinstance(given, Tensor):
         letters = ask_axes(where, given.shape, axes)
-        if letters in ("zyx", "zyxc"):  # supports every dtype of torch, and copies nothing
+        if letters in ("zyx", "zyxc"):  # not by way of NumPy, which lacks bfloat16
             return Volume(given, spacing or (1, 1, 1), origin or (0, 0, 0), nan=nan)
         found = ArrayLike.of(where, given.detach().cpu().numpy(), letters)
     else:

@@ -20,7 +20,7 @@ def index(low: Any, high: Any) -> tuple[slice, ...]:
 
 
 def clamped_box(low: Zyx, high: Zyx, shape: Zyx) -> tuple[list[int], list[int]]:
-    """Returns the part of a box inside a grid, or the nearest: at least one voxel a side."""
+    """Returns the part of a box inside a grid, else the nearest voxels; one a side at least."""
     start = [min(max(a, 0), n - 1) for a, n in zip(low, shape, strict=True)]
     stop = [max(min(b, n), a + 1) for a, b, n in zip(start, high, shape, strict=True)]
     return start, stop

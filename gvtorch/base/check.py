@@ -33,7 +33,7 @@ def describe(tensor: Any) -> str:
 
 
 def brief(record: Any) -> str:
-    """Returns one line on a dataclass: fields that differ from their default, tensors by shape."""
+    """Returns one line on a dataclass: what differs from defaults, tensors by shape and dtype."""
     parts = []
     for field in fields(record):
         value = getattr(record, field.name)
@@ -52,7 +52,7 @@ def shown(value: Any) -> str:
 
 
 def given(value: Any) -> str:
-    """Returns a value as an error message shows it: one line of at most 200 characters."""
+    """Returns a value as an error message shows it: one line of about 200 characters at most."""
     if isinstance(value, int) and value.bit_length() > 1000:
         return f"a number of {value.bit_length()} bits"  # Python refuses to print over 4,300 digits
     return one_line(shown(value), 200)
@@ -93,8 +93,8 @@ def tensors(
     fields: Iterable[Field],
     sizes: Mapping[str, int] | None = None,
 ) -> dict[str, int]:
-    """Checks tensors and returns the size of each letter, which is one over all fields; `sizes` are
-    known beforehand.
+    """Checks tensors and returns the size of each letter, which must be the same in all fields;
+    `sizes` are known beforehand.
 
     Raises:
         ValueError: A tensor is not contiguous or not of its shape, dtype and device.
@@ -220,7 +220,7 @@ def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:
         )
 
 
-_LEAST = 1e-60  # smallest positive number: ratios and squares neither overflow nor become 0
+_LEAST = 1e-60  # smallest allowed size: ratios and squares neither overflow nor become 0
 _MOST_VOXELS_AWAY = 2.0**50  # from the world's origin: positions are exact to 1/8 voxel there
 _MOST_JSON = 1 << 26  # bytes of a user's file
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
@@ -309,7 +309,7 @@ def triple(
 
 
 def box(where: str, value: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Returns two corners, (x, y, z) each; ValueError unless the second exceeds the first."""
+    """Returns two corners, (x, y, z) each; ValueError unless all sides are positive."""
     if len(value) != 2:
         raise ValueError(f"{where}: box must be two corners, got {value!r}")
     low, high = (triple(where, "box", corner) for corner in value)

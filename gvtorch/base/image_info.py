@@ -46,7 +46,7 @@ PREMULTIPLIED = tuple(ChannelInfo(name=name) for name in ("red", "green", "blue"
 
 
 def color_channels(count: int = 3) -> tuple[ChannelInfo, ...]:
-    """Returns `count` channels of a colour image: red, green, blue; any others are alpha."""
+    """Returns `count` >= 3 channels of a colour image: red, green, blue; any others are alpha."""
     colors = [ChannelInfo(name=name, color=COLORS[name]) for name in ("red", "green", "blue")]
     return (*colors, *[ChannelInfo(name="alpha")] * (count - 3))
 

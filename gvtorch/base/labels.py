@@ -108,7 +108,7 @@ def background(labels: np.ndarray | None) -> int | None:
 
 
 def check_narrowed(where: str, values: np.ndarray) -> None:
-    """Raises ValueError if float32 can't keep all of these integers distinct."""
+    """Raises ValueError if integers lie beyond 2^24, where float32 does not hold all of them."""
     if values.dtype.kind not in "iu" or values.dtype.itemsize < 4 or not values.size:
         return
     low, high = int(values.min()), int(values.max())

@@ -6,7 +6,7 @@ import importlib
 import re
 from typing import Any
 
-# Characters by which a terminal runs a command, ends a line or writes from right to left.
+# Characters that a terminal obeys, that end a line, or that change the direction of text.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 
 

@@ -1,4 +1,4 @@
-"""The records that the steps of a frame hand to each other, and what a picture cost."""
+"""The records that the steps of a frame pass to each other, and what a picture cost."""
 
 from __future__ import annotations
 

@@ -187,11 +187,11 @@ class Trace:
         self._counts.append((name, time.perf_counter_ns(), values))
 
     def begin(self) -> tuple[int, torch.cuda.Event | None]:
-        """Records the begin of a stage; the result is passed to `end`."""
+        """Returns when a stage begins, to be passed to `end`."""
         return time.perf_counter_ns(), self._event()
 
     def end(self, name: str, began: tuple[int, torch.cuda.Event | None]) -> None:
-        """Records the end of a stage; `began` is what `begin` returned."""
+        """Records a stage that ends now; `began` is what `begin` returned."""
         (begin, first), last, end = began, self._event(), time.perf_counter_ns()
         marks = None if first is None or last is None else (first, last)
         self._spans.append(_Span(name, self._track(), begin, end, marks))

@@ -71,9 +71,9 @@ NO_DEPTH = "how far slices are apart, which is not told: as far as pixels"
 def spacing_of(
     sizes: Sequence[float | None], units: Sequence[str | None]
 ) -> tuple[tuple[float, float, float], str | None]:
-    """Returns (x, y, z) voxel sizes in one unit, and its name: that of the first axis that has a
-    positive size and a known unit. Axes that lack either get that axis's size. If all do, sizes are
-    returned as they are, 1 unless positive, with None as the unit.
+    """Returns (x, y, z) voxel sizes in one unit, and its name. The first axis that has a positive
+    size and a known unit gives the unit, and its size to axes that lack either. If all lack one,
+    sizes are returned as they are, 1 unless positive, with None as the unit.
     """
     named = [_find(_LENGTH, unit) for unit in units]
     good = [

@@ -37,7 +37,7 @@ class AliasRows(NamedTuple):
     place: Tensor  # (a, 5) int64 number of its tree, and its loc
     goal: Tensor  # (a, 5) the same of the target
     target: Tensor  # (a,) int64 the target, or the node whose children are asked for
-    target_place: Tensor  # (a, 5) of `target`; below another alias not the goal's
+    target_place: Tensor  # (a, 5) the same of `target`; below another alias not `goal`
     exact: Tensor  # (a,) bool, whether `target` lies at `goal`
 
     def some(self, index: Tensor) -> AliasRows:
@@ -62,7 +62,7 @@ class Aliases:
         self.clear()
 
     def clear(self, tree: int | None = None) -> None:
-        """Forgets the aliases in a tree, and what others show of that tree; or all."""
+        """Forgets the aliases in a tree, and unlinks aliases of its nodes; None: forgets all."""
         if tree is not None and len(self):
             self.rows = rows = self.rows.some(self.rows.place[:, 0] != tree)
             stale = rows.node[(rows.goal[:, 0] == tree) | (rows.target_place[:, 0] == tree)]

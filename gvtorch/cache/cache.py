@@ -47,7 +47,7 @@ class LRU:
         return unused + self.fresh if self.fresh else unused
 
     def free(self) -> Tensor:
-        """(1,) int64 `unused` on the device."""
+        """Returns `unused` as a (1,) int64 tensor on the device."""
         return torch.full((1,), self.unused, device=self.order.device)
 
     def give(self, wanted: Tensor, most: Tensor) -> Tensor:
@@ -128,7 +128,7 @@ class Cache:
         return self.nodes.request_tn[: self.nodes.capacity - lru.fresh]
 
     def memory(self) -> dict[str, int]:
-        """Returns bytes by name: content of either pool, and bookkeeping."""
+        """Returns bytes by name: content of each pool, and bookkeeping."""
         nodes, bricks = self.nodes, self.bricks
         content = (*nodes.constants.values(), *nodes.ranges.values())
         node_bytes = sum(words.nbytes for words in (nodes.child_tn, nodes.brick_tn, *content))
@@ -157,7 +157,7 @@ class Cache:
         return torch.cat((*tiles, *bricks, self._no_coarse)[:5])
 
     def used(self) -> Tensor:
-        """(2,) int64 tiles and bricks used in the last picture; the host does not wait."""
+        """Returns (2,) int64 tiles and bricks used in the last picture; the host does not wait."""
         stamps = (self.nodes.stamp_t, self.bricks.stamp_b)
         return torch.stack([(stamp == self.frame_1).sum() for stamp in stamps])
 

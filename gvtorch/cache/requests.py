@@ -59,7 +59,7 @@ class Requests:
 
     def fitting(self, rank: Tensor, room: Sequence[int]) -> Tensor:
         """Returns those rows of `rank` (k,), the most wanted first, that find a slot; `room` is the
-        number of slots, and of coarse ones.
+        number of slots that are not coarse, and of those that are.
         """
         if self.coarse is None:
             return rank[: sum(room)]
@@ -112,8 +112,8 @@ RequestsByKind = Mapping[int, Requests]
 class RequestList:
     """Nodes with a request, as `ops.compact_requests` leaves them on the device."""
 
-    node: Tensor  # (capacity,) int32 node indices, -1 behind the last
-    word: Tensor  # (capacity,) int32 kinds and priority, 0 behind the last
+    node: Tensor  # (capacity,) int32 node indices, -1 after the last
+    word: Tensor  # (capacity,) int32 kinds and priority, 0 after the last
     count: Tensor  # (5,) int64: see `compact_requests`
 
     @classmethod
@@ -168,11 +168,11 @@ def coarser_requests(
     Args:
         cache: The pools.
         requests: All requests of a frame.
-        room: For each kind, how many slots may be taken, and how many coarse ones.
+        room: For each kind, how many slots may be taken, coarse ones separately: see `Cache.room`.
 
     Returns:
-        The subdivisions as they are, and loads of the coarser nodes; or all of `requests` where
-        those nodes have bricks already.
+        The subdivisions as they are, and loads of the coarser nodes; or `requests` unchanged if
+        there are no slots, or if none of those nodes is left to load.
     """
     nodes, most = cache.nodes, room[REQUEST_LOAD]
     node, subdivide = requests[REQUEST_LOAD].node, requests[REQUEST_SUBDIVIDE]
@@ -235,8 +235,8 @@ class CallCost:
         many as were tried lately; `unknown` if there was no call yet.
 
         If the overhead of a call takes most of that time, items still get half of it, because many
-        small calls would take longer. If all calls had as many items, a few more are tried: the
-        line cannot be fitted otherwise.
+        small calls would take longer. If all calls had about the same number of items, a few more
+        are tried: the line cannot be fitted otherwise.
         """
         if not self._weight:
             return unknown
@@ -306,7 +306,7 @@ class Scheduler:
 
     def choose(self, requests: RequestsByKind, room: Mapping[int, Sequence[int]]) -> Choice:
         """Returns which of a frame's requests are served; `room` is for each kind how many slots
-        may be taken, and how many coarse ones.
+        may be taken, coarse ones separately: see `Cache.room`.
         """
         nodes: dict[int, Tensor] = {}
         deferred, exceeded = 0, False

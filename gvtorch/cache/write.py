@@ -161,7 +161,7 @@ def put_rows_of(held: Tensor, slot: Tensor, rows: Tensor) -> None:
 
 
 def _as_bytes(rows: Tensor) -> Tensor:
-    """(k, b) uint8 view of rows (k, ...)."""
+    """Returns rows (k, ...) as (k, b) uint8."""
     rows = rows.detach().contiguous()
     return rows.view(len(rows), math.prod(rows.shape[1:])).view(torch.uint8)
 

@@ -193,7 +193,7 @@ class Engine:
         return View(placed, placed.numbers(self.device), trace, chosen, box)
 
     def _tracers(self, shaders: Shaders, options: RenderOptions, box: Tensor) -> list[TreeTrace]:
-        """Returns for each tree what traces rays through it, given the (2, 3) box of the scene."""
+        """Returns a `TreeTrace` for each tree, given the (2, 3) box of the scene."""
         scene = {name: (one.tree, one.producer.channels) for name, one in self.trees.items()}
         by_level, frame_1 = self.production.by_level, self.cache.frame_1
         return tree_traces(
@@ -536,7 +536,7 @@ class Engine:
         self.production.restore_pending()
 
     def memory(self) -> dict[str, int]:
-        """Returns bytes by name: content of either pool, and bookkeeping."""
+        """Returns bytes by name: content of each pool, and bookkeeping."""
         return self.cache.memory()
 
     @_alone

@@ -26,7 +26,7 @@ from .stats import Collected, FrameStats, Readbacks
 
 _STRIDE = 4  # pixels between look-ahead rays
 _RAREST = 4  # most frames between two look-aheads
-_LOOKS = 4  # look-aheads until the camera is there: each deepens a tree by a level
+_LOOKS = 4  # look-aheads before the camera arrives: each deepens a tree by a level
 
 
 class Steps(Protocol):
@@ -177,8 +177,8 @@ class FrameGraph:
 
 
 class LookAhead:
-    """Rays of future pictures, which request what these would miss. Their camera is the picture's
-    (its numbers stay at one address, `View.numbers`), moved on as it moved since the last frame.
+    """Rays of future pictures, which request what these would miss. Their camera is where
+    the picture's will be if it moves on as since the last frame; its numbers stay at one address.
 
     There is one of these rays for 4 x 4 pixels of the picture: a brick is wider than that on the
     screen. What they use counts as used and so is kept; their requests are served after the

@@ -182,7 +182,7 @@ class HostFrame(RecordedFrame):
             self._asker.submit(self._ask)
 
     def _ask(self) -> None:
-        """Asks for the nodes chosen, of each kind that has no recent answer due (`_SOON`)."""
+        """Asks for chosen nodes; of a kind with an answer due, only `_SOON` after its last call."""
         with self._lock:
             self._going, turn, now = False, self.turn, time.monotonic()
             busy = {batch.kind for _, batch in [*self._waiting.values()]}
@@ -307,8 +307,8 @@ class HostFrame(RecordedFrame):
         fields: Mapping[str, Mapping[str, Tensor]],
         which: Tensor | slice,
     ) -> None:
-        """Posts the rows `which` of fields, with and without channels. A node may be posted only
-        once, so rows of an earlier turn are dropped: their nodes may have been requested again.
+        """Posts entries `which` of `rows`, and of `fields` by channel. A node may be posted only
+        once; those of an earlier turn are dropped: they may have been requested again.
         """
         flat = {f"{name}.{channel}": t for name, by in fields.items() for channel, t in by.items()}
         mail = self._mail[self._by_tree[batch.source.tree.number]]

@@ -35,8 +35,9 @@ def first_ones(node: Tensor) -> Tensor:
 
 
 def parent_bricks(cache: Cache, source: ProducedTree, node: Tensor) -> dict[str, Tensor]:
-    """Returns for each channel but coarse ones (k, z, y, x, c) bricks of the parents of nodes (k,),
-    of a root its own; each has a brick or is EMPTY or CONSTANT. The host does not wait.
+    """Returns for each channel that is not coarse the bricks (k, z, y, x, c) of the parents of (k,)
+    nodes, of a root its own; all of these have a brick or are EMPTY or CONSTANT. The host does not
+    wait.
     """
     parent = _parent(cache, node)
     parent = torch.where(parent >= 0, parent, node)

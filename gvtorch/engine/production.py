@@ -98,7 +98,7 @@ class Failures:
 
     def raise_if_strict(self) -> None:
         """Raises `ProductionError` for the first failure since the last call, if strict: at the end
-        of a frame, when the pools are in order.
+        of a frame, when the pools are consistent.
         """
         first, self._first = self._first, None
         if self.strict and first is not None:
@@ -261,7 +261,7 @@ class Production:
         return answered
 
     def write(self, answers: Sequence[Answered], stats: FrameStats) -> None:
-        """Writes answers into the pools and adds up what they did."""
+        """Writes answers into the pools and adds them to `stats`."""
         stats.stale, self._skipped = stats.stale + self._skipped, 0
         for batch, answer in answers:
             if isinstance(answer, Regions):
@@ -277,7 +277,7 @@ class Production:
         stats.pending, stats.failed = sum(self.pending.values()), len(self.failures)
 
     def wait(self, more: float = 0.0, limit: float = _LONGEST) -> None:
-        """Waits for one answer, until patience or `limit` seconds end; then `more` for all."""
+        """Waits for one answer, at most for patience or `limit` seconds; then `more` for others."""
         if self._waiting and not self._held:
             left = min(item.left for item in self._waiting)
             futures = [item.future for item in self._waiting]
@@ -425,7 +425,7 @@ class Production:
             self._add_up(batch, write.bricks(self.cache, batch.targets, answer.data), stats)
 
     def _write_shipment(self, batch: RequestBatch, shipment: Shipment, stats: FrameStats) -> None:
-        """Writes bricks on their way to the device; holds back those that found no room."""
+        """Writes the bricks that are being sent to the device; holds back those without room."""
         sent, rest = batch[: shipment.sent], batch[shipment.sent :]
         if len(rest):
             self._mark(rest)

@@ -89,7 +89,7 @@ class RaySubsets:
         self.over = self.done == self.count
 
     def _choose(self, group: Tensor, in_grids: Sequence[int]) -> None:
-        """Sets the next pass to a group's rays on the coarsest grid of which more than 1/16 are in
+        """Sets the next pass to the group's rays on the coarsest grid of which more than 1/16 is in
         the group, else to the whole group; `in_grids` is the number of its rays on each grid.
         """
         for grid, size, here in zip(self._grids, self._sizes, in_grids, strict=True):
@@ -99,7 +99,7 @@ class RaySubsets:
         self.next, self._scouts = group.clone(), 0
 
     def trace_all(self) -> None:
-        """Sets the next pass, the last one, to all rays that are not done."""
+        """Sets the next pass to all rays that are not done."""
         self.next, self._scouts = self._open.clone(), 0
 
 

@@ -23,7 +23,7 @@ from .production import Production
 from .stats import COARSER_UNIT, Collected, Readbacks
 
 _MOST_LISTED = 1 << 14  # most nodes whose requests are listed, unless a batch holds more
-_WIDEN, _NARROW = 1.2, 0.97  # largest factors by which cones change from frame to frame
+_WIDEN, _NARROW = 1.2, 0.97  # most by which a frame widens cones, and by which it narrows them
 _WIDEST = 64.0
 _ROOMY = 0.85  # share of a pool: if less is used, cones become narrower
 
@@ -31,7 +31,7 @@ _ROOMY = 0.85  # share of a pool: if less is used, cones become narrower
 class Chosen(NamedTuple):
     """The nodes that are served first."""
 
-    node: Tensor  # (batch,) int64, -1 behind the last
+    node: Tensor  # (batch,) int64, -1 after the last
     priority: Tensor  # (batch,) int32 width of one of its voxels on the screen, 1/16 pixel
 
 
@@ -97,7 +97,7 @@ class RecordedFrame:
         return 0
 
     def finish(self, hits: Hits) -> Collected:
-        """Sorts slots by use and counts; slots that only `look` used do not count as used."""
+        """Sorts slots by use and counts; those used are the picture's, without those of `look`."""
         use, samples = in_branches(
             self.cache.sort_by_use, lambda: hits.samples.sum(dtype=torch.int64).view(1)
         )
@@ -117,7 +117,7 @@ class RecordedFrame:
         """Widens the next frame's cones if the pools can't hold what this one used and requested,
         and narrows them again, down to the camera's, if there is room. A surface needs bricks in
         proportion to the inverse square of the cones' width. `use` is from `Cache.sort_by_use`,
-        `count` from `compact_requests`: pending nodes count as requested.
+        `count` from `compact_requests`: every requested node, pending or not, may need a brick.
         """
         nodes, bricks = self.cache.nodes.capacity, self.cache.bricks.capacity
         taken = torch.stack(((use[3] + count[2]) / bricks, (use[1] + count[4]) / nodes)).amax()

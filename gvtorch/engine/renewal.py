@@ -44,7 +44,7 @@ def renew_tree(cache: Cache, made: ProducedTree, changes: Sequence[Where] | None
 
 def _renew_parts(cache: Cache, made: ProducedTree, changes: Sequence[Where]) -> bool:
     """Classifies the changed nodes again, all but the root, and drops their bricks. Returns False
-    if the producer fails to classify one; then the tree is unchanged except for its requests.
+    if the producer fails to classify one, or answers with aliases; then only requests are cleared.
     """
     nodes, n = cache.nodes, made.layout.branching**3
     tile = ((nodes.tree_t == made.tree.number) & (nodes.parent_t >= 0)).nonzero()[:, 0]
@@ -61,7 +61,7 @@ def _renew_parts(cache: Cache, made: ProducedTree, changes: Sequence[Where]) -> 
     try:
         answer = made.wait(batch.ask())
         regions = checked_regions(answer, batch.nodes, made.producer)
-    except Exception:  # the tree is dropped, and failures are reported by node
+    except Exception:  # the tree is dropped; its requests then report failures by node
         return False
     if regions.errors or regions.alias is not None:
         return False

@@ -1,4 +1,4 @@
-"""`RequestBatch`: what a producer is asked; and how its answer is prepared for writing."""
+"""`RequestBatch`: what a producer is asked, and how its answer is prepared for writing."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
 
 
 def _untold_range(cache: Cache, name: str, kind: Tensor, constant: Tensor | None) -> Tensor:
-    """Returns (k, 2, c) ranges not given: the constant (k, c) of CONSTANT nodes, else `limits`."""
+    """Returns (k, 2, c) ranges not given: constants (k, c) of CONSTANT nodes, else the dtype's."""
     channel = cache.bricks.channels[name]
     shape, dtype, device = (len(kind), channel.width), channel.dtype, kind.device
     ends = [torch.full(shape, end, dtype=dtype, device=device) for end in channel.limits]
@@ -227,7 +227,7 @@ def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, tuple[RequestBa
 def shipped(
     batch: RequestBatch, answer: Regions | Bricks, staging: Staging | None
 ) -> Regions | Bricks | Shipment:
-    """Sends a checked answer to the device if it is voxels on the host only; else returns it."""
+    """Sends a checked answer to the device if it is only voxels, on the host; else returns it."""
     if staging is None or not isinstance(answer, Bricks) or not on_host(answer.data):
         return answer
     kind = answer.kind
@@ -237,7 +237,7 @@ def shipped(
 
 
 def send_ahead(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
-    """Sends an answer if it is valid voxels on the host only; else returns it."""
+    """Sends an answer to the device if it is only valid voxels, on the host; else returns it."""
     data = answer.data if isinstance(answer, Bricks) else answer
     if not isinstance(data, Mapping) or not all(
         isinstance(rows, TableRows) or (isinstance(rows, Tensor) and rows.device.type == "cpu")

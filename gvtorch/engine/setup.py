@@ -33,8 +33,8 @@ class EngineOptions:
 
     Attributes:
         node_pool: Bytes of node words, constants and ranges; a number or a text as in "8 MB".
-            Bookkeeping (`Engine.memory`) takes about 50 bytes more for a tile of 8 nodes.
-        brick_pool: Bytes of voxels, likewise; bookkeeping takes 17 bytes more for a brick.
+            Bookkeeping (`Engine.memory`) takes about 50 bytes more per tile of 8 nodes.
+        brick_pool: Bytes of voxels, likewise; bookkeeping takes 17 bytes more per brick.
         device: Device of the pools, on which rays are traced.
         brick_size: Voxels along a side of a brick, without the border.
         border: Voxels around a brick; with 1 or more no seam shows.
@@ -43,8 +43,8 @@ class EngineOptions:
         load_budget: Most bricks made in a frame.
         subdivide_budget: Most node tiles made in a frame.
         time_budget: Most milliseconds of production in a frame; None: no limit.
-        scout_rounds: Most passes of scouts, at most a sixteenth of the rays, before a frame that
-            missed something.
+        scout_rounds: Most passes of scouts, each at most a sixteenth of the rays, before a picture
+            while something is missing.
         patience: Seconds until an answer that does not come is given up.
         coarse_share: Share of the brick slots that also hold coarse channels, if there are any.
         strict: Whether to raise when something can't be produced.

@@ -152,8 +152,8 @@ class Counts(NamedTuple):
     failed: int = 0
     ahead: int = 0  # nodes that only look-ahead rays missed
     subdivisions: int = 0  # of picture and look-ahead, if a frame may deepen by several levels
-    one_deeper: int = 0  # of these, those that want one more level
-    two_deeper: int = 0
+    one_deeper: int = 0  # of these, those that want at least one more level
+    two_deeper: int = 0  # and at least two
     coarser: int = COARSER_UNIT  # factor by which cones were wider than the camera's
 
     def by_kind(self) -> dict[str, int]:
@@ -166,7 +166,7 @@ class Collected(NamedTuple):
 
     requests: RequestList
     numbers: Tensor  # (11,) or (22,) int64 `Counts`, then the argument of `ask`
-    ask: Callable[[Tensor], int] | None = None  # called on the host; how many nodes it asked for
+    ask: Callable[[Tensor], int] | None = None  # called on the host; returns the number of nodes
 
 
 class Readback:

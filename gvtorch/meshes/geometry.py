@@ -113,7 +113,7 @@ class Geometry:
 
         Returns:
             (k, parts, parts, parts) bool, z y x: False where no triangle comes within reach of a
-            part; and bool, for those parts whether they lie inside the mesh.
+            part; and, of the same shape, whether such a part lies inside the mesh.
         """
         part = size_k / parts
         reach = (reach_k + _HALF_DIAGONAL * part) * (1 + 1e-3)  # exceeds float32's rounding

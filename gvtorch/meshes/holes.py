@@ -47,8 +47,8 @@ def rims(mesh: Mesh) -> tuple[list[Rim], np.ndarray]:
     part = np.full(len(mesh.faces), -1)
     own = part_of_faces(face, edge, len(faces), int(edge.max()) + 1)
     part[kept] = kept[own]
-    # Where triangles run along an edge more often than back, the rim runs back; if an edge has more
-    # triangles than that, the first ones are used.
+    # Where `spare` more triangles run along an edge one way than the other, the rim runs the other
+    # way, `spare` times; of the triangles that run the first way, the first ones are used.
     spare = np.abs(balance)[edge]
     ahead = np.sign(balance)[edge] == np.where(begin < end, 1, -1)
     order = np.lexsort((np.arange(len(edge)), edge))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 _LEAST = 1e-30  # least world size of a mesh, 1 / _LEAST the most: squares must be finite, not 0
-_WELDED = 2.0**40  # steps along a mesh's longest side; vertices that round to one step are one
+_WELDED = 2.0**40  # steps along a mesh's longest side; vertices that round alike are merged
 MOST_FACES = 2**28  # most triangles of a mesh: with their hierarchy, they would take 100 GB
 
 
@@ -208,8 +208,8 @@ def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 def facing_away(mesh: Mesh) -> np.ndarray:
     """Finds triangles that face the other way than most of their part. If exactly two triangles
     share an edge, they face the same way if they run along it in opposite directions; in each part
-    that is connected by such edges, the orientation with less area is returned. A part that can't
-    be oriented, such as a Moebius strip, is left as it is.
+    that is connected by such edges, those that face the way of less area are returned. A part that
+    can't be oriented, such as a Moebius strip, is left as it is.
 
     Returns:
         (m,) int64 triangles.
@@ -251,7 +251,7 @@ def _closed(faces: np.ndarray, counted: np.ndarray) -> np.ndarray:
 
 
 def part_of_faces(face: np.ndarray, edge: np.ndarray, faces: int, edges: int) -> np.ndarray:
-    """Returns (faces,) the lowest face number in each face's part; `face` i has `edge` i."""
+    """Returns (faces,) the lowest face number in each face's part; `face[i]` has `edge[i]`."""
     label = np.arange(faces)
     while True:
         least = np.full(edges, faces)

@@ -11,7 +11,7 @@ from torch import Tensor
 from .geometry import Geometry
 from .mesh import Mesh
 
-_CREASE = 0.9  # cosine of a corner's mean normal and its triangle's; an edge is sharp below this
+_CREASE = 0.9  # cosine between a corner's mean normal and its triangle's; less is a sharp edge
 
 
 class Paint:

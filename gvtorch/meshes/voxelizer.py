@@ -45,7 +45,7 @@ class GridSettings(TypedDict, total=False):
 
 
 def check_channels(where: str, channels: str | Sequence[str]) -> tuple[str, ...]:
-    """Returns the names as a tuple; raises ValueError if one is unknown or repeated, or if none."""
+    """Returns the names as a tuple; ValueError if there are none, or unknown or repeated ones."""
     names = (channels,) if isinstance(channels, str) else tuple(channels)
     unknown = [name for name in names if name not in CHANNELS]
     if unknown or not names or len({*names}) < len(names):

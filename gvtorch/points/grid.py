@@ -17,7 +17,7 @@ from ..base.boxes import extent_in
 from ..ops.splat import shares
 from .points import Points
 
-_MOST = 2**62  # codes that an int64 may count
+_MOST = 2**62  # most codes, which are int64
 
 
 class Codes:
@@ -112,7 +112,7 @@ class PointGrid:
         return levels
 
     def voxel(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns (m, 3) the finest voxels of positions (k, 3) in the box, and (k,) their mask."""
+        """Returns (m, 3) the finest voxels of those positions (k, 3) in the box, (k,) which are."""
         with np.errstate(over="ignore", invalid="ignore"):
             place = np.floor((positions.astype(np.float64) - self.low) / self.spacing_3)
             inside = ((place >= 0) & (place < self.extent)).all(1)
@@ -135,7 +135,7 @@ class PointGrid:
 
     def own_level(self, radius: np.ndarray) -> np.ndarray:
         """Returns (k,) the finest level whose voxels are at least as wide as the radii (k,) of
-        points: there, a point overlaps at most 3^3 voxels.
+        points, else the coarsest: there, a point overlaps at most 3^3 voxels.
         """
         own = np.zeros(len(radius), np.int64)
         for level in range(self.levels - 1):

@@ -21,8 +21,8 @@ class Points:
         values: (n, c) numbers that add up, such as mass, light, or premultiplied colour and
             opacity; (n,) counts as (n, 1); 1 each if left out.
         colors: (n, 3) linear red, green, blue, at least 0.
-        radius: (n,) world units, or one for all: a point's extent along each axis. 0, or left out:
-            the point lies in one voxel.
+        radius: (n,) world units, or one for all: how far a point extends from its position along
+            each axis. 0, or left out: the point lies in one voxel.
     """
 
     positions: Any

@@ -259,7 +259,7 @@ class _Maker:
         self.progress("adding up", self.grid.levels, self.grid.levels)
 
     def _below(self, level: int) -> tuple[Iterator[Rows], int]:
-        """Returns the nearest sums below a level, and how many of their voxels one of it holds."""
+        """Returns the nearest sums below a level, and how many of their voxels make one of it."""
         n = self.grid.branching**3
         if kept := [one for one in self.sums if one < level]:
             return self.sums[kept[-1]].blocks(self.block), n ** (level - kept[-1])

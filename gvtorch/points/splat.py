@@ -15,7 +15,7 @@ from .grid import Codes, peak
 from .sorted import SortedPoints
 from .table import Rows
 
-_CELL = 4  # voxels along a side up to which cells are made, in small cubes
+_CELL = 4  # voxels along a cell's side at most, unless cubes are large: see `_cells`
 _NEARLY = 1.001  # factor on a point's radius that covers rounding errors
 
 

@@ -201,7 +201,7 @@ def by_node(values: Grid, how: Reduction, brick_size: int, border: int) -> Grid:
 def _along(
     values: Grid, axis: int, how: Reduction, size: int, step: int, wide: str | None = None
 ) -> Grid:
-    """Reduces windows, `step` apart, along one axis; sums are of dtype `wide`, or wide enough."""
+    """Reduces windows, `step` apart, along one axis; sums have dtype `wide`, or one wide enough."""
     if how == "mean" and wide is None:
         wide = _wide(_name(values), size)
     count = (values.shape[axis] - size) // step + 1

@@ -141,7 +141,7 @@ class N3Tree:
 
     @property
     def place(self) -> Tensor:
-        """(3, 3) float64 that kernels transform rays into the tree with: the scene's low corner in
+        """(3, 3) float64 by which kernels transform rays into tree units: the scene's low corner in
         the world, the world size of the root cube, the scene's high corner in tree units.
         """
         if self._place is None or self._place.device != self.device:
@@ -241,7 +241,7 @@ class N3Tree:
             volume: A volume, which becomes channel "value", or one volume for each channel, all of
                 one extent, spacing and origin.
             brick_size: Voxels along a side of a brick without border, >= 2.
-            border: Voxels around a brick; from 1 on no seam shows.
+            border: Voxels around a brick; with 1 or more no seam shows.
             branching: N >= 2.
             threshold: Regions with no value above it are EMPTY: they are never drawn, whatever the
                 transfer function. None keeps every value. Not allowed if all channels are labels.
@@ -298,7 +298,7 @@ class N3Tree:
         """Returns the finest voxels of a channel, by default the first, as they are in the bricks
         now. For an unedited tree from `from_volume` they are the original volume.
 
-        Regions that a threshold made EMPTY are filled with their mean.
+        Each region that a threshold made EMPTY is filled with its mean.
 
         Raises:
             ValueError: There is no such channel, it is a coarse one, or not all of the tree is in
@@ -375,7 +375,7 @@ class N3Tree:
         return name
 
     def levels(self) -> BrickLevels:
-        """Returns what reads and writes the voxels of a fully resident tree."""
+        """Returns the levels of a fully resident tree, to read and write its voxels."""
         return BrickLevels(
             nodes=self.nodes,
             bricks=self.bricks,

@@ -69,7 +69,8 @@ def volumes_by_channel(where: str, volume: Volume | Mapping[str, Volume]) -> dic
 
     Arrays become volumes, see `as_volume`.
 
-    Raises ValueError if there is none, one is no volume, or they differ in place or extent.
+    Raises ValueError if there is none, one is not a volume, or they differ in extent, spacing or
+    origin.
     """
     given = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
     volumes = {
@@ -145,7 +146,7 @@ class _Pool:
 
 
 def _moved(value: Any, device: torch.device | str) -> Any:
-    """A tensor on a device, a leaf that requires gradients if it did; anything else as it is."""
+    """Returns a tensor on a device, as a leaf that requires gradients if it did; else the value."""
     if not isinstance(value, Tensor):
         return value
     there = value.detach().to(device)
@@ -353,7 +354,7 @@ class BrickPool(_Pool):
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Lets the block write voxels and their ranges: this is no edit."""
+        """Lets the block write voxels and their ranges: this does not count as an edit."""
         self.edited()
         yield
         self._known = {name: _state(self.bricks[name]) for name in self._known}

@@ -131,7 +131,7 @@ class BrickLevels:
             _ChannelLevels(self, name, how, spacing, empty.get(name))
             for name, how in filters.items()
         ]
-        if any(how != "mean" for how in filters.values()):  # constants are no coarse voxels
+        if any(how != "mean" for how in filters.values()):  # constants may be no coarse voxels
             low, high = (0, 0, 0), self.extent
         begin, end = low, high
         levels = []
@@ -152,7 +152,7 @@ class BrickLevels:
             self._write(summaries, node, exact, threshold)
 
     def _nodes_in_reach(self, level: int, begin: Place, end: Place) -> tuple[Place, Place]:
-        """Returns the nodes (first, after the last) whose bricks with borders hold these voxels."""
+        """Returns the nodes (first, after the last) whose bricks or borders hold any of these."""
         size, border = self.bricks.brick_size, self.bricks.border
         first = tuple(max(0, (at - border) // size) for at in begin)
         ends = zip(end, self.shape(level), strict=True)

@@ -1,8 +1,8 @@
 """`Staging`: sends bricks from the host to the device while the device renders; `BrickTable`:
 bricks that a producer keeps ready in host memory; `mapped`: host memory that the device reads.
 
-Bricks are gathered chunk by chunk into a ring of pinned memory, copied on a stream of their own,
-and written into their slots by the stream that renders, which waits for each copy by an event. One
+Bricks are gathered chunk by chunk into a ring of pinned memory, copied on a separate stream, and
+written into their slots by the stream that renders, which waits for each copy by an event. One
 chunk is gathered, in torch's threads, while the one before is copied. Bricks already in pinned
 memory are copied from there.
 
@@ -27,7 +27,7 @@ from ..base import check
 
 _MOST = 256 * 10**6  # most bytes of a ring
 _CHUNKS = (2 * 10**6, 16 * 10**6)  # bytes of a chunk: smaller is all overhead, larger overlaps less
-_SMALL = 64 * 10**6  # bytes that are copied, not mapped: the device reads its own memory faster
+_SMALL = 64 * 10**6  # most bytes copied, not mapped: the device reads its own memory faster
 _ALIGN = 16  # bytes: alignment of channels in a chunk
 _WORDS = {8: torch.int64, 4: torch.int32, 2: torch.int16, 1: torch.uint8}
 
