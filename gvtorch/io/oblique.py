@@ -84,7 +84,7 @@ class StraightSource(VolumeSource):
         box: tuple[Sequence[int], Sequence[int]],
         out: np.ndarray,
     ) -> None:
-        """Writes a box (z, y, x, c) from inner values (z, y, x, c), the first of voxel `start`."""
+        """Writes a box (z, y, x, c) from inner values (z, y, x, c), of voxels from `start` on."""
         places = np.broadcast_arrays(*self._places(*box))
         shape = self.inner.extent[::-1]
         inside = np.logical_and.reduce(
@@ -122,7 +122,7 @@ def straighten(
 
     The new spacing along an axis of the world is that of the voxels in that direction, and the grid
     covers the source's whole box. Voxels outside that box are 0 for labels, else the smallest value
-    of the source's current time point.
+    at the source's `time`.
 
     Args:
         source: Returned as it is, if its axes are parallel to the world's.
