@@ -1,4 +1,4 @@
-"""`straighten`: resamples a source whose voxel axes are not parallel to the world's along those.
+"""`straighten`: resamples a source along the world's axes if its own are not parallel to them.
 
 Values are interpolated (trilinear, float64); labels are those of the nearest voxel. A region of the
 result reads only the voxels of the source that it overlaps, and has the same bits as in the whole.

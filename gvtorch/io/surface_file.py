@@ -74,7 +74,7 @@ class SurfaceFile:
         self._stack.__exit__(*error)
 
     def add(self, places: np.ndarray, faces: np.ndarray) -> None:
-        """Adds vertices, (v, 3) float64 world x y z, and triangles, (f, 3), of all vertices."""
+        """Adds vertices, (v, 3) float64 world x y z, and triangles, (f, 3) numbers of vertices."""
         self.vertices += len(places)
         self.triangles += len(faces)
         if self.vertices > _MOST:

@@ -43,7 +43,7 @@ class Hdf5Source(VolumeSource):
     valid: tuple[float, float] = (-math.inf, math.inf)  # packed values outside are missing
 
     def as_labels(self) -> Self:
-        """See `VolumeSource`; values that mean missing become labels like others."""
+        """See `VolumeSource`; unless values are scaled, those that mean missing become labels."""
         found = super().as_labels()
         if self.scale:
             return found
