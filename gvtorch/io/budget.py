@@ -31,7 +31,7 @@ _LOOK = 0.05  # seconds between two checks
 
 
 class _TooMuch(BaseException):
-    """Ends the reading thread's work; no `Exception`, because libraries may swallow those."""
+    """Ends the reading thread's work; not an `Exception`, because libraries may swallow those."""
 
 
 def check_regular(path: str | Path) -> None:

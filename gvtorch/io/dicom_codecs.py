@@ -1,8 +1,8 @@
 """Decodes compressed DICOM frames with imagecodecs, as a decoding plugin of pydicom: RLE, JPEG (8
 and 12 bits, lossless), JPEG-LS, JPEG 2000 and High-Throughput JPEG 2000.
 
-The size in a frame's own header is compared with the file's header before it is decoded; RLE frames
-have no header, and are decoded to no more bytes than the file's header states.
+The size in a frame's own header is compared with the file's header before the frame is decoded; RLE
+frames do not state it, and are decoded to no more bytes than the file's header allows.
 Source: DICOM PS3.5, annex A.
 """
 

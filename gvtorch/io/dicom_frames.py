@@ -44,7 +44,7 @@ class DicomFrame:
     position: Triple | None  # of the first voxel's centre, LPS millimetres
     orientation: tuple[float, ...] | None  # of rows, then of columns
     spacing: tuple[float, float]  # between rows, between columns
-    between: float | None  # millimetres between slices, for those without positions
+    between: float | None  # millimetres between slices, where positions do not give it
     moments: dict[str, float] = field(default_factory=dict)  # its values of `_APART`
 
 
@@ -121,8 +121,8 @@ def order_frames(where: str, frames: Sequence[DicomFrame]) -> Ordered:
     """Sorts frames by time and position.
 
     Raises:
-        ValueError: Slices differ in orientation or spacing, are missing, not evenly spaced or not
-            on a line, or no attribute distinguishes several images at one position.
+        ValueError: Slices differ in orientation, spacing or number of images, are missing, not
+            evenly spaced or not on a line, or no attribute distinguishes the images of a slice.
     """
     first = frames[0]
     for frame in frames:
@@ -253,7 +253,7 @@ def _step(where: str, places: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def image_info(header: Any, samples: int, moments: dict[str, Any]) -> tuple[ImageInfo, list[str]]:
-    """Returns what the header says of the values, and which of it is not kept."""
+    """Returns the header's metadata of the values, and which metadata is not kept."""
     lost = []
     kind = str(header.get("PhotometricInterpretation", ""))
     if kind == "PALETTE COLOR":

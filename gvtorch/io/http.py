@@ -27,7 +27,7 @@ REFUSED = 30.0  # seconds for which a file is not requested again after `Endless
 _REASONS = 1000  # errors that are remembered
 _NOT = (0.0, "")
 _refused: dict[str, tuple[float, str]] = {}  # by URL: until when it is refused, and why
-SMALL = 1 << 20  # bytes that any file may take, even if its content should take fewer
+SMALL = 1 << 20  # bytes that any file may take in addition to what its content may take
 _PART = 1 << 16  # bytes
 _SILENT = 1.0  # seconds without a byte after which `ask_again` aborts a request
 _KEPT = 16  # idle connections that are kept open to a server
@@ -38,14 +38,14 @@ _CLOSED = (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError
 
 
 class Endless(OSError):
-    """A file is larger than it can rightly be, or may never end: a server stalls, it is a pipe."""
+    """A file is larger than it may be, or may never end: its server stalls, or it is a pipe."""
 
 
 class HttpStatus(OSError):
     """The server answered with an error.
 
     Attributes:
-        status: The status code, as 503.
+        status: The status code, such as 503.
     """
 
     def __init__(self, status: int, reason: str) -> None:
@@ -78,8 +78,8 @@ def read_http(
         url: The file.
         most: Largest number of bytes to return.
         part: The range of bytes; a negative start counts from the end of the file.
-        whole: Largest size of the whole file in bytes, because servers without support for ranges
-            send all of it; None: `most`.
+        whole: Largest size in bytes of the whole file, which a server without support for ranges
+            sends instead of the part; None: `most`.
         seconds: Time limit.
 
     Raises:
@@ -185,7 +185,7 @@ def _content(
             more = answer.read1(_PART)
         except TimeoutError:
             raise
-        except Exception as error:  # http.client has its own kinds
+        except Exception as error:  # http.client has its own exceptions
             raise OSError(one_line(error)) from None
         if not more:
             break
@@ -291,7 +291,7 @@ class _Connections:
             self._waiting[connection] = time.monotonic(), sock
 
     def break_off(self, before: float) -> None:
-        """Shuts down connections that are silent since `before`; reading from them then fails."""
+        """Shuts down connections that were silent since `before`; reading from them fails."""
         with self._lock:
             silent = [sock for since, sock in self._waiting.values() if since < before]
         for sock in silent:

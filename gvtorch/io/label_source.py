@@ -47,7 +47,7 @@ class IndexSource(VolumeSource):
         )
 
     def staged(self, folder: Path) -> IndexSource:
-        """Reads the labels from `LABELS` in the folder, which has been written before."""
+        """Returns a source that reads its labels from the existing file `LABELS` in the folder."""
         return replace(self, inner=self.inner.staged(folder), labels=str(folder / LABELS))
 
     def read_stored(self, index: Index) -> np.ndarray:
@@ -81,7 +81,7 @@ def indexed_source(
     its values are no labels, are indexed already, or have at most 16 bits.
 
     Args:
-        source: Any.
+        source: Any source.
         time: The time point that is wanted; None: all.
         workers: Threads that read, up to 8; None: one per core.
         folder: Holds `LABELS`, if that has been written before; else the whole source is read once.

@@ -48,7 +48,8 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
     Raises:
         FileNotFoundError: The file or the texture does not exist.
         ValueError: The file has another format, is damaged, has no triangles, positions that are
-            NaN or indices out of range, or refers to a missing file; or it is no path.
+            NaN or indices out of range, or needs a texture or buffer that is missing or in another
+            folder; the mesh has no texture coordinates for `texture`; or an argument is no path.
         ImportError: trimesh is not installed.
     """
     check.instance("read_mesh", "path", path, str, PathLike)
@@ -152,7 +153,7 @@ def _check_textures(images: list[Any], size: int) -> None:
 
 def _check_gltf(ending: str, content: bytes) -> None:
     """Raises ValueError for accessors that claim more values than their buffer holds, or whose
-    numbers trimesh would not find and read as zeros.
+    numbers trimesh would not find, and would read as zeros.
     """
     if ending == "glb":
         content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
@@ -169,7 +170,7 @@ def _check_gltf(ending: str, content: bytes) -> None:
 
 
 def _count(word: bytes) -> int:
-    """Returns the number in a header's word, 0 if it is none; 19 digits are enough to compare."""
+    """Returns the number in a header's word, 0 if it is none; 19 digits suffice to compare it."""
     return int(word.lstrip(b"0")[:19] or b"0") if word.isdigit() else 0
 
 
@@ -218,7 +219,7 @@ class _Beside:
         inside = file.is_relative_to(self._folder.resolve())
         if not inside or not file.is_file():
             where = "is not there" if inside else "is in another folder"
-            # An OBJ may name a material library that was not kept: the mesh is white then.
+            # An OBJ may name a material library that does not exist: the mesh is white then.
             if not plain.lower().endswith(".mtl"):
                 self.missing = f"names {plain}, which {where}"
             raise FileNotFoundError(f"{plain} {where}")

@@ -1,4 +1,4 @@
-"""`straighten`: resamples a source whose voxel axes are not parallel to the world's along those.
+"""`straighten`: resamples a source along the world's axes if its own are not parallel to them.
 
 Values are interpolated (trilinear, float64); labels are those of the nearest voxel. A region of the
 result reads only the voxels of the source that it overlaps, and has the same bits as in the whole.
@@ -84,7 +84,7 @@ class StraightSource(VolumeSource):
         box: tuple[Sequence[int], Sequence[int]],
         out: np.ndarray,
     ) -> None:
-        """Writes a box (z, y, x, c) from inner values (z, y, x, c), the first of voxel `start`."""
+        """Writes a box (z, y, x, c) from inner values (z, y, x, c), of voxels from `start` on."""
         places = np.broadcast_arrays(*self._places(*box))
         shape = self.inner.extent[::-1]
         inside = np.logical_and.reduce(
@@ -122,7 +122,7 @@ def straighten(
 
     The new spacing along an axis of the world is that of the voxels in that direction, and the grid
     covers the source's whole box. Voxels outside that box are 0 for labels, else the smallest value
-    of the source's current time point.
+    at the source's `time`.
 
     Args:
         source: Returned as it is, if its axes are parallel to the world's.

@@ -1,5 +1,5 @@
 """Decompression that is bounded by the size stated in a file's header: data that would unpack to
-more is damaged. `PackedSource` is an array packed as a whole (zlib, gzip, bzip2, text).
+more counts as damaged. `PackedSource` is an array packed as a whole (zlib, gzip, bzip2, text).
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ _JPEG_FRAMES = {*range(0xC0, 0xD0), 0xF7} - {0xC4, 0xC8, 0xCC}  # of JPEG and of
 _JPEG_SCAN = 0xDA
 _BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
 _RATIOS = ((1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))  # of JPEG XL
-_MOST_LAYERS = 64  # numbers per pixel of LERC
+_MOST_LAYERS = 64  # values per pixel of LERC
 _LONG = (9, 13, 18, 30)  # bits of a side of JPEG XL
 _JXL_HEADER = 32  # bytes; more than the fields that are read take
 
@@ -132,7 +132,7 @@ def _jpegxr_size(packed: bytes) -> tuple[int, int] | None:
 
 
 def _jpegxl_size(packed: bytes) -> tuple[int, int] | None:
-    """Returns None for animations, and for images with a preview before the picture."""
+    """Returns (columns, rows); None for animations, and for images with a preview before them."""
     if packed[4:8] == b"JXL ":
         packed = b"".join(_jpegxl_parts(packed))[:_JXL_HEADER]
     if packed[:2] != b"\xff\x0a" or len(packed) < 14:

@@ -92,8 +92,9 @@ def read_points(path: str | Path, **names: Unpack[ColumnNames]) -> Points:
             list or with commas between them ("x,y,z"). If left out, positions are x, y and z, or
             a column of three numbers whose name begins with position, pos, xyz, points or coord;
             values one that begins with value, mass, lumin, intensit, weight, flux, bright or
-            densit; colors red, green and blue, r, g and b, or one that begins with color, colour or
-            rgb; radius one that begins with radius, radii or smoothing, or a number for all.
+            densit; colors red, green and blue, or r, g and b, or one that begins with color, colour
+            or rgb; radius one that begins with radius, radii or smoothing. `radius` may also be one
+            number for all points.
 
     Returns:
         The points. Colours that are whole numbers are read as sRGB, others as linear.
@@ -169,7 +170,7 @@ def _read_fits(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_ply(path: Path) -> dict[str, np.ndarray]:
-    """Returns the columns of the vertices; elements before them must have rows of fixed size."""
+    """Returns the columns of the vertices; only binary rows of fixed size may precede them."""
     with path.open("rb") as file:
         head = file.read(_MOST_HEADER)
         lines = head.partition(b"end_header")[0].decode("ascii").splitlines()

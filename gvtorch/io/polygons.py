@@ -27,7 +27,7 @@ def cut_polygons(content: bytes) -> bytes:
     if not faces:
         return content
     places = np.array([found.groups() for found in _VERTEX.finditer(content)], np.float64)
-    cut: dict[int, tuple[re.Match[bytes], list[list[int]]]] = {}  # by the begin of the line
+    cut: dict[int, tuple[re.Match[bytes], list[list[int]]]] = {}  # by the offset of the line
     for count, some in faces.items():
         words = re.sub(rb"/\S*", b"", b" ".join(found[1] for found in some)).split()
         corner = np.array(words, np.int64).reshape(-1, count)

@@ -56,8 +56,8 @@ def read_volume(
 
     `gvtorch info` and docs/formats.md list the formats. RAW has x as its fastest axis. NumPy arrays
     are (z, y, x), or (z, y, x, c) with at most 4 channels; others need `axes`. NIfTI and NRRD axes
-    that are parallel to the world's are reordered to x, y, z; oblique ones are resampled. A warning
-    reports resampling, and metadata that is not kept.
+    that are parallel to the world's are reordered and flipped to x, y, z; oblique ones are
+    resampled. A warning reports resampling, and metadata that is not kept.
 
     Args:
         path: The file, a folder of slices, `file.h5:/dataset`, a URL (a file is downloaded, see
@@ -69,7 +69,7 @@ def read_volume(
         time: Index of the time point; if left out, the first, with a warning if there are more.
         oblique: What to do if voxel axes are not parallel to the world's: "resample" (the default),
             or "keep", which keeps the voxels and uses their axes as the world's.
-        labels: Values are numbers of objects, see `Volume`; also set if the file says so.
+        labels: Values are label numbers, see `Volume`; also set if the file says so.
         **options: RAW, and files of unknown ending: shape, (x, y, z) voxels, dtype, a NumPy dtype
             as in "int16" or ">i2" (if left out, from `_XxYxZ_dtype` in the name), and offset, bytes
             of a header to skip. key: which of several arrays, series, scenes or images. Formats
@@ -160,7 +160,7 @@ def open_source(
 
 
 def _find(path: Any, given: dict[str, Any]) -> tuple[str, str, Callable[..., VolumeSource]]:
-    """Returns a volume's name in messages, its format's name, and what opens it with `given`."""
+    """Returns a volume's name in messages, its format, and its opener; may put `key` in `given`."""
     if not isinstance(path, (str, PathLike)):
         text, kind = "array", "an array"
         opener: Callable[..., VolumeSource] = partial(as_source, "read_volume", path)

@@ -1,9 +1,9 @@
 """`through`: lets tensorstore read the folder at a URL by way of a relay, a server in this process.
 
 tensorstore accepts whatever a server sends, for however long. So it asks the relay instead, on
-127.0.0.1 and under a secret path. The relay reads the file, or the part of it, with `read_http` (of
-s3:// and gs:// with `read_within`) and answers once it has all of it; it refuses files that are
-longer than a chunk can be, and servers that stall or send too slowly.
+127.0.0.1 and under a secret path. The relay reads the file, or the part of it, with `read_http`
+(from s3:// and gs:// with `read_within`) and answers once it has all of it; it refuses files that
+are longer than a chunk can be, and servers that stall or send too slowly.
 """
 
 from __future__ import annotations
@@ -149,11 +149,11 @@ def read_within(
     folder: Any, name: str, part: slice | None, most: int, wait: Callable[[Any], Any]
 ) -> bytes | None:
     """Returns the content of a file in a key-value store of tensorstore, or a part of it; None if
-    there is no such file. Before a whole file, the byte after `most` is requested, as a check.
+    there is no such file. Before a whole file is read, the byte after `most` is requested.
 
     Raises:
         Endless: The file has more than `most` bytes.
-        Exception: What `wait` raises, which returns a future's result.
+        Exception: What `wait` raises, a function that returns a future's result.
     """
     if part is None:
         try:

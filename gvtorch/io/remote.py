@@ -64,8 +64,8 @@ def cache_limit() -> int:
 
 
 def fetch(url: str) -> Path:
-    """Returns a local copy of the file, downloaded unless the one in the cache is up to date. With
-    a warning it returns the one in the cache where the server does not answer.
+    """Returns a local copy of the file, downloaded unless the one in the cache is up to date. If
+    the server can't be reached or fails, returns the one in the cache, with a warning.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -209,7 +209,7 @@ def _download(url: str, folder: Path, stream: IO[bytes], size: int | None) -> Pa
 def _read(url: str, stream: IO[bytes]) -> bytes:
     try:
         return stream.read(_PART)
-    except Exception as error:  # http.client and fsspec's file systems have their own kinds
+    except Exception as error:  # http.client and fsspec have exceptions of their own
         raise OSError(f"{url}: is cut off: {_reason(error)}") from None
 
 

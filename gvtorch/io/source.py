@@ -104,7 +104,7 @@ class VolumeSource(ABC):
         )
 
     def size(self, axis: str) -> int:
-        """Returns the size along an axis; 1 if the array does not have it."""
+        """Returns the size along an axis; 1 if the array lacks the axis."""
         return self.shape[self.axes.index(axis)] if axis in self.axes else 1
 
     def at_time(self, time: int) -> Self:
@@ -112,7 +112,7 @@ class VolumeSource(ABC):
         return self if time == self.time else dataclasses.replace(self, time=time)
 
     def as_labels(self) -> Self:
-        """Returns the source as one of labels: its values are numbers of objects, kept exactly."""
+        """Returns the source as one of labels: its values are label numbers, kept exactly."""
         return dataclasses.replace(self, info=dataclasses.replace(self.info, labels=True))
 
     def staged(self, folder: Path) -> VolumeSource:
@@ -120,7 +120,7 @@ class VolumeSource(ABC):
         return self
 
     def fingerprint(self) -> list[Any] | None:
-        """Returns values that change if the content does; None if those of the path's files do."""
+        """Returns values that change with the content; None if the files at `path` identify it."""
         return None
 
     def command(self, store: str) -> tuple[str, ...]:

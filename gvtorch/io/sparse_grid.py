@@ -98,7 +98,7 @@ class SparseGrid(ABC):
         return out[tuple(slice(x - s, y - s) for x, y, s in zip(a, b, start, strict=True))]
 
     def _pieces(self, low: np.ndarray, high: np.ndarray, axis: int, across: int) -> np.ndarray:
-        """Fills a box piece by piece along an axis; a layer of its leaves has `across` voxels."""
+        """Fills a box in pieces along an axis; a cross-section of leaves has `across` voxels."""
         side = SIDES[2]
         step = max(side, _WHOLE // across // side * side)
         out = np.empty((*(high - low), len(self.background)), self.dtype)

@@ -56,11 +56,11 @@ def extract_surface(
         value: The value on the surface; for labels, the label.
         level: Level of a store or a tree; 0 is the finest. Voxels of coarse levels are means, so
             thin structures vanish.
-        component: Index of the component (a number of each voxel).
+        component: Index of the component, if voxels hold several numbers.
         channel: Channel of a tree; the first if left out.
         caps: Closes the surface where it leaves the box. Else it ends at the outermost voxel
             centres.
-        progress: Called with the number of blocks done.
+        progress: Called with ("surface", blocks done, blocks in all).
 
     Returns:
         Triangles, counter-clockwise seen from lower values; every edge belongs to two triangles,
@@ -196,7 +196,7 @@ class _Grid:
 
     def crossed(self, low: Sequence[int], high: Sequence[int]) -> bool:
         """Returns whether samples low to high may lie on both sides of the value: judged by the
-        cells of a store, without reading voxels; true if there are none.
+        cells of a store, without reading voxels; true if there are no cells.
         """
         store = self.what
         outside = self.more and any(

@@ -74,7 +74,9 @@ class SurfaceFile:
         self._stack.__exit__(*error)
 
     def add(self, places: np.ndarray, faces: np.ndarray) -> None:
-        """Appends vertices, (v, 3) float64 world x y z, and triangles, (f, 3) vertex indices."""
+        """Appends vertices, (v, 3) float64 world x y z, and triangles, (f, 3) indices of all
+        vertices added so far.
+        """
         self.vertices += len(places)
         self.triangles += len(faces)
         if self.vertices > _MOST:

@@ -101,7 +101,7 @@ def check_pictures(pages: Iterable[Any]) -> None:
 
 
 def _checked(frame: Any, decode: Callable[..., Any]) -> Callable[..., Any]:
-    """Wraps the `decode` of a page: it raises ValueError for pictures larger than their tile."""
+    """Wraps a page's `decode` to raise ValueError for pictures larger than their tile or strip."""
     is_jpeg = frame.compression in JPEG
     wide, tall = frame.tilewidth, frame.tilelength
     if not frame.is_tiled:

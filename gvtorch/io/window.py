@@ -42,7 +42,7 @@ def window(
             a quarter or more of the values, close together in the lower half. The window goes from
             the end of the background to the 99th percentile of the values above; without a
             background, from the 1st to the 99th percentile of all values.
-        component: Index of the component (a number of each voxel) to look at.
+        component: Index of the component, if voxels hold several numbers.
         background: Shows the background too: the low end is the 1st percentile of all values, as
             pictures of slices need it.
 
@@ -129,8 +129,8 @@ def _boxes(size: Zyx) -> list[tuple[Zyx, Zyx]]:
 
 
 def _background(values: np.ndarray) -> float | None:
-    """Returns the value at which the background ends: twice as far above the highest peak of the
-    histogram as the count drops to half; None if there is no background, or nothing else.
+    """Returns the value at which the background ends: twice as far above the peak of the histogram
+    as the value where the count is down to half; None if there is no background, or nothing else.
     """
     low, high = (float(end) for end in np.percentile(values, (0.01, 99.99)))
     step = (high - low) / int(np.clip(values.size**0.5 / 2, 16, _BINS))

@@ -28,8 +28,8 @@ _ENDINGS = (".h5", ".hdf5", ".hdf", ".he5", ".h5ad", ".ilp", ".nc", ".nc4", ".cd
 _MOST_CHUNK = 1 << 31  # bytes
 _MOST_SETS = 100_000
 _KIND = " of three or more axes"  # the data sets that messages list
-_MOST_LINKS = 16  # in a chain
-_MOST_PLACES = 1 << 24  # coordinates of an axis that are read
+_MOST_LINKS = 16  # that lead to one another
+_MOST_PLACES = 1 << 24  # coordinates of an axis, above which they are not read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,11 +39,11 @@ class Hdf5Source(VolumeSource):
     name: str
     packed: str  # dtype of the values in the file, according to its attributes
     scale: tuple[float, float] | None = None  # factor and offset of packed values
-    missing: tuple[float, ...] = ()  # packed values that mark missing ones
-    valid: tuple[float, float] = (-math.inf, math.inf)  # packed values beyond mark missing ones
+    missing: tuple[float, ...] = ()  # packed values that mean missing
+    valid: tuple[float, float] = (-math.inf, math.inf)  # packed values outside are missing
 
     def as_labels(self) -> Self:
-        """See `VolumeSource`; a value that marks missing ones is a label like others."""
+        """See `VolumeSource`; unless values are scaled, those that mean missing become labels."""
         found = super().as_labels()
         if self.scale:
             return found
@@ -143,7 +143,7 @@ def _check_files(path: str, file: Any, name: str, left: int = _MOST_LINKS) -> No
 
 def _check_other(path: str, other: str, name: str | None, left: int) -> None:
     """Checks a file that `path` refers to, and those that it refers to. It must lie in the folder
-    of `path` or below. HDF5 may find it in that folder, or in the process's: both are checked.
+    of `path` or below. HDF5 may find it there, or from the working directory: both are checked.
     """
     import h5py
 

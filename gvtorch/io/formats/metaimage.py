@@ -124,7 +124,7 @@ def _placed(
 
 
 def _info(header: dict[str, str], width: int, rank: int) -> ImageInfo:
-    """Returns what the header says of the values."""
+    """Returns the header's metadata of the values."""
     modality, steps = header.get("Modality", ""), header.get("ElementSpacing", "").split()
     step = float(steps[3]) if rank == len(steps) == 4 else 0.0
     color = width == 3 and header["ElementType"].startswith("MET_UCHAR")

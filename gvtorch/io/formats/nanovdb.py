@@ -212,7 +212,9 @@ class NodeFormat(NamedTuple):
 
     @classmethod
     def of(cls, kind: str, dtype: str, width: int) -> NodeFormat:
-        """Computes the layout that a compiler gives to the structs of a type of values."""
+        """Computes the layout that a compiler gives to the structs of a type of values: smallest,
+        largest (in a root after the background), then mean and deviation.
+        """
         item = np.dtype(dtype).itemsize
         value = item * width
         mean = item if dtype == "|b1" else 8 if item == 8 else 4

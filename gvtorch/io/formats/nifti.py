@@ -1,5 +1,5 @@
 """NIfTI, read with nibabel: (x, y, z), then time, then components. Axes parallel to the world's,
-which are x right, y anterior, z superior, are reordered to x, y, z.
+which are x right, y anterior, z superior, are reordered and flipped to x, y, z.
 
 Source: "NIfTI-1 data format", nifti1.h (nifti.nimh.nih.gov), dim, xyzt_units, intent_code, cal_max.
 """
@@ -75,7 +75,7 @@ def open_nifti(path: str) -> NiftiSource:
 
 
 def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
-    """Returns what the header says of the values, and which of it is not kept."""
+    """Returns the header's metadata of the values, and which metadata is not kept."""
     header, lost = image.header, []
     try:
         length, period = header.get_xyzt_units()

@@ -1,5 +1,5 @@
 """NRRD, attached or detached; pynrrd reads the header. Axes parallel to the world's are reordered
-to x, y, z. The world's axes stay those of the file's space, which `ImageInfo.space` names.
+and flipped to x, y, z. The world's axes stay those of the file's space, see `ImageInfo.space`.
 
 Source: "Definition of NRRD File Format" (teem.sourceforge.net/nrrd/format.html).
 """
@@ -27,7 +27,7 @@ _ENCODINGS = {
     **dict.fromkeys(("gz", "gzip"), "zlib"),
     **dict.fromkeys(("bz2", "bzip2"), "bz2"),
 }
-_MOST_SKIPPED = 1 << 24  # bytes of a line, or of unpacked data
+_MOST_SKIPPED = 1 << 24  # bytes to skip at most: of one line, or of unpacked data
 _SPACES = {"ras": "right-anterior-superior", "las": "left-anterior-superior"}
 _SPACES["lps"] = "left-posterior-superior"
 _SPATIAL = ("domain", "space")
@@ -192,7 +192,7 @@ def _affine(header: dict[str, Any], letters: str) -> np.ndarray:
 def _info(
     header: dict[str, Any], letters: str, shape: tuple[int, ...]
 ) -> tuple[ImageInfo, list[str]]:
-    """Returns what the header says of the values, and which of it is not kept."""
+    """Returns the header's metadata of the values, and which metadata is not kept."""
     own = [str(name) for name in header if str(name).lower() not in _FIELDS]
     lost = [f"the field {name!r}" for name in header if str(name).lower() in _UNKEPT]
     if own:

@@ -217,7 +217,7 @@ def _entries(data: Any) -> tuple[int, list[Entry]]:
         unique, tree, parent = cursor.text(), cursor.text(), cursor.text()
         at, leaves_at, end = cursor.numbers("<3q")
         begin = cursor.at
-        ordered = at <= end if parent else at <= leaves_at <= end  # one that shares has no leaves
+        ordered = at <= end if parent else at <= leaves_at <= end  # with a shared tree, no leaves
         if not (begin <= at and ordered and end <= len(data)):
             raise ValueError(
                 f"a grid from {at} to {end}, its leaves at {leaves_at}, in a file of {len(data)} "
@@ -256,7 +256,7 @@ def _read_head(data: Any, entry: Entry, version: int) -> None:
 class _Packing:
     """How the values of a grid's nodes are stored.
 
-    A byte says what inactive values are; if only active values are stored (`_ACTIVE`), they follow.
+    A byte says what inactive values are; with `_ACTIVE`, only the active ones are stored after it.
     0: the background; 1: minus the background; 2: a number, which is stored; 3: minus the
     background or the background; 4: a stored number or the background; 5: one of two stored
     numbers; of 3 to 5 a mask says which of the two; 6: all values are stored.
@@ -438,7 +438,7 @@ class _Topology:
         self.places[2].append(np.unpackbits(masks, axis=1).sum(1, dtype=np.int64))
 
     def _leaves(self, kind: str, active: list[int]) -> np.ndarray:
-        """Returns the offset of each leaf; `active` are the numbers of their active voxels."""
+        """Returns the offset of each leaf; `active` has the count of active voxels of each."""
         cursor, places = self.cursor, np.empty(len(active), np.int64)
         for number, count in enumerate(active):
             places[number] = cursor.skip(VOXELS // 8)

@@ -225,7 +225,7 @@ def _read_all(path: str, size: int) -> bytes:
 
 
 def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
-    """Returns the arrays of a piece: those marked as scalars, then others; at points, in cells."""
+    """Returns the arrays of a piece: the scalars first; within both groups, points before cells."""
     found: list[dict[str, Any]] = []
     numbers = {id(item): at for at, item in enumerate(root.iter("DataArray"))}
     for kind in ("PointData", "CellData"):

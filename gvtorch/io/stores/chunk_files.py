@@ -31,7 +31,7 @@ _BLOSC = 8  # bytes read of its header; the last four are the unpacked size
 
 
 def index_bytes(values: int, chunk: int, *, summed: bool = True) -> int:
-    """Returns the bytes of a shard's index: `values` values in chunks of `chunk` values."""
+    """Returns the size in bytes of a shard's index: `values` values, `chunk` in a chunk."""
     return _ENTRY * (values // max(1, chunk)) + _CHECKSUM * summed
 
 
@@ -299,7 +299,7 @@ class ChunkFiles:
             os.close(file)
 
     def _head(self, content: bytes) -> int:
-        """Returns the bytes of a chunk before Blosc's header: those of N5's."""
+        """Returns how many bytes of a chunk precede Blosc's header: those of N5's."""
         if not self.n5:
             return 0
         return 4 + 4 * len(self.file) + (4 if content[:2] != b"\0\0" else 0)

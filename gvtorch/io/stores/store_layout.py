@@ -446,7 +446,7 @@ def context() -> Any:
 def kvstore(location: str | Path) -> Any:
     """Returns tensorstore's spec of a folder, given as a path, or as a URL that tensorstore knows.
     Links and ".." in a path are resolved as the operating system does; a path that tensorstore
-    can't take is replaced by a link to it, see `text_path`.
+    can't take, such as one that is not UTF-8, is replaced by a link to it (`text_path`).
     """
     text = str(location)
     if text.startswith("file://"):
