@@ -80,7 +80,7 @@ export class PictureView {
     return this.app.slices.layout?.view ?? [0, 0, this.over.width, this.over.height];
   }
 
-  /** The same in CSS pixels. */
+  /** This part in CSS pixels. */
   get area() {
     const [left, top, width, height] = this.part.map((one) => one / this.ratio);
     return { left, top, width, height };
