@@ -11,7 +11,7 @@ import tyro
 
 import gvtorch as gv
 
-ARMS, WINDING, LENGTH, EXTENT = 2, 3.1, 0.27, 512  # the disc fades by 1/e over LENGTH
+ARMS, WINDING, LENGTH, EXTENT = 2, 3.1, 0.27, 512  # the disc fades to 1/e over LENGTH
 
 
 @dataclass

@@ -11,7 +11,7 @@ import tyro
 
 import gvtorch as gv
 
-FIRST, NUCLEUS = 720_575_940_000_000_000, 1_000_000  # first label; nucleus minus cell
+FIRST, NUCLEUS = 720_575_940_000_000_000, 1_000_000  # first label; offset of a nucleus's
 CELLS, REACH = 360, 0.2  # REACH: more than the radius of any cell, in sides of the box
 GAP, RADIUS, CORE = 0.012, 0.47, 0.42  # in sides of the box; CORE relative to a cell's size
 BONE, SKY = (0.86, 0.80, 0.66), gv.Gradient((0.030, 0.036, 0.052), (0.004, 0.005, 0.008))

@@ -19,7 +19,7 @@ if sys.platform == "linux" and not (find_library("EGL") or find_library("OSMesa"
     sys.exit("mixed_triangles needs OpenGL: a GPU's driver with EGL, or Mesa's EGL or OSMesa")
 
 SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
-EYE, TARGET, UP = (-120.0, -300.0, -30.0), (68.0, 62.0, 126.0), (1.0, 0.3, 0.0)  # lying
+EYE, TARGET, UP = (-120.0, -300.0, -30.0), (68.0, 62.0, 126.0), (1.0, 0.3, 0.0)  # the body lies
 SKY = gv.Gradient((0.05, 0.07, 0.11), (0.008, 0.009, 0.014))
 RINGS = [(82, 58, 205), (80, 60, 170), (79, 58, 135), (76, 54, 100)]  # centres, around the vessel
 DISK, BLUE, GREEN = (64, 64, 58), (0.3, 0.5, 0.9), (0.2, 0.75, 0.55)

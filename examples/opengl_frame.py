@@ -1,5 +1,5 @@
 """A frame drawn by OpenGL and gvtorch: OpenGL draws a ball, voxels join it, and OpenGL adds the
-edges of the box, behind voxels and ball. On an NVIDIA GPU no picture passes through the host.
+edges of the box, partly hidden by both. On an NVIDIA GPU no picture passes through the host.
 """
 
 import sys
@@ -19,7 +19,7 @@ except ImportError as error:
     sys.exit(f"opengl_frame needs moderngl: pip install moderngl ({error})")
 
 SCAN = Path(__file__).parent / "data" / "stent_256x128x128_int16.npz"
-EYE, TARGET, UP = (-170.0, -290.0, 30.0), (62.0, 62.0, 128.0), (1.0, 0.3, 0.0)  # lying
+EYE, TARGET, UP = (-170.0, -290.0, 30.0), (62.0, 62.0, 128.0), (1.0, 0.3, 0.0)  # the body lies
 BALL, RADIUS, TEAL, SIDES = (82.0, 46.0, 130.0), 30.0, (0.05, 0.55, 0.4), 192
 SUN, GOLD, NIGHT = torch.tensor([(0.6, -0.7, -0.3), (0.9, 0.5, 0.1), (0.01, 0.013, 0.022)])
 EDGES = torch.tensor([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])

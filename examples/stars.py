@@ -30,7 +30,7 @@ class Settings:
 
 
 def made_up(count: int = 60_000) -> tuple[gv.Points, np.ndarray]:
-    """Returns stars within the distance at which they are visible, and their B-V."""
+    """Returns stars out to where each is visible, the brighter the farther, and their B-V."""
     random = np.random.default_rng(4)
     luminosity = 0.5 * random.random(count) ** -0.9
     away = np.minimum(90 * np.sqrt(luminosity), 900) * random.random(count) ** 0.5

@@ -16,8 +16,8 @@ from .base.declared import declared_names
 
 __version__ = "0.1.0"
 
-#: How long OpenMP's threads spin before they sleep. The default, milliseconds, takes cores from the
-#: threads that they wait for where other programs run. Read when torch is loaded.
+#: How long OpenMP's threads spin before they sleep. By default they spin for milliseconds; if other
+#: programs run, that takes cores from the threads they wait for. Read when torch is loaded.
 if "torch" not in sys.modules and not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
     os.environ["GOMP_SPINCOUNT"] = "2000"
 

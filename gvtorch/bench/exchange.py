@@ -22,7 +22,7 @@ _FORMATS = {
 
 
 def opengl(record: Record) -> None:
-    """Reads colours and depth from OpenGL and draws them, in shared buffers and by the host."""
+    """Reads colours and depth from OpenGL and draws them, shared and through the host."""
     settings = record.settings
     size = (64, 48) if settings.quick else (1920, 1080)
     context = _context()

@@ -13,7 +13,7 @@ from .record import Record, clock
 from .scenes import worn
 
 _APERTURES = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8)  # in largest sides of the box
-_FOCUS = 0.9  # likewise; a little in front of the box's middle
+_FOCUS = 0.9  # in the same unit; a little in front of the box's middle
 
 
 def lens(record: Record) -> None:

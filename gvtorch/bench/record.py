@@ -45,7 +45,7 @@ class Settings:
     device: torch.device
     quick: bool = False  # tiny sizes, to see that all works; the figures mean nothing
     repeats: int = 7  # timings of each figure
-    seconds: float = 10.0  # after this time no further repeat of a figure begins
+    seconds: float = 10.0  # after it no repeat of a figure begins; one always runs
     peers: tuple[str, ...] | None = None  # None: all that are installed
     only: str = ""  # run only cases whose name contains it
     pictures: Path | None = None  # a folder for the pictures that were compared

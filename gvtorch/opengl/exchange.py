@@ -1,4 +1,4 @@
-"""`Exchange`: passes pictures between OpenGL and torch, on the device where both use the same one.
+"""`Exchange`: passes pictures between OpenGL and torch, without the host if both use one device.
 
 Colours and depths are read as tensors from the framebuffer bound for reading, and written into the
 one bound for drawing. Each is transferred in the type in which OpenGL stores it, because drivers

@@ -266,7 +266,7 @@ class Functions:
             self.ShaderSource(shader, 1, ctypes.byref(source), None)
             self.CompileShader(shader)
             self.AttachShader(program, shader)
-            self.DeleteShader(shader)  # takes effect with the program
+            self.DeleteShader(shader)  # takes effect when the program goes
         self.LinkProgram(program)
         if not self.parameter("GetProgramiv", program, LINK_STATUS):
             self.DeleteProgram(program)
@@ -278,7 +278,7 @@ class Functions:
         """Restores afterwards the part of the context's state that `Exchange` changes.
 
         Until then pixels are tightly packed in host memory and transferred unconverted; with
-        `drawing`, filled triangles overwrite the first draw buffer, without blending and tests.
+        `drawing`, filled triangles overwrite the first draw buffer, without blending or tests.
         """
         with ExitStack() as later:
             later.callback(self.forget_errors)

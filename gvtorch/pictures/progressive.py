@@ -127,8 +127,8 @@ class Progressive:
     def refine(
         self, camera: Camera | Rays, samples: int, progress: Progress = no_progress
     ) -> Picture:
-        """Renders frames, at least one, until the mean has `samples`, and returns it; frames that
-        were rendered of this camera before count.
+        """Renders frames, at least one, until there are `samples` of this camera, and returns their
+        mean; earlier frames of the same camera count.
 
         Raises:
             ValueError: `samples` is no whole number >= 1.

@@ -104,8 +104,8 @@ class Look:
     lens: Annotated[str | None, option(metavar="APERTURE,FOCUS")] = None
     # for lit shaders: sun:X,Y,Z,DEGREES (direction of its light, angular diameter);
     # lamp:X,Y,Z,RADIUS (world units); sky:R,G,B (ambient light); shadows: and
-    # occlusion: (strength, 0 to 1); indirect: (factor); reach: (of the last two, in largest sides
-    # of the scene's box)
+    # occlusion: (strength, 0 to 1); indirect: (factor); reach: (distance for occlusion
+    # and indirect, in largest sides of the scene's box)
     lighting: Annotated[str | None, option(metavar="KIND:NUMBERS;...")] = None
     # index of the number to show, for voxels with several
     component: Annotated[int, option(metavar="N")] = 0

@@ -27,7 +27,7 @@ _NAMES = ("scene", "shader", "camera", "options")  # that a script may set
 
 
 def _path_help() -> str:
-    """Returns what PATH may be; evaluated for this command only, since formats load torch."""
+    """Returns what PATH may be, for the help of this command only, since formats load torch."""
     script = (
         "a Python file that sets scene (what gv.view takes) and optionally shader, camera, options"
     )

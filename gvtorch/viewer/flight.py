@@ -245,7 +245,7 @@ def _curve(times: Sequence[float], values: Sequence[Any], closed: bool, place: A
 
 
 def _form(value: Any, place: Any) -> Any:
-    """Returns the form of a value: between values of equal form there are others."""
+    """Returns the form of a value; only values of equal form are interpolated."""
     if isinstance(value, float):
         return "number"
     if isinstance(value, dict):

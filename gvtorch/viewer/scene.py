@@ -249,7 +249,7 @@ class Scene:
         data is loaded again.
 
         Raises:
-            ValueError: The engine belongs to the caller, or refuses the options; it is then
+            ValueError: The engine belongs to the caller; or it refuses the options, and is
                 recreated with the old ones.
         """
         if self.engine is None or self.remake is None:

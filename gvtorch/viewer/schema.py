@@ -67,7 +67,7 @@ _OF_THE_SCENE = {
     "DistanceField": ("value",),
     "Labels": ("normals",),
 }
-#: Range of a slider; which values are allowed, the objects themselves check.
+#: Range of a slider; the objects themselves check which values are allowed.
 SLIDERS: dict[tuple[str, str], tuple[float, float]] = {
     ("RenderOptions", "step"): (0.1, 4),
     ("RenderOptions", "stop_alpha"): (0.5, 1),

@@ -127,7 +127,7 @@ class Server:
                 started.set_exception(error)
         finally:
             self._loop.close()
-            del self._session  # aiohttp's reference cycles would keep it, and its pools
+            del self._session  # aiohttp's reference cycles would keep it and its pools a while
 
     async def _serve(self, started: Future[None]) -> None:
         self._stop = asyncio.Event()

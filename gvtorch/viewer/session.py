@@ -157,7 +157,7 @@ class Session:
         self.scene.close()
 
     def _step(self) -> bool:
-        """Runs queued tasks, draws one picture; returns False once the session is closed."""
+        """Runs queued tasks, draws a picture and a step of a still; returns False once closed."""
         with self._wake:
             while not (self._closed or self._tasks or self._stills or self._someone()):
                 waits = any(one.waits() for one in self.clients.values())
@@ -519,7 +519,7 @@ class Session:
 
 
 def fitted(scene: Scene, like: Eye | None, size: tuple[int, int], up: Up | None = None) -> Eye:
-    """Returns an eye that sees the whole box in the direction of `like`, or by default."""
+    """Returns an eye that sees the whole box, from the side of `like` or the default one."""
     box = scene.box
     width, height = (max(1, n) for n in size)
     if like is None:

@@ -101,7 +101,7 @@ class Planes:
         return x, y, z
 
     def index(self, axis: str, state: ViewState) -> int:
-        """Returns the index, along an axis, of the finest voxel that contains this position."""
+        """Returns the index, along an axis, of the finest voxel in which `place` lies."""
         n = "xyz".index(axis)
         found = (self.place(state)[n] - self.data.origin[n]) / self.data.spacing[n]
         return min(max(int(np.floor(found + 0.5)), 0), self.data.extent[n] - 1)

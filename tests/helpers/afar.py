@@ -47,7 +47,7 @@ def assert_same_bits(
 
 
 def walls() -> gv.Volume:
-    """Returns a volume of thin upright and slanted walls, a thread, and a ball of noise."""
+    """Returns walls 1.5 voxels thick, upright and slanted, a thread, and a ball of noise."""
     n = 96
     z, y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float32),) * 3, indexing="ij")
     inside = (x > 15) & (x < 60) & (y > 15) & (y < 80) & (z > 15) & (z < 80)

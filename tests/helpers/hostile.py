@@ -83,7 +83,7 @@ def png(width: int, height: int) -> bytes:
 
 
 def zeros(megabytes: int) -> bytes:
-    """Returns a gzip stream of so many megabytes of zeros, a thousandth as long, without an end."""
+    """Returns a gzip stream of megabytes of zeros, a thousandth as long, without an end."""
     engine = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
     block = engine.compress(bytes(1 << 20)) + engine.flush(zlib.Z_FULL_FLUSH)
     return b"\x1f\x8b\x08\0\0\0\0\0\0\x03" + block * megabytes

@@ -112,7 +112,7 @@ def simplex(point, seed=0, period=None) -> float:
 
 
 def cellular(point, feature="F1", jitter=1.0, reach=1, seed=0, period=None) -> float:
-    """Returns distances to the nearest points of all cells nearby, clamped to `reach`."""
+    """Returns F1, F2 or F2-F1 of the points of all cells nearby, distances clamped to `reach`."""
     cell = [math.floor(one) for one in point]
     found = []
     for step in itertools.product(range(-3, 4), repeat=len(point)):

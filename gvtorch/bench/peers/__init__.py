@@ -1,1 +1,1 @@
-"""Other renderers of the same picture, each in a file of its own that imports what it needs."""
+"""Other renderers of the same picture, each in its own file, which imports what it needs."""

@@ -98,7 +98,7 @@ class Marcher(Peer):
         self.mapper.RenderSubVolume()
 
     def picture(self) -> Tensor:
-        """Returns the picture, top row first; the used part of the mapper's image is put in it."""
+        """Returns the picture, top row first; 0 outside the used part of the mapper's image."""
         image = self.mapper.GetRayCastImage()
         (width, height), (x, y) = image.GetImageInUseSize(), image.GetImageOrigin()
         stride, rows = image.GetImageMemorySize()

@@ -223,7 +223,7 @@ export class App {
     this.change({ shader: shader.kind === "TransferFunction" ? f : { ...shader, transfer: f } }, rest);
   }
 
-  /** Whether a kind of shader is offered: Features needs a second channel; StoredColor and Labels are only kept. */
+  /** Whether a kind of shader is offered: Features needs a second channel; StoredColor and Labels only if shown now. */
   offers(kind) {
     const many = Object.keys(this.widths).length > 1;
     return { Features: many, StoredColor: this.state.shader.kind === "StoredColor", Labels: this.state.shader.kind === "Labels" }[kind] ?? this.state.shader.kind !== "Labels";

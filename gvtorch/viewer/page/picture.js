@@ -80,7 +80,7 @@ export class PictureView {
     return this.app.slices.layout?.view ?? [0, 0, this.over.width, this.over.height];
   }
 
-  /** The same in CSS pixels. */
+  /** This part in CSS pixels. */
   get area() {
     const [left, top, width, height] = this.part.map((one) => one / this.ratio);
     return { left, top, width, height };
@@ -154,7 +154,7 @@ export class PictureView {
     context.fillText(text, x, y);
   }
 
-  /** The handle at a place in CSS pixels, or undefined. */
+  /** The handle at a position in CSS pixels, or undefined. */
   handleAt(x, y) {
     const far = ({ at }) => Math.hypot(at[0] / this.ratio - x, at[1] / this.ratio - y);
     const near = this.handles.filter((one) => far(one) < REACH);
@@ -186,7 +186,7 @@ export class PictureView {
     context.globalAlpha = 1;
   }
 
-  /** The axis whose letter is at a place in CSS pixels, or undefined. */
+  /** The axis whose letter is at a position in CSS pixels, or undefined. */
   axisAt(x, y) {
     const near = ({ at }) => Math.hypot(at[0] - x * this.ratio, at[1] - y * this.ratio) < REACH * this.ratio;
     return this.app.shown.axes ? this.ends?.find(near) : undefined;

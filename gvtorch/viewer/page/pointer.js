@@ -31,7 +31,7 @@ export class Pointer {
     return [event.clientX - box.left, event.clientY - box.top];
   }
 
-  /** Converts such pixels to half heights from the picture's middle. */
+  /** Converts CSS pixels from the stage's corner to half heights from the picture's middle. */
   middle([x, y]) {
     const { left, top, width, height } = this.view.area;
     return [(x - left - width / 2) / (height / 2), (y - top - height / 2) / (height / 2)];

@@ -115,7 +115,7 @@ export class Presets {
   }
 }
 
-/** The names of a file's functions, and what returns the text of one; null if the file has only one. */
+/** The names of a file's functions, and a function that returns the text of one; null if it has only one. */
 function several(file, text) {
   if (file.endsWith(".xml")) {
     const parsed = new DOMParser().parseFromString(text, "text/xml");

@@ -20,7 +20,7 @@ export class SlicesView {
     return this.app.state.slices.at ?? this.layout.x.at;
   }
 
-  /** The axis of the plane at a place in CSS pixels, or undefined. */
+  /** The axis of the plane at a position in CSS pixels, or undefined. */
   axisAt(x, y) {
     const { layout } = this, { ratio } = this.view;
     const inside = ([left, top, width, height]) => x * ratio >= left && x * ratio < left + width && y * ratio >= top && y * ratio < top + height;
