@@ -253,7 +253,7 @@ def test_nodes_of_nanovdb_are_those_that_the_grid_tells_of(tmp_path):
         refused(path, forged(672 + 32 + 4 * at, "<I", 9), "nodes, leaves first; it declares")
     (key,) = struct.unpack_from("<Q", content, root)
     for bit in (20, 41, 62, 63):
-        refused(path, forged(root, "<Q", key | 1 << bit), "of no voxel's place")
+        refused(path, forged(root, "<Q", key | 1 << bit), "not a voxel's position")
     for step in (1, 8, 16, -8):
         refused(path, forged(root + 8, "<q", upper + step), "at no multiple of 32 bytes")
     for step in (32, -32, 2112, -lower_size, -2 * lower_size):
