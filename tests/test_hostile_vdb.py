@@ -257,7 +257,7 @@ def test_nodes_of_nanovdb_are_those_that_the_grid_tells_of(tmp_path):
     for step in (1, 8, 16, -8):
         refused(path, forged(root + 8, "<q", upper + step), "at no multiple of 32 bytes")
     for step in (32, -32, 2112, -lower_size, -2 * lower_size):
-        refused(path, forged(leaf_at, "<q", leaf + step), "lie over each other")
+        refused(path, forged(leaf_at, "<q", leaf + step), "nodes of the tree overlap")
     refused(path, forged(root + 8, "<q", -736), "a node lies outside")
 
 
