@@ -51,8 +51,8 @@ def chosen_nvcc() -> str | None:
 
 
 def compression(nvcc: str) -> str:
-    """Returns the flag that compresses the machine code of all architectures: with CUDA 13 to a
-    twelfth, which all of its drivers read; else in a form that every driver reads.
+    """Returns the flag that compresses the machine code of all architectures: from CUDA 13 on to a
+    twelfth, in a form that drivers of CUDA 13 read; before, in one that every driver reads.
     """
     told = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True).stdout
     release = re.search(r"release (\d+)", told)
@@ -103,7 +103,7 @@ def compile_libraries(output: Path) -> list[Path]:
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
     output.mkdir(parents=True, exist_ok=True)
     calls = commands(output)
-    workers = max(1, (os.cpu_count() or 1) - (len(calls) - 1))  # one is nvcc's, which takes longest
+    workers = max(1, (os.cpu_count() or 1) - (len(calls) - 1))  # one core is left to nvcc
     with ThreadPoolExecutor(workers) as pool, ThreadPoolExecutor(len(calls)) as linkers:
 
         def make(library: Path) -> None:

@@ -2,12 +2,12 @@
 
 csrc/user_shader.h describes what a header contains, csrc/user.cpp makes an op of it. The name of a
 library has a digest of all that it is made of: the header and what it includes, gvtorch's headers,
-the flags (and with them the CPU's instruction set), torch's version, and the compilers (path, size,
-time of change, and the environment variables that they read). It is written in a folder next to it
-and then renamed, so two processes may compile the same one at once.
+the flags (and with them the CPU's instruction set), torch's version, the machine, and the compilers
+(path, size, time of change, and the environment variables that they read). It is written in a
+folder next to it and then renamed, so two processes may compile the same one at once.
 
 The includes of a header are found by searching its lines. Other files that the compiler reads, by a
-macro or from another folder, are listed in a file (OP.more) and are part of the digest from then
+macro or from another folder, are listed in a file (*.more) and are part of the digest from then
 on. Compilers run in a folder where files have fixed names, so no path of a user reaches a shell. A
 library's owner, permissions and digest are checked before it is loaded.
 
@@ -46,7 +46,7 @@ from . import SOURCES, compilers, instructions
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]*"([^"\n]+)"', re.MULTILINE)
 _NAME = re.compile(r"(?=.{1,128}$)[A-Za-z_]\w*(::[A-Za-z_]\w*)*", re.ASCII)
 _READ_BY_COMPILERS = ("CPATH", "CPLUS_INCLUDE_PATH", "NVCC_PREPEND_FLAGS", "NVCC_APPEND_FLAGS")
-_HEADER, _DRAFT = "gv_user_header.h", "draft-"  # a user's header as compilers see it; folders
+_HEADER, _DRAFT = "gv_user_header.h", "draft-"  # a header's name for compilers; prefix of folders
 _LONGEST = 3600.0  # seconds after which a folder is taken for that of a killed compilation
 _lock = threading.Lock()
 
@@ -161,8 +161,8 @@ def load_cuda(shader: UserShader) -> None:
 
 
 def reload(shader: UserShader) -> UserShader:
-    """Returns a shader if its op is loaded in this process, else (an unpickled one, say) the shader
-    that `load_op` loads from its header.
+    """Returns the shader itself if its op is loaded in this process; else, as for an unpickled one,
+    the shader that `load_op` loads from its header.
     """
     return shader if (shader.op, "cpu") in _libraries else load_op(shader.header, shader.name)
 
@@ -184,7 +184,7 @@ def _loaded(source: ShaderSource, archs: Sequence[str]) -> Path:
             library = compiled(source, archs, source.op)
             checked = _opened(library)
             try:
-                with torch._ops.dl_open_guard():  # as torch.ops.load_library, which resolves links
+                with torch._ops.dl_open_guard():  # torch.ops.load_library resolves links
                     _handles[key] = ctypes.CDLL(checked)
             except OSError as error:
                 text = str(error).replace(checked, str(library))
@@ -307,8 +307,8 @@ def _is_intact(library: Path) -> bool:
 
 
 def _opened(library: Path) -> str:
-    """Opens a library, checks its owner again, and returns a path of the open file, so that nothing
-    else can be loaded instead. It stays open: the loader identifies libraries by their paths.
+    """Opens a library, checks owner and permissions again, and returns a path of the open file, so
+    that nothing else can be loaded instead. It stays open: loaders know libraries by their paths.
     """
     try:
         file = os.open(library, os.O_RDONLY | os.O_CLOEXEC)

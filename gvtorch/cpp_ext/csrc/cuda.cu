@@ -60,7 +60,7 @@ __global__ void __launch_bounds__(kThreads) count_chunks(List list, int64_t coun
   if (threadIdx.x == 0) chunk_c[blockIdx.x] = own;
 }
 
-// Replaces each chunk's counts by those of the chunks before it; the total is stored behind the last.
+// Replaces each chunk's counts by the sum of those before it; the total is stored after the last.
 __global__ void __launch_bounds__(kScanThreads) add_chunks(Counts* chunk_c, int64_t chunks) {
   using Scan = cub::BlockScan<Counts, kScanThreads, cub::BLOCK_SCAN_WARP_SCANS>;
   __shared__ typename Scan::TempStorage scratch;

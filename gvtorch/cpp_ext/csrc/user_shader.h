@@ -16,7 +16,8 @@
 //
 // Only `add` is required. Everything else of a shader (see shaders.h) has a default here and may be overridden: kEnds,
 // kSeesEmpty, kSurface and `surface`, Sum, hides, done; and kWhole and kFeatures. The struct is copied into the kernel.
-// Where Sum and `hides` are not overridden, `add` may not be called where the transfer function shows nothing.
+// The default `hides` skips nodes in which the transfer function shows nothing; with the default Sum too, `add` need
+// not be called for single intervals in which it shows nothing.
 #pragma once
 
 #include <type_traits>
@@ -79,13 +80,13 @@ constexpr bool kHidesByTransfer<Kind<T>, std::void_t<decltype(&Kind<T>::hides)>>
     std::is_same_v<decltype(&Kind<T>::hides), decltype(&UserShader<T>::hides)>;
 
 #ifndef __CUDACC__
-// The users' Sums of a packet's rays. The walk reads `clear` and writes `missed`, which are vectors over the lanes.
+// The user's Sums of a packet's rays. The walk reads `clear` and writes `missed`, which are vectors over the lanes.
 template <class Sum>
 struct UserSums {
   Sum of_lane[kLanes];
   Floats clear{};
   Mask missed{};
-  int32_t asked = 0;  // lanes whose shader asked for a gradient at the last interval
+  int32_t asked = 0;  // how many lanes asked for a gradient at the last interval
 
   GV_HD void begin(int lane, float clear_then, float hit_clear, float* feature_c) {
     of_lane[lane].begin(0, clear_then, hit_clear, feature_c);

@@ -62,7 +62,7 @@ struct NumberOf {
   using View = T;
 };
 using Int = NumberOf<int32_t>;
-using Count = NumberOf<int64_t>;  // an int of any size, which torch.compile need not know
+using Count = NumberOf<int64_t>;  // an int of any size, in the schema a SymInt: torch.compile need not know it
 using Float = NumberOf<double>;
 using Bool = NumberOf<bool>;
 

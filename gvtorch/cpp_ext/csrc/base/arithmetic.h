@@ -1,5 +1,5 @@
-// Arithmetic on T, which is float, double, or on the CPU `Floats` (simd.h): a number for each ray of a packet. Code
-// written for T serves both one ray and a packet:
+// Arithmetic on T: float, double, or on the CPU a vector of either (simd.h), as `Floats`, a number for each ray of a
+// packet. Code written for T serves both one ray and a packet:
 //
 //   RealOf<T>, IntOf<T>, MaskOf<T>    type of one number; of a whole number per lane; of a comparison's result per lane
 //   select(mask, a, b)                a where the mask is set, else b
@@ -231,7 +231,7 @@ GV_HD T exp2_slope(T f) {
   return series * f + 6.93147181e-1f;
 }
 
-// 2 to the power of `value`; 0 below -126, the largest power below 127 above it.
+// 2 to the power of `value`: 0 at -126 and below, 2^126 above 126.
 template <class T>
 GV_HD T exp2_exact(T value) {
   const auto normal = value > -126.0f;

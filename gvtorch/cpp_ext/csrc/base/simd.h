@@ -159,7 +159,7 @@ GV_HD void load_rows(const void* base, Ints offset, Floats row[4]) {
 #endif
 }
 
-// Loads two such rows, the second right behind the first: half as many loads, twice as wide.
+// Loads two such rows, the second right after the first: half as many loads, twice as wide.
 GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats second[4]) {
 #if defined(__AVX2__)
   int32_t lane[kLanes];
@@ -167,7 +167,7 @@ GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats
   const auto eight = [&](int i) {
     return _mm256_loadu_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
   };
-  Floats half[2][4];  // number i for half of the lanes: of four lanes' first rows, then of their second rows, in turn
+  Floats half[2][4];  // [h][i]: number i of half of the lanes; first rows of four lanes, their second rows, and so on
   for (int h = 0; h < 2; ++h) {
     Native own[4];
     for (int i = 0; i < 4; ++i) {

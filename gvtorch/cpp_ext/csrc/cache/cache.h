@@ -104,7 +104,7 @@ struct ChooseArgs {
 
   GV_HD int64_t node_at(int64_t index) const { return asked_l2k[index + index / listed * listed]; }
   GV_HD int32_t word_at(int64_t index) const { return asked_l2k[index + (index / listed + 1) * listed]; }
-  // Serves a request as a load (`which` 0) or a subdivision (1) if there is room behind the `place` ones before it.
+  // Serves a request as a load (`which` 0) or a subdivision (1) if the `place` ones before it leave room.
   GV_HD void serve(int64_t which, int64_t place, int64_t index) const {
     const int64_t room = room_2[1 - which];  // tiles, bricks
     if (place >= smaller<int64_t>(batch, room)) return;

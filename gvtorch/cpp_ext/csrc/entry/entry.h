@@ -257,8 +257,8 @@ inline std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> give_hits(TraceArgs& a
           give(args.missed_r, table, {args.rays})};
 }
 
-// Checks a second channel of the same pool, with `width` numbers per voxel (0: any); returns how many it has, 0 where
-// there is no channel. coarse: it may be of the pool's first bricks alone, and have no constants.
+// Checks a second channel of the same pool, with `width` numbers per voxel (0: any); returns this number, 0 where
+// there is no channel. coarse: it may have only the pool's first bricks, and no constants.
 inline int32_t check_second(const std::optional<Tensor>& bricks_bzyxc, const std::optional<Tensor>& constant_tnc,
                             const char* name, int64_t width, const TraceArgs& args, VoxelType& voxel,
                             bool coarse = false) {

@@ -217,7 +217,7 @@ struct FollowBalls {
     const Vec3<T> constant = args.julia ? Vec3<T>{own[0], own[1], own[2]} : z;
     const T push = args.julia ? T{} : first, add = args.julia ? 0 : 1;
     T reach = first, low_apart = 1, high_apart = 1, low = infinity, high = -infinity;
-    bool inside = true, lost = false;  // inside: some point may still be
+    bool inside = true, lost = false;  // inside: some orbit may be within the bailout radius
     for (int32_t turn = 0;; ++turn) {
       const T radius = square_root(squared(z)), least = larger(radius - reach, T{}), most = radius + reach;
       if (most > bailout) {

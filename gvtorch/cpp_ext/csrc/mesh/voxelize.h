@@ -13,12 +13,12 @@ constexpr int32_t kMostVoxels = 32;  // along a side of a cube
 constexpr int32_t kArity = 8;        // boxes in a box
 constexpr int32_t kMostFloors = 12;  // levels of boxes: enough for 8^12 triangles
 constexpr int32_t kWaiting = (kArity - 1) * kMostFloors + kArity;
-constexpr double kFlat = 1e-3;      // least share of a normal's component: divisions by it stay finite
+constexpr double kFlat = 1e-3;      // least share of a component in a normal's sum: divisions by it stay finite
 constexpr double kTouch = 1e-6;     // squared distance, in voxels, below which a position lies on the triangle
 constexpr double kBeyond = 0.8661;  // voxels: half a voxel's diagonal, within which a surface may cross it
-constexpr double kParts = 1 << 30;  // volumes before triangles are counted in whole parts, so their order is free
-constexpr int32_t kCorners = 16;    // of a clipped triangle
-constexpr double kCoarse = 2;       // size of voxels, in usual triangles, above which each voxel descends alone
+constexpr double kParts = 1 << 30;  // of a voxel: volumes are summed as whole parts, in any order of triangles
+constexpr int32_t kCorners = 16;    // of a clipped triangle, at most
+constexpr double kCoarse = 2;       // voxel size, in triangle sizes (`detail`), above which voxels descend alone
 
 // Sizes in limits: triangles, boxes, cubes
 #define GV_VOXELIZE(X)                \
@@ -478,7 +478,7 @@ struct VoxelizePack {
     constexpr int32_t kOwn = static_cast<int32_t>(sizeof(F) / sizeof(T));
     F x{}, best{};
     I found = I{} - 1;
-    for (int32_t lane = 0; lane < kOwn; ++lane) {  // lanes behind the row's end repeat its last voxel
+    for (int32_t lane = 0; lane < kOwn; ++lane) {  // lanes beyond the row's end repeat its last voxel
       set_lane(x, lane, place(cube, begin + lane < end ? begin + lane : end - 1));
       set_lane(best, lane, cube.reach * cube.reach);
     }

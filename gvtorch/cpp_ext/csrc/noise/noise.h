@@ -111,7 +111,7 @@ struct NoiseAt {
 
   // --- Kinds
 
-  // A coordinate, or 0 where it, or it skewed, exceeds what 32 bits can count.
+  // A coordinate, or 0 from 2^29 on, where cells, those of the skewed lattice too, might not be counted in 32 bits.
   static GV_HD T counted(T place) {
     constexpr auto kMost = static_cast<Real>(0x1p29);
     const T none{};

@@ -197,7 +197,7 @@ struct TypedValues {
 
   TypedValues(const ChannelView& channel, int32_t side, int32_t component, int64_t)
       : pool(channel.bricks_bzyxc, channel.type, side, channel.width, component) {}
-  GV_HD Ints first_of(Ints brick) const {  // lanes without a brick may hold anything, so the product wraps
+  GV_HD Ints first_of(Ints brick) const {  // lanes without a brick may hold anything, so the product must wrap
     return kFar ? brick : reinterpret_cast<Ints>(reinterpret_cast<Words>(brick) * static_cast<uint32_t>(pool.stride));
   }
   GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return trilinear<Voxel, kFar>(pool, brick, at); }

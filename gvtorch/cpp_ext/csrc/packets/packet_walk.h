@@ -391,7 +391,7 @@ struct PacketWalk {
       parted = parted | (cell[axis] ^ here);
       cell[axis] = here;
     }
-    // A float's exponent is its highest bit. If it was rounded up to a power of two, the result is one level less.
+    // A float's exponent gives the highest bit set. Rounding up to a power of two may make the result one level less.
     const Ints high = ((Ints)to_floats(parted) >> 23) - 126;
     const Ints equal = truncated(to_floats(top - high) / static_cast<float>(tree.digit_bits));
     return parted == 0 ? known : smaller(known, equal);

@@ -34,7 +34,7 @@ struct SplatArgs {
 
 inline namespace GV_NAMESPACE {
 
-// A range of `count` things, clamped to them whatever `ends` holds.
+// A range of indices, clamped to [0, count] whatever `ends` holds.
 struct Span {
   int64_t begin, end;
 
@@ -69,7 +69,7 @@ struct Spread {
     return low - center > reach || center - high > reach;
   }
 
-  // Distance of an edge from the point, scaled so that the spline's knots are the whole numbers -2 to 2.
+  // Signed distance of an edge from the point, scaled so that the spline's knots are the whole numbers -2 to 2.
   template <class T>
   GV_HD T away(T edge) const {
     const T most = T{} + 2.0, least = T{} - 2.0, from = edge - center;
@@ -128,7 +128,7 @@ struct SplatVoxel {
 };
 
 #ifndef __CUDACC__
-constexpr int64_t kPartX = 256, kPartY = 32, kPartZ = 16;  // numbers along x (all those of its voxels); voxels
+constexpr int64_t kPartX = 256, kPartY = 32, kPartZ = 16;  // numbers (voxels * width) along x; voxels along y and z
 
 // The shares of a point in some voxels along an axis.
 template <int64_t kMost>

@@ -14,8 +14,8 @@ struct ShaderFacts {
   static constexpr bool kReadsAll = false;
   static constexpr bool kIntegrates = false;  // its table is (l, m, m, 4)
   static constexpr bool kColored = false;     // its channel holds red, green, blue and opacity, once or by direction
-  static constexpr int32_t kFiltered = 0;     // above 0: numbers per voxel (or a sixth of them) of its second channel,
-                                              // which only the pool's first bricks have
+  static constexpr int32_t kFiltered = 0;     // above 0: numbers that a voxel of its second channel has, once or for
+                                              // each of six directions; only the pool's first bricks have the channel
   static constexpr int32_t kFeatures = 0;     // how many numbers it writes to sum.feature_c; they begin as 0
   static constexpr int32_t kAsOther = -1;     // for kFeatures: as many as the second channel holds
   static bool packs(const ShadeArgs&) { return true; }  // whether packets can trace its rays

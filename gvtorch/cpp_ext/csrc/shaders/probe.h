@@ -22,7 +22,7 @@ GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {
 
 struct ChannelView {
   const void* bricks_bzyxc;  // null where there is no brick
-  const void* constant_tnc;  // null: there is no such channel
+  const void* constant_tnc;  // null: there is no such channel, or only bricks have it
   VoxelType type;
   int32_t width;  // numbers per voxel
 
@@ -181,7 +181,7 @@ struct Probe {
     for (int axis = 0; axis < 3; ++axis) cube[axis] = static_cast<T>(rays.place_33[3 + axis]);
   }
 
-  // From fields that a packet's walk has already.
+  // From all fields, which a packet's walk already has.
   GV_HD Probe(const Channels& channels, const Sight<T>& sight, const Spot<T>& fine, const Spot<T>& coarse, bool mixed,
               T near, T growth, T voxel, T blend, Vec3<T> cube)
       : channels(channels),

@@ -1,7 +1,7 @@
 // Segments: the runs of intervals that rays take in the nodes they visit, for module shaders, which are not part of a
 // kernel. Rays are walked as in shade_rays.h (the same visits, marks and intervals), but nothing is shaded: what a
-// sample needs is stored. SampleBricks then reads any channel at any sample, with the renderer's bits; CompositeRay
-// composites.
+// sample needs is stored. SampleBricks then reads any channel at any sample, equal to the renderer in every bit;
+// CompositeRay composites.
 //
 // A segment is all the whole intervals of one visit that have one length and one base, or one piece of any length: the
 // last interval of a ray, cut at the far side, or a region of one value. Lists have exact sizes: rays are walked twice,

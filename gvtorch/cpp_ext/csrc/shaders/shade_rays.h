@@ -119,7 +119,7 @@ struct ShadeRay : Walk<T> {
 #endif
   }
 
-  // Shades where depth was set. This may be half an interval outside the visited node, so the node is looked up anew.
+  // Shades where depth was set. This may be half an interval outside the visited node, so the node is looked up again.
   template <class Number>
   GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, Sum& sum) const {
     Number digits(tree, this->levels, this->rays, ray, sum.depth);
@@ -170,7 +170,7 @@ struct ShadeRay : Walk<T> {
     GV_HD Eye enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
       return Eye(kernel.channels, *sight, kernel.rays, ray, visit, digits);
     }
-    GV_HD bool uniform(const Eye& probe) const {              // shadows vary in it
+    GV_HD bool uniform(const Eye& probe) const {              // with shadows, light varies in it
       if (kToLight && kernel.light.scatters()) return false;  // 1 - alpha of a long interval would round to 0
       return !kShadowed && probe.uniform() && !kernel.shades_each_place();
     }

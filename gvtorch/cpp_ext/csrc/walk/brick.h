@@ -42,7 +42,7 @@ inline int64_t brick_bytes(VoxelType type, int32_t side, int32_t channels) {
   return bytes;
 }
 
-// A node's brick along a ray: offset + t * slope is the position at distance t, in voxels from its first voxel centre.
+// A node's brick along a ray: offset + t * slope is the position at distance t, in voxels from the first stored centre.
 template <class T>
 struct Spot {
   int32_t node = kAbsent, brick = kAbsent;

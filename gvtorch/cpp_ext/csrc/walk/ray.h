@@ -30,8 +30,8 @@ struct RayView {
 };
 
 // One ray, or the rays of a packet, in tree units (distances along it stay world lengths). The origin is moved to where
-// the ray enters the scene, so float32 serves however far the camera is. float32 distances are exact enough (to less
-// than the cone's width); positions are not, so deep trees subtract them in float64 before they round.
+// the ray enters the scene, so float32 suffices however far the camera is. Rounding errors of distances are below the
+// cone's width; those of positions are not, so deep trees subtract positions in float64 before they round.
 template <class T>
 struct Ray {
   using Real = RealOf<T>;
@@ -80,8 +80,8 @@ struct Ray {
   }
 
   // Slab test (Kay and Kajiya, "Ray tracing complex scenes", 1986).
-  // A ray that no face bounds (zero, NaN or infinite direction) or whose cone is NaN gets an empty range, so that every
-  // loop ends.
+  // A ray without a finite end (no face bounds it: zero, NaN or infinite direction) or whose cone is NaN gets an empty
+  // range, so that every loop ends.
   GV_HD void begin(const RayView& rays, Vec3<double> start) {
     for (int axis = 0; axis < 3; ++axis) {
       origin[axis] = static_cast<T>(start[axis]);
@@ -201,7 +201,7 @@ struct Intervals {
     const Mask full = count >= static_cast<Real>(kMostIntervals);
     const Mask wrong = which && (full || !fits(width));
     if (!any(wrong)) return;
-    start = select(which && full && !(start > base), stop, start);  // intervals too short to move it
+    start = select(which && full && !(start > base), stop, start);  // intervals too short to move it: the ray ends
     base = select(wrong, start, base);
     count = select(wrong, T{}, count);
     level = select(wrong, IntOf<T>{}, level);
@@ -250,7 +250,7 @@ struct Intervals {
     const T here = middle();
     return inside() && extent.holds(here, cone(here));
   }
-  // Moves to the first interval behind the extent.
+  // Moves to the first interval beyond the extent.
   GV_HD void leave(Mask which, const Extent<T>& extent) {
     for (Mask inside = which; any(inside); inside = inside && stays(extent)) {
       const Mask whole = inside && !cut();

@@ -90,7 +90,7 @@ GV_HD T a_little_above(T value) {
   return value + absolute(value) * static_cast<RealOf<T>>(9.5367431640625e-7);
 }
 
-// The table as kernels carry it: as pointers, since only a GPU reads what lies on it.
+// The table as kernels carry it: as pointers, since only a GPU can read its own memory.
 template <class T>
 struct TransferView {
   const Row<T>* table_lm;   // for each length of interval, step * 2^l

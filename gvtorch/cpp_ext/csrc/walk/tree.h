@@ -2,12 +2,12 @@
 // node that a sample needs.
 //
 // A node tile is N*N*N sibling nodes; node = tile * nodes_per_tile + child, child = (z * N + y) * N + x. The root
-// node is child 0 of a tile of its own. Trees of several N share a pool: its tiles are as wide as the widest. Words of
-// a node (GigaVoxels keeps two: Crassin et al., I3D 2009, section 4.1):
+// node is child 0 of a tile of its own. Trees of different N may share a pool: its tiles have room for the largest N.
+// Words of a node (GigaVoxels stores two: Crassin et al., I3D 2009, section 4.1):
 //
 //   child_tn    >= 0 tile of its children | kAbsent: not made yet | kTerminal: nothing finer exists
 //   brick_tn    >= 0 brick slot | kAbsent: not loaded yet | kEmpty | kConstant: one value, see constant_tnc
-//   request_tn  what rays ask for, see post_request in hd.h; null where nobody reads it
+//   request_tn  what rays request, see post_request in hd.h; null where nobody reads it
 //
 // Tree units: the root is the cube [0,1]^3. float32 holds the corners of nodes exactly where N is a power of two and
 // the root is at most kMostShallow voxels wide; other trees are *deep*: their positions are float64. A descent that
