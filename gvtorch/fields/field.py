@@ -21,7 +21,7 @@ from ..base import check
 Values = Tensor | Mapping[str, Tensor]
 #: Smallest and largest value over each of k boxes, (k,) or (k, c) float64; infinite: not known.
 Interval = tuple[Tensor, Tensor]
-#: An interval; of several channels intervals by name, of which unknown ones are left out.
+#: An interval, or intervals by channel without the unknown ones; None: nothing is known.
 Bounds = Interval | Mapping[str, Interval] | None
 
 
@@ -102,7 +102,7 @@ class Field(nn.Module):
         return other
 
     def box(self) -> Tensor | None:
-        """Returns (2, 3) float64 corners of a box beyond which there is nothing; None: unknown."""
+        """Returns (2, 3) float64 corners of a box outside which there is nothing; None: unknown."""
         return None
 
     def number(self, name: str, value: Any, **limits: Any) -> Tensor:

@@ -39,7 +39,7 @@ class SampledDistance(Distance):
     apart: Tensor
 
     def __init__(self, volume: Volume, *, color: Color = WHITE) -> None:
-        """Copies the volume, and its position in the world.
+        """Sets the volume, whose position in the world is the field's. float32 data is not copied.
 
         Raises:
             ValueError: It does not have one number a voxel, or has less than 2 voxels on an axis.

@@ -29,7 +29,7 @@ class Space(Changed):
         return points
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
-        """Returns the value at points, given the shape's; it must not decrease with that."""
+        """Returns the value at points, given the shape's; must not decrease as that grows."""
         return value
 
     def stretch(self, center: Tensor, half: Tensor) -> Tensor | float:
@@ -104,7 +104,7 @@ class Transform(Space):
 
 class Twist(Space):
     """A shape turned about the z axis by an angle that grows along the axis. Space is stretched
-    more with the distance from the axis: by about 1 + rate * radius, at most.
+    more with the distance from the axis: by at most 1 + |rate| * radius.
     """
 
     def __init__(self, shape: Distance, rate: float) -> None:
@@ -147,7 +147,7 @@ class Repeat(Space):
     def __init__(
         self, shape: Distance, period: Sequence[float], count: Sequence[int] | None = None
     ) -> None:
-        """Sets the shape, the distance of its copies along x, y, z (0: not repeated), and how many
+        """Sets the shape, the spacing of its copies along x, y, z (0: not repeated), and how many
         there are along each axis (odd, centred at the origin); None: infinitely many.
 
         Raises:
@@ -178,7 +178,7 @@ class Repeat(Space):
             moved = [*coordinates]
             for axis, side in zip(self._axes, sides, strict=True):
                 period, most = self.period[axis], self._most[axis]
-                # torch has no gradient of floor: it is detached, so the cell's gradient is 1.
+                # The cell number is piecewise constant, so it is detached from the gradient.
                 number = (coordinates[axis] / period).detach().floor() + side
                 moved[axis] = coordinates[axis] - number.clamp(-most, most) * period
             cells.append(torch.stack(moved, -1))

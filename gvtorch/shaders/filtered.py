@@ -50,7 +50,7 @@ from .shader import Sampling, Shader
 from .transfer_function import TransferFunction
 
 #: Results of `finer`. The finest voxels are not filtered: the sharper their detail, the smaller
-#: must the pixels be that are drawn from them, and so must this factor.
+#: the pixels must be that are drawn from them, and the smaller this factor.
 _FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
 _OPAQUE = 0.2  # colours are stored by direction if a finest voxel can have a higher alpha
 _TIMEOUT = 3600.0  # seconds for one read of local data

@@ -271,7 +271,7 @@ def _on_grid(points: np.ndarray, low: float, step: float) -> Points:
         zip(places, points[:, 1:].tolist(), strict=True), lambda p: p[0]
     ):
         rows = [row for _, row in run]
-        jump = rows[0] != rows[-1] and last < at  # else one row, so that curves don't shift upwards
+        jump = rows[0] != rows[-1] and last < at  # else one row, so that values don't shift upwards
         for row in (rows[0], rows[-1]) if jump else rows[-1:]:
             last = max(int(at), last + 1)
             kept.append((low + last * step, *row))

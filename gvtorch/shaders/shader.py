@@ -1,5 +1,5 @@
-"""`Shader`, the base of all shaders: what the tracer and the effects around it ask a shader for.
-And `ColorTable`, which the kernels read: rows of colour and alpha at evenly spaced values.
+"""`Shader`, the base of all shaders, with the methods that the tracer and the effects around it
+call; and `ColorTable`, which the kernels read: rows of colour and alpha at evenly spaced values.
 """
 
 from __future__ import annotations
