@@ -236,7 +236,7 @@ class Isosurface(LitShader):
             color_component: Index of the number that the transfer function reads from it.
             premultiplied: Whether stored colours are multiplied by their opacity.
             filled: False: a hollow shell, whose inner side is seen by rays that begin inside. A
-                `Clip` without caps always draws the surface so.
+                `Clip` always draws the surface so, and closes it with its caps, if it has any.
             **light: As in `Lit`.
 
         Raises:

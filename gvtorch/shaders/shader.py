@@ -231,7 +231,7 @@ class Shader(Checked):
         return None
 
     def opened(self) -> Shader:
-        """Returns the shader for clips without caps: it also shows surfaces from inside."""
+        """Returns the shader for clips: it also shows surfaces from inside. Caps are added to it."""
         return self
 
     def unlit(self) -> Shader:
