@@ -231,7 +231,7 @@ class Shader(Checked):
         return None
 
     def opened(self) -> Shader:
-        """Returns the shader for clips: it also shows surfaces from inside. Caps are added to it."""
+        """Returns the shader for clips, with caps or not: it also shows surfaces from inside."""
         return self
 
     def unlit(self) -> Shader:
