@@ -104,7 +104,7 @@ class Transform(Space):
 
 class Twist(Space):
     """A shape turned about the z axis by an angle that grows along the axis. Space is stretched
-    more with the distance from the axis: by about 1 + rate * radius, at most.
+    more with the distance from the axis: by at most 1 + |rate| * radius.
     """
 
     def __init__(self, shape: Distance, rate: float) -> None:
@@ -178,7 +178,7 @@ class Repeat(Space):
             moved = [*coordinates]
             for axis, side in zip(self._axes, sides, strict=True):
                 period, most = self.period[axis], self._most[axis]
-                # torch has no gradient of floor: it is detached, so the cell's gradient is 1.
+                # torch has no gradient of floor: it is detached, so that of `moved` is 1.
                 number = (coordinates[axis] / period).detach().floor() + side
                 moved[axis] = coordinates[axis] - number.clamp(-most, most) * period
             cells.append(torch.stack(moved, -1))

@@ -217,7 +217,7 @@ class Shader(Checked):
             other_component=self.other_component,
         )
 
-    # For the effects around it. They raise ValueError if they need normals and there are none.
+    # For the effects around it. Those for lighting raise ValueError for unsuitable shaders.
 
     @property
     def projection(self) -> Literal["maximum", "minimum", "mean"] | None:
@@ -231,7 +231,7 @@ class Shader(Checked):
         return None
 
     def opened(self) -> Shader:
-        """Returns the shader for clips without caps: it also shows surfaces from inside."""
+        """Returns the shader drawn under a clip: surfaces are hollow; caps are drawn separately."""
         return self
 
     def unlit(self) -> Shader:

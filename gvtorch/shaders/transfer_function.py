@@ -30,7 +30,7 @@ _FOREIGN = {"RGBPoints", "volumeProperties"}  # keys of other programs' files
 # Cells of a table.
 _FEWEST_CELLS = 2**10
 _FEWEST_SAMPLED = 2**12  # fewest where corners fall between rows
-_CELLS_APART = 16  # least distance of two corners that fall between rows
+_CELLS_APART = 16  # least distance, in cells, of two corners that fall between rows
 _MANY_CELLS = 2**16  # most with all corners on rows, unless only these make the table possible
 _MOST_CELLS = 2**20
 _FEWEST_PAIRED, _MOST_PAIRED = 128, 256  # along a side of an integrated table
@@ -154,8 +154,8 @@ class TransferFunction(Shader):
         return function.stretched(low, high)
 
     def stretched(self, low: float, high: float) -> TransferFunction:
-        """Returns the function with its first corner point moved to `low` and its last to `high`,
-        which is raised a little unless it is above `low`.
+        """Returns the function with its first corner point moved to `low` and its last to `high`. A
+        `high` that is not above `low` becomes low + max(1, 1e-6 |low|).
         """
         where = "TransferFunction.stretched"
         low, high = (check.number(where, n, v) for n, v in (("low", low), ("high", high)))
