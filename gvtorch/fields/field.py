@@ -137,8 +137,8 @@ class Field(nn.Module):
 
 
 def checked_field(where: str, name: str, value: Any) -> nn.Module:
-    """Returns `value` if it is a field or another module with a forward. Raises ValueError if not,
-    as for producers.
+    """Returns `value` if it is a field or another module with a forward. Raises ValueError if it
+    has none; producers have none.
     """
     field = check.instance(where, name, value, nn.Module)
     if getattr(field.forward, "__func__", None) is not nn.Module.forward:

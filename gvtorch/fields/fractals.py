@@ -240,6 +240,7 @@ class Mandelbox(Fractal):
 
     def box(self) -> Tensor:
         """Returns the cube that holds all orbits that never escape, a little enlarged for those
-        that have not escaped after `iterations`: beyond it, distances grow by |scale| in each step.
+        that have not escaped after `iterations`: each step multiplies an orbit's distance beyond
+        the cube by |scale|.
         """
         return self._within(self._side)

@@ -78,8 +78,9 @@ class SampledDistance(Distance):
             mesh: As `read_mesh` returns it.
             resolution: Voxels along its longest side.
             reach: Margin of the volume around the mesh, as a share of that side.
-            solid: Which parts are solids: "auto", closed ones (others are sheets; warns if only a
-                few edges are missing); "always", all, after filling their holes; or "never".
+            solid: Which parts are solids: "auto", closed ones (others are sheets; warns if parts
+                are nearly closed, or a few triangles are turned); "always", all, after filling
+                their holes; or "never".
             color: The surface's.
 
         Raises:

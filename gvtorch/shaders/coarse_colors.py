@@ -77,7 +77,7 @@ def write_colors(
     Columns are weighted by the light that reaches them in a voxel. With `all_light` everything
     before the voxel dims it, so that a row of voxels transmits what its columns do. This suits
     translucent matter, which looks much the same to an oblique ray. In opaque matter an oblique ray
-    may see what no light reaches along an axis: there light is dimmed by the voxel in front only.
+    may see what no light reaches along an axis, so else only the voxel in front dims the light.
     """
     done, total = 0, 3 * math.prod(field.shape)
     numbers = out[0].shape[-1] // _DIRECTIONS if out else 0
@@ -301,7 +301,7 @@ class _Columns:
 def _surfaces(color: Tensor, alpha: Tensor, light: Tensor, step: int) -> Tensor:
     """Returns the moments of intervals (c - 3, n, a, b), weighted by light. Rays also blend in the
     inside of solids, which no light reaches: there an interval takes the moments of the last one
-    before it that light reaches, over `_FAINT`, so that those of other directions count more.
+    before it that light reaches, divided by `_FAINT`, so that other directions count more.
     """
     index = torch.arange(len(alpha), device=alpha.device)[:, None, None]
     comes = light > 2 * _LEAST

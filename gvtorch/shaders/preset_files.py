@@ -31,7 +31,7 @@ _FEW = 2048  # parts in all, if there are few colours
 _SRGB_PARTS = 32  # linear pieces from black to white that approximate sRGB
 _BENT = 128  # parts of a curve between two opacities
 _STRAIGHT, _SUDDEN = 0.01, 0.99  # VTK sharpness: below it is linear, above a step, else a curve
-_UNSATURATED = 0.05  # saturation in Msh, radians
+_UNSATURATED = 0.05  # radians; colours with less saturation in Msh count as grey
 _APART = 0.33 * math.pi  # colours with hues farther apart are mixed through white, as in VTK
 
 

@@ -217,7 +217,7 @@ class Shader(Checked):
             other_component=self.other_component,
         )
 
-    # For the effects around it. They raise ValueError if they need normals and there are none.
+    # For the effects around it. Those for lighting raise ValueError for unsuitable shaders.
 
     @property
     def projection(self) -> Literal["maximum", "minimum", "mean"] | None:

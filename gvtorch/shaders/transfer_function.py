@@ -154,8 +154,8 @@ class TransferFunction(Shader):
         return function.stretched(low, high)
 
     def stretched(self, low: float, high: float) -> TransferFunction:
-        """Returns the function with its first corner point moved to `low` and its last to `high`,
-        which is raised a little unless it is above `low`.
+        """Returns the function with its first corner point moved to `low` and its last to `high`. A
+        `high` that is not above `low` becomes low + max(1, 1e-6 |low|).
         """
         where = "TransferFunction.stretched"
         low, high = (check.number(where, n, v) for n, v in (("low", low), ("high", high)))
