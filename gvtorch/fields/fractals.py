@@ -126,7 +126,7 @@ class Fractal(Distance):
         self.iterations = check.whole(where, "iterations", iterations, low=1, high=1000)
         self.bailout = self.number("bailout", bailout, low=1, open_low=True)
         self.julia = constant is not None
-        self.constant = self.vector("constant", constant or (0.0, 0.0, 0.0))
+        self.constant = self.vector("constant", (0.0, 0.0, 0.0) if constant is None else constant)
         if len(colors) != 3:
             raise ValueError(f"{where}: colors must be three colours, got {len(colors)}")
         self.register_buffer("colors_33", check.reals(where, "colors", colors, (3, 3)).clamp(0, 1))

@@ -158,7 +158,9 @@ class Repeat(Space):
         self.period = self.vector("period", period)
         self._axes = [axis for axis in range(3) if float(self.period[axis]) != 0]
         if bool((self.period < 0).any()) or not self._axes:
-            raise ValueError(f"{where}: period must be >= 0 and once more, got {tuple(period)}")
+            raise ValueError(
+                f"{where}: period must be >= 0, and > 0 along an axis, got {tuple(period)}"
+            )
         box = shape.box()
         beyond = None if box is None else box.abs().amax(0) - self.period / 2
         if beyond is None or bool((beyond[self._axes] > 1e-9).any()):
@@ -211,7 +213,7 @@ class Repeat(Space):
         return (low + high) / 2, (high - low) / 2
 
     def box(self) -> Tensor | None:
-        most = torch.tensor(self._most, dtype=torch.float64)
+        most = self.period.new_tensor(self._most, dtype=torch.float64)
         return grown(self.shape.box(), torch.where(self.period > 0, self.period * most, 0.0))
 
 

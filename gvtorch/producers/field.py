@@ -373,6 +373,7 @@ def _cut_out(where: str, field: Field | None, extent: int | Sequence[int]) -> tu
     box = None if field is None else field.box()
     if box is None or not bool(torch.isfinite(box).all()) or not bool((box[1] > box[0]).all()):
         raise ValueError(f"{where}: box must be given: the field does not say where it ends")
+    box = box.cpu()
     sides, middle = box[1] - box[0], box.mean(0)
     if isinstance(extent, int):
         check.whole(where, "extent", extent, low=5, high=2**40)
