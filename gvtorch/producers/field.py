@@ -29,8 +29,8 @@ class FieldProducer(Producer):
     (..., c), or {channel: (..., c)}, from world positions (..., 3).
 
     A voxel of any level is the mean of `samples`^3 values spread evenly over it; fields that can
-    compute their means (`Field.prefiltered`), such as `Solid`, are evaluated once. Regions that the
-    field's bounds prove uniform or invisible are never made.
+    compute their means (`Field.prefiltered`), such as `Solid`, are evaluated once a voxel. Regions
+    that the field's bounds prove uniform or invisible are never made.
 
     Attributes:
         field: The field.
@@ -66,8 +66,8 @@ class FieldProducer(Producer):
             threshold: Nodes whose values are all proven not to exceed it are EMPTY. One value for
                 all channels, or by name for those channels that decide; left out: the field's, if
                 it has one, else no node is EMPTY.
-            dtype: float32 or float64, of positions; left out: float64 if float32 can't distinguish
-                the finest voxels.
+            dtype: float32 or float64, of positions; left out: float32 if it is exact to 1/128 of a
+                finest voxel in the whole box, else float64.
             branching: N.
             value_range: Smallest and largest value of each channel for which they are known.
 
@@ -121,7 +121,7 @@ class FieldProducer(Producer):
         return {n: check.number(where, "threshold", value) for n, value in threshold.items()}
 
     def classify(self, nodes: Nodes) -> Regions:
-        """Returns EMPTY where all channels are proven not to exceed their thresholds, CONSTANT
+        """Returns EMPTY where all channels with a threshold are proven not to exceed it, CONSTANT
         where all are proven to have one value, else DATA; and the known ranges of values.
         """
         layout = nodes.layout
@@ -173,7 +173,7 @@ class FieldProducer(Producer):
 
     @property
     def _beyond(self) -> float:
-        """How many voxels beyond a brick's border the field is evaluated."""
+        """Voxels beyond a brick's border in which the field is evaluated, and a rounding margin."""
         return getattr(self.field, "margin", 0) + _MARGIN
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
@@ -385,6 +385,6 @@ def _cut_out(where: str, field: Field | None, extent: int | Sequence[int]) -> tu
 
 
 def dtype_of_places(box: Sequence[Sequence[float]], spacing: Sequence[float]) -> torch.dtype:
-    """Returns float32 if it can distinguish the finest voxels of a box, else float64."""
+    """Returns float32 if it is exact to 1/128 of a finest voxel in the whole box, else float64."""
     reach = max(abs(float(end)) for corner in box for end in corner)
     return torch.float32 if reach <= 0.5 * DEEP_VOXELS * min(spacing) else torch.float64

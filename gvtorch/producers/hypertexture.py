@@ -24,7 +24,7 @@ from .producer import Layout, Nodes, Producer, Region, Regions, by_depth, check_
 
 _BATCH = 64  # bricks made at a time on the CPU, so that intermediate values fit into its caches
 _COARSEST = 1.5  # cells along a voxel; beyond, nothing of the noise is left in a voxel's mean
-_ROUNDED = 1e-4  # most that rounding may add to a sum of octaves, in units of the amplitude
+_ROUNDED = 1e-4  # most that rounding may add to a sum of octaves, relative to the largest sum or 1
 
 
 class LevelOctaves(NamedTuple):
@@ -44,7 +44,7 @@ class Hypertexture(Tally, Producer):
 
     where noise is a sum of octaves. In each brick, summation ends as soon as density is 0 or 1 in
     all voxels whatever the remaining octaves add; this changes no bit. Regions where the distance
-    alone proves that are never made.
+    alone proves density 0, or 1 without a channel "distance", are never made.
 
     A voxel is about the mean over its cube. Each octave is weighted by the share of it that is left
     in this mean. The variance that averaging removes, of noise and of the distance, widens the step

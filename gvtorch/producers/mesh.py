@@ -23,10 +23,10 @@ class MeshProducer(Producer):
     """Makes bricks of a mesh at any level from its triangles. Only what is seen is made, so any
     resolution is possible. The finest voxels are those that `gv.voxelize` writes.
 
-    In a store, coarse voxels are means of those below; here they are means of 2^3 positions in the
-    voxel, with a plane in place of the nearest surface. So coverage and distance differ where
-    several parts of the surface are in a voxel. Colours and normals are those of the surface within
-    `band` voxels of the level.
+    In a store, coarse voxels are means of those below; here they are means of 2^3 samples in the
+    voxel. The coverage of solids is exact in both. Distances, and the coverage of sheets, which
+    count as planes at the nearest point, differ where several parts of the surface are in a voxel.
+    Colours and normals are those of the surface within `band` voxels of the level.
     """
 
     on_device = True

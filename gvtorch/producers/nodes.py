@@ -127,7 +127,7 @@ class Nodes:
 
     def wider(self, by: int) -> Nodes:
         """Returns the same nodes with `by` more border voxels on each side: for producers that
-        evaluate a wider grid because voxels depend on their neighbours.
+        evaluate a wider grid because voxels depend on their neighbours. They have no `parents`.
         """
         return Nodes(self.loc, self.layout.wider(by), coarse=self.coarse) if by else self
 
@@ -205,8 +205,8 @@ class Nodes:
     def axes(self) -> tuple[Tensor, Tensor, Tensor]:
         """float32 world coordinates of the voxel centres along x (k, 1, 1, s), y (k, 1, s, 1) and
         z (k, s, 1, 1), border included. A function of them broadcasts to (k, z, y, x) and reads a
-        hundredth of the memory that `positions` take. In worlds of more than about 2^20 voxels a
-        side float32 can't distinguish neighbours: see `local_axes`.
+        hundredth of the memory that `positions` take. In worlds of more than 2^18 voxels a side
+        float32 is exact to 1/128 of a voxel at best: see `local_axes`.
         """
         return _broadcast(self._places)
 

@@ -53,8 +53,8 @@ def by_depth(loc: Tensor) -> Iterator[tuple[int, Tensor]]:
 
 
 def _between(bricks: Tensor, row: Tensor, place: Tensor) -> Tensor:
-    """Returns (p, c) float32 values of bricks (k, z, y, x, c): trilinear, at positions `place`
-    (p, 3), in voxels, of bricks `row` (p,).
+    """Returns (p, c) float32 values, interpolated trilinearly at positions `place` (p, 3), in
+    voxels, in the bricks with indices `row` (p,) among `bricks` (k, z, y, x, c).
     """
     low = place.floor().clamp(max=bricks.shape[1] - 2)
     share, low = (place - low).to(torch.float32), low.to(torch.int64)
@@ -166,8 +166,8 @@ class Producer(torch.nn.Module):
         on_device: Whether `classify` and `fill` take and return only tensors on the engine's
             device, and never make the host wait or copy from host memory, so that `Engine.capture`
             can record them. Batches then have a fixed size and are padded with the root.
-        on_host: Whether both take locs on the host (`Nodes.loc`), and soon return tensors there or
-            futures: a captured frame then calls them while the device renders.
+        on_host: Whether both take locs on the host (`Nodes.loc`), and quickly return tensors there
+            or futures: a captured frame then calls them while the device renders.
         needs_parent: Whether `fill` needs the bricks of the nodes' parents (`Nodes.parents`): a
             node then waits until its parent has a brick. Engines on CUDA also record this if the
             producer is `on_device`.
