@@ -81,6 +81,7 @@ def test_channels_are_streamed_together_as_a_resident_tree(store, mesh):
 
 def test_a_node_is_uniform_where_all_channels_are(store):
     joined = gv.StoredChannels(store)
+    assert joined.host_bytes == sum(one.host_bytes for one in joined.producers.values()) > 0
     layout = Layout.of(joined, 8, 1, torch.device("cpu"))
     joined.prepare(layout)
     at = torch.cartesian_prod(*(torch.arange(-(-n // 8)) for n in joined.extent))
@@ -97,11 +98,13 @@ def test_producers_that_do_not_go_together_are_told(mesh):
     one = gv.MeshProducer(mesh, resolution=32)
     other = gv.MeshProducer(mesh, resolution=48, channels=("distance",))
     both = gv.MeshProducer(mesh, resolution=32, channels=("color", "normal"))
+    octaves = gv.OctaveProducer(gv.noise.SplineSum(), 64, box=((0,) * 3, (1,) * 3))
     for producers, said in (
         ({}, "at least one"),
         ({"a": one, "b": other}, "extent of 'b' is"),
         ({"a": both}, "must have one channel"),
         ({"a": 3}, "must be a Producer"),
+        ({"a": octaves}, "'a' needs its parents' bricks"),
     ):
         with pytest.raises(ValueError, match="JoinedProducer: ") as error:
             gv.JoinedProducer(producers)

@@ -39,7 +39,8 @@ class JoinedProducer(OfProducers):
             producers: By the name that the channel of each gets.
 
         Raises:
-            ValueError: One has several channels, or extent, spacing, origin or branching differ.
+            ValueError: One has several channels or needs its parents' bricks, or extent, spacing,
+                origin or branching differ.
         """
         where = type(self).__name__
         if not isinstance(producers, Mapping):
@@ -55,6 +56,8 @@ class JoinedProducer(OfProducers):
                 raise ValueError(
                     f"{where}: each producer must have one channel, {name!r} has {known}"
                 )
+            if one.needs_parent:
+                raise ValueError(f"{where}: {name!r} needs its parents' bricks")
             ((own, channel),) = one.channels.items()
             channels[name] = channel
             ranges |= {name: one.value_range[own]} if own in one.value_range else {}
@@ -71,6 +74,7 @@ class JoinedProducer(OfProducers):
         self.producers = torch.nn.ModuleDict(producers)
         self.on_host = all(one.on_host for one in producers.values())
         self.on_device = all(one.on_device for one in producers.values())
+        self.host_bytes = sum(one.host_bytes for one in producers.values())
         waits = [one.patience for one in producers.values() if one.patience is not None]
         self.patience = max(waits) if waits else None
 
