@@ -206,3 +206,20 @@ def test_fractals_do_not_depend_on_which_points_come_together(shape, dtype):
     shape.iteration = Mine(shape.iteration)
     for one, other in zip(shape.surface(points), (value, color), strict=True):
         assert torch.equal(one, other), "a step of one's own is followed alike"
+
+
+def test_a_repeated_shape_knows_its_box_on_the_device_that_it_is_on():
+    shape = gv.sdf.Repeat(gv.sdf.Sphere(1.0), (3.0, 3.0, 0.0), (3, 5, None))
+    assert shape.box().tolist() == [[-4, -7, -1], [4, 7, 1]]
+    assert shape.to("meta").box().is_meta
+
+
+def test_a_julia_set_takes_any_three_numbers():
+    points = 3 * torch.rand(200, 3) - 1.5
+    found = [
+        gv.Julia(c)(points)
+        for c in ((0.1, 0.2, 0.3), torch.tensor((0.1, 0.2, 0.3), dtype=torch.float64))
+    ]
+    assert torch.equal(*found) and found[0].unique().numel() > 10
+    with pytest.raises(ValueError, match="constant must be three numbers"):
+        gv.Julia(())

@@ -1,4 +1,4 @@
-"""Fields: functions of position, written in torch only."""
+"""Fields: functions of position, from torch tensors to torch tensors."""
 
 from . import noise, sdf
 from .combine import Blend, Mask, Painted, Stack, Warp

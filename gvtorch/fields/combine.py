@@ -44,8 +44,8 @@ class Warp(Field):
         Args:
             field: The field that is evaluated.
             way: Returns displacements (..., 3), which are added to points (..., 3).
-            most: Limit in world units to which longer displacements are shortened; so the field's
-                bounds over a box wider by this are valid.
+            most: World units to which longer displacements are shortened, so that bounds can be
+                those of the field over a box grown by this on all sides.
         """
         super().__init__()
         self.field = checked_field("Warp", "field", field)
@@ -76,8 +76,8 @@ class Stack(Field):
     """Several fields as the channels of one."""
 
     def __init__(self, **fields: nn.Module) -> None:
-        """Takes fields by the names of their channels. If a field has several channels, their names
-        are appended, as in "rock_rgba".
+        """Takes fields by the names of their channels. If a field itself has named channels, their
+        names are appended, as in "rock_rgba".
         """
         super().__init__()
         if not fields:
@@ -116,7 +116,7 @@ class Blend(Field):
 
     def __init__(self, first: nn.Module, second: nn.Module, mask: nn.Module) -> None:
         """Takes two fields of the same channels, and a mask of one value, such as the density of a
-        `Solid`; a `Distance` is converted to that.
+        `Solid`; a `Distance` is converted to such a density.
         """
         super().__init__()
         where = type(self).__name__
@@ -173,7 +173,7 @@ class Blend(Field):
 
 
 class Mask(Blend):
-    """A field where a mask is 1, and 0 where it is 0: there nothing is made."""
+    """A field multiplied by a mask from 0 to 1. Where the mask is proven 0, nothing is made."""
 
     def __init__(self, field: nn.Module, mask: nn.Module) -> None:
         """Takes the field and a mask of one value; see `Blend`."""
@@ -234,7 +234,7 @@ def _near(part: nn.Module, center: Tensor, half: Tensor) -> nn.Module:
 
 
 def _alike(parts: Iterable[nn.Module], center: Tensor, half: Tensor) -> Tensor:
-    """Returns numbers (k,), equal where all parts have equal ones; see `Field.alike`."""
+    """Returns numbers (k,), equal for boxes in which each part's are equal; see `Field.alike`."""
     found = torch.zeros_like(center[:, 0], dtype=torch.int64)
     for part in parts:
         found = found * HASH + (part.alike(center, half) if isinstance(part, Field) else 0)

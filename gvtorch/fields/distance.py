@@ -1,8 +1,8 @@
 """`Distance`: signed distance fields, negative inside, with a colour and a normal; and their
 combinations. Shapes are in shapes.py, deformations of space in spaces.py.
 
-The value of a combination is not an exact distance. But as long as a bound is known on how fast it
-changes (`slope`), it still bounds the distance from below, which proves boxes empty or full.
+The value of a combination is in general not an exact distance. But divided by a bound on how fast
+it changes (`slope`), it still bounds the distance from below, which proves boxes empty or full.
 
 Sources: Hart, "Sphere tracing: a geometric method for the antialiased ray tracing of implicit
     surfaces", The Visual Computer 1996 (Lipschitz bounds, shapes, their combination); Ricci, "A
@@ -149,7 +149,7 @@ class Pair(Distance):
         return ends.amin(0), ends.amax(0)
 
     def near(self, center: Tensor, half: Tensor) -> Distance:
-        """Returns one shape if only it counts in all boxes, else both, each reduced by `near`."""
+        """Returns one shape if only it counts in all boxes, else the pair, with reduced parts."""
         least, most = self._share(center, half, _ROUNDED)
         alone = torch.stack(((most == 0).all(), (least == 1).all())).tolist()
         if alone[0]:
@@ -205,8 +205,8 @@ class SmoothUnion(Pair):
 
 
 class OfShape(Field):
-    """Base of fields made of one shape. `over` maps the boxes in which they are evaluated to those
-    in which the shape is, and so decides which parts of the shape matter.
+    """Base of fields made of one shape. `over` maps the boxes in which the field is evaluated to
+    those in which the shape is evaluated, so that `near` and `alike` can use the shape's.
     """
 
     shape: Distance

@@ -21,7 +21,7 @@ from ..base import check
 Values = Tensor | Mapping[str, Tensor]
 #: Smallest and largest value over each of k boxes, (k,) or (k, c) float64; infinite: not known.
 Interval = tuple[Tensor, Tensor]
-#: An interval; of several channels intervals by name, of which unknown ones are left out.
+#: An interval, or intervals by channel without the unknown ones; None: nothing is known.
 Bounds = Interval | Mapping[str, Interval] | None
 
 
@@ -102,7 +102,7 @@ class Field(nn.Module):
         return other
 
     def box(self) -> Tensor | None:
-        """Returns (2, 3) float64 corners of a box beyond which there is nothing; None: unknown."""
+        """Returns (2, 3) float64 corners of a box outside which there is nothing; None: unknown."""
         return None
 
     def number(self, name: str, value: Any, **limits: Any) -> Tensor:
@@ -137,8 +137,8 @@ class Field(nn.Module):
 
 
 def checked_field(where: str, name: str, value: Any) -> nn.Module:
-    """Returns `value` if it is a field or another module with a forward. Raises ValueError if not,
-    as for producers.
+    """Returns `value` if it is a field or another module with a forward. Raises ValueError if it
+    has none; producers have none.
     """
     field = check.instance(where, name, value, nn.Module)
     if getattr(field.forward, "__func__", None) is not nn.Module.forward:

@@ -126,7 +126,7 @@ class Fractal(Distance):
         self.iterations = check.whole(where, "iterations", iterations, low=1, high=1000)
         self.bailout = self.number("bailout", bailout, low=1, open_low=True)
         self.julia = constant is not None
-        self.constant = self.vector("constant", constant or (0.0, 0.0, 0.0))
+        self.constant = self.vector("constant", (0.0, 0.0, 0.0) if constant is None else constant)
         if len(colors) != 3:
             raise ValueError(f"{where}: colors must be three colours, got {len(colors)}")
         self.register_buffer("colors_33", check.reals(where, "colors", colors, (3, 3)).clamp(0, 1))
@@ -240,6 +240,7 @@ class Mandelbox(Fractal):
 
     def box(self) -> Tensor:
         """Returns the cube that holds all orbits that never escape, a little enlarged for those
-        that have not escaped after `iterations`: beyond it, distances grow by |scale| in each step.
+        that have not escaped after `iterations`: each step multiplies an orbit's distance beyond
+        the cube by |scale|.
         """
         return self._within(self._side)

@@ -45,10 +45,10 @@ class Fur(OfShape):
 
         Args:
             shape: The shape that they grow on.
-            length: World units.
+            length: Height at which the value reaches 1, in world units.
             frequency: Hairs per world unit.
             fall: Displacement of a tip one length high, in lengths; below, times height squared.
-            seed: Of the noise.
+            seed: Seed of the noise.
         """
         super().__init__()
         self.shape = check.instance("Fur", "shape", shape, Distance)

@@ -39,7 +39,7 @@ class SampledDistance(Distance):
     apart: Tensor
 
     def __init__(self, volume: Volume, *, color: Color = WHITE) -> None:
-        """Copies the volume, and its position in the world.
+        """Sets the volume, whose position in the world is the field's. float32 data is not copied.
 
         Raises:
             ValueError: It does not have one number a voxel, or has less than 2 voxels on an axis.
@@ -78,8 +78,9 @@ class SampledDistance(Distance):
             mesh: As `read_mesh` returns it.
             resolution: Voxels along its longest side.
             reach: Margin of the volume around the mesh, as a share of that side.
-            solid: Which parts are solids: "auto", closed ones (others are sheets; warns if only a
-                few edges are missing); "always", all, after filling their holes; or "never".
+            solid: Which parts are solids: "auto", closed ones (others are sheets; warns if parts
+                are nearly closed, or a few triangles are turned); "always", all, after filling
+                their holes; or "never".
             color: The surface's.
 
         Raises:

@@ -1,7 +1,7 @@
 """Shapes as signed distances.
 
-Sources: Hart, "Sphere tracing", 1996, appendix (sphere, box, torus, plane). The others without a
-    source are plain geometry.
+Sources: Hart, "Sphere tracing", 1996, appendix (sphere, box, torus, plane). Other
+    shapes that name no source are plain geometry.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class Plane(Distance):
         return (points * self.normal.to(points)).sum(-1) - self.height
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
-        """Returns the values at the box's lowest and highest corner: exact."""
+        """Returns the values at the box's lowest and highest corner along the normal: exact."""
         middle, most = self(center), (half * self.normal.abs()).sum(1)
         return middle - most, middle + most
 

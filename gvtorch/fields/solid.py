@@ -12,7 +12,7 @@ from .distance import Distance, OfShape
 from .field import Interval, length
 
 _POINT = 1e-30  # side of voxels of no size
-_DEEP = 4.0  # voxels from the surface beyond which normals are 0
+_DEEP = 4.0  # voxels from the surface beyond which normals by derivatives are 0
 
 
 class Solid(OfShape):

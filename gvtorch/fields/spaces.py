@@ -29,7 +29,7 @@ class Space(Changed):
         return points
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
-        """Returns the value at points, given the shape's; it must not decrease with that."""
+        """Returns the value at points, given the shape's; must not decrease as that grows."""
         return value
 
     def stretch(self, center: Tensor, half: Tensor) -> Tensor | float:
@@ -104,7 +104,7 @@ class Transform(Space):
 
 class Twist(Space):
     """A shape turned about the z axis by an angle that grows along the axis. Space is stretched
-    more with the distance from the axis: by about 1 + rate * radius, at most.
+    more with the distance from the axis: by at most 1 + |rate| * radius.
     """
 
     def __init__(self, shape: Distance, rate: float) -> None:
@@ -147,7 +147,7 @@ class Repeat(Space):
     def __init__(
         self, shape: Distance, period: Sequence[float], count: Sequence[int] | None = None
     ) -> None:
-        """Sets the shape, the distance of its copies along x, y, z (0: not repeated), and how many
+        """Sets the shape, the spacing of its copies along x, y, z (0: not repeated), and how many
         there are along each axis (odd, centred at the origin); None: infinitely many.
 
         Raises:
@@ -158,7 +158,9 @@ class Repeat(Space):
         self.period = self.vector("period", period)
         self._axes = [axis for axis in range(3) if float(self.period[axis]) != 0]
         if bool((self.period < 0).any()) or not self._axes:
-            raise ValueError(f"{where}: period must be >= 0 and once more, got {tuple(period)}")
+            raise ValueError(
+                f"{where}: period must be >= 0, and > 0 along an axis, got {tuple(period)}"
+            )
         box = shape.box()
         beyond = None if box is None else box.abs().amax(0) - self.period / 2
         if beyond is None or bool((beyond[self._axes] > 1e-9).any()):
@@ -178,7 +180,7 @@ class Repeat(Space):
             moved = [*coordinates]
             for axis, side in zip(self._axes, sides, strict=True):
                 period, most = self.period[axis], self._most[axis]
-                # torch has no gradient of floor: it is detached, so the cell's gradient is 1.
+                # The cell number is piecewise constant, so it is detached from the gradient.
                 number = (coordinates[axis] / period).detach().floor() + side
                 moved[axis] = coordinates[axis] - number.clamp(-most, most) * period
             cells.append(torch.stack(moved, -1))
@@ -211,7 +213,7 @@ class Repeat(Space):
         return (low + high) / 2, (high - low) / 2
 
     def box(self) -> Tensor | None:
-        most = torch.tensor(self._most, dtype=torch.float64)
+        most = self.period.new_tensor(self._most, dtype=torch.float64)
         return grown(self.shape.box(), torch.where(self.period > 0, self.period * most, 0.0))
 
 

@@ -75,7 +75,7 @@ class FromChildren(OfProducers):
         super().prepare(layout)
 
     def close(self) -> None:
-        """Closes the producer."""
+        """Drops the cached blocks, and closes the producer."""
         self._kept.clear()
         super().close()
 

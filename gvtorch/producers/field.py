@@ -58,7 +58,7 @@ class FieldProducer(Producer):
         Args:
             field: A field or module; a `Distance` is converted to the `Solid` that it bounds.
             extent: Voxels of the finest level, (x, y, z), or along the longest side of the box.
-            box: World corners ((x, y, z), (x, y, z)); left out: the field's box, 2 voxels wider.
+            box: World corners ((x, y, z), (x, y, z)); left out: the field's and 2 voxels around it.
             channels: What voxels hold; left out: the field's dtypes, by default float32. In integer
                 channels a value of 1 becomes the largest number of the dtype.
             samples: n of the n^3 values that a voxel is the mean of; left out: `branching`, so that
@@ -66,8 +66,8 @@ class FieldProducer(Producer):
             threshold: Nodes whose values are all proven not to exceed it are EMPTY. One value for
                 all channels, or by name for those channels that decide; left out: the field's, if
                 it has one, else no node is EMPTY.
-            dtype: float32 or float64, of positions; left out: float64 if float32 can't distinguish
-                the finest voxels.
+            dtype: float32 or float64, of positions; left out: float64 if the box reaches more than
+                2^17 finest voxels from the world's origin along an axis.
             branching: N.
             value_range: Smallest and largest value of each channel for which they are known.
 
@@ -121,8 +121,8 @@ class FieldProducer(Producer):
         return {n: check.number(where, "threshold", value) for n, value in threshold.items()}
 
     def classify(self, nodes: Nodes) -> Regions:
-        """Returns EMPTY where all channels are proven not to exceed their thresholds, CONSTANT
-        where all are proven to have one value, else DATA; and the known ranges of values.
+        """Returns EMPTY where all channels that have a threshold are proven not to exceed it, else
+        CONSTANT where all channels are proven uniform, else DATA; and the known ranges of values.
         """
         layout = nodes.layout
         size = nodes.voxel_size
@@ -168,7 +168,7 @@ class FieldProducer(Producer):
         return Bricks(data=stored, kind=torch.where(finite, int(Region.DATA), -1))
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
-        """Returns where a part of the field with a time matters (`Field.near`) at either time."""
+        """Returns the nodes where a part of the field with a time matters at either time."""
         return moving(self, self.field, nodes, self._beyond, (before, after))
 
     @property
@@ -373,6 +373,7 @@ def _cut_out(where: str, field: Field | None, extent: int | Sequence[int]) -> tu
     box = None if field is None else field.box()
     if box is None or not bool(torch.isfinite(box).all()) or not bool((box[1] > box[0]).all()):
         raise ValueError(f"{where}: box must be given: the field does not say where it ends")
+    box = box.cpu()
     sides, middle = box[1] - box[0], box.mean(0)
     if isinstance(extent, int):
         check.whole(where, "extent", extent, low=5, high=2**40)
@@ -385,6 +386,6 @@ def _cut_out(where: str, field: Field | None, extent: int | Sequence[int]) -> tu
 
 
 def dtype_of_places(box: Sequence[Sequence[float]], spacing: Sequence[float]) -> torch.dtype:
-    """Returns float32 if it can distinguish the finest voxels of a box, else float64."""
+    """Returns float32 if a box ends within 2^17 finest voxels of the origin, else float64."""
     reach = max(abs(float(end)) for corner in box for end in corner)
     return torch.float32 if reach <= 0.5 * DEEP_VOXELS * min(spacing) else torch.float64

@@ -23,7 +23,7 @@ from .field import alike, distances_of, dtype_of_places, interval_of, moving
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth, check_points
 
 _BATCH = 64  # bricks made at a time on the CPU, so that intermediate values fit into its caches
-_COARSEST = 1.5  # cells along a voxel; beyond, nothing of the noise is left in a voxel's mean
+_COARSEST = 1.5  # cells along a voxel; beyond, a voxel's mean is computed without the octave
 _ROUNDED = 1e-4  # most that rounding may add to a sum of octaves, in units of the amplitude
 
 
@@ -178,7 +178,9 @@ class Hypertexture(Tally, Producer):
         return self._channels(total, distance, self.softness)
 
     def classify(self, nodes: Nodes) -> Regions:
-        """Returns EMPTY or CONSTANT where density is proven 0 or 1 for any noise, else DATA."""
+        """Returns EMPTY where density is proven 0 for any noise, CONSTANT where it is proven 1 and
+        there is no channel "distance", else DATA.
+        """
         layout = nodes.layout
         half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border)
         ends = self.shape.bounds(nodes.center, half)

@@ -39,7 +39,7 @@ class JoinedProducer(OfProducers):
             producers: By the name that the channel of each gets.
 
         Raises:
-            ValueError: One has several channels, or their extent, place or branching differs.
+            ValueError: One has several channels, or extent, spacing, origin or branching differ.
         """
         where = type(self).__name__
         if not isinstance(producers, Mapping):

@@ -23,10 +23,10 @@ class MeshProducer(Producer):
     """Makes bricks of a mesh at any level from its triangles. Only what is seen is made, so any
     resolution is possible. The finest voxels are those that `gv.voxelize` writes.
 
-    In a store, coarse voxels are means of those below; here they are means of 2^3 positions in the
-    voxel, with a plane in place of the nearest surface. So coverage and distance differ where
-    several parts of the surface are in a voxel. Colours and normals are those of the surface within
-    `band` voxels of the level.
+    In a store, coarse voxels are means of those below; here they are means of 2^3 samples in the
+    voxel (materials: one sample). The coverage of solids is the same, to rounding; that of sheets,
+    and distances, differ where several parts of the surface are in a voxel. Colours and normals are
+    those of the surface within `band` finest voxels or, if more, about half a voxel's diagonal.
     """
 
     on_device = True
@@ -45,13 +45,15 @@ class MeshProducer(Producer):
             mesh: A `Mesh`, or a file that `read_mesh` knows.
             channels: coverage, distance, color, normal, material; see `Voxelizer`.
             branching: N.
-            **settings: resolution: finest voxels along its longest side, 1024 if left out. band:
-                distance in finest voxels up to which the nearest surface counts, 4. thickness: in
-                finest voxels, of sheets that bound no solid, 1. solid: "auto", the default: closed
-                parts are solid; "always": holes are filled first; "never": everything is a sheet.
+            **settings: resolution: finest voxels along its longest side, a margin of 2 at either
+                end included; 1024 if left out. band: distance in finest voxels up to which the
+                nearest surface counts, 4. thickness: in finest voxels, of sheets that bound no
+                solid, 1. solid: "auto", the default: closed parts are solid; "always": holes are
+                filled first; "never": everything is a sheet.
 
         Raises:
-            ValueError: It is no mesh (see `read_mesh`), a channel unknown, or a number invalid.
+            ValueError: It is not a mesh (see `read_mesh`), a channel is unknown, or a number is out
+                of its range.
         """
         check.instance("MeshProducer", "mesh", mesh, Mesh, str, Path)
         mesh = mesh if isinstance(mesh, Mesh) else read_mesh(mesh)

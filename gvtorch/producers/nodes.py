@@ -99,8 +99,9 @@ class Nodes:
         layout: How the tree's world is divided: brick size, border, spacing and so on.
         coarse: Whether their bricks also hold coarse channels: then all nodes are above the finest
             level. If a producer has such channels and this is False, all are at the finest level.
-        parents: The bricks of their parents, (k, z, y, x, c) by channel, with borders, as stored;
-            None unless `Producer.needs_parent`, and for the root, which has no parent.
+        parents: The bricks of their parents, (k, z, y, x, c) by channel that is not coarse, with
+            borders, as stored; None unless `Producer.needs_parent`. The root has no parent: None,
+            or, in a recorded batch, its own brick.
     """
 
     def __init__(
@@ -205,8 +206,8 @@ class Nodes:
     def axes(self) -> tuple[Tensor, Tensor, Tensor]:
         """float32 world coordinates of the voxel centres along x (k, 1, 1, s), y (k, 1, s, 1) and
         z (k, s, 1, 1), border included. A function of them broadcasts to (k, z, y, x) and reads a
-        hundredth of the memory that `positions` take. In worlds of more than about 2^20 voxels a
-        side float32 can't distinguish neighbours: see `local_axes`.
+        hundredth of the memory that `positions` take. Beyond 2^18 voxels from the world's origin
+        float32 is exact to 1/64 of a voxel at best: see `local_axes`.
         """
         return _broadcast(self._places)
 

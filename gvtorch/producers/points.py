@@ -105,7 +105,7 @@ class PointProducer(Producer):
             some, low, high = (torch.from_numpy(part) for part in found)
             kind[rows[some]] = int(Region.DATA)
             ends[rows] = torch.stack((low, high), 1)
-        # Values rounded to the channel's dtype may exceed the ends by a relative 2^-7 (bfloat16).
+        # Values rounded to the channel's dtype may exceed the ends, by a relative 2^-7 at most.
         stored = (ends * (1 + 2.0**-7)).clamp(*channel.limits).to(channel.dtype)
         return Regions(kind=kind, ranges={"value": stored})
 

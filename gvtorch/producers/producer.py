@@ -71,7 +71,7 @@ class Answer:
     """Base of answers of producers: tensors with a row for each of k items, mostly by channel."""
 
     def rows(self, row: Tensor) -> Self:
-        """Returns the items with indices `row` (m,), without errors."""
+        """Returns the items with indices `row` (m,), with `errors` left empty."""
 
         def some(value: Any) -> Any:
             if isinstance(value, TableRows):
@@ -127,14 +127,14 @@ class Bricks(Answer):
 
 @runtime_checkable
 class CoarseColors(Protocol):
-    """Interface that makes a coarse channel; that of `Filtered`, which can't be imported here."""
+    """Interface of makers of a coarse channel: that of `Filtered`, which can't be imported here."""
 
     other: str | None  # name of the channel
     component: int | None  # index of the number of a voxel that it is made of
 
     @property
     def made_of(self) -> Mapping[str, Any]:
-        """All inputs that it depends on, as plain values."""
+        """What the channel was made of, as plain values."""
 
     def colors(self, spacing: tuple[float, float, float]) -> Channel:
         """Returns dtype and width of the channel, for voxels of this size."""
@@ -166,13 +166,13 @@ class Producer(torch.nn.Module):
         on_device: Whether `classify` and `fill` take and return only tensors on the engine's
             device, and never make the host wait or copy from host memory, so that `Engine.capture`
             can record them. Batches then have a fixed size and are padded with the root.
-        on_host: Whether both take locs on the host (`Nodes.loc`), and soon return tensors there or
-            futures: a captured frame then calls them while the device renders.
+        on_host: Whether `classify` and `fill` take locs on the host (`Nodes.loc`), and soon return
+            tensors there, or futures: a captured frame then calls them while the device renders.
         needs_parent: Whether `fill` needs the bricks of the nodes' parents (`Nodes.parents`): a
             node then waits until its parent has a brick. Engines on CUDA also record this if the
             producer is `on_device`.
         host_bytes: Bytes of host memory that it may fill while it is used.
-        made_of: For coarse channels, all inputs that they depend on: shaders compare them with what
+        made_of: For coarse channels, by name, what they are made of: shaders compare it with what
             they need.
         version: Number of the content, which increases with each change: see `changed`.
         extent, spacing, origin, branching, channels, value_range, labels: See `__init__`.
@@ -315,8 +315,8 @@ class Producer(torch.nn.Module):
     @property
     def time(self) -> float:
         """The time of all parts that have a buffer `time` (`Field.number`), such as fields or other
-        producers. Setting it calls `changed` for the nodes in `differs`. AttributeError if no part
-        has a time.
+        producers. Setting it calls `changed` for the nodes that `differs` returns, or for all if
+        the parts had different times. AttributeError if no part has a time.
         """
         return float(self._clocks()[0])
 

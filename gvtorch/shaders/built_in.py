@@ -113,7 +113,7 @@ class PreIntegrated(Shader):
 class StoredColor(LitShader):
     """Colour and opacity stored in each voxel: a channel of 4 numbers, linear red, green, blue and
     opacity per reference length; integers are scaled to 0 to 1. Or 24 numbers, 4 for each of six
-    directions, as `Volume.directional` makes them: a ray sees those of the directions it follows.
+    directions, as `Volume.directional` makes them: a ray sees a mix of the three that it follows.
     """
 
     kind = "StoredColor"
@@ -145,7 +145,7 @@ class StoredColor(LitShader):
             premultiplied: Whether colours are stored multiplied by opacity, as they always are for
                 six directions. Coarse levels then keep the colours of opaque voxels; otherwise the
                 colours of transparent ones mix in.
-            lit: Whether it is lit; always true with `normals`, and with shadows.
+            lit: Whether it is lit; always true with `normals`, shadows or `octaves`.
             shadows: As in `Lit`.
             **light: As in `Lit`; without `normals`, the normal is the gradient of the opacity (of
                 that towards +x, where there are six directions).
@@ -236,7 +236,7 @@ class Isosurface(LitShader):
             color_component: Index of the number that the transfer function reads from it.
             premultiplied: Whether stored colours are multiplied by their opacity.
             filled: False: a hollow shell, whose inner side is seen by rays that begin inside. A
-                `Clip` without caps always draws the surface so.
+                `Clip` always draws the surface so, and closes it with its caps, if it has any.
             **light: As in `Lit`.
 
         Raises:

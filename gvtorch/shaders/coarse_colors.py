@@ -74,10 +74,10 @@ def write_colors(
     float16 each: for each of the directions +x -x +y -y +z -z, the n numbers (PLAIN or LIT) of a
     voxel seen in it, over a length of the smallest spacing, and the share of light that reached it.
 
-    Columns are weighted by light. With `all_light` it is dimmed by everything between a column and
-    the outside, so that a row of voxels transmits as much as its columns do together. This suits
+    Columns are weighted by the light that reaches them in a voxel. With `all_light` everything
+    before the voxel dims it, so that a row of voxels transmits what its columns do. This suits
     translucent matter, which looks much the same to an oblique ray. In opaque matter an oblique ray
-    may see what no light reaches along an axis: there light is dimmed by the voxel in front only.
+    may see what no light reaches along an axis, so else only the voxel in front dims the light.
     """
     done, total = 0, 3 * math.prod(field.shape)
     numbers = out[0].shape[-1] // _DIRECTIONS if out else 0
@@ -160,9 +160,9 @@ def _fill_hidden(seen: Tensor, device: torch.device) -> None:
     """Blends the colours of neighbours into voxels that hardly any light reaches. In `seen`,
     (2, n, a, b, c + 1), the last number is the light.
 
-    Hidden voxels are only seen by rays that pass between them and visible ones, and blend both
-    halves: along the rim of a solid such a ray reads half of its inside in each interval, so that
-    solids would grow from afar.
+    A hidden voxel is only seen by rays that pass between it and a visible one, and interpolate the
+    two. Such a ray along the rim of a solid would blend in half of the inside in each interval, so
+    that solids would grow from afar.
     """
     most, (high, wide) = _TILE_VOXELS[device.type], seen.shape[2:4]
     rows = min(high, max(1, most // wide))
@@ -301,7 +301,7 @@ class _Columns:
 def _surfaces(color: Tensor, alpha: Tensor, light: Tensor, step: int) -> Tensor:
     """Returns the moments of intervals (c - 3, n, a, b), weighted by light. Rays also blend in the
     inside of solids, which no light reaches: there an interval takes the moments of the last one
-    before it that light reaches, over `_FAINT`, so that those of other directions count more.
+    before it that light reaches, divided by `_FAINT`, so that other directions count more.
     """
     index = torch.arange(len(alpha), device=alpha.device)[:, None, None]
     comes = light > 2 * _LEAST

@@ -69,7 +69,7 @@ class CompiledShader(LitShader):
         Raises:
             CompileError: The compiler rejects it; holds the compiler's output unchanged.
             RuntimeError: There is no compiler, the header changes while it is compiled, or the
-                cache folder can't be written or is owned by another user.
+                cache folder can't be written, is another user's, or is open to others' writes.
             ValueError: There is no such file, or uniforms are not those that the struct names.
         """
         super().__init__(**light)

@@ -50,7 +50,7 @@ from .shader import Sampling, Shader
 from .transfer_function import TransferFunction
 
 #: Results of `finer`. The finest voxels are not filtered: the sharper their detail, the smaller
-#: must the pixels be that are drawn from them, and so must this factor.
+#: the pixels must be that are drawn from them, and the smaller this factor.
 _FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
 _OPAQUE = 0.2  # colours are stored by direction if a finest voxel can have a higher alpha
 _TIMEOUT = 3600.0  # seconds for one read of local data
@@ -72,9 +72,9 @@ def _to_filter(owner: Any, name: str, value: Any) -> TransferFunction | Lit:
 
 
 class Filtered(Shader):
-    """The transfer function for finest bricks, and for coarse bricks a channel of colours that it
-    makes of the finest voxels below them. From near it draws as the transfer function does; from
-    afar about as many rays a pixel would. `Filtered.of` makes shader and channel.
+    """The transfer function for the finest bricks, and for coarse bricks a channel of colours that
+    it makes of the finest voxels below them. Near by it draws what the transfer function does; from
+    afar, about what many rays per pixel would. `Filtered.of` makes both shader and channel.
 
     Given a `Lit`, coarse bricks also store the normals' moments, and highlights widen with
     distance. Light and material may be edited at any time.
@@ -181,7 +181,7 @@ class Filtered(Shader):
     ) -> Self:
         """Computes the colours of a store, out of core, and writes them into it as a coarse
         channel, which `StoredProducer(store, filtered=shader)` streams. The store's voxels are not
-        changed. Meanwhile temporary files of 9 bytes a finest voxel (lit, 19) are in the store's
+        changed. While it runs, temporary files take 9 bytes a finest voxel (lit, 19) in the store's
         folder; the colours themselves compress well.
 
         Args:
@@ -258,7 +258,7 @@ class Filtered(Shader):
 
     @property
     def made_of(self) -> dict[str, Any]:
-        """All inputs that the colours depend on, as JSON."""
+        """The function, component and use of normals that made the colours, as JSON values."""
         function = self.function
         told = {
             "opacity": function.opacity.tolist(),
@@ -299,7 +299,9 @@ class Filtered(Shader):
             yield self.kept(colors, width).cpu()
 
     def kept(self, colors: Tensor, width: int) -> Tensor:
-        """Converts numbers that `write` wrote to those of a channel of a width."""
+        """Converts what `write` wrote to a channel: without light, averaged if `width` is that of
+        one direction.
+        """
         seen = without_light(colors)
         return seen if seen.shape[-1] == width else mean_of_directions(seen)
 

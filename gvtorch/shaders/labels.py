@@ -29,10 +29,11 @@ class Labels(LitShader):
     between two voxels, that of the one with the higher index. Labels are never mixed; where two
     levels of detail blend, their colours do. `Hits.label` and `Picture.label` hold what is seen.
 
-    It reads a channel of labels (`Volume(..., labels=True)`). If lit, the normal of a sample points
-    to the voxels around it that have another label, looking as many voxels to each side as the
-    border of bricks is wide, 1 to 3: for a ball it is off by 11 degrees on average with a border of
-    1, by 4 with 2, by 2 with 3. Without such voxels a sample is lit as if it faced the light.
+    It reads a channel of labels (`Volume(..., labels=True)`). If lit, the normal of a sample is
+    the mean direction to voxels of other labels around it, turned towards the eye. They are
+    searched as many voxels to each side as bricks have for a border, 1 to 3: for a ball it is off
+    by 11 degrees on average with 1, by 4 with 2, by 2 with 3. Without such voxels a sample is lit
+    as if it faced the light.
 
     Attributes may be edited, also in place: the next picture uses them.
 

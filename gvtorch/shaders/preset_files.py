@@ -31,7 +31,7 @@ _FEW = 2048  # parts in all, if there are few colours
 _SRGB_PARTS = 32  # linear pieces from black to white that approximate sRGB
 _BENT = 128  # parts of a curve between two opacities
 _STRAIGHT, _SUDDEN = 0.01, 0.99  # VTK sharpness: below it is linear, above a step, else a curve
-_UNSATURATED = 0.05  # saturation in Msh, radians
+_UNSATURATED = 0.05  # radians; colours with less saturation in Msh count as grey
 _APART = 0.33 * math.pi  # colours with hues farther apart are mixed through white, as in VTK
 
 
@@ -271,7 +271,7 @@ def _on_grid(points: np.ndarray, low: float, step: float) -> Points:
         zip(places, points[:, 1:].tolist(), strict=True), lambda p: p[0]
     ):
         rows = [row for _, row in run]
-        jump = rows[0] != rows[-1] and last < at  # else one row, so that curves don't shift upwards
+        jump = rows[0] != rows[-1] and last < at  # else one row, so that values don't shift upwards
         for row in (rows[0], rows[-1]) if jump else rows[-1:]:
             last = max(int(at), last + 1)
             kept.append((low + last * step, *row))

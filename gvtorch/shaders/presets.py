@@ -55,7 +55,7 @@ PRESETS: dict[str, Pair] = {
         ],
     ),
 }
-RAMP = PRESETS["gray"][0]  # of colour maps
+RAMP = PRESETS["gray"][0]  # opacity of colour maps
 
 #: In Hounsfield units: air is -1000, lung -900 to -500, fat -100, water 0, muscle 50, vessels with
 #: contrast agent 150 to 500, bone 300 to 2000.
@@ -93,7 +93,7 @@ CT_PRESETS: dict[str, Pair] = {
         ],
     ),
 }
-#: The presets in Hounsfield units that show the same tissue as one over a window.
+#: For a preset over a window, the one in Hounsfield units that shows the same tissue.
 IN_HU = {"bone": "ct-bone", "tissue": "ct-soft", "vessels": "ct-vessels"}
 
 SAMPLES = 256  # of a colour map

@@ -1,5 +1,5 @@
-"""`Shader`, the base of all shaders: what the tracer and the effects around it ask a shader for.
-And `ColorTable`, which the kernels read: rows of colour and alpha at evenly spaced values.
+"""`Shader`, the base of all shaders, with the methods that the tracer and the effects around it
+call; and `ColorTable`, which the kernels read: rows of colour and alpha at evenly spaced values.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ class Shader(Checked):
             other_component=self.other_component,
         )
 
-    # For the effects around it. They raise ValueError if they need normals and there are none.
+    # For the effects around it. Those for lighting raise ValueError for unsuitable shaders.
 
     @property
     def projection(self) -> Literal["maximum", "minimum", "mean"] | None:
@@ -231,7 +231,7 @@ class Shader(Checked):
         return None
 
     def opened(self) -> Shader:
-        """Returns the shader for clips without caps: it also shows surfaces from inside."""
+        """Returns the shader for clips, with caps or not: it also shows surfaces from inside."""
         return self
 
     def unlit(self) -> Shader:

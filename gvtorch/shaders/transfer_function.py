@@ -31,7 +31,7 @@ _FOREIGN = {"RGBPoints", "volumeProperties"}  # keys of other programs' files
 _FEWEST_CELLS = 2**10
 _FEWEST_SAMPLED = 2**12  # fewest where corners fall between rows
 _CELLS_APART = 16  # least distance of two corners that fall between rows
-_MANY_CELLS = 2**16  # most with all corners on rows, unless only these make the table possible
+_MANY_CELLS = 2**16  # most with all corners on rows; more only if no other table is possible
 _MOST_CELLS = 2**20
 _FEWEST_PAIRED, _MOST_PAIRED = 128, 256  # along a side of an integrated table
 _FEWEST_PARTS, _MOST_PARTS = 8, 4096  # parts in which each of these cells is integrated
@@ -154,8 +154,8 @@ class TransferFunction(Shader):
         return function.stretched(low, high)
 
     def stretched(self, low: float, high: float) -> TransferFunction:
-        """Returns the function with its first corner point moved to `low` and its last to `high`,
-        which is raised a little unless it is above `low`.
+        """Returns the function with its first corner point moved to `low` and its last to `high`. A
+        `high` that is not above `low` becomes low + max(1, 1e-6 |low|).
         """
         where = "TransferFunction.stretched"
         low, high = (check.number(where, n, v) for n, v in (("low", low), ("high", high)))
@@ -205,7 +205,7 @@ class TransferFunction(Shader):
         low, high = float(values[0]), float(values[-1])
         if high == low:
             high = low + max(1.0, abs(low))
-        return low, high, np.unique((values - low) / (high - low))  # some may round to one
+        return low, high, np.unique((values - low) / (high - low))  # rounding may make some equal
 
     def length(self, sampling: Sampling) -> float:
         """Returns the length of the shortest interval in reference lengths; at most 1e300, so that
@@ -327,7 +327,7 @@ def _pairs(rows: np.ndarray, thickness: np.ndarray, color: np.ndarray, length: f
 
 
 def _cells(places: np.ndarray) -> int | None:
-    """Returns how many cells of [0, 1] suit corners at these positions; None: too close corners."""
+    """Returns how many cells of [0, 1] suit corners at these positions; None: too dense."""
     exact = _common_cells(places, _MOST_CELLS, tolerance=1e-9)
     gap = float(np.diff(places, append=2.0).min())
     dense = max(_FEWEST_SAMPLED, 2 ** math.ceil(math.log2(_CELLS_APART / max(gap, 1e-9))))

@@ -150,7 +150,7 @@ def periods(where: str, period: Period, n: int, multiple: int = 1) -> tuple[int,
     """Returns the period along each of n axes; 0: none.
 
     Raises:
-        ValueError: One is not a positive multiple of `multiple`.
+        ValueError: It is not one or n positive multiples of `multiple`, at most 2^28.
     """
     if period is None:
         return (0,) * n
@@ -201,7 +201,7 @@ def bounds(basis: Basis, n: int = 3) -> Bounds:
     by 2^-20.
 
     Raises:
-        ValueError: The noise is another function, whose bounds are unknown.
+        ValueError: The noise is another function, or n another number: bounds are unknown.
     """
     options: dict[str, Any] = {}
     while isinstance(basis, partial):

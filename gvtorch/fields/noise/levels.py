@@ -10,10 +10,10 @@ parent's voxels per cell, with 6 points along each axis, over 600 bricks:
     largest         1.3   0.09  5.3e-3  6.5e-4  6.0e-5  7.2e-6
     mean square     0.13  0.01  5.7e-4  5.4e-5  4.4e-6  4.6e-7
 
-An octave that is inherited right from the first level that holds it, at 2 voxels a cell, would be
-lost. So each is evaluated until its cells are `settled` voxels wide, and inherited from then on: at
-16, with about the error of storing float16, to which each further level adds an eighth. A level
-then evaluates 4 octaves, however many coarser ones there are.
+An octave inherited from the first level that represents it, at 2 voxels a cell, would be lost.
+So each is evaluated until its cells are `settled` voxels wide, and inherited from then on: at 16,
+with about the error of storing float16, to which each further level adds an eighth. A level then
+evaluates 4 octaves, however many coarser ones there are.
 
 Source: Lagrange's interpolation; the idea is from the original engine's example of noise that is
     inherited from the parent's brick.
@@ -74,7 +74,7 @@ def inherit(
 
 
 class OctaveSum(Tally):
-    """The sum of `fbm` in bricks of any level, of those octaves that its voxels can represent.
+    """The sum of `fbm` in bricks of any level, of the octaves that its voxels represent.
 
     Attributes:
         octaves: All of them.
