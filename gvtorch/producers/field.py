@@ -29,8 +29,8 @@ class FieldProducer(Producer):
     (..., c), or {channel: (..., c)}, from world positions (..., 3).
 
     A voxel of any level is the mean of `samples`^3 values spread evenly over it; fields that can
-    compute their means (`Field.prefiltered`), such as `Solid`, are evaluated once. Regions that the
-    field's bounds prove uniform or invisible are never made.
+    compute their means (`Field.prefiltered`), such as `Solid`, are evaluated once a voxel. Regions
+    that the field's bounds prove uniform or invisible are never made.
 
     Attributes:
         field: The field.
@@ -173,7 +173,7 @@ class FieldProducer(Producer):
 
     @property
     def _beyond(self) -> float:
-        """How many voxels beyond a brick's border the field is evaluated."""
+        """Voxels beyond a brick's border in which the field is evaluated, and a rounding margin."""
         return getattr(self.field, "margin", 0) + _MARGIN
 
     def at(self, points: Tensor) -> dict[str, Tensor]:

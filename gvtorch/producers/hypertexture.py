@@ -44,7 +44,7 @@ class Hypertexture(Tally, Producer):
 
     where noise is a sum of octaves. In each brick, summation ends as soon as density is 0 or 1 in
     all voxels whatever the remaining octaves add; this changes no bit. Regions where the distance
-    alone proves that are never made.
+    alone proves density 0, or 1 without a channel "distance", are never made.
 
     A voxel is about the mean over its cube. Each octave is weighted by the share of it that is left
     in this mean. The variance that averaging removes, of noise and of the distance, widens the step

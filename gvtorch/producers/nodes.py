@@ -128,7 +128,7 @@ class Nodes:
 
     def wider(self, by: int) -> Nodes:
         """Returns the same nodes with `by` more border voxels on each side: for producers that
-        evaluate a wider grid because voxels depend on their neighbours.
+        evaluate a wider grid because voxels depend on their neighbours. They have no `parents`.
         """
         return Nodes(self.loc, self.layout.wider(by), coarse=self.coarse) if by else self
 

@@ -53,8 +53,8 @@ def by_depth(loc: Tensor) -> Iterator[tuple[int, Tensor]]:
 
 
 def _between(bricks: Tensor, row: Tensor, place: Tensor) -> Tensor:
-    """Returns (p, c) float32 values of bricks (k, z, y, x, c): trilinear, at positions `place`
-    (p, 3), in voxels, of bricks `row` (p,).
+    """Returns (p, c) float32 values, interpolated trilinearly at positions `place` (p, 3), in
+    voxels, in the bricks with indices `row` (p,) among `bricks` (k, z, y, x, c).
     """
     low = place.floor().clamp(max=bricks.shape[1] - 2)
     share, low = (place - low).to(torch.float32), low.to(torch.int64)

@@ -82,8 +82,8 @@ class VolumeProducer(Producer):
         self.volumes, self._threshold, self._hold = volumes, threshold, hold
         self._filtered = filtered
         self.on_device, self.on_host = hold == "mapped", hold != "mapped"
-        self._values: dict[str, list[Tensor]] = {}  # by channel, a tensor a level, the root's first
-        self._tables: dict[str, BrickTable] = {}  # by channel, by depth and then z, y, x
+        self._values: dict[str, list[Tensor]] = {}  # by channel, one per level, the root's first
+        self._tables: dict[str, BrickTable] = {}  # by channel; rows by depth, z, y, x
         self._voxels: dict[str, Tensor] = {}  # by channel (v, c), in the same order
         self._nodes: dict[str, Tensor] = {}  # by channel (n, 3, c) low, high, mean, same order
         self._grids = torch.empty(0)  # (d, 4) for each depth: first node, nodes along z, y, x
