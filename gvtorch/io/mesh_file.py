@@ -248,8 +248,8 @@ def _parts(trimesh: Any, loaded: Any) -> list[Any]:
 
 
 def _joined(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh:
-    """Joins trimesh's meshes. If not `mapped`, no image was read, and an image that trimesh returns
-    is a placeholder of its own.
+    """Joins trimesh's meshes. If not `mapped`, no image was read: images in them are trimesh's
+    default, and are left out.
     """
     vertices, faces, colors, uvs, numbers = [], [], [], [], []
     materials: list[Material] = []

@@ -56,7 +56,6 @@ class FromChildren(OfProducers):
             **grid_of(producer), channels=producer.channels, value_range=producer.value_range
         )
         self.producer, self.patience = producer, producer.patience
-        self.host_bytes = producer.host_bytes
         self.levels = check.whole(where, "levels", levels, low=1, high=10)
         self._kept: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by loc
         self._known = producer.version  # the version that these blocks were made from

@@ -74,7 +74,6 @@ class JoinedProducer(OfProducers):
         self.producers = torch.nn.ModuleDict(producers)
         self.on_host = all(one.on_host for one in producers.values())
         self.on_device = all(one.on_device for one in producers.values())
-        self.host_bytes = sum(one.host_bytes for one in producers.values())
         waits = [one.patience for one in producers.values() if one.patience is not None]
         self.patience = max(waits) if waits else None
 

@@ -418,6 +418,11 @@ class OfProducers(Producer):
         """The latest version of any part."""
         return max(one.version for one in self.parts().values())
 
+    @property
+    def host_bytes(self) -> int:  # type: ignore[override]
+        """The sum over all parts."""
+        return sum(one.host_bytes for one in self.parts().values())
+
     def changed(self, where: Any = None) -> None:
         """See `Producer.changed`; calls it for all parts."""
         for one in self.parts().values():

@@ -85,16 +85,7 @@ def slice_picture(
     check.instance(where, "data", data, Volume, Store)
     scale = check.number(where, "scale", scale, low=0, high=_MOST, open_low=True)
     plane = _Plane(data, component, level)
-    if colors is None:
-        ends = window(data, component=component, background=True) if span is None else span
-        if not isinstance(ends, (tuple, list)) or len(ends) != 2:
-            raise ValueError(f"{where}: span must be the values of black and white, got {span!r}")
-        colors = TransferFunction(*display_grays()).stretched(*ends)
-    elif span is not None:
-        raise ValueError(f"{where}: span is for grays; colors have their own values")
-    elif not callable(colors) or isinstance(colors, type):
-        kind = type(colors).__name__
-        raise ValueError(f"{where}: colors must be a function of values or Labels, got a {kind}")
+    colors = _colors(data, span, colors, component)
     views = _views(data.info.space, up, radiological=radiological, letters=letters)
     if axis == "all":
         if up is not None:
@@ -110,6 +101,24 @@ def slice_picture(
     pixel = min(plane.spacing[n] for n in "xyz" if n != axis) / scale
     view = views[axis] if up is None else PlaneView("", up)
     return _picture(plane.colored(axis, at, view, pixel, colors))
+
+
+def _colors(
+    data: Volume | Store, span: tuple[float, float] | None, colors: Colors | None, component: int
+) -> Colors:
+    """Returns the colours of values: those given, or grays over a span."""
+    where = "slice_picture"
+    if colors is None:
+        ends = window(data, component=component, background=True) if span is None else span
+        if not isinstance(ends, (tuple, list)) or len(ends) != 2:
+            raise ValueError(f"{where}: span must be the values of black and white, got {span!r}")
+        return TransferFunction(*display_grays()).stretched(*ends)
+    if span is not None:
+        raise ValueError(f"{where}: span is for grays; colors have their own values")
+    if not callable(colors) or isinstance(colors, type):
+        kind = type(colors).__name__
+        raise ValueError(f"{where}: colors must be a function of values or Labels, got a {kind}")
+    return colors
 
 
 def _views(
