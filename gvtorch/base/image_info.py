@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 Rgb = tuple[float, float, float]
-Matrix = tuple[tuple[float, ...], ...]
+Rows = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,7 @@ class ImageInfo:
     quantity: str | None = None  # what the values measure, as in "HU"
     labels: bool = False  # values are label numbers, which must not be blended
     space: str | None = None  # where x, y, z point: "right-anterior-superior", ...
-    pose: Matrix | None = None  # (4, 4) to the world from axes of oblique voxels kept as they are
+    pose: Rows | None = None  # (4, 4) to the world from the axes of oblique voxels kept as they are
     time_step: float | None = None  # from one time point to the next
     time_origin: float = 0.0  # of the first time point
     time_unit: str | None = None  # as OME-NGFF spells it: "second", ...

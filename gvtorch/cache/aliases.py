@@ -129,8 +129,8 @@ class Aliases:
             row, is_alias = self._find_rows(node)
             nodes.append(torch.where(is_alias, self.rows.target[row], node))
             priorities.append(priority)
-            above = is_alias & ~self.rows.exact[row]
-            kinds.append(torch.where(above, REQUEST_SUBDIVIDE, kind))
+            at_ancestor = is_alias & ~self.rows.exact[row]
+            kinds.append(torch.where(at_ancestor, REQUEST_SUBDIVIDE, kind))
         node, priority, kind_k = torch.cat(nodes), torch.cat(priorities), torch.cat(kinds)
         result = {}
         for kind in (REQUEST_LOAD, REQUEST_SUBDIVIDE):

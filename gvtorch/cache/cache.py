@@ -131,7 +131,7 @@ class Cache:
         """Returns bytes by name: content of each pool, and bookkeeping."""
         nodes, bricks = self.nodes, self.bricks
         content = (*nodes.constants.values(), *nodes.ranges.values())
-        node_bytes = sum(words.nbytes for words in (nodes.child_tn, nodes.brick_tn, *content))
+        node_bytes = sum(tensor.nbytes for tensor in (nodes.child_tn, nodes.brick_tn, *content))
         brick_bytes = sum(tensor.nbytes for tensor in bricks.bricks.values())
         order = sum(lru.nbytes for group in self.lru.values() for lru in group)
         rest = nodes.nbytes + bricks.nbytes - node_bytes - brick_bytes + order

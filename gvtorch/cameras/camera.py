@@ -314,13 +314,13 @@ class Camera:
     def __getitem__(self, index: int) -> Camera:
         """Returns one camera of the batch."""
         first = range(len(self))[index]
-        parts = {name: getattr(self, name)[first : first + 1] for name in _BATCHED_FIELDS}
-        return self._changed(**parts, batched=False)
+        changes = {name: getattr(self, name)[first : first + 1] for name in _BATCHED_FIELDS}
+        return self._copy_with(**changes, batched=False)
 
-    def _changed(self, **parts: Any) -> Camera:
-        other = object.__new__(type(self))
-        vars(other).update(vars(self), **parts)
-        return other
+    def _copy_with(self, **changes: Any) -> Camera:
+        camera = object.__new__(type(self))
+        vars(camera).update(vars(self), **changes)
+        return camera
 
     @property
     def form(self) -> tuple[Any, ...]:
@@ -353,15 +353,15 @@ class Camera:
             corners = torch.stack([box[corner, (0, 1, 2)] for corner in _CORNERS])
             in_camera = (corners - torch.from_numpy(centre)) @ torch.from_numpy(rotation).mT
             half_extents = [_FIT_FRACTION * half_extent for half_extent in self.fitted]
-            depth, scale = MODELS[self.model].fit(in_camera, *half_extents)  # (n,) each
+            distance, scale = MODELS[self.model].fit(in_camera, *half_extents)  # (n,) each
             translation[:] = -turned_centre
-            translation[:, 2] += depth.numpy()
+            translation[:, 2] += distance.numpy()
             scale = scale[:, None]
         if MODELS[self.model].parallel:
             Ks = Ks.clone()
             Ks[:, (0, 1), (0, 1)] /= scale
-        parts = {"viewmats": torch.from_numpy(view), "Ks": Ks}
-        return self._changed(**parts, frame=Frame.WORLD, fitted=None)
+        changes = {"viewmats": torch.from_numpy(view), "Ks": Ks}
+        return self._copy_with(**changes, frame=Frame.WORLD, fitted=None)
 
     def pixel_width(self, distance: float) -> float:
         """Returns the width of a pixel in world units: of a pinhole at a distance along its axis,
@@ -384,12 +384,12 @@ class Camera:
         """
         Ks = self.Ks.clone()
         Ks[:, :2, 2] -= torch.tensor([dx, dy], dtype=torch.float64)
-        return self._changed(Ks=Ks, sample=self.sample if sample is None else sample)
+        return self._copy_with(Ks=Ks, sample=self.sample if sample is None else sample)
 
     def strip(self, first: int, end: int) -> Camera:
         """Returns the camera of the rows [first, end) of each picture."""
         window = (self.window[0] + first, self.window[1])
-        return self.shifted(0, first)._changed(height=end - first, window=window)
+        return self.shifted(0, first)._copy_with(height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
         """Returns the numbers that `pixel_rays` reads; does not wait for the device. (n, 26)
@@ -419,7 +419,7 @@ class Camera:
     def thinned(self, stride: int) -> Camera:
         """Returns the camera with one ray per stride x stride pixels; see `numbers_ahead`."""
         height, width = (-(-size // stride) for size in (self.height, self.width))
-        return self._changed(height=height, width=width, window=(0, height))
+        return self._copy_with(height=height, width=width, window=(0, height))
 
     def numbers_ahead(self, now: Tensor, before: Tensor, frames: float, stride: int) -> Tensor:
         """Returns the numbers of the camera `thinned` by `stride`, extrapolated by `frames` frames
@@ -580,19 +580,19 @@ def _aimed(
     frame: Frame,
 ) -> Camera:
     """Returns cameras with a centred axis; `distance` (...) is that of the target."""
-    kind = model_of(context, model)
-    fov = kind.fov if fov is None else fov
-    check.number(context, "fov", fov, low=0, high=kind.widest, open_low=True)
+    camera_model = model_of(context, model)
+    fov = camera_model.fov if fov is None else fov
+    check.number(context, "fov", fov, low=0, high=camera_model.widest, open_low=True)
     if fov < _MIN_FOV_DEGREES:
         raise ValueError(
             f"{context}: fov must be at least {_MIN_FOV_DEGREES:g} degrees, got {fov!r}"
         )
     check.whole(context, "width", width, low=1, high=65536)
     check.whole(context, "height", height, low=1, high=65536)
-    fx, fy = kind.focal(math.radians(fov), width, height)
+    fx, fy = camera_model.focal(math.radians(fov), width, height)
     Ks = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float64)
-    if kind.parallel:
+    if camera_model.parallel:
         Ks = Ks.repeat(*distance.shape, 1, 1)
         Ks[..., (0, 1), (0, 1)] /= distance[..., None]
-    max_angle = min(180.0, fov / 2) if kind.has_distortion else 180.0
+    max_angle = min(180.0, fov / 2) if camera_model.has_distortion else 180.0
     return Camera(view, Ks, width, height, model=model, max_angle=max_angle, frame=frame)

@@ -131,7 +131,7 @@ class CustomCamera(Camera):
 
     def __getitem__(self, index: int) -> Camera:
         """Returns one camera of the batch."""
-        return self._changed(_rays=self._pictures()[index].reshape(-1, 11), batched=False)
+        return self._copy_with(_rays=self._pictures()[index].reshape(-1, 11), batched=False)
 
     def same(self, other: Camera) -> bool:
         """Whether the other has the same tensor of rays."""
@@ -150,13 +150,13 @@ class CustomCamera(Camera):
         rays = torch.cat((origin, direction, self._pictures()[..., 6:]), -1).reshape(-1, 11)
         if sample is not None:
             rays[:, -1] = sample
-        return self._changed(_rays=rays)
+        return self._copy_with(_rays=rays)
 
     def strip(self, first: int, end: int) -> Camera:
         """Returns the camera of the rows [first, end) of each picture."""
         rays = self._pictures()[:, first:end].reshape(-1, 11)
         window = (self.window[0] + first, self.window[1])
-        return self._changed(_rays=rays, height=end - first, window=window)
+        return self._copy_with(_rays=rays, height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
         """Returns (r, 11) float64: origin, direction, cone, range and sample."""
@@ -166,8 +166,8 @@ class CustomCamera(Camera):
         """Returns the camera with one ray per stride x stride pixels; see `numbers_ahead`."""
         rays = self._pictures()[:, ::stride, ::stride]
         height, width = rays.shape[1:3]
-        parts = {"height": height, "width": width, "window": (0, height)}
-        return self._changed(_rays=rays.reshape(-1, 11), **parts)
+        changes = {"height": height, "width": width, "window": (0, height)}
+        return self._copy_with(_rays=rays.reshape(-1, 11), **changes)
 
     def numbers_ahead(self, now: Tensor, before: Tensor, frames: float, stride: int) -> Tensor:
         """Returns the numbers of the camera `thinned` by `stride`, extrapolated by `frames` frames

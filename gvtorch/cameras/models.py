@@ -217,8 +217,8 @@ class Panorama(Model):
 
     def edge_depth(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
         """Keeps corners within a frustum: straight edges would bulge out of a band of angles."""
-        slopes = (math.tan(min(half_extent, _MAX_HALF_ANGLE)) for half_extent in (half_x, half_y))
-        return super().edge_depth(corners, *slopes)
+        tangents = (math.tan(min(half_extent, _MAX_HALF_ANGLE)) for half_extent in (half_x, half_y))
+        return super().edge_depth(corners, *tangents)
 
     def rays(self, pixels: PixelRows) -> Rays:
         latitude = pixels.y[:, None].expand(-1, pixels.x.shape[-1])

@@ -50,8 +50,10 @@ class CameraPath:
         lists: dict[str, Sequence[Any]] = {"eye": eye, "target": target, "up": up, "fov": fov}
         for name, values in lists.items():
             if len(values) != count:
-                kind = "numbers" if name == "fov" else "rows as eye has"
-                raise ValueError(f"CameraPath: {name} must have {count} {kind}, got {len(values)}")
+                expected = "numbers" if name == "fov" else "rows as eye has"
+                raise ValueError(
+                    f"CameraPath: {name} must have {count} {expected}, got {len(values)}"
+                )
         angles = [[check.number("CameraPath", "fov", angle, low=0, high=360)] for angle in fov]
         rows = [
             [check.triple("CameraPath", name, value) for value in lists[name]]

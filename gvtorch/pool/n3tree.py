@@ -175,10 +175,10 @@ class N3Tree:
             tile = child[node].to(torch.int64)
             up = (loc[:, 3] - level).clamp(min=0)
             x, y, z = (loc[:, axis] // n**up % n for axis in range(3))
-            below = tile * self.nodes.nodes_per_tile + (z * n + y) * n + x
+            child_node = tile * self.nodes.nodes_per_tile + (z * n + y) * n + x
             deeper = level <= loc[:, 3]
             exact = exact & (~deeper | (tile >= 0))
-            node = torch.where(deeper & exact, below, node)
+            node = torch.where(deeper & exact, child_node, node)
         return node, exact
 
     def __repr__(self) -> str:

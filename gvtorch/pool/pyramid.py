@@ -256,12 +256,12 @@ class TreePlan:
             nodes.loc_t4[tile, 3] = depth + 1
             for name, levels in self.levels.items():
                 summary = levels[depth].nodes
-                for words, values in (
+                for stored, values in (
                     (nodes.constants[name], summary.constants),
                     (nodes.ranges[name], summary.ranges),
                 ):
-                    rows = movable(values(words.dtype))[zyx_index]
-                    movable(words).flatten(0, 1)[node] = rows.to(device)
+                    rows = movable(values(stored.dtype))[zyx_index]
+                    movable(stored).flatten(0, 1)[node] = rows.to(device)
 
     def write_bricks(self, pool: BrickPool, channel: str, depth: int) -> None:
         """Cuts the bricks of a depth out of their level, into consecutive slots."""

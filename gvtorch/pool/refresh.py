@@ -21,7 +21,7 @@ from .pools import BrickPool, NodePool
 from .pyramid import NodeSummary, coarser, node_reduction
 
 _BATCH_BRICKS = 4096  # bricks read or written at a time
-Zyx = tuple[int, ...]  # voxels or nodes of a level, z y x
+GridPosition = tuple[int, ...]  # voxels or nodes of a level, z y x
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class BrickLevels:
     root: int
     depth: int
     branching: int
-    extent: Zyx  # finest voxels z y x
+    extent: GridPosition  # finest voxels z y x
 
     @cached_property
     def slot_n(self) -> Tensor:
@@ -67,7 +67,7 @@ class BrickLevels:
         """(t * n,) int64 tile of each node's children, -1 for none."""
         return _pointed_or_owned(self.nodes.child_tn, self.nodes.parent_t)
 
-    def shape(self, level: int) -> Zyx:
+    def shape(self, level: int) -> GridPosition:
         """Returns the number of voxels z y x of a level; level 0 is the finest."""
         return tuple(-(-size // self.branching**level) for size in self.extent)
 
@@ -84,32 +84,32 @@ class BrickLevels:
             node = torch.where(exact, tile * self.nodes.nodes_per_tile + (z * n + y) * n + x, node)
         return node, exact
 
-    def read(self, channel: str, level: int, low: Zyx, high: Zyx) -> Tensor:
+    def read(self, channel: str, level: int, low: GridPosition, high: GridPosition) -> Tensor:
         """Returns voxels low to high (z, y, x, c) of a level, on the CPU. A region without a brick
         is filled with its constant: for EMPTY ones that is their mean.
         """
         size, border = self.bricks.brick_size, self.bricks.border
         first = tuple(start // size for start in low)
         count = tuple(-(-end // size) - start for start, end in zip(first, high, strict=True))
-        voxels = self.bricks.bricks[channel].detach()
-        pool, constants = movable(voxels), movable(self.nodes.constants[channel]).flatten(0, 1)
-        node, exact = self.find(_grid_positions(first, count, pool.device), level)
+        stored = self.bricks.bricks[channel].detach()
+        bricks, constants = movable(stored), movable(self.nodes.constants[channel]).flatten(0, 1)
+        node, exact = self.find(_grid_positions(first, count, bricks.device), level)
         slot = torch.where(exact, self.slot_n[node], -1)
         inner = slice(border, border + size)
-        out = pool.new_empty((len(node), size, size, size, pool.shape[4]))
-        for part in torch.arange(len(node), device=pool.device).split(_BATCH_BRICKS):
+        out = bricks.new_empty((len(node), size, size, size, bricks.shape[4]))
+        for part in torch.arange(len(node), device=bricks.device).split(_BATCH_BRICKS):
             has_brick = slot[part] >= 0
             out[part[~has_brick]] = constants[node[part[~has_brick]]][:, None, None, None]
-            out[part[has_brick]] = pool[slot[part[has_brick]]][:, inner, inner, inner]
+            out[part[has_brick]] = bricks[slot[part[has_brick]]][:, inner, inner, inner]
         grid = out.view(*count, size, size, size, -1).permute(0, 3, 1, 4, 2, 5, 6)
         crop = (slice(a - size * f, b - size * f) for a, b, f in zip(low, high, first, strict=True))
         box = grid.reshape(*(size * k for k in count), -1)[tuple(crop)]
-        return box.contiguous().cpu().view(voxels.dtype)
+        return box.contiguous().cpu().view(stored.dtype)
 
     def refresh(
         self,
-        low: Zyx,
-        high: Zyx,
+        low: GridPosition,
+        high: GridPosition,
         filters: Mapping[str, str],
         empty: Mapping[str, float | None],
         spacing: tuple[float, float, float],
@@ -151,7 +151,9 @@ class BrickLevels:
             }
             self._write(summaries, node, exact, threshold)
 
-    def _nodes_in_reach(self, level: int, begin: Zyx, end: Zyx) -> tuple[Zyx, Zyx]:
+    def _nodes_in_reach(
+        self, level: int, begin: GridPosition, end: GridPosition
+    ) -> tuple[GridPosition, GridPosition]:
         """Returns the nodes (first, after the last) whose bricks or borders hold any of these."""
         size, border = self.bricks.brick_size, self.bricks.border
         first = tuple(max(0, (voxel - border) // size) for voxel in begin)
@@ -199,9 +201,9 @@ class _ChannelLevels:
     spacing: tuple[float, float, float]
     empty: float | None
     _values: np.ndarray | None = None  # of the previous level
-    _begin: Zyx = (0, 0, 0)  # their first voxel
+    _begin: GridPosition = (0, 0, 0)  # their first voxel
 
-    def prepare(self, node_spans: Sequence[tuple[int, Zyx, Zyx]]) -> None:
+    def prepare(self, node_spans: Sequence[tuple[int, GridPosition, GridPosition]]) -> None:
         """Prepares for the nodes (first, after the last) of each level whose ranges are needed."""
         tree, size, border = self.tree, self.tree.bricks.brick_size, self.tree.bricks.border
         steps = [tree.branching**level for level, _, _ in node_spans]
@@ -225,10 +227,10 @@ class _ChannelLevels:
     def update(
         self,
         level: int,
-        begin: Zyx,
-        end: Zyx,
-        first: Zyx,
-        last: Zyx,
+        begin: GridPosition,
+        end: GridPosition,
+        first: GridPosition,
+        last: GridPosition,
         node: Tensor,
         exact: Tensor,
     ) -> NodeSummary:
@@ -284,7 +286,14 @@ class _ChannelLevels:
         flat = [torch.from_numpy(part.astype(np.float32)).flatten(0, 2) for part in (*ranges, mean)]
         return NodeSummary(*flat)
 
-    def _make_level(self, level: int, begin: Zyx, end: Zyx, low: Zyx, high: Zyx) -> np.ndarray:
+    def _make_level(
+        self,
+        level: int,
+        begin: GridPosition,
+        end: GridPosition,
+        low: GridPosition,
+        high: GridPosition,
+    ) -> np.ndarray:
         """Returns voxels low to high of a level, begin to end of them made from the one before."""
         n = self.tree.branching
         if level == 0:
@@ -358,14 +367,19 @@ def _pointed_or_owned(words: Tensor, owner: Tensor) -> Tensor:
     return pointed_n
 
 
-def _grid_positions(first: Zyx, count: Zyx, device: torch.device) -> Tensor:
+def _grid_positions(first: GridPosition, count: GridPosition, device: torch.device) -> Tensor:
     """Returns (k, 3) int64 z y x of a grid, in order."""
     axes = [torch.arange(a, a + k, device=device) for a, k in zip(first, count, strict=True)]
     return torch.cartesian_prod(*axes).view(-1, 3)
 
 
 def _with_borders(
-    values: np.ndarray, low: Zyx, first: Zyx, last: Zyx, size: int, border: int
+    values: np.ndarray,
+    low: GridPosition,
+    first: GridPosition,
+    last: GridPosition,
+    size: int,
+    border: int,
 ) -> np.ndarray:
     """Returns the voxels of nodes `first` to `last` with their borders, from `values`, which begin
     at voxel `low`; the outermost voxels are repeated.
