@@ -70,7 +70,7 @@ class Timings:
 _timings: ContextVar[Timings | None] = ContextVar("gvtorch_timings", default=None)
 _traces: list[Trace] = []  # those that are open, in all threads
 #: Nsight Systems and Compute set the first variable; users set the second to get ranges anyway.
-_RANGES = torch.version.cuda is not None and bool(
+_NVTX_ENABLED = torch.version.cuda is not None and bool(
     {"NVTX_INJECTION64_PATH", "GVTORCH_NVTX"} & set(os.environ)
 )
 
@@ -88,7 +88,7 @@ class stage:  # not a generator-based context manager, which is slower: a frame 
 
     def __enter__(self) -> None:
         self._ranges = None
-        if _RANGES or torch.autograd._profiler_enabled():
+        if _NVTX_ENABLED or torch.autograd._profiler_enabled():
             self._ranges = _open_ranges(f"gvtorch.{self._name}")
         self._began = [(trace, trace.begin()) for trace in _traces]
         self._timings = timings = _timings.get()
@@ -109,7 +109,7 @@ def _open_ranges(name: str) -> ExitStack:
     with ExitStack() as ranges:
         if torch.autograd._profiler_enabled():
             ranges.enter_context(torch.profiler.record_function(name))
-        if _RANGES:
+        if _NVTX_ENABLED:
             ranges.enter_context(torch.cuda.nvtx.range(name))
         return ranges.pop_all()
 
