@@ -81,7 +81,7 @@ using Bool = NumberOf<bool>;
 #define GV_CHANNEL(X)            \
   X(World, place_33, 9)          \
   X(Int, branching, 17)          \
-  X(Int, max_depth, kMostLevels) \
+  X(Int, max_depth, kMaxLevels)  \
   X(Int, border, (side + 1) / 2) \
   X(Float, root_voxel, kAny)     \
   X(Float, cone_scale, kAny)     \
@@ -142,8 +142,8 @@ constexpr int32_t kDirections = 6;  // +x -x +y -y +z -z: a stored colour may ha
 // The numbers of a fused shader, `parameter_54`, by name; the uniforms of a user's shader follow them.
 template <class T>
 struct Parameters {
-  T light_place[3];  // position of a point light; direction in which a directional one shines
-  T light_kind;      // a LightKind
+  T light_vector[3];  // position of a point light; direction in which a directional one shines
+  T light_kind;       // a LightKind
   T light_color[3], ambient;
   T diffuse, specular, shininess;
   T light_width;                  // of a cone to the light: its growth (directional), or the width at the light (point)

@@ -7,7 +7,7 @@
 
 namespace gvtorch {
 
-struct alignas(16) Wide {  // the most that a thread moves at once
+struct alignas(16) Bytes16 {  // the most that a thread moves at once
   int64_t part_2[2];
 };
 
@@ -22,10 +22,10 @@ inline auto run(const CompactRequestsOp& a) {
   ListRequests args{};
   GV_COMPACT_REQUESTS(GV_TAKE)
   STD_TORCH_CHECK(a.capacity >= 1 && a.request_tn.numel() <= INT32_MAX, "gvtorch: no capacity, or too many nodes");
-  Tensor node_k = give(args.node_k, a.request_tn, {a.capacity});
-  Tensor word_k = give(args.word_k, a.request_tn, {a.capacity});
+  Tensor node_k = make_output(args.node_k, a.request_tn, {a.capacity});
+  Tensor word_k = make_output(args.word_k, a.request_tn, {a.capacity});
   Tensor count_5 = torch::stable::new_zeros(a.request_tn, {5}, ScalarType::Long);
-  args.count_5 = lay(count_5);
+  args.count_5 = to_kernel(count_5);
   compact(a.request_tn, a.request_tn.numel(), args);
   return std::make_tuple(node_k, word_k, count_5);
 }
@@ -44,19 +44,19 @@ inline auto run(const ChooseRequestsOp& a) {
   args.listed = listed;
   args.tiles = tiles;
   const int64_t requests = lists * listed;
-  const Tensor key_lk = give(args.key_lk, a.asked_l2k, {requests});
+  const Tensor key_lk = make_output(args.key_lk, a.asked_l2k, {requests});
   const Tensor counts = torch::stable::new_zeros(a.asked_l2k, {2 * requests + lists});
-  args.before_2lk = lay(counts);
+  args.before_2lk = to_kernel(counts);
   args.end_l = args.before_2lk + 2 * requests;
-  Tensor node_2b = give(args.node_2b, a.asked_l2k, {2, a.batch});
-  Tensor priority_2b = give(args.priority_2b, a.asked_l2k, {2, a.batch});
+  Tensor node_2b = make_output(args.node_2b, a.asked_l2k, {2, a.batch});
+  Tensor priority_2b = make_output(args.priority_2b, a.asked_l2k, {2, a.batch});
   for_each(a.asked_l2k, std::max(requests, 2 * a.batch), RankRequests{args});
-  if (requests <= kMostCompared) {
+  if (requests <= kMaxCompared) {
     for_each(a.asked_l2k, requests * kComparers, CompareRequests{args});
     for_each(a.asked_l2k, requests, ServeRequests{args});
   } else {
     sort_keys(a.asked_l2k, args.key_lk, requests);
-    for (int64_t which = 0; which < 2; ++which) compact(a.asked_l2k, requests, ServeSorted{{args}, which});
+    for (int64_t kind = 0; kind < 2; ++kind) compact(a.asked_l2k, requests, ServeSorted{{args}, kind});
   }
   return std::make_tuple(node_2b, priority_2b);
 }
@@ -69,14 +69,14 @@ inline auto run(const LruPartitionOp& a) {
   UseArgs args{};
   GV_LRU_PARTITION(GV_TAKE)
   args.slots = slots;
-  Tensor sorted_k = give(args.sorted_k, a.order_k, {size});
-  Tensor unused_1 = give(args.unused_1, a.order_k, {1});
+  Tensor sorted_k = make_output(args.sorted_k, a.order_k, {size});
+  Tensor unused_1 = make_output(args.unused_1, a.order_k, {1});
 #ifdef __CUDACC__
   compact(a.order_k, size, SplitByUse<true>{args});
 #else
   const int64_t bytes = (slots + 7) / 8;
-  const Tensor used_s = give(args.used_s, a.order_k, {bytes});
-  const Tensor used_k = give(args.used_k, a.order_k, {size});
+  const Tensor used_s = make_output(args.used_s, a.order_k, {bytes});
+  const Tensor used_k = make_output(args.used_k, a.order_k, {size});
   for_each(a.order_k, bytes, PackUse{args});
   for_each(a.order_k, size, FlagUse{args});
   compact(a.order_k, size, SplitByUse<false>{args});
@@ -95,14 +95,14 @@ inline void run(const UnlinkOp& a) {
   args.slots = slots;
   const Tensor leaving_s = torch::stable::new_zeros(a.pointer_tn, {slots}, ScalarType::Byte);
   const Tensor any_shared = torch::stable::new_zeros(a.pointer_tn, {1});
-  args.leaving_s = lay(leaving_s);
-  args.any_shared = lay(any_shared);
+  args.leaving_s = to_kernel(leaving_s);
+  args.any_shared = to_kernel(any_shared);
   for_each(a.pointer_tn, a.slot_k.numel(), TakeFromOwner{args});
 #ifndef __CUDACC__
   if (*args.any_shared == 0) return;
 #endif
-  constexpr int64_t kTogether = ClearShared::kTogether;
-  for_each(a.pointer_tn, (args.nodes + kTogether - 1) / kTogether, ClearShared{args});
+  constexpr int64_t kWordsPerIndex = ClearShared::kWordsPerIndex;
+  for_each(a.pointer_tn, (args.nodes + kWordsPerIndex - 1) / kWordsPerIndex, ClearShared{args});
 }
 
 GV_OP(OrphanOp, "orphan", GV_ORPHAN, "()");
@@ -174,10 +174,10 @@ void put_words(const PutRowsOp& a, int64_t slots, int64_t count, int64_t bytes) 
 inline void run(const PutRowsOp& a) {
   const int64_t slots = a.target_sb.size(0), count = a.slot_k.numel();
   const int64_t bytes = slots > 0 ? a.target_sb.numel() / slots : 0;
-  const auto odd = reinterpret_cast<uintptr_t>(a.target_sb.data_ptr()) |
-                   reinterpret_cast<uintptr_t>(a.rows_kb.data_ptr()) | static_cast<uintptr_t>(bytes);
-  if (odd % sizeof(Wide) == 0) return put_words<Wide>(a, slots, count, bytes);
-  if (odd % sizeof(int32_t) == 0) return put_words<int32_t>(a, slots, count, bytes);
+  const auto alignment_bits = reinterpret_cast<uintptr_t>(a.target_sb.data_ptr()) |
+                              reinterpret_cast<uintptr_t>(a.rows_kb.data_ptr()) | static_cast<uintptr_t>(bytes);
+  if (alignment_bits % sizeof(Bytes16) == 0) return put_words<Bytes16>(a, slots, count, bytes);
+  if (alignment_bits % sizeof(int32_t) == 0) return put_words<int32_t>(a, slots, count, bytes);
   put_words<uint8_t>(a, slots, count, bytes);
 }
 
@@ -190,7 +190,7 @@ inline Tensor run(const LocateOp& a) {
   GV_LOCATE(GV_TAKE)
   STD_TORCH_CHECK(a.branching >= 2 && a.per_tile >= 1, "gvtorch: branching or per_tile out of range");
   args.nodes = tiles * a.per_tile;
-  Tensor loc_k4 = give(args.loc_k4, a.node_k, {count, 4});
+  Tensor loc_k4 = make_output(args.loc_k4, a.node_k, {count, 4});
   for_each(a.node_k, count, args);
   return loc_k4;
 }
@@ -205,8 +205,8 @@ inline Tensor run(const LackingOp& a) {
   GV_LACKING(GV_TAKE)
   STD_TORCH_CHECK(a.branching >= 2 && per_tile >= 1 && per_tile <= INT32_MAX,
                   "gvtorch: branching or tile out of range");
-  args.places = {args.loc_t4, args.node_k, args.branching, static_cast<int32_t>(per_tile), nullptr, tiles * per_tile};
-  Tensor lacks_k = give(args.lacks_k, a.node_k, {count});
+  args.locator = {args.loc_t4, args.node_k, args.branching, static_cast<int32_t>(per_tile), nullptr, tiles * per_tile};
+  Tensor lacks_k = make_output(args.lacks_k, a.node_k, {count});
   for_each(a.node_k, count, args);
   return lacks_k;
 }
@@ -223,7 +223,7 @@ inline Tensor run(const CutBricksOp& a) {
   STD_TORCH_CHECK(a.brick_size >= 1, "gvtorch: brick_size out of range");
   const int64_t side = args.side();
   Tensor bricks_kzyxc = torch::stable::new_empty(values, {bricks, side, side, side, values.size(3)});
-  args.bricks_kzyxc = lay(bricks_kzyxc);
+  args.bricks_kzyxc = to_kernel(bricks_kzyxc);
   for (int axis = 0; axis < 3; ++axis) args.size_3[axis] = values.size(axis);
   args.bytes = values.size(3) * static_cast<int64_t>(values.element_size());
   args.planes = bricks * side;

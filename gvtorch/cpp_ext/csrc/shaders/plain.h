@@ -31,17 +31,17 @@ struct Plain : ShaderFacts {
   T step;
 
   explicit Plain(const TraceArgs& args) : transfer(args), step(static_cast<T>(args.step)) {}
-  template <class Other>
-  GV_HD explicit Plain(const Plain<T, Other>& other) : transfer(other.transfer), step(other.step) {}
+  template <class OtherTable>
+  GV_HD explicit Plain(const Plain<T, OtherTable>& other) : transfer(other.transfer), step(other.step) {}
 
-  template <class Any>
-  GV_HD bool hides(T low, T high, const Any&) const {
+  template <class AnySum>
+  GV_HD bool hides(T low, T high, const AnySum&) const {
     return Transfer<T>(transfer).transparent(low, high);
   }
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye&, SumOf<V>& sum) const {
-    const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, which);
-    if (!unseen(which, row.alpha)) sum.add(row, piece.start, piece.length, sum.hit_clear, which);
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, SumOf<V>& sum) const {
+    const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
+    if (!unseen(mask, row.alpha)) sum.add(row, piece.start, piece.length, sum.hit_clear, mask);
   }
   GV_HD void done(Sum&) const {}
 };
