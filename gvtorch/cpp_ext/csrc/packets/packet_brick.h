@@ -115,11 +115,11 @@ GV_CALL void read_packet_numbers(const PacketPool& pool, Components<float> compo
   for (int32_t i = 0; i < count; ++i) {
     const int32_t byte = components[i] * kBytes, word_offset = byte / 4 * 4, shift = 8 * (byte - word_offset);
     if (word_offset != loaded) {
-      for (int i = 0; i < 8; i += 2) {
-        const Ints first = corner + ((i >> 1 & 1) * step_y + (i >> 2) * step_z + word_offset);
-        words[i] = load_words<kLongOffsets>(pool, slot, first);
-        words[i + 1] =
-            2 * step_x <= 4 ? words[i] >> (8 * step_x) : load_words<kLongOffsets>(pool, slot, first + step_x);
+      for (int voxel = 0; voxel < 8; voxel += 2) {
+        const Ints first = corner + ((voxel >> 1 & 1) * step_y + (voxel >> 2) * step_z + word_offset);
+        words[voxel] = load_words<kLongOffsets>(pool, slot, first);
+        words[voxel + 1] =
+            2 * step_x <= 4 ? words[voxel] >> (8 * step_x) : load_words<kLongOffsets>(pool, slot, first + step_x);
       }
       loaded = word_offset;
     }
