@@ -13,7 +13,7 @@ namespace gvtorch {
 // The instruction set in use; users' shaders are compiled for the same one (cpp_ext/user.py).
 extern "C" __attribute__((visibility("default"))) const char* gvtorch_instructions() { return processor().name; }
 
-// Calls run(args, begin, end), one of `processor().chunks`, for all items of an op, `share` at a time.
+// Calls run(args, begin, end), one of `processor().chunks`, for all items of an op, `chunk_size` at a time.
 template <class Args>
 void in_chunks(void (*run)(const Args&, int64_t, int64_t), const Args& args, int64_t count, int64_t chunk_size) {
   for_chunks(count, chunk_size, [&](int64_t begin, int64_t end) { run(args, begin, end); });
@@ -36,7 +36,7 @@ void splat_points(const Tensor&, const SplatArgs& args) {
   in_chunks(processor().chunks.splat, args, SplatPart{args}.parts(), 1);
 }
 
-// See cache.h. Threads count chunks, then take them: ranks do not depend on the number of threads.
+// See cache.h. Threads count chunks, then process them: ranks do not depend on the number of threads.
 template <class List>
 void compact(const Tensor&, int64_t count, const List& list) {
   constexpr int64_t kChunk = 1 << 11;
@@ -58,12 +58,12 @@ void compact(const Tensor&, int64_t count, const List& list) {
     for (int64_t index = begin; index < end; ++index) {
       const int32_t flags = list_copy.flags(index);
       if ((flags & kTouched) == 0) continue;
-      list_copy.take(index, flags, rank, all.listed);
+      list_copy.process(index, flags, rank, all.listed);
       rank += flags & kListed;
     }
   });
-  for (int64_t rank = all.listed; rank < list.entries(); ++rank) list.blank(rank);
-  list.total(all.listed, all.counted);
+  for (int64_t rank = all.listed; rank < list.entries(); ++rank) list.clear_entry(rank);
+  list.store_totals(all.listed, all.counted);
 }
 
 void sort_keys(const Tensor&, int64_t* keys, int64_t count) { std::sort(keys, keys + count); }

@@ -40,7 +40,7 @@ void follow_points(const Tensor& like, const OrbitArgs& args) {
   args.in_float64 ? follow_each_point<double>(like, args) : follow_each_point<float>(like, args);
 }
 
-// `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks take their
+// `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks process their
 // chunks. Chunks without flags are not read again.
 constexpr int kThreads = 256;
 constexpr int kScanThreads = 1024;
@@ -77,15 +77,15 @@ __global__ void __launch_bounds__(kScanThreads) add_chunks(Counts* chunk_c, int6
 }
 
 template <class List>
-__global__ void __launch_bounds__(kThreads) take_chunks(List list, int64_t count, const Counts* chunk_c) {
+__global__ void __launch_bounds__(kThreads) process_chunks(List list, int64_t count, const Counts* chunk_c) {
   __shared__ int32_t listed[kThreads / 32];  // how many in each warp
   const int warp = threadIdx.x / 32;
   const int lane = threadIdx.x % 32;
   const Counts before_chunk = chunk_c[blockIdx.x], after_chunk = chunk_c[blockIdx.x + 1], all = chunk_c[gridDim.x];
   const int64_t threads = static_cast<int64_t>(gridDim.x) * kThreads;
   const int64_t thread = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  for (int64_t rank = all.listed + thread; rank < list.entries(); rank += threads) list.blank(rank);
-  if (thread == 0) list.total(all.listed, all.counted);
+  for (int64_t rank = all.listed + thread; rank < list.entries(); rank += threads) list.clear_entry(rank);
+  if (thread == 0) list.store_totals(all.listed, all.counted);
   if (before_chunk.any == after_chunk.any) return;
   int64_t rank = before_chunk.listed;
   for (int64_t offset = 0; offset < kChunk; offset += kThreads) {
@@ -99,7 +99,7 @@ __global__ void __launch_bounds__(kThreads) take_chunks(List list, int64_t count
       if (other_warp < warp) own_rank += listed[other_warp];
       rank += listed[other_warp];
     }
-    if ((flags & kTouched) != 0) list.take(index, flags, own_rank, all.listed);
+    if ((flags & kTouched) != 0) list.process(index, flags, own_rank, all.listed);
     __syncthreads();
   }
 }
@@ -113,7 +113,7 @@ void compact(const Tensor& like, int64_t count, const List& list) {
   const Launcher launch(like);
   launch(count_chunks<List>, chunks, kThreads, list, count, chunk_c);
   launch(add_chunks, 1, kScanThreads, chunk_c, chunks);
-  launch(take_chunks<List>, chunks, kThreads, list, count, chunk_c);
+  launch(process_chunks<List>, chunks, kThreads, list, count, chunk_c);
 }
 
 void sort_keys(const Tensor& like, int64_t* keys, int64_t count) {

@@ -28,7 +28,7 @@ void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
 template <class T>
 void voxelize_rows(const VoxelizeArgs& args, int64_t begin, int64_t end) {
   const VoxelizePack<T> pack{args};
-  for (int64_t row = begin; row < end; ++row) pack.wind(row);
+  for (int64_t row = begin; row < end; ++row) pack.write_winding(row);
   for (int64_t index = begin * pack.packs(); index < end * pack.packs(); ++index) pack(index);
 }
 

@@ -66,7 +66,7 @@ struct LibraryShader {
     const auto run_kernel = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };
     if (in_float64) return run_kernel(ShadeRay<double, CalledShader<UserShaderOf, double>, Digits<double>>(args));
 #ifdef GV_PACKETS
-    if (packs(args)) {
+    if (packets_can_trace(args)) {
       return trace_chunks(like, args, [&](int64_t begin, int64_t end) {
         trace_packets<CalledShader<UserShaderOf, float>, AnyValues>(args, begin, end);
       });

@@ -71,8 +71,8 @@ constexpr int64_t kChunkSize = 256;
 template <class Functor>
 constexpr int64_t kChunkSize<Functor, std::void_t<decltype(Functor::kChunkSize)>> = Functor::kChunkSize;
 
-// Calls body(begin, end) for all indices, in chunks of `share` that threads draw from a counter, so that long rays do
-// not leave a thread idle. Nothing that a body writes may depend on which thread runs it.
+// Calls body(begin, end) for all indices, in chunks of `chunk_size` that threads draw from a counter, so that long rays
+// do not leave a thread idle. Nothing that a body writes may depend on which thread runs it.
 template <class Body>
 void for_chunks(int64_t count, int64_t chunk_size, const Body& body) {
   const int64_t chunks = (count + chunk_size - 1) / chunk_size;

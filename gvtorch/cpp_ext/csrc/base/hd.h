@@ -122,7 +122,7 @@ GV_HD void add_to(T* sum, T value) {
     desired = expected + value;
 #endif
 }
-// Raises a number atomically to at least `least`.
+// Raises a number atomically to at least `minimum`.
 GV_HD void raise_to(int32_t* count, int32_t minimum) {
 #ifdef __CUDA_ARCH__
   atomicMax(count, minimum);

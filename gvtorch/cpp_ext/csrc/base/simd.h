@@ -131,8 +131,8 @@ GV_HD void transpose(const Native rows[4], Floats columns[4]) {
 }
 #endif
 
-// Loads four floats at each address base + offset (a multiple of 16 bytes); row[0] gets the first of all lanes, and so
-// on. A load per lane and a transposition replace four gathers, which would load each number alone.
+// Loads four floats at each address base + offset (a multiple of 16 bytes); columns[0] gets the first of all lanes, and
+// so on. A load per lane and a transposition replace four gathers, which would load each number alone.
 GV_HD void load_rows(const void* base, Ints offset, Floats columns[4]) {
 #ifdef GV_MM
   int32_t lane[kLanes];

@@ -3,11 +3,12 @@
 // they requested, and cut bricks out of a level. Each op's arguments are declared before its functors, see arguments.h.
 //
 // Equal to the twins in ops/cache.py in every integer. What each device defines (cpu.cpp, cuda.cu):
-//   compact(n, list)   list.flags(index) returns which of kListed, kSeen and kTouched each index is
-//                      list.take(index, flags, rank, listed)  is called for every touched index; listed and seen ones
-//                                                             are touched. rank: listed ones before it; listed: all
-//                      list.blank(rank)                       is called for every unused one of list.places()
-//                      list.total(listed, seen)               is called once
+//   compact(n, list)   list.flags(index) returns which of kListed, kCounted and kTouched each index is
+//                      list.process(index, flags, rank, listed)  is called for every touched index; listed and counted
+//                                                                ones are touched. rank: listed ones before it;
+//                                                                listed: all
+//                      list.clear_entry(rank)                    is called for every unused one of list.entries()
+//                      list.store_totals(listed, counted)        is called once
 //   sort_keys(keys, n) sorts n numbers in ascending order
 // Method: Crassin et al., "GigaVoxels", I3D 2009, section 5 (usage stamps, LRU by compaction, request lists).
 #pragma once
@@ -22,7 +23,7 @@ inline namespace GV_NAMESPACE {
 
 constexpr int32_t kListed = 1, kCounted = 2, kTouched = 4;
 
-// How many indices are listed, and seen; `any` is not 0 if one has a flag.
+// How many indices are listed, and counted; `any` is not 0 if one has a flag.
 struct Counts {
   int32_t listed, counted, any;
 
@@ -58,7 +59,7 @@ struct ListRequests {
     return (open_kinds(word) != 0 ? kListed : 0) | ((word & kKinds) != 0 ? kCounted : 0) |
            ((word & ~kPending) != 0 ? kTouched : 0);
   }
-  GV_HD void take(int64_t node, int32_t flags, int64_t rank, int64_t) const {
+  GV_HD void process(int64_t node, int32_t flags, int64_t rank, int64_t) const {
     if ((flags & kListed) != 0 && rank < capacity) {
       const int32_t word = request_tn[node];
       node_k[rank] = static_cast<int32_t>(node);
@@ -69,11 +70,11 @@ struct ListRequests {
     request_tn[node] &= kPending;
   }
   GV_HD int64_t entries() const { return capacity; }
-  GV_HD void blank(int64_t rank) const {
+  GV_HD void clear_entry(int64_t rank) const {
     node_k[rank] = -1;
     word_k[rank] = 0;
   }
-  GV_HD void total(int64_t listed, int64_t counted) const {
+  GV_HD void store_totals(int64_t listed, int64_t counted) const {
     count_5[0] = smaller<int64_t>(listed, capacity);
     count_5[1] = listed;
     count_5[2] = counted;
@@ -104,7 +105,7 @@ struct ChooseArgs {
 
   GV_HD int64_t node_at(int64_t index) const { return asked_l2k[index + index / listed * listed]; }
   GV_HD int32_t word_at(int64_t index) const { return asked_l2k[index + (index / listed + 1) * listed]; }
-  // Serves a request as a load (`which` 0) or a subdivision (1) if the `place` ones before it leave room.
+  // Serves a request as a load (`kind` 0) or a subdivision (1) if the `rank` ones before it leave room.
   GV_HD void serve(int64_t kind, int64_t rank, int64_t index) const {
     const int64_t room = room_2[1 - kind];  // tiles, bricks
     if (rank >= smaller<int64_t>(batch, room)) return;
@@ -174,12 +175,12 @@ struct ServeSorted : ChooseArgs {
     const int64_t key = key_lk[index];
     return key != kNoKey && (key >> kind & 1) != 0 ? kListed | kTouched : 0;
   }
-  GV_HD void take(int64_t index, int32_t, int64_t rank, int64_t) const {
+  GV_HD void process(int64_t index, int32_t, int64_t rank, int64_t) const {
     serve(kind, rank, (key_lk[index] >> 2) & (kIndices - 1));
   }
   GV_HD int64_t entries() const { return 0; }
-  GV_HD void blank(int64_t) const {}
-  GV_HD void total(int64_t, int64_t) const {}
+  GV_HD void clear_entry(int64_t) const {}
+  GV_HD void store_totals(int64_t, int64_t) const {}
 };
 
 // --- The order of use
@@ -223,14 +224,14 @@ struct SplitByUse : UseArgs {
     return slot < slots && stamp_s[slot] == *frame_1;
   }
   GV_HD int32_t flags(int64_t index) const { return kTouched | static_cast<int32_t>(!used(index)); }
-  GV_HD void take(int64_t index, int32_t flags, int64_t rank, int64_t listed) const {
+  GV_HD void process(int64_t index, int32_t flags, int64_t rank, int64_t listed) const {
     const int64_t used_position = listed + index - rank;
     const int64_t mask = -static_cast<int64_t>(flags & kListed);  // no branch: it would often be mispredicted
     sorted_k[used_position + ((rank - used_position) & mask)] = order_k[index];
   }
   GV_HD int64_t entries() const { return 0; }
-  GV_HD void blank(int64_t) const {}
-  GV_HD void total(int64_t listed, int64_t) const { *unused_1 = listed; }
+  GV_HD void clear_entry(int64_t) const {}
+  GV_HD void store_totals(int64_t listed, int64_t) const { *unused_1 = listed; }
 };
 
 // --- Pointers
@@ -262,7 +263,7 @@ struct TakeFromOwner : UnlinkArgs {
   }
 };
 
-// An index is kTogether words. Only shared slots have pointers other than their owner's.
+// An index is kWordsPerIndex words. Only shared slots have pointers other than their owner's.
 struct ClearShared : UnlinkArgs {
   static constexpr int64_t kWordsPerIndex = 16;
 

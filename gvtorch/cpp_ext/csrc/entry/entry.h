@@ -161,7 +161,7 @@ Number to_kernel(Number number) {
 
 #define GV_CHECK(kind, name, limit) check(kinds::kind{}, a.name, #name, like, limit);
 // Checks an argument of `a`, and stores it in the kernels' `args`.
-#define GV_TAKE(kind, name, limit) GV_CHECK(kind, name, limit) args.name = to_kernel(a.name);
+#define GV_CHECK_AND_SET(kind, name, limit) GV_CHECK(kind, name, limit) args.name = to_kernel(a.name);
 
 // Makes a tensor for the kernels to fill, of the pointer's dtype, or of that of `like` if the pointer is void.
 template <class T>
@@ -200,12 +200,12 @@ inline int64_t check_bricks(const Tensor& bricks_bzyxc) {
 
 // Checks and stores the arguments that all ops on rays and bricks have in common.
 template <class Op>
-void take_channel(TraceArgs& args, const Op& a, const Like& like, int64_t nodes) {
+void set_channel_args(TraceArgs& args, const Op& a, const Like& like, int64_t nodes) {
   STD_TORCH_CHECK(a.origin_r3.dim() == 2 && a.origin_r3.size(1) == 3 && a.origin_r3.size(0) <= INT32_MAX,
                   "gvtorch: origin_r3 must be (r, 3)");
   const int64_t rays = a.origin_r3.size(0), side = check_bricks(a.bricks_bzyxc), channels = a.bricks_bzyxc.size(4);
-  GV_RAYS(GV_TAKE)
-  GV_CHANNEL(GV_TAKE)
+  GV_RAYS(GV_CHECK_AND_SET)
+  GV_CHANNEL(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(nodes <= INT32_MAX, "gvtorch: too many nodes");
   STD_TORCH_CHECK(a.branching >= 2 && std::pow(a.branching, a.max_depth) <= kMaxNodes,
                   "gvtorch: branching or max_depth out of range");
@@ -220,7 +220,7 @@ void take_channel(TraceArgs& args, const Op& a, const Like& like, int64_t nodes)
 
 // Checks and stores the arguments that all ops that walk rays have in common. integrates: the table is (l, m, m, 4).
 template <class Op>
-ShadeArgs take_walk(const Op& a, bool integrates = false) {
+ShadeArgs make_walk_args(const Op& a, bool integrates = false) {
   ShadeArgs args{};
   args.shader = kPlainShader;
   // Programs that version 0.1 exported pass requests of 32 bits. Nobody reads them, so none are written.
@@ -229,13 +229,13 @@ ShadeArgs take_walk(const Op& a, bool integrates = false) {
                   unread ? ScalarType::Int : ScalarType::Short};
   STD_TORCH_CHECK(a.child_tn.dim() == 2, "gvtorch: child_tn must be (t, n)");
   const int64_t tiles = a.child_tn.size(0), nodes = a.child_tn.numel();
-  take_channel(args, a, like, nodes);
+  set_channel_args(args, a, like, nodes);
   STD_TORCH_CHECK(a.table_lm4.dim() == (integrates ? 4 : 3) && a.table_lm4.size(0) >= 1 && a.table_lm4.size(1) >= 2,
                   "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
   const int64_t bricks = args.bricks, channels = args.channels;
   const int64_t levels = a.table_lm4.size(0), rows = a.table_lm4.size(1);
   const int64_t table = 4 * levels * rows * (integrates ? rows : 1);
-  GV_WALK(GV_TAKE)
+  GV_WALK(GV_CHECK_AND_SET)
   if (unread) args.request_tn = nullptr;
   STD_TORCH_CHECK(a.child_tn.size(1) >= a.branching * a.branching * a.branching, "gvtorch: child_tn has too few nodes");
   STD_TORCH_CHECK(a.width == 0 || args.rays % a.width == 0, "gvtorch: rays are no rows of this width");
@@ -259,9 +259,9 @@ inline std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> make_hits(TraceArgs& a
 
 // Checks a second channel of the same pool, with `width` numbers per voxel (0: any); returns this number, 0 where
 // there is no channel. coarse: it may have only the pool's first bricks, and no constants.
-inline int32_t check_second(const std::optional<Tensor>& bricks_bzyxc, const std::optional<Tensor>& constant_tnc,
-                            const char* name, int64_t width, const TraceArgs& args, VoxelType& voxel,
-                            bool coarse = false) {
+inline int32_t check_second_channel(const std::optional<Tensor>& bricks_bzyxc,
+                                    const std::optional<Tensor>& constant_tnc, const char* name, int64_t width,
+                                    const TraceArgs& args, VoxelType& voxel, bool coarse = false) {
   STD_TORCH_CHECK(coarse || bricks_bzyxc.has_value() == constant_tnc.has_value(), "gvtorch: ", name,
                   " needs bricks and constants");
   if (!bricks_bzyxc.has_value()) return 0;
@@ -314,7 +314,7 @@ struct FusedShaders {
 GV_OP(TraceRaysOp, "trace_rays", GV_TRACE_RAYS, "(" GV_HITS ")");
 
 inline auto run(const TraceRaysOp& a) {
-  ShadeArgs args = take_walk(a);
+  ShadeArgs args = make_walk_args(a);
   auto hits = make_hits(args, a.table_lm4);
   FusedShaders::run(a.origin_r3, args, is_float64(a.table_lm4));
   return hits;
@@ -326,12 +326,12 @@ GV_OP(ShadeRaysOp, "shade_rays", GV_SHADE_RAYS, "(" GV_HITS ", Tensor normal_r3,
 
 template <class Shaders>
 auto shade_rays(const ShadeRaysOp& a) {
-  ShadeArgs args = take_walk(a, Shaders::integrates(a.shader));
+  ShadeArgs args = make_walk_args(a, Shaders::integrates(a.shader));
   const Like like{a.origin_r3, a.table_lm4.scalar_type()};
-  GV_SHADE(GV_TAKE)
-  check_second(a.normal_bzyxc, a.normal_tnc, "normal_bzyxc", 3, args, args.normal_voxel);
-  args.other_channels =
-      check_second(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel, Shaders::filtered(a.shader));
+  GV_SHADE(GV_CHECK_AND_SET)
+  check_second_channel(a.normal_bzyxc, a.normal_tnc, "normal_bzyxc", 3, args, args.normal_voxel);
+  args.other_channels = check_second_channel(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel,
+                                             Shaders::filtered(a.shader));
   STD_TORCH_CHECK(!a.other_bzyxc.has_value() || a.other_component < args.other_channels,
                   "gvtorch: other_component out of range");
   args.other_bricks = a.other_bzyxc.has_value() ? static_cast<int32_t>(a.other_bzyxc->size(0)) : 0;

@@ -20,7 +20,7 @@ GV_OP(CompactRequestsOp, "compact_requests", GV_COMPACT_REQUESTS, "(Tensor node_
 inline auto run(const CompactRequestsOp& a) {
   const Like like{a.request_tn};
   ListRequests args{};
-  GV_COMPACT_REQUESTS(GV_TAKE)
+  GV_COMPACT_REQUESTS(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.capacity >= 1 && a.request_tn.numel() <= INT32_MAX, "gvtorch: no capacity, or too many nodes");
   Tensor node_k = make_output(args.node_k, a.request_tn, {a.capacity});
   Tensor word_k = make_output(args.word_k, a.request_tn, {a.capacity});
@@ -37,7 +37,7 @@ inline auto run(const ChooseRequestsOp& a) {
   STD_TORCH_CHECK(a.asked_l2k.dim() == 3, "gvtorch: asked_l2k must be (l, 2, k)");
   const int64_t lists = a.asked_l2k.size(0), listed = a.asked_l2k.size(2), tiles = a.loc_t4.numel() / 4;
   ChooseArgs args{};
-  GV_CHOOSE_REQUESTS(GV_TAKE)
+  GV_CHOOSE_REQUESTS(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.batch >= 1 && a.per_tile >= 1 && lists < 512 && lists * listed <= INT32_MAX,
                   "gvtorch: no batch, no nodes, or too many");
   args.lists = lists;
@@ -67,7 +67,7 @@ inline auto run(const LruPartitionOp& a) {
   const Like like{a.order_k};
   const int64_t size = a.order_k.numel(), slots = a.stamp_s.numel();
   UseArgs args{};
-  GV_LRU_PARTITION(GV_TAKE)
+  GV_LRU_PARTITION(GV_CHECK_AND_SET)
   args.slots = slots;
   Tensor sorted_k = make_output(args.sorted_k, a.order_k, {size});
   Tensor unused_1 = make_output(args.unused_1, a.order_k, {1});
@@ -90,7 +90,7 @@ inline void run(const UnlinkOp& a) {
   const Like like{a.pointer_tn};
   const int64_t slots = a.owner_s.numel();
   UnlinkArgs args{};
-  GV_UNLINK(GV_TAKE)
+  GV_UNLINK(GV_CHECK_AND_SET)
   args.nodes = a.pointer_tn.numel();
   args.slots = slots;
   const Tensor leaving_s = torch::stable::new_zeros(a.pointer_tn, {slots}, ScalarType::Byte);
@@ -110,7 +110,7 @@ GV_OP(OrphanOp, "orphan", GV_ORPHAN, "()");
 inline void run(const OrphanOp& a) {
   const Like like{a.pointer_tn};
   ClearOwner args{};
-  GV_ORPHAN(GV_TAKE)
+  GV_ORPHAN(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.pointer_tn.dim() == 2, "gvtorch: pointer_tn must be (t, n)");
   args.tiles = a.pointer_tn.size(0);
   args.per_tile = a.pointer_tn.size(1);
@@ -124,7 +124,7 @@ inline void run(const LinkOp& a) {
   const Like like{a.pointer_tn};
   const int64_t nodes = a.pointer_tn.numel(), count = a.node_k.numel();
   WritePointer args{};
-  GV_LINK(GV_TAKE)
+  GV_LINK(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.kind == kLoad || a.kind == kSubdivide, "gvtorch: kind must be LOAD or SUBDIVIDE");
   args.nodes = nodes;
   for_each(a.pointer_tn, count, args);
@@ -136,7 +136,7 @@ inline void run(const LinkBricksOp& a) {
   const Like like{a.brick_tn};
   const int64_t nodes = a.brick_tn.numel(), slots = a.owner_b.numel(), count = a.node_k.numel();
   LinkBrick args{};
-  GV_LINK_BRICKS(GV_TAKE)
+  GV_LINK_BRICKS(GV_CHECK_AND_SET)
   args.nodes = nodes;
   args.slots = slots;
   for_each(a.brick_tn, count, args);
@@ -150,7 +150,7 @@ inline void run(const LinkTilesOp& a) {
   const int64_t per_tile = tiles > 0 ? a.child_tn.numel() / tiles : 0;
   const int64_t width = rows > 0 ? a.child_jw.numel() / rows : 0;
   LinkTile args{};
-  GV_LINK_TILES(GV_TAKE)
+  GV_LINK_TILES(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(width <= per_tile || rows == 0, "gvtorch: child_jw is wider than a tile");
   args.tiles = tiles;
   args.rows = rows;
@@ -165,7 +165,7 @@ template <class Word>
 void put_words(const PutRowsOp& a, int64_t slots, int64_t count, int64_t bytes) {
   const Like like{a.slot_k};
   PutRows<Word> args{};
-  GV_PUT_ROWS(GV_TAKE)
+  GV_PUT_ROWS(GV_CHECK_AND_SET)
   args.slots = slots;
   args.width = bytes / static_cast<int64_t>(sizeof(Word));
   for_each(a.target_sb, count * args.width, args);
@@ -187,7 +187,7 @@ inline Tensor run(const LocateOp& a) {
   const Like like{a.node_k};
   const int64_t tiles = a.loc_t4.numel() / 4, count = a.node_k.numel();
   LocateNodes args{};
-  GV_LOCATE(GV_TAKE)
+  GV_LOCATE(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.branching >= 2 && a.per_tile >= 1, "gvtorch: branching or per_tile out of range");
   args.nodes = tiles * a.per_tile;
   Tensor loc_k4 = make_output(args.loc_k4, a.node_k, {count, 4});
@@ -202,7 +202,7 @@ inline Tensor run(const LackingOp& a) {
   const int64_t tiles = a.parent_t.numel(), count = a.node_k.numel();
   const int64_t per_tile = tiles > 0 ? a.pointer_tn.numel() / tiles : 1;
   FindLacking args{};
-  GV_LACKING(GV_TAKE)
+  GV_LACKING(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.branching >= 2 && per_tile >= 1 && per_tile <= INT32_MAX,
                   "gvtorch: branching or tile out of range");
   args.locator = {args.loc_t4, args.node_k, args.branching, static_cast<int32_t>(per_tile), nullptr, tiles * per_tile};
@@ -218,7 +218,7 @@ inline Tensor run(const CutBricksOp& a) {
   const Like like{values, ScalarType::Float, values.scalar_type()};
   const int64_t bricks = a.place_k3.numel() / 3;
   CutBricks args{};
-  GV_CUT_BRICKS(GV_TAKE)
+  GV_CUT_BRICKS(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(values.dim() == 4 && values.numel() > 0, "gvtorch: values_zyxc must be (z, y, x, c)");
   STD_TORCH_CHECK(a.brick_size >= 1, "gvtorch: brick_size out of range");
   const int64_t side = args.side();

@@ -15,7 +15,7 @@ inline auto run(const PinholeRaysOp& a) {
                   "gvtorch: camera_nc must be (n, c) with c >= 20");
   const int64_t cameras = a.camera_nc.size(0), columns = a.camera_nc.size(1);
   PinholeRays args{};
-  GV_PINHOLE_RAYS(GV_TAKE)
+  GV_PINHOLE_RAYS(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.height >= 1 && a.first + a.rows <= cameras * a.height, "gvtorch: there are fewer rows");
   STD_TORCH_CHECK(a.first + a.rows <= INT32_MAX && a.rows * a.width <= INT32_MAX, "gvtorch: these are too many rays");
   args.columns = columns;

@@ -24,7 +24,7 @@ inline auto run(const VoxelizeOp& a) {
     boxes += floor;
     args.first[++args.floors] = static_cast<int32_t>(boxes);
   }
-  GV_VOXELIZE(GV_TAKE)
+  GV_VOXELIZE(GV_CHECK_AND_SET)
   args.triangles = triangles;
   args.cubes = cubes;
   const auto make = [&](auto*& pointer, ScalarType dtype, bool wanted = true) {

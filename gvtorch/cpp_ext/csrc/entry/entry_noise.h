@@ -22,7 +22,7 @@ inline auto run(const NoiseOp& a) {
   const Like like{a.point_pn, a.point_pn.scalar_type()};
   const int64_t points = a.point_pn.size(0), axes = a.point_pn.size(1);
   NoiseArgs args{};
-  GV_NOISE(GV_TAKE)
+  GV_NOISE(GV_CHECK_AND_SET)
   args.axes = static_cast<int32_t>(axes);
   Tensor value_p = make_output(args.value_p, a.point_pn, {points});
   make_noise(a.point_pn, args, points);

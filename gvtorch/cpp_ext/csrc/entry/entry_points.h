@@ -20,7 +20,7 @@ inline auto run(const SplatOp& a) {
   const int64_t width = a.value_nc.size(1), narrow = a.value_nc.size(0), wide = a.radius_m.numel();
   const int64_t narrow_runs = a.narrow_s2.numel() / 2, wide_runs = a.wide_t2.numel() / 2;
   SplatArgs args{};
-  GV_SPLAT(GV_TAKE)
+  GV_SPLAT(GV_CHECK_AND_SET)
   args.cubes = cubes;
   args.side = side;
   args.width = width;

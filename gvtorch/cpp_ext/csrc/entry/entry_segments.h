@@ -35,7 +35,7 @@ GV_OP(WriteSegmentsOp, "write_segments", GV_WRITE_SEGMENTS,
 // Runs the functor that make(WalkRay, T{}) returns for every ray.
 template <class Op, class Make>
 void walk_rays(const Op& a, const Make& make) {
-  const ShadeArgs walk_args = take_walk(a);
+  const ShadeArgs walk_args = make_walk_args(a);
   const int64_t rays = walk_args.rays;
   const Like like{a.origin_r3, a.table_lm4.scalar_type()};
   with_real(a.table_lm4, [&](auto real) {
@@ -43,8 +43,8 @@ void walk_rays(const Op& a, const Make& make) {
     with_digits<T>(walk_args, [&](auto* digits) {
       using Digits = std::decay_t<decltype(*digits)>;
       WalkRay<T, Digits> args{ShadeRay<T, Plain<T>, Digits>(walk_args), nullptr, 0, false};
-      GV_PART(GV_TAKE)
-      const Tensor node_cache = hide_nodes(a.origin_r3, walk_args.nodes, args.kernel);
+      GV_PART(GV_CHECK_AND_SET)
+      const Tensor node_cache = allocate_node_cache(a.origin_r3, walk_args.nodes, args.kernel);
       for_each(a.origin_r3, args.kernel.order.count(), make(args, real));
     });
   });
@@ -69,7 +69,7 @@ inline auto run(const WriteSegmentsOp& a) {
     const Like like{a.origin_r3};
     const int64_t rays = walk.kernel.order.rays;
     WriteSegments<decltype(real), decltype(walk)> args{walk, nullptr, 0, {}};
-    GV_SEGMENT_RANGE(GV_TAKE)
+    GV_SEGMENT_RANGE(GV_CHECK_AND_SET)
     ray_s = make_output(args.out.ray_s, a.origin_r3, {a.total});
     node_s2 = make_output(args.out.node_s2, a.origin_r3, {a.total, 2});
     brick_s2 = make_output(args.out.brick_s2, a.origin_r3, {a.total, 2});
@@ -102,14 +102,14 @@ GV_OP(SampleBricksOp, "sample_bricks", GV_SAMPLE_BRICKS, "Tensor value_kc");
 GV_OP(SampleBricksBackwardOp, "sample_bricks_backward", GV_SAMPLE_BRICKS_BACKWARD,
       "(Tensor grad_bzyxc, Tensor grad_tnc)");
 
-// Runs the functor that make(AimSample, T{}, Voxel{}) returns for every sample.
+// Runs the functor that make(FindSample, T{}, Voxel{}) returns for every sample.
 template <class Op, class Make>
-void aim_samples(const Op& a, const Make& make) {
+void for_each_sample(const Op& a, const Make& make) {
   const Like like{a.origin_r3, a.distance_s3.scalar_type(), a.bricks_bzyxc.scalar_type()};
   STD_TORCH_CHECK(a.constant_tnc.dim() == 3 && a.constant_tnc.size(1) > 0, "gvtorch: constant_tnc must be (t, n, c)");
   TraceArgs args{};
   args.nodes_per_tile = static_cast<int32_t>(a.constant_tnc.size(1));
-  take_channel(args, a, like, a.constant_tnc.size(0) * a.constant_tnc.size(1));
+  set_channel_args(args, a, like, a.constant_tnc.size(0) * a.constant_tnc.size(1));
   const int64_t segments = a.ray_s.numel(), samples = a.segment_k.numel();
   GV_SAMPLES(GV_CHECK)
   with_real(a.distance_s3, [&](auto real) {
@@ -128,28 +128,28 @@ void aim_samples(const Op& a, const Make& make) {
       const auto* stored = static_cast<const Voxel*>(args.bricks_bzyxc);
       const auto* constants = static_cast<const Voxel*>(args.constant_tnc);
       const BrickView<Voxel> bricks{stored, constants, args.side, args.border, args.channels};
-      const AimSample<T, Voxel> aim{walk.rays,
-                                    walk.tree,
-                                    walk.levels,
-                                    bricks,
-                                    read,
-                                    to_kernel(a.segment_k),
-                                    to_kernel(a.number_k),
-                                    args.rays,
-                                    segments,
-                                    args.nodes,
-                                    args.bricks,
-                                    walk.options.step};
-      for_each(a.origin_r3, samples, make(aim, real, voxel));
+      const FindSample<T, Voxel> find_sample{walk.rays,
+                                             walk.tree,
+                                             walk.levels,
+                                             bricks,
+                                             read,
+                                             to_kernel(a.segment_k),
+                                             to_kernel(a.number_k),
+                                             args.rays,
+                                             segments,
+                                             args.nodes,
+                                             args.bricks,
+                                             walk.options.step};
+      for_each(a.origin_r3, samples, make(find_sample, real, voxel));
     });
   });
 }
 
 inline auto run(const SampleBricksOp& a) {
   Tensor value_kc;
-  aim_samples(a, [&](const auto& aim, auto real, auto voxel) {
-    SampleBricks<decltype(real), decltype(voxel)> kernel{aim, nullptr};
-    value_kc = make_output(kernel.value_kc, a.origin_r3, {a.segment_k.numel(), aim.bricks.channels});
+  for_each_sample(a, [&](const auto& find_sample, auto real, auto voxel) {
+    SampleBricks<decltype(real), decltype(voxel)> kernel{find_sample, nullptr};
+    value_kc = make_output(kernel.value_kc, a.origin_r3, {a.segment_k.numel(), find_sample.bricks.channels});
     return kernel;
   });
   return value_kc;
@@ -157,12 +157,12 @@ inline auto run(const SampleBricksOp& a) {
 
 inline auto run(const SampleBricksBackwardOp& a) {
   Tensor grad_bzyxc, grad_tnc;
-  aim_samples(a, [&](const auto& aim, auto real, auto voxel) {
-    const int64_t side = aim.bricks.side, channels = aim.bricks.channels, samples = a.segment_k.numel();
+  for_each_sample(a, [&](const auto& find_sample, auto real, auto voxel) {
+    const int64_t side = find_sample.bricks.side, channels = find_sample.bricks.channels, samples = a.segment_k.numel();
     const Like like{a.origin_r3, a.distance_s3.scalar_type()};
-    SpreadGradient<decltype(real), decltype(voxel)> args{aim, nullptr, nullptr, nullptr};
-    GV_GRADIENT(GV_TAKE)
-    grad_bzyxc = make_output(args.grad_bzyxc, a.grad_kc, {aim.brick_count, side, side, side, channels});
+    SpreadGradient<decltype(real), decltype(voxel)> args{find_sample, nullptr, nullptr, nullptr};
+    GV_GRADIENT(GV_CHECK_AND_SET)
+    grad_bzyxc = make_output(args.grad_bzyxc, a.grad_kc, {find_sample.brick_count, side, side, side, channels});
     grad_tnc = make_output(args.grad_tnc, a.grad_kc, {a.constant_tnc.size(0), a.constant_tnc.size(1), channels});
     torch::stable::zero_(grad_bzyxc);
     torch::stable::zero_(grad_tnc);

@@ -91,7 +91,8 @@ GV_HD void complex_power(T& real, T& imaginary, int32_t n) {
   });
 }
 
-// By how much a step stretches distances in a ball: `most` between any two points; `low` to `high` between neighbours.
+// By how much a step stretches distances in a ball: `largest` between any two points; `low` to `high` between
+// neighbours.
 template <class T>
 struct Stretch {
   T largest, low, high;
@@ -159,7 +160,7 @@ struct FoldStep {
   }
 };
 
-// Estimates the distance from an orbit's radius and from how far (`apart`) neighbouring orbits have come apart.
+// Estimates the distance from an orbit's radius and from how far (`separation`) neighbouring orbits have come apart.
 template <class Step, class T>
 GV_HD T estimate(T radius, T separation) {
   if constexpr (Step::kLogarithmic) return static_cast<RealOf<T>>(0.5) * radius * log_exact(radius) / separation;
@@ -173,7 +174,7 @@ struct FollowPoints {
 
   GV_HD void follow(Vec3<T> z, T* result) const {
     using Real = RealOf<T>;
-    const Real bailout = *static_cast<const Real*>(args.bailout_1), add = args.julia ? 0 : 1;
+    const Real bailout = *static_cast<const Real*>(args.bailout_1), added_separation = args.julia ? 0 : 1;
     const auto* constants = static_cast<const Real*>(args.constant_3);
     Vec3<T> constant = z;
     for (int axis = 0; axis < 3; ++axis) {
@@ -182,11 +183,11 @@ struct FollowPoints {
     const Step step(args.amount);
     T radius = square_root(squared(z)), separation = number_of<T>(1), least_radius = radius, plane = from_planes(z);
     MaskOf<T> alive = radius <= bailout;
-    for (int32_t turn = 0; turn < args.iterations && any(alive); ++turn) {
+    for (int32_t iteration = 0; iteration < args.iterations && any(alive); ++iteration) {
       T factor;
       const Vec3<T> stepped = step(z, factor);
       for (int axis = 0; axis < 3; ++axis) z[axis] = select(alive, stepped[axis] + constant[axis], z[axis]);
-      separation = select(alive, factor * separation + add, separation);
+      separation = select(alive, factor * separation + added_separation, separation);
       radius = square_root(squared(z));
       least_radius = smaller(least_radius, radius);
       plane = smaller(plane, from_planes(z));
@@ -217,10 +218,10 @@ struct FollowBalls {
     const Step step(args.amount);
     Vec3<T> z{center[0], center[1], center[2]};
     const Vec3<T> constant = args.julia ? Vec3<T>{constants[0], constants[1], constants[2]} : z;
-    const T push = args.julia ? T{} : first, add = args.julia ? 0 : 1;
+    const T added_reach = args.julia ? T{} : first, added_separation = args.julia ? 0 : 1;
     T reach = first, low_separation = 1, high_separation = 1, low = infinity, high = -infinity;
     bool inside = true, diverged = false;  // inside: some orbit may be within the bailout radius
-    for (int32_t turn = 0;; ++turn) {
+    for (int32_t iteration = 0;; ++iteration) {
       const T radius = square_root(squared(z)), inner_radius = larger(radius - reach, T{}),
               outer_radius = radius + reach;
       if (outer_radius > bailout) {
@@ -229,14 +230,14 @@ struct FollowBalls {
       }
       diverged = !(reach < static_cast<T>(kLostBeyond));
       inside = inner_radius <= bailout && !diverged;
-      if (!inside || turn == args.iterations) break;
+      if (!inside || iteration == args.iterations) break;
       const Stretch<T> stretch = step.stretch(z, reach);
       T factor;
       const Vec3<T> stepped = step(z, factor);
       for (int axis = 0; axis < 3; ++axis) z[axis] = stepped[axis] + constant[axis];
-      reach = stretch.largest * reach + push;
-      low_separation = stretch.low * low_separation + add;
-      high_separation = stretch.high * high_separation + add;
+      reach = stretch.largest * reach + added_reach;
+      low_separation = stretch.low * low_separation + added_separation;
+      high_separation = stretch.high * high_separation + added_separation;
     }
     auto* ends = static_cast<T*>(args.ends_2k);
     ends[index] = diverged ? deep : inside ? smaller(low, deep) : low;

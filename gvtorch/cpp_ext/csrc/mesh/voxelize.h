@@ -67,7 +67,7 @@ template <class T>
 struct Triangle {
   Vec3<T> corner[3], edge[3], edge_normal[3], normal;
   T inverse2[3], length2,
-      max_inside;  // most: largest product with `beside` inside; below 0 for a triangle without area
+      max_inside;  // max_inside: largest product with `edge_normal` inside; below 0 for a triangle without area
 
   GV_HD explicit Triangle(const Vec3<T>* corner_3) {
     for (int i = 0; i < 3; ++i) corner[i] = corner_3[i];
@@ -91,7 +91,7 @@ struct Triangle {
   }
   // True if the nearest point of the triangle's plane lies in the triangle.
   template <class F>
-  GV_HD auto over(Vec3<F> position) const {
+  GV_HD auto projects_inside(Vec3<F> position) const {
     const F first = dot(minus(position, corner[0]), edge_normal[0]),
             second = dot(minus(position, corner[1]), edge_normal[1]),
             third = dot(minus(position, corner[2]), edge_normal[2]);
@@ -102,13 +102,13 @@ struct Triangle {
     const Vec3<F> from0 = from_edge(0, position), from1 = from_edge(1, position), from2 = from_edge(2, position);
     const F best = smaller(smaller(dot(from0, from0), dot(from1, from1)), dot(from2, from2));
     const F height = dot(minus(position, corner[0]), normal);
-    return select(over(position), height * height / length2, best);
+    return select(projects_inside(position), height * height / length2, best);
   }
   // Weights of the corners at the nearest point. This and `away` both search for the nearest edge: one function for
   // both costs 5 to 11 % of the time for a mesh with distances.
   GV_HD Vec3<T> weight(Vec3<T> position) const {
     Vec3<T> weights{};
-    if (over(position)) {
+    if (projects_inside(position)) {
       for (int i = 0; i < 3; ++i) weights[(i + 2) % 3] = -dot(minus(position, corner[i]), edge_normal[i]) / length2;
       return weights;
     }
@@ -129,7 +129,7 @@ struct Triangle {
   }
   // A vector along the line to the nearest point, of any length and sign.
   GV_HD Vec3<T> away(Vec3<T> position, T gap2) const {
-    if (over(position) || gap2 < static_cast<T>(kTouch)) return normal;
+    if (projects_inside(position) || gap2 < static_cast<T>(kTouch)) return normal;
     Vec3<T> toward{};
     T best{};
     for (int i = 0; i < 3; ++i) {
@@ -144,7 +144,7 @@ struct Triangle {
   }
 };
 
-// Where a line along x pierces a triangle (`at`), and the sign of the triangle's normal along x; 0: it misses.
+// Where a line along x pierces a triangle, and the sign of the triangle's normal along x; 0: it misses.
 template <class T>
 struct Pierced {
   T x;
@@ -269,7 +269,8 @@ struct BoxStack {
   }
 };
 
-// An index is kPack voxels of a row along x, for which `wind` has run. T: float or double, for the computation.
+// An index is kPack voxels of a row along x, for which `write_winding` has run. T: float or double, for the
+// computation.
 template <class T>
 struct VoxelizePack {
   VoxelizeArgs a;
@@ -303,7 +304,7 @@ struct VoxelizePack {
     } else {
       find_nearest<VoxelVector<T>>(frame, row, begin, end, y, z);
     }
-    if (a.shares) fill(frame, row, begin, end, y, z);
+    if (a.shares) write_coverage(frame, row, begin, end, y, z);
   }
 
   GV_HD Cube cube_at(int64_t cube) const {
@@ -391,7 +392,7 @@ struct VoxelizePack {
 
   // Writes the winding numbers of a row, which packs read: triangles ahead along x count 1 if their normals point
   // ahead, else -1.
-  GV_HD void wind(int64_t row) const {
+  GV_HD void write_winding(int64_t row) const {
     const int64_t number = row / (a.side * a.side);
     if (!(a.size_k3[3 * number] > 0)) return;
     const Cube cube = cube_at(number);
@@ -412,7 +413,7 @@ struct VoxelizePack {
 
   // Writes the coverage (the mean of the winding number) of those of the voxels begin..end of a row through which a
   // solid's surface may pass. A triangle adds the volume before it along x, with the sign of its normal.
-  GV_HD void fill(const Cube& cube, int64_t row, int32_t begin, int32_t end, T y, T z) const {
+  GV_HD void write_coverage(const Cube& cube, int64_t row, int32_t begin, int32_t end, T y, T z) const {
     const T* distance = static_cast<const T*>(a.distance_kzyx) + row * a.side;
     const int32_t* nearest = a.nearest_kzyx + row * a.side;
     const auto may_be_cut = [&](int32_t i) {
@@ -486,11 +487,11 @@ struct VoxelizePack {
     }
     const double x0 = cube.world(center_of(cube, begin), 0), x1 = cube.world(center_of(cube, end - 1), 0);
     const double y0 = cube.world(y, 1), z0 = cube.world(z, 2);
-    const auto within = [&](T gap) {
+    const auto squared_limit = [&](T gap) {
       const double limit = (static_cast<double>(gap) + kMargin) * cube.voxel;
       return limit * limit;
     };
-    double limit2 = cube.reach >= 0 ? within(cube.reach) : -1;
+    double limit2 = cube.reach >= 0 ? squared_limit(cube.reach) : -1;
     descend(
         [&](int64_t box) {
           const double gx = box_gap(box, 0, x0, x1), gy = box_gap(box, 1, y0, y0), gz = box_gap(box, 2, z0, z0);
@@ -506,7 +507,7 @@ struct VoxelizePack {
           best = select(nearer, gap2, best);
           T worst = lane_of(best, 0);
           for (int32_t lane = 1; lane < kLanesOfF; ++lane) worst = larger(worst, lane_of(best, lane));
-          limit2 = within(square_root(worst));
+          limit2 = squared_limit(square_root(worst));
         });
     for (int32_t i = begin; i < end; ++i) {
       const int32_t nearest = lane_of(nearest_index, i - begin);
@@ -551,7 +552,7 @@ struct WindRow {
 
   static constexpr int kBlocksPerSM = VoxelizePack<T>::kBlocksPerSM;
 
-  GV_HD void operator()(int64_t row) const { pack.wind(row); }
+  GV_HD void operator()(int64_t row) const { pack.write_winding(row); }
 };
 
 }  // namespace GV_NAMESPACE

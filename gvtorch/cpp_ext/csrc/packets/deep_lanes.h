@@ -22,8 +22,8 @@ struct DeepLanes {
     for (int axis = 0; axis < 3; ++axis) origin[lane][axis] = ray.exact_origin(axis);
   }
 
-  // See PacketWalk::go.
-  GV_CALL Ints go(Mask mask, const Vec3<Floats>& direction, Floats t, Ints deepest) {
+  // See PacketWalk::move_to.
+  GV_CALL Ints move_to(Mask mask, const Vec3<Floats>& direction, Floats t, Ints deepest) {
     Vec3<double> high;
     for (int axis = 0; axis < 3; ++axis) high[axis] = Digits<float>::upper_bound_of(rays, axis);
     for_lanes(mask, [&](int lane) {

@@ -48,7 +48,8 @@ GV_HD Ints load_words(const PacketPool& pool, Ints brick, Ints offset) {
   return words;
 }
 
-// Trilinear interpolation. `brick` is the brick's first byte in the pool or, with kFar, its slot, for 64-bit offsets.
+// Trilinear interpolation. `brick` is the brick's first byte in the pool or, with kLongOffsets, its slot, for 64-bit
+// offsets.
 template <class Voxel, bool kLongOffsets>
 GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& position) {
   constexpr int32_t kBytes = sizeof(Voxel);

@@ -35,7 +35,7 @@ template <class Sums, class Sum>
 GV_HD void put_sum(Sums& sums, int lane, const Sum& lane_sum) {
   put_lane(sums, lane, lane_sum);
 }
-// The lanes of `which` in which no value between low and high changes the sum.
+// The lanes of `mask` in which no value between low and high changes the sum.
 template <class Shader, class Sums>
 GV_HD Mask hides_of(const Shader& shader, Mask mask, Floats low, Floats high, const Sums& sums) {
   return mask && shader.hides(low, high, sums);
@@ -111,7 +111,7 @@ struct PacketWalk {
     load(begin, end);
     while (any(alive)) {
       const Mask waiting = alive & (remaining == 0);
-      if (any(waiting)) go_on(waiting);
+      if (any(waiting)) advance(waiting);
       Mask ready = alive & (remaining > 0);
       const int32_t enough = count(alive) / 2 + 1;
       while (count(ready) >= enough) ready = march(ready);
@@ -160,7 +160,7 @@ struct PacketWalk {
     return combined(finer, coarser, [&](Floats a, Floats b) { return mixed ? a + coarse_weight * (b - a) : a; });
   }
 
-  GV_HD void narrow(Mask mask) { marching = mask; }
+  GV_HD void select_lanes(Mask mask) { marching = mask; }
   // Calls body(lane, probe) with the lane's own probe.
   template <class Body>
   GV_HD void each_lane(Mask mask, const Body& body, PrefetchedGradient<float>* prefetched = nullptr) const {
@@ -232,9 +232,9 @@ struct PacketWalk {
   }
 
   // For lanes whose run has ended: begins the next one in the same node, or visits the next node.
-  GV_HD void go_on(Mask waiting) {
+  GV_HD void advance(Mask waiting) {
     const Mask ran = waiting & (number > intervals.count);
-    intervals.go(ran, number);
+    intervals.move_to(ran, number);
     alive = alive & ~(waiting & ~(intervals.inside() & (sum.clear > stop_clear)));
     const Mask again = ran & alive & intervals.stays(extent);
     const Mask visits = waiting & alive & ~again;
@@ -273,7 +273,7 @@ struct PacketWalk {
     Ints depth, node, brick, tile;
     descend(mask, middle, depth, node, brick, tile);
     const Mask hides = node < 0;
-    const Floats exit = ray.leave([&](int axis, Mask upper) { return face(mask, axis, depth, upper); });
+    const Floats exit = ray.exit_distance([&](int axis, Mask upper) { return face(mask, axis, depth, upper); });
     extent.exit = mask ? exit : extent.exit;
 
     // The nodes whose bricks are read.
@@ -327,9 +327,9 @@ struct PacketWalk {
       mixed = runs ? differ : mixed;
       fine_depth = runs ? fine_level : fine_depth;
       coarse_depth = runs ? coarse_level : coarse_depth;
-      aim(runs, fine_level, fine_brick, fine);
+      set_brick(runs, fine_level, fine_brick, fine);
       const Mask both = runs & differ;
-      if (any(both)) aim(both, coarse_level, coarse_brick, coarse);
+      if (any(both)) set_brick(both, coarse_level, coarse_brick, coarse);
       Mask flat = runs & ~fine.stored & (~differ | ~coarse.stored);
       if (kernel.shades_each_position()) flat = Mask{};
       each_lane(flat & differ, [&](int lane, const Probe<float>& probe) { set_lane(flat, lane, probe.uniform()); });
@@ -343,7 +343,7 @@ struct PacketWalk {
   // The same as `descend` in tree.h, level by level for all lanes; those whose path is known to a deeper level wait.
   GV_HD void descend(Mask mask, Floats middle, Ints& depth, Ints& node, Ints& brick, Ints& tile) {
     const TreeView& tree = walk.tree;
-    const Ints shared_depth = go(mask, middle, kKeepsPath ? smaller(path_depth, wanted) : Ints{} - 1);
+    const Ints shared_depth = move_to(mask, middle, kKeepsPath ? smaller(path_depth, wanted) : Ints{} - 1);
     const Ints from = larger(shared_depth, Ints{});
     node = path_entry(path_node, from);
     brick = path_entry(path_brick, from);
@@ -362,7 +362,7 @@ struct PacketWalk {
       next_node = active ? next_node : Ints{};
       stamp(tree.stamp_t, active, home_tile);
       const Ints brick_word = pick(tree.brick_tn, next_node), tile_word = pick(tree.child_tn, next_node);
-      const Ints next_brick = brick_word < tree.bricks ? brick_word : Ints{} + kAbsent;  // as TreeView::within
+      const Ints next_brick = brick_word < tree.bricks ? brick_word : Ints{} + kAbsent;  // as TreeView::checked_word
       const Ints next_tile = tile_word < tree.tiles ? tile_word : Ints{} + kAbsent;
       const Mask hides = hidden(active, next_node);
       node = active ? next_node | (hides & INT32_MIN) : node;
@@ -377,11 +377,11 @@ struct PacketWalk {
     path_depth = mask ? depth : path_depth;
   }
 
-  // `go` moves lanes to their positions at distance t; it returns the deepest level, at most `known`, at which a lane
-  // is in the same node as before. `child` and `face` are those of Digits and BitDigits: which child of the node above
-  // a lane is in, and the offset of a face of its node from its ray's origin.
-  GV_HD Ints go(Mask mask, Floats t, Ints deepest) {
-    if (walk.rays.deep) return deep_lanes.go(mask, ray.direction, t, deepest);
+  // `move_to` moves lanes to their positions at distance t; it returns the deepest level, at most `deepest`, at which a
+  // lane is in the same node as before. `child` and `face` are those of Digits and BitDigits: which child of the node
+  // above a lane is in, and the offset of a face of its node from its ray's origin.
+  GV_HD Ints move_to(Mask mask, Floats t, Ints deepest) {
+    if (walk.rays.deep) return deep_lanes.move_to(mask, ray.direction, t, deepest);
     const TreeView& tree = walk.tree;
     const int32_t top = tree.digit_bits * tree.max_depth;
     const float cells = static_cast<float>(1 << top);
@@ -443,7 +443,7 @@ struct PacketWalk {
     number = mask ? intervals.count : number;
   }
 
-  GV_HD void aim(Mask mask, Ints holder_depth, Ints brick, PacketBrick& to) {
+  GV_HD void set_brick(Mask mask, Ints holder_depth, Ints brick, PacketBrick& to) {
     const Mask stored = brick >= 0;
     const Floats scale = pick(walk.levels.scale, holder_depth);
     const float first = static_cast<float>(kernel.channels.border) - 0.5f;

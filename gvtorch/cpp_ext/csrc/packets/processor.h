@@ -29,8 +29,8 @@ struct Processor {
 // The widest instruction set of this processor; GVTORCH_CPU=baseline, avx2 or avx512 limits it.
 inline Processor find_processor() {
 #ifdef GV_X86
-  const char* named = std::getenv("GVTORCH_CPU");
-  const std::string_view requested = named == nullptr ? "avx512" : named;
+  const char* limit_name = std::getenv("GVTORCH_CPU");
+  const std::string_view requested = limit_name == nullptr ? "avx512" : limit_name;
   __builtin_cpu_init();
   const bool has_avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
   if (requested == "avx512" && has_avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&

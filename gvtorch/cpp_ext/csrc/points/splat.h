@@ -99,19 +99,19 @@ struct SplatVoxel {
     const double* edge = args.edge_k3e + 3 * cube * (side + 1);
     const double *edge_x = edge + x, *edge_y = edge + side + 1 + y, *edge_z = edge + 2 * (side + 1) + z;
     const int64_t* low = args.low_k3 + 3 * cube;
-    const Span narrow(args.narrow_b + cube, args.narrow_runs), wide(args.wide_b + cube, args.wide_runs);
+    const Span narrow_span(args.narrow_b + cube, args.narrow_runs), wide_span(args.wide_b + cube, args.wide_runs);
     double* sum_c = args.sum_kzyxc + index * args.width;
     for (int64_t first = 0; first < args.width; first += kNumbersAtOnce) {
       double sum[kNumbersAtOnce] = {};
       const int64_t remaining = args.width - first;
-      for_rows(narrow, args.narrow_s2, args.narrow, [&](int64_t row) {
+      for_rows(narrow_span, args.narrow_s2, args.narrow, [&](int64_t row) {
         const int64_t* voxel = args.voxel_n3 + 3 * row;
         if (from_low(voxel[0], low[0]) != x || from_low(voxel[1], low[1]) != y || from_low(voxel[2], low[2]) != z)
           return;
         const double* value = args.value_nc + row * args.width + first;
         for (int i = 0; i < kNumbersAtOnce; ++i) sum[i] += i < remaining ? value[i] : 0.0;
       });
-      for_rows(wide, args.wide_t2, args.wide, [&](int64_t row) {
+      for_rows(wide_span, args.wide_t2, args.wide, [&](int64_t row) {
         const double *center = args.center_m3 + 3 * row, radius = args.radius_m[row];
         if (Spread::misses(center[2], radius, edge_z[0], edge_z[1]) ||
             Spread::misses(center[1], radius, edge_y[0], edge_y[1]) ||
@@ -184,8 +184,8 @@ struct SplatPart {
       }
     }
     const int64_t* low = args.low_k3 + 3 * cube;
-    const Span narrow(args.narrow_b + cube, args.narrow_runs), wide(args.wide_b + cube, args.wide_runs);
-    for_rows(narrow, args.narrow_s2, args.narrow, [&](int64_t row) {
+    const Span narrow_span(args.narrow_b + cube, args.narrow_runs), wide_span(args.wide_b + cube, args.wide_runs);
+    for_rows(narrow_span, args.narrow_s2, args.narrow, [&](int64_t row) {
       const int64_t* voxel = args.voxel_n3 + 3 * row;
       const uint64_t x = from_low(voxel[0], low[0]), y = from_low(voxel[1], low[1]), z = from_low(voxel[2], low[2]);
       const uint64_t limit = side;
@@ -205,7 +205,7 @@ struct SplatPart {
     Shares<kPartY> y;
     Shares<kPartZ> z;
     double line[kPartX];
-    for_rows(wide, args.wide_t2, args.wide, [&](int64_t row) {
+    for_rows(wide_span, args.wide_t2, args.wide, [&](int64_t row) {
       const double *center = args.center_m3 + 3 * row, radius = args.radius_m[row];
       if (Spread::misses(center[2], radius, edge_z[0], edge_z[z1 - z0]) ||
           Spread::misses(center[1], radius, edge_y[0], edge_y[y1 - y0]) ||

@@ -47,7 +47,7 @@ struct ChannelRows : Transfer<T> {
 template <class T>
 struct ChannelMix : ShaderFacts {
   static constexpr bool kReadsAll = true;
-  static bool packs(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
+  static bool packets_can_trace(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
     return int64_t{args.levels} * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
   }
   template <class V>
@@ -82,7 +82,7 @@ struct ChannelMix : ShaderFacts {
   }
   template <class V, class AnyProbe>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
-    probe.narrow(mask);
+    probe.select_lanes(mask);
     V values[kMaxNumbers];
     probe.numbers_at(probe.channels.value, Components<T>{&view.table_lm[1].red, 4, width}, count(), piece.middle,
                      values);

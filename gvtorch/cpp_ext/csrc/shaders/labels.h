@@ -118,7 +118,7 @@ struct Labels : ShaderFacts {
     result.row = {row.red * row.alpha, row.green * row.alpha, row.blue * row.alpha, row.alpha};
     return result;
   }
-  // Finds the node's voxel whose cube contains a position, and the offset `from` the voxel's centre; a face that two
+  // Finds the node's voxel whose cube contains a position, and its offset from the voxel's centre; a face that two
   // voxels share belongs to the upper one.
   GV_HD static void find(const Channels& channels, const Vec3<T>& position, int32_t (&cell)[3], T (&from_center)[3]) {
     const T half = static_cast<T>(0.5);

@@ -130,7 +130,7 @@ struct Sight {
     return {origin.x + distance * direction.x, origin.y + distance * direction.y, origin.z + distance * direction.z};
   }
 
-  // Calls body(own member, other's member) for each member that differs between lanes.
+  // Calls body(a's member, b's member) for each member that differs between lanes.
   template <class A, class B, class Body>
   GV_HD static void each_member(A& a, B& b, const Body& body) {
     body(a.origin, b.origin);
@@ -198,7 +198,7 @@ struct Probe {
         cube(cube) {}
 
   // What shaders call to select lanes of a packet's probe (see shaders.h); here there is one ray.
-  GV_HD void narrow(bool) const {}
+  GV_HD void select_lanes(bool) const {}
   template <class Body>
   GV_HD void each_lane(bool mask, const Body& body) const {
     if (mask) body(0, *this);
@@ -225,7 +225,7 @@ struct Probe {
     return mixed ? between(row, four_in(channel, first, coarse, t), t) : row;
   }
 
-  // Several numbers of a channel at distance t, at most kMostNumbers.
+  // Several numbers of a channel at distance t, at most kMaxNumbers.
   GV_HD void numbers_at(const ChannelView& channel, Components<T> components, int32_t count, T t, T* out) const {
     read(channel, components, count, fine, t, out);
     if (!mixed) return;

@@ -22,7 +22,7 @@ struct Segment {
   int32_t wanted = 0;            // depth that the cone asked for
   int32_t first = 0, count = 0;  // number of the first interval, counted from base; how many intervals
   int32_t level = kPiece;        // intervals are step * 2^level long, or kPiece
-  // Distances from where the ray enters the scene; seen: where the nodes were looked up.
+  // Distances from where the ray enters the scene; lookup_t: where the nodes were looked up.
   T base = 0, start = 0, end = 0, lookup_t = 0;
 };
 
@@ -111,7 +111,7 @@ struct WalkRay {
       segment.level = kPiece;
       finish(segment);
     }
-    GV_HD int32_t take(Segment<T>& segment, const Intervals<T>& intervals, int32_t alike, bool last) {
+    GV_HD int32_t take_intervals(Segment<T>& segment, const Intervals<T>& intervals, int32_t run_length, bool last) {
       if (last || intervals.base != segment.base || intervals.level != segment.level) finish(segment);
       if (last) {
         region(segment, intervals.start, intervals.stop);
@@ -123,9 +123,9 @@ struct WalkRay {
         segment.first = static_cast<int32_t>(intervals.count);
         segment.level = intervals.level;
       }
-      segment.count += alike;
-      segment.end = intervals.start_of(intervals.count + static_cast<T>(alike));
-      return alike;
+      segment.count += run_length;
+      segment.end = intervals.start_of(intervals.count + static_cast<T>(run_length));
+      return run_length;
     }
     // Emits the complete segment; another may begin.
     GV_HD void finish(Segment<T>& segment) {
@@ -205,7 +205,7 @@ struct BrickView {
 
 // Finds what a sample of a segment reads: the bricks (or constants) of two nodes, and the weight of the coarse one.
 template <class T, class Voxel>
-struct AimSample {
+struct FindSample {
   RayView rays;
   TreeView tree;  // only its shape
   Levels<T> levels;
@@ -215,16 +215,16 @@ struct AimSample {
   int64_t ray_count, segment_count, node_count, brick_count;
   T step;
 
-  struct Aimed {
+  struct SampleSource {
     Spot<T> fine, coarse;
     T t, weight;
     bool valid = false;  // everything the segment refers to exists
   };
 
-  GV_HD Aimed operator()(int64_t k) const {
-    Aimed aimed;
+  GV_HD SampleSource operator()(int64_t k) const {
+    SampleSource source;
     const int64_t segment = segment_k[k];
-    if (segment < 0 || segment >= segment_count) return aimed;
+    if (segment < 0 || segment >= segment_count) return source;
     const int32_t wanted = segments.depth_s3[3 * segment + 2];
     const int64_t ray_number = segments.ray_s[segment];
     Holder holders[2];
@@ -234,23 +234,23 @@ struct AimSample {
                 segments.depth_s3[3 * segment + i]};
       if (holder.node < 0 || holder.node >= node_count || holder.brick >= brick_count || holder.depth < 0 ||
           holder.depth > tree.max_depth)
-        return aimed;
+        return source;
     }
-    if (ray_number < 0 || ray_number >= ray_count || wanted < 0 || wanted > tree.max_depth) return aimed;
-    aimed.valid = true;
+    if (ray_number < 0 || ray_number >= ray_count || wanted < 0 || wanted > tree.max_depth) return source;
+    source.valid = true;
     const Ray<T> ray(rays, ray_number);
     const Digits<T> digits(tree, levels, rays, ray, segments.distance_s3[3 * segment + 2]);
-    aimed.fine = aimed.coarse = Spot<T>(holders[0], digits, ray, bricks.border);
-    aimed.t = middle_of(segment, number_k[k]);
-    aimed.weight = 0;
+    source.fine = source.coarse = Spot<T>(holders[0], digits, ray, bricks.border);
+    source.t = middle_of(segment, number_k[k]);
+    source.weight = 0;
     if (holders[1].node != holders[0].node) {
-      aimed.coarse = Spot<T>(holders[1], digits, ray, bricks.border);
+      source.coarse = Spot<T>(holders[1], digits, ray, bricks.border);
       const T voxel = levels.voxel[wanted];
       const T blend = 1 / ((wanted > 0 ? levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - voxel);
-      const T cone = ray.cone_near + ray.cone_growth * aimed.t;
-      aimed.weight = clamp((cone - voxel) * blend, static_cast<T>(0), static_cast<T>(1));
+      const T cone = ray.cone_near + ray.cone_growth * source.t;
+      source.weight = clamp((cone - voxel) * blend, static_cast<T>(0), static_cast<T>(1));
     }
-    return aimed;
+    return source;
   }
   // Distance of the middle of a segment's interval.
   GV_HD T middle_of(int64_t segment, int32_t number) const {
@@ -267,24 +267,24 @@ struct AimSample {
 
 template <class T, class Voxel>
 struct SampleBricks {
-  AimSample<T, Voxel> aim_sample;
+  FindSample<T, Voxel> find_sample;
   T* value_kc;
 
   GV_HD void operator()(int64_t k) const {
-    const auto aimed = aim_sample(k);
-    const BrickView<Voxel>& bricks = aim_sample.bricks;
-    const bool mixed = aimed.coarse.node != aimed.fine.node;
+    const auto source = find_sample(k);
+    const BrickView<Voxel>& bricks = find_sample.bricks;
+    const bool mixed = source.coarse.node != source.fine.node;
     for (int32_t channel = 0; channel < bricks.channels; ++channel) {
       T value = 0;
-      if (aimed.valid) {
-        value = read(aimed.fine, aimed.t, channel);
-        if (mixed) value = value + aimed.weight * (read(aimed.coarse, aimed.t, channel) - value);
+      if (source.valid) {
+        value = read(source.fine, source.t, channel);
+        if (mixed) value = value + source.weight * (read(source.coarse, source.t, channel) - value);
       }
       value_kc[k * bricks.channels + channel] = value;
     }
   }
   GV_HD T read(const Spot<T>& spot, T t, int32_t channel) const {
-    const BrickView<Voxel>& bricks = aim_sample.bricks;
+    const BrickView<Voxel>& bricks = find_sample.bricks;
     if (spot.brick < 0)
       return number<T>(bricks.constant_tnc[static_cast<int64_t>(spot.node) * bricks.channels + channel]);
     const Voxel* voxels = bricks.bricks_bzyxc + bricks.first(spot.brick) + channel;
@@ -295,18 +295,18 @@ struct SampleBricks {
 // The gradient of SampleBricks: each sample adds to the voxels (or constants) it was made of.
 template <class T, class Voxel>
 struct SpreadGradient {
-  AimSample<T, Voxel> aim_sample;
+  FindSample<T, Voxel> find_sample;
   const T* grad_kc;
   T *grad_bzyxc, *grad_tnc;
 
   GV_HD void operator()(int64_t k) const {
-    const auto aimed = aim_sample(k);
-    if (!aimed.valid) return;
-    spread(aimed.fine, aimed.t, k, 1 - aimed.weight);
-    if (aimed.coarse.node != aimed.fine.node) spread(aimed.coarse, aimed.t, k, aimed.weight);
+    const auto source = find_sample(k);
+    if (!source.valid) return;
+    spread(source.fine, source.t, k, 1 - source.weight);
+    if (source.coarse.node != source.fine.node) spread(source.coarse, source.t, k, source.weight);
   }
   GV_HD void spread(const Spot<T>& spot, T t, int64_t k, T share) const {
-    const BrickView<Voxel>& bricks = aim_sample.bricks;
+    const BrickView<Voxel>& bricks = find_sample.bricks;
     const T* grad_c = grad_kc + k * bricks.channels;
     if (spot.brick < 0) {
       T* constant = grad_tnc + static_cast<int64_t>(spot.node) * bricks.channels;

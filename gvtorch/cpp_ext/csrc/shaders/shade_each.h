@@ -9,7 +9,7 @@ namespace gvtorch {
 // Gives a ShadeRay memory for each node, to cache what is hidden from all rays: see kUnknown in walk.h. The returned
 // tensor owns it.
 template <class Kernel>
-torch::stable::Tensor hide_nodes(const torch::stable::Tensor& like, int64_t nodes, Kernel& kernel) {
+torch::stable::Tensor allocate_node_cache(const torch::stable::Tensor& like, int64_t nodes, Kernel& kernel) {
   torch::stable::Tensor node_cache;
   if constexpr (Kernel::kHidesAlike) {
 #ifdef __CUDACC__
@@ -26,7 +26,7 @@ torch::stable::Tensor hide_nodes(const torch::stable::Tensor& like, int64_t node
 
 template <class Kernel>
 void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel) {
-  const torch::stable::Tensor node_cache = hide_nodes(like, nodes, kernel);
+  const torch::stable::Tensor node_cache = allocate_node_cache(like, nodes, kernel);
   for_each(like, kernel.order.count(), kernel);
 }
 

@@ -22,7 +22,7 @@ struct ShadeRay : Walk<T> {
   using Walk<T>::tree;
   using Walk<T>::options;
   using Sum = typename Shader::Sum;
-  // Reads of a known dtype are inlined, and a short shader's loop may be instantiated several times. kBlocksAtOnce (see
+  // Reads of a known dtype are inlined, and a short shader's loop may be instantiated several times. kBlocksPerSM (see
   // for_each.h): 8 leave 64 registers to a thread, 4 leave 128.
   static constexpr bool kShort =
       !std::is_void_v<Voxel> && std::is_base_of_v<Plain<T>, Shader> && !std::is_base_of_v<Lit<T>, Shader>;
@@ -142,7 +142,7 @@ struct ShadeRay : Walk<T> {
   // True if light varies in a node of one value: a point light shines on a stored normal from different directions.
   GV_HD bool shades_each_position() const { return channels.normal.exists() && light.kind() == LightKind::kPoint; }
 
-  // See Walk::follow. Any: the shader, or its Veil for a ray to a light.
+  // See Walk::follow. AnyShader: the shader, or its Veil for a ray to a light.
   template <class AnyShader>
   struct Visitor {
     static constexpr bool kSeesEmpty = AnyShader::kSeesEmpty, kEnds = AnyShader::kEnds;
@@ -183,37 +183,38 @@ struct ShadeRay : Walk<T> {
       shader.add(true, piece, probe, sum);
       ++samples;
     }
-    GV_HD int32_t take(const RayProbe& probe, const Intervals<T>& intervals, int32_t alike, bool last) {
+    GV_HD int32_t take_intervals(const RayProbe& probe, const Intervals<T>& intervals, int32_t run_length, bool last) {
       if constexpr (AnyShader::kFiltered >
                     0) {  // it reads colours by itself; visits without any use the plain function
-        if (shader.has_stored(probe)) return take_with(shader, [](T) { return T{}; }, probe, intervals, alike, last);
-        return take(ready_for_ray(shader.plain()), probe, intervals, alike, last);
+        if (shader.has_stored(probe))
+          return take_with(shader, [](T) { return T{}; }, probe, intervals, run_length, last);
+        return take_intervals(ready_for_ray(shader.plain()), probe, intervals, run_length, last);
       } else if constexpr (AnyShader::kReadsAll) {
-        return take_with(shader, [](T) { return T{}; }, probe, intervals, alike, last);
+        return take_with(shader, [](T) { return T{}; }, probe, intervals, run_length, last);
       } else {
-        return take(shader, probe, intervals, alike, last);
+        return take_intervals(shader, probe, intervals, run_length, last);
       }
     }
 
    private:
     template <class ActiveShader>
-    GV_HD int32_t take(const ActiveShader& active_shader, const RayProbe& probe, const Intervals<T>& intervals,
-                       int32_t alike, bool last) {
+    GV_HD int32_t take_intervals(const ActiveShader& active_shader, const RayProbe& probe,
+                                 const Intervals<T>& intervals, int32_t run_length, bool last) {
       if (!kShort || last)
-        return take_with(active_shader, [&](T t) { return probe.value(t); }, probe, intervals, alike, last);
-      const T last_number = intervals.count + static_cast<T>(alike - 1);
+        return take_with(active_shader, [&](T t) { return probe.value(t); }, probe, intervals, run_length, last);
+      const T last_number = intervals.count + static_cast<T>(run_length - 1);
       const T begin = kEnds ? intervals.start : intervals.middle_of(intervals.count);
       const T end = kEnds ? intervals.start_of(last_number + 1) : intervals.middle_of(last_number);
       return probe.with_value(begin, end, [&](const auto& value) {
-        return take_with(active_shader, value, probe, intervals, alike, false);
+        return take_with(active_shader, value, probe, intervals, run_length, false);
       });
     }
     template <class ActiveShader, class Value>
     GV_HD int32_t take_with(const ActiveShader& active_shader, const Value& value, const RayProbe& probe,
-                            const Intervals<T>& intervals, int32_t alike, bool last) {
+                            const Intervals<T>& intervals, int32_t run_length, bool last) {
       Piece<T> piece;
       T number = intervals.count;
-      const T end = number + static_cast<T>(alike);
+      const T end = number + static_cast<T>(run_length);
       if (kEnds) piece.back = value(intervals.start);
       do {
         piece.start = intervals.start_of(number);
@@ -266,7 +267,7 @@ struct ShadeRay : Walk<T> {
                       growth * static_cast<T>(rays.cone_scale), length);
     const Sight<T> sight(probe.sight.at(t), direction);
     Intervals<T> intervals(beam, options.step, lengths);
-    intervals.go(true, intervals.count + 1);
+    intervals.move_to(true, intervals.count + 1);
     const Veil<T, Shader> veil{{}, shader};
     typename Veil<T, Shader>::Sum sum;
     sum.stop_clear = light.faintest(this->stop_clear);

@@ -14,19 +14,20 @@
 //                                                 hides_ranges then replaces `hides`: range_of(component) returns the
 //                                                 smallest and largest value (low, high) that one of a voxel's numbers
 //                                                 has in the node
-//   add(which, piece, probe, sum)                 adds an interval; `probe` reads any channel at any distance
+//   add(mask, piece, probe, sum)                  adds an interval; `probe` reads any channel at any distance
 //   kSurface, surface(probe, sum)                 called where depth was set, with a probe of the node found there
 //   done(sum)                                     called after the last interval
 //
 // A shader that receives shadows also has
 //
 //   alpha(piece, probe)                           share that an interval absorbs of the light from behind
-//   add(which, piece, probe, sum, shadow)         `shadow(t, way, length, growth)`: share of the light that reaches t
+//   add(mask, piece, probe, sum, shadow)          `shadow(t, direction, length, growth)`: share of the light that
+//                                                 reaches t
 //
 // T is float or double. `add` is written once for a ray (V is T) and for a packet (V is Floats, see arithmetic.h), in
-// which each lane of `which` adds an interval; piece, probe and sum are of V. `probe.narrow(which)` limits what is read
-// from then on to fewer lanes, `probe.each(which, body)` passes each lane's own probe. Everything else is called for
-// one ray.
+// which each lane of `mask` adds an interval; piece, probe and sum are of V. `probe.select_lanes(mask)` limits what is
+// read from then on to fewer lanes, `probe.each_lane(mask, body)` passes each lane's own probe. Everything else is
+// called for one ray.
 //
 // An interval belongs to the node that contains its middle. Its ends may lie up to half an interval outside; they are
 // still read in this node, clamped to its brick's outermost voxel centres. With a border of 1 and steps of at most a
@@ -64,7 +65,7 @@ struct Lit : Plain<T> {
     Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
-    probe.narrow(shown);
+    probe.select_lanes(shown);
     const Vec3<V> n = light.normal(probe, piece.middle);
     row = light.shade(row, n, probe, piece.middle, shadow...);
     sum.add_normal(n, sum.clear * row.alpha, shown);
@@ -100,9 +101,9 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
   // What one of the nodes adds; 0 in other lanes.
   template <class V, class AnyProbe, class Node>
   GV_HD LitRow<V> contribution(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
-    const MaskOf<V> colored = mask && node.among(this->bricks), others = mask && !colored;
+    const MaskOf<V> colored = mask && node.among(this->bricks), uncolored = mask && !colored;
     LitRow<V> lit_row;
-    if (any(others)) lit_row = by_function(others, piece, probe, node);
+    if (any(uncolored)) lit_row = by_function(uncolored, piece, probe, node);
     if (!any(colored)) return lit_row;
     return choose(colored, by_colors(colored, piece, probe, node), lit_row);
   }
@@ -114,14 +115,14 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
     const Row<V> row = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, mask);
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return {};
-    probe.narrow(shown);
+    probe.select_lanes(shown);
     const Vec3<V> n = this->light.to_eye(probe.differences(node, t), probe.sight.direction);
     return times_alpha(shown, this->light.shade(row, n, probe, t), n);
   }
   template <class V, class AnyProbe, class Node>
   GV_HD LitRow<V> by_colors(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
     const V t = piece.middle;
-    probe.narrow(mask);
+    probe.select_lanes(mask);
     const auto& colors = probe.channels.other;
     const Vec3<V> d = probe.sight.direction;
     const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_of(lanes, colors, first, node, t); };
@@ -202,7 +203,7 @@ struct Veil : ShaderFacts {
 template <class T>
 struct PreIntegrated : ShaderFacts {
   static constexpr bool kEnds = true, kIntegrates = true;
-  static bool packs(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
+  static bool packets_can_trace(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
     return int64_t{args.levels} * args.rows * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
   }
   template <class V>
@@ -233,7 +234,7 @@ struct PreIntegrated : ShaderFacts {
       const Row<V> parts = over(over(before, with_length(row, rate * absolute(back - front))), behind);
       row = choose(outside, parts, with_length(row, lengths));
     }
-    if (unseen(mask, row.alpha)) return;
+    if (all_transparent(mask, row.alpha)) return;
     sum.add_light(row, sum.clear, mask);
     sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, mask);
   }
@@ -260,8 +261,9 @@ struct PreIntegrated : ShaderFacts {
   }
   template <class V>
   GV_HD static Row<V> over(const Row<V>& a, const Row<V>& b) {
-    const V kept = 1 - a.alpha;
-    return {a.red + kept * b.red, a.green + kept * b.green, a.blue + kept * b.blue, a.alpha + kept * b.alpha};
+    const V transmittance = 1 - a.alpha;
+    return {a.red + transmittance * b.red, a.green + transmittance * b.green, a.blue + transmittance * b.blue,
+            a.alpha + transmittance * b.alpha};
   }
   GV_HD void done(Sum&) const {}
 };
@@ -316,7 +318,7 @@ struct Isosurface : ShaderFacts {
     const Mask crosses = mask && !hits_start && below != (piece.back < level);
     V hit_t = piece.start;
     if (any(crosses)) {
-      probe.narrow(crosses);
+      probe.select_lanes(crosses);
       V near = piece.start, far = piece.end, near_value = piece.front, far_value = piece.back;
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
@@ -403,8 +405,8 @@ struct Projection : ShaderFacts {
   GV_HD MaskOf<V> hides(V low, V high, const SumOf<V>& sum) const {
     if (kind() == ProjectionKind::kMean) return MaskOf<V>{};
     const bool highest = kind() == ProjectionKind::kMaximum;
-    const MaskOf<V> within = highest ? a_little_above(high) <= sum.value : a_little_below(low) >= sum.value;
-    return sum.length > 0 && within;
+    const MaskOf<V> no_gain = highest ? a_little_above(high) <= sum.value : a_little_below(low) >= sum.value;
+    return sum.length > 0 && no_gain;
   }
   template <class V, class AnyProbe>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, SumOf<V>& sum) const {
@@ -449,7 +451,7 @@ struct Features : Plain<T> {
     const V share = sum.clear * row.alpha;
     const MaskOf<V> shown = mask && share > 0;
     if (any(shown)) {
-      probe.narrow(shown);
+      probe.select_lanes(shown);
       const auto& features = probe.channels.other;
       for (int32_t c = 0; c < features.width; ++c) {
         const V number = probe.number_at(features, c, piece.middle);
@@ -482,7 +484,7 @@ struct GradientMagnitude : Plain<T> {
     Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, mask);
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
-    probe.narrow(shown);
+    probe.select_lanes(shown);
     const Vec3<V> slope = probe.gradient(piece.middle);
     const V fraction = clamp(square_root(dot(slope, slope)) / own_numbers<Numbers>(parameters).full, static_cast<T>(0),
                              static_cast<T>(1));

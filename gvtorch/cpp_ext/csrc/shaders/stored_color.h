@@ -9,7 +9,7 @@ namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
 // Reads one of a voxel's two sides along an axis: the numbers from `first` on where a ray goes in the axis' direction,
-// those from first + one on in lanes of `back`, where it goes against it.
+// those from first + per_side on in lanes of `against`, where it goes against it.
 template <class V, class Read>
 GV_HD auto of_side(MaskOf<V> mask, MaskOf<V> against, int32_t first, const Read& read, int32_t per_side) {
   if constexpr (kPacket<V>) {
@@ -22,8 +22,8 @@ GV_HD auto of_side(MaskOf<V> mask, MaskOf<V> against, int32_t first, const Read&
   }
 }
 
-// A voxel's number, or four of them, as seen along direction d; read(which, k) returns number k of the voxel, or the
-// four that begin there. A channel may hold `one` numbers for each of six directions (Crassin et al., "Interactive
+// A voxel's number, or four of them, as seen along direction d; read(mask, k) returns number k of the voxel, or the
+// four that begin there. A channel may hold `per_side` numbers for each of six directions (Crassin et al., "Interactive
 // indirect illumination using voxel cone tracing", CGF 2011): then the three on d's side of each axis are read and
 // weighted by the squares of d, whose sum is 1. Where all six are equal, the result has the same bits as each.
 template <class V, class Read>
@@ -50,7 +50,7 @@ GV_HD auto by_direction(MaskOf<V> mask, const Vec3<V>& d, int32_t width, const R
 template <class T>
 struct StoredColor : ShaderFacts {
   static constexpr bool kColored = true;
-  static bool packs(const ShadeArgs& args) { return args.channels == 4; }
+  static bool packets_can_trace(const ShadeArgs& args) { return args.channels == 4; }
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;
@@ -81,7 +81,7 @@ struct StoredColor : ShaderFacts {
     const V opacity = opacity_of(piece, probe);
     const MaskOf<V> shown = mask && opacity > 0;
     if (!any(shown)) return;
-    probe.narrow(shown);
+    probe.select_lanes(shown);
     const Row<V> stored = four_seen(probe, piece.middle);
     const auto color = [&](V number) {
       const V scaled = number * numbers().scale;
@@ -129,8 +129,8 @@ struct StoredColor : ShaderFacts {
 // nodes without one, are shaded by the function as usual. Where two levels blend, what they show is blended, not their
 // values. `Shader` derives from this and has
 //
-//   look(which, piece, probe, node)   what one of the nodes adds for an interval, of a type that `combined` accepts
-//   take(which, found, piece, sum)    adds it to the sum
+//   contribution(mask, piece, probe, node)        what one of the nodes adds for an interval, of a type that `combined`
+//   accepts add_contribution(mask, added, piece, sum)     adds it to the sum
 template <class T, class Base, class Shader>
 struct FromAfar : Base {
   template <class V>
@@ -146,8 +146,8 @@ struct FromAfar : Base {
   }
   template <class V, class AnyProbe>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
-    const MaskOf<V> colored = mask && has_stored(probe), others = mask && !colored;
-    if (any(others)) Base::add(others, piece, probe, sum);
+    const MaskOf<V> colored = mask && has_stored(probe), uncolored = mask && !colored;
+    if (any(uncolored)) Base::add(uncolored, piece, probe, sum);
     if (!any(colored)) return;
     const Shader& shader = static_cast<const Shader&>(*this);
     auto fine = shader.contribution(colored, piece, probe, probe.fine);
@@ -183,14 +183,14 @@ struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
   template <class V, class AnyProbe, class Node>
   GV_HD Row<V> contribution(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
     const V t = piece.middle;
-    const MaskOf<V> colored = mask && node.among(this->bricks), others = mask && !colored;
+    const MaskOf<V> colored = mask && node.among(this->bricks), uncolored = mask && !colored;
     Row<V> row{};
-    if (any(others)) {
-      const Row<V> plain = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, others);
+    if (any(uncolored)) {
+      const Row<V> plain = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, uncolored);
       row = {plain.red * plain.alpha, plain.green * plain.alpha, plain.blue * plain.alpha, plain.alpha};
     }
     if (!any(colored)) return row;
-    probe.narrow(colored);
+    probe.select_lanes(colored);
     const auto& colors = probe.channels.other;
     const Vec3<V> d = probe.sight.direction;
     const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_of(lanes, colors, first, node, t); };

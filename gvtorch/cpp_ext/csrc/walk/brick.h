@@ -126,7 +126,7 @@ struct EightVoxels {
   }
 };
 
-// Trilinear interpolation of a brick's voxels, between those of `eight` or at a position.
+// Trilinear interpolation of a brick's voxels, between eight corners or at a position.
 template <class T, class Voxel>
 GV_HD T trilinear(const Voxel* voxels, const EightVoxels<T>& corners, int32_t side, int32_t channels) {
   const int32_t step_y = channels * side, step_z = step_y * side;

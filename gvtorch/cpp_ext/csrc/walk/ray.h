@@ -68,7 +68,7 @@ struct Ray {
     begin(rays, start);
   }
 
-  // A secondary cone from a position inside the scene (tree units); `way` is its direction in the world.
+  // A secondary cone from a position inside the scene (tree units), along a direction in the world.
   GV_HD Ray(const RayView& rays, Vec3<double> start, Vec3<T> world_direction, Vec3<T> cube, T cone_near, T cone_growth,
             T last)
       : direction{world_direction.x / cube.x, world_direction.y / cube.y, world_direction.z / cube.z},
@@ -132,7 +132,7 @@ struct Ray {
 
   // Distance at which the ray leaves a box; face(axis, upper): offset of its lower or upper face from the origin.
   template <class Face>
-  GV_HD T leave(const Face& face) const {
+  GV_HD T exit_distance(const Face& face) const {
     T exit = splat<T>(static_cast<Real>(INFINITY));
     for (int axis = 0; axis < 3; ++axis) {
       const T distance = face(axis, direction[axis] > 0) * inverse[axis];
@@ -141,7 +141,7 @@ struct Ray {
     return exit;
   }
 
-  // Calls body(own member, other's member) for each member that differs between lanes.
+  // Calls body(a's member, b's member) for each member that differs between lanes.
   template <class A, class B, class Body>
   GV_HD static void each_member(A& a, B& b, const Body& body) {
     body(a.origin, b.origin);
@@ -161,7 +161,7 @@ struct Extent {
 
 constexpr int32_t kMaxIntervals = 1 << 23;  // counted from one base: float32 holds every count + 1/2 below it
 
-// A ray's current interval in its fixed sequence. Starts are products, so rounding errors do not add up. `which`: the
+// A ray's current interval in its fixed sequence. Starts are products, so rounding errors do not add up. `mask`: the
 // lanes that a call changes or tests.
 template <class T>
 struct Intervals {
@@ -218,7 +218,7 @@ struct Intervals {
     inverse_length = select(wrong, 1 / length, inverse_length);
   }
   // Moves to interval `number`, counted from `base` in intervals of this length.
-  GV_HD void go(Mask mask, T number) {
+  GV_HD void move_to(Mask mask, T number) {
     count = select(mask, number, count);
     start = select(mask, start_of(count), start);
     choose_level(mask);
@@ -235,15 +235,15 @@ struct Intervals {
       const T shortest = larger(extent.cone_low, select(level == 0, extent.cone_low, length));
       limit = select(cone_growth < 0, smaller(limit, (shortest - cone_near) / cone_growth), limit);
     }
-    const T one = splat<T>(static_cast<Real>(1)), max_alike = static_cast<Real>(kMaxIntervals) - count;
-    IntOf<T> alike = truncated(clamp((limit - start) * inverse_length + one, one, max_alike));
+    const T one = splat<T>(static_cast<Real>(1)), longest_run = static_cast<Real>(kMaxIntervals) - count;
+    IntOf<T> run_length = truncated(clamp((limit - start) * inverse_length + one, one, longest_run));
     for (;;) {
-      const Mask over = mask && alike > 1 && !same(count + to_real<T>(alike - 1), extent);
-      if (!any(over)) return alike;
-      alike = select(over, alike - 1, alike);
+      const Mask excess = mask && run_length > 1 && !is_alike(count + to_real<T>(run_length - 1), extent);
+      if (!any(excess)) return run_length;
+      run_length = select(excess, run_length - 1, run_length);
     }
   }
-  GV_HD Mask same(T number, const Extent<T>& extent) const {
+  GV_HD Mask is_alike(T number, const Extent<T>& extent) const {
     const T middle = middle_of(number);
     return extent.holds(middle, cone(middle)) && start_of(number + static_cast<Real>(1)) <= stop &&
            fits(cone(start_of(number)));
@@ -257,13 +257,13 @@ struct Intervals {
   GV_HD void leave(Mask mask, const Extent<T>& extent) {
     for (Mask inside = mask; any(inside); inside = inside && stays(extent)) {
       const Mask uncut = inside && !cut();
-      IntOf<T> alike = splat<IntOf<T>>(1);
-      if (any(uncut)) alike = select(uncut, run(uncut, extent), alike);
-      go(inside, count + to_real<T>(alike));
+      IntOf<T> run_length = splat<IntOf<T>>(1);
+      if (any(uncut)) run_length = select(uncut, run(uncut, extent), run_length);
+      move_to(inside, count + to_real<T>(run_length));
     }
   }
 
-  // Calls body(own member, other's member) for each member.
+  // Calls body(a's member, b's member) for each member.
   template <class A, class B, class Body>
   GV_HD static void each_member(A& a, B& b, const Body& body) {
     body(a.cone_near, b.cone_near);

@@ -39,7 +39,7 @@ GV_HD Numbers choose(Mask mask, const Numbers& a, const Numbers& b) {
 
 // True if no lane of a packet has alpha. False for a single ray, where the test costs more than it saves.
 template <class T>
-GV_HD bool unseen(MaskOf<T> mask, T alpha) {
+GV_HD bool all_transparent(MaskOf<T> mask, T alpha) {
   if constexpr (kPacket<T>) return !any(mask && alpha > 0);
   return false;
 }
@@ -49,7 +49,7 @@ template <class T, class Column>
 GV_HD Row<T> make_row(MaskOf<T> mask, const Column& column) {
   Row<T> row{};
   row.alpha = column(kAlpha);
-  if (unseen(mask, row.alpha)) return row;
+  if (all_transparent(mask, row.alpha)) return row;
   row.red = column(0);
   row.green = column(1);
   row.blue = column(2);
@@ -149,7 +149,7 @@ struct Transfer {
     return {row, position - to_real<V>(row)};
   }
 
-  // Row index + behind, and the next one.
+  // Row index + offset, and the next one.
   GV_HD RowPair<T> rows_at(int32_t index, int32_t offset = 0) const {
     const Row<T>* const row = table_lm + (index + offset);
     return {load_row(row), load_row(row + 1)};
@@ -162,7 +162,7 @@ struct Transfer {
   }
 #endif
 
-  // Colour and alpha of a value in an interval of a level. Lanes outside `which` are undefined.
+  // Colour and alpha of a value in an interval of a level. Lanes outside `mask` are undefined.
   template <class V>
   GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> mask = all_lanes<V>()) const {
     return look_up(value, level, mask, rows);
@@ -198,10 +198,10 @@ using TransferTable = Transfer<T>;
 template <class T>
 GV_HD T stretch(T alpha, T lengths) {
   using Real = RealOf<T>;
-  const T kept = 1 - alpha, opaque = splat<T>(static_cast<Real>(1));
-  const auto translucent = kept > static_cast<Real>(1.1754944e-38f);
+  const T transmittance = 1 - alpha, opaque = splat<T>(static_cast<Real>(1));
+  const auto translucent = transmittance > static_cast<Real>(1.1754944e-38f);
   if (!any(translucent)) return opaque;
-  return select(translucent, 1 - exp2_exact(log2_exact(kept) * lengths), opaque);
+  return select(translucent, 1 - exp2_exact(log2_exact(transmittance) * lengths), opaque);
 }
 
 template <class T>
@@ -234,12 +234,12 @@ struct Accumulator {
   }
   // Fraction of an interval after which the transmittance is hit_clear.
   GV_HD static Real hit_fraction(Real clear, Real alpha, Real hit_clear) {
-    const Real kept = 1 - alpha;
-    if (!(kept > static_cast<Real>(1.1754944e-38f))) return 0;
-    return clamp(log2_exact(hit_clear / clear) / log2_exact(kept), static_cast<Real>(0), static_cast<Real>(1));
+    const Real transmittance = 1 - alpha;
+    if (!(transmittance > static_cast<Real>(1.1754944e-38f))) return 0;
+    return clamp(log2_exact(hit_clear / clear) / log2_exact(transmittance), static_cast<Real>(0), static_cast<Real>(1));
   }
 
-  // Calls body(own member, other's member) for each member that differs between lanes.
+  // Calls body(a's member, b's member) for each member that differs between lanes.
   template <class A, class B, class Body>
   GV_HD static void each_member(A& a, B& b, const Body& body) {
     body(a.red, b.red);

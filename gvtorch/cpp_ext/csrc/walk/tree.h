@@ -10,7 +10,7 @@
 //   request_tn  what rays request, see post_request in hd.h; null where nobody reads it
 //
 // Tree units: the root is the cube [0,1]^3. float32 holds the corners of nodes exactly where N is a power of two and
-// the root is at most kMostShallow voxels wide; other trees are *deep*: their positions are float64. A descent that
+// the root is at most kMaxShallowVoxels wide; other trees are *deep*: their positions are float64. A descent that
 // restarts from the root needs no stack (Horn et al., "Interactive k-d tree GPU raytracing", I3D 2007, kd-restart;
 // Crassin, PhD thesis 2011, 6.1).
 #pragma once
@@ -73,12 +73,12 @@ struct TreeView {
 
   // Words of a node. An index beyond its pool counts as absent, so that no word, whoever wrote it, leads out of the
   // pools.
-  GV_HD int32_t tile_of(int32_t node) const { return within(child_tn[node], tiles); }
-  GV_HD int32_t brick_of(int32_t node) const { return within(brick_tn[node], bricks); }
+  GV_HD int32_t tile_of(int32_t node) const { return checked_word(child_tn[node], tiles); }
+  GV_HD int32_t brick_of(int32_t node) const { return checked_word(brick_tn[node], bricks); }
   GV_HD NodeWords words_of(int32_t node, bool hidden) const {
     return {brick_of(node), hidden ? kConcealed : larger(tile_of(node), kTerminal)};  // never kConcealed by itself
   }
-  GV_HD static int32_t within(int32_t word, int32_t count) { return word < count ? word : kAbsent; }
+  GV_HD static int32_t checked_word(int32_t word, int32_t count) { return word < count ? word : kAbsent; }
 };
 
 inline int32_t digit_bits_of(int64_t branching) {
@@ -122,8 +122,8 @@ struct Digits {
   static constexpr bool kDeep = true;  // where RayView::deep is set
   const Levels<T>& levels;
   Vec3<double> origin;
-  Vec3<int64_t> cell;            // number of the node at the finest level, below 2^51
-  Vec3<int64_t> upper{0, 0, 0};  // number of the node above the next child, at its level
+  Vec3<int64_t> cell;                  // number of the node at the finest level, below 2^51
+  Vec3<int64_t> parent_cell{0, 0, 0};  // number of the node above the next child, at its level
   int32_t branching, bits, max_depth;
 
   GV_HD Digits(const TreeView& tree, const Levels<T>& levels, const RayView& rays, const Ray<T>& ray, T t)
@@ -158,15 +158,15 @@ struct Digits {
   }
   // Makes the next `child` a child of the node of this level.
   GV_HD void start_below(int32_t level) {
-    for (int axis = 0; axis < 3; ++axis) upper[axis] = cell_of(axis, level);
+    for (int axis = 0; axis < 3; ++axis) parent_cell[axis] = cell_of(axis, level);
   }
   GV_HD int32_t child(int32_t level) {
     Vec3<int32_t> digit;
     for (int axis = 0; axis < 3; ++axis) {
       const int64_t level_cell = cell_of(axis, level);
       digit[axis] =
-          static_cast<int32_t>(bits > 0 ? level_cell & ((1 << bits) - 1) : level_cell - upper[axis] * branching);
-      upper[axis] = level_cell;
+          static_cast<int32_t>(bits > 0 ? level_cell & ((1 << bits) - 1) : level_cell - parent_cell[axis] * branching);
+      parent_cell[axis] = level_cell;
     }
     return (digit.z * branching + digit.y) * branching + digit.x;
   }
@@ -220,7 +220,7 @@ void with_digits(const TraceArgs& args, const Body& body) {
 }
 
 // Descends to `wanted` depth, or as far as tiles exist and something is visible; stamps every tile on the way.
-// The coarse holder is set where two levels blend. words_of(node) returns the node's NodeWords.
+// The coarse holder is set where two levels blend. read_words(node) returns the node's NodeWords.
 template <class AnyDigits, class ReadWords>
 GV_HD Descent descend(const TreeView& tree, AnyDigits& digits, int32_t wanted, bool blend, int32_t frame,
                       const ReadWords& read_words) {

@@ -102,13 +102,14 @@ struct Walk {
   //
   //   kSeesEmpty                       true if EMPTY nodes are visited too
   //   missed()                         a bool&, set where visible data is missing
-  //   more()                           true while the ray goes on to another node
-  //   words(node)                      the node's NodeWords, with kConcealed where nothing in it is visible
+  //   goes_on()                        true while the ray goes on to another node
+  //   node_words(node)                 the node's NodeWords, with kConcealed where nothing in it is visible
   //   enter(ray, visit, digits)        begins a visit; returns the visitor's data for it, `node` below
   //   uniform(node)                    true if the visit may be taken as one interval
   //   region(node, start, end)         takes the visit as one interval
-  //   take(node, at, alike, last)      takes at most `alike` whole intervals or, with `last`, the ray's last one, which
-  //                                    is cut at the far side; returns how many it took
+  //   take_intervals(node, intervals, run_length, last)
+  //                                    takes at most `run_length` whole intervals or, with `last`, the ray's last one,
+  //                                    which is cut at the far side; returns how many it took
   //   sees()                           true while the ray goes on in this node
   //   finish(node)                     ends a visit whose intervals have been taken
   template <class Digits, class Visitor>
@@ -154,9 +155,9 @@ struct Walk {
   GV_HD void march(const Extent<T>& extent, Intervals<T>& intervals, Visitor& visitor, Node& node) const {
     do {
       const bool last = intervals.cut();
-      const int32_t alike = last ? 1 : intervals.run(true, extent);
-      const int32_t taken = visitor.take(node, intervals, alike, last);
-      intervals.go(true, intervals.count + static_cast<T>(taken));
+      const int32_t run_length = last ? 1 : intervals.run(true, extent);
+      const int32_t taken = visitor.take_intervals(node, intervals, run_length, last);
+      intervals.move_to(true, intervals.count + static_cast<T>(taken));
       if (last) return;
     } while (visitor.sees() && intervals.stays(extent));
   }
@@ -180,7 +181,7 @@ struct Walk {
     visit.cone_high = reached ? visit.voxel_above : visit.voxel;
 
     const Descent descent = descend(tree, digits, wanted, blend, *frame_1, read_words);
-    visit.exit = ray.leave([&](int axis, bool upper) { return digits.face(axis, descent.depth, upper); });
+    visit.exit = ray.exit_distance([&](int axis, bool upper) { return digits.face(axis, descent.depth, upper); });
     visit.hidden = descent.hidden && (descent.depth < wanted || !blend);
     if (!visit.hidden && mark_missing(descent, wanted, blend, cone)) missed = true;
 
