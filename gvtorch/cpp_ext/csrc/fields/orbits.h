@@ -33,7 +33,7 @@ enum class StepKind : int32_t { kPower, kFold, kCount };
 struct OrbitArgs {
   GV_ORBITS(GV_VIEW)
   int64_t points;
-  bool in_float64;  // float64
+  bool in_float64;  // else in float32
   void* result_3p;  // distance; the orbit's least distance from the origin, and from a coordinate plane
 };
 

@@ -66,8 +66,8 @@ GV_HD Vec3<T> outer(Vec3<T> a, Vec3<T> b) {
 template <class T>
 struct Triangle {
   Vec3<T> corner[3], edge[3], edge_normal[3], normal;
-  T inverse2[3], length2,
-      max_inside;  // max_inside: largest product with `edge_normal` inside; below 0 for a triangle without area
+  // max_inside: largest product with `edge_normal` inside; below 0 for a triangle without area.
+  T inverse2[3], length2, max_inside;
 
   GV_HD explicit Triangle(const Vec3<T>* corner_3) {
     for (int i = 0; i < 3; ++i) corner[i] = corner_3[i];

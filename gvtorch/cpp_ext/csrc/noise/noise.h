@@ -234,8 +234,8 @@ struct NoiseAt {
           const int cell[3] = {x, y, z};
           T square{};
           for (int axis = 0; axis < N; ++axis) {
-            const T random = to_real_signed(shifted(bits, 2 + 10 * axis) & 1023u);
-            const T distance = random * spread + low[axis][cell[axis]];
+            const T random_offset = to_real_signed(shifted(bits, 2 + 10 * axis) & 1023u);
+            const T distance = random_offset * spread + low[axis][cell[axis]];
             square = square + distance * distance;
           }
           second = smaller(second, larger(first, square));

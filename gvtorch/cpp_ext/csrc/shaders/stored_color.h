@@ -129,8 +129,9 @@ struct StoredColor : ShaderFacts {
 // nodes without one, are shaded by the function as usual. Where two levels blend, what they show is blended, not their
 // values. `Shader` derives from this and has
 //
-//   contribution(mask, piece, probe, node)        what one of the nodes adds for an interval, of a type that `combined`
-//   accepts add_contribution(mask, added, piece, sum)     adds it to the sum
+//   contribution(mask, piece, probe, node)       what one of the nodes adds for an interval, of a type that `combined`
+//                                                accepts
+//   add_contribution(mask, added, piece, sum)    adds it to the sum
 template <class T, class Base, class Shader>
 struct FromAfar : Base {
   template <class V>
