@@ -52,7 +52,7 @@ void compact(const Tensor&, int64_t count, const List& list) {
   const Counts all = counts_before.back();
   for_chunks(count, kChunk, [&](int64_t begin, int64_t end) {
     const Counts &before_chunk = counts_before[begin / kChunk], &after_chunk = counts_before[begin / kChunk + 1];
-    if (before_chunk.any == after_chunk.any) return;
+    if (before_chunk.any_flags == after_chunk.any_flags) return;
     const List list_copy = list;  // a copy, which nothing written can alias
     int64_t rank = before_chunk.listed;
     for (int64_t index = begin; index < end; ++index) {

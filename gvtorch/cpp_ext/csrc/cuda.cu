@@ -86,7 +86,7 @@ __global__ void __launch_bounds__(kThreads) process_chunks(List list, int64_t co
   const int64_t thread = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   for (int64_t rank = all.listed + thread; rank < list.entries(); rank += threads) list.clear_entry(rank);
   if (thread == 0) list.store_totals(all.listed, all.counted);
-  if (before_chunk.any == after_chunk.any) return;
+  if (before_chunk.any_flags == after_chunk.any_flags) return;
   int64_t rank = before_chunk.listed;
   for (int64_t offset = 0; offset < kChunk; offset += kThreads) {
     const int64_t index = blockIdx.x * kChunk + offset + threadIdx.x;

@@ -120,7 +120,8 @@ GV_HD Ints pick_shared(const int32_t* table, Ints index) {
 GV_HD Floats pick(const float* table, Ints index) { return (Floats)gather(table, index << 2); }
 
 #ifdef GV_MM
-// Transposes rows of four numbers: own[i] holds those of the lanes i, i + 4, i + 8, ...; number[k], number k of all.
+// Transposes rows of four numbers: rows[i] holds those of the lanes i, i + 4, i + 8, ...; columns[k], number k of
+// all.
 GV_HD void transpose(const Native rows[4], Floats columns[4]) {
   const Native a = GV_MM(unpacklo_ps)(rows[0], rows[1]), b = GV_MM(unpacklo_ps)(rows[2], rows[3]);
   const Native c = GV_MM(unpackhi_ps)(rows[0], rows[1]), d = GV_MM(unpackhi_ps)(rows[2], rows[3]);

@@ -23,17 +23,17 @@ inline namespace GV_NAMESPACE {
 
 constexpr int32_t kListed = 1, kCounted = 2, kTouched = 4;
 
-// How many indices are listed, and counted; `any` is not 0 if one has a flag.
+// How many indices are listed, and counted; `any_flags` is not 0 if one has a flag.
 struct Counts {
-  int32_t listed, counted, any;
+  int32_t listed, counted, any_flags;
 
   GV_HD void add(int32_t flags) {
     listed += flags & kListed;
     counted += (flags & kCounted) / kCounted;
-    any |= flags;
+    any_flags |= flags;
   }
   GV_HD Counts operator+(const Counts& other) const {
-    return {listed + other.listed, counted + other.counted, any + other.any};
+    return {listed + other.listed, counted + other.counted, any_flags + other.any_flags};
   }
 };
 

@@ -117,12 +117,12 @@ struct PowerStep {
     const T count = static_cast<T>(n), zero = 0, one = 1;
     const T axis_distance = square_root(z.x * z.x + z.y * z.y), radius = square_root(squared(z));
     const T inner_radius = larger(radius - reach, zero), outer_radius = radius + reach,
-            safe = larger(radius, number_of<T>(1e-30));
-    const T ratio = smaller(reach / safe, one);
-    const T change = ratio + static_cast<T>(0.5707963267948966) * (ratio * ratio * ratio);  // pi / 2 - 1
-    T cosine = z.z / safe, sine = axis_distance / safe;
+            safe_radius = larger(radius, number_of<T>(1e-30));
+    const T ratio = smaller(reach / safe_radius, one);
+    const T angle_change = ratio + static_cast<T>(0.5707963267948966) * (ratio * ratio * ratio);  // pi / 2 - 1
+    T cosine = z.z / safe_radius, sine = axis_distance / safe_radius;
     complex_power(cosine, sine, n);
-    const T sine_bound = absolute(sine) + count * change;
+    const T sine_bound = absolute(sine) + count * angle_change;
     const T least_sine =
         larger(larger(axis_distance - reach, zero) / larger(outer_radius, number_of<T>(1e-30)), number_of<T>(1.0 / n));
     const T around = clamp(smaller(sine_bound, one) / least_sine, one, count);

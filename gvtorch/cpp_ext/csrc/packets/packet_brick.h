@@ -15,7 +15,7 @@ struct PacketBrick {
   Ints brick;  // its slot, or its first byte in the pool: what `first_of` of the values returns
 
   // True where the brick is in one of the first `count` slots; only if `brick` holds slots.
-  GV_HD Mask among(int32_t count) const { return stored & (brick < count); }
+  GV_HD Mask in_first_slots(int32_t count) const { return stored & (brick < count); }
 
   GV_HD Vec3<Floats> at(Floats t) const {
     return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z};

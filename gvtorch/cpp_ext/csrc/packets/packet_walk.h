@@ -233,12 +233,12 @@ struct PacketWalk {
 
   // For lanes whose run has ended: begins the next one in the same node, or visits the next node.
   GV_HD void advance(Mask waiting) {
-    const Mask ran = waiting & (number > intervals.count);
-    intervals.move_to(ran, number);
+    const Mask finished = waiting & (number > intervals.count);
+    intervals.move_to(finished, number);
     alive = alive & ~(waiting & ~(intervals.inside() & (sum.clear > stop_clear)));
-    const Mask again = ran & alive & intervals.stays(extent);
-    const Mask visits = waiting & alive & ~again;
-    if (any(again)) begin_run(again);
+    const Mask same_node = finished & alive & intervals.stays(extent);
+    const Mask visits = waiting & alive & ~same_node;
+    if (any(same_node)) begin_run(same_node);
     if (any(visits)) visit(visits);
     alive = alive & ~(waiting & (remaining == 0) & ~(intervals.inside() & (sum.clear > stop_clear)));
   }
@@ -299,7 +299,7 @@ struct PacketWalk {
     }
     const Mask skipped = hides & ((depth < wanted) | ~blend);
     const Mask empty = Shader::kSeesEmpty ? Mask{} : (fine_brick == kEmpty) & (coarse_brick == kEmpty);
-    const Mask nothing = mask & (skipped | (fine_brick == kAbsent) | empty);
+    const Mask shows_nothing = mask & (skipped | (fine_brick == kAbsent) | empty);
 
     const Mask seen = mask & ~skipped;
     const Mask lacks =
@@ -321,23 +321,23 @@ struct PacketWalk {
     stamp(walk.stamp_b, seen & (fine_brick >= 0), fine_brick);
     stamp(walk.stamp_b, seen & (coarse_brick >= 0), coarse_brick);
 
-    Mask runs = mask & ~nothing;
+    Mask runs = mask & ~shows_nothing;
     if (any(runs)) {
-      const Mask differ = coarse_level != fine_level;
-      mixed = runs ? differ : mixed;
+      const Mask two_nodes = coarse_level != fine_level;
+      mixed = runs ? two_nodes : mixed;
       fine_depth = runs ? fine_level : fine_depth;
       coarse_depth = runs ? coarse_level : coarse_depth;
       set_brick(runs, fine_level, fine_brick, fine);
-      const Mask both = runs & differ;
+      const Mask both = runs & two_nodes;
       if (any(both)) set_brick(both, coarse_level, coarse_brick, coarse);
-      Mask flat = runs & ~fine.stored & (~differ | ~coarse.stored);
+      Mask flat = runs & ~fine.stored & (~two_nodes | ~coarse.stored);
       if (kernel.shades_each_position()) flat = Mask{};
-      each_lane(flat & differ, [&](int lane, const Probe<float>& probe) { set_lane(flat, lane, probe.uniform()); });
+      each_lane(flat & two_nodes, [&](int lane, const Probe<float>& probe) { set_lane(flat, lane, probe.uniform()); });
       runs = runs & ~flat;
       if (any(runs)) begin_run(runs);
       if (any(flat)) add_region(flat);
     }
-    leave(nothing);
+    leave(shows_nothing);
   }
 
   // The same as `descend` in tree.h, level by level for all lanes; those whose path is known to a deeper level wait.
@@ -467,12 +467,12 @@ struct PacketWalk {
   GV_HD void begin_run(Mask mask) {
     const Ints last = values.first_of(Ints{} + static_cast<int32_t>(bricks - 1));
     const Mask end = (fine.stored & (fine.brick == last)) | (mixed & coarse.stored & (coarse.brick == last));
-    const Mask careful = mask & (intervals.cut() | end);
-    if (any(careful)) {
-      march_alone(careful);
-      fine.brick = careful ? Ints{} : fine.brick;  // reads that lanes ignore must stay in the pool too
-      coarse.brick = careful ? Ints{} : coarse.brick;
-      mask = mask & ~careful;
+    const Mask marches_alone = mask & (intervals.cut() | end);
+    if (any(marches_alone)) {
+      march_alone(marches_alone);
+      fine.brick = marches_alone ? Ints{} : fine.brick;  // reads that lanes ignore must stay in the pool too
+      coarse.brick = marches_alone ? Ints{} : coarse.brick;
+      mask = mask & ~marches_alone;
     }
     remaining = mask ? intervals.run(mask, extent) : remaining;
     number = mask ? intervals.count : number;

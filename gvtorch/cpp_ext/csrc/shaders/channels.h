@@ -26,7 +26,7 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// A whole number that a table holds, clamped to [0, most].
+// A whole number that a table holds, clamped to [0, maximum].
 template <class T>
 GV_HD int32_t whole_up_to(T number, int32_t maximum) {
   return static_cast<int32_t>(clamp(number, static_cast<T>(0), static_cast<T>(maximum)));
@@ -57,7 +57,7 @@ struct ChannelMix : ShaderFacts {
   T step;
   int32_t width;
 #ifndef __CUDACC__
-  int32_t cached = 0;
+  int32_t channel_count = 0;
   ChannelRows<T> cached_rows[kMaxNumbers];  // read once; on a GPU, rows are read where they are needed
 #endif
 
@@ -65,7 +65,7 @@ struct ChannelMix : ShaderFacts {
 #ifndef __CUDACC__
     read([&](int32_t i, const ChannelRows<T>& rows) {
       cached_rows[i] = rows;
-      cached = i + 1;
+      channel_count = i + 1;
     });
 #endif
   }
@@ -87,13 +87,13 @@ struct ChannelMix : ShaderFacts {
     probe.numbers_at(probe.channels.value, Components<T>{&view.table_lm[1].red, 4, width}, count(), piece.middle,
                      values);
     V red{}, green{}, blue{}, total{};
-    const bool added = view.table_lm[0].green > 0;
+    const bool additive = view.table_lm[0].green > 0;
     each_channel([&](int32_t i, const ChannelRows<T>& rows) {
       const Row<V> row = rows.look_up(values[i], piece.level, mask, view.rows);  // its alpha holds halvings
       red = red + row.alpha * row.red;
       green = green + row.alpha * row.green;
       blue = blue + row.alpha * row.blue;
-      total = added ? larger(total, row.alpha) : total + row.alpha;
+      total = additive ? larger(total, row.alpha) : total + row.alpha;
     });
     const MaskOf<V> shown = mask && total > 0;
     if (!any(shown)) return;
@@ -112,7 +112,7 @@ struct ChannelMix : ShaderFacts {
 #ifdef __CUDACC__
     read(body);
 #else
-    for (int32_t i = 0; i < cached; ++i) body(i, cached_rows[i]);
+    for (int32_t i = 0; i < channel_count; ++i) body(i, cached_rows[i]);
 #endif
   }
   template <class Body>
@@ -132,7 +132,7 @@ struct ChannelMix : ShaderFacts {
 #ifdef __CUDACC__
     return declared_count();
 #else
-    return cached;
+    return channel_count;
 #endif
   }
 };

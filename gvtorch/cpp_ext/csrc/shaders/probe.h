@@ -349,7 +349,7 @@ struct TypedProbe : Probe<T> {
   GV_HD T value_of(const Spot<T>& spot, T t) const {
     const ChannelView& channel = this->channels.value;
     const auto* constants = static_cast<const Voxel*>(channel.constant_tnc);
-    if (spot.brick >= 0) return trilinear(first(spot), this->channels.side, channel.width, spot.at(t));
+    if (spot.brick >= 0) return trilinear(first_voxel(spot), this->channels.side, channel.width, spot.at(t));
     return number<T>(constants[static_cast<int64_t>(spot.node) * channel.width + this->channels.component]);
   }
   GV_HD Vec3<T> gradient(T t) const {
@@ -359,7 +359,7 @@ struct TypedProbe : Probe<T> {
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
     Vec3<T> slope{0, 0, 0};
     if (spot.brick < 0) return slope;
-    const Voxel* voxels = first(spot);
+    const Voxel* voxels = first_voxel(spot);
     const int32_t side = this->channels.side, width = this->channels.value.width;
     for (int axis = 0; axis < 3; ++axis) {
       slope[axis] =
@@ -375,7 +375,7 @@ struct TypedProbe : Probe<T> {
     const Spot<T>& spot = this->fine;
     if (!this->mixed && spot.brick >= 0 && this->channels.value.width == 1 &&
         EightVoxels<T>::is_inside(spot.at(begin), side) && EightVoxels<T>::is_inside(spot.at(end), side)) {
-      const Voxel* voxels = first(spot);
+      const Voxel* voxels = first_voxel(spot);
       if (side == 10) return body([&](T t) { return trilinear(voxels, EightVoxels<T>(spot.at(t)), 10, 1); });
       if (side == 18) return body([&](T t) { return trilinear(voxels, EightVoxels<T>(spot.at(t)), 18, 1); });
     }
@@ -384,7 +384,7 @@ struct TypedProbe : Probe<T> {
   }
 
  private:
-  GV_HD const Voxel* first(const Spot<T>& spot) const {
+  GV_HD const Voxel* first_voxel(const Spot<T>& spot) const {
     const ChannelView& channel = this->channels.value;
     return static_cast<const Voxel*>(channel.bricks_bzyxc) + this->first_of(channel, this->channels.component, spot);
   }

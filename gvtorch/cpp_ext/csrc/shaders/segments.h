@@ -200,7 +200,9 @@ struct BrickView {
   const Voxel *bricks_bzyxc, *constant_tnc;
   int32_t side, border, channels;
 
-  GV_HD int64_t first(int32_t brick) const { return static_cast<int64_t>(brick) * side * side * side * channels; }
+  GV_HD int64_t first_number(int32_t brick) const {
+    return static_cast<int64_t>(brick) * side * side * side * channels;
+  }
 };
 
 // Finds what a sample of a segment reads: the bricks (or constants) of two nodes, and the weight of the coarse one.
@@ -287,7 +289,7 @@ struct SampleBricks {
     const BrickView<Voxel>& bricks = find_sample.bricks;
     if (spot.brick < 0)
       return number<T>(bricks.constant_tnc[static_cast<int64_t>(spot.node) * bricks.channels + channel]);
-    const Voxel* voxels = bricks.bricks_bzyxc + bricks.first(spot.brick) + channel;
+    const Voxel* voxels = bricks.bricks_bzyxc + bricks.first_number(spot.brick) + channel;
     return trilinear(voxels, bricks.side, bricks.channels, spot.at(t));
   }
 };
@@ -316,7 +318,7 @@ struct SpreadGradient {
     }
     const EightVoxels<T> corners(spot.at(t), bricks.side);
     const auto& weight = corners.weight;
-    T* first = grad_bzyxc + bricks.first(spot.brick);
+    T* first = grad_bzyxc + bricks.first_number(spot.brick);
     for (int i = 0; i < 8; ++i) {
       const int dx = i & 1, dy = i >> 1 & 1, dz = i >> 2;
       const T corner_share = share * (dx ? weight[0] : 1 - weight[0]) * (dy ? weight[1] : 1 - weight[1]) *

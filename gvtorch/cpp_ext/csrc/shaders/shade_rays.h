@@ -184,8 +184,8 @@ struct ShadeRay : Walk<T> {
       ++samples;
     }
     GV_HD int32_t take_intervals(const RayProbe& probe, const Intervals<T>& intervals, int32_t run_length, bool last) {
-      if constexpr (AnyShader::kFiltered >
-                    0) {  // it reads colours by itself; visits without any use the plain function
+      if constexpr (AnyShader::kFiltered > 0) {
+        // It reads colours by itself; visits without any use the plain function.
         if (shader.has_stored(probe))
           return take_with(shader, [](T) { return T{}; }, probe, intervals, run_length, last);
         return take_intervals(ready_for_ray(shader.plain()), probe, intervals, run_length, last);

@@ -101,7 +101,7 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
   // What one of the nodes adds; 0 in other lanes.
   template <class V, class AnyProbe, class Node>
   GV_HD LitRow<V> contribution(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
-    const MaskOf<V> colored = mask && node.among(this->bricks), uncolored = mask && !colored;
+    const MaskOf<V> colored = mask && node.in_first_slots(this->bricks), uncolored = mask && !colored;
     LitRow<V> lit_row;
     if (any(uncolored)) lit_row = by_function(uncolored, piece, probe, node);
     if (!any(colored)) return lit_row;

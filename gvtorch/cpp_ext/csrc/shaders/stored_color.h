@@ -143,7 +143,7 @@ struct FromAfar : Base {
   GV_HD const Base& plain() const { return *this; }
   template <class AnyProbe>
   GV_HD auto has_stored(const AnyProbe& probe) const {
-    return probe.fine.among(bricks) || (probe.mixed && probe.coarse.among(bricks));
+    return probe.fine.in_first_slots(bricks) || (probe.mixed && probe.coarse.in_first_slots(bricks));
   }
   template <class V, class AnyProbe>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
@@ -184,7 +184,7 @@ struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
   template <class V, class AnyProbe, class Node>
   GV_HD Row<V> contribution(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
     const V t = piece.middle;
-    const MaskOf<V> colored = mask && node.among(this->bricks), uncolored = mask && !colored;
+    const MaskOf<V> colored = mask && node.in_first_slots(this->bricks), uncolored = mask && !colored;
     Row<V> row{};
     if (any(uncolored)) {
       const Row<V> plain = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, uncolored);

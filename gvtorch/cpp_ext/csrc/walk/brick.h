@@ -63,7 +63,7 @@ struct Spot {
   }
   GV_HD Vec3<T> at(T t) const { return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z}; }
   // True if the brick is in one of the first `count` slots.
-  GV_HD bool among(int32_t count) const { return brick >= 0 && brick < count; }
+  GV_HD bool in_first_slots(int32_t count) const { return brick >= 0 && brick < count; }
 };
 
 // Lower one of the two voxels around a position along an axis; the upper one exists. Packets multiply floats faster.

@@ -202,20 +202,20 @@ struct Intervals {
   GV_HD void choose_level(Mask mask) {
     const T width = cone(start);
     const Mask full = count >= static_cast<Real>(kMaxIntervals);
-    const Mask wrong = mask && (full || !fits(width));
-    if (!any(wrong)) return;
+    const Mask misfits = mask && (full || !fits(width));
+    if (!any(misfits)) return;
     start = select(mask && full && !(start > base), stop, start);  // intervals too short to move it: the ray ends
-    base = select(wrong, start, base);
-    count = select(wrong, T{}, count);
-    level = select(wrong, IntOf<T>{}, level);
-    length = select(wrong, splat<T>(step), length);
+    base = select(misfits, start, base);
+    count = select(misfits, T{}, count);
+    level = select(misfits, IntOf<T>{}, level);
+    length = select(misfits, splat<T>(step), length);
     for (;;) {
-      const Mask longer = wrong && !fits(width) && level < top;
+      const Mask longer = misfits && !fits(width) && level < top;
       if (!any(longer)) break;
       length = select(longer, length + length, length);
       level = select(longer, level + 1, level);
     }
-    inverse_length = select(wrong, 1 / length, inverse_length);
+    inverse_length = select(misfits, 1 / length, inverse_length);
   }
   // Moves to interval `number`, counted from `base` in intervals of this length.
   GV_HD void move_to(Mask mask, T number) {

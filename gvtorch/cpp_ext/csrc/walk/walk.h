@@ -197,15 +197,15 @@ struct Walk {
   // Requests what is missing; returns whether anything is. Requests go straight to the wanted level, or level by level:
   // then a node has its brick before it is subdivided. A missing brick or too coarse a node always leads to a request.
   GV_HD bool mark_missing(const Descent& descent, int32_t wanted, bool blend, T cone) const {
-    const bool absent = descent.brick == kAbsent;
-    const bool deeper = descent.depth < wanted && descent.tile == kAbsent;
+    const bool brick_missing = descent.brick == kAbsent;
+    const bool too_coarse = descent.depth < wanted && descent.tile == kAbsent;
     const bool parent_lacks = blend && descent.depth == wanted && tree.brick_of(descent.parent) == kAbsent;
-    if (deeper && !(options.by_level && absent)) request(descent.node, descent.depth, cone, kSubdivide);
-    if (absent && (options.by_level || !deeper || descent.fine.node < 0)) {
+    if (too_coarse && !(options.by_level && brick_missing)) request(descent.node, descent.depth, cone, kSubdivide);
+    if (brick_missing && (options.by_level || !too_coarse || descent.fine.node < 0)) {
       request(descent.node, descent.depth, cone, kLoad);
     }
     if (parent_lacks) request(descent.parent, descent.depth - 1, cone, kLoad);
-    return absent || deeper || parent_lacks;
+    return brick_missing || too_coarse || parent_lacks;
   }
 
   // Priority: the width of one of the node's voxels on the screen, in sixteenths of a pixel, up to 128 pixels.
