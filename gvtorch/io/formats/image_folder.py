@@ -18,7 +18,7 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ...base.volume import check_extent
-from ..picture_size import jpeg_ends, picture_size
+from ..picture_size import has_jpeg_end, picture_size
 from ..resources import amount, memory_free
 from ..source import Index, VolumeSource, told_as
 from ..stores.ngff import is_zarr
@@ -59,9 +59,13 @@ def _slices(path: str) -> list[Path]:
     """Returns the images in a folder; raises ValueError if they are of several kinds."""
     files: dict[str, list[Path]] = {}
     for file in Path(path).iterdir():
-        kind = file.suffix.lower()
-        if kind in (*_TIFF_ENDINGS, *_CODECS) and not file.name.startswith(".") and file.is_file():
-            files.setdefault(_CODECS.get(kind, "tiff"), []).append(file)
+        ending = file.suffix.lower()
+        if (
+            ending in (*_TIFF_ENDINGS, *_CODECS)
+            and not file.name.startswith(".")
+            and file.is_file()
+        ):
+            files.setdefault(_CODECS.get(ending, "tiff"), []).append(file)
     if len(files) > 1:
         kinds = " and ".join(f"{len(group)} {kind}" for kind, group in sorted(files.items()))
         raise ValueError(f"{path}: images of several kinds: {kinds}; expected those of one stack")
@@ -114,7 +118,7 @@ def _decode_image(file: str) -> np.ndarray:
     import imagecodecs
 
     packed = Path(file).read_bytes()
-    if codec == "jpeg8" and not jpeg_ends(packed):
+    if codec == "jpeg8" and not has_jpeg_end(packed):
         raise ValueError(f"{file}: is truncated: the picture has no end")
     with told_as(ValueError, file, f"can't be read as {codec.rstrip('8').upper()}"):
         pixels = np.asarray(getattr(imagecodecs, f"{codec}_decode")(packed))

@@ -42,8 +42,8 @@ def open_metaimage(path: str) -> VolumeSource:
     if rank not in (2, 3, 4) or len(shape) != rank:
         raise ValueError(f"{path}: expected 2 to 4 dimensions, got {shape} of {rank}")
     name = header["ElementType"].removesuffix("_ARRAY")
-    kind = _LONG_TYPES.get(name) or number_type(name.removeprefix("MET_"))
-    if kind is None:
+    number_dtype = _LONG_TYPES.get(name) or number_type(name.removeprefix("MET_"))
+    if number_dtype is None:
         raise ValueError(f"{path}: ElementType {header['ElementType']!r} is unknown")
     width = int(header.get("ElementNumberOfChannels", 1))
     if width < 1:
@@ -52,7 +52,7 @@ def open_metaimage(path: str) -> VolumeSource:
     lost = [f"{name} of the header" for name in sorted(set(header) - _KNOWN_FIELDS)][:8]
     fields: dict[str, Any] = {
         "path": path,
-        "stored": np.dtype((">" if is_big.lower() == "true" else "<") + kind).str,
+        "stored": np.dtype((">" if is_big.lower() == "true" else "<") + number_dtype).str,
         "shape": ((width,) if width > 1 else ()) + shape,
         "info": _info(header, width, rank),
         "lost": tuple(lost),
@@ -73,7 +73,7 @@ def open_metaimage(path: str) -> VolumeSource:
             file=data_file, offset=max(offset, 0), codec="zlib", fortran=True, **fields
         )
     if offset < 0:  # the numbers are at the end of the file
-        need = math.prod(fields["shape"]) * np.dtype(kind).itemsize
+        need = math.prod(fields["shape"]) * np.dtype(number_dtype).itemsize
         offset = max(0, os.stat(data_file).st_size - need)
     return ArraySource(file=data_file, offset=offset, fortran=True, **fields)
 

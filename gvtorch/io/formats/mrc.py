@@ -37,8 +37,8 @@ def open_mrc(path: str) -> ArraySource:
     if serious:
         raise ValueError(serious[0])
     sizes = [int(fields[name]) for name in ("nz", "ny", "nx")]
-    kind = _DTYPES.get(int(fields["mode"]))
-    if kind is None:
+    number_dtype = _DTYPES.get(int(fields["mode"]))
+    if number_dtype is None:
         raise ValueError(f"{path}: mode {int(fields['mode'])}; expected one of {sorted(_DTYPES)}")
     if int(fields["nsymbt"]) < 0:
         raise ValueError(f"{path}: an extended header of {int(fields['nsymbt'])} bytes")
@@ -60,7 +60,7 @@ def open_mrc(path: str) -> ArraySource:
         file=path,
         shape=tuple(sizes),
         axes=axis_order,
-        stored=np.dtype(("<" if order in "<=|" else ">") + kind).str,
+        stored=np.dtype(("<" if order in "<=|" else ">") + number_dtype).str,
         offset=1024 + int(fields["nsymbt"]),
         whole=path.lower().endswith(_PACKED_ENDINGS),
         spacing=spacing,

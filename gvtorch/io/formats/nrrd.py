@@ -54,14 +54,14 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     shape = tuple(int(n) for n in header["sizes"])
     if header.get("dimension") != len(shape):
         raise ValueError(f"{path}: {len(shape)} sizes, dimension {header.get('dimension')}")
-    kind = number_type(str(header["type"]))
-    if kind is None:
+    number_dtype = number_type(str(header["type"]))
+    if number_dtype is None:
         raise ValueError(f"{path}: type {header['type']!r} is unknown")
     encoding = _ENCODINGS.get(str(header["encoding"]).lower())
     if encoding is None:
         known = ", ".join(sorted(_ENCODINGS))
         raise ValueError(f"{path}: encoding {header['encoding']!r} is unknown; known: {known}")
-    if np.dtype(kind).itemsize > 1 and encoding != "text" and "endian" not in header:
+    if np.dtype(number_dtype).itemsize > 1 and encoding != "text" and "endian" not in header:
         raise ValueError(f"{path}: endian is missing, and its numbers have several bytes")
     if header.get("endian", "little") not in ("little", "big"):
         raise ValueError(f"{path}: endian {header['endian']!r} is neither little nor big")
@@ -70,7 +70,7 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     fields: dict[str, Any] = {
         "path": path,
         "shape": shape,
-        "stored": np.dtype((">" if header.get("endian") == "big" else "<") + kind).str,
+        "stored": np.dtype((">" if header.get("endian") == "big" else "<") + number_dtype).str,
         "info": info,
         "lost": tuple(lost),
         **place_axes(
@@ -101,7 +101,7 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
         )
     start = _skip_lines(data_file, start, skip_lines)
     if encoding == "raw":
-        need = math.prod(shape) * np.dtype(kind).itemsize
+        need = math.prod(shape) * np.dtype(number_dtype).itemsize
         # -1: the numbers are at the end.
         array_start = max(start, size - need) if skip_bytes < 0 else start + skip_bytes
         return ArraySource(file=data_file, offset=array_start, fortran=True, exact=True, **fields)
@@ -146,10 +146,10 @@ def _axis_roles(path: str, header: dict[str, Any], shape: tuple[int, ...], axes:
             roles = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
         if roles.count("s") == 3 and roles.count("t") <= 1 and roles.count("c") <= 1:
             return "".join(roles)
-    letters = ask_axes(path, shape[::-1], axes)[::-1]
-    if sum(letter in "zyx" for letter in letters) != 3:
-        raise ValueError(f"{path}: expected three axes of space, got {letters[::-1]}")
-    return "".join("s" if letter in "zyx" else letter for letter in letters)
+    axis_order = ask_axes(path, shape[::-1], axes)[::-1]
+    if sum(letter in "zyx" for letter in axis_order) != 3:
+        raise ValueError(f"{path}: expected three axes of space, got {axis_order[::-1]}")
+    return "".join("s" if letter in "zyx" else letter for letter in axis_order)
 
 
 def _directions(header: dict[str, Any], rank: int) -> np.ndarray:

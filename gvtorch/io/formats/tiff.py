@@ -147,12 +147,12 @@ def _axes(path: str, shape: Sequence[int], axes: str) -> str:
         "-" if size == 1 and letter not in "ZYX" else letter
         for size, letter in zip(shape, axes, strict=True)
     )
-    others = [letter for letter in axis_order if letter not in "TZYXCS-"]
-    if "Z" not in axis_order and len(others) == 1 and others[0] in "QI":
+    other_axes = [letter for letter in axis_order if letter not in "TZYXCS-"]
+    if "Z" not in axis_order and len(other_axes) == 1 and other_axes[0] in "QI":
         # Pages of unknown meaning are slices.
-        axis_order, others = axis_order.replace(others[0], "Z"), []
+        axis_order, other_axes = axis_order.replace(other_axes[0], "Z"), []
     channels = [letter for letter in axis_order if letter in "CS"]
-    if others or len(channels) > 1 or axis_order.count("Y") != 1 or axis_order.count("X") != 1:
+    if other_axes or len(channels) > 1 or axis_order.count("Y") != 1 or axis_order.count("X") != 1:
         raise ValueError(
             f"{path}: axes {axes} {tuple(shape)}; expected T, Z, Y, X and at most one of C, S"
         )
