@@ -126,10 +126,10 @@ def order_frames(path: str, frames: Sequence[DicomFrame]) -> Ordered:
     """
     first = frames[0]
     for frame in frames:
-        same = np.allclose(frame.spacing, first.spacing, rtol=1e-3)
+        is_alike = np.allclose(frame.spacing, first.spacing, rtol=1e-3)
         if frame.orientation is not None and first.orientation is not None:
-            same &= np.allclose(frame.orientation, first.orientation, atol=1e-3)
-        if not same:
+            is_alike &= np.allclose(frame.orientation, first.orientation, atol=1e-3)
+        if not is_alike:
             raise ValueError(
                 f"{path}: a series of slices of different orientation or spacing: "
                 f"{first.orientation} {first.spacing} and {frame.orientation} {frame.spacing}; "

@@ -41,7 +41,7 @@ class SurfaceFile:
     """A file of triangles that appears once it is complete:
 
     with SurfaceFile(path, origin, step) as file:
-        file.add(places, faces)
+        file.add(vertices, faces)
 
     Attributes:
         vertices: Number of vertices so far.

@@ -73,8 +73,8 @@ def open_metaimage(path: str) -> VolumeSource:
             file=data_file, offset=max(offset, 0), codec="zlib", fortran=True, **fields
         )
     if offset < 0:  # the numbers are at the end of the file
-        need = math.prod(fields["shape"]) * np.dtype(number_dtype).itemsize
-        offset = max(0, os.stat(data_file).st_size - need)
+        needed_bytes = math.prod(fields["shape"]) * np.dtype(number_dtype).itemsize
+        offset = max(0, os.stat(data_file).st_size - needed_bytes)
     return ArraySource(file=data_file, offset=offset, fortran=True, **fields)
 
 

@@ -46,9 +46,14 @@ def open_nifti(path: str) -> NiftiSource:
     image, corrections = _load(path)
     shape = tuple(int(n) for n in image.shape)
     packed = path.lower().endswith(".gz")
-    need, size = math.prod(shape) * image.dataobj.dtype.itemsize, os.stat(path).st_size
-    if packed and need > MOST_PACKED * size:  # nibabel allocates memory for all of it at once
-        raise ValueError(f"{path}: takes {need} bytes, which {size} can't unpack to")
+    needed_bytes, file_bytes = (
+        math.prod(shape) * image.dataobj.dtype.itemsize,
+        os.stat(path).st_size,
+    )
+    if (
+        packed and needed_bytes > MOST_PACKED * file_bytes
+    ):  # nibabel allocates memory for all of it at once
+        raise ValueError(f"{path}: takes {needed_bytes} bytes, which {file_bytes} can't unpack to")
     first_voxel = np.asanyarray(image.dataobj[(slice(0, 1),) * len(shape)])
     if first_voxel.dtype.fields is not None:  # colours: a structured dtype of components
         first_voxel = _components(first_voxel)

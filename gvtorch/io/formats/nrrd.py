@@ -101,9 +101,9 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
         )
     start = _skip_lines(data_file, start, skip_lines)
     if encoding == "raw":
-        need = math.prod(shape) * np.dtype(number_dtype).itemsize
+        needed_bytes = math.prod(shape) * np.dtype(number_dtype).itemsize
         # -1: the numbers are at the end.
-        array_start = max(start, size - need) if skip_bytes < 0 else start + skip_bytes
+        array_start = max(start, size - needed_bytes) if skip_bytes < 0 else start + skip_bytes
         return ArraySource(file=data_file, offset=array_start, fortran=True, exact=True, **fields)
     return PackedSource(
         file=data_file, offset=start, skip=skip_bytes, codec=encoding, fortran=True, **fields
