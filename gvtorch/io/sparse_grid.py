@@ -38,19 +38,20 @@ _QUANTITIES = {"level set": "signed distance", "fog volume": "density"}
 
 @dataclass(kw_only=True)
 class SparseGrid(ABC):
-    """The nodes of a grid; all positions except `places` are voxel indices i, j, k."""
+    """The nodes of a grid; all positions except `node_offsets` are voxel indices i, j, k."""
 
     data: Any  # the bytes that hold the nodes
     kind: str  # type of the values, as the format calls it
-    places: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n,) offsets in `data` of each of `origins`
+    # (n,) The offset in `data` of each node of `origins`.
+    node_offsets: tuple[np.ndarray, np.ndarray, np.ndarray]
     dtype: np.dtype
     background: np.ndarray  # (c,)
     origins: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n, 3) int64 of uppers, lowers and leaves
-    root_places: np.ndarray  # (t, 3) int64 of the root's tiles
+    root_origins: np.ndarray  # (t, 3) int64 of the root's tiles
     root_values: np.ndarray  # (t, c)
 
     def __post_init__(self) -> None:
-        origins = np.concatenate((self.root_places, self.origins[0]))
+        origins = np.concatenate((self.root_origins, self.origins[0]))
         misaligned = origins[(origins % SIDES[0]).any(1)]
         if len(misaligned):
             raise ValueError(
@@ -85,8 +86,8 @@ class SparseGrid(ABC):
             return self._pieces(a, b, axis, padded_voxels // int((stop - start)[axis]))
         out = np.empty((*(stop - start), len(self.background)), self.dtype)
         out[:] = self.background
-        tiles = self._overlapping(self.root_places, SIDES[0], start, stop)
-        self._write_tiles(out, start, SIDES[0], self.root_places[tiles], self.root_values[tiles])
+        tiles = self._overlapping(self.root_origins, SIDES[0], start, stop)
+        self._write_tiles(out, start, SIDES[0], self.root_origins[tiles], self.root_values[tiles])
         for level in (0, 1):
             for number in self._overlapping(self.origins[level], SIDES[level], start, stop):
                 origins, values = self._visible_tiles(level, number, start, stop)
@@ -124,7 +125,7 @@ class SparseGrid(ABC):
         """
         low, high = [self.origins[2]], [self.origins[2] + SIDES[2]]
         everywhere = np.array((-MAX_INDEX,) * 3), np.array((MAX_INDEX,) * 3)
-        tile_groups = [(SIDES[0], self.root_places[self._is_foreground(self.root_values)])]
+        tile_groups = [(SIDES[0], self.root_origins[self._is_foreground(self.root_values)])]
         for level in (0, 1):
             for number in range(len(self.origins[level])):
                 tile_groups.append(

@@ -259,7 +259,7 @@ def _round_up(n: int, multiple: int) -> int:
 
 @dataclass(kw_only=True)
 class NanoGrid(SparseGrid):
-    """A grid in memory; `places` are the offsets of the nodes in bytes."""
+    """A grid in memory; `node_offsets` are the offsets of the nodes in bytes."""
 
     layout: NodeFormat
 
@@ -316,16 +316,16 @@ class NanoGrid(SparseGrid):
                 (width,), dtype, data, _ROOT_OFFSET + _round_up(28, np.dtype(dtype).itemsize)
             ),
             origins=(origins[0], origins[1], origins[2]),
-            root_places=corners[~has_child],
+            root_origins=corners[~has_child],
             root_values=root_table["value"][~has_child],
             data=data,
             kind=kind,
             layout=layout,
-            places=(node_offsets[0], node_offsets[1], node_offsets[2]),
+            node_offsets=(node_offsets[0], node_offsets[1], node_offsets[2]),
         )
 
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
-        n, offset = COUNTS[level], int(self.places[level][number])
+        n, offset = COUNTS[level], int(self.node_offsets[level][number])
         width, item_bytes = len(self.background), self.dtype.itemsize
         values_start = offset + self.layout.entries_start[level]
         values = np.ndarray(
@@ -336,7 +336,7 @@ class NanoGrid(SparseGrid):
 
     def leaves(self, numbers: np.ndarray) -> np.ndarray:
         out = np.empty((len(numbers), VOXELS, len(self.background)), self.dtype)
-        for row, offset in enumerate(self.places[2][numbers].tolist()):
+        for row, offset in enumerate(self.node_offsets[2][numbers].tolist()):
             out[row] = self._voxels(offset)
         return out
 

@@ -342,7 +342,7 @@ class _Packing:
 
 @dataclass(kw_only=True)
 class VdbGrid(SparseGrid):
-    """A grid of a file; `places` are the offsets of the masks of each node."""
+    """A grid of a file; `node_offsets` are the offsets of the masks of each node."""
 
     packing: _Packing
 
@@ -376,7 +376,7 @@ class VdbGrid(SparseGrid):
 
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
         n = COUNTS[level]
-        cursor = Cursor(self.data, int(self.places[level][number]))
+        cursor = Cursor(self.data, int(self.node_offsets[level][number]))
         is_child, active = (cursor.mask(n**3) for _ in range(2))
         if self.packing.has_masks:
             values = self.packing.values(cursor, active)
@@ -387,7 +387,7 @@ class VdbGrid(SparseGrid):
 
     def leaves(self, numbers: np.ndarray) -> np.ndarray:
         out = np.empty((len(numbers), VOXELS, self.packing.width), self.dtype)
-        for row, offset in enumerate(self.places[2][numbers].tolist()):
+        for row, offset in enumerate(self.node_offsets[2][numbers].tolist()):
             cursor = Cursor(self.data, offset)
             active = cursor.mask(VOXELS)
             if self.kind == "mask":
@@ -407,34 +407,34 @@ class _Topology:
     def __init__(self, cursor: Cursor, packing: _Packing) -> None:
         self.cursor, self.packing = cursor, packing
         self.origins: tuple[list[Any], ...] = ([], [], [])
-        self.places: tuple[list[Any], ...] = ([], [], [])
+        self.inner_offsets: tuple[list[int], list[int]] = ([], [])  # of upper and lower nodes
+        self.leaf_active_counts: list[np.ndarray] = []  # active voxels of the leaves of each node
 
     def read(self, kind: str, leaves_start: int) -> dict[str, Any]:
-        """Returns `origins`, `places`, `root_places` and `root_values` of a `VdbGrid`; raises
-        ValueError if the leaves do not begin at `leaves_start`, behind the other nodes.
+        """Returns `origins`, `node_offsets`, `root_origins` and `root_values` of a `VdbGrid`.
+
+        Raises:
+            ValueError: The leaves do not begin at `leaves_start`, behind the other nodes.
         """
         cursor, packing = self.cursor, self.packing
         tiles, children = cursor.numbers("<2I")
         check_roots(tiles + children)
         value = (packing.dtype, (packing.width,))
-        table = cursor.array([("place", "<i4", (3,)), ("value", *value), ("on", "u1")], tiles)
+        table = cursor.array([("origin", "<i4", (3,)), ("value", *value), ("on", "u1")], tiles)
         for _ in range(children):
             self._node(0, np.array(cursor.numbers("<3i"), np.int64))
-        counts, none = self.places[2], np.zeros((0, 3), np.int64)
-        active = np.concatenate(counts) if counts else none[:, 0]
+        none = np.zeros((0, 3), np.int64)
+        active_counts = np.concatenate([none[:, 0], *self.leaf_active_counts])
         if cursor.offset != leaves_start:
             raise ValueError(
                 f"leaves begin at {leaves_start}, the nodes above end at {cursor.offset}"
             )
-        places = self._leaves(kind, active.tolist())
+        uppers, lowers = (np.array(part, np.int64) for part in self.inner_offsets)
+        leaves = self._leaves(kind, active_counts.tolist())
         return {
             "origins": tuple(np.concatenate([none, *part]) for part in self.origins),
-            "places": (
-                np.array(self.places[0], np.int64),
-                np.array(self.places[1], np.int64),
-                places,
-            ),
-            "root_places": table["place"].astype(np.int64),
+            "node_offsets": (uppers, lowers, leaves),
+            "root_origins": table["origin"].astype(np.int64),
             "root_values": table["value"],
         }
 
@@ -442,7 +442,7 @@ class _Topology:
         """Visits a node and all below it."""
         cursor, n = self.cursor, COUNTS[level]
         self.origins[level].append(origin[None])
-        self.places[level].append(cursor.offset)
+        self.inner_offsets[level].append(cursor.offset)
         is_child, active = (cursor.mask(n**3) for _ in range(2))
         child_entries = np.flatnonzero(is_child)
         value_count = n**3 if self.packing.has_masks else n**3 - len(child_entries)
@@ -456,7 +456,7 @@ class _Topology:
             return
         masks = cursor.array("u1", len(child_entries) * VOXELS // 8).reshape(-1, VOXELS // 8)
         self.origins[2].append(corners)
-        self.places[2].append(np.unpackbits(masks, axis=1).sum(1, dtype=np.int64))
+        self.leaf_active_counts.append(np.unpackbits(masks, axis=1).sum(1, dtype=np.int64))
 
     def _leaves(self, kind: str, active_counts: list[int]) -> np.ndarray:
         """Returns the offset of each leaf; `active_counts` are the active voxels of each."""
