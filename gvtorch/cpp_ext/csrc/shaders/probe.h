@@ -35,23 +35,24 @@ struct ChannelView {
 };
 
 // A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes. Arguments are passed
-// by value, because an address would put the whole kernel's arguments on the stack.
+// by value, because an address would put the whole kernel's arguments on the stack; positions as three numbers, because
+// a CPU would write a struct to the stack in eights and read it back in sixteens, and wait.
 template <class T>
-GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> position) {
+GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, T x, T y, T z) {
   T out = 0;
   with_voxel(type, [&](auto voxel) {
-    out = trilinear(static_cast<const decltype(voxel)*>(voxels) + first, side, width, position);
+    out = trilinear(static_cast<const decltype(voxel)*>(voxels) + first, side, width, Vec3<T>{x, y, z});
   });
   return out;
 }
 
 // Interpolates four consecutive numbers of the voxels.
 template <class T>
-GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side,
-                         Vec3<T> position) {
+GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, T x, T y,
+                         T z) {
   Row<T> row{};
   with_voxel(type, [&](auto voxel) {
-    const EightVoxels<T> corners(position, side);
+    const EightVoxels<T> corners({x, y, z}, side);
     const int32_t step_y = width * side, step_z = step_y * side;
     const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
                          (corners.cell[2] * step_z + corners.cell[1] * step_y + corners.cell[0] * width);
@@ -81,9 +82,9 @@ struct Components {
 // Interpolates several numbers of the voxels; the eight voxels are found once.
 template <class T>
 GV_CALL void read_numbers(const void* voxels, VoxelType type, Components<T> components, int32_t count, int64_t first,
-                          int32_t side, Vec3<T> position, T* out) {
+                          int32_t side, T x, T y, T z, T* out) {
   with_voxel(type, [&](auto voxel) {
-    const EightVoxels<T> corners(position, side);
+    const EightVoxels<T> corners({x, y, z}, side);
     const int32_t width = components.width, step_y = width * side, step_z = step_y * side;
     const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
                          (corners.cell[2] * step_z + corners.cell[1] * step_y + corners.cell[0] * width);
@@ -267,7 +268,8 @@ struct Probe {
   }
   GV_HD Row<T> four_of(bool, const ChannelView& channel, int32_t component, const Spot<T>& spot, T t) const {
     const int64_t first = first_of(channel, component, spot);
-    return read_four(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, spot.at(t));
+    const Vec3<T> at = spot.at(t);
+    return read_four(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at.x, at.y, at.z);
   }
   GV_HD static T scale_of(const Spot<T>& spot) { return spot.scale; }
   // The value of one voxel of a brick; x, y and z count the border.
@@ -318,13 +320,16 @@ struct Probe {
   GV_HD T read(const ChannelView& channel, int32_t component, const Spot<T>& spot, Vec3<T> position) const {
     if (spot.brick < 0) return channel.constant<T>(spot.node, component);
     const int64_t first = first_of(channel, component, spot);
-    return read_brick(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, position);
+    return read_brick(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, position.x, position.y,
+                      position.z);
   }
   GV_HD void read(const ChannelView& channel, Components<T> components, int32_t count, const Spot<T>& spot, T t,
                   T* out) const {
     if (spot.brick >= 0) {
       const int64_t first = first_of(channel, 0, spot);
-      return read_numbers(channel.bricks_bzyxc, channel.type, components, count, first, channels.side, spot.at(t), out);
+      const Vec3<T> at = spot.at(t);
+      return read_numbers(channel.bricks_bzyxc, channel.type, components, count, first, channels.side, at.x, at.y, at.z,
+                          out);
     }
     for (int32_t i = 0; i < count; ++i) out[i] = channel.constant<T>(spot.node, components[i]);
   }
