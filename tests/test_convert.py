@@ -340,7 +340,7 @@ def test_kill_9_and_resume(tmp_path, raw, data, monkeypatch):
 
 
 def test_processes_write_the_same(tmp_path, data, raw, monkeypatch):
-    monkeypatch.setattr(conversion_plan, "_FEW", 1)
+    monkeypatch.setattr(conversion_plan, "_FEW_TASKS", 1)
     seen: list[tuple[int, int]] = []
     store = convert(
         raw,
