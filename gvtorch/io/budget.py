@@ -41,16 +41,16 @@ def check_regular(path: str | Path) -> None:
         raise ValueError(f"{path}: is not a regular file")
 
 
-def check_beside(path: str, other: str) -> None:
-    """Raises ValueError if `other`, a file that the content of `path` refers to, lies outside the
+def check_beside(path: str, referenced: str) -> None:
+    """Raises ValueError if `referenced`, a file that the content of `path` refers to, lies outside the
     folder of `path` and the folders below it, or is no regular file.
     """
     folder = os.path.realpath(os.path.dirname(path))
-    other_path = os.path.join(folder, other)
-    if os.path.commonpath([folder, os.path.realpath(other_path)]) != folder:
-        raise ValueError(f"{path}: names {other}, which is in another folder")
-    if os.path.lexists(other_path):
-        check_regular(other_path)
+    referenced_path = os.path.join(folder, referenced)
+    if os.path.commonpath([folder, os.path.realpath(referenced_path)]) != folder:
+        raise ValueError(f"{path}: names {referenced}, which is in another folder")
+    if os.path.lexists(referenced_path):
+        check_regular(referenced_path)
 
 
 def check_files(source: object) -> None:

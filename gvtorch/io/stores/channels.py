@@ -104,9 +104,9 @@ def convert_channels(
         progress("converting", done, total)
     (target / "OME").mkdir(exist_ok=True)
     series = {"ome": {"version": "0.5", "series": [*sources]}}
-    unfinished.write_json(target / "OME" / "zarr.json", unfinished.group(series))
+    unfinished.write_json(target / "OME" / "zarr.json", unfinished.group_metadata(series))
     root = {"ome": {"version": "0.5", "bioformats2raw.layout": 3}, CHANNELS_ATTRIBUTE: [*sources]}
-    unfinished.write_json(target / "zarr.json", unfinished.group(root))
+    unfinished.write_json(target / "zarr.json", unfinished.group_metadata(root))
     shutil.rmtree(target / WORK, ignore_errors=True)
     return Store.open(target)
 

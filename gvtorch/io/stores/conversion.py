@@ -36,9 +36,9 @@ from .conversion_plan import (
     Plan,
     check_room,
     estimate_of,
+    fit_workers,
     plan_of,
     source_of,
-    within,
 )
 from .store import Store
 from .store_layout import WORK, Deadline, begin_open
@@ -112,7 +112,7 @@ def convert(
     prepared = indexed_source(make_source(), time, workers, target / WORK, progress)
     plan = plan_of(source, prepared, target, block, threshold, nan, time, workers)
     if executor is None and (memory is not None or workers is None):
-        plan = within(plan, memory)
+        plan = fit_workers(plan, memory)
     if not begun:
         check_room(target, estimate_of(plan))
     _write_store(plan, begun, executor, progress)

@@ -78,9 +78,11 @@ def find_image(
     pyramid = _parse_image(location, attributes, image)
     series = _ngff_attribute(attributes, "bioformats2raw.layout")
     if pyramid is None and layout is None:
-        first = attributes.get(CHANNELS_ATTRIBUTE, ["0"])  # "0": the folder used by bioformats2raw
-        has_names = isinstance(first, list) and first and isinstance(first[0], str)
-        folder = image if image is not None else first[0] if has_names else "0"
+        folders = attributes.get(
+            CHANNELS_ATTRIBUTE, ["0"]
+        )  # "0": the folder used by bioformats2raw
+        has_names = isinstance(folders, list) and folders and isinstance(folders[0], str)
+        folder = image if image is not None else folders[0] if has_names else "0"
         if ".." not in folder and not folder.startswith("/"):
             parent, root = root, child(root, folder)
             folder_attributes = _attributes(f"{location}/{folder}", root, deadline)
@@ -222,13 +224,13 @@ def _note_other_images(image: MultiscaleImage, others: list[str]) -> None:
         image.dropped.append(f"the images {_join_some(others)} {hint}")
 
 
-def _other_images(location: str, root: Any, deadline: Deadline, first: str) -> list[str]:
+def _other_images(location: str, root: Any, deadline: Deadline, opened: str) -> list[str]:
     """Returns the names of the other images of a bioformats2raw layout."""
     try:
         attributes = _attributes(f"{location}/OME", child(root, "OME"), deadline) or {}
         series = _ngff_attribute(attributes, "series")
         if isinstance(series, list):
-            return [str(path) for path in series if path != first]
+            return [str(path) for path in series if path != opened]
         has_second = _attributes(f"{location}/1", child(root, "1"), deadline) is not None
     except (OSError, ValueError):  # damage there must not prevent opening the image
         return []

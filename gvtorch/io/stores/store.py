@@ -348,7 +348,7 @@ class Store:
                 f"read_blocks: a position lies outside the grid {grid} of level {level}"
             )
         deadline, layout = Deadline(timeout), self.layout
-        shape = (len(zyx), *[layout.stored] * 3)
+        shape = (len(zyx), *[layout.bordered_side] * 3)
         if not self.has_blocks:
             out = np.zeros((*shape, self.width), layout.dtype)
             return out, self._cut_blocks(level, zyx, out, deadline)
@@ -508,7 +508,7 @@ class Store:
     ) -> dict[int, str]:
         """Cuts blocks out of region reads; neighbours share a read if that reads less."""
         errors = dict[int, str]()
-        side = self.layout.stored
+        side = self.layout.bordered_side
 
         def read(rows: np.ndarray) -> None:
             low = zyx[rows].min(0) * self.block - self.border
