@@ -42,8 +42,8 @@ def check_regular(path: str | Path) -> None:
 
 
 def check_beside(path: str, referenced: str) -> None:
-    """Raises ValueError if `referenced`, a file that the content of `path` refers to, lies outside the
-    folder of `path` and the folders below it, or is no regular file.
+    """Raises ValueError if `referenced`, a file that the content of `path` refers to, lies outside
+    the folder of `path` and the folders below it, or is no regular file.
     """
     folder = os.path.realpath(os.path.dirname(path))
     referenced_path = os.path.join(folder, referenced)

@@ -214,9 +214,8 @@ def read_time_points(source: VolumeSource, first: int = 0, times: int = 1) -> np
     """Reads whole time points, (t, z, y, x, c); raises ValueError if the file is damaged."""
     is_array = isinstance(source, (ObjectSource, MemorySource))
     same_dtype = np.dtype(source.stored).name == source.dtype
-    is_mapped = (
-        isinstance(source, ArraySource) and not source.whole and same_dtype
-    )  # mapped, not copied
+    # A file that is mapped is not copied.
+    is_mapped = isinstance(source, ArraySource) and not source.whole and same_dtype
     if not isinstance(source, MemorySource) and not is_mapped:
         free, needed = memory_free(), source.peak_bytes + (times - 1) * source.nbytes
         if needed > free:

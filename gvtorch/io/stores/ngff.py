@@ -78,9 +78,8 @@ def find_image(
     pyramid = _parse_image(location, attributes, image)
     series = _ngff_attribute(attributes, "bioformats2raw.layout")
     if pyramid is None and layout is None:
-        folders = attributes.get(
-            CHANNELS_ATTRIBUTE, ["0"]
-        )  # "0": the folder used by bioformats2raw
+        # "0" is the folder that bioformats2raw uses.
+        folders = attributes.get(CHANNELS_ATTRIBUTE, ["0"])
         has_names = isinstance(folders, list) and folders and isinstance(folders[0], str)
         folder = image if image is not None else folders[0] if has_names else "0"
         if ".." not in folder and not folder.startswith("/"):

@@ -155,7 +155,8 @@ def _claimed_folder(target: Path) -> Iterator[None]:
 
 @contextmanager
 def locked(file: Path, message: str) -> Iterator[IO[str]]:
-    """Opens a file that one process at a time may hold open; raises OSError(other) if one does."""
+    """Opens a file that one process at a time may hold open; raises OSError(message) if one
+    does."""
     import fcntl
 
     with file.open("a") as lock:
