@@ -279,11 +279,11 @@ def test_a_full_disk_is_told_and_goes_on(tmp_path, raw, data, monkeypatch):
         def result(self):
             raise ValueError("RESOURCE_EXHAUSTED: Error writing: [OS error 28: No space left on")
 
-    original = shard.write
+    original = shard.begin_write
     with monkeypatch.context() as patch:
         patch.setattr(
             shard,
-            "write",
+            "begin_write",
             lambda root, spec, *rest: (
                 Full()
                 if spec["path"] == "gvtorch/blocks/0" and root["driver"] == "file"

@@ -156,7 +156,8 @@ def _claimed_folder(target: Path) -> Iterator[None]:
 @contextmanager
 def locked(file: Path, message: str) -> Iterator[IO[str]]:
     """Opens a file that one process at a time may hold open; raises OSError(message) if one
-    does."""
+    does.
+    """
     import fcntl
 
     with file.open("a") as lock:
