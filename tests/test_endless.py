@@ -330,6 +330,41 @@ def test_parts_of_files_that_never_end(server, tmp_path):
     assert read_http(f"{server.url}/none", 9) is None
 
 
+class _Racing(dict):
+    """A dict that other threads change while it is iterated over, and after it is looked into."""
+
+    def __init__(self):
+        super().__init__()
+        self.threads = []
+
+    def __iter__(self):
+        keys = super().__iter__()
+        for change in (http.ask_again, lambda: http.keep_reason("other", OSError("other"))):
+            self.threads.append(threading.Thread(target=change))
+            self.threads[-1].start()
+            self.threads[-1].join(0.2)
+        return keys
+
+    def get(self, *arguments):
+        value = super().get(*arguments)
+        self.clear()
+        return value
+
+
+def test_reasons_are_kept_while_other_threads_forget_them(monkeypatch):
+    monkeypatch.setattr(http, "_MAX_REASONS", 2)
+    racing = _Racing()
+    monkeypatch.setattr(http, "_refused", racing)
+    for name in "abc":
+        http.keep_reason(name, OSError(name))
+    for thread in racing.threads:
+        thread.join()
+    assert len(racing) <= 2
+    http.keep_reason("a", http.Endless("it never ends"), 60.0)
+    with pytest.raises(http.Endless, match="it never ends"):
+        read_http("a", 9)
+
+
 def test_nobody_else_reads_by_the_relay(server, tmp_path):
     (tmp_path / "a").write_bytes(b"mine")
     spec = relay.relay_folder(f"{server.url}/").spec

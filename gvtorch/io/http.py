@@ -27,6 +27,7 @@ REFUSED_SECONDS = 30.0  # seconds for which a file is not requested again after 
 _MAX_REASONS = 1000  # errors that are remembered
 _NOT_REFUSED = (0.0, "")
 _refused: dict[str, tuple[float, str]] = {}  # by URL: until when it is refused, and why
+_refused_lock = threading.Lock()  # held while it is changed
 EXTRA_BYTES = 1 << 20  # bytes that any file may take in addition to what its content may take
 _PART_BYTES = 1 << 16  # bytes
 _SILENT_SECONDS = 1.0  # seconds without a byte after which `ask_again` aborts a request
@@ -89,8 +90,9 @@ def read_http(
         HttpStatus: The server answers with an error.
         OSError: The server can't be reached, or breaks off.
     """
-    if time.monotonic() < _refused.get(url, _NOT_REFUSED)[0]:
-        raise Endless(_refused[url][1])
+    refused_until, reason = _refused.get(url, _NOT_REFUSED)
+    if time.monotonic() < refused_until:
+        raise Endless(reason)
     max_seconds = STALL_SECONDS + max_bytes / MIN_BYTES_PER_SECOND
     deadline = time.monotonic() + min(seconds, max_seconds)
     try:
@@ -116,9 +118,10 @@ def read_http(
 
 def keep_reason(url: str, error: OSError, seconds: float = 0.0) -> None:
     """Remembers why a file can't be read; `read_http` refuses it for the next `seconds`."""
-    _refused[url] = time.monotonic() + seconds, str(error)
-    while len(_refused) > _MAX_REASONS:
-        _refused.pop(next(iter(_refused)), None)
+    with _refused_lock:
+        _refused[url] = time.monotonic() + seconds, str(error)
+        while len(_refused) > _MAX_REASONS:
+            del _refused[next(iter(_refused))]
 
 
 def refused(url: str) -> str:
@@ -130,7 +133,8 @@ def ask_again() -> None:
     """Makes the next read of any file try again at once: no file is refused any longer, and
     requests that wait for a silent server are aborted.
     """
-    _refused.clear()
+    with _refused_lock:
+        _refused.clear()
     _connections.shut_down_silent(time.monotonic() - _SILENT_SECONDS)
 
 
