@@ -12,9 +12,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from http import server as servers
+from http.client import HTTPConnection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urlsplit
 
 import google_crc32c
 import numpy as np
@@ -373,3 +375,43 @@ def test_nobody_else_reads_by_the_relay(server, tmp_path):
     for path in ("", "0/a", "x/0/a", f"{relay._server().secret}/999999/a"):
         with pytest.raises(OSError):
             read_http(f"http://127.0.0.1:{port}/{path}", 9)
+
+
+@pytest.mark.parametrize("kind", ["parts", "whole files", "bucket"])
+def test_the_relay_answers_every_range(server, tmp_path, kind):
+    import tensorstore as ts
+
+    from gvtorch.io.stores.store_layout import context
+
+    content, url = bytes(range(256)) * 4, f"{server.url}/"
+    if kind == "bucket":
+        url = "memory://endless-ranges/"
+        ts.KvStore.open(url, context=context()).result()["a"] = content
+    (tmp_path / "a").write_bytes(content)
+    server.parts = kind == "parts"
+    address = urlsplit(relay.relay_folder(url, context()).spec["base_url"])
+
+    def ask(text: str, name: str = "a") -> tuple[int, str | None, bytes]:
+        with contextlib.closing(HTTPConnection(address.netloc)) as connection:
+            connection.request("GET", f"{address.path}{name}", headers={"Range": text})
+            response = connection.getresponse()
+            return response.status, response.headers["Content-Range"], response.read()
+
+    for text, first, part in (
+        ("bytes=1000-", 1000, content[1000:]),
+        ("bytes=1023-", 1023, content[1023:]),
+        ("bytes=0-", 0, content),
+        ("bytes=5-9", 5, content[5:10]),
+    ):
+        assert ask(text) == (206, f"bytes {first}-{first + len(part) - 1}/*", part), text
+    assert ask("bytes=-3")[::2] == (206, content[-3:])
+    for text in ("bytes=1024-", "bytes=5000-", "bytes=-0"):
+        assert ask(text) == (416, None, b""), text
+    for text in ("", "bytes=-", "bytes=9-5", "bytes=0-1,5-6", "lines=0-1", f"bytes={'9' * 5000}-"):
+        assert ask(text) == (200, None, content), text
+    assert ask("bytes=1-", "none")[0] == 404
+    if kind != "bucket":
+        server.bad, server.how = "a", "fast"
+    else:
+        ts.KvStore.open(url, context=context()).result()["a"] = bytes(20_000_000)
+    assert ask("bytes=1-")[0] == 403, "more than any file of metadata has"

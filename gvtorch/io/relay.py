@@ -43,7 +43,9 @@ if TYPE_CHECKING:  # not at run time: `gvtorch --help` imports this module
 _MAX_JOINED_BYTES = 1 << 27  # bytes of parts that tensorstore joins in one request
 _MAX_METADATA_BYTES = 1 << 24  # bytes of a file of metadata
 _INDEX_CACHE_BYTES = 1 << 26  # bytes of shards' indexes that are cached for a folder
+_NO_BYTES = slice(0, 0)  # what "bytes=-0" asks for
 _RETRIES = {"max_retries": 4, "initial_delay": "200ms", "max_delay": "1s"}
+_UNSATISFIABLE = 416  # status code for a range with no byte of the file
 _MAX_CONCURRENT = 16  # concurrent requests for one folder
 
 
@@ -95,6 +97,7 @@ class Relayed:
         return content
 
     def _read(self, name: str, byte_range: slice | None, files: ChunkFiles | None) -> bytes | None:
+        """Reads a file, or a part of it that is not larger than what tensorstore may ask for."""
         max_file_bytes = max_part_bytes = max_bytes = _MAX_METADATA_BYTES
         if files is not None:
             max_file_bytes = max_bytes = files.max_bytes
@@ -102,9 +105,11 @@ class Relayed:
                 2 * files.chunk_bytes + EXTRA_BYTES + _MAX_JOINED_BYTES, files.index_bytes
             )
         if byte_range is not None:
-            max_bytes = (
-                -byte_range.start if byte_range.stop is None else byte_range.stop - byte_range.start
-            )
+            start, stop = byte_range.start, byte_range.stop
+            if stop is not None:
+                max_bytes = stop - start
+            else:
+                max_bytes = -start if start < 0 else min(max_part_bytes, max_file_bytes)
             if not 0 < max_bytes <= min(max_part_bytes, max_file_bytes):
                 raise Endless(f"{max_bytes} bytes are asked for, more than a chunk has")
         url = file_url(self.url, name)
@@ -152,6 +157,9 @@ class Relayed:
         except OSError:
             raise
         except Exception as error:  # tensorstore raises what its status maps to
+            is_open = byte_range is not None and byte_range.stop is None and byte_range.start >= 0
+            if is_open and "OUT_OF_RANGE" in str(error):
+                raise HttpStatus(_UNSATISFIABLE, "the file ends before the range") from None
             raise OSError(one_line(error)) from None
 
     @functools.cached_property
@@ -165,21 +173,24 @@ def read_within(
     folder: Any, name: str, byte_range: slice | None, max_bytes: int, wait: Callable[[Any], Any]
 ) -> bytes | None:
     """Returns the content of a file in a key-value store of tensorstore, or a part of it; None if
-    there is no such file. Before a whole file is read, the byte after `max_bytes` is requested.
+    there is no such file. Before a whole file is read, or all from a byte on, the byte after
+    `max_bytes` is requested.
 
     Raises:
-        Endless: The file has more than `max_bytes` bytes.
+        Endless: There are more than `max_bytes` bytes.
         Exception: What `wait` raises, a function that returns a future's result.
     """
-    if byte_range is None:
+    start = 0 if byte_range is None else byte_range.start or 0
+    if byte_range is None or (byte_range.stop is None and start >= 0):
+        end = start + max_bytes
         try:
-            if wait(folder.read(name, byte_range=slice(max_bytes, max_bytes + 1))).state != "value":
+            if wait(folder.read(name, byte_range=slice(end, end + 1))).state != "value":
                 return None
         except Exception as error:
             if "OUT_OF_RANGE" not in str(error):
                 raise
         else:
-            raise Endless(f"the file is more than {max_bytes} bytes")
+            raise Endless(f"the file is more than {end} bytes")
     result = wait(folder.read(name, byte_range=byte_range))
     return bytes(result.value) if result.state == "value" else None
 
@@ -217,16 +228,17 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if path_match is None or not hmac.compare_digest(path_match[1], self.server.secret):
             self._respond(403)
             return
-        range_match = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
-        byte_range = None
-        if range_match is not None:
-            first, last = range_match.groups()
-            byte_range = slice(int(first), int(last) + 1) if first else slice(-int(last), None)
+        byte_range = _parse_range(self.headers.get("Range", ""))
+        if byte_range == _NO_BYTES:
+            self._respond(_UNSATISFIABLE)
+            return
         folder, name = self.server.folders[int(path_match[2])], path_match[3]
         content: bytes | None = None
         try:
             content = folder.read(name, byte_range)
             status = 404 if content is None else 200 if byte_range is None else 206
+            if status == 206 and not content:
+                status = _UNSATISFIABLE
         except Endless:
             status = 403
         except HttpStatus as error:
@@ -246,6 +258,21 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def log_message(self, *_: object) -> None:
         """Prints nothing."""
+
+
+def _parse_range(text: str) -> slice | None:
+    """Returns the bytes that a Range header asks for; None if it is to be ignored: if it is empty,
+    invalid, or asks for several ranges. Source: RFC 9110, HTTP Semantics, section 14.
+    """
+    match = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", text, re.ASCII)
+    if match is None or not any(match.groups()):
+        return None
+    first, last = match.groups()
+    if not first:
+        return slice(-int(last), None) if int(last) else _NO_BYTES
+    if not last:
+        return slice(int(first), None)
+    return slice(int(first), int(last) + 1) if int(first) <= int(last) else None
 
 
 @functools.cache
