@@ -373,7 +373,7 @@ def test_nobody_else_reads_by_the_relay(server, tmp_path):
     assert read_http(f"{spec['base_url']}a", 9) == b"mine"
     port = relay._server().server_port
     for path in ("", "0/a", "x/0/a", f"{relay._server().secret}/999999/a"):
-        with pytest.raises(OSError):
+        with pytest.raises(http.HttpStatus, match="403"):
             read_http(f"http://127.0.0.1:{port}/{path}", 9)
 
 

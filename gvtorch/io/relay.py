@@ -224,8 +224,11 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     disable_nagle_algorithm = True
 
     def do_GET(self) -> None:
-        path_match = re.fullmatch(r"/([\w-]+)/(\d+)/(.+)", self.path, re.ASCII)
+        path_match = re.fullmatch(r"/([\w-]+)/(\d{1,9})/(.+)", self.path, re.ASCII)
         if path_match is None or not hmac.compare_digest(path_match[1], self.server.secret):
+            self._respond(403)
+            return
+        if int(path_match[2]) >= len(self.server.folders):
             self._respond(403)
             return
         byte_range = _parse_range(self.headers.get("Range", ""))
