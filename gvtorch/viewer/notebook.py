@@ -23,23 +23,23 @@ _IMPORT = re.compile(r'from "\./([a-z]+\.js)"')
 #: Makes modules of the page's texts, and mounts it with the notebook's model as its transport.
 _LOADER = """
 const texts = %s;
-const made = {};
-const address = (name) => made[name] ??= URL.createObjectURL(new Blob(
-  [texts[name].replace(/from "\\.\\/([a-z]+\\.js)"/g, (_, other) => `from "${address(other)}"`)],
+const urls = {};
+const moduleUrl = (name) => urls[name] ??= URL.createObjectURL(new Blob(
+  [texts[name].replace(/from "\\.\\/([a-z]+\\.js)"/g, (_, other) => `from "${moduleUrl(other)}"`)],
   { type: "text/javascript" }));
 export default {
   async render({ model, el }) {
-    const { mount } = await import(address("app.js"));
+    const { mount } = await import(moduleUrl("app.js"));
     const root = document.createElement("div");
     root.className = "gv";
     root.style.height = `${model.get("height")}px`;
     el.append(root);
-    const connect = (take, gone) => {
+    const connect = (receive, onLost) => {
       model.on("msg:custom", (content, buffers) => {
-        if (content.gone) gone(content.gone);
-        else take(buffers.length ? buffers[0] : content.text);
+        if (content.gone) onLost(content.gone);
+        else receive(buffers.length ? buffers[0] : content.text);
       });
-      model.on("comm_live_update", () => gone("The notebook's kernel has ended."));
+      model.on("comm_live_update", () => onLost("The notebook's kernel has ended."));
       return (text) => model.send({ text });
     };
     mount(root, connect);
