@@ -10,7 +10,7 @@ from helpers import ROOT
 from helpers.browser import Tab
 from helpers.labels import cells
 from helpers.stores import noise
-from helpers.viewer import BANDS, Grown
+from helpers.viewer import BANDS, Grown, Page
 
 import gvtorch as gv
 from gvtorch.io.stores.conversion import convert
@@ -390,6 +390,35 @@ def test_views_become_the_keys_of_a_film(tab, viewer, tmp_path):
             tab.page.get_by_label("Load keys").click()
         chooser.value.set_files(tmp_path / file)
         tab.until(f"app.film.keys.length === {count}")
+
+
+def test_a_field_keeps_what_is_typed_while_the_view_changes(tab, viewer):
+    """The panel is rebuilt once the number is entered; a rebuild before would end the edit."""
+    for section in ("Film", "Sampling"):
+        tab.open(section)
+    tab.page.get_by_text("add this view").click()
+    seconds = tab.page.locator("input[title='Seconds']")
+    step = tab.page.locator("label.gv-row:has(> .gv-name:text-is('step')) input").last
+    other = Page(viewer.session)
+    tab.until("Object.keys(app.clients).length === 2")
+
+    def change(size: float) -> None:
+        shown = step.input_value()
+        other.send("change", state={"options": {"step": size}})
+        tab.until(f"app.state.options.step === {size}")
+        assert step.input_value() == shown
+
+    for typed, size in (("3.5", 0.6), ("4.5", 0.8)):
+        seconds.select_text()
+        change(size)
+        tab.page.keyboard.type(typed)
+        change(size + 0.125)
+        if typed == "3.5":
+            tab.page.keyboard.press("Enter")
+        else:
+            tab.page.locator(".gv-stage").focus()
+        tab.until(f"app.film.keys[0].time === {typed}")
+        tab.until(lambda size=size: step.input_value() == str(size + 0.125))
 
 
 def test_every_shader_becomes_every_other(tab):

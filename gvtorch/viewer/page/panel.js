@@ -17,6 +17,17 @@ export class Panel {
     this.labels = new LabelTable(app, this.controls);
     this.body = el("div.gv-sections");
     this.element = el("aside.gv-panel", {}, this.body);
+    this.outdated = false;  // whether the rows wait to be rebuilt
+    this.edited = null;  // the field with the focus, until its number or text is entered
+    const on = (name, handler, capture = false) => this.element.addEventListener(name, handler, capture);
+    const begin = ({ target }) => { this.edited = ["number", "text"].includes(target.type) ? target : null; };
+    const end = () => { this.edited = null; };
+    const catchUp = () => { if (this.outdated) this.show(); };
+    on("focusin", begin);
+    on("input", begin);
+    on("change", end, true);  // before the field's own handler, which may rebuild the rows
+    on("change", catchUp);
+    on("focusout", () => { end(); catchUp(); });
   }
 
   /** A new object of a class: fields of the present shader where they fit, else the page's defaults. */
@@ -53,8 +64,10 @@ export class Panel {
     return element;
   }
 
-  /** Rebuilds all rows from the state. */
+  /** Rebuilds all rows from the state; while one is edited, only after that, since the text would be lost. */
   show() {
+    this.outdated = !!this.edited?.isConnected;
+    if (this.outdated) return;
     const { app } = this, { state } = app, top = this.body.scrollTop;
     const change = (name) => (value, rest) => app.change({ [name]: value }, rest);
     const transfer = app.transfer();

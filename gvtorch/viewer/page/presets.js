@@ -21,7 +21,7 @@ export class Presets {
     this.app = app;
     this.builtIn = [];
     this.file = null;  // the last file with several functions: {name, names, text(name)}
-    this.name = el("input", { type: "text", placeholder: "name", maxLength: 60, onkeydown: (event) => { if (event.key === "Enter") this.save(); } });
+    this.name = el("input", { type: "text", placeholder: "name", maxLength: 60, onkeydown: (event) => { if (event.key === "Enter") this.enter(); } });
     this.target = el("select", { title: "Where these colours are saved" }, ...["save mine", "save file", "ParaView"].map((label) => el("option", {}, label)));
   }
 
@@ -97,6 +97,12 @@ export class Presets {
     if (!name) return app.notify("a name is needed", true);
     this.storeFunctions({ ...ownFunctions(), [name]: app.transfer() }, `${name} is saved in this browser`);
     this.name.value = "";
+  }
+
+  /** Saves them, and ends the edit of the name, so that the panel lists them. */
+  enter() {
+    this.save();
+    this.name.blur();
   }
 
   forget() {
