@@ -125,9 +125,11 @@ class ShadeParameters(NamedTuple):
 
     def pack(self, dtype: torch.dtype, device: torch.device) -> Tensor:
         """Returns (5, 4) numbers; raises ValueError as the function `pack` does."""
-        at = self._fields.index("own")
-        own = (*self.own, *(0.0,) * (_WIDTHS[at] - len(self.own)))
-        return pack((*self[:at], *own, *self[at + 1 :]), dtype, device).reshape(5, 4)
+        own_index = self._fields.index("own")
+        own_numbers = (*self.own, *(0.0,) * (_WIDTHS[own_index] - len(self.own)))
+        return pack(
+            (*self[:own_index], *own_numbers, *self[own_index + 1 :]), dtype, device
+        ).reshape(5, 4)
 
     def own_as(self, record: Callable[..., _Record]) -> _Record:
         """Returns the shader-specific numbers by name, as one of the records above."""
