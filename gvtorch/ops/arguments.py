@@ -39,7 +39,7 @@ class RayArguments(NamedTuple):
             None if rays.transmittance is None else rays.transmittance.double().contiguous(),
         )
 
-    def select(self, index: Tensor) -> "RayArguments":
+    def some(self, index: Tensor) -> "RayArguments":
         """Returns the rays at the indices `index` (k,) int64, without a transmittance."""
         origin, direction, cone, ranges = (column[index] for column in self[:4])
         return RayArguments(origin, direction, cone, ranges)

@@ -58,8 +58,8 @@ class Lit(Plain):
         for channel in (self.channel, *self.light.normals[:1], *self.others[:1]):
             numbers = channel.constant_nc
             same = same & (numbers[fine] == numbers[coarse]).all(1)
-        near = self.light.parameters.light_kind == LightKind.POINT and bool(self.light.normals)
-        return (same | (fine == coarse)) & (self.shadows is None) & (not near)
+        varies = self.light.parameters.light_kind == LightKind.POINT and bool(self.light.normals)
+        return (same | (fine == coarse)) & (self.shadows is None) & (not varies)
 
     def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
         self.lit(self.rgba(piece, probe), piece, probe, mask)
@@ -248,8 +248,8 @@ class Isosurface(Lit):
         if self.numbers.scale > 0:
             components = [probe.number(self.others[i], t) for i in range(4)]
             rgba = torch.stack(components, 1) * self.numbers.scale
-            known = (rgba[:, 3:] > 0) & (self.numbers.premultiplied > 0)
-            return rgba[:, :3] / torch.where(known, rgba[:, 3:], 1.0)
+            has_opacity = (rgba[:, 3:] > 0) & (self.numbers.premultiplied > 0)
+            return rgba[:, :3] / torch.where(has_opacity, rgba[:, 3:], 1.0)
         if self.others:
             return self.transfer.look_up(probe.number(self.others[self.other_component], t))[:, :3]
         return self.transfer.look_up(self.level.expand_as(t))[:, :3]

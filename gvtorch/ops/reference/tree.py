@@ -198,8 +198,8 @@ class ChannelBricks:
             return ()
         if constants is None:  # a coarse channel, whose constants are never used
             constants = bricks.new_zeros((1, len(self.constant_nc), bricks.shape[4]))
-        other = replace(self, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
-        return tuple(replace(other, component=c) for c in range(bricks.shape[4]))
+        other_bricks = replace(self, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
+        return tuple(replace(other_bricks, component=c) for c in range(bricks.shape[4]))
 
     def value_range(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         """Returns (r,) smallest and largest values in reach of bricks of the nodes and below."""
