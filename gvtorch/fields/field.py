@@ -154,6 +154,13 @@ def length(vectors: Tensor) -> Tensor:
     return torch.linalg.vector_norm(vectors, dim=-1)
 
 
+def box_distance(beyond: Tensor) -> Tensor:
+    """Returns (...,) signed distances to a box, from how far points are beyond its faces along each
+    axis, (..., c); below 0 inside.
+    """
+    return length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0)
+
+
 def tighter(first: Interval, second: Interval) -> Interval:
     """Returns the intersection of two intervals of the same values."""
     return torch.maximum(first[0], second[0]), torch.minimum(first[1], second[1])

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..base import check
 from .distance import WHITE, Color, Distance
-from .field import Interval, length
+from .field import Interval, box_distance, length
 
 
 class Sphere(Distance):
@@ -51,7 +51,7 @@ class Box(Distance):
 
     def forward(self, points: Tensor) -> Tensor:
         beyond = points.abs() - (self.size / 2 - self.round).to(points)
-        return length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0) - self.round
+        return box_distance(beyond) - self.round
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Returns the values at the nearest and the farthest point of the box: exact, because the
@@ -177,8 +177,7 @@ class Menger(Distance):
         self.levels = check.whole("Menger", "levels", levels, low=0, high=30)
 
     def forward(self, points: Tensor) -> Tensor:
-        beyond = points.abs() - 0.5
-        distance = length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0)
+        distance = box_distance(points.abs() - 0.5)
         cell = 1.0
         for _ in range(self.levels):
             # Distances from the cell's centre along each axis; cells meet at odd halves.

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..base import check
 from .distance import Changed, Distance, grown
-from .field import Interval, length, tighter
+from .field import Interval, box_distance, length, tighter
 
 Matrix = Sequence[Sequence[float]]
 
@@ -296,7 +296,7 @@ class Extrusion(Space):
     def _with_caps(self, value: Tensor, plane_distance: Tensor) -> Tensor:
         """Combines a 2D distance (`value`) with the distance from the plane (`plane_distance`)."""
         beyond = torch.stack((value, plane_distance - self.height / 2), -1)
-        return length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0)
+        return box_distance(beyond)
 
 
 class Revolution(Space):
