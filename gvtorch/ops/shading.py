@@ -37,6 +37,11 @@ SHADER_KINDS = (
 )
 
 
+#: Filtered colours hold the moments of normals that no light reaches divided by this, and shaders
+#: multiply the moments' trace by it; as `kFaint` in csrc/shaders/light.h.
+FAINT = 32
+
+
 def shader_number(kind: str) -> int:
     """Returns the number of a fused shader; raises ValueError if there is none of this name."""
     check.one_of("shader", "kind", kind, SHADER_KINDS)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..shading import LightKind, ShadeParameters
+from ..shading import FAINT, LightKind, ShadeParameters
 from .exact import clamp, divide, dot, larger, power, smaller, sqrt_exact, unit
 from .march import Piece, Plain, Probe, Visitor, Walk
 from .rays import INF, Intervals, split
@@ -23,8 +23,6 @@ from .tree import ChannelBricks
 #: Factors from one octave of scattering to the next, of its light and of its directedness; fitted
 #: to path traced clouds (benchmarks/cloud_light.py).
 OCTAVE_LIGHT, OCTAVE_DIRECTION = 0.55, 0.6
-#: Largest factor by which moments of normals are reduced where no light comes: see `coarse_colors`.
-FAINT = 32
 
 
 @dataclass
