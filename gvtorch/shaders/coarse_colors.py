@@ -17,12 +17,12 @@ from torch import Tensor
 
 from ..base.stage import Progress
 from ..base.volume import Volume, movable
+from ..ops.shading import FAINT as _FAINT
 from .shader import ColorTable
 
 _TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # finest voxels that are processed at a time
 _LEAST = 0.001  # weight of a column that no light reaches
 _HIDDEN = 0.5  # a voxel with less than this share of its neighbours' light is hidden
-_FAINT = 32  # divides the moments of normals that no light reaches; as in csrc/shaders/light.h
 _DIRECTIONS = 6
 #: Numbers of a voxel seen along one direction: premultiplied colour and alpha; then, for lit
 #: matter, the mean products xx xy xz yy yz zz of the components of its normals, premultiplied.
