@@ -64,7 +64,7 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_a_volume_that_the_device_reads_in_place_is_recorded(backend, monkeypatch):
-    monkeypatch.setattr(staging, "_SMALL", 100_000)  # bytes: the voxels are more
+    monkeypatch.setattr(staging, "_MAX_COPIED_BYTES", 100_000)  # bytes: the voxels are more
     values = torch.rand((48, 52, 44, 2), generator=torch.Generator().manual_seed(2))
     volume = gv.Volume(values, (1, 1.5, 1), (-20, 3, 4))
     tree = gv.N3Tree.from_volume(volume, device=DEVICES[backend])
@@ -458,7 +458,7 @@ def winding(number: int) -> gv.Camera:
     "scene, look_ahead", [("store", 0), ("store", 12), ("mapped", 0), ("formula", 6)]
 )
 def test_a_long_flight_does_not_wait(blobs, tmp_path, scene, look_ahead, backend, monkeypatch):
-    monkeypatch.setattr(staging, "_SMALL", 100_000)  # bytes: the voxels are more
+    monkeypatch.setattr(staging, "_MAX_COPIED_BYTES", 100_000)  # bytes: the voxels are more
     device, options = DEVICES[backend], {"brick_pool": "12 MB"}
     if scene == "store":
         producer = on_the_host(blobs, tmp_path / "store", "store")
@@ -548,7 +548,7 @@ def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
 @pytest.mark.backend("cuda")
 def test_garbage_of_other_engines_does_not_end_a_recording(blobs, monkeypatch):
     """Page-locked memory of garbage is freed by whichever thread runs the garbage collector."""
-    monkeypatch.setattr(staging, "_SMALL", 0)
+    monkeypatch.setattr(staging, "_MAX_COPIED_BYTES", 0)
     garbage: list[Any] = [staging.mapped(torch.zeros(1 << 20), torch.device("cuda"))]
     garbage.append(garbage)
     held, sort, thresholds = [garbage], Cache.sort_by_use, gc.get_threshold()

@@ -119,7 +119,7 @@ def test_ranges_of_nvtx_have_the_stages_names(blobs, monkeypatch):
     monkeypatch.setattr(torch.cuda.nvtx, "range", named)
     with stage("quiet"):
         assert told == []
-    monkeypatch.setattr(stages, "_RANGES", True)
+    monkeypatch.setattr(stages, "_NVTX_ENABLED", True)
     gv.render(
         gv.N3Tree.from_volume(blobs),
         gv.Camera.orbit(width=4, height=4),

@@ -20,8 +20,15 @@ from .units import spacing_of
 from .volume import Volume, check_extent
 
 #: Attributes by which NetCDF and HDF5 files specify how stored numbers map to values.
-_PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned", "valid_range")
-_OFFERS = ("__array__", "__array_interface__", "__dlpack__")
+_PACKING_ATTRIBUTES = (
+    "scale_factor",
+    "add_offset",
+    "_FillValue",
+    "missing_value",
+    "_Unsigned",
+    "valid_range",
+)
+_ARRAY_PROTOCOLS = ("__array__", "__array_interface__", "__dlpack__")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,54 +63,55 @@ class ArrayLike:
         return np.asarray(self.data[index])
 
     @classmethod
-    def of(cls, where: str, given: Any, axes: str | None = None) -> ArrayLike:
+    def of(cls, context: str, array: Any, axes: str | None = None) -> ArrayLike:
         """Returns the description of an array, reading its values only if necessary. `axes` has a
         letter for each axis, for arrays whose axes have no meaningful names.
 
         Raises:
             ValueError: It is not an array of real numbers, or `axes` is needed, or does not fit.
         """
-        where = f"{where} ({type(given).__name__})"
-        if hasattr(given, "data_vars"):
-            held = ", ".join(map(str, given.data_vars))
-            raise ValueError(f"{where}: is a set of arrays, take one of them: {held}")
-        if not hasattr(given, "shape") or not hasattr(given, "dtype"):
-            given = _plain(where, given)
-        if isinstance(given, np.ma.MaskedArray):
-            given = _filled(where, given)
-        elif isinstance(getattr(given, "_meta", None), np.ma.MaskedArray):
-            raise ValueError(f"{where}: its parts are masked arrays: fill them first")
-        shape = tuple(int(n) for n in given.shape)
-        dtype = np.dtype(str(given.dtype)) if not isinstance(given.dtype, np.dtype) else given.dtype
+        context = f"{context} ({type(array).__name__})"
+        if hasattr(array, "data_vars"):
+            variables = ", ".join(map(str, array.data_vars))
+            raise ValueError(f"{context}: is a set of arrays, take one of them: {variables}")
+        if not hasattr(array, "shape") or not hasattr(array, "dtype"):
+            array = _as_numpy(context, array)
+        if isinstance(array, np.ma.MaskedArray):
+            array = _fill_masked(context, array)
+        elif isinstance(getattr(array, "_meta", None), np.ma.MaskedArray):
+            raise ValueError(f"{context}: its parts are masked arrays: fill them first")
+        shape = tuple(int(n) for n in array.shape)
+        dtype = np.dtype(str(array.dtype)) if not isinstance(array.dtype, np.dtype) else array.dtype
         if dtype.kind not in "biuf":
-            raise ValueError(f"{where}: data must hold real numbers, got dtype {dtype}")
-        names, steps, units, lost = _described(given, len(shape))
-        letters = None if axes else named_axes(names, shape)
-        letters = letters or ask_axes(where, shape, axes)
-        place, moments = place_named(letters, shape, steps, units)
-        attrs = _attributes(given)
-        packed = [n for n in _PACKED if n in attrs and np.any(attrs[n] == attrs[n])]  # no NaN
-        if packed:
-            lost = [*lost, f"{', '.join(packed)}: values are taken as they are stored"]
+            raise ValueError(f"{context}: data must hold real numbers, got dtype {dtype}")
+        names, steps, units, lost = _axis_metadata(array, len(shape))
+        axis_letters = None if axes else named_axes(names, shape)
+        axis_letters = axis_letters or ask_axes(context, shape, axes)
+        placement, info_fields = place_named(axis_letters, shape, steps, units)
+        attrs = _attributes(array)
+        # A NaN differs from itself: it packs nothing.
+        packing = [n for n in _PACKING_ATTRIBUTES if n in attrs and np.any(attrs[n] == attrs[n])]
+        if packing:
+            lost = [*lost, f"{', '.join(packing)}: values are taken as they are stored"]
         sizes = np.ravel(attrs.get("spacing", attrs.get("element_size_um", ()))).tolist()
         if not any(steps) and len(sizes) >= 3 and all(isinstance(n, (int, float)) for n in sizes):
             unit = "um" if "element_size_um" in attrs else str(attrs.get("unit", ""))
-            place["spacing"], moments["unit"] = spacing_of(sizes[-3:][::-1], [unit] * 3)
-        width = shape[letters.index("c")] if "c" in letters else 1
+            placement["spacing"], info_fields["unit"] = spacing_of(sizes[-3:][::-1], [unit] * 3)
+        width = shape[axis_letters.index("c")] if "c" in axis_letters else 1
         return cls(
-            data=given,
+            data=array,
             shape=shape,
-            axes=letters,
+            axes=axis_letters,
             dtype=dtype.str,
-            lazy=_is_lazy(given),
-            name=str(getattr(given, "name", None) or "") if hasattr(given, "coords") else "",
+            lazy=_is_lazy(array),
+            name=str(getattr(array, "name", None) or "") if hasattr(array, "coords") else "",
             info=ImageInfo(
-                channels=_channels(given, letters, width),
+                channels=_channel_infos(array, axis_letters, width),
                 quantity=str(attrs["units"]) if isinstance(attrs.get("units"), str) else None,
-                **moments,
+                **info_fields,
             ),
             lost=tuple(lost),
-            **place,
+            **placement,
         )
 
 
@@ -138,100 +146,100 @@ def as_volume(
     if isinstance(given, Volume):
         return given
     if isinstance(given, Tensor):
-        letters = ask_axes(where, given.shape, axes)
-        if letters in ("zyx", "zyxc"):  # not by way of NumPy, which lacks bfloat16
+        axis_letters = ask_axes(where, given.shape, axes)
+        if axis_letters in ("zyx", "zyxc"):  # not by way of NumPy, which lacks bfloat16
             return Volume(given, spacing or (1, 1, 1), origin or (0, 0, 0), nan=nan)
-        found = ArrayLike.of(where, given.detach().cpu().numpy(), letters)
+        array = ArrayLike.of(where, given.detach().cpu().numpy(), axis_letters)
     else:
-        found = ArrayLike.of(where, given, axes)
-    times = found.shape[found.axes.index("t")] if "t" in found.axes else 1
-    check_extent(where, [n for n, a in zip(found.shape, found.axes, strict=True) if a != "t"])
+        array = ArrayLike.of(where, given, axes)
+    times = array.shape[array.axes.index("t")] if "t" in array.axes else 1
+    check_extent(where, [n for n, a in zip(array.shape, array.axes, strict=True) if a != "t"])
     if time is None and times > 1:
         warnings.warn(
             f"{where}: has {times} time points, this is the first; time=N takes another, up to "
             f"{times - 1}",
             stacklevel=2,
         )
-    at = check.whole(where, "time", time or 0, low=0, high=max(times - 1, 0))
-    if found.lost:
-        warnings.warn(f"{where}: not kept: {'; '.join(found.lost)}", stacklevel=2)
+    time_index = check.whole(where, "time", time or 0, low=0, high=max(times - 1, 0))
+    if array.lost:
+        warnings.warn(f"{where}: not kept: {'; '.join(array.lost)}", stacklevel=2)
     return Volume(
-        found.grid(at),
-        found.spacing if spacing is None else spacing,
-        found.origin if origin is None else origin,
-        name=found.name or "volume",
+        array.grid(time_index),
+        array.spacing if spacing is None else spacing,
+        array.origin if origin is None else origin,
+        name=array.name or "volume",
         nan=nan,
-        info=found.info,
+        info=array.info,
     )
 
 
-def _plain(where: str, given: Any) -> np.ndarray:
+def _as_numpy(context: str, value: Any) -> np.ndarray:
     """Returns the NumPy array of an object that offers one."""
-    if not any(hasattr(given, name) for name in _OFFERS):
-        raise ValueError(f"{where}: expected a volume or an array")
+    if not any(hasattr(value, name) for name in _ARRAY_PROTOCOLS):
+        raise ValueError(f"{context}: expected a volume or an array")
     try:
-        return np.asarray(given)
+        return np.asarray(value)
     except Exception as error:
-        raise ValueError(f"{where}: gives no array: {error}") from None
+        raise ValueError(f"{context}: gives no array: {error}") from None
 
 
-def _filled(where: str, given: np.ma.MaskedArray) -> np.ndarray:
+def _fill_masked(context: str, array: np.ma.MaskedArray) -> np.ndarray:
     """Returns the array with NaN where it is masked; integers become float32 if anything is."""
-    data, gaps = np.asarray(given.data), np.ma.getmaskarray(given)
+    data, gaps = np.asarray(array.data), np.ma.getmaskarray(array)
     if not gaps.any() or data.dtype.kind not in "biuf":
         return data
     if data.dtype.kind != "f":
-        check_narrowed(where, data[~gaps])
+        check_narrowed(context, data[~gaps])
         data = data.astype(np.float32)
     return np.where(gaps, data.dtype.type(np.nan), data)
 
 
-def _is_lazy(given: Any) -> bool:
-    variable = getattr(given, "variable", None)
+def _is_lazy(array: Any) -> bool:
+    variable = getattr(array, "variable", None)
     if variable is not None:
         return not getattr(variable, "_in_memory", True)
-    return not isinstance(given, np.ndarray) and not any(
-        hasattr(given, name) for name in ("__array_interface__", "__dlpack__")
+    return not isinstance(array, np.ndarray) and not any(
+        hasattr(array, name) for name in ("__array_interface__", "__dlpack__")
     )
 
 
-def _attributes(given: Any) -> dict[str, Any]:
-    attrs = getattr(given, "attrs", None)
+def _attributes(array: Any) -> dict[str, Any]:
+    attrs = getattr(array, "attrs", None)
     return dict(attrs) if attrs is not None and hasattr(attrs, "keys") else {}
 
 
-def _described(
-    given: Any, rank: int
+def _axis_metadata(
+    array: Any, rank: int
 ) -> tuple[list[str], list[tuple[float, float] | None], list[str | None], list[str]]:
     """Returns each axis's name, coordinates (step and first) and unit, and notes on losses."""
-    metadata = getattr(given, "metadata", None)  # zarr arrays have it
-    dims: Any = getattr(given, "dims", None) or getattr(metadata, "dimension_names", None) or ()
+    metadata = getattr(array, "metadata", None)  # zarr arrays have it
+    dims: Any = getattr(array, "dims", None) or getattr(metadata, "dimension_names", None) or ()
     names = [str(name or "") for name in dims]
     if len(names) != rank or any("<" in name for name in names):  # h5py's dims are objects
         names = [""] * rank
     steps: list[tuple[float, float] | None] = [None] * rank
     units: list[str | None] = [None] * rank
     lost = []
-    coords = getattr(given, "coords", {})
-    for at, name in enumerate(names):
+    coords = getattr(array, "coords", {})
+    for axis, name in enumerate(names):
         if name and name in coords:
-            places = coords[name]
-            values = np.asarray(places.values)
-            steps[at], even = even_steps(values)
-            units[at] = str(places.attrs.get("units", "")) or None
+            coordinate = coords[name]
+            values = np.asarray(coordinate.values)
+            steps[axis], even = even_steps(values)
+            units[axis] = str(coordinate.attrs.get("units", "")) or None
             if not even:
                 lost.append(f"that coordinates along {name} are not evenly spaced")
     return names, steps, units, lost
 
 
-def _channels(given: Any, letters: str, width: int) -> tuple[ChannelInfo, ...]:
+def _channel_infos(array: Any, axis_letters: str, width: int) -> tuple[ChannelInfo, ...]:
     """Returns the names of channels: the coordinates of the axis c, if they are text."""
-    if "c" not in letters or not hasattr(given, "coords"):
+    if "c" not in axis_letters or not hasattr(array, "coords"):
         return ()
-    name = given.dims[letters.index("c")]
-    if name not in given.coords:
+    name = array.dims[axis_letters.index("c")]
+    if name not in array.coords:
         return ()
-    words = np.asarray(given.coords[name].values)
-    if words.dtype.kind not in "UOT" or words.shape != (width,):
+    channel_names = np.asarray(array.coords[name].values)
+    if channel_names.dtype.kind not in "UOT" or channel_names.shape != (width,):
         return ()
-    return tuple(ChannelInfo(name=str(word)) for word in words)
+    return tuple(ChannelInfo(name=str(channel_name)) for channel_name in channel_names)

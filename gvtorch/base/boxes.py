@@ -28,10 +28,10 @@ def clamped_box(low: Zyx, high: Zyx, shape: Zyx) -> tuple[list[int], list[int]]:
 
 def repeat_edges(data: np.ndarray, start: Zyx, low: Zyx, high: Zyx) -> np.ndarray:
     """Returns (z, y, x, c) voxels that begin at `start`, extended to a box by edge voxels."""
-    for axis, (at, a, b) in enumerate(zip(start, low, high, strict=True)):
+    for axis, (first, a, b) in enumerate(zip(start, low, high, strict=True)):
         size = data.shape[axis]
-        if (at, at + size) != (a, b):
-            data = data.take(np.arange(a - at, b - at).clip(0, size - 1), axis)
+        if (first, first + size) != (a, b):
+            data = data.take(np.arange(a - first, b - first).clip(0, size - 1), axis)
     return data
 
 
@@ -39,31 +39,31 @@ def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
     """Returns an array whose axes are `axes` transposed to `order`, which holds all of them; axes
     that the array lacks get size 1. Axes -, of size 1, are dropped.
     """
-    data = data.squeeze(tuple(at for at, axis in enumerate(axes) if axis == "-"))
+    data = data.squeeze(tuple(i for i, axis in enumerate(axes) if axis == "-"))
     axes = axes.replace("-", "")
     missing = "".join(axis for axis in order if axis not in axes)
-    letters = missing + axes
-    return data[(None,) * len(missing)].transpose([letters.index(axis) for axis in order])
+    all_axes = missing + axes
+    return data[(None,) * len(missing)].transpose([all_axes.index(axis) for axis in order])
 
 
-def rows_by_place(places: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+def rows_by_place(positions: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns the distinct places (m, n) of (k, n), sorted, and the row indices of each."""
-    order = np.lexsort(places.T[::-1])
-    places = places[order]
-    others = np.flatnonzero((places[1:] != places[:-1]).any(1)) + 1
-    first = np.append(0, others)[: len(order)]
-    return places[first], np.split(order, others)[: len(order)]
+    order = np.lexsort(positions.T[::-1])
+    positions = positions[order]
+    later_starts = np.flatnonzero((positions[1:] != positions[:-1]).any(1)) + 1
+    starts = np.append(0, later_starts)[: len(order)]
+    return positions[starts], np.split(order, later_starts)[: len(order)]
 
 
 def extent_in(
-    where: str, extent: int | Sequence[int], box: Sequence[Sequence[float]]
+    context: str, extent: int | Sequence[int], box: Sequence[Sequence[float]]
 ) -> Sequence[int]:
     """Returns an extent (x, y, z) as it is. A single number is the extent along the box's longest
     side; the others are chosen so that voxels are cubes, or nearly so.
     """
     if not isinstance(extent, int):
         return extent
-    low, high = check.box(where, box)
-    check.whole(where, "extent", extent, low=1, high=2**40)
+    low, high = check.box(context, box)
+    check.whole(context, "extent", extent, low=1, high=2**40)
     sides = [b - a for a, b in zip(low, high, strict=True)]
     return [max(1, round(extent * side / max(sides))) for side in sides]

@@ -45,7 +45,7 @@ def brief(record: Any) -> str:
 def shown(value: Any) -> str:
     """Returns a value as text; for a tensor or array only its shape and dtype."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key}: {shown(one)}" for key, one in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {shown(item)}" for key, item in value.items()) + "}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
     return repr(value)
@@ -59,7 +59,7 @@ def given(value: Any) -> str:
 
 
 def tensor(
-    where: str,
+    context: str,
     name: str,
     value: Any,
     shape: Sequence[int | str],
@@ -75,20 +75,20 @@ def tensor(
         if all(isinstance(expected, str) or expected == size for expected, size in pairs):
             return
     wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
-    kind = str(dtype).removeprefix("torch.")
+    dtype_name = str(dtype).removeprefix("torch.")
     raise ValueError(
-        f"{where}: {name} must be ({wanted}) {kind} on {device}, got {describe(value)}"
+        f"{context}: {name} must be ({wanted}) {dtype_name} on {device}, got {describe(value)}"
     )
 
 
-_DIGITS = {str(digit): digit for digit in range(10)}
+_DIGIT_SIZES = {str(digit): digit for digit in range(10)}
 #: Name, tensor, shape (a letter or digit per dimension) and dtype of a tensor to check, as in
 #: ("origin_r3", origin_r3, "r3", float64).
 Field = tuple[str, Tensor, str, torch.dtype]
 
 
 def tensors(
-    where: str,
+    context: str,
     device: torch.device,
     fields: Iterable[Field],
     sizes: Mapping[str, int] | None = None,
@@ -99,24 +99,25 @@ def tensors(
     Raises:
         ValueError: A tensor is not contiguous or not of its shape, dtype and device.
     """
-    known = {**_DIGITS, **(sizes or {})}
+    size_by_letter = {**_DIGIT_SIZES, **(sizes or {})}
     for name, value, shape, dtype in fields:
-        before = len(known)
+        count_before = len(size_by_letter)
         fits = isinstance(value, Tensor) and value.dtype == dtype and value.device == device
         if fits and value.dim() == len(shape):
             for letter, size in zip(shape, value.shape, strict=True):
-                if known.setdefault(letter, size) != size:
+                if size_by_letter.setdefault(letter, size) != size:
                     break
             else:
                 if value.is_contiguous():
                     continue
-                raise ValueError(f"{where}: {name} must be contiguous")
-        told = dict(itertools.islice(known.items(), before))  # from the fields before this one
-        expected = [told.get(letter, letter) for letter in shape]
+                raise ValueError(f"{context}: {name} must be contiguous")
+        # Those from the fields before this one.
+        earlier_sizes = dict(itertools.islice(size_by_letter.items(), count_before))
+        expected = [earlier_sizes.get(letter, letter) for letter in shape]
         # Raises, unless the only fault is a letter that has two sizes within this field.
-        tensor(where, name, value, expected, dtype, device)
-        raise ValueError(f"{where}: {name} must be ({', '.join(shape)}), got {describe(value)}")
-    return known
+        tensor(context, name, value, expected, dtype, device)
+        raise ValueError(f"{context}: {name} must be ({', '.join(shape)}), got {describe(value)}")
+    return size_by_letter
 
 
 @functools.cache
@@ -127,55 +128,55 @@ def shape_of(name: str) -> str:
     return name.rpartition("_")[2].replace("bzyx", "bsss")
 
 
-def instance(where: str, name: str, value: Any, *kinds: type[Kind]) -> Kind:
+def instance(context: str, name: str, value: Any, *kinds: type[Kind]) -> Kind:
     """Returns `value`; raises ValueError unless it is an instance of one of the classes."""
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in kinds)
-        raise ValueError(f"{where}: {name} must be a {wanted}, got {type(value).__name__}")
+        raise ValueError(f"{context}: {name} must be a {wanted}, got {type(value).__name__}")
     return value
 
 
-def text(where: str, name: str, value: Any) -> str | None:
+def text(context: str, name: str, value: Any) -> str | None:
     """Returns `value`; ValueError unless it is a str or None (`==` and `or` fail on arrays)."""
-    return None if value is None else instance(where, name, value, str)
+    return None if value is None else instance(context, name, value, str)
 
 
-def one_of(where: str, name: str, value: Any, known: Iterable[Any]) -> None:
+def one_of(context: str, name: str, value: Any, allowed: Iterable[Any]) -> None:
     """Raises ValueError, which lists the known values, unless `value` is one of them."""
-    choices = [*known]
+    choices = [*allowed]
     if value not in choices:
-        *most, last = map(repr, choices or [None])
-        told = f"{', '.join(most)} or {last}" if most else last
-        raise ValueError(f"{where}: {name} must be {told}, got {value!r}")
+        *others, last = map(repr, choices or [None])
+        listing = f"{', '.join(others)} or {last}" if others else last
+        raise ValueError(f"{context}: {name} must be {listing}, got {value!r}")
 
 
-def known(where: str, options: Mapping[str, Any], kind: type) -> None:
+def known(context: str, options: Mapping[str, Any], typed_dict: type) -> None:
     """Raises ValueError unless all options are keys of a `TypedDict`."""
-    names = kind.__annotations__
+    names = typed_dict.__annotations__
     unknown = sorted(set(options) - set(names))
     if unknown:
-        raise ValueError(f"{where}: unknown option {unknown[0]!r}; known: {', '.join(names)}")
+        raise ValueError(f"{context}: unknown option {unknown[0]!r}; known: {', '.join(names)}")
 
 
-def no_gradient(where: str, name: str, value: Any) -> None:
+def no_gradient(context: str, name: str, value: Any) -> None:
     """Raises RuntimeError if a tensor requires gradients that autograd records but would lose.
 
     Works alike in eager, scripted, compiled and exported programs: ops/registry.py calls it for the
     arguments of ops, other modules call it where values leave torch.
     """
     if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
-        raise lost_gradient(where, name)
+        raise lost_gradient(context, name)
 
 
-def lost_gradient(where: str, name: str) -> RuntimeError:
+def lost_gradient(context: str, name: str) -> RuntimeError:
     """Returns the error for a gradient that would be lost."""
     return RuntimeError(
-        f"{where}: gradients by {name} would be lost: only gv.ModuleShader gives gradients, by its "
-        "parameters and by bricks that require them; else take detach() or torch.no_grad()"
+        f"{context}: gradients by {name} would be lost: only gv.ModuleShader gives gradients, by "
+        "its parameters and by bricks that require them; else take detach() or torch.no_grad()"
     )
 
 
-def images(where: str, name: str, value: Any, channels: int, *, batch: bool = True) -> None:
+def images(context: str, name: str, value: Any, channels: int, *, batch: bool = True) -> None:
     """Raises ValueError unless `value` is a non-empty float picture (h, w, channels) or, if `batch`
     is true, several (n, h, w, channels).
     """
@@ -188,27 +189,29 @@ def images(where: str, name: str, value: Any, channels: int, *, batch: bool = Tr
     ):
         return
     wanted = f"(h, w, {channels})" + (f" or (n, h, w, {channels})" if batch else "")
-    raise ValueError(f"{where}: {name} must be {wanted} floats, got {describe(value)}")
+    raise ValueError(f"{context}: {name} must be {wanted} floats, got {describe(value)}")
 
 
-def device(where: str, value: Any) -> torch.device:
+def device(context: str, value: Any) -> torch.device:
     """Returns a device, CUDA always with an index (as in `tensor.device`); ValueError if absent."""
     try:
-        found = torch.device(value)
+        parsed = torch.device(value)
     except (RuntimeError, TypeError):
-        raise ValueError(f"{where}: device must name a device, got {value!r}") from None
-    if found.type != "cuda":
-        return found
+        raise ValueError(f"{context}: device must name a device, got {value!r}") from None
+    if parsed.type != "cuda":
+        return parsed
     if not torch.cuda.is_available():
-        raise ValueError(f"{where}: device 'cuda' can't be used here: torch sees no CUDA device")
-    index = torch.cuda.current_device() if found.index is None else found.index
+        raise ValueError(f"{context}: device 'cuda' can't be used here: torch sees no CUDA device")
+    index = torch.cuda.current_device() if parsed.index is None else parsed.index
     count = torch.cuda.device_count()
     if index >= count:
-        raise ValueError(f"{where}: device {found} can't be used here: torch sees {count} of them")
+        raise ValueError(
+            f"{context}: device {parsed} can't be used here: torch sees {count} of them"
+        )
     return torch.device("cuda", index)
 
 
-def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:
+def memory(context: str, label: str, nbytes: int, device: torch.device) -> None:
     """Raises ValueError if something takes more memory than the device has in all."""
     if device.type == "cuda":
         total = torch.cuda.get_device_properties(device).total_memory
@@ -216,38 +219,39 @@ def memory(where: str, what: str, nbytes: int, device: torch.device) -> None:
         total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if nbytes > total:
         raise ValueError(
-            f"{where}: {what} takes {nbytes / 2**30:.1f} GiB, {device} has {total / 2**30:.1f} GiB"
+            f"{context}: {label} takes {nbytes / 2**30:.1f} GiB, "
+            f"{device} has {total / 2**30:.1f} GiB"
         )
 
 
-_LEAST = 1e-60  # smallest allowed size: ratios and squares neither overflow nor become 0
-_MOST_VOXELS_AWAY = 2.0**50  # from the world's origin: positions are exact to 1/8 voxel there
-_MOST_JSON = 1 << 26  # bytes of a user's file
-_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
-_UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
+_MIN_SIZE = 1e-60  # smallest allowed size: ratios and squares neither overflow nor become 0
+_MAX_ORIGIN_VOXELS = 2.0**50  # from the world's origin: positions are exact to 1/8 voxel there
+_MAX_JSON_BYTES = 1 << 26  # bytes of a user's file
+_BYTE_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+_BYTE_UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
 
 
-def nbytes(where: str, name: str, value: Any) -> int:
+def nbytes(context: str, name: str, value: Any) -> int:
     """Returns bytes from a number, "8 MB" (10^6) or "8 MiB" (2^20); ValueError otherwise."""
     if isinstance(value, str):
         match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", value)
-        unit = _UNITS.get(match[2].upper()) if match else None
+        unit = _BYTE_UNITS.get(match[2].upper()) if match else None
         if match is None or unit is None:
-            raise ValueError(f'{where}: {name} must be bytes, as in "256 MB", got {given(value)}')
+            raise ValueError(f'{context}: {name} must be bytes, as in "256 MB", got {given(value)}')
         value = int(float(match[1]) * unit)
-    return whole(where, name, value, low=1, high=2**62)
+    return whole(context, name, value, low=1, high=2**62)
 
 
-def words(where: str, name: str, value: Tensor, low: int, high: int) -> None:
+def words(context: str, name: str, value: Tensor, low: int, high: int) -> None:
     """Raises ValueError unless all integers of a tensor are in [low, high]."""
-    ends = (int(value.amin()), int(value.amax())) if value.numel() else ()
-    bad = next((end for end in ends if not low <= end <= high), None)
+    extremes = (int(value.amin()), int(value.amax())) if value.numel() else ()
+    bad = next((extreme for extreme in extremes if not low <= extreme <= high), None)
     if bad is not None:
-        raise ValueError(f"{where}: {name} holds {bad}, must be {low} to {high}")
+        raise ValueError(f"{context}: {name} holds {bad}, must be {low} to {high}")
 
 
 def number(
-    where: str,
+    context: str,
     name: str,
     value: Any,
     *,
@@ -256,108 +260,112 @@ def number(
     open_low: bool = False,
 ) -> float:
     """Returns `value` as a float; ValueError unless finite and in [low, high] (or (low, high])."""
-    no_gradient(where, name, value)
+    no_gradient(context, name, value)
     try:
         result = float(value)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{where}: {name} must be a number, got {given(value)}") from None
+        raise ValueError(f"{context}: {name} must be a number, got {given(value)}") from None
     inside = low < result <= high if open_low else low <= result <= high
     if not (math.isfinite(result) and inside):
         lower = f" and {'>' if open_low else '>='} {low:g}" if low > -math.inf else ""
         upper = f" and <= {high:g}" if high < math.inf else ""
-        raise ValueError(f"{where}: {name} must be finite{lower}{upper}, got {given(value)}")
+        raise ValueError(f"{context}: {name} must be finite{lower}{upper}, got {given(value)}")
     return result
 
 
-def whole(where: str, name: str, value: Any, *, low: int, high: int = sys.maxsize) -> int:
+def whole(context: str, name: str, value: Any, *, low: int, high: int = sys.maxsize) -> int:
     """Returns `value` as an int; raises ValueError unless it is a whole number in [low, high]."""
     try:
-        plain = operator.index(value)
+        integer = operator.index(value)
     except (TypeError, RuntimeError):  # from tensors and arrays
-        plain = None
-    if isinstance(value, bool) or plain is None or not low <= plain <= high:
+        integer = None
+    if isinstance(value, bool) or integer is None or not low <= integer <= high:
         upper = f" and <= {high}" if high < sys.maxsize else ""
-        raise ValueError(f"{where}: {name} must be an int >= {low}{upper}, got {given(value)}")
-    return plain
+        raise ValueError(f"{context}: {name} must be an int >= {low}{upper}, got {given(value)}")
+    return integer
 
 
-def halves(where: str, branching: Any, what: str) -> None:
-    """Raises ValueError unless N is 2, as `what` requires: its levels halve the resolution."""
+def halves(context: str, branching: Any, feature: str) -> None:
+    """Raises ValueError unless N is 2, as `feature` requires: its levels halve the resolution."""
     if branching != 2:
-        raise ValueError(f"{where}: branching must be 2 for {what}, got {given(branching)}")
+        raise ValueError(f"{context}: branching must be 2 for {feature}, got {given(branching)}")
 
 
 def triple(
-    where: str, name: str, value: Any, *, positive: bool = False
+    context: str, name: str, value: Any, *, positive: bool = False
 ) -> tuple[float, float, float]:
     """Returns (x, y, z); raises ValueError unless they are finite, and positive if `positive`."""
-    no_gradient(where, name, value)
+    no_gradient(context, name, value)
     if isinstance(value, Tensor):
         value = value.tolist()
     try:
         items = tuple(value)
     except TypeError:
-        raise ValueError(f"{where}: {name} must be three numbers, got {given(value)}") from None
+        raise ValueError(f"{context}: {name} must be three numbers, got {given(value)}") from None
     if len(items) != 3:
-        raise ValueError(f"{where}: {name} must be three numbers, got {len(items)}: {given(value)}")
-    x, y, z = (number(where, name, item) for item in items)
+        raise ValueError(
+            f"{context}: {name} must be three numbers, got {len(items)}: {given(value)}"
+        )
+    x, y, z = (number(context, name, item) for item in items)
     if positive and min(x, y, z) <= 0:
-        raise ValueError(f"{where}: {name} must be positive, got {(x, y, z)}")
-    if positive and not _LEAST <= min(x, y, z) <= max(x, y, z) <= 1 / _LEAST:
-        raise ValueError(f"{where}: {name} must be {_LEAST:g} to {1 / _LEAST:g}, got {(x, y, z)}")
+        raise ValueError(f"{context}: {name} must be positive, got {(x, y, z)}")
+    if positive and not _MIN_SIZE <= min(x, y, z) <= max(x, y, z) <= 1 / _MIN_SIZE:
+        raise ValueError(
+            f"{context}: {name} must be {_MIN_SIZE:g} to {1 / _MIN_SIZE:g}, got {(x, y, z)}"
+        )
     return (x, y, z)
 
 
-def box(where: str, value: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+def box(context: str, value: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Returns two corners, (x, y, z) each; ValueError unless all sides are positive."""
     if len(value) != 2:
-        raise ValueError(f"{where}: box must be two corners, got {value!r}")
-    low, high = (triple(where, "box", corner) for corner in value)
+        raise ValueError(f"{context}: box must be two corners, got {value!r}")
+    low, high = (triple(context, "box", corner) for corner in value)
     sides = [b - a for a, b in zip(low, high, strict=True)]
-    triple(where, "sides of the box", sides, positive=True)
+    triple(context, "sides of the box", sides, positive=True)
     return low, high
 
 
 def placed(
-    where: str, spacing: Any, origin: Any, extent: Sequence[int]
+    context: str, spacing: Any, origin: Any, extent: Sequence[int]
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Returns spacing and origin, (x, y, z) each, of a grid of `extent` voxels (x, y, z); raises
     ValueError if it is so far from 0 that float64 can't resolve its voxels.
     """
-    steps = triple(where, "spacing", spacing, positive=True)
-    place = triple(where, "origin", origin)
-    for step, at, count in zip(steps, place, extent, strict=True):
-        if max(abs(at), abs(at + step * count)) > _MOST_VOXELS_AWAY * step:
+    steps = triple(context, "spacing", spacing, positive=True)
+    position = triple(context, "origin", origin)
+    for step, first, count in zip(steps, position, extent, strict=True):
+        if max(abs(first), abs(first + step * count)) > _MAX_ORIGIN_VOXELS * step:
             raise ValueError(
-                f"{where}: origin must lie within {_MOST_VOXELS_AWAY:g} voxels of 0, got {place} "
-                f"with voxels of {steps}"
+                f"{context}: origin must lie within {_MAX_ORIGIN_VOXELS:g} voxels of 0, got "
+                f"{position} with voxels of {steps}"
             )
-    return steps, place
+    return steps, position
 
 
-def json_file(what: str, path: str | Path) -> Any:
+def json_file(kind: str, path: str | Path) -> Any:
     """Returns the content of a user's JSON file; raises FileNotFoundError or ValueError."""
     file = Path(path)
     if not file.is_file():
-        raise FileNotFoundError(f"{what} not found: {file}")
-    if file.stat().st_size > _MOST_JSON:
-        raise ValueError(f"{file}: not a {what}: it has more than {_MOST_JSON} bytes")
+        raise FileNotFoundError(f"{kind} not found: {file}")
+    if file.stat().st_size > _MAX_JSON_BYTES:
+        raise ValueError(f"{file}: not a {kind}: it has more than {_MAX_JSON_BYTES} bytes")
     try:
         return json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{file}: not a JSON file: {one_line(error)}") from None
 
 
-def reals(where: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:
+def reals(context: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:
     """Returns a float64 CPU tensor; ValueError unless finite and of `shape`, if that is given."""
-    no_gradient(where, name, value)
+    no_gradient(context, name, value)
     try:
         numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
     except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise ValueError(f"{where}: {name} must be numbers, got {given(value)}") from None
+        raise ValueError(f"{context}: {name} must be numbers, got {given(value)}") from None
     if shape is not None and numbers.shape != shape:
-        raise ValueError(f"{where}: {name} must be {shape} numbers, got {tuple(numbers.shape)}")
+        raise ValueError(f"{context}: {name} must be {shape} numbers, got {tuple(numbers.shape)}")
     if not bool(torch.isfinite(numbers).all()):
         got = "NaN or infinity" if hasattr(value, "dtype") else given(value)
-        raise ValueError(f"{where}: {name} must be finite, got {got}")
+        raise ValueError(f"{context}: {name} must be finite, got {got}")
     return numbers

@@ -23,21 +23,21 @@ class Checked:
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        known: dict[str, Check] = {}
+        all_checks: dict[str, Check] = {}
         for base in reversed(cls.__mro__):
-            known.update(vars(base).get("checks", {}))
-        cls._all_checks = known
+            all_checks.update(vars(base).get("checks", {}))
+        cls._all_checks = all_checks
 
     def __setattr__(self, name: str, value: Any) -> None:
-        found = self._all_checks.get(name)
-        super().__setattr__(name, value if found is None else found(self, name, value))
+        checker = self._all_checks.get(name)
+        super().__setattr__(name, value if checker is None else checker(self, name, value))
 
     def check_again(self) -> None:
         """Checks all attributes again: arrays and tensors may have been edited in place."""
-        held = vars(self)
-        for name, found in self._all_checks.items():
-            if name in held:
-                found(self, name, held[name])
+        attributes = vars(self)
+        for name, checker in self._all_checks.items():
+            if name in attributes:
+                checker(self, name, attributes[name])
 
 
 def kind_of(owner: Any) -> str:
@@ -50,9 +50,9 @@ def instance_of(kind: type) -> Check:
     return lambda owner, name, value: check.instance(kind_of(owner), name, value, kind)
 
 
-def or_none(given: Check) -> Check:
+def or_none(checker: Check) -> Check:
     """Returns a check that also accepts None."""
-    return lambda owner, name, value: None if value is None else given(owner, name, value)
+    return lambda owner, name, value: None if value is None else checker(owner, name, value)
 
 
 def positive(owner: Any, name: str, value: Any) -> float:

@@ -27,8 +27,8 @@ def declared_names(module: str, variable: str) -> list[str]:
     raise KeyError(f"{module} has no {variable}")
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: str, choices: Iterable[str]) -> str:
     """Returns " (did you mean ...?)" with the known names most like `name`, or an empty text."""
-    names = {text.lower(): text for text in known}
-    close = difflib.get_close_matches(name.lower(), names, n=3)
-    return f" (did you mean {' or '.join(names[text] for text in close)}?)" if close else ""
+    originals = {text.lower(): text for text in choices}
+    close = difflib.get_close_matches(name.lower(), originals, n=3)
+    return f" (did you mean {' or '.join(originals[text] for text in close)}?)" if close else ""

@@ -19,8 +19,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def option_texts(record: type) -> dict[str, str]:
     """Returns each field's text from the section "Attributes:" of the record's docstring."""
-    part = inspect.cleandoc(record.__doc__ or "").partition("Attributes:\n")[2]
-    items = re.split(r"^(?=\w+: )", textwrap.dedent(part), flags=re.MULTILINE)
+    section = inspect.cleandoc(record.__doc__ or "").partition("Attributes:\n")[2]
+    items = re.split(r"^(?=\w+: )", textwrap.dedent(section), flags=re.MULTILINE)
     pairs = (item.partition(": ") for item in items if item.strip())
     return {name: " ".join(text.split()) for name, _, text in pairs}
 
@@ -30,9 +30,13 @@ def explicit(record: type) -> Callable[[Function], Function]:
     dataclass instead: in its signature, and in place of its docstring's line "**options:".
     """
 
-    def shown(function: Function) -> Function:
+    def decorate(function: Function) -> Function:
         signature = inspect.signature(function)
-        own = [one for one in signature.parameters.values() if one.kind is not one.VAR_KEYWORD]
+        own_parameters = [
+            parameter
+            for parameter in signature.parameters.values()
+            if parameter.kind is not parameter.VAR_KEYWORD
+        ]
         options = [
             inspect.Parameter(
                 field.name,
@@ -42,18 +46,18 @@ def explicit(record: type) -> Callable[[Function], Function]:
             )
             for field in fields(record)
         ]
-        made: Any = function
-        made.__signature__ = signature.replace(parameters=[*own, *options])
+        documented: Any = function
+        documented.__signature__ = signature.replace(parameters=[*own_parameters, *options])
         texts, lines = option_texts(record), []
-        for one in options:
-            text = f"{one.name}: {texts[one.name]} Default: {one.default!r}."
+        for option in options:
+            text = f"{option.name}: {texts[option.name]} Default: {option.default!r}."
             lines += textwrap.wrap(text, 90, subsequent_indent="    ")
 
-        def listed(line: re.Match[str]) -> str:
-            return "\n".join(line[1] + one for one in lines)
+        def option_lines(match: re.Match[str]) -> str:
+            return "\n".join(match[1] + line for line in lines)
 
-        where = re.compile(r"^( +)\*\*options: Fields of `\w+`\.$", re.MULTILINE)
-        made.__doc__ = where.sub(listed, function.__doc__ or "")
+        options_line = re.compile(r"^( +)\*\*options: Fields of `\w+`\.$", re.MULTILINE)
+        documented.__doc__ = options_line.sub(option_lines, function.__doc__ or "")
         return function
 
-    return shown
+    return decorate

@@ -26,12 +26,12 @@ class ChannelInfo:
 
     def describe(self) -> str:
         """Returns name, colour and window in a few words."""
-        words = [self.name] if self.name else []
+        parts = [self.name] if self.name else []
         if self.color is not None:
-            words.append("#" + to_hex(self.color))
+            parts.append("#" + to_hex(self.color))
         if self.window is not None:
-            words.append(f"{self.window[0]:g} to {self.window[1]:g}")
-        return ", ".join(words + ["not shown at first"] * (not self.active)) or "nothing told"
+            parts.append(f"{self.window[0]:g} to {self.window[1]:g}")
+        return ", ".join(parts + ["not shown at first"] * (not self.active)) or "nothing told"
 
 
 #: Colours of microscopists' usual lookup tables.
@@ -53,12 +53,12 @@ def color_channels(count: int = 3) -> tuple[ChannelInfo, ...]:
 
 def to_hex(color: Rgb) -> str:
     """Returns a colour as RRGGBB."""
-    return "".join(f"{round(255 * min(max(part, 0.0), 1.0)):02x}" for part in color)
+    return "".join(f"{round(255 * min(max(component, 0.0), 1.0)):02x}" for component in color)
 
 
 def from_hex(text: str) -> Rgb:
     """Returns the colour of the text RRGGBB; raises ValueError for any other text."""
-    red, green, blue = (part / 255 for part in bytes.fromhex(text))
+    red, green, blue = (component / 255 for component in bytes.fromhex(text))
     return (red, green, blue)
 
 
@@ -88,13 +88,13 @@ class ImageInfo:
 
     def describe(self) -> dict[str, Any]:
         """Returns what is known as plain values."""
-        found: dict[str, Any] = {"unit": self.unit, "quantity": self.quantity, "space": self.space}
-        found["labels"] = self.labels or None
+        info: dict[str, Any] = {"unit": self.unit, "quantity": self.quantity, "space": self.space}
+        info["labels"] = self.labels or None
         if self.pose is not None:
-            found["pose"] = "; ".join(" ".join(f"{n:.6g}" for n in row) for row in self.pose[:3])
+            info["pose"] = "; ".join(" ".join(f"{n:.6g}" for n in row) for row in self.pose[:3])
         if self.time_step is not None:
-            found["time step"] = f"{self.time_step:g} {self.time_unit or ''}".strip()
-        found["channel info"] = {
+            info["time step"] = f"{self.time_step:g} {self.time_unit or ''}".strip()
+        info["channel info"] = {
             str(number): channel.describe() for number, channel in enumerate(self.channels)
         }
-        return {name: value for name, value in found.items() if value}
+        return {name: value for name, value in info.items() if value}

@@ -14,11 +14,12 @@ import numpy as np
 #: The dtypes of labels that are stored as they are.
 NARROW = ("uint8", "int8", "uint16", "int16")
 #: float32 represents all whole numbers up to this one.
-MOST_WHOLE = 2**24
-_SPREAD = 2**22  # labels in a range below this are looked up in a table, others by bisection
+MAX_EXACT_INTEGER = 2**24
+#: Labels in a range below this are looked up in a table, others by bisection.
+_MAX_TABLE_RANGE = 2**22
 
 
-def as_whole(where: str, values: np.ndarray) -> np.ndarray:
+def as_whole(context: str, values: np.ndarray) -> np.ndarray:
     """Returns labels as integers: whole floats become int64, bool becomes uint8. Raises ValueError
     if a label is not a whole number, or beyond int64.
     """
@@ -26,42 +27,42 @@ def as_whole(where: str, values: np.ndarray) -> np.ndarray:
         return values.astype(np.uint8)
     if values.dtype.kind == "f":
         with np.errstate(invalid="ignore"):
-            whole = (np.rint(values) == values) & (np.abs(values) < 2.0**63)
-        if not whole.all():
-            bad = values[~whole].flat[0]
-            raise ValueError(f"{where}: labels must be whole numbers, got {bad:g}")
+            is_whole = (np.rint(values) == values) & (np.abs(values) < 2.0**63)
+        if not is_whole.all():
+            bad = values[~is_whole].flat[0]
+            raise ValueError(f"{context}: labels must be whole numbers, got {bad:g}")
         return values.astype(np.int64)
     if values.dtype.kind not in "iu":
-        raise ValueError(f"{where}: labels must be whole numbers, got {values.dtype}")
+        raise ValueError(f"{context}: labels must be whole numbers, got {values.dtype}")
     if values.dtype == np.uint64 and values.size and int(values.max()) > np.iinfo(np.int64).max:
         raise ValueError(
-            f"{where}: labels must be below 2^63, got {int(values.max())}: renumber them"
+            f"{context}: labels must be below 2^63, got {int(values.max())}: renumber them"
         )
     return values
 
 
-def distinct(where: str, parts: Iterable[np.ndarray]) -> np.ndarray:
+def distinct(context: str, parts: Iterable[np.ndarray]) -> np.ndarray:
     """Returns (k,) int64 the sorted distinct labels of arrays of integers; raises ValueError if
     there are more than 2^24.
     """
-    found, waiting, count = np.zeros(0, np.int64), [], 0
+    labels, pending, count = np.zeros(0, np.int64), [], 0
     for part in parts:
-        waiting.append(np.unique(part).astype(np.int64))
-        count += len(waiting[-1])
-        if count > max(2**20, len(found)):
-            found, waiting, count = np.unique(np.concatenate((found, *waiting))), [], 0
-            check_count(where, len(found))
-    found = np.unique(np.concatenate((found, *waiting)))
-    check_count(where, len(found))
-    return found
+        pending.append(np.unique(part).astype(np.int64))
+        count += len(pending[-1])
+        if count > max(2**20, len(labels)):
+            labels, pending, count = np.unique(np.concatenate((labels, *pending))), [], 0
+            check_count(context, len(labels))
+    labels = np.unique(np.concatenate((labels, *pending)))
+    check_count(context, len(labels))
+    return labels
 
 
-def check_count(where: str, count: int) -> None:
+def check_count(context: str, count: int) -> None:
     """Raises ValueError if there are more labels than bricks can hold."""
-    if count > MOST_WHOLE:
+    if count > MAX_EXACT_INTEGER:
         raise ValueError(
-            f"{where}: holds {count} labels or more, at most {MOST_WHOLE} fit: crop it, or join "
-            "some of them"
+            f"{context}: holds {count} labels or more, at most {MAX_EXACT_INTEGER} fit: crop it, "
+            "or join some of them"
         )
 
 
@@ -74,7 +75,7 @@ def indices(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Returns the index of each value in the sorted `labels` (k,), which hold all values."""
     dtype = index_dtype(len(labels))
     low, high = int(labels[0]), int(labels[-1])
-    if high - low < max(_SPREAD, values.size):
+    if high - low < max(_MAX_TABLE_RANGE, values.size):
         table = np.zeros(high - low + 1, dtype)
         table[labels - low] = np.arange(len(labels), dtype=dtype)
         # To int64 first: NumPy may turn uint64 mixed with int64 into float64.
@@ -82,40 +83,44 @@ def indices(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return np.searchsorted(labels, values.astype(np.int64, copy=False)).astype(dtype)
 
 
-def indexed(where: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def stored_labels(context: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Returns labels as bricks hold them, and (k,) int64 the label of each index; None where they
     are stored as they are. Raises ValueError as `as_whole` and `distinct`.
     """
-    values = as_whole(where, values)
+    values = as_whole(context, values)
     if values.dtype.name in NARROW:
         return values, None
-    labels = distinct(where, values)  # plane by plane
+    labels = distinct(context, values)  # plane by plane
     return indices(values, labels), labels
 
 
 def counted(labels: Any) -> str:
     """Returns the number and range of labels (k,), without background 0, as "12, 1 to 40"."""
-    found = labels[labels != 0]
-    return f"{len(found)}, {int(found.min())} to {int(found.max())}" if len(found) else "0"
+    foreground = labels[labels != 0]
+    return (
+        f"{len(foreground)}, {int(foreground.min())} to {int(foreground.max())}"
+        if len(foreground)
+        else "0"
+    )
 
 
 def background(labels: np.ndarray | None) -> int | None:
     """Returns the stored value of label 0, the background; None if `labels` has no 0."""
     if labels is None:
         return 0
-    at = int(np.searchsorted(labels, 0))
-    return at if at < len(labels) and labels[at] == 0 else None
+    index = int(np.searchsorted(labels, 0))
+    return index if index < len(labels) and labels[index] == 0 else None
 
 
-def check_narrowed(where: str, values: np.ndarray) -> None:
+def check_narrowed(context: str, values: np.ndarray) -> None:
     """Raises ValueError if integers lie beyond 2^24, where float32 does not hold all of them."""
     if values.dtype.kind not in "iu" or values.dtype.itemsize < 4 or not values.size:
         return
     low, high = int(values.min()), int(values.max())
-    most = high if high > -low else low
-    if abs(most) > MOST_WHOLE:
+    extreme = high if high > -low else low
+    if abs(extreme) > MAX_EXACT_INTEGER:
         raise ValueError(
-            f"{where}: {values.dtype.name} values reach {most}, and float32 keeps whole numbers "
-            f"apart up to {MOST_WHOLE}: labels=True (--labels) keeps labels exactly, and "
-            "measurements can be rounded before: data.astype('float32')"
+            f"{context}: {values.dtype.name} values reach {extreme}, and float32 keeps whole "
+            f"numbers apart up to {MAX_EXACT_INTEGER}: labels=True (--labels) keeps labels "
+            "exactly, and measurements can be rounded before: data.astype('float32')"
         )

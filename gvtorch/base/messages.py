@@ -10,31 +10,31 @@ from typing import Any
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 
 
-_MOST = 1500  # characters in a line
+_MAX_CHARACTERS = 1500  # characters in a line
 
 
-def one_line(error: object, most: int = _MOST) -> str:
+def one_line(error: object, limit: int = _MAX_CHARACTERS) -> str:
     """Returns an error's message as one printable line; its type if the message is empty. A line
-    longer than `most` (files and users may put anything into it) loses its middle.
+    longer than `limit` (files and users may put anything into it) loses its middle.
     """
     text = str(error)
-    text = text if len(text) <= 8 * most else f"{text[: 4 * most]} {text[-4 * most :]}"
+    text = text if len(text) <= 8 * limit else f"{text[: 4 * limit]} {text[-4 * limit :]}"
     line = printable(" ".join(text.split())) or type(error).__name__
-    if len(line) <= most:
+    if len(line) <= limit:
         return line
-    half = most // 2
-    return f"{line[:half]} ... {line[-half:]}"
+    half_length = limit // 2
+    return f"{line[:half_length]} ... {line[-half_length:]}"
 
 
 def printable(text: object) -> str:
     """Returns a text with control characters escaped, as in "\\x1b": names and contents of files
     are untrusted.
     """
-    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), str(text))
+    return _CONTROL.sub(lambda match: match[0].encode("unicode_escape").decode("ascii"), str(text))
 
 
-def need_library(what: str, library: str, package: str = "", extra: str = "io") -> Any:
-    """Imports and returns a module on behalf of `what`.
+def need_library(feature: str, library: str, package: str = "", extra: str = "io") -> Any:
+    """Imports and returns a module on behalf of `feature`.
 
     Raises:
         ImportError: It is missing; the message names the extra of gvtorch that installs it.
@@ -43,5 +43,5 @@ def need_library(what: str, library: str, package: str = "", extra: str = "io") 
         return importlib.import_module(library)
     except ImportError as error:
         raise ImportError(
-            f"{what} needs {package or library}: pip install 'gvtorch[{extra}]' ({error})"
+            f"{feature} needs {package or library}: pip install 'gvtorch[{extra}]' ({error})"
         ) from None

@@ -37,13 +37,13 @@ class Rays:
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
         """Returns some of the rays; they no longer count as rows of a picture (width 0)."""
-        return self._each(lambda column: column[index], 0)
+        return self._convert_columns(lambda column: column[index], 0)
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Rays:
         """Returns the rays on a device, in float32 or float64; None leaves either as it is."""
-        return self._each(lambda column: to_device(column, device, dtype), self.width)
+        return self._convert_columns(lambda column: to_device(column, device, dtype), self.width)
 
     def light(self) -> Tensor:
         """Returns (r, 1) float64 transmittance at the first distance."""
@@ -51,9 +51,9 @@ class Rays:
             return torch.ones_like(self.origin[:, :1], dtype=torch.float64)
         return self.transmittance[:, None].to(torch.float64)
 
-    def _each(self, change: Callable[[Tensor], Tensor], width: int) -> Rays:
+    def _convert_columns(self, convert: Callable[[Tensor], Tensor], width: int) -> Rays:
         columns = {name: value for name, value in vars(self).items() if name != "width"}
-        changed = {n: None if value is None else change(value) for n, value in columns.items()}
+        changed = {n: None if value is None else convert(value) for n, value in columns.items()}
         return Rays(**changed, width=width)  # type: ignore[arg-type]
 
     def __repr__(self) -> str:

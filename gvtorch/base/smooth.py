@@ -21,7 +21,7 @@ class Smooth:
         `closed`: the last key equals the first, and the curve passes smoothly through it.
         """
         self._times = list(times)
-        self._values = np.stack([np.asarray(one, np.float64) for one in values])
+        self._values = np.stack([np.asarray(value, np.float64) for value in values])
         spans = np.diff(np.asarray(times, np.float64))
         spans = spans.reshape(-1, *[1] * (self._values.ndim - 1))
         steps = np.diff(self._values, axis=0) / spans
@@ -44,16 +44,19 @@ class Smooth:
         s = (time - self._times[n]) / span
         a, b = self._values[n : n + 2]
         slope_a, slope_b = span * self._slopes[n : n + 2]
-        found = a + s * s * (3 - 2 * s) * (b - a) + s * (1 - s) * ((1 - s) * slope_a - s * slope_b)
-        return np.clip(found, np.minimum(a, b), np.maximum(a, b))  # rounding may leave the span
+        interpolated = (
+            a + s * s * (3 - 2 * s) * (b - a) + s * (1 - s) * ((1 - s) * slope_a - s * slope_b)
+        )
+        # Rounding may leave the span.
+        return np.clip(interpolated, np.minimum(a, b), np.maximum(a, b))
 
 
 def _slope(
     before: np.ndarray, after: np.ndarray, span_before: np.ndarray, span_after: np.ndarray
 ) -> np.ndarray:
     """Returns slopes at keys: weighted harmonic means of both sides' slopes, 0 if signs differ."""
-    same = before * after > 0
-    first, second = 2 * span_after + span_before, span_after + 2 * span_before
+    same_sign = before * after > 0
+    weight_before, weight_after = 2 * span_after + span_before, span_after + 2 * span_before
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = (first + second) / (first / before + second / after)
-    return np.where(same, mean, 0.0)
+        mean = (weight_before + weight_after) / (weight_before / before + weight_after / after)
+    return np.where(same_sign, mean, 0.0)

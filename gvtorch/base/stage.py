@@ -70,7 +70,7 @@ class Timings:
 _timings: ContextVar[Timings | None] = ContextVar("gvtorch_timings", default=None)
 _traces: list[Trace] = []  # those that are open, in all threads
 #: Nsight Systems and Compute set the first variable; users set the second to get ranges anyway.
-_RANGES = torch.version.cuda is not None and bool(
+_NVTX_ENABLED = torch.version.cuda is not None and bool(
     {"NVTX_INJECTION64_PATH", "GVTORCH_NVTX"} & set(os.environ)
 )
 
@@ -88,9 +88,9 @@ class stage:  # not a generator-based context manager, which is slower: a frame 
 
     def __enter__(self) -> None:
         self._ranges = None
-        if _RANGES or torch.autograd._profiler_enabled():
+        if _NVTX_ENABLED or torch.autograd._profiler_enabled():
             self._ranges = _open_ranges(f"gvtorch.{self._name}")
-        self._began = [(one, one.begin()) for one in _traces]
+        self._began = [(trace, trace.begin()) for trace in _traces]
         self._timings = timings = _timings.get()
         self._start = None if timings is None else mark(timings.device)
 
@@ -98,8 +98,8 @@ class stage:  # not a generator-based context manager, which is slower: a frame 
         timings, start = self._timings, self._start
         if timings is not None and start is not None:
             timings.spans.append((self._name, start, mark(timings.device)))
-        for one, what in self._began:
-            one.end(self._name, what)
+        for trace, began in self._began:
+            trace.end(self._name, began)
         if self._ranges is not None:
             self._ranges.close()
 
@@ -109,7 +109,7 @@ def _open_ranges(name: str) -> ExitStack:
     with ExitStack() as ranges:
         if torch.autograd._profiler_enabled():
             ranges.enter_context(torch.profiler.record_function(name))
-        if _RANGES:
+        if _NVTX_ENABLED:
             ranges.enter_context(torch.cuda.nvtx.range(name))
         return ranges.pop_all()
 
@@ -125,7 +125,7 @@ def collect_timings(device: torch.device) -> Iterator[Timings]:
         _timings.reset(token)
 
 
-_ON_DEVICE = 0  # the track of the device; tracks of threads are numbered from 1
+_DEVICE_TRACK = 0  # the track of the device; tracks of threads are numbered from 1
 
 
 class _Span(NamedTuple):
@@ -169,17 +169,17 @@ class Trace:
 
     def __enter__(self) -> Trace:
         """Starts recording."""
-        self._zero = time.perf_counter_ns()
+        self._start_ns = time.perf_counter_ns()
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
-            self._zero, self._first = time.perf_counter_ns(), self._event()
+            self._start_ns, self._start_event = time.perf_counter_ns(), self._event()
         _traces.append(self)
         return self
 
     def __exit__(self, *_error: object) -> None:
         """Stops recording and writes the file."""
         _traces.remove(self)
-        with whole_file(self._path) as part, part.open("w", encoding="utf-8") as file:
+        with whole_file(self._path) as draft, draft.open("w", encoding="utf-8") as file:
             json.dump({"traceEvents": self._events(), "displayTimeUnit": "ms"}, file)
 
     def count(self, name: str, **values: float) -> None:
@@ -192,8 +192,8 @@ class Trace:
 
     def end(self, name: str, began: tuple[int, torch.cuda.Event | None]) -> None:
         """Records a stage that ends now; `began` is what `begin` returned."""
-        (begin, first), last, end = began, self._event(), time.perf_counter_ns()
-        marks = None if first is None or last is None else (first, last)
+        (begin, begin_event), end_event, end = began, self._event(), time.perf_counter_ns()
+        marks = None if begin_event is None or end_event is None else (begin_event, end_event)
         self._spans.append(_Span(name, self._track(), begin, end, marks))
 
     def _event(self) -> torch.cuda.Event | None:
@@ -207,30 +207,33 @@ class Trace:
     def _track(self) -> int:
         thread = threading.current_thread()
         with self._lock:
-            known = self._tracks.setdefault(
+            track = self._tracks.setdefault(
                 threading.get_ident(), (len(self._tracks) + 1, thread.name)
             )
-        return known[0]
+        return track[0]
 
     def _events(self) -> list[dict[str, object]]:
         """Returns all events of the file; waits for the device."""
         common = {"pid": os.getpid()}
-        names = [(number, f"host: {name}") for number, name in self._tracks.values()]
+        track_names = [(number, f"host: {name}") for number, name in self._tracks.values()]
         if any(span.marks for span in self._spans):
             torch.cuda.synchronize(self._device)
-            names.append((_ON_DEVICE, str(self._device)))
+            track_names.append((_DEVICE_TRACK, str(self._device)))
         events: list[dict[str, object]] = [
             {"ph": "M", "name": "thread_name", "tid": number, "args": {"name": name}, **common}
-            for number, name in names
+            for number, name in track_names
         ]
         for name, track, begin, end, marks in self._spans:
-            rows = [(track, (begin - self._zero) / 1e3, (end - begin) / 1e3)]
-            if marks is not None and self._first is not None:
-                at = 1e3 * self._first.elapsed_time(marks[0])
-                rows.append((_ON_DEVICE, at, 1e3 * marks[0].elapsed_time(marks[1])))
-            told = {"ph": "X", "name": name, "cat": "stage", **common}
-            events += [{**told, "tid": tid, "ts": at, "dur": dur} for tid, at, dur in rows]
-        for name, when, values in self._counts:
-            at = (when - self._zero) / 1e3
-            events.append({"ph": "C", "name": name, "ts": at, "args": values, **common})
+            rows = [(track, (begin - self._start_ns) / 1e3, (end - begin) / 1e3)]
+            if marks is not None and self._start_event is not None:
+                start_us = 1e3 * self._start_event.elapsed_time(marks[0])
+                rows.append((_DEVICE_TRACK, start_us, 1e3 * marks[0].elapsed_time(marks[1])))
+            stage_event = {"ph": "X", "name": name, "cat": "stage", **common}
+            events += [
+                {**stage_event, "tid": tid, "ts": start_us, "dur": dur}
+                for tid, start_us, dur in rows
+            ]
+        for name, count_ns, values in self._counts:
+            start_us = (count_ns - self._start_ns) / 1e3
+            events.append({"ph": "C", "name": name, "ts": start_us, "args": values, **common})
         return events

@@ -19,37 +19,37 @@ class Turns:
         self._changer: int | None = None
 
     @contextmanager
-    def using(self, where: str) -> Iterator[None]:
+    def using(self, context: str) -> Iterator[None]:
         """Lets the block read; raises RuntimeError while another thread changes the object."""
-        me = threading.get_ident()
+        thread = threading.get_ident()
         with self._lock:
-            if self._changer not in (None, me):
-                raise RuntimeError(f"{where}: another thread changes this tree")
-            self._users[me] += 1
+            if self._changer not in (None, thread):
+                raise RuntimeError(f"{context}: another thread changes this tree")
+            self._users[thread] += 1
         try:
             yield
         finally:
             with self._lock:
-                self._users[me] -= 1
-                if not self._users[me]:
-                    del self._users[me]
+                self._users[thread] -= 1
+                if not self._users[thread]:
+                    del self._users[thread]
 
     @contextmanager
-    def changing(self, where: str) -> Iterator[None]:
+    def changing(self, context: str) -> Iterator[None]:
         """Lets the block write; raises RuntimeError while another thread uses or changes it."""
-        me = threading.get_ident()
+        thread = threading.get_ident()
         with self._lock:
-            before = self._changer
-            if before not in (None, me):
-                raise RuntimeError(f"{where}: another thread changes this tree")
-            if set(self._users) - {me}:
-                raise RuntimeError(f"{where}: another thread renders or reads this tree")
-            self._changer = me
+            previous = self._changer
+            if previous not in (None, thread):
+                raise RuntimeError(f"{context}: another thread changes this tree")
+            if set(self._users) - {thread}:
+                raise RuntimeError(f"{context}: another thread renders or reads this tree")
+            self._changer = thread
         try:
             yield
         finally:
             with self._lock:
-                self._changer = before
+                self._changer = previous
 
     def __reduce__(self) -> tuple[type[Turns], tuple[()]]:
         return Turns, ()  # a copy has no users yet

@@ -34,25 +34,29 @@ _TIMES: tuple[tuple[str, float, str], ...] = (
 
 
 def _table(rows: tuple[tuple[str, float, str], ...]) -> dict[str, tuple[str, float]]:
-    return {word: (name, size) for name, size, words in rows for word in (name, *words.split())}
+    return {
+        spelling: (name, size)
+        for name, size, spellings in rows
+        for spelling in (name, *spellings.split())
+    }
 
 
-_LENGTH, _TIME = _table(_LENGTHS), _table(_TIMES)
+_LENGTH_BY_SPELLING, _TIME_BY_SPELLING = _table(_LENGTHS), _table(_TIMES)
 
 
 def length_unit(text: str | None) -> str | None:
     """Returns NGFF's name of a unit of length; None if it is not a known one."""
-    return _find(_LENGTH, text)[0]
+    return _look_up(_LENGTH_BY_SPELLING, text)[0]
 
 
 def time_unit(text: str | None) -> str | None:
     """Returns NGFF's name of a unit of time; None if it is not a known one."""
-    return _find(_TIME, text)[0]
+    return _look_up(_TIME_BY_SPELLING, text)[0]
 
 
 def metres(name: str | None) -> float | None:
     """Returns the metres in a unit that `length_unit` returned; None for any other name."""
-    return next((size for known, size, _ in _LENGTHS if known == name), None)
+    return next((size for unit, size, _ in _LENGTHS if unit == name), None)
 
 
 def unit_symbol(text: str | None) -> str:
@@ -61,7 +65,9 @@ def unit_symbol(text: str | None) -> str:
     if name is None:
         return text or ""
     symbols = {"micrometer": "\u00b5m", "angstrom": "\u00c5"}
-    return symbols.get(name) or next(words.split()[0] for n, _, words in _LENGTHS if n == name)
+    return symbols.get(name) or next(
+        spellings.split()[0] for n, _, spellings in _LENGTHS if n == name
+    )
 
 
 #: The note for files that store the width of pixels, but not the distance between slices.
@@ -75,24 +81,24 @@ def spacing_of(
     size and a known unit gives the unit, and its size to axes that lack either. If all lack one,
     sizes are returned as they are, 1 unless positive, with None as the unit.
     """
-    named = [_find(_LENGTH, unit) for unit in units]
-    good = [
+    known_units = [_look_up(_LENGTH_BY_SPELLING, unit) for unit in units]
+    usable = [
         size is not None and math.isfinite(size) and size > 0 and unit[0] is not None
-        for size, unit in zip(sizes, named, strict=True)
+        for size, unit in zip(sizes, known_units, strict=True)
     ]
-    if not any(good):
-        plain = [s if s is not None and math.isfinite(s) and s > 0 else 1.0 for s in sizes]
-        return (plain[0], plain[1], plain[2]), None
-    first = good.index(True)
-    name, scale = named[first]
-    found = [
-        float(size) * (1.0 if unit[0] == name else unit[1] / scale) if told and size else None
-        for size, unit, told in zip(sizes, named, good, strict=True)
+    if not any(usable):
+        plain_sizes = [s if s is not None and math.isfinite(s) and s > 0 else 1.0 for s in sizes]
+        return (plain_sizes[0], plain_sizes[1], plain_sizes[2]), None
+    first = usable.index(True)
+    name, scale = known_units[first]
+    converted = [
+        float(size) * (1.0 if unit[0] == name else unit[1] / scale) if is_usable and size else None
+        for size, unit, is_usable in zip(sizes, known_units, usable, strict=True)
     ]
-    x, y, z = (found[first] if size is None else size for size in found)
+    x, y, z = (converted[first] if size is None else size for size in converted)
     return (x or 1.0, y or 1.0, z or 1.0), name
 
 
-def _find(table: dict[str, tuple[str, float]], text: str | None) -> tuple[str | None, float]:
-    words = (text or "").strip()
-    return table.get(words) or table.get(words.lower()) or (None, 1.0)
+def _look_up(table: dict[str, tuple[str, float]], text: str | None) -> tuple[str | None, float]:
+    spelling = (text or "").strip()
+    return table.get(spelling) or table.get(spelling.lower()) or (None, 1.0)

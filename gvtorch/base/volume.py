@@ -15,7 +15,7 @@ from torch import Tensor
 from . import check
 from . import constants as config
 from .image_info import ImageInfo
-from .labels import check_narrowed, counted, indexed
+from .labels import check_narrowed, counted, stored_labels
 
 #: The dtypes that a brick channel can have. Wider ones are narrowed on the way in, see `Volume`.
 CHANNEL_DTYPES = (
@@ -33,7 +33,7 @@ DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
 def check_extent(
-    where: str, shape: Sequence[int], *, what: str = "extent", most: int = config.MAX_VOXELS
+    context: str, shape: Sequence[int], *, what: str = "extent", most: int = config.MAX_VOXELS
 ) -> None:
     """Raises ValueError unless all sizes are positive and their product is at most `most`.
 
@@ -41,12 +41,13 @@ def check_extent(
     """
     sizes = " x ".join(str(size) for size in shape)
     if any(size < 1 for size in shape):
-        raise ValueError(f"{where}: {what} must be at least 1 in every direction, got {sizes}")
+        raise ValueError(f"{context}: {what} must be at least 1 in every direction, got {sizes}")
     voxels = math.prod(int(size) for size in shape)
     if voxels > most:
-        place = "in memory at once" if most == config.MAX_VOXELS else "into a store"
+        destination = "in memory at once" if most == config.MAX_VOXELS else "into a store"
         raise ValueError(
-            f"{where}: {what} {sizes} is {voxels} voxels, more than the {most} that fit {place}"
+            f"{context}: {what} {sizes} is {voxels} voxels, "
+            f"more than the {most} that fit {destination}"
         )
 
 
@@ -101,27 +102,27 @@ class Volume:
                 from 0. Or labels are not whole numbers, or there are more than 2^24 of them.
             RuntimeError: data requires gradients, and autograd is recording.
         """
-        where = f"Volume {name!r}" if name != "volume" else "Volume"
+        context = f"Volume {name!r}" if name != "volume" else "Volume"
         if isinstance(data, Tensor) and data.requires_grad and torch.is_grad_enabled():
             raise RuntimeError(
-                f"{where}: data requires gradients, which a volume does not keep: take detach(); "
+                f"{context}: data requires gradients, which a volume does not keep: take detach(); "
                 'to learn voxels, let tree.bricks["value"] require gradients and render with a '
                 "gv.ModuleShader"
             )
-        info = ImageInfo() if info is None else check.instance(where, "info", info, ImageInfo)
+        info = ImageInfo() if info is None else check.instance(context, "info", info, ImageInfo)
         if labels or info.labels:
             info, self.filter = replace(info, labels=True), "majority"
-            data, self.label_values = _as_labels(where, data, nan)
-        tensor = _as_tensor(where, data)
+            data, self.label_values = _as_labels(context, data, nan)
+        tensor = _as_tensor(context, data)
         if tensor.dim() not in (3, 4):
             got = check.shown(data)
-            raise ValueError(f"{where}: data must be (z, y, x) or (z, y, x, c), got {got}")
+            raise ValueError(f"{context}: data must be (z, y, x) or (z, y, x, c), got {got}")
         if tensor.dim() == 3:
             tensor = tensor[..., None]
-        check_extent(where, tensor.shape[:3], what="data")
-        check_extent(where, tensor.shape, what="data with its channels")
-        self.data = _finite(where, tensor.contiguous(), nan)
-        self.spacing, self.origin = check.placed(where, spacing, origin, self.extent)
+        check_extent(context, tensor.shape[:3], what="data")
+        check_extent(context, tensor.shape, what="data with its channels")
+        self.data = _finite_values(context, tensor.contiguous(), nan)
+        self.spacing, self.origin = check.placed(context, spacing, origin, self.extent)
         self.name, self.info = name, info
 
     @property
@@ -173,12 +174,12 @@ class Volume:
         Source: Crassin et al., "Interactive indirect illumination using voxel cone tracing", CGF
             2011 (anisotropic voxels).
         """
-        where = "Volume.directional"
+        context = "Volume.directional"
         if dtype not in (torch.float16, torch.bfloat16, torch.float32):
-            raise ValueError(f"{where}: dtype must be float16, bfloat16 or float32, got {dtype}")
+            raise ValueError(f"{context}: dtype must be float16, bfloat16 or float32, got {dtype}")
         if self.width != 4:
             raise ValueError(
-                f"{where}: needs red, green, blue and opacity, got {self.width} numbers a voxel"
+                f"{context}: needs red, green, blue and opacity, got {self.width} numbers a voxel"
             )
         rgba = self.data.to(torch.float32)
         if not self.data.is_floating_point():
@@ -186,10 +187,10 @@ class Volume:
         color, opacity = rgba[..., :3], rgba[..., 3:]
         low, high = (float(end) for end in torch.aminmax(opacity))
         if low < 0 or high > 1:
-            raise ValueError(f"{where}: opacity must lie in 0 to 1, got {low:g} to {high:g}")
+            raise ValueError(f"{context}: opacity must lie in 0 to 1, got {low:g} to {high:g}")
         color = color if premultiplied else color * opacity
-        seen = torch.cat((color, opacity), -1).to(dtype).repeat(1, 1, 1, len(DIRECTIONS))
-        volume = Volume(seen, self.spacing, self.origin, name=self.name)
+        views = torch.cat((color, opacity), -1).to(dtype).repeat(1, 1, 1, len(DIRECTIONS))
+        volume = Volume(views, self.spacing, self.origin, name=self.name)
         volume.filter = "directional"
         return volume
 
@@ -200,10 +201,10 @@ class Volume:
         values = to_numpy(self.data)
         limits = (low, high) if high > low else (low, low + max(1.0, abs(low)))
         counts, total = np.zeros(bins, np.int64), 0.0
-        for part in values:  # by z, in float64: the full range of float16 or float32 needs it
-            wide = part.astype(np.float64)
-            counts += np.histogram(wide, bins=bins, range=limits)[0]
-            total += float(wide.sum())
+        for plane in values:  # by z, in float64: the full range of float16 or float32 needs it
+            plane64 = plane.astype(np.float64)
+            counts += np.histogram(plane64, bins=bins, range=limits)[0]
+            total += float(plane64.sum())
         return {
             "name": self.name,
             "extent": list(self.extent),
@@ -212,21 +213,21 @@ class Volume:
             "spacing": list(self.spacing),
             "origin": list(self.origin),
             **self.info.describe(),
-            **self._labels_told(),
+            **self._label_summary(),
             "range": [low, high],
             "mean": total / values.size,
             "histogram": [int(count) for count in counts],
             "bytes": self.data.nbytes,
         }
 
-    def _labels_told(self) -> dict[str, Any]:
+    def _label_summary(self) -> dict[str, Any]:
         """For label volumes: the count and range of the labels, without the background 0."""
         if not self.info.labels:
             return {}
-        known = self.label_values
-        names = movable(self.data).unique().to(torch.int64) if known is None else known
-        others = "" if known is None else "; the other numbers are places in their list"
-        return {"labels": f"{counted(names)}{others}"}
+        table = self.label_values
+        label_numbers = movable(self.data).unique().to(torch.int64) if table is None else table
+        note = "" if table is None else "; the other numbers are places in their list"
+        return {"labels": f"{counted(label_numbers)}{note}"}
 
     def __repr__(self) -> str:
         dtype = str(self.data.dtype).removeprefix("torch.")
@@ -248,7 +249,7 @@ def movable(tensor: Tensor) -> Tensor:
 
 
 def _as_labels(
-    where: str, data: Tensor | np.ndarray, nan: float | None
+    context: str, data: Tensor | np.ndarray, nan: float | None
 ) -> tuple[Tensor | np.ndarray, Tensor | None]:
     """Returns labels as bricks hold them, and the table of labels if they are indexed."""
     if isinstance(data, Tensor):
@@ -257,45 +258,45 @@ def _as_labels(
         return data, None  # `_as_tensor` and `Volume` raise the error
     if data.dtype.kind == "f" and nan is not None:
         data = np.where(np.isfinite(data), data, nan)
-    values, labels = indexed(where, data)
-    return _as_tensor(where, values), None if labels is None else torch.from_numpy(labels)
+    values, labels = stored_labels(context, data)
+    return _as_tensor(context, values), None if labels is None else torch.from_numpy(labels)
 
 
-def _as_tensor(where: str, data: Tensor | np.ndarray) -> Tensor:
+def _as_tensor(context: str, data: Tensor | np.ndarray) -> Tensor:
     if isinstance(data, Tensor):
         tensor = data.detach()
     elif isinstance(data, np.ndarray):
         if data.dtype.kind not in "biuf":
-            raise ValueError(f"{where}: data must hold numbers, got dtype {data.dtype}")
+            raise ValueError(f"{context}: data must hold numbers, got dtype {data.dtype}")
         if data.dtype.kind == "f" and data.dtype.itemsize > 8:
             data = data.astype(np.float64)
         native = data.astype(data.dtype.newbyteorder("="), copy=False)
         tensor = torch.from_numpy(np.require(native, requirements=["C", "W"]))
     else:
-        raise ValueError(f"{where}: data must be a tensor or array, got {type(data).__name__}")
+        raise ValueError(f"{context}: data must be a tensor or array, got {type(data).__name__}")
     if tensor.dtype == torch.bool:
         return tensor.to(torch.uint8)
     if tensor.dtype in CHANNEL_DTYPES:
         return tensor
     if tensor.is_complex():
-        raise ValueError(f"{where}: data must hold real numbers, got {check.describe(tensor)}")
-    check_narrowed(where, tensor.cpu().numpy())
+        raise ValueError(f"{context}: data must hold real numbers, got {check.describe(tensor)}")
+    check_narrowed(context, tensor.cpu().numpy())
     return tensor.to(torch.float32)
 
 
-def _finite(where: str, tensor: Tensor, nan: float | None) -> Tensor:
+def _finite_values(context: str, tensor: Tensor, nan: float | None) -> Tensor:
     if not tensor.is_floating_point() or tensor.numel() == 0:
         return tensor
     if nan is not None:
         limits = torch.finfo(tensor.dtype)
-        nan = check.number(where, "nan", nan, low=limits.min, high=limits.max)
+        nan = check.number(context, "nan", nan, low=limits.min, high=limits.max)
     low, high = torch.aminmax(tensor)
     if torch.isfinite(low) and torch.isfinite(high):
         return tensor
-    bad = int((~torch.isfinite(tensor)).sum())
+    bad_count = int((~torch.isfinite(tensor)).sum())
     if nan is None:
         raise ValueError(
-            f"{where}: data holds {bad} values that are NaN or infinite (of {tensor.numel()}); "
-            "pass nan=VALUE (--nan VALUE) to replace them"
+            f"{context}: data holds {bad_count} values that are NaN or infinite "
+            f"(of {tensor.numel()}); pass nan=VALUE (--nan VALUE) to replace them"
         )
     return torch.where(torch.isfinite(tensor), tensor, tensor.new_tensor(nan))

@@ -41,26 +41,26 @@ def told_of(path: Path, *drafts: str) -> Iterator[None]:
 def whole_file(path: Path) -> Iterator[Path]:
     """Yields a temporary path to write to; it is renamed to `path` if the block succeeds."""
     try:
-        handle, name = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
+        handle, temp_path = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from None
     try:
-        part = os.path.join(text_path(os.path.abspath(path.parent)), os.path.basename(name))
-        with told_of(path, name, part):  # on an error, an existing file stays as it is
+        draft = os.path.join(text_path(os.path.abspath(path.parent)), os.path.basename(temp_path))
+        with told_of(path, temp_path, draft):  # on an error, an existing file stays as it is
             os.close(handle)
-            yield Path(part)
+            yield Path(draft)
         mask = os.umask(0)
         os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)
-        os.replace(name, path)
+        os.chmod(temp_path, 0o666 & ~mask)
+        os.replace(temp_path, path)
     finally:
-        Path(name).unlink(missing_ok=True)
+        Path(temp_path).unlink(missing_ok=True)
 
 
 def write_whole(path: Path, text: str) -> None:
     """Writes a text file; on a full disk an existing file stays as it is."""
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    with whole_file(path) as draft:
+        draft.write_text(text, encoding="utf-8")
 
 
 @contextmanager
@@ -93,8 +93,8 @@ def write_npy(file: IO[bytes], values: np.ndarray) -> None:
     """
     import numpy as np
 
-    plain: Any = SimpleNamespace(write=file.write)
-    np.lib.format.write_array(plain, np.asarray(values), allow_pickle=False)
+    writer: Any = SimpleNamespace(write=file.write)
+    np.lib.format.write_array(writer, np.asarray(values), allow_pickle=False)
 
 
 def save_npy(path: Path, values: np.ndarray) -> None:
@@ -109,12 +109,12 @@ def text_path(path: str) -> str:
     it in a folder that is removed when this process ends. (tensorstore turns backslashes into "/"
     and refuses folders named like its locks.)
     """
-    bytes_of = os.fsencode(path)
-    plain = path.encode(errors="replace") == bytes_of and ".__lock" not in path
-    if plain and (os.sep == "\\" or "\\" not in path):
+    path_bytes = os.fsencode(path)
+    is_plain = path.encode(errors="replace") == path_bytes and ".__lock" not in path
+    if is_plain and (os.sep == "\\" or "\\" not in path):
         return path
-    name = hashlib.sha256(bytes_of).hexdigest()[:32]
-    link = os.path.join(_folder(os.getpid()), name)
+    name = hashlib.sha256(path_bytes).hexdigest()[:32]
+    link = os.path.join(_link_folder(os.getpid()), name)
     try:
         os.symlink(path, link)
     except FileExistsError:
@@ -122,21 +122,21 @@ def text_path(path: str) -> str:
     return link
 
 
-def cache_folder(part: str) -> Path:
-    """Returns the folder `part` of the cache on disk: in GVTORCH_CACHE, else in gvtorch below
+def cache_folder(name: str) -> Path:
+    """Returns the folder `name` of the cache on disk: in GVTORCH_CACHE, else in gvtorch below
     XDG_CACHE_HOME or ~/.cache. Raises RuntimeError if there is no home folder.
     """
-    named = os.environ.get("GVTORCH_CACHE")
-    base = named or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "gvtorch"
-    return Path(base).expanduser().absolute() / part
+    configured = os.environ.get("GVTORCH_CACHE")
+    base = configured or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "gvtorch"
+    return Path(base).expanduser().absolute() / name
 
 
 @functools.cache
-def _folder(process: int) -> str:
+def _link_folder(process_id: int) -> str:
     folder = tempfile.mkdtemp(prefix="gvtorch-")
 
     def remove() -> None:
-        if os.getpid() == process:  # not in a forked child
+        if os.getpid() == process_id:  # not in a forked child
             shutil.rmtree(folder, ignore_errors=True)
 
     atexit.register(remove)

@@ -41,19 +41,19 @@ class LRU:
         Returns:
             (1,) int64 number of unused slots; `unused` is set once the host knows it.
         """
-        held = self.order[self.fresh :]
-        order, unused = lru_partition(held, stamp, frame)
-        held.copy_(order)
+        given_out = self.order[self.fresh :]
+        order, unused = lru_partition(given_out, stamp, frame)
+        given_out.copy_(order)
         return unused + self.fresh if self.fresh else unused
 
     def free(self) -> Tensor:
         """Returns `unused` as a (1,) int64 tensor on the device."""
         return torch.full((1,), self.unused, device=self.order.device)
 
-    def give(self, wanted: Tensor, most: Tensor) -> Tensor:
-        """Gives slots from the front, one each, to the first `most` (1,) of the rows where `wanted`
-        (k,) is true, and moves these slots to the back. The host does not wait; once it knows their
-        number, the caller subtracts it from `unused`.
+    def give(self, wanted: Tensor, limit: Tensor) -> Tensor:
+        """Gives slots from the front, one each, to the first `limit` (1,) of the rows where
+        `wanted` (k,) is true, and moves these slots to the back. The host does not wait; once it
+        knows their number, the caller subtracts it from `unused`.
 
         Returns:
             (k,) int64 slots; -1 where a row gets none.
@@ -61,24 +61,24 @@ class LRU:
         if not (len(self) and len(wanted)):
             return torch.full_like(wanted, -1, dtype=torch.int64)
         rank = wanted.cumsum(0)
-        given = wanted & (rank <= most)
+        granted = wanted & (rank <= limit)
         slot = self.order[(rank - 1).clamp(0, len(self) - 1)].to(torch.int64)
-        self._roll(torch.minimum(rank[-1:], most).clamp(min=0))
-        return torch.where(given, slot, -1)
+        self._roll(torch.minimum(rank[-1:], limit).clamp(min=0))
+        return torch.where(granted, slot, -1)
 
     def _roll(self, count: Tensor) -> None:
         if count.device.type != "cpu":
-            place = torch.arange(len(self), device=count.device) + count
-            self.order.copy_(self.order[place % len(self)])
+            source = torch.arange(len(self), device=count.device) + count
+            self.order.copy_(self.order[source % len(self)])
             return
-        given, start, memory = int(count), self.order.storage_offset(), self._memory
-        self.fresh = max(0, self.fresh - given)
-        end = start + given + len(self)
+        taken, start, memory = int(count), self.order.storage_offset(), self._memory
+        self.fresh = max(0, self.fresh - taken)
+        end = start + taken + len(self)
         if end <= len(memory):
-            memory[end - given : end] = self.order[:given]
-            self.order = memory[start + given : end]
+            memory[end - taken : end] = self.order[:taken]
+            self.order = memory[start + taken : end]
         else:  # back to the beginning
-            self.order = memory[: len(self)].copy_(self.order.roll(-given))
+            self.order = memory[: len(self)].copy_(self.order.roll(-taken))
 
     @property
     def nbytes(self) -> int:
@@ -131,7 +131,7 @@ class Cache:
         """Returns bytes by name: content of each pool, and bookkeeping."""
         nodes, bricks = self.nodes, self.bricks
         content = (*nodes.constants.values(), *nodes.ranges.values())
-        node_bytes = sum(words.nbytes for words in (nodes.child_tn, nodes.brick_tn, *content))
+        node_bytes = sum(tensor.nbytes for tensor in (nodes.child_tn, nodes.brick_tn, *content))
         brick_bytes = sum(tensor.nbytes for tensor in bricks.bricks.values())
         order = sum(lru.nbytes for group in self.lru.values() for lru in group)
         rest = nodes.nbytes + bricks.nbytes - node_bytes - brick_bytes + order
@@ -150,8 +150,8 @@ class Cache:
         def sort(group: list[LRU], stamp: Tensor) -> list[Tensor]:
             unused, size = [lru.sort(stamp, frame) for lru in group], sum(map(len, group))
             locked = (stamp[: len(stamp) - size] == frame).sum()
-            whole = unused[0] + unused[1] if len(group) > 1 else unused[0]
-            return [whole, locked + size - whole, *unused[1:]]
+            unused_total = unused[0] + unused[1] if len(group) > 1 else unused[0]
+            return [unused_total, locked + size - unused_total, *unused[1:]]
 
         tiles, bricks = in_branches(*map(partial, (sort, sort), self.lru.values(), stamps))
         return torch.cat((*tiles, *bricks, self._no_coarse)[:5])
@@ -203,19 +203,19 @@ class Cache:
             order = torch.cat([lru.order for lru in group]).sort().values
             if not torch.equal(order, torch.arange(capacity - len(order), capacity).to(order)):
                 raise ValueError("Cache: the order of use is no permutation of the slots")
-        hangs = (nodes.parent_t >= 0) | nodes.shared_t
-        hangs[: len(self.finest)] = True  # the roots
-        for what, owner, words, shared in (
+        linked = (nodes.parent_t >= 0) | nodes.shared_t
+        linked[: len(self.finest)] = True  # the roots
+        for label, owner, words, shared in (
             ("brick", bricks.owner_b, nodes.brick_tn, bricks.shared_b),
             ("tile", nodes.parent_t, nodes.child_tn, nodes.shared_t),
         ):
             slot = (owner >= 0).nonzero()[:, 0]
             if bool((words.view(-1)[owner[slot].to(torch.int64)] != slot).any()):
-                raise ValueError(f"Cache: a {what}'s owner does not point to it")
-            named = words[hangs]
-            named = named[named >= 0].to(torch.int64)
-            if bool(((owner[named] < 0) & ~shared[named]).any()):
-                raise ValueError(f"Cache: a pointer leads to a {what} without an owner")
+                raise ValueError(f"Cache: a {label}'s owner does not point to it")
+            pointers = words[linked]
+            pointers = pointers[pointers >= 0].to(torch.int64)
+            if bool(((owner[pointers] < 0) & ~shared[pointers]).any()):
+                raise ValueError(f"Cache: a pointer leads to a {label} without an owner")
 
     def __repr__(self) -> str:
         tiles, bricks = self.nodes.capacity, self.bricks.capacity

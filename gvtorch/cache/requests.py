@@ -28,12 +28,12 @@ from .cache import Cache
 KINDS = {"load": REQUEST_LOAD, "subdivide": REQUEST_SUBDIVIDE}
 #: Most levels beyond the first by which a tree deepens in a frame.
 DEEPER = 2
-_PIXEL = 16  # priority of a node whose voxels are a pixel wide: wider ones are to be subdivided
-_NEWEST = 0.3  # weight of the newest call
-_SPREAD = 0.1  # relative spread of batch sizes from which both parts of a cost are fitted
-_PROBE = 1.25  # times as many items are tried if all sizes were alike
-_LEAST = 0.02  # least share of a call's time that is attributed to its items
-_LEARN_FROM = 64  # items: the time of smaller batches is more overhead than throughput
+_PIXEL_PRIORITY = 16  # of a node whose voxels are a pixel wide: wider ones are to be subdivided
+_NEWEST_WEIGHT = 0.3  # of the newest call
+_MIN_SPREAD = 0.1  # relative spread of batch sizes from which both parts of a cost are fitted
+_PROBE_FACTOR = 1.25  # times as many items are tried if all sizes were alike
+_MIN_ITEM_FRACTION = 0.02  # least share of a call's time that is attributed to its items
+_MIN_LEARNED_ITEMS = 64  # items: the time of smaller batches is more overhead than throughput
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -64,17 +64,17 @@ class Requests:
         if self.coarse is None:
             return rank[: sum(room)]
         coarse = self.coarse[rank]
-        fine, wide = (
+        fits_fine, fits_coarse = (
             mask & (mask.cumsum(0) <= n) for mask, n in zip((~coarse, coarse), room, strict=True)
         )
-        return rank[fine | wide]
+        return rank[fits_fine | fits_coarse]
 
 
 def levels_wanted(priority: Tensor, branching: int) -> Tensor:
     """Returns (DEEPER + 1,) int64 how many subdivisions there are, with priorities (k,), -1 for
     none, and how many of them want at least one more level, and two; see `deeper`.
     """
-    widths = [0, *(_PIXEL * branching**level for level in range(1, DEEPER + 1))]
+    widths = [0, *(_PIXEL_PRIORITY * branching**level for level in range(1, DEEPER + 1))]
     return torch.stack([priority >= width for width in widths]).sum(1)
 
 
@@ -96,11 +96,11 @@ def below(
     Returns:
         (k, n) int64 nodes, and (k, n) bool, which of them are chosen.
     """
-    pool, there = cache.nodes, tile.clamp(min=0)
+    pool, valid_tile = cache.nodes, tile.clamp(min=0)
     child = torch.arange(pool.nodes_per_tile, device=tile.device)
-    wide = (tile >= 0) & (priority >= _PIXEL)
-    node = there[:, None] * pool.nodes_per_tile + child
-    split = wide[:, None] & (pool.child_tn[there] == ABSENT)
+    wide = (tile >= 0) & (priority >= _PIXEL_PRIORITY)
+    node = valid_tile[:, None] * pool.nodes_per_tile + child
+    split = wide[:, None] & (pool.child_tn[valid_tile] == ABSENT)
     return node, split & (2 * split.sum() <= free)
 
 
@@ -129,31 +129,35 @@ class RequestList:
         the numbers of requests by the name of their kind, already on the host, so that it waits
         only if there are aliases.
         """
-        asked, listed = {}, self.word[: sum(counts.values())]  # or fewer: a node may request both
+        requests, words = {}, self.word[: sum(counts.values())]  # or fewer: a node may request both
         for name, kind in KINDS.items():
-            row = torch.nonzero_static((listed & kind).ne(0), size=counts[name])[:, 0]
+            row = torch.nonzero_static((words & kind).ne(0), size=counts[name])[:, 0]
             node, priority = self.node[row].to(torch.int64), self.word[row] & REQUEST_PRIORITY
-            asked[kind] = node, priority
-        return _at_targets(cache, asked)
+            requests[kind] = node, priority
+        return _requests_of_targets(cache, requests)
 
 
-def requests_below(cache: Cache, asked: Requests, branching: int) -> RequestsByKind:
-    """Returns subdivisions of the nodes that subdivisions `asked` (k,) have just made, where rays
-    will want them; see `below`. There are no loads.
+def requests_below(cache: Cache, subdivisions: Requests, branching: int) -> RequestsByKind:
+    """Returns subdivisions of the nodes that `subdivisions` (k,) have just made, where rays will
+    want them; see `below`. There are no loads.
     """
-    tile = cache.nodes.child_tn.view(-1)[asked.node].to(torch.int64)
-    priority = asked.priority // branching
+    tile = cache.nodes.child_tn.view(-1)[subdivisions.node].to(torch.int64)
+    priority = subdivisions.priority // branching
     free = sum(lru.unused for lru in cache.lru[REQUEST_SUBDIVIDE])
     node, split = below(cache, tile, priority, free)
     node, priority = node[split], priority[:, None].expand_as(split)[split]
-    none = node[:0], priority[:0]
-    return _at_targets(cache, {REQUEST_LOAD: none, REQUEST_SUBDIVIDE: (node, priority)})
+    no_requests = node[:0], priority[:0]
+    return _requests_of_targets(
+        cache, {REQUEST_LOAD: no_requests, REQUEST_SUBDIVIDE: (node, priority)}
+    )
 
 
-def _at_targets(cache: Cache, asked: dict[int, tuple[Tensor, Tensor]]) -> dict[int, Requests]:
+def _requests_of_targets(
+    cache: Cache, requests: dict[int, tuple[Tensor, Tensor]]
+) -> dict[int, Requests]:
     """Returns requests of nodes (k,), given with priorities by kind; targets replace aliases."""
-    asked = cache.aliases.by_target(asked) if len(cache.aliases) else asked
-    return {kind: Requests.of(cache, kind, *rows) for kind, rows in asked.items()}
+    requests = cache.aliases.by_target(requests) if len(cache.aliases) else requests
+    return {kind: Requests.of(cache, kind, *rows) for kind, rows in requests.items()}
 
 
 def coarser_requests(
@@ -174,15 +178,15 @@ def coarser_requests(
         The subdivisions as they are, and loads of the coarser nodes; or `requests` unchanged if
         there are no slots, or if none of those nodes is left to load.
     """
-    nodes, most = cache.nodes, room[REQUEST_LOAD]
+    nodes, load_room = cache.nodes, room[REQUEST_LOAD]
     node, subdivide = requests[REQUEST_LOAD].node, requests[REQUEST_SUBDIVIDE]
     if len(subdivide) > sum(room[REQUEST_SUBDIVIDE]):
         node = torch.cat((node, subdivide.node)).unique()  # no room for their children: load these
-    while bool((crowded := _crowded(cache, node, most)).any()):
+    while bool((crowded := _crowded(cache, node, load_room)).any()):
         tile = node // nodes.nodes_per_tile
         depth = torch.where(crowded, nodes.loc_t4[tile, 3], 0)
         deepest = depth.max()
-        if sum(most) == 0 or deepest == 0:
+        if sum(load_room) == 0 or deepest == 0:
             return requests
         parent = nodes.parent_t[tile].to(torch.int64)
         node = torch.where(depth == deepest, parent, node).unique()
@@ -201,14 +205,14 @@ def _crowded(cache: Cache, node: Tensor, room: Sequence[int]) -> Tensor:
     coarse = cache.needs_coarse(node)
     if coarse is None:
         return torch.full_like(node, len(node) > sum(room), dtype=torch.bool)
-    few = [mask.sum() > n for mask, n in zip((~coarse, coarse), room, strict=True)]
-    return torch.where(coarse, few[1], few[0])
+    is_crowded = [mask.sum() > n for mask, n in zip((~coarse, coarse), room, strict=True)]
+    return torch.where(coarse, is_crowded[1], is_crowded[0])
 
 
 class CallCost:
-    """Running estimate of the time of a producer call with n items as a line, own + n * each,
-    fitted to the last calls; older ones weigh less. The first call, which may include one-time
-    work, is dropped at the second.
+    """Running estimate of the time of a producer call with n items as a line, overhead + n *
+    per_item, fitted to the last calls; older ones weigh less. The first call, which may include
+    one-time work, is dropped at the second.
 
     Attributes:
         largest: About the largest number of items in recent calls.
@@ -226,38 +230,40 @@ class CallCost:
             self._weight = self._items = self._time = self._squares = self._products = 0.0
         new = (1, items, milliseconds, items * items, items * milliseconds)
         old = (self._weight, self._items, self._time, self._squares, self._products)
-        both = [before + _NEWEST * (n - before) for before, n in zip(old, new, strict=True)]
-        self._weight, self._items, self._time, self._squares, self._products = both
-        self.largest = max(float(items), (1 - _NEWEST) * self.largest)
+        updated = [
+            before + _NEWEST_WEIGHT * (n - before) for before, n in zip(old, new, strict=True)
+        ]
+        self._weight, self._items, self._time, self._squares, self._products = updated
+        self.largest = max(float(items), (1 - _NEWEST_WEIGHT) * self.largest)
 
-    def fitting(self, milliseconds: float, unknown: int) -> int:
+    def fitting(self, milliseconds: float, default: int) -> int:
         """Returns how many items fit into a call of this duration, at least 1, and at most twice as
-        many as were tried lately; `unknown` if there was no call yet.
+        many as were tried lately; `default` if there was no call yet.
 
         If the overhead of a call takes most of that time, items still get half of it, because many
         small calls would take longer. If all calls had about the same number of items, a few more
         are tried: the line cannot be fitted otherwise.
         """
         if not self._weight:
-            return unknown
-        own, each, known = self._line()
-        fitting = max(1.0, max(milliseconds - own, 0.5 * milliseconds) / each)
+            return default
+        overhead, per_item, is_fitted = self._fitted_line()
+        fitting = max(1.0, max(milliseconds - overhead, 0.5 * milliseconds) / per_item)
         mean = self._items / self._weight
-        if not known and abs(fitting - mean) <= _SPREAD * mean:
-            fitting = max(fitting + 1, _PROBE * fitting)
+        if not is_fitted and abs(fitting - mean) <= _MIN_SPREAD * mean:
+            fitting = max(fitting + 1, _PROBE_FACTOR * fitting)
         return int(min(fitting, max(2 * self.largest, 2.0)))
 
-    def _line(self) -> tuple[float, float, bool]:
+    def _fitted_line(self) -> tuple[float, float, bool]:
         """Returns the time of a call itself and of each item, and whether both could be fitted."""
         items, time = self._items / self._weight, self._time / self._weight
         spread = self._squares / self._weight - items * items
-        known = spread > (_SPREAD * items) ** 2
-        most = time / items
-        if not known:
-            return 0.0, most, known
+        is_fitted = spread > (_MIN_SPREAD * items) ** 2
+        max_per_item = time / items
+        if not is_fitted:
+            return 0.0, max_per_item, is_fitted
         slope = (self._products / self._weight - items * time) / spread
-        each = min(max(slope, _LEAST * most), most)
-        return time - each * items, each, known
+        per_item = min(max(slope, _MIN_ITEM_FRACTION * max_per_item), max_per_item)
+        return time - per_item * items, per_item, is_fitted
 
 
 class Choice(NamedTuple):
@@ -310,21 +316,21 @@ class Scheduler:
         """
         nodes: dict[int, Tensor] = {}
         deferred, exceeded = 0, False
-        for kind, most in self.most.items():
-            asked = requests[kind]
-            self._budget[kind] = min(most, self._in_time(kind))
+        for kind, limit in self.most.items():
+            candidates = requests[kind]
+            self._budget[kind] = min(limit, self._items_in_time(kind))
             budget = max(0, self._budget[kind] - self.spent[kind])
-            fitting = asked.fitting(self._rank(asked), room[kind])
+            fitting = candidates.fitting(self._rank(candidates), room[kind])
             deferred += max(0, len(fitting) - budget)
-            exceeded |= len(asked) > len(fitting)
-            nodes[kind] = asked.node[fitting[:budget]]
+            exceeded |= len(candidates) > len(fitting)
+            nodes[kind] = candidates.node[fitting[:budget]]
         return Choice(nodes, deferred, exceeded)
 
     def learn(self, kind: int, items: int, milliseconds: float) -> None:
         """Learns from a batch that took `milliseconds`. Small ones are ignored as mostly overhead,
         unless the budget itself made them small.
         """
-        if items >= min(_LEARN_FROM, self._budget[kind]) and milliseconds > 0:
+        if items >= min(_MIN_LEARNED_ITEMS, self._budget[kind]) and milliseconds > 0:
             self.cost[kind].learn(items, milliseconds)
 
     def _rank(self, requests: Requests) -> Tensor:
@@ -333,11 +339,11 @@ class Scheduler:
         small = REQUEST_PRIORITY - requests.priority.to(torch.int64)
         return (level * (REQUEST_PRIORITY + 1) + small).argsort(stable=True)
 
-    def _in_time(self, kind: int) -> int:
+    def _items_in_time(self, kind: int) -> int:
         """Returns how many items fit into half of the time budget."""
         if self.milliseconds is None:
             return self.most[kind]
-        return self.cost[kind].fitting(0.5 * self.milliseconds, _LEARN_FROM)
+        return self.cost[kind].fitting(0.5 * self.milliseconds, _MIN_LEARNED_ITEMS)
 
     def __repr__(self) -> str:
         loads, tiles = self.most[REQUEST_LOAD], self.most[REQUEST_SUBDIVIDE]

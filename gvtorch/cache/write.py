@@ -48,8 +48,10 @@ class Targets:
         """
         pool, tree = cache.nodes, self.tree
         words = pool.brick_tn if kind == REQUEST_LOAD else pool.child_tn
-        places = pool.loc_t4, pool.parent_t, pool.tree_t, pool.shared_t
-        return lacking(words, *places, self.node, self.loc, tree.number, tree.root, tree.branching)
+        tile_fields = pool.loc_t4, pool.parent_t, pool.tree_t, pool.shared_t
+        return lacking(
+            words, *tile_fields, self.node, self.loc, tree.number, tree.root, tree.branching
+        )
 
 
 @dataclass
@@ -81,15 +83,15 @@ class Children:
 def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
     """Gives nodes their children; see `put_tiles`. The host waits for the outcome."""
     (lru,) = cache.lru[REQUEST_SUBDIVIDE]
-    put = put_tiles(cache, targets, children, lru.free())
-    done = _outcome(put, targets, lru)
-    done.unplaced = max(0, done.unplaced - lru.unused)
-    if done.items and children.alias is not None:
-        row, child = (children.is_alias & (put.slot >= 0)[:, None]).nonzero().unbind(1)
-        node, tree = put.slot[row] * cache.nodes.nodes_per_tile + child, targets.tree
+    outcome = put_tiles(cache, targets, children, lru.free())
+    written = _read_outcome(outcome, targets, lru)
+    written.unplaced = max(0, written.unplaced - lru.unused)
+    if written.items and children.alias is not None:
+        row, child = (children.is_alias & (outcome.slot >= 0)[:, None]).nonzero().unbind(1)
+        node, tree = outcome.slot[row] * cache.nodes.nodes_per_tile + child, targets.tree
         goal = children.alias[row, child]
         cache.aliases.add(node, tree.number, tree.loc(node), goal, children.alias_tree)
-    return done
+    return written
 
 
 class Put(NamedTuple):
@@ -102,20 +104,20 @@ class Put(NamedTuple):
     @classmethod
     def of(cls, wanted: Tensor, slot: Tensor, owner: Tensor) -> Put:
         """Adds the counts; `owner` (s,) is -1 for slots that were free before."""
-        given = slot >= 0
-        held = given & (owner[slot.clamp(min=0)] >= 0)
-        return cls(wanted, slot, torch.stack((wanted, given, held)).sum(1))
+        placed = slot >= 0
+        evicted = placed & (owner[slot.clamp(min=0)] >= 0)
+        return cls(wanted, slot, torch.stack((wanted, placed, evicted)).sum(1))
 
 
-def _outcome(put: Put, targets: Targets, lru: LRU) -> Written:
+def _read_outcome(outcome: Put, targets: Targets, lru: LRU) -> Written:
     """Returns the outcome on the host, which waits for it, and subtracts the slots that were taken
     from `lru.unused`.
     """
-    lasting, items, evicted = put.counts.tolist()
+    wanted_count, items, evicted = outcome.counts.tolist()
     lru.unused -= items
-    unplaced = lasting - items
-    lost = put.wanted & (put.slot < 0) if unplaced else None
-    stale = len(targets) - lasting
+    unplaced = wanted_count - items
+    lost = outcome.wanted & (outcome.slot < 0) if unplaced else None
+    stale = len(targets) - wanted_count
     return Written(items=items, evicted=evicted, stale=stale, unplaced=unplaced, lost=lost)
 
 
@@ -129,35 +131,37 @@ def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) 
     # A late answer may be for nodes that are no longer used: those whose own tile is among the ones
     # given away get no children now.
     front = lru.order[: len(node)].to(torch.int64)
-    most = torch.minimum(wanted.sum(), free)
+    limit = torch.minimum(wanted.sum(), free)
     leaving = torch.zeros(pool.capacity, dtype=torch.bool, device=node.device)
-    leaving[front] = torch.arange(len(front), device=node.device) < most
+    leaving[front] = torch.arange(len(front), device=node.device) < limit
     staying = wanted & ~leaving[node.clamp(min=0) // per_tile]
-    slot = lru.give(staying, most)
-    put = Put.of(wanted, slot, pool.parent_t)
+    slot = lru.give(staying, limit)
+    outcome = Put.of(wanted, slot, pool.parent_t)
     tile_k = slot.to(torch.int32)
     unlink(pool.child_tn, pool.parent_t, pool.shared_t, tile_k)
     orphan(pool.child_tn, pool.parent_t, tile_k)
     orphan(pool.brick_tn, cache.bricks.owner_b, tile_k)
-    for held, values in ((pool.constants, children.constants), (pool.ranges, children.ranges)):
+    for stored, values in ((pool.constants, children.constants), (pool.ranges, children.ranges)):
         for name, rows in values.items():
-            put_rows_of(held[name], slot, rows)
+            put_rows_of(stored[name], slot, rows)
     words = (pool.child_tn, pool.brick_tn, pool.request_tn)
-    places = (pool.loc_t4, pool.parent_t, pool.tree_t, pool.stamp_t, pool.shared_t)
-    made = (children.child.contiguous(), children.brick.contiguous(), node, targets.loc)
+    tile_fields = (pool.loc_t4, pool.parent_t, pool.tree_t, pool.stamp_t, pool.shared_t)
+    contents = (children.child.contiguous(), children.brick.contiguous(), node, targets.loc)
     rows = torch.arange(len(node), device=node.device)
-    link_tiles(*words, *places, *made, rows, tile_k, tree.number, cache.frame_1)
-    return put
+    link_tiles(*words, *tile_fields, *contents, rows, tile_k, tree.number, cache.frame_1)
+    return outcome
 
 
-def put_rows_of(held: Tensor, slot: Tensor, rows: Tensor) -> None:
+def put_rows_of(pool_rows: Tensor, slot: Tensor, rows: Tensor) -> None:
     """Writes rows (k, ...) into slots (k,) of a pool (s, ...), those of slot -1 left out; a row may
     be shorter than a slot.
     """
-    target, made = _as_bytes(held), _as_bytes(rows.to(held.dtype))
-    if made.shape[1] < target.shape[1]:
-        made = torch.nn.functional.pad(made, (0, target.shape[1] - made.shape[1]))
-    put_rows(target, slot, made)
+    target_bytes, source_bytes = _as_bytes(pool_rows), _as_bytes(rows.to(pool_rows.dtype))
+    if source_bytes.shape[1] < target_bytes.shape[1]:
+        source_bytes = torch.nn.functional.pad(
+            source_bytes, (0, target_bytes.shape[1] - source_bytes.shape[1])
+        )
+    put_rows(target_bytes, slot, source_bytes)
 
 
 def _as_bytes(rows: Tensor) -> Tensor:
@@ -171,10 +175,10 @@ def bricks(cache: Cache, targets: Targets, data: Voxels | Sequence[Chunk]) -> Wr
     first = data if isinstance(data, Mapping) else data[0].data
     coarse = any(cache.bricks.channels[name].coarse for name in first)
     lru = cache.lru[REQUEST_LOAD][coarse]
-    put = put_bricks(cache, targets, data, lru.free(), coarse)
-    done = _outcome(put, targets, lru)
-    done.nbytes = done.items * sum(row_bytes(rows) for rows in first.values())
-    return done
+    outcome = put_bricks(cache, targets, data, lru.free(), coarse)
+    written = _read_outcome(outcome, targets, lru)
+    written.nbytes = written.items * sum(row_bytes(rows) for rows in first.values())
+    return written
 
 
 def put_bricks(
@@ -196,9 +200,9 @@ def put_bricks(
     """
     wanted = targets.lacking(cache, REQUEST_LOAD)
     slot = cache.lru[REQUEST_LOAD][coarse].give(wanted, free)
-    put = Put.of(wanted, slot, cache.bricks.owner_b)
+    outcome = Put.of(wanted, slot, cache.bricks.owner_b)
     write_slots(cache, slot, targets.node, data)
-    return put
+    return outcome
 
 
 def write_slots(cache: Cache, slot: Tensor, node: Tensor, data: Voxels | Sequence[Chunk]) -> None:
@@ -209,26 +213,26 @@ def write_slots(cache: Cache, slot: Tensor, node: Tensor, data: Voxels | Sequenc
     unlink(nodes.brick_tn, pool.owner_b, pool.shared_b, slot_k)
     with pool.writing():
         if isinstance(data, Mapping):
-            there = {n: on_device(r, slot.device) for n, r in data.items()}
-            _fill_slots(cache, slot, there)
-            _narrow_ranges(cache, slot, node, there)
+            device_data = {n: on_device(r, slot.device) for n, r in data.items()}
+            _fill_slots(cache, slot, device_data)
+            _narrow_ranges(cache, slot, node, device_data)
         else:
             for chunk in data:
                 with chunk as arrived:
-                    some = slice(chunk.begin, chunk.end)
-                    _fill_slots(cache, slot[some], arrived)
-                    _narrow_ranges(cache, slot[some], node[some], arrived)
+                    part = slice(chunk.begin, chunk.end)
+                    _fill_slots(cache, slot[part], arrived)
+                    _narrow_ranges(cache, slot[part], node[part], arrived)
     slots = (pool.owner_b, pool.stamp_b, pool.born_b, pool.shared_b)
     link_bricks(nodes.brick_tn, nodes.request_tn, *slots, node, slot_k, cache.frame_1)
 
 
 def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> None:
     """Writes voxels that are on the device."""
-    for name, held in cache.bricks.bricks.items():
+    for name, stored in cache.bricks.bricks.items():
         if name in data:
-            put_rows_of(held, slot, data[name])
+            put_rows_of(stored, slot, data[name])
         elif not cache.bricks.channels[name].coarse:  # a tree without this channel
-            put_rows_of(held, slot, held.new_zeros(1).expand(len(slot), *held.shape[1:]))
+            put_rows_of(stored, slot, stored.new_zeros(1).expand(len(slot), *stored.shape[1:]))
 
 
 def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, Tensor]) -> None:
@@ -239,25 +243,25 @@ def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, 
     nodes = cache.nodes
     finest = nodes.child_tn.view(-1)[node.clamp(min=0)] == TERMINAL
     index = torch.where(finest & (slot >= 0), node, -1)
-    for name, words in nodes.ranges.items():
+    for name, ranges in nodes.ranges.items():
         if name in data and not cache.bricks.channels[name].coarse:
-            held = cache.bricks.bricks[name].detach()
-            rows = movable(held).flatten(1)
-            word = torch.int64 if row_bytes(held) % 8 == 0 else rows.dtype  # fewer to gather
-            found = rows.view(word)[slot.clamp(min=0)]
-            voxels = found.view(held.dtype).view(len(slot), -1, held.shape[-1])
+            pool_bricks = cache.bricks.bricks[name].detach()
+            rows = movable(pool_bricks).flatten(1)
+            word = torch.int64 if row_bytes(pool_bricks) % 8 == 0 else rows.dtype  # fewer to gather
+            gathered = rows.view(word)[slot.clamp(min=0)]
+            voxels = gathered.view(pool_bricks.dtype).view(len(slot), -1, pool_bricks.shape[-1])
             if voxels.dtype == torch.uint16:  # which torch can't compare
                 voxels = voxels.to(torch.int32)
-            ends = torch.stack(torch.aminmax(voxels, dim=1), 1)
-            put_rows_of(words.flatten(0, 1), index, ends)
+            extremes = torch.stack(torch.aminmax(voxels, dim=1), 1)
+            put_rows_of(ranges.flatten(0, 1), index, extremes)
 
 
 def uniform(
     cache: Cache, targets: Targets, word: Tensor, constants: Mapping[str, Tensor]
 ) -> Written:
     """Marks nodes as EMPTY or CONSTANT; see `put_uniform`. The host waits for the outcome."""
-    lasting = int(put_uniform(cache, targets, word, constants))
-    return Written(constant=lasting, stale=len(targets) - lasting)
+    lacking_count = int(put_uniform(cache, targets, word, constants))
+    return Written(constant=lacking_count, stale=len(targets) - lacking_count)
 
 
 def put_uniform(
@@ -272,14 +276,14 @@ def put_uniform(
     """
     wanted = targets.lacking(cache, REQUEST_LOAD)
     node, pool = torch.where(wanted, targets.node, -1), cache.nodes
-    for name, words in pool.constants.items():
-        flat = words.flatten(0, 1)
-        nothing = flat.new_zeros(1).expand(len(node), flat.shape[1])
-        put_rows_of(flat, node, constants.get(name, nothing))
+    for name, stored in pool.constants.items():
+        flat = stored.flatten(0, 1)
+        zeros = flat.new_zeros(1).expand(len(node), flat.shape[1])
+        put_rows_of(flat, node, constants.get(name, zeros))
     link(pool.brick_tn, pool.request_tn, node.to(torch.int32), word, REQUEST_LOAD)
     child = pool.child_tn.view(-1, 1)
-    below = child[node.clamp(min=0)]
-    put_rows_of(child, node, torch.where(below == ABSENT, TERMINAL, below))
+    child_word = child[node.clamp(min=0)]
+    put_rows_of(child, node, torch.where(child_word == ABSENT, TERMINAL, child_word))
     return wanted.sum()
 
 

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 Numbers = float | Sequence[float] | Tensor
 Up = str | Sequence[float] | Tensor  # a name of `DIRECTIONS` such as "+z", or (3,) world
 CONE = slice(16, 18)  # columns of `Camera.numbers`
-_NARROWEST = 1e-12  # narrowest field of view, degrees
-_FILLED = 0.98  # share of half the picture's width or height that a fitted box takes
-_CUT = 0.1  # radians from frame to frame; a camera that turns by more has jumped
+_MIN_FOV_DEGREES = 1e-12
+_FIT_FRACTION = 0.98  # share of half the picture's width or height that a fitted box takes
+_MAX_TURN_RADIANS = 0.1  # from frame to frame; a camera that turns by more has jumped
 
 
 class Frame(Enum):
@@ -41,12 +41,12 @@ class Frame(Enum):
     BOX = "box"  # the scene's box: its centre is 0 and its largest side 1
 
     @classmethod
-    def of(cls, where: str, value: Frame | str) -> Frame:
+    def of(cls, context: str, value: Frame | str) -> Frame:
         """Returns the frame of this name; raises ValueError where there is none."""
         try:
             return cls(value)
         except ValueError:
-            raise ValueError(f"{where}: frame must be 'world' or 'box', got {value!r}") from None
+            raise ValueError(f"{context}: frame must be 'world' or 'box', got {value!r}") from None
 
     def unit(self, box: Tensor) -> float:
         """Returns its unit of length, world units, given the (2, 3) box of the scene."""
@@ -117,7 +117,7 @@ class Camera:
         self.distorted = bool((self.radial_coeffs != 0).any())
 
     def _distort(self, coefficients: Tensor) -> None:
-        if not MODELS[self.model].bends:
+        if not MODELS[self.model].has_distortion:
             raise ValueError(f"Camera: radial_coeffs are for a fisheye, got model {self.model!r}")
         shape, count = tuple(coefficients.shape), len(self)
         if shape not in ((4,), (1, 4), (count, 4)):
@@ -160,25 +160,25 @@ class Camera:
             ValueError: A number is not finite or out of its range, or `fit` and a distance are
                 both given.
         """
-        where = "Camera.orbit"
+        context = "Camera.orbit"
         if fit and distance is not None:
-            raise ValueError(f"{where}: fit finds the distance: leave it out, got {distance!r}")
+            raise ValueError(f"{context}: fit finds the distance: leave it out, got {distance!r}")
         distance = (1.0 if fit else 2.4) if distance is None else distance
-        turn, lift, far = _batch(
-            where, azimuth=(azimuth, ()), elevation=(elevation, ()), distance=(distance, ())
+        az, el, distances = _batch(
+            context, azimuth=(azimuth, ()), elevation=(elevation, ()), distance=(distance, ())
         )
-        if bool((far <= 0).any()):
-            raise ValueError(f"{where}: distance must be > 0, got {distance!r}")
-        turn, lift = turn.deg2rad(), lift.deg2rad()
-        zero = torch.zeros_like(turn)
-        outward = torch.stack((turn.sin() * lift.cos(), lift.sin(), turn.cos() * lift.cos()), -1)
-        sign = torch.where(lift.cos() < -1e-12, -1.0, 1.0)  # keeps up upward beyond a pole
-        right = torch.stack((sign * turn.cos(), zero, -sign * turn.sin()), -1)
+        if bool((distances <= 0).any()):
+            raise ValueError(f"{context}: distance must be > 0, got {distance!r}")
+        az, el = az.deg2rad(), el.deg2rad()
+        zero = torch.zeros_like(az)
+        outward = torch.stack((az.sin() * el.cos(), el.sin(), az.cos() * el.cos()), -1)
+        sign = torch.where(el.cos() < -1e-12, -1.0, 1.0)  # keeps up upward beyond a pole
+        right = torch.stack((sign * az.cos(), zero, -sign * az.sin()), -1)
         if not (isinstance(up, str) and up == "+y"):  # +y needs no rotation
-            axes = _axes_around(upward(where, up))
+            axes = _axes_around(upward(context, up))
             outward, right = outward @ axes, right @ axes
-        view = _viewmat(outward * far[..., None], -outward, right)
-        camera = _aimed(where, view, far, fov, width, height, model, Frame.BOX)
+        view = _viewmat(outward * distances[..., None], -outward, right)
+        camera = _aimed(context, view, distances, fov, width, height, model, Frame.BOX)
         if fit:
             focal = camera.Ks[0, (0, 1), (0, 1)].tolist()
             camera.fitted = (0.5 * width / focal[0], 0.5 * height / focal[1])
@@ -235,24 +235,24 @@ class Camera:
         Raises:
             ValueError: A position is not finite, up is zero, or eye and target are the same.
         """
-        where = "Camera.look_at"
-        up = upward(where, up) if isinstance(up, str) else up
-        eye_, target_, up_ = _batch(where, eye=(eye, (3,)), target=(target, (3,)), up=(up, (3,)))
+        context = "Camera.look_at"
+        up = upward(context, up) if isinstance(up, str) else up
+        eye_, target_, up_ = _batch(context, eye=(eye, (3,)), target=(target, (3,)), up=(up, (3,)))
         if bool((up_ == 0).all(-1).any()):
-            raise ValueError(f"{where}: up must not be zero")
+            raise ValueError(f"{context}: up must not be zero")
         forward = target_ - eye_
         length = forward.norm(dim=-1, keepdim=True)
         if bool((length == 0).any()):
-            raise ValueError(f"{where}: eye and target are at the same position, {eye!r}")
+            raise ValueError(f"{context}: eye and target are at the same position, {eye!r}")
         forward = forward / length
         right = torch.linalg.cross(forward, up_)
         along_z = forward[..., 2:3].abs() > 0.9
-        other = torch.where(along_z, *forward.new_tensor([[0, 1, 0], [0, 0, -1]]))
+        fallback = torch.where(along_z, *forward.new_tensor([[0, 1, 0], [0, 0, -1]]))
         parallel = right.norm(dim=-1, keepdim=True) < 1e-9 * up_.norm(dim=-1, keepdim=True) + 1e-300
-        right = torch.where(parallel, torch.linalg.cross(forward, other), right)
+        right = torch.where(parallel, torch.linalg.cross(forward, fallback), right)
         right = right / right.norm(dim=-1, keepdim=True)
         view = _viewmat(eye_, forward, right)
-        return _aimed(where, view, length[..., 0], fov, width, height, model, Frame.WORLD)
+        return _aimed(context, view, length[..., 0], fov, width, height, model, Frame.WORLD)
 
     @classmethod
     def from_viewmat_K(
@@ -313,14 +313,14 @@ class Camera:
 
     def __getitem__(self, index: int) -> Camera:
         """Returns one camera of the batch."""
-        one = range(len(self))[index]
-        parts = {name: getattr(self, name)[one : one + 1] for name in _ROWS}
-        return self._changed(**parts, batched=False)
+        first = range(len(self))[index]
+        changes = {name: getattr(self, name)[first : first + 1] for name in _BATCHED_FIELDS}
+        return self._copy_with(**changes, batched=False)
 
-    def _changed(self, **parts: Any) -> Camera:
-        other = object.__new__(type(self))
-        vars(other).update(vars(self), **parts)
-        return other
+    def _copy_with(self, **changes: Any) -> Camera:
+        camera = object.__new__(type(self))
+        vars(camera).update(vars(self), **changes)
+        return camera
 
     @property
     def form(self) -> tuple[Any, ...]:
@@ -330,9 +330,9 @@ class Camera:
 
     def same(self, other: Camera) -> bool:
         """Whether another camera has the same rays; does not wait for a device."""
-        mine, others = ((one.form, one.frame, one.fitted) for one in (self, other))
-        return mine == others and all(
-            torch.equal(getattr(self, name), getattr(other, name)) for name in _ROWS
+        own, theirs = ((camera.form, camera.frame, camera.fitted) for camera in (self, other))
+        return own == theirs and all(
+            torch.equal(getattr(self, name), getattr(other, name)) for name in _BATCHED_FIELDS
         )
 
     def placed(self, box: Tensor) -> Camera:
@@ -344,24 +344,24 @@ class Camera:
         low, high = box.numpy()
         centre, side, Ks = (low + high) / 2, (high - low).max(), self.Ks
         view = self.viewmats.numpy().copy()
-        rotation, place = view[:, :3, :3], view[:, :3, 3]
-        turned = _sum_of_three(rotation.swapaxes(0, 2), centre).T
+        rotation, translation = view[:, :3, :3], view[:, :3, 3]
+        turned_centre = _sum_of_three(rotation.swapaxes(0, 2), centre).T
         if self.fitted is None:
-            place[:] = place * side - turned
+            translation[:] = translation * side - turned_centre
             scale: Any = side
         else:
-            corners = torch.stack([box[at, (0, 1, 2)] for at in _CORNERS])
-            seen = (corners - torch.from_numpy(centre)) @ torch.from_numpy(rotation).mT
-            halves = [_FILLED * half for half in self.fitted]
-            away, scale = MODELS[self.model].fit(seen, *halves)  # (n,) each
-            place[:] = -turned
-            place[:, 2] += away.numpy()
+            corners = torch.stack([box[corner, (0, 1, 2)] for corner in _CORNERS])
+            in_camera = (corners - torch.from_numpy(centre)) @ torch.from_numpy(rotation).mT
+            half_extents = [_FIT_FRACTION * half_extent for half_extent in self.fitted]
+            distance, scale = MODELS[self.model].fit(in_camera, *half_extents)  # (n,) each
+            translation[:] = -turned_centre
+            translation[:, 2] += distance.numpy()
             scale = scale[:, None]
         if MODELS[self.model].parallel:
             Ks = Ks.clone()
             Ks[:, (0, 1), (0, 1)] /= scale
-        parts = {"viewmats": torch.from_numpy(view), "Ks": Ks}
-        return self._changed(**parts, frame=Frame.WORLD, fitted=None)
+        changes = {"viewmats": torch.from_numpy(view), "Ks": Ks}
+        return self._copy_with(**changes, frame=Frame.WORLD, fitted=None)
 
     def pixel_width(self, distance: float) -> float:
         """Returns the width of a pixel in world units: of a pinhole at a distance along its axis,
@@ -370,10 +370,12 @@ class Camera:
         Raises:
             ValueError: It is a fisheye or a panorama, a batch, or relative to a box.
         """
-        where = "Camera.pixel_width"
+        context = "Camera.pixel_width"
         if self.model not in ("pinhole", "ortho") or len(self) != 1 or self.frame is Frame.BOX:
-            raise ValueError(f"{where}: takes one pinhole or ortho camera in the world, got {self}")
-        distance = check.number(where, "distance", distance, low=0, open_low=True)
+            raise ValueError(
+                f"{context}: takes one pinhole or ortho camera in the world, got {self}"
+            )
+        distance = check.number(context, "distance", distance, low=0, open_low=True)
         return (1.0 if self.model == "ortho" else distance) / float(self.Ks[0, 0, 0])
 
     def shifted(self, dx: float, dy: float, sample: int | None = None) -> Camera:
@@ -382,12 +384,12 @@ class Camera:
         """
         Ks = self.Ks.clone()
         Ks[:, :2, 2] -= torch.tensor([dx, dy], dtype=torch.float64)
-        return self._changed(Ks=Ks, sample=self.sample if sample is None else sample)
+        return self._copy_with(Ks=Ks, sample=self.sample if sample is None else sample)
 
     def strip(self, first: int, end: int) -> Camera:
         """Returns the camera of the rows [first, end) of each picture."""
         window = (self.window[0] + first, self.window[1])
-        return self.shifted(0, first)._changed(height=end - first, window=window)
+        return self.shifted(0, first)._copy_with(height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
         """Returns the numbers that `pixel_rays` reads; does not wait for the device. (n, 26)
@@ -409,15 +411,15 @@ class Camera:
         pixel, zero = 1 / focal.min(1, keepdims=True), np.zeros((len(self), 1))
         cone = (pixel, zero) if MODELS[self.model].parallel else (zero, pixel)  # at CONE
         range_ = (zero, zero + math.inf)
-        bend = (self.radial_coeffs.numpy(), self.max_angle.numpy()[:, None])
-        parts = (rotation.reshape(-1, 9), position, focal, centre, *cone, *range_, *bend)
+        lens = (self.radial_coeffs.numpy(), self.max_angle.numpy()[:, None])
+        parts = (rotation.reshape(-1, 9), position, focal, centre, *cone, *range_, *lens)
         numbers = np.concatenate((*parts, zero + self.sample), 1)
         return upload(torch.from_numpy(numbers), torch.device(device))
 
     def thinned(self, stride: int) -> Camera:
         """Returns the camera with one ray per stride x stride pixels; see `numbers_ahead`."""
         height, width = (-(-size // stride) for size in (self.height, self.width))
-        return self._changed(height=height, width=width, window=(0, height))
+        return self._copy_with(height=height, width=width, window=(0, height))
 
     def numbers_ahead(self, now: Tensor, before: Tensor, frames: float, stride: int) -> Tensor:
         """Returns the numbers of the camera `thinned` by `stride`, extrapolated by `frames` frames
@@ -455,8 +457,8 @@ class Camera:
 
     def image(self, column: Tensor) -> Tensor:
         """Returns values (r,) or (r, c) of all pixels as a picture (h, w, c), or (n, h, w, c)."""
-        one = (self.height, self.width, -1)
-        return column.reshape(len(self), *one) if self.batched else column.reshape(one)
+        shape = (self.height, self.width, -1)
+        return column.reshape(len(self), *shape) if self.batched else column.reshape(shape)
 
     def rays(self, device: torch.device | str = "cpu", rows: tuple[int, int] | None = None) -> Rays:
         """Returns the rays through pixel centres, camera by camera, row by row, in float64; `rows`
@@ -465,11 +467,11 @@ class Camera:
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
         """
-        everything = (0, len(self) * self.height)
-        return self.pixel_rays(self.numbers(device), rows or everything)
+        all_rows = (0, len(self) * self.height)
+        return self.pixel_rays(self.numbers(device), rows or all_rows)
 
 
-_ROWS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # one row per camera
+_BATCHED_FIELDS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # one row per camera
 _CORNERS = list(itertools.product((0, 1), repeat=3))
 
 
@@ -480,9 +482,11 @@ def continued(now: Tensor, before: Tensor, frames: float, moving: int, axes: sli
     more than 0.1 radian, that row stays as it is now.
     """
     motion = (now - before)[:, :moving]
-    turned = motion[:, axes].unflatten(1, (-1, 3)).square().sum(2).amax(1, keepdim=True)
-    way = torch.where(turned <= _CUT * _CUT, frames * motion, 0.0)
-    return torch.cat((now[:, :moving] + way, now[:, moving:]), 1)
+    turn_squared = motion[:, axes].unflatten(1, (-1, 3)).square().sum(2).amax(1, keepdim=True)
+    displacement = torch.where(
+        turn_squared <= _MAX_TURN_RADIANS * _MAX_TURN_RADIANS, frames * motion, 0.0
+    )
+    return torch.cat((now[:, :moving] + displacement, now[:, moving:]), 1)
 
 
 def _sum_of_three(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -490,19 +494,19 @@ def _sum_of_three(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return values[0] * weights[0] + values[1] * weights[1] + values[2] * weights[2]
 
 
-def upward(where: str, up: Up) -> Tensor:
+def upward(context: str, up: Up) -> Tensor:
     """Returns the up direction, (3,) float64, from a name such as "+z" or three numbers; raises
     ValueError where it is neither, or zero.
     """
     if isinstance(up, str):
         if up not in DIRECTIONS:
-            known = ", ".join(DIRECTIONS)
-            raise ValueError(f"{where}: up must be one of {known} or three numbers, got {up!r}")
-        at, sign = divmod(DIRECTIONS.index(up), 2)
-        return torch.eye(3, dtype=torch.float64)[at] * (1 - 2 * sign)
-    direction = torch.tensor(check.triple(where, "up", up), dtype=torch.float64)
+            names = ", ".join(DIRECTIONS)
+            raise ValueError(f"{context}: up must be one of {names} or three numbers, got {up!r}")
+        axis, sign = divmod(DIRECTIONS.index(up), 2)
+        return torch.eye(3, dtype=torch.float64)[axis] * (1 - 2 * sign)
+    direction = torch.tensor(check.triple(context, "up", up), dtype=torch.float64)
     if not bool(direction.any()):
-        raise ValueError(f"{where}: up must not be zero")
+        raise ValueError(f"{context}: up must not be zero")
     return direction
 
 
@@ -516,25 +520,27 @@ def _axes_around(up: Tensor) -> Tensor:
     return torch.stack((right, up, torch.linalg.cross(right, up)))
 
 
-def _batch(where: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:
+def _batch(context: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:
     """Returns numbers of one camera (*shape), or of n cameras (n, *shape), broadcast."""
-    found, sizes = [], []
+    parsed, sizes = [], []
     for name, (value, shape) in values.items():
-        numbers = check.reals(where, name, value)
+        numbers = check.reals(context, name, value)
         batch = numbers.dim() - len(shape)
         if batch not in (0, 1) or numbers.shape[batch:] != shape:
-            many = str(("n", *shape)).replace("'", "")
+            batch_shape = str(("n", *shape)).replace("'", "")
             got = tuple(numbers.shape)
-            raise ValueError(f"{where}: {name} must be {shape or 'a number'} or {many}, got {got}")
-        found.append((numbers, shape))
+            raise ValueError(
+                f"{context}: {name} must be {shape or 'a number'} or {batch_shape}, got {got}"
+            )
+        parsed.append((numbers, shape))
         sizes.append(numbers.shape[:batch])
     try:
         size = np.broadcast_shapes(*sizes)  # torch's imports sympy: half a second
     except ValueError:
         raise ValueError(
-            f"{where}: {', '.join(values)} do not match, they have different lengths"
+            f"{context}: {', '.join(values)} do not match, they have different lengths"
         ) from None
-    return [numbers.expand((*size, *shape)).contiguous() for numbers, shape in found]
+    return [numbers.expand((*size, *shape)).contiguous() for numbers, shape in parsed]
 
 
 def _check_matrices(viewmats: Tensor, Ks: Tensor) -> None:
@@ -564,7 +570,7 @@ def _viewmat(eye: Tensor, forward: Tensor, right: Tensor) -> Tensor:
 
 
 def _aimed(
-    where: str,
+    context: str,
     view: Tensor,
     distance: Tensor,
     fov: float | None,
@@ -574,17 +580,19 @@ def _aimed(
     frame: Frame,
 ) -> Camera:
     """Returns cameras with a centred axis; `distance` (...) is that of the target."""
-    kind = model_of(where, model)
-    fov = kind.fov if fov is None else fov
-    check.number(where, "fov", fov, low=0, high=kind.widest, open_low=True)
-    if fov < _NARROWEST:
-        raise ValueError(f"{where}: fov must be at least {_NARROWEST:g} degrees, got {fov!r}")
-    check.whole(where, "width", width, low=1, high=65536)
-    check.whole(where, "height", height, low=1, high=65536)
-    fx, fy = kind.focal(math.radians(fov), width, height)
+    camera_model = model_of(context, model)
+    fov = camera_model.fov if fov is None else fov
+    check.number(context, "fov", fov, low=0, high=camera_model.widest, open_low=True)
+    if fov < _MIN_FOV_DEGREES:
+        raise ValueError(
+            f"{context}: fov must be at least {_MIN_FOV_DEGREES:g} degrees, got {fov!r}"
+        )
+    check.whole(context, "width", width, low=1, high=65536)
+    check.whole(context, "height", height, low=1, high=65536)
+    fx, fy = camera_model.focal(math.radians(fov), width, height)
     Ks = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float64)
-    if kind.parallel:
+    if camera_model.parallel:
         Ks = Ks.repeat(*distance.shape, 1, 1)
         Ks[..., (0, 1), (0, 1)] /= distance[..., None]
-    most = min(180.0, fov / 2) if kind.bends else 180.0
-    return Camera(view, Ks, width, height, model=model, max_angle=most, frame=frame)
+    max_angle = min(180.0, fov / 2) if camera_model.has_distortion else 180.0
+    return Camera(view, Ks, width, height, model=model, max_angle=max_angle, frame=frame)

@@ -34,17 +34,19 @@ class CustomCamera(Camera):
                 length.
         """
         columns: list[Tensor] = []
-        known: int | str = "r"
+        expected_rows: int | str = "r"
         for name, size in (("origin", 3), ("direction", 3), ("cone", 2), ("range", 2)):
             column: Any = getattr(rays, name, None)
-            real = isinstance(column, Tensor) and column.is_floating_point() and column.dim() == 2
-            if not real or column.shape[1] != size or known not in ("r", len(column)):
+            is_valid = (
+                isinstance(column, Tensor) and column.is_floating_point() and column.dim() == 2
+            )
+            if not is_valid or column.shape[1] != size or expected_rows not in ("r", len(column)):
                 raise ValueError(
-                    f"CustomCamera: rays.{name} must be ({known}, {size}) float, "
+                    f"CustomCamera: rays.{name} must be ({expected_rows}, {size}) float, "
                     f"got {describe(column)}"
                 )
             columns.append(column)
-            known = len(column)
+            expected_rows = len(column)
         if rays.transmittance is not None:
             raise ValueError("CustomCamera: rays of a picture must have no transmittance, got some")
         count = len(rays.origin)
@@ -61,13 +63,14 @@ class CustomCamera(Camera):
         columns.append(torch.zeros_like(columns[0][:, :1]))
         self._rays = torch.cat([column.to(torch.float64) for column in columns], 1)  # (r, 11)
         if rays.direction.device.type == "cpu":
-            lost = self._rays.isnan().any(1)
-            if bool(lost.any()):
-                raise ValueError(f"CustomCamera: rays must not be NaN, {int(lost.sum())} are")
-            off = (rays.direction.norm(dim=1) - 1).abs() > 1e-3
-            if bool(off.any()):
+            has_nan = self._rays.isnan().any(1)
+            if bool(has_nan.any()):
+                raise ValueError(f"CustomCamera: rays must not be NaN, {int(has_nan.sum())} are")
+            off_unit = (rays.direction.norm(dim=1) - 1).abs() > 1e-3
+            if bool(off_unit.any()):
                 raise ValueError(
-                    f"CustomCamera: directions must be of unit length, {int(off.sum())} are not"
+                    "CustomCamera: directions must be of unit length, "
+                    f"{int(off_unit.sum())} are not"
                 )
         self.frame, self.batched = Frame.WORLD, count > self.width * self.height
 
@@ -128,7 +131,7 @@ class CustomCamera(Camera):
 
     def __getitem__(self, index: int) -> Camera:
         """Returns one camera of the batch."""
-        return self._changed(_rays=self._pictures()[index].reshape(-1, 11), batched=False)
+        return self._copy_with(_rays=self._pictures()[index].reshape(-1, 11), batched=False)
 
     def same(self, other: Camera) -> bool:
         """Whether the other has the same tensor of rays."""
@@ -147,13 +150,13 @@ class CustomCamera(Camera):
         rays = torch.cat((origin, direction, self._pictures()[..., 6:]), -1).reshape(-1, 11)
         if sample is not None:
             rays[:, -1] = sample
-        return self._changed(_rays=rays)
+        return self._copy_with(_rays=rays)
 
     def strip(self, first: int, end: int) -> Camera:
         """Returns the camera of the rows [first, end) of each picture."""
         rays = self._pictures()[:, first:end].reshape(-1, 11)
         window = (self.window[0] + first, self.window[1])
-        return self._changed(_rays=rays, height=end - first, window=window)
+        return self._copy_with(_rays=rays, height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
         """Returns (r, 11) float64: origin, direction, cone, range and sample."""
@@ -163,19 +166,19 @@ class CustomCamera(Camera):
         """Returns the camera with one ray per stride x stride pixels; see `numbers_ahead`."""
         rays = self._pictures()[:, ::stride, ::stride]
         height, width = rays.shape[1:3]
-        parts = {"height": height, "width": width, "window": (0, height)}
-        return self._changed(_rays=rays.reshape(-1, 11), **parts)
+        changes = {"height": height, "width": width, "window": (0, height)}
+        return self._copy_with(_rays=rays.reshape(-1, 11), **changes)
 
     def numbers_ahead(self, now: Tensor, before: Tensor, frames: float, stride: int) -> Tensor:
         """Returns the numbers of the camera `thinned` by `stride`, extrapolated by `frames` frames
         from the `numbers` of the last two frames; see `continued`.
         """
 
-        def some(numbers: Tensor) -> Tensor:
+        def thin(numbers: Tensor) -> Tensor:
             pictures = numbers.view(-1, self.height, self.width, 11)
             return pictures[:, ::stride, ::stride].reshape(-1, 11)
 
-        return continued(some(now), some(before), frames, moving=6, axes=slice(3, 6))
+        return continued(thin(now), thin(before), frames, moving=6, axes=slice(3, 6))
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays of whole rows, from the result of `numbers`."""
@@ -184,11 +187,11 @@ class CustomCamera(Camera):
         return Rays(origin=origin, direction=direction, cone=cone, range=limits, width=self.width)
 
 
-def as_camera(where: str, camera: Camera | Rays) -> Camera:
+def as_camera(context: str, camera: Camera | Rays) -> Camera:
     """Returns a user's camera; rays become a `CustomCamera`. Raises ValueError if it is neither."""
     if isinstance(camera, Rays):
         return CustomCamera(camera)
-    return instance(where, "camera", camera, Camera)
+    return instance(context, "camera", camera, Camera)
 
 
 def _neighbour_cones(origin: Tensor, direction: Tensor) -> Tensor:

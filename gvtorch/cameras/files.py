@@ -32,7 +32,7 @@ from .camera import Camera, Frame
 from .motion import quaternion_of, rotation_of
 
 _FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))  # y down to y up
-_PVCC = (
+_PVCC_PROPERTIES = (
     ("CameraPosition", 3),
     ("CameraFocalPoint", 3),
     ("CameraViewUp", 3),
@@ -44,7 +44,7 @@ _PVCC = (
 _DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _FISHEYE = "OPENCV_FISHEYE"
 #: Parameters of COLMAP's models; distorted pinholes are read only if all their coefficients are 0.
-_COLMAP = {
+_COLMAP_PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
@@ -88,8 +88,8 @@ def read_cameras(
         else:
             cameras = readers[path.suffix](path, width, height)
     except (KeyError, IndexError, TypeError, ArithmeticError, xml.ParseError) as error:
-        told = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path}: can't be read as cameras: {one_line(told)}") from None
+        message = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path}: can't be read as cameras: {one_line(message)}") from None
     except ValueError as error:
         raise ValueError(f"{path}: {one_line(error)}") from None
     if not cameras:
@@ -116,31 +116,31 @@ def write_cameras(
             relative to a box: call `placed(tree.box)` first.
         FileNotFoundError: The folder around it does not exist.
     """
-    path, where = Path(path), "write_cameras"
+    path, context = Path(path), "write_cameras"
     if isinstance(cameras, Camera):
         cameras = {f"{n:04d}.png": cameras[n] for n in range(len(cameras))}
     for name, camera in cameras.items():
-        check.instance(where, "cameras", camera, Camera)
+        check.instance(context, "cameras", camera, Camera)
         if camera.frame is Frame.BOX or len(camera) != 1:
-            raise ValueError(f"{where}: {name!r} must be one camera in the world, got {camera}")
+            raise ValueError(f"{context}: {name!r} must be one camera in the world, got {camera}")
         if not name or any(letter.isspace() for letter in name):
-            raise ValueError(f"{where}: names must not contain blanks, got {name!r}")
+            raise ValueError(f"{context}: names must not contain blanks, got {name!r}")
     if not cameras:
-        raise ValueError(f"{where}: there are no cameras")
+        raise ValueError(f"{context}: there are no cameras")
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{where}: folder not found: {path.parent}")
+        raise FileNotFoundError(f"{context}: folder not found: {path.parent}")
     if path.suffix == ".pvcc":
-        far = check.number(where, "distance", distance, low=0, open_low=True)
-        write_whole(path, _pvcc(cameras, far))
+        eye_distance = check.number(context, "distance", distance, low=0, open_low=True)
+        write_whole(path, _pvcc_text(cameras, eye_distance))
     elif path.suffix == ".json":
-        write_whole(path, json.dumps(_transforms(cameras), indent=1) + "\n")
+        write_whole(path, json.dumps(_transforms_content(cameras), indent=1) + "\n")
     elif path.suffix == "" and (path.is_dir() or not path.exists()):
-        texts = _colmap(cameras)
+        texts = _colmap_texts(cameras)
         path.mkdir(exist_ok=True)
         for name, text in texts.items():
             write_whole(path / name, text)
     else:
-        raise ValueError(f"{where}: path must end in .pvcc or .json or be a folder, got {path}")
+        raise ValueError(f"{context}: path must end in .pvcc or .json or be a folder, got {path}")
 
 
 def _scaled(camera: Camera, width: int, height: int) -> Camera:
@@ -148,59 +148,59 @@ def _scaled(camera: Camera, width: int, height: int) -> Camera:
     Ks = camera.Ks[0].clone()
     Ks[0] *= width / camera.width
     Ks[1] *= height / camera.height
-    bends = camera.radial_coeffs[0] if camera.distorted else None
+    coefficients = camera.radial_coeffs[0] if camera.distorted else None
     view, model = camera.viewmats[0], camera.model
-    return Camera(view, Ks, width, height, model=model, radial_coeffs=bends)
+    return Camera(view, Ks, width, height, model=model, radial_coeffs=coefficients)
 
 
 # ParaView.
 
 
 def _read_pvcc(path: Path, width: int | None, height: int | None) -> dict[str, Camera]:
-    root = xml.fromstring(_text(path))
-    found: dict[str, list[float]] = {}
-    for one in root.iter("Property"):
-        values = [float(item.attrib["value"]) for item in one.iter("Element")]
-        found[one.attrib["name"]] = values
-    eye, target, up = (found[name][:3] for name, _ in _PVCC[:3])
+    root = xml.fromstring(_read_text(path))
+    properties: dict[str, list[float]] = {}
+    for element in root.iter("Property"):
+        values = [float(item.attrib["value"]) for item in element.iter("Element")]
+        properties[element.attrib["name"]] = values
+    eye, target, up = (properties[name][:3] for name, _ in _PVCC_PROPERTIES[:3])
     if width is None or height is None:
         raise ValueError("does not give the size of the picture: give width and height")
-    if not found.get("CameraParallelProjection", [0])[0]:
-        fov = found["CameraViewAngle"][0]
+    if not properties.get("CameraParallelProjection", [0])[0]:
+        fov = properties["CameraViewAngle"][0]
         return {"camera": Camera.look_at(eye, target, up, fov, width, height)}
     camera = Camera.look_at(eye, target, up, 30.0, width, height, "ortho")
-    camera.Ks[:, (0, 1), (0, 1)] = 0.5 * height / found["CameraParallelScale"][0]
+    camera.Ks[:, (0, 1), (0, 1)] = 0.5 * height / properties["CameraParallelScale"][0]
     return {"camera": camera}
 
 
-def _pvcc(cameras: Mapping[str, Camera], distance: float) -> str:
+def _pvcc_text(cameras: Mapping[str, Camera], distance: float) -> str:
     if len(cameras) != 1:
         raise ValueError(f"write_cameras: .pvcc holds one camera, got {len(cameras)}")
     (camera,) = cameras.values()
-    middle = camera.Ks.new_tensor([camera.width / 2, camera.height / 2])
+    centre = camera.Ks.new_tensor([camera.width / 2, camera.height / 2])
     square = bool(torch.isclose(camera.Ks[0, 0, 0], camera.Ks[0, 1, 1], rtol=1e-9))
     if camera.model not in ("pinhole", "ortho") or not square:
         raise ValueError(
             f"write_cameras: .pvcc holds pinhole and ortho, of square pixels: {camera}"
         )
-    if not torch.allclose(camera.Ks[0, :2, 2], middle, atol=1e-6):
+    if not torch.allclose(camera.Ks[0, :2, 2], centre, atol=1e-6):
         raise ValueError("write_cameras: .pvcc has its axis in the middle of the picture")
     to_world = torch.linalg.inv(camera.viewmats[0])
     eye, forward, up = to_world[:3, 3], to_world[:3, 2], -to_world[:3, 1]
-    target, half = eye + distance * forward, 0.5 * camera.height / float(camera.Ks[0, 1, 1])
+    target, half_height = eye + distance * forward, 0.5 * camera.height / float(camera.Ks[0, 1, 1])
     is_ortho = camera.model == "ortho"
-    angle = 30.0 if is_ortho else math.degrees(2 * math.atan(half))
-    scale = half if is_ortho else half * distance
-    told = (eye, target, up, target, [angle], [scale], [int(is_ortho)])
+    angle = 30.0 if is_ortho else math.degrees(2 * math.atan(half_height))
+    scale = half_height if is_ortho else half_height * distance
+    property_values = (eye, target, up, target, [angle], [scale], [int(is_ortho)])
     root = xml.Element("PVCameraConfiguration", description="ParaView camera", version="1.0")
     proxy = xml.SubElement(root, "Proxy", group="views", type="RenderView", id="1", servers="21")
-    for (name, count), values in zip(_PVCC, told, strict=True):
-        one = xml.SubElement(
+    for (name, count), values in zip(_PVCC_PROPERTIES, property_values, strict=True):
+        element = xml.SubElement(
             proxy, "Property", name=name, id=f"1.{name}", number_of_elements=str(count)
         )
         numbers = values.tolist() if isinstance(values, Tensor) else values
         for index, value in enumerate(numbers):
-            xml.SubElement(one, "Element", index=str(index), value=repr(value))
+            xml.SubElement(element, "Element", index=str(index), value=repr(value))
     xml.indent(root)
     return '<?xml version="1.0"?>\n' + xml.tostring(root, encoding="unicode") + "\n"
 
@@ -212,67 +212,71 @@ def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[
     content = check.json_file("cameras", path)
     cameras = {}
     for number, frame in enumerate(content["frames"]):
-        told = {**content, **frame}
-        pose = check.reals(f"frame {number}", "pose", told["transform_matrix"], (4, 4)) @ _FLIP
+        fields = {**content, **frame}
+        pose = check.reals(f"frame {number}", "pose", fields["transform_matrix"], (4, 4)) @ _FLIP
         view = torch.eye(4, dtype=torch.float64)
         view[:3, :3], view[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
-        x, y = (int(told.get(k) or size or 0) for k, size in (("w", width), ("h", height)))
+        x, y = (int(fields.get(k) or size or 0) for k, size in (("w", width), ("h", height)))
         if not x or not y:
             raise ValueError("does not give the size of the pictures: give width and height")
-        fx = told["fl_x"] if "fl_x" in told else 0.5 * x / math.tan(told["camera_angle_x"] / 2)
-        fy = told.get("fl_y", fx)
-        cx, cy = told.get("cx", x / 2), told.get("cy", y / 2)
-        name = str(told.get("file_path", f"{number:04d}.png"))
+        fx = (
+            fields["fl_x"] if "fl_x" in fields else 0.5 * x / math.tan(fields["camera_angle_x"] / 2)
+        )
+        fy = fields.get("fl_y", fx)
+        cx, cy = fields.get("cx", x / 2), fields.get("cy", y / 2)
+        name = str(fields.get("file_path", f"{number:04d}.png"))
         if name in cameras:
             raise ValueError(f"frame {number}: there is one of {name!r} already")
-        model = told.get("camera_model", "PINHOLE")
-        cameras[name] = _made(model, view, (fx, fy, cx, cy), told, (x, y))
+        model = fields.get("camera_model", "PINHOLE")
+        cameras[name] = _camera_of_lens(model, view, (fx, fy, cx, cy), fields, (x, y))
     return cameras
 
 
-def _made(
-    model: str, view: Tensor, lens: Any, told: Mapping[str, Any], size: tuple[int, int]
+def _camera_of_lens(
+    model: str, view: Tensor, intrinsics: Any, parameters: Mapping[str, Any], size: tuple[int, int]
 ) -> Camera:
-    """Returns a camera of one of COLMAP's models; `lens` is fx, fy, cx, cy."""
-    fx, fy, cx, cy = lens
+    """Returns a camera of one of COLMAP's models; `intrinsics` is fx, fy, cx, cy."""
+    fx, fy, cx, cy = intrinsics
     Ks = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-    bends = [float(told.get(name) or 0) for name in ("k1", "k2", "k3", "k4")]
+    radial = [float(parameters.get(name) or 0) for name in ("k1", "k2", "k3", "k4")]
     if model == _FISHEYE:
-        coefficients = bends if any(bends) else None
+        coefficients = radial if any(radial) else None
         return Camera(view, Ks, *size, model="fisheye", radial_coeffs=coefficients)
-    if model not in _COLMAP:
-        raise ValueError(f"camera model {model} is not read; known: {', '.join(_COLMAP)}")
-    if any(told.get(name) for name in _DISTORTIONS):
+    if model not in _COLMAP_PARAMETERS:
+        raise ValueError(
+            f"camera model {model} is not read; known: {', '.join(_COLMAP_PARAMETERS)}"
+        )
+    if any(parameters.get(name) for name in _DISTORTIONS):
         raise ValueError(f"a lens of model {model} with distortion is not read: undistort first")
     return Camera(view, Ks, *size)
 
 
-def _transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
+def _transforms_content(cameras: Mapping[str, Camera]) -> dict[str, Any]:
     frames = []
     for name, camera in cameras.items():
-        model, told = _lens(camera)
+        model, parameters = _lens_of(camera)
         names = {"fx": "fl_x", "fy": "fl_y"}
         frames.append(
             {
                 "file_path": name,
                 "camera_model": model,
                 **{"w": camera.width, "h": camera.height},
-                **{names.get(key, key): value for key, value in told.items()},
+                **{names.get(key, key): value for key, value in parameters.items()},
                 "transform_matrix": (torch.linalg.inv(camera.viewmats[0]) @ _FLIP).tolist(),
             }
         )
     return {"frames": frames}
 
 
-def _lens(camera: Camera) -> tuple[str, dict[str, float]]:
+def _lens_of(camera: Camera) -> tuple[str, dict[str, float]]:
     """Returns COLMAP's model and parameters of a camera."""
     (fx, _, cx), (_, fy, cy), _ = camera.Ks[0].tolist()
-    told = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    parameters = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
     if camera.model == "pinhole":
-        return "PINHOLE", told
+        return "PINHOLE", parameters
     if camera.model == "fisheye":
-        bends = camera.radial_coeffs[0].tolist()
-        return _FISHEYE, told | dict(zip(("k1", "k2", "k3", "k4"), bends, strict=True))
+        coefficients = camera.radial_coeffs[0].tolist()
+        return _FISHEYE, parameters | dict(zip(("k1", "k2", "k3", "k4"), coefficients, strict=True))
     raise ValueError(f"write_cameras: only pinhole and fisheye can be written, got {camera.model}")
 
 
@@ -281,55 +285,62 @@ def _lens(camera: Camera) -> tuple[str, dict[str, float]]:
 
 def _read_colmap(path: Path) -> dict[str, Camera]:
     lenses: dict[str, tuple[str, dict[str, float], tuple[int, int]]] = {}
-    for line in _lines(path / "cameras.txt"):
+    for line in _read_lines(path / "cameras.txt"):
         number, model, x, y, *values = line.split()
-        if model not in _COLMAP:
-            raise ValueError(f"camera model {model} is not read; known: {', '.join(_COLMAP)}")
-        told = dict(zip(_COLMAP[model], map(float, values), strict=True))
-        lenses[number] = (model, told, (int(x), int(y)))
+        if model not in _COLMAP_PARAMETERS:
+            raise ValueError(
+                f"camera model {model} is not read; known: {', '.join(_COLMAP_PARAMETERS)}"
+            )
+        parameters = dict(zip(_COLMAP_PARAMETERS[model], map(float, values), strict=True))
+        lenses[number] = (model, parameters, (int(x), int(y)))
     cameras = {}
-    for line in _lines(path / "images.txt", every=2):
+    for line in _read_lines(path / "images.txt", every=2):
         _, *numbers, lens, name = line.split(maxsplit=9)
         pose = check.reals(f"image {name}", "pose", [float(n) for n in numbers], (7,))
         view = torch.eye(4, dtype=torch.float64)
         view[:3, :3], view[:3, 3] = rotation_of(pose[:4].tolist()), pose[4:]
-        model, told, size = lenses[lens]
-        fx, fy = told.get("fx", told.get("f")), told.get("fy", told.get("f"))
-        cameras[name] = _made(model, view, (fx, fy, told["cx"], told["cy"]), told, size)
+        model, parameters, size = lenses[lens]
+        fx, fy = (
+            parameters.get("fx", parameters.get("f")),
+            parameters.get("fy", parameters.get("f")),
+        )
+        cameras[name] = _camera_of_lens(
+            model, view, (fx, fy, parameters["cx"], parameters["cy"]), parameters, size
+        )
     return cameras
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise ValueError("is not a text file") from None
 
 
-def _lines(path: Path, every: int = 1) -> list[str]:
+def _read_lines(path: Path, every: int = 1) -> list[str]:
     """Returns the lines of a text without comments, in images.txt every other one: each image's
     line is followed by one with its points, which may be empty.
     """
     if not path.is_file():
         raise ValueError(f"has no {path.name}")
-    lines = [line for line in _text(path).splitlines() if not line.startswith("#")]
+    lines = [line for line in _read_text(path).splitlines() if not line.startswith("#")]
     return [line for line in lines[::every] if line.strip()]
 
 
-def _colmap(cameras: Mapping[str, Camera]) -> dict[str, str]:
+def _colmap_texts(cameras: Mapping[str, Camera]) -> dict[str, str]:
     lenses: dict[str, int] = {}
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then its points"]
     for number, (name, camera) in enumerate(cameras.items(), 1):
-        model, told = _lens(camera)
+        model, parameters = _lens_of(camera)
         size = (model, str(camera.width), str(camera.height))
-        lens = " ".join((*size, *(repr(value) for value in told.values())))
-        which = lenses.setdefault(lens, len(lenses) + 1)
+        lens = " ".join((*size, *(repr(value) for value in parameters.values())))
+        lens_id = lenses.setdefault(lens, len(lenses) + 1)
         pose = [*quaternion_of(camera.viewmats[0, :3, :3]), *camera.viewmats[0, :3, 3].tolist()]
-        images += [f"{number} {' '.join(map(repr, pose))} {which} {name}", ""]
-    told_lenses = [f"{number} {lens}" for lens, number in lenses.items()]
+        images += [f"{number} {' '.join(map(repr, pose))} {lens_id} {name}", ""]
+    lens_lines = [f"{number} {lens}" for lens, number in lenses.items()]
     head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS"
     return {
-        "cameras.txt": "\n".join((head, *told_lenses)) + "\n",
+        "cameras.txt": "\n".join((head, *lens_lines)) + "\n",
         "images.txt": "\n".join(images) + "\n",
         "points3D.txt": "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK\n",
     }

@@ -18,10 +18,11 @@ from ..base.records import Rays
 from ..ops import pinhole_rays
 
 CameraModel = Literal["pinhole", "ortho", "fisheye", "panorama"]
-_NEWTON = 20  # steps; one that leaves the bracket halves it instead
-_ROUNDING = 1 + 1e-12  # tolerance at the edges of fisheye and panorama
-_NEAREST = math.radians(45)  # largest half angle that a fitted box spans in a wide view
-_CLEAR = 1.02  # least distance of an ortho camera from the box's centre, over the nearest corner's
+_NEWTON_STEPS = 20  # one that leaves the bracket halves it instead
+_EDGE_TOLERANCE = 1 + 1e-12  # at the edges of fisheye and panorama
+_MAX_HALF_ANGLE = math.radians(45)  # largest half angle that a fitted box spans in a wide view
+#: Least distance of an ortho camera from the box's centre, over the nearest corner's.
+_ORTHO_CLEARANCE = 1.02
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class PixelRows:
             return values.expand(rays, -1)
         return values[:, None].expand(-1, self.width, -1).reshape(rays, -1)
 
-    def turned(self, local: Tensor) -> Tensor:
+    def to_world(self, local: Tensor) -> Tensor:
         """Returns (y, w, 3) directions in camera axes as world directions."""
         parts = (local[..., i, None] * self.rotation[:, None, i] for i in range(3))
         return sum(parts, torch.zeros_like(local))
@@ -110,13 +111,13 @@ class Model(ABC):
         fov: Default vertical field of view, degrees.
         widest: Largest vertical field of view, degrees.
         parallel: Rays are parallel; focal lengths are pixels per world unit, and cones do not grow.
-        bends: Radial coefficients and a largest angle to the axis are allowed.
+        has_distortion: Radial coefficients and a largest angle to the axis are allowed.
     """
 
     fov = 30.0
     widest = 179.0
     parallel = False
-    bends = False
+    has_distortion = False
 
     def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
         """Returns fx and fy for a vertical field of view, radians; if parallel, at distance 1."""
@@ -129,11 +130,11 @@ class Model(ABC):
         relative to the box's centre, in camera axes; they may reach `half_x` and `half_y` from the
         middle of the image plane at distance 1.
         """
-        across, depth = self.reach(corners, half_x, half_y), corners[..., 2]
-        away = (across - depth).amax(1)
-        return away, away
+        depths, depth = self.edge_depth(corners, half_x, half_y), corners[..., 2]
+        distance = (depths - depth).amax(1)
+        return distance, distance
 
-    def reach(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
+    def edge_depth(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
         """Returns the depth (n, 8) at which corners lie on the edge of what they may reach."""
         x, y, _ = corners.abs().unbind(-1)
         return torch.maximum(x / half_x, y / half_y)
@@ -149,8 +150,8 @@ class Pinhole(Model):
     def rays(self, pixels: PixelRows) -> Rays:
         (first, end), sizes = pixels.rows, (pixels.width, pixels.height)
         columns = pinhole_rays(pixels.cameras.contiguous(), first, end - first, *sizes)
-        named = dict(zip(("origin", "direction", "cone", "range"), columns, strict=True))
-        return Rays(**named, width=pixels.width)
+        fields = dict(zip(("origin", "direction", "cone", "range"), columns, strict=True))
+        return Rays(**fields, width=pixels.width)
 
 
 class Ortho(Model):
@@ -160,8 +161,8 @@ class Ortho(Model):
 
     def fit(self, corners: Tensor, half_x: float, half_y: float) -> tuple[Tensor, Tensor]:
         """Keeps the eye in front of the box, however small the scale is."""
-        scale = self.reach(corners, half_x, half_y).amax(1)
-        return torch.maximum(scale, _CLEAR * corners[..., 2].abs().amax(1)), scale
+        scale = self.edge_depth(corners, half_x, half_y).amax(1)
+        return torch.maximum(scale, _ORTHO_CLEARANCE * corners[..., 2].abs().amax(1)), scale
 
     def rays(self, pixels: PixelRows) -> Rays:
         rotation = pixels.rotation
@@ -178,15 +179,15 @@ class Fisheye(Model):
     wide-angle, and fish-eye lenses", PAMI 2006, eq. 6; OpenCV's fisheye model.
     """
 
-    fov, widest, bends = 180.0, 360.0, True
+    fov, widest, has_distortion = 180.0, 360.0, True
 
     def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
         """A unit of the image plane is a radian."""
         return height / fov, height / fov
 
-    def reach(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
+    def edge_depth(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
         """Keeps corners within a cone, which is convex: straight edges between them stay inside."""
-        return corners[..., :2].norm(dim=-1) / math.tan(min(half_x, half_y, _NEAREST))
+        return corners[..., :2].norm(dim=-1) / math.tan(min(half_x, half_y, _MAX_HALF_ANGLE))
 
     def rays(self, pixels: PixelRows) -> Rays:
         x, y = pixels.x, pixels.y[:, None]
@@ -201,8 +202,8 @@ class Fisheye(Model):
             edge = distort(limit, k)
             # Along the radius a pixel spans 1 / slope, across it sin(angle) / radius.
             widening = torch.maximum(1 / slope(angle, k), scale)
-        inside = radius <= edge * _ROUNDING
-        return pixels.rays(pixels.turned(local), widening=widening, inside=inside)
+        inside = radius <= edge * _EDGE_TOLERANCE
+        return pixels.rays(pixels.to_world(local), widening=widening, inside=inside)
 
 
 class Panorama(Model):
@@ -214,23 +215,25 @@ class Panorama(Model):
         """A unit of the image plane is a radian; a picture spans twice the angle horizontally."""
         return width / (2 * fov), height / fov
 
-    def reach(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
+    def edge_depth(self, corners: Tensor, half_x: float, half_y: float) -> Tensor:
         """Keeps corners within a frustum: straight edges would bulge out of a band of angles."""
-        slopes = (math.tan(min(half, _NEAREST)) for half in (half_x, half_y))
-        return super().reach(corners, *slopes)
+        tangents = (math.tan(min(half_extent, _MAX_HALF_ANGLE)) for half_extent in (half_x, half_y))
+        return super().edge_depth(corners, *tangents)
 
     def rays(self, pixels: PixelRows) -> Rays:
         latitude = pixels.y[:, None].expand(-1, pixels.x.shape[-1])
         longitude = pixels.x.expand_as(latitude)
-        ring = latitude.cos()
-        parts = (longitude.sin() * ring, latitude.sin(), longitude.cos() * ring)
-        below = latitude.abs() <= _ROUNDING * math.pi / 2
-        inside = below & (longitude.abs() <= _ROUNDING * math.pi)
+        cos_latitude = latitude.cos()
+        parts = (longitude.sin() * cos_latitude, latitude.sin(), longitude.cos() * cos_latitude)
+        below_poles = latitude.abs() <= _EDGE_TOLERANCE * math.pi / 2
+        inside = below_poles & (longitude.abs() <= _EDGE_TOLERANCE * math.pi)
         # A pixel spans 1 / fy radians down, and along its circle of latitude cos / fx.
         fx, fy = pixels.numbers[:, 12:14].unbind(1)
         span = torch.maximum(pixels.y.cos() / fx, 1 / fy) * torch.minimum(fx, fy)
         widening = span[:, None].expand_as(latitude)
-        return pixels.rays(pixels.turned(torch.stack(parts, -1)), widening=widening, inside=inside)
+        return pixels.rays(
+            pixels.to_world(torch.stack(parts, -1)), widening=widening, inside=inside
+        )
 
 
 #: Every camera model by its name.
@@ -242,9 +245,9 @@ MODELS: dict[str, Model] = {
 }
 
 
-def model_of(where: str, name: str) -> Model:
+def model_of(context: str, name: str) -> Model:
     """Returns the camera model of a name; raises ValueError where there is none."""
-    check.one_of(where, "model", name, MODELS)
+    check.one_of(context, "model", name, MODELS)
     return MODELS[name]
 
 
@@ -266,12 +269,12 @@ def undistort(radius: Tensor, k: Tensor, limit: Tensor) -> Tensor:
     """
     low, high = torch.zeros_like(radius), limit.expand_as(radius)
     angle = torch.minimum(radius, high)
-    for _ in range(_NEWTON):
+    for _ in range(_NEWTON_STEPS):
         excess = distort(angle, k) - radius
         low, high = torch.where(excess < 0, angle, low), torch.where(excess < 0, high, angle)
         step = angle - excess / slope(angle, k)
-        near = (step > low - 1e-12) & (step < high + 1e-12)
-        angle = torch.where(near, step, (low + high) / 2)
+        in_bracket = (step > low - 1e-12) & (step < high + 1e-12)
+        angle = torch.where(in_bracket, step, (low + high) / 2)
     return angle
 
 

@@ -22,7 +22,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-_FASTEST = 2.0  # largest speed at a key, over that of the slower neighbouring interval
+_MAX_SPEED_RATIO = 2.0  # largest speed at a key, over that of the slower neighbouring interval
 
 
 class Motion:
@@ -40,49 +40,50 @@ class Motion:
             for (a, b), span in zip(pairwise(poses), spans, strict=True)
         ]
         pairs = zip(pairwise(steps), pairwise(spans), strict=True)
-        speeds = [_between(*both, *spent) for both, spent in pairs]
+        speeds = [_key_velocity(*velocities, *durations) for velocities, durations in pairs]
         if closed and len(steps) > 1:
-            joint = _between(steps[-1], steps[0], spans[-1], spans[0])
+            joint = _key_velocity(steps[-1], steps[0], spans[-1], spans[0])
             speeds = [joint, *speeds, joint]
         else:
             speeds = [*steps[:1], *speeds, *steps[-1:]]
-        self._parts = []  # of each interval: three steps, whose product leads to the next key
+        # Of each interval: three steps, whose product leads to the next key.
+        self._interval_steps = []
         for n, span in enumerate(spans):
             first, last = speeds[n] * span / 3, speeds[n + 1] * span / 3
-            whole = torch.linalg.solve(poses[n], poses[n + 1])
-            middle = exponential(-first) @ whole @ exponential(-last)
-            self._parts.append((first, logarithm(middle), last))
+            full_step = torch.linalg.solve(poses[n], poses[n + 1])
+            middle = exponential(-first) @ full_step @ exponential(-last)
+            self._interval_steps.append((first, logarithm(middle), last))
 
     def at(self, time: float) -> Tensor:
         """Returns the pose at a time; the first before the first key, the last after the last."""
         n = bisect_right(self._times, time) - 1
-        if n < 0 or n >= len(self._parts):
+        if n < 0 or n >= len(self._interval_steps):
             return self._poses[max(n, 0)]
         s = (time - self._times[n]) / (self._times[n + 1] - self._times[n])
         pose = self._poses[n]
-        shares = (1 - (1 - s) ** 3, s * s * (3 - 2 * s), s**3)
-        for share, step in zip(shares, self._parts[n], strict=True):
-            pose = pose @ exponential(share * step)
+        weights = (1 - (1 - s) ** 3, s * s * (3 - 2 * s), s**3)
+        for weight, step in zip(weights, self._interval_steps[n], strict=True):
+            pose = pose @ exponential(weight * step)
         return pose
 
 
-def _between(before: Tensor, after: Tensor, span_before: float, span_after: float) -> Tensor:
+def _key_velocity(before: Tensor, after: Tensor, span_before: float, span_after: float) -> Tensor:
     """Returns the velocity at a key: that of the parabola through it and its neighbours, limited
     where an interval next to it is slow, so that a camera that rests between two keys does rest.
     """
     speed = (span_after * before + span_before * after) / (span_before + span_after)
-    most = _FASTEST * min(float(before.norm()), float(after.norm()))
+    limit = _MAX_SPEED_RATIO * min(float(before.norm()), float(after.norm()))
     length = float(speed.norm())
-    return speed if length <= most else speed * (most / length)
+    return speed if length <= limit else speed * (limit / length)
 
 
 def exponential(step: Tensor) -> Tensor:
     """Returns the pose (4, 4) that a velocity (7,) reaches from the identity in time 1: growth (1),
     turning (3), shift (3).
     """
-    scaled, along = _flow(step)
+    scaled, integral = _flow(step)
     pose = torch.eye(4, dtype=step.dtype)
-    pose[:3, :3], pose[:3, 3] = scaled, along @ step[4:]
+    pose[:3, :3], pose[:3, 3] = scaled, integral @ step[4:]
     return pose
 
 
@@ -91,7 +92,7 @@ def logarithm(pose: Tensor) -> Tensor:
     scale = float(torch.linalg.det(pose[:3, :3])) ** (1 / 3)
     step = pose.new_zeros(7)
     step[0] = math.log(scale)
-    step[1:4] = _turn(pose[:3, :3] / scale)
+    step[1:4] = _rotation_vector(pose[:3, :3] / scale)
     step[4:] = torch.linalg.solve(_flow(step)[1], pose[:3, 3])
     return step
 
@@ -100,27 +101,27 @@ def _flow(step: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the scaled rotation (3, 3) by growth and turning in time 1, and its integral."""
     growth, angle = float(step[0]), float(step[1:4].norm())
     x, y, z = (step[1:4] / angle if angle > 0 else step[1:4]).tolist()
-    across = step.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    powers = torch.stack((torch.eye(3, dtype=step.dtype), across, across @ across))
+    cross = step.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    powers = torch.stack((torch.eye(3, dtype=step.dtype), cross, cross @ cross))
     scale, rate = math.exp(growth), complex(growth, angle)
-    risen = complex(
+    exp_minus_1 = complex(
         math.expm1(growth) * math.cos(angle) - 2 * math.sin(angle / 2) ** 2,
         scale * math.sin(angle),
     )  # exp(rate) - 1, also where the rate is small
-    mean = risen / rate if rate else 1 + 0j
-    even = math.expm1(growth) / growth if growth else 1.0
-    turned = step.new_tensor([1, math.sin(angle), 2 * math.sin(angle / 2) ** 2])
-    summed = step.new_tensor([even, mean.imag, even - mean.real])
+    mean = exp_minus_1 / rate if rate else 1 + 0j
+    mean_growth = math.expm1(growth) / growth if growth else 1.0
+    rotation_weights = step.new_tensor([1, math.sin(angle), 2 * math.sin(angle / 2) ** 2])
+    integral_weights = step.new_tensor([mean_growth, mean.imag, mean_growth - mean.real])
     return (
-        scale * torch.tensordot(turned, powers, 1),
-        torch.tensordot(summed, powers, 1),
+        scale * torch.tensordot(rotation_weights, powers, 1),
+        torch.tensordot(integral_weights, powers, 1),
     )
 
 
-def _turn(rotation: Tensor) -> Tensor:
+def _rotation_vector(rotation: Tensor) -> Tensor:
     """Returns axis times angle (3,) of a rotation, the angle from 0 to pi."""
-    w, *rest = quaternion_of(rotation)
-    xyz = rotation.new_tensor(rest)
+    w, *vector = quaternion_of(rotation)
+    xyz = rotation.new_tensor(vector)
     length = float(xyz.norm())
     angle = 2 * math.atan2(length, w)
     return xyz * (angle / length) if length > 0 else xyz

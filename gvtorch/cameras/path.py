@@ -18,7 +18,7 @@ from ..base.messages import one_line
 from .camera import Camera, Up, upward
 from .models import CameraModel, model_of
 
-_UP, _FOV = (0.0, 1.0, 0.0), 30.0  # of keys that have none
+_DEFAULT_UP, _DEFAULT_FOV = (0.0, 1.0, 0.0), 30.0  # of keys that have none
 
 
 class CameraPath:
@@ -45,13 +45,15 @@ class CameraPath:
         count = len(eye)
         if count < 1:
             raise ValueError("CameraPath: at least one key is needed")
-        up = [_UP] * count if up is None else up
-        fov = [_FOV] * count if fov is None else fov
+        up = [_DEFAULT_UP] * count if up is None else up
+        fov = [_DEFAULT_FOV] * count if fov is None else fov
         lists: dict[str, Sequence[Any]] = {"eye": eye, "target": target, "up": up, "fov": fov}
         for name, values in lists.items():
             if len(values) != count:
-                kind = "numbers" if name == "fov" else "rows as eye has"
-                raise ValueError(f"CameraPath: {name} must have {count} {kind}, got {len(values)}")
+                expected = "numbers" if name == "fov" else "rows as eye has"
+                raise ValueError(
+                    f"CameraPath: {name} must have {count} {expected}, got {len(values)}"
+                )
         angles = [[check.number("CameraPath", "fov", angle, low=0, high=360)] for angle in fov]
         rows = [
             [check.triple("CameraPath", name, value) for value in lists[name]]
@@ -86,19 +88,19 @@ class CameraPath:
         Raises:
             ValueError: As `Camera.orbit`.
         """
-        where = "CameraPath.orbit"
-        fov = model_of(where, model).fov if fov is None else fov
-        turn = azimuth + torch.linspace(0, 360, 37)
+        context = "CameraPath.orbit"
+        fov = model_of(context, model).fov if fov is None else fov
+        azimuths = azimuth + torch.linspace(0, 360, 37)
         if fit is not None:
             if distance is not None:
-                raise ValueError(f"{where}: fit finds the distance: leave it out, got {distance}")
-            seen = Camera.orbit(turn, elevation, None, fov, *fit, model, up=up, fit=True)
-            farthest = (box.mean(0) - _places(seen.placed(box))).norm(dim=1).amax()
+                raise ValueError(f"{context}: fit finds the distance: leave it out, got {distance}")
+            fitted = Camera.orbit(azimuths, elevation, None, fov, *fit, model, up=up, fit=True)
+            farthest = (box.mean(0) - _eye_positions(fitted.placed(box))).norm(dim=1).amax()
             distance = float(farthest / (box[1] - box[0]).max())
-        cameras = Camera.orbit(turn, elevation, distance, width=1, height=1, up=up).placed(box)
-        eye = _places(cameras)
+        cameras = Camera.orbit(azimuths, elevation, distance, width=1, height=1, up=up).placed(box)
+        eye = _eye_positions(cameras)
         center = box.mean(0).expand_as(eye)
-        ups = [upward(where, up).tolist()] * len(eye)
+        ups = [upward(context, up).tolist()] * len(eye)
         return cls(eye.tolist(), center.tolist(), ups, [fov] * len(eye))
 
     @classmethod
@@ -120,18 +122,20 @@ class CameraPath:
             unknown = sorted(set(key) - {"eye", "target", "up", "fov"})
             missing = sorted({"eye", "target"} - set(key))
             if unknown or missing:
-                what = f"unknown {unknown[0]!r}" if unknown else f"{missing[0]!r} is missing"
-                raise ValueError(f"{path}: key {number}: {what}")
+                problem = f"unknown {unknown[0]!r}" if unknown else f"{missing[0]!r} is missing"
+                raise ValueError(f"{path}: key {number}: {problem}")
         for name, value in (("up", up), ("fov", fov)):
             if value is not None and all(name in key for key in keys):
                 raise ValueError(f"{path}: each key has its own {name}: leave out {name}={value}")
-        others = {
-            "up": _UP if up is None else upward("CameraPath", up).tolist(),
-            "fov": _FOV if fov is None else fov,
+        defaults = {
+            "up": _DEFAULT_UP if up is None else upward("CameraPath", up).tolist(),
+            "fov": _DEFAULT_FOV if fov is None else fov,
         }
-        full = [{**others, **key} for key in keys]
+        full_keys = [{**defaults, **key} for key in keys]
         try:
-            return cls(*([key[name] for key in full] for name in ("eye", "target", "up", "fov")))
+            return cls(
+                *([key[name] for key in full_keys] for name in ("eye", "target", "up", "fov"))
+            )
         except ValueError as error:
             raise ValueError(f"{path}: {one_line(error)}") from None
 
@@ -148,18 +152,18 @@ class CameraPath:
         """
         at = check.number("CameraPath", "at", at, low=0, high=1)
         last = len(self._keys) - 1
-        place = at * last
-        first = min(int(place), max(last - 1, 0))
-        t = place - first
+        position = at * last
+        first = min(int(position), max(last - 1, 0))
+        t = position - first
         index = torch.arange(first - 1, first + 3).clamp(0, last)
         a, b, c, d = self._keys[index]
         # Cubic through b and c, with the slope at each that of the chord between its neighbours.
-        line = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
-        eye, target, up, fov = line[:3], line[3:6], line[6:9], float(line[9])
+        key = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
+        eye, target, up, fov = key[:3], key[3:6], key[6:9], float(key[9])
         return Camera.look_at(eye, target, up, fov, width, height, model)
 
 
-def _places(cameras: Camera) -> Tensor:
+def _eye_positions(cameras: Camera) -> Tensor:
     """Returns (n, 3) world positions of cameras."""
-    rotation, move = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3:]
-    return -(rotation.mT @ move)[..., 0]
+    rotation, translation = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3:]
+    return -(rotation.mT @ translation)[..., 0]

@@ -30,10 +30,11 @@ Reduction = Literal["min", "max", "mean"]
 #: Arrays; or tensors of a dtype that torch can compare and add up: not uint16, nor bfloat16.
 Grid = TypeVar("Grid", np.ndarray, Tensor)
 
-_ARRAYS = {"min": np.minimum, "max": np.maximum, "mean": np.add}
-_TENSORS = {"min": torch.minimum, "max": torch.maximum, "mean": torch.add}
-_SLAB = 1 << 22  # voxels reduced at a time, so that intermediate arrays stay in a core's cache
-_DEVICE_SLAB = 1 << 27  # the same on a device: more would take more memory and no less time
+_NUMPY_OPERATIONS = {"min": np.minimum, "max": np.maximum, "mean": np.add}
+_TORCH_OPERATIONS = {"min": torch.minimum, "max": torch.maximum, "mean": torch.add}
+#: Voxels reduced at a time, so that intermediate arrays stay in a core's cache.
+_SLAB_VOXELS = 1 << 22
+_DEVICE_SLAB_VOXELS = 1 << 27  # the same on a device: more would take more memory and no less time
 
 
 def as_grid(values: Tensor) -> Any:
@@ -66,19 +67,21 @@ def pool_mean(values: Grid, factor: int | Sequence[int]) -> Grid:
     """
 
     def reduce(part: Grid, factors: Factors) -> Grid:
-        return _narrow(_reduced(part, factors, "mean"), math.prod(factors), _name(values))
+        return _rounded_mean(
+            _reduce_blocks(part, factors, "mean"), math.prod(factors), _dtype_name(values)
+        )
 
-    return _pool(values, factor, reduce)
+    return _reduce_slabs(values, factor, reduce)
 
 
 def pool_min(values: Grid, factor: int | Sequence[int]) -> Grid:
     """Returns the minimum of each block; arguments as for `pool_mean`."""
-    return _pool(values, factor, partial(_reduced, how="min"))
+    return _reduce_slabs(values, factor, partial(_reduce_blocks, how="min"))
 
 
 def pool_max(values: Grid, factor: int | Sequence[int]) -> Grid:
     """Returns the maximum of each block; arguments as for `pool_mean`."""
-    return _pool(values, factor, partial(_reduced, how="max"))
+    return _reduce_slabs(values, factor, partial(_reduce_blocks, how="max"))
 
 
 def pool_majority(
@@ -89,7 +92,7 @@ def pool_majority(
     """
 
     def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:
-        low, high = _reduced(part, factors, "min"), _reduced(part, factors, "max")
+        low, high = _reduce_blocks(part, factors, "min"), _reduce_blocks(part, factors, "max")
         mixed = (low != high).nonzero()
         if len(mixed[0]):
             z, y, x = (n // f for n, f in zip(part.shape, factors, strict=False))
@@ -98,20 +101,20 @@ def pool_majority(
             low[mixed] = _most_frequent(rows, background)
         return low
 
-    return _pool(values, factor, reduce)
+    return _reduce_slabs(values, factor, reduce)
 
 
 def _most_frequent(rows: np.ndarray, background: float | None) -> np.ndarray:
     """Returns (k,) the most frequent values of rows (k, m); see `pool_majority`."""
     columns = np.sort(rows, 1).T
     run = np.ones(len(rows), np.int32)
-    best, most = columns[0].copy(), run.copy()
+    best, best_run = columns[0].copy(), run.copy()
     for before, value in itertools.pairwise(columns):
         run = np.where(value == before, run + 1, 1)
-        better = run > most
+        better = run > best_run
         if background is not None:
-            better |= (run == most) & (best == background)
-        best[better], most[better] = value[better], run[better]
+            better |= (run == best_run) & (best == background)
+        best[better], best_run[better] = value[better], run[better]
     return best
 
 
@@ -133,24 +136,24 @@ def pool_directional(
     """
 
     def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:
-        seen = []
-        for number in range(len(DIRECTIONS)):
-            axis = 2 - number // 2
-            rgba = part[..., 4 * number : 4 * number + 4].astype(np.float64)
-            columns = list(range(factor))[:: 1 if number % 2 == 0 else -1]
-            rgba = _of_length(rgba, sides_zyx[axis])
-            total = _every(rgba, axis, columns[0], factor)
+        views = []
+        for direction in range(len(DIRECTIONS)):
+            axis = 2 - direction // 2
+            rgba = part[..., 4 * direction : 4 * direction + 4].astype(np.float64)
+            columns = list(range(factor))[:: 1 if direction % 2 == 0 else -1]
+            rgba = _change_length(rgba, sides_zyx[axis])
+            total = _strided(rgba, axis, columns[0], factor)
             for k in columns[1:]:
-                total = total + (1 - total[..., 3:]) * _every(rgba, axis, k, factor)
-            across = [1 if a == axis else f for a, f in enumerate(factors)]
-            mean = _reduced(total, across, "mean") / factor**2
-            seen.append(_of_length(mean, 1 / (factor * sides_zyx[axis])))
-        return np.concatenate(seen, -1)
+                total = total + (1 - total[..., 3:]) * _strided(rgba, axis, k, factor)
+            cross_factors = [1 if a == axis else f for a, f in enumerate(factors)]
+            mean = _reduce_blocks(total, cross_factors, "mean") / factor**2
+            views.append(_change_length(mean, 1 / (factor * sides_zyx[axis])))
+        return np.concatenate(views, -1)
 
-    return _pool(values, factor, reduce)
+    return _reduce_slabs(values, factor, reduce)
 
 
-def _of_length(rgba: np.ndarray, lengths: float) -> np.ndarray:
+def _change_length(rgba: np.ndarray, lengths: float) -> np.ndarray:
     """Converts premultiplied colour and alpha of a homogeneous medium to other lengths."""
     alpha = rgba[..., 3:]
     with np.errstate(divide="ignore"):  # log 0: opaque
@@ -168,8 +171,8 @@ def reduce_windows(values: Grid, how: Reduction, *, size: int, step: int) -> Gri
         mean.
     """
     for axis in range(3):
-        values = _along(values, axis, how, size, step)
-    return _as(_mean(values, size**3), "float32") if how == "mean" else values
+        values = _reduce_axis(values, axis, how, size, step)
+    return _cast(_divide(values, size**3), "float32") if how == "mean" else values
 
 
 def extend(values: Grid, axis: int, before: int, after: int) -> Grid:
@@ -194,25 +197,27 @@ def by_node(values: Grid, how: Reduction, brick_size: int, border: int) -> Grid:
         count = -(-values.shape[axis] // brick_size)
         extra = count * brick_size - values.shape[axis]
         values = extend(values, axis, border, extra + border)
-        values = _along(values, axis, how, size, brick_size)
-    return _as(_mean(values, size**3) if how == "mean" else values, "float32")
+        values = _reduce_axis(values, axis, how, size, brick_size)
+    return _cast(_divide(values, size**3) if how == "mean" else values, "float32")
 
 
-def _along(
-    values: Grid, axis: int, how: Reduction, size: int, step: int, wide: str | None = None
+def _reduce_axis(
+    values: Grid, axis: int, how: Reduction, size: int, step: int, sum_dtype: str | None = None
 ) -> Grid:
-    """Reduces windows, `step` apart, along one axis; sums have dtype `wide`, or one wide enough."""
-    if how == "mean" and wide is None:
-        wide = _wide(_name(values), size)
+    """Reduces windows, `step` apart, along one axis; sums have `sum_dtype`, or one wide enough."""
+    if how == "mean" and sum_dtype is None:
+        sum_dtype = _sum_dtype(_dtype_name(values), size)
     count = (values.shape[axis] - size) // step + 1
-    found = _as(_every(values, axis, 0, step, count), wide or _name(values), copy=True)
-    combine: Any = (_TENSORS if isinstance(values, Tensor) else _ARRAYS)[how]
+    result = _cast(
+        _strided(values, axis, 0, step, count), sum_dtype or _dtype_name(values), copy=True
+    )
+    combine: Any = (_TORCH_OPERATIONS if isinstance(values, Tensor) else _NUMPY_OPERATIONS)[how]
     for k in range(1, size):
-        combine(found, _every(values, axis, k, step, count), out=found)
-    return found
+        combine(result, _strided(values, axis, k, step, count), out=result)
+    return result
 
 
-def _pool(
+def _reduce_slabs(
     values: Grid, factor: int | Sequence[int], reduce: Callable[[Grid, Factors], Grid]
 ) -> Grid:
     """Runs `reduce`, which turns whole blocks into one voxel each, over slabs of a grid."""
@@ -220,9 +225,9 @@ def _pool(
     shape = [-(-n // f) for n, f in zip(values.shape[:3], factors, strict=True)]
     shape.append(values.shape[3])
     if isinstance(values, Tensor):
-        out, slab = values.new_empty(shape), _DEVICE_SLAB
+        out, slab = values.new_empty(shape), _DEVICE_SLAB_VOXELS
     else:
-        out, slab = np.empty(shape, values.dtype), _SLAB
+        out, slab = np.empty(shape, values.dtype), _SLAB_VOXELS
     rows = max(1, slab // max(1, math.prod(values.shape[1:]) * factors[0]))
     for start in range(0, shape[0], rows):
         part = values[start * factors[0] : (start + rows) * factors[0]]
@@ -232,44 +237,44 @@ def _pool(
     return out
 
 
-def _reduced(part: Grid, factors: Factors, how: Reduction) -> Grid:
+def _reduce_blocks(part: Grid, factors: Factors, how: Reduction) -> Grid:
     """Reduces whole blocks to one voxel each, axis after axis."""
-    wide = _wide(_name(part), math.prod(factors)) if how == "mean" else None
+    sum_dtype = _sum_dtype(_dtype_name(part), math.prod(factors)) if how == "mean" else None
     for axis, factor in enumerate(factors):
-        part = _along(part, axis, how, factor, factor, wide)
+        part = _reduce_axis(part, axis, how, factor, factor, sum_dtype)
     return part
 
 
-def _every(values: Grid, axis: int, first: int, step: int, count: int | None = None) -> Grid:
+def _strided(values: Grid, axis: int, first: int, step: int, count: int | None = None) -> Grid:
     """Returns every `step`-th slice along an axis, `count` of them."""
     stop = None if count is None else first + step * (count - 1) + 1
     return values[(slice(None),) * axis + (slice(first, stop, step),)]
 
 
-def _name(values: Grid) -> str:
+def _dtype_name(values: Grid) -> str:
     """Returns the name of a grid's dtype, which NumPy and torch share."""
     return str(values.dtype).removeprefix("torch.")
 
 
-def _as(values: Grid, name: str, *, copy: bool = False) -> Grid:
+def _cast(values: Grid, name: str, *, copy: bool = False) -> Grid:
     """Returns a grid in the dtype of a name."""
     if isinstance(values, Tensor):
         return values.to(getattr(torch, name), copy=copy)
     return values.astype(name, copy=copy)
 
 
-def _mean(total: Grid, count: int) -> Grid:
+def _divide(total: Grid, count: int) -> Grid:
     """Divides sums by a count, integers in float64. A tensor is divided by a tensor: torch turns
     division by a plain number into a product with the reciprocal, which rounds differently.
     """
-    if "int" in _name(total):
-        total = _as(total, "float64")
+    if "int" in _dtype_name(total):
+        total = _cast(total, "float64")
     if isinstance(total, Tensor):
         return total / torch.full((), count, dtype=total.dtype, device=total.device)
     return total / total.dtype.type(count)
 
 
-def _wide(name: str, terms: int) -> str:
+def _sum_dtype(name: str, terms: int) -> str:
     """Returns a dtype that holds the sum of this many terms of a dtype."""
     dtype = np.dtype(name)
     if dtype.kind == "f":
@@ -277,25 +282,25 @@ def _wide(name: str, terms: int) -> str:
     if dtype.itemsize > 4:
         return "int64"
     info = np.iinfo(dtype)
-    most = max(-int(info.min), int(info.max)) * terms
-    return next(f"int{bits}" for bits in (16, 32, 64) if most < 2 ** (bits - 1))
+    largest = max(-int(info.min), int(info.max)) * terms
+    return next(f"int{bits}" for bits in (16, 32, 64) if largest < 2 ** (bits - 1))
 
 
-def _narrow(total: Grid, voxels: int, name: str) -> Grid:
+def _rounded_mean(total: Grid, voxels: int, name: str) -> Grid:
     """Divides sums by the number of voxels; integers are rounded to nearest, ties to even."""
     if voxels == 1:
-        return _as(total, name)
+        return _cast(total, name)
     if "float" in name:
-        return _as(_mean(total, voxels), name)
+        return _cast(_divide(total, voxels), name)
     if voxels & (voxels - 1) == 0:  # a shift: floor, plus one above a half or at an odd half
         shift = voxels.bit_length() - 1
-        odd = total >> shift
-        odd &= 1
-        odd += total
-        odd += voxels // 2 - 1
-        odd >>= shift
-        return _as(odd, name)
-    whole = total // voxels
-    rest = total - whole * voxels
-    up = (2 * rest > voxels) | ((2 * rest == voxels) & (whole & 1 == 1))
-    return _as(whole + up, name)
+        rounded = total >> shift
+        rounded &= 1
+        rounded += total
+        rounded += voxels // 2 - 1
+        rounded >>= shift
+        return _cast(rounded, name)
+    quotient = total // voxels
+    remainder = total - quotient * voxels
+    rounds_up = (2 * remainder > voxels) | ((2 * remainder == voxels) & (quotient & 1 == 1))
+    return _cast(quotient + rounds_up, name)

@@ -28,10 +28,10 @@ from .pools import (
     labels_by_channel,
     volumes_by_channel,
 )
-from .pyramid import TreePlan, levels_by_depth, maker_of, tree_depth
+from .pyramid import TreePlan, choose_build_device, levels_by_depth, tree_depth
 from .refresh import BrickLevels
 
-_numbering = threading.Lock()
+_frame_lock = threading.Lock()
 
 
 class N3Tree:
@@ -152,7 +152,7 @@ class N3Tree:
 
     def next_frame(self) -> None:
         """Gives the next picture its number."""
-        with _numbering:
+        with _frame_lock:
             self.frame += 1
 
     def loc(self, node: Tensor) -> Tensor:
@@ -175,10 +175,10 @@ class N3Tree:
             tile = child[node].to(torch.int64)
             up = (loc[:, 3] - level).clamp(min=0)
             x, y, z = (loc[:, axis] // n**up % n for axis in range(3))
-            below = tile * self.nodes.nodes_per_tile + (z * n + y) * n + x
+            child_node = tile * self.nodes.nodes_per_tile + (z * n + y) * n + x
             deeper = level <= loc[:, 3]
             exact = exact & (~deeper | (tile >= 0))
-            node = torch.where(deeper & exact, below, node)
+            node = torch.where(deeper & exact, child_node, node)
         return node, exact
 
     def __repr__(self) -> str:
@@ -196,23 +196,26 @@ class N3Tree:
         """
         self._check_words()
         child, brick = self.nodes.child_tn, self.nodes.brick_tn
-        both = (("tile", child, self.nodes.shared_t), ("brick", brick, self.bricks.shared_b))
-        for name, pointers, shared in both:
+        pointer_kinds = (
+            ("tile", child, self.nodes.shared_t),
+            ("brick", brick, self.bricks.shared_b),
+        )
+        for name, pointers, shared in pointer_kinds:
             used = pointers[pointers >= 0].to(torch.int64)
             used = used[~shared[used]]
             if used.unique().numel() != used.numel():
                 raise ValueError(f"N3Tree: a {name} has two owners")
-        parent, places = self.nodes.parent_t.to(torch.int64), self.nodes.loc_t4.to(torch.int64)
+        parent, loc_t4 = self.nodes.parent_t.to(torch.int64), self.nodes.loc_t4.to(torch.int64)
         tile = ((parent >= 0) & (self.nodes.tree_t == self.number)).nonzero()[:, 0]
-        above = self.loc(parent[tile])
-        above[:, 3] += 1
-        if not torch.equal(places[tile], above):
+        expected_loc = self.loc(parent[tile])
+        expected_loc[:, 3] += 1
+        if not torch.equal(loc_t4[tile], expected_loc):
             raise ValueError("N3Tree: a tile's loc does not match its parent")
 
     def _check_words(self) -> None:
-        nodes, most = self.nodes, self.bricks.capacity - 1
+        nodes, last_slot = self.nodes, self.bricks.capacity - 1
         check.words("N3Tree", "child_tn", nodes.child_tn, TERMINAL, nodes.capacity - 1)
-        check.words("N3Tree", "brick_tn", nodes.brick_tn, CONSTANT, most)
+        check.words("N3Tree", "brick_tn", nodes.brick_tn, CONSTANT, last_slot)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restores a pickled tree. Raises ValueError if its pointers lead out of the pools."""
@@ -255,10 +258,10 @@ class N3Tree:
 
         Source: Crassin et al., "GigaVoxels", I3D 2009, section 3; docs/design.md, section 2.
         """
-        given = volumes_by_channel("from_volume", volume)
+        originals = volumes_by_channel("from_volume", volume)
         device = check.device("from_volume", device)
-        maker = maker_of(given.values(), device)
-        volumes = {name: one.to(maker) for name, one in given.items()}
+        build_device = choose_build_device(originals.values(), device)
+        volumes = {name: volume.to(build_device) for name, volume in originals.items()}
         first = next(iter(volumes.values()))
         check.whole("from_volume", "branching", branching, low=2, high=16)
         threshold = checked_threshold("from_volume", threshold, volumes)
@@ -277,14 +280,16 @@ class N3Tree:
             value_range={name: volume.value_range for name, volume in volumes.items()},
             labels=labels_by_channel(volumes),
         )
-        tree.filters = {name: one.filter for name, one in volumes.items() if one.filter != "mean"}
-        tree.infos = {name: one.info for name, one in volumes.items()}
+        tree.filters = {
+            name: volume.filter for name, volume in volumes.items() if volume.filter != "mean"
+        }
+        tree.infos = {name: volume.info for name, volume in volumes.items()}
         tree.threshold = threshold
         plan.write_nodes(tree.nodes, tree.bricks)
         for name in channels:
-            for at in range(depth + 1):
-                plan.write_bricks(tree.bricks, name, at)
-                progress("bricks", at + 1, depth + 1)
+            for level_depth in range(depth + 1):
+                plan.write_bricks(tree.bricks, name, level_depth)
+                progress("bricks", level_depth + 1, depth + 1)
         tree.bricks.in_order()
         return tree
 
@@ -340,36 +345,38 @@ class N3Tree:
             corners = check.reals("N3Tree.refresh", "box", box, (2, 3))
             if not bool((corners[0] <= corners[1]).all()):
                 raise ValueError(f"N3Tree.refresh: box must be low and high corner, got {box!r}")
-            ends = ((corners - self.box[0]) / torch.tensor(self.spacing)).tolist()
-            sizes = zip(*ends, self.extent, strict=True)
+            corner_voxels = ((corners - self.box[0]) / torch.tensor(self.spacing)).tolist()
+            sizes = zip(*corner_voxels, self.extent, strict=True)
             spans = [(max(0, math.floor(a)), min(n, math.floor(b) + 1)) for a, b, n in sizes]
             low, high = (tuple(end) for end in zip(*spans, strict=True))
             if any(a >= b for a, b in spans):
                 return  # outside the tree
-        fine = [name for name, one in self.bricks.channels.items() if not one.coarse]
+        fine = [name for name, channel in self.bricks.channels.items() if not channel.coarse]
         filters = {name: self.filters.get(name, "mean") for name in fine}
-        tables = {name: None if one is None else one.numpy() for name, one in self.labels.items()}
+        tables = {
+            name: None if labels is None else labels.numpy() for name, labels in self.labels.items()
+        }
         empty = {name: background(table) for name, table in tables.items()}
-        told = filters, empty, self.spacing, self.threshold
+        settings = filters, empty, self.spacing, self.threshold
         with self.turns.changing("N3Tree.refresh"):
-            self.levels().refresh(low[::-1], high[::-1], *told)
+            self.levels().refresh(low[::-1], high[::-1], *settings)
             tile, child = divmod(self.root, self.nodes.nodes_per_tile)
             for name in fine:
-                held = self.nodes.ranges[name]
-                two = movable(held)[tile, child].view(held.dtype).float()  # (2, c)
-                self.value_range[name] = (float(two[0].min()), float(two[1].max()))
+                ranges = self.nodes.ranges[name]
+                low_high = movable(ranges)[tile, child].view(ranges.dtype).float()  # (2, c)
+                self.value_range[name] = (float(low_high[0].min()), float(low_high[1].max()))
             for name in self.made_of:
                 self.made_of[name] = {}
             self.bricks.in_order()
 
-    def fine_channel(self, where: str, channel: str | None) -> str:
+    def fine_channel(self, context: str, channel: str | None) -> str:
         """Returns the name of a channel of the finest bricks, the first if none is named; raises
         ValueError if there is no such channel.
         """
-        name = check.text(where, "channel", channel) or self.channel_names[0]
+        name = check.text(context, "channel", channel) or self.channel_names[0]
         if name not in self.bricks.channels or self.bricks.channels[name].coarse:
             raise ValueError(
-                f"{where}: the finest bricks have no channel {check.given(name)}; "
+                f"{context}: the finest bricks have no channel {check.given(name)}; "
                 f"the tree has {', '.join(self.channel_names)}"
             )
         return name

@@ -18,7 +18,7 @@ from ..base.arrays import as_volume
 from ..base.constants import ABSENT
 from ..base.volume import CHANNEL_DTYPES, Volume, movable
 
-_COMMON = ("extent", "spacing", "origin")  # what the volumes of one tree share
+_SHARED_ATTRIBUTES = ("extent", "spacing", "origin")  # what the volumes of one tree share
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class Channel:
     @property
     def limits(self) -> tuple[float, float]:
         """Smallest and largest number of the dtype."""
-        known = torch.finfo if self.dtype.is_floating_point else torch.iinfo
-        return (known(self.dtype).min, known(self.dtype).max)
+        dtype_info = torch.finfo if self.dtype.is_floating_point else torch.iinfo
+        return (dtype_info(self.dtype).min, dtype_info(self.dtype).max)
 
 
 def phrase(channels: Mapping[str, Channel]) -> str:
@@ -64,7 +64,7 @@ def phrase(channels: Mapping[str, Channel]) -> str:
     )
 
 
-def volumes_by_channel(where: str, volume: Volume | Mapping[str, Volume]) -> dict[str, Volume]:
+def volumes_by_channel(context: str, volume: Volume | Mapping[str, Volume]) -> dict[str, Volume]:
     """Returns volumes by channel name; one volume alone becomes channel "value".
 
     Arrays become volumes, see `as_volume`.
@@ -72,35 +72,36 @@ def volumes_by_channel(where: str, volume: Volume | Mapping[str, Volume]) -> dic
     Raises ValueError if there is none, one is not a volume, or they differ in extent, spacing or
     origin.
     """
-    given = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
+    by_name = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
     volumes = {
-        name: as_volume(one, where=f"{where}: channel {name!r}") for name, one in given.items()
+        name: as_volume(array, where=f"{context}: channel {name!r}")
+        for name, array in by_name.items()
     }
     if not volumes:
-        raise ValueError(f"{where}: volume must name at least one channel")
+        raise ValueError(f"{context}: volume must name at least one channel")
     first, *others = volumes.values()
     for other in others:
-        if any(getattr(other, name) != getattr(first, name) for name in _COMMON):
+        if any(getattr(other, name) != getattr(first, name) for name in _SHARED_ATTRIBUTES):
             raise ValueError(
-                f"{where}: channels must share extent, spacing and origin: {first} and {other}"
+                f"{context}: channels must share extent, spacing and origin: {first} and {other}"
             )
     return volumes
 
 
-def checked_threshold(where: str, threshold: Any, volumes: Mapping[str, Volume]) -> float | None:
+def checked_threshold(context: str, threshold: Any, volumes: Mapping[str, Volume]) -> float | None:
     """Returns a user's threshold; raises ValueError where it is not a number, or where all channels
     are labels, whose order means nothing.
     """
     if threshold is None:
         return None
-    if all(one.info.labels for one in volumes.values()):
-        raise ValueError(f"{where}: threshold is for values; labels are hidden by the shader")
-    return check.number(where, "threshold", threshold)
+    if all(volume.info.labels for volume in volumes.values()):
+        raise ValueError(f"{context}: threshold is for values; labels are hidden by the shader")
+    return check.number(context, "threshold", threshold)
 
 
 def labels_by_channel(volumes: Mapping[str, Volume]) -> dict[str, Tensor | None]:
     """Returns `N3Tree.labels` of the volumes that a tree is made of."""
-    return {name: one.label_values for name, one in volumes.items() if one.info.labels}
+    return {name: volume.label_values for name, volume in volumes.items() if volume.info.labels}
 
 
 class _Pool:
@@ -109,13 +110,13 @@ class _Pool:
     @property
     def fields(self) -> dict[str, Tensor]:
         """All tensors by name; those of a channel as `ranges.NAME`."""
-        found: dict[str, Tensor] = {}
+        tensors: dict[str, Tensor] = {}
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
-                found[name] = value
+                tensors[name] = value
             elif isinstance(value, dict) and name != "channels" and name[0] != "_":
-                found |= {f"{name}.{channel}": tensor for channel, tensor in value.items()}
-        return found
+                tensors |= {f"{name}.{channel}": tensor for channel, tensor in value.items()}
+        return tensors
 
     @property
     def capacity(self) -> int:
@@ -134,10 +135,10 @@ class _Pool:
             if isinstance(value, Tensor):
                 setattr(other, name, value.to(device))
             elif isinstance(value, dict):
-                setattr(other, name, {key: _moved(one, device) for key, one in value.items()})
+                setattr(other, name, {key: _move(tensor, device) for key, tensor in value.items()})
         return other
 
-    def _shown(self, slots: str) -> str:
+    def _describe(self, slots: str) -> str:
         device = next(iter(self.fields.values())).device
         return (
             f"{type(self).__name__}({self.capacity} {slots}, "
@@ -145,19 +146,19 @@ class _Pool:
         )
 
 
-def _moved(value: Any, device: torch.device | str) -> Any:
+def _move(value: Any, device: torch.device | str) -> Any:
     """Returns a tensor on a device, as a leaf that requires gradients if it did; else the value."""
     if not isinstance(value, Tensor):
         return value
-    there = value.detach().to(device)
-    same = there.data_ptr() == value.data_ptr()
-    return value if same else there.requires_grad_(value.requires_grad)
+    moved = value.detach().to(device)
+    is_shared = moved.data_ptr() == value.data_ptr()
+    return value if is_shared else moved.requires_grad_(value.requires_grad)
 
 
-_State = tuple[int, int]
+_WriteState = tuple[int, int]
 
 
-def _state(voxels: Tensor) -> _State:
+def _write_state(voxels: Tensor) -> _WriteState:
     """Returns a tensor's address and how often it was written in place, or -1 for an inference
     tensor, of which torch does not count that.
     """
@@ -237,7 +238,7 @@ class NodePool(_Pool):
         return self.child_tn.shape[1]
 
     def __repr__(self) -> str:
-        return self._shown(f"tiles of {self.nodes_per_tile} nodes")
+        return self._describe(f"tiles of {self.nodes_per_tile} nodes")
 
 
 class BrickPool(_Pool):
@@ -298,21 +299,21 @@ class BrickPool(_Pool):
 
         self.stamp_b, self.born_b, self.owner_b = words(-1), words(0), words(-1)
         self.shared_b = torch.zeros((capacity,), dtype=torch.bool, device=device)
-        self._known: dict[str, _State] = {}  # by channel, when last checked
+        self._checked_states: dict[str, _WriteState] = {}  # by channel, when last checked
         self._edited: set[str] = set()
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
 
     def __getitem__(self, channel: str) -> Tensor:
         """Returns the voxels of a channel, (b, z, y, x, c) with borders, to read or to edit."""
         if check.instance("BrickPool", "channel", channel, str) not in self.bricks:
-            known = ", ".join(self.bricks)
-            raise ValueError(f"BrickPool: unknown channel {channel!r}; it has {known}")
+            names = ", ".join(self.bricks)
+            raise ValueError(f"BrickPool: unknown channel {channel!r}; it has {names}")
         return self.bricks[channel]
 
     def __setitem__(self, channel: str, voxels: Tensor) -> None:
         """Replaces a channel's voxels with another tensor, such as a parameter."""
-        held = self[channel]
-        check.tensor("BrickPool", channel, voxels, held.shape, held.dtype, held.device)
+        current = self[channel]
+        check.tensor("BrickPool", channel, voxels, current.shape, current.dtype, current.device)
         if not voxels.is_contiguous():
             raise ValueError(f"BrickPool: {channel} must be contiguous")
         self.bricks[channel] = voxels
@@ -320,14 +321,16 @@ class BrickPool(_Pool):
     def to(self, device: torch.device | str) -> Self:
         """Returns the pool on a device, with the same channels marked as edited."""
         other = super().to(device)
-        other._edited, other._told = set(self.edited()), set(self._told)
-        other._known = {name: _state(other.bricks[name]) for name in self._known}
+        other._edited, other._reported = set(self.edited()), set(self._reported)
+        other._checked_states = {
+            name: _write_state(other.bricks[name]) for name in self._checked_states
+        }
         return other
 
     def in_order(self) -> None:
         """Marks ranges, borders and coarse levels as up to date with the voxels."""
         fine = (name for name, channel in self.channels.items() if not channel.coarse)
-        self._known = {name: _state(self.bricks[name]) for name in fine}
+        self._checked_states = {name: _write_state(self.bricks[name]) for name in fine}
         self._edited.clear()
 
     def edited(self) -> list[str]:
@@ -335,21 +338,21 @@ class BrickPool(_Pool):
         counts it: a write in place through the tensor, a view or a parameter is counted, one
         through `.data`, NumPy or a pointer is not.
         """
-        for name, known in self._known.items():
-            state = _state(self.bricks[name])
-            if state != known:
-                self._known[name] = state
+        for name, previous in self._checked_states.items():
+            state = _write_state(self.bricks[name])
+            if state != previous:
+                self._checked_states[name] = state
                 self._edited.add(name)
-                self._told.discard(name)
+                self._reported.discard(name)
         return sorted(self._edited)
 
     def new_edits(self, learned: bool = False) -> list[str]:
         """Returns the edited channels that were not returned before: each edit once. `learned`:
         without those that require gradients.
         """
-        new = [name for name in self.edited() if name not in self._told]
+        new = [name for name in self.edited() if name not in self._reported]
         new = [name for name in new if not (learned and self.bricks[name].requires_grad)]
-        self._told.update(new)
+        self._reported.update(new)
         return new
 
     @contextmanager
@@ -357,7 +360,9 @@ class BrickPool(_Pool):
         """Lets the block write voxels and their ranges: this does not count as an edit."""
         self.edited()
         yield
-        self._known = {name: _state(self.bricks[name]) for name in self._known}
+        self._checked_states = {
+            name: _write_state(self.bricks[name]) for name in self._checked_states
+        }
 
     def __repr__(self) -> str:
-        return self._shown(f"bricks of {self.brick_size}^3+{self.border}")
+        return self._describe(f"bricks of {self.brick_size}^3+{self.border}")

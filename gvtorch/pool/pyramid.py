@@ -32,8 +32,8 @@ from .downsample import (
 )
 from .pools import BrickPool, NodePool
 
-_BATCH = {"cpu": 4096, "cuda": 1 << 15}  # bricks cut from a level at a time
-_PEAK = 8  # times a volume's bytes: itself, its levels, temporaries, and all bricks
+_BATCH_BRICKS = {"cpu": 4096, "cuda": 1 << 15}  # bricks cut from a level at a time
+_PEAK_MEMORY_FACTOR = 8  # times a volume's bytes: itself, its levels, temporaries, and all bricks
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,8 @@ def volume_levels(
     six directions.
     """
     dtype = volume.data.dtype
-    known = volume.label_values
-    empty = background(None if known is None else known.numpy())
+    label_table = volume.label_values
+    empty = background(None if label_table is None else label_table.numpy())
     values = low = high = as_grid(volume.data)
     for level in range(count):
         if level > 0:
@@ -101,13 +101,13 @@ def volume_levels(
         summary = NodeSummary(
             low=torch.as_tensor(by_node(low, "min", brick_size, border)),
             high=torch.as_tensor(by_node(high, "max", brick_size, border)),
-            mean=torch.as_tensor(by_node(values, middle_of(volume.filter), brick_size, 0)),
+            mean=torch.as_tensor(by_node(values, node_reduction(volume.filter), brick_size, 0)),
         )
         stored = volume.data if level == 0 else from_grid(values, dtype)
         yield Level(values=stored, nodes=summary)
 
 
-def middle_of(how: str) -> Literal["mean", "min"]:
+def node_reduction(how: str) -> Literal["mean", "min"]:
     """Returns which reduction represents a node: a mean of labels may be no label."""
     return "min" if how == "majority" else "mean"
 
@@ -134,16 +134,16 @@ def coarser(
         level: Number of the level that is made, from 1.
         empty: The value of the background, for labels.
     """
-    made: Any = values
+    coarse: Any = values
     if how == "mean":
-        made = pool_mean(made, branching)
+        coarse = pool_mean(coarse, branching)
     elif how == "majority":
-        made = pool_majority(made, branching, empty)
+        coarse = pool_majority(coarse, branching, empty)
     else:
         scale = branching ** (level - 1)
         x, y, z = (side / min(spacing) * scale for side in spacing)
-        made = pool_directional(made, branching, (z, y, x))
-    return as_grid(from_grid(made, dtype)) if dtype == torch.bfloat16 else made
+        coarse = pool_directional(coarse, branching, (z, y, x))
+    return as_grid(from_grid(coarse, dtype)) if dtype == torch.bfloat16 else coarse
 
 
 def levels_by_depth(
@@ -164,14 +164,14 @@ def levels_by_depth(
     return result
 
 
-def maker_of(volumes: Iterable[Volume], device: torch.device) -> torch.device:
+def choose_build_device(volumes: Iterable[Volume], device: torch.device) -> torch.device:
     """Returns the device that makes the levels of volumes, given the device of the pools."""
     host, size = torch.device("cpu"), 0
     for volume in volumes:
         if volume.filter != "mean":
             return host
         size += volume.data.nbytes
-    if device.type != "cuda" or _PEAK * size > torch.cuda.mem_get_info(device)[0]:
+    if device.type != "cuda" or _PEAK_MEMORY_FACTOR * size > torch.cuda.mem_get_info(device)[0]:
         return host
     return device
 
@@ -243,9 +243,9 @@ class TreePlan:
         nodes.child_tn[:], nodes.brick_tn[:] = TERMINAL, EMPTY  # also of nodes beyond the extent
         for depth, exists in enumerate(self.exists):
             zyx = exists.nonzero()
-            here = tuple(zyx.T)
+            zyx_index = tuple(zyx.T)
             node = self._node_index(depth, zyx, nodes.nodes_per_tile).to(device)
-            child, brick = self.child[depth][here], self.brick[depth][here]
+            child, brick = self.child[depth][zyx_index], self.brick[depth][zyx_index]
             nodes.child_tn.view(-1)[node] = child.to(device)
             nodes.brick_tn.view(-1)[node] = brick.to(device)
             has_brick, has_children = brick >= 0, child >= 0
@@ -256,20 +256,20 @@ class TreePlan:
             nodes.loc_t4[tile, 3] = depth + 1
             for name, levels in self.levels.items():
                 summary = levels[depth].nodes
-                for words, values in (
+                for stored, values in (
                     (nodes.constants[name], summary.constants),
                     (nodes.ranges[name], summary.ranges),
                 ):
-                    rows = movable(values(words.dtype))[here]
-                    movable(words).flatten(0, 1)[node] = rows.to(device)
+                    rows = movable(values(stored.dtype))[zyx_index]
+                    movable(stored).flatten(0, 1)[node] = rows.to(device)
 
     def write_bricks(self, pool: BrickPool, channel: str, depth: int) -> None:
         """Cuts the bricks of a depth out of their level, into consecutive slots."""
         has_brick = self.brick[depth] >= 0
-        place, slots = has_brick.nonzero(), self.brick[depth][has_brick]
+        zyx, slots = has_brick.nonzero(), self.brick[depth][has_brick]
         values = self.levels[channel][depth].values
-        batch = _BATCH[values.device.type]
-        for part, slot in zip(place.split(batch), slots[::batch].tolist(), strict=False):
+        batch = _BATCH_BRICKS[values.device.type]
+        for part, slot in zip(zyx.split(batch), slots[::batch].tolist(), strict=False):
             cut = cut_bricks(values, part, pool.brick_size, pool.border)
             pool.bricks[channel][slot : slot + len(part)] = cut
 

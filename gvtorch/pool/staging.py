@@ -25,11 +25,14 @@ from torch import Tensor
 
 from ..base import check
 
-_MOST = 256 * 10**6  # most bytes of a ring
-_CHUNKS = (2 * 10**6, 16 * 10**6)  # bytes of a chunk: smaller is all overhead, larger overlaps less
-_SMALL = 64 * 10**6  # most bytes copied, not mapped: the device reads its own memory faster
-_ALIGN = 16  # bytes: alignment of channels in a chunk
-_WORDS = {8: torch.int64, 4: torch.int32, 2: torch.int16, 1: torch.uint8}
+_MAX_RING_BYTES = 256 * 10**6  # most bytes of a ring
+#: Bytes of a chunk: smaller is all overhead, larger overlaps less.
+_CHUNK_BYTES = (2 * 10**6, 16 * 10**6)
+_MAX_COPIED_BYTES = (
+    64 * 10**6
+)  # most bytes copied, not mapped: the device reads its own memory faster
+_ALIGN_BYTES = 16  # alignment of channels in a chunk
+_WORD_DTYPES = {8: torch.int64, 4: torch.int32, 2: torch.int16, 1: torch.uint8}
 
 
 class BrickTable:
@@ -109,7 +112,7 @@ def wide_rows(*tensors: Tensor) -> list[Tensor]:
         row = math.prod(tensor.shape[1:]) * tensor.itemsize
         widest = math.gcd(widest, row, tensor.storage_offset() * tensor.itemsize)
         widest = math.gcd(widest, tensor.data_ptr())
-    word = _WORDS[widest]
+    word = _WORD_DTYPES[widest]
     return [t.view(len(t), math.prod(t.shape[1:])).view(word) for t in tensors]
 
 
@@ -181,15 +184,15 @@ class Staging:
         """Chooses sizes for at most `payload` bytes a frame, in bricks of `brick_bytes`; memory is
         allocated at the first `send`. On the CPU, for tests, nothing is pinned.
         """
-        least, most = _CHUNKS
-        room = brick_bytes + 64 * _ALIGN  # alignment of up to 64 channels
-        self.chunk = max(room, min(most, max(least, payload // 8)))
-        self.nbytes = max(4 * self.chunk, min(_MOST, 2 * payload))
+        smallest, largest = _CHUNK_BYTES
+        padded_brick = brick_bytes + 64 * _ALIGN_BYTES  # alignment of up to 64 channels
+        self.chunk = max(padded_brick, min(largest, max(smallest, payload // 8)))
+        self.nbytes = max(4 * self.chunk, min(_MAX_RING_BYTES, 2 * payload))
         self._device = device
         self._spans: deque[_RingSpan] = deque()
         self._lock = threading.Lock()
-        self._host: Tensor | None = None
-        self._target: Tensor | None = None
+        self._host_ring: Tensor | None = None
+        self._device_ring: Tensor | None = None
         self._stream: Any = None
 
     def send(self, data: Voxels) -> Shipment:
@@ -203,15 +206,15 @@ class Staging:
         cuda = self._device.type == "cuda"
         pinned = {name for name, rows in data.items() if cuda and _is_pinned(rows)}
         room = self.chunk if len(pinned) < len(data) else self.nbytes // 4  # nothing to overlap
-        per_chunk = (room - _ALIGN * len(data)) // sum(widths)
+        per_chunk = (room - _ALIGN_BYTES * len(data)) // sum(widths)
         if per_chunk < 1:
             raise ValueError(f"Staging: a brick of {sum(widths)} bytes is too large")
         chunks: list[Chunk] = []
         begin = 0
         while begin < count:
             end = min(count, begin + per_chunk)
-            sizes = [-(-(end - begin) * size // _ALIGN) * _ALIGN for size in widths]
-            span = self._take(sum(sizes))
+            sizes = [-(-(end - begin) * size // _ALIGN_BYTES) * _ALIGN_BYTES for size in widths]
+            span = self._reserve(sum(sizes))
             if span is None:
                 break
             bricks = {name: rows[begin:end] for name, rows in data.items()}
@@ -229,17 +232,17 @@ class Staging:
         self, span: _RingSpan, bricks: Voxels, sizes: Sequence[int], pinned: Set[str]
     ) -> dict[str, Tensor]:
         """Gathers bricks into the ring and starts their copy; returns where they arrive."""
-        assert self._host is not None and self._target is not None
+        assert self._host_ring is not None and self._device_ring is not None
         offset, arriving = span.begin, {}
         with torch.cuda.stream(self._stream) if self._stream else nullcontext():
             for (name, rows), size in zip(bricks.items(), sizes, strict=True):
-                at = slice(offset, offset + len(rows) * row_bytes(rows))
+                byte_range = slice(offset, offset + len(rows) * row_bytes(rows))
                 offset += size
-                arriving[name] = self._target[at].view(rows.dtype).view(rows.shape)
+                arriving[name] = self._device_ring[byte_range].view(rows.dtype).view(rows.shape)
                 if isinstance(rows, Tensor) and name in pinned:
                     source = rows
                 else:
-                    source = self._host[at].view(rows.dtype).view(rows.shape)
+                    source = self._host_ring[byte_range].view(rows.dtype).view(rows.shape)
                     rows.gather(source) if isinstance(rows, TableRows) else source.copy_(rows)
                 arriving[name].copy_(source, non_blocking=True)
             if self._stream:
@@ -247,7 +250,7 @@ class Staging:
         span.source = bricks
         return arriving
 
-    def _take(self, nbytes: int) -> _RingSpan | None:
+    def _reserve(self, nbytes: int) -> _RingSpan | None:
         """Reserves the next bytes of the ring; returns None if they are not free."""
         with self._lock:
             self._allocate()
@@ -267,15 +270,15 @@ class Staging:
             return span
 
     def _allocate(self) -> None:
-        if self._host is not None:
+        if self._host_ring is not None:
             return
         cuda = self._device.type == "cuda"
-        self._target = torch.empty(self.nbytes, dtype=torch.uint8, device=self._device)
+        self._device_ring = torch.empty(self.nbytes, dtype=torch.uint8, device=self._device)
         if cuda:
             self._stream = torch.cuda.Stream(self._device)
             self._stream.wait_stream(torch.cuda.current_stream(self._device))
-            self._target.record_stream(self._stream)
-        self._host = torch.empty(self.nbytes, dtype=torch.uint8, pin_memory=cuda)
+            self._device_ring.record_stream(self._stream)
+        self._host_ring = torch.empty(self.nbytes, dtype=torch.uint8, pin_memory=cuda)
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
@@ -285,15 +288,15 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
     return tensor.pin_memory().to(device, non_blocking=True)
 
 
-class _Pages:
+class _LockedPages:
     """Host memory that CUDA has page-locked, in a form that torch can wrap as a tensor."""
 
     def __init__(self, host: Tensor) -> None:
         runtime, start, size = torch.cuda.cudart(), host.data_ptr(), host.nbytes
-        failed = int(runtime.cudaHostRegister(start, size, 0))
-        if failed:
+        error_code = int(runtime.cudaHostRegister(start, size, 0))
+        if error_code:
             raise RuntimeError(
-                f"{size / 1e6:.0f} MB of host memory can't be locked (CUDA {failed})"
+                f"{size / 1e6:.0f} MB of host memory can't be locked (CUDA {error_code})"
             )
         self.host = host  # keeps it alive
         self.__cuda_array_interface__: dict[str, Any] = {
@@ -317,11 +320,11 @@ def mapped(host: Tensor, device: torch.device) -> Tensor:
     Raises:
         RuntimeError: The system does not let that much memory be locked.
     """
-    if device.type != "cuda" or host.nbytes <= _SMALL:
+    if device.type != "cuda" or host.nbytes <= _MAX_COPIED_BYTES:
         return host.to(device)
     with torch.cuda.device(device):
-        there = torch.as_tensor(_Pages(host), device=device)
-    return there.view(host.dtype).view(host.shape)
+        mapped_bytes = torch.as_tensor(_LockedPages(host), device=device)
+    return mapped_bytes.view(host.dtype).view(host.shape)
 
 
 def _is_pinned(rows: Tensor | TableRows) -> bool:
