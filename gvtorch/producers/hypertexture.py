@@ -105,10 +105,8 @@ class Hypertexture(Tally, Producer):
         amplitude = check.number(where, "amplitude", amplitude, low=0)
         softness = check.number(where, "softness", softness, low=0, open_low=True)
         series = octaves_of(where, octaves, lacunarity, gain, seed, frequency)
-        max_noise = (
-            amplitude * sum(octave.amplitude for octave in series) * noise.bounds(noise.perlin).high
-        )
-        max_offset = thickness * max(max_noise + softness - 0.5, 0.0)
+        peak = amplitude * sum(o.amplitude for o in series) * noise.bounds(noise.perlin).high
+        max_offset = thickness * max(peak + softness - 0.5, 0.0)
         if box is None:
             shape_box = shape.box()
             if shape_box is None or not bool(shape_box.isfinite().all()):
@@ -130,9 +128,7 @@ class Hypertexture(Tally, Producer):
         )
         self.shape, self.skip = shape, skip
         self.thickness, self.softness = thickness, softness
-        self.octaves = [
-            octave._replace(amplitude=amplitude * octave.amplitude) for octave in series
-        ]
+        self.octaves = [o._replace(amplitude=amplitude * o.amplitude) for o in series]
         self.dtype = position_dtype(box, self.spacing)
         self._levels: list[LevelOctaves] = []
         self._margins = torch.empty(0)

@@ -29,7 +29,7 @@ from ..pool.staging import TableRows, Voxels, on_device
 from .nodes import Layout, Nodes
 
 #: Returns (k,) bool: which of k nodes have changed, in their own voxels or in those below them.
-ChangedNodes = Callable[[Nodes], Tensor]
+Where = Callable[[Nodes], Tensor]
 # Versions, shared by all producers: a later change has a larger one.
 _version_numbers = itertools.count(1)
 _MAX_CHANGES = 64  # changes that are kept; if more are asked for, everything may have changed
@@ -252,7 +252,7 @@ class Producer(torch.nn.Module):
                     f"{where}: value_range[{name!r}] must be (smallest, largest), got {bounds!r}"
                 )
         self.made_of: dict[str, Any] = {}
-        self._changes: deque[tuple[int, ChangedNodes | None]] = deque(maxlen=_MAX_CHANGES)
+        self._changes: deque[tuple[int, Where | None]] = deque(maxlen=_MAX_CHANGES)
 
     def prepare(self, layout: Layout) -> None:
         """Prepares for nodes of a layout. The engine calls it once, before any other method."""
@@ -280,7 +280,7 @@ class Producer(torch.nn.Module):
         """
         raise NotImplementedError(f"{type(self).__name__}: fill is not implemented")
 
-    def changed(self, where: ChangedNodes | Tensor | Sequence[Any] | None = None) -> None:
+    def changed(self, where: Where | Tensor | Sequence[Any] | None = None) -> None:
         """Declares that the content has changed, for example to another time: in its next frame the
         engine drops what it holds of the changed nodes, and asks for them again.
 
@@ -303,7 +303,7 @@ class Producer(torch.nn.Module):
         self.version = next(_version_numbers)
         self._changes.append((self.version, where))
 
-    def changes(self, since: int) -> list[ChangedNodes] | None:
+    def changes(self, since: int) -> list[Where] | None:
         """Returns functions that find the nodes changed since a version; None: any may have."""
         newer = [finder for version, finder in self._changes if version > since]
         finders = [finder for finder in newer if finder is not None]
@@ -433,7 +433,7 @@ class OfProducers(Producer):
         for part in self.parts().values():
             part.changed(where)
 
-    def changes(self, since: int) -> list[ChangedNodes] | None:
+    def changes(self, since: int) -> list[Where] | None:
         """See `Producer.changes`; returns the changes of all parts."""
         part_changes = [
             part.changes(since) for part in self.parts().values() if part.version > since
@@ -474,7 +474,7 @@ def clocks_of(module: torch.nn.Module) -> list[Tensor]:
     return [buffer for name, buffer in module.named_buffers() if name.rpartition(".")[2] == "time"]
 
 
-def touched(changes: Sequence[ChangedNodes], nodes: Nodes) -> Tensor:
+def touched(changes: Sequence[Where], nodes: Nodes) -> Tensor:
     """Returns (k,) bool: which nodes any of the changes affects."""
     return torch.stack([finder(nodes) for finder in changes]).any(0)
 
