@@ -356,7 +356,9 @@ class Producer(torch.nn.Module):
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the values at world points (..., 3), for each channel (..., c) float32,
         interpolated between the eight nearest finest voxels as renderers do. Needs no engine;
-        without one, this prepares the producer for bricks of 8^3.
+        without one, each call prepares the producer for bricks of 8^3, because since the last call
+        another may have prepared it for other bricks, or its data may have been edited in place.
+        Where preparing is slow (`VolumeProducer`, `FromChildren`), pass many points in one call.
 
         Raises:
             ValueError: Points have another shape or are not finite, or a brick can't be made.
