@@ -206,7 +206,7 @@ def memory(device: torch.device) -> tuple[int, int]:
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_random_flights_end_in_the_resident_picture(blobs, tmp_path, backend, monkeypatch):
-    monkeypatch.setattr(staging, "_MAX_COPIED_BYTES", 0)  # mapped bytes are read in place
+    monkeypatch.setattr(staging, "_MAX_COPIED_BYTES", 0)  # everything mapped is read in place
     device = torch.device(DEVICES[backend])
     store = tmp_path / "store"
     convert(blobs, store)

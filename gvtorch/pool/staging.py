@@ -28,9 +28,8 @@ from ..base import check
 _MAX_RING_BYTES = 256 * 10**6  # most bytes of a ring
 #: Bytes of a chunk: smaller is all overhead, larger overlaps less.
 _CHUNK_BYTES = (2 * 10**6, 16 * 10**6)
-_MAX_COPIED_BYTES = (
-    64 * 10**6
-)  # most bytes copied, not mapped: the device reads its own memory faster
+#: Most bytes copied, not mapped: the device reads its own memory faster.
+_MAX_COPIED_BYTES = 64 * 10**6
 _ALIGN_BYTES = 16  # alignment of channels in a chunk
 _WORD_DTYPES = {8: torch.int64, 4: torch.int32, 2: torch.int16, 1: torch.uint8}
 
