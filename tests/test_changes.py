@@ -208,6 +208,6 @@ def test_what_matters_near_boxes_has_the_same_bits(name):
     axis = torch.arange(8)
     place = torch.cartesian_prod(axis, axis, axis)
     nodes = gv.Nodes(torch.cat((place, torch.full_like(place[:, :1], 3)), 1), layout)
-    whole, some = made._made(nodes, made.field), made.fill(nodes).data
+    whole, some = made._evaluate(nodes, made.field), made.fill(nodes).data
     for channel, values in whole.items():
         assert torch.equal(values, some[channel]), channel

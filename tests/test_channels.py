@@ -12,7 +12,7 @@ from helpers.traces import assert_equal, run
 
 import gvtorch as gv
 from gvtorch.base.image_info import COLORS
-from gvtorch.shaders.channels import DISTINCT, channel_color
+from gvtorch.shaders.channels import DEFAULT_COLORS, channel_color
 
 SPACING, ORIGIN = (1.0, 0.8, 1.3), (3.0, -2.0, 5.0)
 MODES = ["additive", "opacity"]
@@ -164,7 +164,8 @@ def test_every_dtype_and_width(compiled, dtype, width):
     tree = gv.N3Tree.from_volume(gv.Volume(data), 4)
     order = torch.randperm(width, generator=torch.Generator().manual_seed(3)).tolist()
     mixed = [
-        gv.ChannelLook(window=(20 + c, 110 + c), component=c, color=DISTINCT[c]) for c in order
+        gv.ChannelLook(window=(20 + c, 110 + c), component=c, color=DEFAULT_COLORS[c])
+        for c in order
     ]
     for distance in (0.9, 4.0):
         rays = camera_rays(tree, 10, distance=distance)

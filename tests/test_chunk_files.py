@@ -18,7 +18,7 @@ from helpers.stores import noise, serving
 
 import gvtorch as gv
 from gvtorch.io import http, relay
-from gvtorch.io.stores.chunk_files import HEADS, ChunkFiles, begin_read
+from gvtorch.io.stores.chunk_files import METADATA_FILES, ChunkFiles, begin_read
 from gvtorch.io.stores.store_layout import kvstore, opened_at
 
 ts = pytest.importorskip("tensorstore")
@@ -99,7 +99,9 @@ def box(place: tuple[int, ...]) -> tuple[slice, ...]:
 
 def swell(folder: Path, at: int) -> Path:
     """Makes the header of the only chunk claim that it holds a gigabyte."""
-    (file,) = (path for path in folder.rglob("*") if path.is_file() and path.name not in HEADS)
+    (file,) = (
+        path for path in folder.rglob("*") if path.is_file() and path.name not in METADATA_FILES
+    )
     content = bytearray(file.read_bytes())
     assert 120 <= struct.unpack_from("<I", content, at + 4)[0] <= 124
     struct.pack_into("<I", content, at + 4, 1 << 30)
@@ -124,7 +126,7 @@ def test_a_chunk_that_swells_costs_itself(stored, request, place, remote, tmp_pa
                 read(view).result(timeout=30)
         if remote:
             assert "Blosc would make 1073741824 bytes of a chunk" in relay.with_urls(
-                f'Error opening "a": {relay.through(f"{root}/a/").spec["base_url"]}'
+                f'Error opening "a": {relay.relay_folder(f"{root}/a/").spec["base_url"]}'
                 f"{file.relative_to(stored)}: "
             )
         if kind == "shards, turned":  # all chunks of a file are checked
@@ -146,7 +148,9 @@ def test_a_chunk_that_swells_costs_itself(stored, request, place, remote, tmp_pa
 def test_what_is_no_file_of_a_chunk_is_told(stored, what):
     array = opened(stored, stored)
     array[box((0, 0, 0))].write(7).result()
-    (file,) = (path for path in stored.rglob("*") if path.is_file() and path.name not in HEADS)
+    (file,) = (
+        path for path in stored.rglob("*") if path.is_file() and path.name not in METADATA_FILES
+    )
     file.unlink()
     if what == "pipe":
         os.mkfifo(file)
@@ -161,7 +165,7 @@ def test_what_is_no_file_of_a_chunk_is_told(stored, what):
     with pytest.raises(http.Endless, match=f"{file.relative_to(stored)}: {wanted}"):
         read(array).result(timeout=5)
     assert not read(array[box((2, 2, 1))]).result().any()
-    head = next(stored / head for head in HEADS if (stored / head).exists())
+    head = next(stored / head for head in METADATA_FILES if (stored / head).exists())
     head.unlink()
     file.rename(head)
     with pytest.raises(http.Endless, match=f"{head.name}: {wanted}"):
@@ -170,15 +174,15 @@ def test_what_is_no_file_of_a_chunk_is_told(stored, what):
 
 def test_places_are_known_of_items_that_are_chunks_alone():
     zyx, item = np.array([[1, 2, 3], [4, 5, 6]]), (34, 34, 34, 1)
-    plain = {"folder": "/", "separator": "/", "item": 1}
+    plain = {"folder": "/", "separator": "/", "item_bytes": 1}
     for first, time in (((1, 1, 1), []), ((1, 1, 1, 1), [7])):
         files = ChunkFiles(**plain, file=(*first, *item), chunk=(*first, *item))
         wanted = [[*time, *place, 0, 0, 0, 0] for place in zyx.tolist()]
-        assert files.places(7, zyx, item).tolist() == wanted
-        assert replace(files, transposed=True).places(7, zyx, item) is None
-        assert replace(files, chunk=(2, *files.chunk[1:])).places(7, zyx, item) is None
-        assert replace(files, chunk=(*files.chunk[:-1], 2)).places(7, zyx, item) is None
-    assert replace(files, chunk=item, file=item).places(7, zyx, item) is None
+        assert files.chunk_indices(7, zyx, item).tolist() == wanted
+        assert replace(files, transposed=True).chunk_indices(7, zyx, item) is None
+        assert replace(files, chunk=(2, *files.chunk[1:])).chunk_indices(7, zyx, item) is None
+        assert replace(files, chunk=(*files.chunk[:-1], 2)).chunk_indices(7, zyx, item) is None
+    assert replace(files, chunk=item, file=item).chunk_indices(7, zyx, item) is None
 
 
 def test_blosc_inside_another_codec_is_refused(tmp_path):

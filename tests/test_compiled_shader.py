@@ -523,7 +523,7 @@ def test_what_another_process_has_noted_meanwhile_is_no_change(tmp_path, monkeyp
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
     before = user.ShaderSource.read(header, "Own")
     compiler = tmp_path / "c++"
-    note = f"echo '[\"{part}\"]' > {before.more}\necho > shader.so"
+    note = f"echo '[\"{part}\"]' > {before.list_path}\necho > shader.so"
     compiler.write_text(f"#!/bin/sh\n{note}\n")
     compiler.chmod(0o755)
     monkeypatch.setenv("CXX", str(compiler))

@@ -279,11 +279,11 @@ def test_a_full_disk_is_told_and_goes_on(tmp_path, raw, data, monkeypatch):
         def result(self):
             raise ValueError("RESOURCE_EXHAUSTED: Error writing: [OS error 28: No space left on")
 
-    original = shard.write
+    original = shard.begin_write
     with monkeypatch.context() as patch:
         patch.setattr(
             shard,
-            "write",
+            "begin_write",
             lambda root, spec, *rest: (
                 Full()
                 if spec["path"] == "gvtorch/blocks/0" and root["driver"] == "file"
@@ -340,7 +340,7 @@ def test_kill_9_and_resume(tmp_path, raw, data, monkeypatch):
 
 
 def test_processes_write_the_same(tmp_path, data, raw, monkeypatch):
-    monkeypatch.setattr(conversion_plan, "_FEW", 1)
+    monkeypatch.setattr(conversion_plan, "_FEW_TASKS", 1)
     seen: list[tuple[int, int]] = []
     store = convert(
         raw,

@@ -12,9 +12,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from http import server as servers
+from http.client import HTTPConnection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urlsplit
 
 import google_crc32c
 import numpy as np
@@ -104,9 +106,9 @@ class Handler(servers.BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server(tmp_path, monkeypatch) -> Iterator[Server]:
-    monkeypatch.setattr(http, "STALL", 1.5)
-    monkeypatch.setattr(http, "SLOWEST", 10**7)
-    monkeypatch.setattr(http, "REFUSED", 60.0)
+    monkeypatch.setattr(http, "STALL_SECONDS", 1.5)
+    monkeypatch.setattr(http, "MIN_BYTES_PER_SECOND", 10**7)
+    monkeypatch.setattr(http, "REFUSED_SECONDS", 60.0)
     with Server(tmp_path) as found:
         thread = threading.Thread(target=found.serve_forever)
         thread.start()
@@ -238,10 +240,19 @@ def test_a_server_that_sends_all_of_a_file_and_breaks_off_within_the_part_is_tol
     server.bad, server.how = "file", "break"  # 100 bytes come
     with pytest.raises(OSError, match="cut off: 999900 bytes are missing"):
         http.read_http(
-            f"{server.url}/file", most=1000, part=slice(50, 500), whole=10**7, seconds=9.0
+            f"{server.url}/file",
+            max_bytes=1000,
+            byte_range=slice(50, 500),
+            max_file_bytes=10**7,
+            seconds=9.0,
         )
     assert (
-        len(http.read_http(f"{server.url}/file", most=1000, part=slice(50, 90), seconds=9.0)) == 40
+        len(
+            http.read_http(
+                f"{server.url}/file", max_bytes=1000, byte_range=slice(50, 90), seconds=9.0
+            )
+        )
+        == 40
     )
 
 
@@ -273,8 +284,8 @@ def test_buckets_are_read_within_bounds(tmp_path, data, how, monkeypatch):
         never = SimpleNamespace(read=lambda *_, **__: future)
         for known in relay._server().folders:
             stalls.setitem(vars(known), "_bucket", never)
-        monkeypatch.setattr(relay, "STALL", 0.2)
-        monkeypatch.setattr(relay, "SLOWEST", 10**9)
+        monkeypatch.setattr(relay, "STALL_SECONDS", 0.2)
+        monkeypatch.setattr(relay, "MIN_BYTES_PER_SECOND", 10**9)
     elif how == "index":  # the first chunk is said to be huge
         index = bytearray(good)
         index[-(16 * 64 + 4) : -(16 * 64 - 12)] = np.array([0, 1 << 40], "<u8").tobytes()
@@ -300,20 +311,20 @@ def test_parts_of_files_that_never_end(server, tmp_path):
     for server.parts in (True, False):
         for part in (slice(0, 1), slice(5, 70_000), slice(200_000, 200_010), slice(-20, None)):
             wanted = content[part]
-            assert read_http(url, len(wanted), part, whole=len(content)) == wanted
+            assert read_http(url, len(wanted), part, max_file_bytes=len(content)) == wanted
     with pytest.raises(OSError, match="more than 255999 bytes"):
-        read_http(url, 20, slice(-20, None), whole=len(content) - 1)
+        read_http(url, 20, slice(-20, None), max_file_bytes=len(content) - 1)
     http._refused.clear()
     server.parts, server.shift = True, 1
     with pytest.raises(OSError, match="another part came: bytes 6-"):
         read_http(url, 5, slice(5, 10))
     server.bad, server.how = "a", "fast"
     http._refused.clear()
-    assert read_http(url, 90, slice(0, 90), whole=1000) == content[:90]
+    assert read_http(url, 90, slice(0, 90), max_file_bytes=1000) == content[:90]
     for part in (None, slice(-20, None), slice(10**7, 10**7 + 5)):
         http.ask_again()
         with pytest.raises(OSError, match=r"more than 1\d* bytes"):
-            read_http(url, 10**6, part, whole=10**6)
+            read_http(url, 10**6, part, max_file_bytes=10**6)
     server.how = "slow"
     http._refused.clear()
     with pytest.raises(TimeoutError):
@@ -321,11 +332,86 @@ def test_parts_of_files_that_never_end(server, tmp_path):
     assert read_http(f"{server.url}/none", 9) is None
 
 
+class _Racing(dict):
+    """A dict that other threads change while it is iterated over, and after it is looked into."""
+
+    def __init__(self):
+        super().__init__()
+        self.threads = []
+
+    def __iter__(self):
+        keys = super().__iter__()
+        for change in (http.ask_again, lambda: http.keep_reason("other", OSError("other"))):
+            self.threads.append(threading.Thread(target=change))
+            self.threads[-1].start()
+            self.threads[-1].join(0.2)
+        return keys
+
+    def get(self, *arguments):
+        value = super().get(*arguments)
+        self.clear()
+        return value
+
+
+def test_reasons_are_kept_while_other_threads_forget_them(monkeypatch):
+    monkeypatch.setattr(http, "_MAX_REASONS", 2)
+    racing = _Racing()
+    monkeypatch.setattr(http, "_refused", racing)
+    for name in "abc":
+        http.keep_reason(name, OSError(name))
+    for thread in racing.threads:
+        thread.join()
+    assert len(racing) <= 2
+    http.keep_reason("a", http.Endless("it never ends"), 60.0)
+    with pytest.raises(http.Endless, match="it never ends"):
+        read_http("a", 9)
+
+
 def test_nobody_else_reads_by_the_relay(server, tmp_path):
     (tmp_path / "a").write_bytes(b"mine")
-    spec = relay.through(f"{server.url}/").spec
+    spec = relay.relay_folder(f"{server.url}/").spec
     assert read_http(f"{spec['base_url']}a", 9) == b"mine"
     port = relay._server().server_port
-    for path in ("", "0/a", "x/0/a", f"{relay._server().word}/999999/a"):
-        with pytest.raises(OSError):
+    for path in ("", "0/a", "x/0/a", f"{relay._server().secret}/999999/a"):
+        with pytest.raises(http.HttpStatus, match="403"):
             read_http(f"http://127.0.0.1:{port}/{path}", 9)
+
+
+@pytest.mark.parametrize("kind", ["parts", "whole files", "bucket"])
+def test_the_relay_answers_every_range(server, tmp_path, kind):
+    import tensorstore as ts
+
+    from gvtorch.io.stores.store_layout import context
+
+    content, url = bytes(range(256)) * 4, f"{server.url}/"
+    if kind == "bucket":
+        url = "memory://endless-ranges/"
+        ts.KvStore.open(url, context=context()).result()["a"] = content
+    (tmp_path / "a").write_bytes(content)
+    server.parts = kind == "parts"
+    address = urlsplit(relay.relay_folder(url, context()).spec["base_url"])
+
+    def ask(text: str, name: str = "a") -> tuple[int, str | None, bytes]:
+        with contextlib.closing(HTTPConnection(address.netloc)) as connection:
+            connection.request("GET", f"{address.path}{name}", headers={"Range": text})
+            response = connection.getresponse()
+            return response.status, response.headers["Content-Range"], response.read()
+
+    for text, first, part in (
+        ("bytes=1000-", 1000, content[1000:]),
+        ("bytes=1023-", 1023, content[1023:]),
+        ("bytes=0-", 0, content),
+        ("bytes=5-9", 5, content[5:10]),
+    ):
+        assert ask(text) == (206, f"bytes {first}-{first + len(part) - 1}/*", part), text
+    assert ask("bytes=-3")[::2] == (206, content[-3:])
+    for text in ("bytes=1024-", "bytes=5000-", "bytes=-0"):
+        assert ask(text) == (416, None, b""), text
+    for text in ("", "bytes=-", "bytes=9-5", "bytes=0-1,5-6", "lines=0-1", f"bytes={'9' * 5000}-"):
+        assert ask(text) == (200, None, content), text
+    assert ask("bytes=1-", "none")[0] == 404
+    if kind != "bucket":
+        server.bad, server.how = "a", "fast"
+    else:
+        ts.KvStore.open(url, context=context()).result()["a"] = bytes(20_000_000)
+    assert ask("bytes=1-")[0] == 403, "more than any file of metadata has"

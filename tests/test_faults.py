@@ -83,7 +83,7 @@ class Operations(TorchDispatchMode):
 #: The calls by which gvtorch writes its own files: open, fsync, rename, remove.
 WRITES: Calls = [
     *((pathlib.Path, "open"), (pathlib.Path, "replace"), (os, "fsync"), (pathlib.Path, "mkdir")),
-    *((shard, "write"), (shard, "finish_write"), (shard, "shard_files")),
+    *((shard, "begin_write"), (shard, "finish_write"), (shard, "shard_checksums")),
 ]
 
 
@@ -171,7 +171,7 @@ def test_reads_that_fail_cost_their_nodes_alone(tmp_path, kind):
     resident = gv.render(gv.N3Tree.from_volume(gv.Volume(data)), VIEW, look)
     assert resident.alpha.max() > 0
     store = convert(gv.Volume(data), tmp_path / "a.zarr", workers=1)
-    calls = {"read": [*READS, (Store, "_read_stored"), (Store, "_read_cells")]}.get(kind)
+    calls = {"read": [*READS, (Store, "_read_chunks"), (Store, "_read_cells")]}.get(kind)
     failed = 0
     for number in (*range(0, 14, 2), 20, 30):
         producer = gv.StoredProducer(Store.open(store.location), workers=1)

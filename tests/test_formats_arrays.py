@@ -110,7 +110,7 @@ def test_lazy_arrays_convert_part_by_part(tmp_path, monkeypatch):
     assert isinstance(open_source(lazy), ObjectSource)
     store = convert(lazy, tmp_path / "a.zarr", workers=1)
     assert np.array_equal(store.read_region(0, (0, 0, 0), data.shape)[..., 0], data)
-    monkeypatch.setattr(conversion_plan, "_FEW", 1)  # in processes
+    monkeypatch.setattr(conversion_plan, "_FEW_TASKS", 1)  # in processes
     store = convert(zarr.array(data), tmp_path / "b.zarr", workers=2)
     assert np.array_equal(store.read_region(0, (0, 0, 0), data.shape)[..., 0], data)
 

@@ -273,7 +273,7 @@ def test_the_command_line_and_stores(tmp_path, monkeypatch):
     ):
         done = gvtorch(*words, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
-    monkeypatch.setattr(conversion_plan, "_FEW", 1)  # in processes
+    monkeypatch.setattr(conversion_plan, "_FEW_TASKS", 1)  # in processes
     store = gv.convert(path, tmp_path / "a.zarr", workers=2)
     dense = grid.dense(LOW, HIGH).transpose(2, 1, 0, 3)
     assert np.array_equal(store.read_region(0, (0, 0, 0), dense.shape[:3]), dense)

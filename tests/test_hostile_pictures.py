@@ -19,7 +19,7 @@ from helpers import hostile
 from helpers.damage import break_file
 
 import gvtorch as gv
-from gvtorch.io.picture_size import jpeg_ends
+from gvtorch.io.picture_size import has_jpeg_end
 
 MEMORY = 1 << 30  # bytes of address space beyond what the libraries use
 
@@ -173,7 +173,7 @@ def test_only_the_end_of_its_own_scans_ends_a_jpeg():
     small, whole = codecs.jpeg8_encode(pixels[:8, :8].copy()), codecs.jpeg8_encode(pixels)
     beside = b"\xff\xe1" + struct.pack(">H", len(small) + 2) + small  # thumbnail with an end marker
     with_thumbnail = whole[:2] + beside + whole[2:]
-    assert jpeg_ends(whole) and jpeg_ends(with_thumbnail) and jpeg_ends(whole + b"more")
+    assert has_jpeg_end(whole) and has_jpeg_end(with_thumbnail) and has_jpeg_end(whole + b"more")
     assert np.array_equal(codecs.jpeg8_decode(with_thumbnail), codecs.jpeg8_decode(whole))
     for cut in (1, 2, 50, len(whole) // 2, len(whole) - 3):
-        assert not jpeg_ends(whole[:-cut]) and not jpeg_ends(with_thumbnail[:-cut])
+        assert not has_jpeg_end(whole[:-cut]) and not has_jpeg_end(with_thumbnail[:-cut])

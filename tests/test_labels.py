@@ -222,7 +222,7 @@ def test_colours_in_every_form():
         (table, [own[0], *array_from_srgb(table / 255), own[4], own[5]]),
         (torch.tensor([GREEN]), [own[0], GREEN, *own[2:]]),
     ):
-        found = gv.Labels(colors)._look().colors_of(labels)
+        found = gv.Labels(colors)._appearance().colors_of(labels)
         np.testing.assert_allclose(found, np.array(wanted), atol=1e-7)
     np.testing.assert_allclose(linear_color("", "#bc8f00"), (0.50289, 0.27468, 0), atol=1e-5)
 

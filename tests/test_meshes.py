@@ -71,7 +71,7 @@ def test_copies_needles_and_points_do_no_harm():
     mesh = meshes.of_corners(corners)
     grid, plain = (Voxelizer(one, resolution=48) for one in (mesh, ball))
     whole = ((0, 0, 0), plain.extent[::-1])
-    assert len(grid.geometry.kept) == len(ball.faces) and grid.geometry.solid.all()
+    assert len(grid.geometry.mesh_face) == len(ball.faces) and grid.geometry.solid.all()
     assert torch.equal(grid.region(*whole)["coverage"], plain.region(*whole)["coverage"])
 
 
@@ -137,7 +137,7 @@ def test_signed_distance_is_libigl_s(name):
     found = geometry.signed_distance(torch.from_numpy(point)).numpy()
     squared, *_ = igl.point_mesh_squared_distance(point, mesh.vertices, mesh.faces)
     assert np.abs(np.abs(found) - np.sqrt(squared)).max() < 1e-5 * size
-    closed = mesh.faces[geometry.kept.numpy()][geometry.solid.numpy()]
+    closed = mesh.faces[geometry.mesh_face.numpy()][geometry.solid.numpy()]
     if not len(closed):
         assert (found >= 0).all()
         return
@@ -161,7 +161,7 @@ def test_the_channel_of_distances_is_libigl_s(name):
     near = np.random.default_rng(0).permutation(near)[:20_000]
     point = near[:, ::-1] * grid.spacing + np.array(grid.origin)
     squared, *_ = igl.point_mesh_squared_distance(point, mesh.vertices, mesh.faces)
-    closed = mesh.faces[grid.geometry.kept.numpy()][grid.geometry.solid.numpy()]
+    closed = mesh.faces[grid.geometry.mesh_face.numpy()][grid.geometry.solid.numpy()]
     inside = np.abs(igl.fast_winding_number(mesh.vertices, closed, point)) > 0.5
     expected = np.where(inside, -1, 1) * np.sqrt(squared)
     apart = np.abs(found.numpy()[tuple(near.T)] - expected)
@@ -295,7 +295,7 @@ def test_volume_of_the_closed_parts_of_a_castle():
     """Two parts that cross, each one alone."""
     mesh = gv.read_mesh(shared(SHARED["castle"]))
     geometry = Geometry(mesh)
-    closed = meshes.parts(mesh.only(geometry.kept.numpy()[geometry.solid.numpy()]))
+    closed = meshes.parts(mesh.only(geometry.mesh_face.numpy()[geometry.solid.numpy()]))
     assert [len(part.faces) for part in closed] == [98, 200]
     for part in closed:
         assert sums(part, 96) == pytest.approx(meshes.volume(part), rel=1e-3)

@@ -42,9 +42,9 @@ def test_what_only_cuda_includes_counts_and_no_name_comes_to_a_shell(tmp_path, c
     library = user.compiled(before, ARCHS)
     after = user.ShaderSource.read(header, "Own")
     assert library.parent == cache and b"Own_" in library.read_bytes()
-    assert json.loads(after.more.read_text()) == [str(part)]
+    assert json.loads(after.list_path.read_text()) == [str(part)]
     assert after.digest != before.digest and after.op in library.name
-    assert sorted(os.listdir(cache)) == sorted([library.name, after.more.name])
+    assert sorted(os.listdir(cache)) == sorted([library.name, after.list_path.name])
     assert user.compiled(after, ARCHS) == library, "it is kept"
     part.write_text("constexpr float kColor = 0.75f;\n")
     assert user.ShaderSource.read(header, "Own").digest not in (before.digest, after.digest)

@@ -64,7 +64,7 @@ def target(functions: gl.Functions) -> tuple[int, int, int]:
     names = [functions.make("Textures") for _ in range(2)]
     layouts = [(gl.RGBA32F, gl.RGBA), (gl.DEPTH_COMPONENT32F, gl.DEPTH_COMPONENT)]
     frame = functions.make("Framebuffers")
-    for binding in gl.FRAMES:
+    for binding in gl.FRAMEBUFFER_BINDINGS:
         functions.BindFramebuffer(binding, frame)
     places = (gl.COLOR_ATTACHMENT0, gl.DEPTH_ATTACHMENT)
     for name, (stored, layout), place in zip(names, layouts, places, strict=True):
@@ -158,12 +158,14 @@ def test_threads_have_exchanges_of_their_own(device):
 
 def set_odd(functions: gl.Functions) -> None:
     """Sets old OpenGL state by which all fragments fail and all pixels change."""
-    functions._take(gl._system("test"), {"AlphaFunc": "-uf", "PolygonStipple": "-p"})
+    functions._load_functions(
+        gl._system_loader("test"), {"AlphaFunc": "-uf", "PolygonStipple": "-p"}
+    )
     for switch in gl._LEGACY_SWITCHES:
         functions.Enable(switch)
     functions.AlphaFunc(0x0200, 0)  # never
     functions.PolygonStipple(bytes(128))
-    for number, value in gl._TRANSFER.items():
+    for number, value in gl._PIXEL_TRANSFER.items():
         if number != 0x0D10:
             functions.PixelTransferf(number, 0.5 * value + 0.25)
     functions.PolygonMode(gl.FRONT, 0x1B01)  # lines
@@ -181,7 +183,7 @@ def test_old_state_of_a_compatibility_profile_changes_nothing_and_stays(device):
         found: list[float] = functions.integers(gl.POLYGON_MODE, 2)
         found += [functions.IsEnabled(switch) for switch in gl._LEGACY_SWITCHES]
         found += [functions.integer(gl.CLAMP_FRAGMENT_COLOR)]
-        for number in gl._TRANSFER:
+        for number in gl._PIXEL_TRANSFER:
             functions.GetFloatv(number, ctypes.byref(value))
             found.append(value.value)
         return found

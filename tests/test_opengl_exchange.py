@@ -229,7 +229,13 @@ def test_textures_are_there_for_shaders_of_ones_own(context, exchange):
 def state(functions: gl.Functions) -> dict[int, list[int]]:
     """Returns all of a context's state that an exchange touches."""
     several = {gl.VIEWPORT: 4}
-    queries = [*gl._STORE, *gl._BUFFERS.values(), *gl.FRAMES.values(), *several, gl.PROGRAM]
+    queries = [
+        *gl._PIXEL_STORE,
+        *gl._BUFFER_BINDINGS.values(),
+        *gl.FRAMEBUFFER_BINDINGS.values(),
+        *several,
+        gl.PROGRAM,
+    ]
     queries += [gl.VERTEX_ARRAY, gl.DEPTH_MASK, gl.DEPTH_FUNC, gl.POLYGON_MODE, gl.ACTIVE_TEXTURE]
     queries += [gl.RENDERBUFFER_BINDING, gl.CLAMP_READ_COLOR]
     found = {query: functions.integers(query, several.get(query, 1)) for query in queries}
@@ -238,7 +244,7 @@ def state(functions: gl.Functions) -> dict[int, list[int]]:
     for index in range(2):
         mask = (ctypes.c_ubyte * 4)()
         functions.GetBooleani_v(gl.COLOR_MASK, index, mask)
-        found[-1 - index] = [*mask, *(functions.IsEnabledi(s, index) for s in gl._FIRST_SWITCHES)]
+        found[-1 - index] = [*mask, *(functions.IsEnabledi(s, index) for s in gl._INDEXED_SWITCHES)]
     unit = functions.integer(gl.ACTIVE_TEXTURE)
     for each in (gl.TEXTURE0, gl.TEXTURE0 + 1):
         functions.ActiveTexture(each)
@@ -383,7 +389,7 @@ def test_what_opengl_cant_read_is_one_clear_line(context, exchange):
 @pytest.mark.parametrize("kind", ["array", "3D", "cube"])
 def test_a_layer_is_read_if_it_has_the_size(context, exchange, kind):
     functions = gl.Functions("test")
-    functions._take(gl._system("test"), {"FramebufferTextureLayer": "-uuuii"})
+    functions._load_functions(gl._system_loader("test"), {"FramebufferTextureLayer": "-uuuii"})
     frame = functions.make("Framebuffers")
     for target in (gl.READ_FRAMEBUFFER, gl.DRAW_FRAMEBUFFER):
         functions.BindFramebuffer(target, frame)
@@ -407,7 +413,7 @@ def test_a_layer_is_read_if_it_has_the_size(context, exchange, kind):
 @everywhere
 def test_samples_are_all_covered_and_floats_not_clamped(context, exchange):
     functions = gl.Functions("test")
-    functions._take(gl._system("test"), {"SampleCoverage": "-fi"})
+    functions._load_functions(gl._system_loader("test"), {"SampleCoverage": "-fi"})
     plain = context.framebuffer([context.texture((WIDTH, HEIGHT), 4, dtype="f4")])
     samples = context.framebuffer([context.renderbuffer((WIDTH, HEIGHT), 4, 4, dtype="f4")])
     color = torch.rand(HEIGHT, WIDTH, 4) * 8 - 4

@@ -181,7 +181,7 @@ def slow(task, level, place):
 if WORKERS == 1:
     shard.write_shard = slow
 else:
-    conversion_plan._FEW = 0
+    conversion_plan._FEW_TASKS = 0
 if __name__ == "__main__":
     main(["convert", sys.argv[1], sys.argv[2], "--workers", str(WORKERS)])
 """

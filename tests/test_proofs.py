@@ -211,7 +211,7 @@ def test_noise_passes_no_proof_in_random_boxes(octaves):
     layout = Layout.of(producer, 8, 1, torch.device("cpu"))
     producer.prepare(layout)
     finest = producer.level_of(layout.depth)
-    worn = finest.left[0] + finest.soft
+    worn = finest.remaining[0] + finest.half_width
     begins = [0.7 + producer.thickness * one for one in (worn - 0.5, -worn - 0.5)]
     depth = torch.randint(2, layout.depth + 1, (BOXES, 1), generator=random)
     side = layout.spacing[0] * 8 * 2.0 ** (layout.depth - depth)

@@ -23,6 +23,7 @@ from helpers.shapes import (
 )
 
 import gvtorch as gv
+from gvtorch.fields.field import box_distance
 from gvtorch.fields.fractals import Power
 
 sdf = gv.sdf
@@ -120,6 +121,17 @@ def test_gradients_are_those_of_differences(named):
     )
     apart = (shape.gradient(points) - by_steps).abs().amax(1)
     assert apart.quantile(0.99) < 1e-6, "but where two surfaces meet"
+
+
+def test_the_distance_to_a_box_is_that_to_its_nearest_face_edge_or_corner():
+    """Points are as far beyond a box's faces as listed; boxes, sponges and caps share it."""
+    beyond = torch.tensor([(3, 4, 12), (3, -1, 4), (-2, 5, -1), (-3, -2, -1), (0, -1, -1)]).double()
+    distance = torch.tensor([13, 5, 5, -1, 0]).double()
+    assert torch.equal(box_distance(beyond), distance)
+    assert torch.equal(gv.sdf.Box((8, 8, 8))(beyond + 4), distance)
+    assert torch.equal(gv.sdf.Menger(0)(beyond / 16 + 0.5), distance / 16)
+    disc, points = gv.sdf.Extrusion(gv.sdf.Sphere(1), 2), [(4, 0, 5), (0.5, 0, 5), (0.5, 0, 0)]
+    assert torch.equal(disc(torch.tensor(points).double()), torch.tensor([5, 4, -0.5]).double())
 
 
 def test_nothing_lies_beyond_a_box(shape):

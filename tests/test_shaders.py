@@ -20,8 +20,9 @@ import gvtorch as gv
 from gvtorch import cpp_ext
 from gvtorch.ops import shade_rays
 from gvtorch.ops.reference.shaders import TWINS
-from gvtorch.ops.shading import SHADER_KINDS, shader_number
+from gvtorch.ops.shading import FAINT, SHADER_KINDS, shader_number
 from gvtorch.shaders import built_in
+from gvtorch.shaders.coarse_colors import mean_of_directions
 from gvtorch.tracing.tracer import Tracer
 
 GOLDEN = {
@@ -409,6 +410,14 @@ def test_a_kind_has_a_struct_a_twin_and_a_class():
         assert any(kind in [getattr(one, name, "") for name in names] for one in classes), kind
     with pytest.raises(ValueError, match=r"shader: kind must be 'Lit', .*, got 'Lamp'"):
         shader_number("Lamp")
+
+
+def test_faint_moments_are_divided_and_multiplied_by_the_same_number():
+    """Those that write filtered colours divide by it; the shader and its twin multiply by it."""
+    text = (cpp_ext.SOURCES / "shaders" / "light.h").read_text()
+    assert re.findall(r"kFaint = (\d+);", text) == [str(FAINT)]
+    written = torch.tensor([0.5, 0.5, 0.5, 1.0, *[1.0] * 6] * 6)
+    assert mean_of_directions(written)[4:].tolist() == [1 / FAINT] * 6
 
 
 @pytest.mark.parametrize("name", built_in.BY_NAME)

@@ -56,7 +56,7 @@ def test_the_folder_is_there_when_all_is_done_and_not_before(tmp_path, monkeypat
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(sorting._Maker, "add_up", interrupted)
+        patch.setattr(sorting._Sorter, "add_up", interrupted)
         gv.sort_points(cloud(), folder=target)
     assert not list(tmp_path.iterdir()), "nothing is left"
     made = gv.sort_points(cloud(), folder=target)

@@ -55,7 +55,7 @@ def triangles(mesh: gv.Mesh) -> np.ndarray:
 
 @pytest.mark.parametrize("block", [5, 16, 64])
 def test_a_ball_has_the_area_and_the_volume_of_a_ball(monkeypatch, block):
-    monkeypatch.setattr(surface, "_BLOCK", block)
+    monkeypatch.setattr(surface, "_BLOCK_CELLS", block)
     mesh = gv.extract_surface(ball(), 0.0)
     area, volume = area_and_volume(mesh)
     assert math.isclose(area, 4 * math.pi * 14.3**2, rel_tol=4e-3)
@@ -91,7 +91,7 @@ def test_noise_is_wrapped_without_cracks(seed, side, block, whole):
     value = 1.0 if whole else 0.0
     volume = gv.Volume(data.astype(np.float32))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(surface, "_BLOCK", block)
+        patch.setattr(surface, "_BLOCK_CELLS", block)
         mesh = gv.extract_surface(volume, value)
     assert_closed(mesh)
     assert area_and_volume(mesh)[1] >= 0
@@ -157,7 +157,7 @@ def test_what_leaves_the_box_is_closed_there_or_open(caps):
 
 def test_streamed_is_resident_is_dense(tmp_path, monkeypatch):
     """A volume, its tree and its store, at each level, in blocks of any size."""
-    monkeypatch.setattr(surface, "_BLOCK", 24)
+    monkeypatch.setattr(surface, "_BLOCK_CELLS", 24)
     volume = ball(75, 30.0, spacing=(1.0, 0.5, 2.0))
     store = gv.convert(_saved(tmp_path, volume), tmp_path / "s.zarr", spacing=(1.0, 0.5, 2.0))
     tree = gv.N3Tree.from_volume(gv.Volume(volume.data, volume.spacing, store.origin))
@@ -178,7 +178,7 @@ def _saved(folder, volume: gv.Volume):
 
 
 def test_blocks_without_the_surface_are_not_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(surface, "_BLOCK", 16)
+    monkeypatch.setattr(surface, "_BLOCK_CELLS", 16)
     store = gv.convert(_saved(tmp_path, ball(96, 12.0, middle=(20, 20, 20))), tmp_path / "s.zarr")
     read = []
     plain = gv.Store.read_region
@@ -213,7 +213,7 @@ def test_a_label_is_wrapped(tmp_path, wide):
 def test_files_come_back(tmp_path, monkeypatch, ending, origin):
     """As trimesh reads them; positions far from the origin keep their precision."""
     trimesh = pytest.importorskip("trimesh")
-    monkeypatch.setattr(surface, "_BLOCK", 16)
+    monkeypatch.setattr(surface, "_BLOCK_CELLS", 16)
     volume = ball(30, 9.4)
     volume = gv.Volume(volume.data, (0.001, 0.002, 0.001), (origin, 2.0, 3.0))
     expected = gv.extract_surface(volume, 0)

@@ -203,7 +203,7 @@ def test_resume_goes_on_in_the_middle_of_times(tmp_path, npy, data, monkeypatch)
 
 
 def test_processes_convert_times(tmp_path, data, monkeypatch):
-    monkeypatch.setattr(conversion_plan, "_FEW", 1)
+    monkeypatch.setattr(conversion_plan, "_FEW_TASKS", 1)
     path = save_nifti(tmp_path / "a.nii.gz", data)  # staged, so that all processes read it
     told = estimate(path, tmp_path / "a.zarr", workers=2)
     assert told.tasks == 18 and told.source_bytes == data.nbytes

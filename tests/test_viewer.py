@@ -45,7 +45,7 @@ def test_pictures_stop_when_nothing_changes_and_go_on_when_something_does(sessio
     page = Page(session)
     page.final()
     count = len(page.pictures)
-    assert session.ask(lambda: [one.wants() for one in session.clients.values()]) == [False]
+    assert session.ask(lambda: [one.wants_picture() for one in session.clients.values()]) == [False]
     _, before = page.final()
     _, after = page.moved(turned(page.camera, 1.0))
     assert len(page.pictures) > count and np.abs(before.astype(int) - after).max() > 60
@@ -381,7 +381,7 @@ def test_a_surface_is_handed_over_as_a_file(session, monkeypatch, tmp_path):
     """It equals that of `gvtorch surface`; progress is reported, and errors are one line."""
     page = Page(session)
     page.final()
-    monkeypatch.setattr(export, "_EVERY", 0.0)
+    monkeypatch.setattr(export, "_PROGRESS_SECONDS", 0.0)
     expected = tmp_path / "a.ply"
     export_surface(bright_ball(), 100.0, expected)
     page.send("surface", value=100.0, format="ply")
@@ -392,7 +392,7 @@ def test_a_surface_is_handed_over_as_a_file(session, monkeypatch, tmp_path):
     page.send("surface", value=1e6)
     assert "1e+06" in page.next("refused", 0)["text"]
     page.until(lambda: session._export and not session._export.busy)
-    monkeypatch.setattr(export, "_MOST", 100)
+    monkeypatch.setattr(export, "_MAX_FILE_BYTES", 100)
     page.send("surface", value=100.0)
     assert "gvtorch surface" in page.next("refused", 1)["text"]
     assert [*page.files] == ["surface.ply"]

@@ -115,7 +115,7 @@ def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypat
     page = Page(session, 204, 154)
     page.final()
     sliced(page, at=[10.0, 10.0, 10.0])
-    go, real = threading.Event(), Planes._cut
+    go, real = threading.Event(), Planes._render_plane
 
     def slow(self, axis, state, pixel):
         assert go.wait(SOON)
@@ -123,7 +123,7 @@ def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypat
             raise OSError("chunk 3\nis gone")
         return real(self, axis, state, pixel)
 
-    monkeypatch.setattr(Planes, "_cut", slow)
+    monkeypatch.setattr(Planes, "_render_plane", slow)
     page.send("change", state={"slices": {"at": [10.0, 10.0, 20.0]}})
     camera = turned(page.camera, 0.5)
     page.send("move", camera=camera, moving=False)
@@ -136,7 +136,7 @@ def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypat
     told = page.next("error", 0)["text"]
     assert told == "a slice can't be read: chunk 3 is gone"
     page.final()
-    monkeypatch.setattr(Planes, "_cut", real)
+    monkeypatch.setattr(Planes, "_render_plane", real)
     page.send("do", what="retry")
     page.until(lambda: page.pictures[-1][0]["final"] and page.of("error")[-1]["text"] == told)
 

@@ -10,7 +10,7 @@ from helpers import ROOT
 from helpers.browser import Tab
 from helpers.labels import cells
 from helpers.stores import noise
-from helpers.viewer import BANDS, Grown
+from helpers.viewer import BANDS, Grown, Page
 
 import gvtorch as gv
 from gvtorch.io.stores.conversion import convert
@@ -53,7 +53,7 @@ def test_slices_are_moved_by_click_drag_and_wheel(tab, viewer):
         tab.page.mouse.wheel(0, 100)
         tab.page.wait_for_timeout(30)
     tab.until(lambda: viewer.state.slices.at[2] == 15.5)
-    tab.until("!app.before")
+    tab.until("!app.stateBefore")
     scrolled = tab.final()
     left, top, width, height = tab.app("app.slices.layout.z.image")
     part = np.s_[top : top + height, left : left + width]
@@ -69,7 +69,7 @@ def test_slices_are_moved_by_click_drag_and_wheel(tab, viewer):
     tab.page.get_by_label("Redo").click()
     tab.until(lambda: abs(viewer.state.slices.at[0] - 25.5) < 0.5)
     # The picture in its part of the canvas can be turned as before; the planes stay.
-    area = tab.app("app.view.area")
+    area = tab.app("app.view.pictureArea")
     box = tab.page.locator(".gv-stage").bounding_box()
     start = (box["x"] + area["left"] + area["width"] / 2, box["y"] + area["top"] + 60)
     tab.drag(start, (start[0] + 40, start[1] + 10))
@@ -81,7 +81,7 @@ def test_slices_are_moved_by_click_drag_and_wheel(tab, viewer):
 
 def test_a_double_click_beside_planes_looks_at_what_is_hit(tab):
     seen = with_slices(tab).max(-1)
-    left, top, width, height = tab.app("app.view.part")
+    left, top, width, height = tab.app("app.view.pictureRect")
     rows, columns = np.nonzero(seen[top : top + height, left : left + width] > 150)
     box, ratio = tab.page.locator(".gv-stage").bounding_box(), tab.app("app.view.ratio")
     tab.page.mouse.dblclick(
@@ -194,7 +194,7 @@ def test_time_is_slid_and_played(chromium, beat):
         for time in (1, 2, 0):
             tab.until(f"app.view.head.time === {time}")
         tab.page.get_by_role("button", name="Stop").click()
-        tab.until("!app.times.playing && !app.before")
+        tab.until("!app.times.playing && !app.stateBefore")
         assert not tab.complaints
         tab.close()
 
@@ -227,10 +227,10 @@ def strokes(tab: Tab) -> int:
 def test_node_boxes_are_drawn_over_the_picture(tab):
     before = strokes(tab)
     tab.page.locator(".gv-tick:has-text('nodes') input").check()
-    tab.until("app.nodes.told?.boxes.length > 0")
+    tab.until("app.nodes.message?.boxes.length > 0")
     assert strokes(tab) > before + 2000
-    told, box = tab.app("app.nodes.told"), np.array(tab.app("app.box"))
-    ends = np.array(tab.app("app.nodes.told.boxes.map((_, n) => app.nodes.box(n))"))
+    told, box = tab.app("app.nodes.message"), np.array(tab.app("app.box"))
+    ends = np.array(tab.app("app.nodes.message.boxes.map((_, n) => app.nodes.box(n))"))
     assert (ends[:, 0] >= box[0] - 1e-6).all() and (ends[:, 1] <= box[1] + 1e-6).all()
     assert (ends[:, 1] > ends[:, 0]).all() and told["count"] == len(ends)
     tab.drag((340, 210), (400, 230))
@@ -392,6 +392,35 @@ def test_views_become_the_keys_of_a_film(tab, viewer, tmp_path):
         tab.until(f"app.film.keys.length === {count}")
 
 
+def test_a_field_keeps_what_is_typed_while_the_view_changes(tab, viewer):
+    """The panel is rebuilt once the number is entered; a rebuild before would end the edit."""
+    for section in ("Film", "Sampling"):
+        tab.open(section)
+    tab.page.get_by_text("add this view").click()
+    seconds = tab.page.locator("input[title='Seconds']")
+    step = tab.page.locator("label.gv-row:has(> .gv-name:text-is('step')) input").last
+    other = Page(viewer.session)
+    tab.until("Object.keys(app.clients).length === 2")
+
+    def change(size: float) -> None:
+        shown = step.input_value()
+        other.send("change", state={"options": {"step": size}})
+        tab.until(f"app.state.options.step === {size}")
+        assert step.input_value() == shown
+
+    for typed, size in (("3.5", 0.6), ("4.5", 0.8)):
+        seconds.select_text()
+        change(size)
+        tab.page.keyboard.type(typed)
+        change(size + 0.125)
+        if typed == "3.5":
+            tab.page.keyboard.press("Enter")
+        else:
+            tab.page.locator(".gv-stage").focus()
+        tab.until(f"app.film.keys[0].time === {typed}")
+        tab.until(lambda size=size: step.input_value() == str(size + 0.125))
+
+
 def test_every_shader_becomes_every_other(tab):
     """Common fields are kept; fields that only share a name are not."""
     row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
@@ -423,7 +452,7 @@ def test_every_control_of_every_shader_is_touched(tab, viewer):
     row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
     for name in row.locator("option").all_inner_texts():
         row.select_option(label=name)
-        tab.until("!app.before")
+        tab.until("!app.stateBefore")
         tab.page.evaluate(TOUCH)
         tab.page.wait_for_timeout(50)
     assert not tab.complaints
@@ -468,7 +497,7 @@ CHOOSE = """async () => {
       const own = at < lists(["Shader"]).length, count = all()[at].options.length;
       for (let n = own ? 0 : count - 1; n < count && !all()[at].disabled; n++) {
         await choose(all()[at], n);
-        app.put(start);
+        app.replaceState(start);
         await settled();
       }
     }

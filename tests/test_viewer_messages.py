@@ -247,7 +247,7 @@ class Stalling(Handler):
 def test_a_server_that_stops_in_a_chunk_is_told_and_asked_again(stored, monkeypatch, refused):
     """While a chunk is waited for, or after reading it was suspended for half a minute."""
     monkeypatch.setattr(
-        "gvtorch.io.http.REFUSED", 1e6
+        "gvtorch.io.http.REFUSED_SECONDS", 1e6
     )  # so it would never be retried automatically
     monkeypatch.setattr(Stalling, "over", threading.Event())
     server = WebServer(("127.0.0.1", 0), partial(Stalling, directory=str(stored.parent)))
@@ -258,7 +258,7 @@ def test_a_server_that_stops_in_a_chunk_is_told_and_asked_again(stored, monkeypa
     try:
         page = Page(session, 48, 32)
         page.final()
-        monkeypatch.setattr("gvtorch.io.http.STALL", 0.2 if refused else 1e6)
+        monkeypatch.setattr("gvtorch.io.http.STALL_SECONDS", 0.2 if refused else 1e6)
         Stalling.stalls = True
         there = near(page, session)
         page.send("move", camera=there, moving=False)
@@ -268,7 +268,7 @@ def test_a_server_that_stops_in_a_chunk_is_told_and_asked_again(stored, monkeypa
         _, seen = page.final()
         assert seen.max() > 0
         goes_on(page, session)
-        monkeypatch.setattr("gvtorch.io.http.STALL", 20.0)
+        monkeypatch.setattr("gvtorch.io.http.STALL_SECONDS", 20.0)
         Stalling.stalls = False  # requests that wait for it get nothing more
         page.send("do", what="retry")
         page.send("move", camera=there, moving=False)

@@ -258,15 +258,15 @@ def test_the_widget_joins_leaves_and_has_a_png(session):
 
     made, sent = widget(session), []
     made.send = lambda content, buffers=None: sent.append((content, buffers))
-    made._take(made, {"joined": True}, [])
+    made._receive(made, {"joined": True}, [])
     session.ask(lambda: None)
-    made._take(made, {"text": '{"type": "hello", "width": 64, "height": 48}'}, [])
+    made._receive(made, {"text": '{"type": "hello", "width": 64, "height": 48}'}, [])
     for _ in range(100):
         session.ask(lambda: None)
         if any(buffers for _, buffers in sent):
             break
     assert json.loads(sent[0][0]["text"])["type"] == "welcome"
-    made._take(made, {"joined": False}, [])
+    made._receive(made, {"joined": False}, [])
     assert session.ask(lambda: len(session.clients)) == 0
     shown = made._repr_mimebundle_()
     bundle = shown[0] if isinstance(shown, tuple) else shown

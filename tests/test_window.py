@@ -8,7 +8,7 @@ import torch
 from helpers import SHARED, shared
 
 import gvtorch as gv
-from gvtorch.io.window import _MOST, value_range
+from gvtorch.io.window import _SAMPLE_VOXELS, value_range
 from gvtorch.tools.parse import chosen_transfer
 
 FILES = [
@@ -117,7 +117,7 @@ def test_a_volume_and_its_store_have_one_window(tmp_path, monkeypatch):
     monkeypatch.setattr(
         gv.Store, "read_region", lambda s, *a, **k: read.append(a) or plain(s, *a, **k)
     )
-    monkeypatch.setattr("gvtorch.io.window._MOST", 40_000)
+    monkeypatch.setattr("gvtorch.io.window._SAMPLE_VOXELS", 40_000)
     assert gv.window(store) == gv.window(volume) != fine
     assert [level for level, *_ in read] == [1]
     monkeypatch.setattr(gv.Store, "stored_level", lambda self, level: 0)
@@ -142,7 +142,7 @@ def test_a_foreign_image_of_one_level_is_read_in_part(tmp_path, monkeypatch):
         }
     ]
     store = gv.Store.open(tmp_path / "a.zarr")
-    monkeypatch.setattr("gvtorch.io.window._MOST", 8_000)
+    monkeypatch.setattr("gvtorch.io.window._SAMPLE_VOXELS", 8_000)
     assert store.stored_level(store.levels - 1) == 0
     low, high = value_range(store)
     assert 0 <= low < 0.01 and 3 < high < 6
@@ -180,4 +180,4 @@ def test_files_keep_their_values_unless_a_window_is_given(tmp_path):
 
 
 def test_bounded():
-    assert _MOST <= 2**23
+    assert _SAMPLE_VOXELS <= 2**23

@@ -40,9 +40,9 @@ def instructions() -> str:
     """
     if load()["cpp"]:
         return "baseline"
-    tell = ctypes.CDLL(str(FOLDER / "libgvtorch_cpu.so")).gvtorch_instructions
-    tell.restype = ctypes.c_char_p
-    return str(tell().decode())
+    read_name = ctypes.CDLL(str(FOLDER / "libgvtorch_cpu.so")).gvtorch_instructions
+    read_name.restype = ctypes.c_char_p
+    return str(read_name().decode())
 
 
 def _load(name: str) -> str:

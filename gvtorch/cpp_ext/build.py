@@ -54,8 +54,8 @@ def compression(nvcc: str) -> str:
     """Returns the flag that compresses the machine code of all architectures: from CUDA 13 on to a
     twelfth, in a form that drivers of CUDA 13 read; before, in one that every driver reads.
     """
-    told = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True).stdout
-    release = re.search(r"release (\d+)", told)
+    stdout = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True).stdout
+    release = re.search(r"release (\d+)", stdout)
     if release is not None and int(release[1]) >= 13:
         return "--compress-mode=size"
     return "-Xfatbin=-compress-all"
@@ -69,17 +69,17 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
     include, link = compilers.torch_flags()
     cxx = [*compilers.find_cxx(), *compilers.CXX_FLAGS, f"-I{source}", "-Wall", "-Wextra"]
     x86 = platform.machine().lower() in ("x86_64", "amd64")
-    own = (["-DGV_X86"] if x86 else []) + include
-    parts = dict.fromkeys(("cpu_rays", "cpu_segments", "cpu"), own)
+    scalar_flags = (["-DGV_X86"] if x86 else []) + include
+    object_flags = dict.fromkeys(("cpu_rays", "cpu_segments", "cpu"), scalar_flags)
     for name, flags in compilers.INSTRUCTION_SETS.items():
         if x86 or name == "baseline":
-            parts[f"packet.{name}"] = [f"-DGV_NAMESPACE={name}", *flags]
-    objects = [str(output / f"{name}.o") for name in parts]
+            object_flags[f"packet.{name}"] = [f"-DGV_NAMESPACE={name}", *flags]
+    objects = [str(output / f"{name}.o") for name in object_flags]
     calls = {
         output / "libgvtorch_cpu.so": [
             *(
                 [*cxx, *flags, "-c", str(source / f"{name.split('.')[0]}.cpp"), "-o", target]
-                for (name, flags), target in zip(parts.items(), objects, strict=True)
+                for (name, flags), target in zip(object_flags.items(), objects, strict=True)
             ),
             [*compilers.find_cxx(), *objects, "-Wl,--no-as-needed", *link, "-pthread"],
         ]
@@ -110,9 +110,9 @@ def compile_libraries(output: Path) -> list[Path]:
             stamp = library.with_suffix(".stamp")
             state = digest + " " + " ; ".join(shlex.join(call) for call in calls[library])
             if not (library.exists() and stamp.exists() and stamp.read_text() == state):
-                *parts, last = calls[library]
-                list(pool.map(_run, parts))
-                _run([*last, "-o", str(library)])
+                *compile_calls, link_call = calls[library]
+                list(pool.map(_run, compile_calls))
+                _run([*link_call, "-o", str(library)])
                 stamp.write_text(state)
 
         list(linkers.map(make, calls))

@@ -45,9 +45,9 @@ from . import SOURCES, compilers, instructions
 
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]*"([^"\n]+)"', re.MULTILINE)
 _NAME = re.compile(r"(?=.{1,128}$)[A-Za-z_]\w*(::[A-Za-z_]\w*)*", re.ASCII)
-_READ_BY_COMPILERS = ("CPATH", "CPLUS_INCLUDE_PATH", "NVCC_PREPEND_FLAGS", "NVCC_APPEND_FLAGS")
+_COMPILER_VARIABLES = ("CPATH", "CPLUS_INCLUDE_PATH", "NVCC_PREPEND_FLAGS", "NVCC_APPEND_FLAGS")
 _HEADER, _DRAFT = "gv_user_header.h", "draft-"  # a header's name for compilers; prefix of folders
-_LONGEST = 3600.0  # seconds after which a folder is taken for that of a killed compilation
+_MAX_COMPILE_SECONDS = 3600.0  # an older folder is taken for that of a killed compilation
 _lock = threading.Lock()
 
 
@@ -62,34 +62,36 @@ class ShaderSource:
     header: Path
     name: str  # of the struct, with its namespaces
     digest: str
-    known: tuple[Path, ...]  # the header, and what its lines include
-    more: Path  # the file that lists the other files that it is compiled from
-    noted: tuple[tuple[Path, bytes], ...]  # those files, each with its digest
+    header_files: tuple[Path, ...]  # the header, and what its lines include
+    list_path: Path  # the file that lists the other files that it is compiled from
+    listed_files: tuple[tuple[Path, bytes], ...]  # those files, each with its digest
 
     @staticmethod
     def read(header: Path, name: str) -> ShaderSource:
         """Reads the header, all that it includes from its folder, and gvtorch's own headers."""
-        known: dict[Path, bytes] = {}
-        waiting = [header]
-        while waiting:
-            file = waiting.pop()
-            known[file] = text = file.read_bytes()
+        contents: dict[Path, bytes] = {}
+        pending = [header]
+        while pending:
+            file = pending.pop()
+            contents[file] = text = file.read_bytes()
             lines = text.decode(errors="replace").replace("\\\r\n", "").replace("\\\n", "")
-            for named in _INCLUDE.findall(lines):
-                beside = (file.parent / named).resolve()
-                if beside.is_file() and beside not in known:
-                    waiting.append(beside)
-        digest = hashlib.sha256(name.encode() + _own_sources())
-        for file in sorted(known):
+            for included in _INCLUDE.findall(lines):
+                path = (file.parent / included).resolve()
+                if path.is_file() and path not in contents:
+                    pending.append(path)
+        digest = hashlib.sha256(name.encode() + _source_digests())
+        for file in sorted(contents):
             digest.update(os.fsencode(os.path.relpath(file, header.parent)) + b"\0")
-            digest.update(hashlib.sha256(known[file]).digest())
-        more = _folder() / f"{name.replace('::', '_')}_{digest.hexdigest()[:16]}.more"
-        noted = []
-        for file in _noted(more):
-            own = hashlib.sha256(file.read_bytes()).digest() if file.is_file() else b"none"
-            digest.update(os.fsencode(file) + b"\0" + own)
-            noted.append((file, own))
-        return ShaderSource(header, name, digest.hexdigest(), tuple(known), more, tuple(noted))
+            digest.update(hashlib.sha256(contents[file]).digest())
+        list_path = _library_folder() / f"{name.replace('::', '_')}_{digest.hexdigest()[:16]}.more"
+        listed_files = []
+        for file in _read_list(list_path):
+            file_digest = hashlib.sha256(file.read_bytes()).digest() if file.is_file() else b"none"
+            digest.update(os.fsencode(file) + b"\0" + file_digest)
+            listed_files.append((file, file_digest))
+        return ShaderSource(
+            header, name, digest.hexdigest(), tuple(contents), list_path, tuple(listed_files)
+        )
 
     @property
     def op(self) -> str:
@@ -101,9 +103,11 @@ class ShaderSource:
         RuntimeError if a file that was read before has changed.
         """
         if self.header.is_file():
-            now = self.read(self.header, self.name)
-            if now.more == self.more and set(self.noted) <= set(now.noted):
-                return now
+            current = self.read(self.header, self.name)
+            if current.list_path == self.list_path and set(self.listed_files) <= set(
+                current.listed_files
+            ):
+                return current
         raise RuntimeError(f"CompiledShader: {self.header} has changed: create the shader again")
 
 
@@ -136,7 +140,7 @@ def load_op(header: str | os.PathLike[str], name: str) -> UserShader:
         )
     compiled(ShaderSource.read(path, name), ())
     source = ShaderSource.read(path, name)  # the compiler may have listed more files
-    _loaded(source, ())
+    _load(source, ())
     library = _handles[source.op, "cpu"]
     library.gvtorch_uniforms.restype = ctypes.c_char_p
     names = library.gvtorch_uniforms().decode()
@@ -156,8 +160,10 @@ def load_cuda(shader: UserShader) -> None:
         return
     shader.unchanged()
     devices = range(torch.cuda.device_count())
-    found = {"".join(map(str, torch.cuda.get_device_capability(device))) for device in devices}
-    _loaded(shader, sorted(found))
+    capabilities = {
+        "".join(map(str, torch.cuda.get_device_capability(device))) for device in devices
+    }
+    _load(shader, sorted(capabilities))
 
 
 def reload(shader: UserShader) -> UserShader:
@@ -176,18 +182,18 @@ def libraries(op: str) -> list[Path]:
     return [_libraries[op, kind] for kind in ("cpu", "cuda") if (op, kind) in _libraries]
 
 
-def _loaded(source: ShaderSource, archs: Sequence[str]) -> Path:
+def _load(source: ShaderSource, archs: Sequence[str]) -> Path:
     """Returns the path of a library after loading it, once."""
     key = (source.op, "cuda" if archs else "cpu")
     with _lock:
         if key not in _libraries:
             library = compiled(source, archs, source.op)
-            checked = _opened(library)
+            checked_path = _open_checked(library)
             try:
                 with torch._ops.dl_open_guard():  # torch.ops.load_library resolves links
-                    _handles[key] = ctypes.CDLL(checked)
+                    _handles[key] = ctypes.CDLL(checked_path)
             except OSError as error:
-                text = str(error).replace(checked, str(library))
+                text = str(error).replace(checked_path, str(library))
                 raise RuntimeError(f"CompiledShader: {text}") from None
             torch.ops.loaded_libraries.add(str(library))
             _libraries[key] = library
@@ -199,19 +205,22 @@ def compiled(source: ShaderSource, archs: Sequence[str], op: str | None = None) 
     are CUDA compute capabilities, as in ("90",); none for the CPU. `op` is the name of its op if
     that is fixed, as by a library that is loaded already; else it is the source's.
     """
-    header, name, asked, op = source.header, source.name, op, op or source.op
-    kind, for_whom = ("cuda", "CUDA") if archs else ("cpu", "the CPU")
+    header, name, requested_op, op = source.header, source.name, op, op or source.op
+    kind, device = ("cuda", "CUDA") if archs else ("cpu", "the CPU")
     command, flags = _compiler(archs)
     tools = [command, compilers.find_cxx()] if archs else [command]  # nvcc calls the C++ compiler
-    parts = [source.digest, *flags, torch.__version__, platform.machine()]
-    parts += [*map(_identity, tools), *(os.environ.get(one, "") for one in _READ_BY_COMPILERS)]
-    digest = hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()
-    library = _folder() / f"{op}_{kind}_{digest[:16]}.so"
+    digest_parts = [source.digest, *flags, torch.__version__, platform.machine()]
+    digest_parts += [
+        *map(_identity, tools),
+        *(os.environ.get(variable, "") for variable in _COMPILER_VARIABLES),
+    ]
+    digest = hashlib.sha256("\0".join(digest_parts).encode(errors="surrogateescape")).hexdigest()
+    library = _library_folder() / f"{op}_{kind}_{digest[:16]}.so"
     if _is_intact(library):
         return library
     if shutil.which(command[0]) is None:
         raise RuntimeError(
-            f"CompiledShader: no compiler {command[0]!r} to compile {header.name} for {for_whom} "
+            f"CompiledShader: no compiler {command[0]!r} to compile {header.name} for {device} "
             f"with; {'NVCC' if archs else 'CXX'} names another"
         )
     _sweep(library.parent)
@@ -224,9 +233,9 @@ def compiled(source: ShaderSource, archs: Sequence[str], op: str | None = None) 
         (Path(folder) / "beside").symlink_to(header.parent)
         (Path(folder) / _HEADER).symlink_to(header)
         include, link = compilers.torch_flags()
-        quoted = ["-Xcompiler=-iquote,beside"] if archs else ["-iquote", "beside"]
+        quote_flags = ["-Xcompiler=-iquote,beside"] if archs else ["-iquote", "beside"]
         call = [*command, *flags, f"-DGV_USER_SHADER={name}", f"-DGV_USER_OP={op}"]
-        call += [f"-DGV_NAMESPACE=user_{op}", *quoted, "-I", str(SOURCES), *include]
+        call += [f"-DGV_NAMESPACE=user_{op}", *quote_flags, "-I", str(SOURCES), *include]
         call += ["-include", _HEADER, str(SOURCES / "user.cpp"), "-o", target.name]
         call += [*link, "-MD", "-MF", "shader.d"]
         run = subprocess.run(
@@ -234,14 +243,16 @@ def compiled(source: ShaderSource, archs: Sequence[str], op: str | None = None) 
             check=False, cwd=folder,
         )  # fmt: skip
         if run.returncode or not target.exists():
-            said = run.stdout.replace("beside/", f"{header.parent}/").replace(_HEADER, str(header))
-            raise CompileError(
-                f"{header}: {name} did not compile for {for_whom} with: {shlex.join(call)}\n{said}"
+            errors = run.stdout.replace("beside/", f"{header.parent}/").replace(
+                _HEADER, str(header)
             )
-        _note(source.unchanged(), Path(folder))
-        now = source.unchanged()
-        if now.digest != source.digest:  # this compiler, or another process's, listed more
-            return compiled(now, archs, asked)
+            raise CompileError(
+                f"{header}: {name} did not compile for {device} with: {shlex.join(call)}\n{errors}"
+            )
+        _extend_list(source.unchanged(), Path(folder))
+        current = source.unchanged()
+        if current.digest != source.digest:  # this compiler, or another process's, listed more
+            return compiled(current, archs, requested_op)
         with target.open("ab") as file:
             file.write(hashlib.sha256(target.read_bytes()).digest())
         target.chmod(0o644)
@@ -249,45 +260,45 @@ def compiled(source: ShaderSource, archs: Sequence[str], op: str | None = None) 
     return library
 
 
-def _note(source: ShaderSource, folder: Path) -> None:
+def _extend_list(source: ShaderSource, folder: Path) -> None:
     """Adds the files that a compiler has read, and that the source does not know, to the list of
     other files. Files of gvtorch, of torch and of the system are left out.
     """
     try:
-        told = (folder / "shader.d").read_text(errors="surrogateescape")
+        rule = (folder / "shader.d").read_text(errors="surrogateescape")
     except OSError:
         return  # this compiler lists nothing
-    words = re.findall(r"(?:[^\s\\]|\\.)+", told.partition(":")[2].replace("\\\n", " "))
-    names = (re.sub(r"\\(.)", r"\1", word).replace("$$", "$") for word in words)
-    read = {(folder / name).resolve() for name in names}
+    tokens = re.findall(r"(?:[^\s\\]|\\.)+", rule.partition(":")[2].replace("\\\n", " "))
+    names = (re.sub(r"\\(.)", r"\1", token).replace("$$", "$") for token in tokens)
+    read_files = {(folder / name).resolve() for name in names}
     torch_root = Path(torch.__file__).resolve().parent
-    ours = (SOURCES.resolve(), torch_root, Path("/usr"), folder.resolve())
-    noted = {file for file, _ in source.noted}
-    more = {
+    ignored_roots = (SOURCES.resolve(), torch_root, Path("/usr"), folder.resolve())
+    listed_files = {file for file, _ in source.listed_files}
+    new_files = {
         file
-        for file in read - noted - {known.resolve() for known in source.known}
-        if not any(file.is_relative_to(root) for root in ours)
+        for file in read_files - listed_files - {path.resolve() for path in source.header_files}
+        if not any(file.is_relative_to(root) for root in ignored_roots)
     }
-    if more:
+    if new_files:
         draft = folder / "more"
-        draft.write_text(json.dumps(sorted(map(str, more | noted))))
-        draft.replace(source.more)
+        draft.write_text(json.dumps(sorted(map(str, new_files | listed_files))))
+        draft.replace(source.list_path)
 
 
-def _noted(more: Path) -> list[Path]:
+def _read_list(list_path: Path) -> list[Path]:
     """Returns the files in a list of other files; none where it is missing or damaged."""
     try:
-        told = json.loads(more.read_text())
+        entries = json.loads(list_path.read_text())
     except (OSError, ValueError, RecursionError):
         return []
-    return [Path(file) for file in told] if isinstance(told, list) else []
+    return [Path(file) for file in entries] if isinstance(entries, list) else []
 
 
 def _sweep(folder: Path) -> None:
     """Removes the folders that killed compilations have left."""
     for draft in folder.glob(f"{_DRAFT}*"):
         with contextlib.suppress(OSError):
-            if time.time() - draft.lstat().st_mtime > _LONGEST:
+            if time.time() - draft.lstat().st_mtime > _MAX_COMPILE_SECONDS:
                 shutil.rmtree(draft, ignore_errors=True)
 
 
@@ -298,15 +309,15 @@ def _is_intact(library: Path) -> bool:
     try:
         with library.open("rb") as file:
             _check_owner(library, os.fstat(file.fileno()))
-            kept = file.read()
+            content = file.read()
     except FileNotFoundError:
         return False
     except OSError as error:
         raise _refused(error) from None
-    return kept[-32:] == hashlib.sha256(kept[:-32]).digest()
+    return content[-32:] == hashlib.sha256(content[:-32]).digest()
 
 
-def _opened(library: Path) -> str:
+def _open_checked(library: Path) -> str:
     """Opens a library, checks owner and permissions again, and returns a path of the open file, so
     that nothing else can be loaded instead. It stays open: loaders know libraries by their paths.
     """
@@ -334,27 +345,27 @@ def _compiler(archs: Sequence[str]) -> tuple[list[str], list[str]]:
     """Returns the compiler's command and its flags, without those that contain a path."""
     if not archs:  # "defs": an undefined symbol is an error now, not when the library is loaded
         linker = "-Wl,--no-as-needed,-z,defs"
-        own = compilers.INSTRUCTION_SETS[instructions()]
-        return compilers.find_cxx(), [*compilers.CXX_FLAGS, *own, "-pthread", linker]
-    nvcc, own = compilers.find_nvcc() or "nvcc", ("-Xlinker=--no-as-needed", "-x", "cu")
-    return [nvcc], [*compilers.NVCC_FLAGS, *compilers.machine_codes(archs), *own]
+        target_flags = compilers.INSTRUCTION_SETS[instructions()]
+        return compilers.find_cxx(), [*compilers.CXX_FLAGS, *target_flags, "-pthread", linker]
+    nvcc, target_flags = compilers.find_nvcc() or "nvcc", ("-Xlinker=--no-as-needed", "-x", "cu")
+    return [nvcc], [*compilers.NVCC_FLAGS, *compilers.machine_codes(archs), *target_flags]
 
 
-def _folder() -> Path:
+def _library_folder() -> Path:
     """Returns the folder of the cache; makes it, for its owner alone. One that others can write
     to is refused, because a library is code.
     """
     try:
         folder = cache_folder("shaders")
-        for one in (*reversed(folder.parents), folder):  # `parents=True` would let others write
-            if not one.exists():
-                one.mkdir(mode=0o700, exist_ok=True)
-        real = folder.resolve()
-        states = {one: one.stat() for one in (real, *real.parents)}
+        for path in (*reversed(folder.parents), folder):  # `parents=True` would let others write
+            if not path.exists():
+                path.mkdir(mode=0o700, exist_ok=True)
+        real_folder = folder.resolve()
+        states = {path: path.stat() for path in (real_folder, *real_folder.parents)}
     except (OSError, RuntimeError) as error:  # the latter: there is no home
         raise _refused(error) from None
-    for one, state in states.items():
-        _check_owner(one, state)
+    for path, state in states.items():
+        _check_owner(path, state)
     return folder
 
 
@@ -365,7 +376,7 @@ def _refused(reason: object) -> RuntimeError:
 
 
 @functools.cache
-def _own_sources() -> bytes:
+def _source_digests() -> bytes:
     """Returns the digests of gvtorch's own sources, one after the other."""
     files = sorted(path for path in SOURCES.rglob("*") if path.is_file())
     return b"".join(hashlib.sha256(path.read_bytes()).digest() for path in files)
@@ -375,10 +386,10 @@ def _identity(command: Sequence[str]) -> str:
     """Returns a text that identifies a compiler without calling it: its command, and path, size and
     time of change of each program in it (both `ccache` and `g++`, say).
     """
-    parts = [shlex.join(command)]
-    for word in command:
-        program = shutil.which(word)
+    lines = [shlex.join(command)]
+    for argument in command:
+        program = shutil.which(argument)
         if program is not None:
             state = os.stat(program)
-            parts.append(f"{os.path.realpath(program)} {state.st_size} {state.st_mtime_ns}")
-    return "\n".join(parts)
+            lines.append(f"{os.path.realpath(program)} {state.st_size} {state.st_mtime_ns}")
+    return "\n".join(lines)

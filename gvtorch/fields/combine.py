@@ -55,15 +55,17 @@ class Warp(Field):
             self.threshold, self.dtypes = field.threshold, field.dtypes
 
     def forward(self, points: Tensor) -> Values:
-        way = self.way(points)
-        size = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
-        return self.field(points + way * (self.most / size.clamp(min=1e-30)).clamp(max=1))
+        displacement = self.way(points)
+        magnitude = torch.linalg.vector_norm(displacement, dim=-1, keepdim=True)
+        return self.field(
+            points + displacement * (self.most / magnitude.clamp(min=1e-30)).clamp(max=1)
+        )
 
     def bounds(self, center: Tensor, half: Tensor) -> Bounds:
-        return _known(self.field, center, half + self.most, None)
+        return _bounds_of(self.field, center, half + self.most, None)
 
     def near(self, center: Tensor, half: Tensor) -> Self:
-        return self.replaced(field=_near(self.field, center, half + self.most))
+        return self.replaced(field=_reduce(self.field, center, half + self.most))
 
     def alike(self, center: Tensor, half: Tensor) -> Tensor:
         return _alike((self.field,), center, half + self.most)
@@ -83,16 +85,18 @@ class Stack(Field):
         if not fields:
             raise ValueError("Stack: needs a field by name")
         self.fields = nn.ModuleDict(
-            {name: checked_field("Stack", name, one) for name, one in fields.items()}
+            {name: checked_field("Stack", name, field) for name, field in fields.items()}
         )
         self.prefiltered = _prefiltered("Stack", fields.values())
 
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:
-        return _flat({name: field(points) for name, field in self.fields.items()})
+        return _flatten({name: field(points) for name, field in self.fields.items()})
 
     def filtered(self, points: Tensor, size: Tensor) -> Mapping[str, Tensor]:
         """Returns means; fields that are not prefiltered are evaluated at the voxels' centres."""
-        return _flat({name: _ask(field, points, size) for name, field in self.fields.items()})
+        return _flatten(
+            {name: _evaluate(field, points, size) for name, field in self.fields.items()}
+        )
 
     def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
         return self.filtered_bounds(center, half, None)
@@ -100,12 +104,14 @@ class Stack(Field):
     def filtered_bounds(
         self, center: Tensor, half: Tensor, size: Tensor | None
     ) -> Mapping[str, Interval]:
-        known = {n: _known(field, center, half, size) for n, field in self.fields.items()}
-        return _flat({name: found for name, found in known.items() if found is not None})
+        intervals = {n: _bounds_of(field, center, half, size) for n, field in self.fields.items()}
+        return _flatten(
+            {name: interval for name, interval in intervals.items() if interval is not None}
+        )
 
     def near(self, center: Tensor, half: Tensor) -> Self:
-        near = {name: _near(field, center, half) for name, field in self.fields.items()}
-        return self.replaced(fields=nn.ModuleDict(near))
+        parts = {name: _reduce(field, center, half) for name, field in self.fields.items()}
+        return self.replaced(fields=nn.ModuleDict(parts))
 
     def alike(self, center: Tensor, half: Tensor) -> Tensor:
         return _alike(self.fields.values(), center, half)
@@ -119,54 +125,60 @@ class Blend(Field):
         `Solid`; a `Distance` is converted to such a density.
         """
         super().__init__()
-        where = type(self).__name__
-        self.first = checked_field(where, "first", first)
-        self.second = checked_field(where, "second", second)
+        context = type(self).__name__
+        self.first = checked_field(context, "first", first)
+        self.second = checked_field(context, "second", second)
         mask = Solid(mask, colors=False) if isinstance(mask, Distance) else mask
-        self.mask = checked_field(where, "mask", mask)
-        self.prefiltered = _prefiltered(where, (first, second, mask))
+        self.mask = checked_field(context, "mask", mask)
+        self.prefiltered = _prefiltered(context, (first, second, mask))
 
     def forward(self, points: Tensor) -> Values:
         return self._mix(lambda part: part(points))
 
     def filtered(self, points: Tensor, size: Tensor) -> Values:
         """Mixes means; fields that are not prefiltered are evaluated at the voxels' centres."""
-        return self._mix(lambda part: _ask(part, points, size))
+        return self._mix(lambda part: _evaluate(part, points, size))
 
-    def _mix(self, ask: Callable[[nn.Module], Values]) -> Values:
-        first, second, share = ask(self.first), ask(self.second), _single(ask(self.mask))
+    def _mix(self, evaluate: Callable[[nn.Module], Values]) -> Values:
+        first, second, fraction = (
+            evaluate(self.first),
+            evaluate(self.second),
+            _only_channel(evaluate(self.mask)),
+        )
         if isinstance(first, Mapping) and isinstance(second, Mapping):
-            return {name: _mixed(one, second[name], share) for name, one in first.items()}
-        return _mixed(_single(first), _single(second), share)
+            return {
+                name: _mix_values(values, second[name], fraction) for name, values in first.items()
+            }
+        return _mix_values(_only_channel(first), _only_channel(second), fraction)
 
     def bounds(self, center: Tensor, half: Tensor) -> Bounds:
         return self.filtered_bounds(center, half, None)
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
         """Returns the hull of both fields' bounds; one field's where the mask is known 0 or 1."""
-        found = [_known(part, center, half, size) for part in (self.first, self.second)]
-        if found[0] is None or found[1] is None:
+        part_bounds = [_bounds_of(part, center, half, size) for part in (self.first, self.second)]
+        if part_bounds[0] is None or part_bounds[1] is None:
             return None
-        low, high = self._shares(center, half, size)
-        if isinstance(found[0], Mapping) and isinstance(found[1], Mapping):
-            both = {*found[0]} & {*found[1]}
-            return {n: between(found[0][n], found[1][n], low, high) for n in both}
-        if isinstance(found[0], Mapping) or isinstance(found[1], Mapping):
+        low, high = self._mask_bounds(center, half, size)
+        if isinstance(part_bounds[0], Mapping) and isinstance(part_bounds[1], Mapping):
+            names = {*part_bounds[0]} & {*part_bounds[1]}
+            return {n: between(part_bounds[0][n], part_bounds[1][n], low, high) for n in names}
+        if isinstance(part_bounds[0], Mapping) or isinstance(part_bounds[1], Mapping):
             return None
-        return between(found[0], found[1], low, high)
+        return between(part_bounds[0], part_bounds[1], low, high)
 
-    def _shares(self, center: Tensor, half: Tensor, size: Tensor | None) -> Interval:
+    def _mask_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Interval:
         """Returns the mask's bounds (k,) in boxes; 0 to 1 if they are unknown."""
-        known = _known(self.mask, center, half, size)
-        if isinstance(known, Mapping):
-            known = next(iter(known.values())) if len(known) == 1 else None
-        none = torch.zeros_like(center[:, 0])
-        low, high = (none, none + 1) if known is None else known
-        return low.reshape(len(none)), high.reshape(len(none))
+        interval = _bounds_of(self.mask, center, half, size)
+        if isinstance(interval, Mapping):
+            interval = next(iter(interval.values())) if len(interval) == 1 else None
+        zero = torch.zeros_like(center[:, 0])
+        low, high = (zero, zero + 1) if interval is None else interval
+        return low.reshape(len(zero)), high.reshape(len(zero))
 
     def near(self, center: Tensor, half: Tensor) -> Self:
         parts = {"first": self.first, "second": self.second, "mask": self.mask}
-        return self.replaced(**{n: _near(part, center, half) for n, part in parts.items()})
+        return self.replaced(**{n: _reduce(part, center, half) for n, part in parts.items()})
 
     def alike(self, center: Tensor, half: Tensor) -> Tensor:
         return _alike(self.children(), center, half)
@@ -182,44 +194,47 @@ class Mask(Blend):
         if isinstance(field, Field):
             self.dtypes = field.dtypes
 
-    def _mix(self, ask: Callable[[nn.Module], Values]) -> Values:
-        values, share = ask(self.first), _single(ask(self.mask))
+    def _mix(self, evaluate: Callable[[nn.Module], Values]) -> Values:
+        values, fraction = evaluate(self.first), _only_channel(evaluate(self.mask))
         if isinstance(values, Mapping):
-            return {n: _mixed(torch.zeros_like(v), v, share) for n, v in values.items()}
-        return _mixed(torch.zeros_like(values), values, share)
+            return {n: _mix_values(torch.zeros_like(v), v, fraction) for n, v in values.items()}
+        return _mix_values(torch.zeros_like(values), values, fraction)
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
         """Returns 0 where the mask is 0, the field's bounds where it is 1, else their hull."""
-        low, high = self._shares(center, half, size)
-        found = _known(self.first, center, half, size)
-        if found is None:  # even without bounds of the field, it is 0 where the mask is
-            wild = torch.full_like(center[:, 0], torch.inf)
-            found = (-wild, wild)
-        if isinstance(found, Mapping):
-            return {n: between(_zero(one), one, low, high) for n, one in found.items()}
-        return between(_zero(found), found, low, high)
+        low, high = self._mask_bounds(center, half, size)
+        field_bounds = _bounds_of(self.first, center, half, size)
+        if field_bounds is None:  # even without bounds of the field, it is 0 where the mask is
+            infinity = torch.full_like(center[:, 0], torch.inf)
+            field_bounds = (-infinity, infinity)
+        if isinstance(field_bounds, Mapping):
+            return {
+                n: between(_zero(interval), interval, low, high)
+                for n, interval in field_bounds.items()
+            }
+        return between(_zero(field_bounds), field_bounds, low, high)
 
 
 def _zero(interval: Interval) -> Interval:
     return torch.zeros_like(interval[0]), torch.zeros_like(interval[1])
 
 
-def _prefiltered(where: str, parts: Iterable[nn.Module]) -> bool:
+def _prefiltered(context: str, parts: Iterable[nn.Module]) -> bool:
     """Returns whether any part is prefiltered; ValueError if one needs a margin for that."""
     fields = [part for part in parts if isinstance(part, Field)]
     if any(field.margin for field in fields):
-        raise ValueError(f"{where}: takes no field with a margin, such as a Solid of differences")
+        raise ValueError(f"{context}: takes no field with a margin, such as a Solid of differences")
     return any(field.prefiltered for field in fields)
 
 
-def _ask(part: nn.Module, points: Tensor, size: Tensor) -> Values:
+def _evaluate(part: nn.Module, points: Tensor, size: Tensor) -> Values:
     """Returns the means over voxels if the part is prefiltered, else the values at centres."""
     if isinstance(part, Field) and part.prefiltered:
         return part.filtered(points, size)
     return part(points)
 
 
-def _known(part: nn.Module, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
+def _bounds_of(part: nn.Module, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
     """Returns bounds of a part's values, or, if prefiltered, of its means over voxels of `size`."""
     if not isinstance(part, Field):
         return None
@@ -228,20 +243,20 @@ def _known(part: nn.Module, center: Tensor, half: Tensor, size: Tensor | None) -
     return part.filtered_bounds(center, half, size)
 
 
-def _near(part: nn.Module, center: Tensor, half: Tensor) -> nn.Module:
+def _reduce(part: nn.Module, center: Tensor, half: Tensor) -> nn.Module:
     """Returns a part reduced to what matters in boxes; see `Field.near`."""
     return part.near(center, half) if isinstance(part, Field) else part
 
 
 def _alike(parts: Iterable[nn.Module], center: Tensor, half: Tensor) -> Tensor:
     """Returns numbers (k,), equal for boxes in which each part's are equal; see `Field.alike`."""
-    found = torch.zeros_like(center[:, 0], dtype=torch.int64)
+    key = torch.zeros_like(center[:, 0], dtype=torch.int64)
     for part in parts:
-        found = found * HASH + (part.alike(center, half) if isinstance(part, Field) else 0)
-    return found
+        key = key * HASH + (part.alike(center, half) if isinstance(part, Field) else 0)
+    return key
 
 
-def _single(values: Values) -> Tensor:
+def _only_channel(values: Values) -> Tensor:
     """Returns the values of the only channel; ValueError if there are several."""
     if isinstance(values, Mapping):
         if len(values) != 1:
@@ -250,22 +265,22 @@ def _single(values: Values) -> Tensor:
     return values
 
 
-def _flat(by_name: Mapping[str, Any]) -> dict[str, Any]:
+def _flatten(by_name: Mapping[str, Any]) -> dict[str, Any]:
     """Flattens channels within channels: {"a": {"b": x}} becomes {"a_b": x}."""
     flat: dict[str, Any] = {}
     for name, values in by_name.items():
         if isinstance(values, Mapping):
-            flat |= {f"{name}_{channel}": one for channel, one in values.items()}
+            flat |= {f"{name}_{channel}": value for channel, value in values.items()}
         else:
             flat[name] = values
     return flat
 
 
-def _mixed(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
+def _mix_values(first: Tensor, second: Tensor, fraction: Tensor) -> Tensor:
     """Mixes two values (...,) or (..., c) by a share (...,) of the second, clamped to [0, 1]."""
-    share = share.clamp(0, 1)
-    if first.dim() < share.dim():
-        share = share[..., 0]
-    elif first.dim() > share.dim():
-        share = share[..., None]
-    return torch.lerp(first, second, share)
+    fraction = fraction.clamp(0, 1)
+    if first.dim() < fraction.dim():
+        fraction = fraction[..., 0]
+    elif first.dim() > fraction.dim():
+        fraction = fraction[..., None]
+    return torch.lerp(first, second, fraction)

@@ -24,7 +24,7 @@ from .field import Field, Interval, between, length
 Color = Sequence[float]  # linear red, green, blue, 0 to 1
 WHITE = (0.8, 0.8, 0.8)
 HASH = 0x9E3779B1
-_ROUNDED = 2.0**-16  # times the size of coordinates: rounding in float32 changes values by less
+_ROUNDING = 2.0**-16  # times the size of coordinates: rounding in float32 changes values by less
 
 
 class Distance(Field):
@@ -44,10 +44,10 @@ class Distance(Field):
     def __init__(self, color: Color = WHITE) -> None:
         """Sets the colour of the surface."""
         super().__init__()
-        where = type(self).__name__
-        red, green, blue = check.triple(where, "color", color)
+        context = type(self).__name__
+        red, green, blue = check.triple(context, "color", color)
         if min(red, green, blue) < 0 or max(red, green, blue) > 1:
-            raise ValueError(f"{where}: color must be in 0 to 1, got {tuple(color)}")
+            raise ValueError(f"{context}: color must be in 0 to 1, got {tuple(color)}")
         self.color = self.vector("color", (red, green, blue))
 
     def forward(self, points: Tensor) -> Tensor:
@@ -64,8 +64,8 @@ class Distance(Field):
 
     def surface_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Returns distances (...,), linear colours (..., 3) and gradients (..., 3) at points."""
-        value, pull, color = torch.func.vjp(self.surface, points, has_aux=True)  # type: ignore[misc]
-        (gradient,) = pull(torch.ones_like(value))
+        value, vjp, color = torch.func.vjp(self.surface, points, has_aux=True)  # type: ignore[misc]
+        (gradient,) = vjp(torch.ones_like(value))
         return value, color, gradient
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
@@ -76,8 +76,8 @@ class Distance(Field):
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Returns the value in the middle plus and minus what the slope allows; see `Field`."""
-        middle, most = self(center), self.slope(center, half) * length(half)
-        return middle - most, middle + most
+        middle, deviation = self(center), self.slope(center, half) * length(half)
+        return middle - deviation, middle + deviation
 
     def near(self, center: Tensor, half: Tensor) -> Distance:
         return self
@@ -103,9 +103,9 @@ class Pair(Distance):
     def __init__(self, first: Distance, second: Distance) -> None:
         """Sets the shapes, which keep their colours."""
         super().__init__()
-        where = type(self).__name__
-        self.first = check.instance(where, "first", first, Distance)
-        self.second = check.instance(where, "second", second, Distance)
+        context = type(self).__name__
+        self.first = check.instance(context, "first", first, Distance)
+        self.second = check.instance(context, "second", second, Distance)
         self.exact = first.exact and second.exact
         self.smooth = first.smooth and second.smooth
 
@@ -119,9 +119,12 @@ class Pair(Distance):
         return self.mix(self.first(points), self.second(points))[0]
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        (first, own), (second, other) = self.first.surface(points), self.second.surface(points)
-        value, share = self.mix(first, second)
-        return value, torch.lerp(own, other, share[..., None].to(own))
+        (first, first_color), (second, second_color) = (
+            self.first.surface(points),
+            self.second.surface(points),
+        )
+        value, fraction = self.mix(first, second)
+        return value, torch.lerp(first_color, second_color, fraction[..., None].to(first_color))
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
         return torch.maximum(self.first.slope(center, half), self.second.slope(center, half))
@@ -135,23 +138,26 @@ class Pair(Distance):
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         """Returns one shape's intervals where only its colour counts, else the hull of both."""
-        own, other = self.first.colors(center, half), self.second.colors(center, half)
-        return between(own, other, *self._share(center, half, 0.0))
+        first_colors, second_colors = (
+            self.first.colors(center, half),
+            self.second.colors(center, half),
+        )
+        return between(first_colors, second_colors, *self._fraction_bounds(center, half, 0.0))
 
-    def _share(self, center: Tensor, half: Tensor, rounded: float) -> Interval:
+    def _fraction_bounds(self, center: Tensor, half: Tensor, rounding: float) -> Interval:
         """Returns intervals (k,) of the second one's share in boxes; values may be off by rounding,
-        `rounded` times the size of coordinates.
+        `rounding` times the size of coordinates.
         """
-        slack = rounded * (center.abs() + half).amax(1)
+        slack = rounding * (center.abs() + half).amax(1)
         (a, b), (c, d) = self.first.bounds(center, half), self.second.bounds(center, half)
-        shares = self.mix(a - slack, d + slack)[1], self.mix(b + slack, c - slack)[1]
-        ends = torch.stack([share.to(a) for share in shares])
+        fractions = self.mix(a - slack, d + slack)[1], self.mix(b + slack, c - slack)[1]
+        ends = torch.stack([fraction.to(a) for fraction in fractions])
         return ends.amin(0), ends.amax(0)
 
     def near(self, center: Tensor, half: Tensor) -> Distance:
         """Returns one shape if only it counts in all boxes, else the pair, with reduced parts."""
-        least, most = self._share(center, half, _ROUNDED)
-        alone = torch.stack(((most == 0).all(), (least == 1).all())).tolist()
+        low, high = self._fraction_bounds(center, half, _ROUNDING)
+        alone = torch.stack(((high == 0).all(), (low == 1).all())).tolist()
         if alone[0]:
             return self.first.near(center, half)
         if alone[1]:
@@ -160,11 +166,11 @@ class Pair(Distance):
         return self.replaced(first=first, second=second)
 
     def alike(self, center: Tensor, half: Tensor) -> Tensor:
-        least, most = self._share(center, half, _ROUNDED)
-        own = torch.where(most == 0, 0, torch.where(least == 1, 1, 2))
-        first = torch.where(own == 1, 0, self.first.alike(center, half))
-        second = torch.where(own == 0, 0, self.second.alike(center, half))
-        return (first * HASH + second) * 3 + own
+        low, high = self._fraction_bounds(center, half, _ROUNDING)
+        relevance = torch.where(high == 0, 0, torch.where(low == 1, 1, 2))
+        first = torch.where(relevance == 1, 0, self.first.alike(center, half))
+        second = torch.where(relevance == 0, 0, self.second.alike(center, half))
+        return (first * HASH + second) * 3 + relevance
 
     def box(self) -> Tensor | None:
         return joint_box(self.first.box(), self.second.box())
@@ -184,7 +190,7 @@ class Intersection(Pair):
         return torch.maximum(first, second), second > first
 
     def box(self) -> Tensor | None:
-        return common(self.first.box(), self.second.box())
+        return common_box(self.first.box(), self.second.box())
 
 
 class SmoothUnion(Pair):
@@ -197,8 +203,8 @@ class SmoothUnion(Pair):
         self.exact = False
 
     def mix(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        share = (0.5 + 0.5 * (first - second) / self.width).clamp(0, 1)
-        return torch.lerp(first, second, share) - self.width * share * (1 - share), share
+        weight = (0.5 + 0.5 * (first - second) / self.width).clamp(0, 1)
+        return torch.lerp(first, second, weight) - self.width * weight * (1 - weight), weight
 
     def box(self) -> Tensor | None:
         return grown(super().box(), self.width / 4)
@@ -282,7 +288,7 @@ class SmoothIntersection(Negative):
 
     def box(self) -> Tensor | None:
         first, second = self._parts
-        return common(first.box(), second.box())
+        return common_box(first.box(), second.box())
 
 
 class SmoothDifference(SmoothIntersection):
@@ -301,7 +307,7 @@ def joint_box(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     return torch.stack((torch.minimum(first[0], second[0]), torch.maximum(first[1], second[1])))
 
 
-def common(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+def common_box(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     """Returns the intersection of two (2, 3) boxes; the known one if the other is unknown."""
     if first is None or second is None:
         return second if first is None else first

@@ -115,7 +115,7 @@ class Field(nn.Module):
             ValueError: It is not finite, or beyond its limits.
         """
         number = check.number(type(self).__name__, name, value, **limits)
-        return self._kept(name, number)
+        return self._register(name, number)
 
     def vector(self, name: str, value: Sequence[float] | Tensor, **limits: Any) -> Tensor:
         """Stores x, y, z as a buffer `name`, (3,) float64, and returns it. Convert it with
@@ -124,29 +124,29 @@ class Field(nn.Module):
         Raises:
             ValueError: They are not three finite numbers, or beyond their limits.
         """
-        return self._kept(name, check.triple(type(self).__name__, name, value, **limits))
+        return self._register(name, check.triple(type(self).__name__, name, value, **limits))
 
-    def _kept(self, name: str, value: Any) -> Tensor:
-        kept = torch.tensor(value, dtype=torch.float64)
-        self.register_buffer(name, kept)
-        return kept
+    def _register(self, name: str, value: Any) -> Tensor:
+        buffer = torch.tensor(value, dtype=torch.float64)
+        self.register_buffer(name, buffer)
+        return buffer
 
     def __repr__(self) -> str:
         parts = ", ".join(type(part).__name__ for part in self.children())
         return f"{type(self).__name__}({parts})"
 
 
-def checked_field(where: str, name: str, value: Any) -> nn.Module:
+def checked_field(context: str, name: str, value: Any) -> nn.Module:
     """Returns `value` if it is a field or another module with a forward. Raises ValueError if it
     has none; producers have none.
     """
-    field = check.instance(where, name, value, nn.Module)
+    field = check.instance(context, name, value, nn.Module)
     if getattr(field.forward, "__func__", None) is not nn.Module.forward:
         return field
-    kind, more = type(field).__name__, ", which has no forward"
+    kind, reason = type(field).__name__, ", which has no forward"
     if hasattr(field, "classify"):
-        more = ", a producer: give its field, or put producers side by side by gv.JoinedProducer"
-    raise ValueError(f"{where}: {name} must be a field, got {kind}{more}")
+        reason = ", a producer: give its field, or put producers side by side by gv.JoinedProducer"
+    raise ValueError(f"{context}: {name} must be a field, got {kind}{reason}")
 
 
 def length(vectors: Tensor) -> Tensor:
@@ -154,9 +154,16 @@ def length(vectors: Tensor) -> Tensor:
     return torch.linalg.vector_norm(vectors, dim=-1)
 
 
-def tighter(one: Interval, other: Interval) -> Interval:
+def box_distance(beyond: Tensor) -> Tensor:
+    """Returns (...,) signed distances to a box, from how far points are beyond its faces along each
+    axis, (..., c); below 0 inside.
+    """
+    return length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0)
+
+
+def tighter(first: Interval, second: Interval) -> Interval:
     """Returns the intersection of two intervals of the same values."""
-    return torch.maximum(one[0], other[0]), torch.minimum(one[1], other[1])
+    return torch.maximum(first[0], second[0]), torch.minimum(first[1], second[1])
 
 
 def between(first: Interval, second: Interval, low: Tensor, high: Tensor) -> Interval:
@@ -166,11 +173,11 @@ def between(first: Interval, second: Interval, low: Tensor, high: Tensor) -> Int
     if first[0].dim() > low.dim():
         low, high = low[:, None], high[:, None]
     hull = torch.minimum(first[0], second[0]), torch.maximum(first[1], second[1])
-    one, other = (
+    lower, upper = (
         torch.where(high <= 0, a, torch.where(low >= 1, b, both))
         for a, b, both in zip(first, second, hull, strict=True)
     )
-    return one, other
+    return lower, upper
 
 
 def parts_of(center: Tensor, half: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -178,9 +185,13 @@ def parts_of(center: Tensor, half: Tensor, count: int) -> tuple[Tensor, Tensor]:
     (k * count^3, 3) each, box after box. Intervals of small boxes are tighter than that of a large
     one; `joined` combines them to those of the boxes.
     """
-    place = (torch.arange(count, device=center.device, dtype=center.dtype) + 0.5) * 2 / count - 1
-    at = torch.stack(torch.meshgrid(place, place, place, indexing="ij"), -1).view(1, -1, 3)
-    parts = (center[:, None] + half[:, None] * at).flatten(0, 1)
+    axis_offsets = (
+        torch.arange(count, device=center.device, dtype=center.dtype) + 0.5
+    ) * 2 / count - 1
+    offsets = torch.stack(
+        torch.meshgrid(axis_offsets, axis_offsets, axis_offsets, indexing="ij"), -1
+    ).view(1, -1, 3)
+    parts = (center[:, None] + half[:, None] * offsets).flatten(0, 1)
     return parts, (half / count).repeat_interleave(count**3, 0)
 
 

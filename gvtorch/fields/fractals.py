@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from .. import ops
 from ..base import check
-from ..ops.reference import orbits as plain
+from ..ops.reference import orbits as twin
 from .distance import Color, Distance
 from .field import Interval, joined, length, parts_of
 
@@ -57,10 +57,10 @@ class Power(Iteration):
         self.power = check.whole("Power", "power", power, low=2, high=64)
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        return plain.spherical_power(z, self.power)
+        return twin.spherical_power(z, self.power)
 
     def ranges(self, z: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return plain.power_ranges(z, reach, self.power)
+        return twin.power_ranges(z, reach, self.power)
 
 
 class Fold(Iteration):
@@ -85,10 +85,10 @@ class Fold(Iteration):
         return 2 * (self.scale + 1) / (self.scale - 1) if self.scale > 1 else 2.0
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        return plain.fold(z, self.scale)
+        return twin.fold(z, self.scale)
 
     def ranges(self, z: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return plain.fold_ranges(z, reach, self.scale)
+        return twin.fold_ranges(z, reach, self.scale)
 
 
 class Fractal(Distance):
@@ -121,47 +121,53 @@ class Fractal(Distance):
                 of two axes, and to neither.
         """
         super().__init__()
-        where = type(self).__name__
-        self.iteration = check.instance(where, "iteration", iteration, Iteration)
-        self.iterations = check.whole(where, "iterations", iterations, low=1, high=1000)
+        context = type(self).__name__
+        self.iteration = check.instance(context, "iteration", iteration, Iteration)
+        self.iterations = check.whole(context, "iterations", iterations, low=1, high=1000)
         self.bailout = self.number("bailout", bailout, low=1, open_low=True)
         self.julia = constant is not None
         self.constant = self.vector("constant", (0.0, 0.0, 0.0) if constant is None else constant)
         if len(colors) != 3:
-            raise ValueError(f"{where}: colors must be three colours, got {len(colors)}")
-        self.register_buffer("colors_33", check.reals(where, "colors", colors, (3, 3)).clamp(0, 1))
+            raise ValueError(f"{context}: colors must be three colours, got {len(colors)}")
+        self.register_buffer(
+            "colors_33", check.reals(context, "colors", colors, (3, 3)).clamp(0, 1)
+        )
 
     def forward(self, points: Tensor) -> Tensor:
         return self._orbits(points)[0]
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        value, near, plane = self._orbits(points)
-        one, two, three = self.colors_33.to(points)
-        color = torch.lerp(three, two, (1 - plane[..., None]).clamp(0, 1) ** 4)
-        return value, torch.lerp(color, one, (1.2 - near[..., None]).clamp(0, 1) ** 2)
+        value, origin_distance, plane_distance = self._orbits(points)
+        origin_color, plane_color, base_color = self.colors_33.to(points)
+        color = torch.lerp(
+            base_color, plane_color, (1 - plane_distance[..., None]).clamp(0, 1) ** 4
+        )
+        return value, torch.lerp(
+            color, origin_color, (1.2 - origin_distance[..., None]).clamp(0, 1) ** 2
+        )
 
     def _orbits(self, points: Tensor) -> Tensor:
         """Returns (3, ...) distances, and least distances of orbits to origin and axis planes."""
         point = points.reshape(-1, 3).contiguous()
         orbit = self._orbit(point)
         if orbit is None:
-            found = plain.orbits(point, self._way(point))
+            result = twin.orbits(point, self._twin_orbit(point))
         else:
-            found = ops.orbits(point, orbit)
-        return found.view(3, *points.shape[:-1])
+            result = ops.orbits(point, orbit)
+        return result.view(3, *points.shape[:-1])
 
     def _orbit(self, like: Tensor) -> ops.Orbit | None:
         """Returns the arguments of the ops, in the dtype of `like`; None for user-defined steps."""
-        step, numbers = self.iteration, (self.constant.to(like), self.bailout.to(like).view(1))
+        step, tensors = self.iteration, (self.constant.to(like), self.bailout.to(like).view(1))
         if type(step) is Power:
-            return ops.Orbit(*numbers, "power", step.power, self.iterations, self.julia)
+            return ops.Orbit(*tensors, "power", step.power, self.iterations, self.julia)
         if type(step) is Fold:
-            return ops.Orbit(*numbers, "fold", step.scale, self.iterations, self.julia)
+            return ops.Orbit(*tensors, "fold", step.scale, self.iterations, self.julia)
         return None
 
-    def _way(self, like: Tensor) -> plain.Way:
+    def _twin_orbit(self, like: Tensor) -> twin.TwinOrbit:
         """Returns the arguments of the torch twin, which follows any step."""
-        return plain.Way(
+        return twin.TwinOrbit(
             self.iteration,
             self.iteration.ranges,
             self.constant.to(like) if self.julia else None,
@@ -176,10 +182,10 @@ class Fractal(Distance):
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Follows the orbits of whole boxes, in parts; see the head of the file."""
-        middle, part = parts_of(center, half, _PARTS)
-        orbit, reach = self._orbit(middle), length(part)
+        middle, half_part = parts_of(center, half, _PARTS)
+        orbit, reach = self._orbit(middle), length(half_part)
         if orbit is None:
-            low, high = plain.orbit_bounds(middle, reach, self._way(middle))
+            low, high = twin.orbit_bounds(middle, reach, self._twin_orbit(middle))
         else:
             low, high = ops.orbit_bounds(middle, reach, orbit)
         return joined((low, high), _PARTS)
@@ -189,53 +195,56 @@ class Fractal(Distance):
         ends = self.colors_33.to(center)
         return ends.amin(0).expand_as(center), ends.amax(0).expand_as(center)
 
-    def _within(self, most: float) -> Tensor:
+    def _cube(self, half_side: float) -> Tensor:
         """Returns the box (2, 3) of a cube around the origin."""
-        ends = torch.tensor((-most, most), dtype=torch.float64, device=self.colors_33.device)
+        ends = torch.tensor(
+            (-half_side, half_side), dtype=torch.float64, device=self.colors_33.device
+        )
         return ends[:, None].expand(2, 3)
 
 
 class Mandelbulb(Fractal):
     """z^n + c in three dimensions: White and Nylander's bulb."""
 
-    def __init__(self, power: int = 8, **look: object) -> None:
+    def __init__(self, power: int = 8, **settings: object) -> None:
         """Takes n and the arguments of `Fractal`."""
-        super().__init__(Power(power), **look)  # type: ignore[arg-type]
+        super().__init__(Power(power), **settings)  # type: ignore[arg-type]
 
     def box(self) -> Tensor:
         """Returns a cube of half side 2^(1 / (n - 1)); beyond it |z|^n outgrows |c|: all escape."""
         power = self.iteration.power
         assert isinstance(power, int)
-        return self._within(2.0 ** (1 / (power - 1)))
+        return self._cube(2.0 ** (1 / (power - 1)))
 
 
 class Julia(Fractal):
     """z^n + a constant, in three dimensions."""
 
     def __init__(
-        self, constant: Sequence[float] = (-0.55, 0.3, -0.25), power: int = 2, **look: object
+        self, constant: Sequence[float] = (-0.55, 0.3, -0.25), power: int = 2, **settings: object
     ) -> None:
         """Takes the constant, n, and the arguments of `Fractal`."""
-        super().__init__(Power(power), constant=constant, **look)  # type: ignore[arg-type]
+        super().__init__(Power(power), constant=constant, **settings)  # type: ignore[arg-type]
 
     def box(self) -> Tensor:
         """Returns a cube of half side R >= 1 with R^n - |c| > R: all points beyond R escape."""
         power = self.iteration.power
         assert isinstance(power, int)
-        most, size = 1.0, float(self.constant.norm())
-        while most**power - size <= most:
-            most += 1 / 64
-        return self._within(most)
+        radius, constant_norm = 1.0, float(self.constant.norm())
+        while radius**power - constant_norm <= radius:
+            radius += 1 / 64
+        return self._cube(radius)
 
 
 class Mandelbox(Fractal):
     """Lowe's box: each step folds, inverts, scales and translates."""
 
-    def __init__(self, scale: float = 2.0, **look: object) -> None:
+    def __init__(self, scale: float = 2.0, **settings: object) -> None:
         """Takes the scale, below -1 or above 1, and the arguments of `Fractal`."""
         step = Fold(scale)
-        options = {"bailout": 1.8 * step.side, **look}  # corners are sqrt(3) = 1.73 `side` away
-        super().__init__(step, **options)  # type: ignore[arg-type]
+        # Corners are sqrt(3) = 1.73 `side` away.
+        arguments = {"bailout": 1.8 * step.side, **settings}
+        super().__init__(step, **arguments)  # type: ignore[arg-type]
         self._side = step.side + 2 * float(self.bailout) / abs(step.scale) ** self.iterations
 
     def box(self) -> Tensor:
@@ -243,4 +252,4 @@ class Mandelbox(Fractal):
         that have not escaped after `iterations`: each step multiplies an orbit's distance beyond
         the cube by |scale|.
         """
-        return self._within(self._side)
+        return self._cube(self._side)

@@ -16,9 +16,10 @@ from . import noise
 from .distance import Distance, OfShape, grown
 from .field import Interval, length
 
-_SKIN = 0.1  # value of skin and roots
-_HALF, _SPREAD = 0.45, 0.7  # height at which hairs end, in lengths: half + spread * noise
-_SHARP = 5.0  # slope with which a hair ends: from 1 to 0 within 1 / 5 of a length
+_SKIN_VALUE = 0.1  # value of skin and roots
+# Height at which hairs end, in lengths: mean + spread * noise.
+_MEAN_HEIGHT, _HEIGHT_SPREAD = 0.45, 0.7
+_END_SLOPE = 5.0  # slope with which a hair ends: from 1 to 0 within 1 / 5 of a length
 
 
 class Fur(OfShape):
@@ -61,27 +62,27 @@ class Fur(OfShape):
         return self.filtered(points, torch.zeros_like(points))
 
     def filtered(self, points: Tensor, size: Tensor) -> Mapping[str, Tensor]:
-        away, _, gradient = self.shape.surface_and_gradient(points)
-        height = away / self.length
+        distance, _, gradient = self.shape.surface_and_gradient(points)
+        height = distance / self.length
         normal = gradient / length(gradient).clamp(min=0.5)[..., None]
-        fallen = (height * height * self.length)[..., None] * self.fall.to(points)
-        root = points - away[..., None] * normal - fallen
-        cells = size.amax(-1).to(points) * self.frequency
-        seen = torch.exp(-noise.LOST * cells * cells)
-        hairs = noise.perlin(root * self.frequency, seed=self.seed) * seen
-        inside = ((_HALF + _SPREAD * hairs - height) * _SHARP).clamp(0, 1)
-        return {"value": inside * (_SKIN + (1 - _SKIN) * height.clamp(0, 1))}
+        displacement = (height * height * self.length)[..., None] * self.fall.to(points)
+        root = points - distance[..., None] * normal - displacement
+        side_cells = size.amax(-1).to(points) * self.frequency
+        contrast = torch.exp(-noise.LOST * side_cells * side_cells)
+        hairs = noise.perlin(root * self.frequency, seed=self.seed) * contrast
+        inside = ((_MEAN_HEIGHT + _HEIGHT_SPREAD * hairs - height) * _END_SLOPE).clamp(0, 1)
+        return {"value": inside * (_SKIN_VALUE + (1 - _SKIN_VALUE) * height.clamp(0, 1))}
 
     def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
         """Returns 0 above all hairs, the skin's value below all roots, else 0 to 1."""
         low, high = self.shape.bounds(center, half)
-        reach = _SPREAD * noise.bounds(noise.perlin).high
-        above = low > (_HALF + reach) * self.length
-        skin = high < (_HALF - reach - 1 / _SHARP) * self.length
-        least = _SKIN * skin.to(low)
-        return {"value": (least, torch.where(skin, least, (~above).to(low)))}
+        spread = _HEIGHT_SPREAD * noise.bounds(noise.perlin).high
+        above = low > (_MEAN_HEIGHT + spread) * self.length
+        skin = high < (_MEAN_HEIGHT - spread - 1 / _END_SLOPE) * self.length
+        skin_value = _SKIN_VALUE * skin.to(low)
+        return {"value": (skin_value, torch.where(skin, skin_value, (~above).to(low)))}
 
     def box(self) -> Tensor | None:
         """Returns the box around the shape and its hairs."""
-        reach = _HALF + _SPREAD * noise.bounds(noise.perlin).high
-        return grown(self.shape.box(), reach * self.length)
+        max_height = _MEAN_HEIGHT + _HEIGHT_SPREAD * noise.bounds(noise.perlin).high
+        return grown(self.shape.box(), max_height * self.length)

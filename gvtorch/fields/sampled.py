@@ -87,38 +87,40 @@ class SampledDistance(Distance):
             ValueError: A number is out of its range.
         """
         check.instance("SampledDistance", "mesh", mesh, Mesh)
-        if solid == "auto" and (told := told_of_holes(mesh)):
-            warnings.warn(told, stacklevel=2)
+        if solid == "auto" and (message := told_of_holes(mesh)):
+            warnings.warn(message, stacklevel=2)
         reach = check.number("SampledDistance", "reach", reach, low=0, high=4)
-        given: dict[str, Any] = {"channels": ("distance",), "band": _BAND, "solid": solid}
-        grid = Voxelizer(mesh, resolution=resolution, **given)
-        more = math.ceil(reach * resolution)
-        ends = [n + more for n in grid.extent[::-1]]
-        near = grid.region((-more,) * 3, ends)["distance"][..., 0]
-        values = grid.spacing * _spread(near / grid.spacing)
-        origin = [one - more * grid.spacing for one in grid.origin]
+        settings: dict[str, Any] = {"channels": ("distance",), "band": _BAND, "solid": solid}
+        grid = Voxelizer(mesh, resolution=resolution, **settings)
+        margin = math.ceil(reach * resolution)
+        ends = [n + margin for n in grid.extent[::-1]]
+        near_surface = grid.region((-margin,) * 3, ends)["distance"][..., 0]
+        values = grid.spacing * _spread(near_surface / grid.spacing)
+        origin = [coordinate - margin * grid.spacing for coordinate in grid.origin]
         return cls(Volume(values, spacing=(grid.spacing,) * 3, origin=origin), color=color)
 
     def forward(self, points: Tensor) -> Tensor:
-        at = (points - self.origin.to(points)) / self.spacing.to(points)
-        inside = at.clamp(min=torch.zeros_like(self.last).to(at), max=self.last.to(at))
-        low = torch.minimum(inside.floor(), self.last.to(at) - 1)
-        share = inside - low
+        position = (points - self.origin.to(points)) / self.spacing.to(points)
+        clamped = position.clamp(
+            min=torch.zeros_like(self.last).to(position), max=self.last.to(position)
+        )
+        cell = torch.minimum(clamped.floor(), self.last.to(position) - 1)
+        weights = clamped - cell
         _, y, x = self.values.shape
-        first = low.to(torch.int64)
-        first = (first[..., 2] * y + first[..., 1]) * x + first[..., 0]
+        base_index = cell.to(torch.int64)
+        base_index = (base_index[..., 2] * y + base_index[..., 1]) * x + base_index[..., 0]
         flat = self.values.reshape(-1)
         corners = [
-            flat[first + (dz * y + dy) * x + dx].to(at)
+            flat[base_index + (dz * y + dy) * x + dx].to(position)
             for dz in (0, 1)
             for dy in (0, 1)
             for dx in (0, 1)
         ]
         for axis in range(3):
-            weight = share[..., axis]
+            weight = weights[..., axis]
             pairs = zip(corners[::2], corners[1::2], strict=True)
-            corners = [torch.lerp(one, other, weight) for one, other in pairs]
-        beyond = length((at - inside) * self.spacing.to(points))
+            corners = [torch.lerp(left, right, weight) for left, right in pairs]
+        beyond = length((position - clamped) * self.spacing.to(points))
         return corners[0] + beyond
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
@@ -131,10 +133,10 @@ class SampledDistance(Distance):
         at either end a value is a mean of voxels that are on average half a diagonal away.
         """
         middle, radius = self(center), length(half)
-        most = self.apart * (radius + length(self.spacing))
-        most = torch.where(self._inside(center, half), most, most + radius)
-        most = torch.minimum(most, self.slope(center, half) * radius)
-        return middle - most, middle + most
+        deviation = self.apart * (radius + length(self.spacing))
+        deviation = torch.where(self._inside(center, half), deviation, deviation + radius)
+        deviation = torch.minimum(deviation, self.slope(center, half) * radius)
+        return middle - deviation, middle + deviation
 
     def _inside(self, center: Tensor, half: Tensor) -> Tensor:
         """Returns (k,) bool: which boxes are within that of the voxel centres."""
@@ -155,8 +157,8 @@ def _steepest(values: Tensor, spacing: Tensor) -> Tensor:
         steps = values.diff(dim=2 - axis).abs()
         window = [2, 2, 2]
         window[2 - axis] = 1
-        most = torch.nn.functional.max_pool3d(steps[None], window, stride=1)[0]
-        squares = squares + (most.to(torch.float64) / spacing[axis]) ** 2
+        edge_max = torch.nn.functional.max_pool3d(steps[None], window, stride=1)[0]
+        squares = squares + (edge_max.to(torch.float64) / spacing[axis]) ** 2
     assert isinstance(squares, Tensor)
     return squares.max().sqrt()
 
@@ -169,35 +171,42 @@ def _apart(values: Tensor, spacing: Tensor) -> Tensor:
     sqrt(1 + (sqrt 2 - 1)^2 + (sqrt 3 - sqrt 2)^2) = 1.128 times as long as the straight line; sqrt
     3 times if voxels are not cubes.
     """
-    most = torch.zeros((), dtype=torch.float64, device=values.device)
+    steepest = torch.zeros((), dtype=torch.float64, device=values.device)
     for step in itertools.product((-1, 0, 1), repeat=3):  # x, y, z
         if step <= (0, 0, 0):  # the same pair as from the other end
             continue
-        here = [slice(max(-n, 0), min(-n, 0) or None) for n in step[::-1]]
-        there = [slice(max(n, 0), min(n, 0) or None) for n in step[::-1]]
-        differ = (values[tuple(here)] - values[tuple(there)]).abs().amax().to(torch.float64)
-        most = torch.maximum(most, differ / length(torch.tensor(step).to(spacing) * spacing))
-    cubes = bool((spacing == spacing[0]).all())
-    return most * (1.1282 if cubes else math.sqrt(3))
+        start_slices = [slice(max(-n, 0), min(-n, 0) or None) for n in step[::-1]]
+        end_slices = [slice(max(n, 0), min(n, 0) or None) for n in step[::-1]]
+        difference = (
+            (values[tuple(start_slices)] - values[tuple(end_slices)]).abs().amax().to(torch.float64)
+        )
+        steepest = torch.maximum(
+            steepest, difference / length(torch.tensor(step).to(spacing) * spacing)
+        )
+    is_cubic = bool((spacing == spacing[0]).all())
+    return steepest * (1.1282 if is_cubic else math.sqrt(3))
 
 
-def _spread(near: Tensor) -> Tensor:
+def _spread(distances: Tensor) -> Tensor:
     """Completes distances (z, y, x) in voxels of which only the sign is known beyond `_BAND`.
 
     A voxel's vector to the nearest point of the surface is passed to its neighbours, along each
     axis in both directions; a second round takes it around corners.
     """
-    known = near.abs() < _BAND - 1.01  # then all neighbours are known, too
-    slope = torch.stack(torch.gradient(near))
+    reliable = distances.abs() < _BAND - 1.01  # then all neighbours are known, too
+    slope = torch.stack(torch.gradient(distances))
     slope = slope / torch.linalg.vector_norm(slope, dim=0).clamp(min=1e-6)
-    way = torch.where(known, -near * slope, 1e6)
+    vectors = torch.where(reliable, -distances * slope, 1e6)
     for axis in (1, 2, 3) * 2:
-        count = way.shape[axis]
+        count = vectors.shape[axis]
         for step, planes in ((-1, range(1, count)), (1, range(count - 2, -1, -1))):
             for plane in planes:
-                own, other = way.select(axis, plane), way.select(axis, plane + step).clone()
-                other[axis - 1] += step
-                nearer = (other * other).sum(0) < (own * own).sum(0)
-                own.copy_(torch.where(nearer, other, own))
-    far = torch.copysign(torch.linalg.vector_norm(way, dim=0), near)
-    return torch.where(near.abs() < _BAND - 1e-3, near, far)
+                current, neighbour = (
+                    vectors.select(axis, plane),
+                    vectors.select(axis, plane + step).clone(),
+                )
+                neighbour[axis - 1] += step
+                nearer = (neighbour * neighbour).sum(0) < (current * current).sum(0)
+                current.copy_(torch.where(nearer, neighbour, current))
+    propagated = torch.copysign(torch.linalg.vector_norm(vectors, dim=0), distances)
+    return torch.where(distances.abs() < _BAND - 1e-3, distances, propagated)

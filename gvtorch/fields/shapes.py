@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..base import check
 from .distance import WHITE, Color, Distance
-from .field import Interval, length
+from .field import Interval, box_distance, length
 
 
 class Sphere(Distance):
@@ -30,8 +30,8 @@ class Sphere(Distance):
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Returns the values at the nearest and the farthest point of the box: exact."""
-        away = center.abs()
-        near, far = (away - half).clamp(min=0), away + half
+        absolute = center.abs()
+        near, far = (absolute - half).clamp(min=0), absolute + half
         return length(near) - self.radius, length(far) - self.radius
 
     def box(self) -> Tensor:
@@ -51,14 +51,14 @@ class Box(Distance):
 
     def forward(self, points: Tensor) -> Tensor:
         beyond = points.abs() - (self.size / 2 - self.round).to(points)
-        return length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0) - self.round
+        return box_distance(beyond) - self.round
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Returns the values at the nearest and the farthest point of the box: exact, because the
         value rises with |x|, |y| and |z|.
         """
-        away = center.abs()
-        return self((away - half).clamp(min=0)), self(away + half)
+        absolute = center.abs()
+        return self((absolute - half).clamp(min=0)), self(absolute + half)
 
     def box(self) -> Tensor:
         return _mirrored(self.size / 2)
@@ -74,12 +74,12 @@ class Torus(Distance):
         self.tube = self.number("tube", tube, low=0, open_low=True)
 
     def forward(self, points: Tensor) -> Tensor:
-        away = length(points[..., :2]) - self.radius
-        return length(torch.stack((away, points[..., 2]), -1)) - self.tube
+        ring_distance = length(points[..., :2]) - self.radius
+        return length(torch.stack((ring_distance, points[..., 2]), -1)) - self.tube
 
     def box(self) -> Tensor:
-        wide = self.radius + self.tube
-        return _mirrored(torch.stack((wide, wide, self.tube)))
+        extent = self.radius + self.tube
+        return _mirrored(torch.stack((extent, extent, self.tube)))
 
 
 class Capsule(Distance):
@@ -100,9 +100,11 @@ class Capsule(Distance):
         self.radius = self.number("radius", radius, low=0, open_low=True)
 
     def forward(self, points: Tensor) -> Tensor:
-        start, way = self.start.to(points), (self.end - self.start).to(points)
-        share = ((points - start) * way).sum(-1, keepdim=True) / (way * way).sum().clamp(min=1e-30)
-        return length(points - start - share.clamp(0, 1) * way) - self.radius
+        start, axis = self.start.to(points), (self.end - self.start).to(points)
+        fraction = ((points - start) * axis).sum(-1, keepdim=True) / (axis * axis).sum().clamp(
+            min=1e-30
+        )
+        return length(points - start - fraction.clamp(0, 1) * axis) - self.radius
 
     def box(self) -> Tensor:
         low, high = torch.minimum(self.start, self.end), torch.maximum(self.start, self.end)
@@ -132,8 +134,8 @@ class Plane(Distance):
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Returns the values at the box's lowest and highest corner along the normal: exact."""
-        middle, most = self(center), (half * self.normal.abs()).sum(1)
-        return middle - most, middle + most
+        middle, deviation = self(center), (half * self.normal.abs()).sum(1)
+        return middle - deviation, middle + deviation
 
 
 class Gyroid(Distance):
@@ -175,15 +177,14 @@ class Menger(Distance):
         self.levels = check.whole("Menger", "levels", levels, low=0, high=30)
 
     def forward(self, points: Tensor) -> Tensor:
-        beyond = points.abs() - 0.5
-        found = length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0)
+        distance = box_distance(points.abs() - 0.5)
         cell = 1.0
         for _ in range(self.levels):
             # Distances from the cell's centre along each axis; cells meet at odd halves.
-            away = (points - cell * (points / cell).detach().round()).abs()
-            found = torch.maximum(found, cell / 6 - away.sort(-1).values[..., 1])
+            offset = (points - cell * (points / cell).detach().round()).abs()
+            distance = torch.maximum(distance, cell / 6 - offset.sort(-1).values[..., 1])
             cell /= 3
-        return found
+        return distance
 
     def box(self) -> Tensor:
         return _mirrored(torch.full((3,), 0.5, dtype=torch.float64, device=self.color.device))

@@ -11,8 +11,8 @@ from ..base import check
 from .distance import Distance, OfShape
 from .field import Interval, length
 
-_POINT = 1e-30  # side of voxels of no size
-_DEEP = 4.0  # voxels from the surface beyond which normals by derivatives are 0
+_POINT_SIDE = 1e-30  # side of voxels of no size
+_DEEP_VOXELS = 4.0  # voxels from the surface beyond which normals by derivatives are 0
 
 
 class Solid(OfShape):
@@ -53,7 +53,7 @@ class Solid(OfShape):
 
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:
         """Returns infinitely small voxels: 1 inside, 0 outside; normals by derivatives."""
-        size = torch.full_like(points[..., 0], _POINT)
+        size = torch.full_like(points[..., 0], _POINT_SIDE)
         return self._voxels(points, size, differences=False)
 
     def filtered(self, points: Tensor, size: Tensor) -> Mapping[str, Tensor]:
@@ -64,41 +64,41 @@ class Solid(OfShape):
 
     def _voxels(self, points: Tensor, side: Tensor, differences: bool) -> dict[str, Tensor]:
         """Returns channels of voxels with sides (...,); for `differences` see `filtered`."""
-        shape, found = self.shape, {}
+        shape, channels = self.shape, {}
         if differences or (self.exact and not self.normals):
             value, color = shape.surface(points) if self.colors else (shape(points), None)
-            near = value.clamp(-2 * side, 2 * side)[..., None].expand_as(points)
+            normal = value.clamp(-2 * side, 2 * side)[..., None].expand_as(points)
         else:
             value, color, gradient = shape.surface_and_gradient(points)
-            steep = length(gradient).clamp(min=1e-6)
-            value = value if self.exact else value / steep
-            deep = (value.abs() >= _DEEP * side)[..., None]
-            near = torch.where(deep, 0.0, gradient / steep[..., None])
-        alpha = share(value, side)[..., None]
+            steepness = length(gradient).clamp(min=1e-6)
+            value = value if self.exact else value / steepness
+            deep = (value.abs() >= _DEEP_VOXELS * side)[..., None]
+            normal = torch.where(deep, 0.0, gradient / steepness[..., None])
+        alpha = coverage(value, side)[..., None]
         if color is not None and self.colors:
-            found["rgba"] = torch.cat((color * alpha, alpha), -1)
+            channels["rgba"] = torch.cat((color * alpha, alpha), -1)
         else:
-            found["density"] = alpha
-        return {**found, "normal": near} if self.normals else found
+            channels["density"] = alpha
+        return {**channels, "normal": normal} if self.normals else channels
 
     def finish(self, values: Mapping[str, Tensor], size: Tensor) -> Mapping[str, Tensor]:
         """Computes normals from central differences of the distance; 0 where all neighbours are at
         least two voxels away from the surface.
         """
-        near, inner = values["normal"][..., 0], slice(1, -1)
-        across = (
-            near[:, inner, inner, 2:] - near[:, inner, inner, :-2],
-            near[:, inner, 2:, inner] - near[:, inner, :-2, inner],
-            near[:, 2:, inner, inner] - near[:, :-2, inner, inner],
+        distance, inner = values["normal"][..., 0], slice(1, -1)
+        differences = (
+            distance[:, inner, inner, 2:] - distance[:, inner, inner, :-2],
+            distance[:, inner, 2:, inner] - distance[:, inner, :-2, inner],
+            distance[:, 2:, inner, inner] - distance[:, :-2, inner, inner],
         )
-        ways = torch.stack(across, -1) / size.to(near)[:, None, None, None]
-        longest = length(ways)[..., None].clamp(min=1e-30)
-        whole = {name: rows[:, inner, inner, inner] for name, rows in values.items()}
-        return {**whole, "normal": ways / longest}
+        gradient = torch.stack(differences, -1) / size.to(distance)[:, None, None, None]
+        norm = length(gradient)[..., None].clamp(min=1e-30)
+        inner_values = {name: channel[:, inner, inner, inner] for name, channel in values.items()}
+        return {**inner_values, "normal": gradient / norm}
 
     def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
         """Returns intervals for infinitely small voxels."""
-        return self.filtered_bounds(center, half, torch.full_like(center, _POINT))
+        return self.filtered_bounds(center, half, torch.full_like(center, _POINT_SIDE))
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor) -> Mapping[str, Interval]:
         """Returns intervals for voxels of `size` (k, 3) and all smaller ones: a surface that is at
@@ -107,26 +107,26 @@ class Solid(OfShape):
         low, high = self.shape.bounds(center, half)
         side = size.amax(-1)
         if not self.exact:
-            steep = self.shape.slope(center, half)
-            side = side * steep.clamp(min=1e-6)
-        most = torch.where(low > 0, share(low, side), 1.0)
-        least = torch.where(high < 0, share(high, side), 0.0)
-        known: dict[str, Interval] = {"density": (least, most)}
+            slope = self.shape.slope(center, half)
+            side = side * slope.clamp(min=1e-6)
+        max_alpha = torch.where(low > 0, coverage(low, side), 1.0)
+        min_alpha = torch.where(high < 0, coverage(high, side), 0.0)
+        intervals: dict[str, Interval] = {"density": (min_alpha, max_alpha)}
         if self.colors:
             dark, bright = self.shape.colors(center, half)
-            one = torch.ones_like(most)[:, None]
-            low_4, high_4 = torch.cat((dark, one), 1), torch.cat((bright, one), 1)
-            known = {"rgba": (least[:, None] * low_4, most[:, None] * high_4)}
+            ones = torch.ones_like(max_alpha)[:, None]
+            low_4, high_4 = torch.cat((dark, ones), 1), torch.cat((bright, ones), 1)
+            intervals = {"rgba": (min_alpha[:, None] * low_4, max_alpha[:, None] * high_4)}
         if self.normals:
-            deep = (torch.maximum(low, -high) >= _DEEP * side) & (self.margin == 0)
-            turned = torch.where(deep, 0.0, 1.0).to(low)[:, None].expand(-1, 3)
-            known["normal"] = (-turned, turned)
-        return known
+            deep = (torch.maximum(low, -high) >= _DEEP_VOXELS * side) & (self.margin == 0)
+            normal_limit = torch.where(deep, 0.0, 1.0).to(low)[:, None].expand(-1, 3)
+            intervals["normal"] = (-normal_limit, normal_limit)
+        return intervals
 
     def box(self) -> Tensor | None:
         return self.shape.box()
 
 
-def share(distance: Tensor, side: Tensor) -> Tensor:
+def coverage(distance: Tensor, side: Tensor) -> Tensor:
     """Returns the share of a voxel, 0 to 1, that is inside, given its centre's signed distance."""
     return (0.5 - distance / side).clamp(0, 1)

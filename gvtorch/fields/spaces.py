@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..base import check
 from .distance import Changed, Distance, grown
-from .field import Interval, length, tighter
+from .field import Interval, box_distance, length, tighter
 
 Matrix = Sequence[Sequence[float]]
 
@@ -49,8 +49,8 @@ class Space(Changed):
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Intersects the bounds of the shape over the mapped boxes with those by the slope."""
         low, high = super().bounds(center, half)
-        known = self.value(low, center), self.value(high, center)
-        return tighter(known, Distance.bounds(self, center, half))
+        mapped_bounds = self.value(low, center), self.value(high, center)
+        return tighter(mapped_bounds, Distance.bounds(self, center, half))
 
 
 class Transform(Space):
@@ -74,15 +74,15 @@ class Transform(Space):
             ValueError: The matrix has another shape or no inverse.
         """
         super().__init__(shape)
-        turn = check.reals("Transform", "matrix", matrix, (3, 3))
-        stretched = torch.linalg.svdvals(turn)
-        least, most = stretched.min(), stretched.max()
-        if not float(least) > 1e-12 * float(most):
-            raise ValueError(f"Transform: matrix must have an inverse, got {turn.tolist()}")
+        linear = check.reals("Transform", "matrix", matrix, (3, 3))
+        singular_values = torch.linalg.svdvals(linear)
+        smallest, largest = singular_values.min(), singular_values.max()
+        if not float(smallest) > 1e-12 * float(largest):
+            raise ValueError(f"Transform: matrix must have an inverse, got {linear.tolist()}")
         self.offset = self.vector("offset", offset)
-        self.register_buffer("inverse", torch.linalg.inv(turn))
-        self.register_buffer("scale", least)
-        self.exact = shape.exact and float(most / least) < 1 + 1e-9
+        self.register_buffer("inverse", torch.linalg.inv(linear))
+        self.register_buffer("scale", smallest)
+        self.exact = shape.exact and float(largest / smallest) < 1 + 1e-9
 
     def place(self, points: Tensor) -> Tensor:
         return (points - self.offset.to(points)) @ self.inverse.to(points).mT
@@ -119,9 +119,11 @@ class Twist(Space):
         return torch.stack((cosine * x + sine * y, cosine * y - sine * x, z), -1)
 
     def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-        reach = length(half) * self.stretch(center, half)
-        wide = torch.minimum(reach, length((center.abs() + half)[:, :2]) + length(center[:, :2]))
-        return self.place(center), torch.stack((wide, wide, half[:, 2]), 1)
+        radius = length(half) * self.stretch(center, half)
+        half_width = torch.minimum(
+            radius, length((center.abs() + half)[:, :2]) + length(center[:, :2])
+        )
+        return self.place(center), torch.stack((half_width, half_width, half[:, 2]), 1)
 
     def stretch(self, center: Tensor, half: Tensor) -> Tensor:
         """Returns the largest singular value of a shear by rate * radius."""
@@ -154,36 +156,38 @@ class Repeat(Space):
             ValueError: The shape is not known to lie within its cell, or a number is invalid.
         """
         super().__init__(shape)
-        where = type(self).__name__
+        context = type(self).__name__
         self.period = self.vector("period", period)
         self._axes = [axis for axis in range(3) if float(self.period[axis]) != 0]
         if bool((self.period < 0).any()) or not self._axes:
             raise ValueError(
-                f"{where}: period must be >= 0, and > 0 along an axis, got {tuple(period)}"
+                f"{context}: period must be >= 0, and > 0 along an axis, got {tuple(period)}"
             )
         box = shape.box()
         beyond = None if box is None else box.abs().amax(0) - self.period / 2
         if beyond is None or bool((beyond[self._axes] > 1e-9).any()):
             size = "no box" if box is None else f"box {box.tolist()}"
-            raise ValueError(f"{where}: the shape must lie within its cell, it has {size}")
+            raise ValueError(f"{context}: the shape must lie within its cell, it has {size}")
         counts = (None,) * 3 if count is None else tuple(count)
-        for one in counts:
-            if one is not None and check.whole(where, "count", one, low=1) % 2 == 0:
-                raise ValueError(f"{where}: count must be odd, got {counts}")
-        self._most = [math.inf if one is None else (one - 1) // 2 for one in counts]
+        for axis_count in counts:
+            if axis_count is not None and check.whole(context, "count", axis_count, low=1) % 2 == 0:
+                raise ValueError(f"{context}: count must be odd, got {counts}")
+        self._max_cell = [
+            math.inf if axis_count is None else (axis_count - 1) // 2 for axis_count in counts
+        ]
 
     def _cells(self, points: Tensor) -> list[Tensor]:
         """Returns points (..., 3) relative to their two nearest cells along each repeated axis."""
         cells = []
         coordinates = points.unbind(-1)
         for sides in itertools.product((0, 1), repeat=len(self._axes)):
-            moved = [*coordinates]
+            relative = [*coordinates]
             for axis, side in zip(self._axes, sides, strict=True):
-                period, most = self.period[axis], self._most[axis]
+                period, max_cell = self.period[axis], self._max_cell[axis]
                 # The cell number is piecewise constant, so it is detached from the gradient.
-                number = (coordinates[axis] / period).detach().floor() + side
-                moved[axis] = coordinates[axis] - number.clamp(-most, most) * period
-            cells.append(torch.stack(moved, -1))
+                cell_number = (coordinates[axis] / period).detach().floor() + side
+                relative[axis] = coordinates[axis] - cell_number.clamp(-max_cell, max_cell) * period
+            cells.append(torch.stack(relative, -1))
         return cells
 
     def forward(self, points: Tensor) -> Tensor:
@@ -193,8 +197,8 @@ class Repeat(Space):
         first, *others = self._cells(points)
         value, color = self.shape.surface(first)
         for cell in others:
-            other, paint = self.shape.surface(cell)
-            color = torch.where((other < value)[..., None], paint, color)
+            other, other_color = self.shape.surface(cell)
+            color = torch.where((other < value)[..., None], other_color, color)
             value = torch.minimum(value, other)
         return value, color
 
@@ -202,19 +206,19 @@ class Repeat(Space):
         """Returns boxes (k, 3) that hold the results of `_cells` for all points of boxes."""
         low, high = center - half, center + half
         for axis in self._axes:
-            period, most = self.period[axis], self._most[axis]
-            first = (low[:, axis] / period).floor().clamp(-most, most)
-            last = ((high[:, axis] / period).floor() + 1).clamp(-most, most)
+            period, max_cell = self.period[axis], self._max_cell[axis]
+            first = (low[:, axis] / period).floor().clamp(-max_cell, max_cell)
+            last = ((high[:, axis] / period).floor() + 1).clamp(-max_cell, max_cell)
             ends = (low[:, axis] - last * period, high[:, axis] - first * period)
-            if math.isinf(most):
+            if math.isinf(max_cell):
                 ends = ends[0].clamp(min=-period), ends[1].clamp(max=period)
             low = torch.where(torch.arange(3, device=low.device) == axis, ends[0][:, None], low)
             high = torch.where(torch.arange(3, device=low.device) == axis, ends[1][:, None], high)
         return (low + high) / 2, (high - low) / 2
 
     def box(self) -> Tensor | None:
-        most = self.period.new_tensor(self._most, dtype=torch.float64)
-        return grown(self.shape.box(), torch.where(self.period > 0, self.period * most, 0.0))
+        max_cell = self.period.new_tensor(self._max_cell, dtype=torch.float64)
+        return grown(self.shape.box(), torch.where(self.period > 0, self.period * max_cell, 0.0))
 
 
 class Offset(Space):
@@ -246,8 +250,8 @@ class Shell(Offset):
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Takes the absolute value of the shape's interval; if that contains 0, its least is 0."""
         low, high = self.shape.bounds(center, half)
-        least = torch.where((low < 0) & (high > 0), 0.0, torch.minimum(low.abs(), high.abs()))
-        return least - self.by, torch.maximum(low.abs(), high.abs()) - self.by
+        lowest = torch.where((low < 0) & (high > 0), 0.0, torch.minimum(low.abs(), high.abs()))
+        return lowest - self.by, torch.maximum(low.abs(), high.abs()) - self.by
 
 
 class Extrusion(Space):
@@ -267,13 +271,16 @@ class Extrusion(Space):
         return self.place(center), self.place(half)
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
-        return self._within(value, points[..., 2].abs())
+        return self._with_caps(value, points[..., 2].abs())
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         low, high = self.shape.bounds(*self.over(center, half))
-        away, reach = center[:, 2].abs(), half[:, 2]
-        known = self._within(low, (away - reach).clamp(min=0)), self._within(high, away + reach)
-        return tighter(known, Distance.bounds(self, center, half))
+        plane_distance, half_height = center[:, 2].abs(), half[:, 2]
+        mapped_bounds = (
+            self._with_caps(low, (plane_distance - half_height).clamp(min=0)),
+            self._with_caps(high, plane_distance + half_height),
+        )
+        return tighter(mapped_bounds, Distance.bounds(self, center, half))
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
         """Returns the shape's slope, but at least 1, that of the caps."""
@@ -286,10 +293,10 @@ class Extrusion(Space):
         ends = torch.stack((-self.height, self.height)) / 2
         return torch.cat((box[:, :2], ends[:, None]), 1)
 
-    def _within(self, value: Tensor, away: Tensor) -> Tensor:
-        """Combines a 2D distance (`value`) with the distance from the plane (`away`)."""
-        beyond = torch.stack((value, away - self.height / 2), -1)
-        return length(beyond.clamp(min=0)) + beyond.amax(-1).clamp(max=0)
+    def _with_caps(self, value: Tensor, plane_distance: Tensor) -> Tensor:
+        """Combines a 2D distance (`value`) with the distance from the plane (`plane_distance`)."""
+        beyond = torch.stack((value, plane_distance - self.height / 2), -1)
+        return box_distance(beyond)
 
 
 class Revolution(Space):
@@ -303,23 +310,23 @@ class Revolution(Space):
         self.radius = self.number("radius", radius, low=0)
 
     def place(self, points: Tensor) -> Tensor:
-        away = length(points[..., :2]) - self.radius
-        return torch.stack((away, points[..., 2], torch.zeros_like(away)), -1)
+        axis_distance = length(points[..., :2]) - self.radius
+        return torch.stack((axis_distance, points[..., 2], torch.zeros_like(axis_distance)), -1)
 
     def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-        away, reach = center[:, :2].abs(), half[:, :2]
-        near, far = length((away - reach).clamp(min=0)), length(away + reach)
-        none = torch.zeros_like(near)
-        middle = torch.stack(((near + far) / 2 - self.radius, center[:, 2], none), 1)
-        return middle, torch.stack(((far - near) / 2, half[:, 2], none), 1)
+        absolute, half_xy = center[:, :2].abs(), half[:, :2]
+        near, far = length((absolute - half_xy).clamp(min=0)), length(absolute + half_xy)
+        zero = torch.zeros_like(near)
+        middle = torch.stack(((near + far) / 2 - self.radius, center[:, 2], zero), 1)
+        return middle, torch.stack(((far - near) / 2, half[:, 2], zero), 1)
 
     def box(self) -> Tensor | None:
         box = self.shape.box()
         if box is None:
             return None
-        wide = self.radius + box[:, 0].abs().max()
+        radius = self.radius + box[:, 0].abs().max()
         return torch.stack(
-            (torch.stack((-wide, -wide, box[0, 1])), torch.stack((wide, wide, box[1, 1])))
+            (torch.stack((-radius, -radius, box[0, 1])), torch.stack((radius, radius, box[1, 1])))
         )
 
 
@@ -336,11 +343,11 @@ def rotated(shape: Distance, axis: Sequence[float], degrees: float) -> Transform
     Raises:
         ValueError: The axis has no direction, or a number is not finite.
     """
-    along = torch.tensor(check.triple("rotated", "axis", axis), dtype=torch.float64)
-    if not float(along.norm()) > 0:
+    direction = torch.tensor(check.triple("rotated", "axis", axis), dtype=torch.float64)
+    if not float(direction.norm()) > 0:
         raise ValueError(f"rotated: axis must have a direction, got {tuple(axis)}")
     angle = math.radians(check.number("rotated", "degrees", degrees))
-    x, y, z = (along / along.norm()).tolist()
+    x, y, z = (direction / direction.norm()).tolist()
     cross = torch.tensor(((0, -z, y), (z, 0, -x), (-y, x, 0)), dtype=torch.float64)
     matrix = torch.eye(3).double() + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
     return Transform(shape, matrix)
@@ -348,5 +355,7 @@ def rotated(shape: Distance, axis: Sequence[float], degrees: float) -> Transform
 
 def scaled(shape: Distance, x: float, y: float | None = None, z: float | None = None) -> Transform:
     """Returns a shape scaled along the axes; y and z are x if left out."""
-    sides = [check.number("scaled", "factor", x if one is None else one) for one in (x, y, z)]
+    sides = [
+        check.number("scaled", "factor", x if factor is None else factor) for factor in (x, y, z)
+    ]
     return Transform(shape, torch.diag(torch.tensor(sides, dtype=torch.float64)))

@@ -26,11 +26,11 @@ SECONDS_A_BYTE = 5e-7  # and for each byte of its file
 MEMORY = 512 * 10**6  # bytes of memory for any header
 MEMORY_A_BYTE = 40  # and for each byte of its file
 MOST_PACKED = 1032  # largest ratio of unpacked to packed bytes in DEFLATE
-_PATIENCE = 0.5  # seconds of processor time before memory counts
-_LOOK = 0.05  # seconds between two checks
+_MEMORY_GRACE_SECONDS = 0.5  # seconds of processor time before memory counts
+_CHECK_SECONDS = 0.05  # seconds between two checks
 
 
-class _TooMuch(BaseException):
+class _OverBudget(BaseException):
     """Ends the reading thread's work; not an `Exception`, because libraries may swallow those."""
 
 
@@ -41,16 +41,16 @@ def check_regular(path: str | Path) -> None:
         raise ValueError(f"{path}: is not a regular file")
 
 
-def check_beside(path: str, other: str) -> None:
-    """Raises ValueError if `other`, a file that the content of `path` refers to, lies outside the
-    folder of `path` and the folders below it, or is no regular file.
+def check_beside(path: str, referenced: str) -> None:
+    """Raises ValueError if `referenced`, a file that the content of `path` refers to, lies outside
+    the folder of `path` and the folders below it, or is no regular file.
     """
     folder = os.path.realpath(os.path.dirname(path))
-    place = os.path.join(folder, other)
-    if os.path.commonpath([folder, os.path.realpath(place)]) != folder:
-        raise ValueError(f"{path}: names {other}, which is in another folder")
-    if os.path.lexists(place):
-        check_regular(place)
+    referenced_path = os.path.join(folder, referenced)
+    if os.path.commonpath([folder, os.path.realpath(referenced_path)]) != folder:
+        raise ValueError(f"{path}: names {referenced}, which is in another folder")
+    if os.path.lexists(referenced_path):
+        check_regular(referenced_path)
 
 
 def check_files(source: object) -> None:
@@ -71,66 +71,69 @@ def header_budget(path: str) -> Iterator[None]:
         yield
         return
     seconds = SECONDS + SECONDS_A_BYTE * size
-    most = MEMORY + MEMORY_A_BYTE * size
-    watch = _Watch(seconds, most)
+    max_bytes = MEMORY + MEMORY_A_BYTE * size
+    watch = _Watch(seconds, max_bytes)
     try:
         with watch:
             yield
-    except _TooMuch:
+    except _OverBudget:
         raise ValueError(
             f"{path}: damaged: its header takes more than {seconds:.0f} s of processor time or "
-            f"{amount(most)}, which is too much for {size} bytes"
+            f"{amount(max_bytes)}, which is too much for {size} bytes"
         ) from None
 
 
 class _Watch:
-    """Watches the thread that enters, and raises `_TooMuch` in it once a limit is exceeded."""
+    """Watches the thread that enters, and raises `_OverBudget` in it once a limit is exceeded."""
 
-    def __init__(self, seconds: float, most: int) -> None:
-        self._seconds, self._most = seconds, most
+    def __init__(self, seconds: float, max_bytes: int) -> None:
+        self._seconds, self._max_bytes = seconds, max_bytes
         self._reader = threading.get_ident()
         self._clock = time.pthread_getcpuclockid(self._reader)
-        self._begin, self._memory = time.clock_gettime(self._clock), _resident()
-        self._over, self._lock = threading.Event(), threading.Lock()
-        self._sent = self._ended = False
+        self._start_seconds, self._start_memory = time.clock_gettime(self._clock), _resident_bytes()
+        self._finished, self._lock = threading.Event(), threading.Lock()
+        self._error_sent = self._has_ended = False
 
     def __enter__(self) -> None:
-        threading.Thread(target=self._look, daemon=True, name="gvtorch-budget").start()
+        threading.Thread(target=self._watch, daemon=True, name="gvtorch-budget").start()
 
     def __exit__(self, *_error: object) -> None:
-        while not self._ended:
-            with suppress(_TooMuch):  # one may still arrive until the lock is held
+        while not self._has_ended:
+            with suppress(_OverBudget):  # one may still arrive until the lock is held
                 with self._lock:
-                    self._ended = True  # no exception is sent from here on
-        self._over.set()
-        if self._sent:
+                    self._has_ended = True  # no exception is sent from here on
+        self._finished.set()
+        if self._error_sent:
             # An exception may still be pending. It can't be withdrawn: Python 3.11 would then check
             # for it for ever, and hang under a profiler. So another replaces it and is caught here.
-            with suppress(_TooMuch):
-                self._send()
+            with suppress(_OverBudget):
+                self._raise_in_reader()
                 while True:
                     time.sleep(0)
 
-    def _send(self) -> None:
-        """Makes Python raise `_TooMuch` in the thread that reads."""
-        reader, error = ctypes.c_ulong(self._reader), ctypes.py_object(_TooMuch)
+    def _raise_in_reader(self) -> None:
+        """Makes Python raise `_OverBudget` in the thread that reads."""
+        reader, error = ctypes.c_ulong(self._reader), ctypes.py_object(_OverBudget)
         ctypes.pythonapi.PyThreadState_SetAsyncExc(reader, error)
 
-    def _look(self) -> None:
-        pause = _LOOK
-        while not self._over.wait(pause):
+    def _watch(self) -> None:
+        pause = _CHECK_SECONDS
+        while not self._finished.wait(pause):
             with self._lock:
-                if self._ended:
+                if self._has_ended:
                     return
-                spent = time.clock_gettime(self._clock) - self._begin
-                greedy = spent > _PATIENCE and _resident() - self._memory > self._most
-                if spent > self._seconds or greedy:
-                    self._sent = True
-                    self._send()
+                used_seconds = time.clock_gettime(self._clock) - self._start_seconds
+                over_memory = (
+                    used_seconds > _MEMORY_GRACE_SECONDS
+                    and _resident_bytes() - self._start_memory > self._max_bytes
+                )
+                if used_seconds > self._seconds or over_memory:
+                    self._error_sent = True
+                    self._raise_in_reader()
                     pause *= 2  # a library may have swallowed it, or it is still propagating
 
 
-def _resident() -> int:
+def _resident_bytes() -> int:
     """Returns the resident memory of this process, bytes; 0 on systems other than Linux."""
     if not sys.platform.startswith("linux"):
         return 0

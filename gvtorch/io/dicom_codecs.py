@@ -28,7 +28,7 @@ _CODECS = {
     "1.2.840.10008.1.2.4.203": "jpeg2k",
 }
 DECODER_DEPENDENCIES = dict.fromkeys(_CODECS, ("imagecodecs",))
-_NAME = "gvtorch-imagecodecs"
+_PLUGIN_NAME = "gvtorch-imagecodecs"
 
 
 def plugin_of(syntax: str) -> str:
@@ -38,9 +38,9 @@ def plugin_of(syntax: str) -> str:
     from pydicom.pixels import get_decoder
 
     decoder = get_decoder(syntax)
-    if _NAME not in (*decoder.available_plugins, *decoder.missing_dependencies):
-        decoder.add_plugin(_NAME, (__name__, "decode_frame"))
-    return _NAME
+    if _PLUGIN_NAME not in (*decoder.available_plugins, *decoder.missing_dependencies):
+        decoder.add_plugin(_PLUGIN_NAME, (__name__, "decode_frame"))
+    return _PLUGIN_NAME
 
 
 def is_available(uid: str) -> bool:
@@ -61,16 +61,16 @@ def decode_frame(packed: bytes, runner: Any) -> bytes:
 
     codec = _CODECS[str(runner.transfer_syntax)]
     if codec == "dicomrle":
-        return _unpacked_rle(packed, runner)
-    wanted = (runner.columns, runner.rows, runner.samples_per_pixel)
+        return _unpack_rle(packed, runner)
+    expected = (runner.columns, runner.rows, runner.samples_per_pixel)
     size = jpeg2k_size(packed) if codec == "jpeg2k" else jpeg_size(packed)
-    if size != wanted:
-        raise ValueError(f"a frame is of {size} (columns, rows, samples), not of {wanted}")
+    if size != expected:
+        raise ValueError(f"a frame is of {size} (columns, rows, samples), not of {expected}")
     if codec == "jpeg":  # colours stay as they are stored: pydicom converts them
-        kind: dict[str, Any] = (
+        color_options: dict[str, Any] = (
             {"colorspace": "YCBCR", "outcolorspace": "YCBCR"} if size[2] == 3 else {}
         )
-        data = imagecodecs.jpeg_decode(packed, **kind)
+        data = imagecodecs.jpeg_decode(packed, **color_options)
     else:
         data = getattr(imagecodecs, f"{codec}_decode")(packed)
     data = np.asarray(data)
@@ -84,7 +84,7 @@ def decode_frame(packed: bytes, runner: Any) -> bytes:
     return np.ascontiguousarray(data).tobytes()
 
 
-def _unpacked_rle(packed: bytes, runner: Any) -> bytes:
+def _unpack_rle(packed: bytes, runner: Any) -> bytes:
     """Returns the values plane by plane, little-endian."""
     import imagecodecs
 

@@ -16,9 +16,9 @@ import numpy as np
 from ..base.image_info import ChannelInfo, ImageInfo, color_channels
 from .source import Triple
 
-_EVEN = 0.01  # of the usual step between slices: how much a step may differ from it
+_STEP_TOLERANCE = 0.01  # of the usual step between slices: how much a step may differ from it
 #: Attributes that may distinguish images at one position, in order of preference.
-_APART = (
+_DISTINGUISHING = (
     "TemporalPositionIndex",
     "TemporalPositionIdentifier",
     "TriggerTime",
@@ -29,8 +29,8 @@ _APART = (
     "AcquisitionNumber",
     "InstanceNumber",
 )
-_IN_TIME = {"TriggerTime": "millisecond", "FrameReferenceTime": "millisecond"}
-_IN_TIME["AcquisitionTime"] = "second"
+_TIME_UNITS = {"TriggerTime": "millisecond", "FrameReferenceTime": "millisecond"}
+_TIME_UNITS["AcquisitionTime"] = "second"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +44,8 @@ class DicomFrame:
     position: Triple | None  # of the first voxel's centre, LPS millimetres
     orientation: tuple[float, ...] | None  # of rows, then of columns
     spacing: tuple[float, float]  # between rows, between columns
-    between: float | None  # millimetres between slices, where positions do not give it
-    moments: dict[str, float] = field(default_factory=dict)  # its values of `_APART`
+    slice_spacing: float | None  # millimetres between slices, where positions do not give it
+    attributes: dict[str, float] = field(default_factory=dict)  # its values of `_DISTINGUISHING`
 
 
 #: The frames of each time, slice by slice; the (4, 4) affine from (slice, row, column) to LPS
@@ -55,52 +55,52 @@ Ordered = tuple[list[list[DicomFrame]], np.ndarray, list[str], dict[str, Any]]
 
 def frames_of(header: Any, count: int) -> list[DicomFrame]:
     """Returns the frames of a file, from its header without pixels."""
-    shared = _first(header.get("SharedFunctionalGroupsSequence"))
-    each = header.get("PerFrameFunctionalGroupsSequence") or ()
-    if each and len(each) != count:
-        raise ValueError(f"{header.filename}: declares {len(each)} frames and holds {count}")
-    offsets = [float(v) for v in _list(header.get("GridFrameOffsetVector"))]
-    found = []
+    shared = _first_item(header.get("SharedFunctionalGroupsSequence"))
+    per_frame = header.get("PerFrameFunctionalGroupsSequence") or ()
+    if per_frame and len(per_frame) != count:
+        raise ValueError(f"{header.filename}: declares {len(per_frame)} frames and holds {count}")
+    offsets = [float(v) for v in _floats(header.get("GridFrameOffsetVector"))]
+    frames = []
     for number in range(count):
-        groups = [g for g in (each[number] if each else None, shared) if g is not None]
+        groups = [g for g in (per_frame[number] if per_frame else None, shared) if g is not None]
         frame = _frame(header, groups, number)
         if len(offsets) == count > 1 and frame.position and frame.orientation:  # a grid of doses
             normal = np.cross(frame.orientation[:3], frame.orientation[3:])
             moved = np.add(frame.position, normal * (offsets[number] - offsets[0]))
             x, y, z = moved.tolist()
             frame = replace(frame, position=(x, y, z))
-        elif count > 1 and not each:  # the header has one position for all of them
+        elif count > 1 and not per_frame:  # the header has one position for all of them
             frame = replace(frame, position=None)
-        found.append(frame)
-    return found
+        frames.append(frame)
+    return frames
 
 
 def _frame(header: Any, groups: list[Any], number: int) -> DicomFrame:
-    def told(sequence: str, name: str) -> Any:
+    def attribute(sequence: str, name: str) -> Any:
         for group in groups:
-            item = _first(group.get(sequence))
+            item = _first_item(group.get(sequence))
             if item is not None and item.get(name) is not None:
                 return item.get(name)
         return header.get(name)
 
-    spacing = _list(told("PixelMeasuresSequence", "PixelSpacing"))
+    spacing = _floats(attribute("PixelMeasuresSequence", "PixelSpacing"))
     if not spacing:
-        spacing = _list(header.get("ImagerPixelSpacing")) or [1.0, 1.0]
-    position = _list(told("PlanePositionSequence", "ImagePositionPatient"))
-    orientation = _list(told("PlaneOrientationSequence", "ImageOrientationPatient"))
-    slope = told("PixelValueTransformationSequence", "RescaleSlope")
+        spacing = _floats(header.get("ImagerPixelSpacing")) or [1.0, 1.0]
+    position = _floats(attribute("PlanePositionSequence", "ImagePositionPatient"))
+    orientation = _floats(attribute("PlaneOrientationSequence", "ImageOrientationPatient"))
+    slope = attribute("PixelValueTransformationSequence", "RescaleSlope")
     slope = header.get("DoseGridScaling") if slope is None else slope
-    intercept = told("PixelValueTransformationSequence", "RescaleIntercept")
-    between = told("PixelMeasuresSequence", "SpacingBetweenSlices")
-    moments: dict[str, float] = {}
-    for name in _APART:
-        value = told("FrameContentSequence", name)
+    intercept = attribute("PixelValueTransformationSequence", "RescaleIntercept")
+    slice_spacing = attribute("PixelMeasuresSequence", "SpacingBetweenSlices")
+    attributes: dict[str, float] = {}
+    for name in _DISTINGUISHING:
+        value = attribute("FrameContentSequence", name)
         if name == "DiffusionBValue":
-            value = told("MRDiffusionSequence", name)
+            value = attribute("MRDiffusionSequence", name)
         if value not in (None, ""):
-            moments[name] = _seconds(str(value)) if name == "AcquisitionTime" else float(value)
+            attributes[name] = _seconds(str(value)) if name == "AcquisitionTime" else float(value)
     if groups:
-        moments["InstanceNumber"] = number
+        attributes["InstanceNumber"] = number
     numbers = [*spacing, *position, *orientation, *(v for v in (slope, intercept) if v is not None)]
     if not all(math.isfinite(v) for v in numbers) or len(spacing) != 2:
         raise ValueError(f"{header.filename}: position, spacing or rescaling is not a number")
@@ -112,12 +112,12 @@ def _frame(header: Any, groups: list[Any], number: int) -> DicomFrame:
         position=tuple(position) if len(position) == 3 else None,  # type: ignore[arg-type]
         orientation=tuple(orientation) if len(orientation) == 6 else None,
         spacing=(spacing[0], spacing[1]),
-        between=None if between is None else abs(float(between)),
-        moments=moments,
+        slice_spacing=None if slice_spacing is None else abs(float(slice_spacing)),
+        attributes=attributes,
     )
 
 
-def order_frames(where: str, frames: Sequence[DicomFrame]) -> Ordered:
+def order_frames(path: str, frames: Sequence[DicomFrame]) -> Ordered:
     """Sorts frames by time and position.
 
     Raises:
@@ -126,152 +126,171 @@ def order_frames(where: str, frames: Sequence[DicomFrame]) -> Ordered:
     """
     first = frames[0]
     for frame in frames:
-        same = np.allclose(frame.spacing, first.spacing, rtol=1e-3)
+        is_alike = np.allclose(frame.spacing, first.spacing, rtol=1e-3)
         if frame.orientation is not None and first.orientation is not None:
-            same &= np.allclose(frame.orientation, first.orientation, atol=1e-3)
-        if not same:
+            is_alike &= np.allclose(frame.orientation, first.orientation, atol=1e-3)
+        if not is_alike:
             raise ValueError(
-                f"{where}: a series of slices of different orientation or spacing: "
+                f"{path}: a series of slices of different orientation or spacing: "
                 f"{first.orientation} {first.spacing} and {frame.orientation} {frame.spacing}; "
                 "put those of one kind into a folder of their own"
             )
-    rows, columns = _directions(where, first)
+    rows, columns = _directions(path, first)
     affine = np.eye(4)
     affine[:3, 1], affine[:3, 2] = columns * first.spacing[0], rows * first.spacing[1]
     if any(frame.position is None for frame in frames):
-        return _without_place(frames, affine, np.cross(rows, columns))
-    slices = _by_place(frames, np.cross(rows, columns))
-    count, apart = _times(where, slices)
-    ordered = [[one[t] for one in slices] for t in range(count)]
-    places = np.array([one[0].position for one in slices])
-    affine[:3, 3] = places[0]
-    affine[:3, 0] = np.cross(rows, columns) * (first.between or 1.0)
+        return _order_by_number(frames, affine, np.cross(rows, columns))
+    slices = _group_by_position(frames, np.cross(rows, columns))
+    count, attribute = _sort_times(path, slices)
+    ordered = [[slice_frames[t] for slice_frames in slices] for t in range(count)]
+    positions = np.array([slice_frames[0].position for slice_frames in slices])
+    affine[:3, 3] = positions[0]
+    affine[:3, 0] = np.cross(rows, columns) * (first.slice_spacing or 1.0)
     lost = []
     if len(slices) > 1:
-        affine[:3, 0] = _step(where, places, np.cross(rows, columns))
-    elif first.between is None:
+        affine[:3, 0] = _step(path, positions, np.cross(rows, columns))
+    elif first.slice_spacing is None:
         lost.append("how thick its only slice is: it is 1 thick here")
-    if apart is not None and apart not in (*_IN_TIME, *_APART[:2]):
-        lost.append(f"{count} images of each slice differ in {apart}: they are read as time points")
-    return ordered, affine, lost, _moments(ordered, apart)
+    if attribute is not None and attribute not in (*_TIME_UNITS, *_DISTINGUISHING[:2]):
+        lost.append(
+            f"{count} images of each slice differ in {attribute}: they are read as time points"
+        )
+    return ordered, affine, lost, _time_fields(ordered, attribute)
 
 
-def _directions(where: str, frame: DicomFrame) -> tuple[np.ndarray, np.ndarray]:
+def _directions(path: str, frame: DicomFrame) -> tuple[np.ndarray, np.ndarray]:
     """Returns unit vectors along a row and along a column."""
-    told = np.array(frame.orientation or (1, 0, 0, 0, 1, 0), dtype=np.float64)
-    rows, columns = told[:3], told[3:]
+    orientation = np.array(frame.orientation or (1, 0, 0, 0, 1, 0), dtype=np.float64)
+    rows, columns = orientation[:3], orientation[3:]
     lengths = np.linalg.norm(rows), np.linalg.norm(columns)
     if not np.allclose(lengths, 1, atol=1e-2) or abs(rows @ columns) > 1e-2:
-        raise ValueError(f"{where}: Image Orientation {told.tolist()} is not a pair of directions")
+        raise ValueError(
+            f"{path}: Image Orientation {orientation.tolist()} is not a pair of directions"
+        )
     return rows / lengths[0], columns / lengths[1]
 
 
-def _without_place(frames: Sequence[DicomFrame], affine: np.ndarray, normal: np.ndarray) -> Ordered:
+def _order_by_number(
+    frames: Sequence[DicomFrame], affine: np.ndarray, normal: np.ndarray
+) -> Ordered:
     """Orders frames without positions of their own by their numbers."""
-    ordered = sorted(frames, key=lambda f: (f.moments.get("InstanceNumber", 0), f.file, f.number))
-    between = ordered[0].between
-    affine[:3, 0] = normal * (between or 1.0)
+    ordered = sorted(
+        frames, key=lambda f: (f.attributes.get("InstanceNumber", 0), f.file, f.number)
+    )
+    slice_spacing = ordered[0].slice_spacing
+    affine[:3, 0] = normal * (slice_spacing or 1.0)
     lost = ["slices have no place: they follow their numbers, from 0"]
-    if between is None:
+    if slice_spacing is None:
         lost[0] += ", 1 apart"
     return [ordered], affine, lost if len(ordered) > 1 else [], {}
 
 
-def _by_place(frames: Sequence[DicomFrame], normal: np.ndarray) -> list[list[DicomFrame]]:
+def _group_by_position(frames: Sequence[DicomFrame], normal: np.ndarray) -> list[list[DicomFrame]]:
     """Groups frames by their position along the normal of their plane, in increasing order."""
     depths = np.array([frame.position for frame in frames]) @ normal
     order = np.argsort(depths, kind="stable")
     slices: list[list[DicomFrame]] = []
     last = -math.inf
-    for at in order:
-        if depths[at] - last > 1e-3:
+    for index in order:
+        if depths[index] - last > 1e-3:
             slices.append([])
-            last = depths[at]
-        slices[-1].append(frames[at])
+            last = depths[index]
+        slices[-1].append(frames[index])
     return slices
 
 
-def _times(where: str, slices: list[list[DicomFrame]]) -> tuple[int, str | None]:
+def _sort_times(path: str, slices: list[list[DicomFrame]]) -> tuple[int, str | None]:
     """Sorts the frames of each slice by the attribute that distinguishes them; returns how many
     they are, and its name.
     """
-    counts = sorted({len(one) for one in slices})
+    counts = sorted({len(slice_frames) for slice_frames in slices})
     if counts == [1]:
         return 1, None
     if len(counts) > 1:
         raise ValueError(
-            f"{where}: slices occur {counts[0]} to {counts[-1]} times; expected each of "
+            f"{path}: slices occur {counts[0]} to {counts[-1]} times; expected each of "
             f"{len(slices)} positions equally often"
         )
 
     def differs(name: str) -> bool:
-        return all(len({f.moments.get(name, 0.0) for f in one}) == counts[0] for one in slices)
+        return all(
+            len({f.attributes.get(name, 0.0) for f in slice_frames}) == counts[0]
+            for slice_frames in slices
+        )
 
-    name = next(filter(differs, _APART), None)
+    name = next(filter(differs, _DISTINGUISHING), None)
     if name is None:
-        raise ValueError(f"{where}: {counts[0]} images of each slice, which nothing distinguishes")
-    for one in slices:
-        one.sort(key=lambda frame: frame.moments.get(name, 0.0))
+        raise ValueError(f"{path}: {counts[0]} images of each slice, which nothing distinguishes")
+    for slice_frames in slices:
+        slice_frames.sort(key=lambda frame: frame.attributes.get(name, 0.0))
     return counts[0], name
 
 
-def _moments(ordered: list[list[DicomFrame]], apart: str | None) -> dict[str, Any]:
+def _time_fields(ordered: list[list[DicomFrame]], attribute: str | None) -> dict[str, Any]:
     if len(ordered) == 1:
         return {}
-    begin, end = (ordered[at][0].moments for at in (0, -1))
-    name = apart if apart in _IN_TIME else next((n for n in _IN_TIME if n in begin), None)
+    first_attributes, last_attributes = (ordered[index][0].attributes for index in (0, -1))
+    name = (
+        attribute
+        if attribute in _TIME_UNITS
+        else next((n for n in _TIME_UNITS if n in first_attributes), None)
+    )
     if name is None:
         return {}
-    step = (end.get(name, 0.0) - begin.get(name, 0.0)) / (len(ordered) - 1)
-    return {"time_step": step, "time_unit": _IN_TIME[name]} if step > 0 else {}
+    step = (last_attributes.get(name, 0.0) - first_attributes.get(name, 0.0)) / (len(ordered) - 1)
+    return {"time_step": step, "time_unit": _TIME_UNITS[name]} if step > 0 else {}
 
 
-def _step(where: str, places: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _step(path: str, positions: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Returns the step between slices; raises ValueError unless all are evenly spaced on a line."""
-    gaps = np.diff(places @ normal)
-    usual = float(np.median(gaps))
-    odd = np.abs(gaps - usual) > max(_EVEN * usual, 2e-3)
-    if odd.any():
-        at = int(odd.argmax())
-        times = gaps[at] / usual
-        missing = round(times) - 1
-        if missing > 0 and abs(times - round(times)) < 0.1:
-            many = "slices are" if missing > 1 else "slice is"
+    gaps = np.diff(positions @ normal)
+    usual_gap = float(np.median(gaps))
+    is_uneven = np.abs(gaps - usual_gap) > max(_STEP_TOLERANCE * usual_gap, 2e-3)
+    if is_uneven.any():
+        index = int(is_uneven.argmax())
+        gap_ratio = gaps[index] / usual_gap
+        missing = round(gap_ratio) - 1
+        if missing > 0 and abs(gap_ratio - round(gap_ratio)) < 0.1:
+            subject = "slices are" if missing > 1 else "slice is"
             raise ValueError(
-                f"{where}: {missing} {many} missing after slice {at + 1} of {len(places)}: "
-                f"the next lies {gaps[at]:.4g} mm further, others {usual:.4g} mm"
+                f"{path}: {missing} {subject} missing after slice {index + 1} of {len(positions)}: "
+                f"the next lies {gaps[index]:.4g} mm further, others {usual_gap:.4g} mm"
             )
         raise ValueError(
-            f"{where}: slices are not evenly spaced: {gaps.min():.4g} to {gaps.max():.4g} mm; "
+            f"{path}: slices are not evenly spaced: {gaps.min():.4g} to {gaps.max():.4g} mm; "
             "resample them, or put those that are into a separate folder"
         )
-    step: np.ndarray = (places[-1] - places[0]) / (len(places) - 1)
-    beside = places - (places[0] + np.arange(len(places))[:, None] * step)
-    if np.abs(beside).max() > max(0.05 * usual, 1e-2):
-        raise ValueError(f"{where}: slices do not lie on a line, by {np.abs(beside).max():.4g} mm")
+    step: np.ndarray = (positions[-1] - positions[0]) / (len(positions) - 1)
+    deviation = positions - (positions[0] + np.arange(len(positions))[:, None] * step)
+    if np.abs(deviation).max() > max(0.05 * usual_gap, 1e-2):
+        raise ValueError(
+            f"{path}: slices do not lie on a line, by {np.abs(deviation).max():.4g} mm"
+        )
     return step
 
 
-def image_info(header: Any, samples: int, moments: dict[str, Any]) -> tuple[ImageInfo, list[str]]:
+def image_info(
+    header: Any, samples: int, time_fields: dict[str, Any]
+) -> tuple[ImageInfo, list[str]]:
     """Returns the header's metadata of the values, and which metadata is not kept."""
     lost = []
-    kind = str(header.get("PhotometricInterpretation", ""))
-    if kind == "PALETTE COLOR":
+    photometric = str(header.get("PhotometricInterpretation", ""))
+    if photometric == "PALETTE COLOR":
         lost.append("the colours of its palette: values are numbers of its entries")
-    if kind == "MONOCHROME1":
+    if photometric == "MONOCHROME1":
         lost.append("that high values are meant to be dark (MONOCHROME1)")
-    table = header.get("ModalityLUTSequence") and header.get("RescaleSlope") is None
-    if table:
+    uses_table = header.get("ModalityLUTSequence") and header.get("RescaleSlope") is None
+    if uses_table:
         lost.append("the modality's table: values are those that it looks up")
     quantity = str(
         header.get("RescaleType") or header.get("Units") or header.get("DoseUnits") or ""
     )
-    if header.get("Modality") == "CT" and quantity in ("", "US") and not table:
+    if header.get("Modality") == "CT" and quantity in ("", "US") and not uses_table:
         quantity = "HU"
-    shared = _first(header.get("SharedFunctionalGroupsSequence"))
-    voi = _first(shared.get("FrameVOILUTSequence")) if shared is not None else None
+    shared = _first_item(header.get("SharedFunctionalGroupsSequence"))
+    voi = _first_item(shared.get("FrameVOILUTSequence")) if shared is not None else None
     center, width = (
-        _list((voi if voi is not None else header).get(name))
+        _floats((voi if voi is not None else header).get(name))
         for name in ("WindowCenter", "WindowWidth")
     )
     channels: tuple[ChannelInfo, ...] = ()
@@ -285,25 +304,25 @@ def image_info(header: Any, samples: int, moments: dict[str, Any]) -> tuple[Imag
         channels=channels,
         quantity=quantity or None,
         space="right-anterior-superior",
-        **moments,
+        **time_fields,
     )
     return info, lost
 
 
-def _first(sequence: Any) -> Any:
+def _first_item(sequence: Any) -> Any:
     return sequence[0] if sequence else None
 
 
-def _list(value: Any) -> list[float]:
+def _floats(value: Any) -> list[float]:
     if value is None or value == "":
         return []
-    several = hasattr(value, "__iter__") and not isinstance(value, str)
-    return [float(part) for part in (value if several else [value])]
+    is_list = hasattr(value, "__iter__") and not isinstance(value, str)
+    return [float(part) for part in (value if is_list else [value])]
 
 
 def _seconds(text: str) -> float:
     """Returns the seconds since midnight of HHMMSS.FFF."""
     clock = text.replace(":", "").partition(".")
     digits = clock[0].ljust(6, "0")
-    rest = float(f"0.{clock[2]}") if clock[2] else 0.0
-    return int(digits[:2]) * 3600 + int(digits[2:4]) * 60 + int(digits[4:6]) + rest
+    fraction = float(f"0.{clock[2]}") if clock[2] else 0.0
+    return int(digits[:2]) * 3600 + int(digits[2:4]) * 60 + int(digits[4:6]) + fraction

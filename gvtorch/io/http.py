@@ -21,20 +21,21 @@ from typing import Any
 
 from ..base.messages import one_line
 
-STALL = 20.0  # seconds for which a server may send nothing
-SLOWEST = 20_000  # bytes a second that a server must send after its first STALL seconds
-REFUSED = 30.0  # seconds for which a file is not requested again after `Endless`
-_REASONS = 1000  # errors that are remembered
-_NOT = (0.0, "")
+STALL_SECONDS = 20.0  # seconds for which a server may send nothing
+MIN_BYTES_PER_SECOND = 20_000  # that a server must send after its first STALL_SECONDS
+REFUSED_SECONDS = 30.0  # seconds for which a file is not requested again after `Endless`
+_MAX_REASONS = 1000  # errors that are remembered
+_NOT_REFUSED = (0.0, "")
 _refused: dict[str, tuple[float, str]] = {}  # by URL: until when it is refused, and why
-SMALL = 1 << 20  # bytes that any file may take in addition to what its content may take
-_PART = 1 << 16  # bytes
-_SILENT = 1.0  # seconds without a byte after which `ask_again` aborts a request
-_KEPT = 16  # idle connections that are kept open to a server
-AGENT = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
-MISSING = (404, 410)  # status codes for a file that does not exist
-_ELSEWHERE = (301, 302, 303, 307, 308)
-_CLOSED = (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError)
+_refused_lock = threading.Lock()  # held while it is changed
+EXTRA_BYTES = 1 << 20  # bytes that any file may take in addition to what its content may take
+_PART_BYTES = 1 << 16  # bytes
+_SILENT_SECONDS = 1.0  # seconds without a byte after which `ask_again` aborts a request
+_MAX_IDLE = 16  # idle connections that are kept open to a server
+REQUEST_HEADERS = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
+MISSING_STATUS = (404, 410)  # status codes for a file that does not exist
+_REDIRECT_STATUS = (301, 302, 303, 307, 308)
+_CLOSED_ERRORS = (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError)
 
 
 class Endless(OSError):
@@ -60,178 +61,200 @@ def is_http(root: object) -> bool:
 
 def file_url(folder: str, name: str) -> str:
     """Returns the URL of a file in a folder; the folder's URL may end in a query."""
-    base, mark, query = folder.partition("?")
-    return f"{base.rstrip('/')}/{name}{mark}{query}"
+    base, question_mark, query = folder.partition("?")
+    return f"{base.rstrip('/')}/{name}{question_mark}{query}"
 
 
 def read_http(
     url: str,
-    most: int,
-    part: slice | None = None,
+    max_bytes: int,
+    byte_range: slice | None = None,
     *,
-    whole: int | None = None,
+    max_file_bytes: int | None = None,
     seconds: float = 1e9,
 ) -> bytes | None:
     """Returns the content of a file, or a part of its bytes; None if there is no such file.
 
     Args:
         url: The file.
-        most: Largest number of bytes to return.
-        part: The range of bytes; a negative start counts from the end of the file.
-        whole: Largest size in bytes of the whole file, which a server without support for ranges
-            sends instead of the part; None: `most`.
+        max_bytes: Largest number of bytes to return.
+        byte_range: The range of bytes; a negative start counts from the end of the file.
+        max_file_bytes: Largest size of the whole file, which a server without support for ranges
+            sends instead of the part; None: `max_bytes`.
         seconds: Time limit.
 
     Raises:
         TimeoutError: It took longer than `seconds`.
-        Endless: The server sends too much or too slowly, or did so less than `REFUSED` s ago.
+        Endless: The server sends too much or too slowly, or did so less than `REFUSED_SECONDS`
+            ago.
         HttpStatus: The server answers with an error.
         OSError: The server can't be reached, or breaks off.
     """
-    if time.monotonic() < _refused.get(url, _NOT)[0]:
-        raise Endless(_refused[url][1])
-    slow = STALL + most / SLOWEST
-    end = time.monotonic() + min(seconds, slow)
+    refused_until, reason = _refused.get(url, _NOT_REFUSED)
+    if time.monotonic() < refused_until:
+        raise Endless(reason)
+    max_seconds = STALL_SECONDS + max_bytes / MIN_BYTES_PER_SECOND
+    deadline = time.monotonic() + min(seconds, max_seconds)
     try:
-        return _read(url, most, part, most if whole is None else whole, end)
+        return _read(
+            url,
+            max_bytes,
+            byte_range,
+            max_bytes if max_file_bytes is None else max_file_bytes,
+            deadline,
+        )
     except TimeoutError:
-        if seconds < slow and time.monotonic() >= end:
+        if seconds < max_seconds and time.monotonic() >= deadline:
             raise
-        found: OSError = Endless("the server sends hardly anything")
+        failure: OSError = Endless("the server sends hardly anything")
     except OSError as error:
-        found = error
-    keep_reason(url, found, REFUSED if isinstance(found, Endless) else 0.0)
+        failure = error
+    keep_reason(url, failure, REFUSED_SECONDS if isinstance(failure, Endless) else 0.0)
     try:
-        raise found from None
+        raise failure from None
     finally:
-        del found  # its traceback holds this frame, and what was read
+        del failure  # its traceback holds this frame, and what was read
 
 
 def keep_reason(url: str, error: OSError, seconds: float = 0.0) -> None:
     """Remembers why a file can't be read; `read_http` refuses it for the next `seconds`."""
-    _refused[url] = time.monotonic() + seconds, str(error)
-    while len(_refused) > _REASONS:
-        _refused.pop(next(iter(_refused)), None)
+    with _refused_lock:
+        _refused[url] = time.monotonic() + seconds, str(error)
+        while len(_refused) > _MAX_REASONS:
+            del _refused[next(iter(_refused))]
 
 
 def refused(url: str) -> str:
     """Returns why a file could not be read the last time, or ""."""
-    return _refused.get(url, _NOT)[1]
+    return _refused.get(url, _NOT_REFUSED)[1]
 
 
 def ask_again() -> None:
     """Makes the next read of any file try again at once: no file is refused any longer, and
     requests that wait for a silent server are aborted.
     """
-    _refused.clear()
-    _connections.break_off(time.monotonic() - _SILENT)
+    with _refused_lock:
+        _refused.clear()
+    _connections.shut_down_silent(time.monotonic() - _SILENT_SECONDS)
 
 
-def _read(url: str, most: int, part: slice | None, whole: int, end: float) -> bytes | None:
-    headers = dict(AGENT)
-    if part is not None:
-        first, last = part.start or 0, "" if part.stop is None else part.stop - 1
+def _read(
+    url: str, max_bytes: int, byte_range: slice | None, max_file_bytes: int, deadline: float
+) -> bytes | None:
+    headers = dict(REQUEST_HEADERS)
+    if byte_range is not None:
+        first, last = byte_range.start or 0, "" if byte_range.stop is None else byte_range.stop - 1
         headers["Range"] = f"bytes={first}" if first < 0 else f"bytes={first}-{last}"
-    patience = max(1e-3, min(end - time.monotonic(), STALL))
+    patience = max(1e-3, min(deadline - time.monotonic(), STALL_SECONDS))
     try:
-        connection, answer = _ask(url, headers, patience)
+        connection, response = _send_request(url, headers, patience)
     except TimeoutError:
         raise
     except HttpStatus as error:
-        if error.status in MISSING:
+        if error.status in MISSING_STATUS:
             return None
         raise
     except (OSError, http.client.HTTPException, ValueError) as error:
         raise OSError(one_line(error)) from None
-    done = False
+    is_complete = False
     try:
-        if answer.status in MISSING:
+        if response.status in MISSING_STATUS:
             return None
-        if answer.status not in (200, 206):
-            raise HttpStatus(answer.status, answer.reason)
-        sent = re.match(r"bytes (\d+)-", answer.headers.get("Content-Range", ""))
-        if sent and part and (part.start or 0) >= 0 and int(sent[1]) != (part.start or 0):
-            raise OSError(f"another part came: {sent[0]}")
-        cut = part if answer.status == 200 else None
-        content = _content(answer, end, most, cut, whole, connection)
-        done = answer.isclosed()
+        if response.status not in (200, 206):
+            raise HttpStatus(response.status, response.reason)
+        content_range = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
+        if (
+            content_range
+            and byte_range
+            and (byte_range.start or 0) >= 0
+            and int(content_range[1]) != (byte_range.start or 0)
+        ):
+            raise OSError(f"another part came: {content_range[0]}")
+        body_range = byte_range if response.status == 200 else None
+        content = _read_content(
+            response, deadline, max_bytes, body_range, max_file_bytes, connection
+        )
+        is_complete = response.isclosed()
         return content
     finally:
-        keep = done and not answer.will_close
+        keep = is_complete and not response.will_close
         if connection is None or not keep:
-            answer.close()
+            response.close()
         if connection is not None:
             _connections.give_back(url, connection, keep=keep)
 
 
-def _content(
-    answer: http.client.HTTPResponse,
-    end: float,
-    most: int,
-    cut: slice | None,
-    whole: int,
+def _read_content(
+    response: http.client.HTTPResponse,
+    deadline: float,
+    max_bytes: int,
+    body_range: slice | None,
+    max_file_bytes: int,
     connection: http.client.HTTPConnection | None,
 ) -> bytes:
-    """Reads to the end of an answer, or to the end of `cut`, the range to return of a whole file;
-    bytes before that range are not kept in memory.
+    """Reads to the end of a response, or to the end of `body_range`, the range to return of a whole
+    file; bytes before that range are not kept in memory.
     """
-    content, begin = bytearray(), 0  # `content` starts at byte `begin` of the answer
-    first, last = (cut.start or 0, cut.stop) if cut is not None else (0, None)
-    limit = most if cut is None else whole
-    while last is None or begin + len(content) < last:
-        if time.monotonic() > end:
+    # `content` starts at byte `content_start` of the response's body.
+    content, content_start = bytearray(), 0
+    start, stop = (body_range.start or 0, body_range.stop) if body_range is not None else (0, None)
+    limit = max_bytes if body_range is None else max_file_bytes
+    while stop is None or content_start + len(content) < stop:
+        if time.monotonic() > deadline:
             raise TimeoutError
         try:
-            more = answer.read1(_PART)
+            chunk = response.read1(_PART_BYTES)
         except TimeoutError:
             raise
         except Exception as error:  # http.client has its own exceptions
             raise OSError(one_line(error)) from None
-        if not more:
+        if not chunk:
             break
         if connection is not None:
-            _connections.heard(connection)
-        content += more
-        got = begin + len(content)
-        if got > limit and (last is None or got < last):
+            _connections.note_activity(connection)
+        content += chunk
+        received = content_start + len(content)
+        if received > limit and (stop is None or received < stop):
             raise Endless(f"the server sends more than {limit} bytes")
-        useless = len(content) + first if first < 0 else min(first - begin, len(content))
-        if useless > _PART or (first > begin and useless > 0):
-            del content[:useless]
-            begin += useless
+        unneeded = len(content) + start if start < 0 else min(start - content_start, len(content))
+        if unneeded > _PART_BYTES or (start > content_start and unneeded > 0):
+            del content[:unneeded]
+            content_start += unneeded
     # `read1` ends without an error where a server breaks off.
-    if answer.length and (last is None or begin + len(content) < last):
-        raise OSError(f"cut off: {answer.length} bytes are missing")
-    found = content[first:] if first < 0 else content[: None if last is None else last - begin]
-    if len(found) > most:
-        raise Endless(f"the server sends more than {most} bytes")
-    return bytes(found)
+    if response.length and (stop is None or content_start + len(content) < stop):
+        raise OSError(f"cut off: {response.length} bytes are missing")
+    wanted = (
+        content[start:] if start < 0 else content[: None if stop is None else stop - content_start]
+    )
+    if len(wanted) > max_bytes:
+        raise Endless(f"the server sends more than {max_bytes} bytes")
+    return bytes(wanted)
 
 
-def _ask(
+def _send_request(
     url: str, headers: dict[str, str], seconds: float
 ) -> tuple[http.client.HTTPConnection | None, http.client.HTTPResponse]:
     """Sends a request; returns the connection (None if it is urllib's) and the answer, whose body
     is not read yet.
     """
-    place = urllib.parse.urlsplit(url)
-    target = urllib.parse.quote(place.path or "/", safe="/%:@!$&'()*+,;=~")
-    target += f"?{place.query}" if place.query else ""
-    proxied = place.scheme in urllib.request.getproxies()
-    if proxied and not urllib.request.proxy_bypass(place.hostname or ""):
+    url_parts = urllib.parse.urlsplit(url)
+    request_target = urllib.parse.quote(url_parts.path or "/", safe="/%:@!$&'()*+,;=~")
+    request_target += f"?{url_parts.query}" if url_parts.query else ""
+    proxied = url_parts.scheme in urllib.request.getproxies()
+    if proxied and not urllib.request.proxy_bypass(url_parts.hostname or ""):
         return None, ask_by_urllib(url, headers, seconds)
     while True:
-        connection, used = _connections.take(url, seconds)
+        connection, is_reused = _connections.take(url, seconds)
         try:
-            connection.request("GET", target, headers=headers)
-            _connections.heard(connection)
-            answer = connection.getresponse()
-            if answer.status not in _ELSEWHERE:
-                return connection, answer
-            answer.close()
+            connection.request("GET", request_target, headers=headers)
+            _connections.note_activity(connection)
+            response = connection.getresponse()
+            if response.status not in _REDIRECT_STATUS:
+                return connection, response
+            response.close()
         except BaseException as error:
             _connections.give_back(url, connection, keep=False)
-            if used and isinstance(error, _CLOSED):
+            if is_reused and isinstance(error, _CLOSED_ERRORS):
                 continue  # the server has closed the idle connection
             raise
         _connections.give_back(url, connection, keep=False)
@@ -242,7 +265,7 @@ def ask_by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.cli
     """Sends a request through proxies and redirections; raises as `read_http`, except Endless."""
     request = urllib.request.Request(url, headers=headers)
     try:
-        found: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=seconds)
+        response: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=seconds)
     except urllib.error.HTTPError as error:
         error.close()
         raise HttpStatus(error.code, error.reason) from None
@@ -250,7 +273,7 @@ def ask_by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.cli
         if isinstance(error.reason, TimeoutError):
             raise TimeoutError(str(error.reason)) from None
         raise OSError(str(error.reason)) from None
-    return found
+    return response
 
 
 _certificates = functools.cache(ssl.create_default_context)
@@ -265,13 +288,13 @@ class _Connections:
         self._lock = threading.Lock()
 
     @staticmethod
-    def _key(url: str) -> tuple[int, str, str]:
-        place = urllib.parse.urlsplit(url)
-        return os.getpid(), place.scheme, place.netloc
+    def _server_key(url: str) -> tuple[int, str, str]:
+        url_parts = urllib.parse.urlsplit(url)
+        return os.getpid(), url_parts.scheme, url_parts.netloc
 
     def take(self, url: str, seconds: float) -> tuple[http.client.HTTPConnection, bool]:
         """Returns a connection, and whether it was used before."""
-        key = self._key(url)
+        key = self._server_key(url)
         with self._lock:
             idle = self._idle.get(key)
             if idle:
@@ -280,17 +303,19 @@ class _Connections:
                     connection.sock.settimeout(seconds)
                     return connection, True
         if key[1] == "https":
-            safe = http.client.HTTPSConnection(key[2], timeout=seconds, context=_certificates())
-            return safe, False
+            connection = http.client.HTTPSConnection(
+                key[2], timeout=seconds, context=_certificates()
+            )
+            return connection, False
         return http.client.HTTPConnection(key[2], timeout=seconds), False
 
-    def heard(self, connection: http.client.HTTPConnection) -> None:
+    def note_activity(self, connection: http.client.HTTPConnection) -> None:
         """Records that a connection waits from now on for an answer, or for more of one."""
         with self._lock:
             sock = connection.sock or self._waiting[connection][1]
             self._waiting[connection] = time.monotonic(), sock
 
-    def break_off(self, before: float) -> None:
+    def shut_down_silent(self, before: float) -> None:
         """Shuts down connections that were silent since `before`; reading from them fails."""
         with self._lock:
             silent = [sock for since, sock in self._waiting.values() if since < before]
@@ -302,8 +327,8 @@ class _Connections:
         """Ends a connection's wait; keeps it open if `keep` and few are idle, else closes it."""
         with self._lock:
             self._waiting.pop(connection, None)
-            idle = self._idle.setdefault(self._key(url), [])
-            if keep and len(idle) < _KEPT:
+            idle = self._idle.setdefault(self._server_key(url), [])
+            if keep and len(idle) < _MAX_IDLE:
                 idle.append(connection)
                 return
         connection.close()

@@ -20,7 +20,7 @@ from .resources import cores, run_ahead
 from .source import Index, MemorySource, VolumeSource
 
 LABELS = "labels.npy"  # in the hidden folder of an unfinished store
-_CUBE = 128  # voxels along a side of a region that is read at once
+_CUBE_SIDE = 128  # voxels along a side of a region that is read at once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class IndexSource(VolumeSource):
     def of(cls, inner: VolumeSource, labels: np.ndarray, *, indexed: bool = False) -> IndexSource:
         """Returns the source of the indices of a source's labels."""
         x, y, z = inner.extent
-        told = ("path", "spacing", "origin", "info", "time")
+        copied = ("path", "spacing", "origin", "info", "time")
         return cls(
             shape=(inner.times, z, y, x, inner.width),
             axes="tzyxc",
@@ -43,7 +43,7 @@ class IndexSource(VolumeSource):
             inner=inner,
             labels=labels,
             indexed=indexed,
-            **{name: getattr(inner, name) for name in told},
+            **{name: getattr(inner, name) for name in copied},
         )
 
     def staged(self, folder: Path) -> IndexSource:
@@ -52,22 +52,22 @@ class IndexSource(VolumeSource):
 
     def read_stored(self, index: Index) -> np.ndarray:
         times, low, high = index[0], *zip(*((s.start, s.stop) for s in index[1:4]), strict=True)
-        found = self.inner.read_box(low, high, (times.start, times.stop))[..., index[4]]
+        values = self.inner.read_box(low, high, (times.start, times.stop))[..., index[4]]
         if self.indexed:
-            return found
-        labels = _loaded(self.labels) if isinstance(self.labels, str) else self.labels
-        found = as_whole(self.path, found)
+            return values
+        labels = _load_labels(self.labels) if isinstance(self.labels, str) else self.labels
+        values = as_whole(self.path, values)
         try:
-            counted = indices(found, labels)
-            same = labels[counted.astype(np.int64)] == found
+            label_indices = indices(values, labels)
+            is_unchanged = labels[label_indices.astype(np.int64)] == values
         except IndexError:
-            same = np.array(False)
-        if not same.all():
+            is_unchanged = np.array(False)
+        if not is_unchanged.all():
             raise OSError(f"{self.path}: changed while it was read: a label is new")
-        return counted
+        return label_indices
 
 
-_loaded = functools.lru_cache(maxsize=2)(np.load)
+_load_labels = functools.lru_cache(maxsize=2)(np.load)
 
 
 def indexed_source(
@@ -100,30 +100,30 @@ def indexed_source(
         return IndexSource.of(source, np.load(folder / LABELS))
     times = (0, source.times) if time is None else (source.time, source.time + 1)
     threads = min(8, cores() if workers is None else workers)
-    return IndexSource.of(source, _labels_of(source, times, threads, progress))
+    return IndexSource.of(source, _distinct_labels(source, times, threads, progress))
 
 
-def _labels_of(
+def _distinct_labels(
     source: VolumeSource, times: tuple[int, int], workers: int, progress: Progress
 ) -> np.ndarray:
     x, y, z = source.extent
-    spans = [range(*times), *(range(0, n, _CUBE) for n in (z, y, x))]
+    spans = [range(*times), *(range(0, n, _CUBE_SIDE) for n in (z, y, x))]
     total = int(np.prod([len(span) for span in spans]))
 
-    def read(place: tuple[int, ...]) -> np.ndarray:
-        time, *low = place
-        high = [min(a + _CUBE, n) for a, n in zip(low, (z, y, x), strict=True)]
+    def read(corner: tuple[int, ...]) -> np.ndarray:
+        time, *low = corner
+        high = [min(a + _CUBE_SIDE, n) for a, n in zip(low, (z, y, x), strict=True)]
         part = source.at_time(time).read_region(low, high)
         return np.unique(as_whole(source.path, part))
 
     def parts() -> Iterator[np.ndarray]:
         progress("labels", 0, total)
-        places = itertools.product(*spans)
+        corners = itertools.product(*spans)
         with (
             ThreadPoolExecutor(workers) as pool,
-            closing(run_ahead(pool, read, places, 4 * workers)) as found,
+            closing(run_ahead(pool, read, corners, 4 * workers)) as results,
         ):
-            for done, part in enumerate(found, 1):
+            for done, part in enumerate(results, 1):
                 yield part
                 progress("labels", done, total)
 

@@ -27,10 +27,10 @@ from .source import told_as
 #: Endings that are read, also followed by .gz. Other formats of trimesh need more libraries, or
 #: unpickle the content of files.
 ENDINGS = ("obj", "ply", "stl", "gltf", "glb", "off")
-_MEMORY_A_BYTE = 4  # bytes of memory that reading takes for each byte of a file, at least
-_TEXTURES = 1500 * 10**6  # bytes of memory that decoding textures may take, for any file
-_TEXTURES_A_BYTE = 100  # and for each byte of it and of the files that it refers to
-_FACE_BYTES = 1  # a triangle takes more bytes than this in any format
+_MEMORY_PER_BYTE = 4  # bytes of memory that reading takes for each byte of a file, at least
+_MAX_TEXTURE_BYTES = 1500 * 10**6  # bytes of memory that decoding textures may take, for any file
+_TEXTURE_PER_BYTE = 100  # and for each byte of it and of the files that it refers to
+_MIN_FACE_BYTES = 1  # a triangle takes more bytes than this in any format
 
 
 def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
@@ -59,9 +59,9 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
     if not path.is_file():
         raise FileNotFoundError(f"file not found: {path}")
     trimesh = need_library(f"{path}: a mesh", "trimesh", extra="mesh")
-    content = _content(path, packed)
+    content = _read_content(path, packed)
     _check_claims(path, ending, content)
-    resolver: Any = _Beside(path)
+    resolver: Any = _FolderResolver(path)
     try:
         content = cut_polygons(content) if ending == "obj" else content
         loaded = trimesh.load(
@@ -72,20 +72,20 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
             allow_remote=False,
         )
         _check_textures(_images(loaded), len(content) + resolver.size)
-        parts = _parts(trimesh, loaded)
+        parts = _loaded_parts(trimesh, loaded)
     except Exception as error:  # a damaged file may raise anything
-        reason = resolver.missing or one_line(error)
+        reason = resolver.problem or one_line(error)
         raise ValueError(f"{path}: can't be read as {ending}: {reason}") from error
-    if resolver.missing:
-        raise ValueError(f"{path}: {resolver.missing}")
+    if resolver.problem:
+        raise ValueError(f"{path}: {resolver.problem}")
     if not parts:
         raise ValueError(f"{path}: has no triangles")
     has_images = bool(resolver.images) or ending in ("gltf", "glb")
-    mesh = _joined(path, ending, parts, has_images or texture is not None)
-    return mesh if texture is None else _textured(mesh, Path(texture))
+    mesh = _join_parts(path, ending, parts, has_images or texture is not None)
+    return mesh if texture is None else _with_texture(mesh, Path(texture))
 
 
-def _textured(mesh: Mesh, texture: Path) -> Mesh:
+def _with_texture(mesh: Mesh, texture: Path) -> Mesh:
     """Returns the mesh with one image as the texture of all materials."""
     if mesh.uv is None:
         raise ValueError(f"{mesh.name}: has no texture coordinates for {texture}")
@@ -99,8 +99,10 @@ def _textured(mesh: Mesh, texture: Path) -> Mesh:
             pixels = np.asarray(image.convert("RGBA"), np.uint8)
     except (OSError, ValueError, SyntaxError) as error:
         raise ValueError(f"{texture}: can't be read as an image: {error}") from None
-    painted = tuple(Material(name=m.name, color=(1.0,) * 4, texture=pixels) for m in mesh.materials)
-    return replace(mesh, materials=painted)
+    materials = tuple(
+        Material(name=m.name, color=(1.0,) * 4, texture=pixels) for m in mesh.materials
+    )
+    return replace(mesh, materials=materials)
 
 
 def _ending(path: Path) -> tuple[str, bool]:
@@ -112,43 +114,50 @@ def _ending(path: Path) -> tuple[str, bool]:
     return ending, packed
 
 
-def _content(path: Path, packed: bool) -> bytes:
-    most = memory_free() // _MEMORY_A_BYTE
+def _read_content(path: Path, packed: bool) -> bytes:
+    max_bytes = memory_free() // _MEMORY_PER_BYTE
     if not packed:
         _check_size(str(path), path.stat().st_size)
         return path.read_bytes()
     try:
         with gzip.open(path) as stream:
-            content = stream.read(most + 1)
+            content = stream.read(max_bytes + 1)
     except (OSError, EOFError, zlib.error) as error:
         raise ValueError(f"{path}: can't be unpacked: {error}") from None
-    if len(content) > most:
-        raise ValueError(f"{path}: unpacks to more than {amount(most)}, what free memory can take")
+    if len(content) > max_bytes:
+        raise ValueError(
+            f"{path}: unpacks to more than {amount(max_bytes)}, what free memory can take"
+        )
     return content
 
 
-def _check_size(what: str, size: int) -> None:
-    if size * _MEMORY_A_BYTE > (free := memory_free()):
-        needs, has = amount(size * _MEMORY_A_BYTE), amount(free)
-        raise ValueError(f"{what}: takes {needs} of memory, {has} are free")
+def _check_size(label: str, size: int) -> None:
+    if size * _MEMORY_PER_BYTE > (free := memory_free()):
+        needs, has = amount(size * _MEMORY_PER_BYTE), amount(free)
+        raise ValueError(f"{label}: takes {needs} of memory, {has} are free")
 
 
 def _images(loaded: Any) -> list[Any]:
     """Returns the textures that trimesh found, which are not decoded yet."""
     parts = getattr(loaded, "geometry", {"": loaded}).values()
-    looks = (getattr(getattr(part, "visual", None), "material", None) for part in parts)
-    found = {id(one): one for one in looks}.values()
-    images = (getattr(one, "baseColorTexture", getattr(one, "image", None)) for one in found)
+    materials = (getattr(getattr(part, "visual", None), "material", None) for part in parts)
+    unique = {id(material): material for material in materials}.values()
+    images = (
+        getattr(material, "baseColorTexture", getattr(material, "image", None))
+        for material in unique
+    )
     return [image for image in images if image is not None]
 
 
 def _check_textures(images: list[Any], size: int) -> None:
     """Raises ValueError if decoding images takes more memory than files of `size` bytes justify."""
     sizes = [4 * math.prod(image.size) for image in images]
-    takes = sum(sizes) + 2 * max(sizes, default=0)  # they are decoded one after another
-    most = min(_TEXTURES + _TEXTURES_A_BYTE * size, memory_free())
-    if takes > most:
-        raise ValueError(f"its textures take {amount(takes)} of memory, at most {amount(most)}")
+    needed_bytes = sum(sizes) + 2 * max(sizes, default=0)  # they are decoded one after another
+    limit = min(_MAX_TEXTURE_BYTES + _TEXTURE_PER_BYTE * size, memory_free())
+    if needed_bytes > limit:
+        raise ValueError(
+            f"its textures take {amount(needed_bytes)} of memory, at most {amount(limit)}"
+        )
 
 
 def _check_gltf(ending: str, content: bytes) -> None:
@@ -161,15 +170,15 @@ def _check_gltf(ending: str, content: bytes) -> None:
     for view in header.get("bufferViews", ()):
         if min(view.get("byteOffset", 0), view["byteLength"]) < 0:
             raise ValueError("a part of a buffer lies before its start")
-    for number, one in enumerate(header.get("accessors", ())):
-        if "bufferView" not in one or "sparse" in one:
+    for number, accessor in enumerate(header.get("accessors", ())):
+        if "bufferView" not in accessor or "sparse" in accessor:
             raise ValueError(f"accessor {number} is sparse or packed by an extension")
-        length = header["bufferViews"][one["bufferView"]]["byteLength"]
-        if not 0 <= one["count"] <= length or one.get("byteOffset", 0) < 0:
-            raise ValueError(f"accessor {number} has {one['count']} values in {length} bytes")
+        length = header["bufferViews"][accessor["bufferView"]]["byteLength"]
+        if not 0 <= accessor["count"] <= length or accessor.get("byteOffset", 0) < 0:
+            raise ValueError(f"accessor {number} has {accessor['count']} values in {length} bytes")
 
 
-def _count(word: bytes) -> int:
+def _parse_count(word: bytes) -> int:
     """Returns the number in a header's word, 0 if it is none; 19 digits suffice to compare it."""
     return int(word.lstrip(b"0")[:19] or b"0") if word.isdigit() else 0
 
@@ -186,15 +195,15 @@ def _check_claims(path: Path, ending: str, content: bytes) -> None:
         claimed = int.from_bytes(content[80:84], "little")
     if ending == "ply":
         for line in content[:65536].partition(b"end_header")[0].splitlines():
-            words = line.split()
-            if words[:2] in ([b"element", b"face"], [b"element", b"vertex"]) and len(words) == 3:
-                claimed = max(claimed or 0, _count(words[2]))
+            tokens = line.split()
+            if tokens[:2] in ([b"element", b"face"], [b"element", b"vertex"]) and len(tokens) == 3:
+                claimed = max(claimed or 0, _parse_count(tokens[2]))
     if ending == "off":
         numbers = content[:4096].split()[1:3]
-        claimed = max((_count(n) for n in numbers if n.isdigit()), default=None)
+        claimed = max((_parse_count(n) for n in numbers if n.isdigit()), default=None)
     if claimed is None:
         return
-    if claimed > len(content) // _FACE_BYTES:
+    if claimed > len(content) // _MIN_FACE_BYTES:
         raise ValueError(
             f"{path}: declares {claimed} triangles or vertices in {len(content)} bytes: damaged"
         )
@@ -202,88 +211,93 @@ def _check_claims(path: Path, ending: str, content: bytes) -> None:
         raise ValueError(f"{path}: at most {MOST_FACES} triangles, it declares {claimed}")
 
 
-class _Beside:
+class _FolderResolver:
     """Reads the files that a mesh refers to for trimesh, from the mesh's folder and below it."""
 
     def __init__(self, path: Path) -> None:
-        self._folder, self.missing = path.absolute().parent, ""
+        self._folder, self.problem = path.absolute().parent, ""
         self.images = self.size = 0  # number of image files read; bytes of all files read
 
     def get(self, name: str) -> bytes:
         """Returns a file's content."""
-        plain = str(name).strip().replace("\\", "/").replace("%20", " ")
-        if "://" in plain:
-            self.missing = f"names {plain}, and nothing is fetched"
-            raise ValueError(self.missing)
-        file = (self._folder / plain).resolve()
+        plain_name = str(name).strip().replace("\\", "/").replace("%20", " ")
+        if "://" in plain_name:
+            self.problem = f"names {plain_name}, and nothing is fetched"
+            raise ValueError(self.problem)
+        file = (self._folder / plain_name).resolve()
         inside = file.is_relative_to(self._folder.resolve())
         if not inside or not file.is_file():
-            where = "is not there" if inside else "is in another folder"
+            problem = "is not there" if inside else "is in another folder"
             # An OBJ may name a material library that does not exist: the mesh is white then.
-            if not plain.lower().endswith(".mtl"):
-                self.missing = f"names {plain}, which {where}"
-            raise FileNotFoundError(f"{plain} {where}")
+            if not plain_name.lower().endswith(".mtl"):
+                self.problem = f"names {plain_name}, which {problem}"
+            raise FileNotFoundError(f"{plain_name} {problem}")
         self.images += file.suffix.lower() not in (".mtl", ".bin")
         self.size += file.stat().st_size
         try:
-            _check_size(f"names {plain}", self.size)
+            _check_size(f"names {plain_name}", self.size)
         except ValueError as error:
-            self.missing = str(error)
+            self.problem = str(error)
             raise
         return file.read_bytes()
 
     def __getitem__(self, name: str) -> bytes:
         return self.get(name)
 
-    def namespaced(self, _namespace: str) -> _Beside:
+    def namespaced(self, _namespace: str) -> _FolderResolver:
         """Returns itself: trimesh's namespaces are not used."""
         return self
 
 
-def _parts(trimesh: Any, loaded: Any) -> list[Any]:
+def _loaded_parts(trimesh: Any, loaded: Any) -> list[Any]:
     """Returns the meshes that trimesh loaded, with the transforms of their scene applied."""
-    found = loaded.dump(concatenate=False) if isinstance(loaded, trimesh.Scene) else [loaded]
-    found = found if isinstance(found, list) else [found]
-    return [one for one in found if isinstance(one, trimesh.Trimesh) and len(one.faces)]
+    parts = loaded.dump(concatenate=False) if isinstance(loaded, trimesh.Scene) else [loaded]
+    parts = parts if isinstance(parts, list) else [parts]
+    return [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
 
 
-def _joined(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh:
+def _join_parts(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh:
     """Joins trimesh's meshes. If not `mapped`, no image was read: images in them are trimesh's
     default, and are left out.
     """
     vertices, faces, colors, uvs, numbers = [], [], [], [], []
     materials: list[Material] = []
-    known: dict[int, int] = {}
-    before = 0
+    material_numbers: dict[int, int] = {}
+    vertex_count = 0
     for part in parts:
-        own, places = np.asarray(part.faces, np.int64), np.asarray(part.vertices, np.float64)
-        if own.min() < 0 or own.max() >= len(places):
-            wrong = own.min() if own.min() < 0 else own.max()
+        part_faces, part_vertices = (
+            np.asarray(part.faces, np.int64),
+            np.asarray(part.vertices, np.float64),
+        )
+        if part_faces.min() < 0 or part_faces.max() >= len(part_vertices):
+            bad_index = part_faces.min() if part_faces.min() < 0 else part_faces.max()
             raise ValueError(
-                f"{path}: a triangle refers to vertex {wrong}, there are {len(places)}"
+                f"{path}: a triangle refers to vertex {bad_index}, there are {len(part_vertices)}"
             )
-        faces.append(own + before)
-        vertices.append(places)
-        before += len(places)
-        look = part.visual
-        uv = getattr(look, "uv", None)
-        uvs.append(np.zeros((len(own), 3, 2)) if uv is None else np.asarray(uv)[own][..., :2])
-        colors.append(_colors(part, own, ending))
-        material = getattr(look, "material", None)
-        if id(material) not in known:
-            known[id(material)] = len(materials)
+        faces.append(part_faces + vertex_count)
+        vertices.append(part_vertices)
+        vertex_count += len(part_vertices)
+        visual = part.visual
+        uv = getattr(visual, "uv", None)
+        uvs.append(
+            np.zeros((len(part_faces), 3, 2)) if uv is None else np.asarray(uv)[part_faces][..., :2]
+        )
+        colors.append(_colors(part, part_faces, ending))
+        material = getattr(visual, "material", None)
+        if id(material) not in material_numbers:
+            material_numbers[id(material)] = len(materials)
             materials.append(_material(path, material, ending, mapped and uv is not None))
-        numbers.append(np.full(len(own), known[id(material)]))
-    plain = all(one is None for one in colors)
-    white = [
-        np.ones((len(own), 3, 4), np.float32) if color is None else color
-        for own, color in zip(faces, colors, strict=True)
+        numbers.append(np.full(len(part_faces), material_numbers[id(material)]))
+    uncolored = all(color is None for color in colors)
+    filled_colors = [
+        np.ones((len(part_faces), 3, 4), np.float32) if color is None else color
+        for part_faces, color in zip(faces, colors, strict=True)
     ]
     textured = mapped and any(getattr(p.visual, "uv", None) is not None for p in parts)
     return Mesh(
         vertices=np.concatenate(vertices),
         faces=np.concatenate(faces),
-        color=None if plain else np.concatenate(white),
+        color=None if uncolored else np.concatenate(filled_colors),
         uv=np.concatenate(uvs).astype(np.float32) if textured else None,
         material=np.concatenate(numbers),
         materials=tuple(materials),
@@ -295,29 +309,29 @@ def _colors(part: Any, faces: np.ndarray, ending: str) -> np.ndarray | None:
     """Returns (f, 3, 4) float32 linear colours of triangle corners; None if there are none. Colours
     are stored linear in glTF, as sRGB in other formats.
     """
-    look, attributes = part.visual, part.vertex_attributes
-    if look.kind == "vertex":
-        told = np.asarray(look.vertex_colors)[faces]
-    elif look.kind == "face":
-        told = np.repeat(np.asarray(look.face_colors)[:, None], 3, axis=1)
+    visual, attributes = part.visual, part.vertex_attributes
+    if visual.kind == "vertex":
+        colors = np.asarray(visual.vertex_colors)[faces]
+    elif visual.kind == "face":
+        colors = np.repeat(np.asarray(visual.face_colors)[:, None], 3, axis=1)
     elif "color" in attributes and np.asarray(attributes["color"]).shape[-1] in (3, 4):
-        told = np.asarray(attributes["color"])[faces]
+        colors = np.asarray(attributes["color"])[faces]
     else:
         return None
-    if told.shape[-1] == 3:
-        told = np.concatenate((told, np.full_like(told[..., :1], 255)), -1)
-    value = told.astype(np.float32) / (255 if told.dtype == np.uint8 else 1)
+    if colors.shape[-1] == 3:
+        colors = np.concatenate((colors, np.full_like(colors[..., :1], 255)), -1)
+    linear = colors.astype(np.float32) / (255 if colors.dtype == np.uint8 else 1)
     if ending not in ("gltf", "glb"):
-        value[..., :3] = array_from_srgb(value[..., :3])
-    return value
+        linear[..., :3] = array_from_srgb(linear[..., :3])
+    return linear
 
 
 def _opacity(material: Any) -> float:
     """Returns the opacity from an MTL file: d, or 1 - Tr; 1 if it has neither."""
-    told = material.kwargs
-    name = "d" if "d" in told else "tr"
+    properties = material.kwargs
+    name = "d" if "d" in properties else "tr"
     try:
-        value = float(told[name][-1])  # after the option -halo, if there is one
+        value = float(properties[name][-1])  # after the option -halo, if there is one
     except (KeyError, IndexError, ValueError):
         return 1.0
     return min(max(value if name == "d" else 1 - value, 0.0), 1.0)
@@ -327,19 +341,19 @@ def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
     """Converts a material of trimesh; white if there is none."""
     if material is None:
         return Material(color=(1.0, 1.0, 1.0, 1.0))
-    gltf = ending in ("gltf", "glb")
-    if not gltf and not mapped and getattr(material, "image", None) is not None:
+    is_gltf = ending in ("gltf", "glb")
+    if not is_gltf and not mapped and getattr(material, "image", None) is not None:
         return Material(color=(1.0, 1.0, 1.0, 1.0))
-    base = getattr(material, "baseColorFactor", None) if gltf else material.main_color
-    image = getattr(material, "baseColorTexture" if gltf else "image", None)
-    color = np.ones(4) if base is None else np.asarray(base, np.float64)
-    if base is not None and np.asarray(base).dtype.kind in "ui":
+    base_color = getattr(material, "baseColorFactor", None) if is_gltf else material.main_color
+    image = getattr(material, "baseColorTexture" if is_gltf else "image", None)
+    color = np.ones(4) if base_color is None else np.asarray(base_color, np.float64)
+    if base_color is not None and np.asarray(base_color).dtype.kind in "ui":
         color = color / 255
-    if image is not None and not gltf:
+    if image is not None and not is_gltf:
         color = np.ones(4)  # the texture replaces the colour
     if ending == "obj":
         color[3] *= _opacity(material)
-    if not gltf:
+    if not is_gltf:
         color[:3] = array_from_srgb(color[:3])
     texture = None
     if image is not None and mapped:

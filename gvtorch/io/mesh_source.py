@@ -43,16 +43,16 @@ class MeshSource(VolumeSource):
     channel: str
     settings: tuple[tuple[str, Any], ...]  # resolution, band and thickness
     solid: SolidParts
-    marks: tuple[Any, ...]  # identify mesh and settings: equal while these are unchanged
-    words: tuple[str, ...] = ()  # options of the command line that makes the store
-    several: bool = False  # whether its store is one of several, one per channel
+    identity: tuple[Any, ...]  # of mesh and settings: equal while these are unchanged
+    command_options: tuple[str, ...] = ()  # options of the command line that makes the store
+    one_of_several: bool = False  # whether its store is one of several, one per channel
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)  # with its holes filled
     file: str = ""  # holds the mesh, if that is not in memory
 
     @classmethod
     def of(
         cls,
-        given: str | Path | Mesh,
+        mesh_or_path: str | Path | Mesh,
         channels: str | Sequence[str] = "coverage",
         *,
         resolution: int = 1024,
@@ -63,64 +63,70 @@ class MeshSource(VolumeSource):
     ) -> dict[str, MeshSource]:
         """Reads a mesh, lays a grid around it, and returns a source per channel; see `voxelize`."""
         check.whole("voxelize", "resolution", resolution, low=8, high=2**20)
-        check.instance("voxelize", "mesh", given, Mesh, str, PathLike)
+        check.instance("voxelize", "mesh", mesh_or_path, Mesh, str, PathLike)
         check.one_of("voxelize", "solid", solid, get_args(SolidParts))
         names = check_channels("voxelize", channels)
-        if isinstance(given, Mesh):
+        if isinstance(mesh_or_path, Mesh):
             if texture is not None:
                 raise ValueError("voxelize: texture is for files: a Mesh has its own")
-            mesh, marks, name = given, list[Any](), given.name
+            mesh, identity, name = mesh_or_path, list[Any](), mesh_or_path.name
         else:
-            mesh, marks, name = read_mesh(given, texture=texture), fingerprint(given), str(given)
-        if solid == "auto" and (told := told_of_holes(mesh)):
-            warnings.warn(told, stacklevel=3)
-        marks.insert(0, checksum(v for name, v in _arrays(mesh).items() if name != "name"))
-        grid: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
-        made = Voxelizer(mesh, channels=names, **grid, solid=solid)
-        told_words = [word for key, n in grid.items() for word in (f"--{key}", f"{n:g}")]
-        words = ("--channels", ",".join(names), *told_words, "--solid", solid)
-        found = {}
+            mesh, identity, name = (
+                read_mesh(mesh_or_path, texture=texture),
+                fingerprint(mesh_or_path),
+                str(mesh_or_path),
+            )
+        if solid == "auto" and (hole_warning := told_of_holes(mesh)):
+            warnings.warn(hole_warning, stacklevel=3)
+        identity.insert(0, checksum(v for name, v in _mesh_arrays(mesh).items() if name != "name"))
+        settings: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
+        voxelizer = Voxelizer(mesh, channels=names, **settings, solid=solid)
+        setting_options = [word for key, n in settings.items() for word in (f"--{key}", f"{n:g}")]
+        options = ("--channels", ",".join(names), *setting_options, "--solid", solid)
+        sources = {}
         for channel in names:
             dtype, width = CHANNELS[channel]
-            x, y, z = made.extent
+            x, y, z = voxelizer.extent
             colors = PREMULTIPLIED if channel == "color" else ()
-            found[channel] = cls(
+            sources[channel] = cls(
                 path=name,
                 shape=(z, y, x, width),
                 axes="zyxc",
                 stored=str(dtype).removeprefix("torch."),
-                spacing=(made.spacing,) * 3,
-                origin=made.origin,
+                spacing=(voxelizer.spacing,) * 3,
+                origin=voxelizer.origin,
                 info=ImageInfo(channels=colors, quantity=channel, labels=channel == "material"),
                 channel=channel,
-                settings=tuple(grid.items()),
+                settings=tuple(settings.items()),
                 solid=solid,
-                marks=tuple(marks),
-                words=words if texture is None else (*words, "--texture", str(texture)),
-                several=len(names) > 1,
-                mesh=made.mesh,
+                identity=tuple(identity),
+                command_options=options
+                if texture is None
+                else (*options, "--texture", str(texture)),
+                one_of_several=len(names) > 1,
+                mesh=voxelizer.mesh,
             )
-        return found
+        return sources
 
     def staged(self, folder: Path) -> MeshSource:
         """Writes the mesh to a file in the folder."""
         if self.mesh is None:
             return self
-        file, arrays = folder / "mesh.npz", _arrays(self.mesh)
+        file, arrays = folder / "mesh.npz", _mesh_arrays(self.mesh)
         np.savez(file, **arrays)  # type: ignore[arg-type]
         return dataclasses.replace(self, mesh=None, file=str(file))
 
     def fingerprint(self) -> list[Any]:
         """Returns values that identify the mesh, the channel and the settings."""
-        return [*self.marks, self.channel, *(n for _, n in self.settings), self.solid]
+        return [*self.identity, self.channel, *(n for _, n in self.settings), self.solid]
 
     def command(self, store: str) -> tuple[str, ...]:
         """Returns the words of the `gvtorch voxelize` command that makes a store of it."""
-        store = str(Path(store).parent) if self.several else store
-        return ("gvtorch", "voxelize", self.path, "-o", store, *self.words)
+        store = str(Path(store).parent) if self.one_of_several else store
+        return ("gvtorch", "voxelize", self.path, "-o", store, *self.command_options)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
-        low, high = [one.start for one in index[:3]], [one.stop for one in index[:3]]
+        low, high = [span.start for span in index[:3]], [span.stop for span in index[:3]]
         return self.read_region(low, high)[..., index[3]]
 
     def read_region(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
@@ -134,7 +140,7 @@ def _voxelizer(source: MeshSource) -> Voxelizer:
     """Returns the voxelizer of a source, which is cached because every region needs it."""
     if multiprocessing.parent_process() is not None:
         torch.set_num_threads(1)  # one of several processes that share the cores
-    mesh = _load(Path(source.file)) if source.mesh is None else source.mesh
+    mesh = _load_mesh(Path(source.file)) if source.mesh is None else source.mesh
     return Voxelizer(
         mesh,
         channels=(source.channel,),
@@ -180,31 +186,33 @@ def voxelize(
     """
     check.known("voxelize", settings, GridSettings)
     sources = MeshSource.of(mesh, channels, **settings, texture=texture)
-    told: dict[str, Any] = {"block": block, "executor": executor, "workers": workers}
-    told |= {"resume": resume, "progress": progress}
+    options: dict[str, Any] = {"block": block, "executor": executor, "workers": workers}
+    options |= {"resume": resume, "progress": progress}
     if len(sources) > 1:
-        return convert_channels(sources, store, **told)
-    return convert(next(iter(sources.values())), store, **told)
+        return convert_channels(sources, store, **options)
+    return convert(next(iter(sources.values())), store, **options)
 
 
-def _arrays(mesh: Mesh) -> dict[str, np.ndarray]:
+def _mesh_arrays(mesh: Mesh) -> dict[str, np.ndarray]:
     """Returns the data of a mesh as arrays by name."""
-    told = [{"name": one.name, "color": one.color} for one in mesh.materials]
-    arrays = {"materials": np.array(json.dumps(told)), "name": np.array(mesh.name)}
+    materials = [{"name": material.name, "color": material.color} for material in mesh.materials]
+    arrays = {"materials": np.array(json.dumps(materials)), "name": np.array(mesh.name)}
     for name in ("vertices", "faces", "color", "uv", "material"):
         if (value := getattr(mesh, name)) is not None:
             arrays[name] = value
-    for number, one in enumerate(mesh.materials):
-        if one.texture is not None:
-            arrays[f"texture_{number}"] = one.texture
+    for number, material in enumerate(mesh.materials):
+        if material.texture is not None:
+            arrays[f"texture_{number}"] = material.texture
     return arrays
 
 
-def _load(file: Path) -> Mesh:
+def _load_mesh(file: Path) -> Mesh:
     with np.load(file, allow_pickle=False) as content:
         arrays = dict(content)
     materials = tuple(
-        Material(**one | {"color": tuple(one["color"])}, texture=arrays.pop(f"texture_{i}", None))
-        for i, one in enumerate(json.loads(str(arrays.pop("materials"))))
+        Material(
+            **fields | {"color": tuple(fields["color"])}, texture=arrays.pop(f"texture_{i}", None)
+        )
+        for i, fields in enumerate(json.loads(str(arrays.pop("materials"))))
     )
     return Mesh(**arrays | {"name": str(arrays["name"])}, materials=materials)

@@ -24,8 +24,8 @@ from .source import Index, VolumeSource
 
 Oblique = Literal["resample", "keep"]
 
-_SLAB = 1 << 18  # voxels that are interpolated at a time
-_TIE = 2.0**-20  # voxels by which rounding may shift a position
+_SLAB_VOXELS = 1 << 18  # voxels that are interpolated at a time
+_ROUNDING_VOXELS = 2.0**-20  # voxels by which rounding may shift a position
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,30 +50,33 @@ class StraightSource(VolumeSource):
         size = [b - a for a, b in zip(low, high, strict=True)]
         out = np.empty((times.stop - times.start, *size, self.width), self.stored)
         out[...] = self.fill
-        start, stop = self._reach(low, high)
+        start, stop = self._inner_box(low, high)
         if any(a >= b for a, b in zip(start, stop, strict=True)):
             return out[..., index[4]]
-        rows = max(1, _SLAB // math.prod(size[1:]))
-        found = self.inner.read_box(start, stop, (times.start, times.stop))
-        for values, made in zip(found, out, strict=True):
+        rows = max(1, _SLAB_VOXELS // math.prod(size[1:]))
+        inner_times = self.inner.read_box(start, stop, (times.start, times.stop))
+        for values, out_values in zip(inner_times, out, strict=True):
             for z in range(low[0], high[0], rows):
                 box = (z, *low[1:]), (min(z + rows, high[0]), *high[1:])
-                self._resample(values, start, box, made[z - low[0] : box[1][0] - low[0]])
+                self._resample(values, start, box, out_values[z - low[0] : box[1][0] - low[0]])
         return out[..., index[4]]
 
-    def _places(self, low: Sequence[int], high: Sequence[int]) -> list[np.ndarray]:
+    def _inner_positions(self, low: Sequence[int], high: Sequence[int]) -> list[np.ndarray]:
         """Returns positions z, y, x of a box in the inner source; the same bits for any box."""
         z, y, x = np.ogrid[boxes.index(low, high)]
-        found = [a * x + b * y + c * z + d for a, b, c, d in self.to_inner]
-        return found[::-1]
+        positions = [a * x + b * y + c * z + d for a, b, c, d in self.to_inner]
+        return positions[::-1]
 
-    def _reach(self, low: Sequence[int], high: Sequence[int]) -> tuple[list[int], list[int]]:
+    def _inner_box(self, low: Sequence[int], high: Sequence[int]) -> tuple[list[int], list[int]]:
         """Returns start and stop, z y x, of the inner voxels under a box; none if stop <= start."""
         ends = zip(low, np.subtract(high, 1), strict=True)
         corners = np.array([(x, y, z, 1) for z, y, x in itertools.product(*ends)])
-        places = (corners @ np.array(self.to_inner).T)[:, ::-1]
+        positions = (corners @ np.array(self.to_inner).T)[:, ::-1]
         shape = np.array(self.inner.extent[::-1])
-        first, last = np.floor(places.min(0) - _TIE), np.floor(places.max(0) + _TIE) + 2
+        first, last = (
+            np.floor(positions.min(0) - _ROUNDING_VOXELS),
+            np.floor(positions.max(0) + _ROUNDING_VOXELS) + 2,
+        )
         start, stop = np.maximum(first, 0), np.minimum(last, shape)
         return start.astype(int).tolist(), stop.astype(int).tolist()
 
@@ -85,38 +88,46 @@ class StraightSource(VolumeSource):
         out: np.ndarray,
     ) -> None:
         """Writes a box (z, y, x, c) from inner values (z, y, x, c), of voxels from `start` on."""
-        places = np.broadcast_arrays(*self._places(*box))
+        positions = np.broadcast_arrays(*self._inner_positions(*box))
         shape = self.inner.extent[::-1]
         inside = np.logical_and.reduce(
             [
-                (at >= -0.5 - _TIE) & (at <= n - 0.5 + _TIE)
-                for at, n in zip(places, shape, strict=True)
+                (position >= -0.5 - _ROUNDING_VOXELS) & (position <= n - 0.5 + _ROUNDING_VOXELS)
+                for position, n in zip(positions, shape, strict=True)
             ]
         )
         if not inside.any():
             return
-        at = [place[inside].clip(0, n - 1) for place, n in zip(places, shape, strict=True)]
+        inside_positions = [
+            position[inside].clip(0, n - 1) for position, n in zip(positions, shape, strict=True)
+        ]
         if self.nearest:
-            index = [np.floor(a + 0.5).astype(np.int64) - s for a, s in zip(at, start, strict=True)]
+            index = [
+                np.floor(a + 0.5).astype(np.int64) - s
+                for a, s in zip(inside_positions, start, strict=True)
+            ]
             out[inside] = values[tuple(index)]
             return
-        lows = [np.floor(a) for a in at]
-        total = np.zeros((len(at[0]), values.shape[3]))
+        lows = [np.floor(a) for a in inside_positions]
+        total = np.zeros((len(inside_positions[0]), values.shape[3]))
         for corner in itertools.product((0, 1), repeat=3):
-            weight, index = np.ones(len(at[0])), []
-            for a, first, upper, n, s in zip(at, lows, corner, values.shape, start, strict=False):
+            weight, index = np.ones(len(inside_positions[0])), []
+            for a, first, upper, n, s in zip(
+                inside_positions, lows, corner, values.shape, start, strict=False
+            ):
                 weight = weight * (a - first if upper else 1 - (a - first))
-                place = (first + upper).astype(np.int64) - s
-                index.append(np.minimum(place, n - 1))  # voxels beyond have weight 0
-            found = values[tuple(index)].astype(np.float64)
-            total += np.where(weight[:, None] > 0, found * weight[:, None], 0)  # 0 * NaN is NaN
+                position = (first + upper).astype(np.int64) - s
+                index.append(np.minimum(position, n - 1))  # voxels beyond have weight 0
+            corner_values = values[tuple(index)].astype(np.float64)
+            # Where the weight is 0 the value may be NaN, and 0 * NaN is NaN.
+            total += np.where(weight[:, None] > 0, corner_values * weight[:, None], 0)
         out[inside] = round_array(total, out.dtype)
 
 
 def straighten(
     source: VolumeSource,
     oblique: Oblique | None = None,
-    place: Sequence[float] | None = None,
+    first_voxel: Sequence[float] | None = None,
 ) -> VolumeSource:
     """Returns a source whose axes are parallel to the world's, and warns about what it did.
 
@@ -128,7 +139,7 @@ def straighten(
         source: Returned as it is, if its axes are parallel to the world's.
         oblique: "resample" (the default), or "keep": the voxels stay as they are, and their axes
             count as the world's; `info.pose` holds the missing rotation (`RenderOptions.pose`).
-        place: World position of the first voxel, if it is not the file's.
+        first_voxel: World position of the first voxel, if it is not the file's.
 
     Raises:
         ValueError: `oblique` is something else.
@@ -140,24 +151,26 @@ def straighten(
         return source
     affine = np.array(source.oblique)
     lengths = np.linalg.norm(affine[:, :3], axis=0)
-    turned = math.degrees(math.acos(min(1.0, (np.abs(affine[:, :3]).max(0) / lengths).min())))
-    name = f"{Path(source.path).name}: voxel axes are turned by {turned:.3g} degrees"
+    degrees = math.degrees(math.acos(min(1.0, (np.abs(affine[:, :3]).max(0) / lengths).min())))
+    message = f"{Path(source.path).name}: voxel axes are turned by {degrees:.3g} degrees"
     if oblique == "keep":
-        pose = _pose(affine[:, :3] / lengths, np.array(source.origin if place is None else place))
+        pose = _pose(
+            affine[:, :3] / lengths, np.array(source.origin if first_voxel is None else first_voxel)
+        )
         hint = "" if pose is None else "; info.pose turns them (gv.render(..., pose=...))"
-        warnings.warn(f"{name}: kept, and treated as the world's axes{hint}", stacklevel=3)
+        warnings.warn(f"{message}: kept, and treated as the world's axes{hint}", stacklevel=3)
         info = dataclasses.replace(source.info, pose=pose)
         return dataclasses.replace(source, oblique=None, info=info)
     extent, spacing, origin, to_inner = _grid(affine, source.extent)
-    fill = 0.0 if source.info.labels else _smallest(source)
+    fill = 0.0 if source.info.labels else _smallest_value(source)
     x, y, z = extent.tolist()
     warnings.warn(
-        f"{name}: resampled along the world's axes, {x}x{y}x{z} voxels of "
+        f"{message}: resampled along the world's axes, {x}x{y}x{z} voxels of "
         f"{' x '.join(f'{s:.4g}' for s in spacing)}; oblique='keep' (--oblique keep) keeps the "
         "voxels as they are",
         stacklevel=3,
     )
-    kept = {name: getattr(source, name) for name in ("path", "info", "lost", "time", "whole")}
+    fields = {name: getattr(source, name) for name in ("path", "info", "lost", "time", "whole")}
     return StraightSource(
         shape=(source.times, z, y, x, source.width),
         axes="tzyxc",
@@ -168,17 +181,17 @@ def straighten(
         to_inner=tuple(map(tuple, to_inner.tolist())),
         nearest=source.info.labels,
         fill=fill,
-        **kept,
+        **fields,
     )
 
 
-def _grid(affine: np.ndarray, inner: Sequence[int]) -> tuple[np.ndarray, ...]:
+def _grid(affine: np.ndarray, inner_extent: Sequence[int]) -> tuple[np.ndarray, ...]:
     """Returns extent, spacing and origin (x, y, z) of a grid along the world's axes that covers all
     voxels, and the affine from its voxels to theirs, (3, 4).
     """
     inverse = np.linalg.inv(affine[:, :3])
     spacing = 1 / np.linalg.norm(inverse, axis=0)
-    ends = [(-0.5, n - 0.5) for n in inner]
+    ends = [(-0.5, n - 0.5) for n in inner_extent]
     corners = np.array(list(itertools.product(*ends))) @ affine[:, :3].T + affine[:, 3]
     low, high = corners.min(0), corners.max(0)
     extent = np.ceil((high - low) / spacing - 1e-6).astype(int).clip(1)
@@ -187,20 +200,20 @@ def _grid(affine: np.ndarray, inner: Sequence[int]) -> tuple[np.ndarray, ...]:
     return extent, spacing, origin, to_inner
 
 
-def _pose(turn: np.ndarray, origin: np.ndarray) -> Rows | None:
+def _pose(rotation: np.ndarray, origin: np.ndarray) -> Rows | None:
     """Returns the (4, 4) rotation of the axes about the first voxel; None if they are sheared."""
-    if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-4:
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4:
         return None
-    left, _, right = np.linalg.svd(turn)
-    turn = left @ right
-    matrix = np.block([[turn, (origin - turn @ origin)[:, None]], [np.eye(4)[3:]]])
+    left, _, right = np.linalg.svd(rotation)
+    rotation = left @ right
+    matrix = np.block([[rotation, (origin - rotation @ origin)[:, None]], [np.eye(4)[3:]]])
     return tuple(map(tuple, matrix.tolist()))
 
 
-def _smallest(source: VolumeSource) -> float:
+def _smallest_value(source: VolumeSource) -> float:
     """Returns the smallest finite value, reading part by part where that is possible."""
     x, y, z = source.extent
-    rows = z if source.whole else max(1, 16 * _SLAB // (y * x * source.width))
+    rows = z if source.whole else max(1, 16 * _SLAB_VOXELS // (y * x * source.width))
     smallest = math.inf
     for low in range(0, z, rows):
         part = source.read_region((low, 0, 0), (min(low + rows, z), y, x))

@@ -12,82 +12,89 @@ from collections.abc import Callable, Iterator
 
 _JPEG_FRAMES = {*range(0xC0, 0xD0), 0xF7} - {0xC4, 0xC8, 0xCC}  # of JPEG and of JPEG-LS
 _JPEG_SCAN = 0xDA
-_BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
+_BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}  # markers without a length
 _RATIOS = ((1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))  # of JPEG XL
-_MOST_LAYERS = 64  # values per pixel of LERC
-_LONG = (9, 13, 18, 30)  # bits of a side of JPEG XL
-_JXL_HEADER = 32  # bytes; more than the fields that are read take
+_MAX_LAYERS = 64  # values per pixel of LERC
+_SIDE_BITS = (9, 13, 18, 30)  # bits of a side of JPEG XL
+_JXL_HEADER_BYTES = 32  # more than the fields that are read take
 
 
 def picture_size(packed: bytes) -> tuple[int, int] | None:
     """Returns (columns, rows) of a PNG, WebP, JPEG, JPEG-LS, JPEG 2000, JPEG XR, JPEG XL or LERC
     image; None for any other header, and for animations.
     """
-    for begin, read in _READERS.items():
-        if packed.startswith(begin):
+    for signature, reader in _READERS.items():
+        if packed.startswith(signature):
             try:
-                return read(packed)
+                return reader(packed)
             except struct.error:
                 return None
-    found = jpeg_size(packed) or jpeg2k_size(packed)
-    return None if found is None else found[:2]
+    size = jpeg_size(packed) or jpeg2k_size(packed)
+    return None if size is None else size[:2]
 
 
 def jpeg_size(packed: bytes) -> tuple[int, int, int] | None:
     """Returns (columns, rows, samples) from the header of a JPEG or JPEG-LS image; None if it has
     no frame header, or several.
     """
-    at, found = 2, None
-    while packed[:2] == b"\xff\xd8" and at + 9 < len(packed) and packed[at] == 0xFF:
-        marker = packed[at + 1]
+    position, size = 2, None
+    while packed[:2] == b"\xff\xd8" and position + 9 < len(packed) and packed[position] == 0xFF:
+        marker = packed[position + 1]
         if marker == _JPEG_SCAN:
             break
         if marker in _JPEG_FRAMES:
-            if found is not None:
+            if size is not None:
                 return None
-            rows, columns, samples = struct.unpack_from(">HHB", packed, at + 5)
-            found = (columns, rows, samples)
-        bare = marker in _BARE or marker == 0xFF
-        at += (1 if marker == 0xFF else 2) if bare else 2 + int.from_bytes(packed[at + 2 : at + 4])
-    return found
+            rows, columns, samples = struct.unpack_from(">HHB", packed, position + 5)
+            size = (columns, rows, samples)
+        has_no_length = marker in _BARE_MARKERS or marker == 0xFF
+        position += (
+            (1 if marker == 0xFF else 2)
+            if has_no_length
+            else 2 + int.from_bytes(packed[position + 2 : position + 4])
+        )
+    return size
 
 
-def jpeg_ends(packed: bytes) -> bool:
+def has_jpeg_end(packed: bytes) -> bool:
     """Returns whether a JPEG has an end marker after the start of its first scan; if not, libraries
     make the missing part grey. The two bytes of that marker can't occur in a scan's data.
     """
-    at = 2
-    while packed[at : at + 1] == b"\xff" and packed[at + 1 : at + 2] != bytes([_JPEG_SCAN]):
-        filling = packed[at + 1 : at + 2] == b"\xff"
-        at += 1 if filling else 2 + int.from_bytes(packed[at + 2 : at + 4])
-    return packed.find(b"\xff\xd9", at) >= 0
+    position = 2
+    while packed[position : position + 1] == b"\xff" and packed[
+        position + 1 : position + 2
+    ] != bytes([_JPEG_SCAN]):
+        is_fill_byte = packed[position + 1 : position + 2] == b"\xff"
+        position += 1 if is_fill_byte else 2 + int.from_bytes(packed[position + 2 : position + 4])
+    return packed.find(b"\xff\xd9", position) >= 0
 
 
 def jpeg2k_size(packed: bytes) -> tuple[int, int, int] | None:
     """Returns (columns, rows, samples) from the header of a JPEG 2000 codestream, or of the first
     codestream in a file of boxes (JP2).
     """
-    at = 0
+    start = 0
     if packed[4:8] == b"jP  ":
-        at = next((at for at, _, kind in _boxes(packed) if kind == b"jp2c"), len(packed))
-    if packed[at : at + 4] != b"\xff\x4f\xff\x51" or len(packed) < at + 42:
+        start = next((start for start, _, kind in _boxes(packed) if kind == b"jp2c"), len(packed))
+    if packed[start : start + 4] != b"\xff\x4f\xff\x51" or len(packed) < start + 42:
         return None
-    right, low, left, high = struct.unpack_from(">4I", packed, at + 8)
-    return (right - left, low - high, int.from_bytes(packed[at + 40 : at + 42]))
+    right, bottom, left, top = struct.unpack_from(">4I", packed, start + 8)
+    return (right - left, bottom - top, int.from_bytes(packed[start + 40 : start + 42]))
 
 
 def _boxes(packed: bytes) -> Iterator[tuple[int, int, bytes]]:
     """Yields where the content of each box begins and ends, and its kind."""
-    at = 0
-    while at + 8 <= len(packed):
-        size, head = int.from_bytes(packed[at : at + 4]), 8
+    start = 0
+    while start + 8 <= len(packed):
+        size, header_bytes = int.from_bytes(packed[start : start + 4]), 8
         if size == 1:
-            size, head = int.from_bytes(packed[at + 8 : at + 16]), 16
-        end = at + size if size >= head else len(packed)  # a size of 0: to the end of the file
-        yield at + head, end, packed[at + 4 : at + 8]
-        if size < head:
+            size, header_bytes = int.from_bytes(packed[start + 8 : start + 16]), 16
+        # A size of 0: to the end of the file.
+        end = start + size if size >= header_bytes else len(packed)
+        yield start + header_bytes, end, packed[start + 4 : start + 8]
+        if size < header_bytes:
             return
-        at += size
+        start += size
 
 
 def _png_size(packed: bytes) -> tuple[int, int] | None:
@@ -115,57 +122,57 @@ def _lerc_size(packed: bytes) -> tuple[int, int] | None:
         return columns, rows
     (version,) = struct.unpack_from("<i", packed, 6)
     rows, columns, layers = struct.unpack_from("<III", packed, 14 if version >= 3 else 10)
-    return (columns, rows) if version < 4 or layers <= _MOST_LAYERS else None
+    return (columns, rows) if version < 4 or layers <= _MAX_LAYERS else None
 
 
 def _jpegxr_size(packed: bytes) -> tuple[int, int] | None:
     """Returns the size from the codestream that the container points to."""
-    (at,) = struct.unpack_from("<I", packed, 4)
-    (count,) = struct.unpack_from("<H", packed, at)
-    tags = (struct.unpack_from("<HHII", packed, at + 2 + 12 * n) for n in range(count))
+    (directory,) = struct.unpack_from("<I", packed, 4)
+    (count,) = struct.unpack_from("<H", packed, directory)
+    tags = (struct.unpack_from("<HHII", packed, directory + 2 + 12 * n) for n in range(count))
     start = next((value for tag, _, _, value in tags if tag == 0xBCC0), len(packed))
     if packed[start : start + 8] != b"WMPHOTO\0":
         return None
-    (short,) = struct.unpack_from("<B", packed, start + 10)
-    columns, rows = struct.unpack_from(">HH" if short & 0x80 else ">II", packed, start + 12)
+    (flags,) = struct.unpack_from("<B", packed, start + 10)
+    columns, rows = struct.unpack_from(">HH" if flags & 0x80 else ">II", packed, start + 12)
     return columns + 1, rows + 1
 
 
 def _jpegxl_size(packed: bytes) -> tuple[int, int] | None:
     """Returns (columns, rows); None for animations, and for images with a preview before them."""
     if packed[4:8] == b"JXL ":
-        packed = b"".join(_jpegxl_parts(packed))[:_JXL_HEADER]
+        packed = b"".join(_jpegxl_parts(packed))[:_JXL_HEADER_BYTES]
     if packed[:2] != b"\xff\x0a" or len(packed) < 14:
         return None
-    bits = int.from_bytes(packed[2:_JXL_HEADER], "little")
+    bits = int.from_bytes(packed[2:_JXL_HEADER_BYTES], "little")
 
     def take(count: int) -> int:
         nonlocal bits
-        found, bits = bits & ((1 << count) - 1), bits >> count
-        return found
+        value, bits = bits & ((1 << count) - 1), bits >> count
+        return value
 
     def size() -> tuple[int, int]:
         small = take(1)
-        rows = 8 * (take(5) + 1) if small else take(_LONG[take(2)]) + 1
+        rows = 8 * (take(5) + 1) if small else take(_SIDE_BITS[take(2)]) + 1
         if ratio := take(3):
             return rows * _RATIOS[ratio - 1][0] // _RATIOS[ratio - 1][1], rows
-        return 8 * (take(5) + 1) if small else take(_LONG[take(2)]) + 1, rows
+        return 8 * (take(5) + 1) if small else take(_SIDE_BITS[take(2)]) + 1, rows
 
-    told = size()
+    dimensions = size()
     if not take(1) and take(1):  # all_default is unset, extra_fields is set
         take(3)  # orientation
         if take(1):
             size()  # intrinsic size
         if take(2):  # a preview, an animation
             return None
-    return told
+    return dimensions
 
 
 def _jpegxl_parts(packed: bytes) -> Iterator[bytes]:
     """Yields the codestream: whole (jxlc), or in parts (jxlp), without the number before each."""
-    for begin, end, kind in _boxes(packed):
+    for start, end, kind in _boxes(packed):
         if kind in (b"jxlc", b"jxlp"):
-            yield packed[begin + 4 * (kind == b"jxlp") : end]
+            yield packed[start + 4 * (kind == b"jxlp") : end]
 
 
 _READERS: dict[bytes, Callable[[bytes], tuple[int, int] | None]] = {

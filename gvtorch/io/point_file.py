@@ -27,13 +27,13 @@ from .resources import amount, memory_free
 from .source import number_type, told_as
 
 ENDINGS = ("npz", "ply", "fits", "fit", "fits.gz")
-_ALL = 2**62  # points
-_PLACES = ("position", "pos", "xyz", "points", "coord")
-_VALUES = ("value", "mass", "lumin", "intensit", "weight", "flux", "bright", "densit")
-_COLORS = ("color", "colour", "rgb")
-_RADII = ("radius", "radii", "smoothing")
+_ALL_POINTS = 2**62
+_POSITION_NAMES = ("position", "pos", "xyz", "points", "coord")
+_VALUE_NAMES = ("value", "mass", "lumin", "intensit", "weight", "flux", "bright", "densit")
+_COLOR_NAMES = ("color", "colour", "rgb")
+_RADIUS_NAMES = ("radius", "radii", "smoothing")
 _FITS_TYPES = tuple("BIJKEDF")  # codes of columns with a number or an array of numbers per row
-_MOST_HEADER = 65536  # bytes
+_MAX_HEADER_BYTES = 65536
 
 
 class ColumnNames(TypedDict, total=False):
@@ -58,10 +58,10 @@ class PointFile:
         """Opens the file, see `read_points`."""
         check.known("read_points", names, ColumnNames)
         self.path = Path(path)
-        self.columns = _columns(self.path)
+        self.columns = _read_columns(self.path)
         radius = names.get("radius")
         self._constant = radius if isinstance(radius, (int, float)) else None
-        self.used = _chosen(self.path, self.columns, names)
+        self.used = _choose_columns(self.path, self.columns, names)
 
     def __len__(self) -> int:
         return len(self.columns[self.used["positions"][0]])
@@ -71,16 +71,20 @@ class PointFile:
         for start in range(0, len(self), count):
             part = slice(start, start + count)
             with told_as(ValueError, str(self.path), "can't be read"):
-                found = {name: self._joined(used, part) for name, used in self.used.items()}
-                if "colors" in found:
-                    kinds = {self.columns[name].dtype for name in self.used["colors"]}
-                    found["colors"] = _linear(found["colors"][:, :3], kinds)
-                radius = found["radius"][:, 0] if "radius" in found else self._constant
-                yield Points(found["positions"], found.get("values"), found.get("colors"), radius)
+                fields = {name: self._join_columns(used, part) for name, used in self.used.items()}
+                if "colors" in fields:
+                    dtypes = {self.columns[name].dtype for name in self.used["colors"]}
+                    fields["colors"] = _linear_colors(fields["colors"][:, :3], dtypes)
+                radius = fields["radius"][:, 0] if "radius" in fields else self._constant
+                yield Points(
+                    fields["positions"], fields.get("values"), fields.get("colors"), radius
+                )
 
-    def _joined(self, names: Sequence[str], part: slice) -> np.ndarray:
+    def _join_columns(self, names: Sequence[str], part: slice) -> np.ndarray:
         columns = [np.asarray(self.columns[name][part]) for name in names]
-        return np.concatenate([one[:, None] if one.ndim == 1 else one for one in columns], 1)
+        return np.concatenate(
+            [column[:, None] if column.ndim == 1 else column for column in columns], 1
+        )
 
 
 def read_points(path: str | Path, **names: Unpack[ColumnNames]) -> Points:
@@ -105,38 +109,43 @@ def read_points(path: str | Path, **names: Unpack[ColumnNames]) -> Points:
             a number is not finite.
         ImportError: astropy is not installed.
     """
-    return next(PointFile(path, **names).blocks(_ALL))
+    return next(PointFile(path, **names).blocks(_ALL_POINTS))
 
 
-def _columns(path: Path) -> dict[str, np.ndarray]:
-    name = path.name.lower()
-    ending = next((one for one in ENDINGS if name.endswith("." + one)), None)
+def _read_columns(path: Path) -> dict[str, np.ndarray]:
+    file_name = path.name.lower()
+    ending = next((candidate for candidate in ENDINGS if file_name.endswith("." + candidate)), None)
     if ending is None:
         raise ValueError(f"{path}: a name of points must end in {', '.join(ENDINGS)}")
     if not path.is_file():
         raise FileNotFoundError(f"file not found: {path}")
-    read = {"npz": _read_npz, "ply": _read_ply}.get(ending, _read_fits)
+    reader = {"npz": _read_npz, "ply": _read_ply}.get(ending, _read_fits)
     with told_as(ValueError, str(path), f"can't be read as {ending}"):
-        found = {n: one for n, one in read(path).items() if one.dtype.kind in "iuf" and one.ndim}
-    sizes = [len(one) for one in found.values()]
-    count = max(sizes, key=sizes.count) if sizes else 0  # the length that most columns have
+        columns = {
+            n: column
+            for n, column in reader(path).items()
+            if column.dtype.kind in "iuf" and column.ndim
+        }
+    lengths = [len(column) for column in columns.values()]
+    count = max(lengths, key=lengths.count) if lengths else 0  # the length that most columns have
     if not count:
         raise ValueError(f"{path}: holds no columns of numbers")
-    meant = _PLACES + _COLORS + _VALUES + _RADII  # columns of other names may have any length
-    others = [
-        f"{name} ({len(one)})"
-        for name, one in found.items()
-        if len(one) != count and name.lower().startswith(meant)
+    # Columns of other names may have any length.
+    usual_names = _POSITION_NAMES + _COLOR_NAMES + _VALUE_NAMES + _RADIUS_NAMES
+    other_lengths = [
+        f"{name} ({len(column)})"
+        for name, column in columns.items()
+        if len(column) != count and name.lower().startswith(usual_names)
     ]
-    if others:
-        told = f"{path}: not read, since others have {count} rows: {', '.join(others)}"
-        warnings.warn(told, stacklevel=4)
-    return {n: one for n, one in found.items() if len(one) == count and one.ndim <= 2}
+    if other_lengths:
+        message = f"{path}: not read, since others have {count} rows: {', '.join(other_lengths)}"
+        warnings.warn(message, stacklevel=4)
+    return {n: column for n, column in columns.items() if len(column) == count and column.ndim <= 2}
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(path) as archive:
-        size, free = sum(one.file_size for one in archive.infolist()), memory_free()
+        size, free = sum(member.file_size for member in archive.infolist()), memory_free()
     if size > free:
         raise ValueError(f"it unpacks to {amount(size)}, {amount(free)} of memory are free")
     with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
@@ -152,57 +161,57 @@ def _read_fits(path: Path) -> dict[str, np.ndarray]:
         with ExitStack() as stack:
             file = stack.enter_context(path.open("rb"))
             with header_budget(str(path)):
-                units = stack.enter_context(fits.open(file, memmap=not packed))
-                tables = (u for u in units if isinstance(u, fits.BinTableHDU | fits.TableHDU))
-                table = next((u for u in tables if u.header["NAXIS2"]), None)
+                hdus = stack.enter_context(fits.open(file, memmap=not packed))
+                tables = (hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU))
+                table = next((hdu for hdu in tables if hdu.header["NAXIS2"]), None)
             if table is None:
                 raise ValueError("it has no table with rows")
-            begin, size = int(table.fileinfo()["datLoc"]), path.stat().st_size
-            most = min(size * MOST_PACKED, memory_free()) if packed else size - begin
-            if table.size > most:
-                raise ValueError(f"its rows take {table.size} bytes, at most {most} can be there")
-            kinds = zip(table.columns.names, table.columns.formats, strict=True)
+            start, size = int(table.fileinfo()["datLoc"]), path.stat().st_size
+            limit = min(size * MOST_PACKED, memory_free()) if packed else size - start
+            if table.size > limit:
+                raise ValueError(f"its rows take {table.size} bytes, at most {limit} can be there")
+            column_formats = zip(table.columns.names, table.columns.formats, strict=True)
             return {
                 name: np.asarray(table.data[name])
-                for name, kind in kinds
-                if kind.lstrip("0123456789")[:1] in _FITS_TYPES
+                for name, column_format in column_formats
+                if column_format.lstrip("0123456789")[:1] in _FITS_TYPES
             }
 
 
 def _read_ply(path: Path) -> dict[str, np.ndarray]:
     """Returns the columns of the vertices; only binary rows of fixed size may precede them."""
     with path.open("rb") as file:
-        head = file.read(_MOST_HEADER)
-        lines = head.partition(b"end_header")[0].decode("ascii").splitlines()
-        start = head.find(b"\n", head.find(b"end_header")) + 1
+        header = file.read(_MAX_HEADER_BYTES)
+        lines = header.partition(b"end_header")[0].decode("ascii").splitlines()
+        start = header.find(b"\n", header.find(b"end_header")) + 1
         if not lines or lines[0].strip() != "ply" or start == 0:
             raise ValueError("it has no header of PLY")
         layout, elements = _ply_header(lines)
-        skipped = 0
-        for name, count, kinds in elements:
+        skipped_bytes = 0
+        for name, count, fields in elements:
             if count < 0:
                 raise ValueError(f"it declares {count} of {name}")
             if name != "vertex":
-                if kinds is None or layout == "ascii":
+                if fields is None or layout == "ascii":
                     raise ValueError(f"its vertices come after {name}")
-                skipped += count * np.dtype(kinds).itemsize
+                skipped_bytes += count * np.dtype(fields).itemsize
                 continue
-            if kinds is None:
+            if fields is None:
                 raise ValueError("its vertices have lists")
-            size = path.stat().st_size - start - skipped
-            dtype = np.dtype(kinds)
-            least = count * (2 * len(kinds) - 1 if layout == "ascii" else dtype.itemsize)
-            if not 0 < least <= size:
-                raise ValueError(f"{count} vertices take {least} bytes, it has {size}")
+            size = path.stat().st_size - start - skipped_bytes
+            dtype = np.dtype(fields)
+            needed_bytes = count * (2 * len(fields) - 1 if layout == "ascii" else dtype.itemsize)
+            if not 0 < needed_bytes <= size:
+                raise ValueError(f"{count} vertices take {needed_bytes} bytes, it has {size}")
             if layout == "ascii":
                 file.seek(start)
-                lines_of = itertools.islice(file, count)
-                table = np.loadtxt(lines_of, np.float64, ndmin=2, usecols=range(len(kinds)))
+                rows_text = itertools.islice(file, count)
+                table = np.loadtxt(rows_text, np.float64, ndmin=2, usecols=range(len(fields)))
                 if len(table) != count:
                     raise ValueError(f"{count} vertices are declared, {len(table)} are there")
-                return {n: table[:, i].astype(k[1:]) for i, (n, k) in enumerate(kinds)}
-            rows = np.memmap(path, dtype, "r", start + skipped, (count,))
-            return {column: rows[column] for column, _ in kinds}
+                return {n: table[:, i].astype(k[1:]) for i, (n, k) in enumerate(fields)}
+            rows = np.memmap(path, dtype, "r", start + skipped_bytes, (count,))
+            return {column: rows[column] for column, _ in fields}
     raise ValueError("it has no vertices")
 
 
@@ -212,84 +221,87 @@ def _ply_header(
     """Returns "ascii", "<" or ">", and the name, the number of rows and the columns of each element
     (None if some are lists).
     """
-    order, layout = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}, ""
+    byte_orders, layout = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}, ""
     elements: list[tuple[str, int, list[tuple[str, str]] | None]] = []
-    for words in (line.split() for line in lines[1:]):
-        if words[:1] == ["format"]:
-            layout = order[words[1]]
-        elif words[:1] == ["element"]:
-            elements.append((words[1], int(words[2]), []))
-        elif words[:1] == ["property"]:
-            name, count, kinds = elements[-1]
-            if words[1] == "list" or kinds is None:
+    for tokens in (line.split() for line in lines[1:]):
+        if tokens[:1] == ["format"]:
+            layout = byte_orders[tokens[1]]
+        elif tokens[:1] == ["element"]:
+            elements.append((tokens[1], int(tokens[2]), []))
+        elif tokens[:1] == ["property"]:
+            name, count, fields = elements[-1]
+            if tokens[1] == "list" or fields is None:
                 elements[-1] = (name, count, None)
-            elif (kind := number_type(words[1])) is not None:
-                kinds.append((words[2], layout + kind))
+            elif (kind := number_type(tokens[1])) is not None:
+                fields.append((tokens[2], layout + kind))
             else:
-                raise ValueError(f"{words[1]!r} is not a number type")
+                raise ValueError(f"{tokens[1]!r} is not a number type")
     if not layout:
         raise ValueError("its header has no format")
     return ("ascii" if layout == "=" else layout), elements
 
 
-def _chosen(
+def _choose_columns(
     path: Path, columns: Mapping[str, np.ndarray], names: ColumnNames
 ) -> dict[str, list[str]]:
     """Returns the names of the columns that make up positions, values, colors and radius."""
-    widths = {name: math.prod(one.shape[1:]) for name, one in columns.items()}
-    plain = {name.lower(): name for name in columns}
-    found: dict[str, list[str]] = {}
-    given: Any
-    for what, given in names.items():
-        if given is None or isinstance(given, (int, float)):
+    widths = {name: math.prod(column.shape[1:]) for name, column in columns.items()}
+    by_lower_name = {name.lower(): name for name in columns}
+    chosen: dict[str, list[str]] = {}
+    argument: Any
+    for role, argument in names.items():
+        if argument is None or isinstance(argument, (int, float)):
             continue
-        words = given.split(",") if isinstance(given, str) else list(given)
-        found[what] = [word.strip() for word in words]
-        for word in found[what]:
-            if word not in columns:
-                raise ValueError(f"{path}: has no column {word!r}; it has {', '.join(columns)}")
+        column_names = argument.split(",") if isinstance(argument, str) else list(argument)
+        chosen[role] = [name.strip() for name in column_names]
+        for name in chosen[role]:
+            if name not in columns:
+                raise ValueError(f"{path}: has no column {name!r}; it has {', '.join(columns)}")
 
-    def called(what: str, begins: Sequence[str], sizes: Sequence[int]) -> None:
-        fits = [
+    def choose_by_prefix(role: str, prefixes: Sequence[str], allowed_widths: Sequence[int]) -> None:
+        matches = [
             name
-            for low, name in plain.items()
-            if low.startswith(tuple(begins)) and widths[name] in sizes
+            for lower_name, name in by_lower_name.items()
+            if lower_name.startswith(tuple(prefixes)) and widths[name] in allowed_widths
         ]
-        if len(fits) > 1:
+        if len(matches) > 1:
             raise ValueError(
-                f"{path}: {' or '.join(fits)} may be its {what}: say which, as in {what}={fits[0]}"
+                f"{path}: {' or '.join(matches)} may be its {role}: say which, as in "
+                f"{role}={matches[0]}"
             )
-        if fits:
-            found[what] = fits
+        if matches:
+            chosen[role] = matches
 
-    def three(what: str, *groups: str) -> bool:
+    def choose_several(role: str, *groups: str) -> bool:
         for group in groups:
-            words = group.split()
-            if all(word in plain and widths[plain[word]] == 1 for word in words):
-                found[what] = [plain[word] for word in words]
+            column_names = group.split()
+            if all(
+                name in by_lower_name and widths[by_lower_name[name]] == 1 for name in column_names
+            ):
+                chosen[role] = [by_lower_name[name] for name in column_names]
                 return True
         return False
 
-    if "positions" not in found and not three("positions", "x y z"):
-        called("positions", _PLACES, [3])
-    if "positions" not in found:
-        told = ", ".join(f"{name} ({width})" for name, width in widths.items())
-        raise ValueError(f"{path}: which columns are positions? It has {told}")
-    if "colors" not in found and not three("colors", "red green blue", "r g b"):
-        called("colors", _COLORS, [3, 4])
-    if "values" not in found:
-        called("values", _VALUES, [1, 2, 3, 4])
+    if "positions" not in chosen and not choose_several("positions", "x y z"):
+        choose_by_prefix("positions", _POSITION_NAMES, [3])
+    if "positions" not in chosen:
+        listed = ", ".join(f"{name} ({width})" for name, width in widths.items())
+        raise ValueError(f"{path}: which columns are positions? It has {listed}")
+    if "colors" not in chosen and not choose_several("colors", "red green blue", "r g b"):
+        choose_by_prefix("colors", _COLOR_NAMES, [3, 4])
+    if "values" not in chosen:
+        choose_by_prefix("values", _VALUE_NAMES, [1, 2, 3, 4])
     if names.get("radius") is None:
-        called("radius", _RADII, [1])
-    for what, sizes in (("positions", (3,)), ("colors", (3, 4)), ("radius", (1,))):
-        total = sum(widths[name] for name in found.get(what, ()))
-        if what in found and total not in sizes:
-            raise ValueError(f"{path}: {what} must be {sizes[0]} numbers, the columns are {total}")
-    return found
+        choose_by_prefix("radius", _RADIUS_NAMES, [1])
+    for role, sizes in (("positions", (3,)), ("colors", (3, 4)), ("radius", (1,))):
+        total = sum(widths[name] for name in chosen.get(role, ()))
+        if role in chosen and total not in sizes:
+            raise ValueError(f"{path}: {role} must be {sizes[0]} numbers, the columns are {total}")
+    return chosen
 
 
-def _linear(colors: np.ndarray, kinds: set[Any]) -> np.ndarray:
+def _linear_colors(colors: np.ndarray, dtypes: set[Any]) -> np.ndarray:
     """Converts whole numbers, which are sRGB, to linear colours; others are linear already."""
-    if not all(kind.kind in "iu" for kind in kinds):
+    if not all(column_dtype.kind in "iu" for column_dtype in dtypes):
         return colors
-    return array_from_srgb(colors / max(np.iinfo(kind).max for kind in kinds))
+    return array_from_srgb(colors / max(np.iinfo(column_dtype).max for column_dtype in dtypes))

@@ -29,7 +29,7 @@ from .stores.store_layout import WORK
 from .stores.unfinished import as_json, checksum, fingerprint, is_begun, write_json
 
 CHANNELS = ("value", "color")
-_MADE_OF = "made_of.json"
+_RECORD_NAME = "made_of.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,50 +37,52 @@ class SplatSource(VolumeSource):
     """Sorted points, summed in the finest voxels."""
 
     folder: str
-    marks: tuple[Any, ...]  # identify points and settings: equal while these are unchanged
-    words: tuple[str, ...]  # options of the command line that makes the store
+    identity: tuple[Any, ...]  # of points and settings: equal while these are unchanged
+    command_options: tuple[str, ...]  # options of the command line that makes the store
 
     @classmethod
-    def of(cls, folder: Path, channel: str, **told: Any) -> SplatSource:
-        """Returns the sorted points of a folder as a volume; `told` are path, marks and words."""
-        _opened.cache_clear()  # other points may have been there
-        found = _opened(str(folder))
-        x, y, z = found.grid.extent
-        dx, dy, dz = found.grid.spacing_3.tolist()
+    def of(cls, folder: Path, channel: str, **fields: Any) -> SplatSource:
+        """Returns the sorted points of a folder as a volume; `fields` are path, identity and
+        command_options.
+        """
+        _open_sorted.cache_clear()  # other points may have been there
+        points = _open_sorted(str(folder))
+        x, y, z = points.grid.extent
+        dx, dy, dz = points.grid.spacing_3.tolist()
         channels = PREMULTIPLIED if channel == "color" else ()
         return cls(
-            shape=(z, y, x, found.width),
+            shape=(z, y, x, points.width),
             axes="zyxc",
             stored="float32",
             spacing=(dx, dy, dz),
-            origin=found.grid.origin,
+            origin=points.grid.origin,
             info=ImageInfo(channels=channels, quantity=channel),
             folder=str(folder),
-            **told,
+            **fields,
         )
 
     def fingerprint(self) -> list[Any]:
         """Returns values that identify the points and the settings."""
-        return list(self.marks)
+        return list(self.identity)
 
     def command(self, store: str) -> tuple[str, ...]:
         """Returns the words of the `gvtorch splat` command that makes a store of it."""
-        return ("gvtorch", "splat", self.path, "-o", store, *self.words)
+        return ("gvtorch", "splat", self.path, "-o", store, *self.command_options)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
         low, high = (
             tuple(end) for end in zip(*((s.start, s.stop) for s in index[:3]), strict=True)
         )
-        held = region(_opened(self.folder), low, high)[..., index[3]]
+        sums = region(_open_sorted(self.folder), low, high)[..., index[3]]
         with np.errstate(over="ignore"):
-            return held.astype(np.float32)
+            return sums.astype(np.float32)
 
 
-_opened = functools.lru_cache(maxsize=2)(SortedPoints.open)
+_open_sorted = functools.lru_cache(maxsize=2)(SortedPoints.open)
 
 
 @dataclass(frozen=True)
-class _Lit:
+class _LitPoints:
     """Points that `Points.lit` has turned into light."""
 
     points: PointSource
@@ -136,18 +138,18 @@ def splat(
     check.one_of("splat", "channel", channel, CHANNELS)
     begun = is_begun(target, resume=resume)
     source: Any = points if isinstance(points, Points) else PointFile(points, **names)
-    told = {"extent": extent, "box": box, "channel": channel}
-    marks: list[Any] = [_marks(points), {**told, "opacity": opacity, **names}]
+    settings = {"extent": extent, "box": box, "channel": channel}
+    identity: list[Any] = [_points_identity(points), {**settings, "opacity": opacity, **names}]
     if channel == "color":
-        source = _Lit(source, check.number("splat", "opacity", opacity, low=0, high=1))
+        source = _LitPoints(source, check.number("splat", "opacity", opacity, low=0, high=1))
     folder = target / WORK / "points"
-    _sort(source, folder, marks, begun, extent=extent, box=box, memory=memory, progress=progress)
+    _sort(source, folder, identity, begun, extent=extent, box=box, memory=memory, progress=progress)
     volume = SplatSource.of(
         folder,
         channel,
         path="points" if isinstance(points, Points) else str(points),
-        marks=tuple(marks),
-        words=_words(extent, channel, opacity, box, names),
+        identity=tuple(identity),
+        command_options=_command_options(extent, channel, opacity, box, names),
     )
     return convert(
         volume,
@@ -160,11 +162,13 @@ def splat(
     )
 
 
-def _sort(source: PointSource, folder: Path, marks: list[Any], begun: bool, **options: Any) -> None:
+def _sort(
+    source: PointSource, folder: Path, identity: list[Any], begun: bool, **options: Any
+) -> None:
     """Sorts the points into a folder, unless it holds them already."""
-    made_of = folder / _MADE_OF
-    told = as_json(marks)
-    if made_of.exists() and json.loads(made_of.read_text(encoding="utf-8")) == told:
+    record = folder / _RECORD_NAME
+    identity_json = as_json(identity)
+    if record.exists() and json.loads(record.read_text(encoding="utf-8")) == identity_json:
         return
     if begun:
         raise ValueError(
@@ -177,18 +181,18 @@ def _sort(source: PointSource, folder: Path, marks: list[Any], begun: bool, **op
     except BaseException:
         shutil.rmtree(folder.parent.parent, ignore_errors=True)  # nothing else is there
         raise
-    write_json(made_of, told)
+    write_json(record, identity_json)
 
 
-def _marks(points: str | Path | Points) -> list[Any]:
+def _points_identity(points: str | Path | Points) -> list[Any]:
     """Returns values that identify points: equal while these are unchanged."""
     if not isinstance(points, Points):
         return fingerprint(points)
     columns = (points.positions, points.values, points.colors, points.radius)
-    return [len(points), checksum(one for one in columns if one is not None)]
+    return [len(points), checksum(column for column in columns if column is not None)]
 
 
-def _words(
+def _command_options(
     extent: int | Sequence[int],
     channel: str,
     opacity: float,
@@ -197,13 +201,13 @@ def _words(
 ) -> tuple[str, ...]:
     """Returns the options of the command line that makes the same store."""
     sizes = [extent] if isinstance(extent, int) else extent
-    words = ["--extent", ",".join(map(str, sizes)), "--channel", channel]
-    words += ["--opacity", f"{opacity:g}"] if channel == "color" else []
-    words += ["--box", ",".join(f"{n!r}" for end in box for n in end)] if box else []
-    for name, given in names.items():
-        if given is not None:
-            several = [str(given)]
-            if isinstance(given, Iterable) and not isinstance(given, str):
-                several = [str(one) for one in given]
-            words += [f"--{name}", ",".join(several)]
-    return tuple(words)
+    options = ["--extent", ",".join(map(str, sizes)), "--channel", channel]
+    options += ["--opacity", f"{opacity:g}"] if channel == "color" else []
+    options += ["--box", ",".join(f"{n!r}" for end in box for n in end)] if box else []
+    for name, value in names.items():
+        if value is not None:
+            parts = [str(value)]
+            if isinstance(value, Iterable) and not isinstance(value, str):
+                parts = [str(part) for part in value]
+            options += [f"--{name}", ",".join(parts)]
+    return tuple(options)

@@ -11,8 +11,8 @@ import numpy as np
 
 _FACE = re.compile(rb"^[ \t]*f((?:[ \t]+[-\d/]+){4,})[ \t]*(?=\r?$)", re.MULTILINE)
 _VERTEX = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
-_MOST = 1000  # corners of a polygon to cut: in the worst case, the time grows as their cube
-_ROUND = 1e-9  # of the polygon's area: turns up to this count as straight
+_MAX_CORNERS = 1000  # of a polygon to cut: in the worst case, the time grows as their cube
+_STRAIGHT_TURN = 1e-9  # of the polygon's area: turns up to this count as straight
 
 
 def cut_polygons(content: bytes) -> bytes:
@@ -22,52 +22,53 @@ def cut_polygons(content: bytes) -> bytes:
         ValueError: A position is no number, or such a polygon has more than 1000 corners.
     """
     faces: dict[int, list[re.Match[bytes]]] = defaultdict(list)
-    for found in _FACE.finditer(content):
-        faces[len(found[1].split())].append(found)
+    for match in _FACE.finditer(content):
+        faces[len(match[1].split())].append(match)
     if not faces:
         return content
-    places = np.array([found.groups() for found in _VERTEX.finditer(content)], np.float64)
-    cut: dict[int, tuple[re.Match[bytes], list[list[int]]]] = {}  # by the offset of the line
-    for count, some in faces.items():
-        words = re.sub(rb"/\S*", b"", b" ".join(found[1] for found in some)).split()
-        corner = np.array(words, np.int64).reshape(-1, count)
-        corner = np.where(corner > 0, corner - 1, corner + len(places))
-        there = np.flatnonzero(((corner >= 0) & (corner < len(places))).all(1))
-        flat = _flat(places[corner[there]])
-        for at in np.flatnonzero((_turns(flat) < -_ROUND).any(1)).tolist():
-            found = some[there[at]]
-            if count > _MOST:
+    vertices = np.array([match.groups() for match in _VERTEX.finditer(content)], np.float64)
+    # The line of each cut polygon and its triangles, by the offset of the line.
+    triangulated: dict[int, tuple[re.Match[bytes], list[list[int]]]] = {}
+    for count, matches in faces.items():
+        tokens = re.sub(rb"/\S*", b"", b" ".join(match[1] for match in matches)).split()
+        corners = np.array(tokens, np.int64).reshape(-1, count)
+        corners = np.where(corners > 0, corners - 1, corners + len(vertices))
+        valid = np.flatnonzero(((corners >= 0) & (corners < len(vertices))).all(1))
+        flat = _project(vertices[corners[valid]])
+        for number in np.flatnonzero((_turns(flat) < -_STRAIGHT_TURN).any(1)).tolist():
+            match = matches[valid[number]]
+            if count > _MAX_CORNERS:
                 raise ValueError(
-                    f"a polygon of {count} corners is not convex, at most {_MOST} can be cut"
+                    f"a polygon of {count} corners is not convex, at most {_MAX_CORNERS} can be cut"
                 )
-            cut[found.start()] = found, ears(flat[at])
+            triangulated[match.start()] = match, ears(flat[number])
     parts, end = [], 0
-    for start in sorted(cut):
-        found, triangles = cut[start]
-        words = found[1].split()
-        lines = [b"f " + b" ".join(words[one] for one in three) for three in triangles]
+    for start in sorted(triangulated):
+        match, triangles = triangulated[start]
+        tokens = match[1].split()
+        lines = [b"f " + b" ".join(tokens[corner] for corner in triangle) for triangle in triangles]
         parts += [content[end:start], b"\n".join(lines)]
-        end = found.end()
+        end = match.end()
     return b"".join([*parts, content[end:]])
 
 
-def _flat(places: np.ndarray) -> np.ndarray:
+def _project(corners: np.ndarray) -> np.ndarray:
     """Projects corners (p, n, 3) of polygons to their planes, (p, n, 2): counter-clockwise, of
     area 1.
 
     Source: the normal is Newell's; Sutherland, Sproull, Schumacker, "A characterization of ten
         hidden-surface algorithms", ACM Computing Surveys 6, 1974.
     """
-    arm = places - places.mean(1, keepdims=True)
-    normal = 0.5 * np.cross(arm, np.roll(arm, -1, 1)).sum(1)
+    offsets = corners - corners.mean(1, keepdims=True)
+    normal = 0.5 * np.cross(offsets, np.roll(offsets, -1, 1)).sum(1)
     area = np.linalg.norm(normal, axis=1)[:, None]
     area[area == 0] = 1
     normal = normal / area
-    least = np.eye(3)[np.abs(normal).argmin(1)]
-    right = np.cross(least, normal)
+    least_axis = np.eye(3)[np.abs(normal).argmin(1)]
+    right = np.cross(least_axis, normal)
     right /= np.maximum(np.linalg.norm(right, axis=1, keepdims=True), 1e-300)
     basis = np.stack((right, np.cross(normal, right)), -1)
-    return arm @ basis / np.sqrt(area)[:, None]
+    return offsets @ basis / np.sqrt(area)[:, None]
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -89,25 +90,29 @@ def ears(flat: np.ndarray) -> list[list[int]]:
 
     Source: Meisters, "Polygons have ears", American Mathematical Monthly 82, 1975.
     """
-    left = list(range(len(flat)))
-    found = []
-    while len(left) > 3:
-        own = flat[left]
-        turn = _turns(own)
-        not_convex = own[turn <= _ROUND]
-        at = next((n for n in np.argsort(-turn) if _is_ear(own, int(n), turn[n], not_convex)), None)
-        if at is None:
+    remaining = list(range(len(flat)))
+    triangles = []
+    while len(remaining) > 3:
+        polygon = flat[remaining]
+        turn = _turns(polygon)
+        not_convex = polygon[turn <= _STRAIGHT_TURN]
+        ear = next(
+            (n for n in np.argsort(-turn) if _is_ear(polygon, int(n), turn[n], not_convex)), None
+        )
+        if ear is None:
             break
-        n = int(at)
-        found.append([left[n - 1], left[n], left[(n + 1) % len(left)]])
-        del left[n]
-    return found + [[left[0], left[n], left[n + 1]] for n in range(1, len(left) - 1)]
+        n = int(ear)
+        triangles.append([remaining[n - 1], remaining[n], remaining[(n + 1) % len(remaining)]])
+        del remaining[n]
+    return triangles + [
+        [remaining[0], remaining[n], remaining[n + 1]] for n in range(1, len(remaining) - 1)
+    ]
 
 
-def _is_ear(polygon: np.ndarray, at: int, turn: float, not_convex: np.ndarray) -> bool:
+def _is_ear(polygon: np.ndarray, corner: int, turn: float, not_convex: np.ndarray) -> bool:
     if turn <= 0:
         return False
-    a, b, c = polygon[at - 1], polygon[at], polygon[(at + 1) % len(polygon)]
+    a, b, c = polygon[corner - 1], polygon[corner], polygon[(corner + 1) % len(polygon)]
     inside = np.ones(len(not_convex), bool)
     for begin, end in ((a, b), (b, c), (c, a)):
         inside &= _cross(end - begin, not_convex - begin) >= 0

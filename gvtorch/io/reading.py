@@ -24,11 +24,11 @@ from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten
 from .remote import fetch, is_file_url, split_url
 from .resources import amount, memory_free
-from .source import ArraySource, Index, MemorySource, VolumeSource, no_time, told_as
+from .source import ArraySource, Index, MemorySource, VolumeSource, no_time_message, told_as
 from .stores.ngff import is_zarr
-from .stores.store_layout import DTYPES, MOST_TIMES, MOST_VOXELS, StoreError
+from .stores.store_layout import DTYPES, MAX_STORE_VOXELS, MAX_TIMES, StoreError
 
-_MOST_CHANNELS = 2**10
+_MAX_CHANNELS = 2**10
 
 
 class FormatSettings(TypedDict, total=False):
@@ -86,8 +86,13 @@ def read_volume(
             not fit.
         ImportError: A library is missing; the message has the pip command that installs it.
     """
-    told: dict[str, Any] = {"spacing": spacing, "origin": origin, "time": time, "oblique": oblique}
-    source = open_source(path, most=MAX_VOXELS, labels=labels, **told, **options)
+    placement: dict[str, Any] = {
+        "spacing": spacing,
+        "origin": origin,
+        "time": time,
+        "oblique": oblique,
+    }
+    source = open_source(path, most=MAX_VOXELS, labels=labels, **placement, **options)
     if time is None and source.times > 1:
         warnings.warn(
             f"{source.path}: has {source.times} time points, this is the first; "
@@ -99,7 +104,7 @@ def read_volume(
 
 def volume_of(source: VolumeSource, nan: float | None = None) -> Volume:
     """Reads a source's time point; `nan` and errors as in `read_volume`."""
-    data, name = read_whole(source, source.time)[0], Path(source.path).name
+    data, name = read_time_points(source, source.time)[0], Path(source.path).name
     return Volume(data, source.spacing, source.origin, name=name, nan=nan, info=source.info)
 
 
@@ -111,7 +116,7 @@ def open_source(
     time: int | None = None,
     oblique: Oblique | None = None,
     labels: bool = False,
-    most: int = MOST_VOXELS * _MOST_CHANNELS,
+    most: int = MAX_STORE_VOXELS * _MAX_CHANNELS,
     **options: Unpack[FormatSettings],
 ) -> VolumeSource:
     """Reads a volume's header and returns a source, from which its voxels can be read by region.
@@ -123,27 +128,27 @@ def open_source(
         The source, its `time` as asked for, or 0.
     """
     check.known("read_volume", options, FormatSettings)
-    given: dict[str, Any] = {name: v for name, v in options.items() if v is not None}
-    text, kind, opener = _find(path, given)
+    arguments: dict[str, Any] = {name: v for name, v in options.items() if v is not None}
+    text, kind, opener = _find_opener(path, arguments)
     for name in ("key", "axes"):
-        check.text(text, name, given.get(name))
+        check.text(text, name, arguments.get(name))
     check.instance(text, "labels", labels, bool)
     with told_as(ValueError, text, f"can't be read as {kind}", StoreError, TimeoutError):
         # Numbers out of range are refused below; NumPy would print its warnings before the error.
         with header_budget(text), np.errstate(all="ignore"):
-            source = opener(**given)
+            source = opener(**arguments)
         check_files(source)
         if labels:
             source = source.as_labels()
         check_extent(text, (*source.extent, source.width), most=most)
-        check_extent(text, source.extent, most=MOST_VOXELS)
-        if not 1 <= source.times <= MOST_TIMES or min(source.shape) < 1:
-            raise ValueError(f"{text}: expected 1 to {MOST_TIMES} time points, got {source.times}")
+        check_extent(text, source.extent, most=MAX_STORE_VOXELS)
+        if not 1 <= source.times <= MAX_TIMES or min(source.shape) < 1:
+            raise ValueError(f"{text}: expected 1 to {MAX_TIMES} time points, got {source.times}")
         if time is not None and (type(time) is not int or not 0 <= time < source.times):
-            raise ValueError(no_time(text, time, source.times))
+            raise ValueError(no_time_message(text, time, source.times))
         source = source.at_time(time or 0)
-        known = source.info.labels and np.dtype(source.dtype).kind in "iuf"
-        if source.dtype not in DTYPES and not known:
+        is_label_number = source.info.labels and np.dtype(source.dtype).kind in "iuf"
+        if source.dtype not in DTYPES and not is_label_number:
             raise ValueError(f"{text}: values must be real numbers, got dtype {source.dtype}")
         source.check_file()
         if source.oblique is not None and spacing is not None and oblique != "keep":
@@ -152,61 +157,66 @@ def open_source(
                 "out, or keep the voxels as they are with oblique='keep' (--oblique keep)"
             )
         with np.errstate(all="ignore"):
-            source = straighten(source, oblique, place=origin)
+            source = straighten(source, oblique, first_voxel=origin)
     if source.lost:
-        told = " ".join("; ".join(source.lost).split())  # in one line, whatever the file says
-        warnings.warn(f"{text}: not kept: {told}", stacklevel=2)
-    return at_place(text, source, spacing, origin)
+        dropped = " ".join("; ".join(source.lost).split())  # in one line, whatever the file says
+        warnings.warn(f"{text}: not kept: {dropped}", stacklevel=2)
+    return with_placement(text, source, spacing, origin)
 
 
-def _find(path: Any, given: dict[str, Any]) -> tuple[str, str, Callable[..., VolumeSource]]:
-    """Returns a volume's name in messages, its format, and its opener; may put `key` in `given`."""
+def _find_opener(
+    path: Any, arguments: dict[str, Any]
+) -> tuple[str, str, Callable[..., VolumeSource]]:
+    """Returns a volume's name in messages, its format, and its opener; may add `key` to
+    `arguments`.
+    """
     if not isinstance(path, (str, PathLike)):
         text, kind = "array", "an array"
         opener: Callable[..., VolumeSource] = partial(as_source, "read_volume", path)
-        known: tuple[str, ...] = ("axes",)
+        known_options: tuple[str, ...] = ("axes",)
     else:
-        text, inner = split_url(str(path))
+        text, key = split_url(str(path))
         if is_file_url(text):
             text = str(fetch(text))
-        elif inner is None:
-            text, inner = split_path(text)
-        if inner is not None:
-            given["key"] = inner.strip("/") if is_zarr(text) else inner
+        elif key is None:
+            text, key = split_path(text)
+        if key is not None:
+            arguments["key"] = key.strip("/") if is_zarr(text) else key
         if not is_zarr(text) and not Path(text).exists():
             raise FileNotFoundError(f"volume not found: {path}")
         if "://" not in text:
             check_regular(text)
-        found = find_format(text, raw="shape" in given)
-        kind, known = found.name, found.options
-        opener = partial(found.open, text)
-    for name in sorted(set(given).difference(known)):
+        file_format = find_format(text, raw="shape" in arguments)
+        kind, known_options = file_format.name, file_format.options
+        opener = partial(file_format.open, text)
+    for name in sorted(set(arguments).difference(known_options)):
         owners = ", ".join(other.name for other in FORMATS if name in other.options)
         raise ValueError(f"{text}: {name} is for {owners} files, this is {kind}")
     if isinstance(path, (str, PathLike)):
-        found.need_library(text)
+        file_format.need_library(text)
     return text, kind, opener
 
 
-def at_place(
-    where: str,
+def with_placement(
+    label: str,
     source: VolumeSource,
     spacing: Sequence[float] | None,
     origin: Sequence[float] | None,
 ) -> VolumeSource:
     """Returns the source with the user's spacing and origin; None keeps those of the file."""
     steps = source.spacing if spacing is None else spacing
-    place = source.origin if origin is None else origin
-    steps, place = check.placed(where, steps, place, source.extent)
-    return dataclasses.replace(source, spacing=steps, origin=place)
+    position = source.origin if origin is None else origin
+    steps, position = check.placed(label, steps, position, source.extent)
+    return dataclasses.replace(source, spacing=steps, origin=position)
 
 
-def read_whole(source: VolumeSource, first: int = 0, times: int = 1) -> np.ndarray:
+def read_time_points(source: VolumeSource, first: int = 0, times: int = 1) -> np.ndarray:
     """Reads whole time points, (t, z, y, x, c); raises ValueError if the file is damaged."""
     is_array = isinstance(source, (ObjectSource, MemorySource))
-    same = np.dtype(source.stored).name == source.dtype
-    stays = isinstance(source, ArraySource) and not source.whole and same  # mapped, not copied
-    if not isinstance(source, MemorySource) and not stays:
+    same_dtype = np.dtype(source.stored).name == source.dtype
+    # A file that is mapped is not copied.
+    is_mapped = isinstance(source, ArraySource) and not source.whole and same_dtype
+    if not isinstance(source, MemorySource) and not is_mapped:
         free, needed = memory_free(), source.peak_bytes + (times - 1) * source.nbytes
         if needed > free:
             raise ValueError(
@@ -232,36 +242,36 @@ class ObjectSource(VolumeSource):
         return self.array.read(index)
 
 
-def as_source(where: str, given: Any, axes: str | None = None) -> VolumeSource:
+def as_source(label: str, data: Any, axes: str | None = None) -> VolumeSource:
     """Returns a volume or an array as a source; see `ArrayLike.of` for arguments and errors."""
-    if isinstance(given, Volume):
-        place: dict[str, Any] = {"spacing": given.spacing, "origin": given.origin}
-        return MemorySource.of(given.data.cpu().numpy(), path=given.name, info=given.info, **place)
-    if not hasattr(given, "shape") or not hasattr(given, "dtype") or hasattr(given, "device"):
-        if not isinstance(given, np.ndarray):
-            return as_source(where, as_volume(given, axes=axes, where=where))
-    found = ArrayLike.of(where, given, axes)
-    kept = {name: getattr(found, name) for name in ("spacing", "origin", "info", "lost")}
-    kept["path"] = found.name or "array"
-    told = {name: getattr(found, name) for name in ("shape", "axes", "flips")}
-    told |= {"stored": found.dtype, **kept}
-    mapped = _in_file(given)
+    if isinstance(data, Volume):
+        placement: dict[str, Any] = {"spacing": data.spacing, "origin": data.origin}
+        return MemorySource.of(data.data.cpu().numpy(), path=data.name, info=data.info, **placement)
+    if not hasattr(data, "shape") or not hasattr(data, "dtype") or hasattr(data, "device"):
+        if not isinstance(data, np.ndarray):
+            return as_source(label, as_volume(data, axes=axes, where=label))
+    array = ArrayLike.of(label, data, axes)
+    described = {name: getattr(array, name) for name in ("spacing", "origin", "info", "lost")}
+    described["path"] = array.name or "array"
+    fields = {name: getattr(array, name) for name in ("shape", "axes", "flips")}
+    fields |= {"stored": array.dtype, **described}
+    mapped = _memory_map(data)
     if mapped is not None:
-        return ArraySource(**told, **mapped)
-    source = ObjectSource(array=found, **told)
-    if found.lazy:
+        return ArraySource(**fields, **mapped)
+    source = ObjectSource(array=array, **fields)
+    if array.lazy:
         return source
-    return MemorySource.of(source.read_times(0, source.times), **kept)
+    return MemorySource.of(source.read_times(0, source.times), **described)
 
 
-def _in_file(given: Any) -> dict[str, Any] | None:
+def _memory_map(array: Any) -> dict[str, Any] | None:
     """Returns file, offset and order of an array that is a whole memory map, which other processes
     can map too; None for others.
     """
-    if not isinstance(given, np.memmap) or given.filename is None:
+    if not isinstance(array, np.memmap) or array.filename is None:
         return None
-    whole = given.base is not None and not isinstance(given.base, np.ndarray)
-    if not whole or not (given.flags.c_contiguous or given.flags.f_contiguous):
+    is_whole_map = array.base is not None and not isinstance(array.base, np.ndarray)
+    if not is_whole_map or not (array.flags.c_contiguous or array.flags.f_contiguous):
         return None
-    fortran = not given.flags.c_contiguous
-    return {"file": str(given.filename), "offset": int(given.offset), "fortran": fortran}
+    fortran = not array.flags.c_contiguous
+    return {"file": str(array.filename), "offset": int(array.offset), "fortran": fortran}

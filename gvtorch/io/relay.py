@@ -1,4 +1,5 @@
-"""`through`: lets tensorstore read the folder at a URL by way of a relay, a server in this process.
+"""`relay_folder`: lets tensorstore read the folder at a URL by way of a relay, a server in this
+process.
 
 tensorstore accepts whatever a server sends, for however long. So it asks the relay instead, on
 127.0.0.1 and under a secret path. The relay reads the file, or the part of it, with `read_http`
@@ -22,9 +23,9 @@ from typing import TYPE_CHECKING, Any
 
 from ..base.messages import one_line
 from .http import (
-    SLOWEST,
-    SMALL,
-    STALL,
+    EXTRA_BYTES,
+    MIN_BYTES_PER_SECOND,
+    STALL_SECONDS,
     Endless,
     HttpStatus,
     file_url,
@@ -39,11 +40,13 @@ if TYPE_CHECKING:  # not at run time: `gvtorch --help` imports this module
 
     from .stores.chunk_files import ChunkFiles
 
-_JOINED = 1 << 27  # bytes of parts that tensorstore joins in one request
-_METADATA = 1 << 24  # bytes of a file of metadata
-_INDEXES = 1 << 26  # bytes of shards' indexes that are cached for a folder
+_MAX_JOINED_BYTES = 1 << 27  # bytes of parts that tensorstore joins in one request
+_MAX_METADATA_BYTES = 1 << 24  # bytes of a file of metadata
+_INDEX_CACHE_BYTES = 1 << 26  # bytes of shards' indexes that are cached for a folder
+_NO_BYTES = slice(0, 0)  # what "bytes=-0" asks for
 _RETRIES = {"max_retries": 4, "initial_delay": "200ms", "max_delay": "1s"}
-_TOGETHER = 16  # concurrent requests for one folder
+_UNSATISFIABLE = 416  # status code for a range with no byte of the file
+_MAX_CONCURRENT = 16  # concurrent requests for one folder
 
 
 class Relayed:
@@ -59,7 +62,7 @@ class Relayed:
             "driver": "http",
             "base_url": base,
             # Limited per folder, so that a server that stalls does not block files of others.
-            "http_request_concurrency": {"limit": _TOGETHER},
+            "http_request_concurrency": {"limit": _MAX_CONCURRENT},
             "http_request_retries": _RETRIES,
         }
         self.future: Any = None  # of the folder's array, once that is being opened
@@ -78,94 +81,118 @@ class Relayed:
             self.future = None
         return self._files
 
-    def read(self, name: str, part: slice | None) -> bytes | None:
+    def read(self, name: str, byte_range: slice | None) -> bytes | None:
         """Returns a file, or a part of it; raises as `read_http`."""
-        from .stores.chunk_files import HEADS
+        from .stores.chunk_files import METADATA_FILES
 
         url = file_url(self.url, name)
         try:
-            files = None if name.endswith(HEADS) else self.files
-            content = self._read(name, part, files)
+            files = None if name.endswith(METADATA_FILES) else self.files
+            content = self._read(name, byte_range, files)
             if files is not None and content is not None:
-                self._look(name, part, content, files)
+                self._check_content(name, byte_range, content, files)
         except OSError as error:
             keep_reason(url, error)
             raise
         return content
 
-    def _read(self, name: str, part: slice | None, files: ChunkFiles | None) -> bytes | None:
-        whole = piece = most = _METADATA
+    def _read(self, name: str, byte_range: slice | None, files: ChunkFiles | None) -> bytes | None:
+        """Reads a file, or a part of it that is not larger than what tensorstore may ask for."""
+        max_file_bytes = max_part_bytes = max_bytes = _MAX_METADATA_BYTES
         if files is not None:
-            whole = most = files.most
-            piece = max(2 * files.chunk_bytes + SMALL + _JOINED, files.index_bytes)
-        if part is not None:
-            most = -part.start if part.stop is None else part.stop - part.start
-            if not 0 < most <= min(piece, whole):
-                raise Endless(f"{most} bytes are asked for, more than a chunk has")
+            max_file_bytes = max_bytes = files.max_bytes
+            max_part_bytes = max(
+                2 * files.chunk_bytes + EXTRA_BYTES + _MAX_JOINED_BYTES, files.index_bytes
+            )
+        if byte_range is not None:
+            start, stop = byte_range.start, byte_range.stop
+            if stop is not None:
+                max_bytes = stop - start
+            else:
+                max_bytes = -start if start < 0 else min(max_part_bytes, max_file_bytes)
+            if not 0 < max_bytes <= min(max_part_bytes, max_file_bytes):
+                raise Endless(f"{max_bytes} bytes are asked for, more than a chunk has")
         url = file_url(self.url, name)
         if is_http(url):
-            return read_http(url, most, part, whole=whole)
-        return self._read_bucket(urllib.parse.unquote(name), part, most)
+            return read_http(url, max_bytes, byte_range, max_file_bytes=max_file_bytes)
+        return self._read_bucket(urllib.parse.unquote(name), byte_range, max_bytes)
 
-    def _look(self, name: str, part: slice | None, content: bytes, files: ChunkFiles) -> None:
+    def _check_content(
+        self, name: str, byte_range: slice | None, content: bytes, files: ChunkFiles
+    ) -> None:
         """Caches the content if it is a shard's index; else raises Endless if it holds a chunk that
         Blosc would unpack to too many bytes.
         """
-        place, index = files.index_part, None
-        if files.index and part == place:
+        index_range, entries = files.index_part, None
+        if files.index and byte_range == index_range:
             with self._lock:
                 self._indexes[name] = files.entries(content)
-                while len(self._indexes) * files.index_bytes > _INDEXES and len(self._indexes) > 1:
+                while (
+                    len(self._indexes) * files.index_bytes > _INDEX_CACHE_BYTES
+                    and len(self._indexes) > 1
+                ):
                     self._indexes.popitem(last=False)
             return
-        if files.index and part is None:
-            index = files.entries(content[place])
+        if files.index and byte_range is None:
+            entries = files.entries(content[index_range])
         elif files.index:
             with self._lock:
-                index = self._indexes.get(name)
-            if index is None:  # it was evicted from the cache
-                index = files.entries(self._read(name, place, files) or b"")
-        files.check_sent(part.start if part else 0, content, index)
+                entries = self._indexes.get(name)
+            if entries is None:  # it was evicted from the cache
+                entries = files.entries(self._read(name, index_range, files) or b"")
+        files.check_sent(byte_range.start if byte_range else 0, content, entries)
 
-    def _read_bucket(self, name: str, part: slice | None, most: int) -> bytes | None:
-        seconds = STALL + most / SLOWEST
+    def _read_bucket(self, name: str, byte_range: slice | None, max_bytes: int) -> bytes | None:
+        seconds = STALL_SECONDS + max_bytes / MIN_BYTES_PER_SECOND
         try:
-            return read_within(self._bucket, name, part, most, lambda f: f.result(timeout=seconds))
+            return read_within(
+                self._bucket,
+                name,
+                byte_range,
+                max_bytes,
+                lambda future: future.result(timeout=seconds),
+            )
         except TimeoutError:
             raise Endless("the server sends hardly anything") from None
         except OSError:
             raise
         except Exception as error:  # tensorstore raises what its status maps to
+            is_open = byte_range is not None and byte_range.stop is None and byte_range.start >= 0
+            if is_open and "OUT_OF_RANGE" in str(error):
+                raise HttpStatus(_UNSATISFIABLE, "the file ends before the range") from None
             raise OSError(one_line(error)) from None
 
     @functools.cached_property
     def _bucket(self) -> Any:
         import tensorstore as ts
 
-        return ts.KvStore.open(self.url, context=self._context).result(timeout=STALL)
+        return ts.KvStore.open(self.url, context=self._context).result(timeout=STALL_SECONDS)
 
 
 def read_within(
-    folder: Any, name: str, part: slice | None, most: int, wait: Callable[[Any], Any]
+    folder: Any, name: str, byte_range: slice | None, max_bytes: int, wait: Callable[[Any], Any]
 ) -> bytes | None:
     """Returns the content of a file in a key-value store of tensorstore, or a part of it; None if
-    there is no such file. Before a whole file is read, the byte after `most` is requested.
+    there is no such file. Before a whole file is read, or all from a byte on, the byte after
+    `max_bytes` is requested.
 
     Raises:
-        Endless: The file has more than `most` bytes.
+        Endless: There are more than `max_bytes` bytes.
         Exception: What `wait` raises, a function that returns a future's result.
     """
-    if part is None:
+    start = 0 if byte_range is None else byte_range.start or 0
+    if byte_range is None or (byte_range.stop is None and start >= 0):
+        end = start + max_bytes
         try:
-            if wait(folder.read(name, byte_range=slice(most, most + 1))).state != "value":
+            if wait(folder.read(name, byte_range=slice(end, end + 1))).state != "value":
                 return None
         except Exception as error:
             if "OUT_OF_RANGE" not in str(error):
                 raise
         else:
-            raise Endless(f"the file is more than {most} bytes")
-    found = wait(folder.read(name, byte_range=part))
-    return bytes(found.value) if found.state == "value" else None
+            raise Endless(f"the file is more than {end} bytes")
+    result = wait(folder.read(name, byte_range=byte_range))
+    return bytes(result.value) if result.state == "value" else None
 
 
 class _Server(http.server.ThreadingHTTPServer):
@@ -174,16 +201,16 @@ class _Server(http.server.ThreadingHTTPServer):
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
-        self.word = secrets.token_urlsafe(16)
+        self.secret = secrets.token_urlsafe(16)
         self.folders: list[Relayed] = []
         threading.Thread(target=self.serve_forever, daemon=True, name="gvtorch-relay").start()
 
     def folder(self, url: str, context: Any) -> Relayed:
         """Returns the relayed folder of a URL, the same one for the same URL."""
-        for found in self.folders:
-            if found.url == url:
-                return found
-        base = f"http://127.0.0.1:{self.server_port}/{self.word}/{len(self.folders)}/"
+        for folder in self.folders:
+            if folder.url == url:
+                return folder
+        base = f"http://127.0.0.1:{self.server_port}/{self.secret}/{len(self.folders)}/"
         self.folders.append(Relayed(url, base, context))
         return self.folders[-1]
 
@@ -197,33 +224,37 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     disable_nagle_algorithm = True
 
     def do_GET(self) -> None:
-        asked = re.fullmatch(r"/([\w-]+)/(\d+)/(.+)", self.path, re.ASCII)
-        if asked is None or not hmac.compare_digest(asked[1], self.server.word):
-            self._answer(403)
+        path_match = re.fullmatch(r"/([\w-]+)/(\d{1,9})/(.+)", self.path, re.ASCII)
+        if path_match is None or not hmac.compare_digest(path_match[1], self.server.secret):
+            self._respond(403)
             return
-        wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
-        part = None
-        if wanted is not None:
-            first, last = wanted.groups()
-            part = slice(int(first), int(last) + 1) if first else slice(-int(last), None)
-        folder, name = self.server.folders[int(asked[2])], asked[3]
+        if int(path_match[2]) >= len(self.server.folders):
+            self._respond(403)
+            return
+        byte_range = _parse_range(self.headers.get("Range", ""))
+        if byte_range == _NO_BYTES:
+            self._respond(_UNSATISFIABLE)
+            return
+        folder, name = self.server.folders[int(path_match[2])], path_match[3]
         content: bytes | None = None
         try:
-            content = folder.read(name, part)
-            status = 404 if content is None else 200 if part is None else 206
+            content = folder.read(name, byte_range)
+            status = 404 if content is None else 200 if byte_range is None else 206
+            if status == 206 and not content:
+                status = _UNSATISFIABLE
         except Endless:
             status = 403
         except HttpStatus as error:
             status = error.status
         except OSError:  # tensorstore tries again for a while
             status = 503
-        self._answer(status, content or b"", part)
+        self._respond(status, content or b"", byte_range)
 
-    def _answer(self, status: int, content: bytes = b"", part: slice | None = None) -> None:
+    def _respond(self, status: int, content: bytes = b"", byte_range: slice | None = None) -> None:
         self.send_response(status)
         self.send_header("Content-Length", str(len(content)))
-        if part is not None and status == 206:
-            begin = part.start if part.start >= 0 else 0
+        if byte_range is not None and status == 206:
+            begin = byte_range.start if byte_range.start >= 0 else 0
             self.send_header("Content-Range", f"bytes {begin}-{begin + len(content) - 1}/*")
         self.end_headers()
         self.wfile.write(content)
@@ -232,19 +263,37 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Prints nothing."""
 
 
+def _parse_range(text: str) -> slice | None:
+    """Returns the bytes that a Range header asks for; None if it is to be ignored: if it is empty,
+    invalid, or asks for several ranges. Source: RFC 9110, HTTP Semantics, section 14.
+    """
+    match = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", text, re.ASCII)
+    if match is None or not any(match.groups()):
+        return None
+    first, last = match.groups()
+    if not first:
+        return slice(-int(last), None) if int(last) else _NO_BYTES
+    if not last:
+        return slice(int(first), None)
+    return slice(int(first), int(last) + 1) if int(first) <= int(last) else None
+
+
 @functools.cache
 def _server() -> _Server:
     for name in ("no_proxy", "NO_PROXY"):  # libcurl would ask a proxy even for this machine
-        told = os.environ.get(name, "")
-        if any(key.lower().endswith("_proxy") for key in os.environ) and "127.0.0.1" not in told:
-            os.environ[name] = f"{told},127.0.0.1" if told else "127.0.0.1"
+        no_proxy = os.environ.get(name, "")
+        if (
+            any(key.lower().endswith("_proxy") for key in os.environ)
+            and "127.0.0.1" not in no_proxy
+        ):
+            os.environ[name] = f"{no_proxy},127.0.0.1" if no_proxy else "127.0.0.1"
     return _Server()
 
 
 _starting = threading.Lock()
 
 
-def through(url: str, context: Any = None) -> Relayed:
+def relay_folder(url: str, context: Any = None) -> Relayed:
     """Returns the relayed folder of a URL; `context` is tensorstore's, for s3:// and gs://."""
     with _starting:
         return _server().folder(url, context)
@@ -257,10 +306,10 @@ def with_urls(text: str) -> str:
     if not _server.cache_info().currsize:
         return text
     server = _server()
-    base = rf"http://127\.0\.0\.1:\d+/{re.escape(server.word)}/(\d+)/"
-    for found in re.finditer(rf"{base}(\S*): (?!.*{base})", text):
-        folder = server.folders[int(found[1])]
-        url = file_url(folder.url, found[2])
+    base = rf"http://127\.0\.0\.1:\d+/{re.escape(server.secret)}/(\d+)/"
+    for match in re.finditer(rf"{base}(\S*): (?!.*{base})", text):
+        folder = server.folders[int(match[1])]
+        url = file_url(folder.url, match[2])
         if reason := refused(url):
             return f"{url}: {reason}"
-    return re.sub(base, lambda at: server.folders[int(at[1])].url, text)
+    return re.sub(base, lambda match: server.folders[int(match[1])].url, text)

@@ -25,13 +25,13 @@ from urllib.parse import unquote, urlsplit
 from ..base.digits import whole_number
 from ..base.messages import need_library, one_line
 from ..base.whole_file import cache_folder, write_whole
-from .http import AGENT, MISSING, HttpStatus, ask_by_urllib
+from .http import MISSING_STATUS, REQUEST_HEADERS, HttpStatus, ask_by_urllib
 from .resources import amount
 
 _TIMEOUT = 30.0  # seconds without a byte
-_PART = 1 << 20  # bytes
-_FOLDERS = ("zarr", "n5")  # read in parts from the server, not downloaded
-_DETACHED = (".mhd", ".nhdr")
+_PART_BYTES = 1 << 20  # bytes
+_FOLDER_ENDINGS = ("zarr", "n5")  # read in parts from the server, not downloaded
+_DETACHED_HEADERS = (".mhd", ".nhdr")
 
 Version = dict[str, str]  # what identifies the version of a file on its server, as its ETag
 
@@ -40,9 +40,11 @@ def is_file_url(text: str) -> bool:
     """Returns whether a URL is of a file, with a file's ending, and not of a Zarr or N5 folder."""
     if not re.match(r"[a-z0-9+]{2,}://", text) or text.startswith("file://"):
         return False
-    name = _name(text)
+    name = _file_name(text)
     ending = re.search(r"\.([A-Za-z]\w*)$", name)
-    return ending is not None and ending[1].lower() not in _FOLDERS and not text.endswith("/")
+    return (
+        ending is not None and ending[1].lower() not in _FOLDER_ENDINGS and not text.endswith("/")
+    )
 
 
 def split_url(text: str) -> tuple[str, str | None]:
@@ -73,82 +75,90 @@ def fetch(url: str) -> Path:
         OSError: It can't be downloaded, is cut off, or is larger than the cache or the disk.
         ImportError: A library is missing.
     """
-    if url.lower().split("?")[0].endswith(_DETACHED):
+    if url.lower().split("?")[0].endswith(_DETACHED_HEADERS):
         raise ValueError(f"{url}: its numbers are in another file next to it: download both")
     folder = cache_folder("downloads") / hashlib.sha256(url.encode()).hexdigest()[:32]
-    kept = _kept(folder)
+    cached = _cached_copy(folder)
     opener = _open_http if urlsplit(url).scheme in ("http", "https") else _open_fsspec
     try:
-        answer = opener(url, kept[1] if kept else {})
+        download = opener(url, cached[1] if cached else {})
     except FileNotFoundError:
         raise
     except OSError as error:
-        if kept is None:
+        if cached is None:
             raise OSError(f"{url}: can't be downloaded: {_reason(error)}") from None
         warnings.warn(f"{url}: no answer ({_reason(error)}); using the cached copy", stacklevel=3)
-        answer = None
-    if answer is None:
-        assert kept is not None
-        os.utime(kept[0].parent)
-        return kept[0]
-    stream, size, version = answer
+        download = None
+    if download is None:
+        assert cached is not None
+        os.utime(cached[0].parent)
+        return cached[0]
+    stream, size, version = download
     folder.mkdir(parents=True, exist_ok=True)
     with closing(stream):
         file = _download(url, folder, stream, size)
-    place = folder / (_key(version) if version else file.parent.name.strip(".").split("-")[1])
+    version_folder = folder / (
+        _version_key(version) if version else file.parent.name.strip(".").split("-")[1]
+    )
     try:
-        file.parent.rename(place)
+        file.parent.rename(version_folder)
     except OSError:  # another process has written it already
         shutil.rmtree(file.parent, ignore_errors=True)
-    about = {"url": url, "name": file.name, "place": place.name, "version": version}
-    write_whole(folder / "about.json", json.dumps(about))
-    _evict(place)
-    return place / file.name
+    record = {"url": url, "name": file.name, "place": version_folder.name, "version": version}
+    write_whole(folder / "about.json", json.dumps(record))
+    _evict(version_folder)
+    return version_folder / file.name
 
 
-def _name(url: str) -> str:
+def _file_name(url: str) -> str:
     """Returns a file name for a URL, made of harmless characters."""
     name = unquote(urlsplit(url).path.rpartition("/")[2])
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".")[-120:] or "file"
 
 
-def _key(version: Version) -> str:
+def _version_key(version: Version) -> str:
     text = json.dumps(version, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _kept(folder: Path) -> tuple[Path, Version] | None:
+def _cached_copy(folder: Path) -> tuple[Path, Version] | None:
     """Returns the copy in the cache, and its version; None if there is none."""
     try:
-        about = json.loads((folder / "about.json").read_text(encoding="utf-8"))
-        file = folder / Path(about["place"]).name / Path(about["name"]).name
-        version = {str(name): str(value) for name, value in dict(about["version"]).items()}
+        record = json.loads((folder / "about.json").read_text(encoding="utf-8"))
+        file = folder / Path(record["place"]).name / Path(record["name"]).name
+        version = {str(name): str(value) for name, value in dict(record["version"]).items()}
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return (file, version) if file.is_file() else None
 
 
-Answer = tuple[IO[bytes], int | None, Version]
+Download = tuple[IO[bytes], int | None, Version]
 
 
-def _open_http(url: str, known: Version) -> Answer | None:
+def _open_http(url: str, known_version: Version) -> Download | None:
     """Begins a download; returns None if the server still has the known version."""
-    marks = (("ETag", "If-None-Match"), ("Last-Modified", "If-Modified-Since"))
-    asked = {header: known[name] for name, header in marks if known.get(name)}
+    validators = (("ETag", "If-None-Match"), ("Last-Modified", "If-Modified-Since"))
+    conditions = {
+        header: known_version[name] for name, header in validators if known_version.get(name)
+    }
     try:
-        answer = ask_by_urllib(url, AGENT | asked, _TIMEOUT)
+        response = ask_by_urllib(url, REQUEST_HEADERS | conditions, _TIMEOUT)
     except HttpStatus as error:
-        if error.status == 304 and known:
+        if error.status == 304 and known_version:
             return None
-        if error.status in MISSING:
+        if error.status in MISSING_STATUS:
             raise FileNotFoundError(f"volume not found: {url}") from None
         raise
-    length = answer.headers.get("Content-Length", "")
-    version = {n: answer.headers[n] for n in ("ETag", "Last-Modified") if answer.headers.get(n)}
-    return answer, whole_number(length), version
+    length = response.headers.get("Content-Length", "")
+    version = {
+        name: response.headers[name]
+        for name in ("ETag", "Last-Modified")
+        if response.headers.get(name)
+    }
+    return response, whole_number(length), version
 
 
-def _open_fsspec(url: str, known: Version) -> Answer | None:
+def _open_fsspec(url: str, known_version: Version) -> Download | None:
     """Does the same for other schemes; where s3 or gs fails, tries again without credentials."""
     scheme = urlsplit(url).scheme
     fsspec = need_library(f"{url}: reading {scheme}://", "fsspec", extra="remote")
@@ -171,12 +181,14 @@ def _open_fsspec(url: str, known: Version) -> Answer | None:
         system, path = fsspec.core.url_to_fs(url, **anonymous)
         try:
             info = system.info(path)
-        except Exception as other:
-            raise OSError(f"{_reason(error)}; without credentials: {_reason(other)}") from None
+        except Exception as retry_error:
+            raise OSError(
+                f"{_reason(error)}; without credentials: {_reason(retry_error)}"
+            ) from None
     names = ("ETag", "etag", "LastModified", "updated", "mtime", "created", "size")
     version = {name: str(info[name]) for name in names if info.get(name) is not None}
     size = info.get("size")
-    if version == known and len(version) > 1:
+    if version == known_version and len(version) > 1:
         return None
     return system.open(path, "rb"), size if isinstance(size, int) else None, version
 
@@ -185,50 +197,50 @@ def _download(url: str, folder: Path, stream: IO[bytes], size: int | None) -> Pa
     """Writes a stream to a file in a new folder, which is removed again if that fails."""
     limit = cache_limit()
     free = shutil.disk_usage(folder).free
-    most = min(limit, free)
-    what = "the cache (GVTORCH_CACHE_GB)" if limit < free else "the disk"
-    if size is not None and size > most:
-        raise OSError(f"{url}: is {amount(size)}, {what} has room for {amount(most)}")
+    max_bytes = min(limit, free)
+    medium = "the cache (GVTORCH_CACHE_GB)" if limit < free else "the disk"
+    if size is not None and size > max_bytes:
+        raise OSError(f"{url}: is {amount(size)}, {medium} has room for {amount(max_bytes)}")
     target = Path(tempfile.mkdtemp(prefix=".part-", dir=folder))
     try:
-        file, done = target / _name(url), 0
+        file, received = target / _file_name(url), 0
         with file.open("wb") as out:
-            while part := _read(url, stream):
-                done += len(part)
-                if done > most:
-                    raise OSError(f"{url}: is more than {amount(most)}, the room in {what}")
+            while part := _read_part(url, stream):
+                received += len(part)
+                if received > max_bytes:
+                    raise OSError(f"{url}: is more than {amount(max_bytes)}, the room in {medium}")
                 out.write(part)
-        if size is not None and done != size:
-            raise OSError(f"{url}: is cut off: {done} of {size} bytes came")
+        if size is not None and received != size:
+            raise OSError(f"{url}: is cut off: {received} of {size} bytes came")
     except BaseException:
         shutil.rmtree(target, ignore_errors=True)
         raise
     return file
 
 
-def _read(url: str, stream: IO[bytes]) -> bytes:
+def _read_part(url: str, stream: IO[bytes]) -> bytes:
     try:
-        return stream.read(_PART)
+        return stream.read(_PART_BYTES)
     except Exception as error:  # http.client and fsspec have exceptions of their own
         raise OSError(f"{url}: is cut off: {_reason(error)}") from None
 
 
 def _evict(newest: Path) -> None:
     """Removes the least recently used versions until the rest fits into the cache."""
-    found: list[tuple[float, int, Path]] = []
-    for place in newest.parent.parent.glob("*/*"):
-        if place.is_dir():
+    versions: list[tuple[float, int, Path]] = []
+    for folder in newest.parent.parent.glob("*/*"):
+        if folder.is_dir():
             try:
-                size = sum(file.stat().st_size for file in place.iterdir())
-                found.append((place.stat().st_mtime, size, place))
+                size = sum(file.stat().st_size for file in folder.iterdir())
+                versions.append((folder.stat().st_mtime, size, folder))
             except OSError:
                 continue  # another process removes it
-    total, limit = sum(size for _, size, _ in found), cache_limit()
-    for _, size, place in sorted(found):
+    total, limit = sum(size for _, size, _ in versions), cache_limit()
+    for _, size, folder in sorted(versions):
         if total <= limit:
             break
-        if place != newest:
-            shutil.rmtree(place, ignore_errors=True)
+        if folder != newest:
+            shutil.rmtree(folder, ignore_errors=True)
             total -= size
 
 

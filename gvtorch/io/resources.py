@@ -43,31 +43,31 @@ def worker_processes(count: int) -> Iterator[Executor]:
     """Starts worker processes, which ignore Ctrl-C from the start and leave it to this process."""
     spawn = multiprocessing.get_context("spawn")
     with ExitStack() as stack:
-        with _interrupts_later():  # Ctrl-C here would leave a half-made semaphore behind
+        with _defer_interrupts():  # Ctrl-C here would leave a half-made semaphore behind
             pool = stack.enter_context(ProcessPoolExecutor(count, spawn, begin_worker))
             # Blocked only now, because creating the pool unblocks the signal.
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+            previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
             try:
                 for _ in range(count):  # each task starts a process, which inherits the mask
                     pool.submit(int)
             finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+                signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
         yield pool
 
 
 @contextmanager
-def _interrupts_later() -> Iterator[None]:
+def _defer_interrupts() -> Iterator[None]:
     """Defers Ctrl-C, which any thread may receive, to the end of the block."""
     if threading.current_thread() is not threading.main_thread():
         yield  # KeyboardInterrupt is raised in the main thread only
         return
-    came: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _frame: came.append(number))
+    received: list[int] = []
+    previous_handler = signal.signal(signal.SIGINT, lambda number, _frame: received.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-    if came:
+        signal.signal(signal.SIGINT, previous_handler)
+    if received:
         raise KeyboardInterrupt
 
 
@@ -90,10 +90,10 @@ def run_ahead(
     """Runs a task for each item, at most `ahead` at a time, and yields their results in the order
     in which they finish.
     """
-    waiting, running = iter(items), set[Future[Result]]()
+    remaining, running = iter(items), set[Future[Result]]()
     try:
         while True:
-            for item in itertools.islice(waiting, ahead - len(running)):
+            for item in itertools.islice(remaining, ahead - len(running)):
                 running.add(pool.submit(task, item))
             if not running:
                 return

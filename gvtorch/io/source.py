@@ -35,14 +35,19 @@ from .stores.store_layout import value_dtype
 Index = tuple[slice, ...]
 Triple = tuple[float, float, float]
 Told = tuple[ImageInfo, Triple, list[str]]  # info, spacing, metadata that is not kept
-_PART = 1 << 20  # bytes that are unpacked at a time
-_WHOLE = {1: ("char", "int8"), 2: ("short", "int16"), 4: ("int", "int32"), 8: ("longlong", "int64")}
-_NUMBERS = {
-    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
-    **{name: f"i{size}" for size, names in _WHOLE.items() for name in names},
-    **{f"u{name}": f"u{size}" for size, names in _WHOLE.items() for name in names},
+_PART_BYTES = 1 << 20  # bytes that are unpacked at a time
+_INTEGER_NAMES = {
+    1: ("char", "int8"),
+    2: ("short", "int16"),
+    4: ("int", "int32"),
+    8: ("longlong", "int64"),
 }
-_SPELLED = re.compile(
+_DTYPE_CODES = {
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+    **{name: f"i{size}" for size, names in _INTEGER_NAMES.items() for name in names},
+    **{f"u{name}": f"u{size}" for size, names in _INTEGER_NAMES.items() for name in names},
+}
+_C_INTEGER = re.compile(
     r"(?:(?P<un>un)?signed )?(?:(?P<any>char|int)|(?P<long>short|longlong)(?: int)?)"
 )
 #: (4, 4) from world axes left, posterior, superior (LPS) to right, anterior, superior (RAS).
@@ -202,26 +207,27 @@ class ArraySource(VolumeSource):
                 self.file, np.dtype(self.stored), "r", self.offset, self.shape, order
             )
             return data[index]
-        content, size = np.empty(self._expected + self.exact, np.uint8), 0
+        content, size = np.empty(self._expected_bytes + self.exact, np.uint8), 0
         with open_unpacked(self.file, self.member) as stream:
             stream.read(self.offset)
-            while part := stream.read(min(_PART, len(content) - size)):
+            while part := stream.read(min(_PART_BYTES, len(content) - size)):
                 content[size : size + len(part)] = memoryview(part)
                 size += len(part)
         self._check_size(size)
-        numbers = content[: self._expected].view(self.stored)
+        numbers = content[: self._expected_bytes].view(self.stored)
         return numbers.reshape(self.shape, order=order)[index]
 
     @property
-    def _expected(self) -> int:
+    def _expected_bytes(self) -> int:
         return math.prod(self.shape) * np.dtype(self.stored).itemsize
 
     def _check_size(self, size: int) -> None:
-        if size < self._expected or (self.exact and size > self._expected):
-            sizes = "x".join(str(n) for n in self.shape)
+        if size < self._expected_bytes or (self.exact and size > self._expected_bytes):
+            shape = "x".join(str(n) for n in self.shape)
             raise ValueError(
-                f"{self.path}: {sizes} {np.dtype(self.stored).name} takes {self._expected} bytes, "
-                f"the file has {'more' if self.whole and size > self._expected else max(size, 0)}"
+                f"{self.path}: {shape} {np.dtype(self.stored).name} takes {self._expected_bytes} "
+                "bytes, the file has "
+                f"{'more' if self.whole and size > self._expected_bytes else max(size, 0)}"
             )
 
 
@@ -232,10 +238,10 @@ class MemorySource(VolumeSource):
     data: np.ndarray = dataclasses.field(repr=False)  # (z, y, x, c) or (t, z, y, x, c)
 
     @classmethod
-    def of(cls, data: np.ndarray, **told: Any) -> MemorySource:
-        """Wraps (z, y, x, c) or (t, z, y, x, c) values; `told` are path, spacing, origin, info."""
+    def of(cls, data: np.ndarray, **fields: Any) -> MemorySource:
+        """Wraps (z, y, x, c) or (t, z, y, x, c) values; `fields`: path, spacing, origin, info."""
         axes = "tzyxc"[-data.ndim :]
-        return cls(data=data, shape=data.shape, axes=axes, stored=data.dtype.str, **told)
+        return cls(data=data, shape=data.shape, axes=axes, stored=data.dtype.str, **fields)
 
     def staged(self, folder: Path) -> VolumeSource:
         """Writes the values to a file in the folder."""
@@ -284,28 +290,29 @@ def place_axes(
     volume = np.linalg.det(matrix / np.where(lengths > 0, lengths, 1))
     finite = np.isfinite(affine).all() and np.isfinite(lengths).all()
     if not finite or (lengths == 0).any() or abs(volume) < 1e-6:
-        told = affine[:3].tolist()
-        raise ValueError(f"{path}: the header's voxel axes are degenerate: {told}")
-    letters = ["t" if axis == time else "c" for axis in range(len(shape))]
+        rows = affine[:3].tolist()
+        raise ValueError(f"{path}: the header's voxel axes are degenerate: {rows}")
+    axis_letters = ["t" if axis == time else "c" for axis in range(len(shape))]
     spatial = [axis for axis in range(len(shape)) if axis not in (component, time)]
     world_axis = np.abs(matrix).argmax(axis=0)  # of each voxel axis
-    straight = np.zeros((3, 3))
-    straight[world_axis, [0, 1, 2]] = matrix[world_axis, [0, 1, 2]]
-    most = np.array([shape[axis] - 1 for axis in spatial])
-    beside = np.abs((matrix - straight) * most).sum(1)  # by which the farthest voxel is moved
-    is_oblique = len(set(world_axis.tolist())) != 3 or (beside > lengths.min() / 2).any()
+    axis_aligned = np.zeros((3, 3))
+    axis_aligned[world_axis, [0, 1, 2]] = matrix[world_axis, [0, 1, 2]]
+    last_index = np.array([shape[axis] - 1 for axis in spatial])
+    # By which the farthest voxel is moved.
+    displacement = np.abs((matrix - axis_aligned) * last_index).sum(1)
+    is_oblique = len(set(world_axis.tolist())) != 3 or (displacement > lengths.min() / 2).any()
     if is_oblique:
         order, steps = np.arange(3), lengths
     else:
         order = np.argsort(world_axis)
-        steps = straight[[0, 1, 2], order]
+        steps = axis_aligned[[0, 1, 2], order]
     for axis, letter in enumerate("xyz"):
         voxel_axis = spatial[order[axis]]
-        letters[voxel_axis] = letter
+        axis_letters[voxel_axis] = letter
         if steps[axis] < 0:
             origin[axis] += steps[axis] * (shape[voxel_axis] - 1)
     return {
-        "axes": "".join(letters),
+        "axes": "".join(axis_letters),
         "flips": "".join(letter for letter, step in zip("xyz", steps, strict=True) if step < 0),
         "spacing": tuple(np.abs(steps).tolist()),
         "origin": tuple(origin.tolist()),
@@ -318,10 +325,12 @@ def number_type(name: str) -> str | None:
     "unsigned short int", "uchar", "long_long", "uint16_t", "Float32". None if it is unknown, as is
     "long", which has 4 bytes or 8.
     """
-    plain = name.lower().replace("_", " ").replace("long long", "longlong")
-    if spelled := _SPELLED.fullmatch(plain):  # in several words
-        plain = ("u" if spelled["un"] else "") + (spelled["any"] or spelled["long"])
-    return _NUMBERS.get(plain.removesuffix(" t") if plain[-3:-2].isdigit() else plain)
+    normalized = name.lower().replace("_", " ").replace("long long", "longlong")
+    if match := _C_INTEGER.fullmatch(normalized):  # in several words
+        normalized = ("u" if match["un"] else "") + (match["any"] or match["long"])
+    return _DTYPE_CODES.get(
+        normalized.removesuffix(" t") if normalized[-3:-2].isdigit() else normalized
+    )
 
 
 def open_unpacked(file: str, member: str = "") -> IO[bytes]:
@@ -334,25 +343,27 @@ def open_unpacked(file: str, member: str = "") -> IO[bytes]:
     return bz2.open(file, "rb") if file.lower().endswith(".bz2") else open(file, "rb")
 
 
-def no_time(where: str, time: object, times: int) -> str:
+def no_time_message(label: str, time: object, times: int) -> str:
     """Returns the message about a time point that does not exist."""
-    one = "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
-    return f"{where}: has no time {time!r}; it has {one}"
+    available = (
+        "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
+    )
+    return f"{label}: has no time {time!r}; it has {available}"
 
 
 @contextmanager
 def told_as(
-    kind: type[Exception], path: str, what: str, *through: type[Exception]
+    kind: type[Exception], path: str, problem: str, *passed: type[Exception]
 ) -> Iterator[None]:
     """Converts whatever a format library raises for a damaged file to `kind`, with the one-line
     message "path: what: reason". Errors about missing libraries and files, and the types in
-    `through`, pass unchanged.
+    `passed`, pass unchanged.
     """
     try:
         yield
     except Exception as error:
-        if isinstance(error, (ImportError, FileNotFoundError, *through)):
+        if isinstance(error, (ImportError, FileNotFoundError, *passed)):
             raise
         reason = one_line(error)
-        prefix = "" if reason.startswith(one_line(path)) else f"{path}: {what}: "
+        prefix = "" if reason.startswith(one_line(path)) else f"{path}: {problem}: "
         raise kind(prefix + reason) from error

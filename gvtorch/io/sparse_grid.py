@@ -27,35 +27,38 @@ from .source import Index, VolumeSource, place_axes
 SIDES = (4096, 128, 8)  # voxels along a side of an upper node, a lower node and a leaf
 COUNTS = (32, 16, 8)  # entries along a side of each
 VOXELS = 512  # of a leaf
-MOST_INDEX = 2**31
-MOST_ROOTS = 1 << 20  # entries of a root
-_BATCH = 4096  # leaves
-_WHOLE = 1 << 22  # voxels of the whole leaves around a thin box, above which it is filled in pieces
+MAX_INDEX = 2**31
+MAX_ROOTS = 1 << 20  # entries of a root
+_BATCH_LEAVES = 4096
+# Voxels of the whole leaves around a thin box, above which it is filled in pieces.
+_MAX_PADDED_VOXELS = 1 << 22
 _LOCK = threading.Lock()
 _QUANTITIES = {"level set": "signed distance", "fog volume": "density"}
 
 
 @dataclass(kw_only=True)
 class SparseGrid(ABC):
-    """The nodes of a grid; all positions except `places` are voxel indices i, j, k."""
+    """The nodes of a grid; all positions except `node_offsets` are voxel indices i, j, k."""
 
     data: Any  # the bytes that hold the nodes
     kind: str  # type of the values, as the format calls it
-    places: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n,) offsets in `data` of each of `origins`
+    # (n,) The offset in `data` of each node of `origins`.
+    node_offsets: tuple[np.ndarray, np.ndarray, np.ndarray]
     dtype: np.dtype
     background: np.ndarray  # (c,)
     origins: tuple[np.ndarray, np.ndarray, np.ndarray]  # (n, 3) int64 of uppers, lowers and leaves
-    root_places: np.ndarray  # (t, 3) int64 of the root's tiles
+    root_origins: np.ndarray  # (t, 3) int64 of the root's tiles
     root_values: np.ndarray  # (t, c)
 
     def __post_init__(self) -> None:
-        places = np.concatenate((self.root_places, self.origins[0]))
-        off = places[(places % SIDES[0]).any(1)]
-        if len(off):
+        origins = np.concatenate((self.root_origins, self.origins[0]))
+        misaligned = origins[(origins % SIDES[0]).any(1)]
+        if len(misaligned):
             raise ValueError(
-                f"an entry of the root lies at {off[0].tolist()}; expected multiples of {SIDES[0]}"
+                f"an entry of the root lies at {misaligned[0].tolist()}; expected multiples of "
+                f"{SIDES[0]}"
             )
-        cells = places // SIDES[0] + (1 << 20)
+        cells = origins // SIDES[0] + (1 << 20)
         if len(np.unique(cells @ np.array((1 << 42, 1 << 21, 1)))) < len(cells):
             raise ValueError("two entries of the root have one position")
 
@@ -78,36 +81,38 @@ class SparseGrid(ABC):
         """Returns (i, j, k, c) values of a box."""
         leaf, a, b = SIDES[2], np.asarray(low), np.asarray(high)
         start, stop = a // leaf * leaf, -(-b // leaf) * leaf  # whole leaves
-        whole, axis = math.prod((stop - start).tolist()), int((b - a).argmax())
-        if whole > max(_WHOLE, 2 * math.prod((b - a).tolist())):  # of a thin box
-            return self._pieces(a, b, axis, whole // int((stop - start)[axis]))
+        padded_voxels, axis = math.prod((stop - start).tolist()), int((b - a).argmax())
+        if padded_voxels > max(_MAX_PADDED_VOXELS, 2 * math.prod((b - a).tolist())):
+            return self._pieces(a, b, axis, padded_voxels // int((stop - start)[axis]))
         out = np.empty((*(stop - start), len(self.background)), self.dtype)
         out[:] = self.background
-        tiles = self._hits(self.root_places, SIDES[0], start, stop)
-        self._write(out, start, SIDES[0], self.root_places[tiles], self.root_values[tiles])
+        tiles = self._overlapping(self.root_origins, SIDES[0], start, stop)
+        self._write_tiles(out, start, SIDES[0], self.root_origins[tiles], self.root_values[tiles])
         for level in (0, 1):
-            for number in self._hits(self.origins[level], SIDES[level], start, stop):
-                places, values = self._shown(level, number, start, stop)
-                self._write(out, start, SIDES[level + 1], places, values)
-        hits = self._hits(self.origins[2], leaf, start, stop)
+            for number in self._overlapping(self.origins[level], SIDES[level], start, stop):
+                origins, values = self._visible_tiles(level, number, start, stop)
+                self._write_tiles(out, start, SIDES[level + 1], origins, values)
+        hits = self._overlapping(self.origins[2], leaf, start, stop)
         blocks = _blocks(out)
-        for first in range(0, len(hits), _BATCH):
-            numbers = hits[first : first + _BATCH]
+        for first in range(0, len(hits), _BATCH_LEAVES):
+            numbers = hits[first : first + _BATCH_LEAVES]
             i, j, k = ((self.origins[2][numbers] - start) // leaf).T
             blocks[i, :, j, :, k] = self.leaves(numbers).reshape(-1, 8, 8, 8, out.shape[3])
         return out[tuple(slice(x - s, y - s) for x, y, s in zip(a, b, start, strict=True))]
 
-    def _pieces(self, low: np.ndarray, high: np.ndarray, axis: int, across: int) -> np.ndarray:
-        """Fills a box in pieces along an axis; a cross-section of leaves has `across` voxels."""
+    def _pieces(
+        self, low: np.ndarray, high: np.ndarray, axis: int, section_voxels: int
+    ) -> np.ndarray:
+        """Fills a box in pieces along an axis; a cross-section of leaves has `section_voxels`."""
         side = SIDES[2]
-        step = max(side, _WHOLE // across // side * side)
+        step = max(side, _MAX_PADDED_VOXELS // section_voxels // side * side)
         out = np.empty((*(high - low), len(self.background)), self.dtype)
-        ends = [
+        piece_ends = [
             *range(int(low[axis]) // side * side + step, int(high[axis]), step),
             int(high[axis]),
         ]
         a, b = low.copy(), high.copy()
-        for end in ends:
+        for end in piece_ends:
             b[axis], part = end, [slice(None)] * 3
             part[axis] = slice(a[axis] - low[axis], end - low[axis])
             out[tuple(part)] = self.fill(a.tolist(), b.tolist())
@@ -119,19 +124,21 @@ class SparseGrid(ABC):
         tiles that differ from the background.
         """
         low, high = [self.origins[2]], [self.origins[2] + SIDES[2]]
-        everywhere = np.array((-MOST_INDEX,) * 3), np.array((MOST_INDEX,) * 3)
-        found = [(SIDES[0], self.root_places[self._differ(self.root_values)])]
+        everywhere = np.array((-MAX_INDEX,) * 3), np.array((MAX_INDEX,) * 3)
+        tile_groups = [(SIDES[0], self.root_origins[self._is_foreground(self.root_values)])]
         for level in (0, 1):
             for number in range(len(self.origins[level])):
-                found.append((SIDES[level + 1], self._shown(level, number, *everywhere)[0]))
-        for side, places in found:
-            low.append(places)
-            high.append(places + side)
+                tile_groups.append(
+                    (SIDES[level + 1], self._visible_tiles(level, number, *everywhere)[0])
+                )
+        for side, origins in tile_groups:
+            low.append(origins)
+            high.append(origins + side)
         if not sum(map(len, low)):
             raise ValueError("the grid is empty")
         return np.concatenate(low).min(0), np.concatenate(high).max(0)
 
-    def _shown(
+    def _visible_tiles(
         self, level: int, number: int, start: np.ndarray, stop: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns (t, 3) positions and (t, c) values of a node's non-background tiles in a box."""
@@ -140,32 +147,34 @@ class SparseGrid(ABC):
         a = np.maximum((start - origin) // side, 0)
         b = np.minimum(-((origin - stop) // side), COUNTS[level])
         index = tuple(slice(x, y) for x, y in zip(a, b, strict=True))
-        chosen = is_tile[index] & self._differ(values[index])
-        return origin + (a + np.argwhere(chosen)) * side, values[index][chosen]
+        is_visible = is_tile[index] & self._is_foreground(values[index])
+        return origin + (a + np.argwhere(is_visible)) * side, values[index][is_visible]
 
-    def _differ(self, values: np.ndarray) -> np.ndarray:
-        differ = values != self.background
+    def _is_foreground(self, values: np.ndarray) -> np.ndarray:
+        differs = values != self.background
         if self.dtype.kind == "f":
-            differ &= ~(np.isnan(values) & np.isnan(self.background))
-        return differ.any(-1)
+            differs &= ~(np.isnan(values) & np.isnan(self.background))
+        return differs.any(-1)
 
     @staticmethod
-    def _hits(origins: np.ndarray, side: int, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+    def _overlapping(
+        origins: np.ndarray, side: int, start: np.ndarray, stop: np.ndarray
+    ) -> np.ndarray:
         """Returns (k,) the indices of the nodes that overlap a box."""
         return np.flatnonzero(((origins < stop) & (origins + side > start)).all(1))
 
     @staticmethod
-    def _write(
-        out: np.ndarray, start: np.ndarray, side: int, places: np.ndarray, values: np.ndarray
+    def _write_tiles(
+        out: np.ndarray, start: np.ndarray, side: int, origins: np.ndarray, values: np.ndarray
     ) -> None:
         """Writes tiles into a box that begins at `start`."""
         size = np.array(out.shape[:3])
         if side == SIDES[2]:
-            i, j, k = ((places - start) // side).T
+            i, j, k = ((origins - start) // side).T
             _blocks(out)[i, :, j, :, k] = values[:, None, None, None]
             return
-        for place, value in zip(places - start, values, strict=True):
-            a, b = np.maximum(place, 0), np.minimum(place + side, size)
+        for origin, value in zip(origins - start, values, strict=True):
+            a, b = np.maximum(origin, 0), np.minimum(origin + side, size)
             if (a < b).all():
                 out[a[0] : b[0], a[1] : b[1], a[2] : b[2]] = value
 
@@ -178,12 +187,12 @@ def _blocks(out: np.ndarray) -> np.ndarray:
 
 def check_roots(count: int) -> None:
     """Raises ValueError if a root has more entries than can be read."""
-    if count > MOST_ROOTS:
-        raise ValueError(f"a root of {count} entries, at most {MOST_ROOTS} are read")
+    if count > MAX_ROOTS:
+        raise ValueError(f"a root of {count} entries, at most {MAX_ROOTS} are read")
 
 
 @functools.lru_cache(maxsize=2)
-def _grid(kind: type[SparseGrid], path: str, number: int, _opened: int) -> SparseGrid:
+def _read_grid(kind: type[SparseGrid], path: str, number: int, _opened: int) -> SparseGrid:
     return kind.read(path, number)
 
 
@@ -201,42 +210,42 @@ class SparseSource(VolumeSource):
         cls,
         path: str,
         name: str,
-        kind: str,
+        grid_class: str,
         stored: str,
         width: int,
         low: np.ndarray,
         high: np.ndarray,
         affine: np.ndarray,
-        **told: Any,
+        **fields: Any,
     ) -> SparseSource:
         """Returns the source of a grid.
 
         Args:
             path, name: Of the file and the grid.
-            kind: The grid's class: "level set", "fog volume", ...
+            grid_class: The grid's class: "level set", "fog volume", ...
             stored: Dtype of a number.
             width: Numbers per voxel.
             low, high: (3,) The first voxel, and one past the last.
             affine: (4, 4) From voxel indices to the world.
-            **told: Other fields of the source.
+            **fields: Other fields of the source.
         """
         size = [int(n) for n in high - low]
-        if min(size) < 1 or np.abs((low, high)).max() > MOST_INDEX:
+        if min(size) < 1 or np.abs((low, high)).max() > MAX_INDEX:
             raise ValueError(f"{path}: grid {name!r} has no active voxel")
         check_extent(path, size, most=1 << 62)
         shifted = affine.astype(np.float64)
         shifted[:3, 3] += shifted[:3, :3] @ low
         shape = (*size, width) if width > 1 else tuple(size)
         names = [f"{name}.{'xyzw'[n]}" for n in range(width)] if width > 1 else [name]
-        channels = tuple(ChannelInfo(name=one) for one in names) if name else ()
+        channels = tuple(ChannelInfo(name=channel_name) for channel_name in names) if name else ()
         return cls(
             path=path,
             shape=shape,
             stored=stored,
             low=tuple(low.tolist()),
-            info=ImageInfo(channels=channels, quantity=_QUANTITIES.get(kind)),
+            info=ImageInfo(channels=channels, quantity=_QUANTITIES.get(grid_class)),
             **place_axes(path, shifted, shape, component=3 if width > 1 else None),
-            **told,
+            **fields,
         )
 
     @property
@@ -247,15 +256,17 @@ class SparseSource(VolumeSource):
     def grid(self) -> SparseGrid:
         """Returns the grid, which is cached."""
         with _LOCK:  # the first thread searches the nodes
-            return _grid(self.grid_type, self.path, self.number, self.opened)
+            return _read_grid(self.grid_type, self.path, self.number, self.opened)
 
     def read_stored(self, index: Index) -> np.ndarray:
-        low = [part.start + at for part, at in zip(index[:3], self.low, strict=True)]
-        high = [part.stop + at for part, at in zip(index[:3], self.low, strict=True)]
+        low = [part.start + first for part, first in zip(index[:3], self.low, strict=True)]
+        high = [part.stop + first for part, first in zip(index[:3], self.low, strict=True)]
         values = self.grid().fill(low, high)
         return values[..., index[3]] if len(index) > 3 else values[..., 0]
 
 
-def bits(data: Any, at: int, count: int) -> np.ndarray:
-    """Returns (count,) bool, the bits of a mask at byte `at`, the lowest bit of each byte first."""
-    return np.unpackbits(np.frombuffer(data, "u1", count // 8, at), bitorder="little").view(bool)
+def bits(data: Any, offset: int, count: int) -> np.ndarray:
+    """Returns (count,) bool, the bits of a mask at byte `offset`, a byte's lowest bit first."""
+    return np.unpackbits(np.frombuffer(data, "u1", count // 8, offset), bitorder="little").view(
+        bool
+    )

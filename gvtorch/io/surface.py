@@ -27,7 +27,7 @@ from ..pool import N3Tree
 from .stores.store import CELL, Store
 from .surface_file import SurfaceFile, check_surface_path
 
-_BLOCK = 64  # cells along a side
+_BLOCK_CELLS = 64  # along a side
 Numbered = tuple[np.ndarray, np.ndarray]  # keys, increasing, and the numbers of their vertices
 
 
@@ -74,11 +74,11 @@ def extract_surface(
     Source: see meshes/contour.py.
     """
     grid = _Grid(what, value, level, component, channel, caps)
-    parts = list(_parts(grid, progress))
-    places, faces = (np.concatenate(those) for those in zip(*parts, strict=True))
+    parts = list(_surface_parts(grid, progress))
+    vertices, faces = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     if not len(faces):
-        raise ValueError(grid.nothing())
-    return Mesh(vertices=places, faces=faces, name="surface")
+        raise ValueError(grid.no_surface_message())
+    return Mesh(vertices=vertices, faces=faces, name="surface")
 
 
 def export_surface(
@@ -107,11 +107,11 @@ def export_surface(
     path = Path(path)
     check_surface_path("export_surface", path)
     grid = _Grid(what, value, level, component, channel, caps)
-    with SurfaceFile(path, grid.place(np.zeros((1, 3)))[0], float(grid.step.min())) as file:
-        for places, faces in _parts(grid, progress):
-            file.add(places, faces)
+    with SurfaceFile(path, grid.to_world(np.zeros((1, 3)))[0], float(grid.step.min())) as file:
+        for vertices, faces in _surface_parts(grid, progress):
+            file.add(vertices, faces)
         if not file.triangles:
-            raise ValueError(grid.nothing())
+            raise ValueError(grid.no_surface_message())
     return SurfaceSize(file.vertices, file.triangles)
 
 
@@ -122,158 +122,167 @@ class _Grid:
 
     def __init__(
         self,
-        what: Volume | Store | N3Tree,
+        source: Volume | Store | N3Tree,
         value: float,
         level: int,
         component: int,
         channel: str | None,
         caps: bool,
     ) -> None:
-        where = "extract_surface"
-        if not isinstance(what, (Volume, Store, N3Tree)):
-            kind = type(what).__name__
-            raise ValueError(f"{where}: what must be a Volume, Store or N3Tree, got {kind}")
-        self.what, self.more = what, 2 if caps else 0
+        caller = "extract_surface"
+        if not isinstance(source, (Volume, Store, N3Tree)):
+            kind = type(source).__name__
+            raise ValueError(f"{caller}: what must be a Volume, Store or N3Tree, got {kind}")
+        self.source, self.margin = source, 2 if caps else 0
         self.label: int | None = None
-        self.value = check.number(where, "value", value)
-        branching, levels = 2, what.levels if isinstance(what, Store) else 1
-        if isinstance(what, N3Tree):
-            branching, levels = what.branching, what.depth + 1
-            self._bricks, self._channel = what.levels(), what.fine_channel(where, channel)
-            width = what.bricks.channels[self._channel].width
-            known, labels = what.labels.get(self._channel), self._channel in what.labels
+        self.value = check.number(caller, "value", value)
+        branching, levels = 2, source.levels if isinstance(source, Store) else 1
+        if isinstance(source, N3Tree):
+            branching, levels = source.branching, source.depth + 1
+            self._bricks, self._channel = source.levels(), source.fine_channel(caller, channel)
+            width = source.bricks.channels[self._channel].width
+            label_values, is_labelled = (
+                source.labels.get(self._channel),
+                self._channel in source.labels,
+            )
         else:
             if channel is not None:
-                raise ValueError(f"{where}: channel is for trees, got {channel!r}")
-            width, known, labels = what.width, what.label_values, what.info.labels
-        self.level = check.whole(where, "level", level, low=0, high=levels - 1)
-        self.component = check.whole(where, "component", component, low=0, high=width - 1)
-        if labels:
-            self.label, self.value = _stored_label(self.value, known), 0.5
+                raise ValueError(f"{caller}: channel is for trees, got {channel!r}")
+            width, label_values, is_labelled = source.width, source.label_values, source.info.labels
+        self.level = check.whole(caller, "level", level, low=0, high=levels - 1)
+        self.component = check.whole(caller, "component", component, low=0, high=width - 1)
+        if is_labelled:
+            self.label, self.value = _stored_label(self.value, label_values), 0.5
         scale = branching**level
-        self.voxels = tuple(-(-n // scale) for n in what.extent[::-1])
-        self.samples = tuple(n + 2 * self.more for n in self.voxels)
-        spacing, origin = np.array(what.spacing[::-1]), np.array(what.origin[::-1])
+        self.voxels = tuple(-(-n // scale) for n in source.extent[::-1])
+        self.samples = tuple(n + 2 * self.margin for n in self.voxels)
+        spacing, origin = np.array(source.spacing[::-1]), np.array(source.origin[::-1])
         self.step = spacing * scale
-        self._first = origin + spacing * (scale - 1) / 2  # of the first voxel's centre
-        ends = np.array(what.extent[::-1]) / scale - 0.5  # far faces of the box, in voxels
-        self._ends = np.clip(ends, np.array(self.voxels) - 1, None)
+        self._first_center = origin + spacing * (scale - 1) / 2  # of the first voxel's centre
+        far_faces = np.array(source.extent[::-1]) / scale - 0.5  # far faces of the box, in voxels
+        self._far_faces = np.clip(far_faces, np.array(self.voxels) - 1, None)
 
-    def place(self, at: np.ndarray) -> np.ndarray:
+    def to_world(self, positions: np.ndarray) -> np.ndarray:
         """Returns world positions (k, 3) x y z of positions z y x in samples."""
-        found = at - self.more
-        if self.more:
-            found = np.where(found < 0, -0.5 * np.clip(-found, 0, 1), found)
+        voxels = positions - self.margin
+        if self.margin:
+            voxels = np.where(voxels < 0, -0.5 * np.clip(-voxels, 0, 1), voxels)
             last = np.array(self.voxels) - 1
-            beyond = np.clip(found - last, 0, 1)
-            found = np.where(beyond > 0, last + beyond * (self._ends - last), found)
-        return (self._first + found * self.step)[:, ::-1]
+            beyond = np.clip(voxels - last, 0, 1)
+            voxels = np.where(beyond > 0, last + beyond * (self._far_faces - last), voxels)
+        return (self._first_center + voxels * self.step)[:, ::-1]
 
     def read(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
         """Returns samples low to high, float64; outside they are -inf."""
-        begin, end = ([n - self.more for n in corner] for corner in (low, high))
+        begin, end = ([n - self.margin for n in corner] for corner in (low, high))
         start, stop = clamped_box(begin, end, self.voxels)
         values = self._voxels(start, stop)[..., self.component, None]
         values = repeat_edges(values, start, begin, end)[..., 0]
-        same = values == self.label if self.label is not None else values
-        samples = same.astype(np.float64)
+        scalars = values == self.label if self.label is not None else values
+        samples = scalars.astype(np.float64)
         samples[np.isnan(samples)] = -np.inf
-        for axis in range(3 if self.more else 0):
-            at = np.arange(low[axis], high[axis])
-            outside = (at == 0) | (at == self.samples[axis] - 1)
+        for axis in range(3 if self.margin else 0):
+            layer = np.arange(low[axis], high[axis])
+            outside = (layer == 0) | (layer == self.samples[axis] - 1)
             samples[(slice(None),) * axis + (outside,)] = -np.inf
         return samples
 
     def _voxels(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
         """Returns voxels low to high, which must lie inside, (z, y, x, c)."""
-        if isinstance(self.what, Store):
-            return self.what.read_region(self.level, low, high)
-        if isinstance(self.what, N3Tree):
-            found = self._bricks.read(self._channel, self.level, tuple(low), tuple(high))
+        if isinstance(self.source, Store):
+            return self.source.read_region(self.level, low, high)
+        if isinstance(self.source, N3Tree):
+            voxels = self._bricks.read(self._channel, self.level, tuple(low), tuple(high))
         else:
-            found = self.what.data[tuple(map(slice, low, high))]
-        return to_numpy(found)
+            voxels = self.source.data[tuple(map(slice, low, high))]
+        return to_numpy(voxels)
 
-    def crossed(self, low: Sequence[int], high: Sequence[int]) -> bool:
+    def may_cross(self, low: Sequence[int], high: Sequence[int]) -> bool:
         """Returns whether samples low to high may lie on both sides of the value: judged by the
         cells of a store, without reading voxels; true if there are no cells.
         """
-        store = self.what
-        outside = self.more and any(
+        store = self.source
+        outside = self.margin and any(
             a == 0 or b == n for a, b, n in zip(low, high, self.samples, strict=True)
         )
         if not isinstance(store, Store) or not store.has_blocks:
             return True
-        begin, end = ([n - self.more for n in corner] for corner in (low, high))
+        begin, end = ([n - self.margin for n in corner] for corner in (low, high))
         start, stop = clamped_box(begin, end, self.voxels)
         cells = store.read_cells(
             self.level, [n // CELL for n in start], [-(-n // CELL) for n in stop]
         )[..., self.component]
-        least, most = cells[..., 0].min(), cells[..., 1].max()
+        lowest, highest = cells[..., 0].min(), cells[..., 1].max()
         if self.label is not None:
-            return bool(least <= self.label <= most and (least < most or outside))
-        return bool(most >= self.value and (least < self.value or outside))
+            return bool(lowest <= self.label <= highest and (lowest < highest or outside))
+        return bool(highest >= self.value and (lowest < self.value or outside))
 
-    def nothing(self) -> str:
+    def no_surface_message(self) -> str:
         """Returns the message for data without a surface."""
-        what = f"value {self.value:g}" if self.label is None else "that label"
-        return f"extract_surface: the data has no surface at {what}"
+        target = f"value {self.value:g}" if self.label is None else "that label"
+        return f"extract_surface: the data has no surface at {target}"
 
 
-def _stored_label(label: float, known: torch.Tensor | None) -> int:
-    """Returns the number by which a label is stored: its index in `known`, or itself."""
+def _stored_label(label: float, label_values: torch.Tensor | None) -> int:
+    """Returns the number by which a label is stored: its index in `label_values`, or itself."""
     value = check.whole(
         "extract_surface", "value of labels", int(label) if label % 1 == 0 else label, low=0
     )
-    if known is None:
+    if label_values is None:
         return value
-    found = (known == value).nonzero()
-    if not len(found):
+    matches = (label_values == value).nonzero()
+    if not len(matches):
         raise ValueError(f"extract_surface: there is no label {value}")
-    return int(found[0, 0])
+    return int(matches[0, 0])
 
 
-def _parts(grid: _Grid, progress: Progress) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _surface_parts(grid: _Grid, progress: Progress) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yields new vertices, (v, 3) world x y z, and triangles that index all vertices so far. Blocks
     are visited along x, then y, then z; vertices on far faces are kept for the blocks behind them.
     """
-    spans = [[(a, min(a + _BLOCK, n - 1)) for a in range(0, n - 1, _BLOCK)] for n in grid.samples]
-    counts = [len(those) for those in spans]
+    spans = [
+        [(a, min(a + _BLOCK_CELLS, n - 1)) for a in range(0, n - 1, _BLOCK_CELLS)]
+        for n in grid.samples
+    ]
+    counts = [len(axis_spans) for axis_spans in spans]
     total, vertices = int(np.prod(counts)), 0
-    far: dict[tuple[int, ...], Numbered] = {}  # by block, until the one behind it along z is done
-    blocks = itertools.product(*(enumerate(those) for those in spans))
-    for done, block in enumerate(blocks):
-        at, low, high = (
+    # By block, until the one behind it along z is done.
+    far_vertices: dict[tuple[int, ...], Numbered] = {}
+    blocks = itertools.product(*(enumerate(axis_spans) for axis_spans in spans))
+    for blocks_done, block in enumerate(blocks):
+        block_index, low, high = (
             tuple(part) for part in zip(*((n, *span) for n, span in block), strict=True)
         )
-        z, y, x = at
-        before = [far.get(place) for place in ((z, y, x - 1), (z, y - 1, x), (z - 1, y, x))]
-        far.pop((z - 1, y, x), None)
+        z, y, x = block_index
+        neighbours = [
+            far_vertices.get(index) for index in ((z, y, x - 1), (z, y - 1, x), (z - 1, y, x))
+        ]
+        far_vertices.pop((z - 1, y, x), None)
         end = [b + 1 for b in high]
-        if grid.crossed(low, end):
-            made = contour(grid.read(low, end), grid.value, low, grid.samples)
-            number = _numbers(made.keys, filter(None, before), vertices)
-            new = number >= vertices
-            vertices += int(new.sum())
-            start, along = edge_of(made.keys, grid.samples)
-            on = ((start == high) & (along[:, None] != (2, 1, 0))).any(1)
-            far[at] = made.keys[on], number[on]
-            if len(made.faces):
-                yield grid.place(made.places[new]), number[made.faces]
-        progress("surface", done + 1, total)
+        if grid.may_cross(low, end):
+            piece = contour(grid.read(low, end), grid.value, low, grid.samples)
+            vertex_numbers = _vertex_numbers(piece.keys, filter(None, neighbours), vertices)
+            is_new = vertex_numbers >= vertices
+            vertices += int(is_new.sum())
+            start, edge_axis = edge_of(piece.keys, grid.samples)
+            on_far_face = ((start == high) & (edge_axis[:, None] != (2, 1, 0))).any(1)
+            far_vertices[block_index] = piece.keys[on_far_face], vertex_numbers[on_far_face]
+            if len(piece.faces):
+                yield grid.to_world(piece.places[is_new]), vertex_numbers[piece.faces]
+        progress("surface", blocks_done + 1, total)
     yield np.zeros((0, 3)), np.zeros((0, 3), np.int64)
 
 
-def _numbers(keys: np.ndarray, known: Iterable[Numbered], count: int) -> np.ndarray:
+def _vertex_numbers(keys: np.ndarray, earlier: Iterable[Numbered], first_new: int) -> np.ndarray:
     """Returns the number of each key's vertex: the known one, if it is on the far face of an
-    earlier block, else a new one, from `count` on.
+    earlier block, else a new one, from `first_new` on.
     """
-    number = np.full(len(keys), -1)
-    for names, numbers in known:
-        if len(names):
-            found = np.minimum(np.searchsorted(names, keys), len(names) - 1)
-            same = names[found] == keys
-            number[same] = numbers[found[same]]
-    new = number < 0
-    number[new] = count + np.arange(int(new.sum()))
-    return number
+    vertex_numbers = np.full(len(keys), -1)
+    for earlier_keys, earlier_numbers in earlier:
+        if len(earlier_keys):
+            positions = np.minimum(np.searchsorted(earlier_keys, keys), len(earlier_keys) - 1)
+            is_known = earlier_keys[positions] == keys
+            vertex_numbers[is_known] = earlier_numbers[positions[is_known]]
+    is_new = vertex_numbers < 0
+    vertex_numbers[is_new] = first_new + np.arange(int(is_new.sum()))
+    return vertex_numbers

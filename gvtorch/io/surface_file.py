@@ -22,26 +22,26 @@ import numpy as np
 from ..base.whole_file import whole_file
 
 ENDINGS = (".ply", ".glb")
-_MOST = 2**31 - 1  # vertices that int32 can index
-_COPIED = 1 << 24  # bytes at a time
-_PAD = 4  # chunks of a .glb end at multiples of this
+_MAX_VERTICES = 2**31 - 1  # that int32 can index
+_COPY_BYTES = 1 << 24  # at a time
+_CHUNK_ALIGNMENT = 4  # chunks of a .glb end at multiples of this
 
 
-def check_surface_path(where: str, path: Path) -> None:
+def check_surface_path(caller: str, path: Path) -> None:
     """Raises ValueError unless a surface may be written there, FileNotFoundError if there is no
     such folder.
     """
     if path.suffix not in ENDINGS:
-        raise ValueError(f"{where}: path must end in {' or '.join(ENDINGS)}, got {str(path)!r}")
+        raise ValueError(f"{caller}: path must end in {' or '.join(ENDINGS)}, got {str(path)!r}")
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{where}: folder not found: {path.parent}")
+        raise FileNotFoundError(f"{caller}: folder not found: {path.parent}")
 
 
 class SurfaceFile:
     """A file of triangles that appears once it is complete:
 
     with SurfaceFile(path, origin, step) as file:
-        file.add(places, faces)
+        file.add(vertices, faces)
 
     Attributes:
         vertices: Number of vertices so far.
@@ -54,15 +54,15 @@ class SurfaceFile:
         """
         check_surface_path("surface", path)
         self._path, self._origin = path, origin
-        self._glb, self._step = path.suffix == ".glb", step
+        self._is_glb, self._step = path.suffix == ".glb", step
         self.vertices = self.triangles = 0
-        self._ends = np.array([[np.inf] * 3, [-np.inf] * 3])
+        self._bounds = np.array([[np.inf] * 3, [-np.inf] * 3])
         self._stack = ExitStack()
 
     def __enter__(self) -> SurfaceFile:
         """Opens the temporary files and returns itself."""
-        self._part = self._stack.enter_context(whole_file(self._path))
-        self._places, self._faces = (
+        self._temporary_path = self._stack.enter_context(whole_file(self._path))
+        self._vertex_file, self._face_file = (
             self._stack.enter_context(tempfile.TemporaryFile(dir=self._path.parent))
             for _ in range(2)
         )
@@ -73,68 +73,70 @@ class SurfaceFile:
         """Writes the file; after an error, removes what there is of it."""
         self._stack.__exit__(*error)
 
-    def add(self, places: np.ndarray, faces: np.ndarray) -> None:
+    def add(self, positions: np.ndarray, faces: np.ndarray) -> None:
         """Appends vertices, (v, 3) float64 world x y z, and triangles, (f, 3) indices of all
         vertices added so far.
         """
-        self.vertices += len(places)
+        self.vertices += len(positions)
         self.triangles += len(faces)
-        if self.vertices > _MOST:
-            raise ValueError(f"{self._path}: more than {_MOST} vertices: take a coarser level")
-        if self._glb:
-            local = (places - self._origin).astype("<f4")
-            self._places.write(local.tobytes())
-            self._faces.write(faces.astype("<u4").tobytes())
-            places = local
+        if self.vertices > _MAX_VERTICES:
+            raise ValueError(
+                f"{self._path}: more than {_MAX_VERTICES} vertices: take a coarser level"
+            )
+        if self._is_glb:
+            local = (positions - self._origin).astype("<f4")
+            self._vertex_file.write(local.tobytes())
+            self._face_file.write(faces.astype("<u4").tobytes())
+            positions = local
         else:
-            self._places.write(places.astype("<f8").tobytes())
+            self._vertex_file.write(positions.astype("<f8").tobytes())
             rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
             rows["count"], rows["corners"] = 3, faces
-            self._faces.write(rows.tobytes())
-        if len(places):
-            self._ends[0] = np.minimum(self._ends[0], places.min(0))
-            self._ends[1] = np.maximum(self._ends[1], places.max(0))
+            self._face_file.write(rows.tobytes())
+        if len(positions):
+            self._bounds[0] = np.minimum(self._bounds[0], positions.min(0))
+            self._bounds[1] = np.maximum(self._bounds[1], positions.max(0))
 
-    def _write(self, kind: type[BaseException] | None, *_: object) -> None:
+    def _write(self, error_type: type[BaseException] | None, *_: object) -> None:
         """Writes the file at the end, unless there was an error."""
-        if kind is None:
-            with self._part.open("wb") as file:
-                (self._write_glb if self._glb else self._write_ply)(file)
+        if error_type is None:
+            with self._temporary_path.open("wb") as file:
+                (self._write_glb if self._is_glb else self._write_ply)(file)
 
     def _write_ply(self, file: IO[bytes]) -> None:
-        most = max(1.0, float(np.abs(self._ends).max())) if self.vertices else 1.0
-        wide = np.spacing(np.float32(most)) > self._step / 1000
-        kind = "double" if wide else "float"
+        largest = max(1.0, float(np.abs(self._bounds).max())) if self.vertices else 1.0
+        needs_double = np.spacing(np.float32(largest)) > self._step / 1000
+        property_type = "double" if needs_double else "float"
         lines = [
             *("ply", "format binary_little_endian 1.0", f"element vertex {self.vertices}"),
-            *(f"property {kind} {axis}" for axis in "xyz"),
+            *(f"property {property_type} {axis}" for axis in "xyz"),
             *(f"element face {self.triangles}", "property list uchar int vertex_indices"),
             "end_header\n",
         ]
         file.write("\n".join(lines).encode())
-        self._places.seek(0)
-        while part := self._places.read(_COPIED):
-            file.write(part if wide else np.frombuffer(part, "<f8").astype("<f4").tobytes())
-        self._faces.seek(0)
-        shutil.copyfileobj(self._faces, file, _COPIED)
+        self._vertex_file.seek(0)
+        while part := self._vertex_file.read(_COPY_BYTES):
+            file.write(part if needs_double else np.frombuffer(part, "<f8").astype("<f4").tobytes())
+        self._face_file.seek(0)
+        shutil.copyfileobj(self._face_file, file, _COPY_BYTES)
 
     def _write_glb(self, file: IO[bytes]) -> None:
         sizes = 12 * self.vertices, 12 * self.triangles
-        head = json.dumps(self._scene(*sizes), separators=(",", ":")).encode()
-        head += b" " * (-len(head) % _PAD)
-        total = 12 + 8 + len(head) + 8 + sum(sizes)
+        header = json.dumps(self._gltf_header(*sizes), separators=(",", ":")).encode()
+        header += b" " * (-len(header) % _CHUNK_ALIGNMENT)
+        total = 12 + 8 + len(header) + 8 + sum(sizes)
         if total >= 2**32:
             raise ValueError(f"{self._path}: .glb ends at 4 GB, {total / 1e9:.1f} GB came: .ply")
         file.write(struct.pack("<4sII", b"glTF", 2, total))
-        file.write(struct.pack("<I4s", len(head), b"JSON") + head)
+        file.write(struct.pack("<I4s", len(header), b"JSON") + header)
         file.write(struct.pack("<I4s", sum(sizes), b"BIN\0"))
-        for part in (self._places, self._faces):
-            part.seek(0)
-            shutil.copyfileobj(part, file, _COPIED)
+        for temporary in (self._vertex_file, self._face_file):
+            temporary.seek(0)
+            shutil.copyfileobj(temporary, file, _COPY_BYTES)
 
-    def _scene(self, places: int, faces: int) -> dict[str, object]:
+    def _gltf_header(self, vertex_bytes: int, face_bytes: int) -> dict[str, object]:
         """Returns the JSON of a .glb, given the sizes of both parts in bytes."""
-        ends = {"min": self._ends[0].tolist(), "max": self._ends[1].tolist()}
+        bounds = {"min": self._bounds[0].tolist(), "max": self._bounds[1].tolist()}
         return {
             "asset": {"version": "2.0", "generator": "gvtorch"},
             "scene": 0,
@@ -152,15 +154,20 @@ class SurfaceFile:
                     }
                 }
             ],
-            "buffers": [{"byteLength": places + faces}],
+            "buffers": [{"byteLength": vertex_bytes + face_bytes}],
             "bufferViews": [
-                {"buffer": 0, "byteOffset": 0, "byteLength": places, "target": 34962},
-                {"buffer": 0, "byteOffset": places, "byteLength": faces, "target": 34963},
+                {"buffer": 0, "byteOffset": 0, "byteLength": vertex_bytes, "target": 34962},
+                {
+                    "buffer": 0,
+                    "byteOffset": vertex_bytes,
+                    "byteLength": face_bytes,
+                    "target": 34963,
+                },
             ],
             "accessors": [
                 {
                     **{"bufferView": 0, "componentType": 5126, "count": self.vertices},
-                    **{"type": "VEC3", **ends},
+                    **{"type": "VEC3", **bounds},
                 },
                 {
                     **{"bufferView": 1, "componentType": 5125, "count": 3 * self.triangles},

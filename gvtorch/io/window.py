@@ -17,11 +17,11 @@ from ..base.volume import Volume, to_numpy
 from ..pool.downsample import pool_mean
 from .stores.store import Store
 
-_MOST = 2**22  # voxels in the sample
-_BOXES = 4  # boxes of the sample along each axis
-_BINS = 64  # of the histogram, at most: values of a scan may have gaps
-_DOMINATES = 0.25  # share of all values that makes the highest peak the background
-_TAIL = 1.0  # percent of the values that lie beyond each end of the window
+_SAMPLE_VOXELS = 2**22  # voxels in the sample
+_BOXES_PER_AXIS = 4  # boxes of the sample along each axis
+_MAX_BINS = 64  # of the histogram, at most: values of a scan may have gaps
+_BACKGROUND_FRACTION = 0.25  # share of all values that makes the highest peak the background
+_TAIL_PERCENT = 1.0  # percent of the values that lie beyond each end of the window
 
 
 def window(
@@ -59,13 +59,13 @@ def window(
     check.whole("window", "component", component, low=0, high=data.width - 1)
     values = looked_at(data)[..., component].ravel()
     if percent is not None:
-        return _span(*np.percentile(values, percent))
-    low, high = np.percentile(values, (_TAIL, 100 - _TAIL))
+        return _nonempty_window(*np.percentile(values, percent))
+    low, high = np.percentile(values, (_TAIL_PERCENT, 100 - _TAIL_PERCENT))
     edge = _background(values)
     if edge is not None:
         low = low if background else edge
-        high = np.percentile(values[values > edge], 100 - _TAIL)
-    return _span(low, high)
+        high = np.percentile(values[values > edge], 100 - _TAIL_PERCENT)
+    return _nonempty_window(low, high)
 
 
 def windows(
@@ -77,7 +77,7 @@ def windows(
     values, spans = looked_at(data), []
     for component in components:
         low, high = np.percentile(values[..., component], percent)
-        spans.append(_span(low, high if high > low else values[..., component].max()))
+        spans.append(_nonempty_window(low, high if high > low else values[..., component].max()))
     return spans
 
 
@@ -93,7 +93,7 @@ def value_range(data: Volume | Store) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def _span(low: float, high: float) -> tuple[float, float]:
+def _nonempty_window(low: float, high: float) -> tuple[float, float]:
     """Returns the window, widened if it is empty."""
     low, high = float(low), float(high)
     return (low, high) if high > low else (low, low + max(1.0, 1e-6 * abs(low)))
@@ -103,25 +103,27 @@ def looked_at(data: Volume | Store) -> np.ndarray:
     """Returns a sample of the values, (..., c)."""
     if isinstance(data, Volume):
         values = to_numpy(data.data)
-        while values[..., 0].size > _MOST:
+        while values[..., 0].size > _SAMPLE_VOXELS:
             values = pool_mean(values, 2)
         return values
     sizes = [data.level_extent(level)[::-1] for level in range(data.levels)]
-    level = next((n for n, size in enumerate(sizes) if np.prod(size) <= _MOST), data.levels - 1)
+    level = next(
+        (n for n, size in enumerate(sizes) if np.prod(size) <= _SAMPLE_VOXELS), data.levels - 1
+    )
     level = data.stored_level(level)  # others would be averaged from all of a finer level
     parts = [data.read_region(level, *box) for box in _boxes(sizes[level])]
     return np.concatenate([part.reshape(-1, data.width) for part in parts])
 
 
 def _boxes(size: Zyx) -> list[tuple[Zyx, Zyx]]:
-    """Returns a box that is all of a level, or evenly spaced ones of `_MOST` voxels in total."""
-    if np.prod(size) <= _MOST:
+    """Returns a box that is all of a level, or evenly spaced ones of `_SAMPLE_VOXELS` in total."""
+    if np.prod(size) <= _SAMPLE_VOXELS:
         return [((0, 0, 0), size)]
-    share = (_MOST / np.prod(size)) ** (1 / 3)
+    fraction = (_SAMPLE_VOXELS / np.prod(size)) ** (1 / 3)
     spans = []
     for n in size:
-        side = max(1, int(n * share / _BOXES))
-        middles = [(2 * at + 1) * n // (2 * _BOXES) for at in range(_BOXES)]
+        side = max(1, int(n * fraction / _BOXES_PER_AXIS))
+        middles = [(2 * i + 1) * n // (2 * _BOXES_PER_AXIS) for i in range(_BOXES_PER_AXIS)]
         spans.append([(max(0, m - side // 2), max(0, m - side // 2) + side) for m in middles])
     return [
         (tuple(a for a, _ in box), tuple(b for _, b in box)) for box in itertools.product(*spans)
@@ -133,19 +135,19 @@ def _background(values: np.ndarray) -> float | None:
     as the value where the count is down to half; None if there is no background, or nothing else.
     """
     low, high = (float(end) for end in np.percentile(values, (0.01, 99.99)))
-    step = (high - low) / int(np.clip(values.size**0.5 / 2, 16, _BINS))
+    step = (high - low) / int(np.clip(values.size**0.5 / 2, 16, _MAX_BINS))
     if values.dtype.kind in "iu":
         step = max(1.0, np.ceil(step))
     if high > low:
         bins = int((high - low) / step) + 1
         counts = np.bincount(np.clip((values - low) / step, 0, bins - 1).astype(np.int64))
-        top = int(counts.argmax())
-        if top > bins / 2:
+        peak = int(counts.argmax())
+        if peak > bins / 2:
             return None
-        beyond = np.flatnonzero(counts[top:] < counts[top] / 2)
-        half = int(beyond[0]) if len(beyond) else bins
-        edge = low + (top + 2 * half - 1) * step
+        below_half = np.flatnonzero(counts[peak:] < counts[peak] / 2)
+        half_width = int(below_half[0]) if len(below_half) else bins
+        edge = low + (peak + 2 * half_width - 1) * step
     else:
         edge = low
-    share = np.count_nonzero(values <= edge) / values.size
-    return edge if _DOMINATES <= share < 1 else None
+    fraction = np.count_nonzero(values <= edge) / values.size
+    return edge if _BACKGROUND_FRACTION <= fraction < 1 else None

@@ -24,9 +24,9 @@ import numpy as np
 
 #: Corner n of a cell lies at x = n & 1, y = n >> 1 & 1, z = n >> 2 & 1. Edges: axis, first corner.
 _EDGES = [(axis, n) for axis in range(3) for n in range(8) if not n >> axis & 1]
-_NUMBER = {edge: at for at, edge in enumerate(_EDGES)}
-_AXIS = np.array([axis for axis, _ in _EDGES])  # 0: x
-_AT = np.array([[n >> 2 & 1, n >> 1 & 1, n & 1] for _, n in _EDGES])  # z y x
+_EDGE_NUMBER = {edge: number for number, edge in enumerate(_EDGES)}
+_EDGE_AXIS = np.array([axis for axis, _ in _EDGES])  # 0: x
+_EDGE_START = np.array([[n >> 2 & 1, n >> 1 & 1, n & 1] for _, n in _EDGES])  # z y x
 
 
 class Tables(NamedTuple):
@@ -56,20 +56,20 @@ def contour(
     cells = tuple(n - 1 for n in samples.shape)
     kind = np.zeros(cells, np.uint8)
     for n in range(8):
-        at = tuple(
-            slice(n >> up & 1, (n >> up & 1) + c) for up, c in zip((2, 1, 0), cells, strict=True)
+        corner_slices = tuple(
+            slice(n >> bit & 1, (n >> bit & 1) + c) for bit, c in zip((2, 1, 0), cells, strict=True)
         )
-        kind |= inside[at].view(np.uint8) << n
-    place = np.argwhere((kind != 0) & (kind != 255))  # (k, 3)
+        kind |= inside[corner_slices].view(np.uint8) << n
+    crossed_cell = np.argwhere((kind != 0) & (kind != 255))  # (k, 3)
     tables = _tables()
-    found = kind[tuple(place.T)]
-    count = tables.triangles[found]
-    cell = np.repeat(np.arange(len(place)), count)
-    within = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
-    edge = tables.edges[np.repeat(tables.first[found], count) + within]  # (f, 3)
-    start = place[cell][:, None] + _AT[edge] + np.asarray(low)  # (f, 3, 3)
-    keys, faces = np.unique(key(start, _AXIS[edge], grid), return_inverse=True)
-    return Contour(keys, _places(samples, value, keys, low, grid), faces.reshape(-1, 3))
+    cell_kind = kind[tuple(crossed_cell.T)]
+    count = tables.triangles[cell_kind]
+    cell = np.repeat(np.arange(len(crossed_cell)), count)
+    triangle = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
+    edge = tables.edges[np.repeat(tables.first[cell_kind], count) + triangle]  # (f, 3)
+    start = crossed_cell[cell][:, None] + _EDGE_START[edge] + np.asarray(low)  # (f, 3, 3)
+    keys, faces = np.unique(key(start, _EDGE_AXIS[edge], grid), return_inverse=True)
+    return Contour(keys, _vertex_positions(samples, value, keys, low, grid), faces.reshape(-1, 3))
 
 
 def key(start: np.ndarray, axis: np.ndarray, grid: Sequence[int]) -> np.ndarray:
@@ -86,7 +86,7 @@ def edge_of(keys: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarr
     return np.stack(np.unravel_index(rest, tuple(grid)), -1), axis
 
 
-def _places(
+def _vertex_positions(
     samples: np.ndarray, value: float, keys: np.ndarray, low: Sequence[int], grid: Sequence[int]
 ) -> np.ndarray:
     """Returns (v, 3) the position of the value on each edge, by linear interpolation."""
@@ -94,41 +94,42 @@ def _places(
     end = start.copy()
     row, column = np.arange(len(keys)), 2 - axis
     end[row, column] += 1
-    a, b = (samples[tuple((at - np.asarray(low)).T)] for at in (start, end))
+    a, b = (samples[tuple((sample - np.asarray(low)).T)] for sample in (start, end))
     with np.errstate(invalid="ignore"):
-        share = (value - a) / (b - a)
-    share = np.where(np.isneginf(b), 0.0, np.where(np.isneginf(a), 1.0, share))
-    places = start.astype(np.float64)
-    places[row, column] += share
-    return places
+        fraction = (value - a) / (b - a)
+    fraction = np.where(np.isneginf(b), 0.0, np.where(np.isneginf(a), 1.0, fraction))
+    positions = start.astype(np.float64)
+    positions[row, column] += fraction
+    return positions
 
 
 @functools.cache
 def _tables() -> Tables:
     triangles = [
-        [three for loop in _loops(kind) for three in _cut(tuple(loop))] for kind in range(256)
+        [triangle for loop in _loops(kind) for triangle in _triangulated(tuple(loop))]
+        for kind in range(256)
     ]
-    count = np.array([len(those) for those in triangles])
-    edges = np.array([three for those in triangles for three in those])
+    count = np.array([len(cell_triangles) for cell_triangles in triangles])
+    edges = np.array([triangle for cell_triangles in triangles for triangle in cell_triangles])
     return Tables(count, np.cumsum(count) - count, edges)
 
 
 def _loops(kind: int) -> list[list[int]]:
     """Returns the loops of cell edges around the inside corners of a cell."""
-    after: dict[int, int] = {}
+    next_edge: dict[int, int] = {}
     for corners in _faces():
         pairs = list(itertools.pairwise((*corners, corners[0])))
         crossed = [(_edge(a, b), kind >> b & 1) for a, b in pairs if (kind >> a ^ kind >> b) & 1]
         for n, (edge, enters) in enumerate(crossed):
             if enters:  # join the edge where the face's rim enters to the next, where it leaves
-                after[edge] = crossed[(n + 1) % len(crossed)][0]
+                next_edge[edge] = crossed[(n + 1) % len(crossed)][0]
     loops = []
-    while after:
-        edge, follows = after.popitem()
+    while next_edge:
+        edge, following = next_edge.popitem()
         loop = [edge]
-        while follows != edge:
-            loop.append(follows)
-            follows = after.pop(follows)
+        while following != edge:
+            loop.append(following)
+            following = next_edge.pop(following)
         loops.append(loop)
     return loops
 
@@ -144,7 +145,7 @@ def _faces() -> list[tuple[int, ...]]:
 
 
 def _edge(a: int, b: int) -> int:
-    return _NUMBER[(a ^ b).bit_length() - 1, min(a, b)]
+    return _EDGE_NUMBER[(a ^ b).bit_length() - 1, min(a, b)]
 
 
 def _on_one_face(a: int, b: int) -> bool:
@@ -154,7 +155,7 @@ def _on_one_face(a: int, b: int) -> bool:
 
 
 @functools.cache
-def _cut(loop: tuple[int, ...]) -> list[tuple[int, int, int]]:
+def _triangulated(loop: tuple[int, ...]) -> list[tuple[int, int, int]]:
     """Cuts a loop into triangles, with cuts inside the cell only and the least total length."""
     if len(loop) == 3:
         return [(loop[0], loop[1], loop[2])]
@@ -164,16 +165,16 @@ def _cut(loop: tuple[int, ...]) -> list[tuple[int, int, int]]:
         inner = [pair for pair, ends in zip(sides, (n > 1, n < len(loop) - 2), strict=True) if ends]
         if any(_on_one_face(*pair) for pair in inner):
             continue
-        parts = [_cut(part) for part in (loop[: n + 1], loop[n:]) if len(part) > 2]
-        made = [(loop[0], loop[n], loop[-1]), *itertools.chain(*parts)]
-        if all(parts) and (not best or _length(made) < _length(best)):
-            best = made
+        parts = [_triangulated(part) for part in (loop[: n + 1], loop[n:]) if len(part) > 2]
+        triangles = [(loop[0], loop[n], loop[-1]), *itertools.chain(*parts)]
+        if all(parts) and (not best or _length(triangles) < _length(best)):
+            best = triangles
     return best
 
 
 def _length(triangles: list[tuple[int, int, int]]) -> float:
     """Returns the length of all triangles' edges, with vertices in the middle of cell edges."""
-    middles = _AT.astype(np.float64)
-    middles[np.arange(12), 2 - _AXIS] = 0.5
+    middles = _EDGE_START.astype(np.float64)
+    middles[np.arange(12), 2 - _EDGE_AXIS] = 0.5
     corners = middles[np.array(triangles)]
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).sum())

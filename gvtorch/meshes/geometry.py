@@ -13,9 +13,9 @@ from torch import Tensor
 from ..ops.voxelize import ARITY, Voxelized, voxelize
 from .mesh import Mesh, solids
 
-_BITS = 20  # bits of a Morton code along each axis
+_MORTON_BITS = 20  # bits of a Morton code along each axis
 _HALF_DIAGONAL = 0.5 * 3**0.5  # half the diagonal of a unit cube
-_POINTS = 1 << 20  # points per call of the op
+_BATCH_POINTS = 1 << 20  # points per call of the op
 
 
 class Hierarchy:
@@ -46,8 +46,8 @@ class Geometry:
     """The triangles of a mesh in a hierarchy. No method waits for the device.
 
     Attributes:
-        kept: (f,) int64 index in the mesh of each triangle used here, in the hierarchy's order; see
-            `solids`.
+        mesh_face: (f,) int64 index in the mesh of each triangle used here, in the hierarchy's
+            order; see `solids`.
         corner: (f, 3, 3) float64 corners.
         solid: (f,) bool, whether a triangle bounds a solid.
         hierarchy: Boxes around the triangles.
@@ -66,7 +66,7 @@ class Geometry:
         self.hierarchy = Hierarchy(corner)
         order = self.hierarchy.order
         self.corner = corner[order].contiguous()
-        self.kept = torch.from_numpy(kept)[order.cpu()]
+        self.mesh_face = torch.from_numpy(kept)[order.cpu()]
         self.solid = torch.from_numpy(closed & solid).to(device)[order]
         bounds = self.corner.amax(1) - self.corner.amin(1)
         self.size = float((self.corner.amax((0, 1)) - self.corner.amin((0, 1))).max())
@@ -78,25 +78,25 @@ class Geometry:
         a, b, c = self.corner.unbind(1)
         return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
 
-    def winding(self, place_p3: Tensor) -> Tensor:
+    def winding(self, point_p3: Tensor) -> Tensor:
         """Returns (p,) int32 winding numbers of the closed parts at points (p, 3)."""
-        return self._at(place_p3, -1.0)[0]
+        return self._winding_and_distance(point_p3, -1.0)[0]
 
-    def signed_distance(self, place_p3: Tensor) -> Tensor:
+    def signed_distance(self, point_p3: Tensor) -> Tensor:
         """Returns (p,) float64 distances to the nearest triangle, negative inside of closed parts;
         exact to float64's rounding at any distance.
         """
-        winding, distance = self._at(place_p3, torch.inf)
+        winding, distance = self._winding_and_distance(point_p3, torch.inf)
         return torch.where(winding != 0, -distance, distance)
 
-    def _at(self, place_p3: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    def _winding_and_distance(self, point_p3: Tensor, reach: float) -> tuple[Tensor, Tensor]:
         """Returns (p,) winding numbers and distances up to `reach`, from mesh-sized voxels."""
         parts = []
-        for place in place_p3.to(self.corner).split(_POINTS):
-            size = place.new_tensor((self.size, self.size, reach)).expand(len(place), 3)
-            low = place - 0.5 * self.size
-            found = self.cubes(low, size.contiguous(), 1, wide=True)
-            parts.append((found.winding.view(-1), found.distance.view(-1) * self.size))
+        for point in point_p3.to(self.corner).split(_BATCH_POINTS):
+            size = point.new_tensor((self.size, self.size, reach)).expand(len(point), 3)
+            low = point - 0.5 * self.size
+            voxels = self.cubes(low, size.contiguous(), 1, wide=True)
+            parts.append((voxels.winding.view(-1), voxels.distance.view(-1) * self.size))
         winding, distance = (torch.cat(part) for part in zip(*parts, strict=True))
         return winding, distance
 
@@ -115,11 +115,11 @@ class Geometry:
             (k, parts, parts, parts) bool, z y x: False where no triangle comes within reach of a
             part; and, of the same shape, whether such a part lies inside the mesh.
         """
-        part = size_k / parts
-        reach = (reach_k + _HALF_DIAGONAL * part) * (1 + 1e-3)  # exceeds float32's rounding
-        size = torch.stack((part, part, reach), 1)
-        found = self.cubes(low_k3, size, parts, wide=wide)
-        return found.nearest >= 0, found.winding != 0
+        part_size = size_k / parts
+        reach = (reach_k + _HALF_DIAGONAL * part_size) * (1 + 1e-3)  # exceeds float32's rounding
+        size = torch.stack((part_size, part_size, reach), 1)
+        voxels = self.cubes(low_k3, size, parts, wide=wide)
+        return voxels.nearest >= 0, voxels.winding != 0
 
     def cubes(
         self,
@@ -147,13 +147,13 @@ def padded(level: Tensor) -> Tensor:
     return torch.cat((level, level[-1:].expand(-len(level) % ARITY, *level.shape[1:])))
 
 
-def _morton(place_f3: Tensor) -> Tensor:
+def _morton(center_f3: Tensor) -> Tensor:
     """Returns (f,) int64 Morton codes of positions: close positions tend to have close codes."""
-    low, high = place_f3.amin(0), place_f3.amax(0)
-    size = (high - low).max().clamp(min=torch.finfo(place_f3.dtype).tiny)
-    cell = ((place_f3 - low) / size * (2**_BITS - 1)).to(torch.int64)
+    low, high = center_f3.amin(0), center_f3.amax(0)
+    size = (high - low).max().clamp(min=torch.finfo(center_f3.dtype).tiny)
+    cell = ((center_f3 - low) / size * (2**_MORTON_BITS - 1)).to(torch.int64)
     code = torch.zeros_like(cell[:, 0])
-    for bit in range(_BITS):
+    for bit in range(_MORTON_BITS):
         for axis in range(3):
             code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
     return code

@@ -20,9 +20,9 @@ from .winding import WindingNumber
 SolidParts = Literal["auto", "always", "never"]
 
 _RINGS = 4  # rings of triangles between a hole's rim and its middle
-_STEPS = 12  # steps of the bisection
-_FEW = 0.02  # a part with at most this many hole edges per triangle is nearly closed
-_FLAT = 1e-3  # a part whose volume / area^(3/2) is at most this encloses nothing
+_BISECTIONS = 12  # steps of the bisection
+_NEARLY_CLOSED = 0.02  # a part with at most this many hole edges per triangle is nearly closed
+_MIN_VOLUME_RATIO = 1e-3  # a part whose volume / area^(3/2) is at most this encloses nothing
 
 
 @dataclass(frozen=True)
@@ -45,21 +45,23 @@ def rims(mesh: Mesh) -> tuple[list[Rim], np.ndarray]:
     edge, begin, end, balance = edges_of(faces)
     face = np.repeat(np.arange(len(faces)), 3)
     part = np.full(len(mesh.faces), -1)
-    own = part_of_faces(face, edge, len(faces), int(edge.max()) + 1)
-    part[kept] = kept[own]
-    # Where `spare` more triangles run along an edge one way than the other, the rim runs the other
-    # way, `spare` times; of the triangles that run the first way, the first ones are used.
-    spare = np.abs(balance)[edge]
+    part_label = part_of_faces(face, edge, len(faces), int(edge.max()) + 1)
+    part[kept] = kept[part_label]
+    # Where `excess` more triangles run along an edge one way than the other, the rim runs the other
+    # way, `excess` times; of the triangles that run the first way, the first ones are used.
+    excess = np.abs(balance)[edge]
     ahead = np.sign(balance)[edge] == np.where(begin < end, 1, -1)
     order = np.lexsort((np.arange(len(edge)), edge))
-    some = order[(spare > 0)[order] & ahead[order]]
-    rank = np.arange(len(some)) - np.searchsorted(edge[some], edge[some])
-    some = some[rank < spare[some]]
-    found = []
-    for loop in _loops(end[some], begin[some]):
-        at = some[loop]
-        found.append(Rim(int(part[kept[face[at[0]]]]), kept[face[at]], (at + 1) % 3))
-    return found, part
+    rim_edges = order[(excess > 0)[order] & ahead[order]]
+    rank = np.arange(len(rim_edges)) - np.searchsorted(edge[rim_edges], edge[rim_edges])
+    rim_edges = rim_edges[rank < excess[rim_edges]]
+    hole_rims = []
+    for loop in _loops(end[rim_edges], begin[rim_edges]):
+        loop_edges = rim_edges[loop]
+        hole_rims.append(
+            Rim(int(part[kept[face[loop_edges[0]]]]), kept[face[loop_edges]], (loop_edges + 1) % 3)
+        )
+    return hole_rims, part
 
 
 def _loops(begin: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
@@ -67,30 +69,30 @@ def _loops(begin: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
     must end in each vertex as begin there.
     """
     leaving: dict[int, list[int]] = {}
-    for number, vertex in enumerate(begin.tolist()):
-        leaving.setdefault(vertex, []).append(number)
+    for edge, vertex in enumerate(begin.tolist()):
+        leaving.setdefault(vertex, []).append(edge)
     ends, begins = end.tolist(), begin.tolist()
-    found = []
+    loops = []
     for vertex in list(leaving):
         while leaving[vertex]:
             path: list[int] = []
             seen = {vertex: 0}
-            here = vertex
+            current = vertex
             while True:
-                number = leaving[here].pop()
-                path.append(number)
-                here = ends[number]
-                if here in seen:
-                    loop = path[seen[here] :]
-                    found.append(np.array(loop))
-                    del path[seen[here] :]
-                    for one in loop[1:]:
-                        seen.pop(begins[one], None)
+                edge = leaving[current].pop()
+                path.append(edge)
+                current = ends[edge]
+                if current in seen:
+                    loop = path[seen[current] :]
+                    loops.append(np.array(loop))
+                    del path[seen[current] :]
+                    for passed in loop[1:]:
+                        seen.pop(begins[passed], None)
                     if not path:
                         break
                 else:
-                    seen[here] = len(path)
-    return found
+                    seen[current] = len(path)
+    return loops
 
 
 def told_of_holes(mesh: Mesh) -> str:
@@ -99,24 +101,24 @@ def told_of_holes(mesh: Mesh) -> str:
     if solid.all():
         return ""
     away = facing_away(mesh)
-    found, part = rims(mesh.turned(away))
+    hole_rims, part = rims(mesh.turned(away))
     count = np.bincount(part[kept], minlength=len(mesh.faces))
     edges = np.bincount(
-        [one.part for one in found], [len(one.face) for one in found], len(mesh.faces)
+        [rim.part for rim in hole_rims], [len(rim.face) for rim in hole_rims], len(mesh.faces)
     )
-    nearly = np.flatnonzero((edges > 0) & (edges <= _FEW * count))
-    holes = sum(one.part in nearly for one in found)
-    why = []
+    nearly = np.flatnonzero((edges > 0) & (edges <= _NEARLY_CLOSED * count))
+    holes = sum(rim.part in nearly for rim in hole_rims)
+    reasons = []
     if holes:
-        why.append(
+        reasons.append(
             f"{holes} holes of {int(edges[nearly].sum())} edges leave {len(nearly)} parts open"
         )
-    if len(away) and len(away) <= _FEW * len(kept):
-        why.append(f"{len(away)} triangles face the other way than those around them")
-    if not why:
+    if len(away) and len(away) <= _NEARLY_CLOSED * len(kept):
+        reasons.append(f"{len(away)} triangles face the other way than those around them")
+    if not reasons:
         return ""
     return (
-        f"{mesh.name}: {', '.join(why)}: they become sheets; "
+        f"{mesh.name}: {', '.join(reasons)}: they become sheets; "
         'solid="always" (--solid always) mends them'
     )
 
@@ -132,23 +134,25 @@ def filled(mesh: Mesh) -> Mesh:
     """
     away = facing_away(mesh)
     mesh = mesh.turned(away) if len(away) else mesh
-    found, part = rims(mesh)
-    if not found:
+    hole_rims, part = rims(mesh)
+    if not hole_rims:
         return mesh
-    opened = np.isin(part, [one.part for one in found])
-    winding = WindingNumber(torch.from_numpy(mesh.corners[opened]))
-    caps = [(one.part, _cap(mesh, one, winding)) for one in found]
+    in_open_part = np.isin(part, [rim.part for rim in hole_rims])
+    winding = WindingNumber(torch.from_numpy(mesh.corners[in_open_part]))
+    caps = [(rim.part, _cap(mesh, rim, winding)) for rim in hole_rims]
     a, b, c = mesh.corners.transpose(1, 0, 2)
     cross = np.cross(b - a, c - a)
-    area = np.bincount(part[opened], 0.5 * np.linalg.norm(cross[opened], axis=1), len(part))
+    area = np.bincount(
+        part[in_open_part], 0.5 * np.linalg.norm(cross[in_open_part], axis=1), len(part)
+    )
     volume = np.zeros(len(part))
-    for owner in {one.part for one in found}:
+    for owner in {rim.part for rim in hole_rims}:
         corners = np.concatenate(
             [mesh.corners[part == owner], *(cap.corners for other, cap in caps if other == owner)]
         )
         corners = corners - corners.mean((0, 1))
         volume[owner] = (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-    round_enough = np.abs(volume) > _FLAT * area**1.5
+    round_enough = np.abs(volume) > _MIN_VOLUME_RATIO * area**1.5
     return _joined(mesh, [cap for owner, cap in caps if round_enough[owner]])
 
 
@@ -158,17 +162,19 @@ def _cap(mesh: Mesh, rim: Rim, winding: WindingNumber) -> Mesh:
     """
     assert mesh.material is not None
     around, n = np.arange(len(rim.face)), len(rim.face)
-    place = mesh.vertices[mesh.faces[rim.face, rim.corner]]
-    middle = place.mean(0)
-    arm = place - middle
-    normal = np.cross(arm, np.roll(arm, -1, 0)).sum(0)
+    rim_points = mesh.vertices[mesh.faces[rim.face, rim.corner]]
+    middle = rim_points.mean(0)
+    spoke = rim_points - middle
+    normal = np.cross(spoke, np.roll(spoke, -1, 0)).sum(0)
     size = np.linalg.norm(normal)
-    share = np.arange(1, _RINGS + 1)[:, None, None] / _RINGS  # 0 at the rim
-    inner = middle + arm * (1 - share[:-1])
+    fraction = np.arange(1, _RINGS + 1)[:, None, None] / _RINGS  # 0 at the rim
+    inner = middle + spoke * (1 - fraction[:-1])
     points = np.concatenate((inner.reshape(-1, 3), middle[None]))
     if size > 0:
-        points = _on_half(points, normal / size, np.linalg.norm(arm, axis=1).mean(), winding)
-    points = np.concatenate((place, points))
+        points = _on_half_winding(
+            points, normal / size, np.linalg.norm(spoke, axis=1).mean(), winding
+        )
+    points = np.concatenate((rim_points, points))
     ring = np.arange(_RINGS * n).reshape(_RINGS, n)
     ring = np.concatenate((ring, np.full((1, n), _RINGS * n)))
     a, b = ring[:-1], np.roll(ring[:-1], -1, 1)
@@ -181,10 +187,10 @@ def _cap(mesh: Mesh, rim: Rim, winding: WindingNumber) -> Mesh:
         """Returns values for each corner, blended from the rim's to their mean in the middle."""
         if values is None:
             return None
-        own = values[rim.face, rim.corner]
-        mean = own.mean(0)
-        rings = mean + (own - mean) * (1 - np.arange(_RINGS)[:, None, None] / _RINGS)
-        return np.concatenate((rings.reshape(-1, own.shape[1]), mean[None]))[faces]
+        rim_values = values[rim.face, rim.corner]
+        mean = rim_values.mean(0)
+        rings = mean + (rim_values - mean) * (1 - np.arange(_RINGS)[:, None, None] / _RINGS)
+        return np.concatenate((rings.reshape(-1, rim_values.shape[1]), mean[None]))[faces]
 
     owner = np.concatenate((np.tile(around, 2 * (_RINGS - 1)), around))
     return Mesh(
@@ -198,37 +204,39 @@ def _cap(mesh: Mesh, rim: Rim, winding: WindingNumber) -> Mesh:
     )
 
 
-def _on_half(
-    points: np.ndarray, normal: np.ndarray, reach: float, winding: WindingNumber
+def _on_half_winding(
+    points: np.ndarray, normal: np.ndarray, max_offset: float, winding: WindingNumber
 ) -> np.ndarray:
-    """Moves points (p, 3) along a normal to where the winding number is +-1/2, at most by `reach`;
-    points without such a position in reach stay.
+    """Moves points (p, 3) along a normal to where the winding number is +-1/2, at most by
+    `max_offset`; points without such a position in reach stay.
     """
-    place, way = torch.from_numpy(points), torch.from_numpy(normal)
+    start, direction = torch.from_numpy(points), torch.from_numpy(normal)
 
-    def more(t: torch.Tensor) -> torch.Tensor:
-        return winding(place + t[:, None] * way).abs() > 0.5
+    def is_inside(t: torch.Tensor) -> torch.Tensor:
+        return winding(start + t[:, None] * direction).abs() > 0.5
 
-    low = torch.full_like(place[:, 0], -reach)
-    high, inside = -low, more(low)
-    crosses = inside != more(high)
-    for _ in range(_STEPS):
+    low = torch.full_like(start[:, 0], -max_offset)
+    high, inside = -low, is_inside(low)
+    crosses = inside != is_inside(high)
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        same = more(middle) == inside
+        same = is_inside(middle) == inside
         low, high = torch.where(same, middle, low), torch.where(same, high, middle)
     moved = torch.where(crosses, 0.5 * (low + high), 0)
-    return (place + moved[:, None] * way).numpy()
+    return (start + moved[:, None] * direction).numpy()
 
 
 def _joined(mesh: Mesh, caps: list[Mesh]) -> Mesh:
     """Returns the mesh and its caps as one mesh."""
-    every = [mesh, *caps]
-    first = np.cumsum([0, *(len(one.vertices) for one in every)])
+    meshes = [mesh, *caps]
+    first = np.cumsum([0, *(len(part.vertices) for part in meshes)])
 
     def all_of(name: str) -> np.ndarray | None:
-        own = [getattr(one, name) for one in every]
-        return None if own[0] is None else np.concatenate(own)
+        arrays = [getattr(part, name) for part in meshes]
+        return None if arrays[0] is None else np.concatenate(arrays)
 
-    faces = [one.faces + start for one, start in zip(every, first, strict=False)]
-    told: dict[str, Any] = {name: all_of(name) for name in ("vertices", "color", "uv", "material")}
-    return replace(mesh, faces=np.concatenate(faces), **told)
+    faces = [part.faces + start for part, start in zip(meshes, first, strict=False)]
+    fields: dict[str, Any] = {
+        name: all_of(name) for name in ("vertices", "color", "uv", "material")
+    }
+    return replace(mesh, faces=np.concatenate(faces), **fields)

@@ -25,27 +25,27 @@ class Paint:
 
     def __init__(self, mesh: Mesh, geometry: Geometry) -> None:
         """Copies colours, textures and normals to the geometry's device."""
-        kept, device = geometry.kept.numpy(), geometry.corner.device
+        mesh_face, device = geometry.mesh_face.numpy(), geometry.corner.device
 
-        def lay(values: np.ndarray | None) -> Tensor | None:
-            return None if values is None else torch.from_numpy(values[kept]).to(device)
+        def to_device(values: np.ndarray | None) -> Tensor | None:
+            return None if values is None else torch.from_numpy(values[mesh_face]).to(device)
 
-        material = lay(mesh.material)
+        material = to_device(mesh.material)
         assert material is not None
-        self.material, self._color, self._uv = material, lay(mesh.color), lay(mesh.uv)
-        rows = [one.color for one in mesh.materials]
-        self._base = torch.tensor(rows, dtype=torch.float32, device=device)
-        textures = [one.texture for one in mesh.materials]
-        self._texel, self._sheet = None, None
-        if self._uv is not None and any(one is not None for one in textures):
-            self._texel, self._sheet = _side_by_side(textures, device)
+        self.material, self._color, self._uv = material, to_device(mesh.color), to_device(mesh.uv)
+        material_colors = [entry.color for entry in mesh.materials]
+        self._material_color = torch.tensor(material_colors, dtype=torch.float32, device=device)
+        textures = [entry.texture for entry in mesh.materials]
+        self._texel, self._texture_layout = None, None
+        if self._uv is not None and any(texture is not None for texture in textures):
+            self._texel, self._texture_layout = _pack_textures(textures, device)
         self._normal = _corner_normals(mesh, geometry)
         area = geometry.area.to(torch.float32)
         third = torch.full((len(area), 3), 1 / 3, device=device)
         color = self.color(torch.arange(len(area), device=device), third)
-        share = (area / area.sum().clamp(min=1e-30))[:, None]
-        self.mean_color = (color * share).sum(0)
-        sums = torch.zeros(len(rows), device=device).index_add_(0, material, area)
+        area_fraction = (area / area.sum().clamp(min=1e-30))[:, None]
+        self.mean_color = (color * area_fraction).sum(0)
+        sums = torch.zeros(len(material_colors), device=device).index_add_(0, material, area)
         self.main_material = int(sums.argmax())
 
     def color(self, face_p: Tensor, weight_p3: Tensor) -> Tensor:
@@ -53,12 +53,12 @@ class Paint:
         by the weights (p, 3) of their corners.
         """
         material = self.material[face_p]
-        color = self._base[material]
+        color = self._material_color[material]
         if self._color is not None:
             color = color * (self._color[face_p] * weight_p3[..., None]).sum(1)
-        if self._uv is not None and self._texel is not None and self._sheet is not None:
+        if self._uv is not None and self._texel is not None and self._texture_layout is not None:
             uv = (self._uv[face_p] * weight_p3[..., None]).sum(1)
-            color = color * _bilinear(self._texel, self._sheet[material], uv)
+            color = color * _bilinear(self._texel, self._texture_layout[material], uv)
         return color
 
     def normal(self, face_p: Tensor, weight_p3: Tensor) -> Tensor:
@@ -75,37 +75,37 @@ def _linear(texture: Tensor) -> Tensor:
     return torch.cat((rgb, texture[..., 3:].float() / 255), -1).to(torch.float16)
 
 
-def _side_by_side(
+def _pack_textures(
     textures: Sequence[np.ndarray | None], device: torch.device
 ) -> tuple[Tensor, Tensor]:
     """Returns (n, 4) float16 texels of all textures, row after row, and (m, 3) int64 the first
     texel, height and width of each texture. A missing texture is one white texel.
     """
     white = torch.ones((1, 1, 4), dtype=torch.float16)
-    known: dict[int, Tensor] = {}
-    firsts, sheets, parts, total = dict[int, int](), [], [], 0
-    for one in textures:
-        if id(one) not in known:
-            known[id(one)] = white if one is None else _linear(torch.tensor(one))
-            firsts[id(one)] = total
-            parts.append(known[id(one)].view(-1, 4))
+    texels: dict[int, Tensor] = {}
+    firsts, layouts, parts, total = dict[int, int](), [], [], 0
+    for texture in textures:
+        if id(texture) not in texels:
+            texels[id(texture)] = white if texture is None else _linear(torch.tensor(texture))
+            firsts[id(texture)] = total
+            parts.append(texels[id(texture)].view(-1, 4))
             total += len(parts[-1])
-        high, wide, _ = known[id(one)].shape
-        sheets.append((firsts[id(one)], high, wide))
-    return torch.cat(parts).to(device), torch.tensor(sheets, device=device)
+        height, width, _ = texels[id(texture)].shape
+        layouts.append((firsts[id(texture)], height, width))
+    return torch.cat(parts).to(device), torch.tensor(layouts, device=device)
 
 
-def _bilinear(texel: Tensor, sheet_p3: Tensor, uv: Tensor) -> Tensor:
+def _bilinear(texel: Tensor, layout_p3: Tensor, uv: Tensor) -> Tensor:
     """Returns (p, 4) bilinear samples of repeating textures; v runs upwards."""
-    first, high, wide = sheet_p3.unbind(1)
-    x, y = uv[:, 0] * wide - 0.5, (1 - uv[:, 1]) * high - 0.5
+    first, height, width = layout_p3.unbind(1)
+    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     x0, y0 = x.floor(), y.floor()
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
     total = torch.zeros((len(uv), 4), device=uv.device)
     for dy, wy in ((0, 1 - fy), (1, fy)):
         for dx, wx in ((0, 1 - fx), (1, fx)):
-            row, column = (y0 + dy).long() % high, (x0 + dx).long() % wide
-            total += wx * wy * texel[first + row * wide + column].float()
+            row, column = (y0 + dy).long() % height, (x0 + dx).long() % width
+            total += wx * wy * texel[first + row * width + column].float()
     return total
 
 
@@ -115,16 +115,18 @@ def _corner_normals(mesh: Mesh, geometry: Geometry) -> Tensor:
     Tools 1998); at sharp edges the triangle's normal.
     """
     corner = geometry.corner
-    _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    vertex = torch.from_numpy(same.reshape(-1)[mesh.faces[geometry.kept.numpy()]])
+    _, position_index = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    vertex = torch.from_numpy(position_index.reshape(-1)[mesh.faces[geometry.mesh_face.numpy()]])
     vertex = vertex.to(corner.device)
     unit = torch.nn.functional.normalize
     edge = unit(corner.roll(-1, 1) - corner, dim=2)
     angle = torch.acos((edge * -edge.roll(1, 1)).sum(2).clamp(-1, 1))
-    own = unit(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=1)
-    own = own[:, None].expand(-1, 3, 3)
-    sums = own.new_zeros((int(vertex.max()) + 1, 3))
-    sums.index_add_(0, vertex.flatten(), (own * angle[..., None]).reshape(-1, 3))
+    face_normal = unit(
+        torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=1
+    )
+    face_normal = face_normal[:, None].expand(-1, 3, 3)
+    sums = face_normal.new_zeros((int(vertex.max()) + 1, 3))
+    sums.index_add_(0, vertex.flatten(), (face_normal * angle[..., None]).reshape(-1, 3))
     mean = unit(sums, dim=1)[vertex]
-    smooth = (mean * own).sum(2, keepdim=True) > _CREASE
-    return torch.where(smooth, mean, own).to(torch.float32)
+    smooth = (mean * face_normal).sum(2, keepdim=True) > _CREASE
+    return torch.where(smooth, mean, face_normal).to(torch.float32)

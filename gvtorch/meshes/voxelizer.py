@@ -27,12 +27,13 @@ CHANNELS = {
     "normal": (torch.int8, 3),
     "material": (torch.uint8, 1),
 }
-_MARGIN = 2  # voxels around the mesh
-_CUBE, _PARTS = 8, 4  # voxels along a cube's side; cubes along the side of a block of a region
-_BATCH = 1 << 20  # voxels that are computed together
-_FINER = 2  # samples along a side of a coarse voxel, which is their mean
-_DIAGONAL = 0.5 * math.sqrt(3)  # from a voxel's centre to its corner
-_FLOAT32 = 2048.0  # size of a triangle, in voxels, from which on float64 is used
+_MARGIN_VOXELS = 2  # voxels around the mesh
+# Voxels along a cube's side; cubes along the side of a block of a region.
+_CUBE_VOXELS, _BLOCK_CUBES = 8, 4
+_BATCH_VOXELS = 1 << 20  # voxels that are computed together
+_SAMPLES_PER_SIDE = 2  # samples along a side of a coarse voxel, which is their mean
+_HALF_DIAGONAL = 0.5 * math.sqrt(3)  # from a voxel's centre to its corner
+_FLOAT32_VOXELS = 2048.0  # size of a triangle, in voxels, from which on float64 is used
 
 
 class GridSettings(TypedDict, total=False):
@@ -49,8 +50,8 @@ def check_channels(where: str, channels: str | Sequence[str]) -> tuple[str, ...]
     names = (channels,) if isinstance(channels, str) else tuple(channels)
     unknown = [name for name in names if name not in CHANNELS]
     if unknown or not names or len({*names}) < len(names):
-        what = f"{unknown[0]!r}" if unknown else f"{names!r}"
-        raise ValueError(f"{where}: channels must be some of {', '.join(CHANNELS)}, got {what}")
+        rejected = f"{unknown[0]!r}" if unknown else f"{names!r}"
+        raise ValueError(f"{where}: channels must be some of {', '.join(CHANNELS)}, got {rejected}")
     return names
 
 
@@ -115,34 +116,36 @@ class Voxelizer:
         low, high = mesh.bounds
         size = (high - low).max()
         self.mesh, self.channels = mesh, channels
-        self.spacing = float(size / (resolution - 2 * _MARGIN))
-        counts = [max(1, math.ceil(n / self.spacing - 1e-9)) + 2 * _MARGIN for n in high - low]
+        self.spacing = float(size / (resolution - 2 * _MARGIN_VOXELS))
+        counts = [
+            max(1, math.ceil(n / self.spacing - 1e-9)) + 2 * _MARGIN_VOXELS for n in high - low
+        ]
         x, y, z = counts
         self.extent = (x, y, z)
-        middle, half = 0.5 * (low + high), [0.5 * (n - 1) * self.spacing for n in counts]
-        x, y, z = (float(m - h) for m, h in zip(middle, half, strict=True))
+        middle, half_extent = 0.5 * (low + high), [0.5 * (n - 1) * self.spacing for n in counts]
+        x, y, z = (float(m - h) for m, h in zip(middle, half_extent, strict=True))
         self.origin = (x, y, z)
         self.band = check.number(where, "band", band, low=2) * self.spacing
         self.thickness = check.number(where, "thickness", thickness, low=0.1) * self.spacing
         self.device = torch.device(device)
         self.geometry = Geometry(mesh, self.device, solid=solid != "never")
-        self._wide = self.geometry.largest >= _FLOAT32 * self.spacing
+        self._wide = self.geometry.largest >= _FLOAT32_VOXELS * self.spacing
         # Shares of solids are exact in voxels of any size.
-        self._exact = {"coverage"} == {*channels} and bool(self.geometry.solid.all())
-        places = torch.tensor(list(itertools.product(range(_FINER), repeat=3)))
-        self._places = places.to(self.device, torch.float64)
+        self._exact_shares = {"coverage"} == {*channels} and bool(self.geometry.solid.all())
+        sample_offsets = torch.tensor(list(itertools.product(range(_SAMPLES_PER_SIDE), repeat=3)))
+        self._sample_offsets = sample_offsets.to(self.device, torch.float64)
         painted = {"color", "normal", "material"} & {*channels}
         self.paint = Paint(mesh, self.geometry) if painted else None
 
     def reach(self, voxel_k: Tensor) -> Tensor:
         """Returns (k,) the world distance up to which triangles affect voxels of sizes (k,)."""
-        share = (_DIAGONAL * voxel_k + 0.5 * self.thickness) * (1 + 1e-6)
-        return share if {"coverage"} == {*self.channels} else share.clamp(min=self.band)
+        distance = (_HALF_DIAGONAL * voxel_k + 0.5 * self.thickness) * (1 + 1e-6)
+        return distance if {"coverage"} == {*self.channels} else distance.clamp(min=self.band)
 
     def touched(self, low_k3: Tensor, size_k: Tensor, voxel_k: Tensor) -> tuple[Tensor, Tensor]:
         """Calls `Geometry.touched` with the `reach` of voxels of sizes (k,) float64."""
         return self.geometry.touched(
-            low_k3, size_k, self.reach(voxel_k), parts=_PARTS, wide=self._wide
+            low_k3, size_k, self.reach(voxel_k), parts=_BLOCK_CUBES, wide=self._wide
         )
 
     def cubes(
@@ -162,13 +165,13 @@ class Voxelizer:
             dtype, width = CHANNELS[name]
             empty = (0, side, side, side, width)
             parts[name] = [torch.empty(empty, dtype=dtype, device=self.device)]
-        step = max(1, _BATCH // side**3)
+        step = max(1, _BATCH_VOXELS // side**3)
         for begin in range(0, len(low_k3), step):
             part = slice(begin, begin + step)
             coarse = None if coarse_k is None else coarse_k[part]
-            for name, values in self._make(low_k3[part], voxel_k[part], side, coarse).items():
-                parts[name].append(_stored(name, values))
-        return {name: torch.cat(own) for name, own in parts.items()}
+            for name, values in self._sampled(low_k3[part], voxel_k[part], side, coarse).items():
+                parts[name].append(_to_channel_dtype(name, values))
+        return {name: torch.cat(batches) for name, batches in parts.items()}
 
     def constants(self, inside_k: Tensor) -> dict[str, Tensor]:
         """Returns by channel (k, c) the values of voxels far from all triangles, inside the mesh
@@ -183,8 +186,10 @@ class Voxelizer:
             coverage=inside.to(torch.float32),
             weight=torch.zeros((*shape, 3), device=self.device),
         )
-        made = self._channels(far)
-        return {name: _stored(name, values)[:, 0, 0, 0] for name, values in made.items()}
+        voxels = self._channels(far)
+        return {
+            name: _to_channel_dtype(name, values)[:, 0, 0, 0] for name, values in voxels.items()
+        }
 
     def region(self, low: Sequence[int], high: Sequence[int]) -> dict[str, Tensor]:
         """Computes the finest voxels of a box `low` to `high`, (z, y, x).
@@ -192,29 +197,33 @@ class Voxelizer:
         Returns:
             By channel (z, y, x, c) of its dtype, on the device.
         """
-        block, device = _CUBE * _PARTS, self.device
+        block, device = _CUBE_VOXELS * _BLOCK_CUBES, self.device
         first = torch.tensor([n // block for n in low], device=device)
         count = [-(-b // block) - n // block for n, b in zip(low, high, strict=True)]
         blocks = torch.cartesian_prod(*(torch.arange(n, device=device) for n in count)).view(-1, 3)
         world = self._corner((blocks + first) * block)
         voxel = world.new_full((len(world),), self.spacing)
-        found = self.touched(world, block * voxel, voxel)
+        touched = self.touched(world, block * voxel, voxel)
 
         def joined(values: Tensor) -> Tensor:  # (z, y, x) cubes
-            values = values.view(*count, _PARTS, _PARTS, _PARTS).permute(0, 3, 1, 4, 2, 5)
-            return values.reshape([n * _PARTS for n in count])
+            values = values.view(*count, _BLOCK_CUBES, _BLOCK_CUBES, _BLOCK_CUBES).permute(
+                0, 3, 1, 4, 2, 5
+            )
+            return values.reshape([n * _BLOCK_CUBES for n in count])
 
-        near, inside = map(joined, found)
-        cubes = near.nonzero()
-        at = (cubes + first * _PARTS) * _CUBE
+        near_triangles, inside = map(joined, touched)
+        cubes = near_triangles.nonzero()
+        cube_low = (cubes + first * _BLOCK_CUBES) * _CUBE_VOXELS
         # Blocks may stick out of the region; cubes outside of it are not computed.
         begin, end = torch.tensor((tuple(low), tuple(high)), device=device)
-        wanted = ((at + _CUBE > begin) & (at < end)).all(1)
+        overlaps = ((cube_low + _CUBE_VOXELS > begin) & (cube_low < end)).all(1)
         out = self._blank(inside)
-        for some in torch.stack((cubes, at), 1)[wanted].split(max(1, _BATCH // _CUBE**3)):
-            size = torch.full((len(some),), self.spacing, dtype=torch.float64, device=device)
-            for name, values in self.cubes(self._corner(some[:, 1]), size, _CUBE).items():
-                out[name][some[:, 0].unbind(1)] = values
+        for batch in torch.stack((cubes, cube_low), 1)[overlaps].split(
+            max(1, _BATCH_VOXELS // _CUBE_VOXELS**3)
+        ):
+            size = torch.full((len(batch),), self.spacing, dtype=torch.float64, device=device)
+            for name, values in self.cubes(self._corner(batch[:, 1]), size, _CUBE_VOXELS).items():
+                out[name][batch[:, 0].unbind(1)] = values
         start = [n % block for n in low]
         box = tuple(slice(s, s + b - a) for s, a, b in zip(start, low, high, strict=True))
         return {
@@ -228,7 +237,7 @@ class Voxelizer:
         return {
             name: torch.where(inside[..., None], values[1], values[0])[
                 ..., None, None, None, :
-            ].repeat(1, 1, 1, _CUBE, _CUBE, _CUBE, 1)
+            ].repeat(1, 1, 1, _CUBE_VOXELS, _CUBE_VOXELS, _CUBE_VOXELS, 1)
             for name, values in both.items()
         }
 
@@ -237,74 +246,78 @@ class Voxelizer:
         origin = torch.tensor(self.origin, dtype=torch.float64, device=zyx.device)
         return origin + (zyx.flip(1) - 0.5) * self.spacing
 
-    def _make(
+    def _sampled(
         self, low: Tensor, voxel: Tensor, side: int, coarse: Tensor | None
     ) -> dict[str, Tensor]:
         """Returns by channel (k, z, y, x, c) of cubes; coarse ones are means of samples (labels:
         the last sample).
         """
-        if coarse is None or self._exact:
-            return self._look(low, voxel, voxel, side)
-        own = torch.where(coarse, voxel / _FINER, voxel)
-        used = coarse.view(-1, 1, 1, 1, 1)
+        if coarse is None or self._exact_shares:
+            return self._voxelized(low, voxel, voxel, side)
+        sample_size = torch.where(coarse, voxel / _SAMPLES_PER_SIDE, voxel)
+        is_coarse = coarse.view(-1, 1, 1, 1, 1)
 
         def mean(begin: int, end: int) -> dict[str, Tensor]:
             """Averages a range of samples pairwise: equal values then have exactly that mean."""
             if end - begin == 1:
-                there = own if begin == 0 else torch.where(coarse, own, 0)
-                return self._look(low + self._places[begin] * own[:, None], there, voxel, side)
+                step = sample_size if begin == 0 else torch.where(coarse, sample_size, 0)
+                return self._voxelized(
+                    low + self._sample_offsets[begin] * sample_size[:, None], step, voxel, side
+                )
             middle = (begin + end) // 2
             first, second = mean(begin, middle), mean(middle, end)
             return {
                 name: torch.where(
-                    used, second[name] if name == "material" else 0.5 * (one + second[name]), one
+                    is_coarse,
+                    second[name] if name == "material" else 0.5 * (values + second[name]),
+                    values,
                 )
-                for name, one in first.items()
+                for name, values in first.items()
             }
 
-        return mean(0, len(self._places))
+        return mean(0, len(self._sample_offsets))
 
-    def _look(self, low: Tensor, voxel: Tensor, step: Tensor, side: int) -> dict[str, Tensor]:
+    def _voxelized(self, low: Tensor, voxel: Tensor, step: Tensor, side: int) -> dict[str, Tensor]:
         size = torch.stack((voxel, step, self.reach(voxel)), 1)
-        told: dict[str, Any] = {
+        options: dict[str, Any] = {
             "shares": bool({"coverage", "color", "material"} & {*self.channels}),
             "weights": self.paint is not None,
             "wide": self._wide,
         }
-        found = self.geometry.cubes(low, size, side, self.thickness, **told)
-        world = found.distance * voxel[:, None, None, None].to(found.distance.dtype)
-        distance = torch.where(found.nearest >= 0, world, torch.inf)
-        made = {"distance": distance, "coverage": found.coverage, "weight": found.weight}
-        narrow = {name: values.to(torch.float32) for name, values in made.items()}
-        return self._channels(found._replace(**narrow))
+        voxelized = self.geometry.cubes(low, size, side, self.thickness, **options)
+        world = voxelized.distance * voxel[:, None, None, None].to(voxelized.distance.dtype)
+        distance = torch.where(voxelized.nearest >= 0, world, torch.inf)
+        results = {"distance": distance, "coverage": voxelized.coverage, "weight": voxelized.weight}
+        float32_results = {name: values.to(torch.float32) for name, values in results.items()}
+        return self._channels(voxelized._replace(**float32_results))
 
-    def _channels(self, found: Voxelized) -> dict[str, Tensor]:
+    def _channels(self, voxels: Voxelized) -> dict[str, Tensor]:
         """Returns (k, z, y, x, c) float32 by channel (material int64); distances in world units."""
-        made: dict[str, Tensor] = {}
+        channels: dict[str, Tensor] = {}
         if "coverage" in self.channels:
-            made["coverage"] = found.coverage[..., None]
+            channels["coverage"] = voxels.coverage[..., None]
         if "distance" in self.channels:
-            distance = found.distance.clamp(max=self.band)
-            made["distance"] = torch.where(found.winding != 0, -distance, distance)[..., None]
+            distance = voxels.distance.clamp(max=self.band)
+            channels["distance"] = torch.where(voxels.winding != 0, -distance, distance)[..., None]
         if self.paint is not None:
-            near, face = found.nearest[..., None] >= 0, found.nearest.clamp(min=0).view(-1)
-            shape, weight = found.nearest.shape, found.weight.view(-1, 3)
+            near, face = voxels.nearest[..., None] >= 0, voxels.nearest.clamp(min=0).view(-1)
+            shape, weight = voxels.nearest.shape, voxels.weight.view(-1, 3)
             if "color" in self.channels:
                 color = self.paint.color(face, weight).view(*shape, 4)
                 color = torch.where(near, color, self.paint.mean_color)
-                opacity = color[..., 3:] * found.coverage[..., None]
-                made["color"] = torch.cat((color[..., :3] * opacity, opacity), -1)
+                opacity = color[..., 3:] * voxels.coverage[..., None]
+                channels["color"] = torch.cat((color[..., :3] * opacity, opacity), -1)
             if "normal" in self.channels:
                 normal = self.paint.normal(face, weight).view(*shape, 3)
-                made["normal"] = normal * near
+                channels["normal"] = normal * near
             if "material" in self.channels:
                 material = self.paint.material[face].view(*shape, 1)
                 material = torch.where(near, material, self.paint.main_material) + 1
-                made["material"] = material * (found.coverage[..., None] >= 0.5)
-        return {name: made[name] for name in self.channels}
+                channels["material"] = material * (voxels.coverage[..., None] >= 0.5)
+        return {name: channels[name] for name in self.channels}
 
 
-def _stored(name: str, values: Tensor) -> Tensor:
+def _to_channel_dtype(name: str, values: Tensor) -> Tensor:
     """Returns values in the dtype of their channel, rounded to the nearest, ties to even."""
     dtype, _ = CHANNELS[name]
     if name in ("distance", "color", "material"):

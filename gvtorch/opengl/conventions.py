@@ -68,10 +68,10 @@ def matrices(
     projection = torch.zeros(len(camera), 4, 4, dtype=torch.float64)
     projection[:, 0, 0], projection[:, 0, 2] = 2 * fx / camera.width, 1 - 2 * cx / camera.width
     projection[:, 1, 1], projection[:, 1, 2] = 2 * fy / camera.height, 2 * cy / camera.height - 1
-    share = near / far  # 0 for a far plane at infinity
-    slope, offset = -1 / (1 - share), -near / (1 - share)  # window depth 0 to 1 as z / w
+    ratio = near / far  # 0 for a far plane at infinity
+    slope, offset = -1 / (1 - ratio), -near / (1 - ratio)  # window depth 0 to 1 as z / w
     if reversed_z:
-        slope, offset = share / (1 - share), -offset
+        slope, offset = ratio / (1 - ratio), -offset
     if clip_depth is ClipDepth.NEGATIVE_ONE_TO_ONE:
         slope, offset = 2 * slope + 1, 2 * offset
     projection[:, 2, 2], projection[:, 2, 3] = slope, offset
@@ -139,10 +139,10 @@ def ray_distance(
     pixels = _Pixels.of(where, "window_depth", window_depth, projection, clip_depth)
     depth = window_depth.to(torch.float64)
     if pixels.orthographic:
-        along = (pixels.offset - depth) / pixels.slope
+        z = (pixels.offset - depth) / pixels.slope
     else:
-        along = pixels.offset / (depth + pixels.slope)
-    return torch.where(depth == pixels.far, torch.inf, along * pixels.stretch)
+        z = pixels.offset / (depth + pixels.slope)
+    return torch.where(depth == pixels.far, torch.inf, z * pixels.stretch)
 
 
 def window_depth(
@@ -163,11 +163,11 @@ def window_depth(
         points beyond the far plane, and +inf, get that of the far plane.
     """
     pixels = _Pixels.of("opengl.window_depth", "distance", distance, projection, clip_depth)
-    along = distance.to(torch.float64) / pixels.stretch
+    z = distance.to(torch.float64) / pixels.stretch
     if pixels.orthographic:
-        depth = pixels.offset - pixels.slope * along
+        depth = pixels.offset - pixels.slope * z
     else:
-        depth = pixels.offset / along - pixels.slope
+        depth = pixels.offset / z - pixels.slope
     return depth.clamp(0, 1)
 
 
@@ -194,9 +194,9 @@ class _Pixels(NamedTuple):
         batch = matrix.shape[:-2]
         fits = isinstance(image, Tensor) and image.is_floating_point() and image.shape[-1:] == (1,)
         if not (fits and image.dim() == matrix.dim() + 1 and image.shape[:-3] == batch):
-            wanted = f"({batch[0]}, h, w, 1)" if batch else "(h, w, 1)"
+            expected = f"({batch[0]}, h, w, 1)" if batch else "(h, w, 1)"
             raise ValueError(
-                f"{where}: {name} must be {wanted} floats as projection is "
+                f"{where}: {name} must be {expected} floats as projection is "
                 f"{'a batch' if batch else 'one'}, got {check.describe(image)}"
             )
         slope, offset = matrix[..., 2, 2], matrix[..., 2, 3]
@@ -207,17 +207,17 @@ class _Pixels(NamedTuple):
             else:
                 slope = slope - 0.5
         far = (slope < 0 if orthographic else offset < 0).to(slope)
-        columns = (matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 0, 2], matrix[..., 1, 2])
-        numbers = upload(torch.stack((*columns, slope, offset, far), -1), image.device)
-        sx, sy, ax, ay, slope, offset, far = numbers[..., None, None, None].unbind(-4)
+        terms = (matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 0, 2], matrix[..., 1, 2])
+        coefficients = upload(torch.stack((*terms, slope, offset, far), -1), image.device)
+        sx, sy, ax, ay, slope, offset, far = coefficients[..., None, None, None].unbind(-4)
         if orthographic:
             return cls(slope, offset, far, torch.ones_like(slope), orthographic)
         *_, height, width, _ = image.shape
         x = torch.arange(width, dtype=torch.float64, device=image.device)[:, None]
         y = torch.arange(height, dtype=torch.float64, device=image.device)[:, None, None]
-        across = ((2 * x + 1) / width - 1 + ax) / sx
-        up = (1 - (2 * y + 1) / height + ay) / sy
-        stretch = (1 + across * across + up * up).sqrt()
+        tan_x = ((2 * x + 1) / width - 1 + ax) / sx
+        tan_y = (1 - (2 * y + 1) / height + ay) / sy
+        stretch = (1 + tan_x * tan_x + tan_y * tan_y).sqrt()
         return cls(slope, offset, far, stretch, orthographic)
 
 
@@ -229,19 +229,19 @@ def _projection(where: str, projection: Tensor) -> tuple[Tensor, bool]:
             f"{where}: projection must be (4, 4) or (n, 4, 4), got {tuple(matrix.shape)}"
         )
     p = matrix.view(-1, 4, 4)
-    last = p[0, 3].tolist()
-    orthographic = last == [0, 0, 0, 1]
-    if not (orthographic or last == [0, 0, -1, 0]) or bool((p[:, 3] != p[:1, 3]).any()):
+    last_row = p[0, 3].tolist()
+    orthographic = last_row == [0, 0, 0, 1]
+    if not (orthographic or last_row == [0, 0, -1, 0]) or bool((p[:, 3] != p[:1, 3]).any()):
         raise ValueError(
             f"{where}: projection must end in the row (0, 0, -1, 0) (perspective) or "
-            f"(0, 0, 0, 1) (orthographic), got {last}"
+            f"(0, 0, 0, 1) (orthographic), got {last_row}"
         )
-    other = 2 if orthographic else 3  # column whose x and y must be 0
+    zero_column = 2 if orthographic else 3  # column whose x and y must be 0
     zeros = torch.stack((p[:, 0, 1], p[:, 1, 0], p[:, 2, 0], p[:, 2, 1]), 1)
-    zeros = torch.cat((zeros, p[:, :2, other]), 1)
-    moves = p[:, 2, 2 if orthographic else 3]
-    good = torch.isfinite(p).all() & (zeros == 0).all() & (moves != 0).all()
-    if not bool(good & (p[:, 0, 0] > 0).all() & (p[:, 1, 1] > 0).all()):
+    zeros = torch.cat((zeros, p[:, :2, zero_column]), 1)
+    depth_scale = p[:, 2, 2 if orthographic else 3]
+    valid = torch.isfinite(p).all() & (zeros == 0).all() & (depth_scale != 0).all()
+    if not bool(valid & (p[:, 0, 0] > 0).all() & (p[:, 1, 1] > 0).all()):
         raise ValueError(
             f"{where}: projection must be finite, without skew or rotation, scale x and y by "
             f"more than 0 and keep depths apart, got {matrix.tolist()}"

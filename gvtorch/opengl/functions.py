@@ -43,50 +43,60 @@ PROFILE, CORE_PROFILE = 0x9126, 1
 _SWITCHES = (0x0B44, 0x0BD0, 0x0C11, 0x0B90, 0x8C89, 0x8E51, 0x809E, 0x809F, 0x80A0, 0x0B41)
 _SWITCHES += (0x0BF2, 0x864F, 0x8DB9, *range(0x3000, 0x3008))
 #: Indexed capabilities, disabled at index 0 only: blending and (from 4.1 on) the scissor test.
-_FIRST_SWITCHES = (0x0BE2, 0x0C11)
+_INDEXED_SWITCHES = (0x0BE2, 0x0C11)
 #: Of compatibility profiles: alpha test and polygon stipple; neutral values of the pixel transfer:
 #: whether colours are looked up in a table, scale and bias of red, green, blue, alpha and depth.
 _LEGACY_SWITCHES = (0x0BC0, 0x0B42)
-_TRANSFER = {0x0D10: 0.0, 0x0D14: 1.0, 0x0D15: 0.0}
-_TRANSFER |= {number: float(number % 2 == 0) for number in range(0x0D18, 0x0D20)}
+_PIXEL_TRANSFER = {0x0D10: 0.0, 0x0D14: 1.0, 0x0D15: 0.0}
+_PIXEL_TRANSFER |= {number: float(number % 2 == 0) for number in range(0x0D18, 0x0D20)}
 #: Pixel storage modes: swapped bytes, order of bits, row length, skipped rows and pixels,
 #: alignment; first for uploads (unpack), then for reads (pack).
-_STORE = {number: 0 for number in (*range(0x0CF0, 0x0CF5), *range(0x0D00, 0x0D05))}
-_STORE |= {0x0CF5: 1, 0x0D05: 1}
-_BUFFERS = {PIXEL_PACK_BUFFER: 0x88ED, PIXEL_UNPACK_BUFFER: 0x88EF}
+_PIXEL_STORE = {number: 0 for number in (*range(0x0CF0, 0x0CF5), *range(0x0D00, 0x0D05))}
+_PIXEL_STORE |= {0x0CF5: 1, 0x0D05: 1}
+_BUFFER_BINDINGS = {PIXEL_PACK_BUFFER: 0x88ED, PIXEL_UNPACK_BUFFER: 0x88EF}
 #: Framebuffer targets, with the constant that queries the binding.
-FRAMES = {READ_FRAMEBUFFER: READ_FRAMEBUFFER_BINDING, DRAW_FRAMEBUFFER: DRAW_FRAMEBUFFER_BINDING}
+FRAMEBUFFER_BINDINGS = {
+    READ_FRAMEBUFFER: READ_FRAMEBUFFER_BINDING,
+    DRAW_FRAMEBUFFER: DRAW_FRAMEBUFFER_BINDING,
+}
 _ERRORS = {0x0500: "INVALID_ENUM", 0x0501: "INVALID_VALUE", 0x0502: "INVALID_OPERATION"}
 _ERRORS |= {0x0505: "OUT_OF_MEMORY", 0x0506: "INVALID_FRAMEBUFFER_OPERATION"}
 _CONTEXT_LOST = 0x0507
 _ERRORS |= {_CONTEXT_LOST: "CONTEXT_LOST"}
 #: A number of the state: the function that sets it, that function's first arguments, the constant
 #: that queries it, and its value while `Exchange` works (None: each step sets what it needs).
-_Number = tuple[str, tuple[int, ...], int, "int | None"]
-_STATE: list[_Number] = [
-    *(("PixelStorei", (number,), number, value) for number, value in _STORE.items()),
+_StateNumber = tuple[str, tuple[int, ...], int, "int | None"]
+_STATE: list[_StateNumber] = [
+    *(("PixelStorei", (number,), number, value) for number, value in _PIXEL_STORE.items()),
     ("ClampColor", (CLAMP_READ_COLOR,), CLAMP_READ_COLOR, FIXED_ONLY),
-    *(("BindBuffer", (target,), asked, 0) for target, asked in _BUFFERS.items()),
-    *(("BindFramebuffer", (target,), asked, None) for target, asked in FRAMES.items()),
+    *(("BindBuffer", (target,), query, 0) for target, query in _BUFFER_BINDINGS.items()),
+    *(
+        ("BindFramebuffer", (target,), query, None)
+        for target, query in FRAMEBUFFER_BINDINGS.items()
+    ),
     ("ActiveTexture", (), ACTIVE_TEXTURE, None),
 ]
-_DRAWING_STATE: list[_Number] = [
+_DRAWING_STATE: list[_StateNumber] = [
     ("UseProgram", (), PROGRAM, None),
     ("BindVertexArray", (), VERTEX_ARRAY, None),
     ("DepthMask", (), DEPTH_MASK, 1),
     ("DepthFunc", (), DEPTH_FUNC, ALWAYS),
 ]
-_LEGACY_STATE: list[_Number] = [
+_LEGACY_STATE: list[_StateNumber] = [
     ("ClampColor", (CLAMP_FRAGMENT_COLOR,), CLAMP_FRAGMENT_COLOR, FIXED_ONLY)
 ]
 #: Targets of textures with a width and a height, the constant that queries their binding, and the
 #: target that queries their size: 2D, rectangle, array, cube, 3D, array of cubes.
-_TARGETS = [(TEXTURE_2D, 0x8069, TEXTURE_2D), (0x84F5, 0x84F6, 0x84F5), (0x8C1A, 0x8C1D, 0x8C1A)]
-_TARGETS += [(0x8513, 0x8514, 0x8515), (0x806F, 0x806A, 0x806F), (0x9009, 0x900A, 0x9009)]
+_TEXTURE_TARGETS = [
+    (TEXTURE_2D, 0x8069, TEXTURE_2D),
+    (0x84F5, 0x84F6, 0x84F5),
+    (0x8C1A, 0x8C1D, 0x8C1A),
+]
+_TEXTURE_TARGETS += [(0x8513, 0x8514, 0x8515), (0x806F, 0x806A, 0x806F), (0x9009, 0x900A, 0x9009)]
 
-_TYPES: dict[str, Any] = {"i": c_int, "u": c_uint, "f": c_float, "n": c_ssize_t}
-_TYPES |= {"p": c_void_p, "s": c_char_p, "-": None}
-#: Functions by their prototype in letters of `_TYPES`: the return type, then the arguments.
+_CTYPES: dict[str, Any] = {"i": c_int, "u": c_uint, "f": c_float, "n": c_ssize_t}
+_CTYPES |= {"p": c_void_p, "s": c_char_p, "-": None}
+#: Functions by their prototype in letters of `_CTYPES`: the return type, then the arguments.
 _PROTOTYPES = """
 -u ActiveTexture BindVertexArray CompileShader DeleteProgram DeleteShader DepthFunc Disable Enable
 -u LinkProgram UseProgram
@@ -119,8 +129,8 @@ iuu IsEnabledi
 -ii Uniform1i
 -iiii Viewport
 """
-_LINES = [line.split() for line in _PROTOTYPES.strip().splitlines()]
-_FUNCTIONS = {name: kinds for kinds, *names in _LINES for name in names}
+_PROTOTYPE_LINES = [line.split() for line in _PROTOTYPES.strip().splitlines()]
+_FUNCTIONS = {name: type_codes for type_codes, *names in _PROTOTYPE_LINES for name in names}
 _SINCE_3_3 = {"BindSampler": "-uu"}
 _SINCE_4_1 = {"GetFloati_v": "-uup", "ViewportIndexedf": "-uffff"}
 _LEGACY = {"GetFloatv": "-up", "PixelTransferf": "-uf"}
@@ -141,36 +151,36 @@ class Functions:
     def __init__(self, where: str, load: Loader | None = None) -> None:
         """Loads the functions by `load` or from the system's library; raises as `Exchange`."""
         self.where = where
-        load = _system(where) if load is None else load
+        load = _system_loader(where) if load is None else load
         if not callable(load):
             raise ValueError(f"{where}: load must be a function of a name, got {load!r}")
-        self._take(load, _FUNCTIONS)
+        self._load_functions(load, _FUNCTIONS)
         self.require_context()
         version = self.integer(MAJOR_VERSION), self.integer(MINOR_VERSION)
-        told = self.GetString(VERSION).decode(errors="replace")
-        if version < (3, 2) or told.startswith("OpenGL ES"):
-            raise RuntimeError(f"{where}: OpenGL 3.2 is needed, got {told}")
+        version_text = self.GetString(VERSION).decode(errors="replace")
+        if version < (3, 2) or version_text.startswith("OpenGL ES"):
+            raise RuntimeError(f"{where}: OpenGL 3.2 is needed, got {version_text}")
         self._samplers = version >= (3, 3)  # there are sampler objects
         self._viewports = version >= (4, 1)  # and several viewports
         self._legacy = not self.integer(PROFILE) & CORE_PROFILE
-        self._take(load, _SINCE_3_3 if self._samplers else {})
-        self._take(load, _SINCE_4_1 if self._viewports else {})
-        self._take(load, _LEGACY if self._legacy else {})
+        self._load_functions(load, _SINCE_3_3 if self._samplers else {})
+        self._load_functions(load, _SINCE_4_1 if self._viewports else {})
+        self._load_functions(load, _LEGACY if self._legacy else {})
 
-    def _take(self, load: Loader, functions: dict[str, str]) -> None:
-        for name, kinds in functions.items():
-            place = load(f"gl{name}")
-            if not place:
+    def _load_functions(self, load: Loader, functions: dict[str, str]) -> None:
+        for name, type_codes in functions.items():
+            address = load(f"gl{name}")
+            if not address:
                 raise RuntimeError(f"{self.where}: this OpenGL lacks gl{name}; 3.2 is needed")
-            if not isinstance(place, int):
+            if not isinstance(address, int):
                 raise ValueError(
-                    f"{self.where}: load must give addresses as int, got {place!r} for gl{name}"
+                    f"{self.where}: load must give addresses as int, got {address!r} for gl{name}"
                 )
-            prototype: Any = ctypes.CFUNCTYPE(*(_TYPES[kind] for kind in kinds))
-            setattr(self, name, prototype(place))
+            prototype: Any = ctypes.CFUNCTYPE(*(_CTYPES[code] for code in type_codes))
+            setattr(self, name, prototype(address))
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
-        raise AttributeError(name)  # for type checkers: `_take` sets the functions
+        raise AttributeError(name)  # for type checkers: `_load_functions` sets the functions
 
     def require_context(self) -> None:
         """Raises RuntimeError unless a context is current; clears earlier errors."""
@@ -195,13 +205,13 @@ class Functions:
         getattr(self, get)(*arguments, values)
         return list(values)[:count]
 
-    def integer(self, what: int) -> int:
+    def integer(self, constant: int) -> int:
         """Returns a number of the context's state."""
-        return self.integers(what, 1)[0]
+        return self.integers(constant, 1)[0]
 
-    def integers(self, what: int, count: int) -> list[int]:
+    def integers(self, constant: int, count: int) -> list[int]:
         """Returns several numbers of the context's state."""
-        return self.read("GetIntegerv", c_int, count, what)
+        return self.read("GetIntegerv", c_int, count, constant)
 
     def parameter(self, get: str, *arguments: int) -> int:
         """Returns the number that a function such as glGetProgramiv writes; 0 if there is none."""
@@ -214,24 +224,27 @@ class Functions:
         texture's target does not have both.
         """
         if kind == RENDERBUFFER:
-            before = self.integer(RENDERBUFFER_BINDING)
+            previous = self.integer(RENDERBUFFER_BINDING)
             self.BindRenderbuffer(RENDERBUFFER, name)
-            get, numbers = "GetRenderbufferParameteriv", (RENDERBUFFER_WIDTH, RENDERBUFFER_HEIGHT)
-            size = [self.parameter(get, RENDERBUFFER, number) for number in numbers]
-            self.BindRenderbuffer(RENDERBUFFER, before)
+            get, parameters = (
+                "GetRenderbufferParameteriv",
+                (RENDERBUFFER_WIDTH, RENDERBUFFER_HEIGHT),
+            )
+            size = [self.parameter(get, RENDERBUFFER, parameter) for parameter in parameters]
+            self.BindRenderbuffer(RENDERBUFFER, previous)
             return size
-        get, numbers = "GetTexLevelParameteriv", (TEXTURE_WIDTH, TEXTURE_HEIGHT)
-        for target, binding, asked in _TARGETS:
-            before = self.integer(binding)
+        get, parameters = "GetTexLevelParameteriv", (TEXTURE_WIDTH, TEXTURE_HEIGHT)
+        for target, binding, query in _TEXTURE_TARGETS:
+            previous = self.integer(binding)
             self.BindTexture(target, name)
             if not self.GetError():
-                size = [self.parameter(get, asked, level, number) for number in numbers]
-                self.BindTexture(target, before)
+                size = [self.parameter(get, query, level, parameter) for parameter in parameters]
+                self.BindTexture(target, previous)
                 return size
         self.forget_errors()
         return None
 
-    def view(self, width: int, height: int) -> None:
+    def set_viewport(self, width: int, height: int) -> None:
         """Sets the first viewport: its size in pixels, from the lower left corner on."""
         if self._viewports:
             self.ViewportIndexedf(0, 0, 0, width, height)
@@ -280,73 +293,75 @@ class Functions:
         Until then pixels are tightly packed in host memory and transferred unconverted; with
         `drawing`, filled triangles overwrite the first draw buffer, without blending or tests.
         """
-        with ExitStack() as later:
-            later.callback(self.forget_errors)
-            self._set(later, _STATE)
-            for each, neutral in _TRANSFER.items() if self._legacy else ():
-                later.callback(self.PixelTransferf, each, *self.read("GetFloatv", c_float, 1, each))
-                self.PixelTransferf(each, neutral)
+        with ExitStack() as restorers:
+            restorers.callback(self.forget_errors)
+            self._set_state(restorers, _STATE)
+            for parameter, neutral in _PIXEL_TRANSFER.items() if self._legacy else ():
+                restorers.callback(
+                    self.PixelTransferf, parameter, *self.read("GetFloatv", c_float, 1, parameter)
+                )
+                self.PixelTransferf(parameter, neutral)
             for unit in (1, 0):
                 self.ActiveTexture(TEXTURE0 + unit)
                 if self._samplers:
-                    later.callback(self.BindSampler, unit, self.integer(SAMPLER_BINDING))
+                    restorers.callback(self.BindSampler, unit, self.integer(SAMPLER_BINDING))
                     self.BindSampler(unit, 0)
-                later.callback(self.BindTexture, TEXTURE_2D, self.integer(TEXTURE_BINDING))
-                later.callback(self.ActiveTexture, TEXTURE0 + unit)
+                restorers.callback(self.BindTexture, TEXTURE_2D, self.integer(TEXTURE_BINDING))
+                restorers.callback(self.ActiveTexture, TEXTURE0 + unit)
             if drawing:
-                self._draw_plainly(later)
+                self._draw_plainly(restorers)
             yield
 
-    def _set(self, later: ExitStack, states: list[_Number]) -> None:
-        """Sets numbers of the state; `later` restores them."""
-        for function, place, asked, value in states:
-            put: Callable[..., None] = getattr(self, function)
-            later.callback(put, *place, self.integer(asked))
+    def _set_state(self, restorers: ExitStack, states: list[_StateNumber]) -> None:
+        """Sets numbers of the state; `restorers` restores them."""
+        for function, arguments, query, value in states:
+            setter: Callable[..., None] = getattr(self, function)
+            restorers.callback(setter, *arguments, self.integer(query))
             if value is not None:
-                put(*place, value)
+                setter(*arguments, value)
 
-    def _draw_plainly(self, later: ExitStack) -> None:
+    def _draw_plainly(self, restorers: ExitStack) -> None:
         """Sets the drawing state; indexed state only at index 0, except for the colour masks."""
-        for each in _FIRST_SWITCHES:
-            if self.IsEnabledi(each, 0):
-                later.callback(self.Enablei, each, 0)
-                self.Disablei(each, 0)
-        for each in filter(self.IsEnabled, _SWITCHES + _LEGACY_SWITCHES * self._legacy):
-            later.callback(self.Enable, each)
-            self.Disable(each)
-        test = self.Enable if self.IsEnabled(DEPTH_TEST) else self.Disable
-        later.callback(test, DEPTH_TEST)
-        self._set(later, _DRAWING_STATE + _LEGACY_STATE * self._legacy)
+        for switch in _INDEXED_SWITCHES:
+            if self.IsEnabledi(switch, 0):
+                restorers.callback(self.Enablei, switch, 0)
+                self.Disablei(switch, 0)
+        for switch in filter(self.IsEnabled, _SWITCHES + _LEGACY_SWITCHES * self._legacy):
+            restorers.callback(self.Enable, switch)
+            self.Disable(switch)
+        switch_depth_test = self.Enable if self.IsEnabled(DEPTH_TEST) else self.Disable
+        restorers.callback(switch_depth_test, DEPTH_TEST)
+        self._set_state(restorers, _DRAWING_STATE + _LEGACY_STATE * self._legacy)
         if self._viewports:
-            box = self.read("GetFloati_v", c_float, 4, VIEWPORT, 0)
-            later.callback(self.ViewportIndexedf, 0, *box)
+            viewport = self.read("GetFloati_v", c_float, 4, VIEWPORT, 0)
+            restorers.callback(self.ViewportIndexedf, 0, *viewport)
         else:
-            later.callback(self.Viewport, *self.integers(VIEWPORT, 4))
-        for each in range(self.integer(MAX_DRAW_BUFFERS)):
-            mask = self.read("GetBooleani_v", c_ubyte, 4, COLOR_MASK, each)
-            later.callback(self.ColorMaski, each, *mask)
-            self.ColorMaski(each, *4 * [each == 0])
+            restorers.callback(self.Viewport, *self.integers(VIEWPORT, 4))
+        for buffer in range(self.integer(MAX_DRAW_BUFFERS)):
+            mask = self.read("GetBooleani_v", c_ubyte, 4, COLOR_MASK, buffer)
+            restorers.callback(self.ColorMaski, buffer, *mask)
+            self.ColorMaski(buffer, *4 * [buffer == 0])
         faces = (FRONT, BACK) if self._legacy else (FRONT_AND_BACK,)
         for face, mode in zip(faces, self.integers(POLYGON_MODE, len(faces)), strict=True):
-            later.callback(self.PolygonMode, face, mode)
+            restorers.callback(self.PolygonMode, face, mode)
         self.PolygonMode(FRONT_AND_BACK, FILL)
 
 
-def _system(where: str) -> Loader:
+def _system_loader(where: str) -> Loader:
     """Returns the loader of the system's library that knows the current context. Libglvnd's (the
     first two) forward calls to any driver; OSMesa knows only its own contexts.
     """
-    found = False
+    has_library = False
     for name in ("libOpenGL.so.0", "libGL.so.1", "libOSMesa.so.8"):
         try:
             library = ctypes.CDLL(name)
         except OSError:
             continue
-        found = True
+        has_library = True
         library.glGetString.restype = c_char_p
         if library.glGetString(VERSION):
             return partial(_address, library)
-    if found:
+    if has_library:
         raise RuntimeError(f"{where}: {_NO_CONTEXT}")
     raise RuntimeError(
         f"{where}: found no OpenGL library; pass load=..., such as glfw.get_proc_address"

@@ -39,10 +39,10 @@ class RayArguments(NamedTuple):
             None if rays.transmittance is None else rays.transmittance.double().contiguous(),
         )
 
-    def some(self, which: Tensor) -> "RayArguments":
-        """Returns the rays at the indices `which` (k,) int64, without a transmittance."""
-        origin, direction, cone, limits = (column[which] for column in self[:4])
-        return RayArguments(origin, direction, cone, limits)
+    def some(self, index: Tensor) -> "RayArguments":
+        """Returns the rays at the indices `index` (k,) int64, without a transmittance."""
+        origin, direction, cone, ranges = (column[index] for column in self[:4])
+        return RayArguments(origin, direction, cone, ranges)
 
 
 class TraceArguments(NamedTuple):

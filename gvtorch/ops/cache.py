@@ -46,19 +46,19 @@ def compact_requests(
         priority; count_5 (5,) int64: nodes listed; nodes with a request that is not pending; nodes
         with any request; listed loads; listed subdivisions.
     """
-    words = request_tn.view(-1)
-    requested = int((words & REQUEST_KINDS).count_nonzero())
-    open_kinds = words & REQUEST_KINDS & ~(words >> REQUEST_PENDING_SHIFT)
+    request_words = request_tn.view(-1)
+    requested = int((request_words & REQUEST_KINDS).count_nonzero())
+    open_kinds = request_words & REQUEST_KINDS & ~(request_words >> REQUEST_PENDING_SHIFT)
     node = open_kinds.nonzero()[:, 0]
-    kept = node[:capacity]
-    node_k = torch.full((capacity,), -1, dtype=torch.int32, device=words.device)
-    word_k = torch.zeros(capacity, dtype=torch.int32, device=words.device)
-    node_k[: len(kept)] = kept.to(torch.int32)
-    word_k[: len(kept)] = open_kinds[kept] | (words[kept] & REQUEST_PRIORITY)
-    words &= REQUEST_KINDS << REQUEST_PENDING_SHIFT
+    listed = node[:capacity]
+    node_k = torch.full((capacity,), -1, dtype=torch.int32, device=request_words.device)
+    word_k = torch.zeros(capacity, dtype=torch.int32, device=request_words.device)
+    node_k[: len(listed)] = listed.to(torch.int32)
+    word_k[: len(listed)] = open_kinds[listed] | (request_words[listed] & REQUEST_PRIORITY)
+    request_words &= REQUEST_KINDS << REQUEST_PENDING_SHIFT
     kinds = [int((word_k & kind).count_nonzero()) for kind in (REQUEST_LOAD, REQUEST_SUBDIVIDE)]
-    counts = [len(kept), len(node), requested, *kinds]
-    return node_k, word_k, torch.tensor(counts, device=words.device)
+    counts = [len(listed), len(node), requested, *kinds]
+    return node_k, word_k, torch.tensor(counts, device=request_words.device)
 
 
 @op()
@@ -81,17 +81,17 @@ def choose_requests(
     """
     lists, _, listed = asked_l2k.shape
     node, word = asked_l2k.transpose(0, 1).flatten(1)
-    known = (node >= 0) & (node < len(loc_t4) * per_tile)
-    tile = torch.where(known, node, 0).to(torch.int64) // per_tile
+    valid = (node >= 0) & (node < len(loc_t4) * per_tile)
+    tile = torch.where(valid, node, 0).to(torch.int64) // per_tile
     level = loc_t4[tile, 3].to(torch.int64) * (1 if coarse_first else -1)
     size = word & REQUEST_PRIORITY
-    which = torch.arange(lists, device=node.device).repeat_interleave(listed)
-    rank = (which << 20) + level * (REQUEST_PRIORITY + 1) + REQUEST_PRIORITY - size
+    list_index = torch.arange(lists, device=node.device).repeat_interleave(listed)
+    rank = (list_index << 20) + level * (REQUEST_PRIORITY + 1) + REQUEST_PRIORITY - size
     order = rank.argsort(stable=True)
     node_2b = torch.full((2, batch), -1, dtype=torch.int64, device=node.device)
     priority_2b = torch.zeros((2, batch), dtype=torch.int32, device=node.device)
     for row, kind in enumerate((REQUEST_LOAD, REQUEST_SUBDIVIDE)):
-        wanted = order[known[order] & ((word[order] & kind) != 0)]
+        wanted = order[valid[order] & ((word[order] & kind) != 0)]
         chosen = wanted[: min(batch, int(room_2[1 - row]))]
         node_2b[row, : len(chosen)] = node[chosen].to(torch.int64)
         priority_2b[row, : len(chosen)] = size[chosen]
@@ -114,8 +114,8 @@ def lru_partition(
         order_k (k,), unused_1 (1,) int64: number of slots that this frame did not use.
     """
     order = order_k.to(torch.int64)
-    known = (order >= 0) & (order < len(stamp_s))  # others count as unused
-    used = known & (stamp_s[torch.where(known, order, 0)] == frame_1)
+    valid = (order >= 0) & (order < len(stamp_s))  # others count as unused
+    used = valid & (stamp_s[torch.where(valid, order, 0)] == frame_1)
     return torch.cat((order_k[~used], order_k[used])), (~used).sum().view(1)
 
 
@@ -142,8 +142,8 @@ def unlink(
     """
     slots = len(owner_s)
     leaving = _marked(slot_k, slots)
-    named = torch.where(pointer_tn >= 0, pointer_tn, slots).clamp(max=slots)
-    pointer_tn[leaving[named.to(torch.int64)]] = ABSENT
+    slot_tn = torch.where(pointer_tn >= 0, pointer_tn, slots).clamp(max=slots)
+    pointer_tn[leaving[slot_tn.to(torch.int64)]] = ABSENT
     owner_s[leaving[:slots]] = ABSENT
 
 
@@ -214,9 +214,11 @@ def link_bricks(
 
 
 def _check_width(*, child_tn: Tensor, child_jw: Tensor, **_: Any) -> None:
-    most, width = child_tn.shape[1], child_jw.shape[1]
-    if width > most:
-        raise ValueError(f"link_tiles: child_jw must hold at most {most} words a row, got {width}")
+    per_tile, width = child_tn.shape[1], child_jw.shape[1]
+    if width > per_tile:
+        raise ValueError(
+            f"link_tiles: child_jw must hold at most {per_tile} words a row, got {width}"
+        )
 
 
 @op(_check_width)
@@ -280,13 +282,13 @@ def locate(
     backend: Backend = "auto",
 ) -> Tensor:
     """Returns the locs of nodes, (k, 4) int64 x, y, z, depth; -1 for an index that is no node's."""
-    known = (node_k >= 0) & (node_k < len(loc_t4) * per_tile)
-    node = torch.where(known, node_k, 0)
-    above = loc_t4.to(torch.int64)[node // per_tile]
+    valid = (node_k >= 0) & (node_k < len(loc_t4) * per_tile)
+    node = torch.where(valid, node_k, 0)
+    parent_loc = loc_t4.to(torch.int64)[node // per_tile]
     child = node % per_tile
     digits = [child // branching**axis % branching for axis in range(3)]
-    loc = torch.stack([above[:, i] * branching + d for i, d in enumerate(digits)], 1)
-    return torch.where(known[:, None], torch.cat((loc, above[:, 3:]), 1), -1)
+    loc = torch.stack([parent_loc[:, i] * branching + d for i, d in enumerate(digits)], 1)
+    return torch.where(valid[:, None], torch.cat((loc, parent_loc[:, 3:]), 1), -1)
 
 
 @op()
@@ -310,13 +312,13 @@ def lacking(
         (k,) bool: the node's tile is linked into the tree, at this loc, and its word is ABSENT.
     """
     per_tile = pointer_tn.shape[1]
-    known = (node_k >= 0) & (node_k < pointer_tn.numel())
-    node = torch.where(known, node_k, 0)
+    valid = (node_k >= 0) & (node_k < pointer_tn.numel())
+    node = torch.where(valid, node_k, 0)
     tile = node // per_tile
     linked = (parent_t[tile] >= 0) | shared_t[tile] | (node == root)
-    there = (locate(loc_t4, node, branching, per_tile, backend=backend) == loc_k4).all(1)
-    bare = pointer_tn.view(-1)[node] == ABSENT
-    return known & linked & (tree_t[tile] == tree) & there & bare
+    at_loc = (locate(loc_t4, node, branching, per_tile, backend=backend) == loc_k4).all(1)
+    absent = pointer_tn.view(-1)[node] == ABSENT
+    return valid & linked & (tree_t[tile] == tree) & at_loc & absent
 
 
 def cut_bricks(
@@ -342,23 +344,23 @@ def cut_bricks(
         ValueError: A tensor of the wrong shape, dtype or device, a number out of its range, or a
             level without voxels.
     """
-    where = "cut_bricks"
+    context = "cut_bricks"
     shape = ("z", "y", "x", "c")
-    check.instance(where, "values_zyxc", values_zyxc, Tensor)
-    check.instance(where, "place_k3", place_k3, Tensor)
-    check.no_gradient(where, "values_zyxc", values_zyxc)
-    check.tensor(where, "values_zyxc", values_zyxc, shape, values_zyxc.dtype, place_k3.device)
-    check.tensor(where, "place_k3", place_k3, ("k", 3), torch.int64, place_k3.device)
-    check.whole(where, "brick_size", brick_size, low=1, high=2**10)
-    check.whole(where, "border", border, low=0, high=2**10)
+    check.instance(context, "values_zyxc", values_zyxc, Tensor)
+    check.instance(context, "place_k3", place_k3, Tensor)
+    check.no_gradient(context, "values_zyxc", values_zyxc)
+    check.tensor(context, "values_zyxc", values_zyxc, shape, values_zyxc.dtype, place_k3.device)
+    check.tensor(context, "place_k3", place_k3, ("k", 3), torch.int64, place_k3.device)
+    check.whole(context, "brick_size", brick_size, low=1, high=2**10)
+    check.whole(context, "border", border, low=0, high=2**10)
     if not values_zyxc.numel():
-        raise ValueError(f"{where}: values_zyxc has no voxels, got {check.describe(values_zyxc)}")
+        raise ValueError(f"{context}: values_zyxc has no voxels, got {check.describe(values_zyxc)}")
     if choose_backend(backend, place_k3.device) != "reference":
-        given = (values_zyxc.contiguous(), place_k3.contiguous())
-        return torch.ops.gvtorch.cut_bricks(*given, brick_size, border)
-    reach = torch.arange(-border, brick_size + border, device=place_k3.device)
-    place = place_k3.clamp(-(2**50), 2**50)  # beyond any level
-    corner = place[:, :, None] * brick_size + reach  # (k, 3, s)
-    z, y, x = (corner[:, axis].clamp(0, values_zyxc.shape[axis] - 1) for axis in range(3))
+        tensors = (values_zyxc.contiguous(), place_k3.contiguous())
+        return torch.ops.gvtorch.cut_bricks(*tensors, brick_size, border)
+    offsets = torch.arange(-border, brick_size + border, device=place_k3.device)
+    brick_index = place_k3.clamp(-(2**50), 2**50)  # beyond any level
+    voxel = brick_index[:, :, None] * brick_size + offsets  # (k, 3, s)
+    z, y, x = (voxel[:, axis].clamp(0, values_zyxc.shape[axis] - 1) for axis in range(3))
     index = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
     return movable(values_zyxc)[index].view(values_zyxc.dtype)

@@ -19,8 +19,8 @@ def _check_rows(*, camera_nc: Tensor, first: int, rows: int, width: int, height:
     if columns < 20:
         raise ValueError(f"pinhole_rays: camera_nc must have 20 columns or more, got {columns}")
     if height < 1 or first + rows > cameras * height:
-        have = f"{cameras} cameras of {height} rows"
-        raise ValueError(f"pinhole_rays: no rows {first} to {first + rows} in {have}")
+        available = f"{cameras} cameras of {height} rows"
+        raise ValueError(f"pinhole_rays: no rows {first} to {first + rows} in {available}")
     if max(first + rows, rows * width) >= _END:
         raise ValueError(f"pinhole_rays: {rows} rows of {width} are too many at once")
 
@@ -45,15 +45,15 @@ def pinhole_rays(
     row = torch.arange(first, first + rows, device=camera_nc.device)
     column = torch.arange(width, dtype=torch.float64, device=camera_nc.device)
     camera = camera_nc[row // height]  # of each row
-    fx, fy, cx, cy = (one[:, None] for one in camera[:, 12:16].unbind(1))
+    fx, fy, cx, cy = (number[:, None] for number in camera[:, 12:16].unbind(1))
     x, y = (column - cx) / fx, ((row % height)[:, None] - cy) / fy
     rotation = camera[:, :9].unflatten(1, (3, 3))
     length = sqrt_exact(x * x + (y * y + 1))
     across, down = x[..., None] * rotation[:, None, 0], y * rotation[:, 1] + rotation[:, 2]
     direction = (across + down[:, None]) / length[..., None]
 
-    def spread(at: int, count: int) -> Tensor:
-        part = camera[:, None, at : at + count]
-        return part.expand(rows, width, count).reshape(-1, count)
+    def per_pixel(first_column: int, count: int) -> Tensor:
+        numbers = camera[:, None, first_column : first_column + count]
+        return numbers.expand(rows, width, count).reshape(-1, count)
 
-    return spread(9, 3), direction.view(-1, 3), spread(16, 2), spread(18, 2)
+    return per_pixel(9, 3), direction.view(-1, 3), per_pixel(16, 2), per_pixel(18, 2)

@@ -45,24 +45,27 @@ def noise(
     Raises:
         ValueError: A tensor of the wrong shape or dtype, or a number out of its range.
     """
-    where, device = "noise", point_pn.device
+    context, device = "noise", point_pn.device
     n = point_pn.shape[1] if point_pn.dim() == 2 else 0
     if n not in (2, 3) or point_pn.dtype not in (torch.float32, torch.float64):
         got = check.describe(point_pn)
-        raise ValueError(f"{where}: point_pn must be (p, 2) or (p, 3) floats, got {got}")
-    check.one_of(where, "kind", kind, KINDS)
-    check.whole(where, "seed", seed, low=-(2**63))
-    jitter = check.number(where, "jitter", jitter, low=0, high=1)
-    check.whole(where, "reach", reach, low=1, high=2)
+        raise ValueError(f"{context}: point_pn must be (p, 2) or (p, 3) floats, got {got}")
+    check.one_of(context, "kind", kind, KINDS)
+    check.whole(context, "seed", seed, low=-(2**63))
+    jitter = check.number(context, "jitter", jitter, low=0, high=1)
+    check.whole(context, "reach", reach, low=1, high=2)
     if not isinstance(period, Sequence):
-        raise ValueError(f"{where}: period must be numbers of cells, one an axis, got {period!r}")
+        raise ValueError(f"{context}: period must be numbers of cells, one an axis, got {period!r}")
     x, y, z = (*period, 0, 0, 0)[:3]
-    for one in (x, y, z):
-        check.whole(where, "period", one, low=0, high=2**28)
-    number, given = KINDS.index(kind), twin.Given(twin.salts(seed), (x, y, z), jitter, reach)
-    learns = torch.is_grad_enabled() and point_pn.requires_grad
-    chosen = uncached_backend(backend, device)
-    if chosen == "reference" or (learns and backend == "auto"):
-        return twin.noise(point_pn, number, given)
-    numbers = (*(one & 0xFFFFFFFF for one in given.salt), x, y, z, jitter, reach)
-    return torch.ops.gvtorch.noise(point_pn.contiguous(), number, *numbers)
+    for axis_period in (x, y, z):
+        check.whole(context, "period", axis_period, low=0, high=2**28)
+    kind_index, arguments = (
+        KINDS.index(kind),
+        twin.NoiseArguments(twin.salts(seed), (x, y, z), jitter, reach),
+    )
+    needs_gradient = torch.is_grad_enabled() and point_pn.requires_grad
+    chosen_backend = uncached_backend(backend, device)
+    if chosen_backend == "reference" or (needs_gradient and backend == "auto"):
+        return twin.noise(point_pn, kind_index, arguments)
+    scalars = (*(salt & 0xFFFFFFFF for salt in arguments.salt), x, y, z, jitter, reach)
+    return torch.ops.gvtorch.noise(point_pn.contiguous(), kind_index, *scalars)

@@ -25,28 +25,30 @@ class Orbit(NamedTuple):
     iterations: int  # largest number of steps
     julia: bool = False  # whether c is `constant_3`; else it is each point itself
 
-    def check(self, where: str, like: Tensor, fields: list[tuple[str, Tensor, str]]) -> None:
+    def check(self, context: str, like: Tensor, fields: list[tuple[str, Tensor, str]]) -> None:
         """Raises ValueError unless all tensors have the dtype and device of `like` and their
         shapes, and numbers are in range. `fields`: name, tensor and shape of each other argument.
         """
         if like.dtype not in (torch.float32, torch.float64):
             got = check.describe(like)
-            raise ValueError(f"{where}: {fields[0][0]} must be float32 or float64, got {got}")
-        own = [("constant_3", self.constant_3, "3"), ("bailout_1", self.bailout_1, "1")]
-        check.tensors(where, like.device, [(*one, like.dtype) for one in (*fields, *own)])
-        check.one_of(where, "kind", self.kind, KINDS)
+            raise ValueError(f"{context}: {fields[0][0]} must be float32 or float64, got {got}")
+        own_fields = [("constant_3", self.constant_3, "3"), ("bailout_1", self.bailout_1, "1")]
+        check.tensors(
+            context, like.device, [(*field, like.dtype) for field in (*fields, *own_fields)]
+        )
+        check.one_of(context, "kind", self.kind, KINDS)
         if self.kind == "power":
-            check.whole(where, "amount", self.amount, low=2, high=64)
+            check.whole(context, "amount", self.amount, low=2, high=64)
         else:
-            check.number(where, "amount", self.amount)
-        check.whole(where, "iterations", self.iterations, low=1, high=1000)
+            check.number(context, "amount", self.amount)
+        check.whole(context, "iterations", self.iterations, low=1, high=1000)
 
     def arguments(self) -> tuple[Any, ...]:
         """Returns the arguments of the compiled ops that come after the points or balls."""
-        number = KINDS.index(self.kind)
-        return (*self[:2], number, float(self.amount), self.iterations, self.julia)
+        kind_index = KINDS.index(self.kind)
+        return (*self[:2], kind_index, float(self.amount), self.iterations, self.julia)
 
-    def way(self) -> twin.Way:
+    def twin_orbit(self) -> twin.TwinOrbit:
         """Returns this iteration in the form that the twin takes."""
         if self.kind == "power":
             step: twin.Step = partial(twin.spherical_power, n=int(self.amount))
@@ -55,7 +57,7 @@ class Orbit(NamedTuple):
             step = partial(twin.fold, scale=self.amount)
             ranges = partial(twin.fold_ranges, scale=self.amount)
         constant, logarithmic = self.constant_3 if self.julia else None, self.kind == "power"
-        return twin.Way(step, ranges, constant, self.bailout_1, self.iterations, logarithmic)
+        return twin.TwinOrbit(step, ranges, constant, self.bailout_1, self.iterations, logarithmic)
 
 
 def orbits(point_p3: Tensor, orbit: Orbit, backend: Backend = "auto") -> Tensor:
@@ -77,10 +79,12 @@ def orbits(point_p3: Tensor, orbit: Orbit, backend: Backend = "auto") -> Tensor:
         ValueError: A tensor of the wrong shape or dtype, or a number out of its range.
     """
     orbit.check("orbits", point_p3, [("point_p3", point_p3, "p3")])
-    given = (point_p3, orbit.constant_3, orbit.bailout_1)
-    learns = torch.is_grad_enabled() and any(one.requires_grad for one in given)
-    if uncached_backend(backend, point_p3.device) == "reference" or (learns and backend == "auto"):
-        return twin.orbits(point_p3, orbit.way())
+    tensors = (point_p3, orbit.constant_3, orbit.bailout_1)
+    needs_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    if uncached_backend(backend, point_p3.device) == "reference" or (
+        needs_gradient and backend == "auto"
+    ):
+        return twin.orbits(point_p3, orbit.twin_orbit())
     return torch.ops.gvtorch.orbits(point_p3, *orbit.arguments())
 
 
@@ -99,5 +103,5 @@ def orbit_bounds(
     fields = [("center_k3", center_k3, "k3"), ("reach_k", reach_k, "k")]
     orbit.check("orbit_bounds", center_k3, fields)
     if uncached_backend(backend, center_k3.device) == "reference":
-        return twin.orbit_bounds(center_k3, reach_k, orbit.way())
+        return twin.orbit_bounds(center_k3, reach_k, orbit.twin_orbit())
     return torch.ops.gvtorch.orbit_bounds(center_k3, reach_k, *orbit.arguments())

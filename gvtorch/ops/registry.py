@@ -55,60 +55,66 @@ def choose_backend(backend: str, device: torch.device) -> str:
 uncached_backend = choose_backend.__wrapped__  # torch.compile warns of caches
 
 
-def op(also: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
+def op(extra_check: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
     """Turns a twin into an op: it checks the arguments, then calls the compiled op of the twin's
     name or the twin itself, as the argument `backend` says: auto, reference, cpp or cuda.
 
     Tensors must be contiguous, on one device, of the dtype that their annotation names (Words,
     Longs, Requests, Flags, Bytes or Doubles) and of the shape in the suffix of their name (any
-    shape without one); numbers must be in their range. Else the op raises ValueError. `also` is a
-    further check, which gets the arguments by name.
+    shape without one); numbers must be in their range. Else the op raises ValueError. `extra_check`
+    is a further check, which gets the arguments by name.
     """
 
-    def made_of(twin: _Twin) -> _Twin:
-        where, signature = twin.__name__, inspect.signature(twin)
+    def decorate(twin: _Twin) -> _Twin:
+        op_name, signature = twin.__name__, inspect.signature(twin)
         names = [name for name in signature.parameters if name != "backend"]
         hints = get_type_hints(twin, include_extras=True).items()
-        marks = {name: get_args(hint)[1] for name, hint in hints if get_origin(hint) is Annotated}
-        ranges = {name: mark for name, mark in marks.items() if isinstance(mark, range)}
-        places = {name: place for place, name in enumerate(names)}
+        annotations = {
+            name: get_args(hint)[1] for name, hint in hints if get_origin(hint) is Annotated
+        }
+        ranges = {
+            name: annotation
+            for name, annotation in annotations.items()
+            if isinstance(annotation, range)
+        }
+        positions = {name: position for position, name in enumerate(names)}
         tensors = [
-            (places[name], name, check.shape_of(name) if "_" in name else "", dtype)
+            (positions[name], name, check.shape_of(name) if "_" in name else "", dtype)
             for dtype in _DTYPES
-            for name, mark in marks.items()
-            if mark == dtype
+            for name, annotation in annotations.items()
+            if annotation == dtype
         ]
 
         @functools.wraps(twin)
-        def run(*given: Any, backend: Backend = "auto", **named: Any) -> Any:
-            if named or len(given) != len(names):
-                bound = signature.bind(*given, **named)
+        def run(*args: Any, backend: Backend = "auto", **kwargs: Any) -> Any:
+            if kwargs or len(args) != len(names):
+                bound = signature.bind(*args, **kwargs)
                 bound.apply_defaults()
-                given = tuple(bound.arguments.values())[: len(names)]
-            device = check.instance(where, names[0], given[0], Tensor).device
+                args = tuple(bound.arguments.values())[: len(names)]
+            device = check.instance(op_name, names[0], args[0], Tensor).device
             fields = [
-                (name, given[place], shape or _any_shape(where, name, given[place]), dtype)
-                for place, name, shape, dtype in tensors
+                (name, args[position], shape or _any_shape(op_name, name, args[position]), dtype)
+                for position, name, shape, dtype in tensors
             ]
-            check.tensors(where, device, fields)
-            for place, name, _, dtype in tensors:
+            check.tensors(op_name, device, fields)
+            for position, name, _, dtype in tensors:
                 if dtype == torch.float64:
-                    check.no_gradient(where, name, given[place])
-            for name, inside in ranges.items():
-                check.whole(where, name, given[places[name]], low=inside[0], high=inside[-1])
-            if also is not None:
-                also(**dict(zip(names, given, strict=True)))
+                    check.no_gradient(op_name, name, args[position])
+            for name, allowed in ranges.items():
+                check.whole(op_name, name, args[positions[name]], low=allowed[0], high=allowed[-1])
+            if extra_check is not None:
+                extra_check(**dict(zip(names, args, strict=True)))
             if choose_backend(backend, device) == "reference":
-                return twin(*given, backend="reference")
-            return getattr(torch.ops.gvtorch, where)(*given)
+                return twin(*args, backend="reference")
+            return getattr(torch.ops.gvtorch, op_name)(*args)
 
         return cast("_Twin", run)
 
-    return made_of
+    return decorate
 
 
-def _any_shape(where: str, name: str, value: Any) -> str:
-    return "abcd"[: check.instance(where, name, value, Tensor).dim()]
+def _any_shape(context: str, name: str, value: Any) -> str:
+    return "abcd"[: check.instance(context, name, value, Tensor).dim()]
 
 
 def _names(op: Any) -> tuple[str, ...]:
@@ -118,8 +124,8 @@ def _names(op: Any) -> tuple[str, ...]:
 def _register_fake(op: Any, fake: Callable[..., Any]) -> None:
     names = _names(op)
 
-    def by_name(*given: Any, **named: Any) -> Any:
-        return fake(**dict(zip(names, given, strict=False)), **named)
+    def by_name(*args: Any, **kwargs: Any) -> Any:
+        return fake(**dict(zip(names, args, strict=False)), **kwargs)
 
     torch.library.register_fake(op.default.name(), by_name)
 
@@ -133,8 +139,8 @@ def _trace_rays(*, origin_r3: Tensor, table_lm4: Tensor, **_: Any) -> tuple[Tens
     )
 
 
-def _shade_rays(*, table_lm4: Tensor, features: int, **given: Any) -> tuple[Tensor, ...]:
-    hits = _trace_rays(table_lm4=table_lm4, **given)
+def _shade_rays(*, table_lm4: Tensor, features: int, **arguments: Any) -> tuple[Tensor, ...]:
+    hits = _trace_rays(table_lm4=table_lm4, **arguments)
     rays = hits[0].shape[0]
     return (*hits, *(table_lm4.new_empty((rays, width)) for width in (3, features)))
 
@@ -191,12 +197,12 @@ def _pinhole_rays(*, camera_nc: Tensor, rows: int, width: int, **_: Any) -> tupl
 def _voxelize(
     *, low_k3: Tensor, side: int, shares: bool, weights: bool, wide: bool, **_: Any
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    cubes, cube = low_k3.shape[0], (side, side, side)
-    real = low_k3.new_empty((cubes, *cube), dtype=torch.float64 if wide else torch.float32)
-    whole = torch.empty_like(real, dtype=torch.int32)
-    share = real.new_empty((cubes if shares else 0, *cube))
-    weight = real.new_empty((cubes if weights else 0, *cube, 3))
-    return real, whole, torch.empty_like(whole), share, weight
+    cubes, shape = low_k3.shape[0], (side, side, side)
+    float_volume = low_k3.new_empty((cubes, *shape), dtype=torch.float64 if wide else torch.float32)
+    int_volume = torch.empty_like(float_volume, dtype=torch.int32)
+    share = float_volume.new_empty((cubes if shares else 0, *shape))
+    weight = float_volume.new_empty((cubes if weights else 0, *shape, 3))
+    return float_volume, int_volume, torch.empty_like(int_volume), share, weight
 
 
 def _splat(*, edge_k3e: Tensor, value_nc: Tensor, **_: Any) -> Tensor:
@@ -250,18 +256,18 @@ def _refuse_gradients(op: Any) -> None:
     export.
     """
     names = _names(op)
-    namespace, _, where = op.default.name().partition("::")
+    namespace, _, op_name = op.default.name().partition("::")
     if namespace not in _libraries:
         _libraries[namespace] = torch.library.Library(namespace, "IMPL")
 
-    def kernel(keys: Any, *given: Any) -> Any:
+    def kernel(dispatch_keys: Any, *args: Any) -> Any:
         if torch.is_grad_enabled():
-            for at, value in enumerate(given):
+            for position, value in enumerate(args):
                 if isinstance(value, Tensor) and value.requires_grad:
-                    raise check.lost_gradient(where, names[at])
-        return op.default.redispatch(keys & torch._C._after_autograd_keyset, *given)
+                    raise check.lost_gradient(op_name, names[position])
+        return op.default.redispatch(dispatch_keys & torch._C._after_autograd_keyset, *args)
 
-    _libraries[namespace].impl(where, kernel, "Autograd", with_keyset=True)
+    _libraries[namespace].impl(op_name, kernel, "Autograd", with_keyset=True)
 
 
 @functools.cache
@@ -274,10 +280,10 @@ def add_user_op(name: str) -> None:
 
 def _save_samples(ctx: Any, inputs: tuple, output: Tensor) -> None:
     for name, value in zip(_names(torch.ops.gvtorch.sample_bricks), inputs, strict=True):
-        if name not in _LEARNED and isinstance(value, Tensor) and value.requires_grad:
+        if name not in _DIFFERENTIABLE and isinstance(value, Tensor) and value.requires_grad:
             raise check.lost_gradient("sample_bricks", name)
-    ctx.save_for_backward(*(one if isinstance(one, Tensor) else None for one in inputs))
-    ctx.numbers = [None if isinstance(one, Tensor) else one for one in inputs]
+    ctx.save_for_backward(*(value if isinstance(value, Tensor) else None for value in inputs))
+    ctx.numbers = [None if isinstance(value, Tensor) else value for value in inputs]
 
 
 def _sample_gradient(ctx: Any, grad_kc: Tensor) -> tuple[Tensor | None, ...]:
@@ -307,7 +313,7 @@ def _composite_gradient(
 
 
 #: Arguments of `sample_bricks` that have gradients.
-_LEARNED = ("bricks_bzyxc", "constant_tnc")
+_DIFFERENTIABLE = ("bricks_bzyxc", "constant_tnc")
 
 _reasons = cpp_ext.load()
 if not _reasons["cpp"]:

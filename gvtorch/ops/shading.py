@@ -37,6 +37,11 @@ SHADER_KINDS = (
 )
 
 
+#: Filtered colours hold the moments of normals that no light reaches divided by this, and shaders
+#: multiply the moments' trace by it; as `kFaint` in csrc/shaders/light.h.
+FAINT = 32
+
+
 def shader_number(kind: str) -> int:
     """Returns the number of a fused shader; raises ValueError if there is none of this name."""
     check.one_of("shader", "kind", kind, SHADER_KINDS)
@@ -125,9 +130,11 @@ class ShadeParameters(NamedTuple):
 
     def pack(self, dtype: torch.dtype, device: torch.device) -> Tensor:
         """Returns (5, 4) numbers; raises ValueError as the function `pack` does."""
-        at = self._fields.index("own")
-        own = (*self.own, *(0.0,) * (_WIDTHS[at] - len(self.own)))
-        return pack((*self[:at], *own, *self[at + 1 :]), dtype, device).reshape(5, 4)
+        own_index = self._fields.index("own")
+        own_numbers = (*self.own, *(0.0,) * (_WIDTHS[own_index] - len(self.own)))
+        return pack(
+            (*self[:own_index], *own_numbers, *self[own_index + 1 :]), dtype, device
+        ).reshape(5, 4)
 
     def own_as(self, record: Callable[..., _Record]) -> _Record:
         """Returns the shader-specific numbers by name, as one of the records above."""

@@ -17,17 +17,17 @@ from ..base import check
 from .reference.exact import clamp, divide, larger
 from .registry import Backend, Doubles, Longs, op
 
-MOST_VOXELS = (1 << 20) - 1  # along a side of a cube
+MAX_CUBE_SIDE = (1 << 20) - 1  # along a side of a cube
 SMALLEST = 2.0**-1000  # smallest divisor: smaller radii count as this
 
 
 def _check_sizes(*, edge_k3e: Tensor, narrow_b: Tensor, value_nc: Tensor, **_: Any) -> None:
     cubes, edges = len(edge_k3e), edge_k3e.shape[2]
     check.tensor("splat", "narrow_b", narrow_b, (cubes + 1,), torch.int64, narrow_b.device)
-    numbers = value_nc.shape[1]
-    if not 2 <= edges <= MOST_VOXELS + 1 or not numbers:
-        got = f"{edges - 1} and {numbers}"
-        raise ValueError(f"splat: 1 to {MOST_VOXELS} voxels and a number are needed, got {got}")
+    width = value_nc.shape[1]
+    if not 2 <= edges <= MAX_CUBE_SIDE + 1 or not width:
+        got = f"{edges - 1} and {width}"
+        raise ValueError(f"splat: 1 to {MAX_CUBE_SIDE} voxels and a number are needed, got {got}")
 
 
 @op(_check_sizes)
@@ -59,12 +59,12 @@ def splat(
     """
     cubes, side = len(edge_k3e), edge_k3e.shape[2] - 1
     total = edge_k3e.new_zeros((cubes, side, side, side, value_nc.shape[1]))
-    for cube, row in _in_turn(narrow_b, narrow_s2, len(voxel_n3)):
+    for cube, row in _rows_by_turn(narrow_b, narrow_s2, len(voxel_n3)):
         voxel = voxel_n3[row] - low_k3[cube]
         inside = ((voxel >= 0) & (voxel < side)).all(1)
         x, y, z = voxel[inside].unbind(1)
         total[cube[inside], z, y, x] += value_nc[row[inside]]
-    for cube, row in _in_turn(wide_b, wide_t2, len(radius_m)):
+    for cube, row in _rows_by_turn(wide_b, wide_t2, len(radius_m)):
         x, y, z = (
             shares(edge_k3e[cube, axis], center_m3[row, axis], radius_m[row]) for axis in range(3)
         )
@@ -82,35 +82,40 @@ def shares(edge_ke: Tensor, center_k: Tensor, radius_k: Tensor) -> Tensor:
     A point's density is a product of cubic splines along x, y and z, so its share in a box is the
     product of three such integrals, and shares of the parts of a box add up to that of the box.
     """
-    away = edge_ke - center_k[:, None]
-    most = torch.where(away > 0, 2.0, -2.0).to(away)
+    offset = edge_ke - center_k[:, None]
+    outermost_knot = torch.where(offset > 0, 2.0, -2.0).to(offset)
     scale = divide(2.0, larger(radius_k, torch.full_like(radius_k, SMALLEST)), radius_k)
-    knots = clamp(away * scale[:, None], -2.0, 2.0)  # the spline's knots are integers
-    away = torch.where(radius_k[:, None] > 0, knots, most)
-    far = larger(away, -away)
-    rest = 2 - far
+    knots = clamp(offset * scale[:, None], -2.0, 2.0)  # the spline's knots are integers
+    offset = torch.where(radius_k[:, None] > 0, knots, outermost_knot)
+    distance = larger(offset, -offset)
+    rest = 2 - distance
     square = rest * rest
-    inner = 0.5 - far * (2 / 3 - far * far * (1 / 3 - far * 0.125))
-    tail = torch.where(far > 1, square * square * (1 / 24), inner)  # integral beyond `far`
-    below = torch.where(away < 0, tail, 1 - tail)
+    inner = 0.5 - distance * (2 / 3 - distance * distance * (1 / 3 - distance * 0.125))
+    # The integral beyond `distance`.
+    tail = torch.where(distance > 1, square * square * (1 / 24), inner)
+    below = torch.where(offset < 0, tail, 1 - tail)
     return below[:, 1:] - below[:, :-1]
 
 
-def _in_turn(begin_b: Tensor, run_s2: Tensor, rows: int) -> Iterator[tuple[Tensor, Tensor]]:
+def _rows_by_turn(begin_b: Tensor, run_s2: Tensor, rows: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Yields all cubes' first rows, then their second, ...: the cubes that have one, the rows."""
-    runs, of_run = _expanded(torch.stack((begin_b[:-1], begin_b[1:]), 1).clamp(0, len(run_s2)))
-    row, of_row = _expanded(run_s2.clamp(0, rows)[runs])
-    count = torch.bincount(of_run[of_row], minlength=len(begin_b) - 1)
+    runs, cube_of_run = _expand_spans(
+        torch.stack((begin_b[:-1], begin_b[1:]), 1).clamp(0, len(run_s2))
+    )
+    row, run_of_row = _expand_spans(run_s2.clamp(0, rows)[runs])
+    count = torch.bincount(cube_of_run[run_of_row], minlength=len(begin_b) - 1)
     begin = count.cumsum(0) - count
     for turn in range(int(count.amax()) if len(count) else 0):
         (cube,) = (count > turn).nonzero(as_tuple=True)
         yield cube, row[begin[cube] + turn]
 
 
-def _expanded(span_k2: Tensor) -> tuple[Tensor, Tensor]:
+def _expand_spans(span_k2: Tensor) -> tuple[Tensor, Tensor]:
     """Returns all integers in half-open spans, and the index of the span that each is in."""
     begin, end = span_k2.unbind(1)
     count = (end - begin).clamp(min=0)
-    each = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
-    within = torch.arange(len(each), device=count.device) - (count.cumsum(0) - count)[each]
-    return begin[each] + within, each
+    span_index = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
+    offset = (
+        torch.arange(len(span_index), device=count.device) - (count.cumsum(0) - count)[span_index]
+    )
+    return begin[span_index] + offset, span_index

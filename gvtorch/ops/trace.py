@@ -31,58 +31,58 @@ def _fields(record: Any, dtype: torch.dtype, names: str) -> list[check.Field]:
     return [(name, getattr(record, name), check.shape_of(name), dtype) for name in names.split()]
 
 
-def check_rays(where: str, rays: RayArguments) -> dict[str, int]:
+def check_rays(context: str, rays: RayArguments) -> dict[str, int]:
     """Checks rays."""
     names = "origin_r3 direction_r3 cone_r2 range_r2"
     names += "" if rays.clear_r is None else " clear_r"
     fields = _fields(rays, torch.float64, names)
-    sizes = check.tensors(where, rays.origin_r3.device, fields)
-    check.whole(where, "width", rays.width, low=0)
+    sizes = check.tensors(context, rays.origin_r3.device, fields)
+    check.whole(context, "width", rays.width, low=0)
     if rays.width and sizes["r"] % rays.width:
-        raise ValueError(f"{where}: {sizes['r']} rays are not whole rows of {rays.width} pixels")
+        raise ValueError(f"{context}: {sizes['r']} rays are not whole rows of {rays.width} pixels")
     return sizes
 
 
-def check_channel(where: str, arguments: TraceArguments, device: torch.device) -> dict[str, int]:
+def check_channel(context: str, arguments: TraceArguments, device: torch.device) -> dict[str, int]:
     """Checks the fields of `TraceArguments.channel`: placement, bricks and constants."""
-    check.whole(where, "branching", arguments.branching, low=2, high=16)
+    check.whole(context, "branching", arguments.branching, low=2, high=16)
     fields = _fields(arguments, arguments.bricks_bzyxc.dtype, "bricks_bzyxc constant_tnc")
-    place = _fields(arguments, torch.float64, "place_33")
-    sizes = check.tensors(where, device, place + fields)
-    check.whole(where, "max_depth", arguments.max_depth, low=0, high=62)
+    placement = _fields(arguments, torch.float64, "place_33")
+    sizes = check.tensors(context, device, placement + fields)
+    check.whole(context, "max_depth", arguments.max_depth, low=0, high=62)
     if arguments.branching**arguments.max_depth > config.MOST_NODES:
         raise ValueError(
-            f"{where}: branching {arguments.branching} and max_depth {arguments.max_depth} make "
+            f"{context}: branching {arguments.branching} and max_depth {arguments.max_depth} make "
             f"more than 2^50 nodes a side"
         )
-    check.whole(where, "border", arguments.border, low=0, high=(sizes["s"] - 1) // 2)
-    check.number(where, "root_voxel", arguments.root_voxel, low=0, open_low=True)
-    check.number(where, "step", arguments.step, low=0, open_low=True)
-    check.number(where, "cone_scale", arguments.cone_scale, low=0)
+    check.whole(context, "border", arguments.border, low=0, high=(sizes["s"] - 1) // 2)
+    check.number(context, "root_voxel", arguments.root_voxel, low=0, open_low=True)
+    check.number(context, "step", arguments.step, low=0, open_low=True)
+    check.number(context, "cone_scale", arguments.cone_scale, low=0)
     return sizes
 
 
-def check_voxels(where: str, arguments: TraceArguments) -> None:
+def check_voxels(context: str, arguments: TraceArguments) -> None:
     """Checks that the bricks' dtype has a kernel."""
     voxel = arguments.bricks_bzyxc.dtype
     if voxel not in CHANNEL_DTYPES:
-        raise ValueError(f"{where}: bricks_bzyxc has dtype {voxel}, which no channel can have")
+        raise ValueError(f"{context}: bricks_bzyxc has dtype {voxel}, which no channel can have")
 
 
-def check_real(where: str, name: str, tensor: Tensor, shape: str) -> None:
+def check_real(context: str, name: str, tensor: Tensor, shape: str) -> None:
     """Checks that a tensor is float32 or float64; `shape`, as "(k,)", is only for the message."""
     if tensor.dtype not in (torch.float32, torch.float64):
         got = check.describe(tensor)
-        raise ValueError(f"{where}: {name} must be {shape} float32 or float64, got {got}")
+        raise ValueError(f"{context}: {name} must be {shape} float32 or float64, got {got}")
 
 
 def check_trace(
-    where: str, rays: RayArguments, arguments: TraceArguments, table_shape: str = "lm4"
+    context: str, rays: RayArguments, arguments: TraceArguments, table_shape: str = "lm4"
 ) -> dict[str, int]:
     """Checks rays, tree, pools and transfer function."""
     table, device = arguments.table_lm4, rays.origin_r3.device
-    check_real(where, "table_lm4", table, f"({', '.join(table_shape)})")
-    check_voxels(where, arguments)
+    check_real(context, "table_lm4", table, f"({', '.join(table_shape)})")
+    check_voxels(context, arguments)
     fields = [
         *_fields(arguments, arguments.bricks_bzyxc.dtype, "range_tn2c"),
         ("table_lm4", table, table_shape, table.dtype),
@@ -91,18 +91,18 @@ def check_trace(
         *_fields(arguments, torch.int16, "request_tn"),
         *_fields(arguments, torch.int32, "opaque_m frame_1"),
     ]
-    sizes = check_rays(where, rays) | check_channel(where, arguments, device)
-    sizes = check.tensors(where, device, fields, sizes)
+    sizes = check_rays(context, rays) | check_channel(context, arguments, device)
+    sizes = check.tensors(context, device, fields, sizes)
     if sizes["n"] < arguments.branching**3:
         wanted = f"{arguments.branching}^3 nodes a tile"
-        raise ValueError(f"{where}: child_tn must hold {wanted}, got {sizes['n']}")
+        raise ValueError(f"{context}: child_tn must hold {wanted}, got {sizes['n']}")
     if sizes["l"] < 1 or sizes["m"] < 2:
         got = check.describe(table)
-        raise ValueError(f"{where}: table_lm4 needs at least 1 length and 2 rows, got {got}")
-    check.whole(where, "root", arguments.root, low=0, high=sizes["t"] * sizes["n"] - 1)
-    check.whole(where, "component", arguments.component, low=0, high=sizes["c"] - 1)
-    check.number(where, "stop_alpha", arguments.stop_alpha, low=0, high=1)
-    check.number(where, "depth_alpha", arguments.depth_alpha, low=0, high=1)
+        raise ValueError(f"{context}: table_lm4 needs at least 1 length and 2 rows, got {got}")
+    check.whole(context, "root", arguments.root, low=0, high=sizes["t"] * sizes["n"] - 1)
+    check.whole(context, "component", arguments.component, low=0, high=sizes["c"] - 1)
+    check.number(context, "stop_alpha", arguments.stop_alpha, low=0, high=1)
+    check.number(context, "depth_alpha", arguments.depth_alpha, low=0, high=1)
     return sizes
 
 
@@ -111,54 +111,55 @@ def check_shade(
     arguments: TraceArguments,
     shading: ShadeArguments,
     parameter_54: Tensor,
-    own: bool,
+    user_op: bool,
 ) -> None:
-    """Checks everything that a shader reads; `own` is true for a user's shader."""
-    where = "shade_rays"
-    known = ("",) if own else SHADER_KINDS
-    kind = known[check.whole(where, "shader", shading.shader, low=0, high=len(known) - 1)]
-    sizes = check_trace(where, rays, arguments, "lmm4" if kind == "PreIntegrated" else "lm4")
-    device, shape = rays.origin_r3.device, "k" if own else "54"
+    """Checks everything that a shader reads; `user_op` is true for a user's shader."""
+    context = "shade_rays"
+    kinds = ("",) if user_op else SHADER_KINDS
+    kind = kinds[check.whole(context, "shader", shading.shader, low=0, high=len(kinds) - 1)]
+    sizes = check_trace(context, rays, arguments, "lmm4" if kind == "PreIntegrated" else "lm4")
+    device, shape = rays.origin_r3.device, "k" if user_op else "54"
     parameters = ("parameter_54", parameter_54, shape, arguments.table_lm4.dtype)
-    check.tensors(where, device, [parameters])
-    one = {"Filtered": 4, "FilteredLit": 10}.get(kind, 0)  # numbers seen along a direction
-    others, some = 0, "e" if one else "b"  # filtered colours: of coarse slots only, so fewer
+    check.tensors(context, device, [parameters])
+    per_side = {"Filtered": 4, "FilteredLit": 10}.get(kind, 0)  # numbers seen along a direction
+    # Filtered colours are those of coarse slots only, so there are fewer.
+    other_width, other_slots = 0, "e" if per_side else "b"
     for name, bricks, constants, slots, width in (
         ("normal", shading.normal_bzyxc, shading.normal_tnc, "b", "3"),
-        ("other", shading.other_bzyxc, shading.other_tnc, some, "d"),
+        ("other", shading.other_bzyxc, shading.other_tnc, other_slots, "d"),
     ):
         if (bricks is None) != (constants is None) and slots == "b":
-            raise ValueError(f"{where}: {name}_bzyxc and {name}_tnc belong together")
+            raise ValueError(f"{context}: {name}_bzyxc and {name}_tnc belong together")
         if bricks is not None:
             fields = [(f"{name}_bzyxc", bricks, f"{slots}sss{width}", bricks.dtype)]
             if constants is not None:
                 fields.append((f"{name}_tnc", constants, f"tn{width}", bricks.dtype))
-            others = check.tensors(where, device, fields, sizes).get("d", 0)
-            check.whole(where, f"bricks of {name}_bzyxc", len(bricks), low=0, high=sizes["b"])
+            other_width = check.tensors(context, device, fields, sizes).get("d", 0)
+            check.whole(context, f"bricks of {name}_bzyxc", len(bricks), low=0, high=sizes["b"])
     colored = sizes["c"] in (4, 24) and arguments.component == 3
     if kind in ("StoredColor", "ShadowedColor") and not colored:
         raise ValueError(
-            f"{where}: stored colour needs a channel of 4 or 24 numbers and component 3"
+            f"{context}: stored colour needs a channel of 4 or 24 numbers and component 3"
         )
-    if kind == "Features" and not others:
-        raise ValueError(f"{where}: features need other_bzyxc")
-    if one and others not in (one, 6 * one):
-        wanted = f"{one} or {6 * one} numbers"
-        raise ValueError(f"{where}: filtered colours need an other_bzyxc of {wanted}")
-    given = {"Features": others, "Projection": 1, "Labels": 1}.get(kind, 0)
-    if own:
-        check.whole(where, "features", shading.features, low=0)
+    if kind == "Features" and not other_width:
+        raise ValueError(f"{context}: features need other_bzyxc")
+    if per_side and other_width not in (per_side, 6 * per_side):
+        wanted = f"{per_side} or {6 * per_side} numbers"
+        raise ValueError(f"{context}: filtered colours need an other_bzyxc of {wanted}")
+    expected = {"Features": other_width, "Projection": 1, "Labels": 1}.get(kind, 0)
+    if user_op:
+        check.whole(context, "features", shading.features, low=0)
     else:
-        check.whole(where, "features", shading.features, low=given, high=given)
-    high = max(0, others - 1)
-    check.whole(where, "other_component", shading.other_component, low=0, high=high)
+        check.whole(context, "features", shading.features, low=expected, high=expected)
+    high = max(0, other_width - 1)
+    check.whole(context, "other_component", shading.other_component, low=0, high=high)
 
 
-def _refuse_gradients(where: str, *records: Any) -> None:
+def _refuse_gradients(context: str, *records: Any) -> None:
     """Makes twins refuse the gradients that the ops refuse, see `registry.py`."""
     for record in records:
         for name, value in record._asdict().items():
-            check.no_gradient(where, name, value)
+            check.no_gradient(context, name, value)
 
 
 def trace_rays(
@@ -210,7 +211,7 @@ def shade_rays(
 
     Source: Blinn, SIGGRAPH 1977; Engel, Kraus, Ertl, Graphics Hardware 2001.
     """
-    check_shade(rays, arguments, shading, parameter_54, own=op is not None)
+    check_shade(rays, arguments, shading, parameter_54, user_op=op is not None)
     if choose_backend(backend, rays.origin_r3.device) != "reference":
         return op_of(op)(*rays, *arguments, *shading, parameter_54)
     if op is not None:
@@ -249,23 +250,23 @@ def trace_segments(
     Raises:
         ValueError: An argument is invalid, or the segments do not fit into the device's memory.
     """
-    where, device = "trace_segments", rays.origin_r3.device
-    sizes = check_trace(where, rays, arguments)
+    context, device = "trace_segments", rays.origin_r3.device
+    sizes = check_trace(context, rays, arguments)
     if state_r3 is not None:
-        wanted = [("state_r3", state_r3, "r3", arguments.table_lm4.dtype)]
-        check.tensors(where, device, wanted, sizes)
-    check.whole(where, "limit", limit, low=0, high=2**31 - 1)
-    given = (*rays, *arguments, state_r3, limit, by_node)
+        fields = [("state_r3", state_r3, "r3", arguments.table_lm4.dtype)]
+        check.tensors(context, device, fields, sizes)
+    check.whole(context, "limit", limit, low=0, high=2**31 - 1)
+    op_arguments = (*rays, *arguments, state_r3, limit, by_node)
     with torch.no_grad():
         if choose_backend(backend, device) == "reference":
             return twins.walk_segments(rays, arguments, state_r3, limit, by_node)
         op = torch.ops.gvtorch
-        count, state, missed = op.count_segments(*given)
+        count, state, missed = op.count_segments(*op_arguments)
         ends = count[:, 0].cumsum(0, dtype=torch.int64)
         total = int(ends[-1]) if sizes["r"] else 0
-        check.memory(where, f"a list of {total} segments", total * _SEGMENT_BYTES, device)
-        found = op.write_segments(*given, ends - count[:, 0], total)
-        return Segments._make((*found, count, state, missed))
+        check.memory(context, f"a list of {total} segments", total * _SEGMENT_BYTES, device)
+        lists = op.write_segments(*op_arguments, ends - count[:, 0], total)
+        return Segments._make((*lists, count, state, missed))
 
 
 def list_samples(segments: Segments) -> Samples:
@@ -281,8 +282,8 @@ def list_samples(segments: Segments) -> Samples:
     check.memory("list_samples", f"a list of {total} samples", 8 * total, device)
     check.whole("list_samples", "the number of samples", total, low=0, high=2**31 - 1)
     first = count.cumsum(0) - count
-    which = torch.arange(len(count), device=device)
-    segment = torch.repeat_interleave(which, count, output_size=total)
+    segment_index = torch.arange(len(count), device=device)
+    segment = torch.repeat_interleave(segment_index, count, output_size=total)
     number = torch.arange(total, device=device) - first[segment]
     return Samples(segment.to(torch.int32), number.to(torch.int32), offset)
 
@@ -308,21 +309,21 @@ def sample_bricks(
     Returns:
         (k, c) in the segments' dtype.
     """
-    where, device = "sample_bricks", rays.origin_r3.device
-    chosen = choose_backend(backend, device)
-    if chosen != "reference":  # the reference also reads float64
-        check_voxels(where, arguments)
-    check_rays(where, rays)
-    check_channel(where, arguments, device)
-    check_real(where, "distance", segments.distance, "(s, 3)")
-    places = (*segments[:6], samples.segment, samples.number)
+    context, device = "sample_bricks", rays.origin_r3.device
+    chosen_backend = choose_backend(backend, device)
+    if chosen_backend != "reference":  # the reference also reads float64
+        check_voxels(context, arguments)
+    check_rays(context, rays)
+    check_channel(context, arguments, device)
+    check_real(context, "distance", segments.distance, "(s, 3)")
+    tensors = (*segments[:6], samples.segment, samples.number)
     names = (*Segments._fields[:6], "segment", "number")
     shapes = ("s", "s2", "s2", "s3", "s3", "s3", "k", "k")
     dtypes = (*[torch.int32] * 5, segments.distance.dtype, torch.int32, torch.int32)
-    check.tensors(where, device, zip(names, places, shapes, dtypes, strict=True))
-    if chosen == "reference":
+    check.tensors(context, device, zip(names, tensors, shapes, dtypes, strict=True))
+    if chosen_backend == "reference":
         return twins.sample_bricks(rays, arguments, segments, samples)
-    return torch.ops.gvtorch.sample_bricks(*rays, *arguments.channel, *places)
+    return torch.ops.gvtorch.sample_bricks(*rays, *arguments.channel, *tensors)
 
 
 def composite(
@@ -348,26 +349,26 @@ def composite(
         Sums (r, c), transmittance that is left (r,), and the transmittance before each sample (k,),
         0 behind the end of a ray; the third has no gradient.
     """
-    where = "composite"
-    alpha_k = check.instance(where, "alpha_k", alpha_k, Tensor)
-    device, real = alpha_k.device, alpha_k.dtype
-    check_real(where, "alpha_k", alpha_k, "(k,)")
-    length = len(offset_r) if check.instance(where, "offset_r", offset_r, Tensor).dim() else 0
-    rays = check.whole(where, "offset_r's length", length, low=1) - 1
+    context = "composite"
+    alpha_k = check.instance(context, "alpha_k", alpha_k, Tensor)
+    device, dtype = alpha_k.device, alpha_k.dtype
+    check_real(context, "alpha_k", alpha_k, "(k,)")
+    length = len(offset_r) if check.instance(context, "offset_r", offset_r, Tensor).dim() else 0
+    rays = check.whole(context, "offset_r's length", length, low=1) - 1
     clear = alpha_k.new_ones(rays) if clear_r is None else clear_r
     fields = (
-        ("alpha_k", alpha_k, "k", real),
-        ("feature_kc", feature_kc, "kc", real),
+        ("alpha_k", alpha_k, "k", dtype),
+        ("feature_kc", feature_kc, "kc", dtype),
         ("offset_r", offset_r, "o", torch.int64),
-        ("clear_r", clear, "r", real),
+        ("clear_r", clear, "r", dtype),
     )
-    check.tensors(where, device, fields, {"r": rays, "o": rays + 1})
-    stop_clear = 1 - check.number(where, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)
-    args = (alpha_k, feature_kc, offset_r, clear, stop_clear)
+    check.tensors(context, device, fields, {"r": rays, "o": rays + 1})
+    stop_clear = 1 - check.number(context, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)
+    op_arguments = (alpha_k, feature_kc, offset_r, clear, stop_clear)
     if choose_backend(backend, device) == "reference":
-        total, left, before = twins.composite(*args)
-        return total, left, before.detach()
-    return torch.ops.gvtorch.composite(*args)
+        total, remaining, before = twins.composite(*op_arguments)
+        return total, remaining, before.detach()
+    return torch.ops.gvtorch.composite(*op_arguments)
 
 
 def op_of(name: str | None) -> Any:

@@ -11,7 +11,7 @@ from ..base import check
 from .reference import voxelize as twin
 from .registry import Backend, choose_backend
 
-MOST_VOXELS = 32  # along a side of a cube
+MAX_CUBE_SIDE = 32  # along a side of a cube
 ARITY = 8  # boxes in a box
 
 
@@ -71,36 +71,36 @@ def voxelize(
     Raises:
         ValueError: A tensor of the wrong shape, dtype or device, or a number out of its range.
     """
-    where, world = "voxelize", torch.float64
-    device = check.instance(where, "corner_f33", corner_f33, Tensor).device
-    check.no_gradient(where, "corner_f33", corner_f33)
+    context, dtype = "voxelize", torch.float64
+    device = check.instance(context, "corner_f33", corner_f33, Tensor).device
+    check.no_gradient(context, "corner_f33", corner_f33)
     if not corner_f33.numel():
-        raise ValueError(f"{where}: corner_f33 must hold at least one triangle")
+        raise ValueError(f"{context}: corner_f33 must hold at least one triangle")
     check.tensors(
-        where,
+        context,
         device,
         (
-            ("corner_f33", corner_f33, "f33", world),
+            ("corner_f33", corner_f33, "f33", dtype),
             ("solid_f", solid_f, "f", torch.bool),
-            ("low_k3", low_k3, "k3", world),
-            ("size_k3", size_k3, "k3", world),
-            ("box_n6", box_n6, "n6", world),
+            ("low_k3", low_k3, "k3", dtype),
+            ("size_k3", size_k3, "k3", dtype),
+            ("box_n6", box_n6, "n6", dtype),
         ),
         {"n": boxes_of(len(corner_f33))},
     )
-    check.whole(where, "side", side, low=1, high=MOST_VOXELS)
-    thickness = check.number(where, "thickness", thickness, low=0)
-    detail = check.number(where, "detail", detail, low=0)
-    plain = choose_backend(backend, device) == "reference"
-    op = twin.voxelize if plain else torch.ops.gvtorch.voxelize
+    check.whole(context, "side", side, low=1, high=MAX_CUBE_SIDE)
+    thickness = check.number(context, "thickness", thickness, low=0)
+    detail = check.number(context, "detail", detail, low=0)
+    use_twin = choose_backend(backend, device) == "reference"
+    op = twin.voxelize if use_twin else torch.ops.gvtorch.voxelize
     mesh, cubes = (corner_f33, solid_f, box_n6), (low_k3, size_k3, side)
     return Voxelized(*op(*mesh, *cubes, thickness, detail, shares, weights, wide))
 
 
 def boxes_of(triangles: int) -> int:
     """Returns the number of boxes in the hierarchy over `triangles` triangles."""
-    floor = total = triangles
-    while floor > ARITY:
-        floor = -(-floor // ARITY)
-        total += floor
+    floor_boxes = total = triangles
+    while floor_boxes > ARITY:
+        floor_boxes = -(-floor_boxes // ARITY)
+        total += floor_boxes
     return total

@@ -51,9 +51,9 @@ class Gradient(Background):
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
         options: Any = {"dtype": dtype, "device": numbers.device}
         top_row, rows = camera.window
-        place = (torch.arange(top_row, top_row + camera.height, **options) + 0.5) / rows
+        fraction = (torch.arange(top_row, top_row + camera.height, **options) + 0.5) / rows
         ends = zip(*self.ends, strict=True)
-        column = torch.stack([top + (bottom - top) * place for top, bottom in ends], -1)
+        column = torch.stack([top + (bottom - top) * fraction for top, bottom in ends], -1)
         return _by_pixel(column[:, None], camera)
 
 
@@ -68,7 +68,7 @@ class Backdrop(Background):
         if not (image.is_cuda or bool(torch.isfinite(image).all())):
             raise ValueError("Backdrop: image must be finite, got NaN or infinity")
         self.image = image
-        self._there: dict[torch.device, Tensor] = {}
+        self._uploaded: dict[torch.device, Tensor] = {}
 
     def __repr__(self) -> str:
         return f"Backdrop({check.describe(self.image)})"
@@ -81,10 +81,12 @@ class Backdrop(Background):
 
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
         device = numbers.device
-        if self.image.device != device and device not in self._there:
-            self._there[device] = self.image.to(device)
+        if self.image.device != device and device not in self._uploaded:
+            self._uploaded[device] = self.image.to(device)
         top = camera.window[0]
-        image = self._there.get(device, self.image)[..., top : top + camera.height, :, :].to(dtype)
+        image = self._uploaded.get(device, self.image)[..., top : top + camera.height, :, :].to(
+            dtype
+        )
         return _by_pixel(image, camera)
 
 
@@ -109,13 +111,13 @@ class Environment(Background):
         if not bool(torch.isfinite(image).all()):
             raise ValueError("Environment: image must be finite, got NaN or infinity")
         self.image = image
-        eye = torch.eye(3, dtype=torch.float64)
-        self.rotation = eye if rotation is None else torch.as_tensor(rotation).to(eye)
+        identity = torch.eye(3, dtype=torch.float64)
+        self.rotation = identity if rotation is None else torch.as_tensor(rotation).to(identity)
         if self.rotation.shape != (3, 3) or not torch.allclose(
-            self.rotation @ self.rotation.mT, eye, atol=1e-3
+            self.rotation @ self.rotation.mT, identity, atol=1e-3
         ):
             raise ValueError("Environment: rotation must be (3, 3) and orthonormal")
-        self._there: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
+        self._uploaded: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
 
     @classmethod
     def read(cls, path: str | Path) -> Environment:
@@ -125,31 +127,31 @@ class Environment(Background):
     def __repr__(self) -> str:
         return f"Environment({check.describe(self.image)})"
 
-    def _on(self, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    def _map_on(self, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Returns the map (1, 3, h, w + 2), wrapped by a column on both sides, and the rotation."""
-        if (device, dtype) not in self._there:
+        if (device, dtype) not in self._uploaded:
             image = self.image.to(device, dtype).movedim(-1, 0)[None]
-            around = torch.cat((image[..., -1:], image, image[..., :1]), -1)
-            self._there[device, dtype] = (around, self.rotation.to(device))
-        return self._there[device, dtype]
+            wrapped = torch.cat((image[..., -1:], image, image[..., :1]), -1)
+            self._uploaded[device, dtype] = (wrapped, self.rotation.to(device))
+        return self._uploaded[device, dtype]
 
     def look_up(self, direction: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """Returns the colours (r, 3) in world directions (r, 3) of unit length."""
-        around, rotation = self._on(direction.device, dtype)
+        wrapped, rotation = self._map_on(direction.device, dtype)
         x, y, z = (direction.to(torch.float64) @ rotation.mT).unbind(-1)
-        width = around.shape[-1] - 2
+        width = wrapped.shape[-1] - 2
         u = torch.atan2(x, -z) / torch.pi  # -1 to 1 over the map
         v = -2 * torch.asin(y.clamp(-1, 1)) / torch.pi
         grid = torch.stack((u * (width / (width + 2)), v), -1).to(dtype)
-        found = torch.nn.functional.grid_sample(
-            around, grid[None, None], padding_mode="border", align_corners=False
+        colors = torch.nn.functional.grid_sample(
+            wrapped, grid[None, None], padding_mode="border", align_corners=False
         )
-        return found[0, :, 0].mT
+        return colors[0, :, 0].mT
 
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
         blocks = camera.blocks(_PIXELS_A_BLOCK)
         rays = (camera.pixel_rays(numbers, rows) for rows in blocks)
-        return torch.cat([self.look_up(some.direction, dtype) for some in rays])
+        return torch.cat([self.look_up(block_rays.direction, dtype) for block_rays in rays])
 
 
 def checked_background(where: str, value: Any) -> Background | Color | None:
@@ -163,8 +165,8 @@ def checked_background(where: str, value: Any) -> Background | Color | None:
 
 def _color(where: str, name: str, value: Sequence[float], high: float = math.inf) -> Color:
     color = check.triple(where, name, value)
-    for part in color:
-        check.number(where, name, part, low=0, high=high)
+    for number in color:
+        check.number(where, name, number, low=0, high=high)
     return color
 
 

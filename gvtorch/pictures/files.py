@@ -31,20 +31,20 @@ _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _BITS = {".png": (8, 16), ".tif": (8, 16, 32), ".exr": (32, 16), ".npy": (32,), ".npz": (32,)}
 
 
-def checked_path(where: str, path: Path, bits: int | None, known: tuple[str, ...]) -> int:
+def checked_path(where: str, path: Path, bits: int | None, suffixes: tuple[str, ...]) -> int:
     """Returns the bits per number of a file to be written; raises ValueError if the ending is
     unknown or does not allow `bits`, FileNotFoundError if there is no such folder.
     """
-    if path.suffix not in known:
-        wanted = f"{', '.join(known[:-1])} or {known[-1]}"
-        raise ValueError(f"{where}: path must end in {wanted}, got {str(path)!r}")
-    choice = _BITS[path.suffix]
-    if bits is not None and bits not in choice:
-        numbers = " or ".join(str(n) for n in choice)
-        raise ValueError(f"{where}: {path.suffix} has {numbers} bits, got {bits!r}")
+    if path.suffix not in suffixes:
+        expected = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
+        raise ValueError(f"{where}: path must end in {expected}, got {str(path)!r}")
+    allowed_bits = _BITS[path.suffix]
+    if bits is not None and bits not in allowed_bits:
+        choices = " or ".join(str(n) for n in allowed_bits)
+        raise ValueError(f"{where}: {path.suffix} has {choices} bits, got {bits!r}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{where}: folder not found: {path.parent}")
-    return choice[0] if bits is None else bits
+    return allowed_bits[0] if bits is None else bits
 
 
 def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | None = None) -> None:
@@ -74,8 +74,8 @@ def _as_os_errors() -> Iterator[None]:
         raise
     except Exception as error:
         text = one_line(error)
-        number = errno.ENOSPC if "No space left" in text else errno.EIO
-        raise OSError(number, text) from None
+        code = errno.ENOSPC if "No space left" in text else errno.EIO
+        raise OSError(code, text) from None
 
 
 def side_by_side(layers: Layers) -> Layers:
@@ -98,13 +98,13 @@ def display_pixels(color: Tensor, alpha: Tensor | None, bits: int) -> np.ndarray
     """
     color = color.detach().to("cpu", torch.float32 if bits == 8 else torch.float64)
     if alpha is None:
-        parts = to_srgb(color)
+        channels = to_srgb(color)
     else:
         alpha = finite(alpha.detach().to(color)).clamp(max=1)
         straight = torch.where(alpha > 0, color / alpha, 0.0)
-        parts = torch.cat((to_srgb(straight), alpha), -1)
-    whole = (parts * (2**bits - 1)).round()
-    return whole.contiguous().numpy().astype(np.uint8 if bits == 8 else np.uint16)
+        channels = torch.cat((to_srgb(straight), alpha), -1)
+    scaled = (channels * (2**bits - 1)).round()
+    return scaled.contiguous().numpy().astype(np.uint8 if bits == 8 else np.uint16)
 
 
 def file_pixels(layers: Layers, transparent: bool, bits: int) -> np.ndarray:
@@ -134,31 +134,40 @@ def write_png_rows(
     """Writes a PNG (h, w, c), c 3, or 4 with alpha, strip by strip, (rows, w, c) uint8 or uint16.
     Each row gets the filter (None, Sub or Up) with the smallest sum of absolute values.
     """
-    height, width, count = shape
-    apart = count * bits // 8  # bytes from pixel to pixel
-    packed = zlib.compressobj(6)
-    above = np.zeros((1, width * apart), np.uint8)
+    height, width, channels = shape
+    pixel_bytes = channels * bits // 8  # bytes from pixel to pixel
+    compressor = zlib.compressobj(6)
+    row_above = np.zeros((1, width * pixel_bytes), np.uint8)
     with path.open("wb") as file:
 
         def chunk(kind: bytes, content: bytes) -> None:
-            check = zlib.crc32(kind + content)
-            file.write(struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check))
+            checksum = zlib.crc32(kind + content)
+            file.write(
+                struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
+            )
 
         file.write(b"\x89PNG\r\n\x1a\n")
-        kind = {3: 2, 4: 6}[count]
-        chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0))
+        color_type = {3: 2, 4: 6}[channels]
+        chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, color_type, 0, 0, 0))
         for strip in strips:
             rows = strip.astype(f">u{bits // 8}").reshape(len(strip), -1).view(np.uint8)
-            left = rows.copy()
-            left[:, apart:] -= rows[:, :-apart]
-            ways = np.stack((rows, left, rows - np.concatenate((above, rows[:-1]))))
-            above = rows[-1:]
-            best = np.abs(ways.view(np.int8).astype(np.int16)).sum(2, dtype=np.int64).argmin(0)
-            lines = np.empty((len(rows), 1 + rows.shape[1]), np.uint8)
-            lines[:, 0], lines[:, 1:] = best, ways[best, np.arange(len(rows))]
-            if part := packed.compress(lines.tobytes()):
-                chunk(b"IDAT", part)
-        chunk(b"IDAT", packed.flush())
+            left_difference = rows.copy()
+            left_difference[:, pixel_bytes:] -= rows[:, :-pixel_bytes]
+            filtered = np.stack(
+                (rows, left_difference, rows - np.concatenate((row_above, rows[:-1])))
+            )
+            row_above = rows[-1:]
+            best_filter = (
+                np.abs(filtered.view(np.int8).astype(np.int16)).sum(2, dtype=np.int64).argmin(0)
+            )
+            filtered_lines = np.empty((len(rows), 1 + rows.shape[1]), np.uint8)
+            filtered_lines[:, 0], filtered_lines[:, 1:] = (
+                best_filter,
+                filtered[best_filter, np.arange(len(rows))],
+            )
+            if compressed := compressor.compress(filtered_lines.tobytes()):
+                chunk(b"IDAT", compressed)
+        chunk(b"IDAT", compressor.flush())
         chunk(b"IEND", b"")
 
 
@@ -173,7 +182,7 @@ def write_tiff(
     strip may have fewer rows.
     """
     tifffile = need_library(".tif", "tifffile", extra="image")
-    kind = "assocalpha" if dtype.kind == "f" else "unassalpha"
+    alpha_kind = "assocalpha" if dtype.kind == "f" else "unassalpha"
     with tifffile.TiffWriter(path, bigtiff=True) as file:
         file.write(
             (zlib.compress(strip.tobytes()) for strip in strips),
@@ -181,7 +190,7 @@ def write_tiff(
             dtype=dtype,
             rowsperstrip=rows,
             photometric="rgb",
-            extrasamples=[kind] if shape[-1] == 4 else None,
+            extrasamples=[alpha_kind] if shape[-1] == 4 else None,
             compression="zlib",
             metadata=None,
         )
@@ -189,11 +198,11 @@ def write_tiff(
 
 def _write_exr(path: Path, layers: Layers, bits: int) -> None:
     OpenEXR = need_library(".exr", "OpenEXR", extra="image")
-    kind = np.float16 if bits == 16 else np.float32
-    light = np.concatenate((layers["color"], layers["alpha"]), -1)
+    dtype = np.float16 if bits == 16 else np.float32
+    rgba = np.concatenate((layers["color"], layers["alpha"]), -1)
     if bits == 16:
-        light = np.clip(light, -65504, 65504)  # the largest half
-    channels = {name: light[..., index].astype(kind, "C") for index, name in enumerate("RGBA")}
+        rgba = np.clip(rgba, -65504, 65504)  # the largest half
+    channels = {name: rgba[..., index].astype(dtype, "C") for index, name in enumerate("RGBA")}
     channels["Z"] = np.ascontiguousarray(layers["depth"][..., 0])
     channels["samples"] = layers["samples"][..., 0].astype(np.uint32, "C")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 #: Letters of 5 x 7 pixels: the bits of each row as a number.
-_ROWS = {
+_GLYPH_ROWS = {
     "A": (14, 17, 17, 31, 17, 17, 17),
     "I": (14, 4, 4, 4, 4, 4, 14),
     "L": (16, 16, 16, 16, 16, 16, 31),
@@ -13,7 +13,7 @@ _ROWS = {
     "R": (30, 17, 17, 30, 20, 18, 17),
     "S": (15, 16, 16, 14, 1, 1, 30),
 }
-_SMALLEST = 40  # pixels: a smaller plane has no room
+_MIN_SIDE = 40  # pixels: a smaller plane has no room
 
 
 def draw_letters(image: np.ndarray, letters: str) -> None:
@@ -21,12 +21,12 @@ def draw_letters(image: np.ndarray, letters: str) -> None:
     left edge. An image without room for them stays as it is.
     """
     height, width, _ = image.shape
-    if min(height, width) < _SMALLEST:
+    if min(height, width) < _MIN_SIDE:
         return
     size = max(1, min(height, width) // 160)  # pixels of a dot
-    for place, one in zip(((0, 1), (1, 2), (2, 1), (1, 0)), letters, strict=True):
-        dots = np.array([[row >> (4 - bit) & 1 for bit in range(5)] for row in _ROWS[one]])
+    for edge, letter in zip(((0, 1), (1, 2), (2, 1), (1, 0)), letters, strict=True):
+        dots = np.array([[row >> (4 - bit) & 1 for bit in range(5)] for row in _GLYPH_ROWS[letter]])
         stamp = np.pad(dots, 1).repeat(size, 0).repeat(size, 1).astype(image.dtype)
-        spare = height - stamp.shape[0] - 2 * size, width - stamp.shape[1] - 2 * size
-        y, x = (size + at * free // 2 for at, free in zip(place, spare, strict=True))
+        free = height - stamp.shape[0] - 2 * size, width - stamp.shape[1] - 2 * size
+        y, x = (size + halves * room // 2 for halves, room in zip(edge, free, strict=True))
         image[y : y + stamp.shape[0], x : x + stamp.shape[1]] = stamp[..., None]

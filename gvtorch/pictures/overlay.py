@@ -21,11 +21,11 @@ from .files import display_pixels
 from .picture import Picture
 from .tone import from_srgb
 
-_PART = 36  # the picture's shorter side, in heights of a letter
-_SMALLEST = 9  # pixels of a letter
-_BAR = 0.45  # height of a colour bar, as a share of the picture's height
-_SCALE = 0.25  # greatest length of a scale bar, as a share of the picture's width
-_TICKS = 6  # most ticks of a colour bar
+_LETTERS_PER_SIDE = 36  # the picture's shorter side, in heights of a letter
+_MIN_LETTER_SIZE = 9  # pixels of a letter
+_BAR_FRACTION = 0.45  # height of a colour bar, as a fraction of the picture's height
+_SCALE_FRACTION = 0.25  # greatest length of a scale bar, as a fraction of the picture's width
+_MAX_TICKS = 6  # most ticks of a colour bar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,30 +86,32 @@ class Overlay:
             ImportError: Pillow is not installed.
         """
         self._size = (width, height)
-        self._pen = _Pen(max(_SMALLEST, round(min(width, height) / _PART)))
+        self._pen = _Pen(max(_MIN_LETTER_SIZE, round(min(width, height) / _LETTERS_PER_SIDE)))
         self._stamps: list[_Stamp] = []
         if text:
-            self._put(self._pen.text(text), top=self._pen.size, left=self._pen.size)
+            self._add_stamp(self._pen.text_lines(text), top=self._pen.size, left=self._pen.size)
         if pixel is not None:
             pixel = check.number("Overlay", "pixel", pixel, low=0, open_low=True)
-            made = self._pen.scale(_SCALE * width, pixel, unit)
-            self._put(made, top=height - made.shape[0] - self._pen.size, left=self._pen.size)
+            image = self._pen.scale_bar(_SCALE_FRACTION * width, pixel, unit)
+            self._add_stamp(
+                image, top=height - image.shape[0] - self._pen.size, left=self._pen.size
+            )
         if bar is not None:
-            made = self._pen.bar(bar, round(_BAR * height))
-            top = (height - made.shape[0]) // 2
-            self._put(made, top=top, left=width - made.shape[1] - self._pen.size)
+            image = self._pen.color_bar(bar, round(_BAR_FRACTION * height))
+            top = (height - image.shape[0]) // 2
+            self._add_stamp(image, top=top, left=width - image.shape[1] - self._pen.size)
 
-    def _put(self, image: np.ndarray, *, top: int, left: int) -> None:
+    def _add_stamp(self, image: np.ndarray, *, top: int, left: int) -> None:
         """Adds a stamp, sRGB with straight alpha, (h, w, 4) uint8."""
         height, width = image.shape[:2]
         if top < 0 or left < 0 or top + height > self._size[1] or left + width > self._size[0]:
-            have = "x".join(map(str, self._size))
+            picture_size = "x".join(map(str, self._size))
             raise ValueError(
-                f"Overlay: a picture of {have} has no room for what is drawn over it, which takes "
-                f"{width}x{height} and some beside it"
+                f"Overlay: a picture of {picture_size} has no room for what is drawn over it, "
+                f"which takes {width}x{height} and some beside it"
             )
-        parts = torch.from_numpy(image.astype(np.float32) / 255)
-        self._stamps.append(_Stamp(top, left, from_srgb(parts[..., :3]), parts[..., 3:]))
+        rgba = torch.from_numpy(image.astype(np.float32) / 255)
+        self._stamps.append(_Stamp(top, left, from_srgb(rgba[..., :3]), rgba[..., 3:]))
 
     def over(self, picture: Picture, first: int = 0) -> Picture:
         """Returns the picture, (h, w, ...), with the annotations over its colour and alpha.
@@ -125,14 +127,17 @@ class Overlay:
             )
         color, alpha = picture.color.clone(), picture.alpha.clone()
         for stamp in self._stamps:
-            begin, end = max(stamp.top, first), min(stamp.top + len(stamp.alpha), first + height)
-            if begin >= end:
+            top, bottom = max(stamp.top, first), min(stamp.top + len(stamp.alpha), first + height)
+            if top >= bottom:
                 continue
-            rows = slice(begin - stamp.top, end - stamp.top)
-            share, light = stamp.alpha[rows].to(color), stamp.color[rows].to(color)
-            at = (slice(begin - first, end - first), slice(stamp.left, stamp.left + share.shape[1]))
-            color[at] = color[at] * (1 - share) + light * share
-            alpha[at] = alpha[at] * (1 - share) + share
+            rows = slice(top - stamp.top, bottom - stamp.top)
+            coverage, stamp_color = stamp.alpha[rows].to(color), stamp.color[rows].to(color)
+            region = (
+                slice(top - first, bottom - first),
+                slice(stamp.left, stamp.left + coverage.shape[1]),
+            )
+            color[region] = color[region] * (1 - coverage) + stamp_color * coverage
+            alpha[region] = alpha[region] * (1 - coverage) + coverage
         return replace(picture, color=color, alpha=alpha)
 
 
@@ -148,90 +153,96 @@ class _Pen:
         self._rim = max(1, round(size / 9))
         self._line = max(1, round(size / 9))
 
-    def _sheet(self, width: float, height: float) -> Any:
+    def _new_sheet(self, width: float, height: float) -> Any:
         sheet = self._image.new("RGBA", (math.ceil(width), math.ceil(height)), (0, 0, 0, 0))
         return sheet, self._draw.Draw(sheet)
 
-    def _wide(self, text: str) -> float:
+    def _text_width(self, text: str) -> float:
         return max(float(self._font.getlength(line)) for line in text.split("\n"))
 
-    def _write(self, draw: Any, at: tuple[float, float], text: str, anchor: str = "la") -> None:
+    def _write_line(
+        self, draw: Any, position: tuple[float, float], text: str, anchor: str = "la"
+    ) -> None:
         options = {"stroke_width": self._rim, "stroke_fill": (0, 0, 0, 200), "anchor": anchor}
-        draw.text(at, text, font=self._font, fill=(255, 255, 255, 255), **options)
+        draw.text(position, text, font=self._font, fill=(255, 255, 255, 255), **options)
 
-    def text(self, text: str) -> np.ndarray:
+    def text_lines(self, text: str) -> np.ndarray:
         """Returns lines of text, (h, w, 4)."""
         text = text.replace("\\n", "\n")
         self._warn_of_missing(text)
         lines = text.split("\n")
         step = round(1.35 * self.size)
         rim = self._rim
-        sheet, draw = self._sheet(self._wide(text) + 2 * rim, step * len(lines) + 2 * rim)
+        sheet, draw = self._new_sheet(self._text_width(text) + 2 * rim, step * len(lines) + 2 * rim)
         for number, line in enumerate(lines):
-            self._write(draw, (rim, rim + number * step), line)
+            self._write_line(draw, (rim, rim + number * step), line)
         return np.asarray(sheet)
 
     def _warn_of_missing(self, text: str) -> None:
         """Warns of characters that the font lacks and draws as boxes."""
-        box = bytes(self._font.getmask("\uffff"))
-        lacks = sorted(
-            {one for one in text if one.strip() and bytes(self._font.getmask(one)) == box}
+        placeholder = bytes(self._font.getmask("\uffff"))
+        missing = sorted(
+            {
+                letter
+                for letter in text
+                if letter.strip() and bytes(self._font.getmask(letter)) == placeholder
+            }
         )
-        if lacks:
-            warnings.warn(f"the font of pictures has no {' '.join(lacks)}", stacklevel=4)
+        if missing:
+            warnings.warn(f"the font of pictures has no {' '.join(missing)}", stacklevel=4)
 
-    def scale(self, most: float, pixel: float, unit: str | None) -> np.ndarray:
-        """Returns a scale bar at most `most` pixels long, (h, w, 4)."""
-        length = _round_below(most * pixel)
-        wide = length / pixel
+    def scale_bar(self, limit: float, pixel: float, unit: str | None) -> np.ndarray:
+        """Returns a scale bar at most `limit` pixels long, (h, w, 4)."""
+        length = _round_below(limit * pixel)
+        width = length / pixel
         label = f"{length:g} {unit_symbol(unit)}".rstrip()
         rim, tick = self._rim, round(0.5 * self.size)
-        text = self._wide(label)
-        sheet, draw = self._sheet(
-            max(wide, text) + 2 * (rim + self._line), 2.3 * self.size + 2 * rim
+        label_width = self._text_width(label)
+        sheet, draw = self._new_sheet(
+            max(width, label_width) + 2 * (rim + self._line), 2.3 * self.size + 2 * rim
         )
-        left, right = rim + self._line, rim + self._line + wide
+        left, right = rim + self._line, rim + self._line + width
         base = sheet.height - rim - self._line - 1
         lines: list[Any] = [((left, base), (right, base))]
         lines += [((x, base - tick), (x, base)) for x in (left, right)]
-        self._lines(draw, lines)
-        middle = max(left + wide / 2, rim + text / 2)
-        self._write(draw, (middle, base - tick), label, "mb")
+        self._draw_lines(draw, lines)
+        middle = max(left + width / 2, rim + label_width / 2)
+        self._write_line(draw, (middle, base - tick), label, "mb")
         return np.asarray(sheet)
 
-    def _lines(self, draw: Any, lines: list[Any]) -> None:
-        for color, more in (((0, 0, 0, 200), 2 * self._rim), ((255, 255, 255, 255), 0)):
-            wide = self._line + more
+    def _draw_lines(self, draw: Any, lines: list[Any]) -> None:
+        for color, extra in (((0, 0, 0, 200), 2 * self._rim), ((255, 255, 255, 255), 0)):
+            width = self._line + extra
             for (ax, ay), (bx, by) in lines:
-                left, top = ax - wide / 2, ay - wide / 2
-                right, bottom = bx + wide / 2 - 1, by + wide / 2 - 1
+                left, top = ax - width / 2, ay - width / 2
+                right, bottom = bx + width / 2 - 1, by + width / 2 - 1
                 draw.rectangle((left, top, max(left, right), max(top, bottom)), fill=color)
 
-    def bar(self, bar: ColorBar, high: int) -> np.ndarray:
-        """Returns a colour bar `high` pixels high, numbers to its left and the title above it."""
+    def color_bar(self, bar: ColorBar, height: int) -> np.ndarray:
+        """Returns a colour bar `height` pixels high, numbers to its left and the title above it."""
         ticks = _ticks(bar.low, bar.high)
         labels = [f"{value:g}" for value in ticks]
         size, rim, line = self.size, self._rim, self._line
-        left = max(self._wide(label) for label in labels) + size
-        wide = max(left + size + 2 * line, self._wide(bar.title)) + 2 * rim
+        left = max(self._text_width(label) for label in labels) + size
+        width = max(left + size + 2 * line, self._text_width(bar.title)) + 2 * rim
         top = 2 * size if bar.title else size
-        sheet, draw = self._sheet(wide, top + high + size)
+        sheet, draw = self._new_sheet(width, top + height + size)
         left = sheet.width - size - line - rim
         for value, label in zip(ticks, labels, strict=True):
-            y = top + (bar.high - value) / (bar.high - bar.low) * (high - 1)
-            self._lines(draw, [((left - 0.45 * size, y), (left - line, y))])
-            self._write(draw, (left - 0.75 * size, y), label, "rm")
-        edge = (left - line, top - line, left + size + line - 1, top + high + line - 1)
-        a, b, c, d = edge
-        draw.rectangle((a - rim, b - rim, c + rim, d + rim), fill=(0, 0, 0, 200))
+            y = top + (bar.high - value) / (bar.high - bar.low) * (height - 1)
+            self._draw_lines(draw, [((left - 0.45 * size, y), (left - line, y))])
+            self._write_line(draw, (left - 0.75 * size, y), label, "rm")
+        edge = (left - line, top - line, left + size + line - 1, top + height + line - 1)
+        x0, y0, x1, y1 = edge
+        draw.rectangle((x0 - rim, y0 - rim, x1 + rim, y1 + rim), fill=(0, 0, 0, 200))
         draw.rectangle(edge, fill=(255, 255, 255, 255))
-        values = np.linspace(bar.high, bar.low, high)
+        values = np.linspace(bar.high, bar.low, height)
         colors = torch.from_numpy(np.asarray(bar.colors(values), np.float32)[:, :3])
         rows = display_pixels(colors[:, None], None, 8).repeat(size, 1)
         sheet.paste(self._image.fromarray(rows), (left, top))
         if bar.title:
             self._warn_of_missing(bar.title)
-            self._write(draw, (sheet.width - rim - 1, top - 0.6 * size), bar.title, "rb")
+            self._write_line(draw, (sheet.width - rim - 1, top - 0.6 * size), bar.title, "rb")
         return np.asarray(sheet)
 
 
@@ -242,11 +253,11 @@ def _round_below(length: float) -> float:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Returns round values from low to high, as many as possible but at most `_TICKS`."""
-    least = _power((high - low) / _TICKS)
-    for step in (n * least for n in (1, 2, 5, 10, 20)):
+    """Returns round values from low to high, as many as possible but at most `_MAX_TICKS`."""
+    power = _power((high - low) / _MAX_TICKS)
+    for step in (n * power for n in (1, 2, 5, 10, 20)):
         first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-        if last - first < _TICKS:
+        if last - first < _MAX_TICKS:
             break
     return [n * step for n in range(first, last + 1)]
 

@@ -83,7 +83,7 @@ class Picture:
     ) -> Picture:
         """Returns the picture on a device; its floats in another dtype. None leaves each as is."""
         return replace(
-            self, **{name: to_device(v, device, dtype) for name, v in vars(self).items()}
+            self, **{name: to_device(value, device, dtype) for name, value in vars(self).items()}
         )
 
     def show(self) -> None:
@@ -105,8 +105,8 @@ class Picture:
         they exist normal, features (float32) and label (int64).
         """
         names = ("color", "alpha", "depth", "normal", "features")
-        given = {name: getattr(self, name) for name in names}
-        layers = {name: layer.float() for name, layer in given.items() if layer is not None}
+        tensors = {name: getattr(self, name) for name in names}
+        layers = {name: layer.float() for name, layer in tensors.items() if layer is not None}
         layers["samples"] = self.samples
         if self.label is not None:
             layers["label"] = self.label

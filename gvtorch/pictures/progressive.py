@@ -30,17 +30,17 @@ from .files import checked_path, file_pixels, side_by_side, stacked, write_png_r
 from .overlay import Overlay
 from .picture import Picture
 
-_OF_CENTRES = ("depth", "nearest", "normal", "features", "label")  # not averaged
+_CENTRE_LAYERS = ("depth", "nearest", "normal", "features", "label")  # not averaged
 _PLASTIC = 1.32471795724474602596  # the real root of x^3 = x + 1
 STRIP = "256 MB"  # default memory of a strip
 _PIXEL_BYTES = 400  # memory of a strip's pixel: rays (80), hits twice, layers and their encoding
-_TILE = 4  # rows of the tiles in which rays are traced
+_TILE_ROWS = 4  # rows of the tiles in which rays are traced
 
 
 def jitter(index: int) -> tuple[float, float]:
     """Returns the offset (x, y) of a frame's samples from the pixels' centres, in [-1/2, 1/2]."""
-    pair, side = (index + 1) // 2, 1 if index % 2 else -1
-    x, y = (side * ((0.5 + pair / _PLASTIC**power) % 1 - 0.5) for power in (1, 2))
+    pair, sign = (index + 1) // 2, 1 if index % 2 else -1
+    x, y = (sign * ((0.5 + pair / _PLASTIC**power) % 1 - 0.5) for power in (1, 2))
     return x, y
 
 
@@ -50,8 +50,8 @@ def _renderer(where: str, render: Callable[[Camera], Any]) -> Callable[[Camera],
         raise ValueError(f"{where}: render must be callable, got {type(render).__name__}")
 
     def picture(camera: Camera) -> Picture:
-        made = render(camera)
-        return made[0] if isinstance(made, tuple) else made
+        result = render(camera)
+        return result[0] if isinstance(result, tuple) else result
 
     return picture
 
@@ -83,7 +83,7 @@ class Progressive:
     def reset(self) -> None:
         """Starts a new mean; call it when the scene or its shader has changed."""
         self.count = 0
-        self._given: Camera | Rays | None = None
+        self._last_argument: Camera | Rays | None = None
         self._camera: Camera | None = None
 
     def frame(self, camera: Camera | Rays) -> Picture:
@@ -95,34 +95,44 @@ class Progressive:
             `samples` and `stats` are those of this frame; `missed` is true where every frame so far
             had a miss. The first picture equals the plain one to the last bit.
         """
-        if self._camera is None or camera is not self._given:
-            own = as_camera("Progressive", camera)
-            if self._camera is None or not own.same(self._camera):
+        if self._camera is None or camera is not self._last_argument:
+            converted = as_camera("Progressive", camera)
+            if self._camera is None or not converted.same(self._camera):
                 self.reset()
-            self._given, self._camera = camera, own
-        view = self._camera
+            self._last_argument, self._camera = camera, converted
+        current_camera = self._camera
         picture = self._render(
-            view.shifted(*jitter(self.count), sample=self.count) if self.count else view
+            current_camera.shifted(*jitter(self.count), sample=self.count)
+            if self.count
+            else current_camera
         )
-        light = torch.cat((picture.color, picture.alpha), -1).double()
+        rgba = torch.cat((picture.color, picture.alpha), -1).double()
         missed = picture.missed
-        whole = torch.ones_like(picture.alpha, dtype=torch.bool) if missed is None else ~missed
-        named = {name: getattr(picture, name) for name in _OF_CENTRES}
-        still = {name: image for name, image in named.items() if image is not None}
+        complete = torch.ones_like(picture.alpha, dtype=torch.bool) if missed is None else ~missed
+        layers = {name: getattr(picture, name) for name in _CENTRE_LAYERS}
+        centre_layers = {name: image for name, image in layers.items() if image is not None}
         if not self.count:
-            self._sum, self._frames = light, whole.double()
-            self._still = {name: image.clone() for name, image in still.items()}
+            self._sum, self._complete_frames = rgba, complete.double()
+            self._centre_layers = {name: image.clone() for name, image in centre_layers.items()}
         else:
-            seen = self._frames > 0
+            has_mean = self._complete_frames > 0
             # A pixel without a whole frame yet shows the newest one; others add whole frames only.
-            self._sum = torch.where(seen, torch.where(whole, self._sum + light, self._sum), light)
-            for name, image in still.items():
-                self._still[name] = torch.where(seen, self._still[name], image)
-            self._frames = self._frames + whole
+            self._sum = torch.where(
+                has_mean, torch.where(complete, self._sum + rgba, self._sum), rgba
+            )
+            for name, image in centre_layers.items():
+                self._centre_layers[name] = torch.where(has_mean, self._centre_layers[name], image)
+            self._complete_frames = self._complete_frames + complete
         self.count += 1
-        mean = (self._sum / self._frames.clamp(min=1)).to(picture.color.dtype)
+        mean = (self._sum / self._complete_frames.clamp(min=1)).to(picture.color.dtype)
         color, alpha = mean[..., :3], mean[..., 3:]
-        return replace(picture, color=color, alpha=alpha, missed=self._frames == 0, **self._still)
+        return replace(
+            picture,
+            color=color,
+            alpha=alpha,
+            missed=self._complete_frames == 0,
+            **self._centre_layers,
+        )
 
     def refine(
         self, camera: Camera | Rays, samples: int, progress: Progress = no_progress
@@ -133,12 +143,12 @@ class Progressive:
         Raises:
             ValueError: `samples` is no whole number >= 1.
         """
-        most = check.whole("Progressive", "samples", samples, low=1)
+        target = check.whole("Progressive", "samples", samples, low=1)
         camera = as_camera("Progressive", camera)
         while True:
             picture = self.frame(camera)
-            progress("samples", self.count, most)
-            if self.count >= most:
+            progress("samples", self.count, target)
+            if self.count >= target:
                 return picture
 
 
@@ -197,12 +207,12 @@ def render_tiles(
             progress("rows", end, height)
 
     with whole_file(path) as part:
-        _write(part, path.suffix, pictures(), bits, (height, width), rows)
+        _write_strips(part, path.suffix, pictures(), bits, (height, width), rows)
     assert stats is not None
     return stats
 
 
-def _write(
+def _write_strips(
     part: Path,
     suffix: str,
     strips: Iterator[Picture],
@@ -212,27 +222,27 @@ def _write(
 ) -> None:
     """Writes strips of `rows` rows, of which the last may have fewer, as they come."""
     first = next(strips)
-    everything = itertools.chain((first,), strips)
+    all_strips = itertools.chain((first,), strips)
     if suffix == ".npy":
         header = {"descr": "<f4", "fortran_order": False, "shape": (*size, 6)}
         with part.open("wb") as file:
             np.lib.format.write_array_header_1_0(file, header)
-            for picture in everything:
+            for picture in all_strips:
                 file.write(stacked(picture.layers()).astype("<f4").tobytes())
         return
     pixels = (
         file_pixels(side_by_side(picture.layers()), picture.transparent, bits)
-        for picture in everything
+        for picture in all_strips
     )
     shape = (*size, 4 if first.transparent else 3)
     if suffix == ".png":
         write_png_rows(part, shape, bits, pixels)
     else:
-        kind = {8: np.uint8, 16: np.uint16, 32: np.float32}[bits]
-        write_tiff(part, shape, np.dtype(kind), pixels, rows)
+        dtype = {8: np.uint8, 16: np.uint16, 32: np.float32}[bits]
+        write_tiff(part, shape, np.dtype(dtype), pixels, rows)
 
 
 def strip_rows(limit: int, width: int, height: int) -> int:
     """Returns how many rows of a picture are rendered at once within `limit` bytes."""
-    most = limit // (_PIXEL_BYTES * width)
-    return max(1, min(height, most - most % _TILE or most))
+    rows = limit // (_PIXEL_BYTES * width)
+    return max(1, min(height, rows - rows % _TILE_ROWS or rows))

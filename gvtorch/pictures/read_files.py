@@ -28,8 +28,8 @@ from ..io.source import told_as
 from ..io.tiff_info import check_pictures, opened_tiff
 from .tone import from_srgb
 
-_EXR = b"\x76\x2f\x31\x01"
-_MOST_HEAD = 1 << 20  # bytes
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
+_MAX_HEADER_BYTES = 1 << 20  # bytes
 _LOCK = threading.Lock()
 _COPIES = 6  # of 8 bytes a number: the pixels read, and the steps to linear light
 
@@ -66,12 +66,12 @@ def read_image(path: str | Path) -> Tensor:
     return torch.cat((from_srgb(image[..., :3]), image[..., 3:]), -1).float()
 
 
-def _check_size(path: Path, shape: tuple[int, ...], itemsize: int, worth: int = 0) -> None:
-    """Raises ValueError if the numbers do not fit into free memory, or exceed `worth`, the most
+def _check_size(path: Path, shape: tuple[int, ...], itemsize: int, max_bytes: int = 0) -> None:
+    """Raises ValueError if the numbers do not fit into free memory, or exceed `max_bytes`, the most
     bytes that the file can unpack to (0: not checked).
     """
     count = math.prod(shape)
-    if count < 1 or (worth and count * itemsize > worth):
+    if count < 1 or (max_bytes and count * itemsize > max_bytes):
         size = path.stat().st_size
         raise ValueError(f"declares {shape} numbers, which {size} bytes can't unpack to")
     if 8 * _COPIES * count > (free := memory_free()):
@@ -83,19 +83,19 @@ def _read_png(path: Path) -> np.ndarray:
     from kornia_rs.io import read_image_png_u8, read_image_png_u16
 
     with path.open("rb") as file:
-        head = file.read(26)
-    size = picture_size(head)
-    if len(head) < 26 or head[:8] != b"\x89PNG\r\n\x1a\n" or size is None:
+        header = file.read(26)
+    size = picture_size(header)
+    if len(header) < 26 or header[:8] != b"\x89PNG\r\n\x1a\n" or size is None:
         raise ValueError("no PNG")
-    bits, kind = head[24], head[25]  # of the IHDR chunk
+    bits, color_type = header[24], header[25]  # of the IHDR chunk
     modes = {0: ("mono", 1), 2: ("rgb", 3), 6: ("rgba", 4)}
-    if bits not in (8, 16) or kind not in modes:
+    if bits not in (8, 16) or color_type not in modes:
         raise ValueError("a PNG must have 8 or 16 bits and no palette")
-    mode, channels = modes[kind]
+    mode, channels = modes[color_type]
     _check_size(path, (*size[::-1], channels), bits // 8, MOST_PACKED * path.stat().st_size)
     read = read_image_png_u8 if bits == 8 else read_image_png_u16
     pixels = read(str(path), mode)
-    return np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, -1) if kind == 0 else pixels
+    return np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, -1) if color_type == 0 else pixels
 
 
 def _read_exr(path: Path) -> np.ndarray:
@@ -109,8 +109,8 @@ def _read_exr(path: Path) -> np.ndarray:
     names = "RGBA" if "A" in channels else "RGB"
     missing = [name for name in names if name not in channels]
     if missing:
-        known = ", ".join(map(repr, channels))
-        raise ValueError(f"has no channel {missing[0]!r}; it has {known}")
+        listed = ", ".join(map(repr, channels))
+        raise ValueError(f"has no channel {missing[0]!r}; it has {listed}")
     return np.stack([channels[name].pixels for name in names], -1)
 
 
@@ -119,12 +119,12 @@ def _quiet() -> Iterator[None]:
     """Silences both streams: OpenEXR prints there what is wrong with a file, and raises it too."""
     with _LOCK, redirect_stdout(io.StringIO()), ExitStack() as stack:
         with suppress(OSError):  # there is no standard error
-            stream = os.dup(2)
-            stack.callback(os.close, stream)
-            nothing = os.open(os.devnull, os.O_WRONLY)
-            stack.callback(os.close, nothing)
-            os.dup2(nothing, 2)
-            stack.callback(os.dup2, stream, 2)
+            saved_stderr = os.dup(2)
+            stack.callback(os.close, saved_stderr)
+            null = os.open(os.devnull, os.O_WRONLY)
+            stack.callback(os.close, null)
+            os.dup2(null, 2)
+            stack.callback(os.dup2, saved_stderr, 2)
         yield
 
 
@@ -134,44 +134,44 @@ def _check_exr(path: Path) -> None:
     allocates memory for all lines.
     """
     with path.open("rb") as file:
-        head = file.read(_MOST_HEAD)
-    if head[:4] != _EXR or len(head) < 8:
+        header = file.read(_MAX_HEADER_BYTES)
+    if header[:4] != _EXR_MAGIC or len(header) < 8:
         raise ValueError("no EXR")
-    if head[5] & 0x18:
+    if header[5] & 0x18:
         raise ValueError("has several parts or deep pixels; expected one picture")
-    told = dict(_attributes(head))
-    if "dataWindow" not in told or "channels" not in told:
+    attributes = dict(_attributes(header))
+    if "dataWindow" not in attributes or "channels" not in attributes:
         raise ValueError("damaged: its header has no extent or no channels")
-    left, low, right, high = struct.unpack("<4i", told["dataWindow"])
-    count = sum(1 for _ in _channels(told["channels"]))
-    lines, size = high - low + 1, path.stat().st_size
+    left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
+    count = sum(1 for _ in _channels(attributes["channels"]))
+    lines, size = bottom - top + 1, path.stat().st_size
     shape = (lines, right - left + 1, count)
     if min(shape) < 1 or lines // 256 * 8 > size:
         raise ValueError(f"damaged: declares {shape} numbers in {size} bytes")
     _check_size(path, shape, 1, MOST_PACKED * size * 4)
 
 
-def _attributes(head: bytes) -> Iterator[tuple[str, bytes]]:
+def _attributes(header: bytes) -> Iterator[tuple[str, bytes]]:
     """Yields names and values of an EXR header's attributes."""
-    at = 8
-    while head[at : at + 1] not in (b"", b"\0"):
-        name = head[at : head.index(b"\0", at)]
-        at += len(name) + 1
-        at = head.index(b"\0", at) + 1  # its type
-        (size,) = struct.unpack_from("<i", head, at)
-        if not 0 <= size <= len(head) - at - 4:
+    offset = 8
+    while header[offset : offset + 1] not in (b"", b"\0"):
+        name = header[offset : header.index(b"\0", offset)]
+        offset += len(name) + 1
+        offset = header.index(b"\0", offset) + 1  # its type
+        (size,) = struct.unpack_from("<i", header, offset)
+        if not 0 <= size <= len(header) - offset - 4:
             raise ValueError(f"damaged: an attribute of {size} bytes")
-        yield name.decode("latin-1"), head[at + 4 : at + 4 + size]
-        at += 4 + size
+        yield name.decode("latin-1"), header[offset + 4 : offset + 4 + size]
+        offset += 4 + size
 
 
-def _channels(told: bytes) -> Iterator[str]:
+def _channels(channel_list: bytes) -> Iterator[str]:
     """Yields the names of an EXR's channels; 16 bytes follow each name."""
-    at = 0
-    while told[at : at + 1] not in (b"", b"\0"):
-        end = told.index(b"\0", at)
-        yield told[at:end].decode("latin-1")
-        at = end + 17
+    offset = 0
+    while channel_list[offset : offset + 1] not in (b"", b"\0"):
+        end = channel_list.index(b"\0", offset)
+        yield channel_list[offset:end].decode("latin-1")
+        offset = end + 17
 
 
 def _read_npy(path: Path) -> np.ndarray:
@@ -185,8 +185,8 @@ def _read_tiff(path: Path) -> np.ndarray:
     need_library(".tif", "tifffile", extra="image")
     with opened_tiff(str(path)) as (file, _):
         series = file.series[0]
-        most = MOST_PACKED * path.stat().st_size
-        _check_size(path, tuple(series.shape), series.dtype.itemsize, most)
+        max_bytes = MOST_PACKED * path.stat().st_size
+        _check_size(path, tuple(series.shape), series.dtype.itemsize, max_bytes)
         check_pictures(series.pages)
         return series.asarray()
 

@@ -15,8 +15,8 @@ from ..base.whole_file import whole_file
 from .picture import Picture
 
 FILMS = [".mp4", ".gif", ".webp"]
-_FASTEST_GIF = 50  # pictures a second; viewers play faster ones slowly
-_OF_PALETTE = 16  # pictures from which the colours of a GIF are taken
+_MAX_GIF_FPS = 50  # pictures a second; viewers play faster ones slowly
+_PALETTE_FRAMES = 16  # pictures from which the colours of a GIF are taken
 
 
 class Video:
@@ -46,12 +46,12 @@ class Video:
             raise ValueError(f"Video: path must end in {', '.join(FILMS)}, got {str(path)!r}")
         if not self._path.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self._path.parent}")
-        check.whole("Video", "fps", fps, low=1, high=_FASTEST_GIF if suffix == ".gif" else 1000)
+        check.whole("Video", "fps", fps, low=1, high=_MAX_GIF_FPS if suffix == ".gif" else 1000)
         if suffix == ".mp4" and (width % 2 or height % 2):
             raise ValueError(f"Video: size must be even for .mp4, got {width}x{height}")
         self._stack = ExitStack()
         is_mp4 = suffix == ".mp4"
-        self._film = _Mp4(width, height, fps) if is_mp4 else _Loop(suffix, fps)
+        self._film = _Mp4(width, height, fps) if is_mp4 else _LoopingFilm(suffix, fps)
 
     def add(self, picture: Picture) -> None:
         """Appends a picture; raises ValueError if it is of another size, or a batch."""
@@ -63,7 +63,7 @@ class Video:
 
     def __enter__(self) -> Video:
         self._film.open(self._stack.enter_context(whole_file(self._path)))
-        self._stack.push(lambda kind, *_: self._film.close(whole=kind is None))
+        self._stack.push(lambda error_type, *_: self._film.close(complete=error_type is None))
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -92,15 +92,15 @@ class _Mp4:
         frame = self._av.VideoFrame.from_ndarray(pixels, format="rgb24")
         self._file.mux(self._stream.encode(frame))
 
-    def close(self, *, whole: bool) -> None:
+    def close(self, *, complete: bool) -> None:
         try:
-            if whole:
+            if complete:
                 self._file.mux(self._stream.encode())
         finally:
             self._file.close()
 
 
-class _Loop:
+class _LoopingFilm:
     """Keeps the pictures until the film is complete; then Pillow writes it."""
 
     def __init__(self, suffix: str, fps: int) -> None:
@@ -117,23 +117,27 @@ class _Loop:
     def add(self, pixels: np.ndarray) -> None:
         self._frames.append(self._image.fromarray(pixels))
 
-    def close(self, *, whole: bool) -> None:
-        if not whole or not self._frames:
+    def close(self, *, complete: bool) -> None:
+        if not complete or not self._frames:
             return
-        unit = 10 if self._suffix == ".gif" else 1  # a GIF counts in hundredths of a second
-        ends = [round(1000 * n / self._fps / unit) * unit for n in range(len(self._frames) + 1)]
-        lasts = [b - a for a, b in itertools.pairwise(ends)]
+        unit_ms = 10 if self._suffix == ".gif" else 1  # a GIF counts in hundredths of a second
+        ends = [
+            round(1000 * n / self._fps / unit_ms) * unit_ms for n in range(len(self._frames) + 1)
+        ]
+        durations = [b - a for a, b in itertools.pairwise(ends)]
         frames = self._frames
         options: dict[str, Any] = {"quality": 90, "method": 4}
         if self._suffix == ".gif":
             frames, options = self._in_palette(), {"optimize": False, "disposal": 1}
         first, *rest = frames
-        first.save(self._part, save_all=True, append_images=rest, duration=lasts, loop=0, **options)
+        first.save(
+            self._part, save_all=True, append_images=rest, duration=durations, loop=0, **options
+        )
 
     def _in_palette(self) -> list[Any]:
         """Returns the frames in 256 colours common to all, so that still parts do not flicker."""
-        step = -(-len(self._frames) // _OF_PALETTE)
-        some = [np.asarray(frame) for frame in self._frames[::step]]
-        colors = self._image.fromarray(np.concatenate(some)).quantize(256, kmeans=1)
+        step = -(-len(self._frames) // _PALETTE_FRAMES)
+        samples = [np.asarray(frame) for frame in self._frames[::step]]
+        colors = self._image.fromarray(np.concatenate(samples)).quantize(256, kmeans=1)
         dither = self._image.Dither.FLOYDSTEINBERG
         return [frame.quantize(palette=colors, dither=dither) for frame in self._frames]

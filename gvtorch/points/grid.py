@@ -17,7 +17,7 @@ from ..base.boxes import extent_in
 from ..ops.splat import shares
 from .points import Points
 
-_MOST = 2**62  # most codes, which are int64
+_MAX_CODES = 2**62  # most codes, which are int64
 
 
 class Codes:
@@ -33,36 +33,36 @@ class Codes:
         self.branching, self.digits = branching, 1
         while branching**self.digits < side:
             self.digits += 1
-        if branching ** (3 * self.digits) > _MOST:
+        if branching ** (3 * self.digits) > _MAX_CODES:
             raise ValueError(
                 f"points: an extent of {side} has more voxels than a 64-bit number tells apart; "
                 "take a smaller one"
             )
-        self._places: dict[int, np.ndarray] = {}  # by side; a producer uses one or two
-        self._low = branching ** -(-self.digits // 2)
-        at = np.arange(self._low)
-        self._spread = np.zeros(self._low, np.int64)
+        self._positions: dict[int, np.ndarray] = {}  # by side; a producer uses one or two
+        self._table_size = branching ** -(-self.digits // 2)
+        index = np.arange(self._table_size)
+        self._spread = np.zeros(self._table_size, np.int64)
         for digit in range(-(-self.digits // 2)):
-            self._spread += at // branching**digit % branching * branching ** (3 * digit)
+            self._spread += index // branching**digit % branching * branching ** (3 * digit)
 
     def of(self, voxel_k3: np.ndarray) -> np.ndarray:
         """Returns (k,) int64 codes of voxels (k, 3) x, y, z of any level, inside the cube."""
         code = np.zeros(len(voxel_k3), np.int64)
         for axis in (2, 1, 0):
-            high, low = np.divmod(voxel_k3[:, axis], self._low)
+            high, low = np.divmod(voxel_k3[:, axis], self._table_size)
             code *= self.branching
             code += self._spread[low]
-            code += self._spread[high] * self._low**3
+            code += self._spread[high] * self._table_size**3
         return code
 
-    def places(self, side: int) -> np.ndarray:
+    def positions(self, side: int) -> np.ndarray:
         """Returns (side^3, 3) x, y, z of the codes 0, 1, ...; `side` is a power of N."""
-        if side not in self._places:
-            at = np.indices((side,) * 3).reshape(3, -1).T
-            found = np.empty_like(at)
-            found[self.of(at)] = at
-            self._places[side] = found
-        return self._places[side]
+        if side not in self._positions:
+            voxels = np.indices((side,) * 3).reshape(3, -1).T
+            positions = np.empty_like(voxels)
+            positions[self.of(voxels)] = voxels
+            self._positions[side] = positions
+        return self._positions[side]
 
 
 @dataclass(frozen=True)
@@ -114,33 +114,33 @@ class PointGrid:
     def voxel(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns (m, 3) the finest voxels of those positions (k, 3) in the box, (k,) which are."""
         with np.errstate(over="ignore", invalid="ignore"):
-            place = np.floor((positions.astype(np.float64) - self.low) / self.spacing_3)
-            inside = ((place >= 0) & (place < self.extent)).all(1)
-        return place[inside].astype(np.int64), inside
+            voxel = np.floor((positions.astype(np.float64) - self.low) / self.spacing_3)
+            inside = ((voxel >= 0) & (voxel < self.extent)).all(1)
+        return voxel[inside].astype(np.int64), inside
 
     def edges(self, voxel_k3: np.ndarray, count: int, level: int) -> list[np.ndarray]:
         """Returns for each axis (k, count + 1) world coordinates of the edges of `count` voxels of
         a level, beginning at voxels (k, 3), clamped to the box.
         """
         size = self.spacing_3 * self.branching**level
-        at = np.arange(count + 1)
+        index = np.arange(count + 1)
         return [
             np.clip(
-                self.low[axis] + (voxel_k3[:, axis, None] + at) * size[axis],
+                self.low[axis] + (voxel_k3[:, axis, None] + index) * size[axis],
                 self.low[axis],
                 self.high[axis],
             )
             for axis in range(3)
         ]
 
-    def own_level(self, radius: np.ndarray) -> np.ndarray:
+    def level_of_radius(self, radius: np.ndarray) -> np.ndarray:
         """Returns (k,) the finest level whose voxels are at least as wide as the radii (k,) of
         points, else the coarsest: there, a point overlaps at most 3^3 voxels.
         """
-        own = np.zeros(len(radius), np.int64)
+        levels = np.zeros(len(radius), np.int64)
         for level in range(self.levels - 1):
-            own += radius > self.spacing_3.min() * self.branching**level
-        return own
+            levels += radius > self.spacing_3.min() * self.branching**level
+        return levels
 
 
 @np.errstate(over="ignore")  # a box that is not finite is an error later
@@ -148,26 +148,26 @@ def _bounds(blocks: Iterable[Points]) -> list[list[float]]:
     """Returns a box around all points with their radii, and a small margin."""
     low, high = np.full(3, math.inf), np.full(3, -math.inf)
     for block in blocks:
-        reach = 0.0 if block.radius is None else block.radius[:, None]
-        low = np.minimum(low, (block.positions - reach).min(0))
-        high = np.maximum(high, (block.positions + reach).max(0))
+        radius = 0.0 if block.radius is None else block.radius[:, None]
+        low = np.minimum(low, (block.positions - radius).min(0))
+        high = np.maximum(high, (block.positions + radius).max(0))
     middle = 0.5 * (low + high)
     longest = float((high - low).max())
     smallest = max(1e-6 * longest, 1e-9 * float(np.abs(middle).max())) or 1.0
-    half = 0.5 * np.maximum(high - low, smallest) * 1.001
-    return [(middle - half).tolist(), (middle + half).tolist()]
+    half_size = 0.5 * np.maximum(high - low, smallest) * 1.001
+    return [(middle - half_size).tolist(), (middle + half_size).tolist()]
 
 
 def point_shares(edge: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Returns (k, m) float64 the share of each point, with centre (k,) and radius (k,), in each of
     its intervals, which lie between increasing edges (k, m + 1). See `shares`.
     """
-    given = (torch.from_numpy(np.asarray(one, np.float64)) for one in (edge, center, radius))
-    return shares(*given).numpy()
+    arrays = (torch.from_numpy(np.asarray(array, np.float64)) for array in (edge, center, radius))
+    return shares(*arrays).numpy()
 
 
 def peak(radius: np.ndarray, size_3: np.ndarray) -> np.ndarray:
     """Returns (k,) upper bounds of the share of points with radii (k,) in any box of a size."""
     safe = np.maximum(radius, np.finfo(np.float64).tiny)
-    share = np.minimum(1, 4 / 3 * size_3 / safe[:, None])
-    return share[:, 0] * share[:, 1] * share[:, 2]
+    fractions = np.minimum(1, 4 / 3 * size_3 / safe[:, None])
+    return fractions[:, 0] * fractions[:, 1] * fractions[:, 2]

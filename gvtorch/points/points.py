@@ -31,29 +31,29 @@ class Points:
     radius: Any = None
 
     def __post_init__(self) -> None:
-        place = _numbers("positions", self.positions)
-        count = len(place) if place.ndim == 2 else 0
-        if place.ndim != 2 or place.shape[1] != 3 or not count:
-            raise ValueError(f"Points: positions must be (n, 3), n >= 1, got {place.shape}")
+        positions = _checked_array("positions", self.positions)
+        count = len(positions) if positions.ndim == 2 else 0
+        if positions.ndim != 2 or positions.shape[1] != 3 or not count:
+            raise ValueError(f"Points: positions must be (n, 3), n >= 1, got {positions.shape}")
         ones = np.ones((count, 1), np.float32)
-        value = ones if self.values is None else _numbers("values", self.values)
+        value = ones if self.values is None else _checked_array("values", self.values)
         value = value[:, None] if value.ndim == 1 else value
         if value.ndim != 2 or len(value) != count or not value.shape[1]:
             raise ValueError(
                 f"Points: values must be ({count},) or ({count}, c), got {value.shape}"
             )
-        object.__setattr__(self, "positions", place)
+        object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "values", value)
         for name, shape in (("colors", (count, 3)), ("radius", (count,))):
-            if (given := getattr(self, name)) is None:
+            if (attribute := getattr(self, name)) is None:
                 continue
-            part = _numbers(name, given)
-            part = np.broadcast_to(part, shape) if name == "radius" and not part.ndim else part
-            if part.shape != shape:
-                raise ValueError(f"Points: {name} must be {shape}, got {part.shape}")
-            if bool((part < 0).any()):
-                raise ValueError(f"Points: {name} must be at least 0, got {part.min():g}")
-            object.__setattr__(self, name, part)
+            array = _checked_array(name, attribute)
+            array = np.broadcast_to(array, shape) if name == "radius" and not array.ndim else array
+            if array.shape != shape:
+                raise ValueError(f"Points: {name} must be {shape}, got {array.shape}")
+            if bool((array < 0).any()):
+                raise ValueError(f"Points: {name} must be at least 0, got {array.min():g}")
+            object.__setattr__(self, name, array)
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -66,8 +66,8 @@ class Points:
     def part(self, start: int, stop: int) -> Points:
         """Returns some of the points; nothing is copied."""
         names = ("positions", "values", "colors", "radius")
-        cut = (None if (one := getattr(self, n)) is None else one[start:stop] for n in names)
-        return Points(*cut)
+        arrays = (None if (array := getattr(self, n)) is None else array[start:stop] for n in names)
+        return Points(*arrays)
 
     def blocks(self, count: int) -> Iterator[Points]:
         """Yields all points, `count` at a time."""
@@ -85,20 +85,20 @@ class Points:
         return replace(self, values=np.concatenate((light, np.full_like(light[:, :1], opacity)), 1))
 
     def __repr__(self) -> str:
-        told = [f"{len(self)}", f"values of {self.width}"]
-        told += [name for name in ("colors", "radius") if getattr(self, name) is not None]
-        return f"Points({', '.join(told)})"
+        parts = [f"{len(self)}", f"values of {self.width}"]
+        parts += [name for name in ("colors", "radius") if getattr(self, name) is not None]
+        return f"Points({', '.join(parts)})"
 
 
-def _numbers(name: str, value: Any) -> np.ndarray:
+def _checked_array(name: str, value: Any) -> np.ndarray:
     check.no_gradient("Points", name, value)
     try:
-        found = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value
-        found = np.asarray(found)
-        if found.dtype != np.float32:
-            found = found.astype(np.float64, copy=False)
+        array = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value
+        array = np.asarray(array)
+        if array.dtype != np.float32:
+            array = array.astype(np.float64, copy=False)
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"Points: {name} must be numbers, got {check.shown(value)}") from None
-    if not bool(np.isfinite(found).all()):
+    if not bool(np.isfinite(array).all()):
         raise ValueError(f"Points: {name} must be finite, got NaN or infinity")
-    return found
+    return array

@@ -24,11 +24,15 @@ from .table import Fold, Rows, Runs, Table, grouped
 
 _META = "points.json"
 _VERSION = 1
-_FULL = 512  # a level's sums are stored if one of its voxels adds up more rows than this
-_COPIES = 8  # copies of a block of rows in memory while it is sorted
-_ADDED: Mapping[str, Fold] = {"value": np.add.reduceat}
-_WITH_ENDS: Mapping[str, Fold] = {**_ADDED, "low": np.minimum.reduceat, "high": np.maximum.reduceat}
-_ALL_ADDED: Mapping[str, Fold] = dict.fromkeys(("value", "low", "high"), np.add.reduceat)
+_ROWS_WORTH_STORING = 512  # a level's sums are stored if a voxel of it adds up more rows
+_BLOCK_COPIES = 8  # copies of a block of rows in memory while it is sorted
+_VALUE_SUMS: Mapping[str, Fold] = {"value": np.add.reduceat}
+_SUMS_AND_BOUNDS: Mapping[str, Fold] = {
+    **_VALUE_SUMS,
+    "low": np.minimum.reduceat,
+    "high": np.maximum.reduceat,
+}
+_ALL_SUMS: Mapping[str, Fold] = dict.fromkeys(("value", "low", "high"), np.add.reduceat)
 
 
 @runtime_checkable
@@ -48,8 +52,9 @@ class SortedPoints:
         grid: The voxels.
         codes: The codes of voxels.
         width: How many numbers a point's value has.
-        points: By level, the points whose radius needs its voxels (see `PointGrid.own_level`; level
-            0 has all narrower ones): code of the finest voxel, position, value, and radius if any.
+        points: By level, the points whose radius needs its voxels (see
+            `PointGrid.level_of_radius`; level 0 has all narrower ones): code of the finest voxel,
+            position, value, and radius if any.
         sums: By level, only where worth storing: code of each voxel that holds points, its sum, and
             the smallest and largest sum of a finest voxel in it.
         folder: The folder of its files; None: in memory.
@@ -80,20 +85,25 @@ class SortedPoints:
         try:
             if meta["version"] != _VERSION:
                 raise ValueError(f"version {meta['version']!r}, this reads {_VERSION}")
-            told = meta["grid"]
-            box = (told["low"], told["high"])
-            grid = PointGrid.around("grid", (), told["extent"], box, told["branching"])
+            grid_fields = meta["grid"]
+            box = (grid_fields["low"], grid_fields["high"])
+            grid = PointGrid.around(
+                "grid", (), grid_fields["extent"], box, grid_fields["branching"]
+            )
             tables = {
-                what: {
+                table_kind: {
                     int(level): Table.mapped(
                         folder,
-                        f"{what}_{int(level)}",
-                        check.whole("rows", "count", told["count"], low=1),
-                        {name: (str(d), tuple(s)) for name, (d, s) in told["kinds"].items()},
+                        f"{table_kind}_{int(level)}",
+                        check.whole("rows", "count", table_fields["count"], low=1),
+                        {
+                            name: (str(d), tuple(s))
+                            for name, (d, s) in table_fields["kinds"].items()
+                        },
                     )
-                    for level, told in meta[what].items()
+                    for level, table_fields in meta[table_kind].items()
                 }
-                for what in ("points", "sums")
+                for table_kind in ("points", "sums")
             }
             return cls(grid, int(meta["width"]), tables["points"], tables["sums"], folder)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
@@ -104,20 +114,25 @@ class SortedPoints:
 
     def __repr__(self) -> str:
         x, y, z = self.grid.extent
-        place = "in memory" if self.folder is None else str(self.folder)
-        return f"SortedPoints({len(self)}, values of {self.width}, {x}x{y}x{z} (x, y, z), {place})"
+        location = "in memory" if self.folder is None else str(self.folder)
+        return (
+            f"SortedPoints({len(self)}, values of {self.width}, {x}x{y}x{z} (x, y, z), {location})"
+        )
 
     def save(self) -> None:
         """Writes the metadata that `open` reads, the last step of writing the folder."""
         assert self.folder is not None
-        told = {
-            what: {level: {"count": len(one), "kinds": one.kinds} for level, one in tables.items()}
-            for what, tables in (("points", self.points), ("sums", self.sums))
+        tables_by_kind = {
+            kind: {
+                level: {"count": len(table), "kinds": table.kinds}
+                for level, table in tables.items()
+            }
+            for kind, tables in (("points", self.points), ("sums", self.sums))
         }
         grid = dataclasses.asdict(self.grid)
-        meta = {"version": _VERSION, "width": self.width, "grid": grid, **told}
-        place = self.folder / _META
-        with told_of(place), place.open("w", encoding="utf-8") as file:
+        meta = {"version": _VERSION, "width": self.width, "grid": grid, **tables_by_kind}
+        path = self.folder / _META
+        with told_of(path), path.open("w", encoding="utf-8") as file:
             json.dump(meta, file)
             file.flush()
             os.fsync(file.fileno())
@@ -158,23 +173,25 @@ def sort_points(
     if target is not None and target.exists():
         raise FileExistsError(f"{target}: is there already; remove it or choose a new name")
     first = next(iter(points.blocks(1)))
-    row = 8 + sum(one.itemsize * (one.size // len(one)) for one in _columns(first).values())
-    block = len(points)
+    row_bytes = 8 + sum(
+        column.itemsize * (column.size // len(column)) for column in _columns(first).values()
+    )
+    block_rows = len(points)
     if target is not None:
-        block = max(4096, check.nbytes(where, "memory", memory) // (_COPIES * row))
-    grid = PointGrid.around(where, points.blocks(block), extent, box, branching)
+        block_rows = max(4096, check.nbytes(where, "memory", memory) // (_BLOCK_COPIES * row_bytes))
+    grid = PointGrid.around(where, points.blocks(block_rows), extent, box, branching)
     draft = None if target is None else target.with_name(f".{target.name}.draft")
     if draft is not None:
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir(parents=True)
     try:
-        maker = _Maker(grid, draft, block, progress)
-        maker.read(where, points)
-        maker.add_up()
-        made = SortedPoints(grid, first.width, maker.points, maker.sums, draft)
+        sorter = _Sorter(grid, draft, block_rows, progress)
+        sorter.read(where, points)
+        sorter.add_up()
+        sorted_points = SortedPoints(grid, first.width, sorter.points, sorter.sums, draft)
         if draft is None or target is None:
-            return made
-        made.save()
+            return sorted_points
+        sorted_points.save()
         draft.replace(target)
         return SortedPoints.open(target)
     except BaseException:
@@ -189,7 +206,7 @@ def _columns(points: Points) -> Rows:
     return rows if points.radius is None else {**rows, "radius": points.radius}
 
 
-class _Maker:
+class _Sorter:
     """The steps of `sort_points`, and its tables."""
 
     def __init__(
@@ -209,16 +226,18 @@ class _Maker:
             self.progress("sorting", done, 2 * total)
             done += len(part)
             voxel, inside = self.grid.voxel(part.positions)
-            rows = {name: one[inside] for name, one in _columns(part).items()}
+            rows = {name: column[inside] for name, column in _columns(part).items()}
             rows["code"] = self.codes.of(voxel)
             if part.radius is None:
-                self._runs(runs, 0).append(rows)
+                self._level_runs(runs, 0).append(rows)
                 continue
-            own = self.grid.own_level(rows["radius"])
-            for level in np.unique(own).tolist():
-                here = own == level
-                self._runs(runs, level).append({name: one[here] for name, one in rows.items()})
-        runs = {level: one for level, one in sorted(runs.items()) if len(one)}
+            levels = self.grid.level_of_radius(rows["radius"])
+            for level in np.unique(levels).tolist():
+                at_level = levels == level
+                self._level_runs(runs, level).append(
+                    {name: column[at_level] for name, column in rows.items()}
+                )
+        runs = {level: level_runs for level, level_runs in sorted(runs.items()) if len(level_runs)}
         if not runs:
             raise ValueError(f"{where}: no point lies in the box")
         for level, unsorted in runs.items():
@@ -228,7 +247,7 @@ class _Maker:
                 self.progress("sorting", total + sum(map(len, self.points.values())), 2 * total)
             unsorted.remove()
 
-    def _runs(self, runs: dict[int, Runs], level: int) -> Runs:
+    def _level_runs(self, runs: dict[int, Runs], level: int) -> Runs:
         if level not in runs:
             runs[level] = Runs(self.folder, f"runs_{level}", self.block)
         return runs[level]
@@ -237,32 +256,32 @@ class _Maker:
         """Computes the sums level by level, each from the nearest stored sums below it."""
         for level in range(self.grid.levels):
             self.progress("adding up", level, self.grid.levels)
-            own = self._own(level)
-            below, divide = self._below(level)
-            if own is None:
-                made, pays = self._kept(f"sums_{level}", below, divide)
-                if pays:
-                    self.sums[level] = made
+            wide_shares = self._wide_shares(level)
+            sums_below, divide = self._nearest_sums(level)
+            if wide_shares is None:
+                sums, worth_storing = self._level_sums(f"sums_{level}", sums_below, divide)
+                if worth_storing:
+                    self.sums[level] = sums
                 else:
-                    made.remove()
+                    sums.remove()
                 continue
-            both = Runs(self.folder, f"both_{level}", self.block)
-            for rows in grouped(below, _WITH_ENDS, divide):
-                both.append(rows)
-            for rows in own.sorted():
-                both.append(rows)
-            own.remove()
+            merged = Runs(self.folder, f"both_{level}", self.block)
+            for rows in grouped(sums_below, _SUMS_AND_BOUNDS, divide):
+                merged.append(rows)
+            for rows in wide_shares.sorted():
+                merged.append(rows)
+            wide_shares.remove()
             self.sums[level] = Table(self.folder, f"sums_{level}")
-            for rows in grouped(both.sorted(), _ALL_ADDED):
+            for rows in grouped(merged.sorted(), _ALL_SUMS):
                 self.sums[level].append(rows)
-            both.remove()
+            merged.remove()
         self.progress("adding up", self.grid.levels, self.grid.levels)
 
-    def _below(self, level: int) -> tuple[Iterator[Rows], int]:
+    def _nearest_sums(self, level: int) -> tuple[Iterator[Rows], int]:
         """Returns the nearest sums below a level, and how many of their voxels make one of it."""
         n = self.grid.branching**3
-        if kept := [one for one in self.sums if one < level]:
-            return self.sums[kept[-1]].blocks(self.block), n ** (level - kept[-1])
+        if stored_levels := [stored for stored in self.sums if stored < level]:
+            return self.sums[stored_levels[-1]].blocks(self.block), n ** (level - stored_levels[-1])
         if 0 not in self.points or self._is_wide(0):
             return iter(()), n**level
         return finest_sums(self.points[0].blocks(self.block)), n**level
@@ -270,21 +289,24 @@ class _Maker:
     def _is_wide(self, level: int) -> bool:
         return level in self.points and "radius" in self.points[level].rows
 
-    def _kept(self, name: str, below: Iterator[Rows], divide: int) -> tuple[Table, bool]:
+    def _level_sums(self, name: str, sums_below: Iterator[Rows], divide: int) -> tuple[Table, bool]:
         """Computes the sums of a level; returns them, and whether they are worth storing: they are
-        at most half as many rows as below, or a voxel adds up more than `_FULL` rows.
+        at most half as many rows as below, or a voxel adds up more than `_ROWS_WORTH_STORING` rows.
         """
-        before, most = 0, 0
-        ones = ({"rows": np.ones(len(rows["code"]), np.int64), **rows} for rows in below)
-        made = Table(self.folder, name)
-        for rows in grouped(ones, {**_WITH_ENDS, "rows": np.add.reduceat}, divide):
+        rows_below, max_rows = 0, 0
+        counted = ({"rows": np.ones(len(rows["code"]), np.int64), **rows} for rows in sums_below)
+        table = Table(self.folder, name)
+        for rows in grouped(counted, {**_SUMS_AND_BOUNDS, "rows": np.add.reduceat}, divide):
             count = rows.pop("rows")
-            before, most = before + int(count.sum()), max(most, int(count.max(initial=0)))
+            rows_below, max_rows = (
+                rows_below + int(count.sum()),
+                max(max_rows, int(count.max(initial=0))),
+            )
             if len(count):
-                made.append(rows)
-        return made, 0 < 2 * len(made) <= before or most > _FULL
+                table.append(rows)
+        return table, 0 < 2 * len(table) <= rows_below or max_rows > _ROWS_WORTH_STORING
 
-    def _own(self, level: int) -> Runs | None:
+    def _wide_shares(self, level: int) -> Runs | None:
         """Returns the shares of a level's wide points in its voxels; None if there are none."""
         if not self._is_wide(level):
             return None
@@ -297,28 +319,34 @@ class _Maker:
         """Returns rows with the shares of points (k,) in the voxels of their level."""
         n = self.grid.branching**level
         size = self.grid.spacing_3 * n
-        place, radius = rows["position"].astype(np.float64), rows["radius"].astype(np.float64)
-        voxel = np.floor((place - self.grid.low) / size).astype(np.int64)
-        reach = min(int(np.ceil(radius.max() / size.min())), math.ceil(max(self.grid.extent) / n))
-        count = 2 * reach + 1
-        first = voxel - reach
+        position, radius = rows["position"].astype(np.float64), rows["radius"].astype(np.float64)
+        voxel = np.floor((position - self.grid.low) / size).astype(np.int64)
+        radius_voxels = min(
+            int(np.ceil(radius.max() / size.min())), math.ceil(max(self.grid.extent) / n)
+        )
+        count = 2 * radius_voxels + 1
+        first = voxel - radius_voxels
         narrow = radius == 0  # wholly in its voxel
         parts = []
         for axis, edge in enumerate(self.grid.edges(first, count, level)):
-            part = point_shares(edge, place[:, axis], np.where(narrow, 1.0, radius))
-            parts.append(np.where(narrow[:, None], np.arange(count) == reach, part))
+            fractions = point_shares(edge, position[:, axis], np.where(narrow, 1.0, radius))
+            parts.append(np.where(narrow[:, None], np.arange(count) == radius_voxels, fractions))
         x, y, z = parts
-        share = (z[:, :, None, None] * y[:, None, :, None] * x[:, None, None, :]).reshape(-1)
+        fraction = (z[:, :, None, None] * y[:, None, :, None] * x[:, None, None, :]).reshape(-1)
         step = np.indices((count,) * 3).reshape(3, -1).T[:, ::-1]
-        at = (first[:, None] + step).reshape(-1, 3)
-        row = np.repeat(np.arange(len(place)), count**3)
-        some = share > 0
-        row, share = row[some], share[some]
+        target_voxel = (first[:, None] + step).reshape(-1, 3)
+        row = np.repeat(np.arange(len(position)), count**3)
+        nonzero = fraction > 0
+        row, fraction = row[nonzero], fraction[nonzero]
         value = rows["value"][row].astype(np.float64)
         # A finest voxel holds the share itself (level 0), or at most that at the point's centre.
-        most = share if level == 0 else peak(radius, self.grid.spacing_3)[row]
-        ends = ends_of(most[:, None] * value)
-        return {"code": self.codes.of(at[some]), "value": share[:, None] * value, **ends}
+        largest_fraction = fraction if level == 0 else peak(radius, self.grid.spacing_3)[row]
+        bounds = bounds_with_zero(largest_fraction[:, None] * value)
+        return {
+            "code": self.codes.of(target_voxel[nonzero]),
+            "value": fraction[:, None] * value,
+            **bounds,
+        }
 
 
 def finest_sums(blocks: Iterator[Rows]) -> Iterator[Rows]:
@@ -331,12 +359,12 @@ def finest_sums(blocks: Iterator[Rows]) -> Iterator[Rows]:
         }
         for rows in blocks
     )
-    for rows in grouped(points, {**_ADDED, "rows": np.add.reduceat}):
-        yield rows | ends_of(rows["value"])
+    for rows in grouped(points, {**_VALUE_SUMS, "rows": np.add.reduceat}):
+        yield rows | bounds_with_zero(rows["value"])
 
 
-def ends_of(value: np.ndarray) -> Rows:
+def bounds_with_zero(value: np.ndarray) -> Rows:
     """Returns as float32 the smaller and the larger of each value and 0."""
     with np.errstate(over="ignore"):
-        ends = value.astype(np.float32)
-    return {"low": np.minimum(ends, 0), "high": np.maximum(ends, 0)}
+        single = value.astype(np.float32)
+    return {"low": np.minimum(single, 0), "high": np.maximum(single, 0)}

@@ -15,8 +15,8 @@ from .grid import Codes, peak
 from .sorted import SortedPoints
 from .table import Rows
 
-_CELL = 4  # voxels along a cell's side at most, unless cubes are large: see `_cells`
-_NEARLY = 1.001  # factor on a point's radius that covers rounding errors
+_CELL_VOXELS = 4  # voxels along a cell's side at most, unless cubes are large: see `_cells`
+_RADIUS_MARGIN = 1.001  # factor on a point's radius that covers rounding errors
 
 
 class Cubes(NamedTuple):
@@ -36,45 +36,47 @@ class _Cells(NamedTuple):
     start: np.ndarray  # (s,) first row in the table
     rows: np.ndarray  # (s,) number of rows
     size: int  # voxels along a side
-    below: int  # how many codes of the table a voxel has
+    codes_per_voxel: int  # how many codes of the table a voxel has
 
-    def once(self) -> tuple[_Cells, np.ndarray]:
+    def distinct(self) -> tuple[_Cells, np.ndarray]:
         """Returns the distinct cells, and (s,) the index of each cell among these."""
-        _, one, same = np.unique(self.code, return_index=True, return_inverse=True)
-        return self._replace(**{n: getattr(self, n)[one] for n in self._fields[:5]}), same
+        _, first_index, inverse = np.unique(self.code, return_index=True, return_inverse=True)
+        return self._replace(
+            **{n: getattr(self, n)[first_index] for n in self._fields[:5]}
+        ), inverse
 
-    def ahead(self) -> np.ndarray:
+    def rows_before(self) -> np.ndarray:
         """Returns (s,) the number of rows in all cells before each cell."""
         return np.cumsum(self.rows) - self.rows
 
-    def listed(self) -> tuple[np.ndarray, np.ndarray]:
+    def all_rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns (m,) the rows of all cells, and (m,) the cell of each row."""
-        own = np.repeat(np.arange(len(self.rows)), self.rows)
-        return (self.start - self.ahead())[own] + np.arange(len(own)), own
+        cell = np.repeat(np.arange(len(self.rows)), self.rows)
+        return (self.start - self.rows_before())[cell] + np.arange(len(cell)), cell
 
-    def voxels(self, curve: Codes, code: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """Returns (m, 3) the voxels x, y, z of codes (m,), which lie in cells `own` (m,)."""
-        within = code - self.code[own]
-        if self.below > 1:
-            within //= self.below
-        return self.first_s3[own] + curve.places(self.size)[within]
+    def voxels(self, curve: Codes, code: np.ndarray, cell: np.ndarray) -> np.ndarray:
+        """Returns (m, 3) the voxels x, y, z of codes (m,), which lie in cells `cell` (m,)."""
+        offset = code - self.code[cell]
+        if self.codes_per_voxel > 1:
+            offset //= self.codes_per_voxel
+        return self.first_s3[cell] + curve.positions(self.size)[offset]
 
 
 #: (m,) rows of a table in cubes, and (m,) their cubes, increasing; equal codes are adjacent.
-_Found = tuple[np.ndarray, np.ndarray]
+_CubeRows = tuple[np.ndarray, np.ndarray]
 
 
 def values(points: SortedPoints, cubes: Cubes, *, narrow: bool = True) -> np.ndarray:
     """Returns (k, z, y, x, c) float64 the mean sum per finest voxel in each voxel; unless `narrow`,
     without points that are narrower than a finest voxel.
     """
-    table = _finer(points, cubes.level) if narrow else None
+    table = _source_rows(points, cubes.level) if narrow else None
     edge = np.stack(points.grid.edges(cubes.low_k3, cubes.side, cubes.level), 1)
     low = np.ascontiguousarray(cubes.low_k3, np.int64)
     lists = (*_narrow_lists(points, cubes, table), *_wide_lists(points, cubes))
-    held = splat(*(torch.from_numpy(one) for one in (edge, low, *lists)))
+    sums = splat(*(torch.from_numpy(array) for array in (edge, low, *lists)))
     scale = points.grid.branching ** (3 * cubes.level)
-    return held.div_(scale).numpy() if scale > 1 else held.numpy()
+    return sums.div_(scale).numpy() if scale > 1 else sums.numpy()
 
 
 def ranges(
@@ -84,21 +86,21 @@ def ranges(
     of their voxels, at this level and all finer ones; 0 lies between the bounds.
     """
     k = len(cubes.low_k3)
-    some, low = np.zeros(k, bool), np.zeros((k, points.width))
+    nonempty, low = np.zeros(k, bool), np.zeros((k, points.width))
     high = np.zeros_like(low)
-    if narrow and (table := _finer(points, cubes.level)) is not None:
+    if narrow and (table := _source_rows(points, cubes.level)) is not None:
         rows, level = table
-        found = _in_cubes(points, rows["code"], level, cubes)
-        if len(found[0]):
-            _widen(rows, found, some, low, high)
+        cube_rows = _in_cubes(points, rows["code"], level, cubes)
+        if len(cube_rows[0]):
+            _widen(rows, cube_rows, nonempty, low, high)
     for rows, (row, cube) in _reaching(points, cubes):
-        most = peak(rows["radius"][row].astype(np.float64), points.grid.spacing_3)
-        value = most[:, None] * rows["value"][row]
-        first = _begins(cube)
-        some[cube[first]] = True
+        fraction = peak(rows["radius"][row].astype(np.float64), points.grid.spacing_3)
+        value = fraction[:, None] * rows["value"][row]
+        first = _cube_starts(cube)
+        nonempty[cube[first]] = True
         low[cube[first]] += np.add.reduceat(np.minimum(value, 0), first)
         high[cube[first]] += np.add.reduceat(np.maximum(value, 0), first)
-    return some, low, high
+    return nonempty, low, high
 
 
 def region(points: SortedPoints, low: tuple[int, ...], high: tuple[int, ...]) -> np.ndarray:
@@ -108,57 +110,64 @@ def region(points: SortedPoints, low: tuple[int, ...], high: tuple[int, ...]) ->
     out = np.empty((*shape, points.width))
     for corner in itertools.product(*(range(a, b, side) for a, b in zip(low, high, strict=True))):
         cube = values(points, Cubes(np.array([corner[::-1]]), side, 0))[0]
-        at = [c - a for c, a in zip(corner, low, strict=True)]
-        part = tuple(slice(a, a + side) for a in at)
-        z, y, x = out[part].shape[:3]
-        out[part] = cube[:z, :y, :x]
+        start = [c - a for c, a in zip(corner, low, strict=True)]
+        window = tuple(slice(a, a + side) for a in start)
+        z, y, x = out[window].shape[:3]
+        out[window] = cube[:z, :y, :x]
     return out
 
 
-def _begins(cube: np.ndarray) -> np.ndarray:
+def _cube_starts(cube: np.ndarray) -> np.ndarray:
     """Returns the indices at which a new cube begins."""
     return np.flatnonzero(np.diff(cube, prepend=-1))
 
 
-def _finer(points: SortedPoints, level: int) -> tuple[Rows, int] | None:
+def _source_rows(points: SortedPoints, level: int) -> tuple[Rows, int] | None:
     """Returns the rows from which a level's sums are computed, and their level, if any."""
-    if kept := [one for one in points.sums if one <= level]:
-        return points.sums[kept[-1]].rows, kept[-1]
+    if stored_levels := [stored for stored in points.sums if stored <= level]:
+        return points.sums[stored_levels[-1]].rows, stored_levels[-1]
     return (points.points[0].rows, 0) if 0 in points.points else None
 
 
-def _widen(rows: Rows, found: _Found, some: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
+def _widen(
+    rows: Rows, cube_rows: _CubeRows, nonempty: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> None:
     """Updates bounds of cubes in place by the rows found in them."""
-    row, cube = found
+    row, cube = cube_rows
     if "low" in rows:
-        least, most = rows["low"][row], rows["high"][row]
+        smallest, largest = rows["low"][row], rows["high"][row]
     else:  # points: add them up by finest voxel
         code = rows["code"][row]
-        new = (code[1:] != code[:-1]) | (cube[1:] != cube[:-1])
-        first = np.concatenate(([0], np.flatnonzero(new) + 1))
+        is_first = (code[1:] != code[:-1]) | (cube[1:] != cube[:-1])
+        first = np.concatenate(([0], np.flatnonzero(is_first) + 1))
         cube = cube[first]
         total = np.add.reduceat(rows["value"][row].astype(np.float64), first)
-        least, most = np.minimum(total, 0), np.maximum(total, 0)
-    first = _begins(cube)
-    here = cube[first]
-    some[here] = True
-    low[here] = np.minimum.reduceat(least, first)
-    high[here] = np.maximum.reduceat(most, first)
+        smallest, largest = np.minimum(total, 0), np.maximum(total, 0)
+    first = _cube_starts(cube)
+    touched = cube[first]
+    nonempty[touched] = True
+    low[touched] = np.minimum.reduceat(smallest, first)
+    high[touched] = np.maximum.reduceat(largest, first)
 
 
-def _in_cubes(points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes) -> _Found:
+def _in_cubes(points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes) -> _CubeRows:
     """Returns the rows of a table that lie in cubes; its level is the cubes' or a finer one."""
     cells = _cells(points, codes, level, cubes)
-    row, own = cells.listed()
-    cube = cells.cube[own]
-    voxel = cells.voxels(points.codes, codes[row], own) - cubes.low_k3[cube]
+    row, cell = cells.all_rows()
+    cube = cells.cube[cell]
+    voxel = cells.voxels(points.codes, codes[row], cell) - cubes.low_k3[cube]
     x, y, z = ((voxel >= 0) & (voxel < cubes.side)).T
-    keep = x & y & z
-    return row[keep], cube[keep]
+    inside = x & y & z
+    return row[inside], cube[inside]
 
 
 def _cells(
-    points: SortedPoints, codes: np.ndarray, level: int, cubes: Cubes, *, least: int = _CELL
+    points: SortedPoints,
+    codes: np.ndarray,
+    level: int,
+    cubes: Cubes,
+    *,
+    min_size: int = _CELL_VOXELS,
 ) -> _Cells:
     """Returns the cells that cover the cubes and hold rows of a table, whose level is the cubes' or
     a finer one. A cell's side is N, or the largest power of N up to max(least, side // 8).
@@ -166,28 +175,30 @@ def _cells(
     grid, curve = points.grid, points.codes
     n = grid.branching
     size = n
-    while size * n <= max(least, cubes.side // 8):
+    while size * n <= max(min_size, cubes.side // 8):
         size *= n
-    along = (cubes.side + size - 2) // size + 1
-    step = np.indices((along,) * 3).reshape(3, -1).T[:, ::-1]
+    cells_per_side = (cubes.side + size - 2) // size + 1
+    step = np.indices((cells_per_side,) * 3).reshape(3, -1).T[:, ::-1]
     cell = (cubes.low_k3 // size)[:, None] + step  # (k, m, 3)
     first = cell * size
     scale = n**cubes.level
     inside = (first + size > 0) & (first * scale < np.array(grid.extent))
     inside &= first < (cubes.low_k3 + cubes.side)[:, None]
-    cube, which = np.nonzero(inside.all(2))
+    cube, cell_index = np.nonzero(inside.all(2))
     # How many codes of the table a cell covers.
-    below = n ** (3 * (cubes.level - level))
-    covers = min(size**3 * below, n ** (3 * max(0, curve.digits - level)))
-    code = curve.of(cell[cube, which]) * (size**3 * below)
+    codes_per_voxel = n ** (3 * (cubes.level - level))
+    codes_covered = min(size**3 * codes_per_voxel, n ** (3 * max(0, curve.digits - level)))
+    code = curve.of(cell[cube, cell_index]) * (size**3 * codes_per_voxel)
     start = np.searchsorted(codes, code)
-    count = np.searchsorted(codes, code + covers) - start
-    some = np.flatnonzero(count)
-    cube, which, code, start, count = (one[some] for one in (cube, which, code, start, count))
-    return _Cells(cube, first[cube, which], code, start, count, size, below)
+    count = np.searchsorted(codes, code + codes_covered) - start
+    nonempty = np.flatnonzero(count)
+    cube, cell_index, code, start, count = (
+        array[nonempty] for array in (cube, cell_index, code, start, count)
+    )
+    return _Cells(cube, first[cube, cell_index], code, start, count, size, codes_per_voxel)
 
 
-def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _Cells]]:
+def _wide_points(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _Cells]]:
     """Yields for each level coarser than the cubes' its points, and the cells that hold all points
     that may reach into the cubes.
     """
@@ -196,28 +207,28 @@ def _wide(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _Cells]]:
         if level <= cubes.level or "radius" not in table.rows:
             continue
         # Radii are at most a voxel of their level; only those of the coarsest level are unbounded.
-        up = grid.branching ** (level - cubes.level)
-        reach = 1
+        scale = grid.branching ** (level - cubes.level)
+        margin = 1
         if level == grid.levels - 1:
-            reach = int(max(grid.extent)) // grid.branching**level + 1
-        low = cubes.low_k3 // up - reach
-        around = Cubes(low, (cubes.side + up - 2) // up + 1 + 2 * reach, level)
-        yield table.rows, _cells(points, table.rows["code"], 0, around, least=1)
+            margin = int(max(grid.extent)) // grid.branching**level + 1
+        low = cubes.low_k3 // scale - margin
+        widened = Cubes(low, (cubes.side + scale - 2) // scale + 1 + 2 * margin, level)
+        yield table.rows, _cells(points, table.rows["code"], 0, widened, min_size=1)
 
 
-def _reaching(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _Found]]:
+def _reaching(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _CubeRows]]:
     """Yields for each level coarser than the cubes' the points that reach into them, or nearly."""
     grid = points.grid
-    half = 0.5 * cubes.side * grid.spacing_3 * grid.branching**cubes.level
-    middle = grid.low + (2 / cubes.side * cubes.low_k3 + 1) * half
-    for rows, cells in _wide(points, cubes):
-        row, own = cells.listed()
-        cube = cells.cube[own]
+    half_size = 0.5 * cubes.side * grid.spacing_3 * grid.branching**cubes.level
+    middle = grid.low + (2 / cubes.side * cubes.low_k3 + 1) * half_size
+    for rows, cells in _wide_points(points, cubes):
+        row, cell = cells.all_rows()
+        cube = cells.cube[cell]
         for axis in range(3):
-            away = np.abs(rows["position"][row, axis] - middle[cube, axis])
+            distance = np.abs(rows["position"][row, axis] - middle[cube, axis])
             radius = rows["radius"][row].astype(np.float64)
-            near = away < _NEARLY * radius + half[axis]
-            row, cube = row[near], cube[near]
+            reaches = distance < _RADIUS_MARGIN * radius + half_size[axis]
+            row, cube = row[reaches], cube[reaches]
         if len(row):
             yield rows, (row, cube)
 
@@ -227,15 +238,15 @@ def _narrow_lists(
 ) -> tuple[np.ndarray, ...]:
     """Returns the arguments of `ops.splat` for narrow rows: lists of cubes, voxels, values."""
     if table is None:
-        none = (np.empty((0, 3), np.int64), np.empty((0, points.width)))
-        return (*_lists(cubes, np.empty(0, np.int64), np.empty((0, 2), np.int64)), *none)
+        no_points = (np.empty((0, 3), np.int64), np.empty((0, points.width)))
+        return (*_lists(cubes, np.empty(0, np.int64), np.empty((0, 2), np.int64)), *no_points)
     rows, level = table
     cells = _cells(points, rows["code"], level, cubes)
-    once, same = cells.once()
-    row, own = once.listed()
-    voxel = once.voxels(points.codes, rows["code"][row], own)
+    distinct, inverse = cells.distinct()
+    row, cell = distinct.all_rows()
+    voxel = distinct.voxels(points.codes, rows["code"][row], cell)
     value = rows["value"][row].astype(np.float64, copy=False)
-    return (*_lists(cubes, cells.cube, _runs(once, same)), voxel, value)
+    return (*_lists(cubes, cells.cube, _runs(distinct, inverse)), voxel, value)
 
 
 def _wide_lists(points: SortedPoints, cubes: Cubes) -> tuple[np.ndarray, ...]:
@@ -244,25 +255,25 @@ def _wide_lists(points: SortedPoints, cubes: Cubes) -> tuple[np.ndarray, ...]:
     """
     cube, run = [np.empty(0, np.int64)], [np.empty((0, 2), np.int64)]
     parts = [(np.empty((0, 3)), np.empty(0), np.empty((0, points.width)))]
-    ahead = 0
-    for rows, cells in _wide(points, cubes):
-        once, same = cells.once()
-        row, _ = once.listed()
-        place, radius, value = (
+    rows_before = 0
+    for rows, cells in _wide_points(points, cubes):
+        distinct, inverse = cells.distinct()
+        row, _ = distinct.all_rows()
+        position, radius, value = (
             rows[name][row].astype(np.float64) for name in ("position", "radius", "value")
         )
         cube.append(cells.cube)
-        run.append(ahead + _runs(once, same))
-        parts.append((place, radius, value))
-        ahead += len(row)
-    columns = (np.concatenate(one) for one in zip(*parts, strict=True))
+        run.append(rows_before + _runs(distinct, inverse))
+        parts.append((position, radius, value))
+        rows_before += len(row)
+    columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     return (*_lists(cubes, np.concatenate(cube), np.concatenate(run)), *columns)
 
 
-def _runs(once: _Cells, same: np.ndarray) -> np.ndarray:
+def _runs(distinct: _Cells, inverse: np.ndarray) -> np.ndarray:
     """Returns (s, 2) begin and end of each cell's rows in a table of the distinct cells' rows."""
-    begin = once.ahead()
-    return np.stack((begin, begin + once.rows), 1)[same]
+    begin = distinct.rows_before()
+    return np.stack((begin, begin + distinct.rows), 1)[inverse]
 
 
 def _lists(cubes: Cubes, cube_s: np.ndarray, run_s2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -281,8 +292,8 @@ def narrow_near(points: SortedPoints, center: np.ndarray, reach: float) -> np.nd
     while level < grid.levels - 1 and grid.spacing_3.min() * grid.branching**level < reach / 4:
         level += 1
     size = grid.spacing_3 * grid.branching**level
-    first, last = (np.floor((center - grid.low + way * reach) / size) for way in (-1, 1))
-    most = math.ceil(max(grid.extent) / grid.branching**level)
-    low, high = (np.clip(end, -1, most).astype(np.int64) for end in (first, last))
+    first, last = (np.floor((center - grid.low + sign * reach) / size) for sign in (-1, 1))
+    limit = math.ceil(max(grid.extent) / grid.branching**level)
+    low, high = (np.clip(corner, -1, limit).astype(np.int64) for corner in (first, last))
     cubes = Cubes(low[None], int((high - low).max()) + 1, level)
     return _in_cubes(points, points.points[0].rows["code"], 0, cubes)[0]

@@ -35,11 +35,13 @@ class Table:
         table._count, table.kinds = count, kinds
         for column, (dtype, sizes) in kinds.items():
             file = table.file(column)
-            wanted = count * int(np.prod(sizes, initial=1)) * np.dtype(dtype).itemsize
+            expected_bytes = count * int(np.prod(sizes, initial=1)) * np.dtype(dtype).itemsize
             size = file.stat().st_size if file.is_file() else -1
-            if size != wanted:
-                found = "is not there" if size < 0 else f"has {size}"
-                raise ValueError(f"{file}: sorted points take {wanted} bytes, the file {found}")
+            if size != expected_bytes:
+                problem = "is not there" if size < 0 else f"has {size}"
+                raise ValueError(
+                    f"{file}: sorted points take {expected_bytes} bytes, the file {problem}"
+                )
         return table
 
     def file(self, column: str) -> Path:
@@ -66,7 +68,7 @@ class Table:
             return self._rows
         if self.folder is None:
             names = self._parts[0] if self._parts else {}
-            joined = {name: np.concatenate([one[name] for one in self._parts]) for name in names}
+            joined = {name: np.concatenate([part[name] for part in self._parts]) for name in names}
             self._parts = [joined] if joined else []
             self._rows = joined or {"code": np.empty(0, np.int64)}
         elif not self._count:
@@ -104,7 +106,7 @@ class Runs(Table):
     def __init__(self, folder: Path | None, name: str, block: int) -> None:
         """Creates an empty table; see `Table`. `block`: rows to read at a time."""
         super().__init__(folder, name)
-        self._block, self._ends = block, [0]
+        self._block, self._run_ends = block, [0]
 
     def append(self, rows: Rows) -> None:
         """Adds a block of rows as a sorted run."""
@@ -112,27 +114,29 @@ class Runs(Table):
             return
         order = np.argsort(rows["code"], kind="stable")
         super().append({name: values[order] for name, values in rows.items()})
-        self._ends.append(len(self))
+        self._run_ends.append(len(self))
 
     def sorted(self) -> Iterator[Rows]:
         """Yields all rows by increasing codes, a block at a time."""
-        rows, at, ends = self.rows, self._ends[:-1], self._ends[1:]
-        if len(at) == 1:
+        rows, starts, ends = self.rows, self._run_ends[:-1], self._run_ends[1:]
+        if len(starts) == 1:
             yield from self.blocks(self._block)
             return
-        while live := [run for run in range(len(at)) if at[run] < ends[run]]:
+        while live := [run for run in range(len(starts)) if starts[run] < ends[run]]:
             step = max(1, self._block // len(live))
-            read = {run: min(at[run] + step, ends[run]) for run in live}
-            codes = {run: np.asarray(rows["code"][at[run] : read[run]]) for run in live}
+            read_ends = {run: min(starts[run] + step, ends[run]) for run in live}
+            codes = {run: np.asarray(rows["code"][starts[run] : read_ends[run]]) for run in live}
             # Up to this code, all runs have been read.
-            limit = min((codes[r][-1] for r in live if read[r] < ends[r]), default=None)
+            limit = min((codes[r][-1] for r in live if read_ends[r] < ends[r]), default=None)
             parts = []
             for run in live:
                 count = len(codes[run])
                 if limit is not None:
                     count = int(np.searchsorted(codes[run], limit, side="right"))
-                parts.append({n: values[at[run] : at[run] + count] for n, values in rows.items()})
-                at[run] += count
+                parts.append(
+                    {n: values[starts[run] : starts[run] + count] for n, values in rows.items()}
+                )
+                starts[run] += count
             block = {name: np.concatenate([part[name] for part in parts]) for name in rows}
             order = np.argsort(block["code"], kind="stable")
             yield {name: values[order] for name, values in block.items()}
@@ -151,9 +155,9 @@ def grouped(blocks: Iterable[Rows], folds: Mapping[str, Fold], divide: int = 1) 
             block = {name: np.concatenate((carried[name], block[name])) for name in block}
         code = block["code"]
         first = np.concatenate(([0], np.flatnonzero(code[1:] != code[:-1]) + 1))
-        made = {name: fold(block[name], first) for name, fold in folds.items()}
-        made["code"] = code[first]
-        carried = {name: values[-1:] for name, values in made.items()}  # its group may continue
-        yield {name: values[:-1] for name, values in made.items()}
+        reduced = {name: fold(block[name], first) for name, fold in folds.items()}
+        reduced["code"] = code[first]
+        carried = {name: values[-1:] for name, values in reduced.items()}  # its group may continue
+        yield {name: values[:-1] for name, values in reduced.items()}
     if carried is not None:
         yield carried

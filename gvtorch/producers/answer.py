@@ -35,8 +35,8 @@ def checked_bricks(answer: Any, nodes: Nodes, producer: Producer, *, look: bool 
     some channels are on the host and others on the device: then all are copied to the device. For
     `look` see `checked_regions`.
     """
-    given = producer.as_bricks(answer)
-    bricks = _checked("fill", given, Bricks, "a dict of tensors", nodes, producer, look)
+    wrapped = producer.as_bricks(answer)
+    bricks = _checked("fill", wrapped, Bricks, "a dict of tensors", nodes, producer, look)
     if len({on_host({name: rows}) for name, rows in bricks.data.items()}) == 1:
         return bricks
     device = nodes.layout.device
@@ -55,68 +55,72 @@ def regions_of(
     """Returns the regions of k nodes, given summaries of all channels: EMPTY where no channel has a
     value above the threshold, else CONSTANT where every channel is uniform, else DATA.
     """
-    constant = torch.stack([one.is_constant for one in summaries.values()]).all(0)
-    empty = torch.stack([one.is_empty(threshold) for one in summaries.values()]).all(0)
+    constant = torch.stack([summary.is_constant for summary in summaries.values()]).all(0)
+    empty = torch.stack([summary.is_empty(threshold) for summary in summaries.values()]).all(0)
     kind = torch.where(constant, Region.CONSTANT, Region.DATA)
     return Regions(
         kind=torch.where(empty, Region.EMPTY, kind),
-        constants={name: one.constants(channels[name].dtype) for name, one in summaries.items()},
-        ranges={name: one.ranges(channels[name].dtype) for name, one in summaries.items()},
+        constants={
+            name: summary.constants(channels[name].dtype) for name, summary in summaries.items()
+        },
+        ranges={name: summary.ranges(channels[name].dtype) for name, summary in summaries.items()},
     )
 
 
 def _checked(
     method: str,
     answer: Any,
-    form: type[Form],
-    other: str,
+    answer_type: type[Form],
+    alternative: str,
     nodes: Nodes,
     producer: Producer,
     look: bool,
 ) -> Form:
     """Returns the answer with a width in every shape, and with an error for each bad item."""
     where = f"{type(producer).__name__}.{method}"
-    if not isinstance(answer, form):
-        came = type(answer).__name__
-        raise ValueError(f"{where}: must return {form.__name__} or {other}, got {came}")
+    if not isinstance(answer, answer_type):
+        got = type(answer).__name__
+        raise ValueError(f"{where}: must return {answer_type.__name__} or {alternative}, got {got}")
     kind: Any
     layout, count, kind, errors = nodes.layout, len(nodes), answer.kind, dict(answer.errors)
     if any(not 0 <= index < count for index in errors):
         raise ValueError(f"{where}: errors names an item that is not in the batch of {count}")
     if kind is not None or isinstance(answer, Regions):
-        whole = isinstance(kind, Tensor) and not kind.is_floating_point()
-        if not whole or kind.shape != (count,) or kind.dtype == torch.bool:
-            came = check.describe(kind)
-            raise ValueError(f"{where}: kind must be ({count},) of Region, got {came}")
+        is_integer = isinstance(kind, Tensor) and not kind.is_floating_point()
+        if not is_integer or kind.shape != (count,) or kind.dtype == torch.bool:
+            got = check.describe(kind)
+            raise ValueError(f"{where}: kind must be ({count},) of Region, got {got}")
         kind = kind.to(torch.int64)
-    brick = (layout.side,) * 3
-    shapes: dict[str, tuple[int, ...]] = {"data": brick, "constants": (), "ranges": (2,)}
-    given = {name: getattr(answer, name) for name in shapes if hasattr(answer, name)}
-    fine = {name for name, channel in producer.channels.items() if not channel.coarse}
-    wanted = {*producer.channels} if nodes.coarse else fine
-    if missing := sorted(wanted - {*given.get("data", wanted)}):
+    brick_shape = (layout.side,) * 3
+    shapes: dict[str, tuple[int, ...]] = {"data": brick_shape, "constants": (), "ranges": (2,)}
+    by_field = {name: getattr(answer, name) for name in shapes if hasattr(answer, name)}
+    fine_channels = {name for name, channel in producer.channels.items() if not channel.coarse}
+    required = {*producer.channels} if nodes.coarse else fine_channels
+    if missing := sorted(required - {*by_field.get("data", required)}):
         raise ValueError(f"{where}: channel {missing[0]!r} is missing")
-    for name, values in given.items():
-        spare = {*values} & {*producer.channels} - (wanted if name == "data" else fine)
-        if spare:
-            only = "only bricks above the finest level hold"
-            raise ValueError(f"{where}: {name} has channel {min(spare)!r}, which {only}")
+    for name, values in by_field.items():
+        unexpected = {*values} & {*producer.channels} - (
+            required if name == "data" else fine_channels
+        )
+        if unexpected:
+            rule = "only bricks above the finest level hold"
+            raise ValueError(f"{where}: {name} has channel {min(unexpected)!r}, which {rule}")
     fields: dict[str, Any] = {
         name: _by_channel(where, name, by_channel, (count, *shapes[name]), producer)
-        for name, by_channel in given.items()
+        for name, by_channel in by_field.items()
     }
     if not look:
         _refuse_late(where, answer, [*fields.values()], layout.device)
-        return form(kind=kind, **fields)
-    counts = _refuse_bad(form, kind, [*fields.values()], errors)
-    missing = sorted(fine - {*fields["constants"]})
+        return answer_type(kind=kind, **fields)
+    counts = _refuse_bad(answer_type, kind, [*fields.values()], errors)
+    missing = sorted(fine_channels - {*fields["constants"]})
     if missing and counts[Region.CONSTANT]:
         raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
     if not counts[Region.ALIAS]:
-        return form(kind=kind, errors=errors, **fields)
-    alias = _alias(where, answer, kind, nodes, errors)
+        return answer_type(kind=kind, errors=errors, **fields)
+    alias = _checked_alias(where, answer, kind, nodes, errors)
     tree = answer.alias_tree
-    return form(kind=kind, alias=alias, alias_tree=tree, errors=errors, **fields)
+    return answer_type(kind=kind, alias=alias, alias_tree=tree, errors=errors, **fields)
 
 
 def _refuse_late(
@@ -145,15 +149,19 @@ def _by_channel(
         if channel not in producer.channels:
             known = ", ".join(producer.channels)
             raise ValueError(f"{where}: {name} has channel {channel!r}; the producer has {known}")
-        what: Channel = producer.channels[channel]
-        wanted = (*shape, what.width)
-        plain = isinstance(value, Tensor) and what.width == 1 and value.shape == shape
-        tensor = value[..., None] if plain else value
+        spec: Channel = producer.channels[channel]
+        expected_shape = (*shape, spec.width)
+        lacks_width = isinstance(value, Tensor) and spec.width == 1 and value.shape == shape
+        tensor = value[..., None] if lacks_width else value
         types = (Tensor, TableRows) if name == "data" else (Tensor,)
-        fits = isinstance(tensor, types) and tensor.shape == wanted and tensor.dtype == what.dtype
+        fits = (
+            isinstance(tensor, types)
+            and tensor.shape == expected_shape
+            and tensor.dtype == spec.dtype
+        )
         if not fits:
-            sizes = ", ".join(str(size) for size in wanted)
-            dtype = str(what.dtype).removeprefix("torch.")
+            sizes = ", ".join(str(size) for size in expected_shape)
+            dtype = str(spec.dtype).removeprefix("torch.")
             raise ValueError(
                 f"{where}: {name}[{channel!r}] must be ({sizes}) {dtype}, "
                 f"got {check.describe(tensor)}"
@@ -162,7 +170,7 @@ def _by_channel(
     return result
 
 
-def _alias(
+def _checked_alias(
     where: str, answer: Regions | Bricks, kind: Tensor, nodes: Nodes, errors: dict[int, str]
 ) -> Tensor:
     """Returns (k, 4) alias targets; adds an error for each that is not a node of its tree, or lies
@@ -174,8 +182,10 @@ def _alias(
         check.one_of(where, "alias_tree", name, layout.scene)
         layout = layout.scene[name]
         if layout.branching != nodes.layout.branching:
-            own = nodes.layout.branching
-            raise ValueError(f"{where}: tree {name!r} has N={layout.branching}, this one N={own}")
+            own_branching = nodes.layout.branching
+            raise ValueError(
+                f"{where}: tree {name!r} has N={layout.branching}, this one N={own_branching}"
+            )
     if not isinstance(alias, Tensor) or alias.shape != (len(kind), 4):
         raise ValueError(
             f"{where}: alias must be ({len(kind)}, 4) where an item is ALIAS, "
@@ -185,23 +195,23 @@ def _alias(
     depth = alias[:, 3]
     side = float(layout.branching) ** depth.clamp(0, layout.depth).to(torch.float64)
     inside = ((alias[:, :3] >= 0) & (alias[:, :3] < side[:, None])).all(1)
-    wrong = (kind == Region.ALIAS) & ~(inside & (depth >= 0) & (depth <= layout.depth))
-    for index in wrong.nonzero()[:, 0].tolist():
+    not_a_node = (kind == Region.ALIAS) & ~(inside & (depth >= 0) & (depth <= layout.depth))
+    for index in not_a_node.nonzero()[:, 0].tolist():
         tree = "this tree" if name is None else f"tree {name!r}"
         errors.setdefault(index, f"alias {tuple(alias[index].tolist())} is no node of {tree}")
     if layout.extent is not nodes.layout.extent:  # the target tree has another producer
         return alias
     loc = nodes.loc.to(alias.device)
     up = layout.branching ** (depth - loc[:, 3]).clamp(0, layout.depth)
-    around = (alias[:, :3] // up[:, None] == loc[:, :3]).all(1) & (depth >= loc[:, 3])
-    for index in ((kind == Region.ALIAS) & around).nonzero()[:, 0].tolist():
-        one, other = tuple(alias[index].tolist()), tuple(loc[index].tolist())
-        errors.setdefault(index, f"alias {one} lies in the node itself, {other}")
+    inside_node = (alias[:, :3] // up[:, None] == loc[:, :3]).all(1) & (depth >= loc[:, 3])
+    for index in ((kind == Region.ALIAS) & inside_node).nonzero()[:, 0].tolist():
+        target, node = tuple(alias[index].tolist()), tuple(loc[index].tolist())
+        errors.setdefault(index, f"alias {target} lies in the node itself, {node}")
     return alias
 
 
 def _refuse_bad(
-    form: type[Form],
+    answer_type: type[Form],
     kind: Tensor | None,
     fields: Sequence[Mapping[str, Tensor | TableRows]],
     errors: dict[int, str],
@@ -219,18 +229,18 @@ def _refuse_bad(
     if kind is None and not floats:
         return [0] * len(Region)
     sums = [values.sum(dtype=torch.float32).view(1) for _, values in floats]
-    known = [count_kinds(kind) if kind is not None else sums[0].new_zeros(len(Region))]
-    flags = known + [torch.isfinite(number) for number in sums]
-    there = max((flag.device for flag in flags), key=lambda device: device.type != "cpu")
-    read = torch.cat([flag.to(there, torch.int64) for flag in flags]).tolist()
-    counts, finite = read[: len(Region)], read[len(Region) :]
+    counts_on_device = [count_kinds(kind) if kind is not None else sums[0].new_zeros(len(Region))]
+    flags = counts_on_device + [torch.isfinite(number) for number in sums]
+    read_device = max((flag.device for flag in flags), key=lambda device: device.type != "cpu")
+    host_flags = torch.cat([flag.to(read_device, torch.int64) for flag in flags]).tolist()
+    counts, finite = host_flags[: len(Region)], host_flags[len(Region) :]
     if kind is not None and sum(counts) < len(kind):
         for index in ((kind < Region.EMPTY) | (kind > Region.ALIAS)).nonzero()[:, 0].tolist():
-            made = int(kind[index])
-            late = made == -1 and form is Bricks  # see `Bricks.kind`
-            errors[index] = "the values are not finite" if late else f"{made} is no Region"
-    for (channel, values), whole in zip(floats, finite, strict=True):
-        if whole:
+            code = int(kind[index])
+            not_finite = code == -1 and answer_type is Bricks  # see `Bricks.kind`
+            errors[index] = "the values are not finite" if not_finite else f"{code} is no Region"
+    for (channel, values), is_finite in zip(floats, finite, strict=True):
+        if is_finite:
             continue
         bad = ~torch.isfinite(values).flatten(1).all(1)
         for index in bad.nonzero()[:, 0].tolist():

@@ -18,7 +18,7 @@ from .answer import checked_bricks, checked_regions
 from .nodes import Layout, Nodes, grid_of
 from .producer import Bricks, OfProducers, Producer, Region, Regions, arrived, by_depth, touched
 
-_AT_ONCE = 64  # blocks of a level that are made together, from N^3 times as many below
+_BATCH_BLOCKS = 64  # blocks of a level that are made together, from N^3 times as many below
 
 Blocks = dict[str, np.ndarray]  # for each channel (k, z, y, x, c) without borders
 
@@ -48,8 +48,8 @@ class FromChildren(OfProducers):
         where = type(self).__name__
         check.instance(where, "producer", producer, Producer)
         if producer.labels or producer.needs_parent:
-            what = "makes labels" if producer.labels else "needs its parents' bricks"
-            raise ValueError(f"{where}: {type(producer).__name__} {what}")
+            reason = "makes labels" if producer.labels else "needs its parents' bricks"
+            raise ValueError(f"{where}: {type(producer).__name__} {reason}")
         if any(channel.coarse for channel in producer.channels.values()):
             raise ValueError(f"{where}: {type(producer).__name__} makes coarse channels itself")
         super().__init__(
@@ -57,8 +57,8 @@ class FromChildren(OfProducers):
         )
         self.producer, self.patience = producer, producer.patience
         self.levels = check.whole(where, "levels", levels, low=1, high=10)
-        self._kept: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by loc
-        self._known = producer.version  # the version that these blocks were made from
+        self._cache: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by loc
+        self._cached_version = producer.version  # the version that these blocks were made from
 
     def parts(self) -> dict[str, Producer]:
         return {"producer": self.producer}
@@ -71,12 +71,12 @@ class FromChildren(OfProducers):
                 f"{type(self).__name__}: the root of a tree {layout.depth} levels deep is made of "
                 f"{count} finest bricks; the most is levels={self.levels}"
             )
-        self._kept.clear()
+        self._cache.clear()
         super().prepare(layout)
 
     def close(self) -> None:
         """Drops the cached blocks, and closes the producer."""
-        self._kept.clear()
+        self._cache.clear()
         super().close()
 
     def classify(self, nodes: Nodes) -> Regions | Tensor | Future:
@@ -88,67 +88,73 @@ class FromChildren(OfProducers):
         finest = nodes.depth == nodes.layout.depth
         if bool(finest.all()):
             return self.producer.fill(nodes)
-        if self._known != self.producer.version:
-            self._forget(nodes.layout)
+        if self._cached_version != self.producer.version:
+            self._drop_stale(nodes.layout)
         if bool(finest.any()):
-            return self._mixed(nodes, finest)
-        return Bricks(data=self._coarse(nodes))
+            return self._fill_mixed(nodes, finest)
+        return Bricks(data=self._coarse_bricks(nodes))
 
-    def _forget(self, layout: Layout) -> None:
+    def _drop_stale(self, layout: Layout) -> None:
         """Drops the blocks that have changed since they were made."""
-        changes, places = self.producer.changes(self._known), [*self._kept]
-        self._known = self.producer.version
-        if changes is None or not places:
-            self._kept.clear()
+        changes, locs = self.producer.changes(self._cached_version), [*self._cache]
+        self._cached_version = self.producer.version
+        if changes is None or not locs:
+            self._cache.clear()
             return
-        stale = touched(changes, Nodes(torch.tensor(places, device=layout.device), layout))
+        stale = touched(changes, Nodes(torch.tensor(locs, device=layout.device), layout))
         for row in stale.nonzero()[:, 0].tolist():
-            del self._kept[places[row]]
+            del self._cache[locs[row]]
 
-    def _mixed(self, nodes: Nodes, finest: Tensor) -> Bricks:
+    def _fill_mixed(self, nodes: Nodes, finest: Tensor) -> Bricks:
         """Returns the bricks of nodes of which some are at the finest level and some above it."""
         fine, coarse = ((mask.nonzero()[:, 0]) for mask in (finest, ~finest))
-        own = self._asked(nodes[fine])
+        finest_bricks = self._producer_bricks(nodes[fine])
         kind = torch.full((len(nodes),), int(Region.DATA))
-        if own.kind is not None:
-            kind[fine.cpu()] = own.kind.cpu()
-        data, constants, above = {}, {}, self._coarse(nodes[coarse])
+        if finest_bricks.kind is not None:
+            kind[fine.cpu()] = finest_bricks.kind.cpu()
+        data, constants, coarse_data = {}, {}, self._coarse_bricks(nodes[coarse])
         order = torch.cat((fine, coarse)).argsort().cpu()
-        for name, rows in above.items():
-            both = [to_numpy(on_device(own.data[name], rows.device)), to_numpy(rows)]
-            data[name] = from_grid(np.concatenate(both)[order.numpy()], rows.dtype)
-            if name in own.constants:
-                one = to_numpy(own.constants[name].cpu())
-                none = np.zeros((len(coarse), *one.shape[1:]), one.dtype)
-                constants[name] = from_grid(np.concatenate((one, none))[order.numpy()], rows.dtype)
-        errors = {int(fine[index]): message for index, message in own.errors.items()}
+        for name, rows in coarse_data.items():
+            pieces = [to_numpy(on_device(finest_bricks.data[name], rows.device)), to_numpy(rows)]
+            data[name] = from_grid(np.concatenate(pieces)[order.numpy()], rows.dtype)
+            if name in finest_bricks.constants:
+                fine_constants = to_numpy(finest_bricks.constants[name].cpu())
+                coarse_constants = np.zeros(
+                    (len(coarse), *fine_constants.shape[1:]), fine_constants.dtype
+                )
+                constants[name] = from_grid(
+                    np.concatenate((fine_constants, coarse_constants))[order.numpy()], rows.dtype
+                )
+        errors = {int(fine[index]): message for index, message in finest_bricks.errors.items()}
         return Bricks(data=data, kind=kind, constants=constants, errors=errors)
 
-    def _asked(self, nodes: Nodes) -> Bricks:
+    def _producer_bricks(self, nodes: Nodes) -> Bricks:
         """Returns the producer's answer, checked."""
-        found = checked_bricks(arrived(self.producer.fill(nodes)), nodes, self.producer)
-        if found.kind is not None:
-            self._refuse_alias(found.kind)
-        return found
+        bricks = checked_bricks(arrived(self.producer.fill(nodes)), nodes, self.producer)
+        if bricks.kind is not None:
+            self._refuse_alias(bricks.kind)
+        return bricks
 
     def _refuse_alias(self, kind: Tensor) -> None:
         if bool((kind == Region.ALIAS).any()):
-            who = type(self.producer).__name__
-            raise ValueError(f"{type(self).__name__}: {who} must answer without alias")
+            name = type(self.producer).__name__
+            raise ValueError(f"{type(self).__name__}: {name} must answer without alias")
 
-    def _coarse(self, nodes: Nodes) -> dict[str, Tensor]:
+    def _coarse_bricks(self, nodes: Nodes) -> dict[str, Tensor]:
         """Returns the bricks (k, z, y, x, c) of coarse nodes, borders included."""
         layout, loc = nodes.layout, nodes.loc.cpu()
         shape = (len(loc), *(layout.side,) * 3)
-        found = {n: np.empty((*shape, c.width), _held(c.dtype)) for n, c in self.channels.items()}
-        for depth, here in by_depth(loc):
-            for rows in here.split(_AT_ONCE):
+        arrays = {
+            n: np.empty((*shape, c.width), _numpy_dtype(c.dtype)) for n, c in self.channels.items()
+        }
+        for depth, level_rows in by_depth(loc):
+            for rows in level_rows.split(_BATCH_BLOCKS):
                 low = loc[rows, :3] * layout.brick_size - layout.border
-                for name, values in self._region(layout, depth, low, layout.side).items():
-                    found[name][rows.numpy()] = values
-        return {n: from_grid(found[n], c.dtype) for n, c in self.channels.items()}
+                for name, values in self._level_voxels(layout, depth, low, layout.side).items():
+                    arrays[name][rows.numpy()] = values
+        return {n: from_grid(arrays[n], c.dtype) for n, c in self.channels.items()}
 
-    def _region(self, layout: Layout, depth: int, low: Tensor, size: int) -> Blocks:
+    def _level_voxels(self, layout: Layout, depth: int, low: Tensor, size: int) -> Blocks:
         """Returns size^3 voxels of a level from each `low` (k, 3) x y z; outermost ones repeat."""
         step, brick = layout.branching ** (layout.depth - depth), layout.brick_size
         last = torch.tensor([-(-n // step) - 1 for n in layout.extent])[:, None]
@@ -157,62 +163,70 @@ class FromChildren(OfProducers):
         grid = torch.stack(
             torch.broadcast_tensors(x[:, None, None], y[:, None, :, None], z[:, :, None, None]), -1
         )
-        place, row = grid.reshape(-1, 3).unique(dim=0, return_inverse=True)
-        blocks = self._blocks(layout, torch.cat((place, torch.full_like(place[:, :1], depth)), 1))
+        block, block_row = grid.reshape(-1, 3).unique(dim=0, return_inverse=True)
+        blocks = self._blocks(layout, torch.cat((block, torch.full_like(block[:, :1], depth)), 1))
         inner = (voxel % brick).numpy()
-        along = inner[:, 2, :, None, None], inner[:, 1, None, :, None], inner[:, 0, None, None]
-        at = (row.view(grid.shape[:4]).numpy(), *along)
-        return {name: values[at] for name, values in blocks.items()}
+        inner_index = (
+            inner[:, 2, :, None, None],
+            inner[:, 1, None, :, None],
+            inner[:, 0, None, None],
+        )
+        index = (block_row.view(grid.shape[:4]).numpy(), *inner_index)
+        return {name: values[index] for name, values in blocks.items()}
 
     def _blocks(self, layout: Layout, loc: Tensor) -> Blocks:
         """Returns the voxels of nodes (k, 4) of one level; caches them if it is a coarse one."""
         if int(loc[0, 3]) == layout.depth:
-            return self._known_blocks(layout, loc)
-        keys = [tuple(place) for place in loc.tolist()]
-        missing = [row for row, key in enumerate(keys) if key not in self._kept]
-        found: dict[tuple[int, ...], Blocks] = {}
-        for begin in range(0, len(missing), _AT_ONCE):
-            rows = missing[begin : begin + _AT_ONCE]
-            made = self._known_blocks(layout, loc[rows])
-            for at, row in enumerate(rows):
-                found[keys[row]] = {name: values[at] for name, values in made.items()}
-        self._kept |= found
-        return {name: np.stack([self._kept[key][name] for key in keys]) for name in self.channels}
+            return self._make_blocks(layout, loc)
+        keys = [tuple(node_loc) for node_loc in loc.tolist()]
+        missing = [row for row, key in enumerate(keys) if key not in self._cache]
+        new_blocks: dict[tuple[int, ...], Blocks] = {}
+        for begin in range(0, len(missing), _BATCH_BLOCKS):
+            rows = missing[begin : begin + _BATCH_BLOCKS]
+            blocks = self._make_blocks(layout, loc[rows])
+            for index, row in enumerate(rows):
+                new_blocks[keys[row]] = {name: values[index] for name, values in blocks.items()}
+        self._cache |= new_blocks
+        return {name: np.stack([self._cache[key][name] for key in keys]) for name in self.channels}
 
-    def _known_blocks(self, layout: Layout, loc: Tensor) -> Blocks:
+    def _make_blocks(self, layout: Layout, loc: Tensor) -> Blocks:
         """Makes the voxels of nodes of one level; where they are uniform, without making bricks."""
         nodes = Nodes(loc.to(layout.device), layout)
         regions = checked_regions(arrived(self.producer.classify(nodes)), nodes, self.producer)
         _raise_first(regions.errors)
         kind = regions.kind.cpu()
         self._refuse_alias(kind)
-        found = _uniform(self, regions.constants, len(loc), layout.brick_size)
-        rest = ((kind != Region.EMPTY) & (kind != Region.CONSTANT)).nonzero()[:, 0]
-        if len(rest):
-            whole = int(loc[0, 3]) == layout.depth
-            made = self._finest(nodes[rest]) if whole else self._means(layout, loc[rest])
-            for name, values in made.items():
-                found[name][rest.numpy()] = values
-        return found
+        blocks = _uniform(self, regions.constants, len(loc), layout.brick_size)
+        detailed = ((kind != Region.EMPTY) & (kind != Region.CONSTANT)).nonzero()[:, 0]
+        if len(detailed):
+            is_finest = int(loc[0, 3]) == layout.depth
+            voxels = (
+                self._finest_voxels(nodes[detailed])
+                if is_finest
+                else self._means(layout, loc[detailed])
+            )
+            for name, values in voxels.items():
+                blocks[name][detailed.numpy()] = values
+        return blocks
 
     def _means(self, layout: Layout, loc: Tensor) -> Blocks:
         """Returns the means of the voxels of the level below."""
         n, size, depth = layout.branching, layout.brick_size, int(loc[0, 3])
-        found = {}
+        means = {}
         low = loc[:, :3] * (size * n)
-        for name, values in self._region(layout, depth + 1, low, size * n).items():
+        for name, values in self._level_voxels(layout, depth + 1, low, size * n).items():
             # Blocks are stacked along z, and their sides are multiples of N: no mean spans two.
             stacked = values.reshape(-1, *values.shape[2:])
-            told = "mean", n, self.channels[name].dtype, layout.spacing, layout.depth - depth
-            found[name] = coarser(stacked, *told).reshape(len(loc), size, size, size, -1)
-        return found
+            pooling = "mean", n, self.channels[name].dtype, layout.spacing, layout.depth - depth
+            means[name] = coarser(stacked, *pooling).reshape(len(loc), size, size, size, -1)
+        return means
 
-    def _finest(self, nodes: Nodes) -> Blocks:
+    def _finest_voxels(self, nodes: Nodes) -> Blocks:
         """Returns the producer's voxels of finest nodes, without borders."""
-        bricks, border = self._asked(nodes), nodes.layout.border
+        bricks, border = self._producer_bricks(nodes), nodes.layout.border
         _raise_first(bricks.errors)
         size = nodes.layout.brick_size
-        found = _uniform(self, bricks.constants, len(nodes), size)
+        voxels = _uniform(self, bricks.constants, len(nodes), size)
         inner = slice(border, border + size)
         data = torch.ones(len(nodes), dtype=torch.bool)
         if bricks.kind is not None:
@@ -220,23 +234,25 @@ class FromChildren(OfProducers):
             data = (kind != Region.EMPTY) & (kind != Region.CONSTANT)
         for name, rows in bricks.data.items():
             values = to_numpy(on_device(rows, torch.device("cpu")))
-            found[name][data.numpy()] = values[data.numpy(), inner, inner, inner]
-        return found
+            voxels[name][data.numpy()] = values[data.numpy(), inner, inner, inner]
+        return voxels
 
 
 def _uniform(
     producer: Producer, constants: Mapping[str, Tensor], count: int, size: int
 ) -> dict[str, np.ndarray]:
     """Returns (k, z, y, x, c) by channel, filled with its constants (k, c), or 0 without them."""
-    found = {}
+    arrays = {}
     for name, channel in producer.channels.items():
-        found[name] = np.zeros((count, size, size, size, channel.width), _held(channel.dtype))
+        arrays[name] = np.zeros(
+            (count, size, size, size, channel.width), _numpy_dtype(channel.dtype)
+        )
         if name in constants:
-            found[name][:] = to_numpy(constants[name].cpu())[:, None, None, None]
-    return found
+            arrays[name][:] = to_numpy(constants[name].cpu())[:, None, None, None]
+    return arrays
 
 
-def _held(dtype: torch.dtype) -> np.dtype:
+def _numpy_dtype(dtype: torch.dtype) -> np.dtype:
     """Returns the NumPy dtype of arrays that hold a channel."""
     return to_numpy(torch.zeros(0, dtype=dtype)).dtype
 

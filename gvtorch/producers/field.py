@@ -18,10 +18,10 @@ from ..fields.field import checked_field
 from ..pool import Channel
 from .producer import Bricks, Nodes, Producer, Region, Regions, check_points, clocks_of
 
-_BATCH = 64  # bricks made at a time on the CPU, so that intermediate values fit into its caches
-_FEW = 12  # bricks: smaller groups cost more than they save by leaving out parts of a field
-_MARGIN = 1 / 32  # voxels by which boxes are widened, so that they contain rounded positions
-_ROUNDED = 2.0**-18  # relative widening of intervals, because values are rounded too
+_BATCH_BRICKS = 64  # made at a time on the CPU, so that intermediate values fit into its caches
+_MIN_GROUP_BRICKS = 12  # smaller groups cost more than leaving out parts of a field saves
+_MARGIN_VOXELS = 1 / 32  # voxels by which boxes are widened, so that they contain rounded positions
+_ROUNDING = 2.0**-18  # relative widening of intervals, because values are rounded too
 
 
 class FieldProducer(Producer):
@@ -78,33 +78,37 @@ class FieldProducer(Producer):
         where = type(self).__name__
         checked_field(where, "field", field)
         field = Solid(field) if isinstance(field, Distance) else field
-        known = field if isinstance(field, Field) else None
+        known_field = field if isinstance(field, Field) else None
         if box is None:
-            extent, box = _cut_out(where, known, extent)
+            extent, box = _grid_around(where, known_field, extent)
         else:
             extent = extent_in(where, extent, box)
-        given = _channels_of(where, field)
+        field_widths = _channel_widths(where, field)
         dtypes: Mapping[str, torch.dtype] = getattr(field, "dtypes", {})
-        own = {n: Channel(dtypes.get(n, torch.float32), width) for n, width in given.items()}
+        default_channels = {
+            n: Channel(dtypes.get(n, torch.float32), width) for n, width in field_widths.items()
+        }
         super().__init__(
             extent,
-            channels=own if channels is None else channels,
+            channels=default_channels if channels is None else channels,
             box=box,
             branching=branching,
             value_range=value_range,
         )
         widths = {name: channel.width for name, channel in self.channels.items()}
-        if widths != given:
-            raise ValueError(f"{where}: channels must be {given} numbers wide, got {widths}")
+        if widths != field_widths:
+            raise ValueError(f"{where}: channels must be {field_widths} numbers wide, got {widths}")
         if dtype not in (None, torch.float32, torch.float64):
             raise ValueError(f"{where}: dtype must be torch.float32 or torch.float64, got {dtype}")
         self.field = field
         count = branching if samples is None else samples
         self.samples = check.whole(where, "samples", count, low=1, high=64)
-        places = (torch.arange(self.samples, dtype=torch.float64) + 0.5) / self.samples - 0.5
-        self.register_buffer("offsets", torch.cartesian_prod(places, places, places))
-        self.threshold = self._thresholds(where, known, threshold)
-        self.dtype = dtype or dtype_of_places(box, self.spacing)
+        axis_offsets = (torch.arange(self.samples, dtype=torch.float64) + 0.5) / self.samples - 0.5
+        self.register_buffer(
+            "offsets", torch.cartesian_prod(axis_offsets, axis_offsets, axis_offsets)
+        )
+        self.threshold = self._thresholds(where, known_field, threshold)
+        self.dtype = dtype or position_dtype(box, self.spacing)
 
     def _thresholds(
         self, where: str, field: Field | None, threshold: float | Mapping[str, float] | None
@@ -116,8 +120,10 @@ class FieldProducer(Producer):
             threshold = dict.fromkeys(self.channels, threshold)
         for name in threshold:
             if name not in self.channels:
-                known = ", ".join(self.channels)
-                raise ValueError(f"{where}: threshold has channel {name!r}; there are {known}")
+                channel_names = ", ".join(self.channels)
+                raise ValueError(
+                    f"{where}: threshold has channel {name!r}; there are {channel_names}"
+                )
         return {n: check.number(where, "threshold", value) for n, value in threshold.items()}
 
     def classify(self, nodes: Nodes) -> Regions:
@@ -126,22 +132,22 @@ class FieldProducer(Producer):
         """
         layout = nodes.layout
         size = nodes.voxel_size
-        half = size * (0.5 * layout.brick_size + layout.border + _MARGIN)
-        known = self._bounds(nodes.center, half, size)
+        half_extent = size * (0.5 * layout.brick_size + layout.border + _MARGIN_VOXELS)
+        bounds = self._bounds(nodes.center, half_extent, size)
         one_value = empty = torch.zeros_like(nodes.depth, dtype=torch.bool)
-        if len(known) == len(self.channels):
-            one_value = torch.stack([(high == low).all(1) for low, high in known.values()]).all(0)
-        if self.threshold is not None and {*self.threshold} <= {*known}:
-            unseen = [(known[n][1] <= most).all(1) for n, most in self.threshold.items()]
+        if len(bounds) == len(self.channels):
+            one_value = torch.stack([(high == low).all(1) for low, high in bounds.values()]).all(0)
+        if self.threshold is not None and {*self.threshold} <= {*bounds}:
+            unseen = [(bounds[n][1] <= limit).all(1) for n, limit in self.threshold.items()]
             empty = torch.stack(unseen).all(0)
         kind = torch.where(one_value, int(Region.CONSTANT), int(Region.DATA))
         kind, uniform = torch.where(empty, int(Region.EMPTY), kind), (one_value & ~empty)[:, None]
         constants, ranges = {}, {}
-        for name, (low, high) in known.items():
-            slack = _ROUNDED * torch.maximum(low.abs(), high.abs())
+        for name, (low, high) in bounds.items():
+            slack = _ROUNDING * torch.maximum(low.abs(), high.abs())
             slack = torch.where(uniform, 0.0, slack)
-            constants[name] = self._stored(name, torch.where(uniform, low, 0.0))
-            ranges[name] = self._stored(name, torch.stack((low - slack, high + slack), 1))
+            constants[name] = self._to_channel_dtype(name, torch.where(uniform, low, 0.0))
+            ranges[name] = self._to_channel_dtype(name, torch.stack((low - slack, high + slack), 1))
         return Regions(kind=kind, constants=constants, ranges=ranges)
 
     def fill(self, nodes: Nodes) -> Bricks:
@@ -149,32 +155,39 @@ class FieldProducer(Producer):
         which parts of the field matter in them, and only these parts are evaluated.
         """
         if nodes.loc.device.type != "cpu" or torch.compiler.is_compiling():
-            data = self._made(nodes, self.field)
+            data = self._evaluate(nodes, self.field)
         else:
             order, parts = [], []
-            for rows, field in alike(self.field, nodes, self._beyond, _BATCH):
+            for rows, field in group_alike(self.field, nodes, self._margin_voxels, _BATCH_BRICKS):
                 order.append(rows)
-                parts.append(self._made(nodes[rows], field))
-            back = torch.cat(order).argsort()
-            data = {name: torch.cat([part[name] for part in parts])[back] for name in self.channels}
+                parts.append(self._evaluate(nodes[rows], field))
+            original_order = torch.cat(order).argsort()
+            data = {
+                name: torch.cat([part[name] for part in parts])[original_order]
+                for name in self.channels
+            }
         # Infinite values become NaN: they must fail, not be clamped to the largest number.
-        known = {name: rows.masked_fill(rows.isinf(), math.nan) for name, rows in data.items()}
-        stored = {name: self._stored(name, rows) for name, rows in known.items()}
-        whole = [n for n, channel in self.channels.items() if not channel.dtype.is_floating_point]
-        if not whole:
+        nan_marked = {name: rows.masked_fill(rows.isinf(), math.nan) for name, rows in data.items()}
+        stored = {name: self._to_channel_dtype(name, rows) for name, rows in nan_marked.items()}
+        integer_names = [
+            n for n, channel in self.channels.items() if not channel.dtype.is_floating_point
+        ]
+        if not integer_names:
             return Bricks(data=stored)
-        finite = torch.stack([data[name].isfinite().flatten(1).all(1) for name in whole]).all(0)
+        finite = torch.stack(
+            [data[name].isfinite().flatten(1).all(1) for name in integer_names]
+        ).all(0)
         # Integers can't hold NaN: such bricks get kind -1, which fails.
         return Bricks(data=stored, kind=torch.where(finite, int(Region.DATA), -1))
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
         """Returns the nodes where a part of the field with a time matters at either time."""
-        return moving(self, self.field, nodes, self._beyond, (before, after))
+        return moving_nodes(self, self.field, nodes, self._margin_voxels, (before, after))
 
     @property
-    def _beyond(self) -> float:
+    def _margin_voxels(self) -> float:
         """Voxels beyond a brick's border in which the field is evaluated, and a rounding margin."""
-        return getattr(self.field, "margin", 0) + _MARGIN
+        return getattr(self.field, "margin", 0) + _MARGIN_VOXELS
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the field's own values at points (..., 3), for each channel (..., c), in the
@@ -184,53 +197,55 @@ class FieldProducer(Producer):
         check_points(f"{where}.at", points)
         if points.dim() == 1:  # () values would be promoted to the dtype of the field's numbers
             return {name: values[0] for name, values in self.at(points[None]).items()}
-        return _by_channel(where, _asked(where, self.field, self.field, points), points)
+        return _by_channel(where, _call_field(where, self.field, self.field, points), points)
 
-    def _made(self, nodes: Nodes, field: nn.Module) -> dict[str, Tensor]:
+    def _evaluate(self, nodes: Nodes, field: nn.Module) -> dict[str, Tensor]:
         """Returns the voxels of k bricks, (k, z, y, x, c) by channel, before rounding."""
         where = type(self).__name__
         size = nodes.voxel_size.to(self.dtype)[:, None, None, None]
         if isinstance(field, Field) and field.prefiltered:
             points = nodes.wider(field.margin).points(self.dtype)
-            values = _asked(where, field, field.filtered, points, size)
-            found = _by_channel(where, values, points)
+            values = _call_field(where, field, field.filtered, points, size)
+            filtered = _by_channel(where, values, points)
             if field.margin == 0:
-                return found
+                return filtered
             side = nodes.layout.side
-            like = points[:, :side, :side, :side]
-            values = _asked(where, field, field.finish, found, size[:, 0, 0, 0])
-            return _by_channel(where, values, like)
+            brick_points = points[:, :side, :side, :side]
+            values = _call_field(where, field, field.finish, filtered, size[:, 0, 0, 0])
+            return _by_channel(where, values, brick_points)
         points = nodes.points(self.dtype)
         total: dict[str, Any] = {}
         for offset in self.offsets.to(size).unbind(0):
-            asked = _asked(where, field, field, points + size * offset)
-            values = _by_channel(where, asked, points)
+            result = _call_field(where, field, field, points + size * offset)
+            values = _by_channel(where, result, points)
             total = {name: total.get(name, 0) + value for name, value in values.items()}
         return {name: value / len(self.offsets) for name, value in total.items()}
 
-    def _bounds(self, center: Tensor, half: Tensor, size: Tensor) -> dict[str, Interval]:
+    def _bounds(self, center: Tensor, half_extent: Tensor, size: Tensor) -> dict[str, Interval]:
         """Returns intervals by channel, (k, c) each, for the channels that have known bounds."""
         if not isinstance(self.field, Field):
             return {}
-        ask = self.field.filtered_bounds
-        found = _asked(type(self).__name__, self.field, ask, center, half, size)
-        if found is None:
+        compute_bounds = self.field.filtered_bounds
+        bounds = _call_field(
+            type(self).__name__, self.field, compute_bounds, center, half_extent, size
+        )
+        if bounds is None:
             return {}
-        by_channel = found if isinstance(found, Mapping) else {"value": found}
+        by_channel = bounds if isinstance(bounds, Mapping) else {"value": bounds}
         return {
             name: interval_of(self.field, name, ends, len(center), self.channels[name].width)
             for name, ends in by_channel.items()
             if name in self.channels
         }
 
-    def _stored(self, name: str, values: Tensor) -> Tensor:
+    def _to_channel_dtype(self, name: str, values: Tensor) -> Tensor:
         """Converts values to a channel's dtype."""
         channel = self.channels[name]
-        least, most = channel.limits
+        low, high = channel.limits
         values = values.float() if values.dtype.itemsize < 4 else values  # float16 has less range
         if channel.dtype.is_floating_point:
-            return values.clamp(least, most).to(channel.dtype)
-        return (values * most).round().clamp(least, most).to(channel.dtype)
+            return values.clamp(low, high).to(channel.dtype)
+        return (values * high).round().clamp(low, high).to(channel.dtype)
 
 
 def cache_field(
@@ -247,38 +262,42 @@ def interval_of(field: nn.Module, name: str, ends: Any, count: int, width: int) 
     (k, width) each, k = `count`; raises ValueError if it is not one.
     """
     where = f"{type(field).__name__}.bounds"
-    if not isinstance(ends, tuple) or [isinstance(e, Tensor) for e in ends] != [True, True]:
+    if not isinstance(ends, tuple) or [isinstance(end, Tensor) for end in ends] != [True, True]:
         got = f"{len(ends)} items" if isinstance(ends, tuple) else type(ends).__name__
         raise ValueError(f"{where}: {name!r} must be two tensors, low and high, got {got}")
-    if any(tuple(e.shape) not in ((count,), (count, width)) for e in ends):
-        low, high = (check.describe(e) for e in ends)
+    if any(tuple(end.shape) not in ((count,), (count, width)) for end in ends):
+        low, high = (check.describe(end) for end in ends)
         raise ValueError(
             f"{where}: {name!r} must be ({count},) or ({count}, {width}) each, got {low} and {high}"
         )
-    low, high = (e[:, None].expand(-1, width) if e.dim() == 1 else e for e in ends)
-    looks = low.device.type == "cpu" and not torch.compiler.is_compiling()
-    if looks and not bool((low <= high).all()):
+    low, high = (end[:, None].expand(-1, width) if end.dim() == 1 else end for end in ends)
+    check_values = low.device.type == "cpu" and not torch.compiler.is_compiling()
+    if check_values and not bool((low <= high).all()):
         raise ValueError(f"{where}: {name!r} must be low <= high everywhere, and not NaN")
     return low, high
 
 
 def distances_of(where: str, shape: nn.Module, points: Tensor) -> Tensor:
     """Returns a shape's distances (...,) at points (..., 3); ValueError for any other result."""
-    found = _asked(where, shape, shape, points)
-    lead = points.shape[:-1]
-    if not isinstance(found, Tensor) or found.shape != lead or not found.dtype.is_floating_point:
-        sizes = ", ".join(str(size) for size in lead)
+    distances = _call_field(where, shape, shape, points)
+    leading_shape = points.shape[:-1]
+    if (
+        not isinstance(distances, Tensor)
+        or distances.shape != leading_shape
+        or not distances.dtype.is_floating_point
+    ):
+        sizes = ", ".join(str(size) for size in leading_shape)
         raise ValueError(
             f"{where}: shape {type(shape).__name__} must give ({sizes}) distances "
-            f"at ({sizes}, 3) points, got {check.describe(found)}"
+            f"at ({sizes}, 3) points, got {check.describe(distances)}"
         )
-    return found
+    return distances
 
 
-def alike(
-    field: nn.Module, nodes: Nodes, beyond: float, count: int
+def group_alike(
+    field: nn.Module, nodes: Nodes, margin: float, count: int
 ) -> Iterator[tuple[Tensor, nn.Module]]:
-    """Groups nodes by which parts of a field matter in them, up to `beyond` voxels beyond the
+    """Groups nodes by which parts of a field matter in them, up to `margin` voxels beyond the
     brick's border. Yields indices of at most `count` nodes, and the field reduced to these parts;
     small groups are joined. Waits for the device.
     """
@@ -286,48 +305,48 @@ def alike(
         yield from ((rows, field) for rows in torch.arange(len(nodes)).split(count))
         return
     center, layout = nodes.center, nodes.layout
-    half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border + beyond)
-    name, numbers = type(field).__name__, field.alike(center, half)
-    if check.shown(numbers) != f"({len(nodes)},) int64":
-        came = check.describe(numbers)
-        raise ValueError(f"{name}.alike: must give ({len(nodes)},) int64 numbers, got {came}")
-    _, kind = numbers.unique(return_inverse=True)
+    half_extent = nodes.voxel_size * (0.5 * layout.brick_size + layout.border + margin)
+    name, part_keys = type(field).__name__, field.alike(center, half_extent)
+    if check.shown(part_keys) != f"({len(nodes)},) int64":
+        got = check.describe(part_keys)
+        raise ValueError(f"{name}.alike: must give ({len(nodes)},) int64 numbers, got {got}")
+    _, group_index = part_keys.unique(return_inverse=True)
     groups: list[Tensor] = []
-    for group in kind.argsort(stable=True).split(kind.bincount().tolist()):
-        if groups and len(groups[-1]) < _FEW:
+    for group in group_index.argsort(stable=True).split(group_index.bincount().tolist()):
+        if groups and len(groups[-1]) < _MIN_GROUP_BRICKS:
             groups[-1] = torch.cat((groups[-1], group))
         else:
             groups.append(group)
     for group in groups:
-        near = check.instance(
-            f"{name}.near", "answer", field.near(center[group], half[group]), Field
+        reduced = check.instance(
+            f"{name}.near", "answer", field.near(center[group], half_extent[group]), Field
         )
-        yield from ((rows, near) for rows in group.split(count))
+        yield from ((rows, reduced) for rows in group.split(count))
 
 
-def moving(
-    producer: Producer, field: nn.Module, nodes: Nodes, beyond: float, times: Sequence[float]
+def moving_nodes(
+    producer: Producer, field: nn.Module, nodes: Nodes, margin: float, times: Sequence[float]
 ) -> Tensor:
     """Returns (k,) bool: the nodes in which a part of the producer's field that has a time matters
-    at any of `times`; for `beyond` see `alike`.
+    at any of `times`; for `margin` see `group_alike`.
     """
-    found = torch.zeros_like(nodes.depth, dtype=torch.bool)
+    moves = torch.zeros_like(nodes.depth, dtype=torch.bool)
     for time in times:
         with producer.at_time(time):
-            for rows, near in alike(field, nodes, beyond, max(1, len(nodes))):
-                found[rows] |= bool(clocks_of(near))
-    return found
+            for rows, reduced in group_alike(field, nodes, margin, max(1, len(nodes))):
+                moves[rows] |= bool(clocks_of(reduced))
+    return moves
 
 
-def _asked(where: str, field: nn.Module, method: Callable[..., Any], *given: Any) -> Any:
+def _call_field(where: str, field: nn.Module, method: Callable[..., Any], *arguments: Any) -> Any:
     """Calls a method of a field; if it fails, raises a ValueError of one line, naming the field."""
     try:
-        return method(*given)
+        return method(*arguments)
     except (MemoryError, torch.OutOfMemoryError):
         raise  # not the field's fault
     except Exception as error:
-        said = f"{type(error).__name__}: {one_line(error)}"
-        raise ValueError(f"{where}: field {type(field).__name__} failed: {said}") from error
+        reason = f"{type(error).__name__}: {one_line(error)}"
+        raise ValueError(f"{where}: field {type(field).__name__} failed: {reason}") from error
 
 
 def _by_channel(where: str, values: Any, points: Tensor) -> dict[str, Tensor]:
@@ -338,37 +357,37 @@ def _by_channel(where: str, values: Any, points: Tensor) -> dict[str, Tensor]:
         raise ValueError(
             f"{where}: field must give a tensor, or a dict of them, got {type(values).__name__}"
         )
-    found, lead = {}, points.shape[:-1]
+    by_channel, leading_shape = {}, points.shape[:-1]
     for name, value in values.items():
         if not isinstance(value, Tensor) or not value.dtype.is_floating_point:
             raise ValueError(
                 f"{where}: field must give floats for {name!r}, got {check.describe(value)}"
             )
-        wide = value[..., None] if value.shape == lead else value
-        if wide.shape[:-1] != lead:
-            sizes = ", ".join(str(size) for size in lead)
+        with_width = value[..., None] if value.shape == leading_shape else value
+        if with_width.shape[:-1] != leading_shape:
+            sizes = ", ".join(str(size) for size in leading_shape)
             raise ValueError(
                 f"{where}: field must give ({sizes}) or ({sizes}, c) for {name!r} "
                 f"at ({sizes}, 3) points, got {check.describe(value)}"
             )
-        found[name] = wide
-    return found
+        by_channel[name] = with_width
+    return by_channel
 
 
-def _channels_of(where: str, field: nn.Module) -> dict[str, int]:
+def _channel_widths(where: str, field: nn.Module) -> dict[str, int]:
     """Returns the width of each channel of a field, found by evaluating it at 2 x 5 points."""
-    there = [*field.parameters(), *field.buffers()]
-    device = there[0].device if there else torch.device("cpu")
+    tensors = [*field.parameters(), *field.buffers()]
+    device = tensors[0].device if tensors else torch.device("cpu")
     points = torch.full((2, 5, 3), 0.25, device=device)
     with torch.no_grad():
         if isinstance(field, Field) and field.prefiltered:
-            values = _asked(where, field, field.filtered, points, points)
+            values = _call_field(where, field, field.filtered, points, points)
         else:
-            values = _asked(where, field, field, points)
+            values = _call_field(where, field, field, points)
     return {n: value.shape[-1] for n, value in _by_channel(where, values, points).items()}
 
 
-def _cut_out(where: str, field: Field | None, extent: int | Sequence[int]) -> tuple[Any, Any]:
+def _grid_around(where: str, field: Field | None, extent: int | Sequence[int]) -> tuple[Any, Any]:
     """Returns extent and box of a grid around a field's box, 2 voxels wider on each side."""
     box = None if field is None else field.box()
     if box is None or not bool(torch.isfinite(box).all()) or not bool((box[1] > box[0]).all()):
@@ -379,13 +398,13 @@ def _cut_out(where: str, field: Field | None, extent: int | Sequence[int]) -> tu
         check.whole(where, "extent", extent, low=5, high=2**40)
         voxel = sides.max() / (extent - 4)
         extent = [math.ceil(float(side / voxel) - 1e-9) + 4 for side in sides]
-        half = torch.tensor(extent, dtype=torch.float64) * voxel / 2
+        half_size = torch.tensor(extent, dtype=torch.float64) * voxel / 2
     else:
-        half = sides / 2 * (1 + 4 / torch.tensor([max(n, 5) - 4 for n in extent]))
-    return extent, ((middle - half).tolist(), (middle + half).tolist())
+        half_size = sides / 2 * (1 + 4 / torch.tensor([max(n, 5) - 4 for n in extent]))
+    return extent, ((middle - half_size).tolist(), (middle + half_size).tolist())
 
 
-def dtype_of_places(box: Sequence[Sequence[float]], spacing: Sequence[float]) -> torch.dtype:
+def position_dtype(box: Sequence[Sequence[float]], spacing: Sequence[float]) -> torch.dtype:
     """Returns float32 if a box ends within 2^17 finest voxels of the origin, else float64."""
-    reach = max(abs(float(end)) for corner in box for end in corner)
-    return torch.float32 if reach <= 0.5 * DEEP_VOXELS * min(spacing) else torch.float64
+    farthest = max(abs(float(end)) for corner in box for end in corner)
+    return torch.float32 if farthest <= 0.5 * DEEP_VOXELS * min(spacing) else torch.float64

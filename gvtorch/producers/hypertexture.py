@@ -19,20 +19,20 @@ from ..base.boxes import extent_in
 from ..fields import Distance, noise
 from ..fields.noise.fractal import Octave, Tally, octaves_of
 from ..pool import Channel
-from .field import alike, distances_of, dtype_of_places, interval_of, moving
+from .field import distances_of, group_alike, interval_of, moving_nodes, position_dtype
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth, check_points
 
-_BATCH = 64  # bricks made at a time on the CPU, so that intermediate values fit into its caches
-_COARSEST = 1.5  # cells along a voxel; beyond, a voxel's mean is computed without the octave
-_ROUNDED = 1e-4  # most that rounding may add to a sum of octaves, in units of the amplitude
+_BATCH_BRICKS = 64  # made at a time on the CPU, so that intermediate values fit into its caches
+_MAX_CELLS = 1.5  # cells along a voxel; beyond, a voxel's mean is computed without the octave
+_ROUNDING = 1e-4  # most that rounding may add to a sum of octaves, in units of the amplitude
 
 
 class LevelOctaves(NamedTuple):
     """Parameters from which the voxels of a level are made."""
 
     octaves: list[Octave]  # with the amplitudes that are left in the means over voxels
-    left: list[float]  # [i]: upper bound of what octave i and all after it can add
-    soft: float  # half the width of the step from 0 to 1
+    remaining: list[float]  # [i]: upper bound of what octave i and all after it can add
+    half_width: float  # half the width of the step from 0 to 1
     side: float  # of a voxel, world units
 
 
@@ -105,14 +105,14 @@ class Hypertexture(Tally, Producer):
         amplitude = check.number(where, "amplitude", amplitude, low=0)
         softness = check.number(where, "softness", softness, low=0, open_low=True)
         series = octaves_of(where, octaves, lacunarity, gain, seed, frequency)
-        most = amplitude * sum(one.amplitude for one in series) * noise.bounds(noise.perlin).high
-        reach = thickness * max(most + softness - 0.5, 0.0)
+        peak = amplitude * sum(o.amplitude for o in series) * noise.bounds(noise.perlin).high
+        max_offset = thickness * max(peak + softness - 0.5, 0.0)
         if box is None:
-            own = shape.box()
-            if own is None or not bool(own.isfinite().all()):
-                told = "box must be given: the shape does not tell where it ends"
-                raise ValueError(f"{where}: {told}")
-            box = [(own[0] - reach).tolist(), (own[1] + reach).tolist()]
+            shape_box = shape.box()
+            if shape_box is None or not bool(shape_box.isfinite().all()):
+                reason = "box must be given: the shape does not tell where it ends"
+                raise ValueError(f"{where}: {reason}")
+            box = [(shape_box[0] - max_offset).tolist(), (shape_box[1] + max_offset).tolist()]
         extent = extent_in(where, extent, box)
         if not check.instance(where, "dtype", dtype, torch.dtype).is_floating_point:
             raise ValueError(f"{where}: dtype must be one of floats, got {dtype}")
@@ -128,10 +128,10 @@ class Hypertexture(Tally, Producer):
         )
         self.shape, self.skip = shape, skip
         self.thickness, self.softness = thickness, softness
-        self.octaves = [one._replace(amplitude=amplitude * one.amplitude) for one in series]
-        self.dtype = dtype_of_places(box, self.spacing)
+        self.octaves = [o._replace(amplitude=amplitude * o.amplitude) for o in series]
+        self.dtype = position_dtype(box, self.spacing)
         self._levels: list[LevelOctaves] = []
-        self._worn = torch.empty(0)
+        self._margins = torch.empty(0)
 
     @property
     def saved(self) -> float:
@@ -142,10 +142,10 @@ class Hypertexture(Tally, Producer):
         """Computes the parameters of each level."""
         sides = [max(layout.spacing) * layout.branching**n for n in range(layout.depth, -1, -1)]
         self._levels = [self._level(side) for side in sides]
-        worn = [level.left[0] + level.soft for level in self._levels]
+        margins = [level.remaining[0] + level.half_width for level in self._levels]
         # A node's region must also be true of all finer nodes below it.
-        finer = [max(worn[depth:]) for depth in range(len(worn))]
-        self._worn = torch.tensor(finer, dtype=torch.float64, device=layout.device)
+        margins_below = [max(margins[depth:]) for depth in range(len(margins))]
+        self._margins = torch.tensor(margins_below, dtype=torch.float64, device=layout.device)
 
     def level_of(self, depth: int) -> LevelOctaves:
         """Returns the parameters of the voxels of a depth; known once an engine uses this."""
@@ -153,18 +153,21 @@ class Hypertexture(Tally, Producer):
 
     def _level(self, side: float) -> LevelOctaves:
         """Returns the parameters of voxels with a side in world units."""
-        kept, variance = [], self.softness**2 / 5 + (side / self.thickness) ** 2 / 12
-        for one in self.octaves:
-            cells = side * one.frequency
-            share = math.exp(-noise.LOST * cells * cells) if cells <= _COARSEST else 0.0
-            variance += one.amplitude**2 * noise.VARIANCE * (1 - share * share)
-            if share:
-                kept.append(one._replace(amplitude=one.amplitude * share))
+        weighted, variance = [], self.softness**2 / 5 + (side / self.thickness) ** 2 / 12
+        for octave in self.octaves:
+            cells = side * octave.frequency
+            weight = math.exp(-noise.LOST * cells * cells) if cells <= _MAX_CELLS else 0.0
+            variance += octave.amplitude**2 * noise.VARIANCE * (1 - weight * weight)
+            if weight:
+                weighted.append(octave._replace(amplitude=octave.amplitude * weight))
         high = noise.bounds(noise.perlin).high
-        left = [high * sum(one.amplitude for one in kept[n:]) for n in range(len(kept) + 1)]
-        margin = _ROUNDED * max(1.0, *left)
-        left = [one + margin for one in left]
-        return LevelOctaves(kept, left, math.sqrt(5 * variance), side)
+        remaining = [
+            high * sum(octave.amplitude for octave in weighted[n:])
+            for n in range(len(weighted) + 1)
+        ]
+        margin = _ROUNDING * max(1.0, *remaining)
+        remaining = [bound + margin for bound in remaining]
+        return LevelOctaves(weighted, remaining, math.sqrt(5 * variance), side)
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the channels (..., 1) at points (..., 3), of the points' dtype, not filtered."""
@@ -173,8 +176,10 @@ class Hypertexture(Tally, Producer):
             return {name: values[0] for name, values in self.at(points[None]).items()}
         distance = distances_of(type(self).__name__, self.shape, points)
         total = distance * (-1 / self.thickness)
-        for one in self.octaves:
-            total = total + one.amplitude * noise.perlin(points * one.frequency, seed=one.seed)
+        for octave in self.octaves:
+            total = total + octave.amplitude * noise.perlin(
+                points * octave.frequency, seed=octave.seed
+            )
         return self._channels(total, distance, self.softness)
 
     def classify(self, nodes: Nodes) -> Regions:
@@ -182,21 +187,23 @@ class Hypertexture(Tally, Producer):
         there is no channel "distance", else DATA.
         """
         layout = nodes.layout
-        half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border)
-        ends = self.shape.bounds(nodes.center, half)
-        low, high = (end[:, 0] for end in interval_of(self.shape, "value", ends, len(half), 1))
-        worn = self._worn.to(low.device)[nodes.depth]
+        half_extent = nodes.voxel_size * (0.5 * layout.brick_size + layout.border)
+        ends = self.shape.bounds(nodes.center, half_extent)
+        low, high = (
+            end[:, 0] for end in interval_of(self.shape, "value", ends, len(half_extent), 1)
+        )
+        margin = self._margins.to(low.device)[nodes.depth]
         kind = torch.full_like(nodes.depth, Region.DATA)
         if "distance" not in self.channels:
-            full = -high / self.thickness - worn >= 0.5
+            full = -high / self.thickness - margin >= 0.5
             kind = torch.where(full, Region.CONSTANT, kind)
-        kind = torch.where(-low / self.thickness + worn <= 0.5, Region.EMPTY, kind)
+        kind = torch.where(-low / self.thickness + margin <= 0.5, Region.EMPTY, kind)
         is_full = (kind == Region.CONSTANT)[:, None].to(self.channels["density"].dtype)
         return Regions(kind=kind, constants={"density": is_full})
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
         """Returns the nodes in which a part of the shape with a time matters at either time."""
-        return moving(self, self.shape, nodes, 0, (before, after))
+        return moving_nodes(self, self.shape, nodes, 0, (before, after))
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
         """Makes the bricks, level by level, batched by which parts of the shape matter in them."""
@@ -207,15 +214,15 @@ class Hypertexture(Tally, Producer):
             name: torch.empty(shape, dtype=channel.dtype, device=device)
             for name, channel in self.channels.items()
         }
-        for depth, here in by_depth(nodes.loc):
-            count = _BATCH if device.type == "cpu" else len(here)
-            for rows, near in alike(self.shape, nodes[here], 0, count):
-                made = self._made(nodes[here[rows]], self.level_of(depth), near)
-                for name, values in made.items():
-                    data[name][here[rows]] = values.to(data[name].dtype)
+        for depth, level_rows in by_depth(nodes.loc):
+            count = _BATCH_BRICKS if device.type == "cpu" else len(level_rows)
+            for rows, reduced in group_alike(self.shape, nodes[level_rows], 0, count):
+                channels = self._evaluate(nodes[level_rows[rows]], self.level_of(depth), reduced)
+                for name, values in channels.items():
+                    data[name][level_rows[rows]] = values.to(data[name].dtype)
         return data
 
-    def _made(self, nodes: Nodes, level: LevelOctaves, shape: nn.Module) -> dict[str, Tensor]:
+    def _evaluate(self, nodes: Nodes, level: LevelOctaves, shape: nn.Module) -> dict[str, Tensor]:
         """Returns channels (k, z, y, x, 1) of nodes of a level; `shape` may be a reduced one."""
         points = nodes.points(self.dtype)
         distance = distances_of(type(self).__name__, shape, points)
@@ -223,22 +230,24 @@ class Hypertexture(Tally, Producer):
         active = torch.arange(len(nodes), device=total.device)
         values = total.clone()
         self._count(wanted=total.numel() * len(level.octaves))
-        for number, one in enumerate(level.octaves):
+        for index, octave in enumerate(level.octaves):
             if self.skip:
-                away = (values - 0.5).abs().flatten(1).amin(1)
-                needed = (away < level.soft + level.left[number]).nonzero()[:, 0]
+                edge_distance = (values - 0.5).abs().flatten(1).amin(1)
+                needed = (edge_distance < level.half_width + level.remaining[index]).nonzero()[:, 0]
                 if len(needed) < len(active):
                     total[active] = values
                     active, values, points = active[needed], values[needed], points[needed]
             if not len(active):
                 break
             self._count(made=values.numel())
-            values = values + one.amplitude * noise.perlin(points * one.frequency, seed=one.seed)
+            values = values + octave.amplitude * noise.perlin(
+                points * octave.frequency, seed=octave.seed
+            )
         total[active] = values
-        return self._channels(total, distance, level.soft)
+        return self._channels(total, distance, level.half_width)
 
-    def _channels(self, total: Tensor, distance: Tensor, soft: float) -> dict[str, Tensor]:
+    def _channels(self, total: Tensor, distance: Tensor, half_width: float) -> dict[str, Tensor]:
         """Returns the channels (..., 1), computed from s and distances (...)."""
-        t = ((total - (0.5 - soft)) / (2 * soft)).clamp(0, 1)
-        found = {"density": t * t * (3 - 2 * t), "distance": distance}
-        return {name: found[name][..., None] for name in self.channels}
+        t = ((total - (0.5 - half_width)) / (2 * half_width)).clamp(0, 1)
+        channels = {"density": t * t * (3 - 2 * t), "distance": distance}
+        return {name: channels[name][..., None] for name in self.channels}

@@ -49,87 +49,106 @@ class JoinedProducer(OfProducers):
         if not producers:
             raise ValueError(f"{where}: producers must hold at least one")
         channels, ranges, labels = dict[str, Any](), dict[str, Any](), dict[str, Any]()
-        for name, one in producers.items():
-            check.instance(where, f"producers[{name!r}]", one, Producer)
-            if len(one.channels) != 1:
-                known = ", ".join(one.channels)
+        for name, producer in producers.items():
+            check.instance(where, f"producers[{name!r}]", producer, Producer)
+            if len(producer.channels) != 1:
+                names = ", ".join(producer.channels)
                 raise ValueError(
-                    f"{where}: each producer must have one channel, {name!r} has {known}"
+                    f"{where}: each producer must have one channel, {name!r} has {names}"
                 )
-            if one.needs_parent:
+            if producer.needs_parent:
                 raise ValueError(f"{where}: {name!r} needs its parents' bricks")
-            ((own, channel),) = one.channels.items()
+            ((channel_name, channel),) = producer.channels.items()
             channels[name] = channel
-            ranges |= {name: one.value_range[own]} if own in one.value_range else {}
-            labels |= {name: one.labels[own]} if own in one.labels else {}
+            ranges |= (
+                {name: producer.value_range[channel_name]}
+                if channel_name in producer.value_range
+                else {}
+            )
+            labels |= (
+                {name: producer.labels[channel_name]} if channel_name in producer.labels else {}
+            )
         first = next(iter(producers.values()))
-        for name, one in producers.items():
-            both = zip(grid_of(one).items(), grid_of(first).values(), strict=True)
-            for (what, its), wanted in both:
-                if its != wanted:
+        for name, producer in producers.items():
+            pairs = zip(grid_of(producer).items(), grid_of(first).values(), strict=True)
+            for (attribute, value), wanted in pairs:
+                if value != wanted:
                     raise ValueError(
-                        f"{where}: {what} of {name!r} is {its}, that of the first {wanted}"
+                        f"{where}: {attribute} of {name!r} is {value}, that of the first {wanted}"
                     )
         super().__init__(**grid_of(first), channels=channels, value_range=ranges, labels=labels)
         self.producers = torch.nn.ModuleDict(producers)
-        self.on_host = all(one.on_host for one in producers.values())
-        self.on_device = all(one.on_device for one in producers.values())
-        waits = [one.patience for one in producers.values() if one.patience is not None]
+        self.on_host = all(producer.on_host for producer in producers.values())
+        self.on_device = all(producer.on_device for producer in producers.values())
+        waits = [
+            producer.patience for producer in producers.values() if producer.patience is not None
+        ]
         self.patience = max(waits) if waits else None
 
     def parts(self) -> dict[str, Producer]:
-        return {name: one for name, one in self.producers.items() if isinstance(one, Producer)}
+        return {
+            name: producer
+            for name, producer in self.producers.items()
+            if isinstance(producer, Producer)
+        }
 
     def classify(self, nodes: Nodes) -> Regions | Future:
         """Joins the regions of all producers."""
-        answers = {name: one.classify(nodes) for name, one in self.parts().items()}
+        answers = {name: producer.classify(nodes) for name, producer in self.parts().items()}
         return _when_all(answers, functools.partial(self._regions, nodes))
 
     def fill(self, nodes: Nodes) -> Bricks | Future:
         """Joins the bricks of all producers."""
-        answers = {name: one.fill(nodes) for name, one in self.parts().items()}
+        answers = {name: producer.fill(nodes) for name, producer in self.parts().items()}
         return _when_all(answers, functools.partial(self._bricks, nodes))
 
     def _regions(self, nodes: Nodes, answers: Mapping[str, Any]) -> Regions:
-        given = {
-            n: one if isinstance(one, Regions) else Regions(kind=one) for n, one in answers.items()
+        regions = {
+            n: answer if isinstance(answer, Regions) else Regions(kind=answer)
+            for n, answer in answers.items()
         }
-        kind = self._kinds(nodes, [one.kind for one in given.values()])
+        kind = self._kinds(nodes, [answer.kind for answer in regions.values()])
         constants, ranges = dict[str, Tensor](), dict[str, Tensor]()
-        for name, one in given.items():
-            ((own, channel),) = self.parts()[name].channels.items()
+        for name, answer in regions.items():
+            ((channel_name, channel),) = self.parts()[name].channels.items()
             zero = torch.zeros((len(kind), channel.width), dtype=channel.dtype, device=kind.device)
-            constants[name] = one.constants.get(own, zero).view(len(kind), -1).to(channel.dtype)
-            ranges |= {name: one.ranges[own]} if own in one.ranges else {}
-        return Regions(kind=kind, constants=constants, ranges=ranges, errors=_errors(given))
+            constants[name] = (
+                answer.constants.get(channel_name, zero).view(len(kind), -1).to(channel.dtype)
+            )
+            ranges |= {name: answer.ranges[channel_name]} if channel_name in answer.ranges else {}
+        return Regions(kind=kind, constants=constants, ranges=ranges, errors=_errors(regions))
 
     def _bricks(self, nodes: Nodes, answers: Mapping[str, Any]) -> Bricks:
-        data, constants, given = dict[str, Any](), dict[str, Tensor](), dict[str, Bricks]()
+        data, constants, bricks = dict[str, Any](), dict[str, Tensor](), dict[str, Bricks]()
         for name, producer in self.parts().items():
-            one = given[name] = producer.as_bricks(answers[name])
-            (own,) = producer.channels
-            data[name] = one.data[own]
-            constants |= {name: one.constants[own]} if own in one.constants else {}
-        if all(one.kind is None for one in given.values()):
-            return Bricks(data=data, errors=_errors(given))
-        kind = self._kinds(nodes, [one.kind for one in given.values()])
-        if len(constants) < len(given):  # without all constants, CONSTANT nodes need their voxels
+            answer = bricks[name] = producer.as_bricks(answers[name])
+            (channel_name,) = producer.channels
+            data[name] = answer.data[channel_name]
+            constants |= (
+                {name: answer.constants[channel_name]} if channel_name in answer.constants else {}
+            )
+        if all(answer.kind is None for answer in bricks.values()):
+            return Bricks(data=data, errors=_errors(bricks))
+        kind = self._kinds(nodes, [answer.kind for answer in bricks.values()])
+        if len(constants) < len(bricks):  # without all constants, CONSTANT nodes need their voxels
             kind = torch.where(kind == Region.CONSTANT, int(Region.DATA), kind)
-        return Bricks(data=data, kind=kind, constants=constants, errors=_errors(given))
+        return Bricks(data=data, kind=kind, constants=constants, errors=_errors(bricks))
 
     def _kinds(self, nodes: Nodes, kinds: Sequence[Tensor | None]) -> Tensor:
         """Returns (k,) regions true for all. An ALIAS raises ValueError; on CUDA it becomes -1."""
         device = nodes.loc.device if self.on_device else torch.device("cpu")
         data = torch.full((len(nodes),), int(Region.DATA), device=device)
-        given = torch.stack([data if one is None else one.to(device, torch.int64) for one in kinds])
-        if device.type == "cpu" and bool((given == Region.ALIAS).any()):
+        stacked = torch.stack(
+            [data if kind is None else kind.to(device, torch.int64) for kind in kinds]
+        )
+        if device.type == "cpu" and bool((stacked == Region.ALIAS).any()):
             raise ValueError("JoinedProducer: producers must answer without alias")
-        voxels = (given == Region.DATA) | (given == Region.DATA_MAX_DEPTH)
-        deepest = (~voxels | (given == Region.DATA_MAX_DEPTH)).all(0)
+        voxels = (stacked == Region.DATA) | (stacked == Region.DATA_MAX_DEPTH)
+        deepest = (~voxels | (stacked == Region.DATA_MAX_DEPTH)).all(0)
         kind = torch.where(deepest, int(Region.DATA_MAX_DEPTH), int(Region.DATA))
         kind = torch.where(voxels.any(0), kind, int(Region.CONSTANT))
-        kind = torch.where((given == Region.EMPTY).all(0), int(Region.EMPTY), kind)
-        return torch.where((given == Region.ALIAS).any(0), -1, kind)
+        kind = torch.where((stacked == Region.EMPTY).all(0), int(Region.EMPTY), kind)
+        return torch.where((stacked == Region.ALIAS).any(0), -1, kind)
 
 
 class StoredChannels(JoinedProducer):
@@ -165,36 +184,36 @@ class StoredChannels(JoinedProducer):
             if name not in known:
                 raise ValueError(f"{store}: has no channel {name!r}; there are {', '.join(known)}")
         limit = check.nbytes("StoredChannels", "host_cache", host_cache) // max(len(names), 1)
-        told: dict[str, Any] = {"host_cache": limit, "timeout": timeout, "workers": workers}
+        options: dict[str, Any] = {"host_cache": limit, "timeout": timeout, "workers": workers}
         super().__init__(
-            {name: StoredProducer(Store.open(store, image=name), **told) for name in names}
+            {name: StoredProducer(Store.open(store, image=name), **options) for name in names}
         )
 
 
 def _when_all(answers: Mapping[str, Any], join: Callable[[Mapping[str, Any]], Any]) -> Any:
     """Joins answers: at once, or as a future if any of them is one."""
-    late = [one for one in answers.values() if isinstance(one, Future)]
-    if not late:
+    futures = [answer for answer in answers.values() if isinstance(answer, Future)]
+    if not futures:
         return join(answers)
-    found: Future = Future()
-    found.set_running_or_notify_cancel()
-    left, lock = len(late), threading.Lock()
+    joined: Future = Future()
+    joined.set_running_or_notify_cancel()
+    remaining, lock = len(futures), threading.Lock()
 
-    def came(_: Future) -> None:
-        nonlocal left
+    def on_done(_: Future) -> None:
+        nonlocal remaining
         with lock:
-            left -= 1
-            if left:
+            remaining -= 1
+            if remaining:
                 return
         try:
-            found.set_result(join({name: arrived(one) for name, one in answers.items()}))
+            joined.set_result(join({name: arrived(answer) for name, answer in answers.items()}))
         except BaseException as error:  # a read that failed or was cancelled
-            found.set_exception(error)
+            joined.set_exception(error)
 
-    for one in late:
-        one.add_done_callback(came)
-    return found
+    for future in futures:
+        future.add_done_callback(on_done)
+    return joined
 
 
-def _errors(given: Mapping[str, Regions | Bricks]) -> dict[int, str]:
-    return {row: text for one in given.values() for row, text in one.errors.items()}
+def _errors(answers: Mapping[str, Regions | Bricks]) -> dict[int, str]:
+    return {row: message for answer in answers.values() for row, message in answer.errors.items()}

@@ -59,8 +59,8 @@ class MeshProducer(Producer):
         mesh = mesh if isinstance(mesh, Mesh) else read_mesh(mesh)
         check.known("MeshProducer", settings, GridSettings)
         solid = settings.get("solid", "auto")
-        if solid == "auto" and (told := told_of_holes(mesh)):
-            warnings.warn(told, stacklevel=2)
+        if solid == "auto" and (warning := told_of_holes(mesh)):
+            warnings.warn(warning, stacklevel=2)
         grid = Voxelizer(mesh, channels=channels, **settings)
         self._settings: GridSettings = {**settings, "solid": once_filled(solid)}
         ranges = {"coverage": (0.0, 255.0), "distance": (-grid.band, grid.band)}
@@ -70,7 +70,7 @@ class MeshProducer(Producer):
             spacing=grid.spacing,
             origin=grid.origin,
             branching=branching,
-            value_range={name: one for name, one in ranges.items() if name in grid.channels},
+            value_range={name: bounds for name, bounds in ranges.items() if name in grid.channels},
             labels={"material": None} if "material" in grid.channels else None,
         )
         self.voxelizer = grid
@@ -78,8 +78,8 @@ class MeshProducer(Producer):
     def prepare(self, layout: Layout) -> None:
         """Moves the triangles to the layout's device."""
         if layout.device != self.voxelizer.device:
-            told: dict[str, Any] = {"channels": self.voxelizer.channels, "device": layout.device}
-            self.voxelizer = Voxelizer(self.voxelizer.mesh, **told, **self._settings)
+            options: dict[str, Any] = {"channels": self.voxelizer.channels, "device": layout.device}
+            self.voxelizer = Voxelizer(self.voxelizer.mesh, **options, **self._settings)
 
     def classify(self, nodes: Nodes) -> Regions:
         """Returns EMPTY outside (CONSTANT if there are distances) and CONSTANT inside, where no
@@ -88,10 +88,10 @@ class MeshProducer(Producer):
         grid = self.voxelizer
         low, voxel = _cubes(nodes, grid)
         touched, within = grid.touched(low, nodes.layout.side * voxel, voxel)
-        bare, inside = ~touched.flatten(1).any(1), within[:, 0, 0, 0]
-        kind = torch.where(bare, int(Region.CONSTANT), int(Region.DATA))
+        untouched, inside = ~touched.flatten(1).any(1), within[:, 0, 0, 0]
+        kind = torch.where(untouched, int(Region.CONSTANT), int(Region.DATA))
         if "distance" not in grid.channels:
-            kind = torch.where(bare & ~inside, int(Region.EMPTY), kind)
+            kind = torch.where(untouched & ~inside, int(Region.EMPTY), kind)
         return Regions(kind=kind, constants=grid.constants(inside))
 
     def fill(self, nodes: Nodes) -> Bricks:
@@ -103,11 +103,15 @@ class MeshProducer(Producer):
             return Bricks(data=grid.cubes(low, voxel, side, coarse_k=coarse))
         # Finest voxels are sampled at one position, which is faster; reading `coarse` is free here.
         order = coarse.to(torch.int8).argsort(stable=True)
-        fine, rest = order.split([len(order) - int(coarse.sum()), int(coarse.sum())])
-        parts = [grid.cubes(low[fine], voxel[fine], side)]
-        parts.append(grid.cubes(low[rest], voxel[rest], side, coarse_k=coarse[rest]))
-        back = order.argsort()
-        return Bricks(data={n: torch.cat([p[n] for p in parts])[back] for n in self.channels})
+        fine_rows, coarse_rows = order.split([len(order) - int(coarse.sum()), int(coarse.sum())])
+        parts = [grid.cubes(low[fine_rows], voxel[fine_rows], side)]
+        parts.append(
+            grid.cubes(low[coarse_rows], voxel[coarse_rows], side, coarse_k=coarse[coarse_rows])
+        )
+        original_order = order.argsort()
+        return Bricks(
+            data={n: torch.cat([p[n] for p in parts])[original_order] for n in self.channels}
+        )
 
 
 def _cubes(nodes: Nodes, grid: Voxelizer) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..fields.noise import inherit
 from ..pool.pyramid import tree_depth
 
-_ROUNDED = 1 / 32  # voxels; tolerance for rounded positions
+_ROUNDING_VOXELS = 1 / 32  # voxels; tolerance for rounded positions
 
 
 def grid_of(producer: Any) -> dict[str, Any]:
@@ -42,17 +42,17 @@ class Layout:
     def of(cls, producer: Any, brick_size: int, border: int, device: torch.device) -> Layout:
         """Returns the layout of a producer's world in bricks of a size."""
         depth = tree_depth(producer.extent, brick_size, producer.branching)
-        place = grid_of(producer)
-        return cls(depth=depth, brick_size=brick_size, border=border, device=device, **place)
+        grid = grid_of(producer)
+        return cls(depth=depth, brick_size=brick_size, border=border, device=device, **grid)
 
     def wider(self, by: int) -> Layout:
         """Returns the layout with `by` more border voxels on each side of a brick; cached."""
-        if by not in self._wider:
-            self._wider[by] = replace(self, border=self.border + by)
-        return self._wider[by]
+        if by not in self._wider_layouts:
+            self._wider_layouts[by] = replace(self, border=self.border + by)
+        return self._wider_layouts[by]
 
     @functools.cached_property
-    def _wider(self) -> dict[int, Layout]:
+    def _wider_layouts(self) -> dict[int, Layout]:
         return {}
 
     @property
@@ -85,9 +85,9 @@ class Layout:
         """(s * s * s * 3,) int64: for x, y, z of each voxel of a brick (in order z, y, x), the
         index of that coordinate in a flattened (3, s) tensor of coordinates along each axis.
         """
-        at = torch.arange(len(self.reach), device=self.device)
-        z, y, x = torch.meshgrid(at, at, at, indexing="ij")
-        return torch.stack((x, y + len(at), z + 2 * len(at)), -1).flatten()
+        index = torch.arange(len(self.reach), device=self.device)
+        z, y, x = torch.meshgrid(index, index, index, indexing="ij")
+        return torch.stack((x, y + len(index), z + 2 * len(index)), -1).flatten()
 
 
 class Nodes:
@@ -114,7 +114,7 @@ class Nodes:
     ) -> None:
         """See the class."""
         self.loc, self.layout, self.coarse, self.parents = loc, layout, coarse, parents
-        self._known: dict[str, Tensor] = {}  # a cache of properties that torch.compile can trace
+        self._cache: dict[str, Tensor] = {}  # a cache of properties that torch.compile can trace
 
     def __len__(self) -> int:
         return self.loc.shape[0]
@@ -147,14 +147,14 @@ class Nodes:
         """
         if self.parents is None:
             raise ValueError("Nodes.inherited: the producer must have needs_parent, and no root")
-        layout, found = self.layout, {}
-        cut = {"border": layout.border, "branching": layout.branching, "points": points}
+        layout, values = self.layout, {}
+        options = {"border": layout.border, "branching": layout.branching, "points": points}
         for name, bricks in self.parents.items():
             width = bricks.shape[-1]
             flat = bricks.movedim(-1, 1).flatten(0, 1).to(torch.float32)
-            rows = inherit(flat, self.child.repeat_interleave(width, 0), **cut)
-            found[name] = rows.unflatten(0, (-1, width)).movedim(1, -1)
-        return found
+            rows = inherit(flat, self.child.repeat_interleave(width, 0), **options)
+            values[name] = rows.unflatten(0, (-1, width)).movedim(1, -1)
+        return values
 
     @property
     def depth(self) -> Tensor:
@@ -164,10 +164,10 @@ class Nodes:
     @property
     def scale(self) -> Tensor:
         """(k,) float64 side of the nodes' voxels, in finest voxels."""
-        if "scale" not in self._known:
+        if "scale" not in self._cache:
             base = torch.full_like(self.loc[:, 3], self.layout.branching, dtype=torch.float64)
-            self._known["scale"] = base ** (self.layout.depth - self.loc[:, 3])
-        return self._known["scale"]
+            self._cache["scale"] = base ** (self.layout.depth - self.loc[:, 3])
+        return self._cache["scale"]
 
     @property
     def voxel_size(self) -> Tensor:
@@ -179,7 +179,7 @@ class Nodes:
         """(k, 2, 3) float64 world corners, x y z, without the border."""
         low = self.loc[:, :3] * self.layout.brick_size
         faces = torch.stack((low, low + self.layout.brick_size), 1) * self.scale[:, None, None]
-        return self._world(faces - 0.5)
+        return self._to_world(faces - 0.5)
 
     @property
     def center(self) -> Tensor:
@@ -198,8 +198,8 @@ class Nodes:
         boxes.
         """
         layout, boxes = self.layout, boxes.to(self.loc.device, torch.float64)
-        half = self.voxel_size * (0.5 * layout.brick_size + layout.border + _ROUNDED)
-        low, high = (self.center - half)[:, None], (self.center + half)[:, None]
+        half_extent = self.voxel_size * (0.5 * layout.brick_size + layout.border + _ROUNDING_VOXELS)
+        low, high = (self.center - half_extent)[:, None], (self.center + half_extent)[:, None]
         return ((low <= boxes[:, 1]) & (high >= boxes[:, 0])).all(2).any(1)
 
     @property
@@ -209,24 +209,24 @@ class Nodes:
         hundredth of the memory that `positions` take. Beyond 2^18 voxels from the world's origin
         float32 is exact to 1/64 of a voxel at best: see `local_axes`.
         """
-        return _broadcast(self._places)
+        return _broadcast(self._coordinates)
 
     @property
     def local_axes(self) -> tuple[Tensor, Tensor, Tensor]:
         """The same relative to the brick's `center`: exact at any depth. `center` is float64, so
         `nodes.center[:, 0, None, None, None] + x` is a world coordinate in float64.
         """
-        return _broadcast(self._local)
+        return _broadcast(self._local_coordinates)
 
     @property
     def positions(self) -> Tensor:
         """(k, z, y, x, 3) float32 world positions of the voxel centres, border included."""
-        return self._grid("positions", self._places)
+        return self._grid("positions", self._coordinates)
 
     @property
     def local_positions(self) -> Tensor:
         """(k, z, y, x, 3) float32, the same relative to the brick's `center`: see `local_axes`."""
-        return self._grid("local_positions", self._local)
+        return self._grid("local_positions", self._local_coordinates)
 
     def points(self, dtype: torch.dtype) -> Tensor:
         """Returns `positions`, in float32 or, exact at any depth, in float64."""
@@ -234,32 +234,32 @@ class Nodes:
             return self.center[:, None, None, None] + self.local_positions
         return self.positions
 
-    def _grid(self, name: str, places: Tensor) -> Tensor:
+    def _grid(self, name: str, coordinates: Tensor) -> Tensor:
         """Expands (k, 3, s) coordinates along each axis to (k, z, y, x, 3); cached by name."""
-        if name not in self._known:
-            side, grid = self.layout.side, self.layout.grid.to(places.device)
-            flat = places.flatten(1).index_select(1, grid)
-            self._known[name] = flat.view(-1, side, side, side, 3)
-        return self._known[name]
+        if name not in self._cache:
+            side, grid = self.layout.side, self.layout.grid.to(coordinates.device)
+            flat = coordinates.flatten(1).index_select(1, grid)
+            self._cache[name] = flat.view(-1, side, side, side, 3)
+        return self._cache[name]
 
     @property
-    def _local(self) -> Tensor:
+    def _local_coordinates(self) -> Tensor:
         """(k, 3, s) float32 coordinates of the voxel centres along each axis, from `center`."""
         middle = 0.5 * (self.layout.brick_size - 1)
-        reach = self.layout.reach.to(self.loc.device) - middle
-        return (self.voxel_size[:, :, None] * reach).to(torch.float32)
+        offsets = self.layout.reach.to(self.loc.device) - middle
+        return (self.voxel_size[:, :, None] * offsets).to(torch.float32)
 
     @property
-    def _places(self) -> Tensor:
+    def _coordinates(self) -> Tensor:
         """(k, 3, s) float32 world coordinates of the voxel centres along each axis."""
-        if "places" not in self._known:
-            reach = self.layout.reach.to(self.loc.device)
-            voxel = self.loc[:, :3, None] * self.layout.brick_size + reach
+        if "places" not in self._cache:
+            offsets = self.layout.reach.to(self.loc.device)
+            voxel = self.loc[:, :3, None] * self.layout.brick_size + offsets
             finest = (voxel + 0.5) * self.scale[:, None, None] - 0.5
-            self._known["places"] = self._world(finest.mT).mT.to(torch.float32).contiguous()
-        return self._known["places"]
+            self._cache["places"] = self._to_world(finest.mT).mT.to(torch.float32).contiguous()
+        return self._cache["places"]
 
-    def _world(self, finest: Tensor) -> Tensor:
+    def _to_world(self, finest: Tensor) -> Tensor:
         """Converts positions (..., 3) from finest voxels to world units."""
         layout = self.layout
         return finest * layout.spacing_3.to(finest.device) + layout.origin_3.to(finest.device)
@@ -272,7 +272,7 @@ class Nodes:
         )
 
 
-def _broadcast(places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _broadcast(coordinates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Reshapes (k, 3, s) coordinates along each axis so that they broadcast to (k, z, y, x)."""
-    x, y, z = places.unbind(1)
+    x, y, z = coordinates.unbind(1)
     return x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]

@@ -76,42 +76,44 @@ class OctaveProducer(Producer):
         """Adds the finest octaves, level by level. On the CPU each level's nodes are computed;
         elsewhere all nodes at every level, because counting those of a level would block.
         """
-        looks = nodes.loc.device.type == "cpu" and not torch.compiler.is_compiling()
-        return self._by_level(nodes) if looks else self._at_every_level(nodes)
+        on_cpu = nodes.loc.device.type == "cpu" and not torch.compiler.is_compiling()
+        return self._by_level(nodes) if on_cpu else self._at_every_level(nodes)
 
     def _by_level(self, nodes: Nodes) -> dict[str, Tensor]:
         shape = (len(nodes), *(nodes.layout.side,) * 3)
-        found = {name: torch.empty(shape, device=nodes.loc.device) for name in self._names}
+        bricks = {name: torch.empty(shape, device=nodes.loc.device) for name in self._names}
         for depth, rows in by_depth(nodes.loc):
             sums = self._sums(nodes[rows], depth)
             for name, values in zip(self._names, sums, strict=False):
-                found[name][rows] = values
-        return found
+                bricks[name][rows] = values
+        return bricks
 
     def _at_every_level(self, nodes: Nodes) -> dict[str, Tensor]:
         shape = (len(nodes), *(nodes.layout.side,) * 3)
-        found = {name: torch.zeros(shape, device=nodes.loc.device) for name in self._names}
+        bricks = {name: torch.zeros(shape, device=nodes.loc.device) for name in self._names}
         for depth in range(nodes.layout.depth + 1):
-            there = (nodes.depth == depth)[:, None, None, None]
-            alone = Nodes(nodes.loc, nodes.layout)  # a root has no parent
-            sums = self._sums(nodes if depth else alone, depth)
+            at_depth = (nodes.depth == depth)[:, None, None, None]
+            without_parents = Nodes(nodes.loc, nodes.layout)  # a root has no parent
+            sums = self._sums(nodes if depth else without_parents, depth)
             for name, values in zip(self._names, sums, strict=False):
-                found[name] = torch.where(there, values, found[name]).to(torch.float32)
-        return found
+                bricks[name] = torch.where(at_depth, values, bricks[name]).to(torch.float32)
+        return bricks
 
     def _sums(self, nodes: Nodes, depth: int) -> tuple[Tensor, Tensor]:
         """Returns the values of nodes of one level, and what children inherit, (k, z, y, x)."""
         layout = nodes.layout
         side = self.spacing[0] * float(layout.branching) ** (layout.depth - depth)
-        reach = layout.reach.to(nodes.loc.device)
-        places = (nodes.loc[:, :3, None] * layout.brick_size + reach + 0.5) * side
+        offsets = layout.reach.to(nodes.loc.device)
+        coordinates = (nodes.loc[:, :3, None] * layout.brick_size + offsets + 0.5) * side
         parents = None if nodes.parents is None else nodes.parents[self._names[-1]][..., 0]
         if isinstance(self.total, OctaveSum):
             deep = max(self.extent) > DEEP_VOXELS
-            places = places.to(torch.float64 if deep else torch.float32)
-            parents = None if parents is None else parents.to(places.dtype)
-        cut = {"border": layout.border, "branching": layout.branching}
-        values, settled = self.total.bricks(places.unbind(1), side, parents, nodes.child, **cut)
+            coordinates = coordinates.to(torch.float64 if deep else torch.float32)
+            parents = None if parents is None else parents.to(coordinates.dtype)
+        brick_options = {"border": layout.border, "branching": layout.branching}
+        values, inherited = self.total.bricks(
+            coordinates.unbind(1), side, parents, nodes.child, **brick_options
+        )
         if self.values is not None:
             values = self.values(values, nodes)
-        return values, settled
+        return values, inherited

@@ -22,7 +22,7 @@ from ..points.splat import Cubes, ranges, values
 from ..pool import Channel
 from .producer import Nodes, Producer, Region, Regions, by_depth
 
-_BATCH = 256  # bricks made at a time
+_BATCH_BRICKS = 256  # bricks made at a time
 
 
 class PointProducer(Producer):
@@ -78,35 +78,35 @@ class PointProducer(Producer):
         if isinstance(positions, (Points, SortedPoints)) and not (values is radius is None):
             raise ValueError(f"{where}: values and radius go with positions, not with points")
         if isinstance(positions, SortedPoints):
-            found = positions
+            sorted_points = positions
             if box is not None or extent != 1024 or branching != 2:
                 raise ValueError(f"{where}: sorted points have an extent, a box and N already")
         else:
             if not isinstance(positions, Points):
                 positions = Points(positions, values, radius=radius)
-            found = sort_points(positions, extent, box=box, branching=branching)
-        grid = found.grid
+            sorted_points = sort_points(positions, extent, box=box, branching=branching)
+        grid = sorted_points.grid
         super().__init__(
             grid.extent,
-            channels={"value": Channel(dtype, found.width)},
+            channels={"value": Channel(dtype, sorted_points.width)},
             box=(grid.low, grid.high),
             branching=grid.branching,
         )
-        self.points, self.drawn = found, drawn
-        self._told = False  # whether the warning about sums that the channel can't hold was shown
+        self.points, self.drawn = sorted_points, drawn
+        self._warned = False  # whether the warning about sums that the channel can't hold was shown
 
     def classify(self, nodes: Nodes) -> Regions:
         """Returns EMPTY where no point reaches into the brick, else DATA; and the value ranges."""
         channel = self.channels["value"]
         kind = torch.full((len(nodes),), int(Region.EMPTY))
-        ends = torch.zeros((len(nodes), 2, channel.width), dtype=torch.float64)
+        value_range = torch.zeros((len(nodes), 2, channel.width), dtype=torch.float64)
         for rows, cubes in _by_level(nodes):
-            found = ranges(self.points, cubes, narrow=self._narrow(cubes))
-            some, low, high = (torch.from_numpy(part) for part in found)
-            kind[rows[some]] = int(Region.DATA)
-            ends[rows] = torch.stack((low, high), 1)
+            bounds = ranges(self.points, cubes, narrow=self._includes_narrow(cubes))
+            nonempty, low, high = (torch.from_numpy(array) for array in bounds)
+            kind[rows[nonempty]] = int(Region.DATA)
+            value_range[rows] = torch.stack((low, high), 1)
         # Values rounded to the channel's dtype may exceed the ends, by a relative 2^-7 at most.
-        stored = (ends * (1 + 2.0**-7)).clamp(*channel.limits).to(channel.dtype)
+        stored = (value_range * (1 + 2.0**-7)).clamp(*channel.limits).to(channel.dtype)
         return Regions(kind=kind, ranges={"value": stored})
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:
@@ -115,32 +115,35 @@ class PointProducer(Producer):
         shape = (len(nodes), *(nodes.layout.side,) * 3, channel.width)
         out = torch.empty(shape, dtype=channel.dtype)
         for rows, cubes in _by_level(nodes):
-            made = torch.from_numpy(values(self.points, cubes, narrow=self._narrow(cubes)))
-            self._warn_of(made)
-            out[rows] = made.clamp(*channel.limits).to(channel.dtype)
+            sums = torch.from_numpy(values(self.points, cubes, narrow=self._includes_narrow(cubes)))
+            self._warn_overflow(sums)
+            out[rows] = sums.clamp(*channel.limits).to(channel.dtype)
         return {"value": out}
 
-    def _warn_of(self, sums: Tensor) -> None:
+    def _warn_overflow(self, sums: Tensor) -> None:
         """Warns once if sums are larger than the channel can hold."""
         (low, high), dtype = self.channels["value"].limits, self.channels["value"].dtype
-        least, most = (float(end) for end in torch.aminmax(sums)) if sums.numel() else (0.0, 0.0)
-        if not self._told and (least < low or most > high):
-            self._told = True
-            end, name = max(-least, most), str(dtype).removeprefix("torch.")
+        smallest, largest = (
+            (float(extreme) for extreme in torch.aminmax(sums)) if sums.numel() else (0.0, 0.0)
+        )
+        if not self._warned and (smallest < low or largest > high):
+            self._warned = True
+            magnitude, dtype_name = max(-smallest, largest), str(dtype).removeprefix("torch.")
             warnings.warn(
-                f"{type(self).__name__}: a voxel's sum, {end:.3g}, is more than {name} holds, "
-                f"{high:.5g}, which is stored: take float32, or scale the values",
+                f"{type(self).__name__}: a voxel's sum, {magnitude:.3g}, is more than "
+                f"{dtype_name} holds, {high:.5g}, which is stored: "
+                "take float32, or scale the values",
                 stacklevel=2,
             )
 
-    def _narrow(self, cubes: Cubes) -> bool:
+    def _includes_narrow(self, cubes: Cubes) -> bool:
         return not (self.drawn and cubes.level == 0)
 
 
 def _by_level(nodes: Nodes) -> Iterator[tuple[Tensor, Cubes]]:
     """Yields indices of a batch of nodes of one level, and their cubes of voxels with borders."""
     layout, loc = nodes.layout, nodes.loc.cpu()
-    for depth, here in by_depth(loc):
-        for rows in here.split(_BATCH):
+    for depth, level_rows in by_depth(loc):
+        for rows in level_rows.split(_BATCH_BRICKS):
             low = loc[rows, :3].numpy() * layout.brick_size - layout.border
             yield rows, Cubes(np.ascontiguousarray(low), layout.side, layout.depth - depth)

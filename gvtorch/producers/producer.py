@@ -30,8 +30,9 @@ from .nodes import Layout, Nodes
 
 #: Returns (k,) bool: which of k nodes have changed, in their own voxels or in those below them.
 Where = Callable[[Nodes], Tensor]
-_numbers = itertools.count(1)  # versions, shared by all producers: a later change has a larger one
-_REMEMBERED = 64  # changes that are kept; if more are asked for, everything may have changed
+# Versions, shared by all producers: a later change has a larger one.
+_version_numbers = itertools.count(1)
+_MAX_CHANGES = 64  # changes that are kept; if more are asked for, everything may have changed
 
 
 class Region(IntEnum):
@@ -52,19 +53,19 @@ def by_depth(loc: Tensor) -> Iterator[tuple[int, Tensor]]:
         yield depth, (loc[:, 3] == depth).nonzero()[:, 0]
 
 
-def _between(bricks: Tensor, row: Tensor, place: Tensor) -> Tensor:
-    """Returns (p, c) float32 values, interpolated trilinearly at positions `place` (p, 3), in
+def _interpolate(bricks: Tensor, row: Tensor, position: Tensor) -> Tensor:
+    """Returns (p, c) float32 values, interpolated trilinearly at `position` (p, 3), in
     voxels, in the bricks with indices `row` (p,) among `bricks` (k, z, y, x, c).
     """
-    low = place.floor().clamp(max=bricks.shape[1] - 2)
-    share, low = (place - low).to(torch.float32), low.to(torch.int64)
-    found = bricks.new_zeros((len(row), bricks.shape[-1]), dtype=torch.float32)
+    low = position.floor().clamp(max=bricks.shape[1] - 2)
+    fraction, low = (position - low).to(torch.float32), low.to(torch.int64)
+    values = bricks.new_zeros((len(row), bricks.shape[-1]), dtype=torch.float32)
     for corner in itertools.product((0, 1), repeat=3):
-        away = torch.tensor(corner, device=low.device)
-        x, y, z = (low + away).unbind(1)
-        weight = torch.where(away == 1, share, 1 - share).prod(1, keepdim=True)
-        found += weight * bricks[row, z, y, x].to(torch.float32)
-    return found
+        corner_offset = torch.tensor(corner, device=low.device)
+        x, y, z = (low + corner_offset).unbind(1)
+        weight = torch.where(corner_offset == 1, fraction, 1 - fraction).prod(1, keepdim=True)
+        values += weight * bricks[row, z, y, x].to(torch.float32)
+    return values
 
 
 class Answer:
@@ -73,19 +74,19 @@ class Answer:
     def rows(self, row: Tensor) -> Self:
         """Returns the items with indices `row` (m,), with `errors` left empty."""
 
-        def some(value: Any) -> Any:
+        def select(value: Any) -> Any:
             if isinstance(value, TableRows):
                 return value[row]
             return movable(value)[row.to(value.device)].view(value.dtype)
 
-        return self.each(some, errors={})
+        return self.each(select, errors={})
 
     def each(self, change: Callable[[Any], Any], **others: Any) -> Self:
         """Returns the answer with `change` applied to all tensors and rows, and fields `others`."""
 
         def changed(value: Any) -> Any:
             if isinstance(value, Mapping):
-                return {name: changed(one) for name, one in value.items()}
+                return {name: changed(entry) for name, entry in value.items()}
             return change(value) if isinstance(value, (Tensor, TableRows)) else value
 
         fields = {name: changed(value) for name, value in vars(self).items()}
@@ -239,17 +240,19 @@ class Producer(torch.nn.Module):
             if not isinstance(channel, Channel):
                 raise ValueError(f"{where}: channels[{name!r}] must be a Channel, got {channel!r}")
         self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
-        for what, given in (("value_range", self.value_range), ("labels", self.labels)):
-            if unknown := sorted(map(str, {*given} - {*self.channels})):
-                known = ", ".join(self.channels)
-                raise ValueError(f"{where}: {what} has channel {unknown[0]!r}; there are {known}")
-        for name, ends in self.value_range.items():
-            if len(ends) != 2 or not -math.inf < ends[0] <= ends[1] < math.inf:
+        for argument, by_channel in (("value_range", self.value_range), ("labels", self.labels)):
+            if unknown := sorted(map(str, {*by_channel} - {*self.channels})):
+                channel_names = ", ".join(self.channels)
                 raise ValueError(
-                    f"{where}: value_range[{name!r}] must be (smallest, largest), got {ends!r}"
+                    f"{where}: {argument} has channel {unknown[0]!r}; there are {channel_names}"
+                )
+        for name, bounds in self.value_range.items():
+            if len(bounds) != 2 or not -math.inf < bounds[0] <= bounds[1] < math.inf:
+                raise ValueError(
+                    f"{where}: value_range[{name!r}] must be (smallest, largest), got {bounds!r}"
                 )
         self.made_of: dict[str, Any] = {}
-        self._changes: deque[tuple[int, Where | None]] = deque(maxlen=_REMEMBERED)
+        self._changes: deque[tuple[int, Where | None]] = deque(maxlen=_MAX_CHANGES)
 
     def prepare(self, layout: Layout) -> None:
         """Prepares for nodes of a layout. The engine calls it once, before any other method."""
@@ -297,14 +300,14 @@ class Producer(torch.nn.Module):
                     f"got {check.shown(boxes)}"
                 )
             where = partial(Nodes.touch, boxes=boxes.view(-1, 2, 3))
-        self.version = next(_numbers)
+        self.version = next(_version_numbers)
         self._changes.append((self.version, where))
 
     def changes(self, since: int) -> list[Where] | None:
         """Returns functions that find the nodes changed since a version; None: any may have."""
-        new = [where for number, where in self._changes if number > since]
-        known = [where for where in new if where is not None]
-        return known if 0 < len(known) == len(new) < _REMEMBERED else None
+        newer = [finder for version, finder in self._changes if version > since]
+        finders = [finder for finder in newer if finder is not None]
+        return finders if 0 < len(finders) == len(newer) < _MAX_CHANGES else None
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
         """Returns (k,) bool: which nodes differ between two times, in a voxel of their own, borders
@@ -324,23 +327,25 @@ class Producer(torch.nn.Module):
     def time(self, value: float) -> None:
         clocks = self._clocks()
         time = check.number(type(self).__name__, "time", value)
-        before = {float(clock) for clock in clocks}
+        old_times = {float(clock) for clock in clocks}
         for clock in clocks:
             clock.fill_(time)
-        alike = len(before) == 1
-        self.changed(partial(self.differs, before=before.pop(), after=time) if alike else None)
+        same_time = len(old_times) == 1
+        self.changed(
+            partial(self.differs, before=old_times.pop(), after=time) if same_time else None
+        )
 
     @contextmanager
     def at_time(self, time: float) -> Iterator[None]:
         """Sets another time within a `with` block, without calling `changed`."""
         clocks = self._clocks()
-        own = [float(clock) for clock in clocks]
+        old_values = [float(clock) for clock in clocks]
         try:
             for clock in clocks:
                 clock.fill_(time)
             yield
         finally:
-            for clock, value in zip(clocks, own, strict=True):
+            for clock, value in zip(clocks, old_values, strict=True):
                 clock.fill_(value)
 
     def _clocks(self) -> list[Tensor]:
@@ -351,7 +356,9 @@ class Producer(torch.nn.Module):
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the values at world points (..., 3), for each channel (..., c) float32,
         interpolated between the eight nearest finest voxels as renderers do. Needs no engine;
-        without one, this prepares the producer for bricks of 8^3.
+        without one, each call prepares the producer for bricks of 8^3, because since the last call
+        another may have prepared it for other bricks, or its data may have been edited in place.
+        Where preparing is slow (`VolumeProducer`, `FromChildren`), pass many points in one call.
 
         Raises:
             ValueError: Points have another shape or are not finite, or a brick can't be made.
@@ -362,17 +369,17 @@ class Producer(torch.nn.Module):
             self.prepare(layout)
         else:
             layout = self.layout
-        place = (points.reshape(-1, 3).to(layout.origin_3) - layout.origin_3) / layout.spacing_3
-        place = torch.minimum(place.clamp(min=0), layout.extent_3 - 1)  # in voxels
-        depth = torch.full_like(place[:, :1], layout.depth)
-        node = torch.cat(((place / layout.brick_size).floor(), depth), 1).to(torch.int64)
-        loc, row = node.unique(dim=0, return_inverse=True)
+        position = (points.reshape(-1, 3).to(layout.origin_3) - layout.origin_3) / layout.spacing_3
+        position = torch.minimum(position.clamp(min=0), layout.extent_3 - 1)  # in voxels
+        depth = torch.full_like(position[:, :1], layout.depth)
+        node_loc = torch.cat(((position / layout.brick_size).floor(), depth), 1).to(torch.int64)
+        loc, row = node_loc.unique(dim=0, return_inverse=True)
         bricks_of = self.bricks_at(loc, layout)
-        inner = place - node[:, :3] * layout.brick_size + layout.border
-        found = {}
+        brick_position = position - node_loc[:, :3] * layout.brick_size + layout.border
+        values = {}
         for name, bricks in bricks_of.items():
-            found[name] = _between(bricks, row, inner).view(*points.shape[:-1], -1)
-        return found
+            values[name] = _interpolate(bricks, row, brick_position).view(*points.shape[:-1], -1)
+        return values
 
     def bricks_at(self, loc: Tensor, layout: Layout) -> dict[str, Tensor]:
         """Returns, by channel, the bricks (k, z, y, x, c) of nodes `loc` (k, 4) of one level; makes
@@ -380,10 +387,10 @@ class Producer(torch.nn.Module):
         """
         parents = None
         if self.needs_parent and bool((loc[:, 3] > 0).all()):
-            above = torch.cat((loc[:, :3] // layout.branching, loc[:, 3:] - 1), 1)
-            above, row = above.unique(dim=0, return_inverse=True)
-            made = self.bricks_at(above, layout)
-            parents = {name: bricks[row] for name, bricks in made.items()}
+            parent_loc = torch.cat((loc[:, :3] // layout.branching, loc[:, 3:] - 1), 1)
+            parent_loc, row = parent_loc.unique(dim=0, return_inverse=True)
+            parent_bricks = self.bricks_at(parent_loc, layout)
+            parents = {name: bricks[row] for name, bricks in parent_bricks.items()}
         answer = arrived(self.fill(Nodes(loc, layout, parents=parents)))
         answer = self.as_bricks(answer)
         for message in answer.errors.values():
@@ -416,41 +423,44 @@ class OfProducers(Producer):
     @property
     def version(self) -> int:  # type: ignore[override]
         """The latest version of any part."""
-        return max(one.version for one in self.parts().values())
+        return max(part.version for part in self.parts().values())
 
     @property
     def host_bytes(self) -> int:  # type: ignore[override]
         """The sum over all parts."""
-        return sum(one.host_bytes for one in self.parts().values())
+        return sum(part.host_bytes for part in self.parts().values())
 
     def changed(self, where: Any = None) -> None:
         """See `Producer.changed`; calls it for all parts."""
-        for one in self.parts().values():
-            one.changed(where)
+        for part in self.parts().values():
+            part.changed(where)
 
     def changes(self, since: int) -> list[Where] | None:
         """See `Producer.changes`; returns the changes of all parts."""
-        new = [one.changes(since) for one in self.parts().values() if one.version > since]
-        known = [changes for changes in new if changes is not None]
-        if len(known) < len(new):
+        part_changes = [
+            part.changes(since) for part in self.parts().values() if part.version > since
+        ]
+        known_changes = [changes for changes in part_changes if changes is not None]
+        if len(known_changes) < len(part_changes):
             return None
-        return [*dict.fromkeys(where for changes in known for where in changes)]  # each once
+        # Each change once.
+        return [*dict.fromkeys(finder for changes in known_changes for finder in changes)]
 
     def differs(self, nodes: Nodes, before: float, after: float) -> Tensor:
         """Returns (k,) bool: the nodes in which any part with a time differs."""
         parts = [*self.parts().values()]
-        timed = [one for one in parts if hasattr(one, "time")] or parts
-        return torch.stack([one.differs(nodes, before, after) for one in timed]).any(0)
+        timed = [part for part in parts if hasattr(part, "time")] or parts
+        return torch.stack([part.differs(nodes, before, after) for part in timed]).any(0)
 
     def prepare(self, layout: Layout) -> None:
         """Prepares all parts."""
-        for one in self.parts().values():
-            one.prepare(layout)
+        for part in self.parts().values():
+            part.prepare(layout)
 
     def close(self) -> None:
         """Closes all parts."""
-        for one in self.parts().values():
-            one.close()
+        for part in self.parts().values():
+            part.close()
 
 
 def check_points(where: str, points: Any) -> None:
@@ -463,12 +473,12 @@ def check_points(where: str, points: Any) -> None:
 
 def clocks_of(module: torch.nn.Module) -> list[Tensor]:
     """Returns the buffers `time` of all parts that have one."""
-    return [one for name, one in module.named_buffers() if name.rpartition(".")[2] == "time"]
+    return [buffer for name, buffer in module.named_buffers() if name.rpartition(".")[2] == "time"]
 
 
 def touched(changes: Sequence[Where], nodes: Nodes) -> Tensor:
     """Returns (k,) bool: which nodes any of the changes affects."""
-    return torch.stack([where(nodes) for where in changes]).any(0)
+    return torch.stack([finder(nodes) for finder in changes]).any(0)
 
 
 def arrived(answer: Any) -> Any:

@@ -28,14 +28,14 @@ from .answer import regions_of
 from .nodes import Layout, Nodes
 from .producer import Bricks, CoarseColors, Producer, Region, Regions, check_filtered
 
-_TILE = 32  # cells along a side of the cubes in which cells are read
+_TILE_CELLS = 32  # cells along a side of the cubes in which cells are read
 _GROUP_BYTES = 32 * 10**6  # of cubes that are held at a time in addition to the cache
-_CHANNEL = "value"
+_VALUE_CHANNEL = "value"
 
 
 Key = tuple[Any, ...]
-Found = np.ndarray | str  # an array, or why it can't be read
-Read = Callable[[list[Key]], dict[Key, Found]]
+ArrayOrMessage = np.ndarray | str  # an array, or why it can't be read
+ReadArrays = Callable[[list[Key]], dict[Key, ArrayOrMessage]]
 
 
 class HostCache:
@@ -45,43 +45,43 @@ class HostCache:
 
     def __init__(self, limit: int) -> None:
         self.limit, self.nbytes = limit, 0
-        self._kept: OrderedDict[Key, np.ndarray] = OrderedDict()
-        self._reading: dict[Key, Future[Found]] = {}
+        self._arrays: OrderedDict[Key, np.ndarray] = OrderedDict()
+        self._reading: dict[Key, Future[ArrayOrMessage]] = {}
         self._lock = threading.Lock()
 
-    def get(self, keys: Sequence[Key], read: Read) -> list[Found]:
+    def get(self, keys: Sequence[Key], read: ReadArrays) -> list[ArrayOrMessage]:
         """Returns an array for each of the (distinct) keys, or an error message. `read` is called
         with the keys that are neither cached nor being read; messages are not cached.
         """
-        found: dict[Key, Found] = {}
-        mine: list[Key] = []
-        others: dict[Key, Future[Found]] = {}
+        results: dict[Key, ArrayOrMessage] = {}
+        missing: list[Key] = []
+        awaited: dict[Key, Future[ArrayOrMessage]] = {}
         with self._lock:
             for key in keys:
-                if key in self._kept:
-                    self._kept.move_to_end(key)
-                    found[key] = self._kept[key]
+                if key in self._arrays:
+                    self._arrays.move_to_end(key)
+                    results[key] = self._arrays[key]
                 elif key in self._reading:
-                    others[key] = self._reading[key]
+                    awaited[key] = self._reading[key]
                 else:
-                    mine.append(key)
+                    missing.append(key)
                     self._reading[key] = Future()
         try:
-            found |= read(mine) if mine else {}
+            results |= read(missing) if missing else {}
         finally:
             with self._lock:
-                for key in mine:
-                    value = found.get(key, "the read was broken off")
+                for key in missing:
+                    value = results.get(key, "the read was broken off")
                     self._reading.pop(key).set_result(value)
                     if isinstance(value, np.ndarray) and value.nbytes <= self.limit:
-                        self._kept[key] = value
+                        self._arrays[key] = value
                         self.nbytes += value.nbytes
                 while self.nbytes > self.limit:
-                    _, dropped = self._kept.popitem(last=False)
+                    _, dropped = self._arrays.popitem(last=False)
                     self.nbytes -= dropped.nbytes
-        for key, future in others.items():
-            found[key] = future.result()
-        return [found[key] for key in keys]
+        for key, future in awaited.items():
+            results[key] = future.result()
+        return [results[key] for key in keys]
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,9 @@ class _Cubes:
     bricks with their border fit into them, else regions of about that size.
     """
 
-    blocks: bool  # whether cubes are the store's blocks
+    are_blocks: bool  # whether cubes are the store's blocks
     brick_size: int  # voxels along a side of a brick
-    bricks: int  # bricks along a side of a cube
+    bricks_per_side: int  # bricks along a side of a cube
     border: int  # voxels around a cube
 
     @classmethod
@@ -105,7 +105,7 @@ class _Cubes:
     @property
     def side(self) -> int:
         """Voxels along a side of a cube, without its border."""
-        return self.bricks * self.brick_size
+        return self.bricks_per_side * self.brick_size
 
 
 def _coarse_channel(store: Store, filtered: CoarseColors) -> dict[str, Channel]:
@@ -116,14 +116,14 @@ def _coarse_channel(store: Store, filtered: CoarseColors) -> dict[str, Channel]:
             f"{store.location}: filtered colours are of all channels: leave channels out"
         )
     name = str(filtered.other)
-    known = store.coarse.get(name)
-    if known is None or known.made_of != filtered.made_of:
-        what = "were made with another function or component" if known else "are not there"
+    stored = store.coarse.get(name)
+    if stored is None or stored.made_of != filtered.made_of:
+        problem = "were made with another function or component" if stored else "are not there"
         raise ValueError(
-            f"{store.location}: filtered colours {name!r} {what}; "
+            f"{store.location}: filtered colours {name!r} {problem}; "
             "gvtorch filter (Filtered.add_to) makes them"
         )
-    return {name: Channel(torch.float16, known.width, coarse=True)}
+    return {name: Channel(torch.float16, stored.width, coarse=True)}
 
 
 class StoredProducer(Producer):
@@ -180,22 +180,22 @@ class StoredProducer(Producer):
         value_range = {}
         if store.value_range is not None:
             lows, highs = zip(*store.value_range, strict=True)
-            value_range[_CHANNEL] = (min(lows), max(highs))
+            value_range[_VALUE_CHANNEL] = (min(lows), max(highs))
         coarse = {} if filtered is None else _coarse_channel(store, filtered)
         super().__init__(
             store.extent,
-            channels={_CHANNEL: Channel(store.dtype, store.width), **coarse},
+            channels={_VALUE_CHANNEL: Channel(store.dtype, store.width), **coarse},
             spacing=store.spacing,
             origin=store.origin,
             value_range=value_range,
-            labels={_CHANNEL: store.label_values} if store.info.labels else None,
+            labels={_VALUE_CHANNEL: store.label_values} if store.info.labels else None,
         )
         self.store, self.timeout = store, seconds
         self.made_of = {name: store.coarse[name].made_of for name in coarse}
         self.host_bytes, self.workers = limit, workers or (4 if store.is_remote else 1)
-        self._begin()
+        self._start_threads()
 
-    def _begin(self) -> None:
+    def _start_threads(self) -> None:
         """Creates the parts that processes don't share: cache and threads."""
         self._cache, self._closed = HostCache(self.host_bytes), threading.Event()
         self._threads = ThreadPoolExecutor(self.workers, thread_name_prefix="gvtorch-store")
@@ -204,7 +204,7 @@ class StoredProducer(Producer):
     def _submit(self, work: Callable[[Nodes], Any], nodes: Nodes) -> Future:
         """Runs `work` in a thread. After a fork, creates new threads first: the child has none."""
         if os.getpid() != self._process:
-            self._begin()
+            self._start_threads()
 
         def read() -> Any:
             with stage("read"):
@@ -213,18 +213,18 @@ class StoredProducer(Producer):
         return self._threads.submit(read)
 
     def __getstate__(self) -> dict[str, Any]:
-        own = ("_cache", "_closed", "_threads", "_process")
-        return {name: value for name, value in vars(self).items() if name not in own}
+        unshared = ("_cache", "_closed", "_threads", "_process")
+        return {name: value for name, value in vars(self).items() if name not in unshared}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Opens the store again, with a new cache and new threads."""
         super().__setstate__(state)
-        self._begin()
+        self._start_threads()
 
     def prepare(self, layout: Layout) -> None:
         """Checks that bricks can be cut out of blocks, if there are coarse channels."""
-        cut = _Cubes.of(self.store, layout).blocks and layout.depth < self.store.levels
-        if len(self.channels) > 1 and not cut:
+        can_cut = _Cubes.of(self.store, layout).are_blocks and layout.depth < self.store.levels
+        if len(self.channels) > 1 and not can_cut:
             sizes = [n for n in (8, 16, 32, 64) if self.store.block % n == 0]
             raise ValueError(
                 f"{self.store.location}: filtered colours are stored for bricks of "
@@ -251,91 +251,93 @@ class StoredProducer(Producer):
         """Combines the cells that each node's brick, border included, reaches into."""
         layout, store = nodes.layout, self.store
         loc = nodes.loc.cpu().numpy()
-        level, zyx = layout.depth - loc[:, 3], loc[:, 2::-1]
+        node_level, zyx = layout.depth - loc[:, 3], loc[:, 2::-1]
         beyond = max(0, layout.border - store.border)  # cells include `store.border` voxels around
         first = (zyx * layout.brick_size - beyond) // store.cell
         last = -(-((zyx + 1) * layout.brick_size + beyond) // store.cell)
         low, high, mean = np.zeros((3, len(loc), store.width), np.float32)
         if store.info.labels:
             mean[:] = np.inf  # of labels, the smallest is used instead of the mean
-        low[:], high[:] = self.channels[_CHANNEL].limits
+        low[:], high[:] = self.channels[_VALUE_CHANNEL].limits
         count = np.zeros((len(loc), 1), np.float32)
         errors: dict[int, str] = {}
-        for here in np.unique(level[level < store.levels]).tolist():
-            grid = np.array(store.cell_grid(here))
-            rows = np.flatnonzero((level == here) & (first < grid).all(1))
+        for level in np.unique(node_level[node_level < store.levels]).tolist():
+            grid = np.array(store.cell_grid(level))
+            rows = np.flatnonzero((node_level == level) & (first < grid).all(1))
             begin, end = first[rows].clip(0), np.minimum(last[rows], grid)
             low[rows], high[rows] = np.inf, -np.inf
             for offset in np.ndindex(*(end - begin).max(0, initial=0)):
-                at = begin + np.array(offset)
-                some = (at < end).all(1)
-                to = rows[some]
-                cells, wrong = self._cells(here, at[some])
-                errors.update({int(to[index]): text for index, text in wrong.items()})
-                low[to] = np.minimum(low[to], cells[:, 0])
-                high[to] = np.maximum(high[to], cells[:, 1])
+                cell = begin + np.array(offset)
+                in_range = (cell < end).all(1)
+                targets = rows[in_range]
+                cells, cell_errors = self._cells(level, cell[in_range])
+                errors.update(
+                    {int(targets[index]): message for index, message in cell_errors.items()}
+                )
+                low[targets] = np.minimum(low[targets], cells[:, 0])
+                high[targets] = np.maximum(high[targets], cells[:, 1])
                 if store.info.labels:
-                    mean[to] = np.minimum(mean[to], cells[:, 2])
+                    mean[targets] = np.minimum(mean[targets], cells[:, 2])
                 else:
-                    mean[to] += cells[:, 2]
-                    count[to] += 1
+                    mean[targets] += cells[:, 2]
+                    count[targets] += 1
         mean = np.where(np.isfinite(mean), mean / np.maximum(count, 1), low)
         summary = NodeSummary(*(torch.from_numpy(values) for values in (low, high, mean)))
-        found = regions_of({_CHANNEL: summary}, self.channels, store.threshold)
-        return replace(found, errors=errors)
+        regions = regions_of({_VALUE_CHANNEL: summary}, self.channels, store.threshold)
+        return replace(regions, errors=errors)
 
-    def _cells(self, level: int, at: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
-        """Returns (k, 3, c) float32 low, high, mean of cells `at` (k, 3) z y x; errors by row."""
+    def _cells(self, level: int, cells: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
+        """Returns (k, 3, c) float32 low, high, mean of `cells` (k, 3) z y x; errors by row."""
         store, grid = self.store, self.store.cell_grid(level)
-        out = np.zeros((len(at), 3, store.width), np.float32)
+        out = np.zeros((len(cells), 3, store.width), np.float32)
         errors: dict[int, str] = {}
-        tiles, parts = rows_by_place(at // _TILE)
-        keys: list[Key] = [("cells", level, *tile) for tile in tiles.tolist()]
+        tile_positions, tile_rows = rows_by_place(cells // _TILE_CELLS)
+        keys: list[Key] = [("cells", level, *tile) for tile in tile_positions.tolist()]
 
-        def read(missing: list[Key]) -> dict[Key, Found]:
-            found: dict[Key, Found] = {}
+        def read(missing: list[Key]) -> dict[Key, ArrayOrMessage]:
+            results: dict[Key, ArrayOrMessage] = {}
             for key in missing:
-                low = [at * _TILE for at in key[2:]]
-                high = [min(at + _TILE, n) for at, n in zip(low, grid, strict=True)]
+                low = [index * _TILE_CELLS for index in key[2:]]
+                high = [min(start + _TILE_CELLS, n) for start, n in zip(low, grid, strict=True)]
                 try:
-                    found[key] = store.read_cells(level, low, high, timeout=self.timeout)
+                    results[key] = store.read_cells(level, low, high, timeout=self.timeout)
                 except (OSError, ValueError) as error:
-                    found[key] = str(error)
-            return found
+                    results[key] = str(error)
+            return results
 
-        for rows, tile in zip(parts, self._cache.get(keys, read), strict=True):
+        for rows, tile in zip(tile_rows, self._cache.get(keys, read), strict=True):
             if isinstance(tile, str):
                 errors.update(dict.fromkeys(rows.tolist(), tile))
             else:
-                out[rows] = tile[tuple((at[rows] % _TILE).T)]
+                out[rows] = tile[tuple((cells[rows] % _TILE_CELLS).T)]
         return out, errors
 
     def _fill(self, nodes: Nodes) -> Bricks:
         layout, store = nodes.layout, self.store
         loc = nodes.loc.cpu().numpy()
-        level = layout.depth - loc[:, 3]
-        found: dict[str, torch.Tensor] = {}
+        node_level = layout.depth - loc[:, 3]
+        by_channel: dict[str, torch.Tensor] = {}
         errors: dict[int, str] = {}
         for name, channel in self.channels.items():
             if channel.coarse and not nodes.coarse:
                 continue
             dtype = np.dtype(str(channel.dtype).removeprefix("torch."))
             out = np.zeros((len(loc), *(layout.side,) * 3, channel.width), dtype)
-            for here in np.unique(level).tolist():
-                rows = np.flatnonzero(level == here)
-                if here < store.levels:
-                    errors |= self._fill_level(out, rows, loc[rows, 2::-1], name, here, layout)
+            for level in np.unique(node_level).tolist():
+                rows = np.flatnonzero(node_level == level)
+                if level < store.levels:
+                    errors |= self._fill_level(out, rows, loc[rows, 2::-1], name, level, layout)
                 else:
-                    errors |= self._fill_coarser(out, rows, loc[rows, 2::-1], here, layout)
-            found[name] = torch.from_numpy(out)
+                    errors |= self._fill_coarser(out, rows, loc[rows, 2::-1], level, layout)
+            by_channel[name] = torch.from_numpy(out)
         if store.has_blocks:
-            return Bricks(data=found, errors=errors)
-        data, out = found[_CHANNEL], found[_CHANNEL].numpy()
+            return Bricks(data=by_channel, errors=errors)
+        data, out = by_channel[_VALUE_CHANNEL], by_channel[_VALUE_CHANNEL].numpy()
         # Without cells, only the voxels show which nodes of the finest level are uniform.
-        flat = (out == out[:, :1, :1, :1]).all((1, 2, 3, 4)) & (level == 0)
-        kind = torch.where(torch.from_numpy(flat), Region.CONSTANT, Region.DATA)
-        constants = {_CHANNEL: data[:, 0, 0, 0]}
-        return Bricks(data={_CHANNEL: data}, kind=kind, constants=constants, errors=errors)
+        uniform = (out == out[:, :1, :1, :1]).all((1, 2, 3, 4)) & (node_level == 0)
+        kind = torch.where(torch.from_numpy(uniform), Region.CONSTANT, Region.DATA)
+        constants = {_VALUE_CHANNEL: data[:, 0, 0, 0]}
+        return Bricks(data={_VALUE_CHANNEL: data}, kind=kind, constants=constants, errors=errors)
 
     def _fill_level(
         self,
@@ -351,60 +353,64 @@ class StoredProducer(Producer):
         is read.
         """
         cubes = _Cubes.of(self.store, layout)
-        places, parts = rows_by_place(zyx // cubes.bricks)
-        corner = zyx % cubes.bricks * cubes.brick_size + cubes.border - layout.border
+        cube_positions, cube_rows = rows_by_place(zyx // cubes.bricks_per_side)
+        corner = zyx % cubes.bricks_per_side * cubes.brick_size + cubes.border - layout.border
         errors: dict[int, str] = {}
-        late = ""
+        timeout_message = ""
 
-        def read(missing: list[Key]) -> dict[Key, Found]:
-            nonlocal late
-            if self._closed.is_set() or late:
-                return dict.fromkeys(missing, late or f"{self.store.location}: closed")
+        def read(missing: list[Key]) -> dict[Key, ArrayOrMessage]:
+            nonlocal timeout_message
+            if self._closed.is_set() or timeout_message:
+                return dict.fromkeys(missing, timeout_message or f"{self.store.location}: closed")
             try:
-                cubes_read = self._read(cubes, channel, level, [key[3:] for key in missing])
+                cubes_read = self._read_cubes(cubes, channel, level, [key[3:] for key in missing])
             except (OSError, ValueError) as error:
-                late = str(error) if isinstance(error, TimeoutError) else ""
+                timeout_message = str(error) if isinstance(error, TimeoutError) else ""
                 return dict.fromkeys(missing, str(error))
             return dict(zip(missing, cubes_read, strict=True))
 
         nbytes = (cubes.side + 2 * cubes.border) ** 3 * out.shape[4] * out.itemsize
-        group = max(1, _GROUP_BYTES // nbytes)
-        for begin in range(0, len(places), group):
-            some = places[begin : begin + group].tolist()
-            keys: list[Key] = [(channel, cubes, level, *at) for at in some]
-            for here, cube in zip(
-                parts[begin : begin + group], self._cache.get(keys, read), strict=True
+        group_size = max(1, _GROUP_BYTES // nbytes)
+        for begin in range(0, len(cube_positions), group_size):
+            group_positions = cube_positions[begin : begin + group_size].tolist()
+            keys: list[Key] = [(channel, cubes, level, *position) for position in group_positions]
+            for brick_rows, cube in zip(
+                cube_rows[begin : begin + group_size], self._cache.get(keys, read), strict=True
             ):
                 if isinstance(cube, str):
-                    errors.update(dict.fromkeys(rows[here].tolist(), cube))
+                    errors.update(dict.fromkeys(rows[brick_rows].tolist(), cube))
                     continue
-                last = tuple(n - layout.side + 1 for n in cube.shape[:3])
-                shape, strides = (*last, *out.shape[1:]), (*cube.strides[:3], *cube.strides)
-                out[rows[here]] = as_strided(cube, shape, strides)[tuple(corner[here].T)]
+                starts = tuple(n - layout.side + 1 for n in cube.shape[:3])
+                shape, strides = (*starts, *out.shape[1:]), (*cube.strides[:3], *cube.strides)
+                out[rows[brick_rows]] = as_strided(cube, shape, strides)[
+                    tuple(corner[brick_rows].T)
+                ]
         return errors
 
-    def _read(self, cubes: _Cubes, channel: str, level: int, places: list[Key]) -> list[Found]:
+    def _read_cubes(
+        self, cubes: _Cubes, channel: str, level: int, positions: list[Key]
+    ) -> list[ArrayOrMessage]:
         """Reads cubes at (z, y, x) of a channel and level, borders included. A cube that fails
         becomes an error message; raises TimeoutError.
         """
-        store, zyx = self.store, np.array(places, np.int64)
-        if cubes.blocks:
-            if channel == _CHANNEL:
-                data, wrong = store.read_blocks(level, zyx, timeout=self.timeout)
+        store, zyx = self.store, np.array(positions, np.int64)
+        if cubes.are_blocks:
+            if channel == _VALUE_CHANNEL:
+                data, errors = store.read_blocks(level, zyx, timeout=self.timeout)
             else:
-                data, wrong = store.read_coarse(channel, level, zyx, timeout=self.timeout)
-            return [wrong.get(index) or block.copy() for index, block in enumerate(data)]
-        found: list[Found] = []
-        for place in places:
-            low = [at * cubes.side - cubes.border for at in place]
-            high = [at + cubes.side + 2 * cubes.border for at in low]
+                data, errors = store.read_coarse(channel, level, zyx, timeout=self.timeout)
+            return [errors.get(index) or block.copy() for index, block in enumerate(data)]
+        arrays: list[ArrayOrMessage] = []
+        for position in positions:
+            low = [index * cubes.side - cubes.border for index in position]
+            high = [start + cubes.side + 2 * cubes.border for start in low]
             try:
-                found.append(store.read_region(level, low, high, timeout=self.timeout))
+                arrays.append(store.read_region(level, low, high, timeout=self.timeout))
             except TimeoutError:
                 raise
             except (OSError, ValueError) as error:
-                found.append(str(error))
-        return found
+                arrays.append(str(error))
+        return arrays
 
     def _fill_coarser(
         self, out: np.ndarray, rows: np.ndarray, zyx: np.ndarray, level: int, layout: Layout
@@ -418,8 +424,8 @@ class StoredProducer(Producer):
             return dict.fromkeys(rows.tolist(), str(error))
         for _ in range(level - last):
             values = self.store.pool(values, 2)
-        reach = np.arange(layout.side) - layout.border
-        corners = zyx[:, :, None] * layout.brick_size + reach
-        z, y, x = (corners[:, axis].clip(0, values.shape[axis] - 1) for axis in range(3))
+        offsets = np.arange(layout.side) - layout.border
+        coordinates = zyx[:, :, None] * layout.brick_size + offsets
+        z, y, x = (coordinates[:, axis].clip(0, values.shape[axis] - 1) for axis in range(3))
         out[rows] = values[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
         return {}

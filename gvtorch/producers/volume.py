@@ -19,7 +19,7 @@ from .answer import regions_of
 from .nodes import Layout, Nodes
 from .producer import Bricks, CoarseColors, Producer, Regions, by_depth, check_filtered
 
-_BATCH = 4096  # bricks cut from a level at a time
+_BATCH_BRICKS = 4096  # bricks cut from a level at a time
 
 
 class VolumeProducer(Producer):
@@ -57,15 +57,15 @@ class VolumeProducer(Producer):
             ValueError: Channels differ in extent, spacing or origin, or `hold` is unknown.
         """
         check.one_of("VolumeProducer", "hold", hold, ("voxels", "bricks", "mapped"))
-        given = volumes_by_channel("VolumeProducer", volume)
-        volumes = {name: one.to("cpu") for name, one in given.items()}
+        by_channel = volumes_by_channel("VolumeProducer", volume)
+        volumes = {name: volume.to("cpu") for name, volume in by_channel.items()}
         first = next(iter(volumes.values()))
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
         if filtered is not None:
             check_filtered("VolumeProducer", filtered)
             name, last = str(filtered.other), first.width - 1
-            what = "component of filtered"
-            check.whole("VolumeProducer", what, filtered.component, low=0, high=last)
+            label = "component of filtered"
+            check.whole("VolumeProducer", label, filtered.component, low=0, high=last)
             if name in channels:
                 raise ValueError(f"VolumeProducer: channel {name!r} is a volume's")
             channels[name] = filtered.colors(first.spacing)
@@ -91,9 +91,9 @@ class VolumeProducer(Producer):
 
     def prepare(self, layout: Layout) -> None:
         """Makes all levels, and all bricks if `hold` is "bricks"."""
-        cuts = (layout.branching, layout.brick_size, layout.border)
-        by_channel = levels_by_depth(self.volumes, layout.depth, *cuts)
-        values = {name: [one.values for one in levels] for name, levels in by_channel.items()}
+        brick_options = (layout.branching, layout.brick_size, layout.border)
+        by_channel = levels_by_depth(self.volumes, layout.depth, *brick_options)
+        values = {name: [level.values for level in levels] for name, levels in by_channel.items()}
         levels = next(iter(by_channel.values()))
         if self._filtered is not None:
             first = next(iter(self.volumes.values()))
@@ -101,88 +101,93 @@ class VolumeProducer(Producer):
             sizes = (layout.branching, layout.depth, layout.device, self.channels[name].width)
             self.made_of[name] = self._filtered.made_of
             values[name] = [*self._filtered.levels(first, *sizes)][::-1]
-        summaries = {name: torch.cat([*map(_rows_of, own)]) for name, own in by_channel.items()}
-        self._grids = _numbered([level.grid for level in levels])
+        summaries = {
+            name: torch.cat([*map(_node_rows, channel_levels)])
+            for name, channel_levels in by_channel.items()
+        }
+        self._grids = _grid_offsets([level.grid for level in levels])
         if self._hold == "bricks":
-            for name, own in values.items():
-                if own:  # a tree of one brick has no coarse ones
-                    self._tables[name] = BrickTable(_all_bricks(own, levels, layout))
+            for name, channel_values in values.items():
+                if channel_values:  # a tree of one brick has no coarse ones
+                    self._tables[name] = BrickTable(_all_bricks(channel_values, levels, layout))
         if self._hold != "mapped":
             self._values, self._nodes = values, summaries
             return
-        there = layout.device
-        self._grids = self._grids.to(there)
-        self._sizes = _numbered([level.values.shape[:3] for level in levels]).to(there)
-        self._nodes = {name: mapped(rows, there) for name, rows in summaries.items()}
+        device = layout.device
+        self._grids = self._grids.to(device)
+        self._sizes = _grid_offsets([level.values.shape[:3] for level in levels]).to(device)
+        self._nodes = {name: mapped(rows, device) for name, rows in summaries.items()}
         while values:  # one by one, and freed, since each is copied
-            name, own = values.popitem()
-            if own:  # a tree of one brick has no coarse ones
-                rows = [movable(level).flatten(0, 2) for level in own]
-                self._voxels[name] = mapped(torch.cat(rows), there)
+            name, channel_values = values.popitem()
+            if channel_values:  # a tree of one brick has no coarse ones
+                rows = [movable(level).flatten(0, 2) for level in channel_values]
+                self._voxels[name] = mapped(torch.cat(rows), device)
 
     def classify(self, nodes: Nodes) -> Regions:
         """Returns EMPTY where no finest voxel in reach is above the threshold, else CONSTANT where
         all are equal, else DATA.
         """
-        row = self._row(nodes)
-        found = {name: NodeSummary(*rows[row].unbind(1)) for name, rows in self._nodes.items()}
-        return regions_of(found, self.channels, self._threshold)
+        row = self._node_index(nodes)
+        summaries = {name: NodeSummary(*rows[row].unbind(1)) for name, rows in self._nodes.items()}
+        return regions_of(summaries, self.channels, self._threshold)
 
     def fill(self, nodes: Nodes) -> Bricks:
         """Cuts the bricks, or returns rows of the table if `hold` is "bricks"."""
         layout = nodes.layout
-        held = {name: c for name, c in self.channels.items() if nodes.coarse or not c.coarse}
+        wanted = {name: c for name, c in self.channels.items() if nodes.coarse or not c.coarse}
         if self._hold == "bricks":
-            row = self._row(nodes)
-            return Bricks(data={name: self._tables[name][row] for name in held})
+            row = self._node_index(nodes)
+            return Bricks(data={name: self._tables[name][row] for name in wanted})
         if self._hold == "mapped":
-            voxel = self._voxel(nodes)
-            found = {name: self._voxels[name][voxel].view(c.dtype) for name, c in held.items()}
-            return Bricks(data=found)
+            voxel = self._voxel_index(nodes)
+            voxels = {name: self._voxels[name][voxel].view(c.dtype) for name, c in wanted.items()}
+            return Bricks(data=voxels)
         loc, data = nodes.loc.cpu(), {}
-        for name, channel in held.items():
+        for name, channel in wanted.items():
             shape = (len(nodes), *(layout.side,) * 3, channel.width)
             bricks = data[name] = torch.empty(shape, dtype=channel.dtype)
-            for depth, here in by_depth(loc):
-                zyx = loc[here, :3].flip(1)
+            for depth, level_rows in by_depth(loc):
+                zyx = loc[level_rows, :3].flip(1)
                 cut = cut_bricks(self._values[name][depth], zyx, layout.brick_size, layout.border)
-                rows, made = wide_rows(bricks, cut)
-                rows[here] = made
+                rows, cut_rows = wide_rows(bricks, cut)
+                rows[level_rows] = cut_rows
         return Bricks(data=data)
 
-    def _row(self, nodes: Nodes) -> Tensor:
+    def _node_index(self, nodes: Nodes) -> Tensor:
         """Returns (k,) int64 indices of nodes among those of all levels; outside, the nearest's."""
         loc = nodes.loc.to(self._grids.device)
-        first, high, deep, wide = self._grids[loc[:, 3]].unbind(1)
+        first, size_z, size_y, size_x = self._grids[loc[:, 3]].unbind(1)
         z, y, x = (
-            at.minimum(n - 1)
-            for at, n in zip(loc[:, :3].flip(1).unbind(1), (high, deep, wide), strict=True)
+            coordinate.minimum(n - 1)
+            for coordinate, n in zip(
+                loc[:, :3].flip(1).unbind(1), (size_z, size_y, size_x), strict=True
+            )
         )
-        return first + (z * deep + y) * wide + x
+        return first + (z * size_y + y) * size_x + x
 
-    def _voxel(self, nodes: Nodes) -> Tensor:
+    def _voxel_index(self, nodes: Nodes) -> Tensor:
         """Returns (k, s, s, s) int64 indices of voxels among those of all levels, of the bricks
         that `cut_bricks` cuts.
         """
         layout, loc = nodes.layout, nodes.loc.to(self._sizes.device)
         first, *sizes = self._sizes[loc[:, 3], :, None, None, None].unbind(1)
-        reach = torch.arange(layout.side, device=loc.device) - layout.border
-        at = []
+        offsets = torch.arange(layout.side, device=loc.device) - layout.border
+        indices = []
         for axis, (node, size) in enumerate(zip(loc[:, :3].flip(1).unbind(1), sizes, strict=True)):
-            along = reach.view([-1 if other == axis else 1 for other in range(3)])
-            place = node[:, None, None, None] * layout.brick_size + along
-            at.append(place.clamp(min=0).minimum(size - 1))
-        z, y, x = at
+            axis_offsets = offsets.view([-1 if other == axis else 1 for other in range(3)])
+            coordinate = node[:, None, None, None] * layout.brick_size + axis_offsets
+            indices.append(coordinate.clamp(min=0).minimum(size - 1))
+        z, y, x = indices
         return first + (z * sizes[1] + y) * sizes[2] + x
 
 
-def _rows_of(level: Level) -> Tensor:
+def _node_rows(level: Level) -> Tensor:
     """Returns (n, 3, c): low, high and mean of the nodes of a level."""
-    own = level.nodes
-    return torch.stack((own.low, own.high, own.mean), 3).flatten(0, 2)
+    summary = level.nodes
+    return torch.stack((summary.low, summary.high, summary.mean), 3).flatten(0, 2)
 
 
-def _numbered(sizes: Sequence[Sequence[int]]) -> Tensor:
+def _grid_offsets(sizes: Sequence[Sequence[int]]) -> Tensor:
     """Returns (d, 4) int64 for concatenated grids (z, y, x): index of the first entry, sizes."""
     grids = torch.tensor([[*size] for size in sizes])
     count = grids.prod(1, keepdim=True)
@@ -191,11 +196,13 @@ def _numbered(sizes: Sequence[Sequence[int]]) -> Tensor:
 
 def _all_bricks(values: list[Tensor], levels: list[Level], layout: Layout) -> Tensor:
     """Returns (n, s, s, s, c): the bricks of a channel, by level and then z, y, x."""
-    places = [torch.cartesian_prod(*map(torch.arange, one.grid)) for one in levels[: len(values)]]
-    shape = (sum(map(len, places)), *(layout.side,) * 3, values[0].shape[3])
+    node_positions = [
+        torch.cartesian_prod(*map(torch.arange, level.grid)) for level in levels[: len(values)]
+    ]
+    shape = (sum(map(len, node_positions)), *(layout.side,) * 3, values[0].shape[3])
     bricks, begin = torch.empty(shape, dtype=values[0].dtype), 0
-    for level, zyx in zip(values, places, strict=True):
-        for part in zyx.split(_BATCH):
+    for level, zyx in zip(values, node_positions, strict=True):
+        for part in zyx.split(_BATCH_BRICKS):
             cut = cut_bricks(level, part, layout.brick_size, layout.border)
             bricks[begin : begin + len(part)] = cut
             begin += len(part)

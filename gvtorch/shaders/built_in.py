@@ -42,15 +42,15 @@ __all__ = [
     "StoredColor",
 ]
 
-_TRANSFER = instance_of(TransferFunction)
+_TRANSFER_CHECK = instance_of(TransferFunction)
 _WHITE = TransferFunction.from_points([(0, 1)])
-_COLOR = a_triple(low=0, high=1)
+_COLOR_CHECK = a_triple(low=0, high=1)
 _PROJECTIONS = {name: name for name in ("maximum", "minimum", "mean")}
 _PROJECTIONS |= {"max": "maximum", "min": "minimum"}
 # For `WideIsosurface`: rows of its table; width of its ramp in intervals, fitted so that penumbras
 # agree best; largest width of a distance field's ramp in voxels.
-_ROWS, _RAMP, _WIDEST = 1025, 3.0, 16
-_OPAQUE = 1e-20  # a reference length so short that any opacity above 0 becomes 1
+_RAMP_ROWS, _RAMP_INTERVALS, _MAX_RAMP_VOXELS = 1025, 3.0, 16
+_OPAQUE_LENGTH = 1e-20  # a reference length so short that any opacity above 0 becomes 1
 
 
 class Lit(LitShader):
@@ -64,7 +64,7 @@ class Lit(LitShader):
     shadowed_kind = "ShadowedLit"
     transfer: TransferFunction
     checks: ClassVar[Mapping[str, Check]] = {
-        "transfer": _TRANSFER,
+        "transfer": _TRANSFER_CHECK,
         "in_the_way": or_none(instance_of(Shader)),
     }
 
@@ -101,7 +101,7 @@ class PreIntegrated(Shader):
 
     kind = "PreIntegrated"
     transfer: TransferFunction
-    checks: ClassVar[Mapping[str, Check]] = {"transfer": _TRANSFER}
+    checks: ClassVar[Mapping[str, Check]] = {"transfer": _TRANSFER_CHECK}
 
     def __init__(self, transfer: TransferFunction) -> None:
         self.transfer = transfer
@@ -170,24 +170,24 @@ class StoredColor(LitShader):
         )
 
     def unlit(self) -> Self:
-        bare = super().unlit()
-        bare.lit = True
-        return bare
+        unlit = super().unlit()
+        unlit.lit = True
+        return unlit
 
     def blocker(self) -> StoredColor:
-        bare = copy(self)
-        bare.lit = bare.shadows = False
-        bare.octaves = 0
-        return bare
+        blocker = copy(self)
+        blocker.lit = blocker.shadows = False
+        blocker.octaves = 0
+        return blocker
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
-        known = tree.bricks.channels.get(str(self.channel), Channel(width=4))
-        if known.width not in (4, 24):
+        channel = tree.bricks.channels.get(str(self.channel), Channel(width=4))
+        if channel.width not in (4, 24):
             raise ValueError(
                 f"{where}: stored colour needs 4 numbers a voxel, or 24 for six directions, "
-                f"{self.channel!r} has {known.width}"
+                f"{self.channel!r} has {channel.width}"
             )
-        if known.width == 24 and self.reference not in (None, min(tree.spacing)):
+        if channel.width == 24 and self.reference not in (None, min(tree.spacing)):
             raise ValueError(
                 f"{where}: {self.channel!r} has six directions, so its opacity is that of the "
                 f"smallest spacing, {min(tree.spacing):g}; got reference {self.reference:g}"
@@ -209,7 +209,7 @@ class Isosurface(LitShader):
         "color": lambda owner, name, value: (
             value
             if value is None or isinstance(value, TransferFunction)
-            else _COLOR(owner, name, value)
+            else _COLOR_CHECK(owner, name, value)
         ),
         "filled": flag,
         "premultiplied": flag,
@@ -300,7 +300,7 @@ class Isosurface(LitShader):
             colors.channel, colors.component = self.other, self.other_component
         elif self.color is None:
             colors = StoredColor(
-                str(self.other), reference=_OPAQUE, premultiplied=self.premultiplied
+                str(self.other), reference=_OPAQUE_LENGTH, premultiplied=self.premultiplied
             )
         return CutSurface(
             level=self.value, below=self.distance, value=value, color=color, colors=colors
@@ -345,31 +345,38 @@ class WideIsosurface(Shader):
 
     def table(self, sampling: Sampling) -> ColorTable:
         """See `Shader`; computed on the device, where the level may be a tensor. Values more than
-        `most_1` (data units) away from the level, outside of the solid, can be skipped.
+        `half_domain_1` (data units) away from the level, outside of the solid, can be skipped.
         """
         dtype, device = sampling.dtype, sampling.device
         value_1 = pack((self.level,), dtype, device)
         if self.distance:
-            most_1 = torch.full_like(value_1, _WIDEST / 2 * sampling.smallest_spacing)
+            half_domain_1 = torch.full_like(
+                value_1, _MAX_RAMP_VOXELS / 2 * sampling.smallest_spacing
+            )
             slope_1 = torch.ones_like(value_1)
         else:
-            most_1 = value_1.abs() / 2
-            slope_1 = most_1 / (2 * sampling.smallest_spacing)
-        most_1 = torch.maximum(most_1, 1e-5 * value_1.abs().clamp(min=1))  # else the ramp is a jump
+            half_domain_1 = value_1.abs() / 2
+            slope_1 = half_domain_1 / (2 * sampling.smallest_spacing)
+        # At least so wide that the ramp is not a jump.
+        half_domain_1 = torch.maximum(half_domain_1, 1e-5 * value_1.abs().clamp(min=1))
         length_l = sampling.step * 2 ** torch.arange(sampling.levels, dtype=dtype, device=device)
-        half_l = torch.minimum((_RAMP / 2 * slope_1 * length_l).clamp(min=1e-30), most_1)
-        away_m = most_1 * torch.linspace(-1, 1, _ROWS, dtype=dtype, device=device)
-        inside_m = -away_m if self.distance else away_m
-        table = pack((self.color, 0.0), dtype, device).expand(sampling.levels, _ROWS, 4).clone()
-        share_lm = (0.5 + inside_m / (2 * half_l[:, None])).clamp(0, 1)
+        half_ramp_l = torch.minimum(
+            (_RAMP_INTERVALS / 2 * slope_1 * length_l).clamp(min=1e-30), half_domain_1
+        )
+        offset_m = half_domain_1 * torch.linspace(-1, 1, _RAMP_ROWS, dtype=dtype, device=device)
+        inside_m = -offset_m if self.distance else offset_m
+        table = (
+            pack((self.color, 0.0), dtype, device).expand(sampling.levels, _RAMP_ROWS, 4).clone()
+        )
+        fraction_lm = (0.5 + inside_m / (2 * half_ramp_l[:, None])).clamp(0, 1)
         # A cone that grazes a surface meets it in several intervals: each lets through the fourth
         # root of the transmittance.
-        table[:, :, 3] = 1 - (1 - share_lm).sqrt().sqrt()
-        seen_m = (table[:, :, 3] > 0).any(0)
+        table[:, :, 3] = 1 - (1 - fraction_lm).sqrt().sqrt()
+        visible_m = (table[:, :, 3] > 0).any(0)
         return ColorTable(
             table_lm4=table,
-            domain_2=torch.cat((value_1 - most_1, value_1 + most_1)),
-            opaque_m=seen_m.cumsum(0, dtype=torch.int32),
+            domain_2=torch.cat((value_1 - half_domain_1, value_1 + half_domain_1)),
+            opaque_m=visible_m.cumsum(0, dtype=torch.int32),
         )
 
 
@@ -384,7 +391,7 @@ class Projection(Shader):
     which: Literal["maximum", "minimum", "mean"]
     checks: ClassVar[Mapping[str, Check]] = {
         "which": lambda owner, name, value: _projection(value),
-        "transfer": _TRANSFER,
+        "transfer": _TRANSFER_CHECK,
     }
 
     def __init__(
@@ -418,7 +425,7 @@ class Features(Shader):
 
     kind = "Features"
     checks: ClassVar[Mapping[str, Check]] = {
-        "transfer": _TRANSFER,
+        "transfer": _TRANSFER_CHECK,
         "other": lambda owner, _, value: as_name(owner, "channel", value),
     }
 
@@ -440,7 +447,7 @@ class GradientMagnitude(Shader):
     kind = "GradientMagnitude"
     transfer: TransferFunction
     checks: ClassVar[Mapping[str, Check]] = {
-        "transfer": _TRANSFER,
+        "transfer": _TRANSFER_CHECK,
         "full": or_none(a_number(low=1e-30)),
     }
 

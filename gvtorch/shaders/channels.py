@@ -23,17 +23,17 @@ from .transfer_function import TransferFunction
 Mode = Literal["additive", "opacity"]
 
 #: Default colours by a channel's index in the list; the first is a blue light enough to be seen.
-DISTINCT = (
+DEFAULT_COLORS = (
     *("#2850ff", "#00ff00", "#ff0000", "#ff00ff", "#00ffff", "#ffff00", "#ff8000", "#ffffff"),
     *("#8000ff", "#80ff00", "#ff0080", "#0080ff", "#00ff80", "#ff8080", "#80c0ff", "#ffd080"),
 )
 
-MOST = len(DISTINCT)  # channels in one picture
-_RAMP = 16  # linear pieces that approximate the quadratic rise of opacity
-_OPACITY = 0.5
-_OPAQUE = 1024.0  # halvings of light that represent an opacity of 1
-_MOST_ROWS = 2**22  # of a table, so that float32 can index its rows
-_WINDOW = (50.0, 99.9)  # percentiles of the values
+MAX_CHANNELS = len(DEFAULT_COLORS)  # channels in one picture
+_RAMP_PIECES = 16  # linear pieces that approximate the quadratic rise of opacity
+_DEFAULT_OPACITY = 0.5
+_OPAQUE_HALVINGS = 1024.0  # halvings of light that represent an opacity of 1
+_MAX_TABLE_ROWS = 2**22  # of a table, so that float32 can index its rows
+_WINDOW_PERCENTILES = (50.0, 99.9)  # percentiles of the values
 
 
 @dataclass(kw_only=True)
@@ -86,12 +86,14 @@ class ChannelLook:
                 "Channels.of(volume) finds windows"
             )
         low, high = window_of(where, self.window)
-        default = DISTINCT[place] if count > 1 else "white"
+        default = DEFAULT_COLORS[place] if count > 1 else "white"
         color = channel_color(where, default if self.color is None else self.color)
-        opacity = _OPACITY if self.opacity is None else self.opacity
+        opacity = _DEFAULT_OPACITY if self.opacity is None else self.opacity
         opacity = check.number(where, "opacity", opacity, low=0, high=1)
-        parts = [part / _RAMP for part in range(_RAMP)]
-        rising = [(low + part * (high - low), opacity * part * part) for part in parts]
+        fractions = [piece / _RAMP_PIECES for piece in range(_RAMP_PIECES)]
+        rising = [
+            (low + fraction * (high - low), opacity * fraction * fraction) for fraction in fractions
+        ]
         return TransferFunction([*rising, (high, opacity)], [(low, 0, 0, 0), (high, *color)])
 
 
@@ -141,11 +143,12 @@ class Channels(Shader):
             ValueError: There are too many or none, one is no look, or a number is out of its range.
         """
         self.looks = [
-            ChannelLook(transfer=one) if isinstance(one, TransferFunction) else one for one in looks
+            ChannelLook(transfer=look) if isinstance(look, TransferFunction) else look
+            for look in looks
         ]
         self.mode, self.channel = mode, channel
         self._tables: dict[Any, ColorTable] = {}
-        self._shown()
+        self._visible_functions()
 
     @classmethod
     def of(
@@ -174,28 +177,28 @@ class Channels(Shader):
             raise ValueError(f"Channels.of: image must be a Volume or a Store, got {kind}")
         width = image.width
         chosen = range(width) if components is None else components
-        if len(chosen) > MOST:
+        if len(chosen) > MAX_CHANNELS:
             raise ValueError(
-                f"Channels.of: at most {MOST} channels are shown together, got {len(chosen)}; "
-                "choose some: components=[0, 1, ...]"
+                f"Channels.of: at most {MAX_CHANNELS} channels are shown together, "
+                f"got {len(chosen)}; choose some: components=[0, 1, ...]"
             )
         for component in chosen:
             check.whole("Channels.of", "component", component, low=0, high=width - 1)
-        told = {c: one for c, one in enumerate(image.info.channels) if c in chosen}
-        active = not any(one.active for one in told.values()) or components is not None
-        unknown = [c for c in chosen if c not in told or told[c].window is None]
-        found = dict(zip(unknown, windows(image, _WINDOW, unknown), strict=True))
+        infos = {c: info for c, info in enumerate(image.info.channels) if c in chosen}
+        show_all = not any(info.active for info in infos.values()) or components is not None
+        unset = [c for c in chosen if c not in infos or infos[c].window is None]
+        found_windows = dict(zip(unset, windows(image, _WINDOW_PERCENTILES, unset), strict=True))
         looks = []
         for component in chosen:
-            one = told.get(component, ChannelInfo())
+            info = infos.get(component, ChannelInfo())
             looks.append(
                 ChannelLook(
-                    color=one.color and tuple(array_from_srgb(np.array(one.color)).tolist()),
-                    window=one.window or found[component],
+                    color=info.color and tuple(array_from_srgb(np.array(info.color)).tolist()),
+                    window=info.window or found_windows[component],
                     component=component,
-                    visible=active or one.active,
+                    visible=show_all or info.active,
                     opacity=opacity,
-                    name=one.name,
+                    name=info.name,
                 )
             )
         return cls(looks, mode)
@@ -203,65 +206,69 @@ class Channels(Shader):
     @property
     def component(self) -> int:  # type: ignore[override]
         """The highest index that it reads from a voxel: the op checks that voxels have it."""
-        return max((component for component, _ in self._shown()), default=0)
+        return max((component for component, _ in self._visible_functions()), default=0)
 
     def table(self, sampling: Sampling) -> ColorTable:
         """Returns the header and the rows of all channels, see csrc/shaders/channels.h."""
-        shown = self._shown()
-        functions = [(c, f.opacity.tobytes(), f.color.tobytes(), f.reference) for c, f in shown]
-        key = (self.mode, *functions, sampling)
+        functions = self._visible_functions()
+        function_keys = [
+            (c, f.opacity.tobytes(), f.color.tobytes(), f.reference) for c, f in functions
+        ]
+        key = (self.mode, *function_keys, sampling)
         if key not in self._tables:
-            self._tables = {key: _make_table(shown, self.mode == "additive", sampling)}
+            self._tables = {key: _make_table(functions, self.mode == "additive", sampling)}
         return self._tables[key]
 
-    def _shown(self) -> list[tuple[int, TransferFunction]]:
+    def _visible_functions(self) -> list[tuple[int, TransferFunction]]:
         """Returns component and current transfer function of each visible channel."""
         where, looks = "Channels", self.looks
         check.one_of(where, "mode", self.mode, get_args(Mode))
-        if not 1 <= len(looks) <= MOST:
-            raise ValueError(f"{where}: takes 1 to {MOST} channels, got {len(looks)}")
-        shown = []
-        for place, look in enumerate(looks):
-            check.instance(where, f"channel {place}", look, ChannelLook)
-            component = place if look.component is None else look.component
-            check.whole(where, f"component of channel {place}", component, low=0)
-            function = look.function(place, len(looks))
+        if not 1 <= len(looks) <= MAX_CHANNELS:
+            raise ValueError(f"{where}: takes 1 to {MAX_CHANNELS} channels, got {len(looks)}")
+        visible = []
+        for index, look in enumerate(looks):
+            check.instance(where, f"channel {index}", look, ChannelLook)
+            component = index if look.component is None else look.component
+            check.whole(where, f"component of channel {index}", component, low=0)
+            function = look.function(index, len(looks))
             if look.visible:
-                shown.append((component, function))
-        return shown
+                visible.append((component, function))
+        return visible
 
     def __repr__(self) -> str:
         """Returns the mode and each look's name or component."""
         looks = ", ".join(
-            look.name or f"{place if look.component is None else look.component}"
-            for place, look in enumerate(self.looks)
+            look.name or f"{index if look.component is None else look.component}"
+            for index, look in enumerate(self.looks)
         )
         return f"Channels([{looks}], {self.mode!r})"
 
 
 def _make_table(
-    shown: list[tuple[int, TransferFunction]], added: bool, sampling: Sampling
+    functions: list[tuple[int, TransferFunction]], additive: bool, sampling: Sampling
 ) -> ColorTable:
-    sampled = [(component, function, *function.rows()) for component, function in shown]
-    count = 1 + len(shown)
-    total = max(2, count + sum(len(rows) for *_, rows in sampled))
-    if total > _MOST_ROWS:
+    sampled = [(component, function, *function.rows()) for component, function in functions]
+    used_rows = 1 + len(functions)
+    total_rows = max(2, used_rows + sum(len(rows) for *_, rows in sampled))
+    if total_rows > _MAX_TABLE_ROWS:
         raise ValueError(
-            f"Channels: the transfer functions take {total} rows, more than {_MOST_ROWS}: "
-            "some of their points are too close"
+            f"Channels: the transfer functions take {total_rows} rows, more than "
+            f"{_MAX_TABLE_ROWS}: some of their points are too close"
         )
-    levels = sampling.fitting(total)
-    table, opaque_m = np.zeros((levels, total, 4)), np.zeros(total, np.int32)
-    table[:, 0, :2] = len(shown), added
-    for place, (component, function, low, high, rows) in enumerate(sampled, 1):
-        mine = slice(count, count + len(rows))
-        table[:, place] = component, low, (len(rows) - 1) / (high - low), len(rows)
-        table[:, mine, :3] = rows[:, :3]
+    levels = sampling.fitting(total_rows)
+    table, opaque_m = np.zeros((levels, total_rows, 4)), np.zeros(total_rows, np.int32)
+    table[:, 0, :2] = len(functions), additive
+    for header_row, (component, function, low, high, rows) in enumerate(sampled, 1):
+        row_slice = slice(used_rows, used_rows + len(rows))
+        table[:, header_row] = component, low, (len(rows) - 1) / (high - low), len(rows)
+        table[:, row_slice, :3] = rows[:, :3]
         with np.errstate(divide="ignore"):
             halvings = np.log1p(-rows[:, 3]) * (-function.length(sampling) / math.log(2))
-        table[:, mine, 3] = np.minimum(halvings, _OPAQUE) * 2.0 ** np.arange(levels)[:, None]
-        opaque_m[mine] = np.cumsum(rows[:, 3] > 0)
-        count += len(rows)
+        table[:, row_slice, 3] = (
+            np.minimum(halvings, _OPAQUE_HALVINGS) * 2.0 ** np.arange(levels)[:, None]
+        )
+        opaque_m[row_slice] = np.cumsum(rows[:, 3] > 0)
+        used_rows += len(rows)
     dtype, device = sampling.dtype, sampling.device
     return ColorTable(
         table_lm4=torch.tensor(table, dtype=dtype, device=device),
@@ -282,5 +289,5 @@ def window_of(where: str, window: Sequence[float]) -> tuple[float, float]:
 
 def channel_color(where: str, color: Triple | str) -> Triple:
     """Returns a colour as linear RGB; names are those of microscopy lookup tables (`COLORS`)."""
-    named = {name: f"#{to_hex(one)}" for name, one in COLORS.items()}
+    named = {name: f"#{to_hex(rgb)}" for name, rgb in COLORS.items()}
     return named_color(where, color, named)

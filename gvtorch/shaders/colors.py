@@ -21,9 +21,9 @@ NAMED = {
     **{"violet": "#8246c8", "magenta": "#dc28b4", "pink": "#ff96be", "salmon": "#fa8072"},
     **{"brown": "#8c5032", "tan": "#d2b48c", "bone": "#e8dcc5", "olive": "#808000"},
 }
-_GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / the golden ratio
-_MIXED = np.uint64(2**16)
-_APART = 0x57AE147AE147B001  # 2^64 * 0.3425: this makes the first 64 colours differ most
+_HUE_STEP = 0x9E3779B97F4A7C15  # 2^64 / the golden ratio
+_HASHED_FROM = np.uint64(2**16)
+_LIGHTNESS_STEP = 0x57AE147AE147B001  # 2^64 * 0.3425: this makes the first 64 colours differ most
 
 
 def linear_color(
@@ -34,8 +34,8 @@ def linear_color(
     """
     if not isinstance(value, str):
         color = check.triple(where, "colour", value)
-        for part in color:
-            check.number(where, "colour", part, low=0, high=1)
+        for component in color:
+            check.number(where, "colour", component, low=0, high=1)
         return color
     text = named.get(value.lower(), value)
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
@@ -55,22 +55,23 @@ def distinct_colors(numbers: np.ndarray) -> np.ndarray:
     Source: Ottosson, "A perceptual color space for image processing", 2020 (OKLab); Steele, Lea,
         Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014 (the mixing).
     """
-    whole = numbers.astype(np.int64).view(np.uint64)
-    whole = np.where(whole < _MIXED, whole, _mixed(whole))
-    hue, other = (
-        (whole * np.uint64(step) >> np.uint64(11)) * 2.0**-53 for step in (_GOLDEN, _APART)
+    bits = numbers.astype(np.int64).view(np.uint64)
+    bits = np.where(bits < _HASHED_FROM, bits, _hashed(bits))
+    hue, variation = (
+        (bits * np.uint64(step) >> np.uint64(11)) * 2.0**-53
+        for step in (_HUE_STEP, _LIGHTNESS_STEP)
     )
-    lightness = 0.56 + 0.30 * other
-    chroma = 0.165 - 0.05 * np.abs(2 * other - 1)
+    lightness = 0.56 + 0.30 * variation
+    chroma = 0.165 - 0.05 * np.abs(2 * variation - 1)
     angle = 2 * math.pi * (hue + 0.07)
     return _from_oklab(lightness, chroma * np.cos(angle), chroma * np.sin(angle))
 
 
-def _mixed(whole: np.ndarray) -> np.ndarray:
+def _hashed(bits: np.ndarray) -> np.ndarray:
     """Returns (k,) uint64 hashes: every bit depends on all bits of a number."""
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
-        whole = (whole ^ (whole >> np.uint64(shift))) * np.uint64(factor)
-    return whole ^ (whole >> np.uint64(31))
+        bits = (bits ^ (bits >> np.uint64(shift))) * np.uint64(factor)
+    return bits ^ (bits >> np.uint64(31))
 
 
 def _from_oklab(lightness: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

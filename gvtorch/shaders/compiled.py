@@ -74,13 +74,13 @@ class CompiledShader(LitShader):
         """
         super().__init__(**light)
         self.name = name
-        self._take(user.load_op(header, name))
+        self._use_compiled(user.load_op(header, name))
         self.transfer, self.channel, self.component = transfer, channel, component
         self.other, self.other_component = other, other_component
         self.uniforms = {} if uniforms is None else uniforms
-        self._numbers()
+        self._uniform_values()
 
-    def _take(self, compiled: user.UserShader) -> None:
+    def _use_compiled(self, compiled: user.UserShader) -> None:
         self._compiled = compiled
         self.header, self.kind = compiled.header, compiled.name
         self.op, self.whole_ray = compiled.op, compiled.whole
@@ -89,7 +89,7 @@ class CompiledShader(LitShader):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restores a pickled shader: loads its op, compiling it if it is not in the cache."""
         self.__dict__.update(state)
-        self._take(user.reload(self._compiled))
+        self._use_compiled(user.reload(self._compiled))
 
     @property
     def libraries(self) -> list[Path]:
@@ -109,7 +109,7 @@ class CompiledShader(LitShader):
     def parameter_tensor(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
         """Returns (20 + k,): the 20 numbers of any shader, then the current uniforms."""
         fixed = super().parameter_tensor(tree, dtype).reshape(-1)
-        numbers = self._numbers()
+        numbers = self._uniform_values()
         return torch.cat((fixed, pack(numbers, dtype, tree.device))) if numbers else fixed
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
@@ -118,27 +118,29 @@ class CompiledShader(LitShader):
             user.load_cuda(self._compiled)
         return super().shading(where, tree)
 
-    def _numbers(self) -> list[Any]:
+    def _uniform_values(self) -> list[Any]:
         """Returns the uniforms in the struct's order, checked."""
-        names, given = self._compiled.uniforms, self.uniforms
-        if isinstance(given, Tensor):
-            parts: dict[str, Any] = {"uniforms": given}
+        names, uniforms = self._compiled.uniforms, self.uniforms
+        if isinstance(uniforms, Tensor):
+            values: dict[str, Any] = {"uniforms": uniforms}
             count: int | str = "k" if names is None else len(names)
-            check.tensor(self.name, "uniforms", given, (count,), given.dtype, given.device)
-        elif not isinstance(given, Mapping):
-            raise ValueError(f"{self.name}: uniforms must be a dict or a tensor, got {given!r}")
-        elif set(given) != set(names or ()):
-            known = ", ".join(names) if names else "none" if names is not None else "a (k,) tensor"
-            came = ", ".join(map(str, given)) or "none"
-            raise ValueError(f"{self.name}: uniforms must be {known}, got {came}")
+            check.tensor(self.name, "uniforms", uniforms, (count,), uniforms.dtype, uniforms.device)
+        elif not isinstance(uniforms, Mapping):
+            raise ValueError(f"{self.name}: uniforms must be a dict or a tensor, got {uniforms!r}")
+        elif set(uniforms) != set(names or ()):
+            expected = (
+                ", ".join(names) if names else "none" if names is not None else "a (k,) tensor"
+            )
+            names_given = ", ".join(map(str, uniforms)) or "none"
+            raise ValueError(f"{self.name}: uniforms must be {expected}, got {names_given}")
         else:
-            parts = {f"uniform {name}": given[name] for name in names or ()}
-        for what, value in parts.items():
+            values = {f"uniform {name}": uniforms[name] for name in names or ()}
+        for label, value in values.items():
             if not isinstance(value, Tensor):
-                check.number(self.name, what, value)
-            elif value.numel() != 1 and value is not given:
+                check.number(self.name, label, value)
+            elif value.numel() != 1 and value is not uniforms:
                 got = check.describe(value)
-                raise ValueError(f"{self.name}: {what} must be one number, got {got}")
+                raise ValueError(f"{self.name}: {label} must be one number, got {got}")
             elif value.is_complex():
-                raise ValueError(f"{self.name}: {what} must be real, got {check.describe(value)}")
-        return list(parts.values())
+                raise ValueError(f"{self.name}: {label} must be real, got {check.describe(value)}")
+        return list(values.values())

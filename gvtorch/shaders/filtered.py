@@ -52,12 +52,12 @@ from .transfer_function import TransferFunction
 #: Results of `finer`. The finest voxels are not filtered: the sharper their detail, the smaller
 #: the pixels must be that are drawn from them, and the smaller this factor.
 _FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
-_OPAQUE = 0.2  # colours are stored by direction if a finest voxel can have a higher alpha
+_OPAQUE_ALPHA = 0.2  # colours are stored by direction if a finest voxel can have a higher alpha
 _TIMEOUT = 3600.0  # seconds for one read of local data
-_BATCH = 4096  # bricks cut at a time
+_BATCH_BRICKS = 4096  # bricks cut at a time
 
 
-def _to_filter(owner: Any, name: str, value: Any) -> TransferFunction | Lit:
+def _check_filterable(owner: Any, name: str, value: Any) -> TransferFunction | Lit:
     """Checks that a value is a shader that can be filtered."""
     where = kind_of(owner)
     if not isinstance(value, TransferFunction | Lit):
@@ -87,7 +87,10 @@ class Filtered(Shader):
     lit_kind = "FilteredLit"  # of a `Lit`
     reads_coarse = True
     transfer: TransferFunction | Lit
-    checks: ClassVar[Mapping[str, Check]] = {"transfer": _to_filter, "component": whole_between(0)}
+    checks: ClassVar[Mapping[str, Check]] = {
+        "transfer": _check_filterable,
+        "component": whole_between(0),
+    }
 
     def __init__(
         self,
@@ -147,22 +150,24 @@ class Filtered(Shader):
         if channel == tree.channel_names[0]:
             raise ValueError(f"Filtered: channel {channel!r} is that of the values")
         owner_b = tree.bricks.owner_b
-        places = tree.loc(owner_b.clamp(min=0).to(torch.int64)).cpu()
-        upper = (owner_b.cpu() >= 0) & (places[:, 3] < tree.depth)
-        count = int(upper.sum())
-        if not bool(upper[:count].all()):
+        locs = tree.loc(owner_b.clamp(min=0).to(torch.int64)).cpu()
+        is_coarse = (owner_b.cpu() >= 0) & (locs[:, 3] < tree.depth)
+        count = int(is_coarse.sum())
+        if not bool(is_coarse[:count].all()):
             raise ValueError("Filtered: the tree's coarse bricks must come first in its pool")
-        bricks, kind = tree.bricks, shader.colors(tree.spacing)
+        bricks, color_channel = tree.bricks, shader.colors(tree.spacing)
         side = bricks.brick_size + 2 * bricks.border
-        colors = torch.zeros((count, side, side, side, kind.width), dtype=kind.dtype)
-        sizes = (tree.branching, tree.depth, tree.device, kind.width)
-        levels = shader.levels(volume, *sizes, progress)
+        colors = torch.zeros(
+            (count, side, side, side, color_channel.width), dtype=color_channel.dtype
+        )
+        level_arguments = (tree.branching, tree.depth, tree.device, color_channel.width)
+        levels = shader.levels(volume, *level_arguments, progress)
         for level, values in enumerate(levels, 1):
-            mine = (places[:count, 3] == tree.depth - level).nonzero()[:, 0]
-            for some in mine.split(_BATCH):
-                place = places[some, :3].flip(1)
-                colors[some] = cut_bricks(values, place, bricks.brick_size, bricks.border)
-        bricks.channels[channel] = tree.nodes.channels[channel] = kind
+            level_rows = (locs[:count, 3] == tree.depth - level).nonzero()[:, 0]
+            for rows in level_rows.split(_BATCH_BRICKS):
+                zyx = locs[rows, :3].flip(1)
+                colors[rows] = cut_bricks(values, zyx, bricks.brick_size, bricks.border)
+        bricks.channels[channel] = tree.nodes.channels[channel] = color_channel
         bricks.bricks[channel], bricks.coarse = colors.to(tree.device), count
         tree.made_of[channel] = shader.made_of
         return shader
@@ -199,20 +204,20 @@ class Filtered(Shader):
         opened = store if isinstance(store, Store) else Store.open(store)
         check.whole("Filtered", "component", component, low=0, high=opened.width - 1)
         shader = cls(transfer, channel, component, directions=directions)
-        place = check.device("Filtered", device)
-        kind, made_of = shader.colors(opened.spacing), shader.made_of
-        wide = 6 * (shader.numbers + 1)
+        torch_device = check.device("Filtered", device)
+        color_channel, made_of = shader.colors(opened.spacing), shader.made_of
+        voxel_width = 6 * (shader.numbers + 1)
 
         def fill(levels: Sequence[np.ndarray]) -> None:
             out = [torch.from_numpy(level) for level in levels]
             field = _StoreField(opened, component)
-            shader.write(field, opened.spacing, 2, out, place, progress)
+            shader.write(field, opened.spacing, 2, out, torch_device, progress)
 
         def keep(colors: np.ndarray) -> np.ndarray:
-            return shader.kept(torch.from_numpy(colors), kind.width).numpy()
+            return shader.kept(torch.from_numpy(colors), color_channel.width).numpy()
 
-        told = CoarseChannel(width=kind.width, made_of=made_of)
-        make_channel(opened, channel, told, wide, fill, keep, progress)
+        coarse_channel = CoarseChannel(width=color_channel.width, made_of=made_of)
+        make_channel(opened, channel, coarse_channel, voxel_width, fill, keep, progress)
         return shader
 
     @classmethod
@@ -225,26 +230,26 @@ class Filtered(Shader):
         """
         opened = store if isinstance(store, Store) else Store.open(store)
         if channel not in opened.coarse:
-            known = ", ".join(map(repr, opened.coarse)) or "none"
+            names_stored = ", ".join(map(repr, opened.coarse)) or "none"
             raise ValueError(
-                f"{opened.location}: has no filtered colours {channel!r} (it has {known}); "
+                f"{opened.location}: has no filtered colours {channel!r} (it has {names_stored}); "
                 "gvtorch filter (Filtered.add_to) makes them"
             )
-        told = opened.coarse[channel]
+        coarse = opened.coarse[channel]
         names = ("opacity", "color", "reference", "component")
-        lit = told.made_of.get("normals") is True
-        wanted = sorted((*names, "normals") if lit else names)
+        lit = coarse.made_of.get("normals") is True
+        expected_keys = sorted((*names, "normals") if lit else names)
         numbers = LIT if lit else PLAIN
-        if sorted(told.made_of) != wanted or told.width not in (numbers, 6 * numbers):
+        if sorted(coarse.made_of) != expected_keys or coarse.width not in (numbers, 6 * numbers):
             raise ValueError(f"{opened.location}: damaged: {channel!r} holds no filtered colours")
-        opacity, color, reference, component = (told.made_of[name] for name in names)
+        opacity, color, reference, component = (coarse.made_of[name] for name in names)
         try:
             transfer = TransferFunction(opacity, color, reference)
             check.whole("Filtered", "component", component, low=0, high=opened.width - 1)
         except ValueError as error:
             raise ValueError(f"{opened.location}: damaged: {channel!r}: {error}") from None
-        shown = Lit(transfer) if lit else transfer
-        return cls(shown, channel, component, directions=told.width != numbers)
+        shader = Lit(transfer) if lit else transfer
+        return cls(shader, channel, component, directions=coarse.width != numbers)
 
     @property
     def function(self) -> TransferFunction:
@@ -260,13 +265,13 @@ class Filtered(Shader):
     def made_of(self) -> dict[str, Any]:
         """The function, component and use of normals that made the colours, as JSON values."""
         function = self.function
-        told = {
+        description = {
             "opacity": function.opacity.tolist(),
             "color": function.color.tolist(),
             "reference": function.reference,
             "component": self.component,
         }
-        return told if self.numbers == PLAIN else {**told, "normals": True}
+        return description if self.numbers == PLAIN else {**description, "normals": True}
 
     def colors(self, spacing: tuple[float, float, float]) -> Channel:
         """Returns dtype and width of the channel of colours, for voxels of this size."""
@@ -274,7 +279,7 @@ class Filtered(Shader):
         if directions is None:
             one_voxel = Sampling(smallest_spacing=min(spacing), step=min(spacing))
             table = self.transfer.table(one_voxel)
-            directions = float(table.table_lm4[0, :, 3].max()) > _OPAQUE
+            directions = float(table.table_lm4[0, :, 3].max()) > _OPAQUE_ALPHA
         return Channel(torch.float16, self.numbers * (6 if directions else 1), coarse=True)
 
     def levels(
@@ -292,8 +297,8 @@ class Filtered(Shader):
         field = VolumeField(volume, self.component or 0)
         sides = [branching ** (level + 1) for level in range(depth)]
         shapes = [[-(-n // side) for n in field.shape] for side in sides]
-        wide = 6 * (self.numbers + 1)
-        out = [torch.empty((*n, wide), dtype=torch.float16, device=device) for n in shapes]
+        voxel_width = 6 * (self.numbers + 1)
+        out = [torch.empty((*n, voxel_width), dtype=torch.float16, device=device) for n in shapes]
         self.write(field, volume.spacing, branching, out, device, progress)
         for colors in out:
             yield self.kept(colors, width).cpu()
@@ -302,8 +307,8 @@ class Filtered(Shader):
         """Converts what `write` wrote to a channel: without light, averaged if `width` is that of
         one direction.
         """
-        seen = without_light(colors)
-        return seen if seen.shape[-1] == width else mean_of_directions(seen)
+        directional = without_light(colors)
+        return directional if directional.shape[-1] == width else mean_of_directions(directional)
 
     def write(
         self,
@@ -325,8 +330,8 @@ class Filtered(Shader):
         write_colors(field, tables, spacing, branching, out, progress, all_light=one_mean)
 
     def finer(self, tree: N3Tree) -> float:
-        known = tree.bricks.channels.get(str(self.other))
-        if known is not None and known.width > self.numbers:
+        channel = tree.bricks.channels.get(str(self.other))
+        if channel is not None and channel.width > self.numbers:
             return _FINER_BY_DIRECTION
         return _FINER if self.numbers == PLAIN else _FINER_LIT
 
@@ -339,9 +344,9 @@ class Filtered(Shader):
     def unlit(self) -> Shader:
         if not isinstance(self.transfer, Lit):
             return super().unlit()
-        bare = copy(self)
-        bare.transfer = self.transfer.unlit()
-        return bare
+        unlit = copy(self)
+        unlit.transfer = self.transfer.unlit()
+        return unlit
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
         if tree.made_of.get(str(self.other), self.made_of) != self.made_of:
@@ -349,23 +354,23 @@ class Filtered(Shader):
                 f"{where}: the colours {self.other!r} were made of another function or component, "
                 "or it was edited: make them again (Filtered.of, Filtered.add_to, a new producer)"
             )
-        one = self.numbers
-        known = tree.bricks.channels.get(str(self.other), Channel(width=one))
-        if known.width not in (one, 6 * one):
+        numbers = self.numbers
+        channel = tree.bricks.channels.get(str(self.other), Channel(width=numbers))
+        if channel.width not in (numbers, 6 * numbers):
             raise ValueError(
-                f"{where}: filtered colours need {one} numbers a voxel, or {6 * one} for six "
-                f"directions, {self.other!r} has {known.width}"
+                f"{where}: filtered colours need {numbers} numbers a voxel, or {6 * numbers} for "
+                f"six directions, {self.other!r} has {channel.width}"
             )
-        given = super().shading(where, tree)
-        if given is None or self.numbers == PLAIN:
-            return given
-        return given._replace(shader=shader_number(self.lit_kind))
+        arguments = super().shading(where, tree)
+        if arguments is None or self.numbers == PLAIN:
+            return arguments
+        return arguments._replace(shader=shader_number(self.lit_kind))
 
 
 class _StoreField:
     """One number of the finest voxels of a store."""
 
-    across = 64  # the side of its chunks
+    slab_side = 64  # the side of its chunks
 
     def __init__(self, store: Store, component: int) -> None:
         self._store, self._component = store, component

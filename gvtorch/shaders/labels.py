@@ -19,8 +19,8 @@ from .lights import LitShader
 from .shader import ColorTable, Sampling
 
 BACKGROUND = 0
-_MOST_ROWS = 2**24  # of a table, so that float32 can index its rows
-_KEPT = 8  # cached tables and label tensors
+_MAX_TABLE_ROWS = 2**24  # of a table, so that float32 can index its rows
+_CACHED_RESULTS = 8  # cached tables and label tensors
 _Made = TypeVar("_Made")
 
 
@@ -83,23 +83,25 @@ class Labels(LitShader):
             visible = [*visible]
         self.colors, self.opacity, self.visible = colors, opacity, visible
         self.channel, self.reference, self.lit = channel, reference, lit
-        self._kept: dict[Any, tuple[Any, Any]] = {}
-        self._look()
+        self._cache: dict[Any, tuple[Any, Any]] = {}
+        self._appearance()
 
     def __repr__(self) -> str:
         """Returns the arguments that differ from the defaults."""
-        given = {"colors": self.colors, "visible": self.visible}
-        parts = [f"{name}={check.shown(one)}" for name, one in given.items() if one is not None]
+        arguments = {"colors": self.colors, "visible": self.visible}
+        parts = [
+            f"{name}={check.shown(value)}" for name, value in arguments.items() if value is not None
+        ]
         if isinstance(self.opacity, Mapping) or self.opacity < 1:
             parts.append(f"opacity={self.opacity}")
         return f"Labels({', '.join(parts + ['lit=False'] * (not self.lit))})"
 
     def __call__(self, labels: np.ndarray) -> np.ndarray:
         """Returns (..., 4) linear RGB and opacity per reference length of labels, in float64."""
-        look = self._look()
-        known, at = np.unique(np.asarray(labels).astype(np.int64), return_inverse=True)
-        rows = np.column_stack((look.colors_of(known), look.opacities(known)))
-        return rows[at.reshape(np.shape(labels))]
+        appearance = self._appearance()
+        distinct, inverse = np.unique(np.asarray(labels).astype(np.int64), return_inverse=True)
+        rows = np.column_stack((appearance.colors_of(distinct), appearance.opacities(distinct)))
+        return rows[inverse.reshape(np.shape(labels))]
 
     def own_numbers(self, tree: N3Tree) -> LabelNumbers:
         return LabelNumbers(lit=float(self.lit))
@@ -108,66 +110,66 @@ class Labels(LitShader):
         return 1
 
     def unlit(self) -> Self:
-        bare = super().unlit()
-        bare.lit = True
-        return bare
+        unlit = super().unlit()
+        unlit.lit = True
+        return unlit
 
     def blocker(self) -> Labels:
-        bare = copy(self)
-        bare.lit = False  # normals would only cost time
-        return bare
+        blocker = copy(self)
+        blocker.lit = False  # normals would only cost time
+        return blocker
 
     def table(self, sampling: Sampling) -> ColorTable:
         raise ValueError("Labels: which rows there are, the tree tells: table_of")
 
     def table_of(self, tree: N3Tree, channel: str, sampling: Sampling) -> ColorTable:
         """See `Shader`: a row for each label that the channel may hold, in order."""
-        look = self._look()
+        appearance = self._appearance()
 
         def make() -> ColorTable:
-            return self._make_table(*label_rows(tree, channel), look, sampling)
+            return self._make_table(*label_rows(tree, channel), appearance, sampling)
 
-        return self._once(tree, channel, (look.key, self.reference, sampling), make)
+        return self._cached(tree, channel, (appearance.key, self.reference, sampling), make)
 
     def label_names(self, tree: N3Tree, channel: str) -> Tensor:
         def make() -> Tensor:
             _, labels = label_rows(tree, channel)
-            nothing = torch.full((1,), -1, dtype=torch.int64)
-            return torch.cat((nothing, torch.from_numpy(labels))).to(tree.device)
+            no_label = torch.full((1,), -1, dtype=torch.int64)
+            return torch.cat((no_label, torch.from_numpy(labels))).to(tree.device)
 
-        return self._once(tree, channel, (tree.device,), make)
+        return self._cached(tree, channel, (tree.device,), make)
 
-    def _once(self, tree: N3Tree, channel: str, key: Any, make: Callable[[], _Made]) -> _Made:
+    def _cached(self, tree: N3Tree, channel: str, key: Any, make: Callable[[], _Made]) -> _Made:
         """Returns what `make` returns for a tree's labels; caches the last few, also for copies."""
         labels = tree.labels[channel]
         key = (id(labels), tree.value_range.get(channel), key)
-        if key not in self._kept:
-            if len(self._kept) == _KEPT:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = labels, make()  # the reference to `labels` keeps their id unique
-        return self._kept[key][1]
+        if key not in self._cache:
+            if len(self._cache) == _CACHED_RESULTS:
+                self._cache.pop(next(iter(self._cache)))
+            self._cache[key] = labels, make()  # the reference to `labels` keeps their id unique
+        return self._cache[key][1]
 
-    def _look(self) -> _Look:
+    def _appearance(self) -> _Appearance:
         """Returns the current colours, opacities and visibility, checked."""
         if self.reference is not None:
             check.number("Labels", "reference", self.reference, low=0, open_low=True)
-        return _Look(self.colors, self.opacity, self.visible)
+        return _Appearance(self.colors, self.opacity, self.visible)
 
     def _make_table(
-        self, first: float, labels: np.ndarray, look: _Look, sampling: Sampling
+        self, first: float, labels: np.ndarray, appearance: _Appearance, sampling: Sampling
     ) -> ColorTable:
         rows = max(2, len(labels))
         levels = sampling.fitting(rows)
-        table, opacity = np.zeros((levels, rows, 4)), look.opacities(labels)
-        table[:, : len(labels), :3] = look.colors_of(labels)
+        table, opacity = np.zeros((levels, rows, 4)), appearance.opacities(labels)
+        table[:, : len(labels), :3] = appearance.colors_of(labels)
         length = sampling.step / (self.reference or sampling.smallest_spacing)
         with np.errstate(divide="ignore"):
             thickness = np.log1p(-opacity)
         for level in range(levels):
             table[level, : len(labels), 3] = -np.expm1(length * 2.0**level * thickness)
-        seen = np.zeros(rows, bool)
-        seen[: len(labels)] = opacity > 0
-        return ColorTable.of(table, (first, first + rows - 1), seen, sampling)
+        visible = np.zeros(rows, bool)
+        visible[: len(labels)] = opacity > 0
+        return ColorTable.of(table, (first, first + rows - 1), visible, sampling)
 
 
 def label_rows(tree: N3Tree, channel: str) -> tuple[float, np.ndarray]:
@@ -177,104 +179,108 @@ def label_rows(tree: N3Tree, channel: str) -> tuple[float, np.ndarray]:
     labels = tree.labels[channel]
     if labels is not None:
         return 0.0, labels.cpu().numpy()
-    kind = tree.bricks.channels[channel].dtype
-    known = tree.value_range.get(channel)
-    if known is None and kind.is_floating_point:
+    dtype = tree.bricks.channels[channel].dtype
+    value_range = tree.value_range.get(channel)
+    if value_range is None and dtype.is_floating_point:
         raise ValueError(
-            f"Labels: channel {channel!r} is {str(kind).removeprefix('torch.')} without a known "
+            f"Labels: channel {channel!r} is {str(dtype).removeprefix('torch.')} without a known "
             "range: its producer must set value_range or labels"
         )
-    low, high = known or (torch.iinfo(kind).min, torch.iinfo(kind).max)
-    if high - low >= _MOST_ROWS:
+    low, high = value_range or (torch.iinfo(dtype).min, torch.iinfo(dtype).max)
+    if high - low >= _MAX_TABLE_ROWS:
         raise ValueError(
             f"Labels: channel {channel!r} reaches from {low:g} to {high:g}, a table holds "
-            f"{_MOST_ROWS} labels"
+            f"{_MAX_TABLE_ROWS} labels"
         )
     return float(low), np.arange(int(low), int(high) + 1)
 
 
-class _Look:
+class _Appearance:
     """How each label looks; two looks with equal `key` are the same."""
 
     def __init__(self, colors: Any, opacity: Any, visible: Any) -> None:
         where = "Labels"
-        self.first = np.zeros((0, 3))  # colours of labels 0, 1, ...
-        self.colors: dict[int, tuple[float, float, float]] = {}
+        self.listed_colors = np.zeros((0, 3))  # colours of labels 0, 1, ...
+        self.color_by_label: dict[int, tuple[float, float, float]] = {}
         if isinstance(colors, Mapping):
-            self.colors = {_label(n): linear_color(where, color) for n, color in colors.items()}
+            self.color_by_label = {
+                _checked_label(n): linear_color(where, color) for n, color in colors.items()
+            }
         elif colors is not None:
-            self.first = _in_order(where, colors)
-        self.opacity, self.own_opacity = 1.0, dict[int, float]()
+            self.listed_colors = _listed_colors(where, colors)
+        self.opacity, self.opacity_by_label = 1.0, dict[int, float]()
         if isinstance(opacity, Mapping):
-            self.own_opacity = {_label(n): _alpha(where, alpha) for n, alpha in opacity.items()}
+            self.opacity_by_label = {
+                _checked_label(n): _checked_opacity(where, alpha) for n, alpha in opacity.items()
+            }
         else:
-            self.opacity = _alpha(where, opacity)
-        self.everything = isinstance(visible, str) and visible == "all"
+            self.opacity = _checked_opacity(where, opacity)
+        self.show_all = isinstance(visible, str) and visible == "all"
         self.visible: frozenset[int] | None = None
         if isinstance(visible, Iterable) and not isinstance(visible, str):
-            self.visible = frozenset(_label(number) for number in visible)
-        elif visible is not None and not self.everything:
+            self.visible = frozenset(_checked_label(number) for number in visible)
+        elif visible is not None and not self.show_all:
             raise ValueError(f"{where}: visible must be labels, 'all' or None, got {visible!r}")
         self.key = (
-            *(self.first.tobytes(), tuple(self.colors.items())),
-            *(self.opacity, tuple(self.own_opacity.items()), self.everything, self.visible),
+            *(self.listed_colors.tobytes(), tuple(self.color_by_label.items())),
+            *(self.opacity, tuple(self.opacity_by_label.items()), self.show_all, self.visible),
         )
 
     def colors_of(self, labels: np.ndarray) -> np.ndarray:
         """Returns colours (m, 3) of labels (m,), which must be sorted."""
-        found = distinct_colors(labels)
-        told = (labels >= 0) & (labels < len(self.first))
-        found[told] = self.first[labels[told]]
-        _put(found, labels, self.colors)
-        return found
+        colors = distinct_colors(labels)
+        listed = (labels >= 0) & (labels < len(self.listed_colors))
+        colors[listed] = self.listed_colors[labels[listed]]
+        _assign_rows(colors, labels, self.color_by_label)
+        return colors
 
     def opacities(self, labels: np.ndarray) -> np.ndarray:
         """Returns opacities (m,) per reference length of labels (m,), which must be sorted; 0 for
         those that are not visible.
         """
-        found = np.full(len(labels), self.opacity)
-        _put(found, labels, self.own_opacity)
+        opacities = np.full(len(labels), self.opacity)
+        _assign_rows(opacities, labels, self.opacity_by_label)
         if self.visible is not None:
             shown = np.fromiter(self.visible, np.int64, len(self.visible))
-            found[~np.isin(labels, shown)] = 0
-        elif not self.everything:
-            found[labels == BACKGROUND] = 0
-        return found
+            opacities[~np.isin(labels, shown)] = 0
+        elif not self.show_all:
+            opacities[labels == BACKGROUND] = 0
+        return opacities
 
 
-def _put(rows: np.ndarray, labels: np.ndarray, told: Mapping[int, Any]) -> None:
-    """Writes values by label (`told`) into the labels' rows; ignores labels without a row."""
-    if not told:
+def _assign_rows(rows: np.ndarray, labels: np.ndarray, by_label: Mapping[int, Any]) -> None:
+    """Writes values by label into the labels' rows; ignores labels without a row."""
+    if not by_label:
         return
-    wanted = np.fromiter(told, np.int64, len(told))
-    at = np.searchsorted(labels, wanted).clip(max=len(labels) - 1)
-    known = labels[at] == wanted
-    rows[at[known]] = np.array(list(told.values()))[known]
+    given_labels = np.fromiter(by_label, np.int64, len(by_label))
+    row = np.searchsorted(labels, given_labels).clip(max=len(labels) - 1)
+    present = labels[row] == given_labels
+    rows[row[present]] = np.array(list(by_label.values()))[present]
 
 
-def _label(number: Any) -> int:
-    plain = getattr(number, "__index__", None)
-    if plain is None or isinstance(number, bool) or not -(2**63) <= plain() < 2**63:
+def _checked_label(number: Any) -> int:
+    as_int = getattr(number, "__index__", None)
+    if as_int is None or isinstance(number, bool) or not -(2**63) <= as_int() < 2**63:
         raise ValueError(f"Labels: a label must be a whole number below 2^63, got {number!r}")
-    return plain()
+    return as_int()
 
 
-def _alpha(where: str, value: Any) -> float:
+def _checked_opacity(where: str, value: Any) -> float:
     return check.number(where, "opacity", value, low=0, high=1)
 
 
-def _in_order(where: str, colors: Any) -> np.ndarray:
+def _listed_colors(where: str, colors: Any) -> np.ndarray:
     """Returns colours (k, 3) of labels 0, 1, ..."""
     if isinstance(colors, Tensor):
         colors = colors.detach().cpu().numpy()
     if isinstance(colors, np.ndarray):
         if colors.ndim != 2 or colors.shape[1] != 3:
             raise ValueError(f"{where}: colors must be (k, 3), got {check.shown(colors)}")
-        found = colors.astype(np.float64)
-        found = array_from_srgb(found / 255) if colors.dtype == np.uint8 else found
-        if not ((found >= 0) & (found <= 1)).all():
+        rgb = colors.astype(np.float64)
+        rgb = array_from_srgb(rgb / 255) if colors.dtype == np.uint8 else rgb
+        if not ((rgb >= 0) & (rgb <= 1)).all():
             raise ValueError(f"{where}: colors must lie in [0, 1]")
-        return found
+        return rgb
     if isinstance(colors, str) or not isinstance(colors, Sequence):
         raise ValueError(f"{where}: colors must be by label, or a list, got {colors!r}")
     return np.array([linear_color(where, color) for color in colors]).reshape(-1, 3)

@@ -200,27 +200,27 @@ class LitShader(Shader):
         return self.light.parameters()._replace(**{name: getattr(self, name) for name in _MATERIAL})
 
     def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
-        given = super().shading(where, tree)
-        if given is None or not (self.shadows or self.octaves):
-            return given
+        arguments = super().shading(where, tree)
+        if arguments is None or not (self.shadows or self.octaves):
+            return arguments
         if self.shadowed_kind is None:
             raise ValueError(f"{where}: shadows per sample are for Lit and StoredColor")
         if self.octaves and isinstance(self.light, Headlight):
             raise ValueError(f"{where}: octaves of scattering need a sun or lamp, got a Headlight")
-        return given._replace(shader=shader_number(self.shadowed_kind))
+        return arguments._replace(shader=shader_number(self.shadowed_kind))
 
     def unlit(self) -> Self:
-        bare = copy(self)
-        bare.ambient, bare.diffuse, bare.specular = 1.0, 0.0, 0.0
-        bare.shadows, bare.octaves = False, 0
-        return bare
+        unlit = copy(self)
+        unlit.ambient, unlit.diffuse, unlit.specular = 1.0, 0.0, 0.0
+        unlit.shadows, unlit.octaves = False, 0
+        return unlit
 
 
-def check_light(what: str, value: Any) -> Light:
+def check_light(label: str, value: Any) -> Light:
     """Returns `value` if it is a light; raises ValueError otherwise."""
     if not isinstance(value, Light):
         raise ValueError(
-            f"{what} must be a Headlight, DirectionalLight or PointLight, "
+            f"{label} must be a Headlight, DirectionalLight or PointLight, "
             f"got {type(value).__name__}"
         )
     return value

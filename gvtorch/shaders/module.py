@@ -90,14 +90,14 @@ class ModuleShader(Shader, torch.nn.Module):
             ValueError: The module returns something of another shape or dtype, a colour that is not
                 finite, or an alpha outside of [0, 1].
         """
-        made = self.module(values, positions, directions, lengths)
-        if not (isinstance(made, Sequence) and len(made) == 2):
-            got = f"{len(made)} parts" if isinstance(made, Sequence) else type(made).__name__
+        output = self.module(values, positions, directions, lengths)
+        if not (isinstance(output, Sequence) and len(output) == 2):
+            got = f"{len(output)} parts" if isinstance(output, Sequence) else type(output).__name__
             raise ValueError(f"ModuleShader: the module must give colour and alpha, got {got}")
-        color, alpha = made
-        count, real, device = len(values), values.dtype, values.device
-        check.tensor("ModuleShader", "the module's colour", color, (count, 3), real, device)
-        check.tensor("ModuleShader", "the module's alpha", alpha, (count, 1), real, device)
+        color, alpha = output
+        count, dtype, device = len(values), values.dtype, values.device
+        check.tensor("ModuleShader", "the module's colour", color, (count, 3), dtype, device)
+        check.tensor("ModuleShader", "the module's alpha", alpha, (count, 1), dtype, device)
         if not bool(((alpha >= 0) & (alpha <= 1)).all()):
             raise ValueError("ModuleShader: the module's alpha must lie in [0, 1]")
         if not bool(torch.isfinite(color).all()):
@@ -140,22 +140,22 @@ class TransferModule(torch.nn.Module):
 
     def shows(self, values: Tensor) -> Tensor:
         """Returns which values have an opacity, a bool tensor of the same shape."""
-        place = ((values - self.low) * self.scale).clamp(0, len(self.rows) - 1)
+        row_position = ((values - self.low) * self.scale).clamp(0, len(self.rows) - 1)
         opaque = self.rows[:, 3] > 0
-        return opaque[place.floor().long()] | opaque[place.ceil().long()]
+        return opaque[row_position.floor().long()] | opaque[row_position.ceil().long()]
 
     def forward(
         self, values: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Returns colour (k, 3) and alpha (k, 1) of the first channel's first number."""
         last = len(self.rows) - 1
-        place = ((values[:, :1] - self.low) * self.scale).clamp(0, last)
-        row = place.long().clamp(max=last - 1)
+        row_position = ((values[:, :1] - self.low) * self.scale).clamp(0, last)
+        row = row_position.long().clamp(max=last - 1)
         rows = self.rows.to(values.dtype)
         a, b = rows[row[:, 0]], rows[row[:, 0] + 1]
-        rgb = a[:, :3] + (place - row) * (b[:, :3] - a[:, :3])
+        rgb = a[:, :3] + (row_position - row) * (b[:, :3] - a[:, :3])
         alpha_a, alpha_b = (
             -torch.expm1(lengths / self.reference * torch.log1p(-side[:, 3:].clamp(0, 1 - 2**-23)))
             for side in (a, b)
         )
-        return rgb, alpha_a + (place - row) * (alpha_b - alpha_a)
+        return rgb, alpha_a + (row_position - row) * (alpha_b - alpha_a)

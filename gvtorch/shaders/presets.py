@@ -12,10 +12,10 @@ from ..base import check
 from ..base.declared import did_you_mean
 
 Points = Sequence[Sequence[float]]
-Pair = tuple[Points, Points]  # opacity and colour
+FunctionPoints = tuple[Points, Points]  # opacity and colour
 
 #: Over [0, 1], to be stretched over a window of the data.
-PRESETS: dict[str, Pair] = {
+PRESETS: dict[str, FunctionPoints] = {
     "gray": ([(0, 0), (0.05, 0), (1, 0.5)], [(0, 0, 0, 0), (1, 1, 1, 1)]),
     "hot": (
         [(0, 0), (0.1, 0), (0.4, 0.05), (1, 0.6)],
@@ -55,11 +55,11 @@ PRESETS: dict[str, Pair] = {
         ],
     ),
 }
-RAMP = PRESETS["gray"][0]  # opacity of colour maps
+COLORMAP_OPACITY = PRESETS["gray"][0]  # opacity of colour maps
 
 #: In Hounsfield units: air is -1000, lung -900 to -500, fat -100, water 0, muscle 50, vessels with
 #: contrast agent 150 to 500, bone 300 to 2000.
-CT_PRESETS: dict[str, Pair] = {
+CT_PRESETS: dict[str, FunctionPoints] = {
     "ct-bone": (
         [(150, 0), (250, 0.03), (400, 0.35), (700, 0.8), (1500, 0.95)],
         [
@@ -96,33 +96,35 @@ CT_PRESETS: dict[str, Pair] = {
 #: For a preset over a window, the one in Hounsfield units that shows the same tissue.
 IN_HU = {"bone": "ct-bone", "tissue": "ct-soft", "vessels": "ct-vessels"}
 
-SAMPLES = 256  # of a colour map
+COLORMAP_SAMPLES = 256  # of a colour map
 
 
-def named(name: str) -> Pair:
+def preset_points(name: str) -> FunctionPoints:
     """Returns the points of a preset or of a colour map of matplotlib, which gets the opacity of
     "gray". Values are in [0, 1], but in Hounsfield units for `CT_PRESETS`. Raises ValueError if the
     name is unknown.
     """
-    known = {**PRESETS, **CT_PRESETS}
-    if check.instance("preset", "name", name, str) in known:
-        return known[name]
+    presets = {**PRESETS, **CT_PRESETS}
+    if check.instance("preset", "name", name, str) in presets:
+        return presets[name]
     maps, hint = _colormaps()
-    plain = name.removeprefix("matplotlib:")
-    if plain in maps:
-        places = np.arange(SAMPLES) / (SAMPLES - 1)
-        colors = linear(np.asarray(maps[plain](places))[:, :3])
-        return RAMP, np.column_stack((places, colors)).tolist()
+    map_name = name.removeprefix("matplotlib:")
+    if map_name in maps:
+        positions = np.arange(COLORMAP_SAMPLES) / (COLORMAP_SAMPLES - 1)
+        colors = linear_from_srgb(np.asarray(maps[map_name](positions))[:, :3])
+        return COLORMAP_OPACITY, np.column_stack((positions, colors)).tolist()
     raise ValueError(
-        f"unknown preset {name!r}; known: {', '.join(sorted(known))}, {hint}"
-        f"{did_you_mean(plain, (*known, *maps))}"
+        f"unknown preset {name!r}; known: {', '.join(sorted(presets))}, {hint}"
+        f"{did_you_mean(map_name, (*presets, *maps))}"
     )
 
 
-def display_grays() -> Pair:
+def display_grays() -> FunctionPoints:
     """Returns grays over [0, 1] whose sRGB value is the data value."""
-    places = np.arange(SAMPLES) / (SAMPLES - 1)
-    return RAMP, np.column_stack((places, linear(np.repeat(places[:, None], 3, 1)))).tolist()
+    positions = np.arange(COLORMAP_SAMPLES) / (COLORMAP_SAMPLES - 1)
+    return COLORMAP_OPACITY, np.column_stack(
+        (positions, linear_from_srgb(np.repeat(positions[:, None], 3, 1)))
+    ).tolist()
 
 
 def _colormaps() -> tuple[Mapping[str, Callable[..., Any]], str]:
@@ -134,7 +136,7 @@ def _colormaps() -> tuple[Mapping[str, Callable[..., Any]], str]:
     return colormaps, "and matplotlib's colour maps"
 
 
-def converted(name: str, colors: np.ndarray, **options: bool) -> np.ndarray:
+def convert_colors(name: str, colors: np.ndarray, **options: bool) -> np.ndarray:
     """Converts colours (..., 3) by a function of kornia, in float64."""
     import kornia.color
 
@@ -144,6 +146,6 @@ def converted(name: str, colors: np.ndarray, **options: bool) -> np.ndarray:
     )
 
 
-def linear(colors: np.ndarray) -> np.ndarray:
+def linear_from_srgb(colors: np.ndarray) -> np.ndarray:
     """Converts sRGB (k, 3) to linear light."""
-    return converted("rgb_to_linear_rgb", colors).clip(0, 1)
+    return convert_colors("rgb_to_linear_rgb", colors).clip(0, 1)

@@ -19,7 +19,7 @@ from ..ops import ShadeArguments
 from ..ops.shading import Number, ShadeParameters, Triple, pack, shader_number
 from ..pool import N3Tree
 
-_MOST_BYTES = 64 * 2**20  # limit for a table in float32
+_MAX_TABLE_BYTES = 64 * 2**20  # limit for a table in float32
 _CPU = torch.device("cpu")
 
 
@@ -37,7 +37,7 @@ class Sampling:
         """Returns how many interval lengths a table has if each takes `rows` rows: `levels`, or as
         many (at least 1) as keep the table within 64 MB in float32.
         """
-        return max(1, min(self.levels, _MOST_BYTES // (16 * rows)))
+        return max(1, min(self.levels, _MAX_TABLE_BYTES // (16 * rows)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,14 +50,18 @@ class ColorTable:
 
     @classmethod
     def of(
-        cls, table: np.ndarray, domain: tuple[float, float], seen_m: np.ndarray, sampling: Sampling
+        cls,
+        table: np.ndarray,
+        domain: tuple[float, float],
+        visible_m: np.ndarray,
+        sampling: Sampling,
     ) -> ColorTable:
         """Converts a float64 table, and which of its rows are visible, to dtype and device."""
         dtype, device = sampling.dtype, sampling.device
         return cls(
             table_lm4=torch.tensor(table, dtype=dtype, device=device),
             domain_2=torch.tensor(domain, dtype=dtype, device=device),
-            opaque_m=torch.tensor(np.cumsum(seen_m), dtype=torch.int32, device=device),
+            opaque_m=torch.tensor(np.cumsum(visible_m), dtype=torch.int32, device=device),
         )
 
 
@@ -119,8 +123,12 @@ class Shader(Checked):
     def __repr__(self) -> str:
         """Returns the class name with its channels and parts."""
         names = ("channel", "normals", "transfer", "value", "which", "color", "other", "light")
-        given = {name: getattr(self, name, None) for name in names}
-        parts = [f"{name}={check.shown(one)}" for name, one in given.items() if one is not None]
+        attributes = {name: getattr(self, name, None) for name in names}
+        parts = [
+            f"{name}={check.shown(value)}"
+            for name, value in attributes.items()
+            if value is not None
+        ]
         return f"{type(self).__name__}({', '.join(parts)})"
 
     def table(self, sampling: Sampling) -> ColorTable:
@@ -171,9 +179,9 @@ class Shader(Checked):
         self.check_again()
         scale, offset = 1.0, 0.0
         if self.normals is not None:
-            kind = tree.bricks.channels[self.normals].dtype
-            scale = 1 / number_of_one(kind)
-            if kind in (torch.uint8, torch.uint16):
+            normal_dtype = tree.bricks.channels[self.normals].dtype
+            scale = 1 / number_of_one(normal_dtype)
+            if normal_dtype in (torch.uint8, torch.uint16):
                 scale, offset = 2 * scale, -1.0
         parameters = self.material()._replace(
             own=self.own_numbers(tree), normal_scale=scale, normal_offset=offset
@@ -190,8 +198,8 @@ class Shader(Checked):
         channels = tree.bricks.channels
         for name in self.channels:
             if name not in channels:
-                known = ", ".join(tree.channel_names)
-                raise ValueError(f"{where}: unknown channel {name!r}; the tree has {known}")
+                channel_names = ", ".join(tree.channel_names)
+                raise ValueError(f"{where}: unknown channel {name!r}; the tree has {channel_names}")
             if channels[name].coarse and not (self.reads_coarse and name == self.other):
                 raise ValueError(f"{where}: only coarse bricks have channel {name!r}")
         if self.kind is None:
@@ -206,7 +214,9 @@ class Shader(Checked):
             check.whole(where, "component of the colour", self.other_component, low=0, high=last)
         bricks, constants = dict(tree.bricks.bricks), tree.nodes.constants
         if tree.depth == 0:  # the root is the finest level, so there are no coarse bricks
-            bricks |= {name: bricks[name][:0] for name, one in channels.items() if one.coarse}
+            bricks |= {
+                name: bricks[name][:0] for name, channel in channels.items() if channel.coarse
+            }
         return ShadeArguments(
             shader=0 if self.op else shader_number(self.kind),
             features=self.feature_count(tree),

@@ -21,20 +21,20 @@ from ..base.checked import Check, kind_of, or_none, positive
 from ..base.messages import one_line
 from ..base.whole_file import write_whole
 from .preset_files import paraview_item, read_preset
-from .presets import CT_PRESETS, Points, named
+from .presets import CT_PRESETS, Points, preset_points
 from .shader import ColorTable, Sampling, Shader
 
 _LARGEST = 1e300  # limit of values and lengths, so that their differences are finite
-_KEPT = 8  # cached tables of a function
-_FOREIGN = {"RGBPoints", "volumeProperties"}  # keys of other programs' files
+_CACHED_TABLES = 8  # cached tables of a function
+_FOREIGN_KEYS = {"RGBPoints", "volumeProperties"}  # keys of other programs' files
 # Cells of a table.
-_FEWEST_CELLS = 2**10
-_FEWEST_SAMPLED = 2**12  # fewest where corners fall between rows
+_MIN_CELLS = 2**10
+_MIN_SAMPLED_CELLS = 2**12  # fewest where corners fall between rows
 _CELLS_APART = 16  # least distance of two corners that fall between rows
 _MANY_CELLS = 2**16  # most with all corners on rows; more only if no other table is possible
-_MOST_CELLS = 2**20
-_FEWEST_PAIRED, _MOST_PAIRED = 128, 256  # along a side of an integrated table
-_FEWEST_PARTS, _MOST_PARTS = 8, 4096  # parts in which each of these cells is integrated
+_MAX_CELLS = 2**20
+_MIN_PAIRED_CELLS, _MAX_PAIRED_CELLS = 128, 256  # along a side of an integrated table
+_MIN_PARTS, _MAX_PARTS = 8, 4096  # parts in which each of these cells is integrated
 
 
 class TransferFunction(Shader):
@@ -54,8 +54,8 @@ class TransferFunction(Shader):
     reference: float | None
     relative = False
     checks: ClassVar[Mapping[str, Check]] = {
-        "opacity": lambda owner, name, points: _points(kind_of(owner), name, points, 2),
-        "color": lambda owner, name, points: _points(kind_of(owner), name, points, 4),
+        "opacity": lambda owner, name, points: _checked_points(kind_of(owner), name, points, 2),
+        "color": lambda owner, name, points: _checked_points(kind_of(owner), name, points, 4),
         "reference": or_none(positive),
     }
 
@@ -121,8 +121,8 @@ class TransferFunction(Shader):
         """
         if str(path).endswith(".json") and Path(path).is_file():
             content = check.json_file("transfer function file", path)
-            told = content.keys() if isinstance(content, dict) else ()  # then from_json raises
-            if not isinstance(content, list) and _FOREIGN.isdisjoint(told):
+            keys = content.keys() if isinstance(content, dict) else ()  # then from_json raises
+            if not isinstance(content, list) and _FOREIGN_KEYS.isdisjoint(keys):
                 if name is not None:
                     raise ValueError(f"{path}: holds one function, without a name: leave it out")
                 return cls.from_json(path)
@@ -146,7 +146,7 @@ class TransferFunction(Shader):
         Raises:
             ValueError: The name is unknown, or the preset needs values.
         """
-        function = cls(*named(name))
+        function = cls(*preset_points(name))
         if (low is None) != (high is None) or (low is None and name not in CT_PRESETS):
             raise ValueError(f"preset {name!r} is stretched over values: give low and high")
         if low is None or high is None:
@@ -239,7 +239,7 @@ class TransferFunction(Shader):
         if key not in self._tables:
             self.check_again()  # points may have been edited in place
             table = make(self, sampling)
-            if len(self._tables) == _KEPT:
+            if len(self._tables) == _CACHED_TABLES:
                 self._tables.pop(next(iter(self._tables)))
             self._tables[key] = table
         return self._tables[key]
@@ -248,14 +248,16 @@ class TransferFunction(Shader):
         """Returns the first and last value of a table, and its rows (m, 4): linear RGB and opacity
         per reference length, in float64. See `table`.
         """
-        low, high, places = self.corners()
-        cells = _cells(places)
+        low, high, positions = self.corners()
+        cells = _cell_count(positions)
         if cells is None:
-            at = int(np.diff(places).argmin())
-            first, second = (low + place * (high - low) for place in places[at : at + 2])
+            index = int(np.diff(positions).argmin())
+            first, second = (
+                low + position * (high - low) for position in positions[index : index + 2]
+            )
             raise ValueError(
                 f"TransferFunction: values {first:g} and {second:g} are too close "
-                f"for a table of {_MOST_CELLS + 1} rows from {low:g} to {high:g}"
+                f"for a table of {_MAX_CELLS + 1} rows from {low:g} to {high:g}"
             )
         return low, high, self(low + (high - low) * np.arange(cells + 1) / cells)
 
@@ -281,75 +283,83 @@ def integrated_table(transfer: TransferFunction, sampling: Sampling) -> ColorTab
     Source: Engel, Kraus, Ertl, "High-quality pre-integrated volume rendering using
     hardware-accelerated pixel shading", Graphics Hardware 2001.
     """
-    low, high, places = transfer.corners()
-    exact = _common_cells(places, _MOST_PAIRED)
-    cells = exact * math.ceil(_FEWEST_PAIRED / exact) if exact else _MOST_PAIRED
-    gap = float(np.diff(places, append=2.0).min())
-    parts = min(_MOST_PARTS, max(_FEWEST_PARTS, math.ceil(4 / (gap * cells))))
+    low, high, positions = transfer.corners()
+    exact = _common_cells(positions, _MAX_PAIRED_CELLS)
+    cells = exact * math.ceil(_MIN_PAIRED_CELLS / exact) if exact else _MAX_PAIRED_CELLS
+    gap = float(np.diff(positions, append=2.0).min())
+    parts = min(_MAX_PARTS, max(_MIN_PARTS, math.ceil(4 / (gap * cells))))
     middles = (np.arange(cells * parts) + 0.5) / (cells * parts)
-    inside = transfer(low + (high - low) * middles).reshape(cells, parts, 4)
-    density = -np.log1p(-np.minimum(inside[..., 3], 1 - 1e-16))  # per reference length
+    samples = transfer(low + (high - low) * middles).reshape(cells, parts, 4)
+    density = -np.log1p(-np.minimum(samples[..., 3], 1 - 1e-16))  # per reference length
     thickness = density.mean(1)
     weight = density / np.maximum(density.sum(1, keepdims=True), 1e-300)
-    color = (weight[..., None] * inside[..., :3]).sum(1)
+    color = (weight[..., None] * samples[..., :3]).sum(1)
     rows = transfer(low + (high - low) * np.arange(cells + 1) / cells)
     lengths = transfer.lengths(sampling, sampling.fitting(len(rows) ** 2))
     table = np.stack([_pairs(rows, thickness, color, length) for length in lengths])
     # A range that reaches into a cell is tested with both of the cell's rows, so it is enough to
     # mark one of them: not the first or last row, which also represent values beyond the domain.
-    seen = rows[:, 3] > 0
-    seen[1:-1] |= thickness[:-1] > 0
-    seen[-2] |= thickness[-1] > 0
-    return ColorTable.of(table, (low, high), seen, sampling)
+    visible = rows[:, 3] > 0
+    visible[1:-1] |= thickness[:-1] > 0
+    visible[-2] |= thickness[-1] > 0
+    return ColorTable.of(table, (low, high), visible, sampling)
 
 
 def _pairs(rows: np.ndarray, thickness: np.ndarray, color: np.ndarray, length: float) -> np.ndarray:
     """Returns (m, m, 4) for intervals of one length."""
     count = len(rows)
     out = np.zeros((count, count, 4))
-    same = np.arange(count)
+    diagonal = np.arange(count)
     with np.errstate(divide="ignore"):
         alpha = -np.expm1(length * np.log1p(-rows[:, 3]))
-    out[same, same] = np.concatenate((rows[:, :3] * alpha[:, None], alpha[:, None]), 1)
-    for apart in range(1, count):
-        kept = np.exp(-thickness * (length / apart))  # transmittance of each cell in between
-        shown = np.concatenate((color, np.ones((len(color), 1))), 1) * (1 - kept)[:, None]
-        low = np.arange(count - apart)
-        for turned in (False, True):
-            step = -1 if turned else 1
-            kept_w = sliding_window_view(kept, apart)[:, ::step]
-            shown_w = sliding_window_view(shown, apart, axis=0)[:, :, ::step]  # (w, 4, apart)
-            clear = np.ones_like(kept_w)
-            np.cumprod(kept_w[:, :-1], axis=1, out=clear[:, 1:])
-            found = np.matmul(shown_w, clear[:, :, None])[:, :, 0]
-            out[(low + apart, low) if turned else (low, low + apart)] = found
+    out[diagonal, diagonal] = np.concatenate((rows[:, :3] * alpha[:, None], alpha[:, None]), 1)
+    for distance in range(1, count):
+        # Transmittance of each cell in between.
+        transmittance = np.exp(-thickness * (length / distance))
+        emission = (
+            np.concatenate((color, np.ones((len(color), 1))), 1) * (1 - transmittance)[:, None]
+        )
+        low = np.arange(count - distance)
+        for backwards in (False, True):
+            step = -1 if backwards else 1
+            transmittance_w = sliding_window_view(transmittance, distance)[:, ::step]
+            # Shape (w, 4, distance).
+            emission_w = sliding_window_view(emission, distance, axis=0)[:, :, ::step]
+            clear = np.ones_like(transmittance_w)
+            np.cumprod(transmittance_w[:, :-1], axis=1, out=clear[:, 1:])
+            colors = np.matmul(emission_w, clear[:, :, None])[:, :, 0]
+            out[(low + distance, low) if backwards else (low, low + distance)] = colors
     return out
 
 
-def _cells(places: np.ndarray) -> int | None:
+def _cell_count(positions: np.ndarray) -> int | None:
     """Returns how many cells of [0, 1] suit corners at these positions; None: too dense."""
-    exact = _common_cells(places, _MOST_CELLS, tolerance=1e-9)
-    gap = float(np.diff(places, append=2.0).min())
-    dense = max(_FEWEST_SAMPLED, 2 ** math.ceil(math.log2(_CELLS_APART / max(gap, 1e-9))))
-    if exact and (exact <= _MANY_CELLS or dense > _MOST_CELLS):
-        return exact * math.ceil(_FEWEST_CELLS / exact)
-    return dense if dense <= _MOST_CELLS else None
+    exact_cells = _common_cells(positions, _MAX_CELLS, tolerance=1e-9)
+    gap = float(np.diff(positions, append=2.0).min())
+    sampled_cells = max(
+        _MIN_SAMPLED_CELLS, 2 ** math.ceil(math.log2(_CELLS_APART / max(gap, 1e-9)))
+    )
+    if exact_cells and (exact_cells <= _MANY_CELLS or sampled_cells > _MAX_CELLS):
+        return exact_cells * math.ceil(_MIN_CELLS / exact_cells)
+    return sampled_cells if sampled_cells <= _MAX_CELLS else None
 
 
-def _common_cells(places: Iterable[float], most: int, tolerance: float = math.inf) -> int | None:
+def _common_cells(
+    positions: Iterable[float], limit: int, tolerance: float = math.inf
+) -> int | None:
     """Returns the fewest equal cells of [0, 1] with all positions on cell ends; None: it takes more
-    than `most`, or a position is off by more than `tolerance`.
+    than `limit`, or a position is off by more than `tolerance`.
     """
     cells = 1
-    for place in places:
-        fraction = Fraction(float(place)).limit_denominator(most)
+    for position in positions:
+        fraction = Fraction(float(position)).limit_denominator(limit)
         cells = math.lcm(cells, fraction.denominator)
-        if cells > most or abs(float(fraction) - place) > tolerance:
+        if cells > limit or abs(float(fraction) - position) > tolerance:
             return None
     return cells
 
 
-def _points(where: str, name: str, points: Points, width: int) -> np.ndarray:
+def _checked_points(where: str, name: str, points: Points, width: int) -> np.ndarray:
     names = "(value, alpha)" if width == 2 else "(value, red, green, blue)"
     try:
         rows = [list(point) for point in points]
@@ -369,10 +379,10 @@ def _points(where: str, name: str, points: Points, width: int) -> np.ndarray:
         )
     steps = np.diff(array[:, 0])
     if (steps <= 0).any():
-        at = int(np.argmax(steps <= 0))
+        index = int(np.argmax(steps <= 0))
         raise ValueError(
             f"{where}: {name} values must increase, "
-            f"got {array[at, 0]:g} before {array[at + 1, 0]:g} "
+            f"got {array[index, 0]:g} before {array[index + 1, 0]:g} "
             "(for a jump use two values close to each other)"
         )
     if (array[:, 1:] < 0).any() or (array[:, 1:] > 1).any():

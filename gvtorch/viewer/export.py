@@ -17,17 +17,19 @@ from ..io.surface import export_surface
 from .client import Client, Interrupted
 from .protocol import Surface
 
-_MOST = 1 << 28  # most bytes of a file, which a page holds in memory
-_EVERY = 0.2  # seconds between two messages of progress
+_MAX_FILE_BYTES = 1 << 28  # most bytes of a file, which a page holds in memory
+_PROGRESS_SECONDS = 0.2  # seconds between two messages of progress
 
 
 class SurfaceExport:
     """A surface that is being made for a page."""
 
-    def __init__(self, client: Client, wanted: Surface, data: Volume | Store, number: int) -> None:
-        """Starts to make the surface that a page asked for, of component `number` of voxels."""
-        self._client, self._wanted, self._data, self._number = client, wanted, data, number
-        self._ended, self._told = False, 0.0
+    def __init__(
+        self, client: Client, request: Surface, data: Volume | Store, component: int
+    ) -> None:
+        """Starts to make the surface that a page asked for, of one component of the voxels."""
+        self._client, self._request, self._data, self._component = client, request, data, component
+        self._cancelled, self._last_progress = False, 0.0
         self._thread = threading.Thread(target=self._run, name="gvtorch surface", daemon=True)
         self._thread.start()
 
@@ -42,36 +44,37 @@ class SurfaceExport:
 
     def end(self) -> None:
         """Stops it at the next block; does not wait for that."""
-        self._ended = True
+        self._cancelled = True
 
     def _run(self) -> None:
-        wanted, client = self._wanted, self._client
-        name = f"surface.{wanted.format}"
+        request, client = self._request, self._client
+        name = f"surface.{request.format}"
         try:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / name
-                made = export_surface(
-                    *(self._data, wanted.value, path),
-                    level=wanted.level,
-                    component=self._number,
+                surface = export_surface(
+                    *(self._data, request.value, path),
+                    level=request.level,
+                    component=self._component,
                     progress=self._progress,
                 )
                 size = path.stat().st_size
-                if size > _MOST:
+                if size > _MAX_FILE_BYTES:
                     raise ValueError(
-                        f"surface: {made.triangles} triangles, {amount(size)}, are more than the "
-                        f"{amount(_MOST)} that a page takes: a coarser level, or gvtorch surface"
+                        f"surface: {surface.triangles} triangles, {amount(size)}, are more than "
+                        f"the {amount(_MAX_FILE_BYTES)} that a page takes: a coarser level, or "
+                        "gvtorch surface"
                     )
                 client.send_file(name, path.read_bytes())
         except Interrupted:
             pass
         except Exception as error:  # whatever it was, the view goes on
-            client.tell("refused", text=one_line(error))
+            client.send_message("refused", text=one_line(error))
 
-    def _progress(self, _what: str, done: int, total: int) -> None:
-        if self._ended:
+    def _progress(self, _stage: str, done: int, total: int) -> None:
+        if self._cancelled:
             raise Interrupted
         now = time.monotonic()
-        if now > self._told + _EVERY and done < total:
-            self._told = now
-            self._client.tell("exporting", done=done, total=total)
+        if now > self._last_progress + _PROGRESS_SECONDS and done < total:
+            self._last_progress = now
+            self._client.send_message("exporting", done=done, total=total)

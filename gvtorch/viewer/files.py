@@ -7,9 +7,9 @@ import warnings
 from pathlib import Path
 
 from ..shaders import TransferFunction
-from .schema import MOST_ITEMS
+from .schema import MAX_ITEMS
 
-_ENDINGS = (".vp.json", ".json", ".vp", ".xml")
+_SUFFIXES = (".vp.json", ".json", ".vp", ".xml")
 
 
 def read_function(
@@ -19,12 +19,12 @@ def read_function(
     lost; raises ValueError if the file holds none. `name` selects one of several functions; one
     with relative values only, such as ParaView's, is stretched over `low` to `high`.
     """
-    ending = next((one for one in _ENDINGS if file.lower().endswith(one)), None)
-    if ending is None:
-        raise ValueError(f"{file:.80}: must end in {', '.join(_ENDINGS)}")
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as told:
+    suffix = next((suffix for suffix in _SUFFIXES if file.lower().endswith(suffix)), None)
+    if suffix is None:
+        raise ValueError(f"{file:.80}: must end in {', '.join(_SUFFIXES)}")
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        path = Path(folder) / f"function{ending}"
+        path = Path(folder) / f"function{suffix}"
         path.write_text(text, encoding="utf-8")
         try:
             function = TransferFunction.from_file(path, name)
@@ -32,8 +32,8 @@ def read_function(
             raise ValueError(str(error).replace(str(path), f"{file:.80}")) from None
     if function.relative and low is not None and high is not None:
         function = function.stretched(low, high)
-    most = max(len(function.opacity), len(function.color))
-    if most > MOST_ITEMS:
-        raise ValueError(f"{file:.80}: has {most} points, more than {MOST_ITEMS}")
-    lost = [str(one.message).replace(str(path), f"{file:.80}") for one in told]
-    return function, lost
+    points = max(len(function.opacity), len(function.color))
+    if points > MAX_ITEMS:
+        raise ValueError(f"{file:.80}: has {points} points, more than {MAX_ITEMS}")
+    notes = [str(warning.message).replace(str(path), f"{file:.80}") for warning in caught]
+    return function, notes

@@ -31,10 +31,10 @@ from ..cameras.motion import Motion
 from .state import Eye, ViewState, saved_state
 
 Curve = Callable[[float], Any]
-_MOST_PICTURES = 2**31  # most pictures of a film
-_ROUND = 4  # keys of a turntable: between them the camera turns, so that the circle is exact
+_MAX_PICTURES = 2**31  # most pictures of a film
+_TURN_KEYS = 4  # keys of a turntable: between them the camera turns, so that the circle is exact
 #: Fields whose numbers increase along an axis, and must do so between keys too.
-_ORDERED = {
+_INCREASING_FIELDS = {
     ("TransferFunction", "opacity"): (2, 0, slice(0, 1)),  # dimensions, axis, columns of the last
     ("TransferFunction", "color"): (2, 0, slice(0, 1)),
     ("ChannelLook", "window"): (1, 0, slice(None)),
@@ -67,21 +67,23 @@ class Flight:
             raise ValueError("Flight: at least one key is needed")
         times = [check.number("Flight", f"time of key {n}", key[0]) for n, key in enumerate(keys)]
         states = [check.instance("Flight", "state", key[1], ViewState) for key in keys]
-        for n, (one, other) in enumerate(pairwise(times), 1):
-            if other <= one:
-                raise ValueError(f"Flight: key {n} at {other:g} s must come after {one:g} s")
+        for n, (previous, time) in enumerate(pairwise(times), 1):
+            if time <= previous:
+                raise ValueError(f"Flight: key {n} at {time:g} s must come after {previous:g} s")
         if any(state.camera is None for state in states):
             n = next(n for n, state in enumerate(states) if state.camera is None)
             raise ValueError(f"Flight: key {n} has no camera")
         self.keys = list(zip(times, states, strict=True))
         self._times, self._states = times, states
-        told = [state.changed(state.to_json()).to_json() for state in states]  # 1 becomes 1.0
-        self.closed = len(keys) > 2 and told[0] == told[-1]
-        looks = [{name: one[name] for name in one if name != "camera"} for one in told]
-        self._look = _curve(times, looks, self.closed)
+        contents = [state.changed(state.to_json()).to_json() for state in states]  # 1 becomes 1.0
+        self.closed = len(keys) > 2 and contents[0] == contents[-1]
+        fields = [
+            {name: content[name] for name in content if name != "camera"} for content in contents
+        ]
+        self._content_curve = _curve(times, fields, self.closed)
         eyes = [state.camera for state in states if state.camera is not None]
-        self._path = Motion(times, [_pose(eye) for eye in eyes], self.closed)
-        self._fov = Smooth(times, [np.array(eye.fov) for eye in eyes], self.closed)
+        self._motion = Motion(times, [_pose(eye) for eye in eyes], self.closed)
+        self._fov_curve = Smooth(times, [np.array(eye.fov) for eye in eyes], self.closed)
 
     @classmethod
     def read(cls, path: str | Path, now: ViewState) -> Flight:
@@ -110,12 +112,12 @@ class Flight:
         up, target = np.array(eye.up) / np.linalg.norm(eye.up), np.array(eye.target)
         away = np.array(eye.eye) - target
         keys = [(0.0, state)]
-        for n in range(1, _ROUND):  # Rodrigues' rotation of the part across the axis
-            angle = 2 * np.pi * n / _ROUND
-            along = (up @ away) * up
-            turned = along + np.cos(angle) * (away - along) + np.sin(angle) * np.cross(up, away)
-            there = replace(eye, eye=tuple((target + turned).tolist()))
-            keys.append((seconds * n / _ROUND, replace(state, camera=there)))
+        for n in range(1, _TURN_KEYS):  # Rodrigues' rotation of the part across the axis
+            angle = 2 * np.pi * n / _TURN_KEYS
+            axial = (up @ away) * up
+            turned = axial + np.cos(angle) * (away - axial) + np.sin(angle) * np.cross(up, away)
+            camera = replace(eye, eye=tuple((target + turned).tolist()))
+            keys.append((seconds * n / _TURN_KEYS, replace(state, camera=camera)))
         return cls([*keys, (seconds, state)])
 
     def save(self, path: str | Path) -> None:
@@ -141,11 +143,11 @@ class Flight:
         n = bisect_right(self._times, time) - 1
         if n < 0 or self._times[n] == time or n == len(self._times) - 1:
             return self._states[max(n, 0)]
-        before = self._states[n].camera
-        assert before is not None
-        eye = _eye(self._path.at(time), float(self._fov.at(time)), before)
+        key_camera = self._states[n].camera
+        assert key_camera is not None
+        eye = _eye(self._motion.at(time), float(self._fov_curve.at(time)), key_camera)
         try:
-            state = self._states[n].changed(self._look(time))
+            state = self._states[n].changed(self._content_curve(time))
         except ValueError as error:
             raise ValueError(f"Flight: at {time:g} s, after key {n}: {one_line(error)}") from None
         return replace(state, camera=eye)
@@ -173,10 +175,10 @@ class Flight:
     def count(self, fps: float = 25) -> int:
         """Returns the number of pictures of a film."""
         fps = check.number("Flight", "fps", fps, low=0, open_low=True)
-        if self.seconds * fps > _MOST_PICTURES:
+        if self.seconds * fps > _MAX_PICTURES:
             raise ValueError(
                 f"Flight: {self.seconds:g} s of {fps:g} pictures each are more than "
-                f"{_MOST_PICTURES} pictures"
+                f"{_MAX_PICTURES} pictures"
             )
         return max(1, round(self.seconds * fps) + (not self.closed))
 
@@ -251,48 +253,52 @@ def _pose(eye: Eye) -> Tensor:
     return pose
 
 
-def _eye(pose: Tensor, fov: float, before: Eye) -> Eye:
+def _eye(pose: Tensor, fov: float, previous: Eye) -> Eye:
     """Returns the camera of a pose, with the camera model of the key before."""
-    down, forward, target = pose[:3, 1], pose[:3, 2], pose[:3, 3]
-    x, y, z = (tuple(part.tolist()) for part in (target - forward, target, -down / down.norm()))
-    return Eye(eye=x, target=y, up=z, fov=fov, model=before.model)
+    down, forward, origin = pose[:3, 1], pose[:3, 2], pose[:3, 3]
+    eye, target, up = (
+        tuple(vector.tolist()) for vector in (origin - forward, origin, -down / down.norm())
+    )
+    return Eye(eye=eye, target=target, up=up, fov=fov, model=previous.model)
 
 
-def _curve(times: Sequence[float], values: Sequence[Any], closed: bool, place: Any = None) -> Curve:
+def _curve(
+    times: Sequence[float], values: Sequence[Any], closed: bool, field_key: Any = None
+) -> Curve:
     """Returns plain JSON as a function of time: smooth through consecutive keys whose values have
-    one form, else the value of the key before. `place`: class and field that hold the values.
+    one form, else the value of the key before. `field_key`: class and field that hold the values.
     """
-    forms = [_form(value, place) for value in values]
+    forms = [_value_form(value, field_key) for value in values]
     starts = [0, *(n for n in range(1, len(forms)) if forms[n] != forms[n - 1]), len(forms)]
     closed = closed and len(starts) == 2
     runs = [
-        (times[a], times[b - 1], _smooth(times[a:b], values[a:b], closed, place))
+        (times[a], times[b - 1], _smooth_curve(times[a:b], values[a:b], closed, field_key))
         for a, b in pairwise(starts)
     ]
     begins = [begin for begin, _, _ in runs]
 
-    def at(time: float) -> Any:
+    def evaluate(time: float) -> Any:
         begin, end, curve = runs[max(0, bisect_right(begins, time) - 1)]
         return curve(min(max(time, begin), end))
 
-    return at
+    return evaluate
 
 
-def _form(value: Any, place: Any) -> Any:
+def _value_form(value: Any, field_key: Any) -> Any:
     """Returns the form of a value; only values of equal form are interpolated."""
     if isinstance(value, float):
         return "number"
     if isinstance(value, dict):
         return ("kept",) if "kept" in value else (value.get("kind"), *sorted(value))
     if isinstance(value, list):
-        if place in _ORDERED and place[0] == "TransferFunction":
+        if field_key in _INCREASING_FIELDS and field_key[0] == "TransferFunction":
             return "points"
-        numbers = _numbers(value)
+        numbers = _as_array(value)
         return ("list", len(value)) if numbers is None else ("numbers", numbers.shape)
     return "other"
 
 
-def _numbers(value: Any) -> np.ndarray | None:
+def _as_array(value: Any) -> np.ndarray | None:
     """Returns a list of floats, or of lists of them, as an array; None for anything else."""
     flat = value if isinstance(value, list) else []
     while flat and isinstance(flat[0], list):
@@ -305,16 +311,18 @@ def _numbers(value: Any) -> np.ndarray | None:
         return None
 
 
-def _smooth(times: Sequence[float], values: Sequence[Any], closed: bool, place: Any) -> Curve:
+def _smooth_curve(
+    times: Sequence[float], values: Sequence[Any], closed: bool, field_key: Any
+) -> Curve:
     """Returns the curve through values of one form."""
     first = values[0]
     if isinstance(first, float):
         return _number_curve(times, [np.array(value) for value in values], closed)
-    arrays = [found for value in values if (found := _numbers(value)) is not None]
+    arrays = [array for value in values if (array := _as_array(value)) is not None]
     if arrays:
-        if len({one.shape for one in arrays}) > 1:
-            arrays = _sampled(arrays)
-        return _number_curve(times, arrays, closed, place)
+        if len({array.shape for array in arrays}) > 1:
+            arrays = _resampled(arrays)
+        return _number_curve(times, arrays, closed, field_key)
     if isinstance(first, list):
         items = [_curve(times, [v[n] for v in values], closed) for n in range(len(first))]
         return lambda time: [curve(time) for curve in items]
@@ -328,32 +336,32 @@ def _smooth(times: Sequence[float], values: Sequence[Any], closed: bool, place: 
 
 
 def _number_curve(
-    times: Sequence[float], arrays: Sequence[np.ndarray], closed: bool, place: Any = None
+    times: Sequence[float], arrays: Sequence[np.ndarray], closed: bool, field_key: Any = None
 ) -> Curve:
     """Returns the curve through arrays of one shape. Numbers that must increase along an axis are
     interpolated as their first one and the gaps between them, which stay positive.
     """
-    dimensions, axis, columns = _ORDERED.get(place, (None, 0, slice(None)))
+    dimensions, axis, columns = _INCREASING_FIELDS.get(field_key, (None, 0, slice(None)))
     if arrays[0].ndim != dimensions:
         smooth = Smooth(times, arrays, closed)
         return lambda time: smooth.at(time).tolist()
-    before = [np.copy(one) for one in arrays]
-    for one in before:
-        one[..., columns] = np.diff(one[..., columns], axis=axis, prepend=0)
-    gaps = Smooth(times, before, closed)
+    deltas = [np.copy(array) for array in arrays]
+    for array in deltas:
+        array[..., columns] = np.diff(array[..., columns], axis=axis, prepend=0)
+    gaps = Smooth(times, deltas, closed)
 
-    def at(time: float) -> Any:
-        found = gaps.at(time).copy()
-        found[..., columns] = np.cumsum(found[..., columns], axis=axis)
-        return found.tolist()
+    def evaluate(time: float) -> Any:
+        values = gaps.at(time).copy()
+        values[..., columns] = np.cumsum(values[..., columns], axis=axis)
+        return values.tolist()
 
-    return at
+    return evaluate
 
 
-def _sampled(functions: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _resampled(functions: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Resamples piecewise linear functions, rows (value, number, ...), at the values of all."""
-    values = np.unique(np.concatenate([one[:, 0] for one in functions]))
+    values = np.unique(np.concatenate([function[:, 0] for function in functions]))
     return [
-        np.stack([values, *(np.interp(values, one[:, 0], c) for c in one.T[1:])], 1)
-        for one in functions
+        np.stack([values, *(np.interp(values, function[:, 0], c) for c in function.T[1:])], 1)
+        for function in functions
     ]

@@ -17,29 +17,29 @@ from .client import Client, image_file
 from .server import page_files
 from .session import Session
 
-_FIRST = "app.js"
+_ENTRY_MODULE = "app.js"
 _IMPORT = re.compile(r'from "\./([a-z]+\.js)"')
 
 #: Makes modules of the page's texts, and mounts it with the notebook's model as its transport.
-_BOOT = """
+_LOADER = """
 const texts = %s;
-const made = {};
-const address = (name) => made[name] ??= URL.createObjectURL(new Blob(
-  [texts[name].replace(/from "\\.\\/([a-z]+\\.js)"/g, (_, other) => `from "${address(other)}"`)],
+const urls = {};
+const moduleUrl = (name) => urls[name] ??= URL.createObjectURL(new Blob(
+  [texts[name].replace(/from "\\.\\/([a-z]+\\.js)"/g, (_, other) => `from "${moduleUrl(other)}"`)],
   { type: "text/javascript" }));
 export default {
   async render({ model, el }) {
-    const { mount } = await import(address("app.js"));
+    const { mount } = await import(moduleUrl("app.js"));
     const root = document.createElement("div");
     root.className = "gv";
     root.style.height = `${model.get("height")}px`;
     el.append(root);
-    const connect = (take, gone) => {
+    const connect = (receive, onLost) => {
       model.on("msg:custom", (content, buffers) => {
-        if (content.gone) gone(content.gone);
-        else take(buffers.length ? buffers[0] : content.text);
+        if (content.gone) onLost(content.gone);
+        else receive(buffers.length ? buffers[0] : content.text);
       });
-      model.on("comm_live_update", () => gone("The notebook's kernel has ended."));
+      model.on("comm_live_update", () => onLost("The notebook's kernel has ended."));
       return (text) => model.send({ text });
     };
     mount(root, connect);
@@ -53,13 +53,13 @@ export default {
 def module_text() -> str:
     """Returns the whole page as one JavaScript module."""
     files = {name: data.decode() for name, data in page_files().items() if name.endswith(".js")}
-    wanted, left = {}, [_FIRST]
-    while left:
-        name = left.pop()
-        if name not in wanted:
-            wanted[name] = files[name]
-            left += _IMPORT.findall(files[name])
-    return _BOOT % json.dumps(wanted)
+    modules, pending = {}, [_ENTRY_MODULE]
+    while pending:
+        name = pending.pop()
+        if name not in modules:
+            modules[name] = files[name]
+            pending += _IMPORT.findall(files[name])
+    return _LOADER % json.dumps(modules)
 
 
 def widget(session: Session, height: int = 560) -> Any:
@@ -81,12 +81,12 @@ def widget(session: Session, height: int = 560) -> Any:
             super().__init__(**options)
             self.session = session
             self._client: Client | None = None
-            self.on_msg(self._take)
+            self.on_msg(self._receive)
             self._loop: asyncio.AbstractEventLoop | None = None  # running in this thread
             with contextlib.suppress(RuntimeError):
                 self._loop = asyncio.get_running_loop()
 
-        def _take(self, _widget: Any, content: Any, _buffers: Any) -> None:
+        def _receive(self, _widget: Any, content: Any, _buffers: Any) -> None:
             if content.get("joined") is not None:
                 if self._client is not None:
                     self.session.leave(self._client)
@@ -96,11 +96,11 @@ def widget(session: Session, height: int = 560) -> Any:
 
         def _post(self, data: str | bytes) -> None:
             if self._loop is None:
-                self._hand(data)
+                self._send_now(data)
             else:
-                self._loop.call_soon_threadsafe(self._hand, data)
+                self._loop.call_soon_threadsafe(self._send_now, data)
 
-        def _hand(self, data: str | bytes) -> None:
+        def _send_now(self, data: str | bytes) -> None:
             if isinstance(data, str):
                 self.send({"text": data})
             else:
@@ -116,8 +116,8 @@ def widget(session: Session, height: int = 560) -> Any:
             """Returns what is shown, as a PNG file."""
             eye = self.session.state.camera
             assert eye is not None
-            made = self.session.ask(lambda: self.session.still(eye, width, height), 600)
-            return image_file(made, "PNG")
+            picture = self.session.ask(lambda: self.session.still(eye, width, height), 600)
+            return image_file(picture, "PNG")
 
         def close_view(self) -> None:
             """Ends the view; an engine that the caller made stays open."""

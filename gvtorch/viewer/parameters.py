@@ -15,7 +15,7 @@ from ..producers import Producer
 from .scene import Scene
 from .schema import control_for, decode, encode
 
-_MOST = 16  # most numbers of a parameter that gets a control
+_MAX_NUMBERS = 16  # most numbers of a parameter that gets a control
 
 
 class Parameters:
@@ -51,23 +51,30 @@ class Parameters:
 
     def describe(self) -> dict[str, Any] | None:
         """Returns value and control of each parameter, by name; None if there are none."""
-        told: dict[str, Any] = {}
+        descriptions: dict[str, Any] = {}
         if self.record is not None:
             hints = get_type_hints(type(self.record))
             for field in fields(self.record):
-                one = control_for(hints[field.name])
+                control = control_for(hints[field.name])
                 if "range" in field.metadata:
-                    one["range"] = list(field.metadata["range"])
-                told[field.name] = {**one, "value": encode(getattr(self.record, field.name))}
+                    control["range"] = list(field.metadata["range"])
+                descriptions[field.name] = {
+                    **control,
+                    "value": encode(getattr(self.record, field.name)),
+                }
         for name, tensor in self._tensors().items():
             kind = "number" if tensor.numel() == 1 else "numbers"
             value = tensor.item() if tensor.numel() == 1 else tensor.flatten().tolist()
-            told[name] = {"type": kind, "value": value}
-        return told or None
+            descriptions[name] = {"type": kind, "value": value}
+        return descriptions or None
 
     def _tensors(self) -> dict[str, torch.nn.Parameter]:
-        found = self.producer.named_parameters()
-        return {n: p for n, p in found if p.is_floating_point() and p.numel() <= _MOST}
+        named = self.producer.named_parameters()
+        return {
+            name: parameter
+            for name, parameter in named
+            if parameter.is_floating_point() and parameter.numel() <= _MAX_NUMBERS
+        }
 
     def set(self, name: str, value: Any, scene: Scene) -> None:
         """Sets a parameter, and has the scene produced again.
@@ -78,15 +85,15 @@ class Parameters:
         tensors = self._tensors()
         if name in tensors:
             numbers = [value] if not isinstance(value, list) else value
-            given = decode(name, list[float], numbers)
-            if len(given) != tensors[name].numel():
+            decoded = decode(name, list[float], numbers)
+            if len(decoded) != tensors[name].numel():
                 raise ValueError(f"set: {name} has {tensors[name].numel()} numbers")
             with torch.no_grad():
-                tensors[name].copy_(torch.tensor(given).view_as(tensors[name]))
+                tensors[name].copy_(torch.tensor(decoded).view_as(tensors[name]))
             self.producer.changed()
             return
-        known = [] if self.record is None else [field.name for field in fields(self.record)]
-        if name not in known or self._make is None:
+        field_names = [] if self.record is None else [field.name for field in fields(self.record)]
+        if name not in field_names or self._make is None:
             raise ValueError(f"set: there is no parameter {name!r:.60}")
         hint = get_type_hints(type(self.record))[name]
         before = getattr(self.record, name)

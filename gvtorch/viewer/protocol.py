@@ -17,8 +17,8 @@ from ..base import check
 from .schema import decode
 from .state import Eye
 
-MOST_BYTES = 1 << 20  # largest message from a page
-_SIDE = (16, 8192)  # pixels
+MAX_MESSAGE_BYTES = 1 << 20  # largest message from a page
+_SIDE_RANGE = (16, 8192)  # pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class Hello:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            check.whole("hello", name, getattr(self, name), low=_SIDE[0], high=_SIDE[1])
+            check.whole("hello", name, getattr(self, name), low=_SIDE_RANGE[0], high=_SIDE_RANGE[1])
         check.number("hello", "rate", self.rate, low=1, high=240)
 
 
@@ -154,7 +154,7 @@ class Still:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            check.whole("still", name, getattr(self, name), low=_SIDE[0], high=16384)
+            check.whole("still", name, getattr(self, name), low=_SIDE_RANGE[0], high=16384)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +181,7 @@ Message = (
     Hello | Move | Ack | Change | Pick | Histogram | Preset | Read | Export | Nodes | Resize | Set
     | Follow | Monitor | Still | Surface | Do
 )  # fmt: skip
-MESSAGES: dict[str, type[Any]] = {one.__name__.lower(): one for one in Message.__args__}
+MESSAGES: dict[str, type[Any]] = {message.__name__.lower(): message for message in Message.__args__}
 
 
 def parse(text: str | bytes) -> Any:
@@ -190,10 +190,10 @@ def parse(text: str | bytes) -> Any:
     Raises:
         ValueError: The text is no message, or a value is out of its range.
     """
-    if len(text) > MOST_BYTES:
-        raise ValueError(f"message: {len(text)} bytes, more than {MOST_BYTES}")
+    if len(text) > MAX_MESSAGE_BYTES:
+        raise ValueError(f"message: {len(text)} bytes, more than {MAX_MESSAGE_BYTES}")
     try:
-        content = json.loads(text, parse_constant=_no_number)
+        content = json.loads(text, parse_constant=_reject_constant)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"message: not JSON: {error}") from None
     if not isinstance(content, dict):
@@ -201,11 +201,11 @@ def parse(text: str | bytes) -> Any:
     kind = MESSAGES.get(content["type"]) if isinstance(content.get("type"), str) else None
     if kind is None:
         raise ValueError(f"message: type must be one of {', '.join(MESSAGES)}")
-    given = {name: value for name, value in content.items() if name != "type"}
-    return decode(content["type"], kind, given)
+    fields = {name: value for name, value in content.items() if name != "type"}
+    return decode(content["type"], kind, fields)
 
 
-def _no_number(name: str) -> float:
+def _reject_constant(name: str) -> float:
     raise ValueError(f"{name} is no number")
 
 
@@ -214,7 +214,7 @@ def message_text(kind: str, **content: Any) -> str:
     return json.dumps({"type": kind, **content})
 
 
-def with_picture(head: dict[str, Any], picture: bytes) -> bytes:
+def binary_message(header: dict[str, Any], data: bytes) -> bytes:
     """Returns a picture or a file for a page, with its head, as bytes."""
-    text = json.dumps(head).encode()
-    return struct.pack("<I", len(text)) + text + picture
+    text = json.dumps(header).encode()
+    return struct.pack("<I", len(text)) + text + data

@@ -32,15 +32,15 @@ from ..shaders import Channels, Labels, Shader, TransferFunction
 from ..shaders.labels import label_rows
 from ..shaders.presets import IN_HU
 from ..tracing import cost, render
-from .schema import MOST_ITEMS
+from .schema import MAX_ITEMS
 from .state import ViewState, costed
 
 BINS = 256  # of a histogram, at most
-_MOST_BOXES = 1500  # most boxes of nodes that are sent to a page
-_LOOKED_AT = 1 << 20  # values that are checked for being whole numbers
+_MAX_BOXES = 1500  # most boxes of nodes that are sent to a page
+_CHECKED_VALUES = 1 << 20  # values that are checked for being whole numbers
 EngineScene = Producer | Mapping[str, Producer]
 Remake = Callable[[Volume | Store | None], EngineScene]
-_BUDGET = 40.0  # milliseconds of production a frame, so that none takes long
+_BUDGET_MS = 40.0  # milliseconds of production a frame, so that none takes long
 
 
 @dataclass
@@ -79,13 +79,15 @@ class Scene:
     def trees(self) -> list[N3Tree]:
         """All trees."""
         if self.engine is not None:
-            return [one.tree for one in self.engine.trees.values()]
+            return [entry.tree for entry in self.engine.trees.values()]
         return [] if self.tree is None else [self.tree]
 
     @property
     def producers(self) -> list[Producer]:
         """The producers of the engine's trees."""
-        return [] if self.engine is None else [one.producer for one in self.engine.trees.values()]
+        return (
+            [] if self.engine is None else [entry.producer for entry in self.engine.trees.values()]
+        )
 
     def frame(self, camera: Camera, state: ViewState, progress: Progress = no_progress) -> Picture:
         """Renders with the data that is loaded now; what is missing is requested."""
@@ -102,8 +104,8 @@ class Scene:
         (tree,) = self.trees[:1]
         assert state.show != "picture"
         unlit = {**state.settings(), "lighting": None}
-        counted = cost(tree, camera, costed(state.shader), progress=progress, **unlit)
-        return counted.picture(state.show)
+        costs = cost(tree, camera, costed(state.shader), progress=progress, **unlit)
+        return costs.picture(state.show)
 
     def voxels(self, purpose: str) -> Volume | Store:
         """Returns the voxels of which planes and surfaces are made.
@@ -115,10 +117,10 @@ class Scene:
             return self.data
         if self.tree is None:
             producers = self.producers
-            found = _voxels_of(producers[0]) if len(producers) == 1 else None
-            if found is None:
+            voxels = _voxels_of(producers[0]) if len(producers) == 1 else None
+            if voxels is None:
                 raise ValueError(f"{purpose}: this scene has no voxels of its own")
-            return found
+            return voxels
         if self._resident is None:
             self._resident = self.tree.to_volume()
         return self._resident
@@ -142,15 +144,15 @@ class Scene:
         if name in tree.labels:
             return Labels()
         low, high = (0.0, 1.0)
-        for one in self.producers:
-            low, high = one.value_range.get(name, (low, high))
+        for producer in self.producers:
+            low, high = producer.value_range.get(name, (low, high))
         return TransferFunction.preset("gray", low, high)
 
     def histogram(self, component: int, in_view: bool) -> dict[str, Any]:
         """Counts the values of the bricks that the last frame read, or of a sample of all values.
         Returns low, high, and at most BINS counts.
         """
-        values = self._in_view(component) if in_view or self.data is None else None
+        values = self._values_in_view(component) if in_view or self.data is None else None
         if values is None and self.data is not None:
             values = looked_at(self.data)[..., component].ravel()
         if values is None or not len(values):
@@ -158,29 +160,29 @@ class Scene:
         low, high = float(values.min()), float(values.max())
         high = high if high > low else low + 1.0
         bins = BINS
-        if bool((values[:_LOOKED_AT] == np.rint(values[:_LOOKED_AT])).all()):
-            apart = float(np.diff(np.unique(values[:_LOOKED_AT])).min(initial=high - low))
-            width = apart * max(1, math.ceil((high - low) / apart / BINS))  # no empty bins
-            low, bins = low - apart / 2, math.ceil((high - low + apart) / width)
+        if bool((values[:_CHECKED_VALUES] == np.rint(values[:_CHECKED_VALUES])).all()):
+            gap = float(np.diff(np.unique(values[:_CHECKED_VALUES])).min(initial=high - low))
+            width = gap * max(1, math.ceil((high - low) / gap / BINS))  # no empty bins
+            low, bins = low - gap / 2, math.ceil((high - low + gap) / width)
             high = low + bins * width
         counts, _ = np.histogram(values, bins, (low, high))
         return {"low": low, "high": high, "counts": counts.tolist()}
 
-    def _in_view(self, component: int) -> np.ndarray | None:
+    def _values_in_view(self, component: int) -> np.ndarray | None:
         tree = self.trees[0]
         bricks = tree.bricks
         pool = bricks.bricks[tree.channel_names[0]]
-        used = (bricks.stamp_b == tree.frame).nonzero()[:4096, 0]
-        if not len(used):
+        slots = (bricks.stamp_b == tree.frame).nonzero()[:4096, 0]
+        if not len(slots):
             return None
         inner = slice(bricks.border, bricks.border + bricks.brick_size)
-        found = movable(pool)[used].view(pool.dtype)[:, inner, inner, inner, component]
-        values = to_numpy(found.cpu()).ravel().astype(np.float32)
+        voxels = movable(pool)[slots].view(pool.dtype)[:, inner, inner, inner, component]
+        values = to_numpy(voxels.cpu()).ravel().astype(np.float32)
         return values[np.isfinite(values)]
 
     def _clocks(self) -> list[Any]:
         """Returns the producers that have a clock (`Producer.time`)."""
-        return [one for one in self.producers if hasattr(one, "time")]
+        return [producer for producer in self.producers if hasattr(producer, "time")]
 
     def describe_time(self) -> dict[str, Any] | None:
         """Returns what a time slider needs: the number of time points (None for a clock), and step,
@@ -188,8 +190,8 @@ class Scene:
         """
         if self.times > 1:
             info = self.info
-            told = {"step": info.time_step, "origin": info.time_origin, "unit": info.time_unit}
-            return {"times": self.times, **told}
+            time_axis = {"step": info.time_step, "origin": info.time_origin, "unit": info.time_unit}
+            return {"times": self.times, **time_axis}
         return {"times": None} if self._clocks() else None
 
     def describe_labels(self) -> dict[str, Any] | None:
@@ -204,7 +206,7 @@ class Scene:
             names = self.data.data[..., 0].unique().cpu().numpy().astype(np.int64)
         else:
             names = label_rows(tree, channel)[1]
-        first = names[:MOST_ITEMS]
+        first = names[:MAX_ITEMS]
         colors = Labels()(first)[:, :3].round(4)
         return {"names": first.tolist(), "colors": colors.tolist(), "count": len(names)}
 
@@ -227,17 +229,17 @@ class Scene:
 
     def show_time(self, time: float, data: Volume | Store) -> None:
         """Shows another time point of a series: `data` is what `reopen` returned."""
-        before, self.data = self.data, data
+        old_data, self.data = self.data, data
         try:
             self.resize()
         except (ValueError, RuntimeError):
-            self.data = before
+            self.data = old_data
             raise
         self.time = time
 
     def failures(self) -> list[str]:
         """Returns messages on what could not be produced, the newest last."""
-        return [] if self.engine is None else [str(one) for one in self.engine.failures]
+        return [] if self.engine is None else [str(failure) for failure in self.engine.failures]
 
     def retry(self) -> None:
         """Allows what could not be produced to be requested again."""
@@ -254,13 +256,13 @@ class Scene:
         """
         if self.engine is None or self.remake is None:
             raise ValueError("view: the engine was passed in: its owner sets its memory")
-        before = self.engine.options
-        wanted = replace(before, **options)
+        old_options = self.engine.options
+        new_options = replace(old_options, **options)
         self.engine.close()
         try:
-            self.engine = Engine((remake or self.remake)(self.data), **vars(wanted))
+            self.engine = Engine((remake or self.remake)(self.data), **vars(new_options))
         except (ValueError, RuntimeError):
-            self.engine = Engine(self.remake(self.data), **vars(before))
+            self.engine = Engine(self.remake(self.data), **vars(old_options))
             raise
         self.remake = remake or self.remake
 
@@ -269,8 +271,8 @@ class Scene:
         stats = picture.stats
         if not isinstance(stats, FrameStats):
             return True
-        made = sum(stats.produced.values())
-        return stats.converged or not (made or stats.pending or stats.deferred)
+        produced = sum(stats.produced.values())
+        return stats.converged or not (produced or stats.pending or stats.deferred)
 
     def close(self) -> None:
         """Closes the engine unless it belongs to the caller."""
@@ -294,14 +296,16 @@ def open_scene(what: Any, **options: Any) -> Scene:
         if options:
             raise ValueError(f"view: {next(iter(options))} is set where the scene is made already")
         return Scene(repr(what), *((what, None) if isinstance(what, Engine) else (None, what)))
-    options.setdefault("time_budget", _BUDGET)
+    options.setdefault("time_budget", _BUDGET_MS)
     if "device" not in options and not unavailable()["cuda"]:
         options["device"] = "cuda"
-    if isinstance(what, Mapping) and all(isinstance(one, Producer) for one in what.values()):
+    if isinstance(what, Mapping) and all(
+        isinstance(producer, Producer) for producer in what.values()
+    ):
         return Scene(", ".join(what), Engine(what, **options), remake=lambda _: what)
     if isinstance(what, Producer):
         return Scene(repr(what), Engine(what, **options), remake=lambda _: what)
-    data, series = _data_of(what), series_of(what)
+    data, series = _open_data(what), series_of(what)
     options.setdefault("border", 2 if data.info.labels else EngineOptions.border)
     engine = Engine(_producer_of(data), **options)
     return Scene(data.name, engine, data=data, remake=_producer_of, **series)
@@ -321,8 +325,8 @@ def series_of(what: Any, **options: Any) -> dict[str, Any]:
         path, first = fspath(what), options.pop("time", None) or 0
         if is_zarr(path):
             return series_of(Store.open(path, time=first))
-        header = {name: one for name, one in options.items() if name != "nan"}
-        times = open_source(path, **header).times
+        open_options = {name: value for name, value in options.items() if name != "nan"}
+        times = open_source(path, **open_options).times
 
         def reopen(time: int) -> Volume:
             return read_volume(path, **options, time=time)
@@ -342,7 +346,7 @@ def _voxels_of(producer: Producer) -> Volume | Store | None:
     return None
 
 
-def _data_of(what: Any) -> Volume | Store:
+def _open_data(what: Any) -> Volume | Store:
     if isinstance(what, (Volume, Store)):
         return what
     if isinstance(what, (str, PathLike)):
@@ -351,34 +355,34 @@ def _data_of(what: Any) -> Volume | Store:
     try:
         return as_volume(what, where="view")
     except ValueError as error:
-        known = "an Engine, Producer, N3Tree, Volume, Store, array or path"
-        raise ValueError(f"view: takes {known}: {error}") from None
+        accepted = "an Engine, Producer, N3Tree, Volume, Store, array or path"
+        raise ValueError(f"view: takes {accepted}: {error}") from None
 
 
 def node_boxes(
-    tree: N3Tree, eye: tuple[float, float, float], most: int = _MOST_BOXES
+    tree: N3Tree, eye: tuple[float, float, float], limit: int = _MAX_BOXES
 ) -> dict[str, Any]:
     """Returns the nodes whose bricks the last frame read, those nearest to an eye first.
 
     Returns:
-        boxes: At most `most` [x, y, z, depth], see `N3Tree.loc`.
+        boxes: At most `limit` [x, y, z, depth], see `N3Tree.loc`.
         count: Number of all these nodes.
         low, size: World corner and sides of the root.
         branching: N.
     """
     nodes, bricks = tree.nodes, tree.bricks
-    own = (nodes.tree_t == tree.number)[:, None] & (nodes.brick_tn >= 0)
-    tile, child = own.nonzero().unbind(1)
+    has_brick = (nodes.tree_t == tree.number)[:, None] & (nodes.brick_tn >= 0)
+    tile, child = has_brick.nonzero().unbind(1)
     brick = nodes.brick_tn[tile, child].to(torch.int64)
     read = bricks.stamp_b[brick] == tree.frame
     loc = tree.loc(tile[read] * nodes.nodes_per_tile + child[read])
     low, size, _ = tree.place.unbind(0)
-    share = float(tree.branching) ** -loc[:, 3:].to(torch.float64)
-    centre = low + (loc[:, :3] + 0.5) * share * size  # (k, 3) world
+    fraction = float(tree.branching) ** -loc[:, 3:].to(torch.float64)
+    centre = low + (loc[:, :3] + 0.5) * fraction * size  # (k, 3) world
     distance = (centre - torch.tensor(eye, dtype=torch.float64).to(centre)).norm(dim=1)
-    first = distance.argsort(stable=True)[:most]
+    nearest = distance.argsort(stable=True)[:limit]
     return {
-        "boxes": loc[first].tolist(),
+        "boxes": loc[nearest].tolist(),
         "count": len(loc),
         "low": low.tolist(),
         "size": size.tolist(),

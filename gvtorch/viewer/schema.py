@@ -38,30 +38,30 @@ from ..shaders import (
 )
 from ..tracing import Clip, Lighting, RenderOptions, ThinLens
 
-MOST_ITEMS = 4096  # of a list
-_MOST_NUMBERS = 4 * MOST_ITEMS  # of an array: a row of a transfer function has four
-MOST_DEPTH = 16  # of objects in objects
+MAX_ITEMS = 4096  # of a list
+_MAX_NUMBERS = 4 * MAX_ITEMS  # of an array: a row of a transfer function has four
+MAX_DEPTH = 16  # of objects in objects
 
 #: Classes that JSON may name, by name.
 KINDS: dict[str, type] = {
-    one.__name__: one
-    for one in (
+    kind.__name__: kind
+    for kind in (
         *(TransferFunction, Channels, ChannelLook, Labels, Gradient, RenderOptions),
         *(Headlight, DirectionalLight, PointLight, Clip, Lighting, ThinLens),
         *(getattr(built_in, name) for name in built_in.__all__),
     )
 }
 #: Reads arguments of constructors that are stored under another name, or in another form.
-_KEPT_AS: dict[tuple[str, str], Any] = {
-    ("Isosurface", "color_channel"): lambda one: one.other,
-    ("Isosurface", "color_component"): lambda one: one.other_component,
-    ("DistanceField", "offset"): lambda one: one.value,
-    ("Features", "channel"): lambda one: one.other,
-    ("Gradient", "top"): lambda one: one.ends[0],
-    ("Gradient", "bottom"): lambda one: one.ends[1],
+_ARGUMENT_READERS: dict[tuple[str, str], Any] = {
+    ("Isosurface", "color_channel"): lambda shader: shader.other,
+    ("Isosurface", "color_component"): lambda shader: shader.other_component,
+    ("DistanceField", "offset"): lambda shader: shader.value,
+    ("Features", "channel"): lambda shader: shader.other,
+    ("Gradient", "top"): lambda gradient: gradient.ends[0],
+    ("Gradient", "bottom"): lambda gradient: gradient.ends[1],
 }
 #: Arguments that no control changes: they belong to the scene, not to its look.
-_OF_THE_SCENE = {
+_SCENE_ARGUMENTS = {
     "RenderOptions": ("layer", "pose", "dtype", "backend", "channel", "component"),
     "Lit": ("in_the_way",),
     "DistanceField": ("value",),
@@ -102,21 +102,21 @@ def arguments(kind: Any) -> dict[str, tuple[Any, Any]]:
     """Returns type hint and default (`inspect.Parameter.empty`: none) of each argument that a
     constructor takes, including those that it passes on to its base class.
     """
-    found: dict[str, tuple[Any, Any]] = {}
-    left_out = _OF_THE_SCENE.get(kind.__name__, ())
+    collected: dict[str, tuple[Any, Any]] = {}
+    excluded = _SCENE_ARGUMENTS.get(kind.__name__, ())
     for base in kind.__mro__:
         if "__init__" not in vars(base) or base is object:
             continue
         hints = get_type_hints(base.__init__)
-        hands_on = False
-        for one in [*inspect.signature(base.__init__).parameters.values()][1:]:
-            if one.kind is one.VAR_KEYWORD:
-                hands_on = True
-            elif one.name not in found and one.name not in left_out:
-                found[one.name] = (hints.get(one.name, Any), one.default)
-        if not hands_on:
+        passes_on = False
+        for parameter in [*inspect.signature(base.__init__).parameters.values()][1:]:
+            if parameter.kind is parameter.VAR_KEYWORD:
+                passes_on = True
+            elif parameter.name not in collected and parameter.name not in excluded:
+                collected[parameter.name] = (hints.get(parameter.name, Any), parameter.default)
+        if not passes_on:
             break
-    return found
+    return collected
 
 
 def encode(value: Any) -> Any:
@@ -124,210 +124,224 @@ def encode(value: Any) -> Any:
     if isinstance(value, Enum):
         value = value.value
     elif isinstance(value, (np.ndarray, np.generic, Tensor)):
-        small = (
-            max(value.shape, default=0) <= MOST_ITEMS and math.prod(value.shape) <= _MOST_NUMBERS
+        is_small = (
+            max(value.shape, default=0) <= MAX_ITEMS and math.prod(value.shape) <= _MAX_NUMBERS
         )
-        value = value.tolist() if small else _kept(value)
+        value = value.tolist() if is_small else _kept_marker(value)
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
     elif isinstance(value, Mapping):
-        value = {str(name): encode(one) for name, one in value.items()}
+        value = {str(name): encode(item) for name, item in value.items()}
     elif isinstance(value, (list, tuple, range)):
-        value = [encode(one) for one in value]
+        value = [encode(item) for item in value]
     elif not (value is None or isinstance(value, (bool, int, str))):
-        value = _encoded_object(value)
+        value = _encode_object(value)
     return value
 
 
-def _encoded_object(value: Any) -> dict[str, Any]:
+def _encode_object(value: Any) -> dict[str, Any]:
     name = type(value).__name__
     if not (KINDS.get(name) is type(value) or is_dataclass(value)):
-        return _kept(value)
+        return _kept_marker(value)
     kind: Any = type(value)
-    known = {arg: _argument(value, arg) for arg in arguments(kind)}
-    return {"kind": name, **{arg: encode(one) for arg, one in known.items()}}
+    values = {arg: _argument(value, arg) for arg in arguments(kind)}
+    return {"kind": name, **{arg: encode(item) for arg, item in values.items()}}
 
 
 def _argument(owner: Any, name: str) -> Any:
-    read = next(
-        (_KEPT_AS[c.__name__, name] for c in type(owner).__mro__ if (c.__name__, name) in _KEPT_AS),
+    reader = next(
+        (
+            _ARGUMENT_READERS[base.__name__, name]
+            for base in type(owner).__mro__
+            if (base.__name__, name) in _ARGUMENT_READERS
+        ),
         None,
     )
-    return getattr(owner, name) if read is None else read(owner)
+    return getattr(owner, name) if reader is None else reader(owner)
 
 
-def _kept(value: Any) -> dict[str, str]:
+def _kept_marker(value: Any) -> dict[str, str]:
     return {"kept": repr(value)[:200]}
 
 
-def decode(where: str, hint: Any, content: Any, now: Any = None, depth: int = 0) -> Any:
+def decode(path: str, hint: Any, content: Any, current: Any = None, depth: int = 0) -> Any:
     """Makes an object of plain JSON by a type hint.
 
     Args:
-        where: Begins messages.
+        path: Of the content in the JSON, such as "state.options"; begins messages.
         hint: The type that it must have.
         content: What `json.loads` returned.
-        now: The present value, for what the JSON leaves out or marks as kept.
+        current: The present value, for what the JSON leaves out or marks as kept.
         depth: Number of objects around this one.
 
     Raises:
         ValueError: The content is not of the type, or the object refuses it.
     """
-    if depth > MOST_DEPTH:
-        raise ValueError(f"{where}: objects in objects in objects, more than {MOST_DEPTH}")
+    if depth > MAX_DEPTH:
+        raise ValueError(f"{path}: objects in objects in objects, more than {MAX_DEPTH}")
     if isinstance(content, dict) and set(content) == {"kept"}:
-        if now is not None:
-            return now
+        if current is not None:
+            return current
         if hint is not Any:  # Any: JSON as it is
             raise ValueError(
-                f"{where}: JSON can't represent what was here: {content['kept']!r:.200}"
+                f"{path}: JSON can't represent what was here: {content['kept']!r:.200}"
             )
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     problems = []
-    for choice in sorted(choices, key=lambda one: not _fits(one, content)):
+    for choice in sorted(choices, key=lambda choice: not _is_named(choice, content)):
         try:
-            return _decoded(where, choice, content, now, depth)
-        except _Other as other:
-            problems.append(str(other))
-    wanted = " or ".join(dict.fromkeys(problems))
-    raise ValueError(f"{where}: must be {wanted}, got {_brief(content)}")
+            return _decode_type(path, choice, content, current, depth)
+        except _WrongType as error:
+            problems.append(str(error))
+    expected = " or ".join(dict.fromkeys(problems))
+    raise ValueError(f"{path}: must be {expected}, got {_shortened(content)}")
 
 
-class _Other(Exception):
+class _WrongType(Exception):
     """The content is of another type."""
 
 
-def _brief(content: Any) -> str:
+def _shortened(content: Any) -> str:
     text = repr(content)
     return text if len(text) < 80 else text[:77] + "..."
 
 
-def _fits(hint: Any, content: Any) -> bool:
+def _is_named(hint: Any, content: Any) -> bool:
     """Returns whether a class is the one that the content names."""
     return isinstance(content, dict) and getattr(hint, "__name__", "") == content.get("kind")
 
 
-def _decoded(where: str, hint: Any, content: Any, now: Any, depth: int) -> Any:
+def _decode_type(path: str, hint: Any, content: Any, current: Any, depth: int) -> Any:
     origin = get_origin(hint)
     is_class = isinstance(hint, type) and origin is None and hint is not Any
     if origin in (list, tuple, Sequence, Iterable):
-        made = _sequence(where, hint, content, now, depth)
+        decoded = _decode_sequence(path, hint, content, current, depth)
     elif origin in (dict, Mapping):
-        made = _mapping(where, hint, content, depth)
-    elif is_class and hint not in (float, *_WORDS, type(None), Tensor, np.ndarray):
-        whole = issubclass(hint, Enum)
-        made = _named(hint, content) if whole else _object(where, hint, content, now, depth)
+        decoded = _decode_mapping(path, hint, content, depth)
+    elif is_class and hint not in (float, *_TYPE_NAMES, type(None), Tensor, np.ndarray):
+        is_enum = issubclass(hint, Enum)
+        decoded = (
+            _decode_enum(hint, content)
+            if is_enum
+            else _decode_object(path, hint, content, current, depth)
+        )
     else:
-        made = _simple(hint, content)
-    return made
+        decoded = _checked_simple(hint, content)
+    return decoded
 
 
-def _simple(hint: Any, content: Any) -> Any:
+def _checked_simple(hint: Any, content: Any) -> Any:
     """Checks and returns a value that is no list and no object, or (Any) JSON as it is."""
     if hint is float:
-        return _number(content)
+        return _decode_number(content)
     hint = Literal[None] if hint in (None, type(None)) else hint
-    if hint in _WORDS:
+    if hint in _TYPE_NAMES:
         if type(content) is not hint:
-            raise _Other(_WORDS[hint])
+            raise _WrongType(_TYPE_NAMES[hint])
     elif get_origin(hint) is Literal:
-        known = get_args(hint)
-        if not any(content is one or (type(content) is str and content == one) for one in known):
-            raise _Other(" or ".join("null" if one is None else repr(one) for one in known))
+        choices = get_args(hint)
+        if not any(
+            content is choice or (type(content) is str and content == choice) for choice in choices
+        ):
+            raise _WrongType(
+                " or ".join("null" if choice is None else repr(choice) for choice in choices)
+            )
     elif hint is not Any:
-        raise _Other("something else")
+        raise _WrongType("something else")
     return content
 
 
-def _named(hint: type[Enum], content: Any) -> Enum:
-    names = [one.value for one in hint]
+def _decode_enum(hint: type[Enum], content: Any) -> Enum:
+    names = [member.value for member in hint]
     if not isinstance(content, str) or content not in names:
-        raise _Other(" or ".join(map(repr, names)))
+        raise _WrongType(" or ".join(map(repr, names)))
     return hint(content)
 
 
-def _number(content: Any) -> float:
+def _decode_number(content: Any) -> float:
     if isinstance(content, bool) or not isinstance(content, (int, float)):
-        raise _Other("a number")
+        raise _WrongType("a number")
     try:
         number = float(content)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):  # as of 1e999
-        raise _Other("a finite number")
+        raise _WrongType("a finite number")
     return number
 
 
-_WORDS: dict[type, str] = {int: "a whole number", bool: "true or false", str: "a text"}
+_TYPE_NAMES: dict[type, str] = {int: "a whole number", bool: "true or false", str: "a text"}
 
 
-def _sequence(where: str, hint: Any, content: Any, now: Any, depth: int) -> Any:
+def _decode_sequence(path: str, hint: Any, content: Any, current: Any, depth: int) -> Any:
     if not isinstance(content, list):
-        raise _Other("a list")
-    if len(content) > MOST_ITEMS:
-        raise ValueError(f"{where}: {len(content)} items, more than {MOST_ITEMS}")
-    inner = get_args(hint)
-    fixed = get_origin(hint) is tuple and inner[1:] != (...,)
-    if fixed and len(inner) != len(content):
-        raise _Other(f"{len(inner)} items")
-    before = now if isinstance(now, (list, tuple)) and len(now) == len(content) else None
+        raise _WrongType("a list")
+    if len(content) > MAX_ITEMS:
+        raise ValueError(f"{path}: {len(content)} items, more than {MAX_ITEMS}")
+    item_hints = get_args(hint)
+    fixed = get_origin(hint) is tuple and item_hints[1:] != (...,)
+    if fixed and len(item_hints) != len(content):
+        raise _WrongType(f"{len(item_hints)} items")
+    old_items = (
+        current if isinstance(current, (list, tuple)) and len(current) == len(content) else None
+    )
     items = [
         decode(
-            f"{where}[{i}]",
-            inner[i] if fixed else (inner[0] if inner else Any),
-            one,
-            None if before is None else before[i],
+            f"{path}[{i}]",
+            item_hints[i] if fixed else (item_hints[0] if item_hints else Any),
+            item,
+            None if old_items is None else old_items[i],
             depth + 1,
         )
-        for i, one in enumerate(content)
+        for i, item in enumerate(content)
     ]
     return tuple(items) if get_origin(hint) is tuple else items
 
 
-def _mapping(where: str, hint: Any, content: Any, depth: int) -> Any:
-    if not isinstance(content, dict) or len(content) > MOST_ITEMS:
-        raise _Other("an object by name")
-    key, value = get_args(hint)
-    made = {}
-    for name, one in content.items():
+def _decode_mapping(path: str, hint: Any, content: Any, depth: int) -> Any:
+    if not isinstance(content, dict) or len(content) > MAX_ITEMS:
+        raise _WrongType("an object by name")
+    key_type, value_hint = get_args(hint)
+    decoded = {}
+    for name, item in content.items():
         try:
-            made[key(name)] = decode(f"{where}.{name}", value, one, None, depth + 1)
+            decoded[key_type(name)] = decode(f"{path}.{name}", value_hint, item, None, depth + 1)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{where}: {error}") from None
-    return made
+            raise ValueError(f"{path}: {error}") from None
+    return decoded
 
 
-def _object(where: str, hint: type, content: Any, now: Any, depth: int) -> Any:
+def _decode_object(path: str, hint: type, content: Any, current: Any, depth: int) -> Any:
     if not isinstance(content, dict):
-        raise _Other(f"a {hint.__name__}")
+        raise _WrongType(f"a {hint.__name__}")
     name = content.get("kind", hint.__name__)
     kind: Any = KINDS.get(name) if isinstance(name, str) else None
     if kind is None and name == hint.__name__ and is_dataclass(hint):
         kind = hint
     if kind is None or not issubclass(kind, hint):
-        raise _Other(f"a {hint.__name__}")
-    known = arguments(kind)
-    unknown = sorted(str(one) for one in set(content) - set(known) - {"kind"})
+        raise _WrongType(f"a {hint.__name__}")
+    hints = arguments(kind)
+    unknown = sorted(str(field) for field in set(content) - set(hints) - {"kind"})
     if unknown:
-        raise ValueError(f"{where}: {kind.__name__} has no {unknown[0]!r:.80}")
-    now = now if type(now) is kind else None
-    given: dict[str, Any] = {}
-    for arg, (inner, default) in known.items():
-        before = None if now is None else _argument(now, arg)
+        raise ValueError(f"{path}: {kind.__name__} has no {unknown[0]!r:.80}")
+    current = current if type(current) is kind else None
+    values: dict[str, Any] = {}
+    for arg, (arg_hint, default) in hints.items():
+        old_value = None if current is None else _argument(current, arg)
         if arg in content:
-            given[arg] = decode(f"{where}.{arg}", inner, content[arg], before, depth + 1)
-        elif now is not None:
-            given[arg] = before
+            values[arg] = decode(f"{path}.{arg}", arg_hint, content[arg], old_value, depth + 1)
+        elif current is not None:
+            values[arg] = old_value
         elif default is inspect.Parameter.empty:
-            raise ValueError(f"{where}: {kind.__name__} needs {arg!r}")
-    if now is not None:
-        own = inspect.signature(kind).parameters
-        left_out = _OF_THE_SCENE.get(kind.__name__, ())
-        given |= {arg: getattr(now, arg) for arg in left_out if arg in own}
+            raise ValueError(f"{path}: {kind.__name__} needs {arg!r}")
+    if current is not None:
+        parameters = inspect.signature(kind).parameters
+        excluded = _SCENE_ARGUMENTS.get(kind.__name__, ())
+        values |= {arg: getattr(current, arg) for arg in excluded if arg in parameters}
     try:
-        return kind(**given)
+        return kind(**values)
     except (TypeError, OverflowError, RuntimeError) as error:
-        raise ValueError(f"{where}: {error}") from None
+        raise ValueError(f"{path}: {error}") from None
 
 
 def control_for(hint: Any, owner: str = "", name: str = "") -> dict[str, Any]:
@@ -336,63 +350,74 @@ def control_for(hint: Any, owner: str = "", name: str = "") -> dict[str, Any]:
     `optional` if None is allowed. What has no control is of type "kept".
     """
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-    told = [found for one in choices if (found := _described(one, owner, name)) is not None]
-    optional = any(one in (None, type(None)) for one in choices)
-    if not told:
+    controls = [
+        control
+        for choice in choices
+        if (control := _describe_hint(choice, owner, name)) is not None
+    ]
+    optional = any(choice in (None, type(None)) for choice in choices)
+    if not controls:
         return {"type": "kept"}
-    if told[0]["type"] == "choice":
-        told = told[:1]  # a name that may also be given as text
-    answer = dict(told[0])
-    if len(told) > 1:
-        parts = [one.get("choices", ()) if one["type"] == "one of" else (one,) for one in told]
-        answer = {"type": "one of", "choices": [*itertools.chain.from_iterable(parts)]}
-    return answer | ({"optional": True} if optional else {})
+    if controls[0]["type"] == "choice":
+        controls = controls[:1]  # a name that may also be given as text
+    combined = dict(controls[0])
+    if len(controls) > 1:
+        parts = [
+            control.get("choices", ()) if control["type"] == "one of" else (control,)
+            for control in controls
+        ]
+        combined = {"type": "one of", "choices": [*itertools.chain.from_iterable(parts)]}
+    return combined | ({"optional": True} if optional else {})
 
 
-def _described(hint: Any, owner: str, name: str) -> dict[str, Any] | None:
+def _describe_hint(hint: Any, owner: str, name: str) -> dict[str, Any] | None:
     origin, inner = get_origin(hint), get_args(hint)
     is_class = isinstance(hint, type) and origin is None and hint is not Any
     is_three = origin is tuple and inner == (float,) * 3
     if origin is Literal:
-        told: dict[str, Any] | None = {"type": "choice", "choices": list(inner)}
+        description: dict[str, Any] | None = {"type": "choice", "choices": list(inner)}
     elif hint in (bool, int, float, str):
-        told = {"type": {bool: "flag", int: "whole", float: "number", str: "text"}[hint]}
-        span = _slider(owner, name) if hint in (int, float) else None
-        told |= {} if span is None else {"range": span}
-    elif is_three or (hint == Sequence[float] and name in _THREE):
-        told = {"type": "color" if name in _COLORS else "triple"}
+        description = {"type": {bool: "flag", int: "whole", float: "number", str: "text"}[hint]}
+        slider_range = _slider_range(owner, name) if hint in (int, float) else None
+        description |= {} if slider_range is None else {"range": slider_range}
+    elif is_three or (hint == Sequence[float] and name in _TRIPLE_FIELDS):
+        description = {"type": "color" if name in _COLOR_FIELDS else "triple"}
     elif origin is tuple and inner == (float, float):
-        told = {"type": "pair"}
+        description = {"type": "pair"}
     elif origin in (list, tuple, Sequence) and inner:
-        told = {"type": "list", "items": control_for(inner[0])}
+        description = {"type": "list", "items": control_for(inner[0])}
     else:
-        told = _described_class(hint) if is_class else None
-    return told
+        description = _describe_class(hint) if is_class else None
+    return description
 
 
-def _described_class(hint: type) -> dict[str, Any] | None:
+def _describe_class(hint: type) -> dict[str, Any] | None:
     if issubclass(hint, Enum):
-        return {"type": "choice", "choices": [one.value for one in hint]}
+        return {"type": "choice", "choices": [member.value for member in hint]}
     if hint in (Shader, Background):
-        named = [
-            {"type": "object", "kind": name} for name, one in KINDS.items() if issubclass(one, hint)
+        objects = [
+            {"type": "object", "kind": name}
+            for name, kind in KINDS.items()
+            if issubclass(kind, hint)
         ]
-        return named[0] if len(named) == 1 else {"type": "one of", "choices": named}
+        return objects[0] if len(objects) == 1 else {"type": "one of", "choices": objects}
     if hint in KINDS.values() or is_dataclass(hint):
         return {"type": "object", "kind": hint.__name__}
     return None
 
 
-_COLORS = ("top", "bottom", "background", "ambient", "color")
-_THREE = (*_COLORS, "direction", "position")
+_COLOR_FIELDS = ("top", "bottom", "background", "ambient", "color")
+_TRIPLE_FIELDS = (*_COLOR_FIELDS, "direction", "position")
 
 
-def _slider(owner: str, name: str) -> tuple[float, float] | None:
+def _slider_range(owner: str, name: str) -> tuple[float, float] | None:
     kind = KINDS.get(owner)
-    names = [c.__name__ for c in kind.__mro__] if kind is not None else [owner]
+    names = [base.__name__ for base in kind.__mro__] if kind is not None else [owner]
     if kind is not None and issubclass(kind, Shader):
         names.append("Lit")
-    return next((SLIDERS[one, name] for one in names if (one, name) in SLIDERS), None)
+    return next(
+        (SLIDERS[class_name, name] for class_name in names if (class_name, name) in SLIDERS), None
+    )
 
 
 def describe_kind(kind: type) -> dict[str, Any]:
@@ -400,14 +425,14 @@ def describe_kind(kind: type) -> dict[str, Any]:
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         texts |= option_texts(base)
-    declared = {one.name: one for one in fields(kind)} if is_dataclass(kind) else {}
-    told = {}
+    declared = {field.name: field for field in fields(kind)} if is_dataclass(kind) else {}
+    controls = {}
     for name, (hint, default) in arguments(kind).items():
-        one = control_for(hint, kind.__name__, name)
+        control = control_for(hint, kind.__name__, name)
         if default is not inspect.Parameter.empty and default is not None:
-            made = getattr(declared.get(name), "default_factory", MISSING)
-            one["default"] = encode(default if made is MISSING else made())
+            factory = getattr(declared.get(name), "default_factory", MISSING)
+            control["default"] = encode(default if factory is MISSING else factory())
         if name in declared and "range" in declared[name].metadata:
-            one["range"] = declared[name].metadata["range"]
-        told[name] = one | ({"text": texts[name]} if name in texts else {})
-    return {"fields": told, "text": (inspect.getdoc(kind) or "").partition("\n")[0]}
+            control["range"] = declared[name].metadata["range"]
+        controls[name] = control | ({"text": texts[name]} if name in texts else {})
+    return {"fields": controls, "text": (inspect.getdoc(kind) or "").partition("\n")[0]}

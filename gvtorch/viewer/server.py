@@ -22,10 +22,10 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from ..base.messages import need_library
-from .protocol import MOST_BYTES
+from .protocol import MAX_MESSAGE_BYTES
 from .session import Session
 
-_TYPES = {
+_CONTENT_TYPES = {
     ".html": "text/html",
     ".js": "text/javascript",
     ".css": "text/css",
@@ -40,14 +40,14 @@ _HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-cache",
 }
-_QUEUED = 4096  # messages that may wait for a page before it is disconnected
-_LOCAL = ("localhost", "127.0.0.1", "::1")
+_MAX_QUEUED = 4096  # messages that may wait for a page before it is disconnected
+_LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 
 
 def page_files() -> dict[str, bytes]:
     """Returns the files of the page by name."""
     folder = resources.files(__package__) / "page"
-    return {one.name: one.read_bytes() for one in folder.iterdir() if one.is_file()}
+    return {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
 
 
 def aiohttp_web() -> Any:
@@ -56,7 +56,7 @@ def aiohttp_web() -> Any:
     return need_library("view", "aiohttp.web", "aiohttp", "view")
 
 
-def _is_ours(record: logging.LogRecord) -> bool:
+def _is_worth_logging(record: logging.LogRecord) -> bool:
     """Returns whether a log record of aiohttp is worth showing: not one of a malformed request."""
     error = record.exc_info[1] if record.exc_info else None
     return type(error).__module__ != "aiohttp.http_exceptions"
@@ -89,14 +89,14 @@ class Server:
         """
         self._session, self._host = session, host
         self.token = secrets.token_urlsafe(18) if token is None else token
-        if not self.token and host not in _LOCAL:
+        if not self.token and host not in _LOCAL_HOSTS:
             raise ValueError(f"view: a token is needed where others reach {host!r}")
-        self._allowed = {*_LOCAL, host, *allow}
-        if host not in _LOCAL:
-            self._allowed |= {socket.gethostname(), socket.getfqdn()}
+        self._allowed_hosts = {*_LOCAL_HOSTS, host, *allow}
+        if host not in _LOCAL_HOSTS:
+            self._allowed_hosts |= {socket.gethostname(), socket.getfqdn()}
         self.port = port
         self._web, self._files = aiohttp_web(), page_files()
-        self._open: set[Any] = set()
+        self._sockets: set[Any] = set()
         self._loop, started = asyncio.new_event_loop(), Future[None]()
         self._thread = threading.Thread(
             target=self._run, args=(started,), name="gvtorch view server", daemon=True
@@ -132,7 +132,7 @@ class Server:
     async def _serve(self, started: Future[None]) -> None:
         self._stop = asyncio.Event()
         logger = logging.getLogger("gvtorch.view")
-        logger.addFilter(_is_ours)
+        logger.addFilter(_is_worth_logging)
         runner = self._web.AppRunner(
             self._application(), shutdown_timeout=1.0, access_log=None, logger=logger
         )
@@ -150,93 +150,93 @@ class Server:
 
         @web.middleware
         async def guard(request: Any, handler: Any) -> Any:
-            return await self._guard(request, handler)
+            return await self._guard_request(request, handler)
 
         app = web.Application(middlewares=[guard])
-        app.router.add_get("/", self._page)
-        app.router.add_get("/ws", self._socket)
-        app.router.add_get("/{name}", self._page)
-        app.on_shutdown.append(self._let_go)
+        app.router.add_get("/", self._serve_page)
+        app.router.add_get("/ws", self._serve_socket)
+        app.router.add_get("/{name}", self._serve_page)
+        app.on_shutdown.append(self._close_sockets)
         return app
 
-    async def _let_go(self, _app: Any) -> None:
-        for one in list(self._open):
-            await one.close(code=1001, message=b"the view was closed")
+    async def _close_sockets(self, _app: Any) -> None:
+        for ws in list(self._sockets):
+            await ws.close(code=1001, message=b"the view was closed")
 
     def is_allowed(self, host: str | None) -> bool:
         """Returns whether a page may reach this server under the name of its Host header."""
         name = (urlsplit(f"//{host or ''}").hostname or "").rstrip(".")
-        if name in self._allowed:
+        if name in self._allowed_hosts:
             return True
         try:
             ipaddress.ip_address(name)
         except ValueError:
             return False
-        return self._host not in _LOCAL  # an address can't be rebound
+        return self._host not in _LOCAL_HOSTS  # an address can't be rebound
 
-    async def _guard(self, request: Any, handler: Any) -> Any:
+    async def _guard_request(self, request: Any, handler: Any) -> Any:
         """Refuses foreign hosts, and adds the headers that isolate the page from other sites."""
         web = self._web
         try:
             if not self.is_allowed(request.headers.get("Host")):
                 raise web.HTTPForbidden(text="This name is not the viewer's.")
-            answer = await handler(request)
+            response = await handler(request)
         except ValueError:
             raise web.HTTPBadRequest(text="No such address.", headers=_HEADERS) from None
         except web.HTTPException as error:
             error.headers.update(_HEADERS)
             raise
-        if not answer.prepared:
-            answer.headers.update(_HEADERS)
-        return answer
+        if not response.prepared:
+            response.headers.update(_HEADERS)
+        return response
 
-    async def _page(self, request: Any) -> Any:
+    async def _serve_page(self, request: Any) -> Any:
         name = request.match_info.get("name", "index.html")
         if name not in self._files:
             raise self._web.HTTPNotFound(text="There is no such page.")
-        kind = _TYPES.get(f".{name.rpartition('.')[2]}", "application/octet-stream")
+        kind = _CONTENT_TYPES.get(f".{name.rpartition('.')[2]}", "application/octet-stream")
         return self._web.Response(body=self._files[name], content_type=kind, charset="utf-8")
 
-    def _may_speak(self, request: Any) -> bool:
+    def _is_authorized(self, request: Any) -> bool:
         origin = request.headers.get("Origin")
-        own = origin is None or urlsplit(origin).netloc == request.headers.get("Host")
-        given = request.query.get("token", "")
-        return own and hmac.compare_digest(given.encode(), self.token.encode())
+        same_origin = origin is None or urlsplit(origin).netloc == request.headers.get("Host")
+        token = request.query.get("token", "")
+        return same_origin and hmac.compare_digest(token.encode(), self.token.encode())
 
-    async def _socket(self, request: Any) -> Any:
+    async def _serve_socket(self, request: Any) -> Any:
         web = self._web
-        if not self._may_speak(request):
+        if not self._is_authorized(request):
             raise web.HTTPForbidden(text="The address needs the token that the viewer told.")
-        ws = web.WebSocketResponse(max_msg_size=MOST_BYTES, heartbeat=30, compress=False)
+        ws = web.WebSocketResponse(max_msg_size=MAX_MESSAGE_BYTES, heartbeat=30, compress=False)
         await ws.prepare(request)
-        self._open.add(ws)
+        self._sockets.add(ws)
         queue: asyncio.Queue[str | bytes | None] = asyncio.Queue()
         loop = asyncio.get_running_loop()
 
-        def put(data: str | bytes) -> None:
-            if queue.qsize() < _QUEUED:
+        def enqueue(data: str | bytes) -> None:
+            if queue.qsize() < _MAX_QUEUED:
                 queue.put_nowait(data)
-            elif queue.qsize() == _QUEUED:
+            elif queue.qsize() == _MAX_QUEUED:
                 queue.put_nowait(None)  # the page does not keep up
 
         def send(data: str | bytes) -> None:
             if not loop.is_closed():
-                loop.call_soon_threadsafe(put, data)
+                loop.call_soon_threadsafe(enqueue, data)
 
-        async def pump() -> None:
+        async def send_queued() -> None:
             while (data := await queue.get()) is not None:
                 await (ws.send_str(data) if isinstance(data, str) else ws.send_bytes(data))
             await ws.close(code=1008, message=b"too slow")
 
         client = self._session.join(send)
-        task = asyncio.ensure_future(pump())
+        task = asyncio.ensure_future(send_queued())
         try:
             async for message in ws:
                 if message.type in (web.WSMsgType.TEXT, web.WSMsgType.BINARY):
                     self._session.receive(client, message.data)
         finally:
             self._session.leave(client)
-            self._open.discard(ws)
+            self._sockets.discard(ws)
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
         return ws

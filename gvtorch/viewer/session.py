@@ -37,9 +37,16 @@ from .slices import Planes
 from .state import Development, Eye, Slices, ViewState, transfer_of
 from .still import Steps, Stills, finished_picture, still_steps
 
-_TICK = 0.02  # seconds between checks whether a camera has come to rest
-_FIGURES = 0.25  # seconds between figures for monitors
-_ENGINE = ("brick_pool", "node_pool", "load_budget", "subdivide_budget", "time_budget", "loading")
+_TICK_SECONDS = 0.02  # seconds between checks whether a camera has come to rest
+_FIGURES_SECONDS = 0.25  # seconds between figures for monitors
+_ENGINE_OPTIONS = (
+    "brick_pool",
+    "node_pool",
+    "load_budget",
+    "subdivide_budget",
+    "time_budget",
+    "loading",
+)
 _COLOR_MAPS = (
     *("viridis", "magma", "inferno", "plasma", "cividis", "turbo", "coolwarm", "bone", "hot"),
 )
@@ -61,18 +68,18 @@ class Session:
         self.scene, self.state, self.parameters = scene, state, parameters
         self.clients: dict[int, Client] = {}
         self.errors = 0  # pictures that failed
-        self._good = state  # the last state that was drawn
-        self._count, self._turn = 0, 0
+        self._last_good_state = state  # the last state that was drawn
+        self._client_count, self._last_drawn_client = 0, 0
         self._tasks: deque[Callable[[], None]] = deque()
         self._stills = Stills()
         self._wake = threading.Condition()
         self._closed = False
-        self._failed: tuple[str, ...] = ()
-        self._told_busy: Any = None
-        self._figures_at = 0.0
+        self._sent_failures: tuple[str, ...] = ()
+        self._sent_busy: Any = None
+        self._figures_time = 0.0
         self._planes: Planes | None = None
         self._export: SurfaceExport | None = None
-        self._opening: float | None = None  # the time point that a thread reads now
+        self._pending_time: float | None = None  # the time point that a thread reads now
         self._open_planes(state)
         self._thread = threading.Thread(target=self._run, name="gvtorch view", daemon=True)
         self._thread.start()
@@ -82,9 +89,9 @@ class Session:
     def join(self, send: Send) -> Client:
         """Adds a page; `send` sends it a text or bytes, from any thread, without waiting."""
         with self._wake:
-            self._count += 1
+            self._client_count += 1
             assert self.state.camera is not None
-            client = Client(self._count, send, self.state.camera)
+            client = Client(self._client_count, send, self.state.camera)
         self.post(lambda: self._welcome(client))
         return client
 
@@ -98,7 +105,7 @@ class Session:
         try:
             message = parse(text)
         except ValueError as error:
-            client.tell("refused", text=str(error))
+            client.send_message("refused", text=str(error))
             return
         if isinstance(message, protocol.Ack):
             client.ack(message.number)
@@ -117,20 +124,20 @@ class Session:
 
     def ask(self, question: Callable[[], Any], timeout: float = 60.0) -> Any:
         """Runs a function in the thread that renders; waits for its result and returns it."""
-        found: Future[Any] = Future()
+        future: Future[Any] = Future()
 
-        def answer() -> None:
+        def run_question() -> None:
             try:
-                found.set_result(question())
+                future.set_result(question())
             except Exception as error:
-                found.set_exception(error)
+                future.set_exception(error)
 
         if self._closed:
             raise RuntimeError("view: it is closed")
-        self.post(answer)
-        if not wait([found], timeout).done:
+        self.post(run_question)
+        if not wait([future], timeout).done:
             raise TimeoutError("view: no answer")
-        return found.result()
+        return future.result()
 
     def close(self) -> None:
         """Ends the thread and closes the scene."""
@@ -159,9 +166,9 @@ class Session:
     def _step(self) -> bool:
         """Runs queued tasks, draws a picture and a step of a still; returns False once closed."""
         with self._wake:
-            while not (self._closed or self._tasks or self._stills or self._someone()):
-                waits = any(one.waits() for one in self.clients.values())
-                self._wake.wait(_TICK if waits else None)
+            while not (self._closed or self._tasks or self._stills or self._next_client()):
+                is_unfinished = any(client.is_unfinished() for client in self.clients.values())
+                self._wake.wait(_TICK_SECONDS if is_unfinished else None)
             if self._closed:
                 return False
             tasks, self._tasks = self._tasks, deque()
@@ -169,98 +176,98 @@ class Session:
             try:
                 task()
             except Exception as error:  # whatever it was, the view goes on
-                self._tell_all("error", text=f"{type(error).__name__}: {error}")
-        client = self._someone()
+                self._broadcast("error", text=f"{type(error).__name__}: {error}")
+        client = self._next_client()
         if client is not None:
             self._draw(client)
         if self._stills:
-            self._stills.go_on()
+            self._stills.run_step()
         return True
 
-    def _someone(self) -> Client | None:
+    def _next_client(self) -> Client | None:
         """Returns the next client, in turn, that wants a picture, or None."""
-        wanting = [number for number, one in self.clients.items() if one.wants()]
+        wanting = [number for number, client in self.clients.items() if client.wants_picture()]
         if not wanting:
             return None
-        return self.clients[next((n for n in wanting if n > self._turn), wanting[0])]
+        return self.clients[next((n for n in wanting if n > self._last_drawn_client), wanting[0])]
 
     def _draw(self, client: Client) -> None:
-        self._turn = client.number
+        self._last_drawn_client = client.number
         try:
-            picture = client.draw(self.scene, self.state, self._is_newer, self._planes)
+            picture = client.draw(self.scene, self.state, self._is_outdated, self._planes)
         except Exception as error:
-            self._fell(client, error)
+            self._report_failure(client, error)
             return
         if picture is None:
             return
-        self._good = self.state
-        self._tell_nodes(client)
-        self._tell_busy(picture)
-        self._tell_failures()
-        if client.monitor and time.monotonic() - self._figures_at > _FIGURES:
-            self._figures_at = time.monotonic()
-            client.tell("figures", **self._figures(picture))
+        self._last_good_state = self.state
+        self._send_nodes(client)
+        self._broadcast_busy(picture)
+        self._broadcast_failures()
+        if client.monitor and time.monotonic() - self._figures_time > _FIGURES_SECONDS:
+            self._figures_time = time.monotonic()
+            client.send_message("figures", **self._frame_figures(picture))
 
-    def _is_newer(self) -> bool:
+    def _is_outdated(self) -> bool:
         return bool(self._tasks) or self._closed
 
-    def _fell(self, client: Client, error: Exception) -> None:
+    def _report_failure(self, client: Client, error: Exception) -> None:
         """Reports why a picture failed, and returns to the last state that was drawn."""
         self.errors += 1
-        self._tell_all("error", text=one_line(error))
-        if self._good is not self.state:
-            self.state = self._good
-            self._tell_state(None)
-            self._stir()
+        self._broadcast("error", text=one_line(error))
+        if self._last_good_state is not self.state:
+            self.state = self._last_good_state
+            self._broadcast_state(None)
+            self._restart_pictures()
         else:
             client.pause()
 
-    def _tell_all(self, kind: str, **content: Any) -> None:
-        for one in self.clients.values():
-            one.tell(kind, **content)
+    def _broadcast(self, kind: str, **content: Any) -> None:
+        for client in self.clients.values():
+            client.send_message(kind, **content)
 
-    def _tell_state(self, but: Client | None) -> None:
-        for one in self.clients.values():
-            if one is not but:
-                one.tell("state", **self._told_state())
+    def _broadcast_state(self, excluded: Client | None) -> None:
+        for client in self.clients.values():
+            if client is not excluded:
+                client.send_message("state", **self._state_content())
 
-    def _told_state(self) -> dict[str, Any]:
+    def _state_content(self) -> dict[str, Any]:
         return {"state": self.state.to_json(), "unfit": unfit(self.state)}
 
-    def _tell_busy(self, picture: Picture) -> None:
+    def _broadcast_busy(self, picture: Picture) -> None:
         stats = picture.stats
         busy = {
             "pending": getattr(stats, "pending", 0) + getattr(stats, "deferred", 0),
             "misses": getattr(stats, "misses", 0),
             "crowded": bool(getattr(stats, "capacity_exceeded", False)),
         }
-        if busy != self._told_busy:
-            self._told_busy = busy
-            self._tell_all("busy", **busy)
+        if busy != self._sent_busy:
+            self._sent_busy = busy
+            self._broadcast("busy", **busy)
 
-    def _tell_failures(self) -> None:
-        failed = tuple(self.scene.failures())
-        if failed == self._failed:
+    def _broadcast_failures(self) -> None:
+        failures = tuple(self.scene.failures())
+        if failures == self._sent_failures:
             return
-        new = [one for one in failed if one not in self._failed]
-        self._failed = failed
+        new = [failure for failure in failures if failure not in self._sent_failures]
+        self._sent_failures = failures
         engine = self.scene.engine
         count = 0 if engine is None else len(engine.production.failures)
         if new:
-            self._tell_all("failed", text=new[-1], count=count)
+            self._broadcast("failed", text=new[-1], count=count)
 
-    def _figures(self, picture: Picture) -> dict[str, Any]:
+    def _frame_figures(self, picture: Picture) -> dict[str, Any]:
         stats = picture.stats.as_dict()
         names = ("milliseconds", "stages", "rays", "samples", "bricks_used", "tiles_used")
-        told = {name: stats[name] for name in names}
-        extra = ("requests", "misses", "produced", "evicted", "miss_rate", "pending", "failed")
-        told |= {name: stats[name] for name in extra if name in stats}
+        figures = {name: stats[name] for name in names}
+        optional = ("requests", "misses", "produced", "evicted", "miss_rate", "pending", "failed")
+        figures |= {name: stats[name] for name in optional if name in stats}
         engine = self.scene.engine
         if engine is not None:
             report = engine.report().as_dict()
-            named = ("occupancy", "bricks_per_second", "hit_rate", "memory")
-            told["report"] = {name: report[name] for name in named}
-        return told
+            report_names = ("occupancy", "bricks_per_second", "hit_rate", "memory")
+            figures["report"] = {name: report[name] for name in report_names}
+        return figures
 
     # Messages of pages: `_take_NAME` handles the message NAME of the protocol.
 
@@ -268,7 +275,7 @@ class Session:
         self.clients[client.number] = client
         box, info = self.scene.box.tolist(), self.scene.info
         engine = self.scene.engine
-        client.tell(
+        client.send_message(
             "welcome",
             client=client.number,
             name=self.scene.name,
@@ -276,31 +283,33 @@ class Session:
             unit=info.unit,
             time=self.scene.describe_time(),
             labels=self.scene.describe_labels(),
-            channels=[one.name for one in info.channels],
-            widths={name: one.width for name, one in self.scene.trees[0].bricks.channels.items()},
-            **self._told_state(),
+            channels=[channel.name for channel in info.channels],
+            widths={
+                name: channel.width for name, channel in self.scene.trees[0].bricks.channels.items()
+            },
+            **self._state_content(),
             schema=schema(),
             presets=[*PRESETS, *CT_PRESETS, *_COLOR_MAPS],
             engine=None
             if engine is None or self.scene.remake is None
-            else {name: encode(getattr(engine.options, name)) for name in _ENGINE},
+            else {name: encode(getattr(engine.options, name)) for name in _ENGINE_OPTIONS},
             parameters=None if self.parameters is None else self.parameters.describe(),
         )
-        self._tell_clients()
+        self._broadcast_clients()
 
     def _goodbye(self, client: Client) -> None:
         self.clients.pop(client.number, None)
         client.end()
         if self._export is not None and self._export.serves(client):
             self._export.end()
-        for one in self.clients.values():
-            if one.follows == client.number:
-                one.follows = None
-        self._tell_clients()
+        for other in self.clients.values():
+            if other.follows == client.number:
+                other.follows = None
+        self._broadcast_clients()
 
-    def _tell_clients(self) -> None:
-        follows = {one.number: one.follows for one in self.clients.values()}
-        self._tell_all("clients", clients=follows)
+    def _broadcast_clients(self) -> None:
+        follows = {client.number: client.follows for client in self.clients.values()}
+        self._broadcast("clients", clients=follows)
 
     def _take(self, client: Client, message: Any) -> None:
         """Handles a page's message; answers with the reason if it is refused."""
@@ -310,128 +319,128 @@ class Session:
             take = getattr(self, f"_take_{type(message).__name__.lower()}")
             take(client, message)
         except (ValueError, OSError, ImportError, RuntimeError) as error:
-            client.tell("refused", text=one_line(error))
+            client.send_message("refused", text=one_line(error))
             if isinstance(message, protocol.Change):
-                client.tell("state", **self._told_state())
+                client.send_message("state", **self._state_content())
 
     def _take_hello(self, client: Client, message: protocol.Hello) -> None:
         client.resized(message.width, message.height, message.rate)
 
     def _take_move(self, client: Client, message: protocol.Move) -> None:
-        self._place(client, message.camera, message.moving, message.sent)
+        self._move_camera(client, message.camera, message.moving, message.sent)
 
-    def _place(self, client: Client, eye: Eye, moving: bool, sent: float = 0.0) -> None:
+    def _move_camera(self, client: Client, eye: Eye, moving: bool, sent: float = 0.0) -> None:
         """Moves a page's camera and those of all pages that follow it, directly or indirectly."""
         client.move(eye, moving, sent)
-        moved = {client.number}
-        waiting = deque(moved)
-        while waiting:
-            first = waiting.popleft()
-            for other in self.clients.values():
-                if other.follows == first and other.number not in moved:
-                    moved.add(other.number)
-                    waiting.append(other.number)
-                    other.move(eye, moving, 0.0)
-                    other.tell("camera", camera=encode(eye))
+        moved_numbers = {client.number}
+        leader_numbers = deque(moved_numbers)
+        while leader_numbers:
+            leader_number = leader_numbers.popleft()
+            for follower in self.clients.values():
+                if follower.follows == leader_number and follower.number not in moved_numbers:
+                    moved_numbers.add(follower.number)
+                    leader_numbers.append(follower.number)
+                    follower.move(eye, moving, 0.0)
+                    follower.send_message("camera", camera=encode(eye))
 
     def _take_change(self, client: Client, message: protocol.Change) -> None:
         content = message.state
         camera = content.pop("camera", None) if isinstance(content, dict) else None
         state = self.state.changed(content)
         if camera is not None:
-            self._place(client, decode("camera", Eye, camera, client.eye), not message.rest)
-            client.tell("camera", camera=encode(client.eye))
+            self._move_camera(client, decode("camera", Eye, camera, client.eye), not message.rest)
+            client.send_message("camera", camera=encode(client.eye))
         if not content:
             return
         if type(state.shader) is not type(self.state.shader):
             state, left_out = trimmed(state)
-            for why in left_out:
-                client.tell("note", text=f"left out: {why}")
+            for reason in left_out:
+                client.send_message("note", text=f"left out: {reason}")
         self.scene.check_time(state.time)
         self._open_planes(state)
         before, self.state = self.state, state
-        self._tell_state(client if not message.rest else None)
-        beside = state.slices is not None and before.slices is not None
-        if beside and replace(before, slices=state.slices) == state:
-            self._renew_planes()
+        self._broadcast_state(client if not message.rest else None)
+        shows_planes = state.slices is not None and before.slices is not None
+        if shows_planes and replace(before, slices=state.slices) == state:
+            self._refresh_planes()
         else:
-            self._stir(message.rest)
-        self._follow_time()
+            self._restart_pictures(message.rest)
+        self._update_time()
 
     # Planes beside the picture, and time.
 
     def _open_planes(self, state: ViewState) -> None:
         """Creates `Planes` if a state shows slices; raises ValueError if there are no voxels."""
         if state.slices is not None and self._planes is None:
-            self._planes = Planes(self.scene.voxels("slices"), self._plane_came)
+            self._planes = Planes(self.scene.voxels("slices"), self._plane_arrived)
 
-    def _plane_came(self, problem: str) -> None:
+    def _plane_arrived(self, problem: str) -> None:
         """Called by the thread that reads planes; `problem` is the reason of a failure, or ""."""
         if problem:
-            self.post(lambda: self._tell_all("error", text=problem))
-        self.post(self._renew_planes)
+            self.post(lambda: self._broadcast("error", text=problem))
+        self.post(self._refresh_planes)
 
-    def _renew_planes(self) -> None:
-        for one in self.clients.values():
-            one.renew()
+    def _refresh_planes(self) -> None:
+        for client in self.clients.values():
+            client.mark_planes_changed()
 
-    def _follow_time(self) -> None:
+    def _update_time(self) -> None:
         """Shows the time of the state: a clock's at once, a series' once a thread has read it."""
-        wanted = self.state.time
-        if wanted == self.scene.time or self._opening is not None:
+        time_point = self.state.time
+        if time_point == self.scene.time or self._pending_time is not None:
             return
         if self.scene.reopen is None:
-            self.scene.set_clocks(wanted)
+            self.scene.set_clocks(time_point)
             return
-        self._opening = wanted
-        read = threading.Thread(target=self._read_time, args=(wanted,), daemon=True)
-        read.start()
+        self._pending_time = time_point
+        thread = threading.Thread(target=self._read_time, args=(time_point,), daemon=True)
+        thread.start()
 
-    def _read_time(self, wanted: float) -> None:
+    def _read_time(self, time_point: float) -> None:
         """Reads a time point, in its own thread, so that rendering goes on."""
         assert self.scene.reopen is not None
         try:
-            data = self.scene.reopen(int(wanted))
+            data = self.scene.reopen(int(time_point))
         except Exception as error:  # whatever it was, the view goes on
-            text = f"time {wanted:g}: {one_line(error)}"
+            text = f"time {time_point:g}: {one_line(error)}"
             self.post(lambda: self._time_failed(text))
         else:
-            self.post(lambda: self._time_came(wanted, data))
+            self.post(lambda: self._time_arrived(time_point, data))
 
-    def _time_came(self, time: float, data: Volume | Store) -> None:
-        self._opening = None
-        self.scene.show_time(time, data)
+    def _time_arrived(self, time_point: float, data: Volume | Store) -> None:
+        self._pending_time = None
+        self.scene.show_time(time_point, data)
         if self._planes is not None:
             self._planes.close()
             self._planes = None
             self._open_planes(self.state)
-        self._stir()
-        self._follow_time()
+        self._restart_pictures()
+        self._update_time()
 
     def _time_failed(self, text: str) -> None:
         """Sets the state back to the time that is shown."""
-        self._opening = None
+        self._pending_time = None
         self.state = replace(self.state, time=self.scene.time)
-        self._tell_all("error", text=text)
-        self._tell_state(None)
+        self._broadcast("error", text=text)
+        self._broadcast_state(None)
 
     def _take_pick(self, client: Client, message: protocol.Pick) -> None:
-        place = client.picked(message.x, message.y)
-        client.tell("picked", place=place, purpose=message.purpose)
+        position = client.position_at(message.x, message.y)
+        client.send_message("picked", place=position, purpose=message.purpose)
 
     def _take_histogram(self, client: Client, message: protocol.Histogram) -> None:
-        found = self.scene.histogram(self.state.component, message.in_view)
-        client.tell("histogram", in_view=message.in_view, **found)
+        histogram = self.scene.histogram(self.state.component, message.in_view)
+        client.send_message("histogram", in_view=message.in_view, **histogram)
 
     def _take_preset(self, client: Client, message: protocol.Preset) -> None:
         function = TransferFunction.preset(message.name, message.low, message.high)
-        client.tell("preset", name=message.name, function=encode(function))
+        client.send_message("preset", name=message.name, function=encode(function))
 
     def _take_read(self, client: Client, message: protocol.Read) -> None:
-        given = message.file, message.text, message.name, message.low, message.high
-        function, lost = read_function(*given)
+        arguments = message.file, message.text, message.name, message.low, message.high
+        function, notes = read_function(*arguments)
         name = message.name or message.file
-        client.tell("preset", name=name, function=encode(function), lost=lost)
+        client.send_message("preset", name=name, function=encode(function), lost=notes)
 
     def _take_export(self, client: Client, message: protocol.Export) -> None:
         transfer = transfer_of(self.state.shader)
@@ -442,34 +451,34 @@ class Session:
 
     def _take_nodes(self, client: Client, message: protocol.Nodes) -> None:
         client.nodes = message.on
-        self._tell_nodes(client)
+        self._send_nodes(client)
 
-    def _tell_nodes(self, client: Client) -> None:
+    def _send_nodes(self, client: Client) -> None:
         if client.nodes and client.picture is not None:
-            client.tell("nodes", **node_boxes(self.scene.trees[0], client.eye.eye))
+            client.send_message("nodes", **node_boxes(self.scene.trees[0], client.eye.eye))
 
     def _take_resize(self, client: Client, message: protocol.Resize) -> None:
-        unknown = sorted(set(message.engine) - set(_ENGINE))
+        unknown = sorted(set(message.engine) - set(_ENGINE_OPTIONS))
         if unknown:
             raise ValueError(
-                f"resize: {unknown[0]!r:.60} can't be set; known: {', '.join(_ENGINE)}"
+                f"resize: {unknown[0]!r:.60} can't be set; known: {', '.join(_ENGINE_OPTIONS)}"
             )
         if self.scene.engine is None:
             raise ValueError("resize: the scene is resident")
         options = decode("engine", EngineOptions, message.engine, self.scene.engine.options)
         self.scene.resize(**{name: getattr(options, name) for name in message.engine})
-        self._stir()
+        self._restart_pictures()
 
-    def _stir(self, resting: bool = True) -> None:
-        for one in self.clients.values():
-            one.stir(resting)
+    def _restart_pictures(self, resting: bool = True) -> None:
+        for client in self.clients.values():
+            client.restart(resting)
 
     def _take_set(self, client: Client, message: protocol.Set) -> None:
         if self.parameters is None:
             raise ValueError("set: there are no parameters")
         self.parameters.set(message.name, message.value, self.scene)
-        self._tell_all("parameters", parameters=self.parameters.describe())
-        self._stir()
+        self._broadcast("parameters", parameters=self.parameters.describe())
+        self._restart_pictures()
 
     def _take_follow(self, client: Client, message: protocol.Follow) -> None:
         leader = self.clients.get(message.client or 0)
@@ -478,17 +487,17 @@ class Session:
         client.follows = message.client
         if leader is not None:
             client.move(leader.eye, False, 0.0)
-            client.tell("camera", camera=encode(leader.eye))
-        self._tell_clients()
+            client.send_message("camera", camera=encode(leader.eye))
+        self._broadcast_clients()
 
     def _take_monitor(self, client: Client, message: protocol.Monitor) -> None:
         client.monitor = message.on
         if message.on and client.picture is not None:
-            client.tell("figures", **self._figures(client.picture))
+            client.send_message("figures", **self._frame_figures(client.picture))
 
     def _take_still(self, client: Client, message: protocol.Still) -> None:
         size = message.width, message.height
-        self._stills.add(client, self._steps(client.eye, size, lambda: client.gone))
+        self._stills.add(client, self._still_steps(client.eye, size, lambda: client.gone))
 
     def _take_surface(self, client: Client, message: protocol.Surface) -> None:
         if self._export is not None and self._export.busy:
@@ -501,20 +510,20 @@ class Session:
             self.scene.retry()
             if self._planes is not None:
                 self._planes.retry()
-            self._stir()
+            self._restart_pictures()
         else:
             eye = fitted(self.scene, client.eye, client.size)
-            self._place(client, eye, False)
-            client.tell("camera", camera=encode(eye))
+            self._move_camera(client, eye, False)
+            client.send_message("camera", camera=encode(eye))
 
     def still(self, eye: Eye, width: int, height: int) -> Picture:
         """Renders a finished picture: nothing missing, all samples."""
-        return finished_picture(self._steps(eye, (width, height), lambda: False))
+        return finished_picture(self._still_steps(eye, (width, height), lambda: False))
 
-    def _steps(self, eye: Eye, size: tuple[int, int], gone: Callable[[], bool]) -> Steps:
+    def _still_steps(self, eye: Eye, size: tuple[int, int], has_left: Callable[[], bool]) -> Steps:
         return still_steps(
             *(self.scene, lambda: self._planes, self.state, eye, size),
-            unwanted=lambda: self._closed or gone(),
+            unwanted=lambda: self._closed or has_left(),
         )
 
 
@@ -523,24 +532,26 @@ def fitted(scene: Scene, like: Eye | None, size: tuple[int, int], up: Up | None 
     box = scene.box
     width, height = (max(1, n) for n in size)
     if like is None:
-        placed = Camera.orbit(30, 20, width=width, height=height, up=up or "+y", fit=True)
-        eye = Eye.of(placed, box)
+        camera = Camera.orbit(30, 20, width=width, height=height, up=up or "+y", fit=True)
+        eye = Eye.of(camera, box)
         return replace(eye, up=tuple(upward("view", up or "+y").tolist()))
     forward = torch.tensor(like.target) - torch.tensor(like.eye)
     centre, radius = box.mean(0), float((box[1] - box[0]).norm()) / 2
-    half = torch.deg2rad(torch.tensor(min(like.fov, 100.0))) / 2
-    narrow = min(1.0, width / height)
-    far = radius / max(1e-3, float(half.sin())) / narrow
-    place = centre - forward.double() / forward.norm() * far
-    return replace(like, eye=tuple(place.tolist()), target=tuple(centre.tolist()))
+    half_angle = torch.deg2rad(torch.tensor(min(like.fov, 100.0))) / 2
+    aspect = min(1.0, width / height)
+    distance = radius / max(1e-3, float(half_angle.sin())) / aspect
+    position = centre - forward.double() / forward.norm() * distance
+    return replace(like, eye=tuple(position.tolist()), target=tuple(centre.tolist()))
 
 
 def schema() -> dict[str, Any]:
     """Returns the description that the page makes its controls of: the fields of each class."""
-    kinds = {**KINDS, **{one.__name__: one for one in (Eye, Development, Slices, ViewState)}}
-    told = {name: describe_kind(kind) for name, kind in kinds.items()}
-    told["EngineOptions"] = describe_kind(EngineOptions)
-    told["EngineOptions"]["fields"] = {
-        name: one for name, one in told["EngineOptions"]["fields"].items() if name in _ENGINE
+    kinds = {**KINDS, **{kind.__name__: kind for kind in (Eye, Development, Slices, ViewState)}}
+    descriptions = {name: describe_kind(kind) for name, kind in kinds.items()}
+    descriptions["EngineOptions"] = describe_kind(EngineOptions)
+    descriptions["EngineOptions"]["fields"] = {
+        name: field
+        for name, field in descriptions["EngineOptions"]["fields"].items()
+        if name in _ENGINE_OPTIONS
     }
-    return told
+    return descriptions

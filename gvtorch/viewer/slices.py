@@ -26,7 +26,7 @@ from ..tracing.slices import UP, PlaneView, radiological_views
 from .state import ViewState, transfer_of
 
 GAP = 4  # pixels between the four parts
-_KEPT = 48  # planes in the cache
+_CACHED_PLANES = 48  # planes in the cache
 _BACKGROUND = 0.004  # linear light where there is no plane
 
 
@@ -69,20 +69,20 @@ class Planes:
         data: The volume or store that is cut.
     """
 
-    def __init__(self, data: Volume | Store, arrived: Callable[[str], None]) -> None:
-        """`arrived` is called, from another thread, with "" when a plane has been read, or with the
+    def __init__(self, data: Volume | Store, on_read: Callable[[str], None]) -> None:
+        """`on_read` is called, from another thread, with "" when a plane has been read, or with the
         reason why it can't be.
         """
-        self.data, self._arrived = data, arrived
-        self._made: OrderedDict[Any, np.ndarray] = OrderedDict()
-        self._newest: dict[str, np.ndarray] = {}  # by axis
-        self._failed: dict[Any, str] = {}
+        self.data, self._on_read = data, on_read
+        self._images: OrderedDict[Any, np.ndarray] = OrderedDict()
+        self._newest_images: dict[str, np.ndarray] = {}  # by axis
+        self._failures: dict[Any, str] = {}
         self._windows: dict[int, tuple[float, float]] = {}
-        self._wanted: dict[str, tuple[Any, ViewState, float]] = {}  # by axis
-        self._reading: Any = None
+        self._requests: dict[str, tuple[Any, ViewState, float]] = {}  # by axis
+        self._reading_key: Any = None
         self._closed = False
         self._wake = Condition()
-        Thread(target=self._read, name="gvtorch planes", daemon=True).start()
+        Thread(target=self._read_planes, name="gvtorch planes", daemon=True).start()
 
     @cached_property
     def views(self) -> dict[str, PlaneView]:
@@ -91,25 +91,25 @@ class Planes:
             axis: PlaneView("", up) for axis, up in UP.items()
         }
 
-    def place(self, state: ViewState) -> tuple[float, float, float]:
+    def position(self, state: ViewState) -> tuple[float, float, float]:
         """Returns the world position through which the planes go, clamped to the data."""
-        low, high = self._ends()
-        at = (low + high) / 2
+        low, high = self._corners()
+        position = (low + high) / 2
         if state.slices is not None and state.slices.at is not None:
-            at = np.array(state.slices.at)
-        x, y, z = np.clip(at, low, high).tolist()
+            position = np.array(state.slices.at)
+        x, y, z = np.clip(position, low, high).tolist()
         return x, y, z
 
     def index(self, axis: str, state: ViewState) -> int:
-        """Returns the index, along an axis, of the finest voxel in which `place` lies."""
+        """Returns the index, along an axis, of the finest voxel in which `position` lies."""
         n = "xyz".index(axis)
-        found = (self.place(state)[n] - self.data.origin[n]) / self.data.spacing[n]
-        return min(max(int(np.floor(found + 0.5)), 0), self.data.extent[n] - 1)
+        voxel = (self.position(state)[n] - self.data.origin[n]) / self.data.spacing[n]
+        return min(max(int(np.floor(voxel + 0.5)), 0), self.data.extent[n] - 1)
 
-    def _ends(self) -> tuple[np.ndarray, np.ndarray]:
-        step, extent = np.array(self.data.spacing), np.array(self.data.extent)
-        low = np.array(self.data.origin) - step / 2
-        return low, low + step * extent
+    def _corners(self) -> tuple[np.ndarray, np.ndarray]:
+        spacing, extent = np.array(self.data.spacing), np.array(self.data.extent)
+        low = np.array(self.data.origin) - spacing / 2
+        return low, low + spacing * extent
 
     def composed(
         self, picture: Picture, state: ViewState, width: int, height: int, wait: bool = False
@@ -129,138 +129,145 @@ class Planes:
         parts = panes(width, height)
         color = torch.full((height, width, 3), _BACKGROUND)
         view = parts["view"]
-        _put(color, view, _fitted(picture.color.detach().cpu().float(), view))
+        _paste(color, view, _resized(picture.color.detach().cpu().float(), view))
         layout: dict[str, Any] = {"view": list(view)}
-        pixel = max(self._pixel(axis, parts[axis]) for axis in "xyz")
+        pixel_size = max(self._pixel_size(axis, parts[axis]) for axis in "xyz")
         complete = True
         for axis in "xyz":
-            image, known = self._image(axis, state, pixel, wait)
-            complete &= known
-            layout[axis] = self._told(axis, parts[axis], pixel) | {"at": self.place(state)}
+            image, is_current = self._image(axis, state, pixel_size, wait)
+            complete &= is_current
+            layout[axis] = self._plane_layout(axis, parts[axis], pixel_size) | {
+                "at": self.position(state)
+            }
             if image is not None:
-                _put(color, Pane(*layout[axis]["image"]), torch.from_numpy(image))
-        one = torch.ones(height, width, 1)
-        far = one * torch.inf
-        made = Picture(
-            color=color, alpha=one, depth=far, nearest=far, samples=one.int(), stats=picture.stats
+                _paste(color, Pane(*layout[axis]["image"]), torch.from_numpy(image))
+        ones = torch.ones(height, width, 1)
+        infinite = ones * torch.inf
+        composite = Picture(
+            color=color,
+            alpha=ones,
+            depth=infinite,
+            nearest=infinite,
+            samples=ones.int(),
+            stats=picture.stats,
         )
-        return Composed(made, layout, complete)
+        return Composed(composite, layout, complete)
 
     def _sides(self, axis: str) -> tuple[str, str]:
         """Returns the axes along the columns and rows of the picture of a plane."""
         row = self.views[axis].up[1]
         return next(n for n in "xyz" if n not in (axis, row)), row
 
-    def _pixel(self, axis: str, pane: Pane) -> float:
+    def _pixel_size(self, axis: str, pane: Pane) -> float:
         """Returns the world size of a pixel at which a plane fits its part."""
-        low, high = self._ends()
+        low, high = self._corners()
         size = dict(zip("xyz", high - low, strict=True))
         column, row = self._sides(axis)
         return float(max(size[column] / pane.width, size[row] / pane.height))
 
-    def _level(self, axis: str, pixel: float) -> int:
+    def _level(self, axis: str, pixel_size: float) -> int:
         """Returns the coarsest level whose voxels are no larger than a pixel."""
         if not isinstance(self.data, Store):
             return 0
-        least = min(self.data.spacing["xyz".index(n)] for n in self._sides(axis))
-        return int(np.clip(np.floor(np.log2(pixel / least)), 0, self.data.levels - 1))
+        voxel_size = min(self.data.spacing["xyz".index(n)] for n in self._sides(axis))
+        return int(np.clip(np.floor(np.log2(pixel_size / voxel_size)), 0, self.data.levels - 1))
 
-    def _told(self, axis: str, pane: Pane, pixel: float) -> dict[str, Any]:
+    def _plane_layout(self, axis: str, pane: Pane, pixel_size: float) -> dict[str, Any]:
         """Returns the layout of a plane: its part, its picture there, its edges in the world."""
-        low, high = (dict(zip("xyz", one.tolist(), strict=True)) for one in self._ends())
+        low, high = (dict(zip("xyz", corner.tolist(), strict=True)) for corner in self._corners())
         column, row = self._sides(axis)
         view = self.views[axis]
-        width = min(pane.width, max(1, round((high[column] - low[column]) / pixel)))
-        height = min(pane.height, max(1, round((high[row] - low[row]) / pixel)))
-        across = (low[column], high[column])
-        down = (high[row], low[row]) if view.up[0] == "+" else (low[row], high[row])
+        width = min(pane.width, max(1, round((high[column] - low[column]) / pixel_size)))
+        height = min(pane.height, max(1, round((high[row] - low[row]) / pixel_size)))
+        column_edges = (low[column], high[column])
+        row_edges = (high[row], low[row]) if view.up[0] == "+" else (low[row], high[row])
         left = pane.left + (pane.width - width) // 2
         top = pane.top + (pane.height - height) // 2
         return {
             "pane": list(pane),
             "image": [left, top, width, height],
-            "columns": [column, *(across[::-1] if view.mirrored else across)],
-            "rows": [row, *down],
+            "columns": [column, *(column_edges[::-1] if view.mirrored else column_edges)],
+            "rows": [row, *row_edges],
             "step": self.data.spacing["xyz".index(axis)],
             "name": view.name or f"across {axis}",
         }
 
     def _image(
-        self, axis: str, state: ViewState, pixel: float, wait: bool
+        self, axis: str, state: ViewState, pixel_size: float, wait: bool
     ) -> tuple[np.ndarray | None, bool]:
         """Returns the newest picture (h, w, 3) of a plane, and whether no newer one will come."""
-        key = (axis, self.index(axis, state), round(pixel, 9), self._look(state))
-        if wait and key not in self._made:
-            self._keep(key, self._cut(axis, state, pixel))
+        key = (axis, self.index(axis, state), round(pixel_size, 9), self._color_key(state))
+        if wait and key not in self._images:
+            self._cache_image(key, self._render_plane(axis, state, pixel_size))
         with self._wake:
-            made = self._made.get(key)
-            if made is not None:
-                self._made.move_to_end(key)
-                self._newest[axis] = made
-            elif key not in self._failed and key != self._reading:
-                self._wanted[axis] = key, state, pixel
+            image = self._images.get(key)
+            if image is not None:
+                self._images.move_to_end(key)
+                self._newest_images[axis] = image
+            elif key not in self._failures and key != self._reading_key:
+                self._requests[axis] = key, state, pixel_size
                 self._wake.notify()
-            return self._newest.get(axis), made is not None or key in self._failed
+            return self._newest_images.get(axis), image is not None or key in self._failures
 
-    def _read(self) -> None:
+    def _read_planes(self) -> None:
         """Runs in the thread that reads: for each axis, the plane that was wanted last."""
         while True:
             with self._wake:
-                while not (self._wanted or self._closed):
+                while not (self._requests or self._closed):
                     self._wake.wait()
                 if self._closed:
                     return
-                axis, (key, state, pixel) = self._wanted.popitem()
-                self._reading = key
+                axis, (key, state, pixel_size) = self._requests.popitem()
+                self._reading_key = key
             try:
-                self._keep(key, self._cut(axis, state, pixel))
+                self._cache_image(key, self._render_plane(axis, state, pixel_size))
                 problem = ""
             except Exception as error:  # whatever it was, the view goes on
-                self._failed[key] = one_line(error)
-                problem = f"a slice can't be read: {self._failed[key]}"
-            self._reading = None
-            self._arrived(problem)
+                self._failures[key] = one_line(error)
+                problem = f"a slice can't be read: {self._failures[key]}"
+            self._reading_key = None
+            self._on_read(problem)
 
-    def _keep(self, key: Any, image: np.ndarray) -> None:
+    def _cache_image(self, key: Any, image: np.ndarray) -> None:
         with self._wake:
-            self._made[key] = image
-            while len(self._made) > _KEPT:
-                self._made.popitem(last=False)
+            self._images[key] = image
+            while len(self._images) > _CACHED_PLANES:
+                self._images.popitem(last=False)
 
-    def _look(self, state: ViewState) -> Any:
+    def _color_key(self, state: ViewState) -> Any:
         """Returns the part of the state on which the colours depend, as a key."""
         assert state.slices is not None
-        coloured = state.slices.colors == "shader" or self.data.info.labels
-        shader = repr(_colors_told(state.shader)) if coloured else None
+        uses_shader = state.slices.colors == "shader" or self.data.info.labels
+        shader = repr(_shader_key(state.shader)) if uses_shader else None
         return state.slices.window, shader, state.component
 
-    def _cut(self, axis: str, state: ViewState, pixel: float) -> np.ndarray:
+    def _render_plane(self, axis: str, state: ViewState, pixel_size: float) -> np.ndarray:
         """Reads and colours a plane."""
         assert state.slices is not None
-        level, sides = self._level(axis, pixel), self._sides(axis)
-        voxel = min(self.data.spacing["xyz".index(n)] for n in sides) * 2**level
+        level, sides = self._level(axis, pixel_size), self._sides(axis)
+        voxel_size = min(self.data.spacing["xyz".index(n)] for n in sides) * 2**level
         colors = self._colors(state)
-        span = None
+        limits = None
         if colors is None:
-            span = state.slices.window or self._found_window(state.component)
-        known = self.views[axis].name != ""
-        made = slice_picture(
+            limits = state.slices.window or self._auto_window(state.component)
+        is_anatomical = self.views[axis].name != ""
+        picture = slice_picture(
             *(self.data, axis, self.index(axis, state)),
-            span=span,
+            span=limits,
             colors=colors,
             component=state.component,
             level=level,
-            scale=voxel / pixel,
-            up=None if known else self.views[axis].up,
-            radiological=known,
-            letters=known,
+            scale=voxel_size / pixel_size,
+            up=None if is_anatomical else self.views[axis].up,
+            radiological=is_anatomical,
+            letters=is_anatomical,
         )
-        return made.color.numpy()
+        return picture.color.numpy()
 
-    def _found_window(self, component: int) -> tuple[float, float]:
+    def _auto_window(self, component: int) -> tuple[float, float]:
         if component not in self._windows:
-            found = window(self.data, component=component, background=True)
-            self._windows[component] = found
+            limits = window(self.data, component=component, background=True)
+            self._windows[component] = limits
         return self._windows[component]
 
     def _colors(self, state: ViewState) -> Callable[[np.ndarray], np.ndarray] | None:
@@ -268,8 +275,12 @@ class Planes:
         assert state.slices is not None
         if self.data.info.labels:
             shader = state.shader if isinstance(state.shader, Labels) else Labels()
-            names = self.data.label_values
-            return shader if names is None else lambda values: shader(names.numpy()[values])
+            label_values = self.data.label_values
+            return (
+                shader
+                if label_values is None
+                else lambda values: shader(label_values.numpy()[values])
+            )
         if state.slices.colors == "gray":
             return None
         return transfer_of(state.shader)
@@ -277,7 +288,7 @@ class Planes:
     def retry(self) -> None:
         """Allows planes that could not be read to be read again."""
         ask_again()
-        self._failed.clear()
+        self._failures.clear()
 
     def close(self) -> None:
         """Ends the thread; does not wait for what it reads."""
@@ -286,7 +297,7 @@ class Planes:
             self._wake.notify()
 
 
-def _colors_told(shader: Shader) -> Any:
+def _shader_key(shader: Shader) -> Any:
     """Returns a key that differs if two shaders colour values differently."""
     transfer = transfer_of(shader)
     if transfer is not None:
@@ -294,17 +305,17 @@ def _colors_told(shader: Shader) -> Any:
     return (shader.colors, shader.visible) if isinstance(shader, Labels) else None
 
 
-def _fitted(color: Tensor, pane: Pane) -> Tensor:
+def _resized(color: Tensor, pane: Pane) -> Tensor:
     """Scales an image (h, w, 3) to the size of a part."""
     if color.shape[:2] == (pane.height, pane.width):
         return color
     planar = color.movedim(-1, 0)[None]
     size = (pane.height, pane.width)
-    made = torch.nn.functional.interpolate(planar, size, mode="bilinear", align_corners=False)
-    return made[0].movedim(0, -1)
+    resized = torch.nn.functional.interpolate(planar, size, mode="bilinear", align_corners=False)
+    return resized[0].movedim(0, -1)
 
 
-def _put(color: Tensor, pane: Pane, image: Tensor) -> None:
+def _paste(color: Tensor, pane: Pane, image: Tensor) -> None:
     """Writes an image into its part; what is larger is cut."""
     height, width = min(pane.height, image.shape[0]), min(pane.width, image.shape[1])
     color[pane.top : pane.top + height, pane.left : pane.left + width] = image[:height, :width]

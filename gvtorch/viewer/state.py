@@ -29,7 +29,7 @@ from ..tracing import RenderOptions, render
 from .schema import decode, encode
 
 Triple = tuple[float, float, float]
-_FAR = 1e30  # largest coordinate, so that a ray's numbers stay finite
+_MAX_COORDINATE = 1e30  # largest coordinate, so that a ray's numbers stay finite
 Show = Literal["picture", "samples", "nodes", "lod", "age", "fill"]
 
 
@@ -57,8 +57,8 @@ class Eye:
             object.__setattr__(self, name, check.triple("Eye", name, getattr(self, name)))
         widest = model_of("Eye", self.model).widest
         check.number("Eye", "fov", self.fov, low=0, high=widest, open_low=True)
-        if max(abs(one) for one in (*self.eye, *self.target, *self.up)) > _FAR:
-            raise ValueError(f"Eye: eye, target and up must be at most {_FAR:g}")
+        if max(abs(number) for number in (*self.eye, *self.target, *self.up)) > _MAX_COORDINATE:
+            raise ValueError(f"Eye: eye, target and up must be at most {_MAX_COORDINATE:g}")
         if self.eye == self.target or not any(self.up):
             raise ValueError("Eye: eye and target must differ, and up must not be zero")
 
@@ -66,13 +66,13 @@ class Eye:
         """Returns the camera; an orthographic one is moved back until all of the (2, 3) box is in
         front of it.
         """
-        made = Camera.look_at(self.eye, self.target, self.up, self.fov, width, height, self.model)
+        camera = Camera.look_at(self.eye, self.target, self.up, self.fov, width, height, self.model)
         if MODELS[self.model].parallel:
             corners = torch.cartesian_prod(*box.T.to(torch.float64))  # (8, 3)
-            rotation, move = made.viewmats[0, :3, :3], made.viewmats[0, :3, 3]
-            nearest = float((corners @ rotation.mT + move)[:, 2].min())
-            made.viewmats[0, 2, 3] += max(0.0, 0.02 * float((box[1] - box[0]).max()) - nearest)
-        return made
+            rotation, translation = camera.viewmats[0, :3, :3], camera.viewmats[0, :3, 3]
+            nearest = float((corners @ rotation.mT + translation)[:, 2].min())
+            camera.viewmats[0, 2, 3] += max(0.0, 0.02 * float((box[1] - box[0]).max()) - nearest)
+        return camera
 
     @classmethod
     def of(cls, camera: Camera, box: Tensor) -> Self:
@@ -85,23 +85,25 @@ class Eye:
         if camera.batched:
             raise ValueError(f"view: camera must be one, got a batch of {len(camera)}")
         placed = camera.placed(box)
-        rotation, move = placed.viewmats[0, :3, :3], placed.viewmats[0, :3, 3]
-        eye, forward = -(rotation.mT @ move), rotation[2]
-        far = float((box.mean(0) - eye) @ forward)
-        far = far if far > 0 else float((box[1] - box[0]).max())
+        rotation, translation = placed.viewmats[0, :3, :3], placed.viewmats[0, :3, 3]
+        eye, forward = -(rotation.mT @ translation), rotation[2]
+        distance = float((box.mean(0) - eye) @ forward)
+        distance = distance if distance > 0 else float((box[1] - box[0]).max())
         model, focal = placed.model, float(placed.Ks[0, 1, 1])
-        half = 0.5 * placed.height / focal
+        half_height = 0.5 * placed.height / focal
         if MODELS[model].parallel:
             fov = 30.0
-            far = half / math.tan(math.radians(fov / 2))
-            eye = eye + forward * (float((box.mean(0) - eye) @ forward) - far)
+            distance = half_height / math.tan(math.radians(fov / 2))
+            eye = eye + forward * (float((box.mean(0) - eye) @ forward) - distance)
         else:
-            wide = model in ("fisheye", "panorama")
-            fov = math.degrees(2 * half if wide else 2 * math.atan(half))
-        target = eye + far * forward
-        lists = (tuple(part.tolist()) for part in (eye, target, -rotation[1]))
+            is_angular = model in ("fisheye", "panorama")
+            fov = math.degrees(2 * half_height if is_angular else 2 * math.atan(half_height))
+        target = eye + distance * forward
+        triples = (tuple(vector.tolist()) for vector in (eye, target, -rotation[1]))
         return cls(
-            **dict(zip(("eye", "target", "up"), lists, strict=True)), fov=round(fov, 9), model=model
+            **dict(zip(("eye", "target", "up"), triples, strict=True)),
+            fov=round(fov, 9),
+            model=model,
         )
 
 
@@ -149,7 +151,7 @@ class Slices:
         if self.at is not None:
             object.__setattr__(self, "at", check.triple("Slices", "at", self.at))
         if self.window is not None:
-            low, high = (check.number("Slices", "window", one) for one in self.window)
+            low, high = (check.number("Slices", "window", value) for value in self.window)
             if not low < high:
                 raise ValueError(
                     f"Slices: window must be a low and a high value, got {low}, {high}"
@@ -211,15 +213,17 @@ class ViewState:
             ValueError: The state has no camera, or shows costs: see `gv.cost`.
         """
         if self.camera is None or self.show != "picture":
-            lacks = "a camera" if self.camera is None else f"show='picture', not {self.show!r}"
-            raise ValueError(f"ViewState.picture: the state must have {lacks}")
-        drawn = what.render if isinstance(what, Engine) else partial(render, what)
-        return self.taken(drawn, self.camera.camera(width, height, what.box))
+            requirement = (
+                "a camera" if self.camera is None else f"show='picture', not {self.show!r}"
+            )
+            raise ValueError(f"ViewState.picture: the state must have {requirement}")
+        renderer = what.render if isinstance(what, Engine) else partial(render, what)
+        return self.taken(renderer, self.camera.camera(width, height, what.box))
 
     def taken(self, drawn: Callable[..., Picture], camera: Camera) -> Picture:
         """Renders the picture at rest; `drawn` takes the camera, and by name shader and options."""
-        shown = partial(drawn, shader=self.shader, **self.settings())
-        return self.develop.develop(Progressive(shown).refine(camera, self.develop.samples))
+        renderer = partial(drawn, shader=self.shader, **self.settings())
+        return self.develop.develop(Progressive(renderer).refine(camera, self.develop.samples))
 
     def to_json(self) -> dict[str, Any]:
         """Returns the state as plain values, ready for JSON."""
@@ -257,8 +261,8 @@ class ViewState:
 
 def transfer_of(shader: Shader) -> TransferFunction | None:
     """Returns a shader's transfer function, which may be the shader itself, or None."""
-    found = getattr(shader, "transfer", None) or shader
-    return found if isinstance(found, TransferFunction) else None
+    transfer = getattr(shader, "transfer", None) or shader
+    return transfer if isinstance(transfer, TransferFunction) else None
 
 
 def costed(shader: Shader) -> TransferFunction:
@@ -281,9 +285,9 @@ def saved_state(path: str | Path) -> dict[str, Any]:
     return content
 
 
-def blended(picture: Picture, cost: Picture, share: float) -> Picture:
-    """Returns a cost picture, blended by `share` over the picture (1: alone); both developed."""
-    if share == 1:
+def blended(picture: Picture, cost: Picture, fraction: float) -> Picture:
+    """Returns a cost picture, blended by `fraction` over the picture (1: alone); both developed."""
+    if fraction == 1:
         return cost
-    over = share * cost.alpha.to(picture.color)
-    return replace(cost, color=torch.lerp(picture.color, cost.color.to(picture.color), over))
+    weight = fraction * cost.alpha.to(picture.color)
+    return replace(cost, color=torch.lerp(picture.color, cost.color.to(picture.color), weight))

@@ -35,23 +35,23 @@ def still_steps(
             in which case Interrupted is raised.
     """
 
-    def check(_what: str, _done: int, _total: int) -> None:
+    def stop_if_unwanted(_stage: str, _done: int, _total: int) -> None:
         if unwanted():
             raise Interrupted("nobody waits for this still any more")
 
     width, height = size if state.slices is None else panes(*size)["view"][2:]
     camera = eye.camera(width, height, scene.box)
     if scene.engine is not None:  # loads all data
-        scene.engine.render(camera, state.shader, progress=check, **state.settings())
+        scene.engine.render(camera, state.shader, progress=stop_if_unwanted, **state.settings())
         yield
-    mean = Progressive(lambda one: scene.frame(one, state, check))
-    made = mean.frame(camera)
-    while mean.count < state.develop.samples:
+    progressive = Progressive(lambda jittered: scene.frame(jittered, state, stop_if_unwanted))
+    picture = progressive.frame(camera)
+    while progressive.count < state.develop.samples:
         yield
-        made = mean.frame(camera)
-    shown = state.develop.develop(made)
+        picture = progressive.frame(camera)
+    shown = state.develop.develop(picture)
     if state.show != "picture":
-        shown = blended(shown, scene.cost(camera, state, check), state.blend)
+        shown = blended(shown, scene.cost(camera, state, stop_if_unwanted), state.blend)
     beside = planes()
     if beside is None or state.slices is None:
         return shown
@@ -78,14 +78,14 @@ class Stills:
 
     def add(self, client: Client, steps: Steps) -> None:
         """Queues a still for a page; raises ValueError if the page waits for one already."""
-        if any(one is client for one, _ in self._waiting):
+        if any(waiting is client for waiting, _ in self._waiting):
             raise ValueError("still: one is being made already")
         self._waiting.append((client, steps))
 
     def clear(self) -> None:
         self._waiting.clear()
 
-    def go_on(self) -> None:
+    def run_step(self) -> None:
         """Runs the next step of the first still in the queue; sends it if that was the last."""
         client, steps = self._waiting.popleft()
         try:
@@ -95,6 +95,6 @@ class Stills:
         except Interrupted:
             pass
         except Exception as error:  # whatever it was, the view goes on
-            client.tell("refused", text=f"still: {one_line(error)}")
+            client.send_message("refused", text=f"still: {one_line(error)}")
         else:
             self._waiting.append((client, steps))

@@ -25,7 +25,7 @@ from .server import Server, aiohttp_web
 from .session import Session, fitted
 from .state import Eye, ViewState
 
-_SIZE = (16, 9)  # shape of the picture to which the first camera fits the box
+_ASPECT = (16, 9)  # shape of the picture to which the first camera fits the box
 
 
 class Viewer:
@@ -172,7 +172,7 @@ def new_session(
             chosen = chosen.read(Path(state))
         if chosen.camera is None:
             if camera is None:
-                eye = fitted(scene, None, _SIZE, up)
+                eye = fitted(scene, None, _ASPECT, up)
             else:
                 eye = Eye.of(check.instance("view", "camera", camera, Camera), scene.box)
             chosen = replace(chosen, camera=eye)

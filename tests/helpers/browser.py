@@ -54,7 +54,7 @@ class Tab:
 
     def final(self) -> np.ndarray:
         """Waits for the final picture of all changes so far; returns (h, w, 3) uint8."""
-        self.until("!!app && !app.before && !app.asked && app.view.head?.final")
+        self.until("!!app && !app.stateBefore && !app.frameRequest && app.view.head?.final")
         return self.pixels()
 
     def pixels(self) -> np.ndarray:

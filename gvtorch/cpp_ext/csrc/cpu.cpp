@@ -13,10 +13,10 @@ namespace gvtorch {
 // The instruction set in use; users' shaders are compiled for the same one (cpp_ext/user.py).
 extern "C" __attribute__((visibility("default"))) const char* gvtorch_instructions() { return processor().name; }
 
-// Calls run(args, begin, end), one of `processor().chunks`, for all items of an op, `share` at a time.
+// Calls run(args, begin, end), one of `processor().chunks`, for all items of an op, `chunk_size` at a time.
 template <class Args>
-void in_chunks(void (*run)(const Args&, int64_t, int64_t), const Args& args, int64_t count, int64_t share) {
-  for_shares(count, share, [&](int64_t begin, int64_t end) { run(args, begin, end); });
+void in_chunks(void (*run)(const Args&, int64_t, int64_t), const Args& args, int64_t count, int64_t chunk_size) {
+  for_chunks(count, chunk_size, [&](int64_t begin, int64_t end) { run(args, begin, end); });
 }
 
 void voxelize(const Tensor&, const VoxelizeArgs& args) {
@@ -24,7 +24,7 @@ void voxelize(const Tensor&, const VoxelizeArgs& args) {
 }
 
 void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
-  if (is_wide(like)) return noise_each<double>(like, args, points);
+  if (is_float64(like)) return noise_each<double>(like, args, points);
   in_chunks(processor().chunks.noise, args, points, 1 << 11);
 }
 
@@ -36,33 +36,34 @@ void splat_points(const Tensor&, const SplatArgs& args) {
   in_chunks(processor().chunks.splat, args, SplatPart{args}.parts(), 1);
 }
 
-// See cache.h. Threads count chunks, then take them: ranks do not depend on the number of threads.
+// See cache.h. Threads count chunks, then process them: ranks do not depend on the number of threads.
 template <class List>
 void compact(const Tensor&, int64_t count, const List& list) {
   constexpr int64_t kChunk = 1 << 11;
   const int64_t chunks = (count + kChunk - 1) / kChunk;
-  std::vector<Counts> before(static_cast<size_t>(chunks) + 1);  // each chunk; the last entry is the total
-  for_shares(count, kChunk, [&](int64_t begin, int64_t end) {
-    Counts own{};
-    for (int64_t index = begin; index < end; ++index) own.add(list.flags(index));
-    before[begin / kChunk + 1] = own;
+  std::vector<Counts> counts_before(static_cast<size_t>(chunks) + 1);  // each chunk; the last entry is the total
+  for_chunks(count, kChunk, [&](int64_t begin, int64_t end) {
+    Counts counts{};
+    for (int64_t index = begin; index < end; ++index) counts.add(list.flags(index));
+    counts_before[begin / kChunk + 1] = counts;
   });
-  for (int64_t chunk = 0; chunk < chunks; ++chunk) before[chunk + 1] = before[chunk] + before[chunk + 1];
-  const Counts all = before.back();
-  for_shares(count, kChunk, [&](int64_t begin, int64_t end) {
-    const Counts &here = before[begin / kChunk], &behind = before[begin / kChunk + 1];
-    if (here.any == behind.any) return;
-    const List own = list;  // a copy, which nothing written can alias
-    int64_t rank = here.listed;
+  for (int64_t chunk = 0; chunk < chunks; ++chunk)
+    counts_before[chunk + 1] = counts_before[chunk] + counts_before[chunk + 1];
+  const Counts all = counts_before.back();
+  for_chunks(count, kChunk, [&](int64_t begin, int64_t end) {
+    const Counts &before_chunk = counts_before[begin / kChunk], &after_chunk = counts_before[begin / kChunk + 1];
+    if (before_chunk.any_flags == after_chunk.any_flags) return;
+    const List list_copy = list;  // a copy, which nothing written can alias
+    int64_t rank = before_chunk.listed;
     for (int64_t index = begin; index < end; ++index) {
-      const int32_t flags = own.flags(index);
+      const int32_t flags = list_copy.flags(index);
       if ((flags & kTouched) == 0) continue;
-      own.take(index, flags, rank, all.listed);
+      list_copy.process(index, flags, rank, all.listed);
       rank += flags & kListed;
     }
   });
-  for (int64_t rank = all.listed; rank < list.places(); ++rank) list.blank(rank);
-  list.total(all.listed, all.seen);
+  for (int64_t rank = all.listed; rank < list.entries(); ++rank) list.clear_entry(rank);
+  list.store_totals(all.listed, all.counted);
 }
 
 void sort_keys(const Tensor&, int64_t* keys, int64_t count) { std::sort(keys, keys + count); }

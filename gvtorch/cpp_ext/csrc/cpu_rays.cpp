@@ -7,9 +7,10 @@
 
 namespace gvtorch {
 
-void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
-  if (wide) return shade_fused<double>(like, args);
-  if (!(args.shader == kPlainShader ? packs(args) : shades(args))) return shade_fused<float>(like, args);
+void FusedShaders::run(const Tensor& like, ShadeArgs args, bool in_float64) {
+  if (in_float64) return shade_fused<double>(like, args);
+  if (!(args.shader == kPlainShader ? packets_can_trace(args) : packets_can_shade(args)))
+    return shade_fused<float>(like, args);
   trace_chunks(like, args, [&](int64_t begin, int64_t end) { processor().chunks.shade(args, begin, end); });
 }
 

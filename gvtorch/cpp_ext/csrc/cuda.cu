@@ -8,8 +8,8 @@
 
 namespace gvtorch {
 
-void FusedShaders::run(const Tensor& like, ShadeArgs args, bool wide) {
-  wide ? shade_fused<double>(like, args) : shade_fused<float>(like, args);
+void FusedShaders::run(const Tensor& like, ShadeArgs args, bool in_float64) {
+  in_float64 ? shade_fused<double>(like, args) : shade_fused<float>(like, args);
 }
 
 template <class T>
@@ -24,7 +24,7 @@ void voxelize(const Tensor& like, const VoxelizeArgs& args) {
 }
 
 void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
-  is_wide(like) ? noise_each<double>(like, args, points) : noise_each<float>(like, args, points);
+  is_float64(like) ? noise_each<double>(like, args, points) : noise_each<float>(like, args, points);
 }
 
 void splat_points(const Tensor& like, const SplatArgs& args) {
@@ -37,10 +37,10 @@ void follow_each_point(const Tensor& like, const OrbitArgs& args) {
                [&](auto* step) { for_each(like, args.points, FollowPoints<T, std::decay_t<decltype(*step)>>{args}); });
 }
 void follow_points(const Tensor& like, const OrbitArgs& args) {
-  args.wide ? follow_each_point<double>(like, args) : follow_each_point<float>(like, args);
+  args.in_float64 ? follow_each_point<double>(like, args) : follow_each_point<float>(like, args);
 }
 
-// `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks take their
+// `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks process their
 // chunks. Chunks without flags are not read again.
 constexpr int kThreads = 256;
 constexpr int kScanThreads = 1024;
@@ -51,55 +51,55 @@ __global__ void __launch_bounds__(kThreads) count_chunks(List list, int64_t coun
   using Reduce = cub::BlockReduce<Counts, kThreads>;
   __shared__ typename Reduce::TempStorage scratch;
   const int64_t first = blockIdx.x * kChunk + threadIdx.x;
-  Counts own{};
+  Counts counts{};
 #pragma unroll
   for (int64_t offset = 0; offset < kChunk; offset += kThreads) {
-    if (first + offset < count) own.add(list.flags(first + offset));
+    if (first + offset < count) counts.add(list.flags(first + offset));
   }
-  own = Reduce(scratch).Sum(own);
-  if (threadIdx.x == 0) chunk_c[blockIdx.x] = own;
+  counts = Reduce(scratch).Sum(counts);
+  if (threadIdx.x == 0) chunk_c[blockIdx.x] = counts;
 }
 
 // Replaces each chunk's counts by the sum of those before it; the total is stored after the last.
 __global__ void __launch_bounds__(kScanThreads) add_chunks(Counts* chunk_c, int64_t chunks) {
   using Scan = cub::BlockScan<Counts, kScanThreads, cub::BLOCK_SCAN_WARP_SCANS>;
   __shared__ typename Scan::TempStorage scratch;
-  Counts before{};
+  Counts running_total{};
   for (int64_t start = 0; start < chunks; start += kScanThreads) {
     const int64_t chunk = start + threadIdx.x;
-    Counts here = chunk < chunks ? chunk_c[chunk] : Counts{}, all{};
-    Scan(scratch).ExclusiveSum(here, here, all);
-    if (chunk < chunks) chunk_c[chunk] = before + here;
-    before = before + all;
+    Counts counts = chunk < chunks ? chunk_c[chunk] : Counts{}, all{};
+    Scan(scratch).ExclusiveSum(counts, counts, all);
+    if (chunk < chunks) chunk_c[chunk] = running_total + counts;
+    running_total = running_total + all;
     __syncthreads();
   }
-  if (threadIdx.x == 0) chunk_c[chunks] = before;
+  if (threadIdx.x == 0) chunk_c[chunks] = running_total;
 }
 
 template <class List>
-__global__ void __launch_bounds__(kThreads) take_chunks(List list, int64_t count, const Counts* chunk_c) {
+__global__ void __launch_bounds__(kThreads) process_chunks(List list, int64_t count, const Counts* chunk_c) {
   __shared__ int32_t listed[kThreads / 32];  // how many in each warp
   const int warp = threadIdx.x / 32;
   const int lane = threadIdx.x % 32;
-  const Counts before = chunk_c[blockIdx.x], behind = chunk_c[blockIdx.x + 1], all = chunk_c[gridDim.x];
+  const Counts before_chunk = chunk_c[blockIdx.x], after_chunk = chunk_c[blockIdx.x + 1], all = chunk_c[gridDim.x];
   const int64_t threads = static_cast<int64_t>(gridDim.x) * kThreads;
   const int64_t thread = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  for (int64_t rank = all.listed + thread; rank < list.places(); rank += threads) list.blank(rank);
-  if (thread == 0) list.total(all.listed, all.seen);
-  if (before.any == behind.any) return;
-  int64_t rank = before.listed;
+  for (int64_t rank = all.listed + thread; rank < list.entries(); rank += threads) list.clear_entry(rank);
+  if (thread == 0) list.store_totals(all.listed, all.counted);
+  if (before_chunk.any_flags == after_chunk.any_flags) return;
+  int64_t rank = before_chunk.listed;
   for (int64_t offset = 0; offset < kChunk; offset += kThreads) {
     const int64_t index = blockIdx.x * kChunk + offset + threadIdx.x;
     const int32_t flags = index < count ? list.flags(index) : 0;
     const unsigned votes = __ballot_sync(0xffffffff, (flags & kListed) != 0);
     if (lane == 0) listed[warp] = __popc(votes);
     __syncthreads();
-    int64_t own = rank + __popc(votes & ((1u << lane) - 1));
-    for (int other = 0; other < kThreads / 32; ++other) {
-      if (other < warp) own += listed[other];
-      rank += listed[other];
+    int64_t own_rank = rank + __popc(votes & ((1u << lane) - 1));
+    for (int other_warp = 0; other_warp < kThreads / 32; ++other_warp) {
+      if (other_warp < warp) own_rank += listed[other_warp];
+      rank += listed[other_warp];
     }
-    if ((flags & kTouched) != 0) list.take(index, flags, own, all.listed);
+    if ((flags & kTouched) != 0) list.process(index, flags, own_rank, all.listed);
     __syncthreads();
   }
 }
@@ -113,13 +113,13 @@ void compact(const Tensor& like, int64_t count, const List& list) {
   const Launcher launch(like);
   launch(count_chunks<List>, chunks, kThreads, list, count, chunk_c);
   launch(add_chunks, 1, kScanThreads, chunk_c, chunks);
-  launch(take_chunks<List>, chunks, kThreads, list, count, chunk_c);
+  launch(process_chunks<List>, chunks, kThreads, list, count, chunk_c);
 }
 
 void sort_keys(const Tensor& like, int64_t* keys, int64_t count) {
   const Launcher launch(like);
-  const Tensor other = torch::stable::new_empty(like, {count}, ScalarType::Long);
-  cub::DoubleBuffer<int64_t> buffers(keys, static_cast<int64_t*>(other.mutable_data_ptr()));
+  const Tensor second_buffer = torch::stable::new_empty(like, {count}, ScalarType::Long);
+  cub::DoubleBuffer<int64_t> buffers(keys, static_cast<int64_t*>(second_buffer.mutable_data_ptr()));
   size_t bytes = 0;
   const auto sort = [&](void* scratch) {
     const cudaError_t status = cub::DeviceRadixSort::SortKeys(scratch, bytes, buffers, count, 0, 64, launch.stream());

@@ -17,10 +17,10 @@ void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
       if constexpr (!Type::kShadows) trace_packets<typename Type::Shader, AnyValues>(args, begin, end);
     });
   }
-  const bool far = brick_bytes(args.voxel, args.side, args.channels) * args.bricks > INT32_MAX;
+  const bool far_offsets = brick_bytes(args.voxel, args.side, args.channels) * args.bricks > INT32_MAX;
   with_voxel(args.voxel, [&](auto voxel) {
     using Voxel = decltype(voxel);
-    if (far) return trace_packets<Plain<float>, TypedValues<Voxel, true>>(args, begin, end);
+    if (far_offsets) return trace_packets<Plain<float>, TypedValues<Voxel, true>>(args, begin, end);
     return trace_packets<Plain<float>, TypedValues<Voxel, false>>(args, begin, end);
   });
 }
@@ -28,7 +28,7 @@ void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
 template <class T>
 void voxelize_rows(const VoxelizeArgs& args, int64_t begin, int64_t end) {
   const VoxelizePack<T> pack{args};
-  for (int64_t row = begin; row < end; ++row) pack.wind(row);
+  for (int64_t row = begin; row < end; ++row) pack.write_winding(row);
   for (int64_t index = begin * pack.packs(); index < end * pack.packs(); ++index) pack(index);
 }
 
@@ -41,12 +41,12 @@ void noise_chunk(const NoiseArgs& args, int64_t begin, int64_t end) {
 }
 
 void orbits_chunk(const OrbitArgs& args, int64_t begin, int64_t end) {
-  args.wide ? orbits_in_lanes<Doubles>(args, begin, end) : orbits_in_lanes<Floats>(args, begin, end);
+  args.in_float64 ? orbits_in_lanes<Doubles>(args, begin, end) : orbits_in_lanes<Floats>(args, begin, end);
 }
 
 void splat_chunk(const SplatArgs& args, int64_t begin, int64_t end) {
-  const SplatPart part{args};
-  for (int64_t index = begin; index < end; ++index) part(index);
+  const SplatPart splat_part{args};
+  for (int64_t index = begin; index < end; ++index) splat_part(index);
 }
 
 extern const Chunks chunks;

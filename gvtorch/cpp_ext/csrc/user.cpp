@@ -49,39 +49,39 @@ template struct Interface<float, UserShaderOf<float>>;
 template struct Interface<double, UserShaderOf<double>>;
 
 // The shader of the library, see FusedShaders in entry.h.
-struct OneShader {
-  using Known = UserShaderOf<float>;
+struct LibraryShader {
+  using FloatShader = UserShaderOf<float>;
   static bool integrates(int64_t) { return false; }
   static bool filtered(int64_t) { return false; }
   static void check(const ShadeArgs& args) {
-    constexpr int32_t features = Known::kFeatures, uniforms = Known::kUniforms;
+    constexpr int32_t features = FloatShader::kFeatures, uniforms = FloatShader::kUniforms;
     STD_TORCH_CHECK(args.shader == 0, "gvtorch: shader must be 0");
-    const int32_t given = features == Known::kAsOther ? args.other_channels : features;
-    STD_TORCH_CHECK(args.features == given, "gvtorch: features must be ", given, ", got ", args.features);
-    const int32_t own = args.parameters - kParameters;
-    STD_TORCH_CHECK(own >= 0 && (uniforms < 0 || own == uniforms),
-                    "gvtorch: parameter_54 holds the wrong number of uniforms: ", own);
+    const int32_t expected = features == FloatShader::kAsOther ? args.other_channels : features;
+    STD_TORCH_CHECK(args.features == expected, "gvtorch: features must be ", expected, ", got ", args.features);
+    const int32_t uniform_count = args.parameters - kParameters;
+    STD_TORCH_CHECK(uniform_count >= 0 && (uniforms < 0 || uniform_count == uniforms),
+                    "gvtorch: parameter_54 holds the wrong number of uniforms: ", uniform_count);
   }
-  static void run(const Tensor& like, ShadeArgs args, bool wide) {
-    const auto each = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };
-    if (wide) return each(ShadeRay<double, CalledShader<UserShaderOf, double>, Digits<double>>(args));
+  static void run(const Tensor& like, ShadeArgs args, bool in_float64) {
+    const auto run_kernel = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };
+    if (in_float64) return run_kernel(ShadeRay<double, CalledShader<UserShaderOf, double>, Digits<double>>(args));
 #ifdef GV_PACKETS
-    if (packs(args)) {
+    if (packets_can_trace(args)) {
       return trace_chunks(like, args, [&](int64_t begin, int64_t end) {
         trace_packets<CalledShader<UserShaderOf, float>, AnyValues>(args, begin, end);
       });
     }
-    each(ShadeRay<float, CalledShader<UserShaderOf, float>, Digits<float>>(args));  // where packets can't
+    run_kernel(ShadeRay<float, CalledShader<UserShaderOf, float>, Digits<float>>(args));  // where packets can't
 #else
     with_digits<float>(args, [&](auto* digits) {
-      each(ShadeRay<float, CalledShader<UserShaderOf, float>, std::decay_t<decltype(*digits)>>(args));
+      run_kernel(ShadeRay<float, CalledShader<UserShaderOf, float>, std::decay_t<decltype(*digits)>>(args));
     });
 #endif
   }
 };
 
 struct UserOp : ShadeRaysOp {};
-inline auto run(const UserOp& a) { return shade_rays<OneShader>(a); }
+inline auto run(const UserOp& a) { return shade_rays<LibraryShader>(a); }
 
 }  // namespace gvtorch
 
@@ -102,9 +102,9 @@ STABLE_TORCH_LIBRARY_IMPL(gvtorch_user, CPU, library) {
 }
 
 // What Python reads from the struct.
-#define GV_TELLS extern "C" __attribute__((visibility("default")))
-GV_TELLS int32_t gvtorch_features() { return gvtorch::OneShader::Known::kFeatures; }
-GV_TELLS int32_t gvtorch_whole() { return gvtorch::OneShader::Known::kWhole; }
-GV_TELLS int32_t gvtorch_named() { return gvtorch::OneShader::Known::kUniforms >= 0; }
-GV_TELLS const char* gvtorch_uniforms() { return gvtorch::OneShader::Known::kUniformNames; }
+#define GV_EXPORT extern "C" __attribute__((visibility("default")))
+GV_EXPORT int32_t gvtorch_features() { return gvtorch::LibraryShader::FloatShader::kFeatures; }
+GV_EXPORT int32_t gvtorch_whole() { return gvtorch::LibraryShader::FloatShader::kWhole; }
+GV_EXPORT int32_t gvtorch_named() { return gvtorch::LibraryShader::FloatShader::kUniforms >= 0; }
+GV_EXPORT const char* gvtorch_uniforms() { return gvtorch::LibraryShader::FloatShader::kUniformNames; }
 #endif

@@ -86,11 +86,11 @@ struct UserSums {
   Sum of_lane[kLanes];
   Floats clear{};
   Mask missed{};
-  int32_t asked = 0;  // how many lanes asked for a gradient at the last interval
+  int32_t gradient_requests = 0;  // how many lanes asked for a gradient at the last interval
 
-  GV_HD void begin(int lane, float clear_then, float hit_clear, float* feature_c) {
-    of_lane[lane].begin(0, clear_then, hit_clear, feature_c);
-    clear[lane] = clear_then;
+  GV_HD void begin(int lane, float start_clear, float hit_clear, float* feature_c) {
+    of_lane[lane].begin(0, start_clear, hit_clear, feature_c);
+    clear[lane] = start_clear;
   }
 };
 template <class Sum>
@@ -99,14 +99,14 @@ GV_HD Sum& sum_of(UserSums<Sum>& sums, int lane) {
   return sums.of_lane[lane];
 }
 template <class Sum>
-GV_HD void put_sum(UserSums<Sum>& sums, int lane, const Sum& one) {
-  sums.clear[lane] = one.clear;
-  set_lane(sums.missed, lane, one.missed);
+GV_HD void put_sum(UserSums<Sum>& sums, int lane, const Sum& lane_sum) {
+  sums.clear[lane] = lane_sum.clear;
+  set_lane(sums.missed, lane, lane_sum.missed);
 }
 template <class Shader, class Sum>
-GV_HD Mask hides_of(const Shader& shader, Mask which, Floats low, Floats high, UserSums<Sum>& sums) {
+GV_HD Mask hides_of(const Shader& shader, Mask mask, Floats low, Floats high, UserSums<Sum>& sums) {
   Mask hides{};
-  for_lanes(which, [&](int lane) { set_lane(hides, lane, shader.hides(low[lane], high[lane], sum_of(sums, lane))); });
+  for_lanes(mask, [&](int lane) { set_lane(hides, lane, shader.hides(low[lane], high[lane], sum_of(sums, lane))); });
   return hides;
 }
 #endif
@@ -129,23 +129,23 @@ struct CalledShader : Kind<T> {
   static constexpr bool kLeavesOut = kHidesByTransfer<Base> && std::is_same_v<Sum, ShadeSum<T>> && !Base::kEnds;
 
   template <class Packet>
-  GV_HD void add(Mask which, const Piece<Floats>& pieces, Packet& packet, UserSums<Sum>& sums) const {
-    if constexpr (kLeavesOut) which = which && !this->transfer.transparent(pieces.value, pieces.value);
+  GV_HD void add(Mask mask, const Piece<Floats>& pieces, Packet& packet, UserSums<Sum>& sums) const {
+    if constexpr (kLeavesOut) mask = mask && !this->transfer.transparent(pieces.value, pieces.value);
     // The gradients of all lanes at once take about as long as two lanes' one by one.
-    const bool ahead = sums.asked >= 2;
+    const bool prefetch = sums.gradient_requests >= 2;
     Vec3<Floats> slope{};
-    if (ahead) slope = packet.gradient(pieces.middle);
-    sums.asked = 0;
-    KnownGradient<float> known{NAN, {}, false};
-    packet.each(
-        which,
+    if (prefetch) slope = packet.gradient(pieces.middle);
+    sums.gradient_requests = 0;
+    PrefetchedGradient<float> prefetched{NAN, {}, false};
+    packet.each_lane(
+        mask,
         [&](int lane, const Probe<T>& probe) {
-          if (ahead) known = {pieces.middle[lane], lane_of(slope, lane), false};
-          known.asked = false;
+          if (prefetch) prefetched = {pieces.middle[lane], lane_of(slope, lane), false};
+          prefetched.requested = false;
           add_lane(lane, pieces, probe, sums);
-          sums.asked += known.asked ? 1 : 0;
+          sums.gradient_requests += prefetched.requested ? 1 : 0;
         },
-        &known);
+        &prefetched);
   }
 
  private:

@@ -86,10 +86,10 @@ def simplex(points: Points, *, seed: int = 0, period: Period = None) -> Tensor:
     Raises:
         ValueError: Points or period are invalid.
     """
-    place = as_points("noise.simplex", points)
-    if place.shape[-1] == 2 and period is not None:
+    position = as_points("noise.simplex", points)
+    if position.shape[-1] == 2 and period is not None:
         raise ValueError("noise.simplex: in the plane there is no period; perlin has one")
-    return at_points("noise.simplex", "simplex", place, seed, period)
+    return at_points("noise.simplex", "simplex", position, seed, period)
 
 
 def cellular(
@@ -119,14 +119,14 @@ def cellular(
     Raises:
         ValueError: An argument is invalid.
     """
-    where = "noise.cellular"
-    check.number(where, "jitter", jitter, low=0, high=1)
-    check.whole(where, "reach", reach, low=1, high=2)
-    check.one_of(where, "feature", feature, FEATURES)
-    return at_points(where, feature, points, seed, period, jitter=jitter, reach=reach)
+    context = "noise.cellular"
+    check.number(context, "jitter", jitter, low=0, high=1)
+    check.whole(context, "reach", reach, low=1, high=2)
+    check.one_of(context, "feature", feature, FEATURES)
+    return at_points(context, feature, points, seed, period, jitter=jitter, reach=reach)
 
 
-def as_points(where: str, points: Points) -> Tensor:
+def as_points(context: str, points: Points) -> Tensor:
     """Returns points as one tensor (..., n) of floats, n = 2 or 3.
 
     Raises:
@@ -136,17 +136,17 @@ def as_points(where: str, points: Points) -> Tensor:
     n = len(axes)
     if isinstance(points, Tensor):
         n = points.shape[-1] if points.dim() else 0
-    if not 2 <= n <= 3 or not all(isinstance(one, Tensor) for one in axes):
+    if not 2 <= n <= 3 or not all(isinstance(coordinate, Tensor) for coordinate in axes):
         got = check.describe(points) if isinstance(points, Tensor) else f"{n} items"
-        raise ValueError(f"{where}: points must be (..., n) or n tensors, n = 2 or 3, got {got}")
-    kinds = {one.dtype for one in axes}
+        raise ValueError(f"{context}: points must be (..., n) or n tensors, n = 2 or 3, got {got}")
+    kinds = {coordinate.dtype for coordinate in axes}
     if len(kinds) > 1 or not kinds <= {torch.float32, torch.float64}:
         got = ", ".join(sorted(str(kind).removeprefix("torch.") for kind in kinds))
-        raise ValueError(f"{where}: points must be float32 or float64, got {got}")
+        raise ValueError(f"{context}: points must be float32 or float64, got {got}")
     return points if isinstance(points, Tensor) else torch.stack(torch.broadcast_tensors(*axes), -1)
 
 
-def periods(where: str, period: Period, n: int, multiple: int = 1) -> tuple[int, ...]:
+def periods(context: str, period: Period, n: int, multiple: int = 1) -> tuple[int, ...]:
     """Returns the period along each of n axes; 0: none.
 
     Raises:
@@ -154,25 +154,25 @@ def periods(where: str, period: Period, n: int, multiple: int = 1) -> tuple[int,
     """
     if period is None:
         return (0,) * n
-    each = tuple(period) if isinstance(period, Sequence) else (period,) * n
-    if len(each) != n:
-        raise ValueError(f"{where}: period must be an int or {n} of them, got {period!r}")
-    for one in each:
-        check.whole(where, "period", one, low=1, high=2**28)
-        if one % multiple:
-            raise ValueError(f"{where}: period must be a multiple of {multiple}, got {period!r}")
-    return each
+    axis_periods = tuple(period) if isinstance(period, Sequence) else (period,) * n
+    if len(axis_periods) != n:
+        raise ValueError(f"{context}: period must be an int or {n} of them, got {period!r}")
+    for axis_period in axis_periods:
+        check.whole(context, "period", axis_period, low=1, high=2**28)
+        if axis_period % multiple:
+            raise ValueError(f"{context}: period must be a multiple of {multiple}, got {period!r}")
+    return axis_periods
 
 
 def at_points(
-    where: str, kind: str, points: Points, seed: int, period: Period, **options: Any
+    context: str, kind: str, points: Points, seed: int, period: Period, **options: Any
 ) -> Tensor:
     """Returns noise (...) of a kind at points (..., n); `options` are those of `ops.noise`."""
-    place = as_points(where, points)
-    n = place.shape[-1]
-    every = periods(where, period, n, multiple=3 if kind == "simplex" else 1)
-    found = noise(place.reshape(-1, n), kind, seed=seed, period=every, **options)
-    return found.view(place.shape[:-1])
+    position = as_points(context, points)
+    n = position.shape[-1]
+    axis_periods = periods(context, period, n, multiple=3 if kind == "simplex" else 1)
+    values = noise(position.reshape(-1, n), kind, seed=seed, period=axis_periods, **options)
+    return values.view(position.shape[:-1])
 
 
 class Bounds(NamedTuple):
@@ -185,7 +185,7 @@ class Bounds(NamedTuple):
     slope: float
 
 
-_KNOWN = {
+_BOUNDS = {
     (perlin, 2): Bounds(-1.0, 1.0, 2.75),
     (perlin, 3): Bounds(-1.03636, 1.03636, 3.75),
     (value, 2): Bounds(-1.0, 1.0, 3.75),
@@ -207,9 +207,9 @@ def bounds(basis: Basis, n: int = 3) -> Bounds:
     while isinstance(basis, partial):
         options, basis = basis.keywords | options, basis.func
     if basis is cellular:
-        steep = 2.0 if options.get("feature", "F1") == "F2-F1" else 1.0
-        return Bounds(0.0, float(options.get("reach", 1)), steep)
-    if (basis, n) not in _KNOWN:
+        slope = 2.0 if options.get("feature", "F1") == "F2-F1" else 1.0
+        return Bounds(0.0, float(options.get("reach", 1)), slope)
+    if (basis, n) not in _BOUNDS:
         name = getattr(basis, "__name__", repr(basis))
         raise ValueError(f"noise.bounds: nothing is known of {name!r} in {n} dimensions")
-    return _KNOWN[basis, n]
+    return _BOUNDS[basis, n]

@@ -61,7 +61,7 @@ class Tally:
 
 
 def octaves_of(
-    where: str, octaves: int, lacunarity: float, gain: float, seed: int, frequency: float = 1.0
+    context: str, octaves: int, lacunarity: float, gain: float, seed: int, frequency: float = 1.0
 ) -> list[Octave]:
     """Returns the octaves of a sum: amplitudes 1, gain, gain^2, ..., frequencies `frequency` times
     1, lacunarity, ...
@@ -69,14 +69,14 @@ def octaves_of(
     Raises:
         ValueError: There are none, more than 64, or a number is not positive.
     """
-    check.number(where, "frequency", frequency, low=0, open_low=True)
-    check.whole(where, "octaves", octaves, low=1, high=64)
-    check.number(where, "lacunarity", lacunarity, low=0, open_low=True)
-    check.number(where, "gain", gain, low=0, open_low=True)
-    check.whole(where, "seed", seed, low=-(2**62), high=2**62)
+    check.number(context, "frequency", frequency, low=0, open_low=True)
+    check.whole(context, "octaves", octaves, low=1, high=64)
+    check.number(context, "lacunarity", lacunarity, low=0, open_low=True)
+    check.number(context, "gain", gain, low=0, open_low=True)
+    check.whole(context, "seed", seed, low=-(2**62), high=2**62)
     return [
-        Octave(gain**number, lacunarity**number * frequency, seed + number * _NEXT_OCTAVE)
-        for number in range(octaves)
+        Octave(gain**index, lacunarity**index * frequency, seed + index * _NEXT_OCTAVE)
+        for index in range(octaves)
     ]
 
 
@@ -98,18 +98,18 @@ def fbm(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
     Raises:
         ValueError: An argument is invalid.
     """
-    where = "noise.fbm"
-    layers = _layers(where, points, **settings)
-    return _sum(where, (amplitude * noise for amplitude, noise in layers))
+    context = "noise.fbm"
+    layers = _layers(context, points, **settings)
+    return _sum(context, (amplitude * noise for amplitude, noise in layers))
 
 
 def turbulence(points: Points, **settings: Unpack[SumSettings]) -> Tensor:
     """The sum of the absolute values of octaves: it has creases where they pass 0, as in flames and
     marble. Arguments, result and errors are those of `fbm`.
     """
-    where = "noise.turbulence"
-    layers = _layers(where, points, **settings)
-    return _sum(where, (amplitude * noise.abs() for amplitude, noise in layers))
+    context = "noise.turbulence"
+    layers = _layers(context, points, **settings)
+    return _sum(context, (amplitude * noise.abs() for amplitude, noise in layers))
 
 
 def ridged(points: Points, *, sharpness: float = 2.0, **settings: Unpack[SumSettings]) -> Tensor:
@@ -127,18 +127,18 @@ def ridged(points: Points, *, sharpness: float = 2.0, **settings: Unpack[SumSett
     Raises:
         ValueError: An argument is invalid.
     """
-    where = "noise.ridged"
-    check.number(where, "sharpness", sharpness, low=0)
+    context = "noise.ridged"
+    check.number(context, "sharpness", sharpness, low=0)
 
     def crests() -> Iterator[Tensor]:
         weight: Tensor | None = None
-        for amplitude, noise in _layers(where, points, **settings):
+        for amplitude, noise in _layers(context, points, **settings):
             crest = (1 - noise.abs()) * (1 - noise.abs())
             crest = crest if weight is None else crest * weight
             weight = (crest * sharpness).clamp(0, 1)
             yield amplitude * crest
 
-    return _sum(where, crests())
+    return _sum(context, crests())
 
 
 def warp(points: Points, *, amplitude: float = 1.0, **settings: Unpack[SumSettings]) -> Tensor:
@@ -156,13 +156,17 @@ def warp(points: Points, *, amplitude: float = 1.0, **settings: Unpack[SumSettin
     Raises:
         ValueError: An argument is invalid.
     """
-    place = as_points("noise.warp", points)
+    position = as_points("noise.warp", points)
     check.number("noise.warp", "amplitude", amplitude)
     seed, shifts = settings.get("seed", 0), []
-    for axis in range(place.shape[-1]):
-        own: SumSettings = {"octaves": 1, **settings, "seed": seed + (axis + 1) * _NEXT_AXIS}
-        shifts.append(fbm(place, **own))
-    return place + amplitude * torch.stack(shifts, -1)
+    for axis in range(position.shape[-1]):
+        axis_settings: SumSettings = {
+            "octaves": 1,
+            **settings,
+            "seed": seed + (axis + 1) * _NEXT_AXIS,
+        }
+        shifts.append(fbm(position, **axis_settings))
+    return position + amplitude * torch.stack(shifts, -1)
 
 
 def fbm_bounds(
@@ -178,20 +182,20 @@ def fbm_bounds(
     Raises:
         ValueError: An argument is invalid, or the bounds of the noise are unknown.
     """
-    one = bounds(basis, n)
+    basis_bounds = bounds(basis, n)
     series = octaves_of("noise.fbm_bounds", octaves, lacunarity, gain, 0)
     high = sum(octave.amplitude for octave in series)
     slope = sum(octave.amplitude * octave.frequency for octave in series)
-    return Bounds(one.low * high, one.high * high, one.slope * slope)
+    return Bounds(basis_bounds.low * high, basis_bounds.high * high, basis_bounds.slope * slope)
 
 
-def _sum(where: str, parts: Iterable[Tensor]) -> Tensor:
+def _sum(context: str, parts: Iterable[Tensor]) -> Tensor:
     """Adds up octaves, one after another; raises ValueError if the basis returned no tensors."""
-    return check.instance(where, "basis", functools.reduce(operator.add, parts), Tensor)
+    return check.instance(context, "basis", functools.reduce(operator.add, parts), Tensor)
 
 
 def _layers(
-    where: str,
+    context: str,
     points: Points,
     *,
     octaves: int = 6,
@@ -202,14 +206,17 @@ def _layers(
     period: Period = None,
 ) -> Iterator[tuple[float, Tensor]]:
     """Yields amplitude and noise of each octave."""
-    place = as_points(where, points)
+    position = as_points(context, points)
     if not callable(basis):
-        raise ValueError(f"{where}: basis must be a function such as noise.perlin, got {basis!r}")
-    every = periods(where, period, place.shape[-1])
+        raise ValueError(f"{context}: basis must be a function such as noise.perlin, got {basis!r}")
+    axis_periods = periods(context, period, position.shape[-1])
     if period is not None and lacunarity != int(lacunarity):
-        raise ValueError(f"{where}: with a period lacunarity must be whole, got {lacunarity!r}")
-    for octave in octaves_of(where, octaves, lacunarity, gain, seed):
-        finer = None
+        raise ValueError(f"{context}: with a period lacunarity must be whole, got {lacunarity!r}")
+    for octave in octaves_of(context, octaves, lacunarity, gain, seed):
+        octave_period = None
         if period is not None:
-            finer = [one * int(octave.frequency) for one in every]
-        yield octave.amplitude, basis(place * octave.frequency, seed=octave.seed, period=finer)
+            octave_period = [cells * int(octave.frequency) for cells in axis_periods]
+        yield (
+            octave.amplitude,
+            basis(position * octave.frequency, seed=octave.seed, period=octave_period),
+        )

@@ -54,23 +54,23 @@ def inherit(
     Raises:
         ValueError: Shapes do not fit, there is no border, or there are fewer voxels than `points`.
     """
-    where = "noise.inherit"
+    context = "noise.inherit"
     if parents.dim() != 4 or len(set(parents.shape[1:])) > 1 or not parents.is_floating_point():
         raise ValueError(
-            f"{where}: parents must be (k, s, s, s) floats, got {check.describe(parents)}"
+            f"{context}: parents must be (k, s, s, s) floats, got {check.describe(parents)}"
         )
     if child.shape != (len(parents), 3):
         shape = f"({len(parents)}, 3)"
-        raise ValueError(f"{where}: child must be {shape} int64, got {check.describe(child)}")
+        raise ValueError(f"{context}: child must be {shape} int64, got {check.describe(child)}")
     side = parents.shape[1]
-    check.whole(where, "border", border, low=1, high=(side - 1) // 2)
-    check.whole(where, "points", points, low=2, high=side)
+    check.whole(context, "border", border, low=1, high=(side - 1) // 2)
+    check.whole(context, "points", points, low=2, high=side)
     weights = _weights(side, border, branching, points, parents.dtype, parents.device)
     x, y, z = (weights[child[:, axis]] for axis in range(3))  # (k, s, s) each
-    found = parents.flatten(1, 2) @ x.mT  # along x
-    found = found.view(-1, side, side, side).transpose(2, 3).flatten(1, 2) @ y.mT
-    found = found.view(-1, side, side, side).permute(0, 3, 2, 1).flatten(1, 2) @ z.mT  # (y, x, z)
-    return found.view(-1, side, side, side).permute(0, 3, 1, 2)
+    values = parents.flatten(1, 2) @ x.mT  # along x
+    values = values.view(-1, side, side, side).transpose(2, 3).flatten(1, 2) @ y.mT
+    values = values.view(-1, side, side, side).permute(0, 3, 2, 1).flatten(1, 2) @ z.mT  # (y, x, z)
+    return values.view(-1, side, side, side).permute(0, 3, 1, 2)
 
 
 class OctaveSum(Tally):
@@ -104,16 +104,16 @@ class OctaveSum(Tally):
         Raises:
             ValueError: A number is out of its range.
         """
-        where = "noise.OctaveSum"
-        self.hold = check.number(where, "hold", hold, low=0, open_low=True)
+        context = "noise.OctaveSum"
+        self.hold = check.number(context, "hold", hold, low=0, open_low=True)
         if not settled >= self.hold:
-            raise ValueError(f"{where}: settled must be >= hold, {hold:g}, got {settled!r}")
+            raise ValueError(f"{context}: settled must be >= hold, {hold:g}, got {settled!r}")
         self.settled = settled
-        self.octaves = octaves_of(where, octaves, lacunarity, gain, seed, frequency)
+        self.octaves = octaves_of(context, octaves, lacunarity, gain, seed, frequency)
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can represent."""
-        return self._wide(side, self.hold)
+        return self._octaves_wider(side, self.hold)
 
     def bricks(
         self,
@@ -137,30 +137,30 @@ class OctaveSum(Tally):
             child: (k, 3) index of each brick among its parent's children, see `inherit`.
             border, branching: As in `inherit`.
         """
-        above = self._wide(side * branching, self.settled)
-        calm = self._wide(side, self.settled)
-        held = self.held(side)
+        inherited = self._octaves_wider(side * branching, self.settled)
+        settled_octaves = self._octaves_wider(side, self.settled)
+        octaves = self.held(side)
         size = axes[0].shape[0] * axes[0].shape[1] * axes[1].shape[1] * axes[2].shape[1]
-        self._count(wanted=size * len(held))
-        if parents is None or child is None or not above:
-            settled = self._evaluated(axes, calm)
+        self._count(wanted=size * len(octaves))
+        if parents is None or child is None or not inherited:
+            settled = self._evaluate(axes, settled_octaves)
         else:
             settled = inherit(parents, child, border=border, branching=branching)
-            settled = settled + self._evaluated(axes, calm[len(above) :])
-        return settled + self._evaluated(axes, held[len(calm) :]), settled
+            settled = settled + self._evaluate(axes, settled_octaves[len(inherited) :])
+        return settled + self._evaluate(axes, octaves[len(settled_octaves) :]), settled
 
-    def _wide(self, side: float, voxels: float) -> list[Octave]:
+    def _octaves_wider(self, side: float, voxels: float) -> list[Octave]:
         """Returns the octaves whose cells are at least `voxels` voxels of a side wide."""
-        return [one for one in self.octaves if side * one.frequency * voxels <= 1 + 1e-9]
+        return [octave for octave in self.octaves if side * octave.frequency * voxels <= 1 + 1e-9]
 
-    def _evaluated(self, axes: Sequence[Tensor], octaves: Sequence[Octave]) -> Tensor:
+    def _evaluate(self, axes: Sequence[Tensor], octaves: Sequence[Octave]) -> Tensor:
         """Returns the sum of octaves, (k, z, y, x); zeros if there are none."""
         x, y, z = axes
         total = x.new_zeros((len(x), z.shape[1], y.shape[1], x.shape[1]))
         axes = (x[:, None, None, :], y[:, None, :, None], z[:, :, None, None])
-        places = as_points("noise.OctaveSum", axes)
-        for one in octaves:
-            total += one.amplitude * perlin(places * one.frequency, seed=one.seed)
+        positions = as_points("noise.OctaveSum", axes)
+        for octave in octaves:
+            total += octave.amplitude * perlin(positions * octave.frequency, seed=octave.seed)
             self._count(made=total.numel())
         return total
 
@@ -175,15 +175,15 @@ def _weights(
     for child in range(branching):
         rows = []
         for voxel in range(-border, size + border):
-            place = (child * size + voxel + 0.5) / branching - 0.5 + border  # in parent's voxels
-            first = min(max(int(place) - points // 2 + 1, 0), side - points)
+            position = (child * size + voxel + 0.5) / branching - 0.5 + border  # in parent's voxels
+            first = min(max(int(position) - points // 2 + 1, 0), side - points)
             row = [0.0] * side
-            for one in range(first, first + points):
+            for index in range(first, first + points):
                 weight = 1.0
-                for other in range(first, first + points):
-                    if other != one:
-                        weight *= (place - other) / (one - other)
-                row[one] = weight
+                for other_index in range(first, first + points):
+                    if other_index != index:
+                        weight *= (position - other_index) / (index - other_index)
+                row[index] = weight
             rows.append(row)
         children.append(rows)
     return torch.tensor(children, dtype=dtype, device=device)

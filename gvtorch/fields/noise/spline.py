@@ -31,7 +31,7 @@ from ...base import check
 from ...ops.reference import noise as twin
 from .fractal import Octave, Tally, octaves_of
 
-_APART = 1e-6  # relative tolerance between the side of a level's voxels and of an octave's cells
+_TOLERANCE = 1e-6  # relative, of the side of a level's voxels to that of an octave's cells
 
 
 class SplineSum(Tally):
@@ -58,12 +58,12 @@ class SplineSum(Tally):
         Raises:
             ValueError: A number is out of its range.
         """
-        where = "noise.SplineSum"
-        self.octaves = octaves_of(where, octaves, 2.0, gain, seed, frequency)
+        context = "noise.SplineSum"
+        self.octaves = octaves_of(context, octaves, 2.0, gain, seed, frequency)
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can represent."""
-        return [one for one in self.octaves if side * one.frequency <= 1 + _APART]
+        return [octave for octave in self.octaves if side * octave.frequency <= 1 + _TOLERANCE]
 
     def bricks(
         self,
@@ -82,74 +82,78 @@ class SplineSum(Tally):
         Raises:
             ValueError: No octave's cells are as wide as the level's voxels, or N is not 2.
         """
-        where = "noise.SplineSum"
-        check.halves(where, branching, "sums of splines")
+        context = "noise.SplineSum"
+        check.halves(context, branching, "sums of splines")
         steps = math.log2(side * self.octaves[0].frequency)
-        if abs(steps - round(steps)) > _APART:
+        if abs(steps - round(steps)) > _TOLERANCE:
             raise ValueError(
-                f"{where}: voxels must be 2^n times as wide as the first octave's cells, "
+                f"{context}: voxels must be 2^n times as wide as the first octave's cells, "
                 f"{1 / self.octaves[0].frequency:g}, got {side:g}"
             )
         low = [(axis[:, 0] / side).floor().to(torch.int64) for axis in axes]
         size = axes[0].shape[1]
         if parents is None or child is None:
-            found = self._alone(low, size, side)
+            values = self._sum_from_coarsest(low, size, side)
         else:
             inner = size - 2 * border
-            above = [(one + border) // inner // 2 * inner - border for one in low]
-            found = self._added(_finer(parents, above, low, size), low, side)
-        self._count(wanted=len(found) * self._numbers(size, side))
-        return found, found
+            parent_low = [
+                (coordinate + border) // inner // 2 * inner - border for coordinate in low
+            ]
+            values = self._add_octave(_refine(parents, parent_low, low, size), low, side)
+        self._count(wanted=len(values) * self._random_count(size, side))
+        return values, values
 
-    def _alone(self, low: Sequence[Tensor], size: int, side: float) -> Tensor:
+    def _sum_from_coarsest(self, low: Sequence[Tensor], size: int, side: float) -> Tensor:
         """Returns the sum in k cubes of voxels, from the coarsest octave on, without parents."""
         if not self.held(2 * side):
-            none = torch.zeros((len(low[0]), size, size, size), device=low[0].device)
-            return self._added(none, low, side)
-        above = [(one - 1) // 2 for one in low]
-        coarse = self._alone(above, size // 2 + 2, 2 * side)
-        return self._added(_finer(coarse, above, low, size), low, side)
+            zeros = torch.zeros((len(low[0]), size, size, size), device=low[0].device)
+            return self._add_octave(zeros, low, side)
+        parent_low = [(coordinate - 1) // 2 for coordinate in low]
+        coarse = self._sum_from_coarsest(parent_low, size // 2 + 2, 2 * side)
+        return self._add_octave(_refine(coarse, parent_low, low, size), low, side)
 
-    def _added(self, values: Tensor, low: Sequence[Tensor], side: float) -> Tensor:
+    def _add_octave(self, values: Tensor, low: Sequence[Tensor], side: float) -> Tensor:
         """Returns the values plus the octave that begins at this level, if there is one."""
-        for one in self.octaves:
-            if abs(side * one.frequency - 1) < 2 * _APART:
-                reach = torch.arange(values.shape[1], device=values.device)
+        for octave in self.octaves:
+            if abs(side * octave.frequency - 1) < 2 * _TOLERANCE:
+                offsets = torch.arange(values.shape[1], device=values.device)
                 x, y, z = (
-                    twin.scramble((at[:, None] + reach).to(torch.int32), salt)
-                    for at, salt in zip(low, twin.salts(one.seed), strict=True)
+                    twin.scramble((axis_low[:, None] + offsets).to(torch.int32), salt)
+                    for axis_low, salt in zip(low, twin.salts(octave.seed), strict=True)
                 )
                 bits = twin.join(x[:, None], y[:, :, None])
                 bits = twin.join(bits[:, None], z[:, :, None, None])
-                values = values + bits.to(values.dtype) * (one.amplitude * 2.0**-31)
+                values = values + bits.to(values.dtype) * (octave.amplitude * 2.0**-31)
                 self._count(made=values.numel())
         return values
 
-    def _numbers(self, size: int, side: float) -> int:
+    def _random_count(self, size: int, side: float) -> int:
         """Returns how many random numbers a brick needs without parents."""
         count = 0
-        while held := self.held(side):
-            count += size**3 if abs(side * held[-1].frequency - 1) < 2 * _APART else 0
+        while octaves := self.held(side):
+            count += size**3 if abs(side * octaves[-1].frequency - 1) < 2 * _TOLERANCE else 0
             size, side = size // 2 + 2, 2 * side
         return count
 
 
-def _finer(values: Tensor, above: Sequence[Tensor], low: Sequence[Tensor], size: int) -> Tensor:
+def _refine(
+    values: Tensor, parent_low: Sequence[Tensor], low: Sequence[Tensor], size: int
+) -> Tensor:
     """Returns (k, z, y, x): size^3 voxels from corner `low` (x, y, z: (k,) each), interpolated from
-    those of the level above, from corner `above`. The operations for a voxel do not depend on its
-    brick.
+    those of the level above, from corner `parent_low`. The operations for a voxel do not depend on
+    its brick.
     """
-    reach = torch.arange(size, device=values.device)
+    offsets = torch.arange(size, device=values.device)
     for axis in range(3):
-        voxel, dim = low[axis][:, None] + reach, 3 - axis
-        near = voxel // 2 - above[axis][:, None]
+        voxel, dim = low[axis][:, None] + offsets, 3 - axis
+        parent_voxel = voxel // 2 - parent_low[axis][:, None]
         shape = [1, 1, 1]
         shape[dim - 1] = size
-        wide = [*values.shape]
-        wide[dim] = size
+        expanded_shape = [*values.shape]
+        expanded_shape[dim] = size
         parts = [
-            values.gather(dim, place.view(-1, *shape).expand(wide))
-            for place in (near, near + 2 * (voxel % 2) - 1)
+            values.gather(dim, index.view(-1, *shape).expand(expanded_shape))
+            for index in (parent_voxel, parent_voxel + 2 * (voxel % 2) - 1)
         ]
         values = 0.75 * parts[0] + 0.25 * parts[1]
     return values

@@ -40,9 +40,9 @@ def split_path(text: str) -> tuple[str, str | None]:
     """Splits `file.h5:/group/data` or `image.zarr:/labels/cells` into the file and the path inside
     it; other paths are returned whole, with None.
     """
-    file, mark, inner = text.rpartition(":/")
-    if mark and "://" not in text and not Path(text).exists() and Path(file).exists():
-        return file, f"/{inner}"
+    file, separator, inner_path = text.rpartition(":/")
+    if separator and "://" not in text and not Path(text).exists() and Path(file).exists():
+        return file, f"/{inner_path}"
     return text, None
 
 

@@ -45,13 +45,18 @@ class CziSource(VolumeSource):
         out = np.empty([s.stop - s.start for s in index], self.stored)
         spans = [range(s.start, s.stop) for s in index[:3]]
         with czi.open_czi(self.path) as file:
-            for place in itertools.product(*spans):
-                plane = {n: at + first for at, (n, first) in zip(place, self.starts, strict=True)}
-                found = file.read(roi=roi, plane=plane, scene=self.scene)
-                if found.shape[2] == 3:
-                    found = found[..., ::-1]  # blue comes first
-                at = tuple(p - span.start for p, span in zip(place, spans, strict=True))
-                out[at] = found[..., index[5]]
+            for plane_index in itertools.product(*spans):
+                plane = {
+                    axis: position + first
+                    for position, (axis, first) in zip(plane_index, self.starts, strict=True)
+                }
+                pixels = file.read(roi=roi, plane=plane, scene=self.scene)
+                if pixels.shape[2] == 3:
+                    pixels = pixels[..., ::-1]  # blue comes first
+                out_index = tuple(
+                    p - span.start for p, span in zip(plane_index, spans, strict=True)
+                )
+                out[out_index] = pixels[..., index[5]]
         return out
 
 
@@ -66,56 +71,63 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
     with czi.open_czi(path) as file:
         box = file.total_bounding_box
         scenes = file.scenes_bounding_rectangle
-        kinds = sorted(set(file.pixel_types.values()))
+        pixel_types = sorted(set(file.pixel_types.values()))
         xml = file.raw_metadata
-        scene, whole = None, file.total_bounding_rectangle
+        scene, bounds = None, file.total_bounding_rectangle
         others: tuple[str, ...] = ()
         if scenes or key is not None:
-            at, others = choose(path, "scene", sorted(scenes), key)
-            scene = sorted(scenes)[at]
-            whole = scenes[scene]
-    more = {n: b - a for n, (a, b) in box.items() if n not in "TCZXYSM" and b - a > 1}
-    if more:
-        told = ", ".join(f"{name} {size}" for name, size in more.items())
-        raise ValueError(f"{path}: has axes other than T, C, Z, Y, X: {told}")
-    if len(kinds) != 1 or kinds[0] not in _DTYPES:
-        raise ValueError(f"{path}: pixels are {', '.join(map(str, kinds))}; expected one kind")
-    stored, colors = _DTYPES[kinds[0]]
+            chosen, others = choose(path, "scene", sorted(scenes), key)
+            scene = sorted(scenes)[chosen]
+            bounds = scenes[scene]
+    extra_axes = {
+        axis: b - a for axis, (a, b) in box.items() if axis not in "TCZXYSM" and b - a > 1
+    }
+    if extra_axes:
+        axis_sizes = ", ".join(f"{name} {size}" for name, size in extra_axes.items())
+        raise ValueError(f"{path}: has axes other than T, C, Z, Y, X: {axis_sizes}")
+    if len(pixel_types) != 1 or pixel_types[0] not in _DTYPES:
+        raise ValueError(
+            f"{path}: pixels are {', '.join(map(str, pixel_types))}; expected one kind"
+        )
+    stored, colors = _DTYPES[pixel_types[0]]
     starts = tuple((name, box.get(name, (0, 1))[0]) for name in "TCZ")
     counts = [box.get(name, (0, 1))[1] - first for name, first in starts]
     if counts[1] > 1 and colors > 1:
         raise ValueError(f"{path}: {counts[1]} channels of colours; expected one")
-    info, spacing, lost = _told(xml, counts[1], colors, stored)
+    info, spacing, lost = _read_metadata(xml, counts[1], colors, stored)
     return CziSource(
         path=path,
-        shape=(*counts, whole.h, whole.w, colors),
+        shape=(*counts, bounds.h, bounds.w, colors),
         axes="tczyx-" if colors == 1 else "t-zyxc",
         stored=stored,
         spacing=spacing,
         info=info,
         lost=(*lost, *others),
         scene=scene,
-        corner=(whole.x, whole.y),
+        corner=(bounds.x, bounds.y),
         starts=starts,
     )
 
 
-def _told(xml: str, width: int, colors: int, stored: str) -> Told:
+def _read_metadata(xml: str, width: int, colors: int, stored: str) -> Told:
     """Returns info and spacing from the metadata, and which metadata is not kept."""
     root = ElementTree.fromstring(xml)
     sizes: dict[str, float | None] = {}
-    for item in root.iterfind(".//Scaling/Items/Distance"):
-        value = finite_number(item.findtext("Value"))
-        sizes[item.get("Id", "")] = value * 1e6 if value else None
+    for element in root.iterfind(".//Scaling/Items/Distance"):
+        value = finite_number(element.findtext("Value"))
+        sizes[element.get("Id", "")] = value * 1e6 if value else None
     spacing, unit = spacing_of([sizes.get(axis) for axis in "XYZ"], ["um"] * 3)
-    shown = {item.get("Id"): item for item in root.iterfind(".//DisplaySetting/Channels/Channel")}
+    display_settings = {
+        element.get("Id"): element
+        for element in root.iterfind(".//DisplaySetting/Channels/Channel")
+    }
     channels = [
-        _channel(item, shown.get(item.get("Id")), stored)
-        for item in root.iterfind(".//Information/Image/Dimensions/Channels/Channel")
+        _channel(element, display_settings.get(element.get("Id")), stored)
+        for element in root.iterfind(".//Information/Image/Dimensions/Channels/Channel")
     ]
     if colors == 3:
         channels = [*color_channels()]
-    step = finite_number(
+    time_step = finite_number(
         root.findtext(".//Information/Image/Dimensions/T/Positions/Interval/Increment")
     )
     lost = []
@@ -124,24 +136,27 @@ def _told(xml: str, width: int, colors: int, stored: str) -> Told:
     info = ImageInfo(
         unit=unit,
         channels=tuple(channels) if len(channels) == width * colors else (),
-        time_step=step if step and step > 0 else None,
-        time_unit="second" if step and step > 0 else None,
+        time_step=time_step if time_step and time_step > 0 else None,
+        time_unit="second" if time_step and time_step > 0 else None,
     )
     return info, spacing, lost
 
 
-def _channel(item: Any, shown: Any, stored: str) -> ChannelInfo:
+def _channel(element: Any, display: Any, stored: str) -> ChannelInfo:
     """Returns name, colour, window of a channel; Low and High are shares of the dtype's maximum."""
-    text = (None if shown is None else shown.findtext("Color")) or item.findtext("Color") or ""
+    hex_color = (
+        (None if display is None else display.findtext("Color")) or element.findtext("Color") or ""
+    )
     color: Rgb | None = None
-    if len(text) in (7, 9) and text.startswith("#"):
-        color = from_hex(text[-6:])
+    if len(hex_color) in (7, 9) and hex_color.startswith("#"):
+        color = from_hex(hex_color[-6:])
     window = None
-    ends = [
-        finite_number(None if shown is None else shown.findtext(name)) for name in ("Low", "High")
+    limits = [
+        finite_number(None if display is None else display.findtext(name))
+        for name in ("Low", "High")
     ]
-    if None not in ends and stored != "f4":
-        most = float(np.iinfo(stored).max)
-        low, high = (float(end or 0.0) * most for end in ends)
+    if None not in limits and stored != "f4":
+        max_value = float(np.iinfo(stored).max)
+        low, high = (float(end or 0.0) * max_value for end in limits)
         window = (low, high) if low < high else None
-    return ChannelInfo(name=item.get("Name") or "", color=color, window=window)
+    return ChannelInfo(name=element.get("Name") or "", color=color, window=window)

@@ -28,10 +28,10 @@ from ..source import LPS_TO_RAS, Index, VolumeSource, place_axes
 from ..stores.ngff import is_zarr
 from .format import Format, not_chosen
 
-_MOST_FILES = 200_000
-_MOST_UNPACKED = 1 << 32  # bytes
+_MAX_FILES = 200_000
+_MAX_UNPACKED_BYTES = 1 << 32
 _ENDINGS = (".dcm", ".dicom", ".ima")
-_OTHERS = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".bmp", ".txt", ".json")  # not opened
+_SKIPPED_ENDINGS = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".bmp", ".txt", ".json")  # not opened
 _DEFLATED = "1.2.840.10008.1.2.1.99"
 
 
@@ -45,33 +45,35 @@ class DicomSource(VolumeSource):
     def check_file(self) -> None:
         """Raises ValueError if an uncompressed file is too short for its images."""
         for file, number, *_ in dict((frame[0], frame) for frame in self.frames).values():
-            header, size = _header(file), os.stat(file).st_size
+            header, file_bytes = _header(file), os.stat(file).st_size
             meta = header.file_meta if "file_meta" in vars(header) else {}
             syntax = meta.get("TransferSyntaxUID")
             if syntax is None or syntax.is_compressed or syntax == _DEFLATED:
                 continue
             values = math.prod(_image_shape(header)) * (number + 1)
-            need = values * int(header.get("BitsAllocated") or 0) // 8
-            if size < need:
-                raise ValueError(f"{file}: its images take {need} bytes, the file has {size}")
+            needed_bytes = values * int(header.get("BitsAllocated") or 0) // 8
+            if file_bytes < needed_bytes:
+                raise ValueError(
+                    f"{file}: its images take {needed_bytes} bytes, the file has {file_bytes}"
+                )
 
     def read_stored(self, index: Index) -> np.ndarray:
-        times, places, *inside = index
-        numbers = np.arange(len(self.frames)).reshape(self.shape[:2])[times, places]
-        data = np.empty((numbers.size, *(s.stop - s.start for s in inside)), self.stored)
+        times, slices, *pixel_index = index
+        frame_numbers = np.arange(len(self.frames)).reshape(self.shape[:2])[times, slices]
+        data = np.empty((frame_numbers.size, *(s.stop - s.start for s in pixel_index)), self.stored)
         out = iter(data)
-        wanted = (self.frames[number] for number in numbers.ravel())
-        for file, group in groupby(wanted, key=lambda frame: frame[0]):
-            same = list(group)
-            images = _images(file, [number for _, number, _, _ in same])
-            for (_, _, slope, intercept), image in zip(same, images, strict=True):
+        wanted_frames = (self.frames[number] for number in frame_numbers.ravel())
+        for file, group in groupby(wanted_frames, key=lambda frame: frame[0]):
+            file_frames = list(group)
+            images = _decode_images(file, [number for _, number, _, _ in file_frames])
+            for (_, _, slope, intercept), image in zip(file_frames, images, strict=True):
                 if image.shape != self.shape[2:]:
                     raise ValueError(f"{file}: {image.shape} differs from {self.shape[2:]}")
-                part = image[tuple(inside)]
+                pixels = image[tuple(pixel_index)]
                 if (slope, intercept) != (1, 0):
-                    part = part * np.float64(slope) + intercept
-                next(out)[...] = part
-        return data.reshape((*numbers.shape, *data.shape[1:]))
+                    pixels = pixels * np.float64(slope) + intercept
+                next(out)[...] = pixels
+        return data.reshape((*frame_numbers.shape, *data.shape[1:]))
 
 
 def _has_magic(path: str | os.PathLike[str]) -> bool:
@@ -86,16 +88,16 @@ def _has_magic(path: str | os.PathLike[str]) -> bool:
 
 def _files(folder: str) -> Iterator[str]:
     """Yields the DICOM files in a folder and those below, in order of their names."""
-    seen = 0
-    for place, folders, names in os.walk(folder):
+    visited = 0
+    for subfolder, folders, names in os.walk(folder):
         folders.sort()
         for name in sorted(names):
-            seen += 1
-            if seen > _MOST_FILES:
-                raise ValueError(f"{folder}: more than {_MOST_FILES} files")
-            file = os.path.join(place, name)
+            visited += 1
+            if visited > _MAX_FILES:
+                raise ValueError(f"{folder}: more than {_MAX_FILES} files")
+            file = os.path.join(subfolder, name)
             if (
-                not name.lower().endswith(_OTHERS)
+                not name.lower().endswith(_SKIPPED_ENDINGS)
                 and name.upper() != "DICOMDIR"
                 and _has_magic(file)
             ):
@@ -107,8 +109,9 @@ def _is_dicom(path: str) -> bool:
         return False
     if Path(path).is_dir():
         return next(_files(path), None) is not None
-    bare = re.fullmatch(r"|\.\d+", Path(path).suffix) is not None  # as in IM0001, 1.2.840.113619.5
-    return path.lower().endswith(_ENDINGS) or (bare and _has_magic(path))
+    # As in IM0001, 1.2.840.113619.5.
+    is_numbered = re.fullmatch(r"|\.\d+", Path(path).suffix) is not None
+    return path.lower().endswith(_ENDINGS) or (is_numbered and _has_magic(path))
 
 
 @Format("DICOM", *_ENDINGS, matches=_is_dicom, options=("key",), library="pydicom")
@@ -122,13 +125,13 @@ def open_dicom(path: str, key: str | None = None) -> DicomSource:
             header = _header(file)
             if header.get("Rows") and header.get("Columns"):  # else a report, a plan, ...
                 series[str(header.get("SeriesInstanceUID", ""))].append(header)
-        headers = _choose(path, series, key)
+        headers = _choose_series(path, series, key)
     else:
         headers = [_header(path)]
         if _frame_count(headers[0]) == 1:
             headers += _siblings(path, headers[0])
-    once = {str(h.get("SOPInstanceUID", h.filename)): h for h in reversed(headers)}
-    return _source(path, list(reversed(once.values())))
+    by_uid = {str(h.get("SOPInstanceUID", h.filename)): h for h in reversed(headers)}
+    return _series_source(path, list(reversed(by_uid.values())))
 
 
 def _siblings(path: str, first: Any) -> Iterator[Any]:
@@ -159,36 +162,36 @@ def _check_deflated(file: str) -> None:
     meta = read_file_meta_info(file)
     if str(meta.get("TransferSyntaxUID", "")) != _DEFLATED:
         return
-    size, unpack = 0, zlib.decompressobj(-zlib.MAX_WBITS)
+    size, decompressor = 0, zlib.decompressobj(-zlib.MAX_WBITS)
     with open(file, "rb") as stream:
         stream.seek(144 + int(meta.get("FileMetaInformationGroupLength", 0)))
-        while size <= _MOST_UNPACKED and (packed := stream.read(1 << 16)):
-            while packed and size <= _MOST_UNPACKED:
-                size += len(unpack.decompress(packed, 1 << 20))
-                packed = unpack.unconsumed_tail
-    if size > _MOST_UNPACKED:
-        raise ValueError(f"{file}: unpacks to more than {_MOST_UNPACKED} bytes")
+        while size <= _MAX_UNPACKED_BYTES and (packed := stream.read(1 << 16)):
+            while packed and size <= _MAX_UNPACKED_BYTES:
+                size += len(decompressor.decompress(packed, 1 << 20))
+                packed = decompressor.unconsumed_tail
+    if size > _MAX_UNPACKED_BYTES:
+        raise ValueError(f"{file}: unpacks to more than {_MAX_UNPACKED_BYTES} bytes")
 
 
-def _choose(path: str, series: dict[str, list[Any]], key: str | None) -> list[Any]:
+def _choose_series(path: str, series: dict[str, list[Any]], key: str | None) -> list[Any]:
     if not series:
         raise ValueError(f"{path}: no DICOM file in this folder holds an image")
     if key is None and len(series) == 1:
         return next(iter(series.values()))
-    names = {uid: _names(uid, headers[0]) for uid, headers in series.items()}
-    found = [uid for uid, words in names.items() if key is not None and key in words]
-    if len(found) == 1:
-        return series[found[0]]
-    numbers = [words[0] for words in names.values()]
+    names = {uid: _series_identifiers(uid, headers[0]) for uid, headers in series.items()}
+    matches = [uid for uid, identifiers in names.items() if key is not None and key in identifiers]
+    if len(matches) == 1:
+        return series[matches[0]]
+    numbers = [identifiers[0] for identifiers in names.values()]
     listed = [
-        f"{words[0] if numbers.count(words[0]) == 1 else uid} ({words[1] or 'without a name'}, "
-        f"{len(series[uid])} files)"
-        for uid, words in names.items()
+        f"{identifiers[0] if numbers.count(identifiers[0]) == 1 else uid} "
+        f"({identifiers[1] or 'without a name'}, {len(series[uid])} files)"
+        for uid, identifiers in names.items()
     ]
     raise not_chosen(path, "series", listed, key)
 
 
-def _names(uid: str, header: Any) -> list[str]:
+def _series_identifiers(uid: str, header: Any) -> list[str]:
     return [str(header.get("SeriesNumber", uid)), str(header.get("SeriesDescription", "")), uid]
 
 
@@ -199,7 +202,7 @@ def _frame_count(header: Any) -> int:
     return count
 
 
-def _source(path: str, headers: list[Any]) -> DicomSource:
+def _series_source(path: str, headers: list[Any]) -> DicomSource:
     first = headers[0]
     rows, columns, samples = _image_shape(first)
     frames: list[DicomFrame] = []
@@ -212,12 +215,12 @@ def _source(path: str, headers: list[Any]) -> DicomSource:
                 f"{_image_shape(header)} (rows, columns, samples, {Path(header.filename).name})"
             )
         frames += frames_of(header, count)
-    times, affine, lost, moments = order_frames(path, frames)
+    times, affine, lost, time_fields = order_frames(path, frames)
     depth, frames = len(times[0]), list(chain(*times))
-    told = place_axes(path, LPS_TO_RAS @ affine, (depth, rows, columns))
+    placement = place_axes(path, LPS_TO_RAS @ affine, (depth, rows, columns))
     color = (samples,) if samples > 1 else ()
-    told["axes"] = "t" + told["axes"] + "c" * len(color)
-    info, more = image_info(first, samples, moments)
+    placement["axes"] = "t" + placement["axes"] + "c" * len(color)
+    info, info_lost = image_info(first, samples, time_fields)
     if any(frame.position is None for frame in frames):
         info = replace(info, unit=info.unit if first.get("PixelSpacing") else None)
     return DicomSource(
@@ -226,8 +229,8 @@ def _source(path: str, headers: list[Any]) -> DicomSource:
         stored=_dtype(first, frames),
         frames=tuple((f.file, f.number, f.slope, f.intercept) for f in frames),
         info=info,
-        lost=(*lost, *more),
-        **told,
+        lost=(*lost, *info_lost),
+        **placement,
     )
 
 
@@ -238,25 +241,25 @@ def _image_shape(header: Any) -> tuple[int, int, int]:
 
 def _dtype(header: Any, frames: Sequence[DicomFrame]) -> str:
     """Returns the smallest dtype that holds every value after rescaling."""
-    for tag, kind in (("FloatPixelData", "float32"), ("DoubleFloatPixelData", "float64")):
+    for tag, dtype in (("FloatPixelData", "float32"), ("DoubleFloatPixelData", "float64")):
         if tag in header:
-            return kind
+            return dtype
     bits, signed = int(header.get("BitsStored") or 0), int(header.get("PixelRepresentation") or 0)
     if not 1 <= bits <= 32:
         raise ValueError(f"{header.filename}: {bits} bits stored; expected 1 to 32")
     low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
-    ends: list[float] = []
+    extremes: list[float] = []
     for slope, intercept in {(frame.slope, frame.intercept) for frame in frames}:
         if not (slope.is_integer() and intercept.is_integer()):
             return "float32"
-        ends += [low * slope + intercept, high * slope + intercept]
-    for kind in ("uint8", "int8", "int16", "uint16"):
-        if np.iinfo(kind).min <= min(ends) and max(ends) <= np.iinfo(kind).max:
-            return kind
-    return "int32" if max(map(abs, ends)) < 2**31 and bits > 16 else "float32"
+        extremes += [low * slope + intercept, high * slope + intercept]
+    for dtype in ("uint8", "int8", "int16", "uint16"):
+        if np.iinfo(dtype).min <= min(extremes) and max(extremes) <= np.iinfo(dtype).max:
+            return dtype
+    return "int32" if max(map(abs, extremes)) < 2**31 and bits > 16 else "float32"
 
 
-def _images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:
+def _decode_images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:
     """Decodes some of the images of a file."""
     import pydicom
     from pydicom.filereader import read_file_meta_info

@@ -24,14 +24,14 @@ class FitsSource(VolumeSource):
     def read_stored(self, index: Index) -> np.ndarray:
         from astropy.io import fits
 
-        with fits.open(self.path, memmap=False) as units:
-            cube = _cube(self.path, units)
+        with fits.open(self.path, memmap=False) as hdus:
+            cube = _first_cube(self.path, hdus)
             if self.whole or self.covers(index):
                 return np.asarray(cube.data)[index]
-            first = (0,) * (len(index) - 3)
+            leading = (0,) * (len(index) - 3)
             planes = range(*index[-3].indices(self.shape[-3]))
-            found = np.stack([np.asarray(cube.section[(*first, z)])[index[-2:]] for z in planes])
-        return found.reshape((1,) * len(first) + found.shape)
+            stack = np.stack([np.asarray(cube.section[(*leading, z)])[index[-2:]] for z in planes])
+        return stack.reshape((1,) * len(leading) + stack.shape)
 
 
 @Format("FITS", ".fits", ".fits.gz", ".fit", library="astropy")
@@ -42,23 +42,23 @@ def open_fits(path: str) -> VolumeSource:
     packed = is_packed_fits(path)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*truncated.*")
-        with fits.open(path, memmap=False) as units:
-            cube = _cube(path, units)
+        with fits.open(path, memmap=False) as hdus:
+            cube = _first_cube(path, hdus)
             shape = tuple(int(n) for n in cube.shape)
             scaled = any(key in cube.header for key in ("BSCALE", "BZERO", "BLANK"))
-            first = np.asarray(cube.section[(slice(0, 1),) * len(shape)]).dtype
+            dtype = np.asarray(cube.section[(slice(0, 1),) * len(shape)]).dtype
             offset = int(cube.fileinfo()["datLoc"])
-            plain = not (scaled or packed or isinstance(cube, fits.CompImageHDU))
-    told: dict[str, Any] = {"path": path, "shape": shape, "axes": "-" * (len(shape) - 3) + "zyx"}
-    if plain:
-        stored = first.newbyteorder(">").str
-        return ArraySource(file=path, stored=stored, offset=offset, **told)
-    return FitsSource(stored=first.str, whole=packed, **told)
+            is_plain = not (scaled or packed or isinstance(cube, fits.CompImageHDU))
+    fields: dict[str, Any] = {"path": path, "shape": shape, "axes": "-" * (len(shape) - 3) + "zyx"}
+    if is_plain:
+        stored = dtype.newbyteorder(">").str
+        return ArraySource(file=path, stored=stored, offset=offset, **fields)
+    return FitsSource(stored=dtype.str, whole=packed, **fields)
 
 
-def _cube(path: str, units: Any) -> Any:
+def _first_cube(path: str, hdus: Any) -> Any:
     """Returns the first image of three dimensions among the header-data units of a file."""
-    cube = next((unit for unit in units if unit.is_image and len(unit.shape) >= 3), None)
+    cube = next((hdu for hdu in hdus if hdu.is_image and len(hdu.shape) >= 3), None)
     if cube is None:
         raise ValueError(f"{path}: holds no image of three dimensions")
     if math.prod(cube.shape[:-3]) != 1:

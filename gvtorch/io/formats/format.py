@@ -14,7 +14,7 @@ Opener = TypeVar("Opener", bound=Callable[..., VolumeSource])
 
 #: Every format, in the order in which they are tried.
 FORMATS: list[Format] = []
-_MOST_LISTED = 50  # names in a message
+_MAX_LISTED = 50  # names in a message
 
 
 class Format:
@@ -76,13 +76,13 @@ class Format:
 
 
 def choose(
-    path: str, what: str, names: Sequence[str | int], key: str | None, preferred: str = ""
+    path: str, noun: str, names: Sequence[str | int], key: str | None, preferred: str = ""
 ) -> tuple[int, tuple[str, ...]]:
     """Chooses one of several items of a file by its name or number.
 
     Args:
         path: For messages.
-        what: What the items are, for messages: "image".
+        noun: What the items are, for messages: "image".
         names: The names of all items; or their numbers, if they have no names.
         key: A name or a number (if items have names: their index, from 0), also after a slash, as
             in `file.vdb:/density`.
@@ -95,41 +95,48 @@ def choose(
     Raises:
         ValueError: There are no items, or none that matches `key`.
     """
-    numbers = [at if isinstance(name, str) else name for at, name in enumerate(names)]
+    numbers = [index if isinstance(name, str) else name for index, name in enumerate(names)]
     listed = [
         f"{number} {name!r}" if isinstance(name, str) else str(number)
         for number, name in zip(numbers, names, strict=True)
     ]
     if key is None and names:
-        others = f"{len(names) - 1} other {_plural(what)}; key (--key) chooses among"
-        lost = (f"{others} {_list(listed)}",) if len(names) > 1 else ()
+        others = f"{len(names) - 1} other {_plural(noun)}; key (--key) chooses among"
+        lost = (f"{others} {_join_names(listed)}",) if len(names) > 1 else ()
         return names.index(preferred) if preferred in names else 0, lost
-    bare = (key or "").removeprefix("/")
-    for wanted, found in ((key, names), (bare, names), (whole_number(bare), numbers)):
-        if wanted in found:
-            return found.index(wanted), ()
-    raise not_chosen(path, what, listed, key)
+    plain_key = (key or "").removeprefix("/")
+    for wanted, candidates in (
+        (key, names),
+        (plain_key, names),
+        (whole_number(plain_key), numbers),
+    ):
+        if wanted in candidates:
+            return candidates.index(wanted), ()
+    raise not_chosen(path, noun, listed, key)
 
 
 def not_chosen(
-    path: str, what: str, names: Sequence[str], key: str | None, kind: str = ""
+    path: str, noun: str, names: Sequence[str], key: str | None, qualifier: str = ""
 ) -> ValueError:
     """Returns the error for a `key` that matches none of several items, or is left out although one
-    must be chosen. `kind` says which items are listed: " of three or more axes".
+    must be chosen. `noun` as in `choose`; `qualifier` says which items are listed: " of three or
+    more axes".
     """
     if key is not None:
-        told = f"has no {what} {key!r}; it holds {_list(names) or f'none{kind}'}"
+        message = f"has no {noun} {key!r}; it holds {_join_names(names) or f'none{qualifier}'}"
     elif names:
-        told = f"holds {len(names)} {_plural(what)}, choose one with key (--key): {_list(names)}"
+        message = (
+            f"holds {len(names)} {_plural(noun)}, choose one with key (--key): {_join_names(names)}"
+        )
     else:
-        told = f"holds no {what}{kind}"
-    return ValueError(f"{path}: {told}")
+        message = f"holds no {noun}{qualifier}"
+    return ValueError(f"{path}: {message}")
 
 
-def _plural(what: str) -> str:
-    return what if what.endswith("s") else f"{what}s"
+def _plural(noun: str) -> str:
+    return noun if noun.endswith("s") else f"{noun}s"
 
 
-def _list(names: Sequence[str]) -> str:
-    more = ["..."] if len(names) > _MOST_LISTED else []
-    return ", ".join([*names[:_MOST_LISTED], *more])
+def _join_names(names: Sequence[str]) -> str:
+    ellipsis = ["..."] if len(names) > _MAX_LISTED else []
+    return ", ".join([*names[:_MAX_LISTED], *ellipsis])

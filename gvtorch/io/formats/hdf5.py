@@ -25,11 +25,11 @@ from ..source import Index, VolumeSource
 from .format import Format, not_chosen
 
 _ENDINGS = (".h5", ".hdf5", ".hdf", ".he5", ".h5ad", ".ilp", ".nc", ".nc4", ".cdf")
-_MOST_CHUNK = 1 << 31  # bytes
-_MOST_SETS = 100_000
-_KIND = " of three or more axes"  # the data sets that messages list
-_MOST_LINKS = 16  # that lead to one another
-_MOST_PLACES = 1 << 24  # coordinates of an axis, above which they are not read
+_MAX_CHUNK_BYTES = 1 << 31
+_MAX_DATASETS = 100_000
+_VOLUME_QUALIFIER = " of three or more axes"  # the data sets that messages list
+_MAX_LINKS = 16  # that lead to one another
+_MAX_COORDINATES = 1 << 24  # of an axis; more are not read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +44,10 @@ class Hdf5Source(VolumeSource):
 
     def as_labels(self) -> Self:
         """See `VolumeSource`; unless values are scaled, those that mean missing become labels."""
-        found = super().as_labels()
+        source = super().as_labels()
         if self.scale:
-            return found
-        return replace(found, missing=(), valid=(-math.inf, math.inf), stored=self.packed)
+            return source
+        return replace(source, missing=(), valid=(-math.inf, math.inf), stored=self.packed)
 
     def read_stored(self, index: Index) -> np.ndarray:
         """Reads a part; packed values are unpacked, missing ones become NaN."""
@@ -60,15 +60,15 @@ class Hdf5Source(VolumeSource):
         low, high = self.valid
         if self.scale is None and not self.missing and (low, high) == (-math.inf, math.inf):
             return data
-        found = data * np.float64(self.scale[0]) + self.scale[1] if self.scale else data
-        gaps = (data < low) | (data > high)
+        values = data * np.float64(self.scale[0]) + self.scale[1] if self.scale else data
+        is_missing = (data < low) | (data > high)
         for value in self.missing:
-            gaps |= data == value
+            is_missing |= data == value
         if not self.scale:
-            check_narrowed(self.path, data[~gaps])
-        found = np.asarray(found).astype(self.stored)
-        found[gaps] = np.nan
-        return found
+            check_narrowed(self.path, data[~is_missing])
+        values = np.asarray(values).astype(self.stored)
+        values[is_missing] = np.nan
+        return values
 
 
 @Format("HDF5", *_ENDINGS, options=("key", "axes"), library="h5py")
@@ -78,35 +78,35 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
     """
     import h5py
 
-    _check_kind(path)
+    _check_not_classic(path)
     with h5py.File(path, "r") as file:
         if key is not None:
             _check_files(path, file, key)
-        name = _choose(path, file, key)
+        name = _choose_dataset(path, file, key)
         _check_files(path, file, name)
-        data = file[name]
-        _check(path, name, data)
-        shape = tuple(int(n) for n in data.shape)
-        letters, steps, units, lost = _axes(f"{path}:/{name.strip('/')}", data, shape, axes)
-        info, values = _info(data, letters, shape), _values(data)
-        place, moments = place_named(letters, shape, steps, units)
-        sizes = np.ravel(data.attrs.get("element_size_um", ())).tolist()
-        if moments["unit"] is None and len(sizes) == 3:
-            place["spacing"], moments["unit"] = spacing_of(sizes[::-1], ["um"] * 3)
-    info = replace(info, **moments)
+        dataset = file[name]
+        _check_dataset(path, name, dataset)
+        shape = tuple(int(n) for n in dataset.shape)
+        axis_order, steps, units, lost = _axes(f"{path}:/{name.strip('/')}", dataset, shape, axes)
+        info, value_fields = _info(dataset, axis_order, shape), _value_fields(dataset)
+        placement, info_fields = place_named(axis_order, shape, steps, units)
+        element_size = np.ravel(dataset.attrs.get("element_size_um", ())).tolist()
+        if info_fields["unit"] is None and len(element_size) == 3:
+            placement["spacing"], info_fields["unit"] = spacing_of(element_size[::-1], ["um"] * 3)
+    info = replace(info, **info_fields)
     return Hdf5Source(
         path=path,
         shape=shape,
-        axes=letters,
+        axes=axis_order,
         name=name,
-        **values,
+        **value_fields,
         info=info,
         lost=tuple(lost),
-        **place,
+        **placement,
     )
 
 
-def _check_kind(path: str) -> None:
+def _check_not_classic(path: str) -> None:
     with open(path, "rb") as file:
         if re.match(rb"CDF[\1\2\5]", file.read(4)):
             raise ValueError(
@@ -115,97 +115,101 @@ def _check_kind(path: str) -> None:
             )
 
 
-def _check_files(path: str, file: Any, name: str, left: int = _MOST_LINKS) -> None:
+def _check_files(path: str, file: Any, name: str, links_left: int = _MAX_LINKS) -> None:
     """Raises ValueError if `name` leads to another file, by a link or by a virtual or external data
     set, that lies outside the folder of `path` or is no regular file, which may never end.
     """
     import h5py
 
-    if not left:
-        raise ValueError(f"{path}: {name} leads through more than {_MOST_LINKS} links")
-    at = file["/"] if name.startswith("/") else file
+    if not links_left:
+        raise ValueError(f"{path}: {name} leads through more than {_MAX_LINKS} links")
+    item = file["/"] if name.startswith("/") else file
     for part in name.split("/"):
-        link = at.get(part, getlink=True) if part not in ("", ".") else None
+        link = item.get(part, getlink=True) if part not in ("", ".") else None
         if isinstance(link, h5py.ExternalLink):
-            _check_other(path, link.filename, link.path, left)
+            _check_other_file(path, link.filename, link.path, links_left)
         elif isinstance(link, h5py.SoftLink):
-            _check_files(path, at, link.path, left - 1)
-        at = at.get(part) if link is not None else at
-        if not isinstance(at, h5py.Group):
+            _check_files(path, item, link.path, links_left - 1)
+        item = item.get(part) if link is not None else item
+        if not isinstance(item, h5py.Group):
             break
-    if isinstance(at, h5py.Dataset):
-        for other, *_ in at.external or ():
-            _check_other(path, other, None, left)
-        for source in at.virtual_sources() if at.is_virtual else ():
+    if isinstance(item, h5py.Dataset):
+        for file_name, *_ in item.external or ():
+            _check_other_file(path, file_name, None, links_left)
+        for source in item.virtual_sources() if item.is_virtual else ():
             if source.file_name != ".":
-                _check_other(path, source.file_name, source.dset_name, left)
+                _check_other_file(path, source.file_name, source.dset_name, links_left)
 
 
-def _check_other(path: str, other: str, name: str | None, left: int) -> None:
+def _check_other_file(path: str, file_name: str, name: str | None, links_left: int) -> None:
     """Checks a file that `path` refers to, and those that it refers to. It must lie in the folder
     of `path` or below. HDF5 may find it there, or from the working directory: both are checked.
     """
     import h5py
 
     folder = os.path.realpath(os.path.dirname(path))
-    for place in {os.path.join(folder, other), os.path.abspath(other)}:
-        if not os.path.lexists(place):
+    for candidate in {os.path.join(folder, file_name), os.path.abspath(file_name)}:
+        if not os.path.lexists(candidate):
             continue
-        check_beside(path, place)
+        check_beside(path, candidate)
         if name is not None:
-            with h5py.File(place, "r") as file:
-                _check_files(place, file, name, left - 1)
+            with h5py.File(candidate, "r") as file:
+                _check_files(candidate, file, name, links_left - 1)
 
 
-def _choose(path: str, file: Any, key: str | None) -> str:
+def _choose_dataset(path: str, file: Any, key: str | None) -> str:
     import h5py
 
     if key is not None:
         if isinstance(file.get(key), h5py.Dataset):
             return key
         if not isinstance(file.get(key), h5py.Group):
-            raise not_chosen(path, "data set", [*_volumes(file)], key, _KIND)
+            raise not_chosen(path, "data set", [*_volumes(file)], key, _VOLUME_QUALIFIER)
         names = {f"{key.rstrip('/')}/{name}": text for name, text in _volumes(file[key]).items()}
     else:
         names = _volumes(file)
     if len(names) == 1:
         return next(iter(names))
     listed = [f"{path}:/{name.strip('/')} {text}" for name, text in names.items()]
-    raise not_chosen(path, "data set", listed, None, _KIND)
+    raise not_chosen(path, "data set", listed, None, _VOLUME_QUALIFIER)
 
 
 def _volumes(group: Any) -> dict[str, str]:
     """Returns the numeric data sets of three or more axes: shape and dtype, as text, by name."""
     import h5py
 
-    found: dict[str, str] = {}
+    datasets: dict[str, str] = {}
 
     def visit(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and item.ndim >= 3 and item.dtype.kind in "biuf":
-            if len(found) < _MOST_SETS:
-                found[name] = f"({', '.join(map(str, item.shape))}) {item.dtype}"
+            if len(datasets) < _MAX_DATASETS:
+                datasets[name] = f"({', '.join(map(str, item.shape))}) {item.dtype}"
 
     group.visititems(visit)
-    return found
+    return datasets
 
 
-def _check(path: str, name: str, data: Any) -> None:
-    if data.dtype.kind not in "biuf":
-        raise ValueError(f"{path}: {name} must hold real numbers, got dtype {data.dtype}")
-    if data.ndim < 2:
-        raise ValueError(f"{path}: {name} must have 2 to 5 axes, got shape {data.shape}")
-    chunk = math.prod(data.chunks or (1,)) * data.dtype.itemsize
-    if chunk > _MOST_CHUNK:
-        raise ValueError(f"{path}: a chunk of {name} takes {chunk} bytes, more than {_MOST_CHUNK}")
-    if data.chunks is None and data.external is None and not data.is_virtual:
-        held = data.id.get_storage_size()
-        need = math.prod(data.shape) * data.dtype.itemsize
-        if held and held < need:
-            raise ValueError(f"{path}: {name} takes {need} bytes, the file has {held}")
+def _check_dataset(path: str, name: str, dataset: Any) -> None:
+    if dataset.dtype.kind not in "biuf":
+        raise ValueError(f"{path}: {name} must hold real numbers, got dtype {dataset.dtype}")
+    if dataset.ndim < 2:
+        raise ValueError(f"{path}: {name} must have 2 to 5 axes, got shape {dataset.shape}")
+    chunk_bytes = math.prod(dataset.chunks or (1,)) * dataset.dtype.itemsize
+    if chunk_bytes > _MAX_CHUNK_BYTES:
+        raise ValueError(
+            f"{path}: a chunk of {name} takes {chunk_bytes} bytes, more than {_MAX_CHUNK_BYTES}"
+        )
+    if dataset.chunks is None and dataset.external is None and not dataset.is_virtual:
+        stored_bytes = dataset.id.get_storage_size()
+        needed_bytes = math.prod(dataset.shape) * dataset.dtype.itemsize
+        if stored_bytes and stored_bytes < needed_bytes:
+            raise ValueError(
+                f"{path}: {name} takes {needed_bytes} bytes, the file has {stored_bytes}"
+            )
 
 
 def _axes(
-    where: str, data: Any, shape: tuple[int, ...], axes: str | None
+    label: str, dataset: Any, shape: tuple[int, ...], axes: str | None
 ) -> tuple[str, list[tuple[float, float] | None], list[str | None], list[str]]:
     """Returns letter, (step, first position) and unit of each axis, and metadata not kept."""
     rank = len(shape)
@@ -213,90 +217,98 @@ def _axes(
     steps: list[tuple[float, float] | None] = [None] * rank
     units: list[str | None] = [None] * rank
     lost: list[str] = []
-    for at, dimension in enumerate(data.dims):
+    for axis, dimension in enumerate(dataset.dims):
         scale = dimension[0] if len(dimension) else None
-        told = dict(scale.attrs) if scale is not None else {}
-        names[at] = str(dimension.label or (scale.name.rpartition("/")[2] if scale else ""))
-        kind = _text(told.get("axis")).lower() or _text(told.get("standard_name")).lower()
-        names[at] = kind if letter_of(kind) != "?" else names[at]
-        units[at] = _text(told.get("units")) or None
-        if _text(told.get("NAME")).startswith("This is a netCDF dimension but not"):
+        attributes = dict(scale.attrs) if scale is not None else {}
+        names[axis] = str(dimension.label or (scale.name.rpartition("/")[2] if scale else ""))
+        kind = (
+            _text(attributes.get("axis")).lower() or _text(attributes.get("standard_name")).lower()
+        )
+        names[axis] = kind if letter_of(kind) != "?" else names[axis]
+        units[axis] = _text(attributes.get("units")) or None
+        if _text(attributes.get("NAME")).startswith("This is a netCDF dimension but not"):
             continue
         if scale is not None:
-            _check_files(where, scale.file, scale.name or "/")
-        if shape[at] > _MOST_PLACES:
+            _check_files(label, scale.file, scale.name or "/")
+        if shape[axis] > _MAX_COORDINATES:
             continue
-        if scale is not None and scale.shape == shape[at : at + 1] and scale.dtype.kind in "iuf":
-            steps[at], even = even_steps(scale[()])
-            if not even:
-                lost.append(f"that coordinates along {names[at]} are not evenly spaced")
-    tags = _tags(data)
+        if (
+            scale is not None
+            and scale.shape == shape[axis : axis + 1]
+            and scale.dtype.kind in "iuf"
+        ):
+            steps[axis], is_even = even_steps(scale[()])
+            if not is_even:
+                lost.append(f"that coordinates along {names[axis]} are not evenly spaced")
+    tags = _tags(dataset)
     if len(tags) == rank:
         names = [str(tag.get("key", "")) for tag in tags]
-        for at, tag in enumerate(tags):
+        for axis, tag in enumerate(tags):
             size = tag.get("resolution")
-            steps[at] = (float(size), 0.0) if isinstance(size, (int, float)) and size > 0 else None
-    letters = named_axes(names, shape) if axes is None else None
-    if letters is None and axes is None and rank > 3 and set(shape[:-3]) == {1}:
-        letters = "-" * (rank - 3) + "zyx"
-    return letters or ask_axes(where, shape, axes), steps, units, lost
+            steps[axis] = (
+                (float(size), 0.0) if isinstance(size, (int, float)) and size > 0 else None
+            )
+    axis_order = named_axes(names, shape) if axes is None else None
+    if axis_order is None and axes is None and rank > 3 and set(shape[:-3]) == {1}:
+        axis_order = "-" * (rank - 3) + "zyx"
+    return axis_order or ask_axes(label, shape, axes), steps, units, lost
 
 
-def _tags(data: Any) -> list[Any]:
+def _tags(dataset: Any) -> list[Any]:
     """Returns ilastik's `axistags`, one for each axis."""
     try:
-        found = json.loads(_text(data.attrs.get("axistags")) or "{}")
+        axistags = json.loads(_text(dataset.attrs.get("axistags")) or "{}")
     except ValueError:
         return []
-    tags = found.get("axes") if isinstance(found, dict) else None
+    tags = axistags.get("axes") if isinstance(axistags, dict) else None
     return tags if isinstance(tags, list) and all(isinstance(tag, dict) for tag in tags) else []
 
 
-def _info(data: Any, letters: str, shape: tuple[int, ...]) -> ImageInfo:
+def _info(dataset: Any, axis_order: str, shape: tuple[int, ...]) -> ImageInfo:
     """Returns quantity and channel names from the attributes."""
-    quantity, name = (_text(data.attrs.get(key)) for key in ("units", "long_name"))
-    width = shape[letters.index("c")] if "c" in letters else 1
-    names = np.ravel(data.attrs.get("channel_names", ())).tolist()
+    quantity, name = (_text(dataset.attrs.get(key)) for key in ("units", "long_name"))
+    width = shape[axis_order.index("c")] if "c" in axis_order else 1
+    names = np.ravel(dataset.attrs.get("channel_names", ())).tolist()
     channels = tuple(ChannelInfo(name=_text(n)) for n in names) if len(names) == width else ()
     if not channels and width == 1 and name:
         channels = (ChannelInfo(name=name),)
     return ImageInfo(quantity=quantity or None, channels=channels)
 
 
-def _values(data: Any) -> dict[str, Any]:
+def _value_fields(dataset: Any) -> dict[str, Any]:
     """Returns the fields `packed`, `scale`, `missing`, `valid` and `stored` of a source, from the
     attributes.
 
     Source: CF Conventions 1.11, sections 2.5.1 and 8.1; `_Unsigned` is of the NetCDF Users' Guide,
         appendix A.
     """
-    packed, told = data.dtype, _text(data.attrs.get("_Unsigned")).lower()
-    whole, other_sign = data.dtype.kind in "iu", told in ("true", "false")
-    if whole and other_sign:
-        packed = np.dtype(packed.str.replace(packed.kind, "u" if told == "true" else "i"))
+    packed, unsigned = dataset.dtype, _text(dataset.attrs.get("_Unsigned")).lower()
+    is_integer, sign_stated = dataset.dtype.kind in "iu", unsigned in ("true", "false")
+    if is_integer and sign_stated:
+        packed = np.dtype(packed.str.replace(packed.kind, "u" if unsigned == "true" else "i"))
 
     def numbers(name: str) -> list[float]:
-        found = np.ravel(data.attrs.get(name, ()))
-        if whole and other_sign and found.dtype.kind in "iu":
-            found = found.astype(packed)
-        return found.tolist() if found.dtype.kind in "iuf" else []
+        values = np.ravel(dataset.attrs.get(name, ()))
+        if is_integer and sign_stated and values.dtype.kind in "iu":
+            values = values.astype(packed)
+        return values.tolist() if values.dtype.kind in "iuf" else []
 
-    def number(name: str, other: float) -> float:
-        found = numbers(name)
-        return found[0] if len(found) == 1 else other
+    def number(name: str, default: float) -> float:
+        values = numbers(name)
+        return values[0] if len(values) == 1 else default
 
     factor, offset = number("scale_factor", math.nan), number("add_offset", math.nan)
     scale = None
     if not math.isnan(factor) or not math.isnan(offset):
         scale = (1.0 if math.isnan(factor) else factor, 0.0 if math.isnan(offset) else offset)
-    gaps = {number("_FillValue", math.nan), *numbers("missing_value")}
-    missing = tuple(sorted(v for v in gaps if not math.isnan(v)))
+    missing_values = {number("_FillValue", math.nan), *numbers("missing_value")}
+    missing = tuple(sorted(v for v in missing_values if not math.isnan(v)))
     valid = numbers("valid_range")
     if len(valid) != 2:
         valid = [number("valid_min", -math.inf), number("valid_max", math.inf)]
-    if whole and valid[0] <= np.iinfo(packed).min:  # no value lies beyond
+    if is_integer and valid[0] <= np.iinfo(packed).min:  # no value lies beyond
         valid[0] = -math.inf
-    if whole and valid[1] >= np.iinfo(packed).max:
+    if is_integer and valid[1] >= np.iinfo(packed).max:
         valid[1] = math.inf
     stored = packed.str
     if scale or missing or valid != [-math.inf, math.inf]:

@@ -18,17 +18,17 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ...base.volume import check_extent
-from ..picture_size import jpeg_ends, picture_size
+from ..picture_size import has_jpeg_end, picture_size
 from ..resources import amount, memory_free
 from ..source import Index, VolumeSource, told_as
 from ..stores.ngff import is_zarr
 from ..tiff_info import check_pictures, opened_tiff
 from .format import Format
 
-_TIFF = (".tif", ".tiff")
+_TIFF_ENDINGS = (".tif", ".tiff")
 _CODECS = {".png": "png", ".jpg": "jpeg8", ".jpeg": "jpeg8", ".bmp": "bmp"}
-_HEAD = 1 << 20  # bytes of an image that hold its header
-_MOST_PIXELS = 2**31
+_HEADER_BYTES = 1 << 20  # at the start of an image that hold its header
+_MAX_PIXELS = 2**31
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,39 +40,43 @@ class SlicesSource(VolumeSource):
     def read_stored(self, index: Index) -> np.ndarray:
         files = self.files[index[0]]
         data = np.empty((len(files), *[s.stop - s.start for s in index[1:]]), self.stored)
-        for at, file in enumerate(files):
-            shape = _shape(file)
+        for z, file in enumerate(files):
+            shape = _header_shape(file)
             if shape[:2] != self.shape[1:3]:
-                raise self._differs(file, shape)
-            image = _image(file)
+                raise self._mismatch(file, shape)
+            image = _decode_image(file)
             if image.shape != self.shape[1:] or image.dtype != data.dtype:
-                raise self._differs(file, f"{image.shape} {image.dtype}")
-            data[at] = image[index[1:]]
+                raise self._mismatch(file, f"{image.shape} {image.dtype}")
+            data[z] = image[index[1:]]
         return data
 
-    def _differs(self, file: str, found: object) -> ValueError:
-        first = f"{self.shape[1:]} {np.dtype(self.stored)} of {Path(self.files[0]).name}"
-        return ValueError(f"{file}: {found} differs from {first}")
+    def _mismatch(self, file: str, actual: object) -> ValueError:
+        expected = f"{self.shape[1:]} {np.dtype(self.stored)} of {Path(self.files[0]).name}"
+        return ValueError(f"{file}: {actual} differs from {expected}")
 
 
 def _slices(path: str) -> list[Path]:
     """Returns the images in a folder; raises ValueError if they are of several kinds."""
     files: dict[str, list[Path]] = {}
     for file in Path(path).iterdir():
-        kind = file.suffix.lower()
-        if kind in (*_TIFF, *_CODECS) and not file.name.startswith(".") and file.is_file():
-            files.setdefault(_CODECS.get(kind, "tiff"), []).append(file)
+        ending = file.suffix.lower()
+        if (
+            ending in (*_TIFF_ENDINGS, *_CODECS)
+            and not file.name.startswith(".")
+            and file.is_file()
+        ):
+            files.setdefault(_CODECS.get(ending, "tiff"), []).append(file)
     if len(files) > 1:
-        kinds = " and ".join(f"{len(of)} {kind}" for kind, of in sorted(files.items()))
+        kinds = " and ".join(f"{len(group)} {kind}" for kind, group in sorted(files.items()))
         raise ValueError(f"{path}: images of several kinds: {kinds}; expected those of one stack")
     return next(iter(files.values()), [])
 
 
-def _is_folder(path: str) -> bool:
+def _is_image_folder(path: str) -> bool:
     return Path(path).is_dir() and not is_zarr(path)
 
 
-@Format("a folder of images", matches=_is_folder, library="imagecodecs")
+@Format("a folder of images", matches=_is_image_folder, library="imagecodecs")
 def open_folder(path: str) -> SlicesSource:
     """Opens a folder of slices, in natural order of their names."""
     files = _slices(path)
@@ -81,14 +85,14 @@ def open_folder(path: str) -> SlicesSource:
             f"{path}: no .tif, .tiff, .png, .jpg, .jpeg or .bmp slices in this folder, and no "
             "DICOM files"
         )
-    files.sort(key=lambda file: _natural(file.name))
-    shape, free = _shape(str(files[0])), memory_free()
-    check_extent(str(files[0]), shape, most=_MOST_PIXELS)
+    files.sort(key=lambda file: _natural_key(file.name))
+    shape, free = _header_shape(str(files[0])), memory_free()
+    check_extent(str(files[0]), shape, most=_MAX_PIXELS)
     if 8 * math.prod(shape) > free:
         raise ValueError(
             f"{files[0]}: {shape} pixels may take more than {amount(free)}, what is free"
         )
-    first = _image(str(files[0]))
+    first = _decode_image(str(files[0]))
     if first.ndim not in (2, 3):
         raise ValueError(f"{files[0]}: expected one slice (y, x) or (y, x, c), got {first.shape}")
     info = ImageInfo()
@@ -104,7 +108,7 @@ def open_folder(path: str) -> SlicesSource:
     )
 
 
-def _image(file: str) -> np.ndarray:
+def _decode_image(file: str) -> np.ndarray:
     """Decodes an image."""
     codec = _CODECS.get(Path(file).suffix.lower())
     if codec is None:
@@ -114,30 +118,30 @@ def _image(file: str) -> np.ndarray:
     import imagecodecs
 
     packed = Path(file).read_bytes()
-    if codec == "jpeg8" and not jpeg_ends(packed):
+    if codec == "jpeg8" and not has_jpeg_end(packed):
         raise ValueError(f"{file}: is truncated: the picture has no end")
     with told_as(ValueError, file, f"can't be read as {codec.rstrip('8').upper()}"):
-        found = np.asarray(getattr(imagecodecs, f"{codec}_decode")(packed))
-    return found[..., 0] if found.ndim == 3 and found.shape[2] == 1 else found
+        pixels = np.asarray(getattr(imagecodecs, f"{codec}_decode")(packed))
+    return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
 
 
-def _shape(file: str) -> tuple[Any, ...]:
+def _header_shape(file: str) -> tuple[Any, ...]:
     """Returns the shape from the header of an image: rows and columns first."""
-    if Path(file).suffix.lower() in _TIFF:
+    if Path(file).suffix.lower() in _TIFF_ENDINGS:
         with opened_tiff(file) as (tiff, _):
             return tuple(tiff.series[0].shape)
     with open(file, "rb") as stream:
-        head = stream.read(_HEAD)
-    if head[:2] == b"BM" and len(head) >= 26:
-        columns, rows = map(abs, struct.unpack_from("<ii", head, 18))
-    elif (size := picture_size(head)) is not None:
+        header = stream.read(_HEADER_BYTES)
+    if header[:2] == b"BM" and len(header) >= 26:
+        columns, rows = map(abs, struct.unpack_from("<ii", header, 18))
+    elif (size := picture_size(header)) is not None:
         columns, rows = size
     else:
         raise ValueError(f"{file}: is not a PNG, JPEG or BMP image")
     return (rows, columns)
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def _natural_key(name: str) -> list[tuple[int, str]]:
     """Returns a sorting key, by which s9 comes before s10."""
     return [
         (int(part), part) if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)

@@ -21,9 +21,9 @@ from ..packed import PackedSource
 from ..source import LPS_TO_RAS, ArraySource, VolumeSource, number_type, place_axes
 from .format import Format
 
-_LONG = {"MET_LONG": "i4", "MET_ULONG": "u4"}
-_MOST_HEADER = 1 << 20  # bytes
-_KEPT = {
+_LONG_TYPES = {"MET_LONG": "i4", "MET_ULONG": "u4"}
+_MAX_HEADER_BYTES = 1 << 20
+_KNOWN_FIELDS = {
     *("ObjectType", "NDims", "BinaryData", "BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
     *("CompressedData", "CompressedDataSize", "TransformMatrix", "Rotation", "Orientation"),
     *("Offset", "Position", "Origin", "CenterOfRotation", "AnatomicalOrientation", "DimSize"),
@@ -36,67 +36,71 @@ _KEPT = {
 @Format("MetaImage", ".mha", ".mhd")
 def open_metaimage(path: str) -> VolumeSource:
     """Opens an image of 2 to 4 axes, the fourth of which counts times."""
-    header, end = _header(path)
+    header, end = _read_header(path)
     rank = int(header.get("NDims", 3))
     shape = tuple(int(n) for n in header["DimSize"].split())
     if rank not in (2, 3, 4) or len(shape) != rank:
         raise ValueError(f"{path}: expected 2 to 4 dimensions, got {shape} of {rank}")
     name = header["ElementType"].removesuffix("_ARRAY")
-    kind = _LONG.get(name) or number_type(name.removeprefix("MET_"))
-    if kind is None:
+    number_dtype = _LONG_TYPES.get(name) or number_type(name.removeprefix("MET_"))
+    if number_dtype is None:
         raise ValueError(f"{path}: ElementType {header['ElementType']!r} is unknown")
     width = int(header.get("ElementNumberOfChannels", 1))
     if width < 1:
         raise ValueError(f"{path}: {width} channels")
     is_big = header.get("ElementByteOrderMSB", header.get("BinaryDataByteOrderMSB", "False"))
-    lost = [f"{name} of the header" for name in sorted(set(header) - _KEPT)][:8]
-    told: dict[str, Any] = {
+    lost = [f"{name} of the header" for name in sorted(set(header) - _KNOWN_FIELDS)][:8]
+    fields: dict[str, Any] = {
         "path": path,
-        "stored": np.dtype((">" if is_big.lower() == "true" else "<") + kind).str,
+        "stored": np.dtype((">" if is_big.lower() == "true" else "<") + number_dtype).str,
         "shape": ((width,) if width > 1 else ()) + shape,
         "info": _info(header, width, rank),
         "lost": tuple(lost),
-        **_placed(path, header, shape, width),
+        **_placement(path, header, shape, width),
     }
-    file = header["ElementDataFile"].strip()
-    if file.upper() == "LIST" or "%" in file:
-        raise ValueError(f"{path}: its slices are in separate files (ElementDataFile = {file})")
-    is_here = file.upper() == "LOCAL"
-    data = path if is_here else str(Path(path).parent / file)
-    offset = end if is_here else int(header.get("HeaderSize", 0))
+    data_name = header["ElementDataFile"].strip()
+    if data_name.upper() == "LIST" or "%" in data_name:
+        raise ValueError(
+            f"{path}: its slices are in separate files (ElementDataFile = {data_name})"
+        )
+    is_local = data_name.upper() == "LOCAL"
+    data_file = path if is_local else str(Path(path).parent / data_name)
+    offset = end if is_local else int(header.get("HeaderSize", 0))
     if header.get("BinaryData", "True").lower() != "true":
-        return PackedSource(file=data, offset=offset, codec="text", fortran=True, **told)
+        return PackedSource(file=data_file, offset=offset, codec="text", fortran=True, **fields)
     if header.get("CompressedData", "False").lower() == "true":
-        return PackedSource(file=data, offset=max(offset, 0), codec="zlib", fortran=True, **told)
+        return PackedSource(
+            file=data_file, offset=max(offset, 0), codec="zlib", fortran=True, **fields
+        )
     if offset < 0:  # the numbers are at the end of the file
-        need = math.prod(told["shape"]) * np.dtype(kind).itemsize
-        offset = max(0, os.stat(data).st_size - need)
-    return ArraySource(file=data, offset=offset, fortran=True, **told)
+        needed_bytes = math.prod(fields["shape"]) * np.dtype(number_dtype).itemsize
+        offset = max(0, os.stat(data_file).st_size - needed_bytes)
+    return ArraySource(file=data_file, offset=offset, fortran=True, **fields)
 
 
-def _header(path: str) -> tuple[dict[str, str], int]:
+def _read_header(path: str) -> tuple[dict[str, str], int]:
     """Returns the header's values by name, up to ElementDataFile, and the offset of its end."""
     with open(path, "rb") as file:
-        text = file.read(_MOST_HEADER)
-    found: dict[str, str] = {}
-    at = 0
-    while at < len(text):
-        end = text.find(b"\n", at)
+        text = file.read(_MAX_HEADER_BYTES)
+    fields: dict[str, str] = {}
+    position = 0
+    while position < len(text):
+        end = text.find(b"\n", position)
         end = len(text) if end < 0 else end
-        match = re.fullmatch(r"\s*(\w+)\s*[=:]\s*(.*?)\s*", text[at:end].decode("latin-1"))
-        at = end + 1
+        match = re.fullmatch(r"\s*(\w+)\s*[=:]\s*(.*?)\s*", text[position:end].decode("latin-1"))
+        position = end + 1
         if match is None:
             break
-        found[match[1]] = match[2]
+        fields[match[1]] = match[2]
         if match[1] == "ElementDataFile":
             for name in ("DimSize", "ElementType"):
-                if name not in found:
+                if name not in fields:
                     raise ValueError(f"the header has no {name}")
-            return found, at
+            return fields, position
     raise ValueError("no MetaImage: the header has no ElementDataFile")
 
 
-def _placed(
+def _placement(
     path: str, header: dict[str, str], shape: tuple[int, ...], width: int
 ) -> dict[str, Any]:
     """Returns axes and position of the array; its first axis counts channels, if it has several."""
@@ -118,9 +122,9 @@ def _placed(
     affine[:space, :space] = (matrix * steps)[:space, :space]
     affine[:space, 3] = 0.0 if offset is None else offset[:space]
     spatial = (*shape[:3], 1)[:3]
-    place = place_axes(path, LPS_TO_RAS @ affine, spatial)
-    place["axes"] = "c" * (width > 1) + place["axes"][:space] + "t" * (rank == 4)
-    return place
+    placement = place_axes(path, LPS_TO_RAS @ affine, spatial)
+    placement["axes"] = "c" * (width > 1) + placement["axes"][:space] + "t" * (rank == 4)
+    return placement
 
 
 def _info(header: dict[str, str], width: int, rank: int) -> ImageInfo:

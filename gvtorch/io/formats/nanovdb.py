@@ -29,16 +29,16 @@ from ..sparse_grid import (
 )
 from .format import Format, choose
 
-_FILES = (b"NanoVDB0", b"NanoVDB2")
-_GRIDS = (b"NanoVDB0", b"NanoVDB1")
+_FILE_MAGICS = (b"NanoVDB0", b"NanoVDB2")
+_GRID_MAGICS = (b"NanoVDB0", b"NanoVDB1")
 _VERSION = 32
 _CODECS = {0: "none", 1: "zlib", 2: "blosc"}
 _CLASSES = {1: "level set", 2: "fog volume", 3: "staggered"}
-_TYPE, _TREE, _ROOT = 636, 672, 736  # offsets in a grid of its type, its tree and its root
-_COUNTS = _TREE + 32  # offset of the numbers of leaves, lower and upper nodes
-_META = struct.Struct("<4Q2I6d6i3d8I2HI")
-_MOST_GRIDS, _MOST_NAME = 4096, 4096
-_ALIGN = 32
+_TYPE_OFFSET, _TREE_OFFSET, _ROOT_OFFSET = 636, 672, 736  # in a grid
+_COUNTS_OFFSET = _TREE_OFFSET + 32  # offset of the numbers of leaves, lower and upper nodes
+_METADATA = struct.Struct("<4Q2I6d6i3d8I2HI")
+_MAX_GRIDS, _MAX_NAME_BYTES = 4096, 4096
+_ALIGNMENT = 32
 # By number of the type: its name, dtype of a number, numbers per value.
 _TYPES: dict[int, tuple[str, str, int]] = {
     1: ("float", "<f4", 1),
@@ -61,310 +61,340 @@ _TYPES: dict[int, tuple[str, str, int]] = {
     25: ("Vec3u16", "<u2", 3),
     26: ("uint8", "|u1", 1),
 }
-_REFUSED = {
+_REFUSED_TYPES = {
     9: "Half", 12: "RGBA8", 19: "Index", 20: "OnIndex", 21: "IndexMask", 22: "OnIndexMask",
     23: "PointIndex",
 }  # fmt: skip
-_BITS = {"Fp4": 4, "Fp8": 8, "Fp16": 16}
+_CODE_BITS = {"Fp4": 4, "Fp8": 8, "Fp16": 16}
 
 
-class Head(NamedTuple):
+class GridMetadata(NamedTuple):
     """The metadata of a grid, and where it lies in its file."""
 
     name: str
-    kind: int
+    type_code: int
     grid_class: int
     codec: str
     size: int  # bytes of the grid
     offset: int  # in the file
-    packed: int  # bytes in the file
+    packed_size: int  # bytes in the file
 
 
 @Format("NanoVDB", ".nvdb", options=("key",))
 def open_nanovdb(path: str, key: str | None = None) -> SparseSource:
     """Opens the grid `key` (its name or number); "density" or the first, if left out."""
-    heads = _heads(path)
-    number, lost = choose(path, "grid", [head.name for head in heads], key, preferred="density")
-    head = heads[number]
-    if head.kind not in _TYPES:
-        kind = _REFUSED.get(head.kind, f"type {head.kind}")
+    grids = _list_grids(path)
+    chosen, lost = choose(path, "grid", [grid.name for grid in grids], key, preferred="density")
+    grid = grids[chosen]
+    if grid.type_code not in _TYPES:
+        type_name = _REFUSED_TYPES.get(grid.type_code, f"type {grid.type_code}")
         raise ValueError(
-            f"{path}: grid {head.name!r} holds {kind}, not a grid of numbers that can be read"
+            f"{path}: grid {grid.name!r} holds {type_name}, not a grid of numbers that can be read"
         )
-    _, dtype, width = _TYPES[head.kind]
-    affine, low, high = _place(_content(path, head, _ROOT + 24), head)
-    held = head.size if head.codec != "none" else 0
+    _, dtype, width = _TYPES[grid.type_code]
+    affine, low, high = _placement(_read_grid(path, grid, _ROOT_OFFSET + 24), grid)
+    grid_bytes = grid.size if grid.codec != "none" else 0
     return SparseSource.of(
-        *(path, head.name, _CLASSES.get(head.grid_class, ""), dtype, width, low, high, affine),
+        *(path, grid.name, _CLASSES.get(grid.grid_class, ""), dtype, width, low, high, affine),
         grid_type=NanoGrid,
-        number=number,
-        held=held,
+        number=chosen,
+        held=grid_bytes,
         lost=lost,
     )
 
 
-def _heads(path: str) -> list[Head]:
+def _list_grids(path: str) -> list[GridMetadata]:
     """Returns the metadata of all grids of a file."""
-    found: list[Head] = []
+    grids: list[GridMetadata] = []
     size = os.stat(path).st_size
     with open(path, "rb") as file:
         while file.tell() < size:
             magic, version, count, _ = struct.unpack("<8sIHH", file.read(16))
-            if magic not in _FILES or version >> 21 != _VERSION:
-                told = f"of version {version >> 21}" if magic in _FILES else repr(magic)
-                raise ValueError(f"begins a segment {told}; expected NanoVDB of version {_VERSION}")
-            for head in [_head(file) for _ in range(count)]:
-                at = file.tell()
-                packed = _packed(file, head, size)
-                found.append(head._replace(offset=at, packed=packed))
-                if packed > size - at:
+            if magic not in _FILE_MAGICS or version >> 21 != _VERSION:
+                actual = f"of version {version >> 21}" if magic in _FILE_MAGICS else repr(magic)
+                raise ValueError(
+                    f"begins a segment {actual}; expected NanoVDB of version {_VERSION}"
+                )
+            for grid in [_read_metadata(file) for _ in range(count)]:
+                offset = file.tell()
+                packed_size = _packed_size(file, grid, size)
+                grids.append(grid._replace(offset=offset, packed_size=packed_size))
+                if packed_size > size - offset:
                     raise ValueError(
-                        f"grid {head.name!r} takes {packed} bytes, the file has {size - at}"
+                        f"grid {grid.name!r} takes {packed_size} bytes, "
+                        f"the file has {size - offset}"
                     )
-                file.seek(at + packed)
-            if len(found) > _MOST_GRIDS or not count:
-                raise ValueError(f"has {len(found)} grids; expected 1 to {_MOST_GRIDS}")
-    return found
+                file.seek(offset + packed_size)
+            if len(grids) > _MAX_GRIDS or not count:
+                raise ValueError(f"has {len(grids)} grids; expected 1 to {_MAX_GRIDS}")
+    return grids
 
 
-def _head(file: Any) -> Head:
-    told = _META.unpack(file.read(_META.size))
-    length, codec = told[21], told[29]
-    if not 0 < length <= _MOST_NAME or codec not in _CODECS:
-        raise ValueError(f"a grid's head is damaged: a name of {length} bytes, codec {codec}")
-    name = file.read(length).rstrip(b"\0").decode("utf-8", "replace")
-    return Head(name, told[4], told[5], _CODECS[codec], told[0], 0, told[1])
+def _read_metadata(file: Any) -> GridMetadata:
+    fields = _METADATA.unpack(file.read(_METADATA.size))
+    name_bytes, codec = fields[21], fields[29]
+    if not 0 < name_bytes <= _MAX_NAME_BYTES or codec not in _CODECS:
+        raise ValueError(f"a grid's head is damaged: a name of {name_bytes} bytes, codec {codec}")
+    name = file.read(name_bytes).rstrip(b"\0").decode("utf-8", "replace")
+    return GridMetadata(name, fields[4], fields[5], _CODECS[codec], fields[0], 0, fields[1])
 
 
-def _packed(file: Any, head: Head, end: int) -> int:
+def _packed_size(file: Any, grid: GridMetadata, end: int) -> int:
     """Returns the bytes that a grid takes in the file. For packed grids they are counted, because
     some writers state them with the length before each part, some without.
     """
-    if head.codec == "none":
-        return head.packed
+    if grid.codec == "none":
+        return grid.packed_size
     count, size = 0, 0
-    while size < head.size:
+    while size < grid.size:
         (length,) = struct.unpack("<Q", file.read(8))
-        if head.codec == "zlib":
+        if grid.codec == "zlib":
             return 8 + length
-        part = file.read(16)
-        if not 16 <= length <= end or (told := int.from_bytes(part[4:8], "little")) < 1:
-            raise ValueError(f"grid {head.name!r} has a packed part of {length} bytes")
+        blosc_header = file.read(16)
+        if not 16 <= length <= end or (unpacked := int.from_bytes(blosc_header[4:8], "little")) < 1:
+            raise ValueError(f"grid {grid.name!r} has a packed part of {length} bytes")
         file.seek(length - 16, os.SEEK_CUR)
-        count, size = count + 8 + length, size + told
+        count, size = count + 8 + length, size + unpacked
     return count
 
 
-def _content(path: str, head: Head, most: int = 0) -> Any:
-    """Returns a grid's bytes, mapped or unpacked; if `most` is given, at least its first `most`."""
+def _read_grid(path: str, grid: GridMetadata, min_bytes: int = 0) -> Any:
+    """Returns a grid's bytes, mapped or unpacked: all, or at least the first `min_bytes`."""
     with open(path, "rb") as file:
-        if head.codec == "none":
-            if head.size > head.packed or head.size < _ROOT:
-                raise ValueError(f"{head.size} bytes of a grid expected, {head.packed} found")
+        if grid.codec == "none":
+            if grid.size > grid.packed_size or grid.size < _ROOT_OFFSET:
+                raise ValueError(f"{grid.size} bytes of a grid expected, {grid.packed_size} found")
             mapped = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-            return mapped[head.offset : head.offset + head.size]
-        file.seek(head.offset)
+            return mapped[grid.offset : grid.offset + grid.size]
+        file.seek(grid.offset)
         parts, size = [], 0
-        while size < (most or head.size):
+        while size < (min_bytes or grid.size):
             (length,) = struct.unpack("<Q", file.read(8))
             part = file.read(length)
-            if head.codec == "zlib":
-                if most:
-                    return zlib.decompressobj().decompress(part, most)
-                return unpack_block("zlib", part, head.size)
-            if most:
-                parts.append(blosc_begin(part, most - size))
+            if grid.codec == "zlib":
+                if min_bytes:
+                    return zlib.decompressobj().decompress(part, min_bytes)
+                return unpack_block("zlib", part, grid.size)
+            if min_bytes:
+                parts.append(blosc_begin(part, min_bytes - size))
             else:
-                told = int.from_bytes(part[4:8], "little")
-                parts.append(unpack_block("blosc", part, min(told, head.size - size)))
+                unpacked = int.from_bytes(part[4:8], "little")
+                parts.append(unpack_block("blosc", part, min(unpacked, grid.size - size)))
             size += len(parts[-1])
         return b"".join(parts)
 
 
-def _place(grid: Any, head: Head) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _placement(data: Any, grid: GridMetadata) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns (4, 4) from voxels to the world, (3,) the first active voxel and (3,) one past the
     last, from the header and the root of a grid.
     """
-    if len(grid) < _ROOT + 24 or bytes(grid[:8]) not in _GRIDS:
+    if len(data) < _ROOT_OFFSET + 24 or bytes(data[:8]) not in _GRID_MAGICS:
         raise ValueError("a grid does not begin as grids of NanoVDB do")
-    (kind,) = struct.unpack_from("<I", grid, _TYPE)
-    if kind != head.kind:
-        raise ValueError(f"grid {head.name!r} is of type {kind}, its file declares {head.kind}")
+    (type_code,) = struct.unpack_from("<I", data, _TYPE_OFFSET)
+    if type_code != grid.type_code:
+        raise ValueError(
+            f"grid {grid.name!r} is of type {type_code}, its file declares {grid.type_code}"
+        )
     affine = np.eye(4)
-    affine[:3, :3] = np.frombuffer(grid, "<f8", 9, 384).reshape(3, 3)
-    affine[:3, 3] = np.frombuffer(grid, "<f8", 3, 528)
-    if struct.unpack_from("<q", grid, _TREE + 24)[0] != _ROOT - _TREE:
+    affine[:3, :3] = np.frombuffer(data, "<f8", 9, 384).reshape(3, 3)
+    affine[:3, 3] = np.frombuffer(data, "<f8", 3, 528)
+    if struct.unpack_from("<q", data, _TREE_OFFSET + 24)[0] != _ROOT_OFFSET - _TREE_OFFSET:
         raise ValueError("a grid's root does not follow its head")
-    box = np.frombuffer(grid, "<i4", 6, _ROOT).astype(np.int64)
+    box = np.frombuffer(data, "<i4", 6, _ROOT_OFFSET).astype(np.int64)
     return affine, box[:3], box[3:] + 1
 
 
 class NodeFormat(NamedTuple):
     """The layout of the nodes of grids with one type of values: offsets and sizes in bytes."""
 
-    tiles: int  # offset of the tiles in the root
-    tile: int  # size of a tile
-    tile_value: int  # offset of the value in a tile
-    entry: int  # size of an entry of an upper or lower node
-    entries: tuple[int, int]  # offset of the entries in an upper, in a lower node
-    values: int  # offset of the voxels in a leaf
-    leaf: int  # size of a leaf; of FpN: without its codes
+    tiles_start: int  # offset of the tiles in the root
+    tile_size: int  # size of a tile
+    value_offset: int  # offset of the value in a tile
+    entry_size: int  # size of an entry of an upper or lower node
+    entries_start: tuple[int, int]  # offset of the entries in an upper, in a lower node
+    voxels_start: int  # offset of the voxels in a leaf
+    leaf_size: int  # size of a leaf; of FpN: without its codes
 
     @classmethod
     def of(cls, kind: str, dtype: str, width: int) -> NodeFormat:
         """Computes the layout that a compiler gives to the structs of a type of values: smallest,
         largest (in a root after the background), then mean and deviation.
         """
-        item = np.dtype(dtype).itemsize
-        value = item * width
-        mean = item if dtype == "|b1" else 8 if item == 8 else 4
+        item_bytes = np.dtype(dtype).itemsize
+        value_bytes = item_bytes * width
+        mean_bytes = item_bytes if dtype == "|b1" else 8 if item_bytes == 8 else 4
 
-        def behind(start: int, values: int) -> int:
+        def behind(start: int, value_count: int) -> int:
             """Returns the offset behind values, mean and deviation, a multiple of 32 bytes."""
-            return _up(_up(_up(start, item) + values * value, mean) + 2 * mean, _ALIGN)
+            return _round_up(
+                _round_up(_round_up(start, item_bytes) + value_count * value_bytes, mean_bytes)
+                + 2 * mean_bytes,
+                _ALIGNMENT,
+            )
 
-        at = _up(20, item)
-        plain = {"Mask": 0, "bool": 64, "FpN": 0}
-        codes = 64 * _BITS[kind] if kind in _BITS else plain.get(kind, VOXELS * value)
-        values = 16 if kind == "Mask" else 96 if kind in _BITS or kind == "FpN" else behind(80, 2)
+        value_offset = _round_up(20, item_bytes)
+        fixed_bytes = {"Mask": 0, "bool": 64, "FpN": 0}
+        voxel_bytes = (
+            64 * _CODE_BITS[kind]
+            if kind in _CODE_BITS
+            else fixed_bytes.get(kind, VOXELS * value_bytes)
+        )
+        voxels_start = (
+            16 if kind == "Mask" else 96 if kind in _CODE_BITS or kind == "FpN" else behind(80, 2)
+        )
         return cls(
-            tiles=behind(28, 3),
-            tile=_up(at + value, _ALIGN),
-            tile_value=at,
-            entry=_up(max(value, 8), 8),
-            entries=(behind(32 + 2 * 4096, 2), behind(32 + 2 * 512, 2)),
-            values=values,
-            leaf=96 if kind == "Mask" else _up(values + codes, _ALIGN),
+            tiles_start=behind(28, 3),
+            tile_size=_round_up(value_offset + value_bytes, _ALIGNMENT),
+            value_offset=value_offset,
+            entry_size=_round_up(max(value_bytes, 8), 8),
+            entries_start=(behind(32 + 2 * 4096, 2), behind(32 + 2 * 512, 2)),
+            voxels_start=voxels_start,
+            leaf_size=96 if kind == "Mask" else _round_up(voxels_start + voxel_bytes, _ALIGNMENT),
         )
 
 
-def _up(n: int, step: int) -> int:
-    return -(-n // step) * step
+def _round_up(n: int, multiple: int) -> int:
+    return -(-n // multiple) * multiple
 
 
 @dataclass(kw_only=True)
 class NanoGrid(SparseGrid):
-    """A grid in memory; `places` are the offsets of the nodes in bytes."""
+    """A grid in memory; `node_offsets` are the offsets of the nodes in bytes."""
 
     layout: NodeFormat
 
     @classmethod
     def read(cls, path: str, number: int) -> NanoGrid:
-        head = _heads(path)[number]
-        data, (kind, dtype, width) = _content(path, head), _TYPES[head.kind]
+        grid = _list_grids(path)[number]
+        data, (kind, dtype, width) = _read_grid(path, grid), _TYPES[grid.type_code]
         layout = NodeFormat.of(kind, dtype, width)
-        (count,) = struct.unpack_from("<I", data, _ROOT + 24)
+        (count,) = struct.unpack_from("<I", data, _ROOT_OFFSET + 24)
         check_roots(count)
         fields = {
             "names": ["key", "child", "value"],
             "formats": ["<u8", "<i8", (dtype, (width,))],
-            "offsets": [0, 8, layout.tile_value],
-            "itemsize": layout.tile,
+            "offsets": [0, 8, layout.value_offset],
+            "itemsize": layout.tile_size,
         }
-        table = np.ndarray((count,), np.dtype(fields), data, _ROOT + layout.tiles)  # type: ignore[call-overload]
-        keys = table["key"][:, None] >> np.array((42, 21, 0), np.uint64)
+        root_table = np.ndarray((count,), np.dtype(fields), data, _ROOT_OFFSET + layout.tiles_start)  # type: ignore[call-overload]
+        keys = root_table["key"][:, None] >> np.array((42, 21, 0), np.uint64)
         keys[:, 1:] &= np.uint64(2**21 - 1)
         if (keys >> np.uint64(20)).any():
             raise ValueError("a key of the root is not a voxel's position")
         corners = (keys.astype(np.int64) << 44 >> 44) * 4096  # 20 bits, signed
-        inner = table["child"] != 0
-        found = [_checked(_ROOT + table["child"][inner], len(data), layout.entries[0])]
-        origins = [corners[inner]]
+        has_child = root_table["child"] != 0
+        node_offsets = [
+            _checked_offsets(
+                _ROOT_OFFSET + root_table["child"][has_child], len(data), layout.entries_start[0]
+            )
+        ]
+        origins = [corners[has_child]]
         for level in (0, 1):
-            least = layout.entries[1] if level == 0 else layout.leaf
-            below = list(_children(data, layout, level, found[-1], origins[-1]))
-            none = np.zeros((0, 3), np.int64)
-            places = np.concatenate([none[:, 0], *(part for part, _ in below)])
-            origins.append(np.concatenate([none, *(corners for _, corners in below)]))
-            found.append(_checked(places, len(data), least))
+            node_bytes = layout.entries_start[1] if level == 0 else layout.leaf_size
+            children = list(_children(data, layout, level, node_offsets[-1], origins[-1]))
+            empty = np.zeros((0, 3), np.int64)
+            child_offsets = np.concatenate([empty[:, 0], *(part for part, _ in children)])
+            origins.append(np.concatenate([empty, *(part for _, part in children)]))
+            node_offsets.append(_checked_offsets(child_offsets, len(data), node_bytes))
         sizes = (
-            layout.entries[0] + COUNTS[0] ** 3 * layout.entry,
-            layout.entries[1] + COUNTS[1] ** 3 * layout.entry,
-            layout.leaf,
+            layout.entries_start[0] + COUNTS[0] ** 3 * layout.entry_size,
+            layout.entries_start[1] + COUNTS[1] ** 3 * layout.entry_size,
+            layout.leaf_size,
         )
-        _check_apart(found, sizes)
-        counts, told = [len(places) for places in found], struct.unpack_from("<3I", data, _COUNTS)
-        if counts != [*told[::-1]]:
-            raise ValueError(f"the tree has {counts[::-1]} nodes, leaves first; it declares {told}")
+        _check_apart(node_offsets, sizes)
+        counts, declared = (
+            [len(part) for part in node_offsets],
+            struct.unpack_from("<3I", data, _COUNTS_OFFSET),
+        )
+        if counts != [*declared[::-1]]:
+            raise ValueError(
+                f"the tree has {counts[::-1]} nodes, leaves first; it declares {declared}"
+            )
         return cls(
             dtype=np.dtype(dtype),
-            background=np.ndarray((width,), dtype, data, _ROOT + _up(28, np.dtype(dtype).itemsize)),
+            background=np.ndarray(
+                (width,), dtype, data, _ROOT_OFFSET + _round_up(28, np.dtype(dtype).itemsize)
+            ),
             origins=(origins[0], origins[1], origins[2]),
-            root_places=corners[~inner],
-            root_values=table["value"][~inner],
+            root_origins=corners[~has_child],
+            root_values=root_table["value"][~has_child],
             data=data,
             kind=kind,
             layout=layout,
-            places=(found[0], found[1], found[2]),
+            node_offsets=(node_offsets[0], node_offsets[1], node_offsets[2]),
         )
 
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
-        n, place = COUNTS[level], int(self.places[level][number])
-        width, item = len(self.background), self.dtype.itemsize
-        at = place + self.layout.entries[level]
-        values = np.ndarray((n**3, width), self.dtype, self.data, at, (self.layout.entry, item))
-        is_child = bits(self.data, place + 32 + n**3 // 8, n**3)
+        n, offset = COUNTS[level], int(self.node_offsets[level][number])
+        width, item_bytes = len(self.background), self.dtype.itemsize
+        values_start = offset + self.layout.entries_start[level]
+        values = np.ndarray(
+            (n**3, width), self.dtype, self.data, values_start, (self.layout.entry_size, item_bytes)
+        )
+        is_child = bits(self.data, offset + 32 + n**3 // 8, n**3)
         return values.reshape(n, n, n, width), ~is_child.reshape(n, n, n)
 
     def leaves(self, numbers: np.ndarray) -> np.ndarray:
         out = np.empty((len(numbers), VOXELS, len(self.background)), self.dtype)
-        for at, place in enumerate(self.places[2][numbers].tolist()):
-            out[at] = self._voxels(place)
+        for row, offset in enumerate(self.node_offsets[2][numbers].tolist()):
+            out[row] = self._voxels(offset)
         return out
 
-    def _voxels(self, place: int) -> np.ndarray:
+    def _voxels(self, offset: int) -> np.ndarray:
         """Returns (512, c) the voxels of a leaf."""
-        begin = place + self.layout.values
+        start = offset + self.layout.voxels_start
         if self.kind in ("Mask", "bool"):
-            return bits(self.data, begin, VOXELS)[:, None]
-        if self.kind in _BITS or self.kind == "FpN":
-            low, step = np.frombuffer(self.data, "<f4", 2, place + 80)
-            wide = _BITS.get(self.kind) or 1 << (self.data[place + 15] >> 5)
-            return (_codes(self.data, begin, wide) * step + low)[:, None]
+            return bits(self.data, start, VOXELS)[:, None]
+        if self.kind in _CODE_BITS or self.kind == "FpN":
+            low, step = np.frombuffer(self.data, "<f4", 2, offset + 80)
+            code_bits = _CODE_BITS.get(self.kind) or 1 << (self.data[offset + 15] >> 5)
+            return (_codes(self.data, start, code_bits) * step + low)[:, None]
         width = len(self.background)
-        return np.frombuffer(self.data, self.dtype, VOXELS * width, begin).reshape(VOXELS, width)
+        return np.frombuffer(self.data, self.dtype, VOXELS * width, start).reshape(VOXELS, width)
 
 
-def _codes(data: Any, at: int, bits: int) -> np.ndarray:
-    """Returns (512,) float32, numbers of `bits` bits each, the lowest bits of a byte first."""
-    if bits > 16:
-        raise ValueError(f"a leaf has numbers of {bits} bits")
-    if bits == 16:
-        return np.frombuffer(data, "<u2", VOXELS, at).astype(np.float32)
-    packed = np.frombuffer(data, "u1", VOXELS * bits // 8, at)
-    shifts = np.arange(0, 8, bits, dtype=np.uint8)
-    return ((packed[:, None] >> shifts) & (2**bits - 1)).reshape(-1).astype(np.float32)
+def _codes(data: Any, offset: int, code_bits: int) -> np.ndarray:
+    """Returns (512,) float32, numbers of `code_bits` bits each, the lowest bits of a byte first."""
+    if code_bits > 16:
+        raise ValueError(f"a leaf has numbers of {code_bits} bits")
+    if code_bits == 16:
+        return np.frombuffer(data, "<u2", VOXELS, offset).astype(np.float32)
+    packed = np.frombuffer(data, "u1", VOXELS * code_bits // 8, offset)
+    shifts = np.arange(0, 8, code_bits, dtype=np.uint8)
+    return ((packed[:, None] >> shifts) & (2**code_bits - 1)).reshape(-1).astype(np.float32)
 
 
 def _children(
-    data: Any, layout: NodeFormat, level: int, places: np.ndarray, origins: np.ndarray
+    data: Any, layout: NodeFormat, level: int, node_offsets: np.ndarray, origins: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yields for each node the offsets of its children, and their first voxels."""
     n, side = COUNTS[level], COUNTS[level + 1] * (8 if level == 0 else 1)
-    for place, origin in zip(places.tolist(), origins, strict=True):
-        which = np.flatnonzero(bits(data, place + 32 + n**3 // 8, n**3))
-        steps = np.ndarray((n**3,), "<i8", data, place + layout.entries[level], (layout.entry,))
-        corner = np.stack(np.unravel_index(which, (n, n, n)), 1)
-        yield place + steps[which], origin + corner * side
+    for offset, origin in zip(node_offsets.tolist(), origins, strict=True):
+        child_entries = np.flatnonzero(bits(data, offset + 32 + n**3 // 8, n**3))
+        child_steps = np.ndarray(
+            (n**3,), "<i8", data, offset + layout.entries_start[level], (layout.entry_size,)
+        )
+        entry_positions = np.stack(np.unravel_index(child_entries, (n, n, n)), 1)
+        yield offset + child_steps[child_entries], origin + entry_positions * side
 
 
-def _checked(places: np.ndarray, size: int, least: int) -> np.ndarray:
+def _checked_offsets(offsets: np.ndarray, size: int, node_bytes: int) -> np.ndarray:
     """Returns the offsets of nodes; raises ValueError unless all differ, are aligned, and have
-    `least` bytes behind them.
+    `node_bytes` bytes behind them.
     """
-    if len(places) and not (places.min() >= _ROOT and places.max() <= size - least):
+    if len(offsets) and not (offsets.min() >= _ROOT_OFFSET and offsets.max() <= size - node_bytes):
         raise ValueError(f"a node lies outside of the grid's {size} bytes")
-    if (places % _ALIGN).any():
-        raise ValueError(f"a node lies at no multiple of {_ALIGN} bytes")
-    if len(np.unique(places)) != len(places):
+    if (offsets % _ALIGNMENT).any():
+        raise ValueError(f"a node lies at no multiple of {_ALIGNMENT} bytes")
+    if len(np.unique(offsets)) != len(offsets):
         raise ValueError("several positions of the tree share a node")
-    return places
+    return offsets
 
 
-def _check_apart(places: Sequence[np.ndarray], sizes: Sequence[int]) -> None:
+def _check_apart(offsets: Sequence[np.ndarray], sizes: Sequence[int]) -> None:
     """Raises ValueError if nodes overlap; by level: their offsets, and the bytes of one node."""
-    begin = np.concatenate(places)
-    order = np.argsort(begin)
-    end = begin + np.repeat(sizes, [len(part) for part in places])
-    if (end[order][:-1] > begin[order][1:]).any():
+    start = np.concatenate(offsets)
+    order = np.argsort(start)
+    end = start + np.repeat(sizes, [len(part) for part in offsets])
+    if (end[order][:-1] > start[order][1:]).any():
         raise ValueError("nodes of the tree overlap")

@@ -24,20 +24,20 @@ class Nd2Source(VolumeSource):
     def read_stored(self, index: Index) -> np.ndarray:
         import nd2
 
-        times, places, *inside = index
+        times, slices, *plane_index = index
         out = np.empty([s.stop - s.start for s in index], self.stored)
         with nd2.ND2File(self.path) as file:
-            numbers = {
-                (at.get("T", 0), at.get("Z", 0)): number
-                for number, at in enumerate(file.loop_indices)
-                if at.get("P", 0) == self.position
+            frame_numbers = {
+                (loop_index.get("T", 0), loop_index.get("Z", 0)): number
+                for number, loop_index in enumerate(file.loop_indices)
+                if loop_index.get("P", 0) == self.position
             }
             for t, z in itertools.product(
-                range(times.start, times.stop), range(places.start, places.stop)
+                range(times.start, times.stop), range(slices.start, slices.stop)
             ):
-                frame = np.asarray(file.read_frame(numbers[t, z] if numbers else 0))
-                part = frame.reshape(self.shape[2:])[tuple(inside)]
-                out[t - times.start, z - places.start] = part
+                frame = np.asarray(file.read_frame(frame_numbers[t, z] if frame_numbers else 0))
+                part = frame.reshape(self.shape[2:])[tuple(plane_index)]
+                out[t - times.start, z - slices.start] = part
         return out
 
 
@@ -48,19 +48,21 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
 
     with nd2.ND2File(path) as file:
         sizes: Mapping[str, int] = dict(file.sizes)
-        more = {n: size for n, size in sizes.items() if n not in "TPZCYXS" and size > 1}
-        if more:
-            raise ValueError(f"{path}: has axes other than T, P, Z, C, Y, X: {more}")
+        extra_axes = {
+            axis: size for axis, size in sizes.items() if axis not in "TPZCYXS" and size > 1
+        }
+        if extra_axes:
+            raise ValueError(f"{path}: has axes other than T, P, Z, C, Y, X: {extra_axes}")
         position, others = choose(path, "position", range(sizes.get("P", 1)), key)
         dtype = np.dtype(file.dtype).str
-        info, spacing, lost = _told(file, sizes)
+        info, spacing, lost = _read_metadata(file, sizes)
     width, colors = int(sizes.get("C", 1)), int(sizes.get("S", 1))
     if width > 1 and colors > 1:
         raise ValueError(f"{path}: {width} channels of colours; expected one")
-    inside = [width, int(sizes["Y"]), int(sizes["X"]), colors]
+    plane_shape = [width, int(sizes["Y"]), int(sizes["X"]), colors]
     return Nd2Source(
         path=path,
-        shape=(int(sizes.get("T", 1)), int(sizes.get("Z", 1)), *inside),
+        shape=(int(sizes.get("T", 1)), int(sizes.get("Z", 1)), *plane_shape),
         axes="tzcyx-" if colors == 1 else "tz-yxc",
         stored=dtype,
         spacing=spacing,
@@ -70,17 +72,17 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
     )
 
 
-def _told(file: Any, sizes: Mapping[str, int]) -> Told:
+def _read_metadata(file: Any, sizes: Mapping[str, int]) -> Told:
     """Returns info and spacing from the metadata, and which metadata is not kept."""
     voxel = file.voxel_size()
     spacing, unit = spacing_of([float(side) for side in voxel], ["um"] * 3)
     channels = []
-    for one in getattr(file.metadata, "channels", None) or ():
-        shade = getattr(one.channel, "color", None)
+    for channel in getattr(file.metadata, "channels", None) or ():
+        channel_color = getattr(channel.channel, "color", None)
         color: Rgb | None = None
-        if shade is not None and hasattr(shade, "r"):
-            color = (shade.r / 255, shade.g / 255, shade.b / 255)
-        channels.append(ChannelInfo(name=one.channel.name or "", color=color))
+        if channel_color is not None and hasattr(channel_color, "r"):
+            color = (channel_color.r / 255, channel_color.g / 255, channel_color.b / 255)
+        channels.append(ChannelInfo(name=channel.channel.name or "", color=color))
     if sizes.get("S", 1) == 3:
         channels = [*color_channels()]
     step = next(

@@ -32,9 +32,9 @@ class NiftiSource(VolumeSource):
         data = _load(self.path)[0].dataobj
         if self.whole and data.dtype.str == self.stored and (data.slope, data.inter) == (1, 0):
             # nibabel would take several times the memory.
-            told: dict[str, Any] = {"path": self.path, "axes": self.axes, "stored": self.stored}
-            told |= {"shape": data.shape, "offset": data.offset, "fortran": True, "whole": True}
-            return ArraySource(file=self.path, **told).read_stored(index)
+            fields: dict[str, Any] = {"path": self.path, "axes": self.axes, "stored": self.stored}
+            fields |= {"shape": data.shape, "offset": data.offset, "fortran": True, "whole": True}
+            return ArraySource(file=self.path, **fields).read_stored(index)
         if data.dtype.fields is None:
             return np.asanyarray(data[index])
         return _components(np.asanyarray(data[index[: len(data.shape)]]))[..., index[-1]]
@@ -43,19 +43,24 @@ class NiftiSource(VolumeSource):
 @Format("NIfTI", ".nii", ".nii.gz", library="nibabel")
 def open_nifti(path: str) -> NiftiSource:
     """Opens an image; its first voxel is read to find the dtype after scaling."""
-    image, mended = _load(path)
+    image, corrections = _load(path)
     shape = tuple(int(n) for n in image.shape)
     packed = path.lower().endswith(".gz")
-    need, size = math.prod(shape) * image.dataobj.dtype.itemsize, os.stat(path).st_size
-    if packed and need > MOST_PACKED * size:  # nibabel allocates memory for all of it at once
-        raise ValueError(f"{path}: takes {need} bytes, which {size} can't unpack to")
-    first = np.asanyarray(image.dataobj[(slice(0, 1),) * len(shape)])
-    if first.dtype.fields is not None:  # colours: a structured dtype of components
-        first = _components(first)
-        shape = (*shape, *[1] * (4 - len(shape)), first.shape[-1])
+    needed_bytes, file_bytes = (
+        math.prod(shape) * image.dataobj.dtype.itemsize,
+        os.stat(path).st_size,
+    )
+    if (
+        packed and needed_bytes > MOST_PACKED * file_bytes
+    ):  # nibabel allocates memory for all of it at once
+        raise ValueError(f"{path}: takes {needed_bytes} bytes, which {file_bytes} can't unpack to")
+    first_voxel = np.asanyarray(image.dataobj[(slice(0, 1),) * len(shape)])
+    if first_voxel.dtype.fields is not None:  # colours: a structured dtype of components
+        first_voxel = _components(first_voxel)
+        shape = (*shape, *[1] * (4 - len(shape)), first_voxel.shape[-1])
     if len(shape) < 3 or math.prod(shape[5:]) != 1:
         raise ValueError(f"{path}: expected 3 to 5 dimensions, got {shape}")
-    told = place_axes(
+    placement = place_axes(
         path,
         np.asarray(image.affine),
         shape[:5],
@@ -66,11 +71,11 @@ def open_nifti(path: str) -> NiftiSource:
     return NiftiSource(
         path=path,
         shape=shape,
-        stored=first.dtype.str,
+        stored=first_voxel.dtype.str,
         whole=packed,
         info=info,
-        lost=(*mended, *lost),
-        **told | {"axes": told["axes"] + "-" * len(shape[5:])},
+        lost=(*corrections, *lost),
+        **placement | {"axes": placement["axes"] + "-" * len(shape[5:])},
     )
 
 
@@ -97,8 +102,8 @@ def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
     if len(header.extensions):
         lost.append(f"{len(header.extensions)} header extensions")
     window = (float(header["cal_min"]), float(header["cal_max"]))
-    plain = ChannelInfo(window=window if all(map(math.isfinite, window)) else None)
-    channels = [plain] * (shape[4] if len(shape) > 4 else 1) if window[0] < window[1] else []
+    windowed = ChannelInfo(window=window if all(map(math.isfinite, window)) else None)
+    channels = [windowed] * (shape[4] if len(shape) > 4 else 1) if window[0] < window[1] else []
     if image.dataobj.dtype.fields is not None:
         channels = [*color_channels(shape[4])]
     info = ImageInfo(
@@ -135,17 +140,17 @@ class _HeaderLog(logging.Filter):
         return lines is None
 
 
-_HEARD = _HeaderLog()
+_HEADER_LOG = _HeaderLog()
 
 
 def _load(path: str) -> tuple[Any, list[str]]:
     """Returns the image, and what nibabel corrected in its header."""
     import nibabel
 
-    nibabel.imageglobals.logger.addFilter(_HEARD)  # further calls add nothing
-    heard: list[str] = []
-    _HEARD.lines.here = heard
+    nibabel.imageglobals.logger.addFilter(_HEADER_LOG)  # further calls add nothing
+    corrections: list[str] = []
+    _HEADER_LOG.lines.here = corrections
     try:
-        return nibabel.load(path), heard
+        return nibabel.load(path), corrections
     finally:
-        _HEARD.lines.here = None
+        _HEADER_LOG.lines.here = None

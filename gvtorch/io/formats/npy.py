@@ -46,5 +46,5 @@ def open_npz(path: str, key: str | None = None, axes: str | None = None) -> Arra
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
     if key is None and len(names) > 1:
         raise not_chosen(path, "array", names, key)
-    at, _ = choose(path, "array", names, key)
-    return open_npy(path, axes, f"{names[at]}.npy")
+    chosen, _ = choose(path, "array", names, key)
+    return open_npy(path, axes, f"{names[chosen]}.npy")

@@ -27,10 +27,10 @@ _ENCODINGS = {
     **dict.fromkeys(("gz", "gzip"), "zlib"),
     **dict.fromkeys(("bz2", "bzip2"), "bz2"),
 }
-_MOST_SKIPPED = 1 << 24  # bytes to skip at most: of one line, or of unpacked data
+_MAX_SKIPPED_BYTES = 1 << 24  # of one line, or of unpacked data
 _SPACES = {"ras": "right-anterior-superior", "las": "left-anterior-superior"}
 _SPACES["lps"] = "left-posterior-superior"
-_SPATIAL = ("domain", "space")
+_SPATIAL_KINDS = ("domain", "space")
 #: Fields of the format; others are key/value pairs of the file's writer.
 _FIELDS = {
     *("type", "dimension", "sizes", "encoding", "endian", "data file", "datafile", "block size"),
@@ -40,7 +40,7 @@ _FIELDS = {
     *("axis maxs", "axismaxs", "sampleunits", "blocksize", "measurement frame", "min", "max"),
     *("old min", "oldmin", "old max", "oldmax"),
 }
-_UNKEPT = ("measurement frame", "old min", "oldmin", "old max", "oldmax")
+_DROPPED_FIELDS = ("measurement frame", "old min", "oldmin", "old max", "oldmax")
 
 
 @Format("NRRD", ".nrrd", ".nhdr", options=("axes",), library="nrrd", package="pynrrd")
@@ -54,93 +54,109 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     shape = tuple(int(n) for n in header["sizes"])
     if header.get("dimension") != len(shape):
         raise ValueError(f"{path}: {len(shape)} sizes, dimension {header.get('dimension')}")
-    kind = number_type(str(header["type"]))
-    if kind is None:
+    number_dtype = number_type(str(header["type"]))
+    if number_dtype is None:
         raise ValueError(f"{path}: type {header['type']!r} is unknown")
     encoding = _ENCODINGS.get(str(header["encoding"]).lower())
     if encoding is None:
         known = ", ".join(sorted(_ENCODINGS))
         raise ValueError(f"{path}: encoding {header['encoding']!r} is unknown; known: {known}")
-    if np.dtype(kind).itemsize > 1 and encoding != "text" and "endian" not in header:
+    if np.dtype(number_dtype).itemsize > 1 and encoding != "text" and "endian" not in header:
         raise ValueError(f"{path}: endian is missing, and its numbers have several bytes")
     if header.get("endian", "little") not in ("little", "big"):
         raise ValueError(f"{path}: endian {header['endian']!r} is neither little nor big")
-    letters = _letters(path, header, shape, axes)
-    info, lost = _info(header, letters, shape)
-    told: dict[str, Any] = {
+    axis_roles = _axis_roles(path, header, shape, axes)
+    info, lost = _info(header, axis_roles, shape)
+    fields: dict[str, Any] = {
         "path": path,
         "shape": shape,
-        "stored": np.dtype((">" if header.get("endian") == "big" else "<") + kind).str,
+        "stored": np.dtype((">" if header.get("endian") == "big" else "<") + number_dtype).str,
         "info": info,
         "lost": tuple(lost),
         **place_axes(
-            *(path, _affine(header, letters), shape),
-            *(letters.index(letter) if letter in letters else None for letter in "ct"),
+            *(path, _affine(header, axis_roles), shape),
+            *(axis_roles.index(role) if role in axis_roles else None for role in "ct"),
         ),
     }
-    data = header.get("data file", header.get("datafile"))
-    skip = int(header.get("byte skip", header.get("byteskip", 0)))
-    lines = int(header.get("line skip", header.get("lineskip", 0)))
-    if data is not None and (not isinstance(data, str) or data.startswith("LIST") or "%" in data):
-        raise ValueError(f"{path}: its numbers lie in several files (data file: {data})")
-    if skip < -1 or lines < 0 or (skip == -1 and encoding != "raw"):
-        raise ValueError(f"{path}: byte skip {skip}, line skip {lines}")
-    data_file, at = (path, offset) if data is None else (str(Path(path).parent / data), 0)
+    data_name = header.get("data file", header.get("datafile"))
+    skip_bytes = int(header.get("byte skip", header.get("byteskip", 0)))
+    skip_lines = int(header.get("line skip", header.get("lineskip", 0)))
+    if data_name is not None and (
+        not isinstance(data_name, str) or data_name.startswith("LIST") or "%" in data_name
+    ):
+        raise ValueError(f"{path}: its numbers lie in several files (data file: {data_name})")
+    if skip_bytes < -1 or skip_lines < 0 or (skip_bytes == -1 and encoding != "raw"):
+        raise ValueError(f"{path}: byte skip {skip_bytes}, line skip {skip_lines}")
+    data_file, start = (
+        (path, offset) if data_name is None else (str(Path(path).parent / data_name), 0)
+    )
     size = os.stat(data_file).st_size
-    if max(skip, lines) > size and encoding in ("raw", "text"):
-        raise ValueError(f"{path}: skips {max(skip, lines)} bytes or lines of {size} bytes")
-    if skip > _MOST_SKIPPED and encoding not in ("raw", "text"):
-        raise ValueError(f"{path}: byte skip {skip} of what is packed, at most {_MOST_SKIPPED}")
-    at = _behind_lines(data_file, at, lines)
+    if max(skip_bytes, skip_lines) > size and encoding in ("raw", "text"):
+        raise ValueError(
+            f"{path}: skips {max(skip_bytes, skip_lines)} bytes or lines of {size} bytes"
+        )
+    if skip_bytes > _MAX_SKIPPED_BYTES and encoding not in ("raw", "text"):
+        raise ValueError(
+            f"{path}: byte skip {skip_bytes} of what is packed, at most {_MAX_SKIPPED_BYTES}"
+        )
+    start = _skip_lines(data_file, start, skip_lines)
     if encoding == "raw":
-        need = math.prod(shape) * np.dtype(kind).itemsize
-        begin = max(at, size - need) if skip < 0 else at + skip  # -1: numbers are at the end
-        return ArraySource(file=data_file, offset=begin, fortran=True, exact=True, **told)
-    return PackedSource(file=data_file, offset=at, skip=skip, codec=encoding, fortran=True, **told)
+        needed_bytes = math.prod(shape) * np.dtype(number_dtype).itemsize
+        # -1: the numbers are at the end.
+        array_start = max(start, size - needed_bytes) if skip_bytes < 0 else start + skip_bytes
+        return ArraySource(file=data_file, offset=array_start, fortran=True, exact=True, **fields)
+    return PackedSource(
+        file=data_file, offset=start, skip=skip_bytes, codec=encoding, fortran=True, **fields
+    )
 
 
-def _behind_lines(file: str, at: int, lines: int) -> int:
-    """Returns the offset behind `lines` lines of a file that begin at `at`."""
-    if lines:
+def _skip_lines(file: str, start: int, count: int) -> int:
+    """Returns the offset behind `count` lines of a file that begin at `start`."""
+    if count:
         check_regular(file)
         with open(file, "rb") as stream:
-            stream.seek(at)
-            for number in range(lines):
-                line = stream.readline(_MOST_SKIPPED)
+            stream.seek(start)
+            for number in range(count):
+                line = stream.readline(_MAX_SKIPPED_BYTES)
                 if not line.endswith(b"\n"):
                     raise ValueError(
-                        f"{file}: has {number} of {lines} lines to skip, of at most "
-                        f"{_MOST_SKIPPED} bytes"
+                        f"{file}: has {number} of {count} lines to skip, of at most "
+                        f"{_MAX_SKIPPED_BYTES} bytes"
                     )
-            at = stream.tell()
-    return at
+            start = stream.tell()
+    return start
 
 
-def _letters(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: str | None) -> str:
+def _axis_roles(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: str | None) -> str:
     """Returns the meaning of each axis: "s" space, "t" times, "c" components."""
     rank, kinds = len(shape), [str(kind).lower() for kind in header.get("kinds", ())]
     if rank < 3:
         raise ValueError(f"{path}: expected 3 axes of space, got {rank} axes")
     if axes is None:
         if len(kinds) == rank and set(kinds) - {"???", "none"}:
-            found = ["s" if k in _SPATIAL else "t" if k == "time" else "c" for k in kinds]
+            roles = [
+                "s" if kind in _SPATIAL_KINDS else "t" if kind == "time" else "c" for kind in kinds
+            ]
         else:  # axes of space are those with a direction, else those with a step
-            places = _directions(header, rank), _steps(header, rank)[0][:, None]
-            table = next((one for one in places if np.isfinite(one).any()), np.zeros((rank, 1)))
-            found = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
-        if found.count("s") == 3 and found.count("t") <= 1 and found.count("c") <= 1:
-            return "".join(found)
-    letters = ask_axes(path, shape[::-1], axes)[::-1]
-    if sum(letter in "zyx" for letter in letters) != 3:
-        raise ValueError(f"{path}: expected three axes of space, got {letters[::-1]}")
-    return "".join("s" if letter in "zyx" else letter for letter in letters)
+            tables = _directions(header, rank), _steps(header, rank)[0][:, None]
+            table = next(
+                (candidate for candidate in tables if np.isfinite(candidate).any()),
+                np.zeros((rank, 1)),
+            )
+            roles = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
+        if roles.count("s") == 3 and roles.count("t") <= 1 and roles.count("c") <= 1:
+            return "".join(roles)
+    axis_order = ask_axes(path, shape[::-1], axes)[::-1]
+    if sum(letter in "zyx" for letter in axis_order) != 3:
+        raise ValueError(f"{path}: expected three axes of space, got {axis_order[::-1]}")
+    return "".join("s" if letter in "zyx" else letter for letter in axis_order)
 
 
 def _directions(header: dict[str, Any], rank: int) -> np.ndarray:
     """Returns (axes, 3 or 4) a step along each axis in space and, if given, time; NaN for none."""
-    told = np.asarray(header.get("space directions", np.zeros((0, 3))), dtype=np.float64)
-    fits = told.ndim == 2 and len(told) == rank and told.shape[1] in (3, 4)
-    return told if fits else np.full((rank, 3), np.nan)
+    directions = np.asarray(header.get("space directions", np.zeros((0, 3))), dtype=np.float64)
+    is_valid = directions.ndim == 2 and len(directions) == rank and directions.shape[1] in (3, 4)
+    return directions if is_valid else np.full((rank, 3), np.nan)
 
 
 def _numbers(header: dict[str, Any], rank: int, *names: str) -> np.ndarray:
@@ -148,8 +164,8 @@ def _numbers(header: dict[str, Any], rank: int, *names: str) -> np.ndarray:
     none, or not a number for each axis.
     """
     field = next((header[name] for name in names if name in header), np.zeros(0))
-    told = np.asarray(field, dtype=np.float64)
-    return told if told.shape == (rank,) else np.full(rank, np.nan)
+    values = np.asarray(field, dtype=np.float64)
+    return values if values.shape == (rank,) else np.full(rank, np.nan)
 
 
 def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
@@ -161,21 +177,25 @@ def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
     """
     low = _numbers(header, rank, "axis mins", "axismins")
     high = _numbers(header, rank, "axis maxs", "axismaxs")
-    told = header.get("centers", header.get("centerings", ""))
-    told = (told if isinstance(told, str) else " ".join(map(str, told))).lower().split()
-    told = told if len(told) == rank else ["cell"] * rank
-    in_cells = np.array([one != "node" for one in told])
-    count = np.asarray(header["sizes"]) - ~in_cells
+    centerings = header.get("centers", header.get("centerings", ""))
+    centerings = (
+        (centerings if isinstance(centerings, str) else " ".join(map(str, centerings)))
+        .lower()
+        .split()
+    )
+    centerings = centerings if len(centerings) == rank else ["cell"] * rank
+    in_cells = np.array([centering != "node" for centering in centerings])
+    intervals = np.asarray(header["sizes"]) - ~in_cells
     step = _numbers(header, rank, "spacings")
-    step = np.where(np.isnan(step), (high - low) / np.maximum(count, 1), step)
+    step = np.where(np.isnan(step), (high - low) / np.maximum(intervals, 1), step)
     return step, low + np.where(in_cells, 0.5 * step, 0)
 
 
-def _affine(header: dict[str, Any], letters: str) -> np.ndarray:
+def _affine(header: dict[str, Any], axis_roles: str) -> np.ndarray:
     """Returns (4, 4) the affine of the three axes of space."""
-    spatial = [axis for axis, letter in enumerate(letters) if letter == "s"]
-    directions = _directions(header, len(letters))[spatial, :3]
-    spacings, first = (one[spatial] for one in _steps(header, len(letters)))
+    spatial = [axis for axis, role in enumerate(axis_roles) if role == "s"]
+    directions = _directions(header, len(axis_roles))[spatial, :3]
+    spacings, first = (values[spatial] for values in _steps(header, len(axis_roles)))
     affine = np.eye(4)
     if not np.isnan(directions).all():
         affine[:3, :3] = directions.T
@@ -190,51 +210,57 @@ def _affine(header: dict[str, Any], letters: str) -> np.ndarray:
 
 
 def _info(
-    header: dict[str, Any], letters: str, shape: tuple[int, ...]
+    header: dict[str, Any], axis_roles: str, shape: tuple[int, ...]
 ) -> tuple[ImageInfo, list[str]]:
     """Returns the header's metadata of the values, and which metadata is not kept."""
-    own = [str(name) for name in header if str(name).lower() not in _FIELDS]
-    lost = [f"the field {name!r}" for name in header if str(name).lower() in _UNKEPT]
-    if own:
-        more = f" and {len(own) - 3} more" if len(own) > 3 else ""
-        lost.append(f"key/value pairs {', '.join(own[:3])}{more}")
+    key_values = [str(name) for name in header if str(name).lower() not in _FIELDS]
+    lost = [f"the field {name!r}" for name in header if str(name).lower() in _DROPPED_FIELDS]
+    if key_values:
+        more = f" and {len(key_values) - 3} more" if len(key_values) > 3 else ""
+        lost.append(f"key/value pairs {', '.join(key_values[:3])}{more}")
     units = [str(unit) for unit in header.get("units", ())]
-    units = units if len(units) == len(letters) else [""] * len(letters)
+    units = units if len(units) == len(axis_roles) else [""] * len(axis_roles)
     spatial = [str(unit) for unit in header.get("space units", ())][:3]
-    spatial = spatial or [u for u, letter in zip(units, letters, strict=True) if letter == "s"]
-    known = {length_unit(unit) for unit in spatial}
-    unit = known.pop() if len(known) == 1 else None
+    spatial = spatial or [u for u, role in zip(units, axis_roles, strict=True) if role == "s"]
+    unit_names = {length_unit(unit) for unit in spatial}
+    unit = unit_names.pop() if len(unit_names) == 1 else None
     if unit is None and any(spatial):
         lost.append(f"units of space {', '.join(spatial)}")
     step: float | None = None
-    period = None
-    if "t" in letters:
-        at = letters.index("t")
-        steps = (*_directions(header, len(letters))[at, 3:], _steps(header, len(letters))[0][at])
-        step = next((float(one) for one in steps if np.isfinite(one) and one > 0), None)
-        period = time_unit(units[at]) if step else None
+    step_unit = None
+    if "t" in axis_roles:
+        time_axis = axis_roles.index("t")
+        steps = (
+            *_directions(header, len(axis_roles))[time_axis, 3:],
+            _steps(header, len(axis_roles))[0][time_axis],
+        )
+        step = next(
+            (float(candidate) for candidate in steps if np.isfinite(candidate) and candidate > 0),
+            None,
+        )
+        step_unit = time_unit(units[time_axis]) if step else None
     space = str(header.get("space", "")).lower().removesuffix("-time")
     info = ImageInfo(
         unit=unit,
-        channels=_channels(header, letters, shape),
+        channels=_channels(header, axis_roles, shape),
         quantity=str(header.get("sample units", header.get("sampleunits", ""))) or None,
         labels=any(str(name).startswith("Segment0_") for name in header),
         space=_SPACES.get(space, space) or None,
         time_step=step,
-        time_unit=period,
+        time_unit=step_unit,
     )
     return info, lost
 
 
 def _channels(
-    header: dict[str, Any], letters: str, shape: tuple[int, ...]
+    header: dict[str, Any], axis_roles: str, shape: tuple[int, ...]
 ) -> tuple[ChannelInfo, ...]:
     """Returns the names of the components, if the kind of their axis defines them."""
     kinds = [str(kind).lower() for kind in header.get("kinds", ())]
-    at = letters.find("c")
-    kind = kinds[at] if 0 <= at < len(kinds) else ""
-    if kind in ("rgb-color", "rgba-color") and shape[at] == len(kind) - 6:
-        return color_channels(shape[at])
-    if kind == "complex" and shape[at] == 2:
+    axis = axis_roles.find("c")
+    kind = kinds[axis] if 0 <= axis < len(kinds) else ""
+    if kind in ("rgb-color", "rgba-color") and shape[axis] == len(kind) - 6:
+        return color_channels(shape[axis])
+    if kind == "complex" and shape[axis] == 2:
         return (ChannelInfo(name="real"), ChannelInfo(name="imaginary"))
     return ()

@@ -28,24 +28,24 @@ def open_raw(
     name, as in `scan_512x512x300_int16.raw`, little endian unless that says "be". If `offset`, the
     bytes of a header to skip, is given, other bytes may also follow the numbers.
     """
-    named = _NAME.search(Path(path).name.lower())
+    name_match = _NAME.search(Path(path).name.lower())
     if shape is None:
-        if named is None:
+        if name_match is None:
             raise ValueError(f"{path}: a RAW file needs its extent: {_HINT} shape and dtype")
-        shape = [int(named[axis]) for axis in (1, 2, 3)]
+        shape = [int(name_match[axis]) for axis in (1, 2, 3)]
     if len(shape) != 3:
         raise ValueError(f"{path}: shape must be three numbers X,Y,Z, got {tuple(shape)}")
-    if dtype is None and named is None:
+    if dtype is None and name_match is None:
         raise ValueError(f"{path}: a RAW file needs its dtype: {_HINT} dtype")
-    told = named[4] if dtype is None and named else dtype
+    dtype_name = name_match[4] if dtype is None and name_match else dtype
     try:
-        kind = np.dtype(told)
+        stored_dtype = np.dtype(dtype_name)
     except TypeError:
-        raise ValueError(f"{path}: dtype must be a NumPy dtype, got {told!r}") from None
-    if kind.kind not in "iuf":
-        raise ValueError(f"{path}: dtype must be an integer or a float, got {told!r}")
-    if dtype is None and named:
-        kind = kind.newbyteorder(">" if named[5] == "be" else "<")
+        raise ValueError(f"{path}: dtype must be a NumPy dtype, got {dtype_name!r}") from None
+    if stored_dtype.kind not in "iuf":
+        raise ValueError(f"{path}: dtype must be an integer or a float, got {dtype_name!r}")
+    if dtype is None and name_match:
+        stored_dtype = stored_dtype.newbyteorder(">" if name_match[5] == "be" else "<")
     if offset is not None and (type(offset) is not int or offset < 0):
         raise ValueError(f"{path}: offset must be bytes, an int >= 0, got {offset!r}")
     return ArraySource(
@@ -54,7 +54,7 @@ def open_raw(
         shape=tuple(int(size) for size in shape),
         axes="xyz",
         fortran=True,
-        stored=kind.str,
+        stored=stored_dtype.str,
         offset=offset or 0,
         exact=offset is None,
         whole=path.lower().endswith((".gz", ".bz2")),

@@ -16,7 +16,7 @@ from ..source import ArraySource, Index, Told, VolumeSource
 from ..tiff_info import JPEG, check_pictures, imagej_info, ome_info, opened_tiff
 from .format import Format, choose
 
-_LOST = {  # by the tag PhotometricInterpretation
+_PHOTOMETRIC_LOST = {  # by the tag PhotometricInterpretation
     0: "that high values are meant to be dark (MinIsWhite)",
     3: "the colours of its palette: values are numbers of its entries",
 }
@@ -34,15 +34,17 @@ class TiffSource(VolumeSource):
             if self.whole:
                 check_pictures(series.pages)
                 return series.asarray()[index]
-            first = len(self.shape) - len(series.keyframe.shape)
+            leading = len(self.shape) - len(series.keyframe.shape)
             data = np.empty([s.stop - s.start for s in index], self.stored)
-            spans = [range(s.start, s.stop) for s in index[:first]]
-            for place in itertools.product(*spans):
-                number = int(np.ravel_multi_index(place, self.shape[:first])) if first else 0
-                at = tuple(p - span.start for p, span in zip(place, spans, strict=True))
-                if (page := series.pages[number]) is None:
-                    raise ValueError(f"{self.path}: page {number} is missing")
-                data[at] = read_page(page, series.keyframe, index[first:])
+            spans = [range(s.start, s.stop) for s in index[:leading]]
+            for page_index in itertools.product(*spans):
+                page_number = (
+                    int(np.ravel_multi_index(page_index, self.shape[:leading])) if leading else 0
+                )
+                position = tuple(p - span.start for p, span in zip(page_index, spans, strict=True))
+                if (page := series.pages[page_number]) is None:
+                    raise ValueError(f"{self.path}: page {page_number} is missing")
+                data[position] = read_page(page, series.keyframe, index[leading:])
         return data
 
 
@@ -57,42 +59,45 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
     if planes != 1 or depth != 1 or len(page.dataoffsets) != math.prod(keyframe.chunked):
         return page.asarray()[index]
     rows, columns = index[0], index[1]
-    tall, wide = (keyframe.tilelength, keyframe.tilewidth) if keyframe.is_tiled else (
+    tile_height, tile_width = (keyframe.tilelength, keyframe.tilewidth) if keyframe.is_tiled else (
         keyframe.rowsperstrip, width,
     )  # fmt: skip
-    tall, across = min(tall, length) if not keyframe.is_tiled else tall, -(-width // wide)
+    tile_height, tiles_across = (
+        min(tile_height, length) if not keyframe.is_tiled else tile_height,
+        -(-width // tile_width),
+    )
     out = np.zeros((rows.stop - rows.start, columns.stop - columns.start, samples), keyframe.dtype)
     first, last = (rows.start, columns.start), (rows.stop, columns.stop)
-    places = itertools.product(
-        range(rows.start // tall, -(-rows.stop // tall)),
-        range(columns.start // wide, -(-columns.stop // wide)),
+    tile_indices = itertools.product(
+        range(rows.start // tile_height, -(-rows.stop // tile_height)),
+        range(columns.start // tile_width, -(-columns.stop // tile_width)),
     )
-    for down, right in places:
-        tile = _unpacked(page, keyframe, down * across + right)
+    for tile_row, tile_column in tile_indices:
+        tile = _unpack_tile(page, keyframe, tile_row * tiles_across + tile_column)
         if tile is None:
             continue
-        corner = np.array((down * tall, right * wide))
+        corner = np.array((tile_row * tile_height, tile_column * tile_width))
         tile = tile[: length - corner[0], : width - corner[1]]
         low, high = np.maximum(first, corner), np.minimum(last, corner + tile.shape[:2])
         out[boxes.index(low - first, high - first)] = tile[boxes.index(low - corner, high - corner)]
     return out[..., index[2]] if len(index) == 3 else out[..., 0]
 
 
-def _unpacked(page: Any, keyframe: Any, number: int) -> np.ndarray | None:
+def _unpack_tile(page: Any, keyframe: Any, tile_number: int) -> np.ndarray | None:
     """Returns (rows, columns, c) of a tile or strip; None if it is not stored: all are zero."""
-    offset, size = page.dataoffsets[number], page.databytecounts[number]
+    offset, size = page.dataoffsets[tile_number], page.databytecounts[tile_number]
     if not size:
         return None
     file = page.parent.filehandle
     file.seek(offset)
     packed = file.read(size)
     if len(packed) != size:
-        raise ValueError(f"{file.path}: ends before its tile {number}")
-    more = {}
+        raise ValueError(f"{file.path}: ends before its tile {tile_number}")
+    tables = {}
     if keyframe.compression in JPEG:
-        more = {"jpegtables": page.jpegtables, "jpegheader": keyframe.jpegheader}
-    found = keyframe.decode(packed, number, **more)[0]
-    return None if found is None else found[0]
+        tables = {"jpegtables": page.jpegtables, "jpegheader": keyframe.jpegheader}
+    decoded = keyframe.decode(packed, tile_number, **tables)[0]
+    return None if decoded is None else decoded[0]
 
 
 @Format(
@@ -100,17 +105,17 @@ def _unpacked(page: Any, keyframe: Any, number: int) -> np.ndarray | None:
 )  # pyramids: a series is its finest level
 def open_tiff(path: str, key: str | None = None) -> VolumeSource:
     """Opens a stack: the series `key` (its number or name) of a file, the first if left out."""
-    with opened_tiff(path) as (file, warned):
+    with opened_tiff(path) as (file, tiff_warnings):
         if not file.series:
             raise ValueError("it holds no images")
-        number, others = choose(path, "series", [one.name for one in file.series], key)
-        series = file.series[number]
+        chosen, others = choose(path, "series", [item.name for item in file.series], key)
+        series = file.series[chosen]
         shape = tuple(int(n) for n in series.shape)
         axes = _axes(path, shape, series.axes)
-        info, spacing, lost = _told(file, series, number, axes, shape)
+        info, spacing, lost = _read_metadata(file, series, chosen, axes, shape)
         lost += others
-        lost += [f"what tifffile warns of ({text})" for text in dict.fromkeys(warned)]
-        told: dict[str, Any] = {
+        lost += [f"what tifffile warns of ({text})" for text in dict.fromkeys(tiff_warnings)]
+        fields: dict[str, Any] = {
             "path": path,
             "shape": shape,
             "axes": axes,
@@ -120,51 +125,52 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
         if series.dataoffset is not None:
             stored = series.dtype.newbyteorder(file.byteorder).str
             offset = int(series.dataoffset)
-            return ArraySource(file=path, stored=stored, offset=offset, lost=tuple(lost), **told)
-        inside = tuple(series.keyframe.shape)
-        first = len(shape) - len(inside)
-        by_page = shape[first:] == inside and len(series.pages) == math.prod(shape[:first])
-        by_page &= axes[first:].replace("-", "") in ("yx", "yxc") and "-" not in axes[first:]
-        frame = series.keyframe
-        piece = int(np.prod(frame.chunks)) if by_page else math.prod(shape)
-        missing = sum(page is None for page in series.pages)
-        if missing:
-            lost.append(f"{missing} of {len(series.pages)} pages, which are not there")
-    told["unpacked_bytes"] = piece * series.dtype.itemsize
+            return ArraySource(file=path, stored=stored, offset=offset, lost=tuple(lost), **fields)
+        page_shape = tuple(series.keyframe.shape)
+        leading = len(shape) - len(page_shape)
+        by_page = shape[leading:] == page_shape and len(series.pages) == math.prod(shape[:leading])
+        by_page &= axes[leading:].replace("-", "") in ("yx", "yxc") and "-" not in axes[leading:]
+        keyframe = series.keyframe
+        piece_values = int(np.prod(keyframe.chunks)) if by_page else math.prod(shape)
+        missing_pages = sum(page is None for page in series.pages)
+        if missing_pages:
+            lost.append(f"{missing_pages} of {len(series.pages)} pages, which are not there")
+    fields["unpacked_bytes"] = piece_values * series.dtype.itemsize
     return TiffSource(
-        stored=series.dtype.str, whole=not by_page, series=number, lost=tuple(lost), **told
+        stored=series.dtype.str, whole=not by_page, series=chosen, lost=tuple(lost), **fields
     )
 
 
 def _axes(path: str, shape: Sequence[int], axes: str) -> str:
     """Returns what each axis of a series is: t, z, y, x, c, or - for one of size 1 to drop."""
-    letters = "".join(
+    axis_order = "".join(
         "-" if size == 1 and letter not in "ZYX" else letter
         for size, letter in zip(shape, axes, strict=True)
     )
-    others = [letter for letter in letters if letter not in "TZYXCS-"]
-    if "Z" not in letters and len(others) == 1 and others[0] in "QI":
-        letters, others = letters.replace(others[0], "Z"), []  # pages of unknown meaning: slices
-    channels = [letter for letter in letters if letter in "CS"]
-    if others or len(channels) > 1 or letters.count("Y") != 1 or letters.count("X") != 1:
+    other_axes = [letter for letter in axis_order if letter not in "TZYXCS-"]
+    if "Z" not in axis_order and len(other_axes) == 1 and other_axes[0] in "QI":
+        # Pages of unknown meaning are slices.
+        axis_order, other_axes = axis_order.replace(other_axes[0], "Z"), []
+    channels = [letter for letter in axis_order if letter in "CS"]
+    if other_axes or len(channels) > 1 or axis_order.count("Y") != 1 or axis_order.count("X") != 1:
         raise ValueError(
             f"{path}: axes {axes} {tuple(shape)}; expected T, Z, Y, X and at most one of C, S"
         )
-    return letters.replace("S", "C").lower()
+    return axis_order.replace("S", "C").lower()
 
 
-def _told(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) -> Told:
+def _read_metadata(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) -> Told:
     """Returns info and spacing of a series, and which metadata is not kept."""
     width = shape[axes.index("c")] if "c" in axes else 1
     if series.kind == "ome":
         return ome_info(file.ome_metadata, number, series.name, width)
-    kind = int(series.keyframe.photometric)
-    colors = width in (3, 4) and kind in (2, 6)  # RGB, YCbCr
-    channels = color_channels(width) if colors else ()
-    lost = [_LOST[kind]] if kind in _LOST else []
+    photometric = int(series.keyframe.photometric)
+    is_color = width in (3, 4) and photometric in (2, 6)  # RGB, YCbCr
+    channels = color_channels(width) if is_color else ()
+    lost = [_PHOTOMETRIC_LOST[photometric]] if photometric in _PHOTOMETRIC_LOST else []
     if series.kind == "imagej":
-        info, spacing, more = imagej_info(file.imagej_metadata, _resolution(file), width)
-        return replace(info, channels=channels) if colors else info, spacing, [*more, *lost]
+        info, spacing, also_lost = imagej_info(file.imagej_metadata, _resolution(file), width)
+        return replace(info, channels=channels) if is_color else info, spacing, [*also_lost, *lost]
     tags = series.keyframe.tags
     if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are for printers
         lost.append("the size of a pixel in centimeters: the distance between pages is missing")

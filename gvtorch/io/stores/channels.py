@@ -18,7 +18,7 @@ from ...base.stage import Progress, no_progress
 from ..source import VolumeSource
 from . import unfinished
 from .conversion import convert
-from .ngff import SEVERAL, read_json, read_json_file
+from .ngff import CHANNELS_ATTRIBUTE, read_json, read_json_file
 from .store import Store
 from .store_layout import WORK, Deadline, is_name, kvstore
 
@@ -33,15 +33,15 @@ def channel_names(location: str | Path) -> tuple[str, ...]:
         ValueError: The metadata is damaged.
         OSError: It can't be read.
     """
-    where = str(location)
-    content = read_json(where, kvstore(location), "zarr.json", Deadline(_TIMEOUT)) or {}
-    attributes = content.get("attributes")
-    named = attributes.get(SEVERAL) if isinstance(attributes, dict) else None
-    if named is None:
+    label = str(location)
+    group = read_json(label, kvstore(location), "zarr.json", Deadline(_TIMEOUT)) or {}
+    attributes = group.get("attributes")
+    names = attributes.get(CHANNELS_ATTRIBUTE) if isinstance(attributes, dict) else None
+    if names is None:
         return ()
-    if not isinstance(named, list) or not named or not all(is_name(name) for name in named):
-        raise ValueError(f"{where}: damaged: {SEVERAL} is {named!r}")
-    return tuple(named)
+    if not isinstance(names, list) or not names or not all(is_name(name) for name in names):
+        raise ValueError(f"{label}: damaged: {CHANNELS_ATTRIBUTE} is {names!r}")
+    return tuple(names)
 
 
 def convert_channels(
@@ -50,7 +50,7 @@ def convert_channels(
     *,
     resume: bool = False,
     progress: Progress = no_progress,
-    **told: Any,
+    **options: Any,
 ) -> Store:
     """Writes a store of several channels, one after the other.
 
@@ -59,7 +59,7 @@ def convert_channels(
         store: The folder to create.
         resume: Continue a half-written store.
         progress: Called with ("converting", bytes done, bytes in all), for all channels together.
-        **told: block, executor and workers, as for `convert`.
+        **options: block, executor and workers, as for `convert`.
 
     Returns:
         The store of the first channel, open; `Store.open(store, image=NAME)` opens another.
@@ -70,45 +70,53 @@ def convert_channels(
         FileExistsError, OSError, KeyboardInterrupt: As for `convert`.
     """
     target = Path(store)
-    grids = {(one.extent, one.spacing, one.origin) for one in sources.values()}
+    grids = {(source.extent, source.spacing, source.origin) for source in sources.values()}
     if len(grids) != 1:
         raise ValueError(f"a store's channels must be of one grid, got {len(grids)}")
-    if wrong := [name for name in sources if not is_name(name)]:
-        raise ValueError(f"a channel's name is made of letters, digits, - and _, got {wrong[0]!r}")
+    if invalid := [name for name in sources if not is_name(name)]:
+        raise ValueError(
+            f"a channel's name is made of letters, digits, - and _, got {invalid[0]!r}"
+        )
     begun = unfinished.is_begun(target, resume=resume, manifest=_MANIFEST)
     target.mkdir(exist_ok=True)
     (target / WORK).mkdir(exist_ok=True)
     manifest = target / WORK / _MANIFEST
-    marks = unfinished.as_json({name: one.fingerprint() for name, one in sources.items()})
-    if begun and read_json_file(manifest) != {"sources": marks}:
+    fingerprints = unfinished.as_json(
+        {name: source.fingerprint() for name, source in sources.items()}
+    )
+    if begun and read_json_file(manifest) != {"sources": fingerprints}:
         raise ValueError(
             f"{target}: was begun with another source, other channels or other settings; remove "
             "the store to begin again"
         )
-    unfinished.write_json(manifest, {"sources": marks})
-    total, before = sum(one.nbytes for one in sources.values()), 0
+    unfinished.write_json(manifest, {"sources": fingerprints})
+    total, done = sum(source.nbytes for source in sources.values()), 0
     for name, source in sources.items():
         if not unfinished.is_finished(target / name):
-            half = (target / name / WORK / "manifest.json").exists()
-            if not half:
+            is_half_written = (target / name / WORK / "manifest.json").exists()
+            if not is_half_written:
                 shutil.rmtree(target / name, ignore_errors=True)
-            share = _share(progress, before, source.nbytes, total)
-            convert(source, target / name, resume=half, progress=share, **told)
-        before += source.nbytes
-        progress("converting", before, total)
+            channel_progress = _channel_progress(progress, done, source.nbytes, total)
+            convert(
+                source, target / name, resume=is_half_written, progress=channel_progress, **options
+            )
+        done += source.nbytes
+        progress("converting", done, total)
     (target / "OME").mkdir(exist_ok=True)
     series = {"ome": {"version": "0.5", "series": [*sources]}}
-    unfinished.write_json(target / "OME" / "zarr.json", unfinished.group(series))
-    root = {"ome": {"version": "0.5", "bioformats2raw.layout": 3}, SEVERAL: [*sources]}
-    unfinished.write_json(target / "zarr.json", unfinished.group(root))
+    unfinished.write_json(target / "OME" / "zarr.json", unfinished.group_metadata(series))
+    root = {"ome": {"version": "0.5", "bioformats2raw.layout": 3}, CHANNELS_ATTRIBUTE: [*sources]}
+    unfinished.write_json(target / "zarr.json", unfinished.group_metadata(root))
     shutil.rmtree(target / WORK, ignore_errors=True)
     return Store.open(target)
 
 
-def _share(progress: Progress, before: int, own: int, total: int) -> Progress:
+def _channel_progress(
+    progress: Progress, done_before: int, channel_bytes: int, total: int
+) -> Progress:
     """Returns a callback that maps one channel's progress to the progress of all channels."""
 
-    def tell(stage: str, done: int, of: int) -> None:
-        progress(stage, before + own * done // max(of, 1), total)
+    def report(stage: str, done: int, channel_total: int) -> None:
+        progress(stage, done_before + channel_bytes * done // max(channel_total, 1), total)
 
-    return tell
+    return report

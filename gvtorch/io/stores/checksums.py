@@ -22,87 +22,91 @@ from .chunk_files import file_limit, index_bytes
 from .ngff import read_json
 from .store_layout import Deadline, StoreError, StoreLayout, read_key
 
-LIST = "gvtorch/checksums.json"
-_LINE = 128  # bytes of a file's line in the list, at most
-Files = dict[str, int | None]  # CRC-32 by a file's path in the store; None: no such file
+CHECKSUMS_FILE = "gvtorch/checksums.json"
+_MAX_LINE_BYTES = 128  # bytes of a file's line in the list, at most
+FileChecksums = dict[str, int | None]  # CRC-32 by a file's path in the store; None: no such file
 
 
-def sum_of(content: Mapping[str, Any]) -> int:
+def json_checksum(content: Mapping[str, Any]) -> int:
     """Returns the CRC-32 of JSON content, independent of formatting, without key "checksum"."""
-    kept = {name: value for name, value in content.items() if name != "checksum"}
-    return zlib.crc32(json.dumps(kept, sort_keys=True, separators=(",", ":")).encode())
+    entries = {name: value for name, value in content.items() if name != "checksum"}
+    return zlib.crc32(json.dumps(entries, sort_keys=True, separators=(",", ":")).encode())
 
 
-def shard_files(
-    root: Any, specs: Iterable[Mapping[str, Any]], place: tuple[int, ...], deadline: Deadline
-) -> Files:
+def shard_checksums(
+    root: Any, specs: Iterable[Mapping[str, Any]], index: tuple[int, ...], deadline: Deadline
+) -> FileChecksums:
     """Computes the checksums of the shards at index (t,) z, y, x of arrays of the store."""
-    found: Files = {}
+    checksums: FileChecksums = {}
     for spec in specs:
-        name = file_of(spec, place)
-        content = _read(root.get("path", "store"), root, spec, name, deadline)
-        found[name] = None if content is None else zlib.crc32(content)
-    return found
+        path = shard_path(spec, index)
+        content = _read_covered_bytes(root.get("path", "store"), root, spec, path, deadline)
+        checksums[path] = None if content is None else zlib.crc32(content)
+    return checksums
 
 
-def file_of(spec: Mapping[str, Any], place: tuple[int, ...]) -> str:
+def shard_path(spec: Mapping[str, Any], index: tuple[int, ...]) -> str:
     """Returns the path of a shard's file in the store."""
-    shape, names = spec["metadata"]["shape"], spec["metadata"].get("dimension_names", "")
-    at = list(place)
-    if "c" in names:  # each shard holds all channels
-        at.insert(len(at) - 3, 0)
-    at += [0] * (len(shape) - len(at))
-    return "/".join(map(str, (spec["path"], "c", *at)))
+    shape, dimension_names = spec["metadata"]["shape"], spec["metadata"].get("dimension_names", "")
+    file_index = list(index)
+    if "c" in dimension_names:  # each shard holds all channels
+        file_index.insert(len(file_index) - 3, 0)
+    file_index += [0] * (len(shape) - len(file_index))
+    return "/".join(map(str, (spec["path"], "c", *file_index)))
 
 
-def _read(where: str, root: Any, spec: Mapping[str, Any], name: str, deadline: Deadline) -> Any:
+def _read_covered_bytes(
+    location: str, root: Any, spec: Mapping[str, Any], path: str, deadline: Deadline
+) -> Any:
     """Reads the bytes of a file that its checksum covers; None: there is no such file."""
     metadata = spec["metadata"]
-    shard = math.prod(metadata["chunk_grid"]["configuration"]["chunk_shape"])
-    chunk = math.prod(metadata["codecs"][0]["configuration"]["chunk_shape"])
-    whole = spec["path"].startswith("gvtorch/cells")
-    part = None if whole else slice(-index_bytes(shard, chunk), None)
-    most = file_limit(shard, chunk, np.dtype(metadata["data_type"]).itemsize)
-    return read_key(where, root, name, deadline, part, most)
+    shard_values = math.prod(metadata["chunk_grid"]["configuration"]["chunk_shape"])
+    chunk_values = math.prod(metadata["codecs"][0]["configuration"]["chunk_shape"])
+    is_cells = spec["path"].startswith("gvtorch/cells")
+    byte_range = None if is_cells else slice(-index_bytes(shard_values, chunk_values), None)
+    max_bytes = file_limit(shard_values, chunk_values, np.dtype(metadata["data_type"]).itemsize)
+    return read_key(location, root, path, deadline, byte_range, max_bytes)
 
 
 class Checksums:
     """A store's list of checksums, read when first needed. Safe to use from several threads."""
 
-    def __init__(self, where: str, root: Any, layout: StoreLayout, time: int) -> None:
-        self._where, self._root, self._sum = where, root, layout.files_sum
-        self._time = (time,) if layout.times > 1 else ()
+    def __init__(self, location: str, root: Any, layout: StoreLayout, time: int) -> None:
+        self._location, self._root, self._list_checksum = location, root, layout.files_sum
+        self._time_index = (time,) if layout.times > 1 else ()
         shards = sum(math.prod(layout.shards(level)) for level in range(layout.levels))
-        self._most = _LINE * (1 + 3 * layout.times * shards)
-        self._files: Mapping[str, Any] | None = None
-        self._seen: set[str] = set()
+        self._max_list_bytes = _MAX_LINE_BYTES * (1 + 3 * layout.times * shards)
+        self._checksums: Mapping[str, Any] | None = None
+        self._checked_paths: set[str] = set()
 
-    def check(self, spec: Mapping[str, Any], place: tuple[int, ...], deadline: Deadline) -> None:
+    def check(self, spec: Mapping[str, Any], index: tuple[int, ...], deadline: Deadline) -> None:
         """Raises StoreError unless the shard at index z, y, x is the one that was written."""
-        if self._sum is None:
+        if self._list_checksum is None:
             return
-        name = file_of(spec, (*self._time, *place))
-        if name in self._seen:
+        path = shard_path(spec, (*self._time_index, *index))
+        if path in self._checked_paths:
             return
-        if self._files is None:
-            self._files = self._read(deadline)
-        wanted = self._files.get(name)
-        where = f"{self._where}/{name}"
-        if wanted is not None:  # None: no file was written, so there is nothing to compare
-            content = _read(self._where, self._root, spec, name, deadline)
+        if self._checksums is None:
+            self._checksums = self._read_list(deadline)
+        expected = self._checksums.get(path)
+        label = f"{self._location}/{path}"
+        if expected is not None:  # None: no file was written, so there is nothing to compare
+            content = _read_covered_bytes(self._location, self._root, spec, path, deadline)
             if content is None:
                 return  # it reads as zeros, and the store then finds out why
-            if zlib.crc32(content) != wanted:
-                raise StoreError(f"{where}: its checksum is not the one that was written")
-        self._seen.add(name)
+            if zlib.crc32(content) != expected:
+                raise StoreError(f"{label}: its checksum is not the one that was written")
+        self._checked_paths.add(path)
 
-    def _read(self, deadline: Deadline) -> Mapping[str, Any]:
+    def _read_list(self, deadline: Deadline) -> Mapping[str, Any]:
         try:
-            content = read_json(self._where, self._root, LIST, deadline, self._most)
+            content = read_json(
+                self._location, self._root, CHECKSUMS_FILE, deadline, self._max_list_bytes
+            )
         except ValueError as error:
             raise StoreError(str(error)) from None
-        files = None if content is None else content.get("files")
-        if not isinstance(files, dict) or sum_of(files) != self._sum:
-            what = "is missing" if content is None else "is not the one that was written"
-            raise StoreError(f"{self._where}/{LIST}: {what}")
-        return files
+        checksums = None if content is None else content.get("files")
+        if not isinstance(checksums, dict) or json_checksum(checksums) != self._list_checksum:
+            problem = "is missing" if content is None else "is not the one that was written"
+            raise StoreError(f"{self._location}/{CHECKSUMS_FILE}: {problem}")
+        return checksums

@@ -25,21 +25,21 @@ from ...base.stage import Progress, no_progress
 from ...base.whole_file import told_of
 from ..resources import amount
 from .ngff import read_json_file
-from .shard import bordered, create_array, finish_write, write
+from .shard import begin_write, bordered, create_array, finish_write
 from .store import Store
 from .store_layout import BORDER, WORK, CoarseChannel, StoreLayout, is_name
-from .unfinished import group, locked, write_json
+from .unfinished import group_metadata, locked, write_json
 
-_CUBE = 128  # voxels along a side of the cubes that are written at once
+_CUBE_SIDE = 128  # voxels along a side of the cubes that are written at once
 
 
 def make_channel(
     store: Store,
     name: str,
     channel: CoarseChannel,
-    wide: int,
+    fill_width: int,
     fill: Callable[[Sequence[np.ndarray]], None],
-    keep: Callable[[np.ndarray], np.ndarray],
+    to_values: Callable[[np.ndarray], np.ndarray],
     progress: Progress = no_progress,
 ) -> None:
     """Writes a coarse channel. An existing one of the same name is replaced when the new one is
@@ -49,10 +49,11 @@ def make_channel(
         store: A store that `convert` made, in a folder.
         name: Letters, digits, "-" and "_"; not "value".
         channel: Its metadata.
-        wide: How many numbers a voxel has that `fill` writes.
-        fill: Fills the arrays that it is given, (z, y, x, wide) float16, mapped from files, one for
-            each coarse level, the finest of them first.
-        keep: Turns boxes (z, y, x, wide) of these arrays into the channel's values, (z, y, x, c).
+        fill_width: How many numbers a voxel has that `fill` writes.
+        fill: Fills the arrays that it is given, (z, y, x, fill_width) float16, mapped from files,
+            one for each coarse level, the finest of them first.
+        to_values: Turns boxes (z, y, x, fill_width) of these arrays into the channel's values,
+            (z, y, x, c).
         progress: Called with ("writing", voxels done, voxels in all), after `fill`.
 
     Raises:
@@ -76,47 +77,54 @@ def make_channel(
     folder = target / store.coarse_folder
     folder.mkdir(parents=True, exist_ok=True)
     if store.times > 1 and not (folder.parent / "zarr.json").exists():
-        write_json(folder.parent / "zarr.json", group({}))
-    other = f"{folder}: another process makes a coarse channel"
-    with locked(folder / ".lock", other), _levels_in_files(store, wide) as levels:
+        write_json(folder.parent / "zarr.json", group_metadata({}))
+    busy_message = f"{folder}: another process makes a coarse channel"
+    with locked(folder / ".lock", busy_message), _levels_in_files(store, fill_width) as levels:
         fill(levels)
         file = folder / "zarr.json"
-        there = read_json_file(file).get("attributes") if file.exists() else {"channels": {}}
-        known = CoarseChannel.parse(str(file), there)
-        before = known.get(name)
-        made = replace(channel, generation=before.generation + 1 if before else 0)
-        _write_blocks(store, made.folder(name), made.width, levels, keep, progress)
-        known[name] = made
-        told = {one: other.attributes() for one, other in known.items()}
-        write_json(file, group({"channels": told}))
-        store.coarse = known
-        if before is not None:
-            shutil.rmtree(folder / before.folder(name), ignore_errors=True)
+        attributes = read_json_file(file).get("attributes") if file.exists() else {"channels": {}}
+        channels = CoarseChannel.parse(str(file), attributes)
+        previous = channels.get(name)
+        new_channel = replace(channel, generation=previous.generation + 1 if previous else 0)
+        _write_blocks(
+            store, new_channel.folder(name), new_channel.width, levels, to_values, progress
+        )
+        channels[name] = new_channel
+        entries = {key: entry.attributes() for key, entry in channels.items()}
+        write_json(file, group_metadata({"channels": entries}))
+        store.coarse = channels
+        if previous is not None:
+            shutil.rmtree(folder / previous.folder(name), ignore_errors=True)
 
 
 @contextmanager
-def _levels_in_files(store: Store, wide: int) -> Iterator[Sequence[np.ndarray]]:
+def _levels_in_files(store: Store, fill_width: int) -> Iterator[Sequence[np.ndarray]]:
     """Yields an array for each coarse level, mapped from temporary files in the store's folder."""
     folder = Path(store.location) / WORK
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     try:
-        yield [_mapped(store, folder, level, wide) for level in range(1, store.levels)]
+        yield [
+            _map_level_file(store, folder, level, fill_width) for level in range(1, store.levels)
+        ]
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _mapped(store: Store, folder: Path, level: int, wide: int) -> np.ndarray:
-    shape, file = (*store.level_extent(level)[::-1], wide), folder / f"{level}.npy"
+def _map_level_file(store: Store, folder: Path, level: int, fill_width: int) -> np.ndarray:
+    shape, file = (*store.level_extent(level)[::-1], fill_width), folder / f"{level}.npy"
     with told_of(file):
         mapped = np.lib.format.open_memmap(file, mode="w+", dtype=np.float16, shape=shape)
-    with file.open("r+b") as place:  # reserve the disk space: a full disk would kill the process
+    with file.open("r+b") as handle:  # reserve the disk space: a full disk would kill the process
         try:
-            os.posix_fallocate(place.fileno(), 0, file.stat().st_size)
+            os.posix_fallocate(handle.fileno(), 0, file.stat().st_size)
         except OSError as error:
-            sizes = [math.prod(store.level_extent(one)) for one in range(1, store.levels)]
-            text = f"{error.strerror}: while it is made, files take {amount(2 * wide * sum(sizes))}"
-            raise OSError(error.errno, text, store.location) from None
+            sizes = [math.prod(store.level_extent(other)) for other in range(1, store.levels)]
+            reason = (
+                f"{error.strerror}: while it is made, files take "
+                f"{amount(2 * fill_width * sum(sizes))}"
+            )
+            raise OSError(error.errno, reason, store.location) from None
     return mapped
 
 
@@ -125,24 +133,26 @@ def _write_blocks(
     folder: str,
     width: int,
     levels: Sequence[np.ndarray],
-    keep: Callable[[np.ndarray], np.ndarray],
+    to_values: Callable[[np.ndarray], np.ndarray],
     progress: Progress,
 ) -> None:
-    place = Path(store.location) / store.coarse_folder / folder
-    shutil.rmtree(place, ignore_errors=True)  # left by interrupted work
-    place.mkdir()
+    channel_folder = Path(store.location) / store.coarse_folder / folder
+    shutil.rmtree(channel_folder, ignore_errors=True)  # left by interrupted work
+    channel_folder.mkdir()
     done, total = 0, sum(math.prod(values.shape[:3]) for values in levels)
     for level, values in enumerate(levels, 1):
         spec = store.layout.coarse(level, f"{store.coarse_folder}/{folder}", width)
         create_array(store.root, spec)
-        for low in itertools.product(*(range(0, n, _CUBE) for n in values.shape[:3])):
-            size = [min(_CUBE, n - a) for a, n in zip(low, values.shape, strict=False)]
-            blocks = _blocks(store.layout, values, low, size, keep)
-            at = [a // store.layout.block for a in low]
-            finish_write(write(store.root, spec, at, blocks), store.location, "make it again")
+        for low in itertools.product(*(range(0, n, _CUBE_SIDE) for n in values.shape[:3])):
+            size = [min(_CUBE_SIDE, n - a) for a, n in zip(low, values.shape, strict=False)]
+            blocks = _blocks(store.layout, values, low, size, to_values)
+            first_block = [a // store.layout.block for a in low]
+            finish_write(
+                begin_write(store.root, spec, first_block, blocks), store.location, "make it again"
+            )
             done += math.prod(size)
             progress("writing", done, total)
-    write_json(place / "zarr.json", group({}))
+    write_json(channel_folder / "zarr.json", group_metadata({}))
 
 
 def _blocks(
@@ -150,7 +160,7 @@ def _blocks(
     values: np.ndarray,
     low: Sequence[int],
     size: Sequence[int],
-    keep: Callable[[np.ndarray], np.ndarray],
+    to_values: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
     """Returns (gz, gy, gx, s, s, s, c) blocks of a cube of a level, borders included."""
     begin = [a - BORDER for a in low]
@@ -158,5 +168,5 @@ def _blocks(
         a + -(-n // layout.block) * layout.block + BORDER for a, n in zip(low, size, strict=True)
     ]
     start, stop = boxes.clamped_box(begin, end, values.shape[:3])
-    inside = boxes.repeat_edges(keep(values[boxes.index(start, stop)]), start, begin, end)
-    return np.ascontiguousarray(bordered(layout, inside))
+    padded = boxes.repeat_edges(to_values(values[boxes.index(start, stop)]), start, begin, end)
+    return np.ascontiguousarray(bordered(layout, padded))

@@ -36,14 +36,14 @@ from .conversion_plan import (
     Plan,
     check_room,
     estimate_of,
+    fit_workers,
     plan_of,
     source_of,
-    within,
 )
 from .store import Store
 from .store_layout import WORK, Deadline, begin_open
 
-_AHEAD = 64  # tasks submitted at a time to an executor whose number of workers is unknown
+_TASKS_AHEAD = 64  # tasks submitted at a time to an executor whose number of workers is unknown
 _OPEN_TIMEOUT = 60.0  # seconds
 
 
@@ -104,15 +104,15 @@ def convert(
     """
     target = Path(store)
     make_source = partial(source_of, source, spacing, origin, time, oblique, labels, options)
-    if resume and unfinished.is_finished(target) and (whole := Store.open(target)).has_blocks:
+    if resume and unfinished.is_finished(target) and (finished := Store.open(target)).has_blocks:
         with suppress(FileNotFoundError):  # the source may be gone once the store is finished
-            _check_finished(whole, make_source(read=False), block, threshold)
-        return whole
+            _check_finished(finished, make_source(read=False), block, threshold)
+        return finished
     begun = unfinished.is_begun(target, resume=resume)
-    found = indexed_source(make_source(), time, workers, target / WORK, progress)
-    plan = plan_of(source, found, target, block, threshold, nan, time, workers)
+    prepared = indexed_source(make_source(), time, workers, target / WORK, progress)
+    plan = plan_of(source, prepared, target, block, threshold, nan, time, workers)
     if executor is None and (memory is not None or workers is None):
-        plan = within(plan, memory)
+        plan = fit_workers(plan, memory)
     if not begun:
         check_room(target, estimate_of(plan))
     _write_store(plan, begun, executor, progress)
@@ -124,7 +124,7 @@ def _check_finished(
 ) -> None:
     """Raises ValueError if a finished store differs from the one that would be written."""
     is_labels = source.info.labels
-    for name, before, now in (
+    for name, stored, requested in (
         ("extent", store.layout.extent, source.extent),
         ("spacing", store.spacing, source.spacing),
         ("origin", store.origin, source.origin),
@@ -134,10 +134,10 @@ def _check_finished(
         ("block", store.block, block),
         ("threshold", store.threshold, threshold),
     ):
-        if before != now:
+        if stored != requested:
             raise ValueError(
-                f"{store.location}: is finished, with {name} {before!r}, now it is {now!r}; remove "
-                "the store to make it again"
+                f"{store.location}: is finished, with {name} {stored!r}, now it is {requested!r}; "
+                "remove the store to make it again"
             )
 
 
@@ -161,36 +161,39 @@ def estimate(
     Args, Raises: as `convert`.
     """
     target = Path(store)
-    found = source_of(source, spacing, None, time, oblique, labels, options)
-    found = indexed_source(found, time, workers, target / WORK, no_progress)
-    return estimate_of(plan_of(source, found, target, block, threshold, nan, time, workers))
+    prepared = source_of(source, spacing, None, time, oblique, labels, options)
+    prepared = indexed_source(prepared, time, workers, target / WORK, no_progress)
+    return estimate_of(plan_of(source, prepared, target, block, threshold, nan, time, workers))
 
 
 def _write_store(plan: Plan, begun: bool, executor: Executor | None, progress: Progress) -> None:
     """Writes what is missing: levels, labels, and last the metadata that completes the store."""
     task, settings = plan.task, plan.settings
-    with _told_how_to_go_on(plan), unfinished.claimed(plan.target, settings, resume=begun) as work:
+    with (
+        _explain_resume(plan),
+        unfinished.claimed(plan.target, settings, resume=begun) as unfinished_store,
+    ):
         if plan.labels is not None:
             with durable_file(plan.target / WORK / LABELS) as file:
                 write_npy(file, plan.labels)
-        with _executor(executor, plan) as pool:
-            _write_levels(_staged(plan, pool), work, pool, progress)
+        with _open_executor(executor, plan) as pool:
+            _write_levels(_stage_source(plan, pool), unfinished_store, pool, progress)
         if plan.labels is not None:
             shard.write_label_array(task, plan.labels)
         layout = dataclasses.replace(task.layout, value_range=_value_range(task))
-        work.finish(layout, task.source.info, settings)
+        unfinished_store.finish(layout, task.source.info, settings)
 
 
-def _executor(given: Executor | None, plan: Plan) -> AbstractContextManager[Executor]:
-    if given is not None:
-        return nullcontext(given)
+def _open_executor(executor: Executor | None, plan: Plan) -> AbstractContextManager[Executor]:
+    if executor is not None:
+        return nullcontext(executor)
     if plan.uses_processes and plan.workers > 1:
         return resources.worker_processes(plan.workers)
     return ThreadPoolExecutor(plan.workers)
 
 
 @contextmanager
-def _told_how_to_go_on(plan: Plan) -> Iterator[None]:
+def _explain_resume(plan: Plan) -> Iterator[None]:
     """Adds how to resume to the error when a worker ends or the user interrupts."""
     target = plan.target
     command = shlex.join((*plan.task.source.command(str(target)), "--resume"))
@@ -209,7 +212,7 @@ def _told_how_to_go_on(plan: Plan) -> Iterator[None]:
         ) from None
 
 
-def _staged(plan: Plan, pool: Executor) -> Plan:
+def _stage_source(plan: Plan, pool: Executor) -> Plan:
     """Writes a source in memory to files, if other processes have to read it."""
     if isinstance(pool, ThreadPoolExecutor):
         return plan
@@ -218,37 +221,41 @@ def _staged(plan: Plan, pool: Executor) -> Plan:
 
 
 def _write_levels(
-    plan: Plan, work: unfinished.UnfinishedStore, pool: Executor, progress: Progress
+    plan: Plan, unfinished_store: unfinished.UnfinishedStore, pool: Executor, progress: Progress
 ) -> None:
     layout = plan.task.layout
     total = layout.voxels * layout.voxel_bytes
-    done = sum(one.voxels for one in work.done.values()) * layout.voxel_bytes
+    done = sum(finished.voxels for finished in unfinished_store.done.values()) * layout.voxel_bytes
     progress("converting", done, total)
-    counted = isinstance(pool, (ProcessPoolExecutor, ThreadPoolExecutor))
-    ahead = 2 * plan.workers + 2 if counted else _AHEAD
+    knows_workers = isinstance(pool, (ProcessPoolExecutor, ThreadPoolExecutor))
+    ahead = 2 * plan.workers + 2 if knows_workers else _TASKS_AHEAD
     for level in range(layout.levels):
-        places = [place for place in layout.places(level) if (level, *place) not in work.done]
-        if not places:
+        indices = [
+            index
+            for index in layout.shard_indices(level)
+            if (level, *index) not in unfinished_store.done
+        ]
+        if not indices:
             continue
         shard.create_arrays(plan.task, level)
-        bad = 0
+        bad_values = 0
         task = partial(shard.write_shard, plan.task, level)
-        with closing(resources.run_ahead(pool, task, places, ahead)) as results:
+        with closing(resources.run_ahead(pool, task, indices, ahead)) as results:
             for result in results:
-                bad += result.bad
-                if not result.bad:
-                    work.note({(level, *result.place): result})
+                bad_values += result.bad_values
+                if not result.bad_values:
+                    unfinished_store.record({(level, *result.shard_index): result})
                     done += result.voxels * layout.voxel_bytes
                     progress("converting", done, total)
-        if bad:
+        if bad_values:
             shutil.rmtree(plan.target, ignore_errors=True)
             raise ValueError(
-                f"{plan.settings['source']}: {bad} values are NaN or infinite (of "
+                f"{plan.settings['source']}: {bad_values} values are NaN or infinite (of "
                 f"{layout.times * math.prod(layout.extent) * layout.width}); pass nan=VALUE "
                 "(--nan VALUE) to replace them"
             )
-        for which in ("low", "high"):  # bounds of the level below are no longer needed
-            folder = plan.target / WORK / which / str(level - 1)
+        for bound in ("low", "high"):  # bounds of the level below are no longer needed
+            folder = plan.target / WORK / bound / str(level - 1)
             shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -21,19 +21,19 @@ from ...pool.downsample import pool_majority, pool_mean
 from .. import resources
 from ..label_source import IndexSource
 from ..oblique import Oblique
-from ..reading import FormatSettings, at_place, open_source, read_whole
-from ..source import MemorySource, VolumeSource, no_time
+from ..reading import FormatSettings, open_source, read_time_points, with_placement
+from ..source import MemorySource, VolumeSource, no_time_message
 from . import shard, unfinished
 from .level_reader import Pool
 from .store_layout import BLOCKS, DTYPES, StoreLayout, context, kvstore
 
-_FEW = 4  # up to this many tasks of level 0, starting processes does not pay
-_PROCESS = 400 << 20  # bytes of a worker process without data
+_FEW_TASKS = 4  # up to this many tasks of level 0, starting processes does not pay
+_PROCESS_BYTES = 400 << 20  # bytes of a worker process without data
 _COPIES = 12  # copies of its cube that a task holds at its peak
-_BELOW = 4  # cost of a coarser level's voxel, in finest voxels
-_DISK = 2.0  # time of writing to disk, relative to memory
-_SAMPLES = 3  # cubes that are converted for an estimate
-_SAMPLE_TIME = 2.0  # seconds after which no further cube is converted for an estimate
+_COARSE_COST = 4  # cost of a coarser level's voxel, in finest voxels
+_DISK_FACTOR = 2.0  # time of writing to disk, relative to memory
+_SAMPLE_CUBES = 3  # cubes that are converted for an estimate
+_SAMPLE_SECONDS = 2.0  # seconds after which no further cube is converted for an estimate
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -96,7 +96,7 @@ def source_of(
         return source
     if isinstance(source, Volume):
         if time not in (None, 0):
-            raise ValueError(no_time(source.name, time, 1))
+            raise ValueError(no_time_message(source.name, time, 1))
         if labels and not source.info.labels:
             raise ValueError("convert: the volume must hold labels: gv.Volume(data, labels=True)")
         if source.filter == "directional":
@@ -106,32 +106,32 @@ def source_of(
             )
         if str(source.data.dtype).removeprefix("torch.") not in DTYPES:
             raise ValueError(f"{source.name}: {source.data.dtype} can't be stored")
-        told = {"path": source.name, "info": source.info}
-        told |= {"spacing": source.spacing, "origin": source.origin}
-        found = at_place(
-            "convert", MemorySource.of(source.data.cpu().numpy(), **told), spacing, origin
+        fields = {"path": source.name, "info": source.info}
+        fields |= {"spacing": source.spacing, "origin": source.origin}
+        opened = with_placement(
+            "convert", MemorySource.of(source.data.cpu().numpy(), **fields), spacing, origin
         )
         if source.label_values is None:
-            return found
+            return opened
         # The volume's labels are indexed already.
-        return IndexSource.of(found, source.label_values.numpy(), indexed=True)
+        return IndexSource.of(opened, source.label_values.numpy(), indexed=True)
     placement: dict[str, Any] = {"spacing": spacing, "origin": origin, "oblique": oblique}
-    found = open_source(source, time=time, labels=labels, **placement, **options)
-    if not (found.whole and read):
-        return found
-    first, times = (0, found.times) if time is None else (time, 1)
-    free, needed = resources.memory_free(), found.peak_bytes + (times - 1) * found.nbytes
+    opened = open_source(source, time=time, labels=labels, **placement, **options)
+    if not (opened.whole and read):
+        return opened
+    first, times = (0, opened.times) if time is None else (time, 1)
+    free, needed = resources.memory_free(), opened.peak_bytes + (times - 1) * opened.nbytes
     if needed > free:
         raise ValueError(
             f"{source}: can only be read as a whole, which takes {resources.amount(needed)}, and "
             f"{resources.amount(free)} of memory are free: unpack it first"
         )
-    told = {name: getattr(found, name) for name in ("path", "spacing", "origin", "info")}
-    return MemorySource.of(read_whole(found, first, times), **told)
+    fields = {name: getattr(opened, name) for name in ("path", "spacing", "origin", "info")}
+    return MemorySource.of(read_time_points(opened, first, times), **fields)
 
 
 def plan_of(
-    given: str | Path | Volume | Any,
+    user_source: str | Path | Volume | Any,
     source: VolumeSource,
     target: Path,
     block: int,
@@ -144,12 +144,14 @@ def plan_of(
     if threshold is not None:
         threshold = check.number("convert", "threshold", threshold)
     if nan is not None:
-        most = float(np.finfo(source.dtype).max) if np.dtype(source.dtype).kind == "f" else math.inf
-        nan = check.number("convert", "nan", nan, low=-most, high=most)
+        limit = (
+            float(np.finfo(source.dtype).max) if np.dtype(source.dtype).kind == "f" else math.inf
+        )
+        nan = check.number("convert", "nan", nan, low=-limit, high=limit)
     if source.info.labels and threshold is not None:
         raise ValueError("convert: threshold is for values; labels are hidden by the shader")
-    known = source.labels if isinstance(source, IndexSource) else None
-    names = None if isinstance(known, str) else known
+    labels = source.labels if isinstance(source, IndexSource) else None
+    label_values = None if isinstance(labels, str) else labels
     layout = StoreLayout(
         extent=source.extent,
         dtype=source.dtype,
@@ -157,21 +159,21 @@ def plan_of(
         block=block,
         threshold=threshold,
         times=source.times if time is None else 1,
-        label_count=None if names is None else len(names),
+        label_count=None if label_values is None else len(label_values),
     )
-    told_channels = len(source.info.channels)
-    if told_channels not in (0, source.width):
+    info_channels = len(source.info.channels)
+    if info_channels not in (0, source.width):
         raise ValueError(
-            f"{source.path}: its info names {told_channels} channels, it has {source.width}"
+            f"{source.path}: its info names {info_channels} channels, it has {source.width}"
         )
     workers = resources.cores() if workers is None else workers
     workers = check.whole("convert", "workers", workers, low=1)
     tasks = [layout.times * math.prod(layout.shards(level)) for level in range(layout.levels)]
-    told = ("extent", "dtype", "spacing", "origin")
+    fields = ("extent", "dtype", "spacing", "origin")
     settings = {
         "source": source.path,
-        "fingerprint": _fingerprint(given, source),
-        **{name: getattr(source, name) for name in told},
+        "fingerprint": _fingerprint(user_source, source),
+        **{name: getattr(source, name) for name in fields},
         "unit": source.info.unit,
         "times": layout.times,
         "time": source.time,
@@ -184,27 +186,27 @@ def plan_of(
     }
     pool: Pool = pool_mean
     if source.info.labels:
-        pool = partial(pool_majority, background=background(names))
+        pool = partial(pool_majority, background=background(label_values))
     root = kvstore(target)
     return Plan(
         target=target,
         task=shard.Conversion(root=root, layout=layout, source=source, nan=nan, pool=pool),
         settings=settings,
-        labels=names,
+        labels=label_values,
         workers=min(workers, tasks[0]),
-        uses_processes=tasks[0] > _FEW,
+        uses_processes=tasks[0] > _FEW_TASKS,
     )
 
 
 def estimate_of(plan: Plan) -> Estimate:
     layout, source = plan.task.layout, plan.task.source
     voxels = layout.times * math.prod(layout.extent)
-    below = layout.voxels - voxels
-    plain, beside, seen, seconds = _sample(plan.task)
-    share = (voxels + below) / seen
-    each, held = _task_bytes(plan)
-    staged = held if plan.uses_processes else 0
-    start = 3.0 * plan.uses_processes
+    coarse_voxels = layout.voxels - voxels
+    pyramid_bytes, other_bytes, sampled_voxels, seconds = _sample(plan.task)
+    scale = (voxels + coarse_voxels) / sampled_voxels
+    worker_bytes, source_bytes = _task_bytes(plan)
+    staged_bytes = source_bytes if plan.uses_processes else 0
+    start_seconds = 3.0 * plan.uses_processes
     target = plan.target.absolute()
     folder = next(path for path in (target, *target.parents) if path.exists())
     return Estimate(
@@ -214,37 +216,44 @@ def estimate_of(plan: Plan) -> Estimate:
         levels=layout.levels,
         tasks=plan.settings["tasks"],
         source_bytes=layout.times * source.nbytes,
-        disk_bytes=int((plain + beside) * share),
-        temporary_bytes=int(2 * plain * below / seen) + staged,
-        memory_bytes=_PROCESS + plan.workers * each + held,
-        seconds=_DISK * seconds * (voxels + _BELOW * below) / seen / plan.workers + start,
+        disk_bytes=int((pyramid_bytes + other_bytes) * scale),
+        temporary_bytes=int(2 * pyramid_bytes * coarse_voxels / sampled_voxels) + staged_bytes,
+        memory_bytes=_PROCESS_BYTES + plan.workers * worker_bytes + source_bytes,
+        seconds=_DISK_FACTOR
+        * seconds
+        * (voxels + _COARSE_COST * coarse_voxels)
+        / sampled_voxels
+        / plan.workers
+        + start_seconds,
         workers=plan.workers,
         disk_free=shutil.disk_usage(folder).free,
-        memory_free=resources.memory_free() + held,
+        memory_free=resources.memory_free() + source_bytes,
     )
 
 
 def _task_bytes(plan: Plan) -> tuple[int, int]:
     """Returns the most bytes of memory a worker uses, and the bytes of a source in memory."""
-    layout, inner = plan.task.layout, plan.task.source
+    layout, source = plan.task.layout, plan.task.source
     copies = _COPIES * (layout.shard + 2) ** 3 * layout.voxel_bytes
-    cube = min(1.0, math.prod(layout.extent) / layout.shard**3)
-    inner = inner.inner if isinstance(inner, IndexSource) else inner
-    held = inner.data.nbytes if isinstance(inner, MemorySource) else 0
-    own = (_PROCESS if plan.uses_processes else 0) + 2 * inner.unpacked_bytes
-    return own + int(copies * cube), held
+    cube_fraction = min(1.0, math.prod(layout.extent) / layout.shard**3)
+    source = source.inner if isinstance(source, IndexSource) else source
+    source_bytes = source.data.nbytes if isinstance(source, MemorySource) else 0
+    fixed_bytes = (_PROCESS_BYTES if plan.uses_processes else 0) + 2 * source.unpacked_bytes
+    return fixed_bytes + int(copies * cube_fraction), source_bytes
 
 
-def within(plan: Plan, memory: int | str | None) -> Plan:
+def fit_workers(plan: Plan, memory: int | str | None) -> Plan:
     """Returns the plan with at most the workers that fit into `memory`; None: into free memory."""
-    each, held = _task_bytes(plan)
-    free = resources.memory_free() + held
+    worker_bytes, source_bytes = _task_bytes(plan)
+    free = resources.memory_free() + source_bytes
     limit = free if memory is None else check.nbytes("convert", "memory", memory)
-    fitting = (limit - _PROCESS - held) // each
+    fitting = (limit - _PROCESS_BYTES - source_bytes) // worker_bytes
     if fitting < 1 and memory is not None:
-        given, least = (resources.amount(n) for n in (limit, _PROCESS + held + each))
+        limit_text, needed_text = (
+            resources.amount(n) for n in (limit, _PROCESS_BYTES + source_bytes + worker_bytes)
+        )
         raise ValueError(
-            f"{plan.target}: memory of {given} is too little, one worker takes {least}"
+            f"{plan.target}: memory of {limit_text} is too little, one worker takes {needed_text}"
         )
     return dataclasses.replace(plan, workers=max(1, min(plan.workers, fitting)))
 
@@ -254,47 +263,51 @@ def _sample(task: shard.Conversion) -> tuple[int, int, int, float]:
     import tensorstore as ts
 
     layout = task.layout
-    places = list(layout.places(0))  # the picks are spread over space and time
-    picked = [places[(2 * i + 1) * len(places) // (2 * _SAMPLES)] for i in range(_SAMPLES)]
+    indices = list(layout.shard_indices(0))  # the picks are spread over space and time
+    sampled = [
+        indices[(2 * i + 1) * len(indices) // (2 * _SAMPLE_CUBES)] for i in range(_SAMPLE_CUBES)
+    ]
     root = {"driver": "memory", "path": f"gvtorch-estimate-{id(task)}/"}
     store = ts.KvStore.open(root, context=context()).result()
     trial = dataclasses.replace(task, root=root, nan=0.0 if task.nan is None else task.nan)
     shard.create_arrays(trial, 0)
-    start, seen = perf_counter(), 0
-    for place in dict.fromkeys(picked):
-        seen += shard.write_shard(trial, 0, place).voxels
-        if perf_counter() - start > _SAMPLE_TIME:
+    start, voxels = perf_counter(), 0
+    for index in dict.fromkeys(sampled):
+        voxels += shard.write_shard(trial, 0, index).voxels
+        if perf_counter() - start > _SAMPLE_SECONDS:
             break
     seconds = perf_counter() - start
     sizes = {name: len(store.read(name).result().value) for name in store.list().result()}
     store.delete_range(ts.KvStore.KeyRange()).result()
-    plain = sum(size for name, size in sizes.items() if name.startswith(b"0/"))
-    return plain, sum(sizes.values()) - plain, seen, seconds
+    pyramid_bytes = sum(size for name, size in sizes.items() if name.startswith(b"0/"))
+    return pyramid_bytes, sum(sizes.values()) - pyramid_bytes, voxels, seconds
 
 
-def check_room(target: Path, needs: Estimate) -> None:
+def check_room(target: Path, estimate: Estimate) -> None:
     """Raises OSError if disk or memory are too small."""
-    disk = needs.disk_bytes + needs.temporary_bytes
-    if disk > needs.disk_free:
+    disk = estimate.disk_bytes + estimate.temporary_bytes
+    if disk > estimate.disk_free:
         raise OSError(
             f"{target}: the store takes about {resources.amount(disk)}, "
-            f"{resources.amount(needs.disk_free)} are free on the disk"
+            f"{resources.amount(estimate.disk_free)} are free on the disk"
         )
-    if needs.memory_bytes > needs.memory_free:
+    if estimate.memory_bytes > estimate.memory_free:
         raise OSError(
-            f"{target}: converting with {needs.workers} workers takes up to "
-            f"{resources.amount(needs.memory_bytes)} of memory, "
-            f"{resources.amount(needs.memory_free)} are free; fewer --workers take less"
+            f"{target}: converting with {estimate.workers} workers takes up to "
+            f"{resources.amount(estimate.memory_bytes)} of memory, "
+            f"{resources.amount(estimate.memory_free)} are free; fewer --workers take less"
         )
 
 
-def _fingerprint(given: Any, source: VolumeSource) -> list[Any]:
-    own = source.fingerprint()
-    if own is not None:
-        return own
-    if isinstance(given, Volume):
-        return unfinished.fingerprint(given)
-    if isinstance(given, (str, Path)):
+def _fingerprint(user_source: Any, source: VolumeSource) -> list[Any]:
+    fingerprint = source.fingerprint()
+    if fingerprint is not None:
+        return fingerprint
+    if isinstance(user_source, Volume):
+        return unfinished.fingerprint(user_source)
+    if isinstance(user_source, (str, Path)):
         return unfinished.fingerprint(source.path)
-    told: list[Any] = [list(source.shape), source.stored]
-    return told + ([unfinished.checksum([source.data])] if isinstance(source, MemorySource) else [])
+    fields: list[Any] = [list(source.shape), source.stored]
+    return fields + (
+        [unfinished.checksum([source.data])] if isinstance(source, MemorySource) else []
+    )

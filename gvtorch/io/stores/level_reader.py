@@ -20,14 +20,22 @@ import numpy as np
 from ...base import boxes, check
 from ...base.boxes import Zyx
 from ...base.labels import check_narrowed
-from ..source import no_time
+from ..source import no_time_message
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
-from .store_layout import MOST_VOXELS, Deadline, StoreError, StoreLayout, begin_open, child, short
+from .store_layout import (
+    MAX_STORE_VOXELS,
+    Deadline,
+    StoreError,
+    StoreLayout,
+    begin_open,
+    child,
+    one_line_error,
+)
 
 Pool = Callable[[np.ndarray, int | Sequence[int]], np.ndarray]
-_TILE = 64  # voxels along a side of a tile that is computed on demand
-_KEPT = 128 << 20  # bytes of cached tiles
+_TILE_SIDE = 64  # voxels along a side of a tile that is computed on demand
+_CACHE_BYTES = 128 << 20  # bytes of cached tiles
 
 
 @dataclass(frozen=True)
@@ -38,7 +46,7 @@ class StoredArray:
     files: ChunkFiles
     axes: str  # letters among c, z, y, x in stored order
     factors: tuple[int, int, int]  # z y x, finest voxels along a side of one of its voxels
-    where: str
+    label: str
 
     def size(self, axis: str) -> int:
         """Returns the voxels along an axis; 1 if the array lacks the axis."""
@@ -47,17 +55,17 @@ class StoredArray:
     def read(self, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         """Reads (z, y, x, c); voxels beyond the array repeat its outermost ones."""
         start, stop = boxes.clamped_box(low, high, [self.size(axis) for axis in "zyx"])
-        inside = dict(zip("zyx", boxes.index(start, stop), strict=True))
-        place = tuple(inside.get(axis, slice(None)) for axis in self.axes)
-        data = deadline.wait(begin_read(self.array[place], self.files), self.where)
+        slices = dict(zip("zyx", boxes.index(start, stop), strict=True))
+        index = tuple(slices.get(axis, slice(None)) for axis in self.axes)
+        data = deadline.wait(begin_read(self.array[index], self.files), self.label)
         return boxes.repeat_edges(boxes.to_zyxc(data, self.axes), start, low, high)
 
 
 def open_arrays(
-    where: str,
+    location: str,
     root: Any,
     image: MultiscaleImage,
-    moment: int,
+    time: int,
     channels: Sequence[int] | None,
     deadline: Deadline,
 ) -> tuple[list[StoredArray], slice | list[int], dict[str, int]]:
@@ -66,86 +74,90 @@ def open_arrays(
     each axis. Metadata is checked before memory is allocated.
     """
     finest = image.scales[0]
-    at = child(root, finest.path)
-    is_v3 = read_json(f"{where}/{finest.path}", at, "zarr.json", deadline) is not None
+    folder = child(root, finest.path)
+    is_v3 = read_json(f"{location}/{finest.path}", folder, "zarr.json", deadline) is not None
     driver = "zarr3" if is_v3 else "zarr"
     futures = [begin_open(root, {"driver": driver, "path": scale.path}) for scale in image.scales]
     stored: list[StoredArray] = []
     for scale, future in zip(image.scales, futures, strict=True):
-        name = f"{where}/{scale.path}"
+        label = f"{location}/{scale.path}"
         try:
-            array = deadline.wait(future, name)
+            array = deadline.wait(future, label)
         except StoreError as error:
-            raise ValueError(f"{name}: can't be opened: {short(error)}") from None
-        files = _check_array(name, array, image.axes)
+            raise ValueError(f"{label}: can't be opened: {one_line_error(error)}") from None
+        files = _check_array(label, array, image.axes)
         if not stored:
-            chosen = _choose(where, array, image.axes, moment, channels)
+            channel_index = _channel_index(location, array, image.axes, time, channels)
             sizes = dict(zip(image.axes, map(int, array.shape), strict=True))
-        picked: dict[str, Any] = {"t": moment, "c": chosen, "-": 0}
+        selection: dict[str, Any] = {"t": time, "c": channel_index, "-": 0}
         # An index array of channels would move its axis: oindex leaves every axis in place.
-        array = array.oindex[tuple(picked.get(axis, slice(None)) for axis in image.axes)]
+        array = array.oindex[tuple(selection.get(axis, slice(None)) for axis in image.axes)]
         axes = image.axes.replace("t", "").replace("-", "")
-        found = StoredArray(array, files, axes, (1, 1, 1), name)
-        factors = _factors(stored[0], found, finest, scale) if stored else found.factors
+        opened = StoredArray(array, files, axes, (1, 1, 1), label)
+        factors = _factors(stored[0], opened, finest, scale) if stored else opened.factors
         if factors is not None:
-            stored.append(replace(found, factors=factors))
-    return stored, chosen, sizes
+            stored.append(replace(opened, factors=factors))
+    return stored, channel_index, sizes
 
 
-def keep_channels(image: MultiscaleImage, sizes: dict[str, int], chosen: slice | list[int]) -> None:
+def keep_channels(
+    image: MultiscaleImage, sizes: dict[str, int], channel_index: slice | list[int]
+) -> None:
     """Reduces the channel metadata to the chosen channels; drops it if it doesn't fit the array."""
-    told, width = image.info.channels, sizes.get("c", 1)
-    if told and len(told) != width:
-        image.lost.append(f"metadata of {len(told)} channels, where there are {width}")
-        told = ()
+    channels, width = image.info.channels, sizes.get("c", 1)
+    if channels and len(channels) != width:
+        image.dropped.append(f"metadata of {len(channels)} channels, where there are {width}")
+        channels = ()
     if sizes.get("-", 1) > 1:
-        other = f"an axis that is none of t, c, z, y, x: the first of {sizes['-']} is read"
-        image.lost.append(other)
-    if told and not isinstance(chosen, slice):
-        told = tuple(told[number] for number in chosen)
-    image.info = replace(image.info, channels=told)
+        note = f"an axis that is none of t, c, z, y, x: the first of {sizes['-']} is read"
+        image.dropped.append(note)
+    if channels and not isinstance(channel_index, slice):
+        channels = tuple(channels[number] for number in channel_index)
+    image.info = replace(image.info, channels=channels)
 
 
-def _check_array(where: str, array: Any, axes: str) -> ChunkFiles:
+def _check_array(label: str, array: Any, axes: str) -> ChunkFiles:
     if array.rank != len(axes):
-        raise ValueError(f"{where}: has {array.rank} axes, the metadata {len(axes)}: {axes}")
+        raise ValueError(f"{label}: has {array.rank} axes, the metadata {len(axes)}: {axes}")
     voxels = math.prod(array.shape[axes.index(axis)] for axis in "zyx" if axis in axes)
-    if voxels > MOST_VOXELS:
-        raise ValueError(f"{where}: {voxels} voxels are more than the {MOST_VOXELS} of a store")
-    if min(array.shape) < 1 or math.prod(array.shape) > MOST_VOXELS * 2**10:
-        raise ValueError(f"{where}: extent {tuple(array.shape)} is empty or far too large")
-    return files_of(where, array)
+    if voxels > MAX_STORE_VOXELS:
+        raise ValueError(
+            f"{label}: {voxels} voxels are more than the {MAX_STORE_VOXELS} of a store"
+        )
+    if min(array.shape) < 1 or math.prod(array.shape) > MAX_STORE_VOXELS * 2**10:
+        raise ValueError(f"{label}: extent {tuple(array.shape)} is empty or far too large")
+    return files_of(label, array)
 
 
-def _choose(
-    where: str, array: Any, axes: str, moment: int, channels: Sequence[int] | None
+def _channel_index(
+    label: str, array: Any, axes: str, time: int, channels: Sequence[int] | None
 ) -> slice | list[int]:
     size = {axis: int(n) for axis, n in zip(axes, array.shape, strict=True)}
-    moments, width = size.get("t", 1), size.get("c", 1)
-    if isinstance(moment, bool) or not isinstance(moment, int) or not 0 <= moment < moments:
-        raise ValueError(no_time(where, moment, moments))
+    times, width = size.get("t", 1), size.get("c", 1)
+    if isinstance(time, bool) or not isinstance(time, int) or not 0 <= time < times:
+        raise ValueError(no_time_message(label, time, times))
     if channels is None:
         return slice(None)
-    picked = list(check.instance(where, "channels", channels, tuple, list, range))
-    if not picked or not all(isinstance(c, int) and 0 <= c < width for c in picked):
-        raise ValueError(f"{where}: has no channels {picked!r}; it has {width}, from 0")
-    return picked if "c" in axes else slice(None)
+    selected = list(check.instance(label, "channels", channels, tuple, list, range))
+    if not selected or not all(isinstance(c, int) and 0 <= c < width for c in selected):
+        raise ValueError(f"{label}: has no channels {selected!r}; it has {width}, from 0")
+    return selected if "c" in axes else slice(None)
 
 
 def _factors(
     first: StoredArray, other: StoredArray, fine: ImageArray, coarse: ImageArray
 ) -> tuple[int, int, int] | None:
     """Returns whole factors (z, y, x) between the finest array and another; None if not whole."""
-    found = []
+    factors = []
     for axis, a, b in zip("zyx", fine.scale, coarse.scale, strict=True):
-        big, small = first.size(axis), other.size(axis)
+        fine_size, coarse_size = first.size(axis), other.size(axis)
         # Sizes are the fallback for scales; a partial last voxel may have been dropped.
-        for ratio in (b / a, big / small):
+        for ratio in (b / a, fine_size / coarse_size):
             factor = round(ratio) if math.isfinite(ratio) else 0
-            if factor >= 1 and small in (-(-big // factor), big // factor):
-                found.append(factor)
+            if factor >= 1 and coarse_size in (-(-fine_size // factor), fine_size // factor):
+                factors.append(factor)
                 break
-    return (found[0], found[1], found[2]) if len(found) == 3 else None
+    return (factors[0], factors[1], factors[2]) if len(factors) == 3 else None
 
 
 class LevelReader:
@@ -160,12 +172,12 @@ class LevelReader:
         self._plans: list[tuple[StoredArray, list[int]] | None] = []
         cost = 1.0
         for level in range(layout.levels):
-            fits = [s for s in stored if all(2**level % f == 0 for f in s.factors)]
-            base = max(fits, key=lambda s: math.prod(s.factors))
-            rest = [2**level // f for f in base.factors]  # factors that remain to be averaged
-            direct = math.prod(rest)
+            candidates = [s for s in stored if all(2**level % f == 0 for f in s.factors)]
+            base = max(candidates, key=lambda s: math.prod(s.factors))
+            remaining = [2**level // f for f in base.factors]  # factors that remain to be averaged
+            direct = math.prod(remaining)
             if level == 0 or direct < 8 * cost:
-                self._plans.append((base, rest))
+                self._plans.append((base, remaining))
                 cost = direct
             else:
                 self._plans.append(None)
@@ -176,55 +188,59 @@ class LevelReader:
     def read(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         """Reads (z, y, x, c) voxels `low` to `high` of a level; edge voxels repeat beyond it."""
         start, stop = boxes.clamped_box(low, high, self._layout.shape(level))
-        data = self._inside(level, start, stop, deadline)
+        data = self._read_inside(level, start, stop, deadline)
         return np.ascontiguousarray(boxes.repeat_edges(data, start, low, high))
 
     def coarsest(self, level: int) -> int:
         """Returns the coarsest level up to `level` that is read without averaging finer ones."""
-        plain = [n for n, plan in enumerate(self._plans[: level + 1]) if plan and max(plan[1]) == 1]
-        return plain[-1]
+        stored_levels = [
+            n for n, plan in enumerate(self._plans[: level + 1]) if plan and max(plan[1]) == 1
+        ]
+        return stored_levels[-1]
 
-    def _inside(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
+    def _read_inside(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         plan = self._plans[level]
         if plan is None:
-            return self._from_tiles(level, low, high, deadline)
-        base, rest = plan
-        ends = [-(-n // f) for n, f in zip(self._layout.shape(0), base.factors, strict=True)]
-        start = [a * r for a, r in zip(low, rest, strict=True)]
-        stop = [min(b * r, n) for b, r, n in zip(high, rest, ends, strict=True)]
+            return self._read_tiles(level, low, high, deadline)
+        base, remaining = plan
+        base_shape = [-(-n // f) for n, f in zip(self._layout.shape(0), base.factors, strict=True)]
+        start = [a * r for a, r in zip(low, remaining, strict=True)]
+        stop = [min(b * r, n) for b, r, n in zip(high, remaining, base_shape, strict=True)]
         data = base.read(start, stop, deadline)
         if self._layout.dtype == "float32":
-            check_narrowed(base.where, data)
+            check_narrowed(base.label, data)
         data = data.astype(self._layout.dtype, copy=False)
-        return data if math.prod(rest) == 1 else self._pool(data, rest)
+        return data if math.prod(remaining) == 1 else self._pool(data, remaining)
 
-    def _from_tiles(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
+    def _read_tiles(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         size = [b - a for a, b in zip(low, high, strict=True)]
         out = np.empty((*size, self.width), self._layout.dtype)
-        spans = [range(a // _TILE, -(-b // _TILE)) for a, b in zip(low, high, strict=True)]
-        for place in itertools.product(*spans):
-            tile = self._tile(level, place, deadline)
-            corner = np.multiply(place, _TILE)
+        spans = [
+            range(a // _TILE_SIDE, -(-b // _TILE_SIDE)) for a, b in zip(low, high, strict=True)
+        ]
+        for tile_index in itertools.product(*spans):
+            tile = self._tile(level, tile_index, deadline)
+            corner = np.multiply(tile_index, _TILE_SIDE)
             begin, end = np.maximum(low, corner), np.minimum(high, corner + tile.shape[:3])
             part = tile[boxes.index(begin - corner, end - corner)]
             out[boxes.index(begin - low, end - low)] = part
         return out
 
-    def _tile(self, level: int, place: Zyx, deadline: Deadline) -> np.ndarray:
-        key = (level, *place)
+    def _tile(self, level: int, tile_index: Zyx, deadline: Deadline) -> np.ndarray:
+        key = (level, *tile_index)
         with self._lock:
             if key in self._tiles:
                 self._tiles.move_to_end(key)
                 return self._tiles[key]
-        below = self._layout.shape(level - 1)
-        low = [2 * _TILE * at for at in place]
-        high = [min(a + 2 * _TILE, n) for a, n in zip(low, below, strict=True)]
-        tile = self._pool(self._inside(level - 1, low, high, deadline), 2)
+        finer_shape = self._layout.shape(level - 1)
+        low = [2 * _TILE_SIDE * i for i in tile_index]
+        high = [min(a + 2 * _TILE_SIDE, n) for a, n in zip(low, finer_shape, strict=True)]
+        tile = self._pool(self._read_inside(level - 1, low, high, deadline), 2)
         with self._lock:
             self._tiles[key] = tile
-            size = sum(kept.nbytes for kept in self._tiles.values())
-            while len(self._tiles) > 1 and size > _KEPT:
+            cached_bytes = sum(cached.nbytes for cached in self._tiles.values())
+            while len(self._tiles) > 1 and cached_bytes > _CACHE_BYTES:
                 # The oldest of the finest level: coarse tiles are few, and cost most to recompute.
                 victim = min(self._tiles, key=lambda key: key[0])
-                size -= self._tiles.pop(victim).nbytes
+                cached_bytes -= self._tiles.pop(victim).nbytes
         return tile

@@ -19,10 +19,10 @@ from ...base.image_info import ChannelInfo, ImageInfo, Rgb, from_hex, to_hex
 from ...base.units import metres
 from ..http import Endless
 from ..remote import is_file_url
-from .store_layout import MOST_JSON, WORK, Deadline, StoreLayout, child, is_number, read_key
+from .store_layout import MAX_JSON_BYTES, WORK, Deadline, StoreLayout, child, is_number, read_key
 
-SEVERAL = "gvtorch_channels"  # attribute that names the images of a store of several channels
-_MOST_LEVELS = 64
+CHANNELS_ATTRIBUTE = "gvtorch_channels"  # names the images of a store of several channels
+_MAX_LEVELS = 64
 #: Colours written for channels that have none, since viewers want one. A single channel is white.
 _COLORS = ("00ff00", "ff00ff", "00ffff", "ffff00", "ff0000", "0000ff")
 _DEFAULT_AXES = "tczyx"  # in versions 0.1 and 0.2
@@ -45,8 +45,8 @@ class MultiscaleImage:
     scales: tuple[ImageArray, ...]  # finest first
     name: str
     info: ImageInfo = field(default_factory=ImageInfo)
-    lost: list[str] = field(default_factory=list)  # phrases: metadata that is not kept
-    own: dict[str, Any] = field(default_factory=dict)  # gvtorch's attributes, in its stores
+    dropped: list[str] = field(default_factory=list)  # phrases: metadata that is not kept
+    store_json: dict[str, Any] = field(default_factory=dict)  # gvtorch's attributes, in its stores
 
 
 def is_zarr(path: str | Path) -> bool:
@@ -60,7 +60,7 @@ def is_zarr(path: str | Path) -> bool:
 
 
 def find_image(
-    where: str, root: Any, image: str | None, deadline: Deadline
+    location: str, root: Any, image: str | None, deadline: Deadline
 ) -> tuple[Any, MultiscaleImage, StoreLayout | None]:
     """Finds a multiscale image by its name, number or folder; None finds the first.
 
@@ -70,60 +70,68 @@ def find_image(
     Raises:
         ValueError: There is no such image, or the metadata is damaged.
     """
-    attributes = _attributes(where, root, deadline)
+    attributes = _attributes(location, root, deadline)
     if attributes is None:
-        raise _no_store(where, root, deadline)
-    own = attributes.get("gvtorch")
-    layout = None if own is None else StoreLayout.parse(where, own)
-    found = _parse_image(where, attributes, image)
-    series = _member(attributes, "bioformats2raw.layout")
-    if found is None and layout is None:
-        first = attributes.get(SEVERAL, ["0"])  # "0": the folder used by bioformats2raw
-        named = isinstance(first, list) and first and isinstance(first[0], str)
-        inner = image if image is not None else first[0] if named else "0"
-        if ".." not in inner and not inner.startswith("/"):
-            top, root = root, child(root, inner)
-            deeper = _attributes(f"{where}/{inner}", root, deadline)
-            found = _parse_image(where, deeper, None) if deeper else None
-            own = deeper.get("gvtorch") if deeper else None
-            layout = None if own is None else StoreLayout.parse(f"{where}/{inner}", own)
-            if found is not None and image is None and series is not None:
-                _tell_of_images(found, _series(where, top, deadline, inner))
-    if found is None:
-        asked = "no multiscale image" if image is None else f"no image {image!r}"
+        raise _no_store_error(location, root, deadline)
+    store_json = attributes.get("gvtorch")
+    layout = None if store_json is None else StoreLayout.parse(location, store_json)
+    pyramid = _parse_image(location, attributes, image)
+    series = _ngff_attribute(attributes, "bioformats2raw.layout")
+    if pyramid is None and layout is None:
+        # "0" is the folder that bioformats2raw uses.
+        folders = attributes.get(CHANNELS_ATTRIBUTE, ["0"])
+        has_names = isinstance(folders, list) and folders and isinstance(folders[0], str)
+        folder = image if image is not None else folders[0] if has_names else "0"
+        if ".." not in folder and not folder.startswith("/"):
+            parent, root = root, child(root, folder)
+            folder_attributes = _attributes(f"{location}/{folder}", root, deadline)
+            pyramid = _parse_image(location, folder_attributes, None) if folder_attributes else None
+            store_json = folder_attributes.get("gvtorch") if folder_attributes else None
+            layout = (
+                None
+                if store_json is None
+                else StoreLayout.parse(f"{location}/{folder}", store_json)
+            )
+            if pyramid is not None and image is None and series is not None:
+                _note_other_images(pyramid, _other_images(location, parent, deadline, folder))
+    if pyramid is None:
+        problem = "no multiscale image" if image is None else f"no image {image!r}"
         plate = "; it is a plate: name a field of view, as in 'A/1/0'"
-        of = plate if _member(attributes, "plate") is not None else ""
-        known = _image_names(attributes) if image is not None else []
-        held = f"; it holds {_few(known)}" if known else ""
-        raise ValueError(f"{where}: has {asked} (NGFF multiscales){held}{of}")
-    if layout is not None and isinstance(own, dict):
-        found.info, found.own = _own_info(own.get("info"), found.info), own
+        plate_hint = plate if _ngff_attribute(attributes, "plate") is not None else ""
+        names = _image_names(attributes) if image is not None else []
+        names_hint = f"; it holds {_join_some(names)}" if names else ""
+        raise ValueError(f"{location}: has {problem} (NGFF multiscales){names_hint}{plate_hint}")
+    if layout is not None and isinstance(store_json, dict):
+        pyramid.info, pyramid.store_json = (
+            _stored_info(store_json.get("info"), pyramid.info),
+            store_json,
+        )
     else:
-        found.lost += _labels(where, root, deadline)
-    return root, found, layout
+        pyramid.dropped += _label_notes(location, root, deadline)
+    return root, pyramid, layout
 
 
 def read_json(
-    where: str, root: Any, name: str, deadline: Deadline, most: int = MOST_JSON
+    location: str, root: Any, name: str, deadline: Deadline, max_bytes: int = MAX_JSON_BYTES
 ) -> dict[str, Any] | None:
     """Reads a JSON object from a file in a folder, as `parse_json`; None if there is no file."""
-    content = read_key(where, root, name, deadline, most=most)
-    return None if content is None else parse_json(f"{where}/{name}", content, most)
+    content = read_key(location, root, name, deadline, max_bytes=max_bytes)
+    return None if content is None else parse_json(f"{location}/{name}", content, max_bytes)
 
 
-def parse_json(where: str, content: bytes, most: int = MOST_JSON) -> dict[str, Any]:
+def parse_json(location: str, content: bytes, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
     """Parses a JSON object; raises ValueError if it is damaged, not an object, or longer than
-    `most` bytes.
+    `max_bytes`.
     """
-    if len(content) > most:
-        raise ValueError(f"{where}: more than {most} bytes of JSON are too many")
+    if len(content) > max_bytes:
+        raise ValueError(f"{location}: more than {max_bytes} bytes of JSON are too many")
     try:
-        found = json.loads(content)
+        value = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{where}: damaged JSON: {error}") from None
-    if not isinstance(found, dict):
-        raise ValueError(f"{where}: expected a JSON object, got {type(found).__name__}")
-    return found
+        raise ValueError(f"{location}: damaged JSON: {error}") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"{location}: expected a JSON object, got {type(value).__name__}")
+    return value
 
 
 def read_json_file(file: Path) -> dict[str, Any]:
@@ -131,156 +139,168 @@ def read_json_file(file: Path) -> dict[str, Any]:
     from .chunk_files import check_file  # it imports NumPy, for which start-up must not wait
 
     try:
-        check_file(str(file), MOST_JSON)
+        check_file(str(file), MAX_JSON_BYTES)
     except Endless as error:
         raise ValueError(f"{file}: {error}") from None
     return parse_json(str(file), file.read_bytes())
 
 
-def _attributes(where: str, root: Any, deadline: Deadline) -> dict[str, Any] | None:
+def _attributes(location: str, root: Any, deadline: Deadline) -> dict[str, Any] | None:
     """Returns a group's attributes, from zarr.json (v3) or .zattrs (v2)."""
-    group = read_json(where, root, "zarr.json", deadline)
+    group = read_json(location, root, "zarr.json", deadline)
     if group is None:
-        return read_json(where, root, ".zattrs", deadline)
+        return read_json(location, root, ".zattrs", deadline)
     attributes = group.get("attributes", {})
     if group.get("node_type") != "group" or not isinstance(attributes, dict):
-        raise ValueError(f"{where}: zarr.json is that of no group; expected an OME-Zarr image")
+        raise ValueError(f"{location}: zarr.json is that of no group; expected an OME-Zarr image")
     return attributes
 
 
-def _no_store(where: str, root: Any, deadline: Deadline) -> Exception:
+def _no_store_error(location: str, root: Any, deadline: Deadline) -> Exception:
     if isinstance(root, dict) and not Path(root["path"]).exists():
-        return FileNotFoundError(f"store not found: {where}")
-    work = child(root, WORK)
-    manifest = read_json(where, work, "manifest.json", deadline)
+        return FileNotFoundError(f"store not found: {location}")
+    work_folder = child(root, WORK)
+    manifest = read_json(location, work_folder, "manifest.json", deadline)
     if manifest is None:
-        return ValueError(f"{where}: not a store: has neither zarr.json nor .zattrs")
-    done = (read_key(where, work, "journal.jsonl", deadline) or b"").count(b"\n")
+        return ValueError(f"{location}: not a store: has neither zarr.json nor .zattrs")
+    done = (read_key(location, work_folder, "journal.jsonl", deadline) or b"").count(b"\n")
     return ValueError(
-        f"{where}: half-written: {done} of {manifest.get('tasks', '?')} shards are done; "
-        f"gvtorch convert {shlex.join((str(manifest.get('source', 'SOURCE')), where))} --resume "
+        f"{location}: half-written: {done} of {manifest.get('tasks', '?')} shards are done; "
+        f"gvtorch convert {shlex.join((str(manifest.get('source', 'SOURCE')), location))} --resume "
         "goes on"
     )
 
 
 def _parse_image(
-    where: str, attributes: dict[str, Any], image: str | None
+    location: str, attributes: dict[str, Any], image: str | None
 ) -> MultiscaleImage | None:
     """Returns the image of this name or number from a group's attributes; None if not found."""
-    images = _member(attributes, "multiscales")
+    images = _ngff_attribute(attributes, "multiscales")
     if not isinstance(images, list) or not images:
         return None
     if not all(isinstance(item, dict) for item in images):
-        raise ValueError(f"{where}: multiscales must be objects")
+        raise ValueError(f"{location}: multiscales must be objects")
     for number, item in enumerate(images):
         if image in (None, item.get("name"), str(number)):
-            found = _image(where, item, _member(attributes, "omero"))
-            labels = _member(attributes, "image-label")
+            pyramid = _parse_multiscale(location, item, _ngff_attribute(attributes, "omero"))
+            labels = _ngff_attribute(attributes, "image-label")
             if isinstance(labels, dict):
-                found.info = replace(found.info, labels=True)
-                beside = (name for name in ("colors", "properties") if labels.get(name))
-                found.lost += [f"{name} of the labels" for name in beside]
-            others = [str(one.get("name", at)) for at, one in enumerate(images) if at != number]
-            _tell_of_images(found, others if image is None else [])
-            return found
+                pyramid.info = replace(pyramid.info, labels=True)
+                ignored = (name for name in ("colors", "properties") if labels.get(name))
+                pyramid.dropped += [f"{name} of the labels" for name in ignored]
+            others = [str(other.get("name", n)) for n, other in enumerate(images) if n != number]
+            _note_other_images(pyramid, others if image is None else [])
+            return pyramid
     return None
 
 
 def _image_names(attributes: dict[str, Any]) -> list[str]:
     """Returns the names under which `find_image` finds the images that a group lists."""
-    images, folders = _member(attributes, "multiscales"), attributes.get(SEVERAL)
-    scales, inner = (one if isinstance(one, list) else [] for one in (images, folders))
-    names = [str(one.get("name", n)) for n, one in enumerate(scales) if isinstance(one, dict)]
-    return [*names, *(one for one in inner if isinstance(one, str))]
+    images, folders = _ngff_attribute(attributes, "multiscales"), attributes.get(CHANNELS_ATTRIBUTE)
+    multiscales, folder_names = (
+        listed if isinstance(listed, list) else [] for listed in (images, folders)
+    )
+    names = [
+        str(item.get("name", n)) for n, item in enumerate(multiscales) if isinstance(item, dict)
+    ]
+    return [*names, *(name for name in folder_names if isinstance(name, str))]
 
 
-def _few(names: list[str]) -> str:
-    short = [one if len(one) < 50 else brief(one) for one in names[:5]]
-    return ", ".join(short) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+def _join_some(names: list[str]) -> str:
+    shown = [name if len(name) < 50 else brief(name) for name in names[:5]]
+    return ", ".join(shown) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
-def _member(attributes: dict[str, Any], name: str) -> Any:
+def _ngff_attribute(attributes: dict[str, Any], name: str) -> Any:
     """Returns an attribute of NGFF; version 0.5 keeps them in `ome`."""
     ome = attributes.get("ome")
     return (ome if isinstance(ome, dict) else attributes).get(name)
 
 
-def _tell_of_images(found: MultiscaleImage, others: list[str]) -> None:
+def _note_other_images(image: MultiscaleImage, others: list[str]) -> None:
     if others:
-        beside = f"beside {brief(found.name)} (key= or image= names one)"
-        found.lost.append(f"the images {_few(others)} {beside}")
+        hint = f"beside {brief(image.name)} (key= or image= names one)"
+        image.dropped.append(f"the images {_join_some(others)} {hint}")
 
 
-def _series(where: str, root: Any, deadline: Deadline, first: str) -> list[str]:
+def _other_images(location: str, root: Any, deadline: Deadline, opened: str) -> list[str]:
     """Returns the names of the other images of a bioformats2raw layout."""
     try:
-        listed = _attributes(f"{where}/OME", child(root, "OME"), deadline) or {}
-        series = _member(listed, "series")
+        attributes = _attributes(f"{location}/OME", child(root, "OME"), deadline) or {}
+        series = _ngff_attribute(attributes, "series")
         if isinstance(series, list):
-            return [str(path) for path in series if path != first]
-        there = _attributes(f"{where}/1", child(root, "1"), deadline) is not None
+            return [str(path) for path in series if path != opened]
+        has_second = _attributes(f"{location}/1", child(root, "1"), deadline) is not None
     except (OSError, ValueError):  # damage there must not prevent opening the image
         return []
-    return ["1"] if there else []
+    return ["1"] if has_second else []
 
 
-def _labels(where: str, root: Any, deadline: Deadline) -> list[str]:
+def _label_notes(location: str, root: Any, deadline: Deadline) -> list[str]:
     """Returns a phrase on the label images in the image's group `labels`, if it has any."""
     try:
-        group = _attributes(f"{where}/labels", child(root, "labels"), deadline) or {}
+        group = _attributes(f"{location}/labels", child(root, "labels"), deadline) or {}
     except (OSError, ValueError):
         return []
-    labels = _member(group, "labels")
+    labels = _ngff_attribute(group, "labels")
     if not isinstance(labels, list) or not labels:
         return []
     return [f"the labels {', '.join(f'labels/{name}' for name in labels[:5])}"]
 
 
-def _own_info(told: Any, info: ImageInfo) -> ImageInfo:
+def _stored_info(stored: Any, info: ImageInfo) -> ImageInfo:
     """Returns `info` with the metadata that gvtorch stores in addition to NGFF's."""
-    told = told if isinstance(told, dict) else {}
-    quantity, space = (told.get(name) for name in ("quantity", "space"))
+    stored = stored if isinstance(stored, dict) else {}
+    quantity, space = (stored.get(name) for name in ("quantity", "space"))
     return replace(
         info,
-        channels=_forget_assumed(info.channels, told.get("assumed")),
+        channels=_forget_assumed(info.channels, stored.get("assumed")),
         quantity=quantity if isinstance(quantity, str) else None,
         space=space if isinstance(space, str) else None,
-        labels=told.get("labels") is True,
+        labels=stored.get("labels") is True,
     )
 
 
-def _image(where: str, item: dict[str, Any], omero: Any) -> MultiscaleImage:
-    axes, units, lost = _axes(where, item.get("axes"))
+def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> MultiscaleImage:
+    axes, units, dropped = _parse_axes(location, item.get("axes"))
     datasets = item.get("datasets")
-    if not isinstance(datasets, list) or not 1 <= len(datasets) <= _MOST_LEVELS:
-        raise ValueError(f"{where}: multiscales must have 1 to {_MOST_LEVELS} datasets")
-    outer = _transform(where, item.get("coordinateTransformations"), axes, lost)
+    if not isinstance(datasets, list) or not 1 <= len(datasets) <= _MAX_LEVELS:
+        raise ValueError(f"{location}: multiscales must have 1 to {_MAX_LEVELS} datasets")
+    outer = _parse_transforms(location, item.get("coordinateTransformations"), axes, dropped)
     scales, times = [], []
     for dataset in datasets:
         path = dataset.get("path") if isinstance(dataset, dict) else None
-        plain = isinstance(path, str) and path.isprintable() and ".." not in path
-        if not isinstance(path, str) or not plain or not path or path.startswith("/"):
-            raise ValueError(f"{where}: a dataset needs a path inside the store, got {brief(path)}")
-        scale, move = _transform(where, dataset.get("coordinateTransformations"), axes, lost)
-        t, *zyx = (a * b for a, b in zip(scale, outer[0], strict=True))
-        mt, *moves = (m * s + o for m, s, o in zip(move, *outer, strict=True))
-        factors = _in_one_unit(units, lost)
-        sides, places = ([a * f for a, f in zip(one, factors, strict=True)] for one in (zyx, moves))
-        scales.append(ImageArray(path.strip("/"), _triple(sides), _triple(places)))
-        times.append((t, mt))
+        is_printable = isinstance(path, str) and path.isprintable() and ".." not in path
+        if not isinstance(path, str) or not is_printable or not path or path.startswith("/"):
+            raise ValueError(
+                f"{location}: a dataset needs a path inside the store, got {brief(path)}"
+            )
+        scale, translation = _parse_transforms(
+            location, dataset.get("coordinateTransformations"), axes, dropped
+        )
+        time_scale, *zyx = (a * b for a, b in zip(scale, outer[0], strict=True))
+        time_offset, *offsets = (m * s + o for m, s, o in zip(translation, *outer, strict=True))
+        factors = _unit_factors(units, dropped)
+        spacing, position = (
+            [a * f for a, f in zip(lengths, factors, strict=True)] for lengths in (zyx, offsets)
+        )
+        scales.append(ImageArray(path.strip("/"), _triple(spacing), _triple(position)))
+        times.append((time_scale, time_offset))
     name = item.get("name")
     channels, damaged = _read_channels(omero) if omero is not None else ((), [])
-    (step, origin), period = times[0], units.get("t")
-    told = "t" in axes and (period is not None or step != 1)
+    (step, origin), time_unit = times[0], units.get("t")
+    has_time_step = "t" in axes and (time_unit is not None or step != 1)
     info = ImageInfo(
         unit=units.get("x"),
         channels=channels,
-        time_step=step if told else None,
+        time_step=step if has_time_step else None,
         time_origin=origin if "t" in axes else 0.0,
-        time_unit=period,
+        time_unit=time_unit,
     )
-    text = name if isinstance(name, str) else "image"
-    return MultiscaleImage(axes, tuple(scales), text, info, list(dict.fromkeys(lost + damaged)))
+    image_name = name if isinstance(name, str) else "image"
+    return MultiscaleImage(
+        axes, tuple(scales), image_name, info, list(dict.fromkeys(dropped + damaged))
+    )
 
 
 def _triple(values: Sequence[float]) -> tuple[float, float, float]:
@@ -288,60 +308,64 @@ def _triple(values: Sequence[float]) -> tuple[float, float, float]:
     return (z, y, x)
 
 
-def _in_one_unit(units: dict[str, str], lost: list[str]) -> list[float]:
+def _unit_factors(units: dict[str, str], dropped: list[str]) -> list[float]:
     """Returns factors along z, y, x that convert lengths to the unit of x."""
-    one, factors = units.get("x"), []
+    x_unit, factors = units.get("x"), []
     for axis in "zyx":
-        other = units.get(axis)
-        size, wanted = metres(other), metres(one)
-        factors.append(float(f"{size / wanted:.12g}") if size and wanted else 1.0)
-        if not (size and wanted) and other is not None and other != one:
-            lost.append(f"unit {brief(other)} of {axis}, where that of x is {one!r}")
+        unit = units.get(axis)
+        metres_per_unit, metres_per_x = metres(unit), metres(x_unit)
+        factors.append(
+            float(f"{metres_per_unit / metres_per_x:.12g}")
+            if metres_per_unit and metres_per_x
+            else 1.0
+        )
+        if not (metres_per_unit and metres_per_x) and unit is not None and unit != x_unit:
+            dropped.append(f"unit {brief(unit)} of {axis}, where that of x is {x_unit!r}")
     return factors
 
 
-def _axes(where: str, axes: Any) -> tuple[str, dict[str, str], list[str]]:
+def _parse_axes(location: str, axes: Any) -> tuple[str, dict[str, str], list[str]]:
     """Returns a letter for each axis, their units by letter, and phrases on what is not kept."""
     if axes is None:
         return _DEFAULT_AXES, {}, []
-    letters, units, lost = "", dict[str, str](), list[str]()
+    axis_order, units, dropped = "", dict[str, str](), list[str]()
     for axis in axes if isinstance(axes, list) else [None]:
-        told = axis if isinstance(axis, dict) else {"name": axis}
-        name, kind, unit = (told.get(key) for key in ("name", "type", "unit"))
+        fields = axis if isinstance(axis, dict) else {"name": axis}
+        name, kind, unit = (fields.get(key) for key in ("name", "type", "unit"))
         if not isinstance(name, str):
-            raise ValueError(f"{where}: axes must have names, got {brief(name)}")
+            raise ValueError(f"{location}: axes must have names, got {brief(name)}")
         letter = name.lower() if name.lower() in ("t", "c", "z", "y", "x") else None
         letter = letter or {"time": "t", "channel": "c"}.get(str(kind), "-")
-        letters += letter
+        axis_order += letter
         if isinstance(unit, str):
             units[letter] = unit
-    solid = letters.replace("-", "")
-    if len(set(solid)) != len(solid) or not {"y", "x"} <= set(solid):
+    named_axes = axis_order.replace("-", "")
+    if len(set(named_axes)) != len(named_axes) or not {"y", "x"} <= set(named_axes):
         names = ", ".join(brief(a.get("name") if isinstance(a, dict) else a) for a in axes[:8])
-        raise ValueError(f"{where}: axes must have y and x, each of them once, got {names}")
-    return letters, units, lost
+        raise ValueError(f"{location}: axes must have y and x, each of them once, got {names}")
+    return axis_order, units, dropped
 
 
-def _transform(
-    where: str, items: Any, axes: str, lost: list[str]
+def _parse_transforms(
+    location: str, items: Any, axes: str, dropped: list[str]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Returns scale and translation along t, z, y, x; 1 and 0 where they are not given."""
-    told = {"scale": dict.fromkeys("tzyx", 1.0), "translation": dict.fromkeys("tzyx", 0.0)}
+    transform = {"scale": dict.fromkeys("tzyx", 1.0), "translation": dict.fromkeys("tzyx", 0.0)}
     for item in items if isinstance(items, list) else []:
         kind = item.get("type") if isinstance(item, dict) else None
         if kind not in ("scale", "translation"):
             if kind != "identity":
-                lost.append(f"a transformation of type {brief(kind)}")
+                dropped.append(f"a transformation of type {brief(kind)}")
             continue
         values = item.get(kind)
-        plain = isinstance(values, list) and all(map(is_number, values))
-        if not plain or len(values) != len(axes):
-            raise ValueError(f"{where}: {kind} must be {len(axes)} numbers, got {brief(values)}")
-        told[kind].update(zip(axes, map(float, values), strict=True))
-    scale, move = (tuple(told[kind][axis] for axis in "tzyx") for kind in told)
+        is_numeric = isinstance(values, list) and all(map(is_number, values))
+        if not is_numeric or len(values) != len(axes):
+            raise ValueError(f"{location}: {kind} must be {len(axes)} numbers, got {brief(values)}")
+        transform[kind].update(zip(axes, map(float, values), strict=True))
+    scale, translation = (tuple(transform[kind][axis] for axis in "tzyx") for kind in transform)
     if min(scale[1:]) <= 0:
-        raise ValueError(f"{where}: scale must be positive, got {scale[1:]} (z, y, x)")
-    return scale, move
+        raise ValueError(f"{location}: scale must be positive, got {scale[1:]} (z, y, x)")
+    return scale, translation
 
 
 def image_metadata(
@@ -359,9 +383,9 @@ def image_metadata(
     """
     units = {"t": info.time_unit, "c": None, **dict.fromkeys("zyx", info.unit)}
     kinds = {"t": "time", "c": "channel", **dict.fromkeys("zyx", "space")}
-    period = 1.0 if info.time_step is None else info.time_step
-    step = dict(zip("xyztc", (*spacing, period, 1.0), strict=True))
-    first = dict(zip("xyztc", (*origin, info.time_origin, 0.0), strict=True))
+    time_step = 1.0 if info.time_step is None else info.time_step
+    steps = dict(zip("xyztc", (*spacing, time_step, 1.0), strict=True))
+    origins = dict(zip("xyztc", (*origin, info.time_origin, 0.0), strict=True))
     axes = [
         {"name": axis, "type": kinds[axis]} | ({"unit": units[axis]} if units[axis] else {})
         for axis in layout.axes
@@ -370,27 +394,27 @@ def image_metadata(
     for level in range(layout.levels):
         factors = [2**level if axis in "xyz" else 1 for axis in layout.axes]
         pairs = list(zip(layout.axes, factors, strict=True))
-        scale = [step[axis] * factor for axis, factor in pairs]
-        move = [first[axis] + (factor - 1) / 2 * step[axis] for axis, factor in pairs]
+        scale = [steps[axis] * factor for axis, factor in pairs]
+        translation = [origins[axis] + (factor - 1) / 2 * steps[axis] for axis, factor in pairs]
         transforms = [
             {"type": "scale", "scale": scale},
-            {"type": "translation", "translation": move},
+            {"type": "translation", "translation": translation},
         ]
         datasets.append({"path": str(level), "coordinateTransformations": transforms})
-    how = "mode" if info.labels else "mean"  # how coarse levels are made
+    method = "mode" if info.labels else "mean"  # how coarse levels are made
     ome: dict[str, Any] = {
         "version": "0.5",
-        "multiscales": [{"name": name, "type": how, "axes": axes, "datasets": datasets}],
+        "multiscales": [{"name": name, "type": method, "axes": axes, "datasets": datasets}],
     }
-    beside: dict[str, Any] = {
+    extras: dict[str, Any] = {
         "quantity": info.quantity,
         "space": info.space,
         "labels": info.labels or None,
     }
     if info.channels:
         ome["omero"], assumed = _write_channels(info.channels, layout.value_range or ())
-        beside["assumed"] = assumed or None
-    return ome, {key: value for key, value in beside.items() if value}
+        extras["assumed"] = assumed or None
+    return ome, {key: value for key, value in extras.items() if value}
 
 
 # --- omero: names, colours and windows of channels
@@ -400,22 +424,22 @@ def _read_channels(omero: Any) -> tuple[tuple[ChannelInfo, ...], list[str]]:
     """Returns the channels, and phrases on metadata that is damaged or not kept. A viewer's initial
     state (rdefs) and a server's image number (id) are ignored: they are not part of the data.
     """
-    told = omero.get("channels") if isinstance(omero, dict) else None
-    if not isinstance(told, list) or not all(isinstance(channel, dict) for channel in told):
+    entries = omero.get("channels") if isinstance(omero, dict) else None
+    if not isinstance(entries, list) or not all(isinstance(channel, dict) for channel in entries):
         return (), ["omero, which holds no list of channels"]
-    found, lost = [], []
-    for number, channel in enumerate(told):
-        color, window = _shown_color(channel.get("color")), _shown_window(channel.get("window"))
+    channels, dropped = [], []
+    for number, channel in enumerate(entries):
+        color, window = _parse_color(channel.get("color")), _parse_window(channel.get("window"))
         for name, value in (("color", color), ("window", window)):
             if value is None and channel.get(name) is not None:
-                lost.append(f"{name} {brief(channel[name])} of channel {number}")
+                dropped.append(f"{name} {brief(channel[name])} of channel {number}")
         if channel.get("inverted") is True:
-            lost.append(f"channel {number} is shown inverted")
+            dropped.append(f"channel {number} is shown inverted")
         label, active = channel.get("label"), channel.get("active")
         name = label if isinstance(label, str) else "" if label is None else str(label)
-        shown = active is not False
-        found.append(ChannelInfo(name=name, color=color, window=window, active=shown))
-    return tuple(found), lost
+        is_active = active is not False
+        channels.append(ChannelInfo(name=name, color=color, window=window, active=is_active))
+    return tuple(channels), dropped
 
 
 def _write_channels(
@@ -425,44 +449,51 @@ def _write_channels(
     window: the specification requires both, so they are made up.
     """
     assumed: dict[str, list[int]] = {"color": [], "window": []}
-    written = []
+    entries = []
     for number, (channel, (low, high)) in enumerate(zip(channels, value_range, strict=True)):
         for name, numbers in assumed.items():
             if getattr(channel, name) is None:
                 numbers.append(number)
         color = _COLORS[number % len(_COLORS)] if len(channels) > 1 else "ffffff"
         start, end = (low, high) if channel.window is None else channel.window
-        one = {
+        entry = {
             "label": channel.name,
             "color": (color if channel.color is None else to_hex(channel.color)).upper(),
             "window": {"min": min(low, start), "max": max(high, end), "start": start, "end": end},
             "active": channel.active,
         }
-        written.append(one)
-    return {"channels": written}, {name: numbers for name, numbers in assumed.items() if numbers}
+        entries.append(entry)
+    return {"channels": entries}, {name: numbers for name, numbers in assumed.items() if numbers}
 
 
 def _forget_assumed(channels: Sequence[ChannelInfo], assumed: Any) -> tuple[ChannelInfo, ...]:
     """Returns the channels without the colours and windows that `_write_channels` made up."""
-    told = assumed if isinstance(assumed, dict) else {}
-    lists = {name: told[name] for name in ("color", "window") if isinstance(told.get(name), list)}
-    kept = []
+    fields = assumed if isinstance(assumed, dict) else {}
+    assumed_numbers = {
+        name: fields[name] for name in ("color", "window") if isinstance(fields.get(name), list)
+    }
+    cleaned = []
     for number, channel in enumerate(channels):
-        empty: dict[str, Any] = {name: None for name, some in lists.items() if number in some}
-        kept.append(replace(channel, **empty))
-    return tuple(kept)
+        cleared: dict[str, Any] = {
+            name: None for name, numbers in assumed_numbers.items() if number in numbers
+        }
+        cleaned.append(replace(channel, **cleared))
+    return tuple(cleaned)
 
 
-def _shown_color(text: Any) -> Rgb | None:
-    plain = text if isinstance(text, str) else ""
-    found = re.fullmatch(r"#?([0-9a-fA-F]{6})([0-9a-fA-F]{2})?", plain)
-    return None if found is None else from_hex(found[1])
+def _parse_color(text: Any) -> Rgb | None:
+    color = text if isinstance(text, str) else ""
+    match = re.fullmatch(r"#?([0-9a-fA-F]{6})([0-9a-fA-F]{2})?", color)
+    return None if match is None else from_hex(match[1])
 
 
-def _shown_window(told: Any) -> tuple[float, float] | None:
-    if not isinstance(told, dict):
+def _parse_window(window: Any) -> tuple[float, float] | None:
+    if not isinstance(window, dict):
         return None
-    ends: list[Any] = [told.get("start", told.get("min")), told.get("end", told.get("max"))]
-    if not all(map(is_number, ends)) or ends[0] > ends[1]:
+    bounds: list[Any] = [
+        window.get("start", window.get("min")),
+        window.get("end", window.get("max")),
+    ]
+    if not all(map(is_number, bounds)) or bounds[0] > bounds[1]:
         return None
-    return (float(ends[0]), float(ends[1]))
+    return (float(bounds[0]), float(bounds[1]))

@@ -17,18 +17,26 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ...base import boxes
 from ...pool.downsample import Reduction, pool_max, pool_mean, pool_min, reduce_windows, round_array
 from ..source import VolumeSource
-from .checksums import shard_files
+from .checksums import shard_checksums
 from .chunk_files import files_of
 from .level_reader import Pool, StoredArray
 from .store import needed_cells
-from .store_layout import BORDER, CELL, Deadline, StoreError, StoreLayout, begin_open, short
-from .unfinished import Done
+from .store_layout import (
+    BORDER,
+    CELL,
+    Deadline,
+    StoreError,
+    StoreLayout,
+    begin_open,
+    one_line_error,
+)
+from .unfinished import TaskResult
 
 _TIMEOUT = 3600.0  # seconds for one read of local data
 _OPEN_TIMEOUT = 60.0  # seconds
-_SLAB = 32  # planes of a level made at a time, from one chunk (64 planes) of the level below
+_SLAB_PLANES = 32  # planes of a level made at a time, from one chunk (64 planes) of the level below
 
-Place = tuple[int, ...]  # z, y, x, or t, z, y, x where a store has several time points
+ShardIndex = tuple[int, ...]  # z, y, x, or t, z, y, x where a store has several time points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +50,8 @@ class Conversion:
     pool: Pool = pool_mean  # makes coarser voxels
 
 
-def write_shard(conversion: Conversion, level: int, place: Place) -> Done:
-    """Writes the shards of one cube of a level, `place` (z, y, x), or (t, z, y, x), in shards;
+def write_shard(conversion: Conversion, level: int, index: ShardIndex) -> TaskResult:
+    """Writes the shards of one cube of a level, `index` (z, y, x), or (t, z, y, x), in shards;
     level 0 is the finest.
 
     Raises:
@@ -51,56 +59,58 @@ def write_shard(conversion: Conversion, level: int, place: Place) -> Done:
     """
     layout = conversion.layout
     shape = layout.shape(level)
-    low = [at * layout.shard for at in place[-3:]]
-    time = place[0] if len(place) > 3 else None
+    low = [i * layout.shard for i in index[-3:]]
+    time = index[0] if len(index) > 3 else None
     stop = [min(a + layout.shard, n) for a, n in zip(low, shape, strict=True)]
     size = [b - a for a, b in zip(low, stop, strict=True)]
     padded = [-(-n // layout.block) * layout.block for n in size]
     box = [a - BORDER for a in low], [a + n + BORDER for a, n in zip(low, padded, strict=True)]
     inner = tuple(slice(BORDER, BORDER + n) for n in size)
     if level == 0:
-        values, bad = _from_source(conversion, time or 0, *box, inner)
-        if bad:
-            return Done(place, 0, {}, bad)
-        least = most = values
+        values, bad_values = _read_source(conversion, time or 0, *box, inner)
+        if bad_values:
+            return TaskResult(index, 0, {}, bad_values)
+        lowest = highest = values
     else:
-        values, least, most = _from_below(conversion, level, time or 0, *box)
+        values, lowest, highest = _pool_finer_level(conversion, level, time or 0, *box)
     axes = layout.axes.removeprefix("t")
-    plain = _plain(values[inner], axes)
-    writes = [write(conversion.root, layout.plain(level), low, plain, time)]
-    for spec, bound in zip(layout.bounds(level), (least, most), strict=False):
-        writes.append(write(conversion.root, spec, low, _plain(bound[inner], axes), time))
-    middle: Reduction = "min" if conversion.source.info.labels else "mean"  # a mean is no label
-    cells = _cells(values, least, most, [-(-n // CELL) for n in size], middle)
+    pyramid = _to_pyramid_axes(values[inner], axes)
+    writes = [begin_write(conversion.root, layout.pyramid(level), low, pyramid, time)]
+    for spec, bound in zip(layout.bounds(level), (lowest, highest), strict=False):
+        writes.append(
+            begin_write(conversion.root, spec, low, _to_pyramid_axes(bound[inner], axes), time)
+        )
+    reduction: Reduction = "min" if conversion.source.info.labels else "mean"  # a mean is no label
+    cells = _cells(values, lowest, highest, [-(-n // CELL) for n in size], reduction)
     first = [a // CELL for a in low]
-    writes.append(write(conversion.root, layout.cells(level), first, cells, time))
+    writes.append(begin_write(conversion.root, layout.cells(level), first, cells, time))
     blocks = _blocks(layout, values, needed_cells(cells, layout.threshold))
     if blocks is not None:
-        at = [a // layout.block for a in low]
-        writes.append(write(conversion.root, layout.blocks(level), at, blocks, time))
-    for begun in writes:
-        finish_write(begun, conversion.root.get("path", "store"))
-    specs = (layout.plain(level), layout.cells(level), layout.blocks(level))
-    files = shard_files(conversion.root, specs, place, Deadline(_TIMEOUT))
-    return Done(place, int(np.prod(size)), files)
+        first_block = [a // layout.block for a in low]
+        writes.append(begin_write(conversion.root, layout.blocks(level), first_block, blocks, time))
+    for future in writes:
+        finish_write(future, conversion.root.get("path", "store"))
+    specs = (layout.pyramid(level), layout.cells(level), layout.blocks(level))
+    files = shard_checksums(conversion.root, specs, index, Deadline(_TIMEOUT))
+    return TaskResult(index, int(np.prod(size)), files)
 
 
-def _from_source(
+def _read_source(
     conversion: Conversion, time: int, low: list[int], high: list[int], inner: tuple[slice, ...]
 ) -> tuple[np.ndarray, int]:
     """Reads a box; also returns how many of its `inner` values are not finite and not replaced."""
     start, stop = boxes.clamped_box(low, high, conversion.layout.shape(0))
     source = conversion.source.at_time(conversion.source.time + time)
-    values, bad = source.read_region(start, stop), 0
-    if values.dtype.kind == "f" and (wrong := ~np.isfinite(values)).any():
+    values, bad_values = source.read_region(start, stop), 0
+    if values.dtype.kind == "f" and (not_finite := ~np.isfinite(values)).any():
         if conversion.nan is None:
-            bad = int(boxes.repeat_edges(wrong, start, low, high)[inner].sum())
+            bad_values = int(boxes.repeat_edges(not_finite, start, low, high)[inner].sum())
         else:
-            values = np.where(wrong, values.dtype.type(conversion.nan), values)
-    return boxes.repeat_edges(values, start, low, high), bad
+            values = np.where(not_finite, values.dtype.type(conversion.nan), values)
+    return boxes.repeat_edges(values, start, low, high), bad_values
 
 
-def _from_below(
+def _pool_finer_level(
     conversion: Conversion, level: int, time: int, low: list[int], high: list[int]
 ) -> list[np.ndarray]:
     """Computes a box of a level, which may reach beyond the volume, from the level below: means
@@ -110,39 +120,46 @@ def _from_below(
     layout, deadline = conversion.layout, Deadline(_TIMEOUT)
     arrays = []
     # Level 0 has no bounds: there, values are both the smallest and the largest.
-    for spec in (layout.plain(level - 1), *layout.bounds(level - 1)):
+    for spec in (layout.pyramid(level - 1), *layout.bounds(level - 1)):
         array = deadline.wait(begin_open(conversion.root, spec), spec["path"])
         files = files_of(spec["path"], array)
         array = layout.at_time(array, time)
         arrays.append(StoredArray(array, files, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
     start, stop = boxes.clamped_box(low, high, layout.shape(level))
     size = (*[b - a for a, b in zip(start, stop, strict=True)], layout.width)
-    made = [np.empty(size, layout.dtype) for _ in pools]
-    for z in (start[0], *range((start[0] // _SLAB + 1) * _SLAB, stop[0], _SLAB)):
-        end = min(stop[0], (z // _SLAB + 1) * _SLAB)
+    pooled = [np.empty(size, layout.dtype) for _ in pools]
+    for z in (
+        start[0],
+        *range((start[0] // _SLAB_PLANES + 1) * _SLAB_PLANES, stop[0], _SLAB_PLANES),
+    ):
+        end = min(stop[0], (z // _SLAB_PLANES + 1) * _SLAB_PLANES)
         first = [2 * z, 2 * start[1], 2 * start[2]]
         last = np.minimum([2 * end, 2 * stop[1], 2 * stop[2]], layout.shape(level - 1)).tolist()
         parts = [array.read(first, last, deadline) for array in arrays]
-        for out, part, pool in zip(made, parts * (len(pools) // len(parts)), pools, strict=True):
+        for out, part, pool in zip(pooled, parts * (len(pools) // len(parts)), pools, strict=True):
             out[z - start[0] : end - start[0]] = pool(part, 2)
-    return [boxes.repeat_edges(values, start, low, high) for values in made]
+    return [boxes.repeat_edges(values, start, low, high) for values in pooled]
 
 
-def _plain(values: np.ndarray, axes: str) -> np.ndarray:
+def _to_pyramid_axes(values: np.ndarray, axes: str) -> np.ndarray:
     """Returns (z, y, x, c) with the pyramid's axes, czyx or zyx."""
     return np.moveaxis(values, 3, 0) if "c" in axes else values[..., 0]
 
 
 def _cells(
-    values: np.ndarray, least: np.ndarray, most: np.ndarray, count: list[int], middle: Reduction
+    values: np.ndarray,
+    lowest: np.ndarray,
+    highest: np.ndarray,
+    count: list[int],
+    reduction: Reduction,
 ) -> np.ndarray:
     """Returns (gz, gy, gx, 3, c) low, high, mean of the cells of a cube with its border."""
-    reach = tuple(slice(0, n * CELL + 2 * BORDER) for n in count)
-    own = tuple(slice(BORDER, BORDER + n * CELL) for n in count)
+    with_border = tuple(slice(0, n * CELL + 2 * BORDER) for n in count)
+    without_border = tuple(slice(BORDER, BORDER + n * CELL) for n in count)
     size = CELL + 2 * BORDER
-    low = reduce_windows(least[reach], "min", size=size, step=CELL)
-    high = reduce_windows(most[reach], "max", size=size, step=CELL)
-    mean = reduce_windows(values[own], middle, size=CELL, step=CELL)
+    low = reduce_windows(lowest[with_border], "min", size=size, step=CELL)
+    high = reduce_windows(highest[with_border], "max", size=size, step=CELL)
+    mean = reduce_windows(values[without_border], reduction, size=CELL, step=CELL)
     return np.stack((low, high, round_array(mean, values.dtype)), axis=3)
 
 
@@ -150,22 +167,24 @@ def _blocks(layout: StoreLayout, values: np.ndarray, needed: np.ndarray) -> np.n
     """Returns (gz, gy, gx, s, s, s, c) blocks of a cube: zeros, which are not written, where no
     cell needs the block; None if no block is needed.
     """
-    wanted = pool_max(needed[..., None], layout.block // CELL)[..., 0]
-    if not wanted.any():
+    needed_blocks = pool_max(needed[..., None], layout.block // CELL)[..., 0]
+    if not needed_blocks.any():
         return None
-    blocks = np.zeros((*wanted.shape, *[layout.stored] * 3, layout.width), values.dtype)
-    blocks[wanted] = bordered(layout, values)[wanted]
+    blocks = np.zeros(
+        (*needed_blocks.shape, *[layout.bordered_side] * 3, layout.width), values.dtype
+    )
+    blocks[needed_blocks] = bordered(layout, values)[needed_blocks]
     return blocks
 
 
 def bordered(layout: StoreLayout, values: np.ndarray) -> np.ndarray:
     """Returns a bordered cube (z, y, x, c) as bordered blocks: a view (gz, gy, gx, s, s, s, c)."""
-    every, side = slice(None, None, layout.block), layout.stored
+    every, side = slice(None, None, layout.block), layout.bordered_side
     view = sliding_window_view(values, (side, side, side), (0, 1, 2))[every, every, every]
     return np.moveaxis(view, 3, 6)
 
 
-def write(
+def begin_write(
     root: dict[str, Any],
     spec: dict[str, Any],
     low: list[int],
@@ -180,21 +199,21 @@ def write(
     return array[boxes.index(low, np.add(low, data.shape).tolist())].write(data)
 
 
-def finish_write(begun: Any, where: str, then: str = "--resume (resume=True) goes on") -> None:
-    """Waits for a write; `then` is the advice in the error message if the disk is full."""
+def finish_write(future: Any, label: str, advice: str = "--resume (resume=True) goes on") -> None:
+    """Waits for a write; `advice` ends the error message if the disk is full."""
     try:
-        begun.result()
+        future.result()
     except Exception as error:  # tensorstore raises exceptions of several types
         if "No space left" in str(error):
-            text = f"the disk is full; with room again, {then}"
-            raise OSError(errno.ENOSPC, text, where) from None
-        raise StoreError(f"{where}: can't be written: {short(error)}") from None
+            text = f"the disk is full; with room again, {advice}"
+            raise OSError(errno.ENOSPC, text, label) from None
+        raise StoreError(f"{label}: can't be written: {one_line_error(error)}") from None
 
 
 def create_arrays(conversion: Conversion, level: int) -> None:
     """Creates the empty arrays of a level."""
     layout = conversion.layout
-    arrays = (layout.plain(level), layout.blocks(level), layout.cells(level))
+    arrays = (layout.pyramid(level), layout.blocks(level), layout.cells(level))
     for spec in (*arrays, *layout.bounds(level)):
         create_array(conversion.root, spec)
 
@@ -203,7 +222,7 @@ def write_label_array(conversion: Conversion, labels: np.ndarray) -> None:
     """Writes the table of indexed labels."""
     root, spec = conversion.root, conversion.layout.labels()
     create_array(root, spec)
-    finish_write(write(root, spec, [0], labels), root.get("path", "store"))
+    finish_write(begin_write(root, spec, [0], labels), root.get("path", "store"))
 
 
 def create_array(root: dict[str, Any], spec: dict[str, Any]) -> None:

@@ -23,7 +23,7 @@ from ...base import boxes, check
 from ...base.boxes import Zyx, rows_by_place
 from ...base.labels import background, counted
 from ...pool.downsample import pool_majority, pool_mean
-from .checksums import Checksums, file_of, sum_of
+from .checksums import Checksums, json_checksum, shard_path
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .level_reader import LevelReader, Pool, keep_channels, open_arrays
 from .ngff import find_image, read_json
@@ -43,11 +43,11 @@ from .store_layout import (
 )
 
 _OPEN_TIMEOUT = 20.0  # seconds
-_BATCH = 256  # blocks read at once; larger batches only cost memory traffic
-_AHEAD = 2 * _BATCH  # blocks being read at a time
-_GROUP = 4  # blocks along a side of a group that may be read as one region
-_READERS = 4  # threads that read such groups
-Chunked = tuple[Any, ChunkFiles]  # one of tensorstore's arrays, and its files
+_BATCH_BLOCKS = 256  # blocks read at once; larger batches only cost memory traffic
+_BLOCKS_AHEAD = 2 * _BATCH_BLOCKS  # blocks being read at a time
+_GROUP_BLOCKS = 4  # blocks along a side of a group that may be read as one region
+_READER_THREADS = 4  # threads that read such groups
+ChunkedArray = tuple[Any, ChunkFiles]  # one of tensorstore's arrays, and its files
 
 
 class Store:
@@ -91,53 +91,59 @@ class Store:
         channels: Sequence[int] | None = None,
     ) -> None:
         """See `open`."""
-        asked = {"image": image, "time": time, "channels": channels}
-        self._asked: dict[str, Any] = {"location": location, **asked}
-        where, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
-        check.text(where, "image", image)
-        top = root
-        root, found, own = find_image(where, root, image, deadline)
-        if own and root != top:  # a channel of a store of several: its folder is a store, too
-            where = root if isinstance(root, str) else root["path"].rstrip("/")
-        stored, chosen, sizes = open_arrays(where, root, found, time, channels, deadline)
-        dtype = value_dtype(stored[0].array.dtype.numpy_dtype)
+        arguments = {"image": image, "time": time, "channels": channels}
+        self._arguments: dict[str, Any] = {"location": location, **arguments}
+        label, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
+        check.text(label, "image", image)
+        parent = root
+        root, pyramid, own_layout = find_image(label, root, image, deadline)
+        # A channel of a store of several: its folder is a store, too.
+        if own_layout and root != parent:
+            label = root if isinstance(root, str) else root["path"].rstrip("/")
+        arrays, channel_index, sizes = open_arrays(label, root, pyramid, time, channels, deadline)
+        dtype = value_dtype(arrays[0].array.dtype.numpy_dtype)
         if dtype not in DTYPES:
-            raise ValueError(f"{where}: dtype {dtype} is unknown; known: {', '.join(DTYPES)}")
-        x, y, z, width = (stored[0].size(axis) for axis in "xyzc")
+            raise ValueError(f"{label}: dtype {dtype} is unknown; known: {', '.join(DTYPES)}")
+        x, y, z, width = (arrays[0].size(axis) for axis in "xyzc")
         self.time, self.times = time, sizes.get("t", 1)
-        self.layout = layout = own or StoreLayout(extent=(x, y, z), dtype=dtype, width=width)
-        wrong = (layout.extent, layout.dtype) != ((x, y, z), dtype)
-        if wrong or (own and own.times != self.times):
-            raise ValueError(f"{where}: damaged: metadata and level 0 differ in extent or dtype")
-        names = None if layout.label_count is None else _read_labels(where, root, layout, deadline)
-        self.label_values = None if names is None else torch.from_numpy(names)
+        self.layout = layout = own_layout or StoreLayout(extent=(x, y, z), dtype=dtype, width=width)
+        differs = (layout.extent, layout.dtype) != ((x, y, z), dtype)
+        if differs or (own_layout and own_layout.times != self.times):
+            raise ValueError(f"{label}: damaged: metadata and level 0 differ in extent or dtype")
+        label_values = (
+            None if layout.label_count is None else _read_labels(label, root, layout, deadline)
+        )
+        self.label_values = None if label_values is None else torch.from_numpy(label_values)
         self.pool: Pool = pool_mean
-        if found.info.labels:
-            self.pool = partial(pool_majority, background=background(names))
-        self._levels = LevelReader(stored, layout, self.pool)
-        keep_channels(found, sizes, chosen)
-        self.location, self.root, self.has_blocks = where, kvstore(where), own is not None
-        self.name, self.info, self.lost = found.name, found.info, tuple(found.lost)
-        scale, place = found.scales[0].scale[::-1], found.scales[0].translation[::-1]
-        self.spacing, self.origin = check.placed(where, scale, place, layout.extent)
+        if pyramid.info.labels:
+            self.pool = partial(pool_majority, background=background(label_values))
+        self._levels = LevelReader(arrays, layout, self.pool)
+        keep_channels(pyramid, sizes, channel_index)
+        self.location, self.root, self.has_blocks = label, kvstore(label), own_layout is not None
+        self.name, self.info, self.lost = pyramid.name, pyramid.info, tuple(pyramid.dropped)
+        spacing, origin = pyramid.scales[0].scale[::-1], pyramid.scales[0].translation[::-1]
+        self.spacing, self.origin = check.placed(label, spacing, origin, layout.extent)
         self.extent, self.levels, self.block = layout.extent, layout.levels, layout.block
         self.border, self.cell, self.threshold = BORDER, CELL, layout.threshold
         self.dtype: torch.dtype = getattr(torch, dtype)
-        self.width, self._channels = self._levels.width, chosen
-        self.all_channels = isinstance(chosen, slice)
+        self.width, self._channels = self._levels.width, channel_index
+        self.all_channels = isinstance(channel_index, slice)
         self.value_range: list[tuple[float, float]] | None = None
         if layout.value_range is not None:
             ranges = [(float(low), float(high)) for low, high in layout.value_range]
-            self.value_range = [ranges[c] for c in np.arange(layout.width)[chosen]]
+            self.value_range = [ranges[c] for c in np.arange(layout.width)[channel_index]]
         self.coarse: dict[str, CoarseChannel] = {}
-        self._blocks: list[Chunked] = []
-        self._cells: list[Chunked] = []
-        self._seen: set[tuple[Any, ...]] = set()
-        self._sums = Checksums(where, self.root, layout, time)
-        if own:
-            self._open_own(deadline)
-            if found.own.get("checksum", (kept := sum_of(found.own))) != kept:
-                raise ValueError(f"{where}: damaged: gvtorch's metadata is not what was written")
+        self._blocks: list[ChunkedArray] = []
+        self._cells: list[ChunkedArray] = []
+        self._known_shards: set[tuple[Any, ...]] = set()
+        self._checksums = Checksums(label, self.root, layout, time)
+        if own_layout:
+            self._open_blocks_and_cells(deadline)
+            if (
+                pyramid.store_json.get("checksum", (computed := json_checksum(pyramid.store_json)))
+                != computed
+            ):
+                raise ValueError(f"{label}: damaged: gvtorch's metadata is not what was written")
 
     @classmethod
     def open(
@@ -165,22 +171,26 @@ class Store:
 
     def at_time(self, time: int) -> Store:
         """Opens the store again at another time point; raises as `open`."""
-        return Store.open(**{**self._asked, "time": time})
+        return Store.open(**{**self._arguments, "time": time})
 
     def __reduce__(self) -> Any:
-        return partial(Store.open, **self._asked), ()
+        return partial(Store.open, **self._arguments), ()
 
-    def _open_own(self, deadline: Deadline) -> None:
+    def _open_blocks_and_cells(self, deadline: Deadline) -> None:
         """Opens blocks and cells of all levels and checks their shapes and dtypes."""
-        kinds = (self.layout.blocks, self._blocks), (self.layout.cells, self._cells)
-        specs = [(spec(at), arrays) for spec, arrays in kinds for at in range(self.levels)]
+        spec_makers = (self.layout.blocks, self._blocks), (self.layout.cells, self._cells)
+        specs = [
+            (make_spec(level), arrays)
+            for make_spec, arrays in spec_makers
+            for level in range(self.levels)
+        ]
         for spec, arrays, future in [(*pair, begin_open(self.root, pair[0])) for pair in specs]:
-            array, files = _as_told(self.location, spec, future, deadline)
+            array, files = _wait_for_array(self.location, spec, future, deadline)
             arrays.append((self.layout.at_time(array, self.time), files))
         folder = child(self.root, self.coarse_folder)
-        told = read_json(self.location, folder, "zarr.json", deadline)
-        if told is not None:
-            self.coarse = CoarseChannel.parse(self.location, told.get("attributes"))
+        metadata = read_json(self.location, folder, "zarr.json", deadline)
+        if metadata is not None:
+            self.coarse = CoarseChannel.parse(self.location, metadata.get("attributes"))
 
     def __repr__(self) -> str:
         extent = "x".join(str(n) for n in self.extent)
@@ -224,19 +234,19 @@ class Store:
 
     def level_extent(self, level: int) -> tuple[int, int, int]:
         """(x, y, z) voxels of a level, 0 the finest."""
-        return self.layout.shape(self._checked(level))[::-1]
+        return self.layout.shape(self._checked_level(level))[::-1]
 
     def stored_level(self, level: int) -> int:
         """Returns the coarsest level up to `level` that is stored, not averaged on reading."""
-        return self._levels.coarsest(self._checked(level))
+        return self._levels.coarsest(self._checked_level(level))
 
     def block_grid(self, level: int) -> tuple[int, int, int]:
         """(z, y, x) number of blocks of a level."""
-        return self.layout.grid(self._checked(level), self.block)
+        return self.layout.grid(self._checked_level(level), self.block)
 
     def cell_grid(self, level: int) -> tuple[int, int, int]:
         """(z, y, x) number of cells of a level."""
-        return self.layout.grid(self._checked(level), CELL)
+        return self.layout.grid(self._checked_level(level), CELL)
 
     def read_region(self, level: int, low: Zyx, high: Zyx, *, timeout: float = 60.0) -> np.ndarray:
         """Reads a box of voxels of a level.
@@ -256,11 +266,11 @@ class Store:
         """
         _check_box(low, high)
         deadline = Deadline(timeout)
-        data = self._levels.read(self._checked(level), low, high, deadline)
+        data = self._levels.read(self._checked_level(level), low, high, deadline)
         if self.has_blocks:
             start, stop = boxes.clamped_box(low, high, self.layout.shape(level))
             inside = data[boxes.index(np.subtract(start, low).clip(0), data.shape[:3])]
-            self._check_shards(self.layout.plain(level), inside, start, stop, deadline)
+            self._check_shards(self.layout.pyramid(level), inside, start, stop, deadline)
         return data
 
     @property
@@ -338,27 +348,27 @@ class Store:
                 f"read_blocks: a position lies outside the grid {grid} of level {level}"
             )
         deadline, layout = Deadline(timeout), self.layout
-        shape = (len(zyx), *[layout.stored] * 3)
+        shape = (len(zyx), *[layout.bordered_side] * 3)
         if not self.has_blocks:
             out = np.zeros((*shape, self.width), layout.dtype)
             return out, self._cut_blocks(level, zyx, out, deadline)
         out = np.empty((*shape, layout.width), layout.dtype)
         shard = zyx // (layout.shard // self.block)
         order = np.lexsort((*zyx.T[::-1], *shard.T[::-1]))
-        errors = self._read_stored(self._blocks[level], level, zyx, order, out, deadline)
-        for place in np.unique(shard, axis=0):
+        errors = self._read_chunks(self._blocks[level], level, zyx, order, out, deadline)
+        for shard_index in np.unique(shard, axis=0):
             try:
-                self._sums.check(layout.blocks(level), tuple(place.tolist()), deadline)
+                self._checksums.check(layout.blocks(level), tuple(shard_index.tolist()), deadline)
             except (StoreError, ValueError) as error:
-                for row in np.flatnonzero((shard == place).all(1)).tolist():
+                for row in np.flatnonzero((shard == shard_index).all(1)).tolist():
                     out[row] = 0
-                    errors.setdefault(row, self._error(level, zyx[row], error))
-        for row in _blank(out):
+                    errors.setdefault(row, self._block_error(level, zyx[row], error))
+        for row in _zero_rows(out):
             if row not in errors:
                 try:
-                    self._fill_in(level, zyx[row], out[row], deadline)
+                    self._fill_unstored(level, zyx[row], out[row], deadline)
                 except StoreError as error:
-                    errors[row] = self._error(level, zyx[row], error)
+                    errors[row] = self._block_error(level, zyx[row], error)
         return out[..., self._channels], errors
 
     def read_coarse(
@@ -379,83 +389,87 @@ class Store:
                 f"read_coarse: a position lies outside the grid {grid} of level {level}"
             )
         deadline = Deadline(timeout)
-        place = f"{self.coarse_folder}/{channel.folder(name)}"
-        spec = self.layout.coarse(level, place, channel.width)
-        chunked = _as_told(self.location, spec, begin_open(self.root, spec), deadline)
+        folder = f"{self.coarse_folder}/{channel.folder(name)}"
+        spec = self.layout.coarse(level, folder, channel.width)
+        chunked = _wait_for_array(self.location, spec, begin_open(self.root, spec), deadline)
         out = np.empty((len(zyx), *chunked[0].shape[3:]), np.float16)
         order = np.lexsort(zyx.T[::-1])
-        errors = self._read_stored(chunked, level, zyx, order, out, deadline)
-        for row in _blank(out):  # zeros are written, too: the shard of a zero block must exist
+        errors = self._read_chunks(chunked, level, zyx, order, out, deadline)
+        for row in _zero_rows(out):  # zeros are written, too: the shard of a zero block must exist
             try:
                 if row not in errors:
-                    at = zyx[row].tolist()
-                    end = [n + 1 for n in at]
-                    self._check_shards(spec, out[row][None, None, None], at, end, deadline)
+                    low = zyx[row].tolist()
+                    high = [n + 1 for n in low]
+                    self._check_shards(spec, out[row][None, None, None], low, high, deadline)
             except StoreError as error:
-                errors[row] = self._error(level, zyx[row], error)
+                errors[row] = self._block_error(level, zyx[row], error)
         return out, errors
 
-    def _read_stored(
+    def _read_chunks(
         self,
-        chunked: Chunked,
+        chunked: ChunkedArray,
         level: int,
         zyx: np.ndarray,
         order: np.ndarray,
         out: np.ndarray,
         deadline: Deadline,
-        batch: int = _BATCH,
+        batch: int = _BATCH_BLOCKS,
     ) -> dict[int, str]:
         """Fills the rows `order` of `out` in batches, reading the next batch meanwhile. Blocks of a
         batch that fails are read one by one, to find the bad ones; returns their errors.
         """
         array, files = chunked
-        chunks = files.places(self.time, zyx, array.shape[3:])
+        chunks = files.chunk_indices(self.time, zyx, array.shape[3:])
         errors = dict[int, str]()
-        running: deque[tuple[np.ndarray, Any]] = deque()
+        pending: deque[tuple[np.ndarray, Any]] = deque()
 
-        def finish() -> None:
-            rows, future = running.popleft()
+        def finish_oldest() -> None:
+            rows, future = pending.popleft()
             try:
                 out[rows] = deadline.wait(future, self.location)
             except StoreError as error:
                 if batch > 1:
-                    errors.update(self._read_stored(chunked, level, zyx, rows, out, deadline, 1))
+                    errors.update(self._read_chunks(chunked, level, zyx, rows, out, deadline, 1))
                 else:
                     out[rows] = 0
-                    errors[int(rows[0])] = self._error(level, zyx[rows[0]], error)
+                    errors[int(rows[0])] = self._block_error(level, zyx[rows[0]], error)
 
         try:
             for start in range(0, len(order), batch):
                 rows = order[start : start + batch]
                 z, y, x = zyx[rows].T
-                needed = None if chunks is None else chunks[rows]
-                running.append((rows, begin_read(array[z, y, x], files, needed)))
-                if len(running) * batch >= _AHEAD:
-                    finish()
-            while running:
-                finish()
+                needed_chunks = None if chunks is None else chunks[rows]
+                pending.append((rows, begin_read(array[z, y, x], files, needed_chunks)))
+                if len(pending) * batch >= _BLOCKS_AHEAD:
+                    finish_oldest()
+            while pending:
+                finish_oldest()
         finally:
-            for _, future in running:
+            for _, future in pending:
                 future.cancel()
         return errors
 
-    def _fill_in(self, level: int, at: np.ndarray, out: np.ndarray, deadline: Deadline) -> None:
+    def _fill_unstored(
+        self, level: int, block_index: np.ndarray, block: np.ndarray, deadline: Deadline
+    ) -> None:
         """Fills a block that was read as all zeros, so may not be stored, with its values from
         cells or pyramid; raises StoreError if it should have been stored.
         """
-        per = self.block // CELL
-        high = np.minimum((at + 1) * per, self.cell_grid(level))
-        cells = self._read_cells(level, (at * per).tolist(), high.tolist(), deadline)
+        cells_per_block = self.block // CELL
+        high = np.minimum((block_index + 1) * cells_per_block, self.cell_grid(level))
+        cells = self._read_cells(
+            level, (block_index * cells_per_block).tolist(), high.tolist(), deadline
+        )
         if (cells == cells[:1, :1, :1, :1]).all():
-            out[:] = cells[0, 0, 0, 0]
+            block[:] = cells[0, 0, 0, 0]
             return
-        low = at * self.block - BORDER
-        found = self._levels.read(level, low.tolist(), (low + len(out)).tolist(), deadline)
+        low = block_index * self.block - BORDER
+        values = self._levels.read(level, low.tolist(), (low + len(block)).tolist(), deadline)
         if needed_cells(cells, self.threshold).any() and (
-            level == 0 or found.any() or cells[..., 2, :].any()
+            level == 0 or values.any() or cells[..., 2, :].any()
         ):
             raise StoreError("missing chunk")
-        out[..., self._channels] = found
+        block[..., self._channels] = values
 
     def _check_shards(
         self,
@@ -469,80 +483,82 @@ class Store:
         that was written, or if zeros come from a missing shard: these arrays are written in full,
         zeros included.
         """
-        where, coarse = f"{self.location}/{spec['path']}", "coarse" in spec["path"]
+        label, is_coarse = f"{self.location}/{spec['path']}", "coarse" in spec["path"]
         shape = spec["metadata"]["chunk_grid"]["configuration"]["chunk_shape"]
-        moment = (self.time,) if self.times > 1 and not coarse else ()
-        shape = shape[len(moment) :]
-        first = len(shape) == 4  # c, z, y, x
-        per = shape[first]
-        spans = [range(a // per, (b - 1) // per + 1) for a, b in zip(low, high, strict=True)]
-        places = [*itertools.product(*spans)]
-        for place in () if coarse else places:
-            self._sums.check(spec, place, deadline)
-        for place in places:
-            key = (spec["path"], *place)
-            corner = np.multiply(place, per) - low
-            if key in self._seen or data[boxes.index(corner.clip(0), corner + per)].any():
+        time_index = (self.time,) if self.times > 1 and not is_coarse else ()
+        shape = shape[len(time_index) :]
+        space_axis = len(shape) == 4  # c, z, y, x
+        side = shape[space_axis]
+        spans = [range(a // side, (b - 1) // side + 1) for a, b in zip(low, high, strict=True)]
+        shard_indices = [*itertools.product(*spans)]
+        for shard_index in () if is_coarse else shard_indices:
+            self._checksums.check(spec, shard_index, deadline)
+        for shard_index in shard_indices:
+            key = (spec["path"], *shard_index)
+            corner = np.multiply(shard_index, side) - low
+            if key in self._known_shards or data[boxes.index(corner.clip(0), corner + side)].any():
                 continue
-            name = file_of(spec, (*moment, *place))
+            name = shard_path(spec, (*time_index, *shard_index))
             if read_key(self.location, self.root, name, deadline, slice(0, 1)) is None:
-                raise StoreError(f"{where}: shard {place} z y x: missing chunk")
-            self._seen.add(key)
+                raise StoreError(f"{label}: shard {shard_index} z y x: missing chunk")
+            self._known_shards.add(key)
 
     def _cut_blocks(
         self, level: int, zyx: np.ndarray, out: np.ndarray, deadline: Deadline
     ) -> dict[int, str]:
         """Cuts blocks out of region reads; neighbours share a read if that reads less."""
         errors = dict[int, str]()
-        side = self.layout.stored
+        side = self.layout.bordered_side
 
-        def read(index: np.ndarray) -> None:
-            low = zyx[index].min(0) * self.block - self.border
-            high = zyx[index].max(0) * self.block + self.block + self.border
+        def read(rows: np.ndarray) -> None:
+            low = zyx[rows].min(0) * self.block - self.border
+            high = zyx[rows].max(0) * self.block + self.block + self.border
             try:
                 data = self._levels.read(level, low.tolist(), high.tolist(), deadline)
             except StoreError as error:
-                if len(index) == 1:
-                    errors[int(index[0])] = self._error(level, zyx[index[0]], error)
+                if len(rows) == 1:
+                    errors[int(rows[0])] = self._block_error(level, zyx[rows[0]], error)
                     return
-                for i in index:
+                for i in rows:
                     read(np.array([i]))
                 return
-            for i in index:
+            for i in rows:
                 z, y, x = zyx[i] * self.block - self.border - low
                 out[i] = data[z : z + side, y : y + side, x : x + side]
 
-        with ThreadPoolExecutor(_READERS) as threads:
-            for _ in threads.map(read, _groups(zyx, side)):
+        with ThreadPoolExecutor(_READER_THREADS) as threads:
+            for _ in threads.map(read, _group_blocks(zyx, side)):
                 pass
         return errors
 
-    def _error(self, level: int, at: np.ndarray, error: Exception) -> str:
-        z, y, x = at.tolist()
+    def _block_error(self, level: int, block_index: np.ndarray, error: Exception) -> str:
+        z, y, x = block_index.tolist()
         text = str(error).removeprefix(f"{self.location}: ")
         return f"{self.location}: block ({z}, {y}, {x}) z y x of level {level}: {text}"
 
-    def _checked(self, level: int) -> int:
+    def _checked_level(self, level: int) -> int:
         return check.whole(self.location, "level", level, low=0, high=self.levels - 1)
 
 
-def _as_told(where: str, spec: dict[str, Any], future: Any, deadline: Deadline) -> Chunked:
+def _wait_for_array(
+    location: str, spec: dict[str, Any], future: Any, deadline: Deadline
+) -> ChunkedArray:
     """Waits for an array to open; raises ValueError if its shape or dtype is not its spec's."""
-    name, wanted = f"{where}/{spec['path']}", spec["metadata"]
-    array = deadline.wait(future, name)
-    if list(array.shape) != wanted["shape"] or array.dtype.name != wanted["data_type"]:
-        raise ValueError(f"{name}: damaged: {array.shape} {array.dtype.name}")
-    return array, files_of(name, array)
+    label, expected = f"{location}/{spec['path']}", spec["metadata"]
+    array = deadline.wait(future, label)
+    if list(array.shape) != expected["shape"] or array.dtype.name != expected["data_type"]:
+        raise ValueError(f"{label}: damaged: {array.shape} {array.dtype.name}")
+    return array, files_of(label, array)
 
 
-def _read_labels(where: str, root: Any, layout: StoreLayout, deadline: Deadline) -> np.ndarray:
+def _read_labels(location: str, root: Any, layout: StoreLayout, deadline: Deadline) -> np.ndarray:
     """Returns (k,) int64 the table of indexed labels."""
     spec = layout.labels()
-    name = f"{where}/{spec['path']}"
-    chunked = _as_told(where, spec, begin_open(root, spec), deadline)
-    labels: np.ndarray = deadline.wait(begin_read(*chunked), name)
+    label = f"{location}/{spec['path']}"
+    chunked = _wait_for_array(location, spec, begin_open(root, spec), deadline)
+    labels: np.ndarray = deadline.wait(begin_read(*chunked), label)
     if not (labels[1:] > labels[:-1]).all():
-        raise ValueError(f"{name}: damaged: labels must be ascending")
+        raise ValueError(f"{label}: damaged: labels must be ascending")
     return labels
 
 
@@ -555,26 +571,26 @@ def needed_cells(cells: np.ndarray, threshold: float | None) -> np.ndarray:
     return needed
 
 
-def _blank(out: np.ndarray) -> list[int]:
+def _zero_rows(out: np.ndarray) -> list[int]:
     """Returns the rows that are all zero."""
     rows = out.reshape(len(out), -1)
-    likely = np.flatnonzero(~rows[:, :64].any(1)).tolist()
-    return [row for row in likely if not rows[row].any()]
+    candidates = np.flatnonzero(~rows[:, :64].any(1)).tolist()
+    return [row for row in candidates if not rows[row].any()]
 
 
-def _groups(zyx: np.ndarray, side: int) -> list[np.ndarray]:
+def _group_blocks(zyx: np.ndarray, side: int) -> list[np.ndarray]:
     """Returns groups of indices of blocks, each to be read as one region."""
     groups = []
-    for index in rows_by_place(zyx // _GROUP)[1]:
-        span = (zyx[index].max(0) - zyx[index].min(0) + 1) * (side - 2 * BORDER) + 2 * BORDER
-        if math.prod(span.tolist()) <= 2 * len(index) * side**3:
-            groups.append(index)
+    for rows in rows_by_place(zyx // _GROUP_BLOCKS)[1]:
+        extent = (zyx[rows].max(0) - zyx[rows].min(0) + 1) * (side - 2 * BORDER) + 2 * BORDER
+        if math.prod(extent.tolist()) <= 2 * len(rows) * side**3:
+            groups.append(rows)
         else:
-            groups += [np.array([i]) for i in index]
+            groups += [np.array([i]) for i in rows]
     return groups
 
 
 def _check_box(low: Zyx, high: Zyx) -> None:
-    fits = len(low) == len(high) == 3 and all(a < b for a, b in zip(low, high, strict=True))
-    if not fits:
+    is_valid = len(low) == len(high) == 3 and all(a < b for a, b in zip(low, high, strict=True))
+    if not is_valid:
         raise ValueError(f"low and high must be (z, y, x) with low < high, got {low} and {high}")

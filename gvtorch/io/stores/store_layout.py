@@ -36,7 +36,7 @@ from urllib.parse import unquote, urlsplit
 
 from ...base.whole_file import text_path
 from ..http import Endless, file_url, is_http, read_http
-from ..relay import read_within, through, with_urls
+from ..relay import read_within, relay_folder, with_urls
 from ..resources import cores
 
 if TYPE_CHECKING:
@@ -47,16 +47,16 @@ CELL = 8  # voxels along a side of a cell
 BORDER = 1  # voxels around a block; a cell's low and high cover that many around it, too
 BLOCKS = (32, 64)  # voxels along a side of a block
 WORK = ".gvtorch-work"
-MOST_VOXELS = 2**40
-MOST_TIMES = 2**20
-MOST_JSON = 1 << 24  # bytes of metadata
+MAX_STORE_VOXELS = 2**40
+MAX_TIMES = 2**20
+MAX_JSON_BYTES = 1 << 24  # of metadata
 DTYPES = {"uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "float32": 4}  # bytes
 GROUPS = ("gvtorch", "gvtorch/blocks", "gvtorch/cells")
-_PLAIN_CHUNK = 64  # voxels
+_PYRAMID_CHUNK = 64  # voxels
 _CELL_CHUNK = 16  # cells
 _LABEL_CHUNK = 2**16
 _COARSE_SHARD = 128  # voxels along a side of a shard of a coarse channel
-_KEEP = "store_data_equal_to_fill_value"  # write chunks of zeros, too: a missing one is an error
+_WRITE_ZEROS = "store_data_equal_to_fill_value"  # zeros, too: a missing chunk is an error
 
 
 def value_dtype(stored: np.dtype, *, labels: bool = False) -> str:
@@ -105,7 +105,7 @@ class StoreLayout:
         return 256 if self.voxel_bytes <= 2 else 128
 
     @property
-    def stored(self) -> int:
+    def bordered_side(self) -> int:
         """Voxels along a side of a block with its border."""
         return self.block + 2 * BORDER
 
@@ -128,7 +128,7 @@ class StoreLayout:
         """Voxels of all levels and times."""
         return self.times * sum(math.prod(self.shape(level)) for level in range(self.levels))
 
-    def places(self, level: int) -> Iterator[tuple[int, ...]]:
+    def shard_indices(self, level: int) -> Iterator[tuple[int, ...]]:
         """Indices of all shards of a level: (z, y, x), or (t, z, y, x) of several time points."""
         times = [self.times] if self.times > 1 else []
         return itertools.product(*map(range, (*times, *self.shards(level))))
@@ -137,38 +137,38 @@ class StoreLayout:
         """Returns an array of the store at one time point, without the time axis."""
         return array[time] if self.times > 1 else array
 
-    def plain(self, level: int, *, path: str = "") -> dict[str, Any]:
+    def pyramid(self, level: int, *, path: str = "") -> dict[str, Any]:
         """Spec of the pyramid's array of a level."""
-        first = [self.width] if "c" in self.axes else []
+        channel_axis = [self.width] if "c" in self.axes else []
         return self._array(
             path or str(level),
-            shape=[*first, *self.shape(level)],
-            shard=[*first, *[self.shard] * 3],
-            chunk=[1] * len(first) + [_PLAIN_CHUNK] * 3,
-            names=self.axes,
+            shape=[*channel_axis, *self.shape(level)],
+            shard=[*channel_axis, *[self.shard] * 3],
+            chunk=[1] * len(channel_axis) + [_PYRAMID_CHUNK] * 3,
+            dimension_names=self.axes,
             times=self.times,
         )
 
     def blocks(self, level: int) -> dict[str, Any]:
         """Spec of the array of bordered blocks of a level."""
-        inside = [self.stored] * 3 + [self.width]
+        item_shape = [self.bordered_side] * 3 + [self.width]
         return self._array(
             f"gvtorch/blocks/{level}",
-            shape=[*self.grid(level, self.block), *inside],
-            shard=[*[self.shard // self.block] * 3, *inside],
-            chunk=[1, 1, 1, *inside],
-            keep=False,
+            shape=[*self.grid(level, self.block), *item_shape],
+            shard=[*[self.shard // self.block] * 3, *item_shape],
+            chunk=[1, 1, 1, *item_shape],
+            write_zeros=False,
             times=self.times,
         )
 
     def cells(self, level: int) -> dict[str, Any]:
         """Spec of the array of low, high, mean of a level."""
-        inside = [3, self.width]
+        item_shape = [3, self.width]
         return self._array(
             f"gvtorch/cells/{level}",
-            shape=[*self.grid(level, CELL), *inside],
-            shard=[*[self.shard // CELL] * 3, *inside],
-            chunk=[*[_CELL_CHUNK] * 3, *inside],
+            shape=[*self.grid(level, CELL), *item_shape],
+            shard=[*[self.shard // CELL] * 3, *item_shape],
+            chunk=[*[_CELL_CHUNK] * 3, *item_shape],
             times=self.times,
         )
 
@@ -180,12 +180,12 @@ class StoreLayout:
         """Spec of the array of bordered blocks of a coarse channel at a level from 1 on; `folder`
         is the channel's.
         """
-        inside = [self.stored] * 3 + [width]
+        item_shape = [self.bordered_side] * 3 + [width]
         return dataclasses.replace(self, dtype="float16")._array(
             f"{folder}/{level}",
-            shape=[*self.grid(level, self.block), *inside],
-            shard=[*[_COARSE_SHARD // self.block] * 3, *inside],
-            chunk=[1, 1, 1, *inside],
+            shape=[*self.grid(level, self.block), *item_shape],
+            shard=[*[_COARSE_SHARD // self.block] * 3, *item_shape],
+            chunk=[1, 1, 1, *item_shape],
         )
 
     def labels(self) -> dict[str, Any]:
@@ -201,8 +201,8 @@ class StoreLayout:
         Level 0 needs none (its values are both), nor does the last (no level is made from it).
         """
         needed = 0 < level < self.levels - 1
-        paths = [f"{WORK}/{which}/{level}" for which in ("low", "high")]
-        return [self.plain(level, path=path) for path in paths] if needed else []
+        paths = [f"{WORK}/{bound}/{level}" for bound in ("low", "high")]
+        return [self.pyramid(level, path=path) for path in paths] if needed else []
 
     def _array(
         self,
@@ -211,31 +211,31 @@ class StoreLayout:
         shape: list[int],
         shard: list[int],
         chunk: list[int],
-        names: str = "",
-        keep: bool = True,
+        dimension_names: str = "",
+        write_zeros: bool = True,
         times: int = 1,
     ) -> dict[str, Any]:
         if times > 1:  # each time point has shards of its own
             shape, shard, chunk = [times, *shape], [1, *shard], [1, *chunk]
-        size = {**DTYPES, "int64": 8}[self.dtype]
-        wide = size > 1
-        little = {"name": "bytes", "configuration": {"endian": "little"}}
+        item_bytes = {**DTYPES, "int64": 8}[self.dtype]
+        has_byte_order = item_bytes > 1
+        little_endian = {"name": "bytes", "configuration": {"endian": "little"}}
         crc = {"name": "crc32c"}
-        packed = {
+        blosc = {
             "cname": "lz4",
             "clevel": 5,
-            "shuffle": "shuffle" if wide else "noshuffle",
-            "typesize": size,
+            "shuffle": "shuffle" if has_byte_order else "noshuffle",
+            "typesize": item_bytes,
             "blocksize": 0,
         }
         sharding = {
             "chunk_shape": chunk,
             "codecs": [
-                little if wide else {"name": "bytes"},
-                {"name": "blosc", "configuration": packed},
+                little_endian if has_byte_order else {"name": "bytes"},
+                {"name": "blosc", "configuration": blosc},
                 crc,
             ],
-            "index_codecs": [little, crc],
+            "index_codecs": [little_endian, crc],
         }
         metadata: dict[str, Any] = {
             "shape": shape,
@@ -244,20 +244,20 @@ class StoreLayout:
             "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": shard}},
             "codecs": [{"name": "sharding_indexed", "configuration": sharding}],
         }
-        if names:
-            metadata["dimension_names"] = list(names)
-        return {"path": path, "driver": "zarr3", "metadata": metadata, _KEEP: keep}
+        if dimension_names:
+            metadata["dimension_names"] = list(dimension_names)
+        return {"path": path, "driver": "zarr3", "metadata": metadata, _WRITE_ZEROS: write_zeros}
 
-    def attributes(self, place: dict[str, Any]) -> dict[str, Any]:
-        """Returns the metadata of a complete store; `place` is its spacing and origin."""
-        several = {"times": self.times} if self.times > 1 else {}
-        counted = {"label_count": self.label_count} if self.label_count is not None else {}
+    def attributes(self, placement: dict[str, Any]) -> dict[str, Any]:
+        """Returns the metadata of a complete store; `placement` is its spacing and origin."""
+        time_fields = {"times": self.times} if self.times > 1 else {}
+        label_fields = {"label_count": self.label_count} if self.label_count is not None else {}
         return {
             "version": VERSION + (self.times > 1),
             "extent": list(self.extent),
-            **several,
-            **counted,
-            **place,
+            **time_fields,
+            **label_fields,
+            **placement,
             "dtype": self.dtype,
             "channels": self.width,
             "block": self.block,
@@ -271,41 +271,52 @@ class StoreLayout:
         }
 
     @classmethod
-    def parse(cls, where: str, own: Any) -> StoreLayout:
+    def parse(cls, location: str, attributes: Any) -> StoreLayout:
         """Reads `attributes`; raises ValueError unless they are what `convert` writes."""
-        if not isinstance(own, dict) or own.get("complete") is not True:
-            raise ValueError(f"{where}: half-written or damaged: zarr.json does not say complete")
-        if own.get("version") not in (VERSION, VERSION + 1):
+        if not isinstance(attributes, dict) or attributes.get("complete") is not True:
             raise ValueError(
-                f"{where}: store version {brief(own.get('version'))}, this reads {VERSION} and "
-                f"{VERSION + 1}"
+                f"{location}: half-written or damaged: zarr.json does not say complete"
             )
-        times, count = own.get("times", 1), own.get("label_count")
-        extent: Any = own.get("extent")
-        ranges: Any = own.get("value_range")
-        fits = {
-            "extent": _is_list(extent, 3) and all(_is_whole(n, 1, MOST_VOXELS) for n in extent),
-            "times": _is_whole(times, own["version"], MOST_TIMES if own["version"] > 1 else 1),
-            "dtype": own.get("dtype") in list(DTYPES),
+        if attributes.get("version") not in (VERSION, VERSION + 1):
+            raise ValueError(
+                f"{location}: store version {brief(attributes.get('version'))}, this reads "
+                f"{VERSION} and {VERSION + 1}"
+            )
+        times, count = attributes.get("times", 1), attributes.get("label_count")
+        extent: Any = attributes.get("extent")
+        ranges: Any = attributes.get("value_range")
+        checks = {
+            "extent": _is_list(extent, 3)
+            and all(_is_whole(n, 1, MAX_STORE_VOXELS) for n in extent),
+            "times": _is_whole(
+                times, attributes["version"], MAX_TIMES if attributes["version"] > 1 else 1
+            ),
+            "dtype": attributes.get("dtype") in list(DTYPES),
             "label_count": count is None or _is_whole(count, 1, 2**24),
-            "files_sum": own.get("files_sum") is None or _is_whole(own["files_sum"], 0, 2**32 - 1),
-            "channels": _is_whole(own.get("channels"), 1, 2**16),
-            "block": own.get("block") in BLOCKS,
-            "border": own.get("border") == BORDER,
-            "cell": own.get("cell") == CELL,
-            "branching": own.get("branching") == 2,
-            "threshold": own.get("threshold") is None or is_number(own["threshold"]),
-            "value_range": _is_list(ranges, own.get("channels"))
+            "files_sum": attributes.get("files_sum") is None
+            or _is_whole(attributes["files_sum"], 0, 2**32 - 1),
+            "channels": _is_whole(attributes.get("channels"), 1, 2**16),
+            "block": attributes.get("block") in BLOCKS,
+            "border": attributes.get("border") == BORDER,
+            "cell": attributes.get("cell") == CELL,
+            "branching": attributes.get("branching") == 2,
+            "threshold": attributes.get("threshold") is None or is_number(attributes["threshold"]),
+            "value_range": _is_list(ranges, attributes.get("channels"))
             and all(_is_list(pair, 2) for pair in ranges)
             and all(is_number(low) and is_number(high) and low <= high for low, high in ranges),
         }
-        for key, good in fits.items():
-            if not good:
-                raise ValueError(f"{where}: damaged: gvtorch.{key} is {brief(own.get(key))}")
-        told = {key: own[key] for key in ("dtype", "block", "value_range")}
-        told |= {"times": times, "label_count": count, "files_sum": own.get("files_sum")}
+        for key, is_valid in checks.items():
+            if not is_valid:
+                raise ValueError(
+                    f"{location}: damaged: gvtorch.{key} is {brief(attributes.get(key))}"
+                )
+        fields = {key: attributes[key] for key in ("dtype", "block", "value_range")}
+        fields |= {"times": times, "label_count": count, "files_sum": attributes.get("files_sum")}
         return cls(
-            extent=tuple(extent), width=own["channels"], threshold=own.get("threshold"), **told
+            extent=tuple(extent),
+            width=attributes["channels"],
+            threshold=attributes.get("threshold"),
+            **fields,
         )
 
 
@@ -326,28 +337,30 @@ class CoarseChannel:
         return f"{name}.{self.generation}"
 
     @classmethod
-    def parse(cls, where: str, told: Any) -> dict[str, CoarseChannel]:
+    def parse(cls, location: str, attributes: Any) -> dict[str, CoarseChannel]:
         """Returns the channels in a store's metadata, by name; raises ValueError unless they are as
         `make_channel` writes them.
         """
-        channels = told.get("channels") if isinstance(told, dict) else None
+        channels = attributes.get("channels") if isinstance(attributes, dict) else None
         if not isinstance(channels, dict):
-            raise ValueError(f"{where}: damaged: gvtorch/coarse names no channels")
-        found = {}
-        for name, own in channels.items():
-            whole = isinstance(own, dict) and isinstance(own.get("made_of"), dict)
+            raise ValueError(f"{location}: damaged: gvtorch/coarse names no channels")
+        parsed = {}
+        for name, entry in channels.items():
+            is_complete = isinstance(entry, dict) and isinstance(entry.get("made_of"), dict)
             if not (
-                whole
+                is_complete
                 and is_name(name)
-                and own.get("version") == VERSION
-                and _is_whole(own.get("width"), 1, 2**12)
-                and _is_whole(own.get("generation"), 0, 2**31)
+                and entry.get("version") == VERSION
+                and _is_whole(entry.get("width"), 1, 2**12)
+                and _is_whole(entry.get("generation"), 0, 2**31)
             ):
                 raise ValueError(
-                    f"{where}: damaged: gvtorch/coarse has {brief(own)} for {brief(name)}"
+                    f"{location}: damaged: gvtorch/coarse has {brief(entry)} for {brief(name)}"
                 )
-            found[name] = cls(**{field.name: own[field.name] for field in dataclasses.fields(cls)})
-        return found
+            parsed[name] = cls(
+                **{field.name: entry[field.name] for field in dataclasses.fields(cls)}
+            )
+        return parsed
 
 
 def is_name(value: Any) -> bool:
@@ -357,8 +370,8 @@ def is_name(value: Any) -> bool:
 
 def is_number(value: Any) -> bool:
     """Returns whether a value from JSON is a number, not a bool, and finite as a float."""
-    plain = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return plain and -sys.float_info.max <= value <= sys.float_info.max
+    is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return is_real and -sys.float_info.max <= value <= sys.float_info.max
 
 
 def _is_list(value: Any, size: Any) -> bool:
@@ -389,11 +402,11 @@ class Deadline:
         """Seconds until then."""
         return max(0.0, self._end - time.monotonic())
 
-    def over(self, where: str) -> TimeoutError:
+    def timeout_error(self, label: str) -> TimeoutError:
         """Returns the error of a read that took too long."""
-        return TimeoutError(f"{where}: no answer within {self.timeout:g} s")
+        return TimeoutError(f"{label}: no answer within {self.timeout:g} s")
 
-    def wait(self, future: Any, where: str) -> Any:
+    def wait(self, future: Any, label: str) -> Any:
         """Returns the result of one of tensorstore's futures; raises TimeoutError if it took too
         long, StoreError if it failed.
         """
@@ -401,25 +414,25 @@ class Deadline:
             return future.result(timeout=self.left)
         except TimeoutError:
             future.cancel()
-            raise self.over(where) from None
+            raise self.timeout_error(label) from None
         except Exception as error:  # tensorstore raises exceptions of several types
-            raise StoreError(f"{where}: {short(error)}") from None
+            raise StoreError(f"{label}: {one_line_error(error)}") from None
 
 
-def short(error: BaseException) -> str:
+def one_line_error(error: BaseException) -> str:
     """Returns tensorstore's message in one line, without its annotations."""
     text = re.sub(r"\s*\[[a-z_]+(=| locations=).*", "", str(error), flags=re.DOTALL)
     return with_urls(" ".join(text.split()))[:400] or type(error).__name__
 
 
-_users: set[int] = set()  # processes that used tensorstore: this one, or one it was forked from
+_user_pids: set[int] = set()  # processes that used tensorstore: this one, or one it was forked from
 
 
 def check_process() -> None:
     """Raises StoreError in a process that was forked after tensorstore was used: it has lost
     tensorstore's threads, and would crash.
     """
-    if _users - {os.getpid()}:
+    if _user_pids - {os.getpid()}:
         raise StoreError(
             "stores can't be read in a process that was forked after one was opened: open the "
             "first one in the workers, or start these by 'spawn' or 'forkserver' "
@@ -432,7 +445,7 @@ def context() -> Any:
     """Returns tensorstore's context: few threads, no cache (pools and host cache replace it)."""
     import tensorstore as ts
 
-    _users.add(os.getpid())
+    _user_pids.add(os.getpid())
     return ts.Context(
         {
             "cache_pool": {"total_bytes_limit": 0},
@@ -465,15 +478,15 @@ def child(root: Any, path: str) -> Any:
 
 
 def read_key(
-    where: str,
+    location: str,
     root: Any,
     name: str,
     deadline: Deadline,
-    part: slice | None = None,
-    most: int = MOST_JSON,
+    byte_range: slice | None = None,
+    max_bytes: int = MAX_JSON_BYTES,
 ) -> Any:
     """Returns the content of a file in a folder, or a part of its bytes, which may count from its
-    end; None if there is no such file. A file of more than `most` bytes is a StoreError. Raises as
+    end; None if there is no such file. A file of more than `max_bytes` is a StoreError. Raises as
     `Deadline.wait`, and ValueError if there can be no such folder.
     """
     import tensorstore as ts
@@ -482,29 +495,43 @@ def read_key(
         from .chunk_files import check_file
 
         try:
-            check_file(f"{root['path']}{name}", most)
+            check_file(f"{root['path']}{name}", max_bytes)
         except Endless as error:
-            raise StoreError(f"{where}/{name}: {error}") from None
+            raise StoreError(f"{location}/{name}: {error}") from None
     if is_http(root):
-        url, size = file_url(root, name), most
-        if part is not None:
-            size = part.stop - (part.start or 0) if part.stop is not None else -part.start
+        url, size = file_url(root, name), max_bytes
+        if byte_range is not None:
+            size = (
+                byte_range.stop - (byte_range.start or 0)
+                if byte_range.stop is not None
+                else -byte_range.start
+            )
         try:
-            return read_http(url, min(size, most), part, whole=most, seconds=deadline.left)
+            return read_http(
+                url,
+                min(size, max_bytes),
+                byte_range,
+                max_file_bytes=max_bytes,
+                seconds=deadline.left,
+            )
         except TimeoutError:
-            raise deadline.over(f"{where}/{name}") from None
+            raise deadline.timeout_error(f"{location}/{name}") from None
         except OSError as error:
-            raise StoreError(f"{where}/{name}: {short(error)}") from None
+            raise StoreError(f"{location}/{name}: {one_line_error(error)}") from None
     try:
-        folder = deadline.wait(ts.KvStore.open(root, context=context()), where)
+        folder = deadline.wait(ts.KvStore.open(root, context=context()), location)
     except StoreError as error:
-        raise ValueError(f"{where}: not a store: {error}") from None
+        raise ValueError(f"{location}: not a store: {error}") from None
     try:
         return read_within(
-            folder, name, part, most, lambda future: deadline.wait(future, f"{where}/{name}")
+            folder,
+            name,
+            byte_range,
+            max_bytes,
+            lambda future: deadline.wait(future, f"{location}/{name}"),
         )
     except Endless as error:
-        raise StoreError(f"{where}/{name}: {error}") from None
+        raise StoreError(f"{location}/{name}: {error}") from None
 
 
 def begin_open(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
@@ -513,26 +540,28 @@ def begin_open(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
     `root` comes from `kvstore`, `spec` from `StoreLayout`; `mode` is "read", "write" or "create"
     (unless it exists).
     """
-    left_out = {"read": ("path", "metadata", _KEEP), "write": ("path", "metadata")}
-    store = {key: value for key, value in spec.items() if key not in left_out.get(mode, ("path",))}
-    return opened_at(child(root, spec["path"]), store, create=mode == "create")
+    omitted = {"read": ("path", "metadata", _WRITE_ZEROS), "write": ("path", "metadata")}
+    array_spec = {
+        key: value for key, value in spec.items() if key not in omitted.get(mode, ("path",))
+    }
+    return opened_at(child(root, spec["path"]), array_spec, create=mode == "create")
 
 
 def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any:
     """Starts opening the array in a folder; returns tensorstore's future."""
     import tensorstore as ts
 
-    relayed = through(folder, context()) if isinstance(folder, str) else None
+    relayed = relay_folder(folder, context()) if isinstance(folder, str) else None
     if relayed is None:
-        from .chunk_files import HEADS, check_file, failed
+        from .chunk_files import METADATA_FILES, check_file, failed_future
 
-        for head in HEADS:
+        for name in METADATA_FILES:
             try:
-                check_file(f"{folder['path']}{head}", MOST_JSON)
+                check_file(f"{folder['path']}{name}", MAX_JSON_BYTES)
             except Endless as error:
-                return failed(Endless(f"{head}: {error}"))
-    store = {**spec, "kvstore": relayed.spec if relayed else folder}
-    future = ts.open(store, context=context(), open=True, create=create)
+                return failed_future(Endless(f"{name}: {error}"))
+    array_spec = {**spec, "kvstore": relayed.spec if relayed else folder}
+    future = ts.open(array_spec, context=context(), open=True, create=create)
     if relayed:
         relayed.future = future
     return future

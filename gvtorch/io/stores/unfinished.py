@@ -20,7 +20,7 @@ import numpy as np
 from ...base.image_info import ImageInfo
 from ...base.volume import Volume, movable
 from ...base.whole_file import durable_file, rename, told_of
-from .checksums import LIST, Files, sum_of
+from .checksums import CHECKSUMS_FILE, FileChecksums, json_checksum
 from .ngff import image_metadata, read_json_file
 from .store_layout import GROUPS, WORK, StoreLayout
 
@@ -28,13 +28,13 @@ Task = tuple[int, ...]  # level, z, y, x, or level, t, z, y, x
 _JOURNAL, _MANIFEST, _LOCK = "journal.jsonl", "manifest.json", "lock"
 
 
-class Done(NamedTuple):
+class TaskResult(NamedTuple):
     """What a finished task has written."""
 
-    place: tuple[int, ...]  # z, y, x, or t, z, y, x
+    shard_index: tuple[int, ...]  # z, y, x, or t, z, y, x
     voxels: int
-    files: Files  # checksums
-    bad: int = 0  # values that are not finite; if there are any, nothing was written
+    files: FileChecksums  # checksums
+    bad_values: int = 0  # values that are not finite; if there are any, nothing was written
 
 
 @dataclass
@@ -43,28 +43,28 @@ class UnfinishedStore:
 
     target: Path
     journal: IO[str]
-    done: dict[Task, Done]
+    done: dict[Task, TaskResult]
 
-    def note(self, done: Mapping[Task, Done]) -> None:
+    def record(self, done: Mapping[Task, TaskResult]) -> None:
         """Adds finished tasks to the journal; they are on disk when this returns."""
         self.done |= done
         with told_of(self.target / WORK / _JOURNAL):
-            _write_lines(self.journal, done)
+            _write_journal_lines(self.journal, done)
 
     def finish(self, layout: StoreLayout, info: ImageInfo, settings: Mapping[str, Any]) -> None:
         """Writes the metadata, the root's last of all, and removes the work folder."""
         for name in GROUPS:
-            write_json(self.target / name / "zarr.json", group({}))
-        files = {name: one for done in self.done.values() for name, one in done.files.items()}
-        write_json(self.target / LIST, {"files": files})
-        place = {"spacing": settings["spacing"], "origin": settings["origin"]}
+            write_json(self.target / name / "zarr.json", group_metadata({}))
+        files = {path: crc for result in self.done.values() for path, crc in result.files.items()}
+        write_json(self.target / CHECKSUMS_FILE, {"files": files})
+        placement = {"spacing": settings["spacing"], "origin": settings["origin"]}
         name = Path(os.path.realpath(self.target)).name.removesuffix(".zarr")
-        image, beside = image_metadata(name, layout, info, **place)
-        own = layout.attributes(place) | ({"info": beside} if beside else {})
-        own["files_sum"] = sum_of(files)
-        own["checksum"] = sum_of(as_json(own))
-        attributes = {"ome": image, "gvtorch": own}
-        write_json(self.target / "zarr.json", group(attributes))
+        ome, extras = image_metadata(name, layout, info, **placement)
+        store_json = layout.attributes(placement) | ({"info": extras} if extras else {})
+        store_json["files_sum"] = json_checksum(files)
+        store_json["checksum"] = json_checksum(as_json(store_json))
+        attributes = {"ome": ome, "gvtorch": store_json}
+        write_json(self.target / "zarr.json", group_metadata(attributes))
         shutil.rmtree(self.target / WORK, ignore_errors=True)
 
 
@@ -115,14 +115,14 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
         begun = is_begun(target, resume=resume)
         done = {}
         if begun:
-            _compare(target, settings)
+            _check_settings(target, settings)
             done = _read_journal(folder / _JOURNAL)
         else:
             write_json(folder / _MANIFEST, settings)
         draft = folder / f".{_JOURNAL}.draft"
         with draft.open("w", encoding="utf-8") as journal:
             with told_of(draft):
-                _write_lines(journal, done)
+                _write_journal_lines(journal, done)
             rename(draft, folder / _JOURNAL)
             yield UnfinishedStore(target, journal, done)
 
@@ -132,53 +132,56 @@ def _claimed_folder(target: Path) -> Iterator[None]:
     """Holds the lock of a target. At the end, removes the work folder if it is empty, and then the
     target if this created it. If another process removes folder and lock meanwhile, tries again.
     """
-    folder, made = target / WORK, not target.exists()
+    folder, created = target / WORK, not target.exists()
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         with locked(folder / _LOCK, f"{target}: another process is converting to it") as lock:
             try:
-                same = os.path.samestat(os.fstat(lock.fileno()), (folder / _LOCK).stat())
+                is_same_file = os.path.samestat(os.fstat(lock.fileno()), (folder / _LOCK).stat())
             except FileNotFoundError:
-                same = False
-            if not same:
+                is_same_file = False
+            if not is_same_file:
                 continue
             try:
                 yield
             finally:
                 if {entry.name for entry in folder.iterdir()} <= {_LOCK} if folder.exists() else ():
                     shutil.rmtree(folder, ignore_errors=True)
-                    if made:
+                    if created:
                         with suppress(OSError):
                             target.rmdir()
             return
 
 
 @contextmanager
-def locked(file: Path, other: str) -> Iterator[IO[str]]:
-    """Opens a file that one process at a time may hold open; raises OSError(other) if one does."""
+def locked(file: Path, message: str) -> Iterator[IO[str]]:
+    """Opens a file that one process at a time may hold open; raises OSError(message) if one
+    does.
+    """
     import fcntl
 
     with file.open("a") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise OSError(other) from None
+            raise OSError(message) from None
         yield lock
 
 
-def _compare(target: Path, settings: dict[str, Any]) -> None:
+def _check_settings(target: Path, settings: dict[str, Any]) -> None:
     manifest = target / WORK / _MANIFEST
-    before = read_json_file(manifest)
-    plain = as_json(settings)
-    if before.get("fingerprint") != plain["fingerprint"]:
+    previous = read_json_file(manifest)
+    current = as_json(settings)
+    if previous.get("fingerprint") != current["fingerprint"]:
         raise ValueError(
-            f"{target}: the source is not the one that it was begun with ({before.get('source')}): "
-            "size or time of change differ; remove the store to begin again"
+            f"{target}: the source is not the one that it was begun with "
+            f"({previous.get('source')}): size or time of change differ; remove the store to begin "
+            "again"
         )
-    for key, value in plain.items():
-        if key != "source" and before.get(key) != value:
+    for key, value in current.items():
+        if key != "source" and previous.get(key) != value:
             raise ValueError(
-                f"{target}: was begun with {key} {before.get(key)!r}, now it is {value!r}; "
+                f"{target}: was begun with {key} {previous.get(key)!r}, now it is {value!r}; "
                 "remove the store to begin again"
             )
 
@@ -189,24 +192,24 @@ def count_done(target: Path) -> int:
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
 
-def _write_lines(journal: IO[str], done: Mapping[Task, Done]) -> None:
+def _write_journal_lines(journal: IO[str], done: Mapping[Task, TaskResult]) -> None:
     """Writes a line with a checksum for each task; they are on disk when this returns."""
-    for task, one in done.items():
-        entry = {"task": list(task), "voxels": one.voxels, "files": one.files}
-        journal.write(json.dumps(entry | {"checksum": sum_of(entry)}) + "\n")
+    for task, result in done.items():
+        entry = {"task": list(task), "voxels": result.voxels, "files": result.files}
+        journal.write(json.dumps(entry | {"checksum": json_checksum(entry)}) + "\n")
     journal.flush()
     os.fsync(journal.fileno())
 
 
-def _read_journal(path: Path) -> dict[Task, Done]:
+def _read_journal(path: Path) -> dict[Task, TaskResult]:
     """Returns the finished tasks. A truncated or altered line is skipped: its task runs again."""
     done = {}
     for line in path.read_bytes().splitlines() if path.exists() else []:
         try:
             entry = json.loads(line)
-            if entry["checksum"] == sum_of(entry):
+            if entry["checksum"] == json_checksum(entry):
                 task = tuple(int(n) for n in entry["task"])
-                done[task] = Done(task[1:], int(entry["voxels"]), dict(entry["files"]))
+                done[task] = TaskResult(task[1:], int(entry["voxels"]), dict(entry["files"]))
         except (ValueError, KeyError, TypeError, RecursionError):
             continue
     return done
@@ -217,7 +220,7 @@ def as_json(value: Any) -> Any:
     return json.loads(json.dumps(value))
 
 
-def group(attributes: dict[str, Any]) -> dict[str, Any]:
+def group_metadata(attributes: dict[str, Any]) -> dict[str, Any]:
     """Returns the metadata of a Zarr group."""
     return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
 
@@ -231,8 +234,8 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 def checksum(arrays: Iterable[np.ndarray]) -> int:
     """Returns the CRC-32 of the bytes of arrays, one after the other."""
     total = 0
-    for one in arrays:
-        total = zlib.crc32(one.tobytes(), total)
+    for array in arrays:
+        total = zlib.crc32(array.tobytes(), total)
     return total
 
 
@@ -248,10 +251,10 @@ def fingerprint(source: str | Path | Volume) -> list[Any]:
     if not path.is_dir():
         stat = path.stat()
         return [stat.st_size, stat.st_mtime_ns]
-    digest, files = hashlib.sha256(), 0
+    digest, file_count = hashlib.sha256(), 0
     for file in sorted(path.iterdir()):
         stat = file.stat()
         size = stat.st_size if file.is_file() else 0
         digest.update(f"{file.name} {size} {stat.st_mtime_ns}\n".encode())
-        files += 1
-    return [files, digest.hexdigest()]
+        file_count += 1
+    return [file_count, digest.hexdigest()]

@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from .exact import clamp, larger, taken_by
+from .exact import absorbed_by, clamp, larger
 from .march import Piece, Probe, Transfer
 from .tree import ChannelBricks
 
@@ -18,7 +18,7 @@ from .tree import ChannelBricks
 class AllNumbers(ChannelBricks):
     """All numbers of a channel; smallest and largest values are (r, c)."""
 
-    def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+    def value_range(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         low, high = self.range_n2c[node].to(real).unbind(1)
         return low, high
 
@@ -26,33 +26,36 @@ class AllNumbers(ChannelBricks):
 class ChannelRows(Transfer):
     """One number's rows of the shared table, as a transfer function."""
 
-    def __init__(self, every: Transfer, head: Sequence[float], first: int) -> None:
+    def __init__(self, transfer: Transfer, head: Sequence[float], first: int) -> None:
         component, self.low, self.scale, rows = head
         self.component, self.rows = int(component), int(rows)
-        mine = slice(first, first + self.rows)
-        self.table_lm4, self.opaque_m = every.table_lm4[:, mine], every.opaque_m[mine]
+        table_rows = slice(first, first + self.rows)
+        self.table_lm4, self.opaque_m = (
+            transfer.table_lm4[:, table_rows],
+            transfer.opaque_m[table_rows],
+        )
 
-    def place(self, value: Tensor) -> Tensor:
+    def row_position(self, value: Tensor) -> Tensor:
         return clamp((value - self.low) * self.scale, 0, self.rows - 1)
 
 
 class ChannelTable:
     """The transfer functions of all numbers."""
 
-    def __init__(self, every: Transfer) -> None:
-        heads = every.table_lm4[0]
-        count, self.added = int(heads[0, 0]), bool(heads[0, 1] > 0)
+    def __init__(self, transfer: Transfer) -> None:
+        heads = transfer.table_lm4[0]
+        count, self.additive = int(heads[0, 0]), bool(heads[0, 1] > 0)
         self.channels, first = [], 1 + count
         for head in heads[1:first].tolist():
-            self.channels.append(ChannelRows(every, head, first))
+            self.channels.append(ChannelRows(transfer, head, first))
             first += self.channels[-1].rows
 
     def transparent(self, low: Tensor, high: Tensor) -> Tensor:
         """Returns (r,) bool: no number shows anything between low and high (r, c)."""
-        unseen = torch.ones_like(low[:, 0], dtype=torch.bool)
+        hidden = torch.ones_like(low[:, 0], dtype=torch.bool)
         for rows in self.channels:
-            unseen = unseen & rows.transparent(low[:, rows.component], high[:, rows.component])
-        return unseen
+            hidden = hidden & rows.transparent(low[:, rows.component], high[:, rows.component])
+        return hidden
 
     def interval(self, piece: Piece, probe: Probe) -> Tensor:
         """Returns (r, 4) premultiplied colours and alphas of intervals."""
@@ -60,11 +63,11 @@ class ChannelTable:
         color = total[:, None].expand(-1, 3)
         level = torch.where(piece.odd, 0, piece.level)
         for rows in self.channels:
-            numbers = replace(probe.channel, component=rows.component)
-            row = rows.look_up(probe.number(numbers, piece.middle), level)
+            component = replace(probe.channel, component=rows.component)
+            row = rows.look_up(probe.number(component, piece.middle), level)
             halvings = row[:, 3]
             color = color + halvings[:, None] * row[:, :3]
-            total = larger(total, halvings) if self.added else total + halvings
-        alpha = taken_by(torch.where(piece.odd, total * piece.lengths, total))
-        part = alpha / torch.where(total > 0, total, 1.0)
-        return torch.cat((color * part[:, None], alpha[:, None]), 1)
+            total = larger(total, halvings) if self.additive else total + halvings
+        alpha = absorbed_by(torch.where(piece.odd, total * piece.lengths, total))
+        scale = alpha / torch.where(total > 0, total, 1.0)
+        return torch.cat((color * scale[:, None], alpha[:, None]), 1)

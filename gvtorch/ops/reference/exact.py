@@ -35,14 +35,14 @@ def larger(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(b > a, b, a)
 
 
-def _seen_by_numpy(value: Tensor) -> np.ndarray | None:
+def _as_numpy(value: Tensor) -> np.ndarray | None:
     """Returns floats on the CPU as an array, or None where something tracks operations on them:
     gradients of either mode, a compiler, a recording, a transform of `torch.func`.
     """
     if value.device.type != "cpu" or type(value) is not Tensor or value.requires_grad:
         return None
-    followed = is_compiling() or is_tracing() or is_in_torch_dispatch_mode()
-    if followed or value.dtype not in (torch.float32, torch.float64):
+    tracked = is_compiling() or is_tracing() or is_in_torch_dispatch_mode()
+    if tracked or value.dtype not in (torch.float32, torch.float64):
         return None
     try:
         return value.numpy() if unpack_dual(value).tangent is None else None
@@ -56,19 +56,21 @@ def sqrt_exact(value: Tensor) -> Tensor:
     when split into halves (Dekker, "A floating-point technique for extending the available
     precision", 1971).
     """
-    seen = _seen_by_numpy(value)
-    if seen is not None:
+    array = _as_numpy(value)
+    if array is not None:
         with np.errstate(invalid="ignore"):
-            return torch.from_numpy(np.sqrt(seen, out=np.empty_like(seen)))  # `out`: for 0 axes
+            return torch.from_numpy(np.sqrt(array, out=np.empty_like(array)))  # `out`: for 0 axes
     root = torch.sqrt(value.to(torch.float64))
     if value.dtype != torch.float64:
         return root.to(value.dtype)
-    near = root.detach()
-    wide = near * 134217729.0  # 2^27 + 1
-    high = wide - (wide - near)
-    low, square = near - high, near * near
-    left = value.detach() - square - (high * high - square + 2 * high * low + low * low)
-    return root + torch.where((near > 0) & (near < 1e140), left / (2 * near), 0.0)
+    approximate = root.detach()
+    scaled = approximate * 134217729.0  # 2^27 + 1
+    high = scaled - (scaled - approximate)
+    low, square = approximate - high, approximate * approximate
+    remainder = value.detach() - square - (high * high - square + 2 * high * low + low * low)
+    return root + torch.where(
+        (approximate > 0) & (approximate < 1e140), remainder / (2 * approximate), 0.0
+    )
 
 
 def _polynomial(x: Tensor, highest: float, *coefficients: float) -> Tensor:
@@ -102,10 +104,12 @@ def log_exact(value: Tensor) -> Tensor:
     """Returns the natural logarithm of positive normal numbers, by + - * / alone in both
     precisions; infinity and NaN as they are. Source: as `log2_exact`.
     """
-    known = value.detach()
-    exponent, s, series = _log_series(known)
-    found = torch.where(known < torch.inf, exponent * 0.6931471805599453 + s * series, known)
-    return found + (value - known) / known if value.requires_grad else found
+    detached = value.detach()
+    exponent, s, series = _log_series(detached)
+    logarithm = torch.where(
+        detached < torch.inf, exponent * 0.6931471805599453 + s * series, detached
+    )
+    return logarithm + (value - detached) / detached if value.requires_grad else logarithm
 
 
 def _log_series(value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -144,22 +148,26 @@ def exp2_exact(value: Tensor) -> Tensor:
 
     Source: Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964, 4.2.1.
     """
-    wide = value.dtype == torch.float64
-    most, bias, digits = (1022, 1023, 52) if wide else (126, 127, 23)
-    tiny = ~(value > -most)
-    x = torch.where(tiny, 0.0, smaller(value, torch.full_like(value, float(most))))
-    whole = torch.floor(x + 0.5)
-    f = x - whole
+    is_double = value.dtype == torch.float64
+    max_exponent, bias, digits = (1022, 1023, 52) if is_double else (126, 127, 23)
+    underflows = ~(value > -max_exponent)
+    x = torch.where(underflows, 0.0, smaller(value, torch.full_like(value, float(max_exponent))))
+    integer = torch.floor(x + 0.5)
+    f = x - integer
     series = _exp2_slope(f) * f + 1.0
-    power = ((whole.to(torch.int64 if wide else torch.int32) + bias) << digits).view(value.dtype)
-    return torch.where(tiny, 0.0, series * power)
+    power = ((integer.to(torch.int64 if is_double else torch.int32) + bias) << digits).view(
+        value.dtype
+    )
+    return torch.where(underflows, 0.0, series * power)
 
 
-def taken_by(halvings: Tensor) -> Tensor:
+def absorbed_by(halvings: Tensor) -> Tensor:
     """Returns 1 - 2^-halvings, the share of light that is absorbed; accurate if small, too."""
     thin = halvings < 0.5
-    near = torch.where(thin, halvings, 0.0)
-    return torch.where(thin, _exp2_slope(-near) * near, 1 - exp2_exact(-halvings))
+    small_halvings = torch.where(thin, halvings, 0.0)
+    return torch.where(
+        thin, _exp2_slope(-small_halvings) * small_halvings, 1 - exp2_exact(-halvings)
+    )
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -172,23 +180,25 @@ def unit(v: Tensor) -> Tensor:
     """Returns (r, 3) vectors of length 1, or 0 where there is no direction."""
     columns = v.mT.contiguous()  # (3, r): passes over numbers side by side are several times faster
     x, y, z = columns.abs()
-    most = larger(larger(x, y), z)
-    known = (most > 0) & (most < torch.inf)
-    scaled = columns / torch.where(known, most, 1.0)
+    largest = larger(larger(x, y), z)
+    has_direction = (largest > 0) & (largest < torch.inf)
+    scaled = columns / torch.where(has_direction, largest, 1.0)
     x, y, z = scaled * scaled
     length = sqrt_exact(x + y + z)
-    return torch.where(known, scaled / length, 0.0).mT.contiguous()
+    return torch.where(has_direction, scaled / length, 0.0).mT.contiguous()
 
 
 def power(x: Tensor, exponent: float | Tensor) -> Tensor:
     """Returns x^exponent for x in [0, 1]."""
-    known = x > TINY
-    return torch.where(known, exp2_exact(log2_exact(torch.where(known, x, 1.0)) * exponent), 0.0)
+    positive = x > TINY
+    return torch.where(
+        positive, exp2_exact(log2_exact(torch.where(positive, x, 1.0)) * exponent), 0.0
+    )
 
 
 def stretch(alpha: Tensor, lengths: Tensor) -> Tensor:
     """Returns the alphas of intervals of given lengths, from the alphas of length 1."""
-    kept = 1 - alpha
-    solid = ~(kept > TINY)
-    part = 1 - exp2_exact(log2_exact(torch.where(solid, 0.5, kept)) * lengths)
-    return torch.where(solid, 1.0, part)
+    transmittance = 1 - alpha
+    opaque = ~(transmittance > TINY)
+    stretched = 1 - exp2_exact(log2_exact(torch.where(opaque, 0.5, transmittance)) * lengths)
+    return torch.where(opaque, 1.0, stretched)

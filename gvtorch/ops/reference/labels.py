@@ -11,7 +11,7 @@ from .exact import clamp, larger, smaller
 from .rays import INF, Beam
 from .tree import ChannelBricks, Holder
 
-_MOST_REACH = 3  # voxels
+_MAX_REACH = 3  # voxels
 
 
 @dataclass
@@ -20,7 +20,7 @@ class Nearest:
 
     value: Tensor  # (r,) the node's constant where it has no brick, 0 where there is no node
     cell: Tensor  # (r, 3) int64 x y z, counted with the border
-    place: Tensor  # (r, 3) the position from the voxel's centre, -0.5 to 0.5
+    from_center: Tensor  # (r, 3) the position from the voxel's centre, -0.5 to 0.5
 
 
 class LabelBricks(ChannelBricks):
@@ -29,17 +29,17 @@ class LabelBricks(ChannelBricks):
     def nearest(self, holder: Holder, beam: Beam, t: Tensor) -> Nearest:
         """Returns the voxels at distances t (r,)."""
         real, side = t.dtype, self.bricks_bzyxc.shape[1]
-        at = self.places(holder, beam, t)
+        position = self.positions(holder, beam, t)
         low, high = self.border, side - 1 - self.border
-        place = clamp(at + 0.5, low, high + 1)
-        cell = smaller(torch.floor(place), torch.full_like(place, high))
-        beside = clamp(at - cell, -0.5, 0.5)
+        clamped = clamp(position + 0.5, low, high + 1)
+        cell = smaller(torch.floor(clamped), torch.full_like(clamped, high))
+        from_center = clamp(position - cell, -0.5, 0.5)
         cell = cell.to(torch.int64)
         constant = self.constant(holder, real)
-        value = torch.where(holder.brick >= 0, self.voxel(holder, cell, real), constant)
-        return Nearest(value, cell, beside)
+        value = torch.where(holder.brick >= 0, self.voxel_value(holder, cell, real), constant)
+        return Nearest(value, cell, from_center)
 
-    def voxel(self, holder: Holder, cell: Tensor, real: torch.dtype) -> Tensor:
+    def voxel_value(self, holder: Holder, cell: Tensor, real: torch.dtype) -> Tensor:
         """Returns (r,) values of voxels (r, 3); undefined where there is no brick."""
         x, y, z = cell.unbind(1)
         if self.bricks_bzyxc.shape[0] == 0:
@@ -47,36 +47,43 @@ class LabelBricks(ChannelBricks):
         brick = holder.brick.clamp(min=0)
         return self.bricks_bzyxc[brick, z, y, x, self.component].to(real)
 
-    def away(self, holder: Holder, here: Nearest) -> Tensor:
+    def toward_others(self, holder: Holder, nearest: Nearest) -> Tensor:
         """Returns (r, 3) vectors, in voxels and of any length, towards the surrounding voxels of
         other labels: the sum of the offsets to these, each weighted by a tent around the position,
         which ends half a voxel beyond the reach: as many voxels as the border is wide, 1 to 3.
         """
-        value, last = here.value, self.bricks_bzyxc.shape[1] - 1
-        reach = max(1, min(_MOST_REACH, self.border))
-        around = range(-reach, reach + 1)
-        offsets = [k - here.place for k in around]
-        shares = [clamp(reach + 0.5 - larger(one, -one), 0, INF).unbind(1) for one in offsets]
-        ways = [
-            tuple(weight * column for weight, column in zip(share, one.unbind(1), strict=True))
-            for share, one in zip(shares, offsets, strict=True)
+        value, last = nearest.value, self.bricks_bzyxc.shape[1] - 1
+        reach = max(1, min(_MAX_REACH, self.border))
+        steps = range(-reach, reach + 1)
+        offsets = [k - nearest.from_center for k in steps]
+        weights = [
+            clamp(reach + 0.5 - larger(offset, -offset), 0, INF).unbind(1) for offset in offsets
+        ]
+        moments = [
+            tuple(
+                weight * column
+                for weight, column in zip(axis_weights, offset.unbind(1), strict=True)
+            )
+            for axis_weights, offset in zip(weights, offsets, strict=True)
         ]
         zero = torch.zeros_like(value)
         x, y, z = zero, zero, zero
-        for k in around:
+        for k in steps:
             plane, along_x, along_y = zero, zero, zero
-            for j in around:
+            for j in steps:
                 row, along = zero, zero
-                for i in around:
-                    other = (here.cell + torch.tensor((i, j, k)).to(here.cell)).clamp(0, last)
-                    found = self.voxel(holder, other, value.dtype)
-                    differs = (found != value).to(value)
-                    row = row + shares[i + reach][0] * differs
-                    along = along + ways[i + reach][0] * differs
-                plane = plane + shares[j + reach][1] * row
-                along_x = along_x + shares[j + reach][1] * along
-                along_y = along_y + ways[j + reach][1] * row
-            x = x + shares[k + reach][2] * along_x
-            y = y + shares[k + reach][2] * along_y
-            z = z + ways[k + reach][2] * plane
+                for i in steps:
+                    neighbour = (nearest.cell + torch.tensor((i, j, k)).to(nearest.cell)).clamp(
+                        0, last
+                    )
+                    voxel_label = self.voxel_value(holder, neighbour, value.dtype)
+                    differs = (voxel_label != value).to(value)
+                    row = row + weights[i + reach][0] * differs
+                    along = along + moments[i + reach][0] * differs
+                plane = plane + weights[j + reach][1] * row
+                along_x = along_x + weights[j + reach][1] * along
+                along_y = along_y + moments[j + reach][1] * row
+            x = x + weights[k + reach][2] * along_x
+            y = y + weights[k + reach][2] * along_y
+            z = z + moments[k + reach][2] * plane
         return torch.stack((x, y, z), 1)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..shading import LightKind, ShadeParameters
+from ..shading import FAINT, LightKind, ShadeParameters
 from .exact import clamp, divide, dot, larger, power, smaller, sqrt_exact, unit
 from .march import Piece, Plain, Probe, Visitor, Walk
 from .rays import INF, Intervals, split
@@ -23,8 +23,6 @@ from .tree import ChannelBricks
 #: Factors from one octave of scattering to the next, of its light and of its directedness; fitted
 #: to path traced clouds (benchmarks/cloud_light.py).
 OCTAVE_LIGHT, OCTAVE_DIRECTION = 0.55, 0.6
-#: Largest factor by which moments of normals are reduced where no light comes: see `coarse_colors`.
-FAINT = 32
 
 
 @dataclass
@@ -34,7 +32,7 @@ class Light:
     parameters: ShadeParameters
     normals: tuple[ChannelBricks, ...]  # three components, or none
     eye: Tensor  # (r, 3) position
-    along: Tensor  # (r, 3) direction of the rays
+    direction: Tensor  # (r, 3) direction of the rays
     moved: Tensor  # (r,) distance from the eye to where distances t begin
     cube: Tensor  # (3,) size of the root cube
 
@@ -46,54 +44,54 @@ class Light:
     def normal_at(self, probe: Probe, t: Tensor) -> Tensor:
         """Returns (r, 3) normals towards the eye, stored or the gradient's; 0 where none exists."""
         if self.scatters:
-            return torch.zeros_like(self.along)
+            return torch.zeros_like(self.direction)
         if self.normals:
-            p, columns = self.parameters, [probe.number(c, t) for c in self.normals]
-            normal = torch.stack(columns, 1) * p.normal_scale + p.normal_offset
+            p, components = self.parameters, [probe.number(c, t) for c in self.normals]
+            normal = torch.stack(components, 1) * p.normal_scale + p.normal_offset
         else:
             normal = probe.gradient(t, self.cube)
         return self.to_eye(normal)
 
-    def to_eye(self, way: Tensor) -> Tensor:
+    def to_eye(self, vector: Tensor) -> Tensor:
         """Returns (r, 3) unit normals towards the eye, from vectors of any length."""
-        normal = unit(way)
-        return torch.where((dot(normal, self.along) > 0)[:, None], -normal, normal)
+        normal = unit(vector)
+        return torch.where((dot(normal, self.direction) > 0)[:, None], -normal, normal)
 
     def towards(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Returns (r, 3) directions and (r,) distances to the light, and (r,) growth of cones."""
-        back, place = -self.along, torch.as_tensor(self.parameters.light)
+        backward, light_vector = -self.direction, torch.as_tensor(self.parameters.light)
         length = torch.full_like(t, INF)
         growth = torch.zeros_like(t) + self.parameters.light_growth
         if self.parameters.light_kind == LightKind.DIRECTIONAL:
-            return unit(-place.expand_as(back)), length, growth
+            return unit(-light_vector.expand_as(backward)), length, growth
         if self.parameters.light_kind == LightKind.POINT:
-            way = place - (self.eye + (t + self.moved)[:, None] * self.along)
-            length = sqrt_exact(dot(way, way))
-            return unit(way), length, growth / length
-        return back, length, growth
+            to_light = light_vector - (self.eye + (t + self.moved)[:, None] * self.direction)
+            length = sqrt_exact(dot(to_light, to_light))
+            return unit(to_light), length, growth / length
+        return backward, length, growth
 
     def shade(
         self,
         base: Tensor,
         normal: Tensor,
         t: Tensor,
-        share: Callable[[Tensor], Tensor] | None = None,
+        shadow: Callable[[Tensor], Tensor] | None = None,
     ) -> Tensor:
-        """Returns (r, 3) lit colours of base colours (r, 3). `share` maps bools (r,), which samples
-        face the light, to the share of light that reaches them; None: all light reaches all.
+        """Returns (r, 3) lit colours of base colours (r, 3). `shadow` maps bools (r,), true for
+        samples that face the light, to the share of light that reaches them; None: all of it.
         """
         zero = torch.zeros_like(t)
         to_light, _, _ = self.towards(t)
-        bare = ~(dot(normal, normal) > 0)
-        facing = torch.where(bare, 1.0, larger(zero, dot(normal, to_light)))
-        half = unit(to_light - self.along)
-        highlight = power(larger(zero, dot(normal, half)), self.parameters.shininess)
-        highlight = torch.where((facing > 0) & ~bare, highlight, zero)
-        if share is not None:
-            comes = share(facing > 0)
+        no_normal = ~(dot(normal, normal) > 0)
+        facing = torch.where(no_normal, 1.0, larger(zero, dot(normal, to_light)))
+        half_vector = unit(to_light - self.direction)
+        highlight = power(larger(zero, dot(normal, half_vector)), self.parameters.shininess)
+        highlight = torch.where((facing > 0) & ~no_normal, highlight, zero)
+        if shadow is not None:
+            share = shadow(facing > 0)
             if self.scatters:
-                return self.scattered(base, dot(self.along, to_light), comes)
-            facing, highlight = facing * comes, highlight * comes
+                return self.scattered(base, dot(self.direction, to_light), share)
+            facing, highlight = facing * share, highlight * share
         return self.lit(base, facing, highlight)
 
     def lit(self, base: Tensor, facing: Tensor, highlight: Tensor) -> Tensor:
@@ -123,7 +121,7 @@ class Light:
         Returns:
             (r, 3) lit colours, and (r, 3) vectors along the normals, towards the eye.
         """
-        zero, d, shininess = torch.zeros_like(t), self.along, self.parameters.shininess
+        zero, d, shininess = torch.zeros_like(t), self.direction, self.parameters.shininess
         total = moments[:, 0] + moments[:, 3] + moments[:, 5]
         share = clamp(FAINT * total, 0, 1)
         xx, xy, xz, yy, yz, zz = (moments / torch.where(total > 0, total, 1.0)[:, None]).unbind(1)
@@ -135,29 +133,32 @@ class Light:
 
         square = xx * xx + yy * yy + zz * zz + 2 * (xy * xy + xz * xz + yz * yz)
         to_light, _, _ = self.towards(t)
-        back = -times(d)
-        seen = sqrt_exact(larger(zero, -dot(d, back)))
-        known = 0.8 + 0.2 * square  # ratio of mean magnitude to root mean square
-        mean = known * dot(to_light, back) / torch.where(seen > 0, seen, 1.0)
+        normal = -times(d)
+        seen_rms = sqrt_exact(larger(zero, -dot(d, normal)))
+        mean_per_rms = 0.8 + 0.2 * square  # ratio of mean magnitude to root mean square
+        mean = mean_per_rms * dot(to_light, normal) / torch.where(seen_rms > 0, seen_rms, 1.0)
         if front is not None:
-            outside = known * dot(to_light, front) / torch.where(total > 0, total, 1.0)
-            mean = smaller(mean, outside)
+            front_mean = mean_per_rms * dot(to_light, front) / torch.where(total > 0, total, 1.0)
+            mean = smaller(mean, front_mean)
         variance = larger(zero, dot(to_light, times(to_light)) - mean * mean)
-        wide = sqrt_exact(3 * variance)  # half the width of the uniform distribution
-        above = clamp(mean + wide, 0, 2 * wide)
-        part = above * above / torch.where(wide > 0, 4 * wide, 1.0)
-        facing = part + larger(zero, mean - wide)
+        half_width = sqrt_exact(3 * variance)  # half the width of the uniform distribution
+        upper_part = clamp(mean + half_width, 0, 2 * half_width)
+        upper_term = upper_part * upper_part / torch.where(half_width > 0, 4 * half_width, 1.0)
+        facing = upper_term + larger(zero, mean - half_width)
 
-        half = unit(to_light - d)
-        even = sqrt_exact(clamp(1.5 * square - 0.5, 0, 1))  # 0: a ball's normals, 1: one normal
-        spread = divide(1 - even, 3.0, even)
-        little = 0.9 * (spread * spread)  # large where there is no main normal
-        along = dot(half, times(half)) - spread + divide(little, 3.0, little)
-        dull = divide(shininess, 1 + shininess * spread, spread)
-        bright = divide(1 + dull, 1 + shininess, dull)
-        highlight = bright * power(clamp(along / (even + little), 0, 1), dull * 0.5)
+        half_vector = unit(to_light - d)
+        # 0: a ball's normals, 1: one normal
+        alignment = sqrt_exact(clamp(1.5 * square - 0.5, 0, 1))
+        spread = divide(1 - alignment, 3.0, alignment)
+        correction = 0.9 * (spread * spread)  # large where there is no main normal
+        along = dot(half_vector, times(half_vector)) - spread + divide(correction, 3.0, correction)
+        effective_shininess = divide(shininess, 1 + shininess * spread, spread)
+        brightness = divide(1 + effective_shininess, 1 + shininess, effective_shininess)
+        highlight = brightness * power(
+            clamp(along / (alignment + correction), 0, 1), effective_shininess * 0.5
+        )
         highlight = torch.where(facing > 0, highlight, zero)
-        return self.lit(base, 1 - share + share * facing, share * highlight), back
+        return self.lit(base, 1 - share + share * facing, share * highlight), normal
 
     def scattered(self, base: Tensor, cosine: Tensor, clear: Tensor) -> Tensor:
         """Returns (r, 3) colours of samples in a medium, given the transmittance (r,) to the light.
@@ -184,8 +185,8 @@ class Light:
 def phase(g: Tensor, cosine: Tensor) -> Tensor:
     """Returns (r,) Henyey and Greenstein's phase function, whose mean over all directions is 1."""
     square = g * g
-    away = 1 + square - 2 * g * cosine
-    return (1 - square) / (away * sqrt_exact(away))
+    base = 1 + square - 2 * g * cosine
+    return (1 - square) / (base * sqrt_exact(base))
 
 
 class Shadows:
@@ -195,67 +196,71 @@ class Shadows:
         self.walk, self.cube, self.cone_scale = walk, cube, cone_scale  # the eye's; see `Light`
         self.samples, self.missed = torch.zeros_like(walk.samples), torch.zeros_like(walk.missed)
 
-    def share(
+    def light_share(
         self,
-        matter: Plain,
+        shader: Plain,
         t: Tensor,
-        way: Tensor,
+        direction: Tensor,
         length: Tensor,
         growth: Tensor,
-        where: Tensor,
+        mask: Tensor,
         light: Light,
     ) -> Tensor:
         """Returns (r,) the share of a light, `length` (r,) away, that reaches the points at t (r,)
-        where `where` is true. A cone starts as wide as the eye's is there; its first interval is
+        where `mask` is true. A cone starts as wide as the eye's is there; its first interval is
         left out, so that a point does not shadow itself.
         """
-        which = where.nonzero()[:, 0]
-        t, way, eye = t[which], way[which], self.walk.at.beam[which]
-        origin, rest = split(eye.along(t), eye.deep, t.dtype)
+        ray_index = mask.nonzero()[:, 0]
+        t, direction, eye_beam = (
+            t[ray_index],
+            direction[ray_index],
+            self.walk.intervals.beam[ray_index],
+        )
+        origin, rest = split(eye_beam.along(t), eye_beam.deep, t.dtype)
         beam = replace(
-            eye,
+            eye_beam,
             origin=origin,
             rest=rest,
-            direction=way / self.cube,
-            cone_near=eye.cone(t),
-            cone_growth=growth[which] * self.cone_scale,
+            direction=direction / self.cube,
+            cone_near=eye_beam.cone(t),
+            cone_growth=growth[ray_index] * self.cone_scale,
             first=torch.zeros_like(t),
-            last=length[which],
+            last=length[ray_index],
             moved=torch.zeros_like(t),
         ).clipped()
-        length_l = self.walk.at.length_l
-        at = Intervals(beam, length_l[0], len(length_l))
-        at.next(torch.ones_like(where[which]))
-        ends = light.faintest(matter.stop_clear), light.scatters
-        veil = Veil(matter.transfer, matter.channel, matter, way, torch.ones_like(t), *ends)
-        walk = Walk(at, self.walk.tree, matter.channel)
+        length_l = self.walk.intervals.length_l
+        intervals = Intervals(beam, length_l[0], len(length_l))
+        intervals.next(torch.ones_like(mask[ray_index]))
+        limits = light.faintest(shader.stop_clear), light.scatters
+        veil = Veil(shader.transfer, shader.channel, shader, direction, torch.ones_like(t), *limits)
+        walk = Walk(intervals, self.walk.tree, shader.channel)
         walk.go(veil)
-        self.samples[which] += walk.samples
-        self.missed[which] |= walk.missed
-        return torch.ones_like(length).index_put((which,), veil.clear)
+        self.samples[ray_index] += walk.samples
+        self.missed[ray_index] |= walk.missed
+        return torch.ones_like(length).index_put((ray_index,), veil.clear)
 
 
 @dataclass
 class Veil(Visitor):
     """The visitor of shadow cones: the transmittance through matter."""
 
-    matter: Plain
-    along: Tensor  # (r, 3) world direction
+    shader: Plain
+    direction: Tensor  # (r, 3) world direction
     clear: Tensor  # (r,) transmittance
     stop_clear: Tensor  # (): cones end at this transmittance
     each_interval: bool  # regions of one value are not taken in one step
 
-    def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        return self.matter.hides(which, low, high)
+    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        return self.shader.hides(ray_index, low, high)
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
         if self.each_interval:  # 1 - alpha of a long interval would round to 0
             return torch.zeros_like(fine, dtype=torch.bool)
-        return self.matter.same(fine, coarse)
+        return self.shader.same(fine, coarse)
 
-    def goes_on(self, leaves: Tensor) -> Tensor:
+    def goes_on(self, leaving: Tensor) -> Tensor:
         return self.clear > self.stop_clear
 
-    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        clear = self.clear * (1 - self.matter.alpha(piece, probe, self.along))
-        self.clear = torch.where(where, clear, self.clear)
+    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+        clear = self.clear * (1 - self.shader.alpha(piece, probe, self.direction))
+        self.clear = torch.where(mask, clear, self.clear)

@@ -36,36 +36,38 @@ class NodePair(Rows):
     fine: Holder
     coarse: Holder  # same as `fine` where only one node is used
     voxel: Tensor  # (r,) world size of a voxel at the wanted depth
-    above: Tensor  # (r,) and at the depth above it
+    voxel_above: Tensor  # (r,) and at the depth above it
 
 
 @dataclass
 class Visit(NodePair):
     """The node that each ray is in: where the visit ends, and what the node shows."""
 
-    seen: Tensor  # (r,) distance at which the node was looked up
+    lookup_t: Tensor  # (r,) distance at which the node was looked up
     wanted: Tensor  # (r,) int64 depth that the cone asked for
-    reaches: Tensor  # (r,) bool: the cone is at least as wide as a voxel of the wanted depth
+    voxel_fits: Tensor  # (r,) bool: the cone is at least as wide as a voxel of the wanted depth
     exit: Tensor  # (r,) distance at which the ray leaves the node
-    nothing: Tensor  # (r,) bool: nothing is seen, no node has data, or only EMPTY ones
+    invisible: Tensor  # (r,) bool: nothing is seen, no node has data, or only EMPTY ones
     uniform: Tensor  # (r,) bool: the node has one value everywhere
 
     @classmethod
-    def none(cls, like: Tensor) -> Visit:
+    def initial(cls, like: Tensor) -> Visit:
         """Returns the visit of rays that have not looked up any node yet."""
-        zero, no = torch.zeros_like(like), torch.zeros_like(like, dtype=torch.bool)
-        word = zero.to(torch.int64)
-        holder = Holder(word, word, word, torch.stack((zero,) * 3, 1).double(), zero)
-        return cls(holder, holder, zero, zero, zero, word, no, zero, no, no)
-
-    def stays(self, at: Intervals) -> Tensor:
-        """Returns (r,) bool: the interval's middle is in the node and wants the same levels."""
-        middle = at.middle
-        cone = at.beam.cone(middle)
-        fits = torch.where(
-            self.reaches, (cone >= self.voxel) & (cone < self.above), cone < self.voxel
+        zero, false = torch.zeros_like(like), torch.zeros_like(like, dtype=torch.bool)
+        zero_index = zero.to(torch.int64)
+        holder = Holder(
+            zero_index, zero_index, zero_index, torch.stack((zero,) * 3, 1).double(), zero
         )
-        return at.inside() & (middle < self.exit) & fits
+        return cls(holder, holder, zero, zero, zero, zero_index, false, zero, false, false)
+
+    def stays(self, intervals: Intervals) -> Tensor:
+        """Returns (r,) bool: the interval's middle is in the node and wants the same levels."""
+        middle = intervals.middle
+        cone = intervals.beam.cone(middle)
+        fits = torch.where(
+            self.voxel_fits, (cone >= self.voxel) & (cone < self.voxel_above), cone < self.voxel
+        )
+        return intervals.inside() & (middle < self.exit) & fits
 
 
 @dataclass
@@ -92,24 +94,25 @@ class Probe:
         """Returns (r, 3) gradients from one of the nodes; see `gradient`."""
         slopes = []
         for axis in range(3):
-            shifts = [[way if a == axis else 0.0 for a in range(3)] for way in (-0.5, 0.5)]
+            shifts = [[offset if a == axis else 0.0 for a in range(3)] for offset in (-0.5, 0.5)]
             low, high = (self.channel.sample(holder, self.beam, t, shift) for shift in shifts)
             slopes.append((high - low) * (holder.scale / cube[axis]))
         return torch.stack(slopes, 1)
 
-    def blend(self, t: Tensor, ask: Callable[[Holder], Tensor]) -> Tensor:
-        """Returns (r,) or (r, c): `ask` of the fine node, blended with `ask` of the coarse one,
-        whose weight grows from 0 where the cone is `voxel` wide to 1 where it is `above` wide.
+    def blend(self, t: Tensor, read: Callable[[Holder], Tensor]) -> Tensor:
+        """Returns (r,) or (r, c): `read` of the fine node, blended with `read` of the coarse one,
+        whose weight grows from 0 where the cone is `voxel` wide to 1 where it is as wide as
+        `voxel_above`.
         """
         nodes = self.nodes
-        two, value = nodes.fine.node != nodes.coarse.node, ask(nodes.fine)
-        if not two.any():
+        mixed, value = nodes.fine.node != nodes.coarse.node, read(nodes.fine)
+        if not mixed.any():
             return value
-        share = divide(1.0, nodes.above - nodes.voxel, nodes.voxel)
-        weight = clamp((self.beam.cone(t) - nodes.voxel) * share, 0, 1)
+        scale = divide(1.0, nodes.voxel_above - nodes.voxel, nodes.voxel)
+        weight = clamp((self.beam.cone(t) - nodes.voxel) * scale, 0, 1)
         if value.dim() == 2:
-            weight, two = weight[:, None], two[:, None]
-        return torch.where(two, value + weight * (ask(nodes.coarse) - value), value)
+            weight, mixed = weight[:, None], mixed[:, None]
+        return torch.where(mixed, value + weight * (read(nodes.coarse) - value), value)
 
 
 @dataclass
@@ -131,48 +134,48 @@ class Accumulator:
     """Front-to-back sums of every ray."""
 
     def __init__(self, beam: Beam, hit_clear: Tensor, clear_r: Tensor | None) -> None:
-        one = torch.ones_like(beam.first)
+        ones = torch.ones_like(beam.first)
         self.color = torch.zeros_like(beam.origin)  # (r, 3) premultiplied
-        self.clear = one if clear_r is None else clear_r.to(one)  # (r,) transmittance
-        self.depth = one * INF  # (r,) where the transmittance falls to hit_clear; +inf: nowhere
+        self.clear = ones if clear_r is None else clear_r.to(ones)  # (r,) transmittance
+        self.depth = ones * INF  # (r,) where the transmittance falls to hit_clear; +inf: nowhere
         self.hit_clear = hit_clear  # ()
 
     def hits(self, beam: Beam) -> tuple[Tensor, Tensor, Tensor]:
         """Returns colours (r, 3), alphas (r, 1) and world depths (r, 1)."""
         return self.color, (1 - self.clear)[:, None], (self.depth + beam.moved)[:, None]
 
-    def add(self, rgba: Tensor, piece: Piece, where: Tensor) -> None:
-        """Adds an interval with colour and alpha (r, 4) where `where` is true."""
+    def add(self, rgba: Tensor, piece: Piece, mask: Tensor) -> None:
+        """Adds an interval with colour and alpha (r, 4) where `mask` is true."""
         share = self.clear * rgba[:, 3]
-        self.add_light(share[:, None] * rgba[:, :3], where)
-        self.absorb(rgba[:, 3], piece, where)
+        self.add_light(share[:, None] * rgba[:, :3], mask)
+        self.absorb(rgba[:, 3], piece, mask)
 
-    def add_light(self, color: Tensor, where: Tensor) -> None:
-        """Adds light (r, 3) that reaches the eye, where `where` is true."""
-        self.color = torch.where(where[:, None], self.color + color, self.color)
+    def add_light(self, color: Tensor, mask: Tensor) -> None:
+        """Adds light (r, 3) that reaches the eye, where `mask` is true."""
+        self.color = torch.where(mask[:, None], self.color + color, self.color)
 
-    def absorb(self, alpha: Tensor, piece: Piece, where: Tensor) -> None:
-        """Multiplies the transmittance by 1 - alpha where `where` is true. Depth is where inside
+    def absorb(self, alpha: Tensor, piece: Piece, mask: Tensor) -> None:
+        """Multiplies the transmittance by 1 - alpha where `mask` is true. Depth is where inside
         the interval the transmittance falls to hit_clear, as if the interval were homogeneous.
         """
-        kept = 1 - alpha
-        left = self.clear * kept
-        hit = where & (left < self.hit_clear) & (self.clear >= self.hit_clear)
-        solid = ~(kept > TINY)
-        part = log2_exact(torch.where(hit, self.hit_clear / self.clear, 1.0))
-        part = part / log2_exact(torch.where(hit & ~solid, kept, 0.5))
-        part = torch.where(solid, 0.0, clamp(part, 0, 1))
-        self.depth = torch.where(hit, piece.start + part * piece.length, self.depth)
-        self.clear = torch.where(where, left, self.clear)
+        transmittance = 1 - alpha
+        clear_after = self.clear * transmittance
+        hit = mask & (clear_after < self.hit_clear) & (self.clear >= self.hit_clear)
+        opaque = ~(transmittance > TINY)
+        fraction = log2_exact(torch.where(hit, self.hit_clear / self.clear, 1.0))
+        fraction = fraction / log2_exact(torch.where(hit & ~opaque, transmittance, 0.5))
+        fraction = torch.where(opaque, 0.0, clamp(fraction, 0, 1))
+        self.depth = torch.where(hit, piece.start + fraction * piece.length, self.depth)
+        self.clear = torch.where(mask, clear_after, self.clear)
 
 
 class Transfer:
     """The transfer function: rows at even distances over a domain; see `TraceArguments`."""
 
-    def __init__(self, a: TraceArguments) -> None:
-        self.table_lm4, self.domain_2, self.opaque_m = a.table_lm4, a.domain_2, a.opaque_m
+    def __init__(self, args: TraceArguments) -> None:
+        self.table_lm4, self.domain_2, self.opaque_m = args.table_lm4, args.domain_2, args.opaque_m
 
-    def place(self, value: Tensor) -> Tensor:
+    def row_position(self, value: Tensor) -> Tensor:
         """Returns (r,) fractional rows of values."""
         low, high = self.domain_2.unbind(0)
         last = len(self.opaque_m) - 1
@@ -180,27 +183,27 @@ class Transfer:
 
     def cell(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (r,) int64 rows at or before values, and (r,) weights of the next rows."""
-        place = self.place(value)
-        row = smaller(torch.floor(place), torch.full_like(place, len(self.opaque_m) - 2))
-        return row.to(torch.int64), place - row
+        position = self.row_position(value)
+        row = smaller(torch.floor(position), torch.full_like(position, len(self.opaque_m) - 2))
+        return row.to(torch.int64), position - row
 
     def look_up(self, value: Tensor, level: Tensor | None = None) -> Tensor:
         """Returns (r, 4) linear RGB and alpha of an interval of each ray's level; None: level 0."""
         row, weight = self.cell(value)
-        which = torch.zeros_like(row) if level is None else level
-        return mix(self.table_lm4[which, row], self.table_lm4[which, row + 1], weight)
+        table_level = torch.zeros_like(row) if level is None else level
+        return mix(self.table_lm4[table_level, row], self.table_lm4[table_level, row + 1], weight)
 
     def interval(self, value: Tensor, piece: Piece) -> Tensor:
         """Returns (r, 4) linear RGB and the alpha of an interval of one value."""
-        odd, whole = self.look_up(value), self.look_up(value, piece.level)
-        alpha = stretch(odd[:, 3], piece.lengths)[:, None]
-        odd = torch.cat((odd[:, :3], alpha), 1)
-        return torch.where(piece.odd[:, None], odd, whole)
+        odd_rgba, whole_rgba = self.look_up(value), self.look_up(value, piece.level)
+        alpha = stretch(odd_rgba[:, 3], piece.lengths)[:, None]
+        odd_rgba = torch.cat((odd_rgba[:, :3], alpha), 1)
+        return torch.where(piece.odd[:, None], odd_rgba, whole_rgba)
 
     def transparent(self, smallest: Tensor, largest: Tensor) -> Tensor:
         """Returns bools: no value between the two has an opacity."""
-        first = torch.floor(self.place(a_little_below(smallest))).to(torch.int64)
-        end = torch.ceil(self.place(a_little_above(largest))).to(torch.int64)
+        first = torch.floor(self.row_position(a_little_below(smallest))).to(torch.int64)
+        end = torch.ceil(self.row_position(a_little_above(largest))).to(torch.int64)
         before = torch.where(first > 0, self.opaque_m[(first - 1).clamp(min=0)], 0)
         return self.opaque_m[end] == before
 
@@ -228,8 +231,8 @@ class Visitor(ABC):
     channel: ChannelBricks
     sees_empty = False  # whether EMPTY nodes are sampled, too
 
-    def hides(self, which: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """Returns (k,) bool: no value from low to high (k,) has an effect on rays `which` (k,)."""
+    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """Returns (k,) bool: no value from low to high (k,) affects the rays `ray_index` (k,)."""
         return self.transfer.transparent(low, high)
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
@@ -237,90 +240,101 @@ class Visitor(ABC):
         return self.channel.same(fine, coarse)
 
     @abstractmethod
-    def goes_on(self, leaves: Tensor) -> Tensor:
-        """Returns (r,) bool: the ray has not ended; `leaves` (r,): it is between two nodes."""
+    def goes_on(self, leaving: Tensor) -> Tensor:
+        """Returns (r,) bool: the ray has not ended; `leaving` (r,): it is between two nodes."""
 
     @abstractmethod
-    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        """Adds an interval where `where` (r,) is true."""
+    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+        """Adds an interval where `mask` (r,) is true."""
 
 
 class Walk:
     """Rays on their way through a tree."""
 
-    def __init__(self, at: Intervals, tree: Tree, channel: ChannelBricks) -> None:
-        self.at, self.tree, self.channel = at, tree, channel
-        self.visit = Visit.none(at.start)
-        self.samples = self.visits = torch.zeros_like(at.start, dtype=torch.int32)
-        self.missed = torch.zeros_like(at.start, dtype=torch.bool)
+    def __init__(self, intervals: Intervals, tree: Tree, channel: ChannelBricks) -> None:
+        self.intervals, self.tree, self.channel = intervals, tree, channel
+        self.visit = Visit.initial(intervals.start)
+        self.samples = self.visits = torch.zeros_like(intervals.start, dtype=torch.int32)
+        self.missed = torch.zeros_like(intervals.start, dtype=torch.bool)
 
     @classmethod
     def enter(
-        cls, rays: RayArguments, a: TraceArguments, channel: type[ChannelBricks] = ChannelBricks
+        cls, rays: RayArguments, args: TraceArguments, channel: type[ChannelBricks] = ChannelBricks
     ) -> Walk:
         """Returns a walk of world rays, at the points where they enter the scene."""
-        beam = Beam.enter(rays, a, a.table_lm4.dtype)
-        return cls(Intervals(beam, a.step, len(a.table_lm4)), Tree(a), channel.of(a))
+        beam = Beam.enter(rays, args, args.table_lm4.dtype)
+        return cls(Intervals(beam, args.step, len(args.table_lm4)), Tree(args), channel.of(args))
 
     def go(self, visitor: Visitor) -> None:
         """Walks every ray to the scene's far side, or until it ends."""
-        at, leaves = self.at, torch.ones_like(self.missed)
-        active = at.inside() & visitor.goes_on(leaves)
+        intervals, leaving = self.intervals, torch.ones_like(self.missed)
+        active = intervals.inside() & visitor.goes_on(leaving)
         while active.any():
-            if (active & leaves).any():
-                self.look_up((active & leaves).nonzero()[:, 0], at.middle, visitor)
+            if (active & leaving).any():
+                self.look_up((active & leaving).nonzero()[:, 0], intervals.middle, visitor)
             visit = self.visit
 
             # A node of one value, or of none, is crossed in one step; else one interval is added.
-            whole = active & (visit.uniform | visit.nothing)
-            level, base, count, start = at.level, at.base, at.count, at.start
-            middle, odd, length = at.middle, visit.uniform | at.cut, at.length
-            moves = active
-            while moves.any():
-                at.next(moves)
-                moves = whole & visit.stays(at)
-            end = smaller(at.start, at.beam.last)
+            one_step = active & (visit.uniform | visit.invisible)
+            level, base, count, start = (
+                intervals.level,
+                intervals.base,
+                intervals.count,
+                intervals.start,
+            )
+            middle, odd, length = intervals.middle, visit.uniform | intervals.cut, intervals.length
+            moving = active
+            while moving.any():
+                intervals.next(moving)
+                moving = one_step & visit.stays(intervals)
+            end = smaller(intervals.start, intervals.beam.last)
             length = torch.where(odd, end - start, length)
             middle = torch.where(visit.uniform, start + length * 0.5, middle)
-            lengths = divide(length, at.length_l[0], length)
+            lengths = divide(length, intervals.length_l[0], length)
             piece = Piece(start, end, middle, length, lengths, odd, level, base, count)
-            seen = active & ~visit.nothing
-            self.samples = self.samples + seen.to(torch.int32)
-            visitor.add(piece, Probe(at.beam, visit, self.channel), seen)
-            leaves = whole | ~visit.stays(at)
-            active = at.inside() & visitor.goes_on(leaves)
+            sampled = active & ~visit.invisible
+            self.samples = self.samples + sampled.to(torch.int32)
+            visitor.add(piece, Probe(intervals.beam, visit, self.channel), sampled)
+            leaving = one_step | ~visit.stays(intervals)
+            active = intervals.inside() & visitor.goes_on(leaving)
 
-    def look_up(self, which: Tensor, t: Tensor, visitor: Visitor) -> None:
-        """Finds the nodes of rays `which` (k,) at t (r,); stamps used and requests absent data."""
-        tree, beam, t = self.tree, self.at.beam[which], t[which]
+    def look_up(self, ray_index: Tensor, t: Tensor, visitor: Visitor) -> None:
+        """Finds the nodes of the rays `ray_index` (k,) at t (r,); stamps what is used and requests
+        what is absent.
+        """
+        tree, beam, t = self.tree, self.intervals.beam[ray_index], t[ray_index]
         cone, position = beam.cone(t), beam.at(t)
         wanted = tree.levels.wanted(cone)
-        voxel, above = tree.levels.voxels(wanted)
+        voxel, voxel_above = tree.levels.voxels(wanted)
 
         def hides(node: Tensor) -> Tensor:
-            return visitor.hides(which, *self.channel.ends(node, t.dtype))
+            return visitor.hides(ray_index, *self.channel.value_range(node, t.dtype))
 
-        found = tree.descend(position, wanted, hides)
-        reaches = voxel <= cone
-        blends = reaches & (wanted > 0)
-        alone = ~blends | (found.coarse < 0)
-        fine = tree.holder(found.fine, found.fine_depth, position)
-        coarse_node = torch.where(alone, found.fine, found.coarse)
-        coarse_depth = torch.where(alone, found.fine_depth, found.coarse_depth)
+        descent = tree.descend(position, wanted, hides)
+        voxel_fits = voxel <= cone
+        blends = voxel_fits & (wanted > 0)
+        only_fine = ~blends | (descent.coarse < 0)
+        fine = tree.holder(descent.fine, descent.fine_depth, position)
+        coarse_node = torch.where(only_fine, descent.fine, descent.coarse)
+        coarse_depth = torch.where(only_fine, descent.fine_depth, descent.coarse_depth)
         coarse = tree.holder(coarse_node, coarse_depth, position)
-        unseen = found.hidden & ((found.depth < wanted) | ~blends)
-        tree.stamp(torch.cat((fine.brick[~unseen], coarse.brick[~unseen])))
-        missed = tree.mark(found, wanted, blends, cone, ~unseen)
+        hidden = descent.hidden & ((descent.depth < wanted) | ~blends)
+        tree.stamp(torch.cat((fine.brick[~hidden], coarse.brick[~hidden])))
+        missed = tree.mark(descent, wanted, blends, cone, ~hidden)
 
         empty = (fine.brick == EMPTY) & (coarse.brick == EMPTY)
-        nothing = unseen | (found.fine < 0) | (empty & (not visitor.sees_empty))
+        invisible = hidden | (descent.fine < 0) | (empty & (not visitor.sees_empty))
         same = visitor.same(fine.node.clamp(min=0), coarse.node.clamp(min=0))
-        uniform = ~nothing & (fine.brick < 0) & (coarse.brick < 0) & same
-        leave = beam.leave(*tree.levels.corners(position, found.depth))
-        visit = Visit(fine, coarse, voxel, above, t, wanted, reaches, leave, nothing, uniform)
-        self.visit = self.visit.index_put((which,), visit)
-        self.visits = self.visits.index_add(0, which, torch.ones_like(which, dtype=torch.int32))
-        self.missed = self.missed.index_put((which,), self.missed[which] | missed)
+        uniform = ~invisible & (fine.brick < 0) & (coarse.brick < 0) & same
+        exit_t = beam.leave(*tree.levels.corners(position, descent.depth))
+        visit = Visit(
+            fine, coarse, voxel, voxel_above, t, wanted, voxel_fits, exit_t, invisible, uniform
+        )
+        self.visit = self.visit.index_put((ray_index,), visit)
+        self.visits = self.visits.index_add(
+            0, ray_index, torch.ones_like(ray_index, dtype=torch.int32)
+        )
+        self.missed = self.missed.index_put((ray_index,), self.missed[ray_index] | missed)
 
 
 @dataclass
@@ -331,27 +345,27 @@ class Plain(Visitor):
     stop_clear: Tensor  # (): a ray ends where its transmittance is not above this
 
     @classmethod
-    def begin(cls, rays: RayArguments, a: TraceArguments, walk: Walk, *more: Any) -> Self:
-        """Returns a shader before its first interval; `more` are the fields of a subclass."""
+    def begin(cls, rays: RayArguments, args: TraceArguments, walk: Walk, *fields: Any) -> Self:
+        """Returns a shader before its first interval; `fields` are the fields of a subclass."""
         hit_clear, stop_clear = (
-            1 - torch.tensor(alpha, dtype=a.table_lm4.dtype).to(a.table_lm4)
-            for alpha in (a.depth_alpha, a.stop_alpha)
+            1 - torch.tensor(alpha, dtype=args.table_lm4.dtype).to(args.table_lm4)
+            for alpha in (args.depth_alpha, args.stop_alpha)
         )
-        sums = Accumulator(walk.at.beam, hit_clear, rays.clear_r)
-        return cls(Transfer(a), walk.channel, sums, stop_clear, *more)
+        sums = Accumulator(walk.intervals.beam, hit_clear, rays.clear_r)
+        return cls(Transfer(args), walk.channel, sums, stop_clear, *fields)
 
-    def goes_on(self, leaves: Tensor) -> Tensor:
+    def goes_on(self, leaving: Tensor) -> Tensor:
         return self.sum.clear > self.stop_clear
 
-    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        self.sum.add(self.rgba(piece, probe), piece, where)
+    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+        self.sum.add(self.rgba(piece, probe), piece, mask)
 
     def rgba(self, piece: Piece, probe: Probe) -> Tensor:
         """Returns (r, 4) colours and alphas of intervals by the transfer function."""
         return self.transfer.interval(probe.value(piece.middle), piece)
 
-    def alpha(self, piece: Piece, probe: Probe, along: Tensor) -> Tensor:
-        """Returns (r,) alphas of intervals, seen along the directions `along` (r, 3)."""
+    def alpha(self, piece: Piece, probe: Probe, direction: Tensor) -> Tensor:
+        """Returns (r,) alphas of intervals, seen along the directions `direction` (r, 3)."""
         return self.rgba(piece, probe)[:, 3]
 
 
@@ -362,4 +376,4 @@ def trace_rays(
     walk = Walk.enter(rays, arguments)
     plain = Plain.begin(rays, arguments, walk)
     walk.go(plain)
-    return *plain.sum.hits(walk.at.beam), walk.samples, walk.missed
+    return *plain.sum.hits(walk.intervals.beam), walk.samples, walk.missed

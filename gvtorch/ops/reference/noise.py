@@ -26,22 +26,22 @@ from .exact import sqrt_exact
 #: Points evaluated together on the CPU: their temporaries then stay in its caches.
 CHUNK = 1 << 16
 #: Coordinates from here on count as 0: cell numbers must fit into 32 bits, also skewed ones.
-_MOST = 2.0**29
+_MAX_COORDINATE = 2.0**29
 #: In the order of `NoiseKind` in csrc/noise/noise.h.
 KINDS = ("perlin", "value", "simplex", "F1", "F2", "F2-F1")
 
-_FIRST, _SECOND = 0x2C1B3C6D, 0x297A2D39  # odd, about half of their bits set
+_FIRST_FACTOR, _SECOND_FACTOR = 0x2C1B3C6D, 0x297A2D39  # odd, about half of their bits set
 _AXIS = (0x632BE59B, 0x4F1BBCDD, 0x1E3779B9)
 _THIRD = 2796203  # 2^23 / 3
-_TOP = {torch.float32: -(2**31), torch.float64: -(2**63)}
-_ONE = {torch.float32: 0x3F800000, torch.float64: 0x3FF0000000000000}  # the bits of 1.0
+_TOP_BIT = {torch.float32: -(2**31), torch.float64: -(2**63)}
+_ONE_BITS = {torch.float32: 0x3F800000, torch.float64: 0x3FF0000000000000}  # the bits of 1.0
 #: Simplex noise times this lies in -1 to 1, by dimensions; see `bounds`.
 _SIMPLEX_SCALE = {2: 70.148, 3: 76.880}
 _SKEW = {2: (math.sqrt(3) - 1) / 2, 3: 1 / 3}
 _UNSKEW = {2: (3 - math.sqrt(3)) / 6, 3: 1 / 6}
 
 
-class Given(NamedTuple):
+class NoiseArguments(NamedTuple):
     """The parameters of a noise."""
 
     salt: tuple[int, int, int]  # int32
@@ -58,65 +58,68 @@ class Cell(NamedTuple):
     high: Tensor  # int32
 
 
-def noise(point_pn: Tensor, kind: int, given: Given) -> Tensor:
+def noise(point_pn: Tensor, kind: int, arguments: NoiseArguments) -> Tensor:
     """See `ops.noise`."""
-    make: Callable[..., Tensor] = (_perlin, _value, _simplex, _cellular)[min(kind, 3)]
+    function: Callable[..., Tensor] = (_perlin, _value, _simplex, _cellular)[min(kind, 3)]
 
     def evaluate(*axes: Tensor) -> Tensor:
-        return make(axes, given) if kind < 3 else make(axes, given, KINDS[kind])
+        return function(axes, arguments) if kind < 3 else function(axes, arguments, KINDS[kind])
 
-    counted = torch.where(point_pn.detach().abs() >= _MOST, 0.0, point_pn)
-    return in_chunks(evaluate, counted.unbind(1))
+    bounded = torch.where(point_pn.detach().abs() >= _MAX_COORDINATE, 0.0, point_pn)
+    return in_chunks(evaluate, bounded.unbind(1))
 
 
-def _perlin(axes: Sequence[Tensor], given: Given) -> Tensor:
-    found = cells(axes, given)
-    ends = [(cell.offset, cell.offset - 1) for cell in found]
+def _perlin(axes: Sequence[Tensor], arguments: NoiseArguments) -> Tensor:
+    axis_cells = cells(axes, arguments)
+    ends = [(cell.offset, cell.offset - 1) for cell in axis_cells]
     ramps = []
-    for number, bits in enumerate(corners(found)):
+    for number, bits in enumerate(corners(axis_cells)):
         away = [end[number >> axis & 1] for axis, end in enumerate(ends)]
         ramps.append(ramp(bits, away))
-    return blend(ramps, [fade(cell.offset) for cell in found])
+    return blend(ramps, [fade(cell.offset) for cell in axis_cells])
 
 
-def _value(axes: Sequence[Tensor], given: Given) -> Tensor:
-    found = cells(axes, given)
-    values = [bits.to(axes[0].dtype) * 2.0**-31 for bits in corners(found)]
-    return blend(values, [fade(cell.offset) for cell in found])
+def _value(axes: Sequence[Tensor], arguments: NoiseArguments) -> Tensor:
+    axis_cells = cells(axes, arguments)
+    values = [bits.to(axes[0].dtype) * 2.0**-31 for bits in corners(axis_cells)]
+    return blend(values, [fade(cell.offset) for cell in axis_cells])
 
 
-def _simplex(axes: Sequence[Tensor], given: Given) -> Tensor:
+def _simplex(axes: Sequence[Tensor], arguments: NoiseArguments) -> Tensor:
     """Evaluates simplex noise. Ramps fade by (1/2 - r^2)^4, which is 0 before the next corner's
     cell begins; with the 0.6 that is often used in space it is not, and such noise jumps.
     """
     n = len(axes)
     skew = sum(axes[1:], axes[0]).detach() * _SKEW[n]
-    floors = [(one.detach() + skew).floor() for one in axes]
-    back = sum(floors[1:], floors[0]) * _UNSKEW[n]
-    offsets = [one - (floor - back) for one, floor in zip(axes, floors, strict=True)]
-    places = [floor.to(torch.int32) for floor in floors]
+    floors = [(coordinate.detach() + skew).floor() for coordinate in axes]
+    unskew = sum(floors[1:], floors[0]) * _UNSKEW[n]
+    offsets = [
+        coordinate - (floor - unskew) for coordinate, floor in zip(axes, floors, strict=True)
+    ]
+    lattice = [floor.to(torch.int32) for floor in floors]
     rank, total = _ranks(offsets), torch.zeros_like(axes[0])
     for corner in range(n + 1):
-        steps = [(one + corner >= n).to(torch.int32) for one in rank]  # the `corner` largest
+        # 1 along the `corner` axes of the largest offsets
+        steps = [(axis_rank + corner >= n).to(torch.int32) for axis_rank in rank]
         away = [
             offset - step + corner * _UNSKEW[n] for offset, step in zip(offsets, steps, strict=True)
         ]
         square = away[0] * away[0]
-        for one in away[1:]:
-            square = square + one * one
-        near = (0.5 - square).clamp_min(0)
-        bits = _simplex_hash([a + b for a, b in zip(places, steps, strict=True)], given)
-        total = total + near * near * (near * near) * ramp(bits, away)
+        for distance in away[1:]:
+            square = square + distance * distance
+        falloff = (0.5 - square).clamp_min(0)
+        bits = _simplex_hash([a + b for a, b in zip(lattice, steps, strict=True)], arguments)
+        total = total + falloff * falloff * (falloff * falloff) * ramp(bits, away)
     return total * _SIMPLEX_SCALE[n]
 
 
-def _cellular(axes: Sequence[Tensor], given: Given, feature: str) -> Tensor:
-    first = second = torch.full_like(axes[0], float(given.reach) ** 2)
-    for bits, away in _neighbours(axes, given):
+def _cellular(axes: Sequence[Tensor], arguments: NoiseArguments, feature: str) -> Tensor:
+    first = second = torch.full_like(axes[0], float(arguments.reach) ** 2)
+    for bits, away in _neighbours(axes, arguments):
         square = torch.zeros_like(first)
         for axis, low in enumerate(away):
-            stray = ((bits >> (2 + 10 * axis)) & 1023).to(low.dtype)
-            distance = stray * (given.jitter / 1023) + low
+            random_offset = ((bits >> (2 + 10 * axis)) & 1023).to(low.dtype)
+            distance = random_offset * (arguments.jitter / 1023) + low
             square = square + distance * distance
         second = torch.minimum(second, torch.maximum(first, square))
         first = torch.minimum(first, square)
@@ -136,44 +139,46 @@ def _ranks(offsets: list[Tensor]) -> list[Tensor]:
     return ranks
 
 
-def _simplex_hash(places: list[Tensor], given: Given) -> Tensor:
+def _simplex_hash(lattice: list[Tensor], arguments: NoiseArguments) -> Tensor:
     """Returns int32 hashes of corners from their int32 skewed coordinates.
 
     In space, 6 times the unskewed coordinates are integers, and a period wraps those.
     """
-    if len(places) == 3:
-        total = sum(places[1:], places[0])
-        places = [
-            wrapped(6 * place - total, 6 * every)
-            for place, every in zip(places, given.period, strict=True)
+    if len(lattice) == 3:
+        total = sum(lattice[1:], lattice[0])
+        lattice = [
+            wrapped(6 * coordinate - total, 6 * period)
+            for coordinate, period in zip(lattice, arguments.period, strict=True)
         ]
-    bits = scramble(places[0], given.salt[0])
-    for place, salt in zip(places[1:], given.salt[1:], strict=False):
-        bits = join(bits, scramble(place, salt))
+    bits = scramble(lattice[0], arguments.salt[0])
+    for coordinate, salt in zip(lattice[1:], arguments.salt[1:], strict=False):
+        bits = join(bits, scramble(coordinate, salt))
     return bits
 
 
-def _neighbours(axes: Sequence[Tensor], given: Given) -> list[tuple[Tensor, list[Tensor]]]:
+def _neighbours(
+    axes: Sequence[Tensor], arguments: NoiseArguments
+) -> list[tuple[Tensor, list[Tensor]]]:
     """Returns for each cell in reach its int32 hashes, and along each axis the offset from the
     evaluated point to the lowest position that the cell's point can have.
     """
-    steps, hashes, lows = range(-given.reach, given.reach + 1), [], []
-    for place, salt, every in zip(axes, given.salt, given.period, strict=False):
-        floor = place.detach().floor()
-        own, least = floor.to(torch.int32), 0.5 * (1 - given.jitter) - (place - floor)
-        ends = [wrapped(own + step, every) for step in steps]
+    steps, hashes, lows = range(-arguments.reach, arguments.reach + 1), [], []
+    for coordinate, salt, period in zip(axes, arguments.salt, arguments.period, strict=False):
+        floor = coordinate.detach().floor()
+        lattice, least = floor.to(torch.int32), 0.5 * (1 - arguments.jitter) - (coordinate - floor)
+        ends = [wrapped(lattice + step, period) for step in steps]
         hashes.append([scramble(end, salt) for end in ends])
         lows.append([least + step for step in steps])
-    found = []
+    neighbours = []
     for row in itertools.product(range(len(steps)), repeat=len(axes) - 1):  # z, y
-        part = hashes[-1][row[0]]
-        for axis, at in zip(range(len(axes) - 2, 0, -1), row[1:], strict=True):
-            part = join(part, hashes[axis][at])
-        for at in range(len(steps)):
-            where = (at, *reversed(row))
-            away = [low[step] for low, step in zip(lows, where, strict=True)]
-            found.append((join(part, hashes[0][at]), away))
-    return found
+        row_hash = hashes[-1][row[0]]
+        for axis, index in zip(range(len(axes) - 2, 0, -1), row[1:], strict=True):
+            row_hash = join(row_hash, hashes[axis][index])
+        for index in range(len(steps)):
+            cell = (index, *reversed(row))
+            away = [low[step] for low, step in zip(lows, cell, strict=True)]
+            neighbours.append((join(row_hash, hashes[0][index]), away))
+    return neighbours
 
 
 def salts(seed: int) -> tuple[int, int, int]:
@@ -184,7 +189,7 @@ def salts(seed: int) -> tuple[int, int, int]:
 
 def _salt(seed: int, axis: int) -> int:
     bits = ((seed + (seed >> 32) * 0x61C88647) * 0x9E3779B1 + _AXIS[axis]) & 0xFFFFFFFF
-    for factor in (_FIRST, _SECOND):
+    for factor in (_FIRST_FACTOR, _SECOND_FACTOR):
         bits ^= bits >> 16
         bits = bits * factor & 0xFFFFFFFF
     bits ^= bits >> 15
@@ -193,8 +198,8 @@ def _salt(seed: int, axis: int) -> int:
 
 def scramble(lattice: Tensor, salt: int) -> Tensor:
     """Returns int32 hashes of int32 coordinates along an axis, given the axis' salt."""
-    bits = lattice.bitwise_xor(salt).mul_(_FIRST)
-    bits = bits.bitwise_xor_(bits >> 15).mul_(_SECOND)
+    bits = lattice.bitwise_xor(salt).mul_(_FIRST_FACTOR)
+    bits = bits.bitwise_xor_(bits >> 15).mul_(_SECOND_FACTOR)
     return bits.bitwise_xor_(bits >> 13)
 
 
@@ -204,19 +209,19 @@ def join(first: Tensor, second: Tensor) -> Tensor:
     The shift is arithmetic, so a word and its complement get the same hash. That costs one bit of
     32 and saves the mask that a logical shift needs.
     """
-    bits = first.bitwise_xor(second).mul_(_FIRST)
-    return bits.bitwise_xor_(bits >> 15).mul_(_SECOND)
+    bits = first.bitwise_xor(second).mul_(_FIRST_FACTOR)
+    return bits.bitwise_xor_(bits >> 15).mul_(_SECOND_FACTOR)
 
 
-def cells(axes: Sequence[Tensor], given: Given) -> list[Cell]:
+def cells(axes: Sequence[Tensor], arguments: NoiseArguments) -> list[Cell]:
     """Returns for each axis the cells of the integer lattice that contain the points."""
-    found = []
-    for place, salt, every in zip(axes, given.salt, given.period, strict=False):
-        floor = place.detach().floor()
+    axis_cells = []
+    for coordinate, salt, period in zip(axes, arguments.salt, arguments.period, strict=False):
+        floor = coordinate.detach().floor()
         low = floor.to(torch.int32)
-        ends = wrapped(low, every), wrapped(low + 1, every)
-        found.append(Cell(place - floor, *(scramble(end, salt) for end in ends)))
-    return found
+        ends = wrapped(low, period), wrapped(low + 1, period)
+        axis_cells.append(Cell(coordinate - floor, *(scramble(end, salt) for end in ends)))
+    return axis_cells
 
 
 def wrapped(lattice: Tensor, period: int) -> Tensor:
@@ -224,13 +229,13 @@ def wrapped(lattice: Tensor, period: int) -> Tensor:
     return lattice.remainder(period) if period else lattice
 
 
-def corners(found: Sequence[Cell]) -> list[Tensor]:
+def corners(axis_cells: Sequence[Cell]) -> list[Tensor]:
     """Returns the int32 hashes of a cell's 2^n corners, x running fastest."""
-    x, y = found[0], found[1]
+    x, y = axis_cells[0], axis_cells[1]
     hashes = [join(a, b) for b in (y.low, y.high) for a in (x.low, x.high)]
-    if len(found) == 2:
+    if len(axis_cells) == 2:
         return hashes
-    return [join(a, b) for b in (found[2].low, found[2].high) for a in hashes]
+    return [join(a, b) for b in (axis_cells[2].low, axis_cells[2].high) for a in hashes]
 
 
 def fade(offset: Tensor) -> Tensor:
@@ -255,12 +260,13 @@ def gradient(bits: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
     """
     third = bits >> 8
     not_x, not_z = (third + _THIRD) >> 31, (_THIRD - third) >> 31  # -1 where that one is 0, else 0
-    wide = bits
+    wide_bits = bits
     if dtype == torch.float64:
-        wide, not_x, not_z = (one.to(torch.int64) for one in (bits, not_x, not_z))
-    size = 31 if dtype == torch.float32 else 63
-    first = ((wide << (size - 6)) & _TOP[dtype]).bitwise_or_(_ONE[dtype])  # 1.0 or -1.0
-    second = ((wide << (size - 7)) & _TOP[dtype]).bitwise_or_(_ONE[dtype])
+        wide_bits, not_x, not_z = (word.to(torch.int64) for word in (bits, not_x, not_z))
+    top_bit = 31 if dtype == torch.float32 else 63
+    # Each is 1.0 or -1.0.
+    first = ((wide_bits << (top_bit - 6)) & _TOP_BIT[dtype]).bitwise_or_(_ONE_BITS[dtype])
+    second = ((wide_bits << (top_bit - 7)) & _TOP_BIT[dtype]).bitwise_or_(_ONE_BITS[dtype])
     in_x, in_z = first & not_x.bitwise_not_(), second & not_z.bitwise_not_()
     in_y = first.bitwise_xor_(in_x).bitwise_or_(second.bitwise_xor_(in_z))
     return in_x.view(dtype), in_y.view(dtype), in_z.view(dtype)
@@ -270,9 +276,9 @@ def ramp(bits: Tensor, away: Sequence[Tensor]) -> Tensor:
     """Returns the dot product of the gradient that hashes select and (x, y) or (x, y, z). In 2D it
     equals that in space with z = 0.
     """
-    own = gradient(bits, away[0].dtype)
-    total = own[0] * away[0] + own[1] * away[1]
-    return total if len(away) == 2 else total + own[2] * away[2]
+    slope = gradient(bits, away[0].dtype)
+    total = slope[0] * away[0] + slope[1] * away[1]
+    return total if len(away) == 2 else total + slope[2] * away[2]
 
 
 def in_chunks(evaluate: Callable[..., Tensor], axes: Sequence[Tensor]) -> Tensor:
@@ -280,13 +286,15 @@ def in_chunks(evaluate: Callable[..., Tensor], axes: Sequence[Tensor]) -> Tensor
     chunks on the CPU, unless gradients are recorded or torch.compile fuses the operations.
     """
     first = axes[0]
-    whole = first.device.type != "cpu" or torch.compiler.is_compiling()
-    learns = torch.is_grad_enabled() and any(one.requires_grad for one in axes)
-    if whole or learns or first.numel() <= CHUNK:
+    at_once = first.device.type != "cpu" or torch.compiler.is_compiling()
+    needs_gradient = torch.is_grad_enabled() and any(
+        coordinate.requires_grad for coordinate in axes
+    )
+    if at_once or needs_gradient or first.numel() <= CHUNK:
         return evaluate(*axes)
-    flat = [one.reshape(-1) for one in axes]
+    flat = [coordinate.reshape(-1) for coordinate in axes]
     out = torch.empty(first.numel(), dtype=first.dtype)
     for begin in range(0, len(out), CHUNK):
-        part = slice(begin, begin + CHUNK)
-        out[part] = evaluate(*(one[part] for one in flat))
+        chunk = slice(begin, begin + CHUNK)
+        out[chunk] = evaluate(*(coordinate[chunk] for coordinate in flat))
     return out.view(first.shape)

@@ -35,10 +35,10 @@ def spherical_power(z: Tensor, n: int) -> tuple[Tensor, Tensor]:
     is the distance from the axis.
     """
     x, y, up = z.unbind(0)
-    away = sqrt_exact(_at_least(x * x + y * y, 1e-30))
-    radius = sqrt_exact(away * away + up * up)
-    cosine, sine = _turned(x / away, y / away, n)
-    height, width = _turned(up, away, n)
+    axis_distance = sqrt_exact(_at_least(x * x + y * y, 1e-30))
+    radius = sqrt_exact(axis_distance * axis_distance + up * up)
+    cosine, sine = _complex_power(x / axis_distance, y / axis_distance, n)
+    height, width = _complex_power(up, axis_distance, n)
     raised = torch.stack((width * cosine, width * sine, height))
     return raised, n * _product(radius, n - 1)
 
@@ -50,17 +50,19 @@ def power_ranges(z: Tensor, reach: Tensor, n: int) -> tuple[Tensor, Tensor, Tens
     all terms of its series are positive and those beyond the first add up to pi / 2 - 1 at s = 1.
     """
     x, y, up = z.unbind(0)
-    away, radius = sqrt_exact(x * x + y * y), sqrt_exact(_squared(z))
-    least, most = _at_least(radius - reach, 0.0), radius + reach
-    safe = _at_least(radius, 1e-30)
-    part = smaller(reach / safe, torch.ones_like(reach))
-    change = part + (math.pi / 2 - 1) * (part * part * part)
-    _, sine = _turned(up / safe, away / safe, n)
-    turned = larger(sine, -sine) + n * change
-    own = _at_least(_at_least(away - reach, 0.0) / _at_least(most, 1e-30), 1 / n)
-    turn = clamp(smaller(turned, torch.ones_like(turned)) / own, 1.0, n)
-    low, high = n * _product(least, n - 1), n * _product(most, n - 1)
-    return high * turn, low, high
+    axis_distance, radius = sqrt_exact(x * x + y * y), sqrt_exact(_squared(z))
+    inner_radius, outer_radius = _at_least(radius - reach, 0.0), radius + reach
+    safe_radius = _at_least(radius, 1e-30)
+    ratio = smaller(reach / safe_radius, torch.ones_like(reach))
+    angle_change = ratio + (math.pi / 2 - 1) * (ratio * ratio * ratio)
+    _, sine = _complex_power(up / safe_radius, axis_distance / safe_radius, n)
+    sine_bound = larger(sine, -sine) + n * angle_change
+    least_sine = _at_least(
+        _at_least(axis_distance - reach, 0.0) / _at_least(outer_radius, 1e-30), 1 / n
+    )
+    around = clamp(smaller(sine_bound, torch.ones_like(sine_bound)) / least_sine, 1.0, n)
+    low, high = n * _product(inner_radius, n - 1), n * _product(outer_radius, n - 1)
+    return high * around, low, high
 
 
 def fold(z: Tensor, scale: float) -> tuple[Tensor, Tensor]:
@@ -68,8 +70,8 @@ def fold(z: Tensor, scale: float) -> tuple[Tensor, Tensor]:
     radius 1/2 and 1, and scales.
     """
     folded = 2 * clamp(z, -1.0, 1.0) - z
-    grown = divide(1.0, clamp(_squared(folded), 0.25, 1.0), z[0])
-    return folded * (grown * scale), grown * abs(scale)
+    inverted = divide(1.0, clamp(_squared(folded), 0.25, 1.0), z[0])
+    return folded * (inverted * scale), inverted * abs(scale)
 
 
 def fold_ranges(z: Tensor, reach: Tensor, scale: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -80,7 +82,7 @@ def fold_ranges(z: Tensor, reach: Tensor, scale: float) -> tuple[Tensor, Tensor,
     return high, divide(abs(scale), far * far, reach), high
 
 
-class Way(NamedTuple):
+class TwinOrbit(NamedTuple):
     """The iteration of orbits, and when they end."""
 
     step: Step
@@ -91,62 +93,74 @@ class Way(NamedTuple):
     logarithmic: bool  # |z| grows as a power; else by a factor
 
 
-def orbits(point_p3: Tensor, way: Way) -> Tensor:
+def orbits(point_p3: Tensor, orbit: TwinOrbit) -> Tensor:
     """Iterates points until they escape; see `ops.orbits`."""
-    z, bailout = point_p3.mT, way.bailout_1
-    constant, add = (z, 1.0) if way.constant_3 is None else (way.constant_3[:, None], 0.0)
+    z, bailout = point_p3.mT, orbit.bailout_1
+    constant, added_separation = (
+        (z, 1.0) if orbit.constant_3 is None else (orbit.constant_3[:, None], 0.0)
+    )
     radius = sqrt_exact(_squared(z))
-    apart, near, plane = torch.ones_like(radius), radius, _from_planes(z)
-    for _ in range(way.iterations):
+    separation, least_radius, plane = torch.ones_like(radius), radius, _from_planes(z)
+    for _ in range(orbit.iterations):
         alive = radius <= bailout
-        after, grown = way.step(z)
-        z = torch.where(alive, after + constant, z)
-        apart = torch.where(alive, grown * apart + add, apart)
+        stepped, factor = orbit.step(z)
+        z = torch.where(alive, stepped + constant, z)
+        separation = torch.where(alive, factor * separation + added_separation, separation)
         radius = sqrt_exact(_squared(z))
-        near, plane = smaller(near, radius), smaller(plane, _from_planes(z))
-    value = torch.where(radius <= bailout, -INSIDE, _estimate(radius, apart, way))
-    return torch.stack((value, near, plane))
+        least_radius, plane = smaller(least_radius, radius), smaller(plane, _from_planes(z))
+    value = torch.where(radius <= bailout, -INSIDE, _estimate(radius, separation, orbit))
+    return torch.stack((value, least_radius, plane))
 
 
-def orbit_bounds(center_k3: Tensor, reach_k: Tensor, way: Way) -> Tensor:
+def orbit_bounds(center_k3: Tensor, reach_k: Tensor, orbit: TwinOrbit) -> Tensor:
     """Iterates the centres of balls, and for each a radius within which the orbits of all points of
     the ball are; see `ops.orbit_bounds`.
     """
-    z, reach, bailout = center_k3.mT, reach_k, way.bailout_1
-    constant, push, add = z, reach, 1.0
-    if way.constant_3 is not None:
-        constant, push, add = way.constant_3[:, None], torch.zeros_like(reach), 0.0
-    low_apart = high_apart = torch.ones_like(reach)
+    z, reach, bailout = center_k3.mT, reach_k, orbit.bailout_1
+    constant, added_reach, added_separation = z, reach, 1.0
+    if orbit.constant_3 is not None:
+        constant, added_reach, added_separation = (
+            orbit.constant_3[:, None],
+            torch.zeros_like(reach),
+            0.0,
+        )
+    low_separation = high_separation = torch.ones_like(reach)
     low, high = torch.full_like(reach, math.inf), torch.full_like(reach, -math.inf)
     inside = torch.ones_like(reach, dtype=torch.bool)  # some point may not have escaped yet
-    lost = ~inside
-    for turn in range(way.iterations + 1):
+    diverged = ~inside
+    for iteration in range(orbit.iterations + 1):
         radius = sqrt_exact(_squared(z))
-        least, most = _at_least(radius - reach, 0.0), radius + reach
-        escaping = inside & (most > bailout)
-        first = _estimate(larger(least, bailout), high_apart, way)
-        last = _estimate(most, low_apart, way)
-        low = torch.where(escaping, smaller(low, first), low)
-        high = torch.where(escaping, larger(high, last), high)
-        lost = lost | (inside & ~(reach < FAR))
-        inside = inside & (least <= bailout) & ~lost
-        if turn == way.iterations:
+        inner_radius, outer_radius = _at_least(radius - reach, 0.0), radius + reach
+        escaping = inside & (outer_radius > bailout)
+        low_estimate = _estimate(larger(inner_radius, bailout), high_separation, orbit)
+        high_estimate = _estimate(outer_radius, low_separation, orbit)
+        low = torch.where(escaping, smaller(low, low_estimate), low)
+        high = torch.where(escaping, larger(high, high_estimate), high)
+        diverged = diverged | (inside & ~(reach < FAR))
+        inside = inside & (inner_radius <= bailout) & ~diverged
+        if iteration == orbit.iterations:
             break
-        stretch, slow, fast = way.ranges(z, reach)
-        after, _ = way.step(z)
-        z = torch.where(inside, after + constant, z)
-        reach = torch.where(inside, stretch * reach + push, reach)
-        low_apart = torch.where(inside, slow * low_apart + add, low_apart)
-        high_apart = torch.where(inside, fast * high_apart + add, high_apart)
+        stretch, low_factor, high_factor = orbit.ranges(z, reach)
+        stepped, _ = orbit.step(z)
+        z = torch.where(inside, stepped + constant, z)
+        reach = torch.where(inside, stretch * reach + added_reach, reach)
+        low_separation = torch.where(
+            inside, low_factor * low_separation + added_separation, low_separation
+        )
+        high_separation = torch.where(
+            inside, high_factor * high_separation + added_separation, high_separation
+        )
     deep = torch.full_like(low, -INSIDE)
     low = torch.where(inside, smaller(low, deep), low)
     high = torch.where(inside, larger(high, deep), high)
-    return torch.stack((torch.where(lost, deep, low), torch.where(lost, math.inf, high)))
+    return torch.stack((torch.where(diverged, deep, low), torch.where(diverged, math.inf, high)))
 
 
-def _estimate(radius: Tensor, apart: Tensor, way: Way) -> Tensor:
-    """Returns distance estimates of orbits at `radius`; `apart`: their neighbours' stretch."""
-    return 0.5 * radius * log_exact(radius) / apart if way.logarithmic else radius / apart
+def _estimate(radius: Tensor, separation: Tensor, orbit: TwinOrbit) -> Tensor:
+    """Returns distance estimates of orbits at `radius`; `separation`: their neighbours' stretch."""
+    return (
+        0.5 * radius * log_exact(radius) / separation if orbit.logarithmic else radius / separation
+    )
 
 
 def _squared(z: Tensor) -> Tensor:
@@ -173,10 +187,10 @@ def _product(value: Tensor, n: int) -> Tensor:
     return root * root * value if n % 2 else root * root
 
 
-def _turned(real: Tensor, imaginary: Tensor, n: int) -> tuple[Tensor, Tensor]:
+def _complex_power(real: Tensor, imaginary: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """Returns the n-th power of complex numbers, by squares and products."""
     if n == 1:
         return real, imaginary
-    a, b = _turned(real, imaginary, n // 2)
+    a, b = _complex_power(real, imaginary, n // 2)
     a, b = (a - b) * (a + b), 2 * a * b
     return (a * real - b * imaginary, a * imaginary + b * real) if n % 2 else (a, b)

@@ -20,14 +20,16 @@ INF = math.inf
 class Rows:
     """Base of dataclasses whose tensors all have one row per ray."""
 
-    def __getitem__(self, which: Tensor) -> Self:
+    def __getitem__(self, index: Tensor) -> Self:
         """Returns the rows of some rays."""
-        return replace(self, **{name: field[which] for name, field in vars(self).items()})
+        return replace(self, **{name: field[index] for name, field in vars(self).items()})
 
-    def index_put(self, which: tuple[Tensor], rows: Self) -> Self:
+    def index_put(self, index: tuple[Tensor], rows: Self) -> Self:
         """Returns a copy with the rows of some rays replaced."""
-        mine = vars(self).items()
-        return replace(self, **{name: row.index_put(which, vars(rows)[name]) for name, row in mine})
+        own_fields = vars(self).items()
+        return replace(
+            self, **{name: row.index_put(index, vars(rows)[name]) for name, row in own_fields}
+        )
 
 
 @dataclass
@@ -46,19 +48,19 @@ class Beam(Rows):
     moved: Tensor  # (r,) distance from the camera to the origin
 
     @classmethod
-    def enter(cls, rays: RayArguments, a: TraceArguments, real: torch.dtype) -> Beam:
+    def enter(cls, rays: RayArguments, args: TraceArguments, real: torch.dtype) -> Beam:
         """Transforms world rays to tree units in float64, then rounds them to `real`."""
-        corner, size, high = a.place_33
+        corner, size, high = args.place_33
         high = high.nan_to_num(0.0).clamp(0, 1)  # keeps a caller's scene inside the root cube
         origin, direction = (rays.origin_r3 - corner) / size, rays.direction_r3 / size
         low_t, high_t = -origin / direction, (high - origin) / direction
-        near = torch.full_like(origin[:, 0], -INF)
+        entry = torch.full_like(origin[:, 0], -INF)
         for axis in range(3):
-            entry = larger(near, smaller(low_t[:, axis], high_t[:, axis]))
-            near = torch.where(direction[:, axis] != 0, entry, near)
-        moved = torch.where((near > 0) & (near < INF), near, 0.0)
-        near_cone, growth = (rays.cone_r2 * a.cone_scale).unbind(1)
-        deep = torch.full_like(moved, is_deep(a), dtype=torch.bool)
+            axis_entry = larger(entry, smaller(low_t[:, axis], high_t[:, axis]))
+            entry = torch.where(direction[:, axis] != 0, axis_entry, entry)
+        moved = torch.where((entry > 0) & (entry < INF), entry, 0.0)
+        near_cone, growth = (rays.cone_r2 * args.cone_scale).unbind(1)
+        deep = torch.full_like(moved, is_deep(args), dtype=torch.bool)
         columns = (
             direction,
             near_cone + growth * moved,
@@ -67,12 +69,12 @@ class Beam(Rows):
             rays.range_r2[:, 1] - moved,
             moved,
         )
-        way, *numbers = (column.to(real) for column in columns)
+        real_direction, *numbers = (column.to(real) for column in columns)
         start = split(origin + moved[:, None] * direction, deep, real)
-        return cls(*start, deep, way, high.expand_as(origin), *numbers).clipped()
+        return cls(*start, deep, real_direction, high.expand_as(origin), *numbers).clipped()
 
     @property
-    def place(self) -> Tensor:
+    def exact_origin(self) -> Tensor:
         """(r, 3) float64 positions where the rays begin."""
         return self.origin.double() + self.rest.double()
 
@@ -82,15 +84,15 @@ class Beam(Rows):
         """
         first, last = self.first, self.last
         for axis in range(3):
-            columns = (self.place, self.direction, self.high)
-            place, direction, high = (column[:, axis] for column in columns)
-            to_high = (high - place).to(direction)
+            columns = (self.exact_origin, self.direction, self.high)
+            position, direction, high = (column[:, axis] for column in columns)
+            to_high = (high - position).to(direction)
             a, b = -self.origin[:, axis] / direction, to_high / direction
-            flat = direction == 0
-            beside = flat & ~((place >= 0) & (place <= high))
-            last = torch.where(beside, first, last)
-            first = torch.where(flat, first, larger(first, smaller(a, b)))
-            last = torch.where(flat, last, smaller(last, larger(a, b)))
+            parallel = direction == 0
+            outside = parallel & ~((position >= 0) & (position <= high))
+            last = torch.where(outside, first, last)
+            first = torch.where(parallel, first, larger(first, smaller(a, b)))
+            last = torch.where(parallel, last, smaller(last, larger(a, b)))
         is_cone = (self.cone_near == self.cone_near) & (self.cone_growth == self.cone_growth)
         return replace(self, first=first, last=torch.where(is_cone & (last < INF), last, first))
 
@@ -100,41 +102,41 @@ class Beam(Rows):
 
     def along(self, t: Tensor) -> Tensor:
         """Returns (r, 3) float64 positions at distances t (r,), computed in float64 if deep."""
-        near = (self.origin + t[:, None] * self.direction).double()
-        exact = self.place + t[:, None].double() * self.direction.double()
-        return torch.where(self.deep[:, None], exact, near)
+        rounded = (self.origin + t[:, None] * self.direction).double()
+        exact = self.exact_origin + t[:, None].double() * self.direction.double()
+        return torch.where(self.deep[:, None], exact, rounded)
 
     def at(self, t: Tensor) -> Tensor:
         """Returns the positions of `along`, clamped into the scene; its high faces belong to it."""
         high = self.high.to(self.origin)
-        inside = (high * torch.tensor(0.9999999).to(high)).double()
-        inside = torch.where(self.deep[:, None], self.high * (1 - 2.0**-50), inside)
-        return clamp(self.along(t), 0, inside)
+        upper_bound = (high * torch.tensor(0.9999999).to(high)).double()
+        upper_bound = torch.where(self.deep[:, None], self.high * (1 - 2.0**-50), upper_bound)
+        return clamp(self.along(t), 0, upper_bound)
 
     def leave(self, low: Tensor, high: Tensor) -> Tensor:
         """Returns (r,) distances at which rays leave float64 boxes; +inf for a direction of 0."""
         face = torch.where(self.direction > 0, high, low)
         inverse = divide(1.0, self.direction, self.direction)
-        way = (face - self.place).to(self.direction)
-        x, y, z = torch.where(self.direction == 0, INF, way * inverse).unbind(1)
+        distance = (face - self.exact_origin).to(self.direction)
+        x, y, z = torch.where(self.direction == 0, INF, distance * inverse).unbind(1)
         return smaller(smaller(smaller(torch.full_like(x, INF), x), y), z)
 
 
-def is_deep(a: TraceArguments) -> bool:
+def is_deep(args: TraceArguments) -> bool:
     """Returns whether positions are computed in float64: where the root cube has more than 2^18
     voxels a side, or N is no power of two, so that float32 can't hold corners of nodes.
     """
-    brick = a.bricks_bzyxc.shape[1] - 2 * a.border
-    power = a.branching & (a.branching - 1) == 0
-    return not power or brick * a.branching**a.max_depth > DEEP_VOXELS
+    brick_size = args.bricks_bzyxc.shape[1] - 2 * args.border
+    is_power = args.branching & (args.branching - 1) == 0
+    return not is_power or brick_size * args.branching**args.max_depth > DEEP_VOXELS
 
 
-def split(place: Tensor, deep: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+def split(position: Tensor, deep: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
     """Splits float64 positions (r, 3) into numbers of dtype `real` and their rounding errors, which
     are 0 unless `deep` (r,).
     """
-    origin = place.to(real)
-    rest = torch.where(deep[:, None], place - origin.double(), 0)
+    origin = position.to(real)
+    rest = torch.where(deep[:, None], position - origin.double(), 0)
     return origin, rest.to(real)
 
 
@@ -191,24 +193,26 @@ class Intervals:
         """Returns (r,) bool: the interval starts before the far side."""
         return self.start < self.beam.last
 
-    def next(self, move: Tensor) -> None:
-        """Moves to the next interval where `move` (r,) is true."""
+    def next(self, mask: Tensor) -> None:
+        """Moves to the next interval where `mask` (r,) is true."""
         start = self.whole_end
-        self.count = torch.where(move, self.count + 1, self.count)
-        self.start = torch.where(move, start, self.start)
-        self._choose_level(move)
+        self.count = torch.where(mask, self.count + 1, self.count)
+        self.start = torch.where(mask, start, self.start)
+        self._choose_level(mask)
 
-    def _choose_level(self, move: Tensor) -> None:
+    def _choose_level(self, mask: Tensor) -> None:
         width = self.beam.cone(self.start)
         top = len(self.length_l) - 1
-        short, long = self.level > 0, self.level < top
-        fits = (~short | ~(width < self.length)) & (~long | ~(width >= self.length + self.length))
+        not_shortest, not_longest = self.level > 0, self.level < top
+        fits = (~not_shortest | ~(width < self.length)) & (
+            ~not_longest | ~(width >= self.length + self.length)
+        )
         level = (width[:, None] >= self.length_l[1:]).sum(1)
         full = self.count >= MAX_INTERVALS  # as many as are counted from one base
         self.start = torch.where(
-            move & full & ~(self.start > self.base), self.beam.last, self.start
+            mask & full & ~(self.start > self.base), self.beam.last, self.start
         )
-        change = move & (full | ~fits)
-        self.base = torch.where(change, self.start, self.base)
-        self.count = torch.where(change, 0.0, self.count)
-        self.level = torch.where(change, level, self.level)
+        changes = mask & (full | ~fits)
+        self.base = torch.where(changes, self.start, self.base)
+        self.count = torch.where(changes, 0.0, self.count)
+        self.level = torch.where(changes, level, self.level)

@@ -14,7 +14,7 @@ from .march import NodePair, Piece, Probe, Transfer, Visitor, Walk
 from .rays import Beam
 from .tree import ChannelBricks, Levels
 
-_PIECE = -1  # level of an odd interval
+_ODD = -1  # level of an odd interval
 
 
 @dataclass
@@ -28,49 +28,49 @@ class SegmentWriter(Visitor):
     by_node: bool  # a region counts as being of one value only where no two nodes blend
 
     def __post_init__(self) -> None:
-        real = self.walk.at.start[:0]
-        whole = real.to(torch.int64)
-        tables = (whole.view(0, 2), whole.view(0, 2), whole.view(0, 3))
-        empty: tuple[Tensor, ...] = (whole, whole, *tables, *(real,) * 5, whole)
+        reals = self.walk.intervals.start[:0]
+        integers = reals.to(torch.int64)
+        tables = (integers.view(0, 2), integers.view(0, 2), integers.view(0, 3))
+        empty: tuple[Tensor, ...] = (integers, integers, *tables, *(reals,) * 5, integers)
         self.parts = [empty]
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
         same = super().same(fine, coarse)
         return same & (fine == coarse) if self.by_node else same
 
-    def goes_on(self, leaves: Tensor) -> Tensor:
-        return ~(leaves & (self.limit > 0) & (self.walk.samples >= self.limit))
+    def goes_on(self, leaving: Tensor) -> Tensor:
+        return ~(leaving & (self.limit > 0) & (self.walk.samples >= self.limit))
 
-    def add(self, piece: Piece, probe: Probe, where: Tensor) -> None:
-        visit, odd, ray = self.walk.visit, piece.odd, where.nonzero()[:, 0]
+    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+        visit, odd, ray_index = self.walk.visit, piece.odd, mask.nonzero()[:, 0]
         fine, coarse = visit.fine, visit.coarse
         columns = (
             self.walk.visits,
             torch.stack((fine.node, coarse.node), 1),
             torch.stack((fine.brick, coarse.brick), 1),
             torch.stack((fine.depth, coarse.depth, visit.wanted), 1),
-            *(visit.seen, piece.start, piece.end),
+            *(visit.lookup_t, piece.start, piece.end),
             torch.where(odd, piece.start, piece.base),
             torch.where(odd, 0.0, piece.count),
-            torch.where(odd, _PIECE, piece.level),
+            torch.where(odd, _ODD, piece.level),
         )
-        self.parts.append((ray, *(column[ray] for column in columns)))
+        self.parts.append((ray_index, *(column[ray_index] for column in columns)))
 
     def segments(self) -> Segments:
         """Joins the intervals, recorded for all rays in lockstep, to segments ray by ray."""
         columns = [torch.cat(column) for column in zip(*self.parts, strict=True)]
         order = columns[0].argsort(stable=True)
-        ray, visit, node, brick, depth, seen, start, end, base, count, level = (
+        ray, visit, node, brick, depth, lookup_t, start, end, base, count, level = (
             column[order] for column in columns
         )
-        new = torch.ones_like(ray, dtype=torch.bool)
+        begins = torch.ones_like(ray, dtype=torch.bool)
         alike = [column[1:] == column[:-1] for column in (ray, visit, level, base)]
-        new[1:] = ~(torch.stack(alike).all(0) & (level[1:] != _PIECE))
-        first = new.nonzero()[:, 0]
+        begins[1:] = ~(torch.stack(alike).all(0) & (level[1:] != _ODD))
+        first = begins.nonzero()[:, 0]
         last = torch.cat((first[1:] - 1, torch.full_like(first[:1], len(ray) - 1)))
         intervals = (count[first].to(torch.int64), last - first + 1, level[first])
         walk, ray = self.walk, ray[first]
-        moved = walk.at.beam.moved[ray]
+        moved = walk.intervals.beam.moved[ray]
         counts = (torch.bincount(ray, minlength=len(walk.samples)), walk.samples, walk.visits)
         return Segments(
             ray_index=ray.to(torch.int32),
@@ -78,23 +78,23 @@ class SegmentWriter(Visitor):
             brick=brick[first].to(torch.int32),
             depth=depth[first].to(torch.int32),
             interval=torch.stack(intervals, 1).to(torch.int32),
-            distance=torch.stack((base[first], end[last], seen[first]), 1),
+            distance=torch.stack((base[first], end[last], lookup_t[first]), 1),
             t0=start[first] + moved,
             t1=end[last] + moved,
             counts=torch.stack(counts, 1).to(torch.int32),
-            state=walk.at.state,
+            state=walk.intervals.state,
             missed=walk.missed,
         )
 
 
 def walk_segments(
-    rays: RayArguments, a: TraceArguments, state_r3: Tensor | None, limit: int, by_node: bool
+    rays: RayArguments, args: TraceArguments, state_r3: Tensor | None, limit: int, by_node: bool
 ) -> Segments:
     """Twin of `torch.ops.gvtorch.count_segments` and `write_segments` in one."""
-    walk = Walk.enter(rays, a)
+    walk = Walk.enter(rays, args)
     if state_r3 is not None:
-        walk.at.resume(state_r3)
-    writer = SegmentWriter(Transfer(a), walk.channel, walk, limit, by_node)
+        walk.intervals.resume(state_r3)
+    writer = SegmentWriter(Transfer(args), walk.channel, walk, limit, by_node)
     walk.go(writer)
     return writer.segments()
 
@@ -103,33 +103,33 @@ def sample_bricks(
     rays: RayArguments, arguments: TraceArguments, segments: Segments, samples: Samples
 ) -> Tensor:
     """Twin of `torch.ops.gvtorch.sample_bricks`: (k, c). Bricks may be float64 here."""
-    a, real, segment = arguments, segments.distance.dtype, samples.segment.to(torch.int64)
-    count, rays_there = len(segments.distance), len(rays.origin_r3)
-    if not count or not rays_there:
-        return segments.distance.new_zeros((len(segment), a.bricks_bzyxc.shape[-1]))
+    args, real, segment = arguments, segments.distance.dtype, samples.segment.to(torch.int64)
+    count, ray_count = len(segments.distance), len(rays.origin_r3)
+    if not count or not ray_count:
+        return segments.distance.new_zeros((len(segment), args.bricks_bzyxc.shape[-1]))
     ray = segments.ray_index.to(torch.int64)
-    known = (segment >= 0) & (segment < count)
-    segment = torch.where(known, segment, 0)
-    known = known & (ray[segment] >= 0) & (ray[segment] < rays_there)
-    beam = Beam.enter(rays, a, real)[torch.where(known, ray[segment], 0)]
-    base, end, seen = segments.distance[segment].unbind(1)
+    valid = (segment >= 0) & (segment < count)
+    segment = torch.where(valid, segment, 0)
+    valid = valid & (ray[segment] >= 0) & (ray[segment] < ray_count)
+    beam = Beam.enter(rays, args, real)[torch.where(valid, ray[segment], 0)]
+    base, end, lookup_t = segments.distance[segment].unbind(1)
     first, _, level = segments.interval[segment].unbind(1)
-    length = torch.tensor(a.step, dtype=real).to(base) * 2.0 ** level.clamp(min=0).to(real)
+    length = torch.tensor(args.step, dtype=real).to(base) * 2.0 ** level.clamp(min=0).to(real)
     middle = base + ((first + samples.number).to(real) + 0.5) * length
-    t = torch.where(level == _PIECE, base + (end - base) * 0.5, middle)
+    t = torch.where(level == _ODD, base + (end - base) * 0.5, middle)
 
-    words = (segments.node, segments.brick, segments.depth)
-    nodes, bricks, depths = (word.to(torch.int64)[segment].unbind(1) for word in words)
-    levels, place = Levels(a, real), beam.at(seen)
+    node_fields = (segments.node, segments.brick, segments.depth)
+    nodes, bricks, depths = (field.to(torch.int64)[segment].unbind(1) for field in node_fields)
+    levels, position = Levels(args, real), beam.at(lookup_t)
     fine, coarse = (
-        levels.holder(node, brick, depth, place)
+        levels.holder(node, brick, depth, position)
         for node, brick, depth in zip(nodes, bricks, depths[:2], strict=True)
     )
-    channel = ChannelBricks.of(a)
+    channel = ChannelBricks.of(args)
     probe = Probe(beam, NodePair(fine, coarse, *levels.voxels(depths[2])), channel)
-    components = channel.components(a.bricks_bzyxc, a.constant_tnc)
-    found = torch.stack([probe.number(component, t) for component in components], 1)
-    return torch.where(known[:, None], found, 0.0)
+    components = channel.components(args.bricks_bzyxc, args.constant_tnc)
+    values = torch.stack([probe.number(component, t) for component in components], 1)
+    return torch.where(valid[:, None], values, 0.0)
 
 
 def composite(
@@ -138,14 +138,14 @@ def composite(
     """Twin of `torch.ops.gvtorch.composite`: rays in lockstep, from sample to sample."""
     begin, counts = offset_r[:-1], offset_r.diff()
     total = feature_kc.new_zeros((len(begin), feature_kc.shape[1]))
-    left, before_k = clear_r, torch.zeros_like(alpha_k)
+    remaining, before_k = clear_r, torch.zeros_like(alpha_k)
     for number in range(int(counts.max()) if len(counts) else 0):
-        which = (counts > number).nonzero()[:, 0]
+        ray_index = (counts > number).nonzero()[:, 0]
         if stop_clear > 0:
-            which = which[left[which] > stop_clear]
-        k, clear = begin[which] + number, left[which]
+            ray_index = ray_index[remaining[ray_index] > stop_clear]
+        k, clear = begin[ray_index] + number, remaining[ray_index]
         before_k = before_k.index_put((k,), clear)
         share = clear * alpha_k[k]
-        total = total.index_put((which,), total[which] + share[:, None] * feature_kc[k])
-        left = left.index_put((which,), clear * (1 - alpha_k[k]))
-    return total, left, before_k
+        total = total.index_put((ray_index,), total[ray_index] + share[:, None] * feature_kc[k])
+        remaining = remaining.index_put((ray_index,), clear * (1 - alpha_k[k]))
+    return total, remaining, before_k

@@ -18,15 +18,16 @@ from .rays import INF, Beam, Rows
 class Levels:
     """Sizes and numbers of the nodes and voxels of each depth."""
 
-    def __init__(self, a: TraceArguments, real: torch.dtype) -> None:
-        counts = [float(a.branching**depth) for depth in range(a.max_depth + 1)]
-        self.branching = a.branching
-        self.count_d = torch.tensor(counts, dtype=torch.float64, device=a.place_33.device)
+    def __init__(self, args: TraceArguments, real: torch.dtype) -> None:
+        counts = [float(args.branching**depth) for depth in range(args.max_depth + 1)]
+        self.branching = args.branching
+        self.count_d = torch.tensor(counts, dtype=torch.float64, device=args.place_33.device)
         # (d,) nodes along a side of the root cube, and the side of a node in tree units
         self.size_d = 1 / self.count_d
-        brick = a.bricks_bzyxc.shape[1] - 2 * a.border
-        self.scale_d = (brick * self.count_d).to(real)  # (d,) voxels a tree unit
-        self.voxel_d = (a.root_voxel / self.count_d).to(real)  # (d,) side of a voxel, world units
+        brick_size = args.bricks_bzyxc.shape[1] - 2 * args.border
+        self.scale_d = (brick_size * self.count_d).to(real)  # (d,) voxels a tree unit
+        # (d,) side of a voxel, world units
+        self.voxel_d = (args.root_voxel / self.count_d).to(real)
 
     def wanted(self, cone: Tensor) -> Tensor:
         """Returns (r,) the first depths whose voxels are not wider than the cone (the lod)."""
@@ -34,14 +35,14 @@ class Levels:
 
     def voxels(self, depth: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (r,) voxel sizes at each depth, and at the one above (+inf above the root)."""
-        above = torch.where(depth > 0, self.voxel_d[(depth - 1).clamp(min=0)], INF)
-        return self.voxel_d[depth], above
+        voxel_above = torch.where(depth > 0, self.voxel_d[(depth - 1).clamp(min=0)], INF)
+        return self.voxel_d[depth], voxel_above
 
     def cells(self, position_r3: Tensor, depth: Tensor) -> Tensor:
         """Returns (r, 3) int64 x, y, z of the nodes at a depth (r,) around float64 positions."""
         finest = torch.floor(position_r3 * self.count_d[-1]).to(torch.int64)
-        up = self.count_d[len(self.count_d) - 1 - depth].to(torch.int64)
-        return finest // up[:, None]
+        cells_per_node = self.count_d[len(self.count_d) - 1 - depth].to(torch.int64)
+        return finest // cells_per_node[:, None]
 
     def corners(self, position_r3: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (r, 3) float64 low and high corners of the same nodes."""
@@ -82,13 +83,18 @@ class Descent:
 class Tree:
     """The tree of an op's arguments, with the node pool as flat words."""
 
-    def __init__(self, a: TraceArguments) -> None:
-        self.arguments, self.levels = a, Levels(a, a.table_lm4.dtype)
+    def __init__(self, args: TraceArguments) -> None:
+        self.arguments, self.levels = args, Levels(args, args.table_lm4.dtype)
         # A word that names a tile or slot beyond the pool counts as absent.
-        child, brick, tiles, bricks = a.child_tn, a.brick_tn, len(a.child_tn), len(a.bricks_bzyxc)
+        child, brick, tiles, bricks = (
+            args.child_tn,
+            args.brick_tn,
+            len(args.child_tn),
+            len(args.bricks_bzyxc),
+        )
         self.child_n = torch.where(child < tiles, child, ABSENT).view(-1)
         self.brick_n = torch.where(brick < bricks, brick, ABSENT).view(-1)
-        self.request_n, self.per_tile = a.request_tn.view(-1), a.child_tn.shape[1]
+        self.request_n, self.per_tile = args.request_tn.view(-1), args.child_tn.shape[1]
 
     def descend(
         self, position_r3: Tensor, wanted_r: Tensor, hides: Callable[[Tensor], Tensor]
@@ -96,30 +102,30 @@ class Tree:
         """Descends from the root to the wanted depth, or as far as tiles exist and something is
         seen; stamps the tiles.
         """
-        a, n = self.arguments, self.levels.branching
-        node, depth = torch.full_like(wanted_r, a.root), torch.zeros_like(wanted_r)
-        none = torch.full_like(node, -1)
-        at = Descent(node, depth, none, hides(node), none, depth, none, depth)
-        going = torch.ones_like(node, dtype=torch.bool)
+        args, n = self.arguments, self.levels.branching
+        node, depth = torch.full_like(wanted_r, args.root), torch.zeros_like(wanted_r)
+        absent = torch.full_like(node, -1)
+        descent = Descent(node, depth, absent, hides(node), absent, depth, absent, depth)
+        active = torch.ones_like(node, dtype=torch.bool)
         while True:
-            a.stamp_t[torch.unique(at.node[going] // self.per_tile)] = a.frame_1[0]
-            answers = going & (self.brick_n[at.node] != ABSENT)
-            at.fine = torch.where(answers, at.node, at.fine)
-            at.fine_depth = torch.where(answers, at.depth, at.fine_depth)
-            above = answers & (at.depth < wanted_r)
-            at.coarse = torch.where(above, at.node, at.coarse)
-            at.coarse_depth = torch.where(above, at.depth, at.coarse_depth)
+            args.stamp_t[torch.unique(descent.node[active] // self.per_tile)] = args.frame_1[0]
+            has_data = active & (self.brick_n[descent.node] != ABSENT)
+            descent.fine = torch.where(has_data, descent.node, descent.fine)
+            descent.fine_depth = torch.where(has_data, descent.depth, descent.fine_depth)
+            above_wanted = has_data & (descent.depth < wanted_r)
+            descent.coarse = torch.where(above_wanted, descent.node, descent.coarse)
+            descent.coarse_depth = torch.where(above_wanted, descent.depth, descent.coarse_depth)
 
-            tile = self.child_n[at.node].to(torch.int64)
-            going = going & (at.depth < wanted_r) & (tile >= 0) & ~at.hidden
-            if not going.any():
-                return at
-            x, y, z = (self.levels.cells(position_r3, at.depth + going) % n).unbind(1)
+            tile = self.child_n[descent.node].to(torch.int64)
+            active = active & (descent.depth < wanted_r) & (tile >= 0) & ~descent.hidden
+            if not active.any():
+                return descent
+            x, y, z = (self.levels.cells(position_r3, descent.depth + active) % n).unbind(1)
             child = tile * self.per_tile + (z * n + y) * n + x
-            at.parent = torch.where(going, at.node, at.parent)
-            at.node = torch.where(going, child, at.node)
-            at.depth = torch.where(going, at.depth + 1, at.depth)
-            at.hidden = torch.where(going, hides(at.node), at.hidden)
+            descent.parent = torch.where(active, descent.node, descent.parent)
+            descent.node = torch.where(active, child, descent.node)
+            descent.depth = torch.where(active, descent.depth + 1, descent.depth)
+            descent.hidden = torch.where(active, hides(descent.node), descent.hidden)
 
     def holder(self, node: Tensor, depth: Tensor, position_r3: Tensor) -> Holder:
         """Returns nodes (r,), or -1, that were found at a depth around positions."""
@@ -127,26 +133,34 @@ class Tree:
         return self.levels.holder(node, brick, depth, position_r3)
 
     def mark(
-        self, found: Descent, wanted: Tensor, blends: Tensor, cone: Tensor, seen: Tensor
+        self, descent: Descent, wanted: Tensor, blends: Tensor, cone: Tensor, visible: Tensor
     ) -> Tensor:
         """Requests absent tiles and bricks where something is seen, straight to the wanted level or
         level by level; returns (r,) bool: the ray made a request.
         """
-        by_level, absent = self.arguments.by_level, self.brick_n[found.node] == ABSENT
-        deeper = (found.depth < wanted) & (self.child_n[found.node] == ABSENT)
-        short = seen & deeper & ~(by_level & absent)
-        missing = seen & absent & (by_level | ~deeper | (found.fine < 0))
-        parent = found.parent.clamp(min=0)
-        above = seen & blends & (found.depth == wanted) & (self.brick_n[parent] == ABSENT)
-        self.request(found.node[short], found.depth[short], cone[short], REQUEST_SUBDIVIDE)
-        self.request(found.node[missing], found.depth[missing], cone[missing], REQUEST_LOAD)
-        self.request(parent[above], found.depth[above] - 1, cone[above], REQUEST_LOAD)
-        return short | missing | above
+        by_level, absent = self.arguments.by_level, self.brick_n[descent.node] == ABSENT
+        deeper = (descent.depth < wanted) & (self.child_n[descent.node] == ABSENT)
+        needs_tile = visible & deeper & ~(by_level & absent)
+        needs_brick = visible & absent & (by_level | ~deeper | (descent.fine < 0))
+        parent = descent.parent.clamp(min=0)
+        needs_parent = (
+            visible & blends & (descent.depth == wanted) & (self.brick_n[parent] == ABSENT)
+        )
+        self.request(
+            descent.node[needs_tile], descent.depth[needs_tile], cone[needs_tile], REQUEST_SUBDIVIDE
+        )
+        self.request(
+            descent.node[needs_brick], descent.depth[needs_brick], cone[needs_brick], REQUEST_LOAD
+        )
+        self.request(
+            parent[needs_parent], descent.depth[needs_parent] - 1, cone[needs_parent], REQUEST_LOAD
+        )
+        return needs_tile | needs_brick | needs_parent
 
     def stamp(self, brick: Tensor) -> None:
         """Stamps brick slots as used in this frame; words below 0 are no slots."""
-        a = self.arguments
-        a.stamp_b[torch.unique(brick[brick >= 0])] = a.frame_1[0]
+        args = self.arguments
+        args.stamp_b[torch.unique(brick[brick >= 0])] = args.frame_1[0]
 
     def request(self, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
         """Joins requests into the request words: kinds by OR, priorities by maximum. A priority is
@@ -155,12 +169,12 @@ class Tree:
         voxel = self.levels.voxel_d[depth]
         priority = torch.where(cone > 0, voxel / cone * 16, REQUEST_PRIORITY)
         priority = torch.where(priority < REQUEST_PRIORITY, priority, REQUEST_PRIORITY)
-        asked, inverse = torch.unique(node, return_inverse=True)
-        most = torch.zeros_like(asked, dtype=torch.int16)
-        most.scatter_reduce_(0, inverse, priority.to(torch.int16), "amax")
-        word = self.request_n[asked]
+        requested, inverse = torch.unique(node, return_inverse=True)
+        highest = torch.zeros_like(requested, dtype=torch.int16)
+        highest.scatter_reduce_(0, inverse, priority.to(torch.int16), "amax")
+        word = self.request_n[requested]
         kinds = (word & ~REQUEST_PRIORITY) | kind
-        self.request_n[asked] = kinds | torch.maximum(word & REQUEST_PRIORITY, most)
+        self.request_n[requested] = kinds | torch.maximum(word & REQUEST_PRIORITY, highest)
 
 
 @dataclass
@@ -174,9 +188,9 @@ class ChannelBricks:
     component: int
 
     @classmethod
-    def of(cls, a: TraceArguments) -> Self:
-        constant_nc, range_n2c = a.constant_tnc.flatten(0, 1), a.range_tn2c.flatten(0, 1)
-        return cls(a.bricks_bzyxc, constant_nc, range_n2c, a.border, a.component)
+    def of(cls, args: TraceArguments) -> Self:
+        constant_nc, range_n2c = args.constant_tnc.flatten(0, 1), args.range_tn2c.flatten(0, 1)
+        return cls(args.bricks_bzyxc, constant_nc, range_n2c, args.border, args.component)
 
     def components(self, bricks: Tensor | None, constants: Tensor | None) -> tuple[Self, ...]:
         """Returns every number of another channel of the same nodes; () where that is None."""
@@ -184,10 +198,10 @@ class ChannelBricks:
             return ()
         if constants is None:  # a coarse channel, whose constants are never used
             constants = bricks.new_zeros((1, len(self.constant_nc), bricks.shape[4]))
-        other = replace(self, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
-        return tuple(replace(other, component=c) for c in range(bricks.shape[4]))
+        other_bricks = replace(self, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
+        return tuple(replace(other_bricks, component=c) for c in range(bricks.shape[4]))
 
-    def ends(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+    def value_range(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         """Returns (r,) smallest and largest values in reach of bricks of the nodes and below."""
         low, high = self.range_n2c[node, :, self.component].to(real).unbind(1)
         return low, high
@@ -202,10 +216,10 @@ class ChannelBricks:
         constant = self.constant_nc[holder.node.clamp(min=0), self.component].to(real)
         return torch.where(holder.node >= 0, constant, 0.0)
 
-    def places(self, holder: Holder, beam: Beam, t: Tensor) -> Tensor:
+    def positions(self, holder: Holder, beam: Beam, t: Tensor) -> Tensor:
         """Returns (r, 3) x, y, z in bricks at distances t (r,), in voxels from the first centre."""
         scale = holder.scale[:, None]
-        offset = (beam.place - holder.corner).to(t.dtype) * scale + (self.border - 0.5)
+        offset = (beam.exact_origin - holder.corner).to(t.dtype) * scale + (self.border - 0.5)
         return offset + t[:, None] * (beam.direction * scale)
 
     def sample(
@@ -218,12 +232,12 @@ class ChannelBricks:
         constant = self.constant(holder, real)
         if self.bricks_bzyxc.shape[0] == 0:
             return constant
-        columns = zip(self.places(holder, beam, t).unbind(1), shift, strict=True)
-        place = clamp(torch.stack([p + d if d else p for p, d in columns], 1), 0, side - 1)
-        cell = smaller(torch.floor(place), torch.full_like(place, side - 2))
-        wx, wy, wz = (place - cell).unbind(1)
-        both = torch.arange(2, device=t.device)[:, None]
-        x, y, z = (cell.to(torch.int64)[:, None] + both).unbind(2)
+        columns = zip(self.positions(holder, beam, t).unbind(1), shift, strict=True)
+        position = clamp(torch.stack([p + d if d else p for p, d in columns], 1), 0, side - 1)
+        cell = smaller(torch.floor(position), torch.full_like(position, side - 2))
+        wx, wy, wz = (position - cell).unbind(1)
+        pair = torch.arange(2, device=t.device)[:, None]
+        x, y, z = (cell.to(torch.int64)[:, None] + pair).unbind(2)
         corners = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
         brick = holder.brick.clamp(min=0)[:, None, None, None]
         value_rzyx = self.bricks_bzyxc[(brick, *corners, self.component)].to(real)  # (r, 2, 2, 2)

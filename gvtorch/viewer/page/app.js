@@ -1,6 +1,6 @@
 // The page: its copy of the view's state, its parts, and the messages that it handles and sends.
 import { between, distance, facing } from "./camera.js";
-import { el, iconButton, keep, openJson } from "./dom.js";
+import { el, iconButton, saveFile, openJson } from "./dom.js";
 import { ClipEditor } from "./clip.js";
 import { Film } from "./film.js";
 import { History } from "./history.js";
@@ -23,15 +23,15 @@ const TOOLS = {
   window: "Window: drag right for a wider window, down for brighter (or hold Alt)",
 };
 const TYPES = { png: "image/png", json: "application/json", glb: "model/gltf-binary" };
-const REST = 160;  // milliseconds after which a wheel or a key is at rest
+const REST_MS = 160;  // milliseconds after which a wheel or a key is at rest
 
 /** Merges a change into a value: objects of one kind field by field; anything else is replaced. */
-function merged(now, change) {
-  const plain = (one) => one !== null && typeof one === "object" && !Array.isArray(one);
-  if (!plain(change) || !plain(now) || (change.kind && now.kind && change.kind !== now.kind)) return change;
-  const made = { ...now };
-  for (const [name, value] of Object.entries(change)) made[name] = merged(now[name], value);
-  return made;
+function merged(current, change) {
+  const isObject = (value) => value !== null && typeof value === "object" && !Array.isArray(value);
+  if (!isObject(change) || !isObject(current) || (change.kind && current.kind && change.kind !== current.kind)) return change;
+  const result = { ...current };
+  for (const [name, value] of Object.entries(change)) result[name] = merged(current[name], value);
+  return result;
 }
 
 export class App {
@@ -39,7 +39,7 @@ export class App {
     this.root = root;
     this.tool = "orbit";
     this.surfaceLevel = 0;
-    this.shown = { axes: true, scale: true, box: false, nodes: false };
+    this.overlays = { axes: true, scale: true, box: false, nodes: false };
     this.history = new History();
     this.clients = {};
     this.inView = false;
@@ -57,26 +57,26 @@ export class App {
     this.note = el("div.gv-note", { role: "status" });
     this.title = el("span.gv-title");
     root.append(this.view.element, this.toolbar(), this.times.element, this.progress, this.note);
-    const on = (type, take) => this.link.on(type, take);
-    on("welcome", (told) => this.welcome(told));
-    on("picture", (picture) => this.view.take(picture));
-    on("file", ({ head, bytes }) => { keep(head.file, bytes, TYPES[head.file.split(".").at(-1)] ?? "application/octet-stream"); this.say(`${head.file} is saved`); });
-    on("state", (told) => this.take(told));
-    on("camera", ({ camera }) => this.seat(camera));
+    const on = (type, handler) => this.link.on(type, handler);
+    on("welcome", (message) => this.welcome(message));
+    on("picture", (picture) => this.view.receive(picture));
+    on("file", ({ head, bytes }) => { saveFile(head.file, bytes, TYPES[head.file.split(".").at(-1)] ?? "application/octet-stream"); this.notify(`${head.file} is saved`); });
+    on("state", (message) => this.receiveState(message));
+    on("camera", ({ camera }) => this.setCamera(camera));
     on("clients", ({ clients }) => { this.clients = clients; this.refresh(); });
-    on("histogram", (told) => this.panel?.editor.setHistogram(told));
-    on("preset", (told) => this.presets.came(told));
-    on("nodes", (told) => this.nodes.take(told));
-    on("note", ({ text }) => this.say(text));
-    on("picked", (told) => this.picked(told));
+    on("histogram", (message) => this.panel?.editor.setHistogram(message));
+    on("preset", (message) => this.presets.receive(message));
+    on("nodes", (message) => this.nodes.receive(message));
+    on("note", ({ text }) => this.notify(text));
+    on("picked", (message) => this.picked(message));
     on("parameters", ({ parameters }) => { this.parameters = parameters; this.refresh(); this.askHistogram(this.inView); });
     on("busy", (busy) => this.busy(busy));
-    on("figures", (figures) => this.monitor.take(figures));
-    on("exporting", ({ done, total }) => this.say(`making the surface … ${Math.round((100 * done) / total)} %`, false, null, true));
-    on("refused", ({ text }) => this.say(text, true));
-    on("error", ({ text }) => this.say(text, true));
-    on("failed", ({ text, count }) => this.say(`${count} parts could not be loaded: ${text}`, true, () => this.link.send("do", { what: "retry" })));
-    on("gone", ({ why }) => { this.say(why || "The view is gone; trying to reach it again …", true); this.root.classList.add("gv-lost"); });
+    on("figures", (figures) => this.monitor.receive(figures));
+    on("exporting", ({ done, total }) => this.notify(`making the surface … ${Math.round((100 * done) / total)} %`, false, null, true));
+    on("refused", ({ text }) => this.notify(text, true));
+    on("error", ({ text }) => this.notify(text, true));
+    on("failed", ({ text, count }) => this.notify(`${count} parts could not be loaded: ${text}`, true, () => this.link.send("do", { what: "retry" })));
+    on("gone", ({ reason }) => { this.notify(reason || "The view is gone; trying to reach it again …", true); this.root.classList.add("gv-lost"); });
     this.view.element.addEventListener("drawn", ({ detail }) => {
       this.monitor.drawn();
       this.times.drawn(detail);
@@ -85,53 +85,53 @@ export class App {
 
   toolbar() {
     this.buttons = {};
-    for (const [name, title] of Object.entries(TOOLS)) this.buttons[name] = iconButton(name, title, () => this.use(name));
+    for (const [name, title] of Object.entries(TOOLS)) this.buttons[name] = iconButton(name, title, () => this.useTool(name));
     this.buttons.orbit.classList.add("gv-on");
-    const bar = (...items) => el("div.gv-tools", {}, ...items);
-    return el("nav.gv-top", {}, bar(...Object.values(this.buttons)),
-      bar(iconButton("home", "The whole box (F)", () => this.link.send("do", { what: "fit" })),
+    const group = (...items) => el("div.gv-tools", {}, ...items);
+    return el("nav.gv-top", {}, group(...Object.values(this.buttons)),
+      group(iconButton("home", "The whole box (F)", () => this.link.send("do", { what: "fit" })),
         iconButton("ortho", "Orthographic or perspective (O); views along axes: 1 to 6, or a click on x, y, z", () => this.switchOrtho())),
-      bar(this.slicesButton = iconButton("slices", "Three slices beside the picture", () => this.slices.show(!this.state.slices))),
-      bar(iconButton("undo", "Undo (Ctrl Z)", () => this.undo()),
+      group(this.slicesButton = iconButton("slices", "Three slices beside the picture", () => this.slices.show(!this.state.slices))),
+      group(iconButton("undo", "Undo (Ctrl Z)", () => this.undo()),
         iconButton("redo", "Redo (Ctrl Shift Z)", () => this.redo()),
-        iconButton("camera", "Save the picture (PNG)", () => this.still()),
-        iconButton("save", "Save all that is shown (JSON): gvtorch view --state, gvtorch render --state", () => keep("view.json", JSON.stringify({ ...this.state, camera: this.camera }, null, 1), "application/json")),
-        iconButton("open", "Load what was saved (JSON)", () => openJson((state) => this.load(state), (why) => this.say(why, true)))),
+        iconButton("camera", "Save the picture (PNG)", () => this.saveStill()),
+        iconButton("save", "Save all that is shown (JSON): gvtorch view --state, gvtorch render --state", () => saveFile("view.json", JSON.stringify({ ...this.state, camera: this.camera }, null, 1), "application/json")),
+        iconButton("open", "Load what was saved (JSON)", () => openJson((state) => this.load(state), (reason) => this.notify(reason, true)))),
       this.title, el("span.gv-gap"),
-      bar(iconButton("panel", "Panel", () => { this.root.classList.toggle("gv-closed"); })));
+      group(iconButton("panel", "Panel", () => { this.root.classList.toggle("gv-closed"); })));
   }
 
-  use(name) {
+  useTool(name) {
     this.tool = name;
     for (const [other, button] of Object.entries(this.buttons)) button.classList.toggle("gv-on", other === name);
     this.view.element.focus({ preventScroll: true });
   }
 
-  welcome(told) {
+  welcome(message) {
     Object.assign(this, {
-      number: told.client, box: told.box, unit: told.unit, schema: told.schema, time: told.time, labels: told.labels,
-      channels: told.channels, widths: told.widths, engine: told.engine, parameters: told.parameters,
+      number: message.client, box: message.box, unit: message.unit, schema: message.schema, time: message.time, labels: message.labels,
+      channels: message.channels, widths: message.widths, engine: message.engine, parameters: message.parameters,
     });
-    this.presets.builtIn = told.presets;
+    this.presets.builtIn = message.presets;
     this.root.classList.remove("gv-lost");
     this.note.classList.remove("gv-shown");
-    const { camera, ...state } = told.state;
+    const { camera, ...state } = message.state;
     this.state = state;
-    this.unfit = told.unfit;
+    this.unfit = message.unfit;
     this.camera ??= camera;
     this.home = camera;
-    this.title.textContent = told.name;
-    document.title = this.root.classList.contains("gv-page") ? `${told.name} · gvtorch` : document.title;
+    this.title.textContent = message.name;
+    document.title = this.root.classList.contains("gv-page") ? `${message.name} · gvtorch` : document.title;
     this.panel?.element.remove();
     this.panel = new Panel(this);
     this.root.append(this.panel.element);
-    this.view.hello();
-    this.view.overlay();
+    this.view.sendSize();
+    this.view.drawOverlay();
     this.lastTransfer = this.transfer() ?? { kind: "TransferFunction", opacity: [[0, 0], [1, 0.5]], color: [[0, 0, 0, 0], [1, 1, 1, 1]] };
     this.refresh();
     this.askHistogram(false);
-    if (this.shown.nodes) this.nodes.show(true);
-    if (this.panel.open.has("Monitor")) this.watch(true);
+    if (this.overlays.nodes) this.nodes.show(true);
+    if (this.panel.open.has("Monitor")) this.setMonitor(true);
   }
 
   refresh() {
@@ -144,66 +144,66 @@ export class App {
 
   // The state.
 
-  take({ state, unfit }) {
+  receiveState({ state, unfit }) {
     const { camera, ...rest } = state;
     if (JSON.stringify([rest, unfit]) === JSON.stringify([this.state, this.unfit])) return;
     this.state = rest;
     this.unfit = unfit;
     this.refresh();
-    this.view.overlay();
+    this.view.drawOverlay();
   }
 
   change(part, rest = true) {
-    if (!this.before) this.before = this.state;
-    const shape = (one) => [one.shader.kind, one.options.clip?.planes.length, one.options.lens, one.options.lighting, !one.slices, one.show].map((x) => JSON.stringify(x)?.length);
-    const old = shape(this.state);
+    if (!this.stateBefore) this.stateBefore = this.state;
+    const layoutKey = (state) => [state.shader.kind, state.options.clip?.planes.length, state.options.lens, state.options.lighting, !state.slices, state.show].map((part) => JSON.stringify(part)?.length);
+    const oldKey = layoutKey(this.state);
     this.state = merged(this.state, part);
     this.link.send("change", { state: part, rest });
     if (rest) {
-      this.remember(this.before, this.state);
-      this.before = null;
+      this.remember(this.stateBefore, this.state);
+      this.stateBefore = null;
     }
-    if (rest || shape(this.state).some((one, n) => one !== old[n])) this.refresh();
-    this.view.overlay();
+    if (rest || layoutKey(this.state).some((state, n) => state !== oldKey[n])) this.refresh();
+    this.view.drawOverlay();
   }
 
   /** Adds an edit of the state to the history. */
   remember(before, after) {
-    this.history.push(() => this.put(before), () => this.put(after));
+    this.history.push(() => this.replaceState(before), () => this.replaceState(after));
   }
 
   /** Replaces the whole state. */
-  put(state) {
+  replaceState(state) {
     this.state = state;
     this.link.send("change", { state, rest: true });
     this.refresh();
-    this.view.overlay();
+    this.view.drawOverlay();
   }
 
   undo() {
-    if (!this.history.undo()) this.say("there is nothing to undo");
+    if (!this.history.undo()) this.notify("there is nothing to undo");
   }
 
   redo() {
-    if (!this.history.redo()) this.say("there is nothing to do again");
+    if (!this.history.redo()) this.notify("there is nothing to do again");
   }
 
   /** Sets a parameter of the scene, or the engine's memory. */
-  set(type, values, name, value, message) {
+  setValue(type, values, name, value, message) {
     const before = type === "set" ? values[name].value : values[name];
-    const put = (one) => {
-      if (type === "resize") values[name] = one;
-      this.link.send(type, message(one));
+    const apply = (newValue) => {
+      if (type === "resize") values[name] = newValue;
+      this.link.send(type, message(newValue));
       this.refresh();
     };
-    this.history.push(() => put(before), () => put(value));
-    put(value);
+    this.history.push(() => apply(before), () => apply(value));
+    apply(value);
   }
 
   load(state) {
     const { camera, ...rest } = state, before = this.state;
     this.link.send("change", { state, rest: true });
-    if (camera) this.seat(camera);
+    if (camera) this.setCamera(camera);
     this.state = merged(this.state, rest);
     this.remember(before, this.state);
     this.refresh();
@@ -213,8 +213,8 @@ export class App {
 
   transfer() {
     const { shader } = this.state;
-    const found = shader.kind === "TransferFunction" ? shader : shader.transfer;
-    return Array.isArray(found?.opacity) && Array.isArray(found.color) ? found : null;
+    const transfer = shader.kind === "TransferFunction" ? shader : shader.transfer;
+    return Array.isArray(transfer?.opacity) && Array.isArray(transfer.color) ? transfer : null;
   }
 
   changeTransfer(f, rest) {
@@ -225,8 +225,8 @@ export class App {
 
   /** Whether a kind of shader is offered: Features needs a second channel; StoredColor and Labels only if shown now. */
   offers(kind) {
-    const many = Object.keys(this.widths).length > 1;
-    return { Features: many, StoredColor: this.state.shader.kind === "StoredColor", Labels: this.state.shader.kind === "Labels" }[kind] ?? this.state.shader.kind !== "Labels";
+    const severalChannels = Object.keys(this.widths).length > 1;
+    return { Features: severalChannels, StoredColor: this.state.shader.kind === "StoredColor", Labels: this.state.shader.kind === "Labels" }[kind] ?? this.state.shader.kind !== "Labels";
   }
 
   askHistogram(inView) {
@@ -241,51 +241,51 @@ export class App {
 
   dragWindow(dx, dy) {
     const move = ([low, high]) => {
-      const wide = (high - low) * Math.exp(dx * 3), middle = (low + high) / 2 - dy * (high - low) * 1.5;
-      return [middle - wide / 2, middle + wide / 2];
+      const width = (high - low) * Math.exp(dx * 3), middle = (low + high) / 2 - dy * (high - low) * 1.5;
+      return [middle - width / 2, middle + width / 2];
     };
     const f = this.transfer(), { shader } = this.state;
     if (f) this.changeTransfer(stretched(f, domain(f), move(domain(f))), false);
-    else if (shader.looks) this.change({ shader: { ...shader, looks: shader.looks.map((one) => (one.window ? { ...one, window: move(one.window) } : one)) } }, false);
+    else if (shader.looks) this.change({ shader: { ...shader, looks: shader.looks.map((look) => (look.window ? { ...look, window: move(look.window) } : look)) } }, false);
     else if ("value" in shader) this.change({ shader: { ...shader, value: shader.value - dy * (Math.abs(shader.value) + 1) } }, false);
   }
 
-  settle() {
-    if (this.before) this.change({}, true);
+  finishEdit() {
+    if (this.stateBefore) this.change({}, true);
     this.refresh();
   }
 
   // The camera.
 
-  seat(camera) {
+  setCamera(camera) {
     this.camera = camera;
-    this.view.overlay();
+    this.view.drawOverlay();
     this.refresh();
   }
 
-  look(camera, moving) {
+  moveCamera(camera, moving) {
     this.camera = camera;
-    this.view.overlay();
-    if (moving && this.asked) return;
+    this.view.drawOverlay();
+    if (moving && this.frameRequest) return;
     if (!moving) return this.sendCamera(false);
-    this.asked = requestAnimationFrame(() => { this.asked = 0; this.sendCamera(true); });
+    this.frameRequest = requestAnimationFrame(() => { this.frameRequest = 0; this.sendCamera(true); });
   }
 
   sendCamera(moving) {
-    if (this.asked) cancelAnimationFrame(this.asked);
-    this.asked = 0;
+    if (this.frameRequest) cancelAnimationFrame(this.frameRequest);
+    this.frameRequest = 0;
     const { eye, target, up, fov, model } = this.camera;
     this.link.send("move", { camera: { eye, target, up, fov, model }, moving, sent: moving ? performance.now() : 0 });
   }
 
-  rest() {
+  finishMove() {
     this.sendCamera(false);
     if (this.panel?.open.has("Camera")) this.refresh();
   }
 
-  restSoon() {
-    clearTimeout(this.resting);
-    this.resting = setTimeout(() => this.rest(), REST);
+  finishMoveSoon() {
+    clearTimeout(this.restTimer);
+    this.restTimer = setTimeout(() => this.finishMove(), REST_MS);
   }
 
   /** Moves smoothly to a camera in a quarter of a second. */
@@ -293,74 +293,74 @@ export class App {
     const from = this.camera, start = performance.now();
     const step = (now) => {
       const t = clamp((now - start) / 260, 0, 1);
-      this.look(t < 1 ? between(from, camera, t * t * (3 - 2 * t)) : camera, t < 1);
+      this.moveCamera(t < 1 ? between(from, camera, t * t * (3 - 2 * t)) : camera, t < 1);
       if (t < 1) requestAnimationFrame(step);
     };
     step(start);
   }
 
-  face(axis, side) {
+  faceAxis(axis, side) {
     this.glide(facing(this.camera, axis, side, this.home.up));
   }
 
   /** Sets a field of the camera, which can be undone. */
   changeCamera(camera, rest) {
     this.cameraBefore ??= this.camera;
-    this.look(camera, !rest);
+    this.moveCamera(camera, !rest);
     if (!rest) return;
-    const before = this.cameraBefore, put = (one) => { this.look(one, false); this.refresh(); };
+    const before = this.cameraBefore, apply = (newCamera) => { this.moveCamera(newCamera, false); this.refresh(); };
     this.cameraBefore = null;
-    this.history.push(() => put(before), () => put(camera));
+    this.history.push(() => apply(before), () => apply(camera));
   }
 
   switchOrtho() {
-    this.look({ ...this.camera, model: this.camera.model === "ortho" ? "pinhole" : "ortho" }, false);
+    this.moveCamera({ ...this.camera, model: this.camera.model === "ortho" ? "pinhole" : "ortho" }, false);
     this.refresh();
   }
 
-  picked({ place, purpose }) {
+  picked({ place: position, purpose }) {
     if (purpose !== "focus") return;
-    if (!place) return this.say("there is nothing");
-    const { camera } = this, move = place.map((one, axis) => one - camera.target[axis]);
-    this.glide({ ...camera, target: place, eye: camera.eye.map((one, axis) => one + move[axis]) });
-    this.say(`at ${place.map((one) => Number(one.toPrecision(5))).join(", ")}; ${Number(distance(camera).toPrecision(3))} away`);
+    if (!position) return this.notify("there is nothing");
+    const { camera } = this, shift = position.map((value, axis) => value - camera.target[axis]);
+    this.glide({ ...camera, target: position, eye: camera.eye.map((value, axis) => value + shift[axis]) });
+    this.notify(`at ${position.map((value) => Number(value.toPrecision(5))).join(", ")}; ${Number(distance(camera).toPrecision(3))} away`);
   }
 
-  surface(wanted) {
-    this.say("making the surface …", false, null, true);
-    this.link.send("surface", wanted);
+  saveSurface(request) {
+    this.notify("making the surface …", false, null, true);
+    this.link.send("surface", request);
   }
 
-  still() {
-    this.say("rendering …");
-    this.link.send("still", { width: this.view.over.width, height: this.view.over.height });
+  saveStill() {
+    this.notify("rendering …");
+    this.link.send("still", { width: this.view.overlayCanvas.width, height: this.view.overlayCanvas.height });
   }
 
   // Figures, progress and notes.
 
-  watch(on) {
+  setMonitor(on) {
     this.link.send("monitor", { on });
   }
 
   busy({ pending, misses, crowded }) {
-    const left = Math.max(pending, misses);
-    this.progress.classList.toggle("gv-shown", left > 0);
-    this.most = left ? Math.max(this.most ?? 0, left) : 0;
-    this.progress.style.setProperty("--done", `${left ? Math.max(4, 100 * (1 - left / this.most)) : 100}%`);
-    if (crowded && !this.toldCrowded) this.say("The brick pool is too small for this picture: parts of it are coarser (Memory).");
-    this.toldCrowded = crowded;
+    const remaining = Math.max(pending, misses);
+    this.progress.classList.toggle("gv-shown", remaining > 0);
+    this.busyMax = remaining ? Math.max(this.busyMax ?? 0, remaining) : 0;
+    this.progress.style.setProperty("--done", `${remaining ? Math.max(4, 100 * (1 - remaining / this.busyMax)) : 100}%`);
+    if (crowded && !this.wasCrowded) this.notify("The brick pool is too small for this picture: parts of it are coarser (Memory).");
+    this.wasCrowded = crowded;
   }
 
-  say(text, bad = false, again = null, stays = false) {
-    clearTimeout(this.saying);
-    this.note.replaceChildren(text, ...(again ? [el("button.gv-small", { type: "button", onclick: () => { again(); this.note.classList.remove("gv-shown"); } }, "try again")] : []));
-    this.note.classList.toggle("gv-bad", bad);
+  notify(text, isError = false, retry = null, isSticky = false) {
+    clearTimeout(this.noteTimer);
+    this.note.replaceChildren(text, ...(retry ? [el("button.gv-small", { type: "button", onclick: () => { retry(); this.note.classList.remove("gv-shown"); } }, "try again")] : []));
+    this.note.classList.toggle("gv-bad", isError);
     this.note.classList.add("gv-shown");
-    if (!again && !stays) this.saying = setTimeout(() => this.note.classList.remove("gv-shown"), bad ? 7000 : 2200);
+    if (!retry && !isSticky) this.noteTimer = setTimeout(() => this.note.classList.remove("gv-shown"), isError ? 7000 : 2200);
   }
 }
 
-/** Shows a view in an element; `connect(take, gone)` opens its transport. */
+/** Shows a view in an element; `connect(receive, onLost)` opens its transport. */
 export function mount(root, connect) {
   root.app = new App(root, connect);
   return root.app;

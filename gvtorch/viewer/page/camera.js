@@ -26,7 +26,7 @@ export function orbited(c, yaw, pitch) {
 }
 
 /** Turns the view direction by angles (radians), from the same position. */
-export function looked(c, yaw, pitch) {
+export function lookedAround(c, yaw, pitch) {
   const pole = unit(c.up), towards = sub(c.target, c.eye);
   const { right } = axes(c);
   const angle = Math.acos(clamp(dot(unit(towards), pole), -1, 1));
@@ -45,43 +45,43 @@ export function panned(c, x, y) {
 }
 
 /** The world position, at the target's distance, of a point of the picture: x, y in half heights from its middle. */
-export function under(c, x, y) {
+export function worldPoint(c, x, y) {
   const { right, up } = axes(c), half = halfHeight(c);
   return add(c.target, add(times(right, x * half), times(up, -y * half)));
 }
 
 /** Scales the distance to a world position: nearer if factor < 1. */
-export function zoomed(c, factor, place) {
-  const near = (p) => add(place, times(sub(p, place), factor));
-  return { ...c, eye: near(c.eye), target: near(c.target) };
+export function zoomed(c, factor, centre) {
+  const scaled = (p) => add(centre, times(sub(p, centre), factor));
+  return { ...c, eye: scaled(c.eye), target: scaled(c.target) };
 }
 
 /** Looks along an axis (0, 1, 2) from its positive or negative side (+1, -1). */
 export function facing(c, axis, side, up) {
   const away = [0, 0, 0];
   away[axis] = side;
-  const along = Math.abs(dot(unit(up), away)) > 0.9;
-  const other = axis === 1 ? [0, 0, -side] : [0, 1, 0];
-  return { ...c, eye: add(c.target, times(away, distance(c))), up: along ? other : up };
+  const isParallel = Math.abs(dot(unit(up), away)) > 0.9;
+  const alternative = axis === 1 ? [0, 0, -side] : [0, 1, 0];
+  return { ...c, eye: add(c.target, times(away, distance(c))), up: isParallel ? alternative : up };
 }
 
 /** Projects a world position: half heights from the picture's middle (x right, y down), depth; null: behind the eye. */
-export function projected(c, place) {
-  const { right, up, forward } = axes(c), from = sub(place, c.eye);
-  const depth = dot(from, forward);
+export function projected(c, position) {
+  const { right, up, forward } = axes(c), offset = sub(position, c.eye);
+  const depth = dot(offset, forward);
   const half = c.model === "ortho" ? halfHeight(c) : (depth * halfHeight(c)) / distance(c);
   if (c.model !== "ortho" && depth <= 1e-9 * distance(c)) return null;
-  return { x: dot(from, right) / half, y: -dot(from, up) / half, depth };
+  return { x: dot(offset, right) / half, y: -dot(offset, up) / half, depth };
 }
 
 /** Interpolates two cameras; t from 0 to 1. */
 export function between(a, b, t) {
   const mix = (p, q) => add(times(p, 1 - t), times(q, t));
-  const far = Math.exp((1 - t) * Math.log(distance(a)) + t * Math.log(distance(b)));
+  const targetDistance = Math.exp((1 - t) * Math.log(distance(a)) + t * Math.log(distance(b)));
   const target = mix(a.target, b.target);
   let away = mix(unit(sub(a.eye, a.target)), unit(sub(b.eye, b.target)));
   if (length(away) < 1e-3) away = add(away, times(axes(a).right, 0.1));
   let up = mix(unit(a.up), unit(b.up));
   if (length(up) < 1e-3) up = b.up;
-  return { ...b, target, eye: add(target, times(unit(away), far)), up, fov: (1 - t) * a.fov + t * b.fov };
+  return { ...b, target, eye: add(target, times(unit(away), targetDistance)), up, fov: (1 - t) * a.fov + t * b.fov };
 }

@@ -28,15 +28,15 @@ export class ClipEditor {
     return [0, 1, 2].map((axis) => (box[0][axis] + box[1][axis]) / 2);
   }
 
-  toBox(place) {
-    return times(sub(place, this.middle), 1 / this.side);
+  toBox(position) {
+    return times(sub(position, this.middle), 1 / this.side);
   }
 
   /** The box of the clip in the world, or null. */
   cropBox() {
-    const found = this.clip?.boxes?.[0];
-    if (!found || found.length !== 2) return null;
-    return this.inWorld ? found : found.map((one) => add(times(one, this.side), this.middle));
+    const box = this.clip?.boxes?.[0];
+    if (!box || box.length !== 2) return null;
+    return this.inWorld ? box : box.map((point) => add(times(point, this.side), this.middle));
   }
 
   /** Plane n in the world: unit normal, to the kept side, and offset. */
@@ -47,26 +47,26 @@ export class ClipEditor {
     return { normal, offset: (d / length) * this.side - dot(normal, this.middle) };
   }
 
-  put(clip, rest) {
+  setClip(clip, rest) {
     const empty = clip && !clip.planes?.length && !clip.boxes?.length && !clip.without?.length;
     this.app.change({ options: { clip: empty ? null : clip } }, rest);
   }
 
   setCrop(on) {
-    const now = this.clip ?? { kind: "Clip", planes: [], boxes: [], without: [], frame: "box" };
-    const whole = this.app.box.map((one) => (now.frame === "world" ? one : this.toBox(one)));
-    this.put({ ...now, boxes: on ? [whole] : [] }, true);
+    const clip = this.clip ?? { kind: "Clip", planes: [], boxes: [], without: [], frame: "box" };
+    const corners = this.app.box.map((point) => (clip.frame === "world" ? point : this.toBox(point)));
+    this.setClip({ ...clip, boxes: on ? [corners] : [] }, true);
   }
 
   addPlane() {
     const { app } = this, { forward } = axes(app.camera), { target } = app.camera;
-    const now = this.clip ?? { kind: "Clip", frame: "box", planes: [], boxes: [], without: [] };
-    const at = now.frame === "world" ? target : this.toBox(target);
-    this.put({ ...now, planes: [...now.planes, [...forward, -dot(forward, at)]] }, true);
+    const clip = this.clip ?? { kind: "Clip", frame: "box", planes: [], boxes: [], without: [] };
+    const point = clip.frame === "world" ? target : this.toBox(target);
+    this.setClip({ ...clip, planes: [...clip.planes, [...forward, -dot(forward, point)]] }, true);
   }
 
   setPlane(n, numbers, rest) {
-    this.put({ ...this.clip, planes: this.clip.planes.map((old, at) => (at === n ? numbers : old)) }, rest);
+    this.setClip({ ...this.clip, planes: this.clip.planes.map((old, index) => (index === n ? numbers : old)) }, rest);
   }
 
   /** Sets a plane that is given in the world. */
@@ -75,14 +75,14 @@ export class ClipEditor {
     this.setPlane(n, [...normal, d], false);
   }
 
-  moveFace(axis, side, by) {
-    const { clip, app } = this, box = clip.boxes[0].map((one) => [...one]);
+  moveFace(axis, side, amount) {
+    const { clip, app } = this, box = clip.boxes[0].map((point) => [...point]);
     const scale = this.inWorld ? 1 : 1 / this.side;
-    const thin = this.side * 0.01 * scale;
-    const moved = box[side][axis] + by * scale;
-    const limit = app.box.map((one) => (this.inWorld ? one : this.toBox(one))[axis]);
-    box[side][axis] = side ? clamp(moved, box[0][axis] + thin, limit[1]) : clamp(moved, limit[0], box[1][axis] - thin);
-    this.put({ ...clip, boxes: [box] }, false);
+    const minThickness = this.side * 0.01 * scale;
+    const moved = box[side][axis] + amount * scale;
+    const limit = app.box.map((point) => (this.inWorld ? point : this.toBox(point))[axis]);
+    box[side][axis] = side ? clamp(moved, box[0][axis] + minThickness, limit[1]) : clamp(moved, limit[0], box[1][axis] - minThickness);
+    this.setClip({ ...clip, boxes: [box] }, false);
   }
 
   /** Draws boxes and planes; returns their handles. */
@@ -100,42 +100,42 @@ export class ClipEditor {
   }
 
   /** Pixel of a world position, and the step in pixels of a displacement from it; null: behind the eye. */
-  step(place, way) {
-    const ends = [place, add(place, way)].map((one) => projected(this.camera, one));
+  step(position, displacement) {
+    const ends = [position, add(position, displacement)].map((point) => projected(this.camera, point));
     if (!ends.every(Boolean)) return null;
-    const [at, next] = ends.map((one) => this.view.pixel(one));
-    return { at, step: [next[0] - at[0], next[1] - at[1]] };
+    const [pixel, nextPixel] = ends.map((point) => this.view.pixel(point));
+    return { at: pixel, step: [nextPixel[0] - pixel[0], nextPixel[1] - pixel[1]] };
   }
 
   faces(context, crop, handles) {
-    const centre = [0, 1, 2].map((axis) => (crop[0][axis] + crop[1][axis]) / 2), unit_ = this.side * 0.01;
+    const centre = [0, 1, 2].map((axis) => (crop[0][axis] + crop[1][axis]) / 2), stepSize = this.side * 0.01;
     for (const axis of [0, 1, 2]) {
       for (const side of [0, 1]) {
-        const place = [...centre], way = [0, 0, 0];
-        place[axis] = crop[side][axis];
-        way[axis] = unit_;
-        const found = this.step(place, way);
-        if (!found) continue;
-        const drag = (dx, dy) => this.along(found.step, dx, dy, unit_, (by) => this.moveFace(axis, side, by));
-        handles.push({ kind: "face", axis, side, ...found, drag });
-        this.view.dot(context, found.at, COLORS[axis]);
+        const anchor = [...centre], displacement = [0, 0, 0];
+        anchor[axis] = crop[side][axis];
+        displacement[axis] = stepSize;
+        const projection = this.step(anchor, displacement);
+        if (!projection) continue;
+        const drag = (dx, dy) => this.dragAlong(projection.step, dx, dy, stepSize, (amount) => this.moveFace(axis, side, amount));
+        handles.push({ kind: "face", axis, side, ...projection, drag });
+        this.view.dot(context, projection.at, COLORS[axis]);
       }
     }
   }
 
   /** Converts a move of the pointer to a world distance along a direction: `step` pixels there are `size` long. */
-  along(step, dx, dy, size, take) {
-    const long = step[0] ** 2 + step[1] ** 2;
-    if (long > 1e-6) take(((dx * step[0] + dy * step[1]) * size) / long);
+  dragAlong(step, dx, dy, size, apply) {
+    const lengthSquared = step[0] ** 2 + step[1] ** 2;
+    if (lengthSquared > 1e-6) apply(((dx * step[0] + dy * step[1]) * size) / lengthSquared);
   }
 
   drawPlane(context, n, handles) {
     const { view, camera } = this, { normal, offset } = this.plane(n);
     const anchor = add(this.middle, times(normal, -(dot(normal, this.middle) + offset)));
-    const rim = this.rim(normal, offset, anchor).map((one) => projected(camera, one));
+    const rim = this.rim(normal, offset, anchor).map((point) => projected(camera, point));
     if (rim.length > 2 && rim.every(Boolean)) {
       context.beginPath();
-      rim.forEach((one, at) => (at ? context.lineTo(...view.pixel(one)) : context.moveTo(...view.pixel(one))));
+      rim.forEach((point, index) => (index ? context.lineTo(...view.pixel(point)) : context.moveTo(...view.pixel(point))));
       context.closePath();
       context.fillStyle = `rgba(${WARM},.07)`;
       context.fill();
@@ -144,18 +144,18 @@ export class ClipEditor {
       context.stroke();
     }
     const tip = add(anchor, times(normal, -ARROW * this.side));  // towards what is cut away
-    const size = this.side * 0.01, found = this.step(anchor, times(normal, -size)), end = projected(camera, tip);
-    if (!found || !end) return;
+    const size = this.side * 0.01, projection = this.step(anchor, times(normal, -size)), end = projected(camera, tip);
+    if (!projection || !end) return;
     context.strokeStyle = `rgb(${WARM})`;
     context.lineWidth = 2 * view.ratio;
     context.beginPath();
-    context.moveTo(...found.at);
+    context.moveTo(...projection.at);
     context.lineTo(...view.pixel(end));
     context.stroke();
-    const move = (by) => this.putPlane(n, normalOf(this.plane(n)), this.plane(n).offset + by);
-    handles.push({ kind: "plane", n, ...found, drag: (dx, dy) => this.along(found.step, dx, dy, size, move) });
+    const move = (amount) => this.putPlane(n, normalOf(this.plane(n)), this.plane(n).offset + amount);
+    handles.push({ kind: "plane", n, ...projection, drag: (dx, dy) => this.dragAlong(projection.step, dx, dy, size, move) });
     handles.push({ kind: "tilt", n, at: view.pixel(end), drag: (dx, dy) => this.tilt(n, dx, dy) });
-    view.dot(context, found.at, `rgb(${WARM})`);
+    view.dot(context, projection.at, `rgb(${WARM})`);
     view.dot(context, view.pixel(end), "#fff", 4.5);
   }
 
@@ -166,24 +166,24 @@ export class ClipEditor {
     const tip = add(anchor, times(normal, -ARROW * this.side));
     const { right, up } = axes(camera), depth = projected(camera, tip)?.depth;
     if (!depth) return;
-    const half = camera.model === "ortho" ? halfHeight(camera) : (depth * halfHeight(camera)) / distance(camera);
-    const pixel = half / (this.view.part[3] / 2);
-    const moved = add(tip, add(times(right, dx * pixel), times(up, -dy * pixel)));
+    const halfWorld = camera.model === "ortho" ? halfHeight(camera) : (depth * halfHeight(camera)) / distance(camera);
+    const pixelSize = halfWorld / (this.view.pictureRect[3] / 2);
+    const moved = add(tip, add(times(right, dx * pixelSize), times(up, -dy * pixelSize)));
     const turned = unit(sub(anchor, moved));
     this.putPlane(n, turned, -dot(turned, anchor));
   }
 
   /** The polygon in which a plane cuts the box of the scene: its corners in order. */
   rim(normal, offset, anchor) {
-    const { box } = this.app, found = [];
+    const { box } = this.app, points = [];
     for (const [a, b] of EDGES) {
-      const [p, q] = [corner(box, a), corner(box, b)], [s, t] = [p, q].map((one) => dot(normal, one) + offset);
-      if (s * t < 0) found.push(add(p, times(sub(q, p), s / (s - t))));
+      const [p, q] = [corner(box, a), corner(box, b)], [s, t] = [p, q].map((point) => dot(normal, point) + offset);
+      if (s * t < 0) points.push(add(p, times(sub(q, p), s / (s - t))));
     }
-    if (!found.length) return found;
-    const x = unit(sub(found[0], anchor)), y = cross(normal, x);
-    const angle = (one) => Math.atan2(dot(sub(one, anchor), y), dot(sub(one, anchor), x));
-    return found.sort((one, other) => angle(one) - angle(other));
+    if (!points.length) return points;
+    const x = unit(sub(points[0], anchor)), y = cross(normal, x);
+    const angle = (point) => Math.atan2(dot(sub(point, anchor), y), dot(sub(point, anchor), x));
+    return points.sort((point, otherPoint) => angle(point) - angle(otherPoint));
   }
 }
 

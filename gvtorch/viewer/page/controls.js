@@ -2,142 +2,142 @@
 import { el } from "./dom.js";
 import { hex, linear } from "./vectors.js";
 
-const words = (name) => name.replaceAll("_", " ");
-const LETTERS = ["x", "y", "z"];
+const spaced = (name) => name.replaceAll("_", " ");
+const AXIS_NAMES = ["x", "y", "z"];
 
 export class Controls {
-  /** `schema`: fields by class name; `first(kind)` returns a new object of a class; `unfit()` returns why
+  /** `schema`: fields by class name; `newObject(kind)` returns a new object of a class; `unfit()` returns why
    * controls (`Class.field`), or choices of them (`Class.field=choice`), can't be used at present. */
-  constructor(schema, first, unfit) {
+  constructor(schema, newObject, unfit) {
     this.schema = schema;
-    this.first = first;
+    this.newObject = newObject;
     this.unfit = unfit;
   }
 
   /** Rows for the fields of an object; `change(value, rest, name)` gets the whole changed object. */
   fields(value, change, { only, without = [] } = {}) {
-    const told = this.schema[value.kind]?.fields ?? {};
-    const names = (only ?? Object.keys(told)).filter((name) => name in told && !without.includes(name));
-    const now = { ...value };
+    const descriptions = this.schema[value.kind]?.fields ?? {};
+    const names = (only ?? Object.keys(descriptions)).filter((name) => name in descriptions && !without.includes(name));
+    const changed = { ...value };
     return names.map((name) => {
-      const set = (one, rest) => {
-        now[name] = one;
-        change({ ...now }, rest, name);
+      const set = (newValue, rest) => {
+        changed[name] = newValue;
+        change({ ...changed }, rest, name);
       };
-      const own = `${value.kind}.${name}`, why = this.unfit()[own];
-      const row = this.row(name, told[name], value[name], set, own);
-      if (row && why) {
-        row.title = why;
+      const control = `${value.kind}.${name}`, reason = this.unfit()[control];
+      const row = this.row(name, descriptions[name], value[name], set, control);
+      if (row && reason) {
+        row.title = reason;
         row.classList.add("gv-unfit");
-        for (const part of row.querySelectorAll("input, select, button")) part.disabled = true;
+        for (const input of row.querySelectorAll("input, select, button")) input.disabled = true;
       }
       return row;
     }).filter(Boolean);
   }
 
-  row(name, told, value, set, own = name) {
-    if (told.type === "kept" || (value && value.kept)) return null;
-    if (told.type === "object" || told.type === "one of" || told.type === "list") {
-      return this.group(name, told, value, set, own);
+  row(name, field, value, set, control = name) {
+    if (field.type === "kept" || (value && value.kept)) return null;
+    if (field.type === "object" || field.type === "one of" || field.type === "list") {
+      return this.group(name, field, value, set, control);
     }
-    return el("label.gv-row", { title: told.text ?? "" }, el("span.gv-name", {}, words(name)), this.simple(told, value, set));
+    return el("label.gv-row", { title: field.text ?? "" }, el("span.gv-name", {}, spaced(name)), this.simple(field, value, set));
   }
 
-  simple(told, value, set) {
-    if (told.type === "flag") return el("input.gv-flag", { type: "checkbox", checked: !!value, onchange: (e) => set(e.target.checked, true) });
-    if (told.type === "choice") return this.choice(told.choices, value, set, told.optional);
-    if (told.type === "color") return this.color(value, set);
-    if (told.type === "triple") return this.numbers(value ?? (told.optional ? Array(3).fill(null) : [0, 0, 0]), set);
-    if (told.type === "pair") return this.numbers(value ?? (told.optional ? [null, null] : [0, 1]), set);
-    if (told.type === "numbers") return this.numbers(value, set);
-    if (told.type === "text") return el("input", { type: "text", value: value ?? "", onchange: (e) => set(e.target.value || (told.optional ? null : ""), true) });
-    return this.number(told, value, set);
+  simple(field, value, set) {
+    if (field.type === "flag") return el("input.gv-flag", { type: "checkbox", checked: !!value, onchange: (event) => set(event.target.checked, true) });
+    if (field.type === "choice") return this.choice(field.choices, value, set, field.optional);
+    if (field.type === "color") return this.color(value, set);
+    if (field.type === "triple") return this.numbers(value ?? (field.optional ? Array(3).fill(null) : [0, 0, 0]), set);
+    if (field.type === "pair") return this.numbers(value ?? (field.optional ? [null, null] : [0, 1]), set);
+    if (field.type === "numbers") return this.numbers(value, set);
+    if (field.type === "text") return el("input", { type: "text", value: value ?? "", onchange: (event) => set(event.target.value || (field.optional ? null : ""), true) });
+    return this.number(field, value, set);
   }
 
   choice(choices, value, set, optional) {
-    const all = optional ? [null, ...choices] : choices;
-    const made = el("select", { onchange: () => set(all[made.selectedIndex], true) },
-      ...all.map((one) => el("option", {}, one === null ? "–" : words(String(one)))));
-    made.selectedIndex = Math.max(0, all.indexOf(value ?? null));
-    return made;
+    const options = optional ? [null, ...choices] : choices;
+    const select = el("select", { onchange: () => set(options[select.selectedIndex], true) },
+      ...options.map((option) => el("option", {}, option === null ? "–" : spaced(String(option)))));
+    select.selectedIndex = Math.max(0, options.indexOf(value ?? null));
+    return select;
   }
 
   color(value, set) {
-    const now = Array.isArray(value) ? value : [1, 1, 1];
-    const take = (rest) => (event) => set(linear(event.target.value), rest);
-    return el("input.gv-color", { type: "color", value: hex(now), oninput: take(false), onchange: take(true) });
+    const color = Array.isArray(value) ? value : [1, 1, 1];
+    const handler = (rest) => (event) => set(linear(event.target.value), rest);
+    return el("input.gv-color", { type: "color", value: hex(color), oninput: handler(false), onchange: handler(true) });
   }
 
-  number(told, value, set) {
-    const whole = told.type === "whole";
-    const read = (text) => (text === "" && told.optional ? null : whole ? Math.round(Number(text)) : Number(text));
-    const box = el("input.gv-number", { type: "number", step: "any", value: typeof value === "number" ? Number(value.toPrecision(6)) : "", placeholder: told.optional ? "auto" : "" });
+  number(field, value, set) {
+    const isInteger = field.type === "whole";
+    const parse = (text) => (text === "" && field.optional ? null : isInteger ? Math.round(Number(text)) : Number(text));
+    const input = el("input.gv-number", { type: "number", step: "any", value: typeof value === "number" ? Number(value.toPrecision(6)) : "", placeholder: field.optional ? "auto" : "" });
     let slider = null;
-    box.onchange = () => {
-      const found = read(box.value);
-      if (found !== null && !Number.isFinite(found)) return;
-      if (slider && found !== null) slider.value = found;
-      set(found, true);
+    input.onchange = () => {
+      const number = parse(input.value);
+      if (number !== null && !Number.isFinite(number)) return;
+      if (slider && number !== null) slider.value = number;
+      set(number, true);
     };
-    if (!told.range) return box;
-    const [low, high] = told.range;
-    slider = el("input.gv-slider", { type: "range", min: low, max: high, step: whole ? 1 : (high - low) / 400, value: value ?? low });
+    if (!field.range) return input;
+    const [low, high] = field.range;
+    slider = el("input.gv-slider", { type: "range", min: low, max: high, step: isInteger ? 1 : (high - low) / 400, value: value ?? low });
     slider.oninput = () => {
-      box.value = whole ? slider.value : Number(Number(slider.value).toPrecision(4));
-      set(read(slider.value), false);
+      input.value = isInteger ? slider.value : Number(Number(slider.value).toPrecision(4));
+      set(parse(slider.value), false);
     };
-    slider.onchange = () => set(read(slider.value), true);
-    return el("span.gv-both", {}, slider, box);
+    slider.onchange = () => set(parse(slider.value), true);
+    return el("span.gv-both", {}, slider, input);
   }
 
   numbers(value, set) {
-    const now = [...value];
-    return el("span.gv-triple", {}, ...now.map((one, at) => el("input.gv-number", {
-      type: "number", step: "any", value: one === null ? "" : Number(one.toPrecision(6)), placeholder: one === null ? "auto" : "", title: LETTERS[at] ?? "",
+    const current = [...value];
+    return el("span.gv-triple", {}, ...current.map((number, index) => el("input.gv-number", {
+      type: "number", step: "any", value: number === null ? "" : Number(number.toPrecision(6)), placeholder: number === null ? "auto" : "", title: AXIS_NAMES[index] ?? "",
       onchange: (event) => {
-        now[at] = event.target.value === "" ? null : Number(event.target.value);
-        if (now.every(Number.isFinite)) set([...now], true);
-        else if (now.every((each) => each === null)) set(null, true);
+        current[index] = event.target.value === "" ? null : Number(event.target.value);
+        if (current.every(Number.isFinite)) set([...current], true);
+        else if (current.every((number) => number === null)) set(null, true);
       },
     })));
   }
 
   /** An object, one of several kinds, or a list of objects, as a block of rows. */
-  group(name, told, value, set, own = name) {
-    if (told.type === "list") return this.list(name, told, value, set);
-    const kinds = (told.type === "one of" ? told.choices : [told]).filter((one) => one.type !== "list");
-    const label = (one) => (one.type === "object" ? one.kind : one.type);
-    const fits = (one) => one === current || !this.unfit()[`${own}=${one ? label(one) : "none"}`];
-    const kindOf = (one) => kinds.find((k) => (k.type === "object" ? k.kind === one?.kind : k.type === "color" ? Array.isArray(one) : typeof one === "string"));
+  group(name, field, value, set, control = name) {
+    if (field.type === "list") return this.list(name, field, value, set);
+    const kinds = (field.type === "one of" ? field.choices : [field]).filter((kind) => kind.type !== "list");
+    const label = (kind) => (kind.type === "object" ? kind.kind : kind.type);
+    const fits = (kind) => kind === current || !this.unfit()[`${control}=${kind ? label(kind) : "none"}`];
+    const kindOf = (item) => kinds.find((kind) => (kind.type === "object" ? kind.kind === item?.kind : kind.type === "color" ? Array.isArray(item) : typeof item === "string"));
     const current = value === null || value === undefined ? null : kindOf(value) ?? null;
-    const options = (told.optional ? [null, ...kinds] : kinds).filter(fits);
-    const pick = el("select", { title: told.text ?? "" }, ...options.map((one) => el("option", {}, one ? words(label(one)) : "none")));
-    pick.selectedIndex = Math.max(0, options.indexOf(current));
-    pick.onchange = () => {
-      const chosen = options[pick.selectedIndex];
-      set(chosen ? (chosen.type === "object" ? this.first(chosen.kind, name) : chosen.type === "color" ? [0, 0, 0] : "") : null, true);
+    const options = (field.optional ? [null, ...kinds] : kinds).filter(fits);
+    const select = el("select", { title: field.text ?? "" }, ...options.map((kind) => el("option", {}, kind ? spaced(label(kind)) : "none")));
+    select.selectedIndex = Math.max(0, options.indexOf(current));
+    select.onchange = () => {
+      const chosen = options[select.selectedIndex];
+      set(chosen ? (chosen.type === "object" ? this.newObject(chosen.kind, name) : chosen.type === "color" ? [0, 0, 0] : "") : null, true);
     };
-    const head = el("label.gv-row", { title: told.text ?? "" }, el("span.gv-name", {}, words(name)));
+    const header = el("label.gv-row", { title: field.text ?? "" }, el("span.gv-name", {}, spaced(name)));
     if (current && current.type === "color") {
-      head.append(options.length > 1 ? el("span.gv-both", {}, pick, this.color(value, set)) : this.color(value, set));
-      return head;
+      header.append(options.length > 1 ? el("span.gv-both", {}, select, this.color(value, set)) : this.color(value, set));
+      return header;
     }
-    head.append(pick);
-    if (!current || current.type !== "object" || value.kind === "TransferFunction") return options.length > 1 ? head : null;
-    return el("div.gv-group", {}, options.length > 1 ? head : el("div.gv-row", {}, el("span.gv-name", {}, words(name))),
+    header.append(select);
+    if (!current || current.type !== "object" || value.kind === "TransferFunction") return options.length > 1 ? header : null;
+    return el("div.gv-group", {}, options.length > 1 ? header : el("div.gv-row", {}, el("span.gv-name", {}, spaced(name))),
       el("div.gv-inner", {}, ...this.fields(value, set)));
   }
 
   /** A list of objects; lists of plain numbers have editors of their own. */
-  list(name, told, value, set) {
-    const kinds = told.items?.type === "one of" ? told.items.choices : [told.items];
-    if (!kinds.every((one) => one?.type === "object")) return null;
+  list(name, field, value, set) {
+    const kinds = field.items?.type === "one of" ? field.items.choices : [field.items];
+    if (!kinds.every((item) => item?.type === "object")) return null;
     const items = value ?? [];
-    const put = (at, one, rest) => set(items.map((old, n) => (n === at ? one : old)), rest);
-    const rows = items.map((one, at) => el("div.gv-inner", {},
-      this.group(`${at + 1}`, told.items, one, (next, rest) => put(at, next, rest)) ?? "",
-      el("button.gv-small", { type: "button", onclick: () => set(items.filter((_, n) => n !== at), true) }, "remove")));
-    const more = el("button.gv-small", { type: "button", onclick: () => set([...items, this.first(kinds[kinds.length > 1 ? 1 : 0].kind, name)], true) }, "add");
-    return el("div.gv-group", { title: told.text ?? "" }, el("div.gv-row", {}, el("span.gv-name", {}, words(name)), more), ...rows);
+    const replaceItem = (index, item, rest) => set(items.map((old, n) => (n === index ? item : old)), rest);
+    const rows = items.map((item, index) => el("div.gv-inner", {},
+      this.group(`${index + 1}`, field.items, item, (next, rest) => replaceItem(index, next, rest)) ?? "",
+      el("button.gv-small", { type: "button", onclick: () => set(items.filter((_, n) => n !== index), true) }, "remove")));
+    const addButton = el("button.gv-small", { type: "button", onclick: () => set([...items, this.newObject(kinds[kinds.length > 1 ? 1 : 0].kind, name)], true) }, "add");
+    return el("div.gv-group", { title: field.text ?? "" }, el("div.gv-row", {}, el("span.gv-name", {}, spaced(name)), addButton), ...rows);
   }
 }

@@ -3,26 +3,26 @@
 /** Makes an element: el("div.a.b", {title: "..."}, child, "text"). */
 export function el(kind, props = {}, ...children) {
   const [tag, ...classes] = kind.split(".");
-  const made = document.createElement(tag);
-  made.className = classes.join(" ");
+  const element = document.createElement(tag);
+  element.className = classes.join(" ");
   for (const [name, value] of Object.entries(props)) {
-    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
-    else if (name === "style") Object.assign(made.style, value);
-    else if (name in made && name !== "list") made[name] = value;
-    else made.setAttribute(name, value);
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (name === "style") Object.assign(element.style, value);
+    else if (name in element && name !== "list") element[name] = value;
+    else element.setAttribute(name, value);
   }
-  made.append(...children.filter((one) => one !== null && one !== undefined));
-  return made;
+  element.append(...children.filter((child) => child !== null && child !== undefined));
+  return element;
 }
 
 /** An icon of strokes in a box of 24 x 24. */
 export function icon(path) {
-  const space = "http://www.w3.org/2000/svg";
-  const svg = document.createElementNS(space, "svg");
+  const namespace = "http://www.w3.org/2000/svg";
+  const svg = document.createElementNS(namespace, "svg");
   svg.setAttribute("viewBox", "0 0 24 24");
-  const line = document.createElementNS(space, "path");
-  line.setAttribute("d", path);
-  svg.append(line);
+  const stroke = document.createElementNS(namespace, "path");
+  stroke.setAttribute("d", path);
+  svg.append(stroke);
   return svg;
 }
 
@@ -49,24 +49,24 @@ export const ICONS = {
 
 /** A button with an icon. */
 export function iconButton(name, title, onclick) {
-  const made = el("button.gv-icon", { title, onclick, type: "button", ariaLabel: title });
-  made.append(icon(ICONS[name]));
-  return made;
+  const button = el("button.gv-icon", { title, onclick, type: "button", ariaLabel: title });
+  button.append(icon(ICONS[name]));
+  return button;
 }
 
 /** Saves a file that the page made. */
-export function keep(name, content, type) {
+export function saveFile(name, content, type) {
   const url = URL.createObjectURL(new Blob([content], { type }));
   el("a", { href: url, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
 
 /** Asks for a file; passes its name and text to `take`. */
-export function openText(accept, take, fail) {
+export function openText(accept, handler, fail) {
   const input = el("input", { type: "file", accept });
   input.onchange = async () => {
     try {
-      take(input.files[0].name, await input.files[0].text());
+      handler(input.files[0].name, await input.files[0].text());
     } catch (error) {
       fail(`${input.files[0].name}: ${error.message}`);
     }
@@ -75,4 +75,4 @@ export function openText(accept, take, fail) {
 }
 
 /** Asks for a JSON file; passes its content to `take`. */
-export const openJson = (take, fail) => openText(".json,application/json", (_, text) => take(JSON.parse(text)), fail);
+export const openJson = (handler, fail) => openText(".json,application/json", (_, text) => handler(JSON.parse(text)), fail);

@@ -1,7 +1,7 @@
 // Key frames: states of this page, each at a time, in the format of `gvtorch fly --keys`.
-import { el, iconButton, keep, openJson } from "./dom.js";
+import { el, iconButton, saveFile, openJson } from "./dom.js";
 
-const APART = 2;  // seconds from a key to the next
+const KEY_SPACING = 2;  // seconds from a key to the next
 
 export class Film {
   constructor(app) {
@@ -11,43 +11,43 @@ export class Film {
 
   /** Rows of the panel. */
   rows() {
-    const keys = this.keys.map((key, at) => {
-      const time = el("input", { type: "number", min: 0, step: 0.5, value: key.time, title: "Seconds", onchange: () => this.move(at, time.valueAsNumber) });
+    const keys = this.keys.map((key, index) => {
+      const time = el("input", { type: "number", min: 0, step: 0.5, value: key.time, title: "Seconds", onchange: () => this.move(index, time.valueAsNumber) });
       const button = (text, title, onclick) => el("button.gv-small", { type: "button", title, onclick }, text);
-      return el("div.gv-row", {}, el("span.gv-name", {}, `key ${at + 1}`), el("span.gv-both", {}, time,
+      return el("div.gv-row", {}, el("span.gv-name", {}, `key ${index + 1}`), el("span.gv-both", {}, time,
         button("show", "Show this key", () => this.app.load(key.state)),
-        button("remove", "Remove this key", () => this.put(this.keys.filter((one) => one !== key)))));
+        button("remove", "Remove this key", () => this.setKeys(this.keys.filter((otherKey) => otherKey !== key)))));
     });
     return [...keys, el("div.gv-bar", {},
       el("button.gv-small", { type: "button", title: "What is shown now, after the last key", onclick: () => this.add() }, "add this view"),
       el("span.gv-gap"),
-      this.keys.length ? iconButton("save", "Save the keys (JSON): gvtorch fly --keys", () => keep("keys.json", JSON.stringify(this.keys, null, 1), "application/json")) : null,
-      iconButton("open", "Load keys that were saved (JSON)", () => openJson((keys) => this.load(keys), (why) => this.app.say(why, true))))];
+      this.keys.length ? iconButton("save", "Save the keys (JSON): gvtorch fly --keys", () => saveFile("keys.json", JSON.stringify(this.keys, null, 1), "application/json")) : null,
+      iconButton("open", "Load keys that were saved (JSON)", () => openJson((keys) => this.load(keys), (reason) => this.app.notify(reason, true))))];
   }
 
   add() {
-    const time = this.keys.length ? this.keys.at(-1).time + APART : 0;
-    this.put([...this.keys, { time, state: { ...this.app.state, camera: this.app.camera } }]);
+    const time = this.keys.length ? this.keys.at(-1).time + KEY_SPACING : 0;
+    this.setKeys([...this.keys, { time, state: { ...this.app.state, camera: this.app.camera } }]);
   }
 
   /** Moves a key to another time. */
-  move(at, time) {
-    if (Number.isFinite(time) && !this.keys.some((key, n) => n !== at && key.time === time)) {
-      return this.put(this.keys.map((key, n) => (n === at ? { ...key, time } : key)));
+  move(index, time) {
+    if (Number.isFinite(time) && !this.keys.some((key, n) => n !== index && key.time === time)) {
+      return this.setKeys(this.keys.map((key, n) => (n === index ? { ...key, time } : key)));
     }
-    this.app.say("each key has a time of its own", true);
+    this.app.notify("each key has a time of its own", true);
     this.app.refresh();
   }
 
   load(keys) {
-    const whole = (key) => Number.isFinite(key?.time) && key.state?.camera && key.state.shader;
-    if (Array.isArray(keys) && keys.length && keys.every(whole) && new Set(keys.map((key) => key.time)).size === keys.length) return this.put(keys);
-    this.app.say("these are no keys: each must have a time of its own, in seconds, and a whole state", true);
+    const isKey = (key) => Number.isFinite(key?.time) && key.state?.camera && key.state.shader;
+    if (Array.isArray(keys) && keys.length && keys.every(isKey) && new Set(keys.map((key) => key.time)).size === keys.length) return this.setKeys(keys);
+    this.app.notify("these are no keys: each must have a time of its own, in seconds, and a whole state", true);
   }
 
-  put(keys) {
+  setKeys(keys) {
     const before = this.keys, after = [...keys].sort((a, b) => a.time - b.time);
-    const set = (one) => { this.keys = one; this.app.refresh(); };
+    const set = (keys) => { this.keys = keys; this.app.refresh(); };
     this.app.history.push(() => set(before), () => set(after));
     set(after);
   }

@@ -1,6 +1,6 @@
 // The history of edits: undo and redo.
 
-const MOST = 100;  // steps that are kept
+const MAX_STEPS = 100;  // steps that are kept
 
 export class History {
   constructor() {
@@ -10,7 +10,7 @@ export class History {
 
   /** Adds an edit: `back` undoes it, `forth` redoes it. */
   push(back, forth) {
-    this.done = [...this.done.slice(1 - MOST), { back, forth }];
+    this.done = [...this.done.slice(1 - MAX_STEPS), { back, forth }];
     this.undone = [];
   }
 
@@ -24,10 +24,10 @@ export class History {
   }
 }
 
-function step(from, to, way) {
+function step(from, to, direction) {
   const last = from.pop();
   if (!last) return false;
   to.push(last);
-  last[way]();
+  last[direction]();
   return true;
 }

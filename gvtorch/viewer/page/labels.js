@@ -2,7 +2,7 @@
 import { el } from "./dom.js";
 import { hex, linear } from "./vectors.js";
 
-const ROWS = 60;  // shown at a time
+const MAX_ROWS = 60;  // shown at a time
 
 export class LabelTable {
   constructor(app, controls) {
@@ -25,7 +25,7 @@ export class LabelTable {
   /** Colours that were chosen, by label. */
   get chosen() {
     const { colors } = this.shader;
-    if (Array.isArray(colors)) return Object.fromEntries(colors.map((one, n) => [n, one]));
+    if (Array.isArray(colors)) return Object.fromEntries(colors.map((color, n) => [n, color]));
     return colors && !colors.kept ? colors : {};
   }
 
@@ -48,21 +48,21 @@ export class LabelTable {
 
   fill() {
     const { names, colors, count } = this.app.labels, { chosen } = this;
-    const found = names.map((_, n) => n).filter((n) => String(names[n]).includes(this.search));
-    const rows = found.slice(0, ROWS).map((n) => this.row(names[n], chosen[names[n]] ?? colors[n]));
-    const left = found.length - rows.length + (count - names.length);
-    this.body.replaceChildren(...rows, ...(left ? [el("div.gv-dim", {}, `${left} more: find them by number`)] : []));
+    const matches = names.map((_, n) => n).filter((n) => String(names[n]).includes(this.search));
+    const rows = matches.slice(0, MAX_ROWS).map((n) => this.row(names[n], chosen[names[n]] ?? colors[n]));
+    const remaining = matches.length - rows.length + (count - names.length);
+    this.body.replaceChildren(...rows, ...(remaining ? [el("div.gv-dim", {}, `${remaining} more: find them by number`)] : []));
   }
 
   row(name, color) {
     const paint = (rest) => (event) => this.change({ colors: { ...this.chosen, [name]: linear(event.target.value) } }, rest);
-    const others = (on) => {
-      const shown = this.app.labels.names.filter((one) => this.shows(one) && one !== name);
+    const visibleWith = (on) => {
+      const shown = this.app.labels.names.filter((label) => this.shows(label) && label !== name);
       return on ? [...shown, name].sort((a, b) => a - b) : shown;
     };
     const value = Array.isArray(color) ? hex(color) : color;
     return el("div.gv-row.gv-label", {},
-      el("input.gv-flag", { type: "checkbox", title: "Show it", checked: this.shows(name), onchange: (e) => this.change({ visible: others(e.target.checked) }) }),
+      el("input.gv-flag", { type: "checkbox", title: "Show it", checked: this.shows(name), onchange: (event) => this.change({ visible: visibleWith(event.target.checked) }) }),
       el("input.gv-color", { type: "color", title: "Its colour", value, oninput: paint(false), onchange: paint(true) }),
       el("span", {}, String(name)), el("span.gv-gap"),
       el("button.gv-small", { type: "button", title: "Show this one alone", onclick: () => this.change({ visible: [name] }) }, "only"));

@@ -1,35 +1,35 @@
 // The messages: texts, passed on by their type, and pictures and files, which come as bytes.
 
 export class Link {
-  /** `connect(take, gone)` opens a transport and returns the function that sends a text. */
+  /** `connect(receive, onLost)` opens a transport and returns the function that sends a text. */
   constructor(connect) {
-    this.takers = new Map();
-    this.post = connect((data) => this.take(data), (why) => this.emit("gone", { why }));
+    this.handlers = new Map();
+    this.post = connect((data) => this.receive(data), (reason) => this.emit("gone", { reason }));
   }
 
-  on(type, take) {
-    this.takers.set(type, [...(this.takers.get(type) ?? []), take]);
+  on(type, handler) {
+    this.handlers.set(type, [...(this.handlers.get(type) ?? []), handler]);
   }
 
   emit(type, content) {
-    for (const take of this.takers.get(type) ?? []) take(content);
+    for (const handler of this.handlers.get(type) ?? []) handler(content);
   }
 
   send(type, content = {}) {
     this.post(JSON.stringify({ type, ...content }));
   }
 
-  take(data) {
+  receive(data) {
     if (typeof data === "string") {
       const content = JSON.parse(data);
       this.emit(content.type, content);
       return;
     }
     const view = new DataView(data.buffer ?? data, data.byteOffset ?? 0, data.byteLength);
-    const size = view.getUint32(0, true);
+    const headSize = view.getUint32(0, true);
     const bytes = new Uint8Array(view.buffer, view.byteOffset);
-    const head = JSON.parse(new TextDecoder().decode(bytes.subarray(4, 4 + size)));
-    const rest = bytes.subarray(4 + size, view.byteLength);
-    this.emit(head.file ? "file" : "picture", { head, bytes: rest });
+    const head = JSON.parse(new TextDecoder().decode(bytes.subarray(4, 4 + headSize)));
+    const body = bytes.subarray(4 + headSize, view.byteLength);
+    this.emit(head.file ? "file" : "picture", { head, bytes: body });
   }
 }

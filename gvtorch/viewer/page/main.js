@@ -5,19 +5,19 @@ const address = new URL("ws" + location.search, location.href);
 address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
 
 /** Opens the socket, and reopens it when it is lost. */
-function connect(take, gone) {
+function connect(receive, onLost) {
   let socket = null;
-  let wait = 500, why = "";
+  let delay = 500, reason = "";
   const open = () => {
     socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => { [wait, why] = [500, ""]; };
-    socket.onmessage = (event) => take(event.data);
+    socket.onopen = () => { [delay, reason] = [500, ""]; };
+    socket.onmessage = (event) => receive(event.data);
     socket.onclose = (event) => {
-      if (event.wasClean && event.code === 1001) why = "The view was closed.";
-      gone(why);
-      setTimeout(open, wait);
-      wait = Math.min(8000, wait * 2);
+      if (event.wasClean && event.code === 1001) reason = "The view was closed.";
+      onLost(reason);
+      setTimeout(open, delay);
+      delay = Math.min(8000, delay * 2);
     };
   };
   open();

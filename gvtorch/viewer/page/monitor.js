@@ -2,8 +2,8 @@
 import { el } from "./dom.js";
 import { short } from "./vectors.js";
 
-const KEPT = 120;
-const STAGES = ["#6fb1ff", "#f2b56b", "#8fd460", "#d68cff", "#ff7a6b", "#5fd4c4", "#e6d35c", "#9aa7bd"];
+const MAX_FRAMES = 120;
+const STAGE_COLORS = ["#6fb1ff", "#f2b56b", "#8fd460", "#d68cff", "#ff7a6b", "#5fd4c4", "#e6d35c", "#9aa7bd"];
 
 export class MonitorView {
   constructor(app) {
@@ -25,21 +25,21 @@ export class MonitorView {
     this.times = [...this.times.filter((time) => now - time < 2000), now];
   }
 
-  take(figures) {
+  receive(figures) {
     this.frames.push(figures);
-    if (this.frames.length > KEPT) this.frames.shift();
+    if (this.frames.length > MAX_FRAMES) this.frames.shift();
     this.draw();
   }
 
   draw() {
     const last = this.frames.at(-1);
     if (!last || !this.element.isConnected) return;
-    const names = [...new Set(this.frames.flatMap((one) => Object.keys(one.stages)))];
+    const names = [...new Set(this.frames.flatMap((frame) => Object.keys(frame.stages)))];
     this.bars(names);
     this.line();
-    const own = names.filter((name) => last.stages[name] >= 0.05).sort((a, b) => last.stages[b] - last.stages[a]).slice(0, 8);
-    this.stages.replaceChildren(...own.map((name) => el("span.gv-stage-name", {},
-      el("i", { style: { background: STAGES[names.indexOf(name) % STAGES.length] } }), `${name} ${last.stages[name].toFixed(1)}`)));
+    const topStages = names.filter((name) => last.stages[name] >= 0.05).sort((a, b) => last.stages[b] - last.stages[a]).slice(0, 8);
+    this.stages.replaceChildren(...topStages.map((name) => el("span.gv-stage-name", {},
+      el("i", { style: { background: STAGE_COLORS[names.indexOf(name) % STAGE_COLORS.length] } }), `${name} ${last.stages[name].toFixed(1)}`)));
     const report = last.report, rows = [
       ["pictures / s", short(this.rate())],
       ["from hand to picture", this.latency()],
@@ -51,7 +51,7 @@ export class MonitorView {
     if (report) {
       rows.push(["bricks / s", short(report.bricks_per_second)]);
       rows.push(["hit rate", `${(100 * report.hit_rate).toFixed(1)} %`]);
-      for (const [name, share] of Object.entries(report.occupancy)) rows.push([`${name} in use`, `${(100 * share).toFixed(1)} %`]);
+      for (const [name, fraction] of Object.entries(report.occupancy)) rows.push([`${name} in use`, `${(100 * fraction).toFixed(1)} %`]);
     }
     if (last.failed) rows.push(["failed", short(last.failed)]);
     this.table.replaceChildren(...rows.flatMap(([name, value]) => [el("span", {}, name), el("b", {}, String(value))]));
@@ -65,43 +65,43 @@ export class MonitorView {
   latency() {
     const sorted = [...this.app.view.latencies].sort((a, b) => a - b);
     if (!sorted.length) return "–";
-    const at = (share) => sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))].toFixed(0);
-    return `${at(0.5)} ms, 95 %: ${at(0.95)} ms`;
+    const percentile = (fraction) => sorted[Math.min(sorted.length - 1, Math.floor(fraction * sorted.length))].toFixed(0);
+    return `${percentile(0.5)} ms, 95 %: ${percentile(0.95)} ms`;
   }
 
-  surface(canvas) {
-    const ratio = window.devicePixelRatio || 1, [wide, tall] = [canvas.clientWidth, canvas.clientHeight];
-    [canvas.width, canvas.height] = [wide * ratio, tall * ratio];
+  prepareCanvas(canvas) {
+    const ratio = window.devicePixelRatio || 1, [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    [canvas.width, canvas.height] = [width * ratio, height * ratio];
     const c = canvas.getContext("2d");
     c.scale(ratio, ratio);
-    return { c, wide, tall };
+    return { c, width, height };
   }
 
   bars(names) {
-    const { c, wide, tall } = this.surface(this.chart);
-    const sums = this.frames.map((one) => one.milliseconds);
-    const usual = [...sums].sort((a, b) => a - b)[Math.floor(0.9 * (sums.length - 1))];
-    const most = Math.max(20, 1.3 * usual), step = wide / KEPT;
-    this.frames.forEach((one, n) => {
-      let y = tall;
-      const x = wide - (this.frames.length - n) * step;
-      names.forEach((name, at) => {
-        const height = ((one.stages[name] ?? 0) / most) * tall;
-        c.fillStyle = STAGES[at % STAGES.length];
-        c.fillRect(x, y - height, Math.max(1, step - 0.5), height);
-        y -= height;
+    const { c, width, height } = this.prepareCanvas(this.chart);
+    const sums = this.frames.map((frame) => frame.milliseconds);
+    const typical = [...sums].sort((a, b) => a - b)[Math.floor(0.9 * (sums.length - 1))];
+    const limit = Math.max(20, 1.3 * typical), step = width / MAX_FRAMES;
+    this.frames.forEach((frame, n) => {
+      let y = height;
+      const x = width - (this.frames.length - n) * step;
+      names.forEach((name, index) => {
+        const barHeight = ((frame.stages[name] ?? 0) / limit) * height;
+        c.fillStyle = STAGE_COLORS[index % STAGE_COLORS.length];
+        c.fillRect(x, y - barHeight, Math.max(1, step - 0.5), barHeight);
+        y -= barHeight;
       });
     });
     c.fillStyle = "rgba(235,240,250,.6)";
     c.font = "10px system-ui, sans-serif";
-    c.fillText(`${most.toFixed(0)} ms`, 3, 10);
+    c.fillText(`${limit.toFixed(0)} ms`, 3, 10);
   }
 
   line() {
-    const { c, wide, tall } = this.surface(this.misses), step = wide / KEPT;
+    const { c, width, height } = this.prepareCanvas(this.misses), step = width / MAX_FRAMES;
     c.beginPath();
-    this.frames.forEach((one, n) => {
-      const x = wide - (this.frames.length - n - 0.5) * step, y = tall - 2 - (one.miss_rate ?? 0) * (tall - 4);
+    this.frames.forEach((frame, n) => {
+      const x = width - (this.frames.length - n - 0.5) * step, y = height - 2 - (frame.miss_rate ?? 0) * (height - 4);
       if (n) c.lineTo(x, y);
       else c.moveTo(x, y);
     });

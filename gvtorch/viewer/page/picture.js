@@ -9,7 +9,7 @@ const UNITS = {
   angstrom: "Å", picometer: "pm", kilometer: "km", inch: "in", foot: "ft",
 };
 export const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
-const REACH = 12;  // pixels within which a handle is hit
+const HIT_RADIUS = 12;  // pixels within which a handle is hit
 
 /** Corner n of a box: bit 0 is x, bit 1 y, bit 2 z. */
 export const corner = (box, n) => [0, 1, 2].map((axis) => box[(n >> axis) & 1][axis]);
@@ -18,8 +18,8 @@ export class PictureView {
   constructor(app) {
     this.app = app;
     this.canvas = el("canvas.gv-picture");
-    this.over = el("canvas.gv-over");
-    this.element = el("div.gv-stage", { tabIndex: 0 }, this.canvas, this.over);
+    this.overlayCanvas = el("canvas.gv-over");
+    this.element = el("div.gv-stage", { tabIndex: 0 }, this.canvas, this.overlayCanvas);
     this.camera = null;
     this.handles = [];
     this.drawing = Promise.resolve();
@@ -34,28 +34,28 @@ export class PictureView {
     this.width = width;
     this.height = height;
     const size = [Math.round(width * ratio), Math.round(height * ratio)];
-    [this.over.width, this.over.height] = size;
+    [this.overlayCanvas.width, this.overlayCanvas.height] = size;
     this.ratio = ratio;
     clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.hello(), 60);
-    this.overlay();
+    this.timer = setTimeout(() => this.sendSize(), 60);
+    this.drawOverlay();
   }
 
-  hello() {
+  sendSize() {
     if (!this.width) return;
-    const most = 4096 / Math.max(this.over.width, this.over.height, 4096);
-    const [width, height] = [this.over.width, this.over.height].map((n) => Math.max(16, Math.round(n * most)));
+    const scale = 4096 / Math.max(this.overlayCanvas.width, this.overlayCanvas.height, 4096);
+    const [width, height] = [this.overlayCanvas.width, this.overlayCanvas.height].map((n) => Math.max(16, Math.round(n * scale)));
     this.app.link.send("hello", { width, height });
   }
 
   /** Draws a picture, then acknowledges it. */
-  take({ head, bytes }) {
+  receive({ head, bytes }) {
     this.drawing = this.drawing.then(async () => {
       try {
         const image = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
         const { canvas } = this;
-        if (canvas.width !== this.over.width || canvas.height !== this.over.height) {
-          [canvas.width, canvas.height] = [this.over.width, this.over.height];
+        if (canvas.width !== this.overlayCanvas.width || canvas.height !== this.overlayCanvas.height) {
+          [canvas.width, canvas.height] = [this.overlayCanvas.width, this.overlayCanvas.height];
         }
         const context = canvas.getContext("2d", { alpha: false });
         context.imageSmoothingQuality = "high";
@@ -70,19 +70,19 @@ export class PictureView {
       }
       this.camera = head.camera;
       this.head = head;
-      this.overlay();
+      this.drawOverlay();
       this.element.dispatchEvent(new CustomEvent("drawn", { detail: head }));
     });
   }
 
   /** The part of the canvas that the picture covers, [left, top, width, height] in pixels: all of it without planes. */
-  get part() {
-    return this.app.slices.layout?.view ?? [0, 0, this.over.width, this.over.height];
+  get pictureRect() {
+    return this.app.slices.layout?.view ?? [0, 0, this.overlayCanvas.width, this.overlayCanvas.height];
   }
 
   /** This part in CSS pixels. */
-  get area() {
-    const [left, top, width, height] = this.part.map((one) => one / this.ratio);
+  get pictureArea() {
+    const [left, top, width, height] = this.pictureRect.map((number) => number / this.ratio);
     return { left, top, width, height };
   }
 
@@ -92,14 +92,14 @@ export class PictureView {
 
   /** Canvas pixels of a point that is given in half heights from the picture's middle. */
   pixel({ x, y }) {
-    const [left, top, width, height] = this.part;
+    const [left, top, width, height] = this.pictureRect;
     return [left + width / 2 + (x * height) / 2, top + height / 2 + (y * height) / 2];
   }
 
-  overlay() {
+  drawOverlay() {
     const { app } = this, camera = app.camera ?? this.camera;
-    const context = this.over.getContext("2d");
-    context.clearRect(0, 0, this.over.width, this.over.height);
+    const context = this.overlayCanvas.getContext("2d");
+    context.clearRect(0, 0, this.overlayCanvas.width, this.overlayCanvas.height);
     this.handles = [];
     if (!camera || !app.box) return;
     context.lineCap = "round";
@@ -107,13 +107,13 @@ export class PictureView {
     if (camera.model === "fisheye" || camera.model === "panorama") return;
     context.save();
     context.beginPath();
-    context.rect(...this.part);
+    context.rect(...this.pictureRect);
     context.clip();
     app.nodes.draw(context, camera);
-    if (app.shown.box) this.edges(context, camera, app.box, "rgba(255,255,255,.28)", 1);
+    if (app.overlays.box) this.edges(context, camera, app.box, "rgba(255,255,255,.28)", 1);
     this.handles = app.clip.draw(this, context, camera);
-    if (app.shown.axes) this.gizmo(context, camera);
-    if (app.shown.scale) this.scaleBar(context, camera);
+    if (app.overlays.axes) this.gizmo(context, camera);
+    if (app.overlays.scale) this.scaleBar(context, camera);
     context.restore();
   }
 
@@ -131,9 +131,9 @@ export class PictureView {
   }
 
   /** Draws a handle. */
-  dot(context, at, color, size = 6) {
+  dot(context, position, color, size = 6) {
     context.beginPath();
-    context.arc(...at, size * this.ratio, 0, 2 * Math.PI);
+    context.arc(...position, size * this.ratio, 0, 2 * Math.PI);
     context.fillStyle = color;
     context.fill();
     context.lineWidth = 2 * this.ratio;
@@ -156,16 +156,16 @@ export class PictureView {
 
   /** The handle at a position in CSS pixels, or undefined. */
   handleAt(x, y) {
-    const far = ({ at }) => Math.hypot(at[0] / this.ratio - x, at[1] / this.ratio - y);
-    const near = this.handles.filter((one) => far(one) < REACH);
-    return near.reduce((best, one) => (best && far(best) < far(one) ? best : one), undefined);  // of equals the topmost
+    const distanceTo = ({ at }) => Math.hypot(at[0] / this.ratio - x, at[1] / this.ratio - y);
+    const hits = this.handles.filter((handle) => distanceTo(handle) < HIT_RADIUS);
+    return hits.reduce((best, handle) => (best && distanceTo(best) < distanceTo(handle) ? best : handle), undefined);  // of equals the topmost
   }
 
   gizmo(context, camera) {
     const { right, up, forward } = axes(camera), size = 30 * this.ratio;
-    const [left, top, , height] = this.part;
+    const [left, top, , height] = this.pictureRect;
     const middle = [left + 52 * this.ratio, top + height - 56 * this.ratio];
-    this.ends = [];
+    this.axisLetters = [];
     const order = [0, 1, 2].map((axis) => ({ axis, x: right[axis], y: -up[axis], z: forward[axis] })).sort((a, b) => b.z - a.z);
     for (const { axis, x, y, z } of order) {
       const end = [middle[0] + x * size, middle[1] + y * size];
@@ -181,24 +181,24 @@ export class PictureView {
       context.textBaseline = "middle";
       const letter = [middle[0] + x * size * 1.38, middle[1] + y * size * 1.38];
       context.fillText("xyz"[axis], ...letter);
-      this.ends.push({ axis, at: letter, side: 1 });
+      this.axisLetters.push({ axis, at: letter, side: 1 });
     }
     context.globalAlpha = 1;
   }
 
   /** The axis whose letter is at a position in CSS pixels, or undefined. */
   axisAt(x, y) {
-    const near = ({ at }) => Math.hypot(at[0] - x * this.ratio, at[1] - y * this.ratio) < REACH * this.ratio;
-    return this.app.shown.axes ? this.ends?.find(near) : undefined;
+    const isNear = ({ at }) => Math.hypot(at[0] - x * this.ratio, at[1] - y * this.ratio) < HIT_RADIUS * this.ratio;
+    return this.app.overlays.axes ? this.axisLetters?.find(isNear) : undefined;
   }
 
   scaleBar(context, camera) {
-    const [left, top, width, height] = this.part;
-    const pixel = (2 * halfHeight(camera)) / height;
-    const wanted = 130 * this.ratio * pixel;
-    const power = 10 ** Math.floor(Math.log10(wanted));
-    const size = [5, 2, 1].map((n) => n * power).find((n) => n <= wanted) ?? power;
-    const span = size / pixel, y = top + height - (this.app.time ? 62 : 26) * this.ratio;
+    const [left, top, width, height] = this.pictureRect;
+    const pixelSize = (2 * halfHeight(camera)) / height;
+    const maxSize = 130 * this.ratio * pixelSize;
+    const power = 10 ** Math.floor(Math.log10(maxSize));
+    const size = [5, 2, 1].map((n) => n * power).find((n) => n <= maxSize) ?? power;
+    const span = size / pixelSize, y = top + height - (this.app.time ? 62 : 26) * this.ratio;
     const middle = left + width / 2, [a, b] = [middle - span / 2, middle + span / 2];
     const text = `${short(size)} ${this.unit}`.trim();
     const draw = () => {

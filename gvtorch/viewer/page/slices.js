@@ -2,7 +2,7 @@
 import { COLORS } from "./picture.js";
 
 const AXES = ["x", "y", "z"];
-const STILL = 200;  // milliseconds after which a wheel is at rest
+const REST_MS = 200;  // milliseconds after which a wheel is at rest
 
 export class SlicesView {
   constructor(app, view) {
@@ -16,7 +16,7 @@ export class SlicesView {
   }
 
   /** The world position through which the planes go. */
-  get place() {
+  get position() {
     return this.app.state.slices.at ?? this.layout.x.at;
   }
 
@@ -32,39 +32,39 @@ export class SlicesView {
     this.app.change({ slices: on ? { kind: "Slices", at: middle } : null });
   }
 
-  moveTo(at, rest) {
-    this.app.change({ slices: { ...this.app.state.slices, at } }, rest);
+  moveTo(position, rest) {
+    this.app.change({ slices: { ...this.app.state.slices, at: position } }, rest);
   }
 
   /** Moves the planes to the point that a plane shows at a position in CSS pixels. */
   pick(axis, x, y) {
     const { image: [left, top, width, height], columns, rows } = this.layout[axis];
-    const share = (one, from, size) => Math.min(1, Math.max(0, (one * this.view.ratio - from) / size));
-    const at = [...this.place];
-    const put = ([name, first, last], t) => { at[AXES.indexOf(name)] = first + t * (last - first); };
-    put(columns, share(x, left, width));
-    put(rows, share(y, top, height));
-    this.moveTo(at, false);
+    const fraction = (pixel, start, size) => Math.min(1, Math.max(0, (pixel * this.view.ratio - start) / size));
+    const position = [...this.position];
+    const setCoordinate = ([name, first, last], t) => { position[AXES.indexOf(name)] = first + t * (last - first); };
+    setCoordinate(columns, fraction(x, left, width));
+    setCoordinate(rows, fraction(y, top, height));
+    this.moveTo(position, false);
   }
 
   /** Moves a plane by one voxel. */
-  wheel(axis, lines) {
-    const at = [...this.place], { step } = this.layout[axis], number = AXES.indexOf(axis), { box } = this.app;
-    const moved = at[number] - Math.sign(lines) * step;
-    at[number] = Math.min(box[1][number] - step / 2, Math.max(box[0][number] + step / 2, moved));
-    this.moveTo(at, false);
+  wheel(axis, amount) {
+    const position = [...this.position], { step } = this.layout[axis], index = AXES.indexOf(axis), { box } = this.app;
+    const moved = position[index] - Math.sign(amount) * step;
+    position[index] = Math.min(box[1][index] - step / 2, Math.max(box[0][index] + step / 2, moved));
+    this.moveTo(position, false);
     clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.app.settle(), STILL);
+    this.timer = setTimeout(() => this.app.finishEdit(), REST_MS);
   }
 
   draw(context) {
     const { layout } = this, { ratio } = this.view;
     if (!layout) return;
-    const place = this.place;
+    const position = this.position;
     for (const axis of AXES) {
       const { pane, image, columns, rows, name } = layout[axis];
-      const along = ([other, first, last], from, size) => from + ((place[AXES.indexOf(other)] - first) / (last - first)) * size;
-      const [x, y] = [along(columns, image[0], image[2]), along(rows, image[1], image[3])];
+      const toPixel = ([axisName, first, last], start, size) => start + ((position[AXES.indexOf(axisName)] - first) / (last - first)) * size;
+      const [x, y] = [toPixel(columns, image[0], image[2]), toPixel(rows, image[1], image[3])];
       const line = (color, ...ends) => {
         context.strokeStyle = COLORS[AXES.indexOf(color)];
         context.globalAlpha = 0.75;
@@ -80,7 +80,7 @@ export class SlicesView {
       context.strokeStyle = COLORS[AXES.indexOf(axis)];
       context.lineWidth = ratio;
       context.strokeRect(pane[0] + 0.5, pane[1] + 0.5, pane[2] - 1, pane[3] - 1);
-      const number = Number(place[AXES.indexOf(axis)].toPrecision(5));
+      const number = Number(position[AXES.indexOf(axis)].toPrecision(5));
       const unit = this.view.unit ? ` ${this.view.unit}` : "";
       this.view.label(context, `${name}, ${axis} = ${number}${unit}`, pane[0] + 10 * ratio, pane[1] + pane[3] - 10 * ratio, "left");
     }

@@ -3,8 +3,8 @@ import { el } from "./dom.js";
 import { clamp, hex, linear, short, toSrgb } from "./vectors.js";
 
 const [HEIGHT, STRIP, EDGE, TOP] = [136, 18, 10, 24];  // CSS pixels
-const MOST = 40;  // points of a function up to which they are drawn and can be edited
-const TAKEN = 9;  // pixels within which a point is hit
+const MAX_POINTS = 40;  // points of a function up to which they are drawn and can be edited
+const HIT_RADIUS = 9;  // pixels within which a point is hit
 
 /** The range of values of a function's points. */
 export function domain(f) {
@@ -25,7 +25,7 @@ export function valueAt(points, v) {
   if (next < 0) return points.at(-1).slice(1);
   const [a, b] = [points[next - 1], points[next]];
   const t = (v - a[0]) / (b[0] - a[0] || 1);
-  return a.slice(1).map((one, at) => one + t * (b[at + 1] - one));
+  return a.slice(1).map((value, index) => value + t * (b[index + 1] - value));
 }
 
 // The opacity axis is a square root, so that small opacities can be set finely.
@@ -39,17 +39,17 @@ export class TransferEditor {
     this.histogram = null;
     this.log = true;
     this.canvas = el("canvas.gv-tf", { tabIndex: 0 });
-    this.told = el("span.gv-told");
+    this.readout = el("span.gv-told");
     this.picker = el("input.gv-hidden", { type: "color" });
-    this.element = el("div.gv-transfer", {}, this.canvas, el("div.gv-ends", {}, this.told), this.picker);
-    const on = (name, take) => this.canvas.addEventListener(name, take);
+    this.element = el("div.gv-transfer", {}, this.canvas, el("div.gv-ends", {}, this.readout), this.picker);
+    const on = (name, handler) => this.canvas.addEventListener(name, handler);
     on("pointerdown", (event) => this.down(event));
     on("pointermove", (event) => this.moved(event));
     on("pointerup", () => this.up());
     on("dblclick", (event) => this.recolor(event));
     on("contextmenu", (event) => this.remove(event));
     on("keydown", (event) => { if (["Delete", "Backspace"].includes(event.key)) this.removeChosen(); });
-    on("pointerleave", () => { this.told.textContent = this.ends(); });
+    on("pointerleave", () => { this.readout.textContent = this.rangeText(); });
     this.picker.oninput = () => this.colored(false);
     this.picker.onchange = () => this.colored(true);
     new ResizeObserver(() => this.draw()).observe(this.canvas);
@@ -58,7 +58,7 @@ export class TransferEditor {
   set(f) {
     this.f = f;
     if (!this.dragged) this.span = this.wholeSpan();
-    this.told.textContent = this.ends();
+    this.readout.textContent = this.rangeText();
     this.draw();
   }
 
@@ -82,7 +82,7 @@ export class TransferEditor {
     return high > low ? [low, high] : [low, low + 1];
   }
 
-  ends() {
+  rangeText() {
     const [low, high] = this.f ? domain(this.f) : [0, 1];
     return `${short(low)} – ${short(high)}`;
   }
@@ -94,11 +94,11 @@ export class TransferEditor {
   alpha(y) { return clamp(down(clamp(1 - (y - TOP) / (HEIGHT - TOP), 0, 1)), 0, 1); }
 
   draw() {
-    const { canvas } = this, wide = canvas.clientWidth;
-    if (!this.f || !wide) return;
-    const ratio = window.devicePixelRatio || 1, tall = HEIGHT + STRIP + 12;
-    canvas.style.height = `${tall}px`;
-    [canvas.width, canvas.height] = [Math.round(wide * ratio), Math.round(tall * ratio)];
+    const { canvas } = this, width = canvas.clientWidth;
+    if (!this.f || !width) return;
+    const ratio = window.devicePixelRatio || 1, height = HEIGHT + STRIP + 12;
+    canvas.style.height = `${height}px`;
+    [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
     const c = canvas.getContext("2d");
     c.scale(ratio, ratio);
     this.drawHistogram(c);
@@ -110,11 +110,11 @@ export class TransferEditor {
     const h = this.histogram;
     if (!h) return;
     const scale = this.log ? Math.log1p : (n) => n;
-    const most = Math.max(1e-9, ...h.counts.map(scale)), bin = (h.high - h.low) / h.counts.length;
+    const maxCount = Math.max(1e-9, ...h.counts.map(scale)), bin = (h.high - h.low) / h.counts.length;
     c.beginPath();
     c.moveTo(this.x(h.low), HEIGHT);
     h.counts.forEach((count, n) => {
-      const y = HEIGHT - (scale(count) / most) * (HEIGHT - TOP);
+      const y = HEIGHT - (scale(count) / maxCount) * (HEIGHT - TOP);
       c.lineTo(this.x(h.low + n * bin), y);
       c.lineTo(this.x(h.low + (n + 1) * bin), y);
     });
@@ -146,8 +146,8 @@ export class TransferEditor {
     c.strokeStyle = "rgba(255,255,255,.12)";
     c.lineWidth = 1;
     c.stroke(new Path2D(`M${EDGE} ${HEIGHT + 0.5}H${right}`));
-    if (points.length > MOST) return;
-    points.forEach(([v, alpha], n) => this.dot(c, this.x(v), this.y(alpha), "#fff", this.chosen?.what === "opacity" && this.chosen.at === n));
+    if (points.length > MAX_POINTS) return;
+    points.forEach(([v, alpha], n) => this.dot(c, this.x(v), this.y(alpha), "#fff", this.chosen?.row === "opacity" && this.chosen.index === n));
   }
 
   dot(c, x, y, color, chosen) {
@@ -161,13 +161,13 @@ export class TransferEditor {
   }
 
   gradient(c, opacity) {
-    const made = c.createLinearGradient(EDGE, 0, EDGE + this.width, 0);
+    const gradient = c.createLinearGradient(EDGE, 0, EDGE + this.width, 0);
     for (let n = 0; n <= 64; n += 1) {
       const color = valueAt(this.f.color, this.v(EDGE + (n / 64) * this.width));
-      const parts = color.map((one) => Math.round(255 * toSrgb(clamp(one, 0, 1))));
-      made.addColorStop(n / 64, `rgba(${parts.join(",")},${opacity})`);
+      const rgb = color.map((channel) => Math.round(255 * toSrgb(clamp(channel, 0, 1))));
+      gradient.addColorStop(n / 64, `rgba(${rgb.join(",")},${opacity})`);
     }
-    return made;
+    return gradient;
   }
 
   drawStrip(c) {
@@ -176,35 +176,35 @@ export class TransferEditor {
     c.beginPath();
     c.roundRect(EDGE, top, this.width, STRIP - 6, 4);
     c.fill();
-    if (this.f.color.length > MOST) return;
-    this.f.color.forEach(([v, ...color], n) => this.dot(c, this.x(v), top + STRIP - 4, hex(color), this.chosen?.what === "color" && this.chosen.at === n));
+    if (this.f.color.length > MAX_POINTS) return;
+    this.f.color.forEach(([v, ...color], n) => this.dot(c, this.x(v), top + STRIP - 4, hex(color), this.chosen?.row === "color" && this.chosen.index === n));
   }
 
-  /** What is under the pointer: point `at` of the opacity or of the colours, or no point of that row (-1). */
-  found(event) {
+  /** What is under the pointer: point `index` of the opacity or of the colours, or no point of that row (-1). */
+  pointAt(event) {
     const box = this.canvas.getBoundingClientRect();
     const [x, y] = [event.clientX - box.left, event.clientY - box.top];
-    const what = y > HEIGHT + 2 ? "color" : "opacity";
-    const points = this.f[what];
-    const far = (point) => (what === "color" ? Math.abs(this.x(point[0]) - x) : Math.hypot(this.x(point[0]) - x, this.y(point[1]) - y));
-    let at = -1;
-    if (points.length <= MOST) points.forEach((point, n) => { if (far(point) < TAKEN && (at < 0 || far(point) < far(points[at]))) at = n; });
-    return { what, at, x, y };
+    const row = y > HEIGHT + 2 ? "color" : "opacity";
+    const points = this.f[row];
+    const distanceTo = (point) => (row === "color" ? Math.abs(this.x(point[0]) - x) : Math.hypot(this.x(point[0]) - x, this.y(point[1]) - y));
+    let index = -1;
+    if (points.length <= MAX_POINTS) points.forEach((point, n) => { if (distanceTo(point) < HIT_RADIUS && (index < 0 || distanceTo(point) < distanceTo(points[index]))) index = n; });
+    return { row, index, x, y };
   }
 
   down(event) {
     if (event.button || !this.f) return;
     this.canvas.setPointerCapture(event.pointerId);
-    const { what, at, x, y } = this.found(event);
-    this.chosen = { what, at };
-    if (at < 0) {
-      const points = this.f[what], v = this.v(x);
-      if (points.length > MOST) return;
-      const point = what === "color" ? [v, ...valueAt(points, v)] : [v, this.alpha(y)];
-      if (points.some((one) => one[0] === v)) return;
+    const { row, index, x, y } = this.pointAt(event);
+    this.chosen = { row, index };
+    if (index < 0) {
+      const points = this.f[row], v = this.v(x);
+      if (points.length > MAX_POINTS) return;
+      const point = row === "color" ? [v, ...valueAt(points, v)] : [v, this.alpha(y)];
+      if (points.some((other) => other[0] === v)) return;
       const next = [...points, point].sort((a, b) => a[0] - b[0]);
-      this.chosen.at = next.indexOf(point);
-      this.edited({ ...this.f, [what]: next }, false);
+      this.chosen.index = next.indexOf(point);
+      this.applyEdit({ ...this.f, [row]: next }, false);
     }
     this.dragged = this.chosen;
     this.draw();
@@ -216,56 +216,56 @@ export class TransferEditor {
     const [x, y] = [event.clientX - box.left, event.clientY - box.top];
     if (!this.dragged) {
       const v = this.v(clamp(x, EDGE, EDGE + this.width));
-      this.told.textContent = `${short(v)}: ${short(100 * valueAt(this.f.opacity, v)[0])} %`;
+      this.readout.textContent = `${short(v)}: ${short(100 * valueAt(this.f.opacity, v)[0])} %`;
       return;
     }
-    const { what, at } = this.dragged, points = this.f[what].map((point) => [...point]);
-    const apart = (this.span[1] - this.span[0]) * 1e-4;
-    const low = at ? points[at - 1][0] + apart : -Infinity;
-    const high = at + 1 < points.length ? points[at + 1][0] - apart : Infinity;
-    points[at][0] = clamp(this.v(clamp(x, EDGE, EDGE + this.width)), low, high);
-    if (what === "opacity") points[at][1] = this.alpha(y);
-    this.edited({ ...this.f, [what]: points }, false);
-    this.told.textContent = `${short(points[at][0])}: ${what === "opacity" ? `${short(100 * points[at][1])} %` : hex(points[at].slice(1))}`;
+    const { row, index } = this.dragged, points = this.f[row].map((point) => [...point]);
+    const minGap = (this.span[1] - this.span[0]) * 1e-4;
+    const low = index ? points[index - 1][0] + minGap : -Infinity;
+    const high = index + 1 < points.length ? points[index + 1][0] - minGap : Infinity;
+    points[index][0] = clamp(this.v(clamp(x, EDGE, EDGE + this.width)), low, high);
+    if (row === "opacity") points[index][1] = this.alpha(y);
+    this.applyEdit({ ...this.f, [row]: points }, false);
+    this.readout.textContent = `${short(points[index][0])}: ${row === "opacity" ? `${short(100 * points[index][1])} %` : hex(points[index].slice(1))}`;
   }
 
   up() {
     if (!this.dragged) return;
     this.dragged = null;
-    this.edited(this.f, true);
+    this.applyEdit(this.f, true);
   }
 
-  edited(f, rest) {
+  applyEdit(f, rest) {
     this.f = f;
     this.draw();
     this.change(f, rest);
   }
 
   recolor(event) {
-    const { what, at } = this.found(event);
-    if (what !== "color" || at < 0) return;
-    this.chosen = { what, at };
-    this.picker.value = hex(this.f.color[at].slice(1));
+    const { row, index } = this.pointAt(event);
+    if (row !== "color" || index < 0) return;
+    this.chosen = { row, index };
+    this.picker.value = hex(this.f.color[index].slice(1));
     this.picker.click();
   }
 
   colored(rest) {
-    if (this.chosen?.what !== "color") return;
-    const color = this.f.color.map((point, n) => (n === this.chosen.at ? [point[0], ...linear(this.picker.value)] : point));
-    this.edited({ ...this.f, color }, rest);
+    if (this.chosen?.row !== "color") return;
+    const color = this.f.color.map((point, n) => (n === this.chosen.index ? [point[0], ...linear(this.picker.value)] : point));
+    this.applyEdit({ ...this.f, color }, rest);
   }
 
   remove(event) {
     event.preventDefault();
-    const { what, at } = this.found(event);
-    this.chosen = { what, at };
+    const { row, index } = this.pointAt(event);
+    this.chosen = { row, index };
     this.removeChosen();
   }
 
   removeChosen() {
-    const { what, at } = this.chosen ?? {};
-    if (!what || at < 0 || this.f[what].length < 2) return;
-    this.edited({ ...this.f, [what]: this.f[what].filter((_, n) => n !== at) }, true);
+    const { row, index } = this.chosen ?? {};
+    if (!row || index < 0 || this.f[row].length < 2) return;
+    this.applyEdit({ ...this.f, [row]: this.f[row].filter((_, n) => n !== index) }, true);
     this.chosen = null;
   }
 }

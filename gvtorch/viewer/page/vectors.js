@@ -14,8 +14,8 @@ export const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
 /** Turns v around a unit axis (Rodrigues' formula). */
 export function turned(v, axis, angle) {
   const c = Math.cos(angle), s = Math.sin(angle);
-  const along = times(axis, dot(axis, v) * (1 - c));
-  return add(add(times(v, c), times(cross(axis, v), s)), along);
+  const parallel = times(axis, dot(axis, v) * (1 - c));
+  return add(add(times(v, c), times(cross(axis, v), s)), parallel);
 }
 
 export const toSrgb = (x) => (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055);
@@ -23,13 +23,13 @@ export const fromSrgb = (x) => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055)
 
 /** #rrggbb of linear red, green, blue. */
 export function hex(color) {
-  const part = (x) => Math.round(255 * clamp(toSrgb(clamp(x, 0, 1)), 0, 1));
-  return "#" + color.slice(0, 3).map((x) => part(x).toString(16).padStart(2, "0")).join("");
+  const channel = (x) => Math.round(255 * clamp(toSrgb(clamp(x, 0, 1)), 0, 1));
+  return "#" + color.slice(0, 3).map((x) => channel(x).toString(16).padStart(2, "0")).join("");
 }
 
 /** Linear red, green, blue of #rrggbb. */
 export function linear(text) {
-  return [1, 3, 5].map((at) => fromSrgb(parseInt(text.slice(at, at + 2), 16) / 255));
+  return [1, 3, 5].map((start) => fromSrgb(parseInt(text.slice(start, start + 2), 16) / 255));
 }
 
 /** A number in few digits. */

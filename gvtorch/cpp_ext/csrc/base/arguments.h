@@ -9,9 +9,10 @@
 //
 //   GV_VIEW    a member of the struct that kernels read
 //   GV_FIELD   a member of the struct that torch fills (in entry.h, like those below)
-//   GV_WORD    its text in the schema
+//   GV_SCHEMA  its text in the schema
 //   GV_TYPE    its type, in the order of the schema
-//   GV_TAKE    its check, and the copy from torch's struct to the kernels'
+//   GV_CHECK_AND_SET
+//              its check, and the copy from torch's struct to the kernels'
 //
 // An op's list consists of groups: trace_rays has GV_RAYS, GV_CHANNEL and GV_WALK, shade_rays these and GV_SHADE; those
 // of segments are in entry_segments.h, the cache's in cache.h. ops/arguments.py documents the arguments on rays, with
@@ -81,7 +82,7 @@ using Bool = NumberOf<bool>;
 #define GV_CHANNEL(X)            \
   X(World, place_33, 9)          \
   X(Int, branching, 17)          \
-  X(Int, max_depth, kMostLevels) \
+  X(Int, max_depth, kMaxLevels)  \
   X(Int, border, (side + 1) / 2) \
   X(Float, root_voxel, kAny)     \
   X(Float, cone_scale, kAny)     \
@@ -128,7 +129,7 @@ struct TraceArgs {
   void *color_r3, *alpha_r1, *depth_r1;
   int32_t* samples_r;
   bool* missed_r;
-  uint8_t* hidden_tn;  // scratch, see hide_nodes
+  uint8_t* hidden_tn;  // scratch, see allocate_node_cache
 
   int64_t rays, bricks, nodes;
   VoxelType voxel;
@@ -142,12 +143,12 @@ constexpr int32_t kDirections = 6;  // +x -x +y -y +z -z: a stored colour may ha
 // The numbers of a fused shader, `parameter_54`, by name; the uniforms of a user's shader follow them.
 template <class T>
 struct Parameters {
-  T light_place[3];  // position of a point light; direction in which a directional one shines
-  T light_kind;      // a LightKind
+  T light_vector[3];  // position of a point light; direction in which a directional one shines
+  T light_kind;       // a LightKind
   T light_color[3], ambient;
   T diffuse, specular, shininess;
   T light_width;                  // of a cone to the light: its growth (directional), or the width at the light (point)
-  T own[4];                       // the shader's struct Own, see shaders.h
+  T own[4];                       // the shader's struct Numbers, see shaders.h
   T normal_scale, normal_offset;  // a stored normal is number * scale + offset
   T octaves, anisotropy;          // of multiple scattering; 0 octaves: a surface is lit
 };

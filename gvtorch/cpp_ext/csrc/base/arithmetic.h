@@ -25,7 +25,7 @@ template <class T>
 struct LanesOf {
   using Real = T;
   using Int = int32_t;
-  using Word = uint32_t;  // sums wrap
+  using UInt = uint32_t;  // sums wrap
   using Index = int32_t;  // into a table
   using Mask = bool;
   using Pointer = T*;
@@ -34,32 +34,32 @@ struct LanesOf {
 };
 
 template <class T>
-GV_HD T select(bool which, T a, T b) {
-  return which ? a : b;
+GV_HD T select(bool mask, T a, T b) {
+  return mask ? a : b;
 }
-GV_HD bool any(bool which) { return which; }
+GV_HD bool any(bool mask) { return mask; }
 template <class Body>
-GV_HD void for_lanes(bool which, const Body& body) {
-  if (which) body(0);
+GV_HD void for_lanes(bool mask, const Body& body) {
+  if (mask) body(0);
 }
 template <class T>
 GV_HD T lane_of(T value, int) {
   return value;
 }
 template <class T>
-GV_HD void set_lane(T& value, int, T own) {
-  value = own;
+GV_HD void set_lane(T& value, int, T lane_value) {
+  value = lane_value;
 }
 // The smallest value among the threads of a warp that run this together; values are not negative. On the CPU, and on
 // GPUs before compute capability 8.0, which have no such instruction, the thread's own value.
-GV_HD float smallest_together(float value) {
+GV_HD float warp_minimum(float value) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   return __uint_as_float(__reduce_min_sync(__activemask(), __float_as_uint(value)));
 #else
   return value;
 #endif
 }
-GV_HD double smallest_together(double value) { return value; }
+GV_HD double warp_minimum(double value) { return value; }
 template <class T>
 GV_HD T pick(const T* table, int32_t index) {
   return table[index];
@@ -112,7 +112,7 @@ template <>
 struct LanesOf<Floats> {
   using Real = float;
   using Int = Ints;
-  using Word = Words;
+  using UInt = UInts;
   using Index = Ints;
   using Mask = Ints;
   using Pointer = LanePointers;
@@ -127,24 +127,24 @@ struct LanesOf<Doubles> {
   using Mask = Longs;
 };
 
-GV_HD Doubles select(Longs which, Doubles a, Doubles b) { return which ? a : b; }
-GV_HD Longs select(Longs which, Longs a, Longs b) { return which ? a : b; }
-GV_HD Floats select(Mask which, Floats a, Floats b) { return which ? a : b; }
-GV_HD Ints select(Mask which, Ints a, Ints b) { return which ? a : b; }
+GV_HD Doubles select(Longs mask, Doubles a, Doubles b) { return mask ? a : b; }
+GV_HD Longs select(Longs mask, Longs a, Longs b) { return mask ? a : b; }
+GV_HD Floats select(Mask mask, Floats a, Floats b) { return mask ? a : b; }
+GV_HD Ints select(Mask mask, Ints a, Ints b) { return mask ? a : b; }
 GV_HD float lane_of(Floats value, int lane) { return value[lane]; }
 GV_HD int32_t lane_of(Ints value, int lane) { return value[lane]; }
 GV_HD float* lane_of(const LanePointers& pointers, int lane) { return pointers.lane[lane]; }
-GV_HD void set_lane(Floats& value, int lane, float own) { value[lane] = own; }
-GV_HD void set_lane(Ints& value, int lane, int32_t own) { value[lane] = own; }
-GV_HD void set_lane(Ints& mask, int lane, bool own) { mask[lane] = own ? -1 : 0; }
-GV_HD void set_lane(LanePointers& pointers, int lane, float* own) { pointers.lane[lane] = own; }
+GV_HD void set_lane(Floats& value, int lane, float lane_value) { value[lane] = lane_value; }
+GV_HD void set_lane(Ints& value, int lane, int32_t lane_value) { value[lane] = lane_value; }
+GV_HD void set_lane(Ints& mask, int lane, bool lane_value) { mask[lane] = lane_value ? -1 : 0; }
+GV_HD void set_lane(LanePointers& pointers, int lane, float* lane_value) { pointers.lane[lane] = lane_value; }
 template <class T>
 GV_HD Vec3<float> lane_of(const Vec3<T>& value, int lane) {
   return {lane_of(value.x, lane), lane_of(value.y, lane), lane_of(value.z, lane)};
 }
 template <class T>
-GV_HD void set_lane(Vec3<T>& value, int lane, const Vec3<float>& own) {
-  for (int axis = 0; axis < 3; ++axis) set_lane(value[axis], lane, own[axis]);
+GV_HD void set_lane(Vec3<T>& value, int lane, const Vec3<float>& lane_value) {
+  for (int axis = 0; axis < 3; ++axis) set_lane(value[axis], lane, lane_value[axis]);
 }
 
 template <>
@@ -177,7 +177,7 @@ using RealOf = typename LanesOf<T>::Real;
 template <class T>
 using IntOf = typename LanesOf<T>::Int;
 template <class T>
-using WordOf = typename LanesOf<T>::Word;
+using UIntOf = typename LanesOf<T>::UInt;
 template <class T>
 using MaskOf = typename LanesOf<T>::Mask;
 template <class T>
@@ -196,8 +196,8 @@ GV_HD T absolute(T value) {
 // x86-64) std::floor is a call.
 template <class T>
 GV_HD IntOf<T> floor_int(T value) {
-  const IntOf<T> whole = truncated(value);
-  return select(to_real<T>(whole) > value, bit_cast<IntOf<T>>(bit_cast<WordOf<T>>(whole) - 1u), whole);
+  const IntOf<T> integer = truncated(value);
+  return select(to_real<T>(integer) > value, bit_cast<IntOf<T>>(bit_cast<UIntOf<T>>(integer) - 1u), integer);
 }
 
 // Base-2 logarithm of a positive, normal float.
@@ -237,10 +237,10 @@ GV_HD T exp2_exact(T value) {
   const auto normal = value > -126.0f;
   if (!any(normal)) return T{};
   const T x = smaller(value, splat<T>(126.0f));
-  const auto whole = floor_int(x + 0.5f);
-  const T f = x - to_real<T>(whole);
+  const auto integer = floor_int(x + 0.5f);
+  const T f = x - to_real<T>(integer);
   const T series = exp2_slope(f) * f + 1.0f;
-  return select(normal, series * bit_cast<T>((bit_cast<WordOf<T>>(whole) + 127u) << 23), T{});
+  return select(normal, series * bit_cast<T>((bit_cast<UIntOf<T>>(integer) + 127u) << 23), T{});
 }
 
 // Splits a positive, normal number: it is the returned fraction, in [1/2, 1), times 2^power.
@@ -251,19 +251,19 @@ GV_HD T fraction_of(T value, IntOf<T>& power) {
   return bit_cast<T>((bits & 0x007fffff) | 0x3f000000);
 }
 template <class T, class Bits>
-GV_HD T wide_fraction_of(T value, Bits& power) {
+GV_HD T double_fraction_of(T value, Bits& power) {
   const auto bits = bit_cast<Bits>(value);
   power = (bits >> 52) - 1022;
   return bit_cast<T>((bits & 0x000fffffffffffff) | 0x3fe0000000000000);
 }
 GV_HD double fraction_of(double value, int32_t& power) {
-  int64_t whole;
-  const double fraction = wide_fraction_of(value, whole);
-  power = static_cast<int32_t>(whole);
+  int64_t long_power;
+  const double fraction = double_fraction_of(value, long_power);
+  power = static_cast<int32_t>(long_power);
   return fraction;
 }
 #ifndef __CUDACC__
-GV_HD Doubles fraction_of(Doubles value, Longs& power) { return wide_fraction_of(value, power); }
+GV_HD Doubles fraction_of(Doubles value, Longs& power) { return double_fraction_of(value, power); }
 #endif
 
 // A positive, normal number split for logarithms: the exponent of the nearest power of two, and the natural logarithm
@@ -292,8 +292,8 @@ template <class T>
 GV_HD T log_exact(T value) {
   using Real = RealOf<T>;
   const LogParts<T> parts = log_parts(value);
-  const T found = parts.exponent * static_cast<Real>(0.6931471805599453) + parts.s * parts.series;
-  return select(value < static_cast<Real>(INFINITY), found, value);
+  const T logarithm = parts.exponent * static_cast<Real>(0.6931471805599453) + parts.s * parts.series;
+  return select(value < static_cast<Real>(INFINITY), logarithm, value);
 }
 
 // The base-2 logarithm, and powers of two, in float64, by longer series.
@@ -314,14 +314,14 @@ GV_HD double exp2_slope(double f) {
 GV_HD double exp2_exact(double value) {
   if (!(value > -1022.0)) return 0;
   const double x = smaller(value, 1022.0);
-  const int32_t whole = floor_int(x + 0.5);
-  const double f = x - whole;
-  return (exp2_slope(f) * f + 1.0) * bit_cast<double>(static_cast<int64_t>(whole + 1023) << 52);
+  const int32_t integer = floor_int(x + 0.5);
+  const double f = x - integer;
+  return (exp2_slope(f) * f + 1.0) * bit_cast<double>(static_cast<int64_t>(integer + 1023) << 52);
 }
 
 // The share of light absorbed after `halvings` halvings: 1 - 2^-halvings, without cancellation where that is small.
 template <class T>
-GV_HD T taken_by(T halvings) {
+GV_HD T absorbed_by(T halvings) {
   const auto thin = halvings < static_cast<RealOf<T>>(0.5);
   return select(thin, exp2_slope(-halvings) * halvings, 1 - exp2_exact(-halvings));
 }

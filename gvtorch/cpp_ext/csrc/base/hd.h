@@ -18,11 +18,11 @@
 #ifdef __CUDACC__
 #define GV_HD __host__ __device__ __forceinline__
 #define GV_CALL __host__ __device__ __noinline__
-#define GV_ASIDE GV_HD  // code that few rays reach: on a CPU a call, which keeps the loops around it small
+#define GV_RARE GV_HD  // code that few rays reach: on a CPU a call, which keeps the loops around it small
 #else
 #define GV_HD inline __attribute__((always_inline))
 #define GV_CALL __attribute__((noinline))
-#define GV_ASIDE GV_CALL
+#define GV_RARE GV_CALL
 #endif
 
 namespace gvtorch {
@@ -116,18 +116,20 @@ GV_HD void add_to(T* sum, T value) {
     atomicAdd(sum, value);
   }
 #else
-  T seen = *sum;
-  T next = seen + value;
-  while (!__atomic_compare_exchange(sum, &seen, &next, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) next = seen + value;
+  T expected = *sum;
+  T desired = expected + value;
+  while (!__atomic_compare_exchange(sum, &expected, &desired, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED))
+    desired = expected + value;
 #endif
 }
-// Raises a number atomically to at least `least`.
-GV_HD void raise_to(int32_t* count, int32_t least) {
+// Raises a number atomically to at least `minimum`.
+GV_HD void raise_to(int32_t* count, int32_t minimum) {
 #ifdef __CUDA_ARCH__
-  atomicMax(count, least);
+  atomicMax(count, minimum);
 #else
-  int32_t seen = __atomic_load_n(count, __ATOMIC_RELAXED);
-  while (seen < least && !__atomic_compare_exchange_n(count, &seen, least, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+  int32_t current = __atomic_load_n(count, __ATOMIC_RELAXED);
+  while (current < minimum &&
+         !__atomic_compare_exchange_n(count, &current, minimum, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
   }
 #endif
 }
@@ -141,23 +143,23 @@ constexpr int32_t kSubdivide = 1 << 12;
 template <class Word>
 GV_HD Word join_request(Word word, int32_t request) {
   const int32_t kinds = (word | request) & ~kPriorityMask;
-  const int32_t before = word & kPriorityMask, now = request & kPriorityMask;
-  return static_cast<Word>(kinds | (now > before ? now : before));
+  const int32_t old_priority = word & kPriorityMask, new_priority = request & kPriorityMask;
+  return static_cast<Word>(kinds | (new_priority > old_priority ? new_priority : old_priority));
 }
 
 GV_HD void post_request(int16_t* word, int32_t request) {
 #ifdef __CUDA_ARCH__
   auto* bits = reinterpret_cast<unsigned short*>(word);
-  auto seen = *reinterpret_cast<volatile unsigned short*>(bits);
-  for (auto joined = join_request(seen, request); joined != seen; joined = join_request(seen, request)) {
-    const auto before = atomicCAS(bits, seen, joined);
-    if (before == seen) return;
-    seen = before;
+  auto current = *reinterpret_cast<volatile unsigned short*>(bits);
+  for (auto joined = join_request(current, request); joined != current; joined = join_request(current, request)) {
+    const auto previous = atomicCAS(bits, current, joined);
+    if (previous == current) return;
+    current = previous;
   }
 #else
-  int16_t seen = __atomic_load_n(word, __ATOMIC_RELAXED);
-  for (int16_t joined = join_request(seen, request); joined != seen; joined = join_request(seen, request)) {
-    if (__atomic_compare_exchange_n(word, &seen, joined, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) return;
+  int16_t current = __atomic_load_n(word, __ATOMIC_RELAXED);
+  for (int16_t joined = join_request(current, request); joined != current; joined = join_request(current, request)) {
+    if (__atomic_compare_exchange_n(word, &current, joined, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) return;
   }
 #endif
 }

@@ -31,7 +31,7 @@ using Native = __m128;
 #endif
 typedef float Floats __attribute__((vector_size(kLanes * 4)));
 typedef int32_t Ints __attribute__((vector_size(kLanes * 4)));
-typedef uint32_t Words __attribute__((vector_size(kLanes * 4)));  // sums and products wrap
+typedef uint32_t UInts __attribute__((vector_size(kLanes * 4)));  // sums and products wrap
 using Mask = Ints;                                                // -1 or 0 in each lane
 typedef double Doubles __attribute__((vector_size(kLanes * 4)));  // half as many lanes
 typedef int64_t Longs __attribute__((vector_size(kLanes * 4)));
@@ -75,9 +75,9 @@ GV_HD uint32_t bits(Mask mask) {
 #elif defined(__SSE2__)
   return static_cast<uint32_t>(_mm_movemask_ps((__m128)mask));
 #else
-  uint32_t found = 0;
-  for (int i = 0; i < kLanes; ++i) found |= static_cast<uint32_t>(mask[i] & 1) << i;
-  return found;
+  uint32_t set_bits = 0;
+  for (int i = 0; i < kLanes; ++i) set_bits |= static_cast<uint32_t>(mask[i] & 1) << i;
+  return set_bits;
 #endif
 }
 GV_HD bool any(Mask mask) { return bits(mask) != 0; }
@@ -87,7 +87,7 @@ GV_HD int32_t count(Mask mask) { return __builtin_popcount(bits(mask)); }
 // Calls body(lane) for each lane that is set.
 template <class Body>
 GV_HD void for_lanes(Mask mask, const Body& body) {
-  for (uint32_t left = bits(mask); left != 0; left &= left - 1) body(__builtin_ctz(left));
+  for (uint32_t remaining = bits(mask); remaining != 0; remaining &= remaining - 1) body(__builtin_ctz(remaining));
 }
 
 // Loads 4 bytes at each address base + offset.
@@ -97,13 +97,13 @@ GV_HD Ints gather(const void* base, Ints offset) {
 #elif defined(__AVX2__)
   return (Ints)_mm256_i32gather_epi32(static_cast<const int*>(base), (__m256i)offset, 1);
 #else
-  Ints word;
+  Ints words;
   for (int lane = 0; lane < kLanes; ++lane) {
-    int32_t one;
-    memcpy(&one, static_cast<const char*>(base) + offset[lane], 4);
-    word[lane] = one;
+    int32_t word;
+    memcpy(&word, static_cast<const char*>(base) + offset[lane], 4);
+    words[lane] = word;
   }
-  return word;
+  return words;
 #endif
 }
 GV_HD Ints pick(const int32_t* table, Ints index) { return gather(table, index << 2); }
@@ -112,50 +112,51 @@ GV_HD Ints pick_shared(const int32_t* table, Ints index) {
 #if defined(__AVX2__)
   return pick(table, index);
 #else
-  Ints word;
-  for (int lane = 0; lane < kLanes; ++lane) word[lane] = __atomic_load_n(table + index[lane], __ATOMIC_RELAXED);
-  return word;
+  Ints words;
+  for (int lane = 0; lane < kLanes; ++lane) words[lane] = __atomic_load_n(table + index[lane], __ATOMIC_RELAXED);
+  return words;
 #endif
 }
 GV_HD Floats pick(const float* table, Ints index) { return (Floats)gather(table, index << 2); }
 
 #ifdef GV_MM
-// Transposes rows of four numbers: own[i] holds those of the lanes i, i + 4, i + 8, ...; number[k], number k of all.
-GV_HD void transpose(const Native own[4], Floats number[4]) {
-  const Native a = GV_MM(unpacklo_ps)(own[0], own[1]), b = GV_MM(unpacklo_ps)(own[2], own[3]);
-  const Native c = GV_MM(unpackhi_ps)(own[0], own[1]), d = GV_MM(unpackhi_ps)(own[2], own[3]);
-  number[0] = (Floats)GV_MM(shuffle_ps)(a, b, 0x44);
-  number[1] = (Floats)GV_MM(shuffle_ps)(a, b, 0xee);
-  number[2] = (Floats)GV_MM(shuffle_ps)(c, d, 0x44);
-  number[3] = (Floats)GV_MM(shuffle_ps)(c, d, 0xee);
+// Transposes rows of four numbers: rows[i] holds those of the lanes i, i + 4, i + 8, ...; columns[k], number k of
+// all.
+GV_HD void transpose(const Native rows[4], Floats columns[4]) {
+  const Native a = GV_MM(unpacklo_ps)(rows[0], rows[1]), b = GV_MM(unpacklo_ps)(rows[2], rows[3]);
+  const Native c = GV_MM(unpackhi_ps)(rows[0], rows[1]), d = GV_MM(unpackhi_ps)(rows[2], rows[3]);
+  columns[0] = (Floats)GV_MM(shuffle_ps)(a, b, 0x44);
+  columns[1] = (Floats)GV_MM(shuffle_ps)(a, b, 0xee);
+  columns[2] = (Floats)GV_MM(shuffle_ps)(c, d, 0x44);
+  columns[3] = (Floats)GV_MM(shuffle_ps)(c, d, 0xee);
 }
 #endif
 
-// Loads four floats at each address base + offset (a multiple of 16 bytes); row[0] gets the first of all lanes, and so
-// on. A load per lane and a transposition replace four gathers, which would load each number alone.
-GV_HD void load_rows(const void* base, Ints offset, Floats row[4]) {
+// Loads four floats at each address base + offset (a multiple of 16 bytes); columns[0] gets the first of all lanes, and
+// so on. A load per lane and a transposition replace four gathers, which would load each number alone.
+GV_HD void load_rows(const void* base, Ints offset, Floats columns[4]) {
 #ifdef GV_MM
   int32_t lane[kLanes];
   memcpy(lane, &offset, sizeof(lane));
-  const auto four = [&](int i) {
+  const auto load_four = [&](int i) {
     return _mm_loadu_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
   };
-  Native own[4];
+  Native rows[4];
   for (int i = 0; i < 4; ++i) {
 #if defined(__AVX512F__)
-    own[i] = _mm512_castps128_ps512(four(i));
-    own[i] = _mm512_insertf32x4(own[i], four(i + 4), 1);
-    own[i] = _mm512_insertf32x4(own[i], four(i + 8), 2);
-    own[i] = _mm512_insertf32x4(own[i], four(i + 12), 3);
+    rows[i] = _mm512_castps128_ps512(load_four(i));
+    rows[i] = _mm512_insertf32x4(rows[i], load_four(i + 4), 1);
+    rows[i] = _mm512_insertf32x4(rows[i], load_four(i + 8), 2);
+    rows[i] = _mm512_insertf32x4(rows[i], load_four(i + 12), 3);
 #elif defined(__AVX2__)
-    own[i] = _mm256_insertf128_ps(_mm256_castps128_ps256(four(i)), four(i + 4), 1);
+    rows[i] = _mm256_insertf128_ps(_mm256_castps128_ps256(load_four(i)), load_four(i + 4), 1);
 #else
-    own[i] = four(i);
+    rows[i] = load_four(i);
 #endif
   }
-  transpose(own, row);
+  transpose(rows, columns);
 #else
-  for (int i = 0; i < 4; ++i) row[i] = (Floats)gather(static_cast<const float*>(base) + i, offset);
+  for (int i = 0; i < 4; ++i) columns[i] = (Floats)gather(static_cast<const float*>(base) + i, offset);
 #endif
 }
 
@@ -164,23 +165,23 @@ GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats
 #if defined(__AVX2__)
   int32_t lane[kLanes];
   memcpy(lane, &offset, sizeof(lane));
-  const auto eight = [&](int i) {
+  const auto load_eight = [&](int i) {
     return _mm256_loadu_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
   };
-  Floats half[2][4];  // [h][i]: number i of half of the lanes; first rows of four lanes, their second rows, and so on
+  Floats halves[2][4];  // [h][i]: number i of half of the lanes; first rows of four lanes, their second rows, and so on
   for (int h = 0; h < 2; ++h) {
-    Native own[4];
+    Native rows[4];
     for (int i = 0; i < 4; ++i) {
 #if defined(__AVX512F__)
-      own[i] = _mm512_insertf32x8(_mm512_castps256_ps512(eight(8 * h + i)), eight(8 * h + i + 4), 1);
+      rows[i] = _mm512_insertf32x8(_mm512_castps256_ps512(load_eight(8 * h + i)), load_eight(8 * h + i + 4), 1);
 #else
-      own[i] = eight(4 * h + i);
+      rows[i] = load_eight(4 * h + i);
 #endif
     }
-    transpose(own, half[h]);
+    transpose(rows, halves[h]);
   }
   for (int i = 0; i < 4; ++i) {
-    const auto low = (Native)half[0][i], high = (Native)half[1][i];
+    const auto low = (Native)halves[0][i], high = (Native)halves[1][i];
 #if defined(__AVX512F__)
     first[i] = (Floats)_mm512_shuffle_f32x4(low, high, 0x88);
     second[i] = (Floats)_mm512_shuffle_f32x4(low, high, 0xdd);
@@ -233,17 +234,17 @@ struct Unpack<float> {
 };
 
 // Converts four consecutive voxels to numbers.
-typedef float Four __attribute__((vector_size(16)));
+typedef float Floats4 __attribute__((vector_size(16)));
 template <class Voxel>
-GV_HD Four four_numbers(const char* first) {
+GV_HD Floats4 four_numbers(const char* first) {
   Voxel voxel[4];
   memcpy(voxel, first, sizeof(voxel));
 #if defined(__F16C__)
   if constexpr (std::is_same_v<Voxel, Half>) {
-    return (Four)_mm_cvtph_ps(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(first)));
+    return (Floats4)_mm_cvtph_ps(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(first)));
   }
 #endif
-  return Four{number<float>(voxel[0]), number<float>(voxel[1]), number<float>(voxel[2]), number<float>(voxel[3])};
+  return Floats4{number<float>(voxel[0]), number<float>(voxel[1]), number<float>(voxel[2]), number<float>(voxel[3])};
 }
 
 }  // namespace GV_NAMESPACE

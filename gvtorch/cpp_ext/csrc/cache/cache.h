@@ -3,11 +3,12 @@
 // they requested, and cut bricks out of a level. Each op's arguments are declared before its functors, see arguments.h.
 //
 // Equal to the twins in ops/cache.py in every integer. What each device defines (cpu.cpp, cuda.cu):
-//   compact(n, list)   list.flags(index) returns which of kListed, kSeen and kTouched each index is
-//                      list.take(index, flags, rank, listed)  is called for every touched index; listed and seen ones
-//                                                             are touched. rank: listed ones before it; listed: all
-//                      list.blank(rank)                       is called for every unused one of list.places()
-//                      list.total(listed, seen)               is called once
+//   compact(n, list)   list.flags(index) returns which of kListed, kCounted and kTouched each index is
+//                      list.process(index, flags, rank, listed)  is called for every touched index; listed and counted
+//                                                                ones are touched. rank: listed ones before it;
+//                                                                listed: all
+//                      list.clear_entry(rank)                    is called for every unused one of list.entries()
+//                      list.store_totals(listed, counted)        is called once
 //   sort_keys(keys, n) sorts n numbers in ascending order
 // Method: Crassin et al., "GigaVoxels", I3D 2009, section 5 (usage stamps, LRU by compaction, request lists).
 #pragma once
@@ -20,19 +21,19 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-constexpr int32_t kListed = 1, kSeen = 2, kTouched = 4;
+constexpr int32_t kListed = 1, kCounted = 2, kTouched = 4;
 
-// How many indices are listed, and seen; `any` is not 0 if one has a flag.
+// How many indices are listed, and counted; `any_flags` is not 0 if one has a flag.
 struct Counts {
-  int32_t listed, seen, any;
+  int32_t listed, counted, any_flags;
 
   GV_HD void add(int32_t flags) {
     listed += flags & kListed;
-    seen += (flags & kSeen) / kSeen;
-    any |= flags;
+    counted += (flags & kCounted) / kCounted;
+    any_flags |= flags;
   }
   GV_HD Counts operator+(const Counts& other) const {
-    return {listed + other.listed, seen + other.seen, any + other.any};
+    return {listed + other.listed, counted + other.counted, any_flags + other.any_flags};
   }
 };
 
@@ -55,10 +56,10 @@ struct ListRequests {
 
   GV_HD int32_t flags(int64_t node) const {
     const int32_t word = request_tn[node];
-    return (open_kinds(word) != 0 ? kListed : 0) | ((word & kKinds) != 0 ? kSeen : 0) |
+    return (open_kinds(word) != 0 ? kListed : 0) | ((word & kKinds) != 0 ? kCounted : 0) |
            ((word & ~kPending) != 0 ? kTouched : 0);
   }
-  GV_HD void take(int64_t node, int32_t flags, int64_t rank, int64_t) const {
+  GV_HD void process(int64_t node, int32_t flags, int64_t rank, int64_t) const {
     if ((flags & kListed) != 0 && rank < capacity) {
       const int32_t word = request_tn[node];
       node_k[rank] = static_cast<int32_t>(node);
@@ -68,15 +69,15 @@ struct ListRequests {
     }
     request_tn[node] &= kPending;
   }
-  GV_HD int64_t places() const { return capacity; }
-  GV_HD void blank(int64_t rank) const {
+  GV_HD int64_t entries() const { return capacity; }
+  GV_HD void clear_entry(int64_t rank) const {
     node_k[rank] = -1;
     word_k[rank] = 0;
   }
-  GV_HD void total(int64_t listed, int64_t seen) const {
+  GV_HD void store_totals(int64_t listed, int64_t counted) const {
     count_5[0] = smaller<int64_t>(listed, capacity);
     count_5[1] = listed;
-    count_5[2] = seen;
+    count_5[2] = counted;
   }
 };
 
@@ -89,9 +90,9 @@ struct ListRequests {
   X(Int, batch, kAny)                     \
   X(Bool, coarse_first, kAny)
 
-constexpr int64_t kNoKey = INT64_MAX;       // not a request of a node of the pool
-constexpr int64_t kComparers = 16;          // threads that share the comparisons of a request
-constexpr int64_t kMostCompared = 1 << 15;  // longer lists are sorted
+constexpr int64_t kNoKey = INT64_MAX;      // not a request of a node of the pool
+constexpr int64_t kComparers = 16;         // threads that share the comparisons of a request
+constexpr int64_t kMaxCompared = 1 << 15;  // longer lists are sorted
 constexpr int64_t kIndices = int64_t{1} << 31;
 
 struct ChooseArgs {
@@ -104,12 +105,12 @@ struct ChooseArgs {
 
   GV_HD int64_t node_at(int64_t index) const { return asked_l2k[index + index / listed * listed]; }
   GV_HD int32_t word_at(int64_t index) const { return asked_l2k[index + (index / listed + 1) * listed]; }
-  // Serves a request as a load (`which` 0) or a subdivision (1) if the `place` ones before it leave room.
-  GV_HD void serve(int64_t which, int64_t place, int64_t index) const {
-    const int64_t room = room_2[1 - which];  // tiles, bricks
-    if (place >= smaller<int64_t>(batch, room)) return;
-    node_2b[which * batch + place] = node_at(index);
-    priority_2b[which * batch + place] = word_at(index) & kPriorityMask;
+  // Serves a request as a load (`kind` 0) or a subdivision (1) if the `rank` ones before it leave room.
+  GV_HD void serve(int64_t kind, int64_t rank, int64_t index) const {
+    const int64_t room = room_2[1 - kind];  // tiles, bricks
+    if (rank >= smaller<int64_t>(batch, room)) return;
+    node_2b[kind * batch + rank] = node_at(index);
+    priority_2b[kind * batch + rank] = word_at(index) & kPriorityMask;
   }
 };
 
@@ -126,8 +127,8 @@ struct RankRequests : ChooseArgs {
     key_lk[index] = kNoKey;
     if (node < 0 || node >= tiles * per_tile || (word & kKinds) == 0) return;
     const int64_t depth = loc_t4[4 * (node / per_tile) + 3];
-    const int32_t small = kPriorityMask - (word & kPriorityMask);
-    const int64_t rank = (list << 20) + (coarse_first ? depth : -depth) * (kPriorityMask + 1) + small;
+    const int32_t inverse_priority = kPriorityMask - (word & kPriorityMask);
+    const int64_t rank = (list << 20) + (coarse_first ? depth : -depth) * (kPriorityMask + 1) + inverse_priority;
     key_lk[index] = (rank * kIndices + index) * 4 + (word & kKinds) / kLoad;
     raise_to(&end_l[list], static_cast<int32_t>(index % listed + 1));
   }
@@ -139,15 +140,15 @@ struct RankRequests : ChooseArgs {
 struct CompareRequests : ChooseArgs {
   GV_HD void operator()(int64_t number) const {
     const int64_t index = number % (lists * listed), first = number / (lists * listed);
-    const int64_t own = key_lk[index];
-    if (own == kNoKey) return;
+    const int64_t own_key = key_lk[index];
+    if (own_key == kNoKey) return;
     int32_t loads = 0, subdivisions = 0;
     for (int64_t list = 0; list < lists; ++list) {
       const int64_t* const key_k = key_lk + list * listed;
       const int32_t end = end_l[list];
       for (auto other = static_cast<int32_t>(first); other < end; other += kComparers) {
         const int64_t key = key_k[other];
-        if (key >= own) continue;
+        if (key >= own_key) continue;
         loads += static_cast<int32_t>(key & 1);
         subdivisions += static_cast<int32_t>(key >> 1 & 1);
       }
@@ -160,26 +161,26 @@ struct CompareRequests : ChooseArgs {
 struct ServeRequests : ChooseArgs {
   GV_HD void operator()(int64_t index) const {
     if (key_lk[index] == kNoKey) return;
-    for (int64_t which = 0; which < 2; ++which) {
-      if ((key_lk[index] >> which & 1) != 0) serve(which, before_2lk[which * lists * listed + index], index);
+    for (int64_t kind = 0; kind < 2; ++kind) {
+      if ((key_lk[index] >> kind & 1) != 0) serve(kind, before_2lk[kind * lists * listed + index], index);
     }
   }
 };
 
 // ServeRequests for sorted keys, for loads or for subdivisions; see `compact`.
 struct ServeSorted : ChooseArgs {
-  int64_t which;
+  int64_t kind;
 
-  GV_HD int32_t flags(int64_t place) const {
-    const int64_t key = key_lk[place];
-    return key != kNoKey && (key >> which & 1) != 0 ? kListed | kTouched : 0;
+  GV_HD int32_t flags(int64_t index) const {
+    const int64_t key = key_lk[index];
+    return key != kNoKey && (key >> kind & 1) != 0 ? kListed | kTouched : 0;
   }
-  GV_HD void take(int64_t place, int32_t, int64_t rank, int64_t) const {
-    serve(which, rank, (key_lk[place] >> 2) & (kIndices - 1));
+  GV_HD void process(int64_t index, int32_t, int64_t rank, int64_t) const {
+    serve(kind, rank, (key_lk[index] >> 2) & (kIndices - 1));
   }
-  GV_HD int64_t places() const { return 0; }
-  GV_HD void blank(int64_t) const {}
-  GV_HD void total(int64_t, int64_t) const {}
+  GV_HD int64_t entries() const { return 0; }
+  GV_HD void clear_entry(int64_t) const {}
+  GV_HD void store_totals(int64_t, int64_t) const {}
 };
 
 // --- The order of use
@@ -199,10 +200,10 @@ struct PackUse : UseArgs {
   GV_HD void operator()(int64_t index) const {
     const int32_t frame = *frame_1;
     const int64_t first = 8 * index;
-    const int64_t here = smaller<int64_t>(8, slots - first);
-    int32_t word = 0;
-    for (int64_t slot = 0; slot < here; ++slot) word |= (stamp_s[first + slot] == frame ? 1 : 0) << slot;
-    used_s[index] = static_cast<uint8_t>(word);
+    const int64_t count = smaller<int64_t>(8, slots - first);
+    int32_t bits = 0;
+    for (int64_t slot = 0; slot < count; ++slot) bits |= (stamp_s[first + slot] == frame ? 1 : 0) << slot;
+    used_s[index] = static_cast<uint8_t>(bits);
   }
 };
 
@@ -223,14 +224,14 @@ struct SplitByUse : UseArgs {
     return slot < slots && stamp_s[slot] == *frame_1;
   }
   GV_HD int32_t flags(int64_t index) const { return kTouched | static_cast<int32_t>(!used(index)); }
-  GV_HD void take(int64_t index, int32_t flags, int64_t rank, int64_t listed) const {
-    const int64_t behind = listed + index - rank;
+  GV_HD void process(int64_t index, int32_t flags, int64_t rank, int64_t listed) const {
+    const int64_t used_position = listed + index - rank;
     const int64_t mask = -static_cast<int64_t>(flags & kListed);  // no branch: it would often be mispredicted
-    sorted_k[behind + ((rank - behind) & mask)] = order_k[index];
+    sorted_k[used_position + ((rank - used_position) & mask)] = order_k[index];
   }
-  GV_HD int64_t places() const { return 0; }
-  GV_HD void blank(int64_t) const {}
-  GV_HD void total(int64_t listed, int64_t) const { *unused_1 = listed; }
+  GV_HD int64_t entries() const { return 0; }
+  GV_HD void clear_entry(int64_t) const {}
+  GV_HD void store_totals(int64_t listed, int64_t) const { *unused_1 = listed; }
 };
 
 // --- Pointers
@@ -262,14 +263,14 @@ struct TakeFromOwner : UnlinkArgs {
   }
 };
 
-// An index is kTogether words. Only shared slots have pointers other than their owner's.
+// An index is kWordsPerIndex words. Only shared slots have pointers other than their owner's.
 struct ClearShared : UnlinkArgs {
-  static constexpr int64_t kTogether = 16;
+  static constexpr int64_t kWordsPerIndex = 16;
 
   GV_HD void operator()(int64_t index) const {
     if (*any_shared == 0) return;
-    const int64_t end = smaller(nodes, (index + 1) * kTogether);
-    for (int64_t node = index * kTogether; node < end; ++node) {
+    const int64_t end = smaller(nodes, (index + 1) * kWordsPerIndex);
+    for (int64_t node = index * kWordsPerIndex; node < end; ++node) {
       const int32_t word = pointer_tn[node];
       if (word >= 0 && word < slots && leaving_s[word] != 0) pointer_tn[node] = kAbsent;
     }
@@ -287,10 +288,10 @@ struct ClearOwner {
   int64_t tiles, slots, per_tile;
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t which = index / per_tile;
-    const int64_t tile = tile_k[which];
+    const int64_t entry = index / per_tile;
+    const int64_t tile = tile_k[entry];
     if (tile < 0 || tile >= tiles) return;
-    const int64_t node = tile * per_tile + (index - which * per_tile);
+    const int64_t node = tile * per_tile + (index - entry * per_tile);
     const int32_t slot = pointer_tn[node];
     if (slot >= 0 && slot < slots && owner_s[slot] == node) owner_s[slot] = kAbsent;
   }
@@ -371,20 +372,20 @@ struct LinkTile {
   int32_t per_tile, width;
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t which = index / per_tile;
-    const auto child = static_cast<int32_t>(index - which * per_tile);
-    const int64_t tile = tile_k[which];
-    const int64_t row = row_k[which];
+    const int64_t entry = index / per_tile;
+    const auto child = static_cast<int32_t>(index - entry * per_tile);
+    const int64_t tile = tile_k[entry];
+    const int64_t row = row_k[entry];
     if (tile < 0 || tile >= tiles || row < 0 || row >= rows) return;
     const int64_t node = node_j[row];
     if (node < 0 || node >= tiles * per_tile) return;
-    const int64_t word = tile * per_tile + child;
-    child_tn[word] = child < width ? child_jw[row * width + child] : kTerminal;
-    brick_tn[word] = child < width ? brick_jw[row * width + child] : kEmpty;
-    request_tn[word] = 0;
+    const int64_t child_node = tile * per_tile + child;
+    child_tn[child_node] = child < width ? child_jw[row * width + child] : kTerminal;
+    brick_tn[child_node] = child < width ? brick_jw[row * width + child] : kEmpty;
+    request_tn[child_node] = 0;
     if (child > 0) return;
-    for (int32_t part = 0; part < 4; ++part) {
-      loc_t4[4 * tile + part] = static_cast<int32_t>(loc_j4[4 * row + part]) + (part == 3 ? 1 : 0);
+    for (int32_t component = 0; component < 4; ++component) {
+      loc_t4[4 * tile + component] = static_cast<int32_t>(loc_j4[4 * row + component]) + (component == 3 ? 1 : 0);
     }
     parent_t[tile] = static_cast<int32_t>(node);
     tree_t[tile] = tree;
@@ -431,17 +432,17 @@ struct LocateNodes {
 
   GV_HD void operator()(int64_t index) const {
     const int64_t node = node_k[index];
-    for (int32_t part = 0; part < 4; ++part) loc_k4[4 * index + part] = at(node, part);
+    for (int32_t component = 0; component < 4; ++component) loc_k4[4 * index + component] = coordinate(node, component);
   }
   // A part of a node's loc: x, y, z or depth.
-  GV_HD int64_t at(int64_t node, int32_t part) const {
+  GV_HD int64_t coordinate(int64_t node, int32_t component) const {
     if (node < 0 || node >= nodes) return -1;
     const int64_t tile = node / per_tile;
-    const int64_t above = loc_t4[4 * tile + part];
-    if (part == 3) return above;
+    const int64_t parent = loc_t4[4 * tile + component];
+    if (component == 3) return parent;
     auto digit = static_cast<int32_t>(node - tile * per_tile);
-    for (int32_t axis = 0; axis < part; ++axis) digit /= branching;
-    return above * branching + digit % branching;
+    for (int32_t axis = 0; axis < component; ++axis) digit /= branching;
+    return parent * branching + digit % branching;
   }
 };
 
@@ -461,17 +462,18 @@ struct LocateNodes {
 // pointer.
 struct FindLacking {
   GV_LACKING(GV_VIEW)
-  LocateNodes places;  // its loc_k4 is not written
+  LocateNodes locator;  // its loc_k4 is not written
   bool* lacks_k;
 
   GV_HD void operator()(int64_t index) const {
     const int64_t node = node_k[index];
-    bool lacks = node >= 0 && node < places.nodes;
+    bool lacks = node >= 0 && node < locator.nodes;
     if (lacks) {
-      const int64_t tile = node / places.per_tile;
+      const int64_t tile = node / locator.per_tile;
       lacks = (parent_t[tile] >= 0 || shared_t[tile] || node == root) && tree_t[tile] == tree &&
               pointer_tn[node] == kAbsent;
-      for (int32_t part = 0; part < 4; ++part) lacks = lacks && places.at(node, part) == loc_k4[4 * index + part];
+      for (int32_t component = 0; component < 4; ++component)
+        lacks = lacks && locator.coordinate(node, component) == loc_k4[4 * index + component];
     }
     lacks_k[index] = lacks;
   }
@@ -496,36 +498,37 @@ struct CutBricks {
 
   GV_HD int32_t side() const { return brick_size + 2 * border; }
   GV_HD int64_t low(int64_t plane, int32_t axis) const {
-    const int64_t place = place_k3[3 * (plane / side()) + axis], far = int64_t{1} << 50;  // beyond any level
-    return larger(-far, smaller(place, far)) * brick_size - border;
+    const int64_t index = place_k3[3 * (plane / side()) + axis], bound = int64_t{1} << 50;  // beyond any level
+    return larger(-bound, smaller(index, bound)) * brick_size - border;
   }
-  GV_HD int64_t inside(int64_t at, int32_t axis) const {
-    return larger<int64_t>(0, smaller<int64_t>(at, size_3[axis] - 1));
+  GV_HD int64_t clamp_to_level(int64_t voxel, int32_t axis) const {
+    return larger<int64_t>(0, smaller<int64_t>(voxel, size_3[axis] - 1));
   }
   // Address of the voxel x = 0 of a row.
   GV_HD const char* row(int64_t plane, int32_t y) const {
-    const int64_t z = inside(low(plane, 0) + plane % side(), 0);
-    return static_cast<const char*>(values_zyxc) + (z * size_3[1] + inside(low(plane, 1) + y, 1)) * size_3[2] * bytes;
+    const int64_t z = clamp_to_level(low(plane, 0) + plane % side(), 0);
+    return static_cast<const char*>(values_zyxc) +
+           (z * size_3[1] + clamp_to_level(low(plane, 1) + y, 1)) * size_3[2] * bytes;
   }
 
   GV_HD void operator()(int64_t plane) const {
 #ifndef __CUDA_ARCH__
     constexpr int64_t kAhead = 4;
     if (plane + kAhead < planes) {
-      const int64_t x = inside(low(plane + kAhead, 2), 2);
+      const int64_t x = clamp_to_level(low(plane + kAhead, 2), 2);
       for (int32_t y = 0; y < side(); ++y) __builtin_prefetch(row(plane + kAhead, y) + x * bytes);
     }
 #endif
     const int64_t first = low(plane, 2);
-    const bool whole = first >= 0 && first + side() <= size_3[2];
+    const bool in_level = first >= 0 && first + side() <= size_3[2];
     char* to = bricks_kzyxc + plane * side() * side() * bytes;
     for (int32_t y = 0; y < side(); ++y, to += side() * bytes) {
       const char* from = row(plane, y);
-      if (whole) {
+      if (in_level) {
         memcpy(to, from + first * bytes, side() * bytes);
         continue;
       }
-      for (int32_t x = 0; x < side(); ++x) memcpy(to + x * bytes, from + inside(first + x, 2) * bytes, bytes);
+      for (int32_t x = 0; x < side(); ++x) memcpy(to + x * bytes, from + clamp_to_level(first + x, 2) * bytes, bytes);
     }
   }
 };

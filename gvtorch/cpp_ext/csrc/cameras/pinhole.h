@@ -27,16 +27,16 @@ struct PinholeRays {
 
   GV_HD void operator()(int64_t index) const {
     const int64_t ray = index / kThreads;
-    const int32_t narrow = static_cast<int32_t>(ray);  // 31 bits: a GPU divides wider numbers slowly
-    const int32_t down = narrow / width, row = first + down;
+    const int32_t ray_int32 = static_cast<int32_t>(ray);  // 31 bits: a GPU divides wider numbers slowly
+    const int32_t row_offset = ray_int32 / width, row = first + row_offset;
     const double* const camera = camera_nc + row / height * columns;
-    const double x = (static_cast<double>(narrow - down * width) - camera[14]) / camera[12];
+    const double x = (static_cast<double>(ray_int32 - row_offset * width) - camera[14]) / camera[12];
     const double y = (static_cast<double>(row % height) - camera[15]) / camera[13];
     const double length = square_root(x * x + (y * y + 1));
     for (int64_t axis = index % kThreads; axis < 3; axis += kThreads) {
-      const double ahead = y * camera[3 + axis] + camera[6 + axis];
+      const double forward = y * camera[3 + axis] + camera[6 + axis];
       origin_r3[3 * ray + axis] = camera[9 + axis];
-      direction_r3[3 * ray + axis] = (x * camera[axis] + ahead) / length;
+      direction_r3[3 * ray + axis] = (x * camera[axis] + forward) / length;
       if (axis == 2) break;
       cone_r2[2 * ray + axis] = camera[16 + axis];
       range_r2[2 * ray + axis] = camera[18 + axis];

@@ -33,28 +33,28 @@ using torch::stable::Tensor;
 // --- From a kind to the type that torch passes, and to its word in a schema.
 
 template <class Kind>
-struct Handed;
+struct TorchType;
 template <class T>
-struct Handed<kinds::NumberOf<T>> {
+struct TorchType<kinds::NumberOf<T>> {
   static constexpr bool kFloat = std::is_same_v<T, double>, kBool = std::is_same_v<T, bool>;
   using Type = std::conditional_t<kFloat || kBool, T, int64_t>;
-  static std::string word() { return kFloat ? "float " : kBool ? "bool " : sizeof(T) == 8 ? "SymInt " : "int "; }
+  static std::string schema_type() { return kFloat ? "float " : kBool ? "bool " : sizeof(T) == 8 ? "SymInt " : "int "; }
 };
 template <class T, char kAlias, bool kOptional>
-struct Handed<kinds::TensorOf<T, kAlias, kOptional>> {
+struct TorchType<kinds::TensorOf<T, kAlias, kOptional>> {
   using Type = std::conditional_t<kOptional, std::optional<Tensor>, Tensor>;
-  static std::string word() {
+  static std::string schema_type() {
     if (kAlias != 0) return std::string("Tensor(") + kAlias + "!) ";
     return kOptional ? "Tensor? " : "Tensor ";
   }
 };
 
-inline std::string schema_of(const char* name, std::initializer_list<std::string> words, const char* returns) {
+inline std::string schema_of(const char* name, std::initializer_list<std::string> arguments, const char* returns) {
   std::string text = name;
-  const char* before = "(";
-  for (const std::string& word : words) {
-    text += before + word;
-    before = ", ";
+  const char* separator = "(";
+  for (const std::string& argument : arguments) {
+    text += separator + argument;
+    separator = ", ";
   }
   return text + ") -> " + returns;
 }
@@ -62,27 +62,27 @@ inline std::string schema_of(const char* name, std::initializer_list<std::string
 struct Begin {};  // the first of a list's types, because GV_TYPE puts a comma before each of the others
 template <class...>
 struct Types {};
-template <class... One, class... Other>
-Types<One..., Other...> operator+(Types<One...>, Types<Other...>);  // both lists as one
+template <class... First, class... Second>
+Types<First..., Second...> operator+(Types<First...>, Types<Second...>);  // both lists as one
 
-#define GV_FIELD(kind, name, limit) Handed<kinds::kind>::Type name;
-#define GV_TYPE(kind, name, limit) , Handed<kinds::kind>::Type
-#define GV_WORD(kind, name, limit) Handed<kinds::kind>::word() + #name,
+#define GV_FIELD(kind, name, limit) TorchType<kinds::kind>::Type name;
+#define GV_TYPE(kind, name, limit) , TorchType<kinds::kind>::Type
+#define GV_SCHEMA(kind, name, limit) TorchType<kinds::kind>::schema_type() + #name,
 
 // Declares the struct of an op.
-#define GV_OP(Op, op_name, LIST, returns)                                                                     \
-  struct Op {                                                                                                 \
-    LIST(GV_FIELD)                                                                                            \
-    using List = Types<Begin LIST(GV_TYPE)>;                                                                  \
-    static constexpr const char* kName = op_name;                                                             \
-    static std::string schema(const char* name = kName) { return schema_of(name, {LIST(GV_WORD)}, returns); } \
+#define GV_OP(Op, op_name, LIST, returns)                                                                       \
+  struct Op {                                                                                                   \
+    LIST(GV_FIELD)                                                                                              \
+    using List = Types<Begin LIST(GV_TYPE)>;                                                                    \
+    static constexpr const char* kName = op_name;                                                               \
+    static std::string schema(const char* name = kName) { return schema_of(name, {LIST(GV_SCHEMA)}, returns); } \
   }
 
 // `call` is an op's function as torch calls it, with one parameter for each argument.
 template <class Op, class List = typename Op::List>
-struct Called;
+struct OpFunction;
 template <class Op, class... Type>
-struct Called<Op, Types<Begin, Type...>> {
+struct OpFunction<Op, Types<Begin, Type...>> {
   static auto call(const Type&... values) { return run(Op{values...}); }
 };
 
@@ -93,7 +93,7 @@ void define(Library& library, Types<Op...>) {
 }
 template <class Op, class Library>
 void implement_as(Library& library, const char* name) {
-  static constexpr auto kCall = &Called<Op>::call;
+  static constexpr auto kCall = &OpFunction<Op>::call;
   library.impl(name, TORCH_BOX(kCall));
 }
 template <class Library, class... Op>
@@ -135,8 +135,8 @@ void check(Kind kind, const std::optional<Tensor>& tensor, const char* name, con
 }
 template <class T>
 void check(kinds::NumberOf<T>, int64_t number, const char* name, const Like&, int64_t end) {
-  const int64_t most = end != kAny ? end - 1 : std::numeric_limits<T>::max();
-  STD_TORCH_CHECK(number >= 0 && number <= most, "gvtorch: ", name, " out of range: ", number);
+  const int64_t maximum = end != kAny ? end - 1 : std::numeric_limits<T>::max();
+  STD_TORCH_CHECK(number >= 0 && number <= maximum, "gvtorch: ", name, " out of range: ", number);
 }
 inline void check(kinds::Float, double, const char*, const Like&, int64_t) {}
 inline void check(kinds::Bool, bool, const char*, const Like&, int64_t) {}
@@ -152,37 +152,37 @@ struct Memory {
     if constexpr (!std::is_const_v<T>) return static_cast<T*>(tensor->mutable_data_ptr());
   }
 };
-inline Memory lay(const Tensor& tensor) { return {&tensor}; }
-inline Memory lay(const std::optional<Tensor>& tensor) { return {tensor.has_value() ? &*tensor : nullptr}; }
+inline Memory to_kernel(const Tensor& tensor) { return {&tensor}; }
+inline Memory to_kernel(const std::optional<Tensor>& tensor) { return {tensor.has_value() ? &*tensor : nullptr}; }
 template <class Number>
-Number lay(Number number) {
+Number to_kernel(Number number) {
   return number;
 }
 
 #define GV_CHECK(kind, name, limit) check(kinds::kind{}, a.name, #name, like, limit);
 // Checks an argument of `a`, and stores it in the kernels' `args`.
-#define GV_TAKE(kind, name, limit) GV_CHECK(kind, name, limit) args.name = lay(a.name);
+#define GV_CHECK_AND_SET(kind, name, limit) GV_CHECK(kind, name, limit) args.name = to_kernel(a.name);
 
 // Makes a tensor for the kernels to fill, of the pointer's dtype, or of that of `like` if the pointer is void.
 template <class T>
-Tensor give(T*& pointer, const Tensor& like, std::initializer_list<int64_t> shape) {
+Tensor make_output(T*& pointer, const Tensor& like, std::initializer_list<int64_t> shape) {
   ScalarType dtype = like.scalar_type();
   if constexpr (!std::is_void_v<T>) dtype = CppTypeToScalarType<T>::value;
-  Tensor made = torch::stable::new_empty(like, shape, dtype);
-  pointer = lay(made);
-  return made;
+  Tensor output = torch::stable::new_empty(like, shape, dtype);
+  pointer = to_kernel(output);
+  return output;
 }
 
 inline VoxelType voxel_type(ScalarType dtype) {
-  constexpr ScalarType kInOrder[] = {ScalarType::Byte, ScalarType::Char,     ScalarType::Short, ScalarType::UInt16,
-                                     ScalarType::Half, ScalarType::BFloat16, ScalarType::Float};
-  const auto* found = std::find(std::begin(kInOrder), std::end(kInOrder), dtype);
-  STD_TORCH_CHECK(found != std::end(kInOrder), "gvtorch: this channel dtype has no kernel");
-  return static_cast<VoxelType>(found - kInOrder);
+  constexpr ScalarType kScalarTypes[] = {ScalarType::Byte, ScalarType::Char,     ScalarType::Short, ScalarType::UInt16,
+                                         ScalarType::Half, ScalarType::BFloat16, ScalarType::Float};
+  const auto* match = std::find(std::begin(kScalarTypes), std::end(kScalarTypes), dtype);
+  STD_TORCH_CHECK(match != std::end(kScalarTypes), "gvtorch: this channel dtype has no kernel");
+  return static_cast<VoxelType>(match - kScalarTypes);
 }
 
 // True if an op computes in float64, not in float32.
-inline bool is_wide(const Tensor& tensor) {
+inline bool is_float64(const Tensor& tensor) {
   const ScalarType dtype = tensor.scalar_type();
   STD_TORCH_CHECK(dtype == ScalarType::Float || dtype == ScalarType::Double, "gvtorch: must be float32 or float64");
   return dtype == ScalarType::Double;
@@ -200,14 +200,14 @@ inline int64_t check_bricks(const Tensor& bricks_bzyxc) {
 
 // Checks and stores the arguments that all ops on rays and bricks have in common.
 template <class Op>
-void take_channel(TraceArgs& args, const Op& a, const Like& like, int64_t nodes) {
+void set_channel_args(TraceArgs& args, const Op& a, const Like& like, int64_t nodes) {
   STD_TORCH_CHECK(a.origin_r3.dim() == 2 && a.origin_r3.size(1) == 3 && a.origin_r3.size(0) <= INT32_MAX,
                   "gvtorch: origin_r3 must be (r, 3)");
   const int64_t rays = a.origin_r3.size(0), side = check_bricks(a.bricks_bzyxc), channels = a.bricks_bzyxc.size(4);
-  GV_RAYS(GV_TAKE)
-  GV_CHANNEL(GV_TAKE)
+  GV_RAYS(GV_CHECK_AND_SET)
+  GV_CHANNEL(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(nodes <= INT32_MAX, "gvtorch: too many nodes");
-  STD_TORCH_CHECK(a.branching >= 2 && std::pow(a.branching, a.max_depth) <= kMostNodes,
+  STD_TORCH_CHECK(a.branching >= 2 && std::pow(a.branching, a.max_depth) <= kMaxNodes,
                   "gvtorch: branching or max_depth out of range");
   STD_TORCH_CHECK(a.step > 0 && a.root_voxel > 0, "gvtorch: step and root_voxel must be positive");
   args.rays = rays;
@@ -220,7 +220,7 @@ void take_channel(TraceArgs& args, const Op& a, const Like& like, int64_t nodes)
 
 // Checks and stores the arguments that all ops that walk rays have in common. integrates: the table is (l, m, m, 4).
 template <class Op>
-ShadeArgs take_walk(const Op& a, bool integrates = false) {
+ShadeArgs make_walk_args(const Op& a, bool integrates = false) {
   ShadeArgs args{};
   args.shader = kPlainShader;
   // Programs that version 0.1 exported pass requests of 32 bits. Nobody reads them, so none are written.
@@ -229,13 +229,13 @@ ShadeArgs take_walk(const Op& a, bool integrates = false) {
                   unread ? ScalarType::Int : ScalarType::Short};
   STD_TORCH_CHECK(a.child_tn.dim() == 2, "gvtorch: child_tn must be (t, n)");
   const int64_t tiles = a.child_tn.size(0), nodes = a.child_tn.numel();
-  take_channel(args, a, like, nodes);
+  set_channel_args(args, a, like, nodes);
   STD_TORCH_CHECK(a.table_lm4.dim() == (integrates ? 4 : 3) && a.table_lm4.size(0) >= 1 && a.table_lm4.size(1) >= 2,
                   "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
   const int64_t bricks = args.bricks, channels = args.channels;
   const int64_t levels = a.table_lm4.size(0), rows = a.table_lm4.size(1);
   const int64_t table = 4 * levels * rows * (integrates ? rows : 1);
-  GV_WALK(GV_TAKE)
+  GV_WALK(GV_CHECK_AND_SET)
   if (unread) args.request_tn = nullptr;
   STD_TORCH_CHECK(a.child_tn.size(1) >= a.branching * a.branching * a.branching, "gvtorch: child_tn has too few nodes");
   STD_TORCH_CHECK(a.width == 0 || args.rays % a.width == 0, "gvtorch: rays are no rows of this width");
@@ -251,17 +251,17 @@ ShadeArgs take_walk(const Op& a, bool integrates = false) {
 // --- The ops
 
 // Makes the tensors of what traced rays return.
-inline std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> give_hits(TraceArgs& args, const Tensor& table) {
-  return {give(args.color_r3, table, {args.rays, 3}), give(args.alpha_r1, table, {args.rays, 1}),
-          give(args.depth_r1, table, {args.rays, 1}), give(args.samples_r, table, {args.rays}),
-          give(args.missed_r, table, {args.rays})};
+inline std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> make_hits(TraceArgs& args, const Tensor& table) {
+  return {make_output(args.color_r3, table, {args.rays, 3}), make_output(args.alpha_r1, table, {args.rays, 1}),
+          make_output(args.depth_r1, table, {args.rays, 1}), make_output(args.samples_r, table, {args.rays}),
+          make_output(args.missed_r, table, {args.rays})};
 }
 
 // Checks a second channel of the same pool, with `width` numbers per voxel (0: any); returns this number, 0 where
 // there is no channel. coarse: it may have only the pool's first bricks, and no constants.
-inline int32_t check_second(const std::optional<Tensor>& bricks_bzyxc, const std::optional<Tensor>& constant_tnc,
-                            const char* name, int64_t width, const TraceArgs& args, VoxelType& voxel,
-                            bool coarse = false) {
+inline int32_t check_second_channel(const std::optional<Tensor>& bricks_bzyxc,
+                                    const std::optional<Tensor>& constant_tnc, const char* name, int64_t width,
+                                    const TraceArgs& args, VoxelType& voxel, bool coarse = false) {
   STD_TORCH_CHECK(coarse || bricks_bzyxc.has_value() == constant_tnc.has_value(), "gvtorch: ", name,
                   " needs bricks and constants");
   if (!bricks_bzyxc.has_value()) return 0;
@@ -297,16 +297,16 @@ struct FusedShaders {
       STD_TORCH_CHECK(!by_other || args.other_channels > 0, "gvtorch: other_bzyxc is missing");
       const bool colored = (args.channels == 4 || args.channels == 4 * kDirections) && args.component == 3;
       STD_TORCH_CHECK(!Shader::kColored || colored, "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
-      constexpr int32_t kSeen = Shader::kFiltered;
-      const bool sided = args.other_channels == kSeen || args.other_channels == kSeen * kDirections;
-      STD_TORCH_CHECK(kSeen == 0 || sided, "gvtorch: other_bzyxc must hold filtered colours");
+      constexpr int32_t kNumbers = Shader::kFiltered;
+      const bool sided = args.other_channels == kNumbers || args.other_channels == kNumbers * kDirections;
+      STD_TORCH_CHECK(kNumbers == 0 || sided, "gvtorch: other_bzyxc must hold filtered colours");
       STD_TORCH_CHECK(args.features == (by_other ? args.other_channels : Shader::kFeatures),
                       "gvtorch: features is not what the shader gives");
     });
     STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold ", kParameters, " elements, got ",
                     args.parameters);
   }
-  static void run(const Tensor& like, ShadeArgs args, bool wide);  // in cpu_rays.cpp and in cuda.cu
+  static void run(const Tensor& like, ShadeArgs args, bool in_float64);  // in cpu_rays.cpp and in cuda.cu
 };
 
 #define GV_TRACE_RAYS(X) GV_RAYS(X) GV_CHANNEL(X) GV_WALK(X)
@@ -314,9 +314,9 @@ struct FusedShaders {
 GV_OP(TraceRaysOp, "trace_rays", GV_TRACE_RAYS, "(" GV_HITS ")");
 
 inline auto run(const TraceRaysOp& a) {
-  ShadeArgs args = take_walk(a);
-  auto hits = give_hits(args, a.table_lm4);
-  FusedShaders::run(a.origin_r3, args, is_wide(a.table_lm4));
+  ShadeArgs args = make_walk_args(a);
+  auto hits = make_hits(args, a.table_lm4);
+  FusedShaders::run(a.origin_r3, args, is_float64(a.table_lm4));
   return hits;
 }
 
@@ -326,22 +326,22 @@ GV_OP(ShadeRaysOp, "shade_rays", GV_SHADE_RAYS, "(" GV_HITS ", Tensor normal_r3,
 
 template <class Shaders>
 auto shade_rays(const ShadeRaysOp& a) {
-  ShadeArgs args = take_walk(a, Shaders::integrates(a.shader));
+  ShadeArgs args = make_walk_args(a, Shaders::integrates(a.shader));
   const Like like{a.origin_r3, a.table_lm4.scalar_type()};
-  GV_SHADE(GV_TAKE)
-  check_second(a.normal_bzyxc, a.normal_tnc, "normal_bzyxc", 3, args, args.normal_voxel);
-  args.other_channels =
-      check_second(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel, Shaders::filtered(a.shader));
+  GV_SHADE(GV_CHECK_AND_SET)
+  check_second_channel(a.normal_bzyxc, a.normal_tnc, "normal_bzyxc", 3, args, args.normal_voxel);
+  args.other_channels = check_second_channel(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel,
+                                             Shaders::filtered(a.shader));
   STD_TORCH_CHECK(!a.other_bzyxc.has_value() || a.other_component < args.other_channels,
                   "gvtorch: other_component out of range");
   args.other_bricks = a.other_bzyxc.has_value() ? static_cast<int32_t>(a.other_bzyxc->size(0)) : 0;
   STD_TORCH_CHECK(a.parameter_54.numel() <= INT32_MAX, "gvtorch: parameter_54 is too large");
   args.parameters = static_cast<int32_t>(a.parameter_54.numel());
   Shaders::check(args);
-  auto hits = give_hits(args, a.table_lm4);
-  Tensor normal_r3 = give(args.normal_r3, a.table_lm4, {args.rays, 3});
-  Tensor features_rc = give(args.features_rc, a.table_lm4, {args.rays, a.features});
-  Shaders::run(a.origin_r3, args, is_wide(a.table_lm4));
+  auto hits = make_hits(args, a.table_lm4);
+  Tensor normal_r3 = make_output(args.normal_r3, a.table_lm4, {args.rays, 3});
+  Tensor features_rc = make_output(args.features_rc, a.table_lm4, {args.rays, a.features});
+  Shaders::run(a.origin_r3, args, is_float64(a.table_lm4));
   return std::tuple_cat(hits, std::make_tuple(normal_r3, features_rc));
 }
 

@@ -7,7 +7,7 @@
 
 namespace gvtorch {
 
-struct alignas(16) Wide {  // the most that a thread moves at once
+struct alignas(16) Bytes16 {  // the most that a thread moves at once
   int64_t part_2[2];
 };
 
@@ -20,12 +20,12 @@ GV_OP(CompactRequestsOp, "compact_requests", GV_COMPACT_REQUESTS, "(Tensor node_
 inline auto run(const CompactRequestsOp& a) {
   const Like like{a.request_tn};
   ListRequests args{};
-  GV_COMPACT_REQUESTS(GV_TAKE)
+  GV_COMPACT_REQUESTS(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.capacity >= 1 && a.request_tn.numel() <= INT32_MAX, "gvtorch: no capacity, or too many nodes");
-  Tensor node_k = give(args.node_k, a.request_tn, {a.capacity});
-  Tensor word_k = give(args.word_k, a.request_tn, {a.capacity});
+  Tensor node_k = make_output(args.node_k, a.request_tn, {a.capacity});
+  Tensor word_k = make_output(args.word_k, a.request_tn, {a.capacity});
   Tensor count_5 = torch::stable::new_zeros(a.request_tn, {5}, ScalarType::Long);
-  args.count_5 = lay(count_5);
+  args.count_5 = to_kernel(count_5);
   compact(a.request_tn, a.request_tn.numel(), args);
   return std::make_tuple(node_k, word_k, count_5);
 }
@@ -37,26 +37,26 @@ inline auto run(const ChooseRequestsOp& a) {
   STD_TORCH_CHECK(a.asked_l2k.dim() == 3, "gvtorch: asked_l2k must be (l, 2, k)");
   const int64_t lists = a.asked_l2k.size(0), listed = a.asked_l2k.size(2), tiles = a.loc_t4.numel() / 4;
   ChooseArgs args{};
-  GV_CHOOSE_REQUESTS(GV_TAKE)
+  GV_CHOOSE_REQUESTS(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.batch >= 1 && a.per_tile >= 1 && lists < 512 && lists * listed <= INT32_MAX,
                   "gvtorch: no batch, no nodes, or too many");
   args.lists = lists;
   args.listed = listed;
   args.tiles = tiles;
   const int64_t requests = lists * listed;
-  const Tensor key_lk = give(args.key_lk, a.asked_l2k, {requests});
+  const Tensor key_lk = make_output(args.key_lk, a.asked_l2k, {requests});
   const Tensor counts = torch::stable::new_zeros(a.asked_l2k, {2 * requests + lists});
-  args.before_2lk = lay(counts);
+  args.before_2lk = to_kernel(counts);
   args.end_l = args.before_2lk + 2 * requests;
-  Tensor node_2b = give(args.node_2b, a.asked_l2k, {2, a.batch});
-  Tensor priority_2b = give(args.priority_2b, a.asked_l2k, {2, a.batch});
+  Tensor node_2b = make_output(args.node_2b, a.asked_l2k, {2, a.batch});
+  Tensor priority_2b = make_output(args.priority_2b, a.asked_l2k, {2, a.batch});
   for_each(a.asked_l2k, std::max(requests, 2 * a.batch), RankRequests{args});
-  if (requests <= kMostCompared) {
+  if (requests <= kMaxCompared) {
     for_each(a.asked_l2k, requests * kComparers, CompareRequests{args});
     for_each(a.asked_l2k, requests, ServeRequests{args});
   } else {
     sort_keys(a.asked_l2k, args.key_lk, requests);
-    for (int64_t which = 0; which < 2; ++which) compact(a.asked_l2k, requests, ServeSorted{{args}, which});
+    for (int64_t kind = 0; kind < 2; ++kind) compact(a.asked_l2k, requests, ServeSorted{{args}, kind});
   }
   return std::make_tuple(node_2b, priority_2b);
 }
@@ -67,16 +67,16 @@ inline auto run(const LruPartitionOp& a) {
   const Like like{a.order_k};
   const int64_t size = a.order_k.numel(), slots = a.stamp_s.numel();
   UseArgs args{};
-  GV_LRU_PARTITION(GV_TAKE)
+  GV_LRU_PARTITION(GV_CHECK_AND_SET)
   args.slots = slots;
-  Tensor sorted_k = give(args.sorted_k, a.order_k, {size});
-  Tensor unused_1 = give(args.unused_1, a.order_k, {1});
+  Tensor sorted_k = make_output(args.sorted_k, a.order_k, {size});
+  Tensor unused_1 = make_output(args.unused_1, a.order_k, {1});
 #ifdef __CUDACC__
   compact(a.order_k, size, SplitByUse<true>{args});
 #else
   const int64_t bytes = (slots + 7) / 8;
-  const Tensor used_s = give(args.used_s, a.order_k, {bytes});
-  const Tensor used_k = give(args.used_k, a.order_k, {size});
+  const Tensor used_s = make_output(args.used_s, a.order_k, {bytes});
+  const Tensor used_k = make_output(args.used_k, a.order_k, {size});
   for_each(a.order_k, bytes, PackUse{args});
   for_each(a.order_k, size, FlagUse{args});
   compact(a.order_k, size, SplitByUse<false>{args});
@@ -90,19 +90,19 @@ inline void run(const UnlinkOp& a) {
   const Like like{a.pointer_tn};
   const int64_t slots = a.owner_s.numel();
   UnlinkArgs args{};
-  GV_UNLINK(GV_TAKE)
+  GV_UNLINK(GV_CHECK_AND_SET)
   args.nodes = a.pointer_tn.numel();
   args.slots = slots;
   const Tensor leaving_s = torch::stable::new_zeros(a.pointer_tn, {slots}, ScalarType::Byte);
   const Tensor any_shared = torch::stable::new_zeros(a.pointer_tn, {1});
-  args.leaving_s = lay(leaving_s);
-  args.any_shared = lay(any_shared);
+  args.leaving_s = to_kernel(leaving_s);
+  args.any_shared = to_kernel(any_shared);
   for_each(a.pointer_tn, a.slot_k.numel(), TakeFromOwner{args});
 #ifndef __CUDACC__
   if (*args.any_shared == 0) return;
 #endif
-  constexpr int64_t kTogether = ClearShared::kTogether;
-  for_each(a.pointer_tn, (args.nodes + kTogether - 1) / kTogether, ClearShared{args});
+  constexpr int64_t kWordsPerIndex = ClearShared::kWordsPerIndex;
+  for_each(a.pointer_tn, (args.nodes + kWordsPerIndex - 1) / kWordsPerIndex, ClearShared{args});
 }
 
 GV_OP(OrphanOp, "orphan", GV_ORPHAN, "()");
@@ -110,7 +110,7 @@ GV_OP(OrphanOp, "orphan", GV_ORPHAN, "()");
 inline void run(const OrphanOp& a) {
   const Like like{a.pointer_tn};
   ClearOwner args{};
-  GV_ORPHAN(GV_TAKE)
+  GV_ORPHAN(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.pointer_tn.dim() == 2, "gvtorch: pointer_tn must be (t, n)");
   args.tiles = a.pointer_tn.size(0);
   args.per_tile = a.pointer_tn.size(1);
@@ -124,7 +124,7 @@ inline void run(const LinkOp& a) {
   const Like like{a.pointer_tn};
   const int64_t nodes = a.pointer_tn.numel(), count = a.node_k.numel();
   WritePointer args{};
-  GV_LINK(GV_TAKE)
+  GV_LINK(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.kind == kLoad || a.kind == kSubdivide, "gvtorch: kind must be LOAD or SUBDIVIDE");
   args.nodes = nodes;
   for_each(a.pointer_tn, count, args);
@@ -136,7 +136,7 @@ inline void run(const LinkBricksOp& a) {
   const Like like{a.brick_tn};
   const int64_t nodes = a.brick_tn.numel(), slots = a.owner_b.numel(), count = a.node_k.numel();
   LinkBrick args{};
-  GV_LINK_BRICKS(GV_TAKE)
+  GV_LINK_BRICKS(GV_CHECK_AND_SET)
   args.nodes = nodes;
   args.slots = slots;
   for_each(a.brick_tn, count, args);
@@ -150,7 +150,7 @@ inline void run(const LinkTilesOp& a) {
   const int64_t per_tile = tiles > 0 ? a.child_tn.numel() / tiles : 0;
   const int64_t width = rows > 0 ? a.child_jw.numel() / rows : 0;
   LinkTile args{};
-  GV_LINK_TILES(GV_TAKE)
+  GV_LINK_TILES(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(width <= per_tile || rows == 0, "gvtorch: child_jw is wider than a tile");
   args.tiles = tiles;
   args.rows = rows;
@@ -165,7 +165,7 @@ template <class Word>
 void put_words(const PutRowsOp& a, int64_t slots, int64_t count, int64_t bytes) {
   const Like like{a.slot_k};
   PutRows<Word> args{};
-  GV_PUT_ROWS(GV_TAKE)
+  GV_PUT_ROWS(GV_CHECK_AND_SET)
   args.slots = slots;
   args.width = bytes / static_cast<int64_t>(sizeof(Word));
   for_each(a.target_sb, count * args.width, args);
@@ -174,10 +174,10 @@ void put_words(const PutRowsOp& a, int64_t slots, int64_t count, int64_t bytes) 
 inline void run(const PutRowsOp& a) {
   const int64_t slots = a.target_sb.size(0), count = a.slot_k.numel();
   const int64_t bytes = slots > 0 ? a.target_sb.numel() / slots : 0;
-  const auto odd = reinterpret_cast<uintptr_t>(a.target_sb.data_ptr()) |
-                   reinterpret_cast<uintptr_t>(a.rows_kb.data_ptr()) | static_cast<uintptr_t>(bytes);
-  if (odd % sizeof(Wide) == 0) return put_words<Wide>(a, slots, count, bytes);
-  if (odd % sizeof(int32_t) == 0) return put_words<int32_t>(a, slots, count, bytes);
+  const auto alignment_bits = reinterpret_cast<uintptr_t>(a.target_sb.data_ptr()) |
+                              reinterpret_cast<uintptr_t>(a.rows_kb.data_ptr()) | static_cast<uintptr_t>(bytes);
+  if (alignment_bits % sizeof(Bytes16) == 0) return put_words<Bytes16>(a, slots, count, bytes);
+  if (alignment_bits % sizeof(int32_t) == 0) return put_words<int32_t>(a, slots, count, bytes);
   put_words<uint8_t>(a, slots, count, bytes);
 }
 
@@ -187,10 +187,10 @@ inline Tensor run(const LocateOp& a) {
   const Like like{a.node_k};
   const int64_t tiles = a.loc_t4.numel() / 4, count = a.node_k.numel();
   LocateNodes args{};
-  GV_LOCATE(GV_TAKE)
+  GV_LOCATE(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.branching >= 2 && a.per_tile >= 1, "gvtorch: branching or per_tile out of range");
   args.nodes = tiles * a.per_tile;
-  Tensor loc_k4 = give(args.loc_k4, a.node_k, {count, 4});
+  Tensor loc_k4 = make_output(args.loc_k4, a.node_k, {count, 4});
   for_each(a.node_k, count, args);
   return loc_k4;
 }
@@ -202,11 +202,11 @@ inline Tensor run(const LackingOp& a) {
   const int64_t tiles = a.parent_t.numel(), count = a.node_k.numel();
   const int64_t per_tile = tiles > 0 ? a.pointer_tn.numel() / tiles : 1;
   FindLacking args{};
-  GV_LACKING(GV_TAKE)
+  GV_LACKING(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.branching >= 2 && per_tile >= 1 && per_tile <= INT32_MAX,
                   "gvtorch: branching or tile out of range");
-  args.places = {args.loc_t4, args.node_k, args.branching, static_cast<int32_t>(per_tile), nullptr, tiles * per_tile};
-  Tensor lacks_k = give(args.lacks_k, a.node_k, {count});
+  args.locator = {args.loc_t4, args.node_k, args.branching, static_cast<int32_t>(per_tile), nullptr, tiles * per_tile};
+  Tensor lacks_k = make_output(args.lacks_k, a.node_k, {count});
   for_each(a.node_k, count, args);
   return lacks_k;
 }
@@ -218,12 +218,12 @@ inline Tensor run(const CutBricksOp& a) {
   const Like like{values, ScalarType::Float, values.scalar_type()};
   const int64_t bricks = a.place_k3.numel() / 3;
   CutBricks args{};
-  GV_CUT_BRICKS(GV_TAKE)
+  GV_CUT_BRICKS(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(values.dim() == 4 && values.numel() > 0, "gvtorch: values_zyxc must be (z, y, x, c)");
   STD_TORCH_CHECK(a.brick_size >= 1, "gvtorch: brick_size out of range");
   const int64_t side = args.side();
   Tensor bricks_kzyxc = torch::stable::new_empty(values, {bricks, side, side, side, values.size(3)});
-  args.bricks_kzyxc = lay(bricks_kzyxc);
+  args.bricks_kzyxc = to_kernel(bricks_kzyxc);
   for (int axis = 0; axis < 3; ++axis) args.size_3[axis] = values.size(axis);
   args.bytes = values.size(3) * static_cast<int64_t>(values.element_size());
   args.planes = bricks * side;

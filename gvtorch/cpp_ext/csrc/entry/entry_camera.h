@@ -15,14 +15,15 @@ inline auto run(const PinholeRaysOp& a) {
                   "gvtorch: camera_nc must be (n, c) with c >= 20");
   const int64_t cameras = a.camera_nc.size(0), columns = a.camera_nc.size(1);
   PinholeRays args{};
-  GV_PINHOLE_RAYS(GV_TAKE)
+  GV_PINHOLE_RAYS(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.height >= 1 && a.first + a.rows <= cameras * a.height, "gvtorch: there are fewer rows");
   STD_TORCH_CHECK(a.first + a.rows <= INT32_MAX && a.rows * a.width <= INT32_MAX, "gvtorch: these are too many rays");
   args.columns = columns;
   const int64_t rays = a.rows * a.width;
-  Tensor origin_r3 = give(args.origin_r3, a.camera_nc, {rays, 3});
-  Tensor direction_r3 = give(args.direction_r3, a.camera_nc, {rays, 3});
-  Tensor cone_r2 = give(args.cone_r2, a.camera_nc, {rays, 2}), range_r2 = give(args.range_r2, a.camera_nc, {rays, 2});
+  Tensor origin_r3 = make_output(args.origin_r3, a.camera_nc, {rays, 3});
+  Tensor direction_r3 = make_output(args.direction_r3, a.camera_nc, {rays, 3});
+  Tensor cone_r2 = make_output(args.cone_r2, a.camera_nc, {rays, 2}),
+         range_r2 = make_output(args.range_r2, a.camera_nc, {rays, 2});
   for_each(a.camera_nc, PinholeRays::kThreads * rays, args);
   return std::make_tuple(origin_r3, direction_r3, cone_r2, range_r2);
 }

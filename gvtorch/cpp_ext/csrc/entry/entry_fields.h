@@ -21,23 +21,23 @@ inline auto run(const OrbitsOp& a) {
   const Like like{a.point_p3, a.point_p3.scalar_type()};
   const int64_t points = a.point_p3.numel() / 3;
   OrbitArgs args{};
-  GV_ORBITS(GV_TAKE)
+  GV_ORBITS(GV_CHECK_AND_SET)
   args.points = points;
-  args.wide = is_wide(a.point_p3);  // raises for other dtypes
-  Tensor found_3p = give(args.found_3p, a.point_p3, {3, points});
+  args.in_float64 = is_float64(a.point_p3);  // raises for other dtypes
+  Tensor result_3p = make_output(args.result_3p, a.point_p3, {3, points});
   follow_points(a.point_p3, args);
-  return found_3p;
+  return result_3p;
 }
 
 inline auto run(const OrbitBoundsOp& a) {
-  const bool wide = is_wide(a.center_k3);
+  const bool in_float64 = is_float64(a.center_k3);
   const Like like{a.center_k3, a.center_k3.scalar_type()};
   const int64_t balls = a.reach_k.numel();
   OrbitBoundsArgs args{};
-  GV_ORBIT_BOUNDS(GV_TAKE)
+  GV_ORBIT_BOUNDS(GV_CHECK_AND_SET)
   args.balls = balls;
-  Tensor ends_2k = give(args.ends_2k, a.center_k3, {2, balls});
-  wide ? follow_balls<double>(a.center_k3, args) : follow_balls<float>(a.center_k3, args);
+  Tensor ends_2k = make_output(args.ends_2k, a.center_k3, {2, balls});
+  in_float64 ? follow_balls<double>(a.center_k3, args) : follow_balls<float>(a.center_k3, args);
   return ends_2k;
 }
 

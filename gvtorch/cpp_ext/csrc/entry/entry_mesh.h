@@ -24,19 +24,19 @@ inline auto run(const VoxelizeOp& a) {
     boxes += floor;
     args.first[++args.floors] = static_cast<int32_t>(boxes);
   }
-  GV_VOXELIZE(GV_TAKE)
+  GV_VOXELIZE(GV_CHECK_AND_SET)
   args.triangles = triangles;
   args.cubes = cubes;
   const auto make = [&](auto*& pointer, ScalarType dtype, bool wanted = true) {
-    Tensor made = torch::stable::new_empty(a.corner_f33, {wanted ? cubes : 0, side, side, side}, dtype);
-    pointer = lay(made);
-    return made;
+    Tensor output = torch::stable::new_empty(a.corner_f33, {wanted ? cubes : 0, side, side, side}, dtype);
+    pointer = to_kernel(output);
+    return output;
   };
   Tensor distance_kzyx = make(args.distance_kzyx, real), nearest_kzyx = make(args.nearest_kzyx, ScalarType::Int);
   Tensor winding_kzyx = make(args.winding_kzyx, ScalarType::Int),
          coverage_kzyx = make(args.coverage_kzyx, real, a.shares);
   Tensor weight_kzyx3 = torch::stable::new_empty(a.corner_f33, {a.weights ? cubes : 0, side, side, side, 3}, real);
-  args.weight_kzyx3 = lay(weight_kzyx3);
+  args.weight_kzyx3 = to_kernel(weight_kzyx3);
   voxelize(a.corner_f33, args);
   return std::make_tuple(distance_kzyx, nearest_kzyx, winding_kzyx, coverage_kzyx, weight_kzyx3);
 }

@@ -11,7 +11,7 @@ GV_OP(SplatOp, "splat", GV_SPLAT, "Tensor");
 void splat_points(const Tensor& like, const SplatArgs& args);  // in cpu.cpp and in cuda.cu
 
 inline auto run(const SplatOp& a) {
-  STD_TORCH_CHECK(a.edge_k3e.dim() == 3 && a.edge_k3e.size(2) >= 2 && a.edge_k3e.size(2) <= kMostSplatted,
+  STD_TORCH_CHECK(a.edge_k3e.dim() == 3 && a.edge_k3e.size(2) >= 2 && a.edge_k3e.size(2) <= kMaxSplatSide,
                   "gvtorch: edge_k3e must be (k, 3, e), e >= 2");
   STD_TORCH_CHECK(a.value_nc.dim() == 2 && a.value_nc.size(1) >= 1 && a.value_nc.size(1) <= INT32_MAX,
                   "gvtorch: value_nc must be (n, c)");
@@ -20,7 +20,7 @@ inline auto run(const SplatOp& a) {
   const int64_t width = a.value_nc.size(1), narrow = a.value_nc.size(0), wide = a.radius_m.numel();
   const int64_t narrow_runs = a.narrow_s2.numel() / 2, wide_runs = a.wide_t2.numel() / 2;
   SplatArgs args{};
-  GV_SPLAT(GV_TAKE)
+  GV_SPLAT(GV_CHECK_AND_SET)
   args.cubes = cubes;
   args.side = side;
   args.width = width;
@@ -28,7 +28,7 @@ inline auto run(const SplatOp& a) {
   args.narrow_runs = narrow_runs;
   args.wide = wide;
   args.wide_runs = wide_runs;
-  Tensor sum_kzyxc = give(args.sum_kzyxc, a.edge_k3e, {cubes, side, side, side, width});
+  Tensor sum_kzyxc = make_output(args.sum_kzyxc, a.edge_k3e, {cubes, side, side, side, width});
   splat_points(a.edge_k3e, args);
   return sum_kzyxc;
 }

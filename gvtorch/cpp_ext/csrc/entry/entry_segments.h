@@ -10,7 +10,7 @@ namespace gvtorch {
 // Calls body(T{}) with float or double.
 template <class Body>
 void with_real(const Tensor& tensor, const Body& body) {
-  if (is_wide(tensor)) {
+  if (is_float64(tensor)) {
     body(double{});
   } else {
     body(float{});
@@ -24,9 +24,9 @@ void with_real(const Tensor& tensor, const Body& body) {
   X(MaybeReals, state_r3, 3 * rays) \
   X(Int, limit, kAny)               \
   X(Bool, by_node, kAny)
-#define GV_PLACES(X) X(Longs, first_r, rays) X(Count, total, kAny)
+#define GV_SEGMENT_RANGE(X) X(Longs, first_r, rays) X(Count, total, kAny)
 #define GV_COUNT_SEGMENTS(X) GV_TRACE_RAYS(X) GV_PART(X)
-#define GV_WRITE_SEGMENTS(X) GV_COUNT_SEGMENTS(X) GV_PLACES(X)
+#define GV_WRITE_SEGMENTS(X) GV_COUNT_SEGMENTS(X) GV_SEGMENT_RANGE(X)
 GV_OP(CountSegmentsOp, "count_segments", GV_COUNT_SEGMENTS, "(Tensor count_r3, Tensor state_r3, Tensor missed_r)");
 GV_OP(WriteSegmentsOp, "write_segments", GV_WRITE_SEGMENTS,
       "(Tensor ray_s, Tensor node_s2, Tensor brick_s2, Tensor depth_s3, Tensor interval_s3, Tensor distance_s3, "
@@ -35,16 +35,16 @@ GV_OP(WriteSegmentsOp, "write_segments", GV_WRITE_SEGMENTS,
 // Runs the functor that make(WalkRay, T{}) returns for every ray.
 template <class Op, class Make>
 void walk_rays(const Op& a, const Make& make) {
-  const ShadeArgs walked = take_walk(a);
-  const int64_t rays = walked.rays;
+  const ShadeArgs walk_args = make_walk_args(a);
+  const int64_t rays = walk_args.rays;
   const Like like{a.origin_r3, a.table_lm4.scalar_type()};
   with_real(a.table_lm4, [&](auto real) {
     using T = decltype(real);
-    with_digits<T>(walked, [&](auto* digits) {
+    with_digits<T>(walk_args, [&](auto* digits) {
       using Digits = std::decay_t<decltype(*digits)>;
-      WalkRay<T, Digits> args{ShadeRay<T, Plain<T>, Digits>(walked), nullptr, 0, false};
-      GV_PART(GV_TAKE)
-      const Tensor places = hide_nodes(a.origin_r3, walked.nodes, args.kernel);
+      WalkRay<T, Digits> args{ShadeRay<T, Plain<T>, Digits>(walk_args), nullptr, 0, false};
+      GV_PART(GV_CHECK_AND_SET)
+      const Tensor node_cache = allocate_node_cache(a.origin_r3, walk_args.nodes, args.kernel);
       for_each(a.origin_r3, args.kernel.order.count(), make(args, real));
     });
   });
@@ -55,9 +55,9 @@ inline auto run(const CountSegmentsOp& a) {
   walk_rays(a, [&](auto walk, auto real) {
     const int64_t rays = walk.kernel.order.rays;
     CountSegments<decltype(real), decltype(walk)> kernel{walk, nullptr, nullptr, nullptr};
-    count_r3 = give(kernel.count_r3, a.origin_r3, {rays, 3});
-    state_r3 = give(kernel.state_r3, a.origin_r3, {rays, 3});
-    missed_r = give(kernel.missed_r, a.origin_r3, {rays});
+    count_r3 = make_output(kernel.count_r3, a.origin_r3, {rays, 3});
+    state_r3 = make_output(kernel.state_r3, a.origin_r3, {rays, 3});
+    missed_r = make_output(kernel.missed_r, a.origin_r3, {rays});
     return kernel;
   });
   return std::make_tuple(count_r3, state_r3, missed_r);
@@ -69,15 +69,15 @@ inline auto run(const WriteSegmentsOp& a) {
     const Like like{a.origin_r3};
     const int64_t rays = walk.kernel.order.rays;
     WriteSegments<decltype(real), decltype(walk)> args{walk, nullptr, 0, {}};
-    GV_PLACES(GV_TAKE)
-    ray_s = give(args.out.ray_s, a.origin_r3, {a.total});
-    node_s2 = give(args.out.node_s2, a.origin_r3, {a.total, 2});
-    brick_s2 = give(args.out.brick_s2, a.origin_r3, {a.total, 2});
-    depth_s3 = give(args.out.depth_s3, a.origin_r3, {a.total, 3});
-    interval_s3 = give(args.out.interval_s3, a.origin_r3, {a.total, 3});
-    distance_s3 = give(args.out.distance_s3, a.origin_r3, {a.total, 3});
-    t0_s = give(args.out.t0_s, a.origin_r3, {a.total});
-    t1_s = give(args.out.t1_s, a.origin_r3, {a.total});
+    GV_SEGMENT_RANGE(GV_CHECK_AND_SET)
+    ray_s = make_output(args.out.ray_s, a.origin_r3, {a.total});
+    node_s2 = make_output(args.out.node_s2, a.origin_r3, {a.total, 2});
+    brick_s2 = make_output(args.out.brick_s2, a.origin_r3, {a.total, 2});
+    depth_s3 = make_output(args.out.depth_s3, a.origin_r3, {a.total, 3});
+    interval_s3 = make_output(args.out.interval_s3, a.origin_r3, {a.total, 3});
+    distance_s3 = make_output(args.out.distance_s3, a.origin_r3, {a.total, 3});
+    t0_s = make_output(args.out.t0_s, a.origin_r3, {a.total});
+    t1_s = make_output(args.out.t1_s, a.origin_r3, {a.total});
     return args;
   });
   return std::make_tuple(ray_s, node_s2, brick_s2, depth_s3, interval_s3, distance_s3, t0_s, t1_s);
@@ -102,39 +102,54 @@ GV_OP(SampleBricksOp, "sample_bricks", GV_SAMPLE_BRICKS, "Tensor value_kc");
 GV_OP(SampleBricksBackwardOp, "sample_bricks_backward", GV_SAMPLE_BRICKS_BACKWARD,
       "(Tensor grad_bzyxc, Tensor grad_tnc)");
 
-// Runs the functor that make(AimSample, T{}, Voxel{}) returns for every sample.
+// Runs the functor that make(FindSample, T{}, Voxel{}) returns for every sample.
 template <class Op, class Make>
-void aim_samples(const Op& a, const Make& make) {
+void for_each_sample(const Op& a, const Make& make) {
   const Like like{a.origin_r3, a.distance_s3.scalar_type(), a.bricks_bzyxc.scalar_type()};
   STD_TORCH_CHECK(a.constant_tnc.dim() == 3 && a.constant_tnc.size(1) > 0, "gvtorch: constant_tnc must be (t, n, c)");
   TraceArgs args{};
   args.nodes_per_tile = static_cast<int32_t>(a.constant_tnc.size(1));
-  take_channel(args, a, like, a.constant_tnc.size(0) * a.constant_tnc.size(1));
+  set_channel_args(args, a, like, a.constant_tnc.size(0) * a.constant_tnc.size(1));
   const int64_t segments = a.ray_s.numel(), samples = a.segment_k.numel();
   GV_SAMPLES(GV_CHECK)
   with_real(a.distance_s3, [&](auto real) {
     using T = decltype(real);
     const Walk<T> walk(args);
-    const SegmentView<T> read{lay(a.ray_s),       lay(a.node_s2), lay(a.brick_s2), lay(a.depth_s3),
-                              lay(a.interval_s3), nullptr,        nullptr,         lay(a.distance_s3)};
+    const SegmentView<T> read{to_kernel(a.ray_s),
+                              to_kernel(a.node_s2),
+                              to_kernel(a.brick_s2),
+                              to_kernel(a.depth_s3),
+                              to_kernel(a.interval_s3),
+                              nullptr,
+                              nullptr,
+                              to_kernel(a.distance_s3)};
     with_voxel(args.voxel, [&](auto voxel) {
       using Voxel = decltype(voxel);
       const auto* stored = static_cast<const Voxel*>(args.bricks_bzyxc);
       const auto* constants = static_cast<const Voxel*>(args.constant_tnc);
       const BrickView<Voxel> bricks{stored, constants, args.side, args.border, args.channels};
-      const AimSample<T, Voxel> aim{walk.rays, walk.tree,        walk.levels,     bricks,
-                                    read,      lay(a.segment_k), lay(a.number_k), args.rays,
-                                    segments,  args.nodes,       args.bricks,     walk.options.step};
-      for_each(a.origin_r3, samples, make(aim, real, voxel));
+      const FindSample<T, Voxel> find_sample{walk.rays,
+                                             walk.tree,
+                                             walk.levels,
+                                             bricks,
+                                             read,
+                                             to_kernel(a.segment_k),
+                                             to_kernel(a.number_k),
+                                             args.rays,
+                                             segments,
+                                             args.nodes,
+                                             args.bricks,
+                                             walk.options.step};
+      for_each(a.origin_r3, samples, make(find_sample, real, voxel));
     });
   });
 }
 
 inline auto run(const SampleBricksOp& a) {
   Tensor value_kc;
-  aim_samples(a, [&](const auto& aim, auto real, auto voxel) {
-    SampleBricks<decltype(real), decltype(voxel)> kernel{aim, nullptr};
-    value_kc = give(kernel.value_kc, a.origin_r3, {a.segment_k.numel(), aim.bricks.channels});
+  for_each_sample(a, [&](const auto& find_sample, auto real, auto voxel) {
+    SampleBricks<decltype(real), decltype(voxel)> kernel{find_sample, nullptr};
+    value_kc = make_output(kernel.value_kc, a.origin_r3, {a.segment_k.numel(), find_sample.bricks.channels});
     return kernel;
   });
   return value_kc;
@@ -142,13 +157,13 @@ inline auto run(const SampleBricksOp& a) {
 
 inline auto run(const SampleBricksBackwardOp& a) {
   Tensor grad_bzyxc, grad_tnc;
-  aim_samples(a, [&](const auto& aim, auto real, auto voxel) {
-    const int64_t side = aim.bricks.side, channels = aim.bricks.channels, samples = a.segment_k.numel();
+  for_each_sample(a, [&](const auto& find_sample, auto real, auto voxel) {
+    const int64_t side = find_sample.bricks.side, channels = find_sample.bricks.channels, samples = a.segment_k.numel();
     const Like like{a.origin_r3, a.distance_s3.scalar_type()};
-    SpreadGradient<decltype(real), decltype(voxel)> args{aim, nullptr, nullptr, nullptr};
-    GV_GRADIENT(GV_TAKE)
-    grad_bzyxc = give(args.grad_bzyxc, a.grad_kc, {aim.brick_count, side, side, side, channels});
-    grad_tnc = give(args.grad_tnc, a.grad_kc, {a.constant_tnc.size(0), a.constant_tnc.size(1), channels});
+    SpreadGradient<decltype(real), decltype(voxel)> args{find_sample, nullptr, nullptr, nullptr};
+    GV_GRADIENT(GV_CHECK_AND_SET)
+    grad_bzyxc = make_output(args.grad_bzyxc, a.grad_kc, {find_sample.brick_count, side, side, side, channels});
+    grad_tnc = make_output(args.grad_tnc, a.grad_kc, {a.constant_tnc.size(0), a.constant_tnc.size(1), channels});
     torch::stable::zero_(grad_bzyxc);
     torch::stable::zero_(grad_tnc);
     return args;
@@ -178,7 +193,7 @@ template <class Op>
 PackedView pack(const Op& a) {
   STD_TORCH_CHECK(a.feature_kc.dim() == 2 && a.feature_kc.size(1) <= INT32_MAX, "gvtorch: feature_kc must be (k, c)");
   STD_TORCH_CHECK(a.offset_r.numel() >= 1, "gvtorch: offset_r must be (r + 1,)");
-  return {lay(a.offset_r), a.feature_kc.size(0), static_cast<int32_t>(a.feature_kc.size(1))};
+  return {to_kernel(a.offset_r), a.feature_kc.size(0), static_cast<int32_t>(a.feature_kc.size(1))};
 }
 
 inline auto run(const CompositeOp& a) {
@@ -191,9 +206,14 @@ inline auto run(const CompositeOp& a) {
   Tensor before_k = torch::stable::new_zeros(a.alpha_k, {count});
   with_real(a.alpha_k, [&](auto real) {
     using T = decltype(real);
-    const CompositeRay<T> kernel{
-        packed,      lay(a.alpha_k), lay(a.feature_kc), lay(a.clear_r), static_cast<T>(a.stop_clear),
-        lay(sum_rc), lay(left_r),    lay(before_k)};
+    const CompositeRay<T> kernel{packed,
+                                 to_kernel(a.alpha_k),
+                                 to_kernel(a.feature_kc),
+                                 to_kernel(a.clear_r),
+                                 static_cast<T>(a.stop_clear),
+                                 to_kernel(sum_rc),
+                                 to_kernel(left_r),
+                                 to_kernel(before_k)};
     for_each(a.alpha_k, rays, kernel);
   });
   return std::make_tuple(sum_rc, left_r, before_k);
@@ -210,15 +230,15 @@ inline auto run(const CompositeBackwardOp& a) {
   with_real(a.alpha_k, [&](auto real) {
     using T = decltype(real);
     const CompositeGradient<T> kernel{packed,
-                                      lay(a.alpha_k),
-                                      lay(a.feature_kc),
-                                      lay(a.before_k),
-                                      lay(a.grad_sum_rc),
-                                      lay(a.grad_left_r),
+                                      to_kernel(a.alpha_k),
+                                      to_kernel(a.feature_kc),
+                                      to_kernel(a.before_k),
+                                      to_kernel(a.grad_sum_rc),
+                                      to_kernel(a.grad_left_r),
                                       static_cast<T>(a.stop_clear),
-                                      lay(grad_alpha_k),
-                                      lay(grad_feature_kc),
-                                      lay(grad_clear_r)};
+                                      to_kernel(grad_alpha_k),
+                                      to_kernel(grad_feature_kc),
+                                      to_kernel(grad_clear_r)};
     for_each(a.alpha_k, rays, kernel);
   });
   return std::make_tuple(grad_alpha_k, grad_feature_kc, grad_clear_r);

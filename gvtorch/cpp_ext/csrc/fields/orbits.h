@@ -33,8 +33,8 @@ enum class StepKind : int32_t { kPower, kFold, kCount };
 struct OrbitArgs {
   GV_ORBITS(GV_VIEW)
   int64_t points;
-  bool wide;       // float64
-  void* found_3p;  // distance; the orbit's least distance from the origin, and from a coordinate plane
+  bool in_float64;  // else in float32
+  void* result_3p;  // distance; the orbit's least distance from the origin, and from a coordinate plane
 };
 
 struct OrbitBoundsArgs {
@@ -73,12 +73,12 @@ GV_HD void for_bits(int32_t n, const Body& body) {
 // value^n, for n >= 1.
 template <class T>
 GV_HD T product(T value, int32_t n) {
-  T whole = value;
+  T power = value;
   for_bits(n, [&](bool odd) {
-    whole = whole * whole;
-    if (odd) whole = whole * value;
+    power = power * power;
+    if (odd) power = power * value;
   });
-  return whole;
+  return power;
 }
 // The n-th power of a complex number.
 template <class T>
@@ -91,10 +91,11 @@ GV_HD void complex_power(T& real, T& imaginary, int32_t n) {
   });
 }
 
-// By how much a step stretches distances in a ball: `most` between any two points; `low` to `high` between neighbours.
+// By how much a step stretches distances in a ball: `largest` between any two points; `low` to `high` between
+// neighbours.
 template <class T>
 struct Stretch {
-  T most, low, high;
+  T largest, low, high;
 };
 
 template <class T>
@@ -103,27 +104,29 @@ struct PowerStep {
   int32_t n;
 
   GV_HD explicit PowerStep(double amount) : n(static_cast<int32_t>(amount)) {}
-  GV_HD Vec3<T> operator()(const Vec3<T>& z, T& grown) const {
-    const T away = square_root(larger(z.x * z.x + z.y * z.y, number_of<T>(1e-30)));
-    const T radius = square_root(away * away + z.z * z.z);
-    T cosine = z.x / away, sine = z.y / away, height = z.z, width = away;
+  GV_HD Vec3<T> operator()(const Vec3<T>& z, T& factor) const {
+    const T axis_distance = square_root(larger(z.x * z.x + z.y * z.y, number_of<T>(1e-30)));
+    const T radius = square_root(axis_distance * axis_distance + z.z * z.z);
+    T cosine = z.x / axis_distance, sine = z.y / axis_distance, height = z.z, width = axis_distance;
     complex_power(cosine, sine, n);
     complex_power(height, width, n);
-    grown = static_cast<RealOf<T>>(n) * product(radius, n - 1);
+    factor = static_cast<RealOf<T>>(n) * product(radius, n - 1);
     return {width * cosine, width * sine, height};
   }
   GV_HD Stretch<T> stretch(const Vec3<T>& z, T reach) const {
-    const T count = static_cast<T>(n), none = 0, one = 1;
-    const T away = square_root(z.x * z.x + z.y * z.y), radius = square_root(squared(z));
-    const T least = larger(radius - reach, none), most = radius + reach, safe = larger(radius, number_of<T>(1e-30));
-    const T part = smaller(reach / safe, one);
-    const T change = part + static_cast<T>(0.5707963267948966) * (part * part * part);  // pi / 2 - 1
-    T cosine = z.z / safe, sine = away / safe;
+    const T count = static_cast<T>(n), zero = 0, one = 1;
+    const T axis_distance = square_root(z.x * z.x + z.y * z.y), radius = square_root(squared(z));
+    const T inner_radius = larger(radius - reach, zero), outer_radius = radius + reach,
+            safe_radius = larger(radius, number_of<T>(1e-30));
+    const T ratio = smaller(reach / safe_radius, one);
+    const T angle_change = ratio + static_cast<T>(0.5707963267948966) * (ratio * ratio * ratio);  // pi / 2 - 1
+    T cosine = z.z / safe_radius, sine = axis_distance / safe_radius;
     complex_power(cosine, sine, n);
-    const T turned = absolute(sine) + count * change;
-    const T own = larger(larger(away - reach, none) / larger(most, number_of<T>(1e-30)), number_of<T>(1.0 / n));
-    const T around = clamp(smaller(turned, one) / own, one, count);
-    const T low = count * product(least, n - 1), high = count * product(most, n - 1);
+    const T sine_bound = absolute(sine) + count * angle_change;
+    const T least_sine =
+        larger(larger(axis_distance - reach, zero) / larger(outer_radius, number_of<T>(1e-30)), number_of<T>(1.0 / n));
+    const T around = clamp(smaller(sine_bound, one) / least_sine, one, count);
+    const T low = count * product(inner_radius, n - 1), high = count * product(outer_radius, n - 1);
     return {high * around, low, high};
   }
 };
@@ -142,11 +145,11 @@ struct FoldStep {
     }
     return to;
   }
-  GV_HD Vec3<T> operator()(const Vec3<T>& z, T& grown) const {
+  GV_HD Vec3<T> operator()(const Vec3<T>& z, T& factor) const {
     const Vec3<T> to = folded(z);
     const T inverted = static_cast<RealOf<T>>(1) / clamp(squared(to), number_of<T>(0.25), number_of<T>(1));
     const T scaled = inverted * scale;
-    grown = inverted * size;
+    factor = inverted * size;
     return {to.x * scaled, to.y * scaled, to.z * scaled};
   }
   GV_HD Stretch<T> stretch(const Vec3<T>& z, T reach) const {
@@ -157,11 +160,11 @@ struct FoldStep {
   }
 };
 
-// Estimates the distance from an orbit's radius and from how far (`apart`) neighbouring orbits have come apart.
+// Estimates the distance from an orbit's radius and from how far (`separation`) neighbouring orbits have come apart.
 template <class Step, class T>
-GV_HD T estimate(T radius, T apart) {
-  if constexpr (Step::kLogarithmic) return static_cast<RealOf<T>>(0.5) * radius * log_exact(radius) / apart;
-  return radius / apart;
+GV_HD T estimate(T radius, T separation) {
+  if constexpr (Step::kLogarithmic) return static_cast<RealOf<T>>(0.5) * radius * log_exact(radius) / separation;
+  return radius / separation;
 }
 
 // Follows points. An index is a point.
@@ -169,36 +172,36 @@ template <class T, class Step>
 struct FollowPoints {
   OrbitArgs args;
 
-  GV_HD void follow(Vec3<T> z, T* found) const {
+  GV_HD void follow(Vec3<T> z, T* result) const {
     using Real = RealOf<T>;
-    const Real bailout = *static_cast<const Real*>(args.bailout_1), add = args.julia ? 0 : 1;
-    const auto* own = static_cast<const Real*>(args.constant_3);
+    const Real bailout = *static_cast<const Real*>(args.bailout_1), added_separation = args.julia ? 0 : 1;
+    const auto* constants = static_cast<const Real*>(args.constant_3);
     Vec3<T> constant = z;
     for (int axis = 0; axis < 3; ++axis) {
-      if (args.julia) constant[axis] = splat<T>(own[axis]);
+      if (args.julia) constant[axis] = splat<T>(constants[axis]);
     }
     const Step step(args.amount);
-    T radius = square_root(squared(z)), apart = number_of<T>(1), near = radius, plane = from_planes(z);
+    T radius = square_root(squared(z)), separation = number_of<T>(1), least_radius = radius, plane = from_planes(z);
     MaskOf<T> alive = radius <= bailout;
-    for (int32_t turn = 0; turn < args.iterations && any(alive); ++turn) {
-      T grown;
-      const Vec3<T> after = step(z, grown);
-      for (int axis = 0; axis < 3; ++axis) z[axis] = select(alive, after[axis] + constant[axis], z[axis]);
-      apart = select(alive, grown * apart + add, apart);
+    for (int32_t iteration = 0; iteration < args.iterations && any(alive); ++iteration) {
+      T factor;
+      const Vec3<T> stepped = step(z, factor);
+      for (int axis = 0; axis < 3; ++axis) z[axis] = select(alive, stepped[axis] + constant[axis], z[axis]);
+      separation = select(alive, factor * separation + added_separation, separation);
       radius = square_root(squared(z));
-      near = smaller(near, radius);
+      least_radius = smaller(least_radius, radius);
       plane = smaller(plane, from_planes(z));
       alive = radius <= bailout;
     }
-    found[0] = select(alive, number_of<T>(-kDeepInside), estimate<Step>(radius, apart));
-    found[1] = near;
-    found[2] = plane;
+    result[0] = select(alive, number_of<T>(-kDeepInside), estimate<Step>(radius, separation));
+    result[1] = least_radius;
+    result[2] = plane;
   }
   GV_HD void operator()(int64_t index) const {
     const T* point = static_cast<const T*>(args.point_p3) + 3 * index;
-    T found[3];
-    follow({point[0], point[1], point[2]}, found);
-    for (int which = 0; which < 3; ++which) static_cast<T*>(args.found_3p)[which * args.points + index] = found[which];
+    T result[3];
+    follow({point[0], point[1], point[2]}, result);
+    for (int i = 0; i < 3; ++i) static_cast<T*>(args.result_3p)[i * args.points + index] = result[i];
   }
 };
 
@@ -209,35 +212,36 @@ struct FollowBalls {
 
   GV_HD void operator()(int64_t index) const {
     const T* center = static_cast<const T*>(args.center_k3) + 3 * index;
-    const auto* own = static_cast<const T*>(args.constant_3);
+    const auto* constants = static_cast<const T*>(args.constant_3);
     const T bailout = *static_cast<const T*>(args.bailout_1), first = static_cast<const T*>(args.reach_k)[index];
     const T infinity = static_cast<T>(INFINITY), deep = -kDeepInside;
     const Step step(args.amount);
     Vec3<T> z{center[0], center[1], center[2]};
-    const Vec3<T> constant = args.julia ? Vec3<T>{own[0], own[1], own[2]} : z;
-    const T push = args.julia ? T{} : first, add = args.julia ? 0 : 1;
-    T reach = first, low_apart = 1, high_apart = 1, low = infinity, high = -infinity;
-    bool inside = true, lost = false;  // inside: some orbit may be within the bailout radius
-    for (int32_t turn = 0;; ++turn) {
-      const T radius = square_root(squared(z)), least = larger(radius - reach, T{}), most = radius + reach;
-      if (most > bailout) {
-        low = smaller(low, estimate<Step>(larger(least, bailout), high_apart));
-        high = larger(high, estimate<Step>(most, low_apart));
+    const Vec3<T> constant = args.julia ? Vec3<T>{constants[0], constants[1], constants[2]} : z;
+    const T added_reach = args.julia ? T{} : first, added_separation = args.julia ? 0 : 1;
+    T reach = first, low_separation = 1, high_separation = 1, low = infinity, high = -infinity;
+    bool inside = true, diverged = false;  // inside: some orbit may be within the bailout radius
+    for (int32_t iteration = 0;; ++iteration) {
+      const T radius = square_root(squared(z)), inner_radius = larger(radius - reach, T{}),
+              outer_radius = radius + reach;
+      if (outer_radius > bailout) {
+        low = smaller(low, estimate<Step>(larger(inner_radius, bailout), high_separation));
+        high = larger(high, estimate<Step>(outer_radius, low_separation));
       }
-      lost = !(reach < static_cast<T>(kLostBeyond));
-      inside = least <= bailout && !lost;
-      if (!inside || turn == args.iterations) break;
+      diverged = !(reach < static_cast<T>(kLostBeyond));
+      inside = inner_radius <= bailout && !diverged;
+      if (!inside || iteration == args.iterations) break;
       const Stretch<T> stretch = step.stretch(z, reach);
-      T grown;
-      const Vec3<T> after = step(z, grown);
-      for (int axis = 0; axis < 3; ++axis) z[axis] = after[axis] + constant[axis];
-      reach = stretch.most * reach + push;
-      low_apart = stretch.low * low_apart + add;
-      high_apart = stretch.high * high_apart + add;
+      T factor;
+      const Vec3<T> stepped = step(z, factor);
+      for (int axis = 0; axis < 3; ++axis) z[axis] = stepped[axis] + constant[axis];
+      reach = stretch.largest * reach + added_reach;
+      low_separation = stretch.low * low_separation + added_separation;
+      high_separation = stretch.high * high_separation + added_separation;
     }
     auto* ends = static_cast<T*>(args.ends_2k);
-    ends[index] = lost ? deep : inside ? smaller(low, deep) : low;
-    ends[args.balls + index] = lost ? infinity : inside ? larger(high, deep) : high;
+    ends[index] = diverged ? deep : inside ? smaller(low, deep) : low;
+    ends[args.balls + index] = diverged ? infinity : inside ? larger(high, deep) : high;
   }
 };
 
@@ -253,21 +257,21 @@ void with_step(int32_t kind, const Body& body) {
 template <class T>
 void orbits_in_lanes(const OrbitArgs& args, int64_t begin, int64_t end) {
   using Real = RealOf<T>;
-  constexpr int64_t kMost = sizeof(T) / sizeof(Real);
+  constexpr int64_t kPerVector = sizeof(T) / sizeof(Real);
   with_step<T>(args.kind, [&](auto* step) {
     const FollowPoints<T, std::decay_t<decltype(*step)>> points{args};
-    for (int64_t index = begin; index < end; index += kMost) {
-      const int64_t some = end - index < kMost ? end - index : kMost;
+    for (int64_t index = begin; index < end; index += kPerVector) {
+      const int64_t count = end - index < kPerVector ? end - index : kPerVector;
       const Real* point = static_cast<const Real*>(args.point_p3) + 3 * index;
-      Vec3<T> place{};
-      for (int64_t lane = 0; lane < some; ++lane) {
-        for (int axis = 0; axis < 3; ++axis) place[axis][lane] = point[3 * lane + axis];
+      Vec3<T> position{};
+      for (int64_t lane = 0; lane < count; ++lane) {
+        for (int axis = 0; axis < 3; ++axis) position[axis][lane] = point[3 * lane + axis];
       }
-      T found[3];
-      points.follow(place, found);
-      for (int which = 0; which < 3; ++which) {
-        memcpy(static_cast<Real*>(args.found_3p) + which * args.points + index, &found[which],
-               static_cast<size_t>(some) * sizeof(Real));
+      T result[3];
+      points.follow(position, result);
+      for (int i = 0; i < 3; ++i) {
+        memcpy(static_cast<Real*>(args.result_3p) + i * args.points + index, &result[i],
+               static_cast<size_t>(count) * sizeof(Real));
       }
     }
   });

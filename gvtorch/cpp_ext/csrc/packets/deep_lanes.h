@@ -19,40 +19,40 @@ struct DeepLanes {
       : rays(rays), tree(tree), levels(levels) {}
   // Begins a ray in a lane; `cell` is still that of the previous ray.
   GV_HD void begin(int lane, const Ray<float>& ray) {
-    for (int axis = 0; axis < 3; ++axis) origin[lane][axis] = ray.place(axis);
+    for (int axis = 0; axis < 3; ++axis) origin[lane][axis] = ray.exact_origin(axis);
   }
 
-  // See PacketWalk::go.
-  GV_CALL Ints go(Mask which, const Vec3<Floats>& direction, Floats t, Ints known) {
+  // See PacketWalk::move_to.
+  GV_CALL Ints move_to(Mask mask, const Vec3<Floats>& direction, Floats t, Ints deepest) {
     Vec3<double> high;
-    for (int axis = 0; axis < 3; ++axis) high[axis] = Digits<float>::inner_of(rays, axis);
-    for_lanes(which, [&](int lane) {
-      const Digits<float> before = digits(lane);
+    for (int axis = 0; axis < 3; ++axis) high[axis] = Digits<float>::upper_bound_of(rays, axis);
+    for_lanes(mask, [&](int lane) {
+      const Digits<float> old_digits = digits(lane);
       for (int axis = 0; axis < 3; ++axis) {
-        const double place =
+        const double position =
             origin[lane][axis] + static_cast<double>(t[lane]) * static_cast<double>(direction[axis][lane]);
-        cell[lane][axis] = Digits<float>::cell_at(levels, tree.max_depth, place, high[axis]);
+        cell[lane][axis] = Digits<float>::cell_at(levels, tree.max_depth, position, high[axis]);
       }
-      const Digits<float> now = digits(lane);
-      int32_t level = known[lane];
-      while (level > 0 && !now.shares(before, level)) --level;
-      known[lane] = level;
+      const Digits<float> new_digits = digits(lane);
+      int32_t level = deepest[lane];
+      while (level > 0 && !new_digits.in_same_node(old_digits, level)) --level;
+      deepest[lane] = level;
     });
-    return known;
+    return deepest;
   }
-  GV_CALL Ints child(Mask which, int32_t level) const {
-    Ints found{};
-    for_lanes(which, [&](int lane) {
-      Digits<float> own = digits(lane);
-      own.start_below(level - 1);
-      found[lane] = own.child(level);
+  GV_CALL Ints child(Mask mask, int32_t level) const {
+    Ints children{};
+    for_lanes(mask, [&](int lane) {
+      Digits<float> lane_digits = digits(lane);
+      lane_digits.start_below(level - 1);
+      children[lane] = lane_digits.child(level);
     });
-    return found;
+    return children;
   }
-  GV_CALL Floats face(Mask which, int axis, Ints level, Mask upper) const {
-    Floats found{};
-    for_lanes(which, [&](int lane) { found[lane] = digits(lane).face(axis, level[lane], upper[lane] != 0); });
-    return found;
+  GV_CALL Floats face(Mask mask, int axis, Ints level, Mask upper) const {
+    Floats offsets{};
+    for_lanes(mask, [&](int lane) { offsets[lane] = digits(lane).face(axis, level[lane], upper[lane] != 0); });
+    return offsets;
   }
 
  private:

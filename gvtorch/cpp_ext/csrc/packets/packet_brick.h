@@ -15,7 +15,7 @@ struct PacketBrick {
   Ints brick;  // its slot, or its first byte in the pool: what `first_of` of the values returns
 
   // True where the brick is in one of the first `count` slots; only if `brick` holds slots.
-  GV_HD Mask among(int32_t count) const { return stored & (brick < count); }
+  GV_HD Mask in_first_slots(int32_t count) const { return stored & (brick < count); }
 
   GV_HD Vec3<Floats> at(Floats t) const {
     return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z};
@@ -33,64 +33,66 @@ struct PacketPool {
     with_voxel(type, [&](auto voxel) { first = static_cast<const decltype(voxel)*>(bricks) + component; });
   }
   // True if offsets in the pool need 64 bits.
-  bool far(int64_t bricks) const { return stride * bricks > INT32_MAX; }
+  bool needs_long_offsets(int64_t bricks) const { return stride * bricks > INT32_MAX; }
 };
 
-template <bool kFar>
+template <bool kLongOffsets>
 GV_HD Ints load_words(const PacketPool& pool, Ints brick, Ints offset) {
-  if (!kFar) return gather(pool.first, brick + offset);
-  Ints word;
+  if (!kLongOffsets) return gather(pool.first, brick + offset);
+  Ints words;
   for (int lane = 0; lane < kLanes; ++lane) {
-    int32_t one;
-    memcpy(&one, static_cast<const char*>(pool.first) + brick[lane] * pool.stride + offset[lane], 4);
-    word[lane] = one;
+    int32_t word;
+    memcpy(&word, static_cast<const char*>(pool.first) + brick[lane] * pool.stride + offset[lane], 4);
+    words[lane] = word;
   }
-  return word;
+  return words;
 }
 
-// Trilinear interpolation. `brick` is the brick's first byte in the pool or, with kFar, its slot, for 64-bit offsets.
-template <class Voxel, bool kFar>
-GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& at) {
+// Trilinear interpolation. `brick` is the brick's first byte in the pool or, with kLongOffsets, its slot, for 64-bit
+// offsets.
+template <class Voxel, bool kLongOffsets>
+GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& position) {
   constexpr int32_t kBytes = sizeof(Voxel);
   const int32_t step_x = pool.channels * kBytes;
   const int32_t step_y = step_x * pool.side;
   const int32_t step_z = step_y * pool.side;
-  const Eight<Floats> eight(at, pool.side);
+  const EightVoxels<Floats> corners(position, pool.side);
   const Ints corner =
-      truncated(eight.cell[2] * static_cast<float>(step_z) + eight.cell[1] * static_cast<float>(step_y) +
-                eight.cell[0] * static_cast<float>(step_x));
-  return eight.blend([&](int y, int z, Floats& left, Floats& right) {
+      truncated(corners.cell[2] * static_cast<float>(step_z) + corners.cell[1] * static_cast<float>(step_y) +
+                corners.cell[0] * static_cast<float>(step_x));
+  return corners.blend([&](int y, int z, Floats& left, Floats& right) {
     const Ints first = corner + (z * step_z + y * step_y);
-    const Ints word = load_words<kFar>(pool, brick, first);
+    const Ints word = load_words<kLongOffsets>(pool, brick, first);
     left = Unpack<Voxel>::low(word);
     if (kBytes <= 2 && step_x == kBytes) {  // one load serves both
       right = Unpack<Voxel>::low((word >> (8 * kBytes % 32)) & ((1 << (8 * kBytes % 32)) - 1));
     } else {
-      right = Unpack<Voxel>::low(load_words<kFar>(pool, brick, first + step_x));
+      right = Unpack<Voxel>::low(load_words<kLongOffsets>(pool, brick, first + step_x));
     }
   });
 }
 
 // Interpolates four numbers of the voxels, from `shift` bytes on; lane by lane, as the four are consecutive in memory.
 template <class Voxel>
-GV_CALL Row<Floats> read_packet_four(const PacketPool& pool, int64_t shift, Mask which, Ints brick, Floats x, Floats y,
+GV_CALL Row<Floats> read_packet_four(const PacketPool& pool, int64_t shift, Mask mask, Ints brick, Floats x, Floats y,
                                      Floats z) {
   const int64_t step_x = pool.channels * static_cast<int64_t>(sizeof(Voxel));
   const int64_t step_y = step_x * pool.side, step_z = step_y * pool.side;
-  const Eight<Floats> eight(Vec3<Floats>{x, y, z}, pool.side);
-  const Ints cell = truncated(
-      (eight.cell[2] * static_cast<float>(pool.side) + eight.cell[1]) * static_cast<float>(pool.side) + eight.cell[0]);
+  const EightVoxels<Floats> corners(Vec3<Floats>{x, y, z}, pool.side);
+  const Ints cell =
+      truncated((corners.cell[2] * static_cast<float>(pool.side) + corners.cell[1]) * static_cast<float>(pool.side) +
+                corners.cell[0]);
   const char* const first = static_cast<const char*>(pool.first) + shift;
   float numbers[kLanes][4] = {};
-  for_lanes(which, [&](int lane) {
+  for_lanes(mask, [&](int lane) {
     const char* const corner = first + brick[lane] * pool.stride + cell[lane] * step_x;
-    const float weight[3] = {eight.weight[0][lane], eight.weight[1][lane], eight.weight[2][lane]};
-    const Four found = blend_eight<Four>(weight, [&](int y, int z, Four& left, Four& right) {
+    const float weight[3] = {corners.weight[0][lane], corners.weight[1][lane], corners.weight[2][lane]};
+    const Floats4 blended = blend_eight<Floats4>(weight, [&](int y, int z, Floats4& left, Floats4& right) {
       const char* const pair = corner + (z * step_z + y * step_y);
       left = four_numbers<Voxel>(pair);
       right = four_numbers<Voxel>(pair + step_x);
     });
-    memcpy(numbers[lane], &found, sizeof(found));
+    memcpy(numbers[lane], &blended, sizeof(blended));
   });
   Floats row[4];
   load_rows(numbers, lane_numbers() << 4, row);
@@ -99,30 +101,30 @@ GV_CALL Row<Floats> read_packet_four(const PacketPool& pool, int64_t shift, Mask
 
 // Interpolates several numbers of the voxels. A word of 32 bits holds up to four of them, which may include those of
 // the next voxel along x.
-template <class Voxel, bool kFar>
+template <class Voxel, bool kLongOffsets>
 GV_CALL void read_packet_numbers(const PacketPool& pool, Components<float> components, int32_t count, Ints brick,
                                  Floats x, Floats y, Floats z, Floats* out) {
   constexpr int32_t kBytes = sizeof(Voxel);
   const int32_t step_x = pool.channels * kBytes, step_y = step_x * pool.side, step_z = step_y * pool.side;
-  const Eight<Floats> eight(Vec3<Floats>{x, y, z}, pool.side);
+  const EightVoxels<Floats> corners(Vec3<Floats>{x, y, z}, pool.side);
   const Ints corner =
-      truncated(eight.cell[2] * static_cast<float>(step_z) + eight.cell[1] * static_cast<float>(step_y) +
-                eight.cell[0] * static_cast<float>(step_x));
-  const Ints slot = kFar ? brick : brick * static_cast<int32_t>(pool.stride);
+      truncated(corners.cell[2] * static_cast<float>(step_z) + corners.cell[1] * static_cast<float>(step_y) +
+                corners.cell[0] * static_cast<float>(step_x));
+  const Ints slot = kLongOffsets ? brick : brick * static_cast<int32_t>(pool.stride);
   Ints words[8]{};
   int32_t loaded = -1;  // offset of the loaded words in the voxel, bytes
   for (int32_t i = 0; i < count; ++i) {
-    const int32_t byte = components[i] * kBytes, word = byte / 4 * 4, shift = 8 * (byte - word);
-    if (word != loaded) {
-      for (int which = 0; which < 8; which += 2) {
-        const Ints first = corner + ((which >> 1 & 1) * step_y + (which >> 2) * step_z + word);
-        words[which] = load_words<kFar>(pool, slot, first);
-        words[which + 1] =
-            2 * step_x <= 4 ? words[which] >> (8 * step_x) : load_words<kFar>(pool, slot, first + step_x);
+    const int32_t byte = components[i] * kBytes, word_offset = byte / 4 * 4, shift = 8 * (byte - word_offset);
+    if (word_offset != loaded) {
+      for (int voxel = 0; voxel < 8; voxel += 2) {
+        const Ints first = corner + ((voxel >> 1 & 1) * step_y + (voxel >> 2) * step_z + word_offset);
+        words[voxel] = load_words<kLongOffsets>(pool, slot, first);
+        words[voxel + 1] =
+            2 * step_x <= 4 ? words[voxel] >> (8 * step_x) : load_words<kLongOffsets>(pool, slot, first + step_x);
       }
-      loaded = word;
+      loaded = word_offset;
     }
-    out[i] = eight.blend([&](int y, int z, Floats& left, Floats& right) {
+    out[i] = corners.blend([&](int y, int z, Floats& left, Floats& right) {
       left = Unpack<Voxel>::low(words[2 * y + 4 * z] >> shift);
       right = Unpack<Voxel>::low(words[1 + 2 * y + 4 * z] >> shift);
     });
@@ -130,26 +132,27 @@ GV_CALL void read_packet_numbers(const PacketPool& pool, Components<float> compo
 }
 
 // Interpolates the component at `shift` bytes in a voxel; `brick` is a slot.
-template <class Voxel, bool kFar>
-GV_HD Floats read_shifted(PacketPool pool, int64_t shift, Ints brick, const Vec3<Floats>& at) {
+template <class Voxel, bool kLongOffsets>
+GV_HD Floats read_shifted(PacketPool pool, int64_t shift, Ints brick, const Vec3<Floats>& position) {
   pool.first = static_cast<const char*>(pool.first) + shift;
-  return trilinear<Voxel, kFar>(pool, kFar ? brick : brick * static_cast<int32_t>(pool.stride), at);
+  return trilinear<Voxel, kLongOffsets>(pool, kLongOffsets ? brick : brick * static_cast<int32_t>(pool.stride),
+                                        position);
 }
-template <class Voxel, bool kFar>
+template <class Voxel, bool kLongOffsets>
 GV_CALL Floats read_packet(const PacketPool& pool, int64_t shift, Ints brick, Floats x, Floats y, Floats z) {
-  return read_shifted<Voxel, kFar>(pool, shift, brick, {x, y, z});
+  return read_shifted<Voxel, kLongOffsets>(pool, shift, brick, {x, y, z});
 }
 
 // Differences of the component along each axis over one voxel, half a voxel to each side.
-template <class Voxel, bool kFar>
+template <class Voxel, bool kLongOffsets>
 GV_CALL Vec3<Floats> read_rise(const PacketPool& pool, int64_t shift, Ints brick, Floats x, Floats y, Floats z) {
   Vec3<Floats> rise;
   for (int axis = 0; axis < 3; ++axis) {
     Vec3<Floats> below{x, y, z}, above{x, y, z};
     below[axis] = below[axis] - 0.5f;
     above[axis] = above[axis] + 0.5f;
-    rise[axis] =
-        read_shifted<Voxel, kFar>(pool, shift, brick, above) - read_shifted<Voxel, kFar>(pool, shift, brick, below);
+    rise[axis] = read_shifted<Voxel, kLongOffsets>(pool, shift, brick, above) -
+                 read_shifted<Voxel, kLongOffsets>(pool, shift, brick, below);
   }
   return rise;
 }
@@ -168,39 +171,43 @@ struct PacketChannel : ChannelView {
     with_voxel(type, [&](auto voxel) {
       using Voxel = decltype(voxel);
       bytes = sizeof(Voxel);
-      reader = pool.far(bricks) ? &read_packet<Voxel, true> : &read_packet<Voxel, false>;
-      rise_reader = pool.far(bricks) ? &read_rise<Voxel, true> : &read_rise<Voxel, false>;
+      reader = pool.needs_long_offsets(bricks) ? &read_packet<Voxel, true> : &read_packet<Voxel, false>;
+      rise_reader = pool.needs_long_offsets(bricks) ? &read_rise<Voxel, true> : &read_rise<Voxel, false>;
       four_reader = &read_packet_four<Voxel>;
-      numbers_reader = pool.far(bricks) ? &read_packet_numbers<Voxel, true> : &read_packet_numbers<Voxel, false>;
+      numbers_reader =
+          pool.needs_long_offsets(bricks) ? &read_packet_numbers<Voxel, true> : &read_packet_numbers<Voxel, false>;
     });
   }
-  GV_HD Floats read(int32_t component, Ints brick, const Vec3<Floats>& at) const {
-    return reader(pool, component * bytes, brick, at.x, at.y, at.z);
+  GV_HD Floats read(int32_t component, Ints brick, const Vec3<Floats>& position) const {
+    return reader(pool, component * bytes, brick, position.x, position.y, position.z);
   }
-  GV_HD Row<Floats> four(Mask which, int32_t component, Ints brick, const Vec3<Floats>& at) const {
-    return four_reader(pool, component * bytes, which, brick, at.x, at.y, at.z);
+  GV_HD Row<Floats> four(Mask mask, int32_t component, Ints brick, const Vec3<Floats>& position) const {
+    return four_reader(pool, component * bytes, mask, brick, position.x, position.y, position.z);
   }
-  GV_HD void numbers(Components<float> components, int32_t count, Ints brick, const Vec3<Floats>& at,
+  GV_HD void numbers(Components<float> components, int32_t count, Ints brick, const Vec3<Floats>& position,
                      Floats* out) const {
-    numbers_reader(pool, components, count, brick, at.x, at.y, at.z, out);
+    numbers_reader(pool, components, count, brick, position.x, position.y, position.z, out);
   }
-  GV_HD Vec3<Floats> rise(int32_t component, Ints brick, const Vec3<Floats>& at) const {
-    return rise_reader(pool, component * bytes, brick, at.x, at.y, at.z);
+  GV_HD Vec3<Floats> rise(int32_t component, Ints brick, const Vec3<Floats>& position) const {
+    return rise_reader(pool, component * bytes, brick, position.x, position.y, position.z);
   }
 };
 
 // The shader's values: of a dtype known to the compiler, or only at run time.
-template <class Known, bool kFar>
+template <class KnownVoxel, bool kLongOffsets>
 struct TypedValues {
-  using Voxel = Known;
+  using Voxel = KnownVoxel;
   const PacketPool pool;
 
   TypedValues(const ChannelView& channel, int32_t side, int32_t component, int64_t)
       : pool(channel.bricks_bzyxc, channel.type, side, channel.width, component) {}
   GV_HD Ints first_of(Ints brick) const {  // lanes without a brick may hold anything, so the product must wrap
-    return kFar ? brick : reinterpret_cast<Ints>(reinterpret_cast<Words>(brick) * static_cast<uint32_t>(pool.stride));
+    return kLongOffsets ? brick
+                        : reinterpret_cast<Ints>(reinterpret_cast<UInts>(brick) * static_cast<uint32_t>(pool.stride));
   }
-  GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return trilinear<Voxel, kFar>(pool, brick, at); }
+  GV_HD Floats read(Ints brick, const Vec3<Floats>& position) const {
+    return trilinear<Voxel, kLongOffsets>(pool, brick, position);
+  }
 };
 struct AnyValues {
   using Voxel = void;
@@ -210,8 +217,10 @@ struct AnyValues {
   AnyValues(const ChannelView& channel, int32_t side, int32_t component, int64_t bricks)
       : channel(channel, side, bricks), component(component) {}
   GV_HD Ints first_of(Ints brick) const { return brick; }
-  GV_HD Floats read(Ints brick, const Vec3<Floats>& at) const { return channel.read(component, brick, at); }
-  GV_HD Vec3<Floats> rise(Ints brick, const Vec3<Floats>& at) const { return channel.rise(component, brick, at); }
+  GV_HD Floats read(Ints brick, const Vec3<Floats>& position) const { return channel.read(component, brick, position); }
+  GV_HD Vec3<Floats> rise(Ints brick, const Vec3<Floats>& position) const {
+    return channel.rise(component, brick, position);
+  }
 };
 
 }  // namespace GV_NAMESPACE

@@ -29,22 +29,22 @@ struct Processor {
 // The widest instruction set of this processor; GVTORCH_CPU=baseline, avx2 or avx512 limits it.
 inline Processor find_processor() {
 #ifdef GV_X86
-  const char* named = std::getenv("GVTORCH_CPU");
-  const std::string_view asked = named == nullptr ? "avx512" : named;
+  const char* limit_name = std::getenv("GVTORCH_CPU");
+  const std::string_view requested = limit_name == nullptr ? "avx512" : limit_name;
   __builtin_cpu_init();
-  const bool wide = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
-  if (asked == "avx512" && wide && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+  const bool has_avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
+  if (requested == "avx512" && has_avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
       __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
     return {"avx512", avx512::chunks};
   }
-  if ((asked == "avx512" || asked == "avx2") && wide) return {"avx2", avx2::chunks};
+  if ((requested == "avx512" || requested == "avx2") && has_avx2) return {"avx2", avx2::chunks};
 #endif
   return {"baseline", baseline::chunks};
 }
 
 inline const Processor& processor() {
-  static const Processor found = find_processor();
-  return found;
+  static const Processor chosen = find_processor();
+  return chosen;
 }
 
 }  // namespace gvtorch

@@ -9,18 +9,19 @@ namespace gvtorch {
 
 // True if packets can trace the rays. They address nodes by 32-bit byte offsets, compute offsets in a brick in floats,
 // and load 4 bytes at once: beyond a voxel, but not beyond the pool, whose last brick only single rays' functions read.
-inline bool packs(const TraceArgs& args) {
-  constexpr int64_t kMostWords = INT32_MAX / sizeof(int32_t);
-  return args.nodes <= kMostWords && args.bricks >= 2 && brick_bytes(args.voxel, args.side, args.channels) < 1 << 24;
+inline bool packets_can_trace(const TraceArgs& args) {
+  constexpr int64_t kMaxAddressed = INT32_MAX / sizeof(int32_t);
+  return args.nodes <= kMaxAddressed && args.bricks >= 2 && brick_bytes(args.voxel, args.side, args.channels) < 1 << 24;
 }
 
 // True if packets can trace a fused shader's rays.
-inline bool shades(const ShadeArgs& args) {
+inline bool packets_can_shade(const ShadeArgs& args) {
   const auto fits = [&](VoxelType type, int32_t channels) { return brick_bytes(type, args.side, channels) < 1 << 24; };
-  if (!packs(args) || !fits(args.normal_voxel, 3) || !fits(args.other_voxel, args.other_channels)) return false;
+  if (!packets_can_trace(args) || !fits(args.normal_voxel, 3) || !fits(args.other_voxel, args.other_channels))
+    return false;
   return with_shader<float>(args.shader, [&](auto type) {
     using Type = decltype(type);
-    return !Type::kShadows && Type::Shader::packs(args);
+    return !Type::kShadows && Type::Shader::packets_can_trace(args);
   });
 }
 
@@ -31,7 +32,7 @@ void trace_chunks(const torch::stable::Tensor& like, TraceArgs& args, const Body
   torch::stable::Tensor hidden_tn =
       torch::stable::new_zeros(like, {args.nodes + 3}, torch::headeronly::ScalarType::Byte);
   args.hidden_tn = static_cast<uint8_t*>(hidden_tn.mutable_data_ptr());
-  for_shares(RayOrder{args.rays, args.width}.count(), kChunk, body);
+  for_chunks(RayOrder{args.rays, args.width}.count(), kChunk, body);
 }
 
 }  // namespace gvtorch

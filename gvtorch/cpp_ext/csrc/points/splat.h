@@ -8,7 +8,7 @@
 
 namespace gvtorch {
 
-constexpr int64_t kMostSplatted = 1 << 20;  // voxels along a side of a cube
+constexpr int64_t kMaxSplatSide = 1 << 20;  // voxels along a side of a cube
 constexpr double kSmallest = 0x1p-1000;     // smallest radius to divide by: SMALLEST of the twin
 
 // Sizes in limits: cubes, side, width; rows and runs of rows of narrow and of wide points. The list of cube k is the
@@ -46,8 +46,8 @@ struct Span {
 template <class Body>
 GV_HD void for_rows(const Span& runs, const int64_t* run_s2, int64_t rows, const Body& body) {
   for (int64_t run = runs.begin; run < runs.end; ++run) {
-    const Span own(run_s2 + 2 * run, rows);
-    for (int64_t row = own.begin; row < own.end; ++row) body(row);
+    const Span span(run_s2 + 2 * run, rows);
+    for (int64_t row = span.begin; row < span.end; ++row) body(row);
   }
 }
 
@@ -72,17 +72,17 @@ struct Spread {
   // Signed distance of an edge from the point, scaled so that the spline's knots are the whole numbers -2 to 2.
   template <class T>
   GV_HD T away(T edge) const {
-    const T most = T{} + 2.0, least = T{} - 2.0, from = edge - center;
-    if (!wide) return select(from > T{}, most, least);
-    return clamp(from * scale, least, most);
+    const T high = T{} + 2.0, low = T{} - 2.0, from = edge - center;
+    if (!wide) return select(from > T{}, high, low);
+    return clamp(from * scale, low, high);
   }
   // The share of the point that is below an edge.
   template <class T>
   static GV_HD T below(T away) {
-    const T none{}, one = none + 1.0, far = absolute(away), rest = 2.0 - far, square = rest * rest;
+    const T zero{}, one = zero + 1.0, far = absolute(away), rest = 2.0 - far, square = rest * rest;
     const T inner = 0.5 - far * (2.0 / 3 - far * far * (1.0 / 3 - far * 0.125));
     const T tail = select(far > one, square * square * (1.0 / 24), inner);
-    return select(away < none, tail, 1.0 - tail);
+    return select(away < zero, tail, 1.0 - tail);
   }
   GV_HD double share(const double* edge) const { return below(away(edge[1])) - below(away(edge[0])); }
 };
@@ -90,7 +90,7 @@ struct Spread {
 // An index is a voxel.
 struct SplatVoxel {
   SplatArgs args;
-  static constexpr int kTogether = 4;  // numbers of a value that are summed at once
+  static constexpr int kNumbersAtOnce = 4;  // numbers of a value that are summed at once
 
   GV_HD void operator()(int64_t index) const {
     const int64_t side = args.side;
@@ -99,18 +99,19 @@ struct SplatVoxel {
     const double* edge = args.edge_k3e + 3 * cube * (side + 1);
     const double *edge_x = edge + x, *edge_y = edge + side + 1 + y, *edge_z = edge + 2 * (side + 1) + z;
     const int64_t* low = args.low_k3 + 3 * cube;
-    const Span narrow(args.narrow_b + cube, args.narrow_runs), wide(args.wide_b + cube, args.wide_runs);
+    const Span narrow_span(args.narrow_b + cube, args.narrow_runs), wide_span(args.wide_b + cube, args.wide_runs);
     double* sum_c = args.sum_kzyxc + index * args.width;
-    for (int64_t first = 0; first < args.width; first += kTogether) {
-      double sum[kTogether] = {};
-      const int64_t some = args.width - first;
-      for_rows(narrow, args.narrow_s2, args.narrow, [&](int64_t row) {
-        const int64_t* at = args.voxel_n3 + 3 * row;
-        if (from_low(at[0], low[0]) != x || from_low(at[1], low[1]) != y || from_low(at[2], low[2]) != z) return;
+    for (int64_t first = 0; first < args.width; first += kNumbersAtOnce) {
+      double sum[kNumbersAtOnce] = {};
+      const int64_t remaining = args.width - first;
+      for_rows(narrow_span, args.narrow_s2, args.narrow, [&](int64_t row) {
+        const int64_t* voxel = args.voxel_n3 + 3 * row;
+        if (from_low(voxel[0], low[0]) != x || from_low(voxel[1], low[1]) != y || from_low(voxel[2], low[2]) != z)
+          return;
         const double* value = args.value_nc + row * args.width + first;
-        for (int i = 0; i < kTogether; ++i) sum[i] += i < some ? value[i] : 0.0;
+        for (int i = 0; i < kNumbersAtOnce; ++i) sum[i] += i < remaining ? value[i] : 0.0;
       });
-      for_rows(wide, args.wide_t2, args.wide, [&](int64_t row) {
+      for_rows(wide_span, args.wide_t2, args.wide, [&](int64_t row) {
         const double *center = args.center_m3 + 3 * row, radius = args.radius_m[row];
         if (Spread::misses(center[2], radius, edge_z[0], edge_z[1]) ||
             Spread::misses(center[1], radius, edge_y[0], edge_y[1]) ||
@@ -120,9 +121,9 @@ struct SplatVoxel {
         const double plane = Spread(center[2], radius).share(edge_z) * Spread(center[1], radius).share(edge_y);
         const double share_x = Spread(center[0], radius).share(edge_x);
         const double* value = args.value_mc + row * args.width + first;
-        for (int i = 0; i < kTogether; ++i) sum[i] += plane * (share_x * (i < some ? value[i] : 0.0));
+        for (int i = 0; i < kNumbersAtOnce; ++i) sum[i] += plane * (share_x * (i < remaining ? value[i] : 0.0));
       });
-      for (int i = 0; i < kTogether && i < some; ++i) sum_c[first + i] = sum[i];
+      for (int i = 0; i < kNumbersAtOnce && i < remaining; ++i) sum_c[first + i] = sum[i];
     }
   }
 };
@@ -131,26 +132,26 @@ struct SplatVoxel {
 constexpr int64_t kPartX = 256, kPartY = 32, kPartZ = 16;  // numbers (voxels * width) along x; voxels along y and z
 
 // The shares of a point in some voxels along an axis.
-template <int64_t kMost>
+template <int64_t kMaxVoxels>
 struct Shares {
   static constexpr int64_t kStep = sizeof(Doubles) / sizeof(double);
-  double share[kMost + kStep];
+  double share[kMaxVoxels + kStep];
   int64_t begin, end;  // of the shares that are not 0
 
   // Computes the shares of `count` voxels, from their count + 1 edges.
   void fill(const Spread& point, const double* edge, int64_t count) {
-    double below[kMost + 2 * kStep];
-    Doubles at;
+    double below[kMaxVoxels + 2 * kStep];
+    Doubles edges;
     for (int64_t first = 0; first <= count; first += kStep) {
-      const int64_t some = count + 1 - first < kStep ? count + 1 - first : kStep;
-      if (some == kStep) {
-        memcpy(&at, edge + first, sizeof(at));
+      const int64_t filled = count + 1 - first < kStep ? count + 1 - first : kStep;
+      if (filled == kStep) {
+        memcpy(&edges, edge + first, sizeof(edges));
       } else {
-        at = splat<Doubles>(edge[count]);
-        for (int64_t lane = 0; lane < some; ++lane) at[lane] = edge[first + lane];
+        edges = splat<Doubles>(edge[count]);
+        for (int64_t lane = 0; lane < filled; ++lane) edges[lane] = edge[first + lane];
       }
-      at = Spread::below(point.away(at));
-      memcpy(below + first, &at, sizeof(at));
+      edges = Spread::below(point.away(edges));
+      memcpy(below + first, &edges, sizeof(edges));
     }
     for (int64_t i = 0; i < count; ++i) share[i] = below[i + 1] - below[i];
     begin = 0, end = count;
@@ -171,11 +172,11 @@ struct SplatPart {
   // A row of the cube has all numbers of its first voxel, then those of the next, and so on.
   void operator()(int64_t index) const {
     const int64_t side = args.side, width = args.width, row_size = side * width;
-    const int64_t x0 = index % along_x() * kPartX, x1 = least(x0 + kPartX, row_size);
+    const int64_t x0 = index % along_x() * kPartX, x1 = minimum(x0 + kPartX, row_size);
     index /= along_x();
-    const int64_t y0 = index % along_y() * kPartY, y1 = least(y0 + kPartY, side);
+    const int64_t y0 = index % along_y() * kPartY, y1 = minimum(y0 + kPartY, side);
     index /= along_y();
-    const int64_t z0 = index % along_z() * kPartZ, z1 = least(z0 + kPartZ, side), cube = index / along_z();
+    const int64_t z0 = index % along_z() * kPartZ, z1 = minimum(z0 + kPartZ, side), cube = index / along_z();
     double* sum = args.sum_kzyxc + cube * side * side * row_size;
     for (int64_t z = z0; z < z1; ++z) {
       for (int64_t y = y0; y < y1; ++y) {
@@ -183,18 +184,18 @@ struct SplatPart {
       }
     }
     const int64_t* low = args.low_k3 + 3 * cube;
-    const Span narrow(args.narrow_b + cube, args.narrow_runs), wide(args.wide_b + cube, args.wide_runs);
-    for_rows(narrow, args.narrow_s2, args.narrow, [&](int64_t row) {
-      const int64_t* at = args.voxel_n3 + 3 * row;
-      const uint64_t x = from_low(at[0], low[0]), y = from_low(at[1], low[1]), z = from_low(at[2], low[2]);
-      const uint64_t most = side;
-      if (x >= most || y >= most || z >= most) return;
+    const Span narrow_span(args.narrow_b + cube, args.narrow_runs), wide_span(args.wide_b + cube, args.wide_runs);
+    for_rows(narrow_span, args.narrow_s2, args.narrow, [&](int64_t row) {
+      const int64_t* voxel = args.voxel_n3 + 3 * row;
+      const uint64_t x = from_low(voxel[0], low[0]), y = from_low(voxel[1], low[1]), z = from_low(voxel[2], low[2]);
+      const uint64_t limit = side;
+      if (x >= limit || y >= limit || z >= limit) return;
       const int64_t i = x * width, j = y, k = z;
       if (j < y0 || j >= y1 || k < z0 || k >= z1) return;
-      double* own = sum + (k * side + j) * row_size + i;
+      double* target = sum + (k * side + j) * row_size + i;
       const double* value = args.value_nc + row * width;
       for (int64_t c = 0; c < width; ++c) {
-        if (i + c >= x0 && i + c < x1) own[c] += value[c];
+        if (i + c >= x0 && i + c < x1) target[c] += value[c];
       }
     });
     const double* edge = args.edge_k3e + 3 * cube * (side + 1);
@@ -204,7 +205,7 @@ struct SplatPart {
     Shares<kPartY> y;
     Shares<kPartZ> z;
     double line[kPartX];
-    for_rows(wide, args.wide_t2, args.wide, [&](int64_t row) {
+    for_rows(wide_span, args.wide_t2, args.wide, [&](int64_t row) {
       const double *center = args.center_m3 + 3 * row, radius = args.radius_m[row];
       if (Spread::misses(center[2], radius, edge_z[0], edge_z[z1 - z0]) ||
           Spread::misses(center[1], radius, edge_y[0], edge_y[y1 - y0]) ||
@@ -216,7 +217,7 @@ struct SplatPart {
       x.fill({center[0], radius}, edge_x, voxels);
       if (z.begin == z.end || y.begin == y.end || x.begin == x.end) return;
       const double* value = args.value_mc + row * width;
-      const int64_t begin = most((first + x.begin) * width, x0), end = least((first + x.end) * width, x1);
+      const int64_t begin = maximum((first + x.begin) * width, x0), end = minimum((first + x.end) * width, x1);
       int64_t voxel = begin / width - first, c = begin % width;
       for (int64_t i = begin; i < end; ++i) {
         line[i - begin] = x.share[voxel] * value[c];
@@ -225,15 +226,15 @@ struct SplatPart {
       for (int64_t k = z.begin; k < z.end; ++k) {
         for (int64_t j = y.begin; j < y.end; ++j) {
           const double plane = z.share[k] * y.share[j];
-          double* own = sum + ((z0 + k) * side + y0 + j) * row_size + begin;
-          for (int64_t i = 0; i < end - begin; ++i) own[i] += plane * line[i];
+          double* target = sum + ((z0 + k) * side + y0 + j) * row_size + begin;
+          for (int64_t i = 0; i < end - begin; ++i) target[i] += plane * line[i];
         }
       }
     });
   }
 
-  static int64_t least(int64_t a, int64_t b) { return b < a ? b : a; }
-  static int64_t most(int64_t a, int64_t b) { return b > a ? b : a; }
+  static int64_t minimum(int64_t a, int64_t b) { return b < a ? b : a; }
+  static int64_t maximum(int64_t a, int64_t b) { return b > a ? b : a; }
 };
 #endif
 

@@ -26,10 +26,10 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// A whole number that a table holds, clamped to [0, most].
+// A whole number that a table holds, clamped to [0, maximum].
 template <class T>
-GV_HD int32_t whole_up_to(T number, int32_t most) {
-  return static_cast<int32_t>(clamp(number, static_cast<T>(0), static_cast<T>(most)));
+GV_HD int32_t whole_up_to(T number, int32_t maximum) {
+  return static_cast<int32_t>(clamp(number, static_cast<T>(0), static_cast<T>(maximum)));
 }
 
 // The rows of one channel, as a transfer function.
@@ -47,7 +47,7 @@ struct ChannelRows : Transfer<T> {
 template <class T>
 struct ChannelMix : ShaderFacts {
   static constexpr bool kReadsAll = true;
-  static bool packs(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
+  static bool packets_can_trace(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
     return int64_t{args.levels} * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
   }
   template <class V>
@@ -57,15 +57,15 @@ struct ChannelMix : ShaderFacts {
   T step;
   int32_t width;
 #ifndef __CUDACC__
-  int32_t known = 0;
-  ChannelRows<T> known_rows[kMostNumbers];  // read once; on a GPU, rows are read where they are needed
+  int32_t channel_count = 0;
+  ChannelRows<T> cached_rows[kMaxNumbers];  // read once; on a GPU, rows are read where they are needed
 #endif
 
   explicit ChannelMix(const ShadeArgs& args) : view(args), step(static_cast<T>(args.step)), width(args.channels) {
 #ifndef __CUDACC__
     read([&](int32_t i, const ChannelRows<T>& rows) {
-      known_rows[i] = rows;
-      known = i + 1;
+      cached_rows[i] = rows;
+      channel_count = i + 1;
     });
 #endif
   }
@@ -74,33 +74,33 @@ struct ChannelMix : ShaderFacts {
   template <class RangeOf>
   GV_HD bool hides_ranges(const RangeOf& range_of) const {
     bool hides = true;
-    each([&](int32_t, const ChannelRows<T>& rows) {
+    each_channel([&](int32_t, const ChannelRows<T>& rows) {
       const auto range = range_of(rows.component);
       hides = hides && rows.transparent(range.low, range.high);
     });
     return hides;
   }
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
-    probe.narrow(which);
-    V values[kMostNumbers];
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+    probe.select_lanes(mask);
+    V values[kMaxNumbers];
     probe.numbers_at(probe.channels.value, Components<T>{&view.table_lm[1].red, 4, width}, count(), piece.middle,
                      values);
     V red{}, green{}, blue{}, total{};
-    const bool added = view.table_lm[0].green > 0;
-    each([&](int32_t i, const ChannelRows<T>& rows) {
-      const Row<V> row = rows.look_up(values[i], piece.level, which, view.rows);  // its alpha holds halvings
+    const bool additive = view.table_lm[0].green > 0;
+    each_channel([&](int32_t i, const ChannelRows<T>& rows) {
+      const Row<V> row = rows.look_up(values[i], piece.level, mask, view.rows);  // its alpha holds halvings
       red = red + row.alpha * row.red;
       green = green + row.alpha * row.green;
       blue = blue + row.alpha * row.blue;
-      total = added ? larger(total, row.alpha) : total + row.alpha;
+      total = additive ? larger(total, row.alpha) : total + row.alpha;
     });
-    const MaskOf<V> shown = which && total > 0;
+    const MaskOf<V> shown = mask && total > 0;
     if (!any(shown)) return;
     V halvings = total;
     if (piece.odd) halvings = total * (piece.length / step);
-    const V alpha = taken_by(halvings), part = alpha / total;
-    sum.add_light({red * part, green * part, blue * part, alpha}, sum.clear, shown);
+    const V alpha = absorbed_by(halvings), scale = alpha / total;
+    sum.add_light({red * scale, green * scale, blue * scale, alpha}, sum.clear, shown);
     sum.absorb(alpha, piece.start, piece.length, sum.hit_clear, shown);
   }
   GV_HD void done(Sum&) const {}
@@ -108,29 +108,31 @@ struct ChannelMix : ShaderFacts {
  private:
   // Calls body(i, rows) for each channel. Whatever the head holds, no row outside the table is read.
   template <class Body>
-  GV_HD void each(const Body& body) const {
+  GV_HD void each_channel(const Body& body) const {
 #ifdef __CUDACC__
     read(body);
 #else
-    for (int32_t i = 0; i < known; ++i) body(i, known_rows[i]);
+    for (int32_t i = 0; i < channel_count; ++i) body(i, cached_rows[i]);
 #endif
   }
   template <class Body>
   GV_HD void read(const Body& body) const {
-    int32_t first = 1 + asked();
-    for (int32_t i = 0; i < asked() && first + 2 <= view.rows; ++i) {
+    int32_t first = 1 + declared_count();
+    for (int32_t i = 0; i < declared_count() && first + 2 <= view.rows; ++i) {
       const ChannelRows<T> rows(view, view.table_lm[1 + i], first, width);
       if (rows.rows < 2) return;
       body(i, rows);
       first += rows.rows;
     }
   }
-  GV_HD int32_t asked() const { return whole_up_to(view.table_lm[0].red, smaller(kMostNumbers, view.rows - 1)); }
+  GV_HD int32_t declared_count() const {
+    return whole_up_to(view.table_lm[0].red, smaller(kMaxNumbers, view.rows - 1));
+  }
   GV_HD int32_t count() const {
 #ifdef __CUDACC__
-    return asked();
+    return declared_count();
 #else
-    return known;
+    return channel_count;
 #endif
   }
 };

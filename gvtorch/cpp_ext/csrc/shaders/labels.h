@@ -9,7 +9,7 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-constexpr int32_t kMostReach = 3;  // voxels
+constexpr int32_t kMaxReach = 3;  // voxels
 
 // The table has a row for each label: consecutive whole numbers, from the first row's value on. Where two levels blend,
 // their colours do. The normal is the mean offset to the voxels of other labels around the position, weighted by a tent
@@ -29,11 +29,11 @@ struct Labels : ShaderFacts {
   explicit Labels(const ShadeArgs& args)
       : transfer(args), step(static_cast<T>(args.step)), light(args), component(args.component) {}
 
-  struct Own {
+  struct Numbers {
     T lit;  // 1 or 0
   };
   // What one of the nodes adds for an interval.
-  struct Look {
+  struct Contribution {
     Row<T> row{};      // premultiplied
     Vec3<T> normal{};  // times alpha
     int32_t label = 0;
@@ -42,28 +42,28 @@ struct Labels : ShaderFacts {
   template <class RangeOf>
   GV_HD bool hides_ranges(const RangeOf& range_of) const {
     const auto range = range_of(component);
-    const Transfer<T> places(transfer);
-    const int32_t first = row_of(places, range.low), last = row_of(places, range.high);
-    return places.opaque_m[last] == (first > 0 ? places.opaque_m[first - 1] : 0);
+    const Transfer<T> table(transfer);
+    const int32_t first = row_of(table, range.low), last = row_of(table, range.high);
+    return table.opaque_m[last] == (first > 0 ? table.opaque_m[first - 1] : 0);
   }
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
     Row<V> row{};
     Vec3<V> normal{};
-    probe.each(which, [&](int lane, const auto& one) {
-      const Look look =
-          blended(lane_of(piece.middle, lane), lane_of(piece.length, lane), lane_of(piece.level, lane), piece.odd, one);
-      const T clear = lane_of(sum.clear, lane), left = clear * (1 - look.row.alpha);
-      if (left < sum.hit_clear && clear >= sum.hit_clear) {
-        lane_of(sum.feature_c, lane)[0] = static_cast<T>(1 + look.label);
+    probe.each_lane(mask, [&](int lane, const auto& lane_probe) {
+      const Contribution contribution = blended(lane_of(piece.middle, lane), lane_of(piece.length, lane),
+                                                lane_of(piece.level, lane), piece.odd, lane_probe);
+      const T clear = lane_of(sum.clear, lane), clear_after = clear * (1 - contribution.row.alpha);
+      if (clear_after < sum.hit_clear && clear >= sum.hit_clear) {
+        lane_of(sum.feature_c, lane)[0] = static_cast<T>(1 + contribution.label);
       }
-      set_lane(row.red, lane, look.row.red);
-      set_lane(row.green, lane, look.row.green);
-      set_lane(row.blue, lane, look.row.blue);
-      set_lane(row.alpha, lane, look.row.alpha);
-      for (int axis = 0; axis < 3; ++axis) set_lane(normal[axis], lane, look.normal[axis]);
+      set_lane(row.red, lane, contribution.row.red);
+      set_lane(row.green, lane, contribution.row.green);
+      set_lane(row.blue, lane, contribution.row.blue);
+      set_lane(row.alpha, lane, contribution.row.alpha);
+      for (int axis = 0; axis < 3; ++axis) set_lane(normal[axis], lane, contribution.normal[axis]);
     });
-    const MaskOf<V> shown = which && row.alpha > 0;
+    const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
     sum.add_normal(normal, sum.clear, shown);
     sum.add_light(row, sum.clear, shown);
@@ -72,75 +72,77 @@ struct Labels : ShaderFacts {
   GV_HD void done(Sum&) const {}
 
  private:
-  GV_HD static int32_t row_of(const Transfer<T>& places, T label) {
-    return static_cast<int32_t>(clamp(label - places.low, static_cast<T>(0), places.last));
+  GV_HD static int32_t row_of(const Transfer<T>& table, T label) {
+    return static_cast<int32_t>(clamp(label - table.low, static_cast<T>(0), table.last));
   }
   // Blends both nodes; the label is the finer node's, or the coarser one's where the finer node shows nothing.
-  GV_HD Look blended(T t, T length, int32_t level, bool odd, const Probe<T>& probe) const {
-    Look look;
+  GV_HD Contribution blended(T t, T length, int32_t level, bool odd, const Probe<T>& probe) const {
+    Contribution result;
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
-    for (int which = 0; which <= static_cast<int>(probe.mixed); ++which) {
-      const Look one = look_at(t, length, level, odd, probe, which == 0 ? probe.fine : probe.coarse);
-      if (which == 0) {
-        look = one;
+    for (int node = 0; node <= static_cast<int>(probe.mixed); ++node) {
+      const Contribution contribution =
+          contribution_of(t, length, level, odd, probe, node == 0 ? probe.fine : probe.coarse);
+      if (node == 0) {
+        result = contribution;
         continue;
       }
-      if (!(look.row.alpha > 0)) look.label = one.label;
-      look.row = probe.between(look.row, one.row, t);
-      look.normal = probe.between(look.normal, one.normal, t);
+      if (!(result.row.alpha > 0)) result.label = contribution.label;
+      result.row = probe.between(result.row, contribution.row, t);
+      result.normal = probe.between(result.normal, contribution.normal, t);
     }
-    return look;
+    return result;
   }
-  GV_HD Look look_at(T t, T length, int32_t level, bool odd, const Probe<T>& probe, const Spot<T>& spot) const {
-    const Transfer<T> places(transfer);
-    Look look;
+  GV_HD Contribution contribution_of(T t, T length, int32_t level, bool odd, const Probe<T>& probe,
+                                     const Spot<T>& spot) const {
+    const Transfer<T> table(transfer);
+    Contribution result;
     int32_t cell[3] = {0, 0, 0};
-    T from[3] = {0, 0, 0}, label;
+    T from_center[3] = {0, 0, 0}, label;
     if (spot.brick < 0) {
       label = probe.value_of(spot, t);
     } else {
-      find(probe.channels, spot.at(t), cell, from);
+      find(probe.channels, spot.at(t), cell, from_center);
       label = probe.value_in(spot, cell[0], cell[1], cell[2]);
     }
-    look.label = row_of(places, label);
-    Row<T> row = load_row(&places.table_lm[(odd ? 0 : level) * places.rows + look.label]);
-    if (!(row.alpha > 0)) return look;
+    result.label = row_of(table, label);
+    Row<T> row = load_row(&table.table_lm[(odd ? 0 : level) * table.rows + result.label]);
+    if (!(row.alpha > 0)) return result;
     if (odd) row.alpha = stretch(row.alpha, length / step);
-    if (own_numbers<Own>(light.parameters).lit > 0) {
-      if (spot.brick >= 0) look.normal = normal(probe, spot, cell, from, label);
-      row = light.shade(row, look.normal, probe, t);
+    if (own_numbers<Numbers>(light.parameters).lit > 0) {
+      if (spot.brick >= 0) result.normal = normal(probe, spot, cell, from_center, label);
+      row = light.shade(row, result.normal, probe, t);
     }
-    for (int axis = 0; axis < 3; ++axis) look.normal[axis] = look.normal[axis] * row.alpha;
-    look.row = {row.red * row.alpha, row.green * row.alpha, row.blue * row.alpha, row.alpha};
-    return look;
+    for (int axis = 0; axis < 3; ++axis) result.normal[axis] = result.normal[axis] * row.alpha;
+    result.row = {row.red * row.alpha, row.green * row.alpha, row.blue * row.alpha, row.alpha};
+    return result;
   }
-  // Finds the node's voxel whose cube contains a position, and the offset `from` the voxel's centre; a face that two
+  // Finds the node's voxel whose cube contains a position, and its offset from the voxel's centre; a face that two
   // voxels share belongs to the upper one.
-  GV_HD static void find(const Channels& channels, const Vec3<T>& at, int32_t (&cell)[3], T (&from)[3]) {
+  GV_HD static void find(const Channels& channels, const Vec3<T>& position, int32_t (&cell)[3], T (&from_center)[3]) {
     const T half = static_cast<T>(0.5);
     for (int axis = 0; axis < 3; ++axis) {
       const T low = static_cast<T>(channels.border), high = static_cast<T>(channels.side - 1 - channels.border);
-      const T place = clamp(at[axis] + half, low, high + static_cast<T>(1));
-      cell[axis] = smaller(static_cast<int32_t>(place), channels.side - 1 - channels.border);
-      from[axis] = clamp(at[axis] - static_cast<T>(cell[axis]), -half, half);
+      const T clamped = clamp(position[axis] + half, low, high + static_cast<T>(1));
+      cell[axis] = smaller(static_cast<int32_t>(clamped), channels.side - 1 - channels.border);
+      from_center[axis] = clamp(position[axis] - static_cast<T>(cell[axis]), -half, half);
     }
   }
   // Unit normal along the mean offset, turned towards the eye. Beyond the brick, its outermost voxels are repeated.
-  GV_HD Vec3<T> normal(const Probe<T>& probe, const Spot<T>& spot, const int32_t (&cell)[3], const T (&from)[3],
+  GV_HD Vec3<T> normal(const Probe<T>& probe, const Spot<T>& spot, const int32_t (&cell)[3], const T (&from_center)[3],
                        T label) const {
-    const int32_t reach = larger(smaller(probe.channels.border, kMostReach), 1), last = probe.channels.side - 1;
-    T share[3][2 * kMostReach + 1], way[3][2 * kMostReach + 1];  // per axis: weights, and weights times offsets
+    const int32_t reach = larger(smaller(probe.channels.border, kMaxReach), 1), last = probe.channels.side - 1;
+    T weight[3][2 * kMaxReach + 1], moment[3][2 * kMaxReach + 1];  // per axis: weights, and weights times offsets
     for (int axis = 0; axis < 3; ++axis) {
       for (int k = -reach; k <= reach; ++k) {
-        const T offset = static_cast<T>(k) - from[axis];
-        const T left = static_cast<T>(reach) + static_cast<T>(0.5) - absolute(offset);
-        share[axis][k + reach] = larger(left, static_cast<T>(0));
-        way[axis][k + reach] = share[axis][k + reach] * offset;
+        const T offset = static_cast<T>(k) - from_center[axis];
+        const T tent = static_cast<T>(reach) + static_cast<T>(0.5) - absolute(offset);
+        weight[axis][k + reach] = larger(tent, static_cast<T>(0));
+        moment[axis][k + reach] = weight[axis][k + reach] * offset;
       }
     }
-    const auto beside = [&](int axis, int k) { return smaller(larger(cell[axis] + k - reach, 0), last); };
+    const auto clamped_cell = [&](int axis, int k) { return smaller(larger(cell[axis] + k - reach, 0), last); };
     Vec3<T> n{0, 0, 0};
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
@@ -153,18 +155,18 @@ struct Labels : ShaderFacts {
       for (int j = 0; j <= 2 * reach; ++j) {
         T row = 0, along = 0;
         for (int i = 0; i <= 2 * reach; ++i) {
-          const T other = probe.value_in(spot, beside(0, i), beside(1, j), beside(2, k));
-          const T differs = other == label ? static_cast<T>(0) : static_cast<T>(1);
-          row = row + share[0][i] * differs;
-          along = along + way[0][i] * differs;
+          const T voxel_label = probe.value_in(spot, clamped_cell(0, i), clamped_cell(1, j), clamped_cell(2, k));
+          const T differs = voxel_label == label ? static_cast<T>(0) : static_cast<T>(1);
+          row = row + weight[0][i] * differs;
+          along = along + moment[0][i] * differs;
         }
-        plane = plane + share[1][j] * row;
-        along_x = along_x + share[1][j] * along;
-        along_y = along_y + way[1][j] * row;
+        plane = plane + weight[1][j] * row;
+        along_x = along_x + weight[1][j] * along;
+        along_y = along_y + moment[1][j] * row;
       }
-      n.x = n.x + share[2][k] * along_x;
-      n.y = n.y + share[2][k] * along_y;
-      n.z = n.z + way[2][k] * plane;
+      n.x = n.x + weight[2][k] * along_x;
+      n.y = n.y + weight[2][k] * along_y;
+      n.z = n.z + moment[2][k] * plane;
     }
     for (int axis = 0; axis < 3; ++axis) n[axis] = n[axis] * (spot.scale / probe.cube[axis]);
     return light.to_eye(n, probe.sight.direction);

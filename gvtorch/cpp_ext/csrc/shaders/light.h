@@ -30,8 +30,8 @@ struct ShadeSum : Accumulator<T> {
   Real hit_clear;                          // transmittance at which depth is recorded
   typename LanesOf<T>::Pointer feature_c;  // of each lane
 
-  GV_HD void add_normal(Vec3<T> n, T share, Mask which = all_lanes<T>()) {
-    for (int axis = 0; axis < 3; ++axis) normal[axis] = select(which, normal[axis] + share * n[axis], normal[axis]);
+  GV_HD void add_normal(Vec3<T> n, T share, Mask mask = all_lanes<T>()) {
+    for (int axis = 0; axis < 3; ++axis) normal[axis] = select(mask, normal[axis] + share * n[axis], normal[axis]);
   }
 
   // Begins a new ray in a lane.
@@ -40,20 +40,20 @@ struct ShadeSum : Accumulator<T> {
     this->hit_clear = hit_clear;
     set_lane(this->feature_c, lane, feature_c);
   }
-  template <class Own, class Other, class Body>
-  GV_HD static void each(Own& own, Other& other, const Body& body) {
-    Base::each(own, other, body);
-    body(own.normal, other.normal);
-    body(own.hit_clear, other.hit_clear);
-    body(own.feature_c, other.feature_c);
+  template <class A, class B, class Body>
+  GV_HD static void each_member(A& a, B& b, const Body& body) {
+    Base::each_member(a, b, body);
+    body(a.normal, b.normal);
+    body(a.hit_clear, b.hit_clear);
+    body(a.feature_c, b.feature_c);
   }
 };
 
 // The transfer function's colour of a value, and its alpha over an interval of any length.
 template <class T, class V>
 GV_HD Row<V> look_up(const Transfer<T>& transfer, V value, const Piece<V>& piece, T step,
-                     MaskOf<V> which = all_lanes<V>()) {
-  Row<V> row = transfer.look_up(value, piece.level, which);
+                     MaskOf<V> mask = all_lanes<V>()) {
+  Row<V> row = transfer.look_up(value, piece.level, mask);
   if (piece.odd) row.alpha = stretch(row.alpha, piece.length / step);
   return row;
 }
@@ -67,10 +67,10 @@ GV_HD T power_of(T x, Power power) {
 }
 
 // A shader's own parameters by name: a struct of at most four numbers.
-template <class Own, class T>
-GV_HD const Own& own_numbers(const Parameters<T>* parameters) {
-  static_assert(sizeof(Own) <= sizeof(parameters->own));
-  return *reinterpret_cast<const Own*>(parameters->own);
+template <class Numbers, class T>
+GV_HD const Numbers& own_numbers(const Parameters<T>* parameters) {
+  static_assert(sizeof(Numbers) <= sizeof(parameters->own));
+  return *reinterpret_cast<const Numbers*>(parameters->own);
 }
 
 // Factors of an octave of scattering over the one before it: of its light, and of its anisotropy. Fitted to path traced
@@ -109,11 +109,11 @@ struct Light {
   GV_HD LightKind kind() const { return static_cast<LightKind>(static_cast<int32_t>(parameters->light_kind)); }
 
   // The unit normal at distance t, towards the eye: the stored one, or the gradient's direction. 0 in a medium.
-  template <class Eye, class V = typename Eye::Number>
-  GV_HD Vec3<V> normal(const Eye& probe, typename Eye::Number t) const {
+  template <class AnyProbe, class V = typename AnyProbe::Number>
+  GV_HD Vec3<V> normal(const AnyProbe& probe, typename AnyProbe::Number t) const {
     Vec3<V> n{};
     if (scatters()) return n;
-    if (probe.channels.normal.given()) {
+    if (probe.channels.normal.exists()) {
       for (int axis = 0; axis < 3; ++axis) {
         n[axis] =
             probe.number_at(probe.channels.normal, axis, t) * parameters->normal_scale + parameters->normal_offset;
@@ -127,49 +127,49 @@ struct Light {
   template <class V>
   GV_HD static Vec3<V> to_eye(Vec3<V> n, const Vec3<V>& d) {
     n = unit(n);
-    const MaskOf<V> away = dot(n, d) > 0;
-    for (int axis = 0; axis < 3; ++axis) n[axis] = select(away, -n[axis], n[axis]);
+    const MaskOf<V> faces_away = dot(n, d) > 0;
+    for (int axis = 0; axis < 3; ++axis) n[axis] = select(faces_away, -n[axis], n[axis]);
     return n;
   }
   // Direction and distance to the light, and how much cones to the light grow per unit of length.
   template <class V>
-  struct Way {
+  struct LightCone {
     Vec3<V> direction;
     V length, growth;
   };
-  template <class Eye, class V = typename Eye::Number>
-  GV_HD Way<V> towards(const Eye& probe, typename Eye::Number t) const {
-    const Parameters<T>& own = *parameters;
+  template <class AnyProbe, class V = typename AnyProbe::Number>
+  GV_HD LightCone<V> towards(const AnyProbe& probe, typename AnyProbe::Number t) const {
+    const Parameters<T>& p = *parameters;
     const Vec3<V> d = probe.sight.direction;
-    Way<V> way{{-d.x, -d.y, -d.z}, splat<V>(static_cast<T>(INFINITY)), splat<V>(own.light_width)};
+    LightCone<V> cone{{-d.x, -d.y, -d.z}, splat<V>(static_cast<T>(INFINITY)), splat<V>(p.light_width)};
     if (kind() == LightKind::kDirectional) {
-      for (int axis = 0; axis < 3; ++axis) way.direction[axis] = splat<V>(-own.light_place[axis]);
-      way.direction = unit(way.direction);
+      for (int axis = 0; axis < 3; ++axis) cone.direction[axis] = splat<V>(-p.light_vector[axis]);
+      cone.direction = unit(cone.direction);
     }
     if (kind() == LightKind::kPoint) {
-      const Vec3<V> place = probe.sight.at(t);
-      Vec3<V> straight;
-      for (int axis = 0; axis < 3; ++axis) straight[axis] = own.light_place[axis] - place[axis];
-      way.direction = unit(straight);
-      way.length = square_root(dot(straight, straight));
-      way.growth = way.growth / way.length;
+      const Vec3<V> position = probe.sight.at(t);
+      Vec3<V> to_light;
+      for (int axis = 0; axis < 3; ++axis) to_light[axis] = p.light_vector[axis] - position[axis];
+      cone.direction = unit(to_light);
+      cone.length = square_root(dot(to_light, to_light));
+      cone.growth = cone.growth / cone.length;
     }
-    return way;
+    return cone;
   }
   // Lit colour of a position. Without a normal (n is 0), it is lit as if it faced the light, without a highlight.
-  template <class Eye, class V = typename Eye::Number, class... Shadow>
-  GV_HD Row<V> shade(Row<typename Eye::Number> base, Vec3<typename Eye::Number> n, const Eye& probe,
-                     typename Eye::Number t, const Shadow&... shadow) const {
-    const Parameters<T>& own = *parameters;
+  template <class AnyProbe, class V = typename AnyProbe::Number, class... Shadow>
+  GV_HD Row<V> shade(Row<typename AnyProbe::Number> base, Vec3<typename AnyProbe::Number> n, const AnyProbe& probe,
+                     typename AnyProbe::Number t, const Shadow&... shadow) const {
+    const Parameters<T>& p = *parameters;
     const Vec3<V> d = probe.sight.direction;
     const auto [to_light, length, growth] = towards(probe, t);
     V facing = splat<V>(static_cast<T>(1)), highlight{};
-    const MaskOf<V> turned = dot(n, n) > 0;
-    if (any(turned)) {
-      facing = select(turned, larger(V{}, dot(n, to_light)), facing);
-      const Vec3<V> half = unit(minus(to_light, d));
-      const MaskOf<V> faces = turned && facing > 0;
-      if (any(faces)) highlight = select(faces, power_of(larger(V{}, dot(n, half)), own.shininess), highlight);
+    const MaskOf<V> has_normal = dot(n, n) > 0;
+    if (any(has_normal)) {
+      facing = select(has_normal, larger(V{}, dot(n, to_light)), facing);
+      const Vec3<V> half_vector = unit(minus(to_light, d));
+      const MaskOf<V> faces = has_normal && facing > 0;
+      if (any(faces)) highlight = select(faces, power_of(larger(V{}, dot(n, half_vector)), p.shininess), highlight);
     }
     if constexpr (sizeof...(shadow) > 0) {
       if (facing > 0 && kind() != LightKind::kHeadlight) {
@@ -184,12 +184,12 @@ struct Light {
   // Lights a base colour by the factors of its diffuse (`facing`) and specular (`highlight`) light.
   template <class V>
   GV_HD Row<V> lit(const Row<V>& base, V facing, V highlight) const {
-    const Parameters<T>& own = *parameters;
-    const V diffuse = own.diffuse * facing;
-    const V specular = own.specular * highlight;
-    const auto lit = [&](V color, int which) {
-      const T light = own.light_color[which];
-      return color * (own.ambient + diffuse * light) + specular * light;
+    const Parameters<T>& p = *parameters;
+    const V diffuse = p.diffuse * facing;
+    const V specular = p.specular * highlight;
+    const auto lit = [&](V color, int channel) {
+      const T light = p.light_color[channel];
+      return color * (p.ambient + diffuse * light) + specular * light;
     };
     return {lit(base.red, 0), lit(base.green, 1), lit(base.blue, 2), base.alpha};
   }
@@ -201,39 +201,40 @@ struct Light {
   // The moments give the mean and deviation of the normals' cosine with the light, on the side that the eye sees; it is
   // assumed to be uniformly distributed, as it is for the normals of a ball. Highlights: Toksvig, "Mipmapping normal
   // maps", 2005, for a spread that is the same to all sides of a main normal.
-  template <class Eye, class V>
-  GV_HD Row<V> shade_rough(const Row<V>& base, Moments<V> m, bool sided, const Vec3<V>& front, const Eye& probe, V t,
-                           Vec3<V>& normal) const {
+  template <class AnyProbe, class V>
+  GV_HD Row<V> shade_rough(const Row<V>& base, Moments<V> m, bool sided, const Vec3<V>& front, const AnyProbe& probe,
+                           V t, Vec3<V>& normal) const {
     const T zero = 0, one = 1, two = 2, three = 3, shininess = parameters->shininess;
     const Vec3<V> d = probe.sight.direction;
     const V total = m.trace(), unity = splat<V>(one);
-    const V share = clamp(static_cast<T>(kFaint) * total, zero, one), whole = select(total > 0, total, unity);
-    m = {m.xx / whole, m.xy / whole, m.xz / whole, m.yy / whole, m.yz / whole, m.zz / whole};
+    const V share = clamp(static_cast<T>(kFaint) * total, zero, one), divisor = select(total > 0, total, unity);
+    m = {m.xx / divisor, m.xy / divisor, m.xz / divisor, m.yy / divisor, m.yz / divisor, m.zz / divisor};
     const V square = m.xx * m.xx + m.yy * m.yy + m.zz * m.zz + two * (m.xy * m.xy + m.xz * m.xz + m.yz * m.yz);
     const Vec3<V> to_light = towards(probe, t).direction;
     normal = m.times(d);
     for (int axis = 0; axis < 3; ++axis) normal[axis] = -normal[axis];
-    const V seen = square_root(larger(V{}, -dot(d, normal)));
+    const V seen_rms = square_root(larger(V{}, -dot(d, normal)));
     // The ratio of a mean magnitude to its root mean square.
-    const V known = static_cast<T>(0.8) + static_cast<T>(0.2) * square;
-    V mean = known * dot(to_light, normal) / select(seen > 0, seen, unity);
-    if (sided) mean = smaller(mean, known * dot(to_light, front) / whole);
-    const V wide = square_root(three * larger(V{}, dot(to_light, m.times(to_light)) - mean * mean));
-    const V above = clamp(mean + wide, V{}, two * wide);
-    const V facing = above * above / select(wide > 0, two * two * wide, unity) + larger(V{}, mean - wide);
+    const V mean_per_rms = static_cast<T>(0.8) + static_cast<T>(0.2) * square;
+    V mean = mean_per_rms * dot(to_light, normal) / select(seen_rms > 0, seen_rms, unity);
+    if (sided) mean = smaller(mean, mean_per_rms * dot(to_light, front) / divisor);
+    const V half_width = square_root(three * larger(V{}, dot(to_light, m.times(to_light)) - mean * mean));
+    const V upper_part = clamp(mean + half_width, V{}, two * half_width);
+    const V facing = upper_part * upper_part / select(half_width > 0, two * two * half_width, unity) +
+                     larger(V{}, mean - half_width);
 
-    const Vec3<V> half = unit(minus(to_light, d));
-    const V even = square_root(clamp(static_cast<T>(1.5) * square - static_cast<T>(0.5), zero, one));
-    const V spread = (one - even) / three;
-    const V little = static_cast<T>(0.9) * (spread * spread);
-    const V along = dot(half, m.times(half)) - spread + little / three;
-    const V dull = shininess / (one + shininess * spread);
-    const V bright = (one + dull) / (one + shininess);
+    const Vec3<V> half_vector = unit(minus(to_light, d));
+    const V alignment = square_root(clamp(static_cast<T>(1.5) * square - static_cast<T>(0.5), zero, one));
+    const V spread = (one - alignment) / three;
+    const V correction = static_cast<T>(0.9) * (spread * spread);
+    const V along = dot(half_vector, m.times(half_vector)) - spread + correction / three;
+    const V effective_shininess = shininess / (one + shininess * spread);
+    const V brightness = (one + effective_shininess) / (one + shininess);
     V highlight{};
     const MaskOf<V> faces = facing > 0;
     if (any(faces)) {
-      const V cosine = clamp(along / (even + little), zero, one);
-      highlight = select(faces, bright * power_of(cosine, dull * static_cast<T>(0.5)), highlight);
+      const V cosine = clamp(along / (alignment + correction), zero, one);
+      highlight = select(faces, brightness * power_of(cosine, effective_shininess * static_cast<T>(0.5)), highlight);
     }
     return lit(base, one - share + share * facing, share * highlight);
   }
@@ -242,11 +243,11 @@ struct Light {
   // is single scattering; the others approximate more and more scatterings: each has half the optical depth of the one
   // before, is weaker, more coloured and less directed.
   GV_HD Row<T> scattered(Row<T> base, T cosine, T clear) const {
-    const Parameters<T>& own = *parameters;
+    const Parameters<T>& p = *parameters;
     const T albedo[3] = {base.red, base.green, base.blue};
     T weight[3] = {albedo[0], albedo[1], albedo[2]}, sum[3] = {};
-    T g = own.anisotropy;
-    for (T octave = 0; octave < own.octaves; octave = octave + 1) {
+    T g = p.anisotropy;
+    for (T octave = 0; octave < p.octaves; octave = octave + 1) {
       const T share = phase(g, cosine) * clear;
       for (int i = 0; i < 3; ++i) {
         sum[i] = sum[i] + weight[i] * share;
@@ -255,14 +256,14 @@ struct Light {
       g = g * static_cast<T>(kOctaveDirection);
       clear = square_root(clear);
     }
-    const auto lit = [&](int i) { return albedo[i] * own.ambient + own.diffuse * own.light_color[i] * sum[i]; };
+    const auto lit = [&](int i) { return albedo[i] * p.ambient + p.diffuse * p.light_color[i] * sum[i]; };
     return {lit(0), lit(1), lit(2), base.alpha};
   }
   // The Henyey-Greenstein phase function, scaled to a mean of 1 over all directions.
   GV_HD static T phase(T g, T cosine) {
     const T square = g * g;
-    const T away = 1 + square - 2 * g * cosine;
-    return (1 - square) / (away * square_root(away));
+    const T base = 1 + square - 2 * g * cosine;
+    return (1 - square) / (base * square_root(base));
   }
   // The transmittance at which rays to the light end: so small because the last octave uses a root of it.
   GV_HD T faintest(T stop_clear) const {

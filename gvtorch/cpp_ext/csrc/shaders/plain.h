@@ -18,7 +18,7 @@ struct ShaderFacts {
                                               // each of six directions; only the pool's first bricks have the channel
   static constexpr int32_t kFeatures = 0;     // how many numbers it writes to sum.feature_c; they begin as 0
   static constexpr int32_t kAsOther = -1;     // for kFeatures: as many as the second channel holds
-  static bool packs(const ShadeArgs&) { return true; }  // whether packets can trace its rays
+  static bool packets_can_trace(const ShadeArgs&) { return true; }  // whether packets can trace its rays
 };
 
 // The plain transfer function. Table: TransferTable or Transfer.
@@ -31,17 +31,17 @@ struct Plain : ShaderFacts {
   T step;
 
   explicit Plain(const TraceArgs& args) : transfer(args), step(static_cast<T>(args.step)) {}
-  template <class Other>
-  GV_HD explicit Plain(const Plain<T, Other>& other) : transfer(other.transfer), step(other.step) {}
+  template <class OtherTable>
+  GV_HD explicit Plain(const Plain<T, OtherTable>& other) : transfer(other.transfer), step(other.step) {}
 
-  template <class Any>
-  GV_HD bool hides(T low, T high, const Any&) const {
+  template <class AnySum>
+  GV_HD bool hides(T low, T high, const AnySum&) const {
     return Transfer<T>(transfer).transparent(low, high);
   }
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye&, SumOf<V>& sum) const {
-    const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, which);
-    if (!unseen(which, row.alpha)) sum.add(row, piece.start, piece.length, sum.hit_clear, which);
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, SumOf<V>& sum) const {
+    const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
+    if (!all_transparent(mask, row.alpha)) sum.add(row, piece.start, piece.length, sum.hit_clear, mask);
   }
   GV_HD void done(Sum&) const {}
 };

@@ -11,7 +11,7 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-constexpr int32_t kMostNumbers = 16;  // of a voxel that `numbers_at` reads at once
+constexpr int32_t kMaxNumbers = 16;  // of a voxel that `numbers_at` reads at once
 
 template <class T>
 GV_CALL T read_number(const void* numbers, VoxelType type, int64_t index) {
@@ -26,7 +26,7 @@ struct ChannelView {
   VoxelType type;
   int32_t width;  // numbers per voxel
 
-  GV_HD bool given() const { return constant_tnc != nullptr; }
+  GV_HD bool exists() const { return constant_tnc != nullptr; }
   // A number of a node without a brick.
   template <class T>
   GV_HD T constant(int32_t node, int32_t component) const {
@@ -35,27 +35,30 @@ struct ChannelView {
 };
 
 // A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes. Arguments are passed
-// by value, because an address would put the whole kernel's arguments on the stack.
+// by value, because an address would put the whole kernel's arguments on the stack; positions as three numbers, because
+// a CPU would write a struct to the stack in eights and read it back in sixteens, and wait.
 template <class T>
-GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> at) {
+GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, T x, T y, T z) {
   T out = 0;
-  with_voxel(
-      type, [&](auto voxel) { out = trilinear(static_cast<const decltype(voxel)*>(voxels) + first, side, width, at); });
+  with_voxel(type, [&](auto voxel) {
+    out = trilinear(static_cast<const decltype(voxel)*>(voxels) + first, side, width, Vec3<T>{x, y, z});
+  });
   return out;
 }
 
 // Interpolates four consecutive numbers of the voxels.
 template <class T>
-GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, Vec3<T> at) {
+GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, T x, T y,
+                         T z) {
   Row<T> row{};
   with_voxel(type, [&](auto voxel) {
-    const Eight<T> eight(at, side);
+    const EightVoxels<T> corners({x, y, z}, side);
     const int32_t step_y = width * side, step_z = step_y * side;
     const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
-                         (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * width);
-    const auto blend = [&](int32_t which) {
-      return eight.blend([&](int y, int z, T& left, T& right) {
-        const auto* pair = corner + (z * step_z + y * step_y) + which;
+                         (corners.cell[2] * step_z + corners.cell[1] * step_y + corners.cell[0] * width);
+    const auto blend = [&](int32_t i) {
+      return corners.blend([&](int y, int z, T& left, T& right) {
+        const auto* pair = corner + (z * step_z + y * step_y) + i;
         left = number<T>(pair[0]);
         right = number<T>(pair[width]);
       });
@@ -79,15 +82,15 @@ struct Components {
 // Interpolates several numbers of the voxels; the eight voxels are found once.
 template <class T>
 GV_CALL void read_numbers(const void* voxels, VoxelType type, Components<T> components, int32_t count, int64_t first,
-                          int32_t side, Vec3<T> at, T* out) {
+                          int32_t side, T x, T y, T z, T* out) {
   with_voxel(type, [&](auto voxel) {
-    const Eight<T> eight(at, side);
+    const EightVoxels<T> corners({x, y, z}, side);
     const int32_t width = components.width, step_y = width * side, step_z = step_y * side;
     const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
-                         (eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * width);
+                         (corners.cell[2] * step_z + corners.cell[1] * step_y + corners.cell[0] * width);
     for (int32_t i = 0; i < count; ++i) {
       const int32_t component = components[i];
-      out[i] = eight.blend([&](int y, int z, T& left, T& right) {
+      out[i] = corners.blend([&](int y, int z, T& left, T& right) {
         const auto* pair = corner + (z * step_z + y * step_y) + component;
         left = number<T>(pair[0]);
         right = number<T>(pair[width]);
@@ -99,13 +102,13 @@ GV_CALL void read_numbers(const void* voxels, VoxelType type, Components<T> comp
 // A vector of length 1, or 0 where there is no direction.
 template <class T>
 GV_HD Vec3<T> unit(Vec3<T> v) {
-  const T most = larger(larger(absolute(v.x), absolute(v.y)), absolute(v.z));
-  const MaskOf<T> some = most > 0 && most < static_cast<RealOf<T>>(INFINITY);
+  const T largest = larger(larger(absolute(v.x), absolute(v.y)), absolute(v.z));
+  const MaskOf<T> nonzero = largest > 0 && largest < static_cast<RealOf<T>>(INFINITY);
   Vec3<T> scaled{};
-  if (!any(some)) return scaled;
-  scaled = {v.x / most, v.y / most, v.z / most};
+  if (!any(nonzero)) return scaled;
+  scaled = {v.x / largest, v.y / largest, v.z / largest};
   const T length = square_root(dot(scaled, scaled));
-  for (int axis = 0; axis < 3; ++axis) scaled[axis] = select(some, scaled[axis] / length, T{});
+  for (int axis = 0; axis < 3; ++axis) scaled[axis] = select(nonzero, scaled[axis] / length, T{});
   return scaled;
 }
 
@@ -124,16 +127,16 @@ struct Sight {
     }
   }
   GV_HD Vec3<T> at(T t) const {
-    const T far = t + moved;
-    return {origin.x + far * direction.x, origin.y + far * direction.y, origin.z + far * direction.z};
+    const T distance = t + moved;
+    return {origin.x + distance * direction.x, origin.y + distance * direction.y, origin.z + distance * direction.z};
   }
 
-  // Calls body(own member, other's member) for each member that differs between lanes.
-  template <class Own, class Other, class Body>
-  GV_HD static void each(Own& own, Other& other, const Body& body) {
-    body(own.origin, other.origin);
-    body(own.direction, other.direction);
-    body(own.moved, other.moved);
+  // Calls body(a's member, b's member) for each member that differs between lanes.
+  template <class A, class B, class Body>
+  GV_HD static void each_member(A& a, B& b, const Body& body) {
+    body(a.origin, b.origin);
+    body(a.direction, b.direction);
+    body(a.moved, b.moved);
   }
 };
 
@@ -145,10 +148,10 @@ struct Channels {
 
 // A gradient that the CPU computed for many rays at once, before a shader asks for it.
 template <class T>
-struct KnownGradient {
-  T at;  // distance; NaN: none is known
+struct PrefetchedGradient {
+  T t;  // distance; NaN: none is known
   Vec3<T> gradient;
-  bool asked;
+  bool requested;
 };
 
 template <class T>
@@ -158,11 +161,11 @@ struct Probe {
   const Sight<T>& sight;
   Spot<T> fine, coarse;
   bool mixed;
-  T near, growth;  // cone
-  T voxel, blend;  // weight of the coarse node: (cone - voxel) * blend
-  Vec3<T> cube;    // world size of the root cube
+  T cone_near, cone_growth;  // cone
+  T voxel, blend;            // weight of the coarse node: (cone - voxel) * blend
+  Vec3<T> cube;              // world size of the root cube
 #ifndef __CUDACC__
-  KnownGradient<T>* known = nullptr;
+  PrefetchedGradient<T>* prefetched = nullptr;
 #endif
 
   template <class Digits>
@@ -173,33 +176,33 @@ struct Probe {
         fine(visit.fine, digits, ray, channels.border),
         coarse(fine),
         mixed(visit.coarse.node != visit.fine.node),
-        near(ray.cone_near),
-        growth(ray.cone_growth),
+        cone_near(ray.cone_near),
+        cone_growth(ray.cone_growth),
         voxel(visit.voxel),
-        blend(1 / (visit.above - visit.voxel)) {
+        blend(1 / (visit.voxel_above - visit.voxel)) {
     if (mixed) coarse = Spot<T>(visit.coarse, digits, ray, channels.border);
     for (int axis = 0; axis < 3; ++axis) cube[axis] = static_cast<T>(rays.place_33[3 + axis]);
   }
 
   // From all fields, which a packet's walk already has.
   GV_HD Probe(const Channels& channels, const Sight<T>& sight, const Spot<T>& fine, const Spot<T>& coarse, bool mixed,
-              T near, T growth, T voxel, T blend, Vec3<T> cube)
+              T cone_near, T cone_growth, T voxel, T blend, Vec3<T> cube)
       : channels(channels),
         sight(sight),
         fine(fine),
         coarse(coarse),
         mixed(mixed),
-        near(near),
-        growth(growth),
+        cone_near(cone_near),
+        cone_growth(cone_growth),
         voxel(voxel),
         blend(blend),
         cube(cube) {}
 
   // What shaders call to select lanes of a packet's probe (see shaders.h); here there is one ray.
-  GV_HD void narrow(bool) const {}
+  GV_HD void select_lanes(bool) const {}
   template <class Body>
-  GV_HD void each(bool which, const Body& body) const {
-    if (which) body(0, *this);
+  GV_HD void each_lane(bool mask, const Body& body) const {
+    if (mask) body(0, *this);
   }
 
   // The shader's value at distance t.
@@ -223,23 +226,23 @@ struct Probe {
     return mixed ? between(row, four_in(channel, first, coarse, t), t) : row;
   }
 
-  // Several numbers of a channel at distance t, at most kMostNumbers.
+  // Several numbers of a channel at distance t, at most kMaxNumbers.
   GV_HD void numbers_at(const ChannelView& channel, Components<T> components, int32_t count, T t, T* out) const {
     read(channel, components, count, fine, t, out);
     if (!mixed) return;
-    T other[kMostNumbers];
-    read(channel, components, count, coarse, t, other);
-    const T part = weight(t);
-    for (int32_t i = 0; i < count; ++i) out[i] = out[i] + part * (other[i] - out[i]);
+    T coarse_numbers[kMaxNumbers];
+    read(channel, components, count, coarse, t, coarse_numbers);
+    const T coarse_weight = weight(t);
+    for (int32_t i = 0; i < count; ++i) out[i] = out[i] + coarse_weight * (coarse_numbers[i] - out[i]);
   }
 
   // Gradient of the value at distance t, per world unit: differences over one voxel, half a voxel to each side, for
   // which a border of 1 suffices. Neighbours read the same voxels at the face they share, so no seam shows.
   GV_HD Vec3<T> gradient(T t) const {
 #ifndef __CUDACC__
-    if (known != nullptr) {
-      known->asked = true;
-      if (known->at == t) return known->gradient;
+    if (prefetched != nullptr) {
+      prefetched->requested = true;
+      if (prefetched->t == t) return prefetched->gradient;
     }
 #endif
     const Vec3<T> slope = differences(fine, t);
@@ -258,14 +261,15 @@ struct Probe {
 #pragma unroll 1
 #endif
     for (int axis = 0; axis < 3; ++axis) {
-      slope[axis] =
-          difference(spot, t, axis, [&](Vec3<T> at) { return read(channels.value, channels.component, spot, at); });
+      slope[axis] = difference(
+          spot, t, axis, [&](Vec3<T> position) { return read(channels.value, channels.component, spot, position); });
     }
     return slope;
   }
   GV_HD Row<T> four_of(bool, const ChannelView& channel, int32_t component, const Spot<T>& spot, T t) const {
     const int64_t first = first_of(channel, component, spot);
-    return read_four(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, spot.at(t));
+    const Vec3<T> at = spot.at(t);
+    return read_four(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at.x, at.y, at.z);
   }
   GV_HD static T scale_of(const Spot<T>& spot) { return spot.scale; }
   // The value of one voxel of a brick; x, y and z count the border.
@@ -275,13 +279,15 @@ struct Probe {
     return read_number<T>(channel.bricks_bzyxc, channel.type,
                           first_of(channel, channels.component, spot) + voxel * channel.width);
   }
-  GV_HD T weight(T t) const { return clamp((near + growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1)); }
+  GV_HD T weight(T t) const {
+    return clamp((cone_near + cone_growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1));
+  }
 
   // Blends the two nodes' results at distance t, a number or several: the coarse one has `weight`.
-  template <class Some>
-  GV_HD Some between(const Some& finer, const Some& coarser, T t) const {
-    const T part = weight(t);
-    return combined(finer, coarser, [&](T a, T b) { return a + part * (b - a); });
+  template <class Numbers>
+  GV_HD Numbers between(const Numbers& finer, const Numbers& coarser, T t) const {
+    const T coarse_weight = weight(t);
+    return combined(finer, coarser, [&](T a, T b) { return a + coarse_weight * (b - a); });
   }
 
   // True if neither node has a brick and all numbers of both are equal: one value all over the visit.
@@ -308,24 +314,27 @@ struct Probe {
  private:
   GV_HD Row<T> four_in(const ChannelView& channel, int32_t first, const Spot<T>& spot, T t) const {
     if (spot.brick >= 0) return four_of(true, channel, first, spot, t);
-    const auto read = [&](int32_t which) { return channel.constant<T>(spot.node, first + which); };
+    const auto read = [&](int32_t i) { return channel.constant<T>(spot.node, first + i); };
     return {read(0), read(1), read(2), read(3)};
   }
-  GV_HD T read(const ChannelView& channel, int32_t component, const Spot<T>& spot, Vec3<T> at) const {
+  GV_HD T read(const ChannelView& channel, int32_t component, const Spot<T>& spot, Vec3<T> position) const {
     if (spot.brick < 0) return channel.constant<T>(spot.node, component);
     const int64_t first = first_of(channel, component, spot);
-    return read_brick(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at);
+    return read_brick(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, position.x, position.y,
+                      position.z);
   }
   GV_HD void read(const ChannelView& channel, Components<T> components, int32_t count, const Spot<T>& spot, T t,
                   T* out) const {
     if (spot.brick >= 0) {
       const int64_t first = first_of(channel, 0, spot);
-      return read_numbers(channel.bricks_bzyxc, channel.type, components, count, first, channels.side, spot.at(t), out);
+      const Vec3<T> at = spot.at(t);
+      return read_numbers(channel.bricks_bzyxc, channel.type, components, count, first, channels.side, at.x, at.y, at.z,
+                          out);
     }
     for (int32_t i = 0; i < count; ++i) out[i] = channel.constant<T>(spot.node, components[i]);
   }
   GV_HD bool same(const ChannelView& channel) const {
-    if (!channel.given()) return true;
+    if (!channel.exists()) return true;
     for (int32_t component = 0; component < channel.width; ++component) {
       if (channel.constant<T>(fine.node, component) != channel.constant<T>(coarse.node, component)) return false;
     }
@@ -345,7 +354,7 @@ struct TypedProbe : Probe<T> {
   GV_HD T value_of(const Spot<T>& spot, T t) const {
     const ChannelView& channel = this->channels.value;
     const auto* constants = static_cast<const Voxel*>(channel.constant_tnc);
-    if (spot.brick >= 0) return trilinear(first(spot), this->channels.side, channel.width, spot.at(t));
+    if (spot.brick >= 0) return trilinear(first_voxel(spot), this->channels.side, channel.width, spot.at(t));
     return number<T>(constants[static_cast<int64_t>(spot.node) * channel.width + this->channels.component]);
   }
   GV_HD Vec3<T> gradient(T t) const {
@@ -355,10 +364,11 @@ struct TypedProbe : Probe<T> {
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
     Vec3<T> slope{0, 0, 0};
     if (spot.brick < 0) return slope;
-    const Voxel* voxels = first(spot);
+    const Voxel* voxels = first_voxel(spot);
     const int32_t side = this->channels.side, width = this->channels.value.width;
     for (int axis = 0; axis < 3; ++axis) {
-      slope[axis] = this->difference(spot, t, axis, [&](Vec3<T> at) { return trilinear(voxels, side, width, at); });
+      slope[axis] =
+          this->difference(spot, t, axis, [&](Vec3<T> position) { return trilinear(voxels, side, width, position); });
     }
     return slope;
   }
@@ -369,17 +379,17 @@ struct TypedProbe : Probe<T> {
     const int32_t side = this->channels.side;
     const Spot<T>& spot = this->fine;
     if (!this->mixed && spot.brick >= 0 && this->channels.value.width == 1 &&
-        Eight<T>::is_inside(spot.at(begin), side) && Eight<T>::is_inside(spot.at(end), side)) {
-      const Voxel* voxels = first(spot);
-      if (side == 10) return body([&](T t) { return trilinear(voxels, Eight<T>(spot.at(t)), 10, 1); });
-      if (side == 18) return body([&](T t) { return trilinear(voxels, Eight<T>(spot.at(t)), 18, 1); });
+        EightVoxels<T>::is_inside(spot.at(begin), side) && EightVoxels<T>::is_inside(spot.at(end), side)) {
+      const Voxel* voxels = first_voxel(spot);
+      if (side == 10) return body([&](T t) { return trilinear(voxels, EightVoxels<T>(spot.at(t)), 10, 1); });
+      if (side == 18) return body([&](T t) { return trilinear(voxels, EightVoxels<T>(spot.at(t)), 18, 1); });
     }
 #endif
     return body([this](T t) { return value(t); });
   }
 
  private:
-  GV_HD const Voxel* first(const Spot<T>& spot) const {
+  GV_HD const Voxel* first_voxel(const Spot<T>& spot) const {
     const ChannelView& channel = this->channels.value;
     return static_cast<const Voxel*>(channel.bricks_bzyxc) + this->first_of(channel, this->channels.component, spot);
   }

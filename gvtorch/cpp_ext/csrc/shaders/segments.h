@@ -22,8 +22,8 @@ struct Segment {
   int32_t wanted = 0;            // depth that the cone asked for
   int32_t first = 0, count = 0;  // number of the first interval, counted from base; how many intervals
   int32_t level = kPiece;        // intervals are step * 2^level long, or kPiece
-  // Distances from where the ray enters the scene; seen: where the nodes were looked up.
-  T base = 0, start = 0, end = 0, seen = 0;
+  // Distances from where the ray enters the scene; lookup_t: where the nodes were looked up.
+  T base = 0, start = 0, end = 0, lookup_t = 0;
 };
 
 template <class T>
@@ -31,23 +31,23 @@ struct SegmentView {
   int32_t *ray_s, *node_s2, *brick_s2, *depth_s3, *interval_s3;
   T *t0_s, *t1_s, *distance_s3;
 
-  GV_HD void write(int64_t place, int64_t ray, const Segment<T>& segment, T moved) const {
-    ray_s[place] = static_cast<int32_t>(ray);
-    node_s2[2 * place] = segment.fine.node;
-    node_s2[2 * place + 1] = segment.coarse.node;
-    brick_s2[2 * place] = segment.fine.brick;
-    brick_s2[2 * place + 1] = segment.coarse.brick;
-    depth_s3[3 * place] = segment.fine.depth;
-    depth_s3[3 * place + 1] = segment.coarse.depth;
-    depth_s3[3 * place + 2] = segment.wanted;
-    interval_s3[3 * place] = segment.first;
-    interval_s3[3 * place + 1] = segment.count;
-    interval_s3[3 * place + 2] = segment.level;
-    t0_s[place] = segment.start + moved;
-    t1_s[place] = segment.end + moved;
-    distance_s3[3 * place] = segment.base;
-    distance_s3[3 * place + 1] = segment.end;
-    distance_s3[3 * place + 2] = segment.seen;
+  GV_HD void write(int64_t row, int64_t ray, const Segment<T>& segment, T moved) const {
+    ray_s[row] = static_cast<int32_t>(ray);
+    node_s2[2 * row] = segment.fine.node;
+    node_s2[2 * row + 1] = segment.coarse.node;
+    brick_s2[2 * row] = segment.fine.brick;
+    brick_s2[2 * row + 1] = segment.coarse.brick;
+    depth_s3[3 * row] = segment.fine.depth;
+    depth_s3[3 * row + 1] = segment.coarse.depth;
+    depth_s3[3 * row + 2] = segment.wanted;
+    interval_s3[3 * row] = segment.first;
+    interval_s3[3 * row + 1] = segment.count;
+    interval_s3[3 * row + 2] = segment.level;
+    t0_s[row] = segment.start + moved;
+    t1_s[row] = segment.end + moved;
+    distance_s3[3 * row] = segment.base;
+    distance_s3[3 * row + 1] = segment.end;
+    distance_s3[3 * row + 2] = segment.lookup_t;
   }
 };
 
@@ -60,16 +60,17 @@ struct WalkRay {
   bool by_node;       // a visit of two nodes is never a region, even where their constants are equal
 
   GV_HD Intervals<T> begin(const Ray<T>& ray, int64_t number) const {
-    Intervals<T> at(ray, kernel.options.step, kernel.lengths);
-    if (state_r3 == nullptr) return at;
-    at.base = state_r3[3 * number];
-    at.count = state_r3[3 * number + 1];
-    at.level = static_cast<int32_t>(clamp(state_r3[3 * number + 2], static_cast<T>(0), static_cast<T>(at.top)));
-    at.length = at.step;
-    for (int32_t level = 0; level < at.level; ++level) at.length = at.length + at.length;
-    at.shortness = 1 / at.length;
-    at.start = at.start_of(at.count);
-    return at;
+    Intervals<T> intervals(ray, kernel.options.step, kernel.lengths);
+    if (state_r3 == nullptr) return intervals;
+    intervals.base = state_r3[3 * number];
+    intervals.count = state_r3[3 * number + 1];
+    intervals.level =
+        static_cast<int32_t>(clamp(state_r3[3 * number + 2], static_cast<T>(0), static_cast<T>(intervals.top)));
+    intervals.length = intervals.step;
+    for (int32_t level = 0; level < intervals.level; ++level) intervals.length = intervals.length + intervals.length;
+    intervals.inverse_length = 1 / intervals.length;
+    intervals.start = intervals.start_of(intervals.count);
+    return intervals;
   }
 
   // See Walk::follow.
@@ -79,22 +80,22 @@ struct WalkRay {
     const WalkRay& walk;
     Emit& emit;
     int32_t segments = 0, samples = 0, visits = 0;
-    bool lacks = false;
+    bool missing = false;
 
-    GV_HD bool& missed() { return lacks; }
+    GV_HD bool& missed() { return missing; }
     GV_HD bool sees() const { return true; }
-    GV_HD bool more() {
+    GV_HD bool goes_on() {
       if (walk.limit != 0 && samples >= walk.limit) return false;
       ++visits;
       return true;
     }
-    GV_HD NodeWords words(int32_t node) const { return walk.kernel.words(node); }
+    GV_HD NodeWords node_words(int32_t node) const { return walk.kernel.node_words(node); }
     GV_HD Segment<T> enter(const Ray<T>&, const Visit<T>& visit, const Digits&) const {
       Segment<T> segment;
       segment.fine = visit.fine;
       segment.coarse = visit.coarse;
       segment.wanted = visit.wanted;
-      segment.seen = visit.seen;
+      segment.lookup_t = visit.lookup_t;
       return segment;
     }
     GV_HD bool uniform(const Segment<T>& segment) const {
@@ -110,21 +111,21 @@ struct WalkRay {
       segment.level = kPiece;
       finish(segment);
     }
-    GV_HD int32_t take(Segment<T>& segment, const Intervals<T>& at, int32_t alike, bool last) {
-      if (last || at.base != segment.base || at.level != segment.level) finish(segment);
+    GV_HD int32_t take_intervals(Segment<T>& segment, const Intervals<T>& intervals, int32_t run_length, bool last) {
+      if (last || intervals.base != segment.base || intervals.level != segment.level) finish(segment);
       if (last) {
-        region(segment, at.start, at.stop);
+        region(segment, intervals.start, intervals.stop);
         return 1;
       }
       if (segment.count == 0) {
-        segment.base = at.base;
-        segment.start = at.start;
-        segment.first = static_cast<int32_t>(at.count);
-        segment.level = at.level;
+        segment.base = intervals.base;
+        segment.start = intervals.start;
+        segment.first = static_cast<int32_t>(intervals.count);
+        segment.level = intervals.level;
       }
-      segment.count += alike;
-      segment.end = at.start_of(at.count + static_cast<T>(alike));
-      return alike;
+      segment.count += run_length;
+      segment.end = intervals.start_of(intervals.count + static_cast<T>(run_length));
+      return run_length;
     }
     // Emits the complete segment; another may begin.
     GV_HD void finish(Segment<T>& segment) {
@@ -137,9 +138,9 @@ struct WalkRay {
   };
 
   template <class Emit>
-  GV_HD Visitor<Emit> walk(const Ray<T>& ray, Intervals<T>& at, Emit& emit) const {
+  GV_HD Visitor<Emit> walk(const Ray<T>& ray, Intervals<T>& intervals, Emit& emit) const {
     Visitor<Emit> visitor{*this, emit};
-    kernel.template follow<Digits>(ray, at, visitor);
+    kernel.template follow<Digits>(ray, intervals, visitor);
     return visitor;
   }
 
@@ -159,16 +160,16 @@ struct CountSegments {
     const int64_t ray_number = walk.kernel.order(index);
     if (ray_number < 0) return;
     const Ray<T> ray(walk.kernel.rays, ray_number);
-    Intervals<T> at = walk.begin(ray, ray_number);
+    Intervals<T> intervals = walk.begin(ray, ray_number);
     const auto ignore = [](const Segment<T>&) {};
-    const auto walked = walk.walk(ray, at, ignore);
+    const auto walked = walk.walk(ray, intervals, ignore);
     count_r3[3 * ray_number] = walked.segments;
     count_r3[3 * ray_number + 1] = walked.samples;
     count_r3[3 * ray_number + 2] = walked.visits;
-    state_r3[3 * ray_number] = at.base;
-    state_r3[3 * ray_number + 1] = at.count;
-    state_r3[3 * ray_number + 2] = static_cast<T>(at.level);
-    missed_r[ray_number] = walked.lacks;
+    state_r3[3 * ray_number] = intervals.base;
+    state_r3[3 * ray_number + 1] = intervals.count;
+    state_r3[3 * ray_number + 2] = static_cast<T>(intervals.level);
+    missed_r[ray_number] = walked.missing;
   }
 };
 
@@ -183,13 +184,13 @@ struct WriteSegments {
     const int64_t ray_number = walk.kernel.order(index);
     if (ray_number < 0) return;
     const Ray<T> ray(walk.kernel.rays, ray_number);
-    Intervals<T> at = walk.begin(ray, ray_number);
-    int64_t place = first_r[ray_number];
+    Intervals<T> intervals = walk.begin(ray, ray_number);
+    int64_t row = first_r[ray_number];
     const auto write = [&](const Segment<T>& segment) {
-      if (place >= 0 && place < total) out.write(place, ray_number, segment, ray.moved);
-      ++place;
+      if (row >= 0 && row < total) out.write(row, ray_number, segment, ray.moved);
+      ++row;
     };
-    walk.walk(ray, at, write);
+    walk.walk(ray, intervals, write);
   }
 };
 
@@ -199,12 +200,14 @@ struct BrickView {
   const Voxel *bricks_bzyxc, *constant_tnc;
   int32_t side, border, channels;
 
-  GV_HD int64_t first(int32_t brick) const { return static_cast<int64_t>(brick) * side * side * side * channels; }
+  GV_HD int64_t first_number(int32_t brick) const {
+    return static_cast<int64_t>(brick) * side * side * side * channels;
+  }
 };
 
 // Finds what a sample of a segment reads: the bricks (or constants) of two nodes, and the weight of the coarse one.
 template <class T, class Voxel>
-struct AimSample {
+struct FindSample {
   RayView rays;
   TreeView tree;  // only its shape
   Levels<T> levels;
@@ -214,51 +217,51 @@ struct AimSample {
   int64_t ray_count, segment_count, node_count, brick_count;
   T step;
 
-  struct Aimed {
+  struct SampleSource {
     Spot<T> fine, coarse;
     T t, weight;
-    bool known = false;  // everything the segment refers to exists
+    bool valid = false;  // everything the segment refers to exists
   };
 
-  GV_HD Aimed operator()(int64_t k) const {
-    Aimed aimed;
+  GV_HD SampleSource operator()(int64_t k) const {
+    SampleSource source;
     const int64_t segment = segment_k[k];
-    if (segment < 0 || segment >= segment_count) return aimed;
+    if (segment < 0 || segment >= segment_count) return source;
     const int32_t wanted = segments.depth_s3[3 * segment + 2];
     const int64_t ray_number = segments.ray_s[segment];
     Holder holders[2];
-    for (int which = 0; which < 2; ++which) {
-      Holder& holder = holders[which];
-      holder = {segments.node_s2[2 * segment + which], segments.brick_s2[2 * segment + which],
-                segments.depth_s3[3 * segment + which]};
+    for (int i = 0; i < 2; ++i) {
+      Holder& holder = holders[i];
+      holder = {segments.node_s2[2 * segment + i], segments.brick_s2[2 * segment + i],
+                segments.depth_s3[3 * segment + i]};
       if (holder.node < 0 || holder.node >= node_count || holder.brick >= brick_count || holder.depth < 0 ||
           holder.depth > tree.max_depth)
-        return aimed;
+        return source;
     }
-    if (ray_number < 0 || ray_number >= ray_count || wanted < 0 || wanted > tree.max_depth) return aimed;
-    aimed.known = true;
+    if (ray_number < 0 || ray_number >= ray_count || wanted < 0 || wanted > tree.max_depth) return source;
+    source.valid = true;
     const Ray<T> ray(rays, ray_number);
     const Digits<T> digits(tree, levels, rays, ray, segments.distance_s3[3 * segment + 2]);
-    aimed.fine = aimed.coarse = Spot<T>(holders[0], digits, ray, bricks.border);
-    aimed.t = place(segment, number_k[k]);
-    aimed.weight = 0;
+    source.fine = source.coarse = Spot<T>(holders[0], digits, ray, bricks.border);
+    source.t = middle_of(segment, number_k[k]);
+    source.weight = 0;
     if (holders[1].node != holders[0].node) {
-      aimed.coarse = Spot<T>(holders[1], digits, ray, bricks.border);
+      source.coarse = Spot<T>(holders[1], digits, ray, bricks.border);
       const T voxel = levels.voxel[wanted];
       const T blend = 1 / ((wanted > 0 ? levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - voxel);
-      const T cone = ray.cone_near + ray.cone_growth * aimed.t;
-      aimed.weight = clamp((cone - voxel) * blend, static_cast<T>(0), static_cast<T>(1));
+      const T cone = ray.cone_near + ray.cone_growth * source.t;
+      source.weight = clamp((cone - voxel) * blend, static_cast<T>(0), static_cast<T>(1));
     }
-    return aimed;
+    return source;
   }
   // Distance of the middle of a segment's interval.
-  GV_HD T place(int64_t segment, int32_t number) const {
+  GV_HD T middle_of(int64_t segment, int32_t number) const {
     const int32_t level = segments.interval_s3[3 * segment + 2];
     const T base = segments.distance_s3[3 * segment];
     const T end = segments.distance_s3[3 * segment + 1];
     if (level < 0) return base + (end - base) * static_cast<T>(0.5);
     T length = step;
-    for (int32_t power = 0; power < smaller(level, kMostLevels); ++power) length = length + length;
+    for (int32_t power = 0; power < smaller(level, kMaxLevels); ++power) length = length + length;
     const int32_t count = segments.interval_s3[3 * segment] + number;
     return base + (static_cast<T>(count) + static_cast<T>(0.5)) * length;
   }
@@ -266,27 +269,27 @@ struct AimSample {
 
 template <class T, class Voxel>
 struct SampleBricks {
-  AimSample<T, Voxel> aim_sample;
+  FindSample<T, Voxel> find_sample;
   T* value_kc;
 
   GV_HD void operator()(int64_t k) const {
-    const auto aimed = aim_sample(k);
-    const BrickView<Voxel>& bricks = aim_sample.bricks;
-    const bool mixed = aimed.coarse.node != aimed.fine.node;
+    const auto source = find_sample(k);
+    const BrickView<Voxel>& bricks = find_sample.bricks;
+    const bool mixed = source.coarse.node != source.fine.node;
     for (int32_t channel = 0; channel < bricks.channels; ++channel) {
       T value = 0;
-      if (aimed.known) {
-        value = read(aimed.fine, aimed.t, channel);
-        if (mixed) value = value + aimed.weight * (read(aimed.coarse, aimed.t, channel) - value);
+      if (source.valid) {
+        value = read(source.fine, source.t, channel);
+        if (mixed) value = value + source.weight * (read(source.coarse, source.t, channel) - value);
       }
       value_kc[k * bricks.channels + channel] = value;
     }
   }
   GV_HD T read(const Spot<T>& spot, T t, int32_t channel) const {
-    const BrickView<Voxel>& bricks = aim_sample.bricks;
+    const BrickView<Voxel>& bricks = find_sample.bricks;
     if (spot.brick < 0)
       return number<T>(bricks.constant_tnc[static_cast<int64_t>(spot.node) * bricks.channels + channel]);
-    const Voxel* voxels = bricks.bricks_bzyxc + bricks.first(spot.brick) + channel;
+    const Voxel* voxels = bricks.bricks_bzyxc + bricks.first_number(spot.brick) + channel;
     return trilinear(voxels, bricks.side, bricks.channels, spot.at(t));
   }
 };
@@ -294,18 +297,18 @@ struct SampleBricks {
 // The gradient of SampleBricks: each sample adds to the voxels (or constants) it was made of.
 template <class T, class Voxel>
 struct SpreadGradient {
-  AimSample<T, Voxel> aim_sample;
+  FindSample<T, Voxel> find_sample;
   const T* grad_kc;
   T *grad_bzyxc, *grad_tnc;
 
   GV_HD void operator()(int64_t k) const {
-    const auto aimed = aim_sample(k);
-    if (!aimed.known) return;
-    spread(aimed.fine, aimed.t, k, 1 - aimed.weight);
-    if (aimed.coarse.node != aimed.fine.node) spread(aimed.coarse, aimed.t, k, aimed.weight);
+    const auto source = find_sample(k);
+    if (!source.valid) return;
+    spread(source.fine, source.t, k, 1 - source.weight);
+    if (source.coarse.node != source.fine.node) spread(source.coarse, source.t, k, source.weight);
   }
   GV_HD void spread(const Spot<T>& spot, T t, int64_t k, T share) const {
-    const BrickView<Voxel>& bricks = aim_sample.bricks;
+    const BrickView<Voxel>& bricks = find_sample.bricks;
     const T* grad_c = grad_kc + k * bricks.channels;
     if (spot.brick < 0) {
       T* constant = grad_tnc + static_cast<int64_t>(spot.node) * bricks.channels;
@@ -313,17 +316,17 @@ struct SpreadGradient {
         add_to(constant + channel, share * grad_c[channel]);
       return;
     }
-    const Eight<T> eight(spot.at(t), bricks.side);
-    const auto& weight = eight.weight;
-    T* first = grad_bzyxc + bricks.first(spot.brick);
-    for (int which = 0; which < 8; ++which) {
-      const int dx = which & 1, dy = which >> 1 & 1, dz = which >> 2;
-      const T part = share * (dx ? weight[0] : 1 - weight[0]) * (dy ? weight[1] : 1 - weight[1]) *
-                     (dz ? weight[2] : 1 - weight[2]);
-      const int64_t z = eight.cell[2] + dz, y = eight.cell[1] + dy, x = eight.cell[0] + dx;
+    const EightVoxels<T> corners(spot.at(t), bricks.side);
+    const auto& weight = corners.weight;
+    T* first = grad_bzyxc + bricks.first_number(spot.brick);
+    for (int i = 0; i < 8; ++i) {
+      const int dx = i & 1, dy = i >> 1 & 1, dz = i >> 2;
+      const T corner_share = share * (dx ? weight[0] : 1 - weight[0]) * (dy ? weight[1] : 1 - weight[1]) *
+                             (dz ? weight[2] : 1 - weight[2]);
+      const int64_t z = corners.cell[2] + dz, y = corners.cell[1] + dy, x = corners.cell[0] + dx;
       T* voxel_c = first + ((z * bricks.side + y) * bricks.side + x) * bricks.channels;
       for (int32_t channel = 0; channel < bricks.channels; ++channel) {
-        add_to(voxel_c + channel, part * grad_c[channel]);
+        add_to(voxel_c + channel, corner_share * grad_c[channel]);
       }
     }
   }
@@ -378,20 +381,20 @@ struct CompositeGradient {
 
   GV_HD void operator()(int64_t ray) const {
     const int64_t begin = packed.begin(ray), end = packed.end(ray);
-    T behind = grad_left_r[ray];  // gradient of the light that enters the samples behind
+    T grad_behind = grad_left_r[ray];  // gradient of the light that enters the samples behind
     for (int64_t k = end - 1; k >= begin; --k) {
       const T before = before_k[k], alpha = alpha_k[k];
-      T own = 0;  // gradient of the light that the sample absorbs
+      T grad_absorbed = 0;  // gradient of the light that the sample absorbs
       for (int32_t channel = 0; channel < packed.channels; ++channel) {
         const T grad = grad_sum_rc[ray * packed.channels + channel];
-        own = own + grad * feature_kc[k * packed.channels + channel];
+        grad_absorbed = grad_absorbed + grad * feature_kc[k * packed.channels + channel];
         grad_feature_kc[k * packed.channels + channel] = before * alpha * grad;
       }
       const bool counts = before > 0 || !(stop_clear > 0);
-      grad_alpha_k[k] = counts ? before * (own - behind) : 0;
-      if (counts) behind = alpha * own + (1 - alpha) * behind;
+      grad_alpha_k[k] = counts ? before * (grad_absorbed - grad_behind) : 0;
+      if (counts) grad_behind = alpha * grad_absorbed + (1 - alpha) * grad_behind;
     }
-    grad_clear_r[ray] = behind;
+    grad_clear_r[ray] = grad_behind;
   }
 };
 

@@ -9,24 +9,24 @@ namespace gvtorch {
 // Gives a ShadeRay memory for each node, to cache what is hidden from all rays: see kUnknown in walk.h. The returned
 // tensor owns it.
 template <class Kernel>
-torch::stable::Tensor hide_nodes(const torch::stable::Tensor& like, int64_t nodes, Kernel& kernel) {
-  torch::stable::Tensor places;
+torch::stable::Tensor allocate_node_cache(const torch::stable::Tensor& like, int64_t nodes, Kernel& kernel) {
+  torch::stable::Tensor node_cache;
   if constexpr (Kernel::kHidesAlike) {
 #ifdef __CUDACC__
-    places = torch::stable::new_empty(like, {nodes}, torch::headeronly::ScalarType::Long);
-    kernel.words_tn = static_cast<NodeWords*>(places.mutable_data_ptr());
+    node_cache = torch::stable::new_empty(like, {nodes}, torch::headeronly::ScalarType::Long);
+    kernel.words_tn = static_cast<NodeWords*>(node_cache.mutable_data_ptr());
     for_each(like, nodes, HideShaded<Kernel>{kernel});
 #else
-    places = torch::stable::new_zeros(like, {nodes}, torch::headeronly::ScalarType::Byte);
-    kernel.hidden_tn = static_cast<uint8_t*>(places.mutable_data_ptr());
+    node_cache = torch::stable::new_zeros(like, {nodes}, torch::headeronly::ScalarType::Byte);
+    kernel.hidden_tn = static_cast<uint8_t*>(node_cache.mutable_data_ptr());
 #endif
   }
-  return places;
+  return node_cache;
 }
 
 template <class Kernel>
 void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel) {
-  const torch::stable::Tensor places = hide_nodes(like, nodes, kernel);
+  const torch::stable::Tensor node_cache = allocate_node_cache(like, nodes, kernel);
   for_each(like, kernel.order.count(), kernel);
 }
 
@@ -35,11 +35,11 @@ void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel)
 // rays, for the plain function in float32 alone.
 template <class T>
 void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
-  const auto each = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };
+  const auto trace_with = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };
   const auto typed = [&](auto shader, auto voxel) {
     using Shader = typename decltype(shader)::Shader;
     with_digits<T>(args, [&](auto* digits) {
-      each(ShadeRay<T, Shader, std::decay_t<decltype(*digits)>, false, decltype(voxel)>(args));
+      trace_with(ShadeRay<T, Shader, std::decay_t<decltype(*digits)>, false, decltype(voxel)>(args));
     });
   };
 #ifdef __CUDACC__
@@ -56,7 +56,7 @@ void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
     if (!is_deep(args)) {
       const auto shallow = [&](auto shader, auto voxel) {
         using Shader = typename decltype(shader)::Shader;
-        each(ShadeRay<T, Shader, BitDigits, false, decltype(voxel)>(args));
+        trace_with(ShadeRay<T, Shader, BitDigits, false, decltype(voxel)>(args));
       };
       const ShaderType<Lit<T>, false> lit;
       const bool is_lit = is(ShaderKind::kLit);
@@ -75,7 +75,7 @@ void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
       return with_voxel(args.voxel, [&](auto voxel) { typed(ShaderType<Plain<T>, false>{}, voxel); });
     }
   }
-  with_rays<T>(args, each);
+  with_rays<T>(args, trace_with);
 }
 
 }  // namespace gvtorch

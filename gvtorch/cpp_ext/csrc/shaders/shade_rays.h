@@ -18,15 +18,15 @@ inline namespace GV_NAMESPACE {
 // Digits: see `with_digits`. Voxel: dtype of the shader's value; void: known at run time only.
 template <class T, class Shader, class Digits, bool kShadows = false, class Voxel = void>
 struct ShadeRay : Walk<T> {
-  using Eye = ProbeOf<T, Voxel>;
+  using RayProbe = ProbeOf<T, Voxel>;
   using Walk<T>::tree;
   using Walk<T>::options;
   using Sum = typename Shader::Sum;
-  // Reads of a known dtype are inlined, and a short shader's loop may be instantiated several times. kBlocksAtOnce (see
+  // Reads of a known dtype are inlined, and a short shader's loop may be instantiated several times. kBlocksPerSM (see
   // for_each.h): 8 leave 64 registers to a thread, 4 leave 128.
   static constexpr bool kShort =
       !std::is_void_v<Voxel> && std::is_base_of_v<Plain<T>, Shader> && !std::is_base_of_v<Lit<T>, Shader>;
-  static constexpr int kBlocksAtOnce = kShort && Shader::kFiltered == 0 ? 8 : 4;
+  static constexpr int kBlocksPerSM = kShort && Shader::kFiltered == 0 ? 8 : 4;
   static constexpr bool kHidesAlike = Shader::kHidesAlike;
   Shader shader;
   Channels channels;
@@ -61,13 +61,13 @@ struct ShadeRay : Walk<T> {
     if (number < 0) return;
     const Ray<T> ray(this->rays, number);
     const Sight<T> sight(this->rays, number, ray.moved);
-    Intervals<T> at(ray, options.step, lengths);
+    Intervals<T> intervals(ray, options.step, lengths);
     Sum sum;
     sum.begin(0, static_cast<T>(this->rays.clear(number)), this->hit_clear, features_rc + number * features);
     for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
     const auto& ready = ready_for_ray(shader);
     Visitor<std::decay_t<decltype(ready)>> visitor{*this, ready, &ray, &sight, sum};
-    this->template follow<Digits>(ray, at, visitor);
+    this->template follow<Digits>(ray, intervals, visitor);
     if constexpr (Shader::kSurface) {
       if (sum.depth < static_cast<T>(INFINITY)) {
         surface<Digits>(ray, sight, sum);
@@ -85,16 +85,16 @@ struct ShadeRay : Walk<T> {
     const int64_t row = int64_t{2} * node * channels.value.width + component;
     const auto read = [&](int64_t index) { return read_number<T>(range_tn2c, channels.value.type, index); };
     Range range{read(row), read(row + channels.value.width)};
-    for (int32_t other = 1; other < directions; ++other) {
-      range.low = smaller(range.low, read(row + 4 * other));
-      range.high = larger(range.high, read(row + channels.value.width + 4 * other));
+    for (int32_t direction = 1; direction < directions; ++direction) {
+      range.low = smaller(range.low, read(row + 4 * direction));
+      range.high = larger(range.high, read(row + channels.value.width + 4 * direction));
     }
     return range;
   }
   // True if no value in the node's range changes the sum.
-  template <class Any>
-  GV_HD bool hides(const Any& shader, int32_t node, const typename Any::Sum& sum) const {
-    if constexpr (Any::kReadsAll) {
+  template <class AnyShader>
+  GV_HD bool hides(const AnyShader& shader, int32_t node, const typename AnyShader::Sum& sum) const {
+    if constexpr (AnyShader::kReadsAll) {
       return shader.hides_ranges([&](int32_t component) { return range_of(node, component); });
     } else {
       const Range range = range_of(node);
@@ -104,14 +104,14 @@ struct ShadeRay : Walk<T> {
 
   // The same for all rays, computed once per node.
   bool hides(int32_t node) const {
-    uint8_t known = load_byte(&hidden_tn[node]);
-    if (known == kUnknown) {
-      known = hides(shader, node, Sum()) ? kHidden : kShown;
-      store_byte(&hidden_tn[node], known);
+    uint8_t state = load_byte(&hidden_tn[node]);
+    if (state == kUnknown) {
+      state = hides(shader, node, Sum()) ? kHidden : kShown;
+      store_byte(&hidden_tn[node], state);
     }
-    return known == kHidden;
+    return state == kHidden;
   }
-  GV_HD NodeWords words(int32_t node) const {
+  GV_HD NodeWords node_words(int32_t node) const {
 #ifdef __CUDA_ARCH__
     return words_tn[node];
 #else
@@ -120,13 +120,13 @@ struct ShadeRay : Walk<T> {
   }
 
   // Shades where depth was set. This may be half an interval outside the visited node, so the node is looked up again.
-  template <class Number>
+  template <class AnyDigits>
   GV_HD void surface(const Ray<T>& ray, const Sight<T>& sight, Sum& sum) const {
-    Number digits(tree, this->levels, this->rays, ray, sum.depth);
+    AnyDigits digits(tree, this->levels, this->rays, ray, sum.depth);
     int32_t wanted = 0;
-    const auto words = [&](int32_t node) { return tree.words_of(node, false); };
+    const auto read_words = [&](int32_t node) { return tree.words_of(node, false); };
     const T cone = ray.cone_near + ray.cone_growth * sum.depth;
-    const Visit<T> visit = this->find(ray, digits, cone, words, wanted, sum.missed);
+    const Visit<T> visit = this->find(ray, digits, cone, read_words, wanted, sum.missed);
     shader.surface(Probe<T>(channels, sight, this->rays, ray, visit, digits), sum);
   }
 
@@ -140,19 +140,19 @@ struct ShadeRay : Walk<T> {
   }
 
   // True if light varies in a node of one value: a point light shines on a stored normal from different directions.
-  GV_HD bool shades_each_place() const { return channels.normal.given() && light.kind() == LightKind::kPoint; }
+  GV_HD bool shades_each_position() const { return channels.normal.exists() && light.kind() == LightKind::kPoint; }
 
-  // See Walk::follow. Any: the shader, or its Veil for a ray to a light.
-  template <class Any>
+  // See Walk::follow. AnyShader: the shader, or its Veil for a ray to a light.
+  template <class AnyShader>
   struct Visitor {
-    static constexpr bool kSeesEmpty = Any::kSeesEmpty, kEnds = Any::kEnds;
-    static constexpr bool kShadowed = kShadows && std::is_same_v<Any, Shader>;  // none for a ray to a light
-    static constexpr bool kToLight = std::is_same_v<Any, Veil<T, Shader>>;
+    static constexpr bool kSeesEmpty = AnyShader::kSeesEmpty, kEnds = AnyShader::kEnds;
+    static constexpr bool kShadowed = kShadows && std::is_same_v<AnyShader, Shader>;  // none for a ray to a light
+    static constexpr bool kToLight = std::is_same_v<AnyShader, Veil<T, Shader>>;
     const ShadeRay& kernel;
-    const Any& shader;
+    const AnyShader& shader;
     const Ray<T>* ray;
     const Sight<T>* sight;
-    typename Any::Sum& sum;
+    typename AnyShader::Sum& sum;
     int32_t samples = 0;
 
     GV_HD bool& missed() { return sum.missed; }
@@ -160,21 +160,21 @@ struct ShadeRay : Walk<T> {
       if constexpr (kToLight) return sum.clear > sum.stop_clear;
       return sum.clear > kernel.stop_clear;
     }
-    GV_HD bool more() const { return sees(); }
+    GV_HD bool goes_on() const { return sees(); }
     template <class Node>
     GV_HD void finish(const Node&) const {}
-    GV_HD NodeWords words(int32_t node) const {
-      if constexpr (Any::kHidesAlike) return kernel.words(node);
+    GV_HD NodeWords node_words(int32_t node) const {
+      if constexpr (AnyShader::kHidesAlike) return kernel.node_words(node);
       return kernel.tree.words_of(node, kernel.hides(shader, node, sum));
     }
-    GV_HD Eye enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
-      return Eye(kernel.channels, *sight, kernel.rays, ray, visit, digits);
+    GV_HD RayProbe enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
+      return RayProbe(kernel.channels, *sight, kernel.rays, ray, visit, digits);
     }
-    GV_HD bool uniform(const Eye& probe) const {              // with shadows, light varies in it
+    GV_HD bool uniform(const RayProbe& probe) const {         // with shadows, light varies in it
       if (kToLight && kernel.light.scatters()) return false;  // 1 - alpha of a long interval would round to 0
-      return !kShadowed && probe.uniform() && !kernel.shades_each_place();
+      return !kShadowed && probe.uniform() && !kernel.shades_each_position();
     }
-    GV_HD void region(const Eye& probe, T start, T end) {
+    GV_HD void region(const RayProbe& probe, T start, T end) {
       Piece<T> piece;
       piece.start = start;
       piece.end = end;
@@ -183,43 +183,48 @@ struct ShadeRay : Walk<T> {
       shader.add(true, piece, probe, sum);
       ++samples;
     }
-    GV_HD int32_t take(const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
-      if constexpr (Any::kFiltered > 0) {  // it reads colours by itself; visits without any use the plain function
-        if (shader.stored(probe)) return take_by(shader, [](T) { return T{}; }, probe, at, alike, last);
-        return take(ready_for_ray(shader.plain()), probe, at, alike, last);
-      } else if constexpr (Any::kReadsAll) {
-        return take_by(shader, [](T) { return T{}; }, probe, at, alike, last);
+    GV_HD int32_t take_intervals(const RayProbe& probe, const Intervals<T>& intervals, int32_t run_length, bool last) {
+      if constexpr (AnyShader::kFiltered > 0) {
+        // It reads colours by itself; visits without any use the plain function.
+        if (shader.has_stored(probe))
+          return take_with(shader, [](T) { return T{}; }, probe, intervals, run_length, last);
+        return take_intervals(ready_for_ray(shader.plain()), probe, intervals, run_length, last);
+      } else if constexpr (AnyShader::kReadsAll) {
+        return take_with(shader, [](T) { return T{}; }, probe, intervals, run_length, last);
       } else {
-        return take(shader, probe, at, alike, last);
+        return take_intervals(shader, probe, intervals, run_length, last);
       }
     }
 
    private:
-    template <class Adds>
-    GV_HD int32_t take(const Adds& adds, const Eye& probe, const Intervals<T>& at, int32_t alike, bool last) {
-      if (!kShort || last) return take_by(adds, [&](T t) { return probe.value(t); }, probe, at, alike, last);
-      const T last_number = at.count + static_cast<T>(alike - 1);
-      const T begin = kEnds ? at.start : at.middle_of(at.count);
-      const T end = kEnds ? at.start_of(last_number + 1) : at.middle_of(last_number);
-      return probe.with_value(begin, end,
-                              [&](const auto& value) { return take_by(adds, value, probe, at, alike, false); });
+    template <class ActiveShader>
+    GV_HD int32_t take_intervals(const ActiveShader& active_shader, const RayProbe& probe,
+                                 const Intervals<T>& intervals, int32_t run_length, bool last) {
+      if (!kShort || last)
+        return take_with(active_shader, [&](T t) { return probe.value(t); }, probe, intervals, run_length, last);
+      const T last_number = intervals.count + static_cast<T>(run_length - 1);
+      const T begin = kEnds ? intervals.start : intervals.middle_of(intervals.count);
+      const T end = kEnds ? intervals.start_of(last_number + 1) : intervals.middle_of(last_number);
+      return probe.with_value(begin, end, [&](const auto& value) {
+        return take_with(active_shader, value, probe, intervals, run_length, false);
+      });
     }
-    template <class Adds, class Value>
-    GV_HD int32_t take_by(const Adds& adds, const Value& value, const Eye& probe, const Intervals<T>& at, int32_t alike,
-                          bool last) {
+    template <class ActiveShader, class Value>
+    GV_HD int32_t take_with(const ActiveShader& active_shader, const Value& value, const RayProbe& probe,
+                            const Intervals<T>& intervals, int32_t run_length, bool last) {
       Piece<T> piece;
-      T number = at.count;
-      const T end = number + static_cast<T>(alike);
-      if (kEnds) piece.back = value(at.start);
+      T number = intervals.count;
+      const T end = number + static_cast<T>(run_length);
+      if (kEnds) piece.back = value(intervals.start);
       do {
-        piece.start = at.start_of(number);
-        piece.end = last ? at.stop : at.start_of(number + 1);
+        piece.start = intervals.start_of(number);
+        piece.end = last ? intervals.stop : intervals.start_of(number + 1);
         if (last) {
           cut(piece);
         } else {
-          piece.level = at.level;
-          piece.length = at.length;
-          piece.middle = at.middle_of(number);
+          piece.level = intervals.level;
+          piece.length = intervals.length;
+          piece.middle = intervals.middle_of(number);
         }
         if (kEnds) {
           piece.front = piece.back;
@@ -227,10 +232,10 @@ struct ShadeRay : Walk<T> {
         } else {
           piece.value = value(piece.middle);
         }
-        add(adds, piece, probe);
+        add(active_shader, piece, probe);
         number = number + 1;
       } while (number < end && sees());
-      const int32_t taken = static_cast<int32_t>(number - at.count);
+      const int32_t taken = static_cast<int32_t>(number - intervals.count);
       samples += taken;
       return taken;
     }
@@ -239,14 +244,14 @@ struct ShadeRay : Walk<T> {
       piece.length = piece.end - piece.start;
       piece.middle = piece.start + piece.length * static_cast<T>(0.5);
     }
-    template <class Adds>
-    GV_HD void add(const Adds& adds, const Piece<T>& piece, const Eye& probe) {
+    template <class ActiveShader>
+    GV_HD void add(const ActiveShader& active_shader, const Piece<T>& piece, const RayProbe& probe) {
       if constexpr (kShadowed) {
-        adds.add(true, piece, probe, sum, [&](T t, Vec3<T> way, T length, T growth) {
-          return kernel.share_of_light(*ray, probe, t, way, length, growth, samples, sum.missed);
+        active_shader.add(true, piece, probe, sum, [&](T t, Vec3<T> direction, T length, T growth) {
+          return kernel.share_of_light(*ray, probe, t, direction, length, growth, samples, sum.missed);
         });
       } else {
-        adds.add(true, piece, probe, sum);
+        active_shader.add(true, piece, probe, sum);
       }
     }
   };
@@ -254,20 +259,20 @@ struct ShadeRay : Walk<T> {
  private:
   // Share of the light from `length` away that reaches the position at distance t. The cone to the light begins as wide
   // as the ray's is there; its first interval is left out, so that a position does not shadow itself.
-  GV_HD T share_of_light(const Ray<T>& ray, const Probe<T>& probe, T t, Vec3<T> way, T length, T growth,
+  GV_HD T share_of_light(const Ray<T>& ray, const Probe<T>& probe, T t, Vec3<T> direction, T length, T growth,
                          int32_t& samples, bool& missed) const {
     const RayView& rays = this->rays;
-    const Vec3<double> place = ray.along(t, Digits::kDeep && rays.deep);
-    const Ray<T> beam(rays, place, way, probe.cube, ray.cone_near + ray.cone_growth * t,
+    const Vec3<double> position = ray.along(t, Digits::kDeep && rays.deep);
+    const Ray<T> beam(rays, position, direction, probe.cube, ray.cone_near + ray.cone_growth * t,
                       growth * static_cast<T>(rays.cone_scale), length);
-    const Sight<T> sight(probe.sight.at(t), way);
-    Intervals<T> at(beam, options.step, lengths);
-    at.go(true, at.count + 1);
+    const Sight<T> sight(probe.sight.at(t), direction);
+    Intervals<T> intervals(beam, options.step, lengths);
+    intervals.move_to(true, intervals.count + 1);
     const Veil<T, Shader> veil{{}, shader};
     typename Veil<T, Shader>::Sum sum;
     sum.stop_clear = light.faintest(this->stop_clear);
     Visitor<Veil<T, Shader>> visitor{*this, veil, &beam, &sight, sum};
-    this->template follow<Digits>(beam, at, visitor);
+    this->template follow<Digits>(beam, intervals, visitor);
     samples += visitor.samples;
     missed = missed || sum.missed;
     return sum.clear;

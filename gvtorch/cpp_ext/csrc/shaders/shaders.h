@@ -14,19 +14,20 @@
 //                                                 hides_ranges then replaces `hides`: range_of(component) returns the
 //                                                 smallest and largest value (low, high) that one of a voxel's numbers
 //                                                 has in the node
-//   add(which, piece, probe, sum)                 adds an interval; `probe` reads any channel at any distance
+//   add(mask, piece, probe, sum)                  adds an interval; `probe` reads any channel at any distance
 //   kSurface, surface(probe, sum)                 called where depth was set, with a probe of the node found there
 //   done(sum)                                     called after the last interval
 //
 // A shader that receives shadows also has
 //
 //   alpha(piece, probe)                           share that an interval absorbs of the light from behind
-//   add(which, piece, probe, sum, shadow)         `shadow(t, way, length, growth)`: share of the light that reaches t
+//   add(mask, piece, probe, sum, shadow)          `shadow(t, direction, length, growth)`: share of the light that
+//                                                 reaches t
 //
 // T is float or double. `add` is written once for a ray (V is T) and for a packet (V is Floats, see arithmetic.h), in
-// which each lane of `which` adds an interval; piece, probe and sum are of V. `probe.narrow(which)` limits what is read
-// from then on to fewer lanes, `probe.each(which, body)` passes each lane's own probe. Everything else is called for
-// one ray.
+// which each lane of `mask` adds an interval; piece, probe and sum are of V. `probe.select_lanes(mask)` limits what is
+// read from then on to fewer lanes, `probe.each_lane(mask, body)` passes each lane's own probe. Everything else is
+// called for one ray.
 //
 // An interval belongs to the node that contains its middle. Its ends may lie up to half an interval outside; they are
 // still read in this node, clamped to its brick's outermost voxel centres. With a border of 1 and steps of at most a
@@ -59,12 +60,12 @@ struct Lit : Plain<T> {
   GV_HD T alpha(const Piece<T>& piece, const Probe<T>&) const {
     return look_up(Transfer<T>(transfer), piece.value, piece, step).alpha;
   }
-  template <class V, class Eye, class... Shadow>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum, const Shadow&... shadow) const {
-    Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, which);
-    const MaskOf<V> shown = which && row.alpha > 0;
+  template <class V, class AnyProbe, class... Shadow>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum, const Shadow&... shadow) const {
+    Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
+    const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
-    probe.narrow(shown);
+    probe.select_lanes(shown);
     const Vec3<V> n = light.normal(probe, piece.middle);
     row = light.shade(row, n, probe, piece.middle, shadow...);
     sum.add_normal(n, sum.clear * row.alpha, shown);
@@ -88,92 +89,95 @@ GV_HD LitRow<V> combined(const LitRow<V>& a, const LitRow<V>& b, const F& f) {
 template <class T>
 struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
   static constexpr int32_t kFiltered = 10;
-  using Own = typename Filtered<T>::Own;
+  using Numbers = typename Filtered<T>::Numbers;
   using FromAfar<T, Lit<T>, FilteredLit<T>>::FromAfar;
 
   template <class V>
-  GV_HD void take(MaskOf<V> which, const LitRow<V>& found, const Piece<V>& piece, ShadeSum<V>& sum) const {
-    sum.add_normal(found.normal, sum.clear, which && found.row.alpha > 0);
-    sum.add_light(found.row, sum.clear, which);
-    sum.absorb(found.row.alpha, piece.start, piece.length, sum.hit_clear, which);
+  GV_HD void add_contribution(MaskOf<V> mask, const LitRow<V>& lit_row, const Piece<V>& piece, ShadeSum<V>& sum) const {
+    sum.add_normal(lit_row.normal, sum.clear, mask && lit_row.row.alpha > 0);
+    sum.add_light(lit_row.row, sum.clear, mask);
+    sum.absorb(lit_row.row.alpha, piece.start, piece.length, sum.hit_clear, mask);
   }
   // What one of the nodes adds; 0 in other lanes.
-  template <class V, class Eye, class Node>
-  GV_HD LitRow<V> look(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
-    const MaskOf<V> colored = which && node.among(this->bricks), others = which && !colored;
-    LitRow<V> found;
-    if (any(others)) found = near(others, piece, probe, node);
-    if (!any(colored)) return found;
-    return choose(colored, far(colored, piece, probe, node), found);
+  template <class V, class AnyProbe, class Node>
+  GV_HD LitRow<V> contribution(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
+    const MaskOf<V> colored = mask && node.in_first_slots(this->bricks), uncolored = mask && !colored;
+    LitRow<V> lit_row;
+    if (any(uncolored)) lit_row = by_function(uncolored, piece, probe, node);
+    if (!any(colored)) return lit_row;
+    return choose(colored, by_colors(colored, piece, probe, node), lit_row);
   }
 
  private:
-  template <class V, class Eye, class Node>
-  GV_HD LitRow<V> near(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+  template <class V, class AnyProbe, class Node>
+  GV_HD LitRow<V> by_function(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
     const V t = piece.middle;
-    const Row<V> row = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, which);
-    const MaskOf<V> shown = which && row.alpha > 0;
+    const Row<V> row = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, mask);
+    const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return {};
-    probe.narrow(shown);
+    probe.select_lanes(shown);
     const Vec3<V> n = this->light.to_eye(probe.differences(node, t), probe.sight.direction);
     return times_alpha(shown, this->light.shade(row, n, probe, t), n);
   }
-  template <class V, class Eye, class Node>
-  GV_HD LitRow<V> far(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+  template <class V, class AnyProbe, class Node>
+  GV_HD LitRow<V> by_colors(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
     const V t = piece.middle;
-    probe.narrow(which);
+    probe.select_lanes(mask);
     const auto& colors = probe.channels.other;
     const Vec3<V> d = probe.sight.direction;
-    const auto read = [&](MaskOf<V> some, int32_t first) { return probe.four_of(some, colors, first, node, t); };
-    const Row<V> color = by_direction(which, d, colors.width, read, kFiltered);
-    const V whole = clamp(color.alpha, static_cast<T>(0), static_cast<T>(1));
-    const V alpha = stretch(whole, piece.length * probe.scale_of(node) / own_numbers<Own>(this->light.parameters).side);
-    const MaskOf<V> shown = which && whole > 0 && alpha / whole > 0;
+    const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_of(lanes, colors, first, node, t); };
+    const Row<V> color = by_direction(mask, d, colors.width, read, kFiltered);
+    const V stored_alpha = clamp(color.alpha, static_cast<T>(0), static_cast<T>(1));
+    const V alpha =
+        stretch(stored_alpha, piece.length * probe.scale_of(node) / own_numbers<Numbers>(this->light.parameters).side);
+    const MaskOf<V> shown = mask && stored_alpha > 0 && alpha / stored_alpha > 0;
     if (!any(shown)) return {};
     const bool sided = colors.width != kFiltered;
     Vec3<V> front{}, n;
-    Moments<V> m = sided ? seen(shown, read, d, front) : moments(shown, read, 0);
-    m = {m.xx / whole, m.xy / whole, m.xz / whole, m.yy / whole, m.yz / whole, m.zz / whole};
-    front = {front.x / whole, front.y / whole, front.z / whole};
-    const Row<V> base{color.red / whole, color.green / whole, color.blue / whole, alpha};
+    Moments<V> m = sided ? moments_seen(shown, read, d, front) : moments(shown, read, 0);
+    m = {m.xx / stored_alpha, m.xy / stored_alpha, m.xz / stored_alpha,
+         m.yy / stored_alpha, m.yz / stored_alpha, m.zz / stored_alpha};
+    front = {front.x / stored_alpha, front.y / stored_alpha, front.z / stored_alpha};
+    const Row<V> base{color.red / stored_alpha, color.green / stored_alpha, color.blue / stored_alpha, alpha};
     const Row<V> row = this->light.shade_rough(base, m, sided, front, probe, t, n);
     return times_alpha(shown, row, unit(n));
   }
-  template <class Which, class Read>
-  GV_HD static auto moments(Which which, const Read& read, int32_t first) {
-    const auto a = read(which, first + 4), b = read(which, first + 6);
+  template <class AnyMask, class Read>
+  GV_HD static auto moments(AnyMask mask, const Read& read, int32_t first) {
+    const auto a = read(mask, first + 4), b = read(mask, first + 6);
     return Moments<decltype(a.red + b.red)>{a.red, a.green, a.blue, a.alpha, b.blue, b.alpha};
   }
   // The moments of the normals seen along direction d, and in `front` the mean of these normals: those seen along an
   // axis are turned against the ray's direction along it.
   template <class V, class Read>
-  GV_HD static Moments<V> seen(MaskOf<V> which, const Read& read, const Vec3<V>& d, Vec3<V>& front) {
+  GV_HD static Moments<V> moments_seen(MaskOf<V> mask, const Read& read, const Vec3<V>& d, Vec3<V>& front) {
     Moments<V> sum{};
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
 #endif
     for (int axis = 0; axis < 3; ++axis) {
-      const MaskOf<V> back = which && d[axis] < 0;
-      const auto six = [&](MaskOf<V> some, int32_t first) { return moments(some, read, first); };
-      const Moments<V> m = of_side<V>(which, back, 2 * kFiltered * axis, six, kFiltered);
+      const MaskOf<V> against = mask && d[axis] < 0;
+      const auto read_moments = [&](MaskOf<V> lanes, int32_t first) { return moments(lanes, read, first); };
+      const Moments<V> m = of_side<V>(mask, against, 2 * kFiltered * axis, read_moments, kFiltered);
       const Vec3<V> column = axis == 0   ? Vec3<V>{m.xx, m.xy, m.xz}
                              : axis == 1 ? Vec3<V>{m.xy, m.yy, m.yz}
                                          : Vec3<V>{m.xz, m.yz, m.zz};
-      const V weight = d[axis] * d[axis], total = m.trace(), own = column[axis];
+      const V weight = d[axis] * d[axis], total = m.trace(), along_axis = column[axis];
       V scale{};
-      const MaskOf<V> some = which && total > 0 && own > 0;
-      if (any(some)) scale = select(some, square_root(total / own) * weight, scale);
-      scale = select(back, scale, -scale);
+      const MaskOf<V> nonzero = mask && total > 0 && along_axis > 0;
+      if (any(nonzero)) scale = select(nonzero, square_root(total / along_axis) * weight, scale);
+      scale = select(against, scale, -scale);
       sum = combined(sum, m, [&](V a, V b) { return a + weight * b; });
       front = {front.x + scale * column.x, front.y + scale * column.y, front.z + scale * column.z};
     }
     return sum;
   }
   template <class V>
-  GV_HD static LitRow<V> times_alpha(MaskOf<V> which, const Row<V>& row, const Vec3<V>& n) {
-    const V a = select(which, row.alpha, V{});
-    const auto of = [&](V number) { return select(which, number * a, V{}); };
-    return {{of(row.red), of(row.green), of(row.blue), a}, {of(n.x), of(n.y), of(n.z)}};
+  GV_HD static LitRow<V> times_alpha(MaskOf<V> mask, const Row<V>& row, const Vec3<V>& n) {
+    const V a = select(mask, row.alpha, V{});
+    const auto weighted = [&](V number) { return select(mask, number * a, V{}); };
+    return {{weighted(row.red), weighted(row.green), weighted(row.blue), a},
+            {weighted(n.x), weighted(n.y), weighted(n.z)}};
   }
 };
 
@@ -199,7 +203,7 @@ struct Veil : ShaderFacts {
 template <class T>
 struct PreIntegrated : ShaderFacts {
   static constexpr bool kEnds = true, kIntegrates = true;
-  static bool packs(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
+  static bool packets_can_trace(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
     return int64_t{args.levels} * args.rows * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
   }
   template <class V>
@@ -211,44 +215,44 @@ struct PreIntegrated : ShaderFacts {
   explicit PreIntegrated(const ShadeArgs& args) : transfer(args), step(static_cast<T>(args.step)) {}
 
   GV_HD bool hides(T low, T high, const Sum&) const { return Transfer<T>(transfer).transparent(low, high); }
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye&, SumOf<V>& sum) const {
-    const Transfer<T> places(transfer);
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, SumOf<V>& sum) const {
+    const Transfer<T> table(transfer);
     V lengths = splat<V>(static_cast<T>(1));
     if (piece.odd) lengths = piece.length / step;
-    const auto pair = [&](V from, V to) { return between(places, from, to, piece.level, which); };
-    const V front = clamp(piece.front, places.low, places.high);
-    const V back = clamp(piece.back, places.low, places.high);
-    const MaskOf<V> beyond = which && !(front == back || (front == piece.front && back == piece.back));
+    const auto pair = [&](V from, V to) { return between(table, from, to, piece.level, mask); };
+    const V front = clamp(piece.front, table.low, table.high);
+    const V back = clamp(piece.back, table.low, table.high);
+    const MaskOf<V> outside = mask && !(front == back || (front == piece.front && back == piece.back));
     Row<V> row = pair(front, back);
-    if (!any(beyond)) {
-      row = part(row, lengths);
+    if (!any(outside)) {
+      row = with_length(row, lengths);
     } else {
-      const V share = lengths / absolute(piece.back - piece.front);
-      const Row<V> before = part(pair(front, front), share * absolute(front - piece.front));
-      const Row<V> behind = part(pair(back, back), share * absolute(piece.back - back));
-      const Row<V> parts = over(over(before, part(row, share * absolute(back - front))), behind);
-      row = choose(beyond, parts, part(row, lengths));
+      const V rate = lengths / absolute(piece.back - piece.front);
+      const Row<V> before = with_length(pair(front, front), rate * absolute(front - piece.front));
+      const Row<V> behind = with_length(pair(back, back), rate * absolute(piece.back - back));
+      const Row<V> parts = over(over(before, with_length(row, rate * absolute(back - front))), behind);
+      row = choose(outside, parts, with_length(row, lengths));
     }
-    if (unseen(which, row.alpha)) return;
-    sum.add_light(row, sum.clear, which);
-    sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, which);
+    if (all_transparent(mask, row.alpha)) return;
+    sum.add_light(row, sum.clear, mask);
+    sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, mask);
   }
   // The row of an interval from one value to another, of a length that the table has.
   template <class V>
-  GV_HD Row<V> between(const Transfer<T>& places, V from, V to, IntOf<V> level, MaskOf<V> which) const {
-    const Cell<V> front = places.find(from), back = places.find(to);
-    const int32_t rows = places.rows;
+  GV_HD Row<V> between(const Transfer<T>& table, V from, V to, IntOf<V> level, MaskOf<V> mask) const {
+    const Cell<V> front = table.find(from), back = table.find(to);
+    const int32_t rows = table.rows;
     const auto index = (static_cast<typename LanesOf<V>::Index>(level) * rows + front.row) * rows + back.row;
-    const RowPair<V> nearer = places.rows_at(index), farther = places.rows_at(index, rows);
-    return make_row<V>(which, [&](int column) {
+    const RowPair<V> nearer = table.rows_at(index), farther = table.rows_at(index, rows);
+    return make_row<V>(mask, [&](int column) {
       const V near = nearer.at(back.weight, column), far = farther.at(back.weight, column);
       return near + front.weight * (far - near);
     });
   }
   // The same values over another length.
   template <class V>
-  GV_HD static Row<V> part(const Row<V>& row, V lengths) {
+  GV_HD static Row<V> with_length(const Row<V>& row, V lengths) {
     const MaskOf<V> changes = row.alpha > 0 && !(lengths == 1);
     if (!any(changes)) return row;
     const V alpha = select(lengths > 0, stretch(row.alpha, lengths), V{});
@@ -257,8 +261,9 @@ struct PreIntegrated : ShaderFacts {
   }
   template <class V>
   GV_HD static Row<V> over(const Row<V>& a, const Row<V>& b) {
-    const V kept = 1 - a.alpha;
-    return {a.red + kept * b.red, a.green + kept * b.green, a.blue + kept * b.blue, a.alpha + kept * b.alpha};
+    const V transmittance = 1 - a.alpha;
+    return {a.red + transmittance * b.red, a.green + transmittance * b.green, a.blue + transmittance * b.blue,
+            a.alpha + transmittance * b.alpha};
   }
   GV_HD void done(Sum&) const {}
 };
@@ -271,16 +276,16 @@ struct Isosurface : ShaderFacts {
   static constexpr bool kEnds = true, kSurface = true;
   template <class V>
   struct SumOf : ShadeSum<V> {
-    V before{};
-    V before_end = splat<V>(static_cast<T>(-INFINITY));  // +INFINITY: the ray began inside, without a surface there
-    V share{};                                           // transmittance in front of the surface
+    V last_value{};
+    V last_end = splat<V>(static_cast<T>(-INFINITY));  // +INFINITY: the ray began inside, without a surface there
+    V share{};                                         // transmittance in front of the surface
 
-    template <class Own, class Other, class Body>
-    GV_HD static void each(Own& own, Other& other, const Body& body) {
-      ShadeSum<V>::each(own, other, body);
-      body(own.before, other.before);
-      body(own.before_end, other.before_end);
-      body(own.share, other.share);
+    template <class A, class B, class Body>
+    GV_HD static void each_member(A& a, B& b, const Body& body) {
+      ShadeSum<V>::each_member(a, b, body);
+      body(a.last_value, b.last_value);
+      body(a.last_end, b.last_end);
+      body(a.share, b.share);
     }
   };
   using Sum = SumOf<T>;
@@ -290,30 +295,30 @@ struct Isosurface : ShaderFacts {
 
   explicit Isosurface(const ShadeArgs& args) : transfer(args), light(args), color_component(args.other_component) {}
 
-  struct Own {
+  struct Numbers {
     T level;
     T filled;         // 1: solid where the value is not below the level; -1: where it is; 0: nowhere
     T scale;          // of the second channel's four numbers, which are the colour; 0: the transfer function's colour
     T premultiplied;  // 1: the colour is stored times the fourth number
   };
-  GV_HD const Own& own() const { return own_numbers<Own>(light.parameters); }
-  GV_HD T iso() const { return own().level; }
-  GV_HD T filled() const { return own().filled; }
+  GV_HD const Numbers& numbers() const { return own_numbers<Numbers>(light.parameters); }
+  GV_HD T iso() const { return numbers().level; }
+  GV_HD T filled() const { return numbers().filled; }
   GV_HD bool hides(T low, T high, const Sum&) const {
     return (!(filled() < 0) && a_little_above(high) < iso()) || (!(filled() > 0) && a_little_below(low) >= iso());
   }
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
     using Mask = MaskOf<V>;
     const T level = iso();
     const Mask below = piece.front < level;
-    const Mask leapt = sum.before_end == piece.start && (sum.before < level) != below;
-    const Mask within = filled() == 0 ? Mask{} : filled() > 0 ? !below : below;
-    const Mask parted = which && (leapt || within);
-    const Mask crosses = which && !parted && below != (piece.back < level);
-    V place = piece.start;
+    const Mask jumped = sum.last_end == piece.start && (sum.last_value < level) != below;
+    const Mask solid = filled() == 0 ? Mask{} : filled() > 0 ? !below : below;
+    const Mask hits_start = mask && (jumped || solid);
+    const Mask crosses = mask && !hits_start && below != (piece.back < level);
+    V hit_t = piece.start;
     if (any(crosses)) {
-      probe.narrow(crosses);
+      probe.select_lanes(crosses);
       V near = piece.start, far = piece.end, near_value = piece.front, far_value = piece.back;
 #ifdef __CUDA_ARCH__
 #pragma unroll 1
@@ -327,32 +332,33 @@ struct Isosurface : ShaderFacts {
         far = select(same, far, middle);
         far_value = select(same, far_value, value);
       }
-      const V part = clamp((level - near_value) / (far_value - near_value), static_cast<T>(0), static_cast<T>(1));
-      place = select(crosses, near + part * (far - near), place);
+      const V fraction = clamp((level - near_value) / (far_value - near_value), static_cast<T>(0), static_cast<T>(1));
+      hit_t = select(crosses, near + fraction * (far - near), hit_t);
     }
-    const Mask hit = parted || crosses, passed = which && !hit;
-    const Mask begins = parted && !leapt && sum.before_end == static_cast<T>(-INFINITY);
+    const Mask hit = hits_start || crosses, passed = mask && !hit;
+    const Mask begins = hits_start && !jumped && sum.last_end == static_cast<T>(-INFINITY);
     sum.share = select(hit, sum.clear, sum.share);
     sum.clear = select(hit, V{}, sum.clear);
-    sum.depth = select(hit, place, sum.depth);
-    sum.before = select(passed, piece.back, sum.before);
-    sum.before_end = select(passed, piece.end, sum.before_end);
-    sum.before_end = select(begins, splat<V>(static_cast<T>(INFINITY)), sum.before_end);
+    sum.depth = select(hit, hit_t, sum.depth);
+    sum.last_value = select(passed, piece.back, sum.last_value);
+    sum.last_end = select(passed, piece.end, sum.last_end);
+    sum.last_end = select(begins, splat<V>(static_cast<T>(INFINITY)), sum.last_end);
   }
   GV_HD Row<T> color_at(const Probe<T>& probe, T t) const {
-    const auto& other = probe.channels.other;
-    if (own().scale > 0) {
-      const Row<T> stored = probe.four_at(other, 0, t);
-      const T opacity = stored.alpha * own().scale;
-      const T whole = own().premultiplied > 0 && opacity > 0 ? opacity : 1;
-      return {stored.red * own().scale / whole, stored.green * own().scale / whole, stored.blue * own().scale / whole,
-              0};
+    const auto& color_channel = probe.channels.other;
+    if (numbers().scale > 0) {
+      const Row<T> stored = probe.four_at(color_channel, 0, t);
+      const T opacity = stored.alpha * numbers().scale;
+      const T divisor = numbers().premultiplied > 0 && opacity > 0 ? opacity : 1;
+      return {stored.red * numbers().scale / divisor, stored.green * numbers().scale / divisor,
+              stored.blue * numbers().scale / divisor, 0};
     }
-    return Transfer<T>(transfer).look_up(other.given() ? probe.number_at(other, color_component, t) : iso(), 0);
+    return Transfer<T>(transfer).look_up(
+        color_channel.exists() ? probe.number_at(color_channel, color_component, t) : iso(), 0);
   }
   GV_HD void surface(const Probe<T>& probe, Sum& sum) const {
     const T t = sum.depth;
-    const Vec3<T> n = sum.before_end == static_cast<T>(INFINITY) ? Vec3<T>{0, 0, 0} : light.normal(probe, t);
+    const Vec3<T> n = sum.last_end == static_cast<T>(INFINITY) ? Vec3<T>{0, 0, 0} : light.normal(probe, t);
     const Row<T> row = light.shade(color_at(probe, t), n, probe, t);
     sum.red = sum.share * row.red;
     sum.green = sum.share * row.green;
@@ -370,16 +376,16 @@ struct Projection : ShaderFacts {
   static constexpr int32_t kFeatures = 1;  // the value
   template <class V>
   struct SumOf : ShadeSum<V> {
-    V found{};   // extreme so far, or sum of value * length
-    V length{};  // sum of lengths
-    V at{};      // distance of the extreme; for a mean, of the first interval's start
+    V value{};    // extreme so far, or sum of value * length
+    V length{};   // sum of lengths
+    V value_t{};  // distance of the extreme; for a mean, of the first interval's start
 
-    template <class Own, class Other, class Body>
-    GV_HD static void each(Own& own, Other& other, const Body& body) {
-      ShadeSum<V>::each(own, other, body);
-      body(own.found, other.found);
-      body(own.length, other.length);
-      body(own.at, other.at);
+    template <class A, class B, class Body>
+    GV_HD static void each_member(A& a, B& b, const Body& body) {
+      ShadeSum<V>::each_member(a, b, body);
+      body(a.value, b.value);
+      body(a.length, b.length);
+      body(a.value_t, b.value_t);
     }
   };
   using Sum = SumOf<T>;
@@ -389,43 +395,43 @@ struct Projection : ShaderFacts {
   explicit Projection(const ShadeArgs& args)
       : transfer(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
 
-  struct Own {
+  struct Numbers {
     T kind;  // a ProjectionKind
   };
   GV_HD ProjectionKind kind() const {
-    return static_cast<ProjectionKind>(static_cast<int32_t>(own_numbers<Own>(parameters).kind));
+    return static_cast<ProjectionKind>(static_cast<int32_t>(own_numbers<Numbers>(parameters).kind));
   }
   template <class V>
   GV_HD MaskOf<V> hides(V low, V high, const SumOf<V>& sum) const {
     if (kind() == ProjectionKind::kMean) return MaskOf<V>{};
     const bool highest = kind() == ProjectionKind::kMaximum;
-    const MaskOf<V> within = highest ? a_little_above(high) <= sum.found : a_little_below(low) >= sum.found;
-    return sum.length > 0 && within;
+    const MaskOf<V> no_gain = highest ? a_little_above(high) <= sum.value : a_little_below(low) >= sum.value;
+    return sum.length > 0 && no_gain;
   }
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye&, SumOf<V>& sum) const {
-    const MaskOf<V> first = which && !(sum.length > 0);
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, SumOf<V>& sum) const {
+    const MaskOf<V> first = mask && !(sum.length > 0);
     if (kind() == ProjectionKind::kMean) {
-      sum.at = select(first, piece.start, sum.at);
-      sum.found = select(which, sum.found + piece.value * piece.length, sum.found);
+      sum.value_t = select(first, piece.start, sum.value_t);
+      sum.value = select(mask, sum.value + piece.value * piece.length, sum.value);
     } else {
       const bool highest = kind() == ProjectionKind::kMaximum;
-      const MaskOf<V> beyond = highest ? piece.value > sum.found : piece.value < sum.found;
-      const MaskOf<V> better = first || (which && beyond);
-      sum.found = select(better, piece.value, sum.found);
-      sum.at = select(better, piece.middle, sum.at);
+      const MaskOf<V> exceeds = highest ? piece.value > sum.value : piece.value < sum.value;
+      const MaskOf<V> better = first || (mask && exceeds);
+      sum.value = select(better, piece.value, sum.value);
+      sum.value_t = select(better, piece.middle, sum.value_t);
     }
-    sum.length = select(which, sum.length + piece.length, sum.length);
+    sum.length = select(mask, sum.length + piece.length, sum.length);
   }
   GV_HD void done(Sum& sum) const {
     if (!(sum.length > 0)) return;
-    const T value = kind() == ProjectionKind::kMean ? sum.found / sum.length : sum.found;
+    const T value = kind() == ProjectionKind::kMean ? sum.value / sum.length : sum.value;
     const Row<T> row = Transfer<T>(transfer).look_up(value, 0);
     sum.red = sum.clear * row.red;
     sum.green = sum.clear * row.green;
     sum.blue = sum.clear * row.blue;
     sum.clear = 0;
-    sum.depth = sum.at;
+    sum.depth = sum.value_t;
     sum.feature_c[0] = value;
   }
 };
@@ -439,13 +445,13 @@ struct Features : Plain<T> {
   using SumOf = ShadeSum<V>;
   using Plain<T>::Plain;
 
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
-    const Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, which);
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+    const Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, mask);
     const V share = sum.clear * row.alpha;
-    const MaskOf<V> shown = which && share > 0;
+    const MaskOf<V> shown = mask && share > 0;
     if (any(shown)) {
-      probe.narrow(shown);
+      probe.select_lanes(shown);
       const auto& features = probe.channels.other;
       for (int32_t c = 0; c < features.width; ++c) {
         const V number = probe.number_at(features, c, piece.middle);
@@ -455,7 +461,7 @@ struct Features : Plain<T> {
         });
       }
     }
-    sum.add(row, piece.start, piece.length, sum.hit_clear, which);
+    sum.add(row, piece.start, piece.length, sum.hit_clear, mask);
   }
 };
 
@@ -465,7 +471,7 @@ template <class T>
 struct GradientMagnitude : Plain<T> {
   template <class V>
   using SumOf = ShadeSum<V>;
-  struct Own {
+  struct Numbers {
     T full;  // gradient length of full density, in units of the value per world unit
   };
   const Parameters<T>* parameters;
@@ -473,16 +479,16 @@ struct GradientMagnitude : Plain<T> {
   explicit GradientMagnitude(const ShadeArgs& args)
       : Plain<T>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
 
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
-    Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, which);
-    const MaskOf<V> shown = which && row.alpha > 0;
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+    Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, mask);
+    const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
-    probe.narrow(shown);
+    probe.select_lanes(shown);
     const Vec3<V> slope = probe.gradient(piece.middle);
-    const V part =
-        clamp(square_root(dot(slope, slope)) / own_numbers<Own>(parameters).full, static_cast<T>(0), static_cast<T>(1));
-    row.alpha = select(part > 0, stretch(row.alpha, part), V{});
+    const V fraction = clamp(square_root(dot(slope, slope)) / own_numbers<Numbers>(parameters).full, static_cast<T>(0),
+                             static_cast<T>(1));
+    row.alpha = select(fraction > 0, stretch(row.alpha, fraction), V{});
     sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
   }
 };

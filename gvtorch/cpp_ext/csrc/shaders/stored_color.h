@@ -9,27 +9,29 @@ namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
 // Reads one of a voxel's two sides along an axis: the numbers from `first` on where a ray goes in the axis' direction,
-// those from first + one on in lanes of `back`, where it goes against it.
+// those from first + per_side on in lanes of `against`, where it goes against it.
 template <class V, class Read>
-GV_HD auto of_side(MaskOf<V> which, MaskOf<V> back, int32_t first, const Read& read, int32_t one) {
+GV_HD auto of_side(MaskOf<V> mask, MaskOf<V> against, int32_t first, const Read& read, int32_t per_side) {
   if constexpr (kPacket<V>) {
-    const MaskOf<V> ahead = which && !back;
-    if (!any(back)) return read(ahead, first);
-    if (!any(ahead)) return read(back, first + one);
-    return choose(back, read(back, first + one), read(ahead, first));
+    const MaskOf<V> along = mask && !against;
+    if (!any(against)) return read(along, first);
+    if (!any(along)) return read(against, first + per_side);
+    return choose(against, read(against, first + per_side), read(along, first));
   } else {
-    return read(which, back ? first + one : first);
+    return read(mask, against ? first + per_side : first);
   }
 }
 
-// A voxel's number, or four of them, as seen along direction d; read(which, k) returns number k of the voxel, or the
-// four that begin there. A channel may hold `one` numbers for each of six directions (Crassin et al., "Interactive
+// A voxel's number, or four of them, as seen along direction d; read(mask, k) returns number k of the voxel, or the
+// four that begin there. A channel may hold `per_side` numbers for each of six directions (Crassin et al., "Interactive
 // indirect illumination using voxel cone tracing", CGF 2011): then the three on d's side of each axis are read and
 // weighted by the squares of d, whose sum is 1. Where all six are equal, the result has the same bits as each.
 template <class V, class Read>
-GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const Read& read, int32_t one = 4) {
-  if (width == one) return read(which, 0);
-  const auto side = [&](int axis) { return of_side<V>(which, which && d[axis] < 0, 2 * one * axis, read, one); };
+GV_HD auto by_direction(MaskOf<V> mask, const Vec3<V>& d, int32_t width, const Read& read, int32_t per_side = 4) {
+  if (width == per_side) return read(mask, 0);
+  const auto side = [&](int axis) {
+    return of_side<V>(mask, mask && d[axis] < 0, 2 * per_side * axis, read, per_side);
+  };
   const auto z = side(2);
   auto seen = z;
 #ifdef __CUDA_ARCH__
@@ -48,7 +50,7 @@ GV_HD auto by_direction(MaskOf<V> which, const Vec3<V>& d, int32_t width, const 
 template <class T>
 struct StoredColor : ShaderFacts {
   static constexpr bool kColored = true;
-  static bool packs(const ShadeArgs& args) { return args.channels == 4; }
+  static bool packets_can_trace(const ShadeArgs& args) { return args.channels == 4; }
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;
@@ -56,38 +58,38 @@ struct StoredColor : ShaderFacts {
 
   explicit StoredColor(const ShadeArgs& args) : light(args) {}
 
-  template <class Any>
-  GV_HD bool hides(T, T high, const Any&) const {
+  template <class AnySum>
+  GV_HD bool hides(T, T high, const AnySum&) const {
     return !(a_little_above(high) > 0);
   }
-  struct Own {
+  struct Numbers {
     T scale;               // of the stored numbers
     T reference_length;    // to which the stored opacity refers, world
     T premultiplied, lit;  // 1 or 0
   };
-  GV_HD const Own& own() const { return own_numbers<Own>(light.parameters); }
-  template <class V, class Eye>
-  GV_HD V opacity_of(const Piece<V>& piece, const Eye& probe) const {
+  GV_HD const Numbers& numbers() const { return own_numbers<Numbers>(light.parameters); }
+  template <class V, class AnyProbe>
+  GV_HD V opacity_of(const Piece<V>& piece, const AnyProbe& probe) const {
     const V value = probe.channels.value.width == 4 ? piece.value : seen(probe, 3, piece.middle);
-    return clamp(value * own().scale, static_cast<T>(0), static_cast<T>(1));
+    return clamp(value * numbers().scale, static_cast<T>(0), static_cast<T>(1));
   }
   GV_HD T alpha(const Piece<T>& piece, const Probe<T>& probe) const {
-    return stretch(opacity_of(piece, probe), piece.length / own().reference_length);
+    return stretch(opacity_of(piece, probe), piece.length / numbers().reference_length);
   }
-  template <class V, class Eye, class... Shadow>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum, const Shadow&... shadow) const {
+  template <class V, class AnyProbe, class... Shadow>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum, const Shadow&... shadow) const {
     const V opacity = opacity_of(piece, probe);
-    const MaskOf<V> shown = which && opacity > 0;
+    const MaskOf<V> shown = mask && opacity > 0;
     if (!any(shown)) return;
-    probe.narrow(shown);
+    probe.select_lanes(shown);
     const Row<V> stored = four_seen(probe, piece.middle);
     const auto color = [&](V number) {
-      const V scaled = number * own().scale;
-      return own().premultiplied > 0 ? scaled / opacity : scaled;
+      const V scaled = number * numbers().scale;
+      return numbers().premultiplied > 0 ? scaled / opacity : scaled;
     };
     Row<V> row{color(stored.red), color(stored.green), color(stored.blue),
-               stretch(opacity, piece.length / own().reference_length)};
-    if (own().lit > 0) {
+               stretch(opacity, piece.length / numbers().reference_length)};
+    if (numbers().lit > 0) {
       const Vec3<V> n = light.normal(probe, piece.middle);
       row = light.shade(row, n, probe, piece.middle, shadow...);
       sum.add_normal(n, sum.clear * row.alpha, shown);
@@ -95,28 +97,28 @@ struct StoredColor : ShaderFacts {
     sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
   }
   // All four numbers as seen along the ray; a packet does not read the opacity, which it already has.
-  template <class Eye, class V>
-  GV_HD static Row<V> four_seen(const Eye& probe, V t) {
+  template <class AnyProbe, class V>
+  GV_HD static Row<V> four_seen(const AnyProbe& probe, V t) {
     const auto& channel = probe.channels.value;
     if constexpr (kPacket<V>) {
       return {probe.number_at(channel, 0, t), probe.number_at(channel, 1, t), probe.number_at(channel, 2, t), V{}};
     } else {
       if (channel.width == 4) return probe.four_at(channel, 0, t);
-      return of_sides(probe, [&](bool, int32_t behind) { return probe.four_at(channel, behind, t); });
+      return of_sides(probe, [&](bool, int32_t offset) { return probe.four_at(channel, offset, t); });
     }
   }
   // One of the four numbers as seen along the ray.
-  template <class Eye, class V>
-  GV_HD static V seen(const Eye& probe, int32_t number, V t) {
+  template <class AnyProbe, class V>
+  GV_HD static V seen(const AnyProbe& probe, int32_t number, V t) {
     const auto& channel = probe.channels.value;
     if constexpr (kPacket<V>) {
       return probe.number_at(channel, number, t);
     } else {
-      return of_sides(probe, [&](bool, int32_t behind) { return probe.number_at(channel, number + behind, t); });
+      return of_sides(probe, [&](bool, int32_t offset) { return probe.number_at(channel, number + offset, t); });
     }
   }
-  template <class Eye, class Read>
-  GV_ASIDE static auto of_sides(const Eye& probe, const Read& read) {
+  template <class AnyProbe, class Read>
+  GV_RARE static auto of_sides(const AnyProbe& probe, const Read& read) {
     return by_direction(true, probe.sight.direction, probe.channels.value.width, read);
   }
   GV_HD void done(Sum&) const {}
@@ -127,8 +129,9 @@ struct StoredColor : ShaderFacts {
 // nodes without one, are shaded by the function as usual. Where two levels blend, what they show is blended, not their
 // values. `Shader` derives from this and has
 //
-//   look(which, piece, probe, node)   what one of the nodes adds for an interval, of a type that `combined` accepts
-//   take(which, found, piece, sum)    adds it to the sum
+//   contribution(mask, piece, probe, node)       what one of the nodes adds for an interval, of a type that `combined`
+//                                                accepts
+//   add_contribution(mask, added, piece, sum)    adds it to the sum
 template <class T, class Base, class Shader>
 struct FromAfar : Base {
   template <class V>
@@ -138,24 +141,24 @@ struct FromAfar : Base {
   explicit FromAfar(const ShadeArgs& args) : Base(args), bricks(args.other_bricks) {}
 
   GV_HD const Base& plain() const { return *this; }
-  template <class Eye>
-  GV_HD auto stored(const Eye& probe) const {
-    return probe.fine.among(bricks) || (probe.mixed && probe.coarse.among(bricks));
+  template <class AnyProbe>
+  GV_HD auto has_stored(const AnyProbe& probe) const {
+    return probe.fine.in_first_slots(bricks) || (probe.mixed && probe.coarse.in_first_slots(bricks));
   }
-  template <class V, class Eye>
-  GV_HD void add(MaskOf<V> which, const Piece<V>& piece, Eye& probe, SumOf<V>& sum) const {
-    const MaskOf<V> seen = which && stored(probe), others = which && !seen;
-    if (any(others)) Base::add(others, piece, probe, sum);
-    if (!any(seen)) return;
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+    const MaskOf<V> colored = mask && has_stored(probe), uncolored = mask && !colored;
+    if (any(uncolored)) Base::add(uncolored, piece, probe, sum);
+    if (!any(colored)) return;
     const Shader& shader = static_cast<const Shader&>(*this);
-    auto found = shader.look(seen, piece, probe, probe.fine);
-    const MaskOf<V> mixed = seen && probe.mixed;
+    auto fine = shader.contribution(colored, piece, probe, probe.fine);
+    const MaskOf<V> mixed = colored && probe.mixed;
     if (any(mixed)) {
-      const auto coarse = shader.look(mixed, piece, probe, probe.coarse);
+      const auto coarse = shader.contribution(mixed, piece, probe, probe.coarse);
       const V weight = probe.weight(piece.middle);
-      found = combined(found, coarse, [&](V a, V b) { return select(mixed, a + weight * (b - a), a); });
+      fine = combined(fine, coarse, [&](V a, V b) { return select(mixed, a + weight * (b - a), a); });
     }
-    shader.take(seen, found, piece, sum);
+    shader.add_contribution(colored, fine, piece, sum);
   }
 };
 
@@ -164,7 +167,7 @@ struct FromAfar : Base {
 template <class T>
 struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
   static constexpr int32_t kFiltered = 4;
-  struct Own {
+  struct Numbers {
     T side;  // world size of the root cube
   };
   const Parameters<T>* parameters;
@@ -173,33 +176,33 @@ struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
       : FromAfar<T, Plain<T>, Filtered<T>>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
 
   template <class V>
-  GV_HD void take(MaskOf<V> which, const Row<V>& found, const Piece<V>& piece, ShadeSum<V>& sum) const {
-    sum.add_light(found, sum.clear, which);
-    sum.absorb(found.alpha, piece.start, piece.length, sum.hit_clear, which);
+  GV_HD void add_contribution(MaskOf<V> mask, const Row<V>& color, const Piece<V>& piece, ShadeSum<V>& sum) const {
+    sum.add_light(color, sum.clear, mask);
+    sum.absorb(color.alpha, piece.start, piece.length, sum.hit_clear, mask);
   }
   // Premultiplied colour and alpha of an interval in one of the nodes.
-  template <class V, class Eye, class Node>
-  GV_HD Row<V> look(MaskOf<V> which, const Piece<V>& piece, Eye& probe, const Node& node) const {
+  template <class V, class AnyProbe, class Node>
+  GV_HD Row<V> contribution(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
     const V t = piece.middle;
-    const MaskOf<V> colored = which && node.among(this->bricks), others = which && !colored;
+    const MaskOf<V> colored = mask && node.in_first_slots(this->bricks), uncolored = mask && !colored;
     Row<V> row{};
-    if (any(others)) {
-      const Row<V> plain = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, others);
+    if (any(uncolored)) {
+      const Row<V> plain = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, uncolored);
       row = {plain.red * plain.alpha, plain.green * plain.alpha, plain.blue * plain.alpha, plain.alpha};
     }
     if (!any(colored)) return row;
-    probe.narrow(colored);
+    probe.select_lanes(colored);
     const auto& colors = probe.channels.other;
     const Vec3<V> d = probe.sight.direction;
-    const auto read = [&](MaskOf<V> some, int32_t first) { return probe.four_of(some, colors, first, node, t); };
+    const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_of(lanes, colors, first, node, t); };
     const Row<V> seen = by_direction(colored, d, colors.width, read);
-    const V whole = clamp(seen.alpha, static_cast<T>(0), static_cast<T>(1));
-    const V alpha = stretch(whole, piece.length * probe.scale_of(node) / own_numbers<Own>(parameters).side);
-    const V part = alpha / whole;
-    const MaskOf<V> shown = colored && whole > 0;
+    const V stored_alpha = clamp(seen.alpha, static_cast<T>(0), static_cast<T>(1));
+    const V alpha = stretch(stored_alpha, piece.length * probe.scale_of(node) / own_numbers<Numbers>(parameters).side);
+    const V scale = alpha / stored_alpha;
+    const MaskOf<V> shown = colored && stored_alpha > 0;
     const auto choose = [&](V color, V plain) { return select(shown, color, select(colored, V{}, plain)); };
-    return {choose(seen.red * part, row.red), choose(seen.green * part, row.green), choose(seen.blue * part, row.blue),
-            choose(alpha, row.alpha)};
+    return {choose(seen.red * scale, row.red), choose(seen.green * scale, row.green),
+            choose(seen.blue * scale, row.blue), choose(alpha, row.alpha)};
   }
 };
 

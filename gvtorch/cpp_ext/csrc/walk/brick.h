@@ -63,17 +63,17 @@ struct Spot {
   }
   GV_HD Vec3<T> at(T t) const { return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z}; }
   // True if the brick is in one of the first `count` slots.
-  GV_HD bool among(int32_t count) const { return brick >= 0 && brick < count; }
+  GV_HD bool in_first_slots(int32_t count) const { return brick >= 0 && brick < count; }
 };
 
 // Lower one of the two voxels around a position along an axis; the upper one exists. Packets multiply floats faster.
 template <class T>
-GV_HD int32_t voxel_below(T place, int32_t side) {
-  return smaller(static_cast<int32_t>(place), side - 2);
+GV_HD int32_t voxel_below(T position, int32_t side) {
+  return smaller(static_cast<int32_t>(position), side - 2);
 }
 #ifndef __CUDACC__
-GV_HD Floats voxel_below(Floats place, int32_t side) {
-  return smaller(to_floats(truncated(place)), splat<Floats>(static_cast<float>(side - 2)));
+GV_HD Floats voxel_below(Floats position, int32_t side) {
+  return smaller(to_floats(truncated(position)), splat<Floats>(static_cast<float>(side - 2)));
 }
 #endif
 
@@ -96,28 +96,29 @@ GV_HD V blend_eight(const T* weight_3, const Pair& pair) {
 // The eight voxels around a position in a brick, and their weights. Positions count in voxels from the centre of the
 // first one, and are clamped to the voxel centres.
 template <class T>
-struct Eight {
+struct EightVoxels {
   decltype(voxel_below(T{}, 0)) cell[3];
   T weight[3];
 
-  GV_HD Eight(const Vec3<T>& at, int32_t side) {
+  GV_HD EightVoxels(const Vec3<T>& position, int32_t side) {
     using Real = RealOf<T>;
     for (int axis = 0; axis < 3; ++axis) {
-      const T place = clamp(at[axis], static_cast<Real>(0), static_cast<Real>(side - 1));
-      cell[axis] = voxel_below(place, side);
-      weight[axis] = place - static_cast<T>(cell[axis]);
+      const T clamped = clamp(position[axis], static_cast<Real>(0), static_cast<Real>(side - 1));
+      cell[axis] = voxel_below(clamped, side);
+      weight[axis] = clamped - static_cast<T>(cell[axis]);
     }
   }
   // Without the clamp, for positions for which is_inside is true.
-  GV_HD explicit Eight(const Vec3<T>& at) {
+  GV_HD explicit EightVoxels(const Vec3<T>& position) {
     for (int axis = 0; axis < 3; ++axis) {
-      cell[axis] = static_cast<int32_t>(at[axis]);
-      weight[axis] = at[axis] - static_cast<T>(cell[axis]);
+      cell[axis] = static_cast<int32_t>(position[axis]);
+      weight[axis] = position[axis] - static_cast<T>(cell[axis]);
     }
   }
-  GV_HD static bool is_inside(const Vec3<T>& at, int32_t side) {
+  GV_HD static bool is_inside(const Vec3<T>& position, int32_t side) {
     const T last = static_cast<T>(side - 1);
-    return at.x >= 0 && at.y >= 0 && at.z >= 0 && at.x < last && at.y < last && at.z < last;
+    return position.x >= 0 && position.y >= 0 && position.z >= 0 && position.x < last && position.y < last &&
+           position.z < last;
   }
   template <class Pair>
   GV_HD T blend(const Pair& pair) const {
@@ -125,21 +126,22 @@ struct Eight {
   }
 };
 
-// Trilinear interpolation of a brick's voxels, between those of `eight` or at a position.
+// Trilinear interpolation of a brick's voxels, between eight corners or at a position.
 template <class T, class Voxel>
-GV_HD T trilinear(const Voxel* voxels, const Eight<T>& eight, int32_t side, int32_t channels) {
+GV_HD T trilinear(const Voxel* voxels, const EightVoxels<T>& corners, int32_t side, int32_t channels) {
   const int32_t step_y = channels * side, step_z = step_y * side;
-  const auto offset = static_cast<uint32_t>(eight.cell[2] * step_z + eight.cell[1] * step_y + eight.cell[0] * channels);
+  const auto offset =
+      static_cast<uint32_t>(corners.cell[2] * step_z + corners.cell[1] * step_y + corners.cell[0] * channels);
   const Voxel* corner = voxels + offset;
-  return eight.blend([&](int y, int z, T& left, T& right) {
+  return corners.blend([&](int y, int z, T& left, T& right) {
     const Voxel* first = corner + (z * step_z + y * step_y);
     left = number<T>(first[0]);
     right = number<T>(first[channels]);
   });
 }
 template <class T, class Voxel>
-GV_HD T trilinear(const Voxel* voxels, int32_t side, int32_t channels, Vec3<T> at) {
-  return trilinear(voxels, Eight<T>(at, side), side, channels);
+GV_HD T trilinear(const Voxel* voxels, int32_t side, int32_t channels, Vec3<T> position) {
+  return trilinear(voxels, EightVoxels<T>(position, side), side, channels);
 }
 
 }  // namespace GV_NAMESPACE

@@ -24,8 +24,8 @@ struct RayView {
   GV_HD double clear(int64_t index) const { return clear_r == nullptr ? 1.0 : clear_r[index]; }
   // The scene's high corner, clamped to the root cube whatever the tensor holds: node indices are computed from it.
   GV_HD double high(int axis) const {
-    const double told = place_33[6 + axis];
-    return told > 0 ? smaller(told, 1.0) : 0.0;
+    const double corner = place_33[6 + axis];
+    return corner > 0 ? smaller(corner, 1.0) : 0.0;
   }
 };
 
@@ -36,9 +36,9 @@ template <class T>
 struct Ray {
   using Real = RealOf<T>;
   Vec3<T> origin, direction;
-  Vec3<T> rest;      // what rounding removed from the origin, in a deep tree; else 0
-  Vec3<T> inverse;   // of the direction
-  Vec3<Real> inner;  // largest position in the scene along each axis: points on its high face are clamped to it
+  Vec3<T> rest;            // what rounding removed from the origin, in a deep tree; else 0
+  Vec3<T> inverse;         // of the direction
+  Vec3<Real> upper_bound;  // largest position in the scene along each axis: points on its high face are clamped to it
   T cone_near, cone_growth;
   T first, last;
   T moved;  // distance from the camera to the origin
@@ -46,15 +46,15 @@ struct Ray {
   Ray() = default;
   GV_HD Ray(const RayView& rays, int64_t index) {
     Vec3<double> from, along, start;
-    double near = -INFINITY;
+    double entry = -INFINITY;
     for (int axis = 0; axis < 3; ++axis) {
       const double size = rays.place_33[3 + axis];
       from[axis] = (rays.origin_r3[3 * index + axis] - rays.place_33[axis]) / size;
       along[axis] = rays.direction_r3[3 * index + axis] / size;
       const double face = along[axis] > 0 ? -from[axis] : rays.high(axis) - from[axis];  // the nearer one
-      if (along[axis] != 0) near = larger(near, face / along[axis]);
+      if (along[axis] != 0) entry = larger(entry, face / along[axis]);
     }
-    const double shift = near > 0 && near < static_cast<double>(INFINITY) ? near : 0;
+    const double shift = entry > 0 && entry < static_cast<double>(INFINITY) ? entry : 0;
     const double growth = rays.cone_r2[2 * index + 1] * rays.cone_scale;
     cone_near = static_cast<T>(rays.cone_r2[2 * index] * rays.cone_scale + growth * shift);
     cone_growth = static_cast<T>(growth);
@@ -68,9 +68,10 @@ struct Ray {
     begin(rays, start);
   }
 
-  // A secondary cone from a position inside the scene (tree units); `way` is its direction in the world.
-  GV_HD Ray(const RayView& rays, Vec3<double> start, Vec3<T> way, Vec3<T> cube, T cone_near, T cone_growth, T last)
-      : direction{way.x / cube.x, way.y / cube.y, way.z / cube.z},
+  // A secondary cone from a position inside the scene (tree units), along a direction in the world.
+  GV_HD Ray(const RayView& rays, Vec3<double> start, Vec3<T> world_direction, Vec3<T> cube, T cone_near, T cone_growth,
+            T last)
+      : direction{world_direction.x / cube.x, world_direction.y / cube.y, world_direction.z / cube.z},
         cone_near(cone_near),
         cone_growth(cone_growth),
         first(0),
@@ -87,8 +88,8 @@ struct Ray {
       origin[axis] = static_cast<T>(start[axis]);
       rest[axis] = rays.deep ? static_cast<T>(start[axis] - static_cast<double>(origin[axis])) : T{};
       inverse[axis] = 1 / direction[axis];
-      inner[axis] = inner_of(rays, axis);
-      const double from = place(axis), to = rays.high(axis);
+      upper_bound[axis] = upper_bound_of(rays, axis);
+      const double from = exact_origin(axis), to = rays.high(axis);
       if (direction[axis] == 0) {
         if (!(from >= 0 && from <= to)) last = first;
         continue;
@@ -103,33 +104,35 @@ struct Ray {
   }
 
   // The origin along an axis, with what rounding removed.
-  GV_HD double place(int axis) const { return static_cast<double>(origin[axis]) + static_cast<double>(rest[axis]); }
+  GV_HD double exact_origin(int axis) const {
+    return static_cast<double>(origin[axis]) + static_cast<double>(rest[axis]);
+  }
 
   // Position at distance t.
   GV_HD Vec3<double> along(T t, bool deep) const {
-    Vec3<double> found;
+    Vec3<double> position;
     for (int axis = 0; axis < 3; ++axis) {
-      found[axis] = deep ? place(axis) + static_cast<double>(t) * static_cast<double>(direction[axis])
-                         : static_cast<double>(origin[axis] + t * direction[axis]);
+      position[axis] = deep ? exact_origin(axis) + static_cast<double>(t) * static_cast<double>(direction[axis])
+                            : static_cast<double>(origin[axis] + t * direction[axis]);
     }
-    return found;
+    return position;
   }
 
   // Position at distance t, clamped to the scene.
   GV_HD Vec3<T> at(T t) const {
-    Vec3<T> place;
+    Vec3<T> position;
     for (int axis = 0; axis < 3; ++axis) {
-      place[axis] = clamp(origin[axis] + t * direction[axis], static_cast<Real>(0), inner[axis]);
+      position[axis] = clamp(origin[axis] + t * direction[axis], static_cast<Real>(0), upper_bound[axis]);
     }
-    return place;
+    return position;
   }
-  GV_HD static Real inner_of(const RayView& rays, int axis) {
+  GV_HD static Real upper_bound_of(const RayView& rays, int axis) {
     return static_cast<Real>(rays.high(axis)) * static_cast<Real>(0.9999999);
   }
 
   // Distance at which the ray leaves a box; face(axis, upper): offset of its lower or upper face from the origin.
   template <class Face>
-  GV_HD T leave(const Face& face) const {
+  GV_HD T exit_distance(const Face& face) const {
     T exit = splat<T>(static_cast<Real>(INFINITY));
     for (int axis = 0; axis < 3; ++axis) {
       const T distance = face(axis, direction[axis] > 0) * inverse[axis];
@@ -138,13 +141,13 @@ struct Ray {
     return exit;
   }
 
-  // Calls body(own member, other's member) for each member that differs between lanes.
-  template <class Own, class Other, class Body>
-  GV_HD static void each(Own& own, Other& other, const Body& body) {
-    body(own.origin, other.origin);
-    body(own.direction, other.direction);
-    body(own.inverse, other.inverse);
-    body(own.moved, other.moved);
+  // Calls body(a's member, b's member) for each member that differs between lanes.
+  template <class A, class B, class Body>
+  GV_HD static void each_member(A& a, B& b, const Body& body) {
+    body(a.origin, b.origin);
+    body(a.direction, b.direction);
+    body(a.inverse, b.inverse);
+    body(a.moved, b.moved);
   }
 };
 
@@ -156,36 +159,36 @@ struct Extent {
   GV_HD MaskOf<T> holds(T t, T cone) const { return t < exit && cone >= cone_low && cone < cone_high; }
 };
 
-constexpr int32_t kMostIntervals = 1 << 23;  // counted from one base: float32 holds every count + 1/2 below it
+constexpr int32_t kMaxIntervals = 1 << 23;  // counted from one base: float32 holds every count + 1/2 below it
 
-// A ray's current interval in its fixed sequence. Starts are products, so rounding errors do not add up. `which`: the
+// A ray's current interval in its fixed sequence. Starts are products, so rounding errors do not add up. `mask`: the
 // lanes that a call changes or tests.
 template <class T>
 struct Intervals {
   using Real = RealOf<T>;
   using Mask = MaskOf<T>;
-  T near, growth, stop;
+  T cone_near, cone_growth, stop;
   Real step;
   int32_t top;  // level of the longest intervals
   IntOf<T> level{};
-  T base, length, shortness;  // start = base + count * length; shortness: 1 / length
+  T base, length, inverse_length;  // start = base + count * length; inverse_length: 1 / length
   T count{};
   T start;
 
   GV_HD Intervals(const Ray<T>& ray, T step, int32_t levels)
-      : near(ray.cone_near),
-        growth(ray.cone_growth),
+      : cone_near(ray.cone_near),
+        cone_growth(ray.cone_growth),
         stop(ray.last),
         step(step),
         top(levels - 1),
         base(ray.first),
         length(step),
-        shortness(1 / step),
+        inverse_length(1 / step),
         start(ray.first) {
     choose_level(true);
   }
   Intervals() = default;
-  GV_HD T cone(T t) const { return near + growth * t; }
+  GV_HD T cone(T t) const { return cone_near + cone_growth * t; }
   GV_HD T start_of(T number) const { return base + number * length; }
   GV_HD T middle_of(T number) const { return base + (number + static_cast<Real>(0.5)) * length; }
   GV_HD Mask inside() const { return start < stop; }
@@ -196,84 +199,84 @@ struct Intervals {
   GV_HD Mask fits(T width) const {
     return (level == 0 || !(width < length)) && (level == top || !(width >= length + length));
   }
-  GV_HD void choose_level(Mask which) {
+  GV_HD void choose_level(Mask mask) {
     const T width = cone(start);
-    const Mask full = count >= static_cast<Real>(kMostIntervals);
-    const Mask wrong = which && (full || !fits(width));
-    if (!any(wrong)) return;
-    start = select(which && full && !(start > base), stop, start);  // intervals too short to move it: the ray ends
-    base = select(wrong, start, base);
-    count = select(wrong, T{}, count);
-    level = select(wrong, IntOf<T>{}, level);
-    length = select(wrong, splat<T>(step), length);
+    const Mask full = count >= static_cast<Real>(kMaxIntervals);
+    const Mask misfits = mask && (full || !fits(width));
+    if (!any(misfits)) return;
+    start = select(mask && full && !(start > base), stop, start);  // intervals too short to move it: the ray ends
+    base = select(misfits, start, base);
+    count = select(misfits, T{}, count);
+    level = select(misfits, IntOf<T>{}, level);
+    length = select(misfits, splat<T>(step), length);
     for (;;) {
-      const Mask longer = wrong && !fits(width) && level < top;
+      const Mask longer = misfits && !fits(width) && level < top;
       if (!any(longer)) break;
       length = select(longer, length + length, length);
       level = select(longer, level + 1, level);
     }
-    shortness = select(wrong, 1 / length, shortness);
+    inverse_length = select(misfits, 1 / length, inverse_length);
   }
   // Moves to interval `number`, counted from `base` in intervals of this length.
-  GV_HD void go(Mask which, T number) {
-    count = select(which, number, count);
-    start = select(which, start_of(count), start);
-    choose_level(which);
+  GV_HD void move_to(Mask mask, T number) {
+    count = select(mask, number, count);
+    start = select(mask, start_of(count), start);
+    choose_level(mask);
   }
   // Number of alike intervals from this one on: whole, of one length, in the extent. At least 1. All bounds are
   // monotone along the ray, also where the cone narrows, so it suffices to test the last interval.
-  GV_HD IntOf<T> run(Mask which, const Extent<T>& extent) const {
+  GV_HD IntOf<T> run(Mask mask, const Extent<T>& extent) const {
     T limit = smaller(extent.exit, stop);
-    if (any(growth > 0)) {
+    if (any(cone_growth > 0)) {
       const T longest = smaller(extent.cone_high, select(level == top, extent.cone_high, length + length));
-      limit = select(growth > 0, smaller(limit, (longest - near) / growth), limit);
+      limit = select(cone_growth > 0, smaller(limit, (longest - cone_near) / cone_growth), limit);
     }
-    if (any(growth < 0)) {
+    if (any(cone_growth < 0)) {
       const T shortest = larger(extent.cone_low, select(level == 0, extent.cone_low, length));
-      limit = select(growth < 0, smaller(limit, (shortest - near) / growth), limit);
+      limit = select(cone_growth < 0, smaller(limit, (shortest - cone_near) / cone_growth), limit);
     }
-    const T one = splat<T>(static_cast<Real>(1)), most = static_cast<Real>(kMostIntervals) - count;
-    IntOf<T> alike = truncated(clamp((limit - start) * shortness + one, one, most));
+    const T one = splat<T>(static_cast<Real>(1)), longest_run = static_cast<Real>(kMaxIntervals) - count;
+    IntOf<T> run_length = truncated(clamp((limit - start) * inverse_length + one, one, longest_run));
     for (;;) {
-      const Mask over = which && alike > 1 && !same(count + to_real<T>(alike - 1), extent);
-      if (!any(over)) return alike;
-      alike = select(over, alike - 1, alike);
+      const Mask excess = mask && run_length > 1 && !is_alike(count + to_real<T>(run_length - 1), extent);
+      if (!any(excess)) return run_length;
+      run_length = select(excess, run_length - 1, run_length);
     }
   }
-  GV_HD Mask same(T number, const Extent<T>& extent) const {
+  GV_HD Mask is_alike(T number, const Extent<T>& extent) const {
     const T middle = middle_of(number);
     return extent.holds(middle, cone(middle)) && start_of(number + static_cast<Real>(1)) <= stop &&
            fits(cone(start_of(number)));
   }
   // True if this interval lies in the extent.
   GV_HD Mask stays(const Extent<T>& extent) const {
-    const T here = middle();
-    return inside() && extent.holds(here, cone(here));
+    const T t = middle();
+    return inside() && extent.holds(t, cone(t));
   }
   // Moves to the first interval beyond the extent.
-  GV_HD void leave(Mask which, const Extent<T>& extent) {
-    for (Mask inside = which; any(inside); inside = inside && stays(extent)) {
-      const Mask whole = inside && !cut();
-      IntOf<T> alike = splat<IntOf<T>>(1);
-      if (any(whole)) alike = select(whole, run(whole, extent), alike);
-      go(inside, count + to_real<T>(alike));
+  GV_HD void leave(Mask mask, const Extent<T>& extent) {
+    for (Mask inside = mask; any(inside); inside = inside && stays(extent)) {
+      const Mask uncut = inside && !cut();
+      IntOf<T> run_length = splat<IntOf<T>>(1);
+      if (any(uncut)) run_length = select(uncut, run(uncut, extent), run_length);
+      move_to(inside, count + to_real<T>(run_length));
     }
   }
 
-  // Calls body(own member, other's member) for each member.
-  template <class Own, class Other, class Body>
-  GV_HD static void each(Own& own, Other& other, const Body& body) {
-    body(own.near, other.near);
-    body(own.growth, other.growth);
-    body(own.stop, other.stop);
-    body(own.step, other.step);
-    body(own.top, other.top);
-    body(own.level, other.level);
-    body(own.base, other.base);
-    body(own.length, other.length);
-    body(own.shortness, other.shortness);
-    body(own.count, other.count);
-    body(own.start, other.start);
+  // Calls body(a's member, b's member) for each member.
+  template <class A, class B, class Body>
+  GV_HD static void each_member(A& a, B& b, const Body& body) {
+    body(a.cone_near, b.cone_near);
+    body(a.cone_growth, b.cone_growth);
+    body(a.stop, b.stop);
+    body(a.step, b.step);
+    body(a.top, b.top);
+    body(a.level, b.level);
+    body(a.base, b.base);
+    body(a.length, b.length);
+    body(a.inverse_length, b.inverse_length);
+    body(a.count, b.count);
+    body(a.start, b.start);
   }
 };
 

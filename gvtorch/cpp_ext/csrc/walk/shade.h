@@ -12,7 +12,9 @@ template <class T>
 struct alignas(16) alignas(T) Row {
   T red, green, blue, alpha;
 
-  GV_HD T operator[](int which) const { return which == 0 ? red : (which == 1 ? green : (which == 2 ? blue : alpha)); }
+  GV_HD T operator[](int column) const {
+    return column == 0 ? red : (column == 1 ? green : (column == 2 ? blue : alpha));
+  }
 };
 constexpr int kAlpha = 3;
 
@@ -30,24 +32,24 @@ GV_HD Vec3<V> combined(const Vec3<V>& a, const Vec3<V>& b, const F& f) {
   return {f(a.x, b.x), f(a.y, b.y), f(a.z, b.z)};
 }
 // `select` for everything that `combined` accepts.
-template <class Mask, class Some>
-GV_HD Some choose(Mask which, const Some& a, const Some& b) {
-  return combined(a, b, [&](auto one, auto other) { return select(which, one, other); });
+template <class Mask, class Numbers>
+GV_HD Numbers choose(Mask mask, const Numbers& a, const Numbers& b) {
+  return combined(a, b, [&](auto x, auto y) { return select(mask, x, y); });
 }
 
 // True if no lane of a packet has alpha. False for a single ray, where the test costs more than it saves.
 template <class T>
-GV_HD bool unseen(MaskOf<T> which, T alpha) {
-  if constexpr (kPacket<T>) return !any(which && alpha > 0);
+GV_HD bool all_transparent(MaskOf<T> mask, T alpha) {
+  if constexpr (kPacket<T>) return !any(mask && alpha > 0);
   return false;
 }
 
 // Builds a row of column(0) to column(kAlpha); colours stay 0 where no lane of a packet has alpha.
 template <class T, class Column>
-GV_HD Row<T> make_row(MaskOf<T> which, const Column& column) {
+GV_HD Row<T> make_row(MaskOf<T> mask, const Column& column) {
   Row<T> row{};
   row.alpha = column(kAlpha);
-  if (unseen(which, row.alpha)) return row;
+  if (all_transparent(mask, row.alpha)) return row;
   row.red = column(0);
   row.green = column(1);
   row.blue = column(2);
@@ -137,48 +139,48 @@ struct Transfer {
 #endif
 
   template <class V>
-  GV_HD V place_of(V value) const {
+  GV_HD V row_position(V value) const {
     return clamp((value - low) * scale, static_cast<T>(0), last);
   }
   template <class V>
   GV_HD Cell<V> find(V value) const {
-    const V place = place_of(value);
-    const IntOf<V> row = smaller(truncated(place), splat<IntOf<V>>(rows - 2));
-    return {row, place - to_real<V>(row)};
+    const V position = row_position(value);
+    const IntOf<V> row = smaller(truncated(position), splat<IntOf<V>>(rows - 2));
+    return {row, position - to_real<V>(row)};
   }
 
-  // Row index + behind, and the next one.
-  GV_HD RowPair<T> rows_at(int32_t index, int32_t behind = 0) const {
-    const Row<T>* const row = table_lm + (index + behind);
+  // Row index + offset, and the next one.
+  GV_HD RowPair<T> rows_at(int32_t index, int32_t offset = 0) const {
+    const Row<T>* const row = table_lm + (index + offset);
     return {load_row(row), load_row(row + 1)};
   }
 #ifndef __CUDACC__
-  GV_HD RowPair<Floats> rows_at(Ints index, int32_t behind = 0) const {
+  GV_HD RowPair<Floats> rows_at(Ints index, int32_t offset = 0) const {
     RowPair<Floats> rows;
-    load_row_pairs(table_lm + behind, index << 4, &rows.first.red, &rows.second.red);
+    load_row_pairs(table_lm + offset, index << 4, &rows.first.red, &rows.second.red);
     return rows;
   }
 #endif
 
-  // Colour and alpha of a value in an interval of a level. Lanes outside `which` are undefined.
+  // Colour and alpha of a value in an interval of a level. Lanes outside `mask` are undefined.
   template <class V>
-  GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which = all_lanes<V>()) const {
-    return look_up(value, level, which, rows);
+  GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> mask = all_lanes<V>()) const {
+    return look_up(value, level, mask, rows);
   }
   // The same in a table of several functions, with `level_rows` rows per level.
   template <class V>
-  GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> which, int32_t level_rows) const {
+  GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> mask, int32_t level_rows) const {
     const Cell<V> cell = find(value);
     const auto index = static_cast<typename LanesOf<V>::Index>(level) * level_rows + cell.row;
     const RowPair<V> pair = rows_at(index);
-    return make_row<V>(which, [&](int column) { return pair.at(cell.weight, column); });
+    return make_row<V>(mask, [&](int column) { return pair.at(cell.weight, column); });
   }
 
   // True if no value in the range has an opacity. The range is widened: interpolation may round beyond its ends.
   template <class V>
   GV_HD MaskOf<V> transparent(V smallest, V largest) const {
-    const IntOf<V> before = floor_int(place_of(a_little_below(smallest))) - 1;
-    const IntOf<V> end = -floor_int(-place_of(a_little_above(largest)));
+    const IntOf<V> before = floor_int(row_position(a_little_below(smallest))) - 1;
+    const IntOf<V> end = -floor_int(-row_position(a_little_above(largest)));
     return pick(opaque_m, end) == select(before < 0, IntOf<V>{}, pick(opaque_m, larger(before, IntOf<V>{})));
   }
 };
@@ -196,10 +198,10 @@ using TransferTable = Transfer<T>;
 template <class T>
 GV_HD T stretch(T alpha, T lengths) {
   using Real = RealOf<T>;
-  const T kept = 1 - alpha, whole = splat<T>(static_cast<Real>(1));
-  const auto left = kept > static_cast<Real>(1.1754944e-38f);
-  if (!any(left)) return whole;
-  return select(left, 1 - exp2_exact(log2_exact(kept) * lengths), whole);
+  const T transmittance = 1 - alpha, opaque = splat<T>(static_cast<Real>(1));
+  const auto translucent = transmittance > static_cast<Real>(1.1754944e-38f);
+  if (!any(translucent)) return opaque;
+  return select(translucent, 1 - exp2_exact(log2_exact(transmittance) * lengths), opaque);
 }
 
 template <class T>
@@ -212,40 +214,40 @@ struct Accumulator {
   Mask missed{};  // visible data was missing
 
   // Adds an interval.
-  GV_HD void add(const Row<T>& row, T start, T length, Real hit_clear, Mask which = all_lanes<T>()) {
-    add_light(row, clear * row.alpha, which);
-    absorb(row.alpha, start, length, hit_clear, which);
+  GV_HD void add(const Row<T>& row, T start, T length, Real hit_clear, Mask mask = all_lanes<T>()) {
+    add_light(row, clear * row.alpha, mask);
+    absorb(row.alpha, start, length, hit_clear, mask);
   }
-  GV_HD void add_light(const Row<T>& row, T share, Mask which) {
-    red = select(which, red + share * row.red, red);
-    green = select(which, green + share * row.green, green);
-    blue = select(which, blue + share * row.blue, blue);
+  GV_HD void add_light(const Row<T>& row, T share, Mask mask) {
+    red = select(mask, red + share * row.red, red);
+    green = select(mask, green + share * row.green, green);
+    blue = select(mask, blue + share * row.blue, blue);
   }
   // Depth is where in the interval the transmittance falls to hit_clear, as if the interval were homogeneous.
-  GV_HD void absorb(T alpha, T start, T length, Real hit_clear, Mask which) {
-    const T left = clear * (1 - alpha);
-    for_lanes(which && left < hit_clear && clear >= hit_clear, [&](int lane) {
-      const Real part = reach(lane_of(clear, lane), lane_of(alpha, lane), hit_clear);
-      set_lane(depth, lane, lane_of(start, lane) + part * lane_of(length, lane));
+  GV_HD void absorb(T alpha, T start, T length, Real hit_clear, Mask mask) {
+    const T clear_after = clear * (1 - alpha);
+    for_lanes(mask && clear_after < hit_clear && clear >= hit_clear, [&](int lane) {
+      const Real fraction = hit_fraction(lane_of(clear, lane), lane_of(alpha, lane), hit_clear);
+      set_lane(depth, lane, lane_of(start, lane) + fraction * lane_of(length, lane));
     });
-    clear = select(which, left, clear);
+    clear = select(mask, clear_after, clear);
   }
   // Fraction of an interval after which the transmittance is hit_clear.
-  GV_HD static Real reach(Real clear, Real alpha, Real hit_clear) {
-    const Real kept = 1 - alpha;
-    if (!(kept > static_cast<Real>(1.1754944e-38f))) return 0;
-    return clamp(log2_exact(hit_clear / clear) / log2_exact(kept), static_cast<Real>(0), static_cast<Real>(1));
+  GV_HD static Real hit_fraction(Real clear, Real alpha, Real hit_clear) {
+    const Real transmittance = 1 - alpha;
+    if (!(transmittance > static_cast<Real>(1.1754944e-38f))) return 0;
+    return clamp(log2_exact(hit_clear / clear) / log2_exact(transmittance), static_cast<Real>(0), static_cast<Real>(1));
   }
 
-  // Calls body(own member, other's member) for each member that differs between lanes.
-  template <class Own, class Other, class Body>
-  GV_HD static void each(Own& own, Other& other, const Body& body) {
-    body(own.red, other.red);
-    body(own.green, other.green);
-    body(own.blue, other.blue);
-    body(own.clear, other.clear);
-    body(own.depth, other.depth);
-    body(own.missed, other.missed);
+  // Calls body(a's member, b's member) for each member that differs between lanes.
+  template <class A, class B, class Body>
+  GV_HD static void each_member(A& a, B& b, const Body& body) {
+    body(a.red, b.red);
+    body(a.green, b.green);
+    body(a.blue, b.blue);
+    body(a.clear, b.clear);
+    body(a.depth, b.depth);
+    body(a.missed, b.missed);
   }
 };
 

@@ -52,11 +52,11 @@ struct RayOrder {
 // box, or where other levels are wanted.
 template <class T>
 struct Visit : Extent<T> {
-  Holder fine, coarse;  // of the wanted level and of the one above it; equal where they do not blend
-  T voxel, above;       // world size of a voxel of either level
-  T seen;               // distance at which the node was looked up
-  int32_t wanted;       // depth that the level of detail asks for
-  bool hidden;          // neither marked nor sampled
+  Holder fine, coarse;   // of the wanted level and of the one above it; equal where they do not blend
+  T voxel, voxel_above;  // world size of a voxel of either level
+  T lookup_t;            // distance at which the node was looked up
+  int32_t wanted;        // depth that the level of detail asks for
+  bool hidden;           // neither marked nor sampled
 };
 
 template <class T>
@@ -71,7 +71,7 @@ struct Walk {
   int32_t* stamp_b;
   T stop_clear, hit_clear;  // transmittance at which a ray ends, and at which its depth is recorded
 
-  static constexpr int64_t kShare = 16;  // see for_each.h
+  static constexpr int64_t kChunkSize = 16;  // see for_each.h
 
   explicit Walk(const TraceArgs& args)
       : rays{args.origin_r3, args.direction_r3, args.cone_r2,  args.range_r2,
@@ -102,22 +102,23 @@ struct Walk {
   //
   //   kSeesEmpty                       true if EMPTY nodes are visited too
   //   missed()                         a bool&, set where visible data is missing
-  //   more()                           true while the ray goes on to another node
-  //   words(node)                      the node's NodeWords, with kConcealed where nothing in it is visible
+  //   goes_on()                        true while the ray goes on to another node
+  //   node_words(node)                 the node's NodeWords, with kConcealed where nothing in it is visible
   //   enter(ray, visit, digits)        begins a visit; returns the visitor's data for it, `node` below
   //   uniform(node)                    true if the visit may be taken as one interval
   //   region(node, start, end)         takes the visit as one interval
-  //   take(node, at, alike, last)      takes at most `alike` whole intervals or, with `last`, the ray's last one, which
-  //                                    is cut at the far side; returns how many it took
+  //   take_intervals(node, intervals, run_length, last)
+  //                                    takes at most `run_length` whole intervals or, with `last`, the ray's last one,
+  //                                    which is cut at the far side; returns how many it took
   //   sees()                           true while the ray goes on in this node
   //   finish(node)                     ends a visit whose intervals have been taken
   template <class Digits, class Visitor>
-  GV_HD void follow(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor) const {
+  GV_HD void follow(const Ray<T>& ray, Intervals<T>& intervals, Visitor& visitor) const {
     int32_t wanted = 0;
-    while (at.inside()) {
-      if (is_ahead(at.start, wanted)) continue;
-      if (!visitor.more()) return;
-      visit<Digits>(ray, at, visitor, wanted);
+    while (intervals.inside()) {
+      if (is_ahead(intervals.start, wanted)) continue;
+      if (!visitor.goes_on()) return;
+      visit<Digits>(ray, intervals, visitor, wanted);
     }
   }
 
@@ -126,46 +127,46 @@ struct Walk {
   // corner of one more node fall a turn behind, so that long and short visits share turns. A ray therefore waits while
   // it is more than a node's side ahead of the warp's hindmost ray, which never waits.
   GV_HD bool is_ahead(T start, int32_t wanted) const {
-    return start - smallest_together(start) > levels.voxel[wanted] * levels.scale[0];
+    return start - warp_minimum(start) > levels.voxel[wanted] * levels.scale[0];
   }
 
   // Visits one node: finds it, marks it, and takes all intervals whose middle lies in it.
   template <class Digits, class Visitor>
-  GV_HD void visit(const Ray<T>& ray, Intervals<T>& at, Visitor& visitor, int32_t& wanted) const {
-    const T middle = at.middle();
+  GV_HD void visit(const Ray<T>& ray, Intervals<T>& intervals, Visitor& visitor, int32_t& wanted) const {
+    const T middle = intervals.middle();
     Digits digits(tree, levels, rays, ray, middle);
-    const auto words = [&](int32_t node) { return visitor.words(node); };
-    Visit<T> visit = find(ray, digits, at.cone(middle), words, wanted, visitor.missed());
-    visit.seen = middle;
+    const auto node_words = [&](int32_t node) { return visitor.node_words(node); };
+    Visit<T> visit = find(ray, digits, intervals.cone(middle), node_words, wanted, visitor.missed());
+    visit.lookup_t = middle;
     const bool empty = !Visitor::kSeesEmpty && visit.fine.brick == kEmpty && visit.coarse.brick == kEmpty;
-    if (visit.hidden || visit.fine.node < 0 || empty) return at.leave(true, visit);
+    if (visit.hidden || visit.fine.node < 0 || empty) return intervals.leave(true, visit);
     auto node = visitor.enter(ray, visit, digits);
     if (visitor.uniform(node)) {
-      const T entry = at.start;
-      at.leave(true, visit);
-      return visitor.region(node, entry, smaller(at.start, at.stop));
+      const T entry = intervals.start;
+      intervals.leave(true, visit);
+      return visitor.region(node, entry, smaller(intervals.start, intervals.stop));
     }
-    march(visit, at, visitor, node);
+    march(visit, intervals, visitor, node);
     visitor.finish(node);
   }
 
   // Takes the remaining intervals of a visit.
   template <class Visitor, class Node>
-  GV_HD void march(const Extent<T>& extent, Intervals<T>& at, Visitor& visitor, Node& node) const {
+  GV_HD void march(const Extent<T>& extent, Intervals<T>& intervals, Visitor& visitor, Node& node) const {
     do {
-      const bool last = at.cut();
-      const int32_t alike = last ? 1 : at.run(true, extent);
-      const int32_t taken = visitor.take(node, at, alike, last);
-      at.go(true, at.count + static_cast<T>(taken));
+      const bool last = intervals.cut();
+      const int32_t run_length = last ? 1 : intervals.run(true, extent);
+      const int32_t taken = visitor.take_intervals(node, intervals, run_length, last);
+      intervals.move_to(true, intervals.count + static_cast<T>(taken));
       if (last) return;
-    } while (visitor.sees() && at.stays(extent));
+    } while (visitor.sees() && intervals.stays(extent));
   }
 
   // Finds the node in which an interval's middle lies; marks what is used and what is missing. `wanted` enters as the
   // depth that the previous visit wanted. Level of detail: the first depth whose voxel fits into the cone
   // (packet_walk.h has the same for packets; Levels.wanted in the twin).
-  template <class Digits, class Words>
-  GV_HD Visit<T> find(const Ray<T>& ray, Digits& digits, T cone, const Words& words, int32_t& wanted,
+  template <class Digits, class ReadWords>
+  GV_HD Visit<T> find(const Ray<T>& ray, Digits& digits, T cone, const ReadWords& read_words, int32_t& wanted,
                       bool& missed) const {
     const T infinity = static_cast<T>(INFINITY);
     while (wanted < tree.max_depth && levels.voxel[wanted] > cone) ++wanted;
@@ -173,44 +174,44 @@ struct Walk {
     Visit<T> visit;
     visit.wanted = wanted;
     visit.voxel = levels.voxel[wanted];
-    visit.above = wanted > 0 ? levels.voxel[wanted - 1] : infinity;
+    visit.voxel_above = wanted > 0 ? levels.voxel[wanted - 1] : infinity;
     const bool reached = visit.voxel <= cone;
     const bool blend = reached && wanted > 0;
     visit.cone_low = reached ? visit.voxel : -infinity;
-    visit.cone_high = reached ? visit.above : visit.voxel;
+    visit.cone_high = reached ? visit.voxel_above : visit.voxel;
 
-    const Place place = descend(tree, digits, wanted, blend, *frame_1, words);
-    visit.exit = ray.leave([&](int axis, bool upper) { return digits.face(axis, place.depth, upper); });
-    visit.hidden = place.hidden && (place.depth < wanted || !blend);
-    if (!visit.hidden && mark_missing(place, wanted, blend, cone)) missed = true;
+    const Descent descent = descend(tree, digits, wanted, blend, *frame_1, read_words);
+    visit.exit = ray.exit_distance([&](int axis, bool upper) { return digits.face(axis, descent.depth, upper); });
+    visit.hidden = descent.hidden && (descent.depth < wanted || !blend);
+    if (!visit.hidden && mark_missing(descent, wanted, blend, cone)) missed = true;
 
     // The two levels that blend. Only one is read where both are the same node, as where no voxel fits into the cone.
-    visit.fine = place.fine;
-    visit.coarse = place.coarse.node >= 0 ? place.coarse : visit.fine;
+    visit.fine = descent.fine;
+    visit.coarse = descent.coarse.node >= 0 ? descent.coarse : visit.fine;
     if (!visit.hidden && visit.fine.brick >= 0) store_stamp(&stamp_b[visit.fine.brick], *frame_1);
-    const bool other = visit.coarse.node != visit.fine.node;
-    if (!visit.hidden && other && visit.coarse.brick >= 0) store_stamp(&stamp_b[visit.coarse.brick], *frame_1);
+    const bool two_nodes = visit.coarse.node != visit.fine.node;
+    if (!visit.hidden && two_nodes && visit.coarse.brick >= 0) store_stamp(&stamp_b[visit.coarse.brick], *frame_1);
     return visit;
   }
 
   // Requests what is missing; returns whether anything is. Requests go straight to the wanted level, or level by level:
   // then a node has its brick before it is subdivided. A missing brick or too coarse a node always leads to a request.
-  GV_HD bool mark_missing(const Place& place, int32_t wanted, bool blend, T cone) const {
-    const bool absent = place.brick == kAbsent;
-    const bool deeper = place.depth < wanted && place.tile == kAbsent;
-    const bool above = blend && place.depth == wanted && tree.brick_of(place.parent) == kAbsent;
-    if (deeper && !(options.by_level && absent)) request(place.node, place.depth, cone, kSubdivide);
-    if (absent && (options.by_level || !deeper || place.fine.node < 0)) {
-      request(place.node, place.depth, cone, kLoad);
+  GV_HD bool mark_missing(const Descent& descent, int32_t wanted, bool blend, T cone) const {
+    const bool brick_missing = descent.brick == kAbsent;
+    const bool too_coarse = descent.depth < wanted && descent.tile == kAbsent;
+    const bool parent_lacks = blend && descent.depth == wanted && tree.brick_of(descent.parent) == kAbsent;
+    if (too_coarse && !(options.by_level && brick_missing)) request(descent.node, descent.depth, cone, kSubdivide);
+    if (brick_missing && (options.by_level || !too_coarse || descent.fine.node < 0)) {
+      request(descent.node, descent.depth, cone, kLoad);
     }
-    if (above) request(place.parent, place.depth - 1, cone, kLoad);
-    return absent || deeper || above;
+    if (parent_lacks) request(descent.parent, descent.depth - 1, cone, kLoad);
+    return brick_missing || too_coarse || parent_lacks;
   }
 
   // Priority: the width of one of the node's voxels on the screen, in sixteenths of a pixel, up to 128 pixels.
   GV_HD void request(int32_t node, int32_t depth, T cone, int32_t kind) const {
-    const T most = static_cast<T>(kPriorityMask);
-    const T priority = cone > 0 ? smaller(levels.voxel[depth] / cone * 16, most) : most;
+    const T max_priority = static_cast<T>(kPriorityMask);
+    const T priority = cone > 0 ? smaller(levels.voxel[depth] / cone * 16, max_priority) : max_priority;
     if (tree.request_tn == nullptr) return;
     post_request(&tree.request_tn[node], kind | static_cast<int32_t>(priority));
   }
