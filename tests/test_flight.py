@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
+from gvtorch.base import check
 from gvtorch.cameras.motion import exponential, logarithm
 from gvtorch.viewer.state import Development, Eye
 
@@ -302,6 +304,32 @@ def test_flags_that_the_keys_tell_are_refused(small, tmp_path):
         assert run.returncode == 2 and f"--keys sets what {flags[0]} sets" in run.stderr
     run = gvtorch("fly", small, "-o", tmp_path / "f", "--keys", tmp_path / "no.json")
     assert run.returncode == 2 and "key frames not found" in run.stderr
+
+
+@pytest.mark.backend("cpp")
+def test_fly_reads_each_file_of_a_flight_once(tmp_path, monkeypatch):
+    """So that files which change meanwhile can't change a film between its parts."""
+    np.save(tmp_path / "series.npy", np.random.default_rng(0).random((3, 8, 8, 8), np.float32))
+    for n in range(2):
+        shown(orbit(30 * n)).save(tmp_path / f"{n}.json")
+    content = [{"time": 0, "state": "0.json"}, {"time": 2, "state": {"time": 2}}]
+    (tmp_path / "k.json").write_text(json.dumps(content))
+    read, json_file = [], check.json_file
+
+    def counted(kind, path):
+        read.append(Path(path).name)
+        return json_file(kind, path)
+
+    monkeypatch.setattr(check, "json_file", counted)
+    data = ("fly", tmp_path / "series.npy", "--axes", "tzyx", "--size", "8x8")
+    run = gvtorch(*data, "-o", tmp_path / "a", "--keys", tmp_path / "k.json", "--frames", "3")
+    assert run.returncode == 0, run.stderr
+    assert sorted(read) == ["0.json", "k.json"]
+    read.clear()
+    flags = ("--state", tmp_path / "1.json", "--turntable", "1", "--fps", "3", "--times", "all")
+    run = gvtorch(*data, "-o", tmp_path / "b", *flags)
+    assert run.returncode == 0, run.stderr
+    assert read == ["1.json"]
 
 
 @pytest.mark.parametrize(

@@ -147,8 +147,8 @@ def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) 
     words = (pool.child_tn, pool.brick_tn, pool.request_tn)
     tile_fields = (pool.loc_t4, pool.parent_t, pool.tree_t, pool.stamp_t, pool.shared_t)
     contents = (children.child.contiguous(), children.brick.contiguous(), node, targets.loc)
-    rows = torch.arange(len(node), device=node.device)
-    link_tiles(*words, *tile_fields, *contents, rows, tile_k, tree.number, cache.frame_1)
+    row_index = torch.arange(len(node), device=node.device)
+    link_tiles(*words, *tile_fields, *contents, row_index, tile_k, tree.number, cache.frame_1)
     return outcome
 
 

@@ -337,7 +337,7 @@ def _colmap_texts(cameras: Mapping[str, Camera]) -> dict[str, str]:
         lens_id = lenses.setdefault(lens, len(lenses) + 1)
         pose = [*quaternion_of(camera.viewmats[0, :3, :3]), *camera.viewmats[0, :3, 3].tolist()]
         images += [f"{number} {' '.join(map(repr, pose))} {lens_id} {name}", ""]
-    lens_lines = [f"{number} {lens}" for lens, number in lenses.items()]
+    lens_lines = [f"{lens_id} {lens}" for lens, lens_id in lenses.items()]
     head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS"
     return {
         "cameras.txt": "\n".join((head, *lens_lines)) + "\n",

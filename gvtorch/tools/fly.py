@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +17,7 @@ from tyro.conf import Positional
 
 from ..base.declared import declared_names
 from ..base.digits import whole_number
-from ..base.messages import printable
+from ..base.messages import one_line, printable
 from ..base.whole_file import write_whole
 from ..io.stores.ngff import is_zarr
 from .common import Bar, check_outputs, flags_given, option, size, volume_formats
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from ..cameras import Camera
     from ..cameras.path import CameraPath
     from ..pictures import Picture, Video
-    from ..viewer.flight import Flight
+    from ..viewer.flight import Flight, KeyFile
     from ..viewer.state import ViewState
 
 _FILMS = tuple(declared_names("pictures.video", "FILMS"))
@@ -139,7 +140,7 @@ class Fly:
 
     def _loops(self) -> bool:
         """Whether the path ends where it begins, so that its last picture is left out."""
-        return self._flight().closed if self._saved is not None else self.flight == "orbit"
+        return self._bare_flight.closed if self._saved is not None else self.flight == "orbit"
 
     @property
     def _saved(self) -> Path | None:
@@ -168,7 +169,7 @@ class Fly:
                 eye = Eye.of(camera, scene.box) if flags_given(self.drawn) else now.camera
                 return replace(now, camera=eye), camera, scene.render(camera)
         else:
-            flight = self._flight(now)
+            flight = self._flight_from(now)
 
             def shot(at: float) -> tuple[ViewState, Camera, Picture]:
                 state = flight.along(at)
@@ -185,19 +186,44 @@ class Fly:
 
         return picture
 
-    def _flight(self, now: ViewState | None = None) -> Flight:
-        """Returns the flight; `now` supplies what its states leave out (None: only a check)."""
-        from ..shaders import TransferFunction
+    @cached_property
+    def _key_file(self) -> KeyFile:
+        """The content of --keys, read once: the file may change while pictures are made."""
+        from ..viewer.flight import KeyFile
+
+        assert self.keys is not None
+        return KeyFile(self.keys)
+
+    @cached_property
+    def _first_fields(self) -> dict[str, Any]:
+        """The fields of --state, or of the first state of --keys, unchecked."""
+        from ..viewer.state import saved_state
+
+        if self.keys is not None:
+            return self._key_file.first_fields
+        assert self.state is not None
+        return saved_state(self.state)
+
+    def _flight_from(self, now: ViewState) -> Flight:
+        """Returns the flight; `now` supplies what its states leave out."""
         from ..viewer.flight import Flight
+
+        if self.keys is not None:
+            return self._key_file.flight(now)
+        try:
+            state = now.changed(self._first_fields)
+        except ValueError as error:
+            raise ValueError(f"{self.state}: {one_line(error)}") from None
+        return Flight.turntable(state)
+
+    @cached_property
+    def _bare_flight(self) -> Flight:
+        """The flight before the data are known: with its times, its length and its models."""
+        from ..shaders import TransferFunction
         from ..viewer.state import Eye, ViewState
 
         anywhere = Eye(eye=(0, 0, 1), target=(0, 0, 0))
-        any_state = ViewState(shader=TransferFunction([(0, 1)]), camera=anywhere)
-        now = any_state if now is None else now
-        if self.keys is not None:
-            return Flight.read(self.keys, now)
-        assert self.state is not None
-        return Flight.turntable(now.read(self.state))
+        return self._flight_from(ViewState(shader=TransferFunction([(0, 1)]), camera=anywhere))
 
     def _parts(self, frames: int) -> list[tuple[int | None, range]]:
         """Returns time points and the numbers of their pictures; None: the one of --time."""
@@ -209,7 +235,7 @@ class Fly:
 
     def _parts_of_keys(self, frames: int) -> list[tuple[int | None, range]]:
         """Returns the same by the times of key frames: runs of pictures of one time point."""
-        flight = self._flight()
+        flight = self._bare_flight
         if all(state.time == 0 for _, state in flight.keys):
             return [(None, range(frames))]
         if self.scene.source.time is not None:
@@ -256,7 +282,7 @@ class Fly:
 
         fps = check.whole("fly", "--fps", 25 if self.fps is None else self.fps, low=1, high=1000)
         if self.keys is not None:
-            count = self._flight().count(fps) if self.frames is None else self.frames
+            count = self._bare_flight.count(fps) if self.frames is None else self.frames
             return check.whole("fly", "--frames", count, low=1), fps
         if self.turntable is None:
             if self.fps is not None and self.output.suffix not in _FILMS:
@@ -295,31 +321,22 @@ class Fly:
             raise FileNotFoundError(f"folder not found: {self.poses.parent}")
         models = [self.scene.look.camera_model]
         if self._saved is not None:
-            models = [s.camera.model for _, s in self._flight().keys if s.camera is not None]
+            models = [s.camera.model for _, s in self._bare_flight.keys if s.camera is not None]
         other = next((one for one in models if one not in ("pinhole", "fisheye")), None)
         if other is not None:
             raise ValueError(f"--poses can write pinhole and fisheye, not {other}")
 
     def _check_saved(self) -> None:
         """Raises ValueError if a flag sets what the saved states set."""
-        from ..base import check
-        from ..viewer.state import saved_state
-
-        self._flight()  # raises if it is wrong
+        flight = self._bare_flight  # raises if it is wrong
         path = self.flight if self.flight != "orbit" else None
         paths: dict[str, Any] = {"--path": path, "--orbit": self.orbit}
-        if self.keys is None:
-            assert self.state is not None
-            first = saved_state(self.state)
-        else:
+        if self.keys is not None:
             paths |= {"--turntable": self.turntable, "--state": self.state}
-            first = check.json_file("key frames", self.keys)[0]["state"]
-            if isinstance(first, str):
-                first = saved_state(self.keys.parent / first)
         flags = [name for name, value in paths.items() if value]
-        if self.times is not None and any(state.time != 0 for _, state in self._flight().keys):
+        if self.times is not None and any(state.time != 0 for _, state in flight.keys):
             flags.append("--times")
-        flags += self.scene.look.told_by(first)
+        flags += self.scene.look.told_by(self._first_fields)
         if flags:
             raise ValueError(f"{self._flag} sets what {flags[0]} sets: leave one out")
 

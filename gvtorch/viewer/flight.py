@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from ..base.smooth import Smooth
 from ..base.whole_file import write_whole
 from ..cameras import Camera
 from ..cameras.motion import Motion
-from .state import Eye, ViewState
+from .state import Eye, ViewState, saved_state
 
 Curve = Callable[[float], Any]
 _MAX_PICTURES = 2**31  # most pictures of a film
@@ -95,24 +95,7 @@ class Flight:
             FileNotFoundError: There is no such file.
             ValueError: It holds something else; the message names file and key.
         """
-        content = check.json_file("key frames", path)
-        if not isinstance(content, list) or not content:
-            raise ValueError(f'{path}: must be a list of keys {{"time": ..., "state": ...}}')
-        keys = []
-        for n, key in enumerate(content):
-            if not isinstance(key, dict) or set(key) != {"time", "state"}:
-                raise ValueError(f'{path}: key {n}: must be {{"time": ..., "state": ...}}')
-            entry = key["state"]
-            try:
-                is_path = isinstance(entry, str)
-                now = now.read(Path(path).parent / entry) if is_path else now.changed(entry)
-                keys.append((check.number("Flight", "time", key["time"]), now))
-            except ValueError as error:
-                raise ValueError(f"{path}: key {n}: {one_line(error)}") from None
-        try:
-            return cls(keys)
-        except ValueError as error:
-            raise ValueError(f"{path}: {one_line(error)}") from None
+        return KeyFile(path).flight(now)
 
     @classmethod
     def turntable(cls, state: ViewState, seconds: float = 10.0) -> Flight:
@@ -205,6 +188,57 @@ class Flight:
 
     def __repr__(self) -> str:
         return f"Flight({len(self)} keys, {self.seconds:g} s{', closed' * self.closed})"
+
+
+class _SavedKey(NamedTuple):
+    time: Any  # seconds, unchecked
+    fields: Any  # of its state, unchecked
+    path: Path | None  # the state's own file
+
+
+class KeyFile:
+    """The content of a file of key frames and of the state files that it names, read once."""
+
+    def __init__(self, path: str | Path) -> None:
+        """Reads the files; see `Flight.read`."""
+        content = check.json_file("key frames", path)
+        if not isinstance(content, list) or not content:
+            raise ValueError(f'{path}: must be a list of keys {{"time": ..., "state": ...}}')
+        self._path = path
+        self._keys: list[_SavedKey] = []
+        for n, key in enumerate(content):
+            if not isinstance(key, dict) or set(key) != {"time", "state"}:
+                raise ValueError(f'{path}: key {n}: must be {{"time": ..., "state": ...}}')
+            state = key["state"]
+            try:
+                state_path = Path(path).parent / state if isinstance(state, str) else None
+                fields = state if state_path is None else saved_state(state_path)
+            except ValueError as error:
+                raise ValueError(f"{path}: key {n}: {one_line(error)}") from None
+            self._keys.append(_SavedKey(key["time"], fields, state_path))
+
+    @property
+    def first_fields(self) -> dict[str, Any]:
+        """The fields of the first key's state, unchecked."""
+        return self._keys[0].fields
+
+    def flight(self, now: ViewState) -> Flight:
+        """Returns the flight; `now` supplies what the first state leaves out. ValueError: a key or
+        a state is wrong.
+        """
+        keys = []
+        for n, key in enumerate(self._keys):
+            label = f"{self._path}: key {n}"
+            try:
+                now = now.changed(key.fields)
+            except ValueError as error:
+                label = label if key.path is None else f"{label}: {key.path}"
+                raise ValueError(f"{label}: {one_line(error)}") from None
+            keys.append((check.number(f"{label}: Flight", "time", key.time), now))
+        try:
+            return Flight(keys)
+        except ValueError as error:
+            raise ValueError(f"{self._path}: {one_line(error)}") from None
 
 
 def _pose(eye: Eye) -> Tensor:
