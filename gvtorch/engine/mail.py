@@ -112,7 +112,7 @@ class Mail:
         buffer[: 8 * self._node_rows].view(torch.int64).fill_(-1)
 
     def __repr__(self) -> str:
-        return f"Mail({', '.join(self._taken)}; {self.rows} rows each)"
+        return f"Mail({', '.join(self._filled_rows)}; {self.rows} rows each)"
 
 
 def _views(
