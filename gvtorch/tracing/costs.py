@@ -73,19 +73,19 @@ class Cost:
 
         check.one_of("Cost", "image", name, IMAGES)
         if colormap not in ColorMapType.__members__:
-            known = ", ".join(sorted(ColorMapType.__members__))
-            raise ValueError(f"Cost: unknown colormap {colormap!r}; known: {known}")
+            names = ", ".join(sorted(ColorMapType.__members__))
+            raise ValueError(f"Cost: unknown colormap {colormap!r}; known: {names}")
         image = getattr(self, name).to("cpu", torch.float32)
-        known = ~image.isnan()
+        valid = ~image.isnan()
         if high is None:
-            high = float(image[known].max()) if known.any() else 1.0
+            high = float(image[valid].max()) if valid.any() else 1.0
         position = ((image - low) / max(high - low, 1e-6)).clamp(0, 1)
         colors = rgb_to_linear_rgb(ColorMap(colormap, 256).colors[:, :, None])[:, :, 0].T
-        color = colors[torch.where(known, position * 255, 0).round().long()[..., 0]] * known
+        color = colors[torch.where(valid, position * 255, 0).round().long()[..., 0]] * valid
         no_depth = torch.full_like(image, torch.inf)
         return Picture(
             color=color,
-            alpha=known.float(),
+            alpha=valid.float(),
             depth=no_depth,
             nearest=no_depth,
             samples=self.samples.cpu(),

@@ -176,7 +176,7 @@ def radiological_views(space: str | None) -> dict[str, PlaneView]:
         name, above, left = _RADIOLOGICAL_PLANES[
             letter if letter in _RADIOLOGICAL_PLANES else _OPPOSITE[letter]
         ]
-        in_plane = {n: letter for n, letter in towards.items() if n != axis}
+        in_plane = {n: direction for n, direction in towards.items() if n != axis}
         rows = next(
             (n for n, direction in in_plane.items() if direction in (above, _OPPOSITE[above])), ""
         )
