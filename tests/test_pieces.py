@@ -255,7 +255,7 @@ def test_normals_of_three_trees_are_the_mean_by_the_light_that_each_takes():
             lambda _, one=one: one,
             SimpleNamespace(
                 shader=gv.TransferFunction([(0, 0), (1, 1)]),
-                inside=lambda rays: rays,
+                to_tree=lambda rays: rays,
                 tree=SimpleNamespace(box=box),
             ),
         )
