@@ -209,6 +209,57 @@ def test_a_busy_producer_is_asked_for_several_frames_at_once(blobs, backend, slo
         engine.validate()
 
 
+class Guarded(dict[Any, Any]):
+    """Lists its methods that are called while nobody holds a lock."""
+
+    def __init__(self, lock: threading.Lock) -> None:
+        super().__init__()
+        self.lock, self.unlocked = lock, []
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in ("pop", "clear", "values", "items") and not self.lock.locked():
+            self.unlocked.append(name)
+        return super().__getattribute__(name)
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        if not self.lock.locked():
+            self.unlocked.append("set")
+        super().__setitem__(key, value)
+
+    def __delitem__(self, key: Any) -> None:
+        if not self.lock.locked():
+            self.unlocked.append("delete")
+        super().__delitem__(key)
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_answers_on_their_way_are_listed_under_a_lock(blobs, backend):
+    """Frames read and change the list, and so do the threads in which answers arrive."""
+
+    class Later(gv.VolumeProducer):
+        patience = 0.2
+        late: list[tuple[Future, Any]] | None = None
+
+        def fill(self, nodes):
+            if self.late is None:
+                return super().fill(nodes)
+            self.late.append((Future(), super().fill(nodes)))
+            return self.late[-1][0]
+
+    with gv.Engine(Later(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        engine.frame(view(24), LOOK)
+        frames = Frames(engine, view(24), LOOK, 3)
+        late = engine.trees["scene"].producer.late = []
+        waiting = frames.served._waiting = Guarded(frames.served._lock)
+        while not (late and waiting):
+            frames.frame()
+        late[0][0].set_result(late[0][1])
+        while not any("no answer within" in failure.message for failure in engine.failures):
+            frames.frame()
+        engine.release()
+        assert not waiting and not waiting.unlocked
+
+
 @pytest.mark.parametrize("backend", COMPILED)
 def test_what_fails_on_the_host_is_named_and_not_asked_for_again(blobs, backend):
     class Spoiled(gv.VolumeProducer):

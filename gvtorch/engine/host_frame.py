@@ -48,7 +48,7 @@ class HostFrame(RecordedFrame):
         # Nodes asked for, and failed, since the last `release`.
         self._asked_count = self._failed_count = 0
         self.active = False  # whether frames have been rendered since the last `release`
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # held to read or write the four fields below
         self._waiting: dict[Future, tuple[float, RequestBatch]] = {}  # deadlines
         self._chosen: dict[int, list[Tensor]] = {kind: [] for kind in KINDS.values()}
         self._last_call = dict.fromkeys(KINDS.values(), -math.inf)  # seconds
@@ -81,10 +81,10 @@ class HostFrame(RecordedFrame):
         if not self.active:
             return
         self.active = False
-        self._waiting.clear()
         # An answer being processed is either posted before the lock is held, and dropped below, or
         # posted later, and refused because its generation is over.
         with self._lock:
+            self._waiting.clear()
             self.generation += 1
             for rows in self._chosen.values():
                 rows.clear()
@@ -190,7 +190,7 @@ class HostFrame(RecordedFrame):
         """Asks for chosen nodes; of a kind with an answer due, `_CALL_GAP` after its last call."""
         with self._lock:
             self._ask_scheduled, generation, now = False, self.generation, time.monotonic()
-            busy_kinds = {batch.kind for _, batch in [*self._waiting.values()]}
+            busy_kinds = {batch.kind for _, batch in self._waiting.values()}
             free_kinds = [
                 kind
                 for kind in self._chosen
@@ -213,7 +213,8 @@ class HostFrame(RecordedFrame):
         """Asks for a batch; if the producer raises, asks again for each half."""
 
         def on_arrival(future: Future) -> None:
-            was_waiting = self._waiting.pop(future, None) is not None  # else it was given up
+            with self._lock:
+                was_waiting = self._waiting.pop(future, None) is not None  # else it was given up
             self._schedule_ask()
             if was_waiting and batch.generation == self.generation:
                 self._settle(batch, future.result)
@@ -224,7 +225,8 @@ class HostFrame(RecordedFrame):
             self._ask_halves(batch, error)
             return
         if isinstance(answer, Future):
-            self._waiting[answer] = time.monotonic() + batch.source.patience, batch
+            with self._lock:  # not while a callback is added: it may be called at once
+                self._waiting[answer] = time.monotonic() + batch.source.patience, batch
             answer.add_done_callback(on_arrival)
         else:
             self._settle(batch, lambda: answer)
@@ -232,10 +234,13 @@ class HostFrame(RecordedFrame):
     def _fail_overdue(self) -> None:
         """Records batches as failed whose answers have not come in time."""
         now = time.monotonic()
-        for future, (deadline, batch) in list(self._waiting.items()):
-            if deadline < now and self._waiting.pop(future, None) is not None:
-                future.cancel()
-                self._fail(batch, f"no answer within {batch.source.patience:g} s")
+        with self._lock:
+            overdue = {f: batch for f, (deadline, batch) in self._waiting.items() if deadline < now}
+            for future in overdue:
+                del self._waiting[future]
+        for future, batch in overdue.items():
+            future.cancel()
+            self._fail(batch, f"no answer within {batch.source.patience:g} s")
 
     def _ask_halves(self, batch: RequestBatch, error: Exception) -> None:
         if len(batch) == 1:
