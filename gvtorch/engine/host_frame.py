@@ -123,8 +123,8 @@ class HostFrame(RecordedFrame):
 
     def _write_answers(self, source: ProducedTree, mail: Mail) -> None:
         """Writes the answers sent for one tree; nodes that found no slot may be requested again."""
-        tiles, bricks, bare, again = (
-            mail.device_boxes[box] for box in ("tiles", "bricks", "bare", "again")
+        tiles, bricks, uniform, to_host = (
+            mail.device_boxes[box] for box in ("tiles", "bricks", "uniform", "to_host")
         )
         children = Children(
             child=tiles["child"],
@@ -135,7 +135,9 @@ class HostFrame(RecordedFrame):
             alias=None,
             alias_tree=source.tree.number,
         )
-        targets = [Targets(source.tree, box["node"], box["loc"]) for box in (tiles, bricks, bare)]
+        targets = [
+            Targets(source.tree, box["node"], box["loc"]) for box in (tiles, bricks, uniform)
+        ]
         outcome = put_tiles(self.cache, targets[0], children, self._unused_slots[:1])
         self._count_outcome(REQUEST_SUBDIVIDE, targets[0], outcome, 0)
         outcome = put_bricks(
@@ -143,9 +145,9 @@ class HostFrame(RecordedFrame):
         )
         self._count_outcome(REQUEST_LOAD, targets[1], outcome, 1)
         self._outcomes[2] += put_uniform(
-            self.cache, targets[2], bare["word"], _by_channel(bare, "constants")
+            self.cache, targets[2], uniform["word"], _by_channel(uniform, "constants")
         )
-        self._clear_pending(again["node"], again["bit"])
+        self._clear_pending(to_host["node"], to_host["bit"])
         mail.clear()
 
     def _count_outcome(self, kind: int, targets: Targets, outcome: Put, index: int) -> None:
@@ -315,13 +317,13 @@ class HostFrame(RecordedFrame):
             for name, channel in batch.source.producer.channels.items()
         }
         fields = {"constants": {**zeros, **answer.constants}}
-        self._post(batch, "bare", {**rows, "word": brick_word}, fields, kept_index[is_uniform])
+        self._post(batch, "uniform", {**rows, "word": brick_word}, fields, kept_index[is_uniform])
 
     def _leave_to_host(self, batch: RequestBatch) -> None:
         """Lets nodes be requested again, for `Engine.frame`, which can find alias targets."""
         self.host_needed = True
         bit = torch.full((len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
-        self._post(batch, "again", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
+        self._post(batch, "to_host", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
 
     def _post(
         self,
@@ -369,13 +371,13 @@ def _box_forms(cache: Cache, source: ProducedTree) -> dict[str, RowForm]:
             f"data.{name}": ((*brick, channel.width), channel.dtype)
             for name, channel in channels.items()
         },
-        "bare": loc_field
+        "uniform": loc_field
         | {"word": ((), word_dtype)}
         | {
             f"constants.{name}": ((channel.width,), channel.dtype)
             for name, channel in channels.items()
         },
-        "again": {"bit": ((), word_dtype)},
+        "to_host": {"bit": ((), word_dtype)},
     }
 
 
