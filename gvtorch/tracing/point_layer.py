@@ -78,22 +78,18 @@ def point_layer(
             for name, column in points.points[0].rows.items()
         }
         position = rows["position"].astype(np.float64)
-        eye_position = position @ view[:3, :3].T + view[:3, 3]
+        xyz = position @ view[:3, :3].T + view[:3, 3]
         coarse = grid.spacing_3 * grid.branching
         coarse_center = (np.floor((position - grid.low) / coarse) + 0.5) * coarse + grid.low
         cone = growth * np.linalg.norm(coarse_center - eye, axis=1)
         fraction = np.clip((finest * grid.branching - cone) / (finest * (grid.branching - 1)), 0, 1)
-        visible = (fraction > 0) & (eye_position[:, 2] > _MIN_DEPTH_VOXELS * finest)
-        eye_position, fraction, value = (
-            eye_position[visible],
-            fraction[visible],
-            rows["value"][visible].astype(np.float64),
-        )
-        depth, distance = eye_position[:, 2], np.linalg.norm(eye_position, axis=1)
+        shown = (fraction > 0) & (xyz[:, 2] > _MIN_DEPTH_VOXELS * finest)
+        xyz, fraction, value = xyz[shown], fraction[shown], rows["value"][shown].astype(np.float64)
+        depth, distance = xyz[:, 2], np.linalg.norm(xyz, axis=1)
         # A pixel's solid angle is z^3 / (distance^3 fx fy).
         fraction *= voxel_light * K[0, 0] * K[1, 1] * distance / depth**3
-        x = K[0, 0] * eye_position[:, 0] / depth + K[0, 2]
-        y = K[1, 1] * eye_position[:, 1] / depth + K[1, 2]
+        x = K[0, 0] * xyz[:, 0] / depth + K[0, 2]
+        y = K[1, 1] * xyz[:, 1] / depth + K[1, 2]
         _draw(total, (height, width), (x, y), size, np.c_[fraction[:, None] * value, distance])
     return _layer(total, (height, width))
 
