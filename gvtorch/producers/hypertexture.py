@@ -110,7 +110,8 @@ class Hypertexture(Tally, Producer):
         if box is None:
             shape_box = shape.box()
             if shape_box is None or not bool(shape_box.isfinite().all()):
-                raise ValueError(f"{where}: box must be given: the shape does not tell where it ends")
+                reason = "box must be given: the shape does not tell where it ends"
+                raise ValueError(f"{where}: {reason}")
             box = [(shape_box[0] - max_offset).tolist(), (shape_box[1] + max_offset).tolist()]
         extent = extent_in(where, extent, box)
         if not check.instance(where, "dtype", dtype, torch.dtype).is_floating_point:
