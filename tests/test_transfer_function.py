@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
@@ -242,6 +242,7 @@ def test_steps_of_paraview(tmp_path):
         assert function(np.array([value]))[0, :3].tolist() == list(expected.GetColor(value))
 
 
+@settings(deadline=None)  # the first call of a process imports and compiles
 @given(
     middle=st.floats(0.05, 0.95),
     sharp=st.one_of(st.just(0.0), st.floats(0.02, 0.99)),  # above, versions of VTK differ

@@ -82,8 +82,8 @@ def key(start: np.ndarray, axis: np.ndarray, grid: Sequence[int]) -> np.ndarray:
 
 def edge_of(keys: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Returns first samples (k, 3) z y x and axes of keys (k,)."""
-    rest, axis = np.divmod(keys, 3)
-    return np.stack(np.unravel_index(rest, tuple(grid)), -1), axis
+    first_sample, axis = np.divmod(keys, 3)
+    return np.stack(np.unravel_index(first_sample, tuple(grid)), -1), axis
 
 
 def _vertex_positions(

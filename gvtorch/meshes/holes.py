@@ -100,8 +100,8 @@ def told_of_holes(mesh: Mesh) -> str:
     kept, solid = solids(mesh)
     if solid.all():
         return ""
-    away = facing_away(mesh)
-    hole_rims, part = rims(mesh.turned(away))
+    flipped = facing_away(mesh)
+    hole_rims, part = rims(mesh.turned(flipped))
     count = np.bincount(part[kept], minlength=len(mesh.faces))
     edges = np.bincount(
         [rim.part for rim in hole_rims], [len(rim.face) for rim in hole_rims], len(mesh.faces)
@@ -113,8 +113,8 @@ def told_of_holes(mesh: Mesh) -> str:
         reasons.append(
             f"{holes} holes of {int(edges[nearly].sum())} edges leave {len(nearly)} parts open"
         )
-    if len(away) and len(away) <= _NEARLY_CLOSED * len(kept):
-        reasons.append(f"{len(away)} triangles face the other way than those around them")
+    if len(flipped) and len(flipped) <= _NEARLY_CLOSED * len(kept):
+        reasons.append(f"{len(flipped)} triangles face the other way than those around them")
     if not reasons:
         return ""
     return (
@@ -132,8 +132,8 @@ def filled(mesh: Mesh) -> Mesh:
     """Returns the mesh with its holes closed, and triangles that face the wrong way turned. Parts
     that enclose nothing even then, such as a leaf, are not closed.
     """
-    away = facing_away(mesh)
-    mesh = mesh.turned(away) if len(away) else mesh
+    flipped = facing_away(mesh)
+    mesh = mesh.turned(flipped) if len(flipped) else mesh
     hole_rims, part = rims(mesh)
     if not hole_rims:
         return mesh

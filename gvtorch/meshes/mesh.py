@@ -49,21 +49,25 @@ class Mesh:
             value = getattr(self, field_name)
             if value is None:
                 continue
-            wanted = ", ".join("n" if n is None else str(n) for n in shape)
+            expected_shape = ", ".join("n" if n is None else str(n) for n in shape)
             try:
                 array = np.asarray(value)
                 is_whole = dtype != np.int64 or (array == np.trunc(array)).all()
                 with np.errstate(invalid="ignore"):
                     value = np.ascontiguousarray(array, dtype)
             except (TypeError, ValueError):  # rows of different lengths, text
-                raise ValueError(f"{self.name}: {field_name} must be ({wanted}) numbers") from None
+                raise ValueError(
+                    f"{self.name}: {field_name} must be ({expected_shape}) numbers"
+                ) from None
             if not is_whole:
                 raise ValueError(f"{self.name}: {field_name} must be whole numbers")
             fits = value.ndim == len(shape) and all(
                 n is None or n == m for n, m in zip(shape, value.shape, strict=True)
             )
             if not fits:
-                raise ValueError(f"{self.name}: {field_name} must be ({wanted}), got {value.shape}")
+                raise ValueError(
+                    f"{self.name}: {field_name} must be ({expected_shape}), got {value.shape}"
+                )
             object.__setattr__(self, field_name, value)
         if self.material is None:
             object.__setattr__(self, "material", np.zeros(count, np.int64))

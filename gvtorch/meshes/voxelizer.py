@@ -300,19 +300,22 @@ class Voxelizer:
             distance = voxels.distance.clamp(max=self.band)
             channels["distance"] = torch.where(voxels.winding != 0, -distance, distance)[..., None]
         if self.paint is not None:
-            near, face = voxels.nearest[..., None] >= 0, voxels.nearest.clamp(min=0).view(-1)
+            near_surface, face = (
+                voxels.nearest[..., None] >= 0,
+                voxels.nearest.clamp(min=0).view(-1),
+            )
             shape, weight = voxels.nearest.shape, voxels.weight.view(-1, 3)
             if "color" in self.channels:
                 color = self.paint.color(face, weight).view(*shape, 4)
-                color = torch.where(near, color, self.paint.mean_color)
+                color = torch.where(near_surface, color, self.paint.mean_color)
                 opacity = color[..., 3:] * voxels.coverage[..., None]
                 channels["color"] = torch.cat((color[..., :3] * opacity, opacity), -1)
             if "normal" in self.channels:
                 normal = self.paint.normal(face, weight).view(*shape, 3)
-                channels["normal"] = normal * near
+                channels["normal"] = normal * near_surface
             if "material" in self.channels:
                 material = self.paint.material[face].view(*shape, 1)
-                material = torch.where(near, material, self.paint.main_material) + 1
+                material = torch.where(near_surface, material, self.paint.main_material) + 1
                 channels["material"] = material * (voxels.coverage[..., None] >= 0.5)
         return {name: channels[name] for name in self.channels}
 

@@ -147,8 +147,10 @@ def _by_channel(
     result = {}
     for channel, value in values.items():
         if channel not in producer.channels:
-            known = ", ".join(producer.channels)
-            raise ValueError(f"{where}: {name} has channel {channel!r}; the producer has {known}")
+            channel_names = ", ".join(producer.channels)
+            raise ValueError(
+                f"{where}: {name} has channel {channel!r}; the producer has {channel_names}"
+            )
         spec: Channel = producer.channels[channel]
         expected_shape = (*shape, spec.width)
         lacks_width = isinstance(value, Tensor) and spec.width == 1 and value.shape == shape

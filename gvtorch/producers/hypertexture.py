@@ -126,8 +126,7 @@ class Hypertexture(Tally, Producer):
             branching=branching,
             value_range={"density": (0.0, 1.0)},
         )
-        self.shape, self.skip = shape, skip
-        self.thickness, self.softness = thickness, softness
+        self.shape, self.skip, self.thickness, self.softness = shape, skip, thickness, softness
         self.octaves = [o._replace(amplitude=amplitude * o.amplitude) for o in series]
         self.dtype = position_dtype(box, self.spacing)
         self._levels: list[LevelOctaves] = []

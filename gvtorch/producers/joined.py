@@ -71,10 +71,10 @@ class JoinedProducer(OfProducers):
         first = next(iter(producers.values()))
         for name, producer in producers.items():
             pairs = zip(grid_of(producer).items(), grid_of(first).values(), strict=True)
-            for (attribute, value), wanted in pairs:
-                if value != wanted:
+            for (attribute, value), expected in pairs:
+                if value != expected:
                     raise ValueError(
-                        f"{where}: {attribute} of {name!r} is {value}, that of the first {wanted}"
+                        f"{where}: {attribute} of {name!r} is {value}, that of the first {expected}"
                     )
         super().__init__(**grid_of(first), channels=channels, value_range=ranges, labels=labels)
         self.producers = torch.nn.ModuleDict(producers)
@@ -176,13 +176,15 @@ class StoredChannels(JoinedProducer):
             ValueError: It has no such channel, or is not such a store; or see `StoredProducer`.
             OSError: It can't be read.
         """
-        known = channel_names(store)
-        if not known:
+        stored_names = channel_names(store)
+        if not stored_names:
             raise ValueError(f"{store}: is not a store of several channels: use StoredProducer")
-        names = known if channels is None else tuple(channels)
+        names = stored_names if channels is None else tuple(channels)
         for name in names:
-            if name not in known:
-                raise ValueError(f"{store}: has no channel {name!r}; there are {', '.join(known)}")
+            if name not in stored_names:
+                raise ValueError(
+                    f"{store}: has no channel {name!r}; there are {', '.join(stored_names)}"
+                )
         limit = check.nbytes("StoredChannels", "host_cache", host_cache) // max(len(names), 1)
         options: dict[str, Any] = {"host_cache": limit, "timeout": timeout, "workers": workers}
         super().__init__(

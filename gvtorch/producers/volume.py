@@ -134,16 +134,16 @@ class VolumeProducer(Producer):
     def fill(self, nodes: Nodes) -> Bricks:
         """Cuts the bricks, or returns rows of the table if `hold` is "bricks"."""
         layout = nodes.layout
-        wanted = {name: c for name, c in self.channels.items() if nodes.coarse or not c.coarse}
+        channels = {name: c for name, c in self.channels.items() if nodes.coarse or not c.coarse}
         if self._hold == "bricks":
             row = self._node_index(nodes)
-            return Bricks(data={name: self._tables[name][row] for name in wanted})
+            return Bricks(data={name: self._tables[name][row] for name in channels})
         if self._hold == "mapped":
             voxel = self._voxel_index(nodes)
-            voxels = {name: self._voxels[name][voxel].view(c.dtype) for name, c in wanted.items()}
+            voxels = {name: self._voxels[name][voxel].view(c.dtype) for name, c in channels.items()}
             return Bricks(data=voxels)
         loc, data = nodes.loc.cpu(), {}
-        for name, channel in wanted.items():
+        for name, channel in channels.items():
             shape = (len(nodes), *(layout.side,) * 3, channel.width)
             bricks = data[name] = torch.empty(shape, dtype=channel.dtype)
             for depth, level_rows in by_depth(loc):

@@ -241,8 +241,8 @@ class _Appearance:
         opacities = np.full(len(labels), self.opacity)
         _assign_rows(opacities, labels, self.opacity_by_label)
         if self.visible is not None:
-            shown = np.fromiter(self.visible, np.int64, len(self.visible))
-            opacities[~np.isin(labels, shown)] = 0
+            visible_labels = np.fromiter(self.visible, np.int64, len(self.visible))
+            opacities[~np.isin(labels, visible_labels)] = 0
         elif not self.show_all:
             opacities[labels == BACKGROUND] = 0
         return opacities

@@ -456,7 +456,7 @@ class FilteredLit(Filtered):
         super().add_contribution(contribution, piece, mask)
 
     def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
-        """Returns (r, 7): the result of `Filtered.look`, lit, and normals times alpha."""
+        """Returns (r, 7): the result of `Filtered.contribution`, lit, and normals times alpha."""
         t, light = piece.middle, self.light
         row = self.function_row(piece, probe, holder)
         normal = light.to_eye(probe.slope(holder, t, light.cube))

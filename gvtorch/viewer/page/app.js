@@ -234,11 +234,6 @@ export class App {
     this.link.send("histogram", { in_view: inView });
   }
 
-  beginWindow() {
-    const { shader } = this.state;
-    this.windowed = this.transfer() ?? shader;
-  }
-
   dragWindow(dx, dy) {
     const move = ([low, high]) => {
       const width = (high - low) * Math.exp(dx * 3), middle = (low + high) / 2 - dy * (high - low) * 1.5;

@@ -61,7 +61,7 @@ export function saveFile(name, content, type) {
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
 
-/** Asks for a file; passes its name and text to `take`. */
+/** Asks for a file; passes its name and text to `handler`. */
 export function openText(accept, handler, fail) {
   const input = el("input", { type: "file", accept });
   input.onchange = async () => {
@@ -74,5 +74,5 @@ export function openText(accept, handler, fail) {
   input.click();
 }
 
-/** Asks for a JSON file; passes its content to `take`. */
+/** Asks for a JSON file; passes its content to `handler`. */
 export const openJson = (handler, fail) => openText(".json,application/json", (_, text) => handler(JSON.parse(text)), fail);

@@ -50,7 +50,6 @@ export class Pointer {
       this.tool = pan ? "pan" : event.altKey ? "window" : event.ctrlKey ? "fly" : this.app.tool;
     }
     if (this.plane) this.app.slices.pick(this.plane, ...position);
-    else if (this.tool === "window") this.app.beginWindow();
   }
 
   moved(event) {
