@@ -348,7 +348,7 @@ def test_small_cameras_share_calls(monkeypatch):
     one_call = gv.render(tree, cameras, shader, progress=told)
     assert calls == [320] and one_call.alpha.max() > 0.3
     calls.clear()
-    monkeypatch.setattr(pixels, "_WATCHED", 1000)  # 62 rows, in the middle of a camera
+    monkeypatch.setattr(pixels, "_RAYS_PER_REPORT", 1000)  # 62 rows, in the middle of a camera
     parts = gv.render(tree, cameras, shader, progress=told)
     assert calls == [62, 124, 186, 248, 310, 320]
     traced, march = [], Tracer.__call__

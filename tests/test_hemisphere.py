@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 import gvtorch as gv
 from gvtorch.pictures.progressive import jitter
-from gvtorch.tracing.lighting import _cones_over
+from gvtorch.tracing.lighting import _hemisphere_directions
 
 SIDE, PIXELS, REACH = 48, 48, 12.0
 PAINT = (0.8, 0.5, 0.3)
@@ -108,7 +108,7 @@ def test_refined_pictures_converge_to_monte_carlo(compiled, look):
 def directions(sample: Tensor, count: int) -> Tensor:
     """Returns directions (count, r, 3) around the z axis."""
     up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64, device=sample.device)
-    return torch.stack(list(_cones_over(up.expand(len(sample), 3), sample, count)))
+    return torch.stack(list(_hemisphere_directions(up.expand(len(sample), 3), sample, count)))
 
 
 def test_directions_are_the_same_on_every_device(backend):

@@ -221,9 +221,9 @@ def test_batches_and_blocks_of_rays_change_nothing(monkeypatch, blobs):
     depth = torch.stack([screen(cameras[i], middle(blobs), (0.2, 0, 1)) for i in range(3)])
     for alpha in (None, 0.5 * torch.ones_like(depth)):
         layer = layer_of(depth, alpha)
-        monkeypatch.setattr(pixels, "_RAYS_A_BLOCK", 1 << 16)
+        monkeypatch.setattr(pixels, "_RAYS_PER_BLOCK", 1 << 16)
         whole = gv.render(tree, cameras, GRAY, layer=layer)
-        monkeypatch.setattr(pixels, "_RAYS_A_BLOCK", 24 * 7)  # blocks that span cameras
+        monkeypatch.setattr(pixels, "_RAYS_PER_BLOCK", 24 * 7)  # blocks that span cameras
         assert_same_picture(gv.render(tree, cameras, GRAY, layer=layer), whole)
         for i in range(3):
             own = layer_of(depth[i], None if alpha is None else alpha[i])

@@ -255,7 +255,7 @@ def test_normals_of_three_trees_are_the_mean_by_the_light_that_each_takes():
             lambda _, one=one: one,
             SimpleNamespace(
                 shader=gv.TransferFunction([(0, 0), (1, 1)]),
-                inside=lambda rays: rays,
+                to_tree=lambda rays: rays,
                 tree=SimpleNamespace(box=box),
             ),
         )
@@ -290,7 +290,7 @@ def test_rays_that_the_cpu_leaves_out_change_no_bit(channels, monkeypatch, name)
     light = gv.Lighting(occlusion=0.8, indirect=0.5, cones=3, reach=0.2, frame="box")
     cut = gv.Clip(without=[((0, 0, 0), (0.6, 0.6, 0.6))], frame="box", caps=True)
     options = {"clip": cut, "lighting": None if name == "features" else light}
-    few = composite.if_few
+    few = composite.indices_if_few
 
     def noted(some):
         which = few(some)
@@ -299,7 +299,7 @@ def test_rays_that_the_cpu_leaves_out_change_no_bit(channels, monkeypatch, name)
 
     for chosen in (noted, lambda some: None):
         for room in (clip, composite, lighting):
-            monkeypatch.setattr(room, "if_few", chosen)
+            monkeypatch.setattr(room, "indices_if_few", chosen)
         view = gv.Camera.orbit(30, 20, 1.6, 30, 40, 28)
         pictures.append(gv.render(tree, view, LEFT_OUT[name], **options))
     one, other = map(vars, pictures)

@@ -232,7 +232,7 @@ def test_a_box_that_is_turned_lies_in_the_box_around_it():
     pose = Pose.of("test", "pose", matrix_of())
     around = pose.box(box)
     inside = box[0] + torch.rand(1000, 3, dtype=torch.float64) * (box[1] - box[0])
-    placed = pose.places(inside)
+    placed = pose.world_positions(inside)
     assert bool(((placed >= around[0]) & (placed <= around[1])).all())
     assert bool((placed.amax(0) > around[1] - 2).all())
     assert bool((placed.amin(0) < around[0] + 2).all())
@@ -254,7 +254,7 @@ def test_voxels_that_are_kept_tell_how_to_turn_them(tmp_path):
             expected = index.numpy() @ affine[:3, :3].T + (
                 affine[:3, 3] if place is None else place
             )
-            np.testing.assert_allclose(pose.places(own).numpy(), expected, atol=1e-5)
+            np.testing.assert_allclose(pose.world_positions(own).numpy(), expected, atol=1e-5)
             assert np.array_equal(volume.data[..., 0].numpy(), data.T)
         assert volume.info.describe()["pose"]
     sheared = affine.copy()

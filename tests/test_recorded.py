@@ -154,20 +154,20 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
         Slow.gate.set()
         frames, asker = Frames(engine, view(24), LOOK, 64), engine.recorded[0]
         while not frames.frame()[1].requests["load"]:
-            asker._asker.submit(int).result()
+            asker._executor.submit(int).result()
         Slow.gate.clear()
         frames.frame()  # requests these, and is held up
         engine.release()
         for _ in range(2):
             frames.frame()  # requests them again
         Slow.gate.set()
-        asker._asker.submit(int).result()  # both answers have arrived
+        asker._executor.submit(int).result()  # both answers have arrived
         for _ in range(3):
             frames.frame()
             engine.validate()  # no node has two slots
         for _ in range(200):
             _, stats = frames.frame()
-            asker._asker.submit(int).result()
+            asker._executor.submit(int).result()
             if stats.converged:
                 break
         assert stats.converged and engine.render(view(24), LOOK).stats.produced["bricks"] == 0
@@ -185,7 +185,7 @@ def test_a_busy_producer_is_asked_for_several_frames_at_once(blobs, backend, slo
             self.late.append((Future(), super().fill(nodes)))
             return self.late[-1][0]
 
-    monkeypatch.setattr(host_frame, "_SOON", 0.0 if slow else math.inf)
+    monkeypatch.setattr(host_frame, "_CALL_GAP", 0.0 if slow else math.inf)
     with gv.Engine(Later(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         engine.render(view(24), LOOK)
         late = engine.trees["scene"].producer.late = []
@@ -194,19 +194,70 @@ def test_a_busy_producer_is_asked_for_several_frames_at_once(blobs, backend, slo
             frames.look_from(view(24, angle))
             for _ in range(6):
                 listed += frames.frame()[1].requests["load"] > 0
-                frames.served._asker.submit(int).result()  # until its requests are passed on
+                frames.served._executor.submit(int).result()  # until its requests are passed on
         assert listed > 3
         if slow:  # it does not wait for answers
             assert len(late) > 3
         else:
             assert len(late) == 1
             late[0][0].set_result(late[0][1])
-            frames.served._asker.submit(int).result()
+            frames.served._executor.submit(int).result()
             assert len(late) == 2
             assert len(late[1][1].data["value"]) > 2 * 3, "of more than two frames"
         for _ in range(3):
             frames.frame()
         engine.validate()
+
+
+class Guarded(dict[Any, Any]):
+    """Lists its methods that are called while nobody holds a lock."""
+
+    def __init__(self, lock: threading.Lock) -> None:
+        super().__init__()
+        self.lock, self.unlocked = lock, []
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in ("pop", "clear", "values", "items") and not self.lock.locked():
+            self.unlocked.append(name)
+        return super().__getattribute__(name)
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        if not self.lock.locked():
+            self.unlocked.append("set")
+        super().__setitem__(key, value)
+
+    def __delitem__(self, key: Any) -> None:
+        if not self.lock.locked():
+            self.unlocked.append("delete")
+        super().__delitem__(key)
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_answers_on_their_way_are_listed_under_a_lock(blobs, backend):
+    """Frames read and change the list, and so do the threads in which answers arrive."""
+
+    class Later(gv.VolumeProducer):
+        patience = 0.2
+        late: list[tuple[Future, Any]] | None = None
+
+        def fill(self, nodes):
+            if self.late is None:
+                return super().fill(nodes)
+            self.late.append((Future(), super().fill(nodes)))
+            return self.late[-1][0]
+
+    with gv.Engine(Later(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        engine.frame(view(24), LOOK)
+        frames = Frames(engine, view(24), LOOK, 3)
+        late = engine.trees["scene"].producer.late = []
+        waiting = frames.served._waiting = Guarded(frames.served._lock)
+        while not (late and waiting):
+            frames.frame()
+        late[0][0].set_result(late[0][1])
+        while not any("no answer within" in failure.message for failure in engine.failures):
+            frames.frame()
+        engine.release()
+        assert not waiting and not waiting.unlocked
 
 
 @pytest.mark.parametrize("backend", COMPILED)

@@ -231,7 +231,7 @@ def finest(engine) -> torch.Tensor:
 def serve(engine, node, kind) -> gv.FrameStats:
     """Serves requests as a frame does, without tracing rays."""
     stats = gv.FrameStats()
-    engine.production.write(engine.production.late(), stats)
+    engine.production.write(engine.production.late_answers(), stats)
     engine.production.write(engine.production.ask({kind: node}), stats)
     return stats
 

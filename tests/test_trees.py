@@ -293,7 +293,7 @@ def test_mistakes_are_told_in_a_line(volumes, make, told):
 @pytest.mark.backend("cpp")
 def test_what_some_blocks_of_rays_lack_is_nothing(volumes, monkeypatch):
     """Features of rays that meet nothing are 0, also if a block has only such rays."""
-    monkeypatch.setattr(pixels, "_WATCHED", 32)
+    monkeypatch.setattr(pixels, "_RAYS_PER_REPORT", 32)
     trees = {
         name: gv.N3Tree.from_volume(
             {"value": one, "more": gv.Volume(one.data + 1, one.spacing, one.origin)}

@@ -19,19 +19,19 @@ from ..cache.requests import below, levels_wanted
 from ..cache.write import Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
 from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
-from .parents import first_ones, parent_bricks, ready
+from .parents import nearest_loadable, parent_bricks, without_repeats
 from .production import Production
 from .recorded import RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
 from .stats import FrameStats, Readbacks
 
 
-class Unchecked(NamedTuple):
+class UncheckedAnswer(NamedTuple):
     """A producer's answer to a batch, not checked yet."""
 
     node: Tensor  # (batch,) int64 nodes that were asked for, -1 for none
     batch: RequestBatch
-    given: Any
+    answer: Any
 
 
 class DeviceFrame(RecordedFrame):
@@ -40,7 +40,7 @@ class DeviceFrame(RecordedFrame):
     def __init__(self, production: Production, batch: int, fit: bool) -> None:
         super().__init__(production, batch, fit)
         # (batch, 2) nodes made last that are to be subdivided in turn, and their priorities.
-        self._below = self._unused.new_zeros((batch, 2)) - 1
+        self._next_subdivisions = self._unused_slots.new_zeros((batch, 2)) - 1
         self.serve()  # warm-up before recording; there are no requests yet
         self.deepen()
 
@@ -59,118 +59,136 @@ class DeviceFrame(RecordedFrame):
         """
         loads, subdivisions = self.choose()
         bricks, regions = in_branches(
-            partial(self._answers, REQUEST_LOAD, loads.node),
-            partial(self._answers, REQUEST_SUBDIVIDE, subdivisions.node),
+            partial(self._ask_producers, REQUEST_LOAD, loads.node),
+            partial(self._ask_producers, REQUEST_SUBDIVIDE, subdivisions.node),
         )
-        self._load(bricks)
+        self._write_bricks(bricks)
         self._subdivide(regions, *subdivisions)
 
     def deepen(self) -> None:
         """Subdivides nodes that `serve` or the previous `deepen` has just made, where the priority
         of the parent shows that rays will want finer ones, so that no ray has to ask for them.
         """
-        chosen, priority = self._below.unbind(1)
-        self._subdivide(self._answers(REQUEST_SUBDIVIDE, chosen), chosen, priority)
+        chosen, priority = self._next_subdivisions.unbind(1)
+        self._subdivide(self._ask_producers(REQUEST_SUBDIVIDE, chosen), chosen, priority)
 
     def deeper(self, readbacks: Readbacks) -> int:
         """Returns how many more levels the last readback wanted on average; 0 if `by_level`."""
         return 0 if self._production.by_level else readbacks.deeper
 
-    def _levels(self) -> Tensor:
-        word = self._requests[:, 1].flatten()
-        wide = torch.where((word & REQUEST_SUBDIVIDE) != 0, word & REQUEST_PRIORITY, -1)
+    def _count_levels(self) -> Tensor:
+        request_word = self._requests[:, 1].flatten()
+        priority = torch.where(
+            (request_word & REQUEST_SUBDIVIDE) != 0, request_word & REQUEST_PRIORITY, -1
+        )
         branching = max(source.layout.branching for source in self.trees)
-        return levels_wanted(wide, branching)
+        return levels_wanted(priority, branching)
 
-    def _answers(self, kind: int, chosen: Tensor) -> list[Unchecked]:
+    def _ask_producers(self, kind: int, chosen: Tensor) -> list[UncheckedAnswer]:
         """Asks each tree's producer for those of the nodes (batch,) that belong to its tree."""
-        number, answers = self.tree_of(chosen), []
+        tree_number, answers = self.tree_of(chosen), []
         for source in self.trees:
-            node = torch.where(number == source.tree.number, chosen, -1)
+            node = torch.where(tree_number == source.tree.number, chosen, -1)
             if kind == REQUEST_LOAD and source.producer.needs_parent:
-                node = first_ones(ready(self.cache, node, source.layout.depth))
-            batch = self._asked(source, kind, node)
-            answers.append(Unchecked(node, batch, batch.ask()))
+                node = without_repeats(nearest_loadable(self.cache, node, source.layout.depth))
+            batch = self._padded_batch(source, kind, node)
+            answers.append(UncheckedAnswer(node, batch, batch.ask()))
         return answers
 
-    def _load(self, answers: Sequence[Unchecked]) -> None:
+    def _write_bricks(self, answers: Sequence[UncheckedAnswer]) -> None:
         """Writes bricks."""
-        free = self._unused[1:]
+        free_slots = self._unused_slots[1:]
         for answer in answers:
-            put, bare, failed = self._fill(answer, free)
-            free -= put[1:2]
-            self._made[1:2] += put[1:2]
-            self._made[2:3] += bare
-            self._made[4:5] += put[2:]
-            self._made[5:] += failed
+            counts, uniform_count, failed_count = self._check_and_put_bricks(answer, free_slots)
+            free_slots -= counts[1:2]
+            self._outcomes[1:2] += counts[1:2]
+            self._outcomes[2:3] += uniform_count
+            self._outcomes[4:5] += counts[2:]
+            self._outcomes[5:] += failed_count
 
-    def _subdivide(self, answers: Sequence[Unchecked], chosen: Tensor, priority: Tensor) -> None:
+    def _subdivide(
+        self, answers: Sequence[UncheckedAnswer], chosen: Tensor, priority: Tensor
+    ) -> None:
         """Subdivides nodes (batch,), and lists the children to subdivide next, in order."""
-        free = self._unused[:1]
-        slot, wide = torch.full_like(chosen, -1), torch.zeros_like(chosen)
+        free_slots = self._unused_slots[:1]
+        slot, child_priority = torch.full_like(chosen, -1), torch.zeros_like(chosen)
         for answer in answers:
-            mine, source = answer.node >= 0, answer.batch.source
-            put, failed = self._classify(answer, free)
-            free -= put.counts[1:2]
-            self._made[:1] += put.counts[1:2]
-            self._made[3:4] += put.counts[2:]
-            self._made[5:] += failed
-            slot = torch.where(mine, put.slot, slot)
-            wide = torch.where(mine, priority // source.layout.branching, wide)
-        node, split = below(self.cache, slot, wide, free)
+            in_tree, source = answer.node >= 0, answer.batch.source
+            outcome, failed_count = self._check_and_put_tiles(answer, free_slots)
+            free_slots -= outcome.counts[1:2]
+            self._outcomes[:1] += outcome.counts[1:2]
+            self._outcomes[3:4] += outcome.counts[2:]
+            self._outcomes[5:] += failed_count
+            slot = torch.where(in_tree, outcome.slot, slot)
+            child_priority = torch.where(
+                in_tree, priority // source.layout.branching, child_priority
+            )
+        node, split = below(self.cache, slot, child_priority, free_slots)
         rank = split.flatten().cumsum(0)
-        rows = torch.stack((node, wide[:, None].expand_as(node)), 2).flatten(0, 1)
-        self._below.fill_(-1)
-        taken = split.flatten() & (rank <= self.batch)
-        put_rows_of(self._below, torch.where(taken, rank - 1, -1), rows)
+        rows = torch.stack((node, child_priority[:, None].expand_as(node)), 2).flatten(0, 1)
+        self._next_subdivisions.fill_(-1)
+        listed = split.flatten() & (rank <= self.batch)
+        put_rows_of(self._next_subdivisions, torch.where(listed, rank - 1, -1), rows)
 
-    def _fill(self, answer: Unchecked, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _check_and_put_bricks(
+        self, unchecked: UncheckedAnswer, free_slots: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Loads nodes (k,). Returns `Put.counts`, how many need no brick (1,), and failed (1,)."""
-        node, batch, given = answer
-        bricks = checked_bricks(given, batch.nodes, batch.source.producer, look=False)
-        good = _finite([bricks.data, bricks.constants], len(node), node.device)
-        data, constant = good, torch.zeros_like(node[:1])
+        node, batch, fill_answer = unchecked
+        bricks = checked_bricks(fill_answer, batch.nodes, batch.source.producer, look=False)
+        valid = _finite([bricks.data, bricks.constants], len(node), node.device)
+        has_data, uniform_count = valid, torch.zeros_like(node[:1])
         if bricks.kind is not None:
-            data = (bricks.kind == Region.DATA) | (bricks.kind == Region.DATA_MAX_DEPTH)
+            has_data = (bricks.kind == Region.DATA) | (bricks.kind == Region.DATA_MAX_DEPTH)
             word = brick_words(bricks.kind)
-            bare = word != ABSENT
-            good, data, bare = good & (data | bare), good & data, good & bare
-            targets = _only(batch.targets, node, bare)
-            constant = put_uniform(self.cache, targets, word, bricks.constants).view(1)
-        put = put_bricks(self.cache, _only(batch.targets, node, data), bricks.data, free)
-        return put.counts, constant, ((node >= 0) & ~good).sum().view(1)
+            uniform = word != ABSENT
+            valid, has_data, uniform = (
+                valid & (has_data | uniform),
+                valid & has_data,
+                valid & uniform,
+            )
+            targets = _masked_targets(batch.targets, node, uniform)
+            uniform_count = put_uniform(self.cache, targets, word, bricks.constants).view(1)
+        outcome = put_bricks(
+            self.cache, _masked_targets(batch.targets, node, has_data), bricks.data, free_slots
+        )
+        return outcome.counts, uniform_count, ((node >= 0) & ~valid).sum().view(1)
 
-    def _classify(self, answer: Unchecked, free: Tensor) -> tuple[Put, Tensor]:
+    def _check_and_put_tiles(
+        self, unchecked: UncheckedAnswer, free_slots: Tensor
+    ) -> tuple[Put, Tensor]:
         """Subdivides nodes (k,); returns the outcome, and how many failed (1,)."""
-        node, batch, given = answer
-        regions = checked_regions(given, batch.nodes, batch.source.producer, look=False)
+        node, batch, classify_answer = unchecked
+        regions = checked_regions(classify_answer, batch.nodes, batch.source.producer, look=False)
         count = len(regions.kind)
-        good = _finite([regions.constants, regions.ranges], count, node.device)
-        good = good & (regions.kind >= Region.EMPTY) & (regions.kind <= Region.DATA_MAX_DEPTH)
-        good = good.view(len(node), -1).all(1)
+        valid = _finite([regions.constants, regions.ranges], count, node.device)
+        valid = valid & (regions.kind >= Region.EMPTY) & (regions.kind <= Region.DATA_MAX_DEPTH)
+        valid = valid.view(len(node), -1).all(1)
         children = children_of(batch, regions, self.cache)
-        put = put_tiles(self.cache, _only(batch.targets, node, good), children, free)
-        return put, ((node >= 0) & ~good).sum().view(1)
+        outcome = put_tiles(
+            self.cache, _masked_targets(batch.targets, node, valid), children, free_slots
+        )
+        return outcome, ((node >= 0) & ~valid).sum().view(1)
 
-    def _asked(self, source: ProducedTree, kind: int, node: Tensor) -> RequestBatch:
+    def _padded_batch(self, source: ProducedTree, kind: int, node: Tensor) -> RequestBatch:
         """Returns the request batch of nodes (k,), with the root where the index is -1."""
-        there = torch.where(node >= 0, node, source.tree.root)
-        batch = RequestBatch(source, kind, Targets(source.tree, there, source.tree.loc(there)))
+        padded = torch.where(node >= 0, node, source.tree.root)
+        batch = RequestBatch(source, kind, Targets(source.tree, padded, source.tree.loc(padded)))
         if kind == REQUEST_LOAD and source.producer.needs_parent:
-            return replace(batch, parents=parent_bricks(self.cache, source, there))
+            return replace(batch, parents=parent_bricks(self.cache, source, padded))
         return batch
 
 
-def _only(targets: Targets, node: Tensor, which: Tensor) -> Targets:
-    """Returns the targets with node -1 for padding and wherever `which` (k,) is false."""
-    return replace(targets, node=torch.where(which, node, -1))
+def _masked_targets(targets: Targets, node: Tensor, mask: Tensor) -> Targets:
+    """Returns the targets with node -1 for padding and wherever `mask` (k,) is false."""
+    return replace(targets, node=torch.where(mask, node, -1))
 
 
-def _finite(answers: Sequence[Mapping[str, Any]], count: int, device: torch.device) -> Tensor:
+def _finite(field_groups: Sequence[Mapping[str, Any]], count: int, device: torch.device) -> Tensor:
     """Returns (k,) bool, which items hold neither NaN nor infinite values."""
-    good = torch.ones(count, dtype=torch.bool, device=device)
-    for by_channel in answers:
+    finite = torch.ones(count, dtype=torch.bool, device=device)
+    for by_channel in field_groups:
         for values in by_channel.values():
             if values.is_floating_point():
-                good = good & torch.isfinite(values).flatten(1).all(1)
-    return good
+                finite = finite & torch.isfinite(values).flatten(1).all(1)
+    return finite

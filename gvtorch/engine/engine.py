@@ -57,19 +57,19 @@ from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
 
 Scene = Producer | Mapping[str, Producer]
 
-_MOST_LISTED = 1 << 17  # most nodes whose requests one frame lists
-_KEPT = 1000  # most frames in a report
-_MOST_PRODUCED = 256 * 10**6  # most bytes of voxels produced in one frame
+_MAX_LISTED_NODES = 1 << 17  # most nodes whose requests one frame lists
+_REPORTED_FRAMES = 1000  # most frames in a report
+_MAX_PRODUCED_BYTES = 256 * 10**6  # most bytes of voxels produced in one frame
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 
 
-def _alone(method: _Method) -> _Method:
+def _locked(method: _Method) -> _Method:
     """Lets a method of an engine run in one thread at a time."""
 
     @wraps(method)
-    def run(self: Engine, *given: Any, **named: Any) -> Any:
+    def run(self: Engine, *args: Any, **kwargs: Any) -> Any:
         with self.lock:
-            return method(self, *given, **named)
+            return method(self, *args, **kwargs)
 
     return cast("_Method", run)
 
@@ -115,10 +115,10 @@ class Engine:
             check.instance("Engine", "name of a tree", name, str)
         nodes, bricks = make_pools(producers, self.options, self.device)
         self.cache = Cache(nodes, bricks, len(producers))
-        most_loads = max(1, _MOST_PRODUCED // brick_bytes(bricks.channels, self.options))
+        max_loads = max(1, _MAX_PRODUCED_BYTES // brick_bytes(bricks.channels, self.options))
         self.scheduler = Scheduler(
             order=self.options.order,
-            loads=min(self.options.load_budget, most_loads),
+            loads=min(self.options.load_budget, max_loads),
             subdivisions=self.options.subdivide_budget,
             milliseconds=self.options.time_budget,
         )
@@ -128,7 +128,7 @@ class Engine:
         self.readbacks = Readbacks()
         self.frames, self._closed = 0, False
         self._missed: Tensor | None = None  # (r,) bool, which rays of the last picture missed
-        self._last: deque[FrameStats] = deque(maxlen=_KEPT)  # for the report
+        self._recent_stats: deque[FrameStats] = deque(maxlen=_REPORTED_FRAMES)  # for the report
         self._versions: dict[str, int] = {}  # of the content that the trees hold
         self.recorded: list[HostFrame] = []  # captured, with producers on the host
         try:
@@ -141,7 +141,7 @@ class Engine:
             raise
 
     @explicit(RenderOptions)
-    @_alone
+    @_locked
     def frame(
         self,
         camera: Camera | Rays,
@@ -194,7 +194,9 @@ class Engine:
 
     def _tracers(self, shaders: Shaders, options: RenderOptions, box: Tensor) -> list[TreeTrace]:
         """Returns a `TreeTrace` for each tree, given the (2, 3) box of the scene."""
-        scene = {name: (one.tree, one.producer.channels) for name, one in self.trees.items()}
+        scene = {
+            name: (source.tree, source.producer.channels) for name, source in self.trees.items()
+        }
         by_level, frame_1 = self.production.by_level, self.cache.frame_1
         return tree_traces(
             "frame", scene, shaders, options, box, by_level=by_level, frame_1=frame_1
@@ -239,7 +241,7 @@ class Engine:
 
         stats.later(complete)
         if monitor:
-            self._last.append(stats)
+            self._recent_stats.append(stats)
         self.production.failures.raise_if_strict()
 
     def serve_last_frame(self, stats: FrameStats, wait: bool = False) -> None:
@@ -251,36 +253,40 @@ class Engine:
         """
         self.renew()
         self.release()
-        last = self.readbacks.catch_up(wait or self.production.due)
+        newest = self.readbacks.catch_up(wait or self.production.due)
         if self.readbacks:
             return
-        if last is not None:  # nothing was written since it was traced: its nodes are still there
+        if newest is not None:  # nothing was written since it was traced: its nodes are still there
             self.scheduler.begin()
-            self.production.serve(last.requests, last.wait(), stats)
+            self.production.serve(newest.requests, newest.wait(), stats)
         with stage("write"):
-            self.production.write(self.production.late(), stats)
+            self.production.write(self.production.late_answers(), stats)
 
     def renew(self) -> None:
         """Drops nodes and bricks that producers have reported as changed (`Producer.changed`), and
         remakes the roots of their trees; the host waits for that. The next frames make the rest.
         """
-        changed = [s for n, s in self.trees.items() if s.producer.version != self._versions[n]]
+        changed = [
+            source
+            for name, source in self.trees.items()
+            if source.producer.version != self._versions[name]
+        ]
         if not changed:
             return
         self.release()
         self.readbacks.catch_up(wait=True)  # their requests are dropped
         for source in changed:
             self.production.forget(source)
-            since, producer = self._versions[source.name], source.producer
-            renew_tree(self.cache, source, producer.changes(since))
+            old_version, producer = self._versions[source.name], source.producer
+            renew_tree(self.cache, source, producer.changes(old_version))
             self._versions[source.name] = producer.version
         self._missed = None
 
     def release(self, but: HostFrame | None = None) -> None:
         """Drops the answers that are on their way to captured frames, except those of `but`."""
-        for one in self.recorded:
-            if one is not but:
-                one.release()
+        for host_frame in self.recorded:
+            if host_frame is not but:
+                host_frame.release()
 
     def scout(self, view: View, stats: FrameStats) -> None:
         """Traces some rays before the picture: while answers are written at once, some rays that
@@ -290,11 +296,11 @@ class Engine:
         or that was written since. What exceeds the budgets or the pools is left to the whole
         picture.
         """
-        written, hits = 0, None
+        produced_count, hits = 0, None
         for _ in range(self.options.scout_rounds):
-            if sum(stats.produced.values()) == written or stats.capacity_exceeded:
+            if sum(stats.produced.values()) == produced_count or stats.capacity_exceeded:
                 break  # nothing new to see, or no room for more
-            written = sum(stats.produced.values())
+            produced_count = sum(stats.produced.values())
             if hits is None:
                 hits = empty_hits(self.device, view.options.dtype, view.rays)
                 if self._missed is not None and len(self._missed) == view.rays:
@@ -327,13 +333,13 @@ class Engine:
         counts both and the sum of (r,) samples; all results stay on the device.
         """
         with stage("requests"):
-            most = min(_MOST_LISTED, self.cache.nodes.child_tn.numel())
-            requests = RequestList.collect(self.cache, most)
+            capacity = min(_MAX_LISTED_NODES, self.cache.nodes.child_tn.numel())
+            requests = RequestList.collect(self.cache, capacity)
         with stage("lru"):
             use = self.cache.sort_by_use()
         with stage("count"):
-            total = samples.sum(dtype=torch.int64).view(1)
-            return Collected(requests, torch.cat((requests.count, use, total)))
+            sample_count = samples.sum(dtype=torch.int64).view(1)
+            return Collected(requests, torch.cat((requests.count, use, sample_count)))
 
     def read_back(self, stats: FrameStats, hits: Hits, collected: Collected) -> None:
         """Starts copying a frame's counts to the host; until they arrive no slot may be taken."""
@@ -345,7 +351,7 @@ class Engine:
         self.readbacks.append(Readback(stats, collected, self.readbacks))
 
     @explicit(RenderOptions)
-    @_alone
+    @_locked
     def render(
         self,
         camera: Camera | Rays,
@@ -393,33 +399,34 @@ class Engine:
             return view.picture(*self._balance(view, productions))
         return view.picture(*self._converge(view, max_frames, progress))
 
-    def _balance(self, view: View, most: int) -> tuple[Hits, FrameStats]:
-        """Renders at most `most` frames, until one has converged."""
+    def _balance(self, view: View, max_frames: int) -> tuple[Hits, FrameStats]:
+        """Renders at most `max_frames` frames, until one has converged."""
         total = FrameStats()
-        for number in range(1, most + 1):
+        for frame_count in range(1, max_frames + 1):
             hits, stats = self._served_frame(view)
             total = stats.following(total)
             if stats.converged:
                 break
-            if stats.pending and number < most:  # at most as long as a frame takes
+            if stats.pending and frame_count < max_frames:  # at most as long as a frame takes
                 self.production.wait(limit=stats.milliseconds / 1e3)
-        total.frames = number
+        total.frames = frame_count
         return hits, total
 
-    def _converge(self, view: View, most: int, progress: Progress) -> tuple[Hits, FrameStats]:
-        """Renders at most `most` frames, each with rays that still miss something."""
-        last, ahead = self._missed, most > 1
-        if last is not None and len(last) == view.rays:
-            ahead = ahead and bool(last.any())  # else this picture will hardly miss anything
-        subsets = RaySubsets(view.rays, view.camera.width, self.device, ahead=ahead)
+    def _converge(self, view: View, max_frames: int, progress: Progress) -> tuple[Hits, FrameStats]:
+        """Renders at most `max_frames` frames, each with rays that still miss something."""
+        missed, scouts_first = self._missed, max_frames > 1
+        if missed is not None and len(missed) == view.rays:
+            # If no ray missed anything, this picture will hardly miss anything.
+            scouts_first = scouts_first and bool(missed.any())
+        subsets = RaySubsets(view.rays, view.camera.width, self.device, scouts_first=scouts_first)
         total, again = FrameStats(), None
-        if ahead:
+        if scouts_first:
             again = empty_hits(self.device, view.options.dtype, view.rays), subsets.next
-        for number in range(1, most + 1):
+        for frame_count in range(1, max_frames + 1):
             hits, stats = self._served_frame(view, again)
             subsets.update(hits.missed, stats, total.failed)
             total = stats.following(total)
-            if number == most - 1:
+            if frame_count == max_frames - 1:
                 subsets.trace_all()
             progress("rays", subsets.done, subsets.count)
             if subsets.over:
@@ -427,8 +434,8 @@ class Engine:
             if stats.pending:  # more answers are worth the time of a pass
                 self.production.wait(stats.milliseconds / 1e3)
             again = hits, subsets.next
-        total.converged, total.capacity_exceeded = subsets.whole, subsets.crowded
-        total.frames = number
+        total.converged, total.capacity_exceeded = subsets.complete, subsets.crowded
+        total.frames = frame_count
         return hits, total
 
     def _served_frame(self, view: View, again: Again | None = None) -> tuple[Hits, FrameStats]:
@@ -443,7 +450,7 @@ class Engine:
         return hits, stats
 
     @explicit(RenderOptions)
-    @_alone
+    @_locked
     def capture(
         self,
         camera: Camera | Rays,
@@ -480,7 +487,9 @@ class Engine:
             ProductionError: See `frame`.
         """
         shaders = shader.values() if isinstance(shader, Mapping) else (shader,)
-        if any(isinstance(one, Shader) and one.uses_torch for one in shaders):
+        if any(
+            isinstance(tree_shader, Shader) and tree_shader.uses_torch for tree_shader in shaders
+        ):
             raise ValueError(
                 "Engine.capture: a ModuleShader can't be recorded: the host waits in it"
             )
@@ -496,17 +505,17 @@ class Engine:
         check.whole("capture", "batch", batch, low=1, high=1 << 18)
         check.number("capture", "look_ahead", look_ahead, low=0, high=1000)
         check.instance("capture", "fit", fit, bool)
-        again = partial(self.frame, shader=shader, **options)
-        again(camera)  # warm-up before recording
-        served = make_recorded_frame(self.production, batch, fit)
-        if fit and served is None:
+        render_frame = partial(self.frame, shader=shader, **options)
+        render_frame(camera)  # warm-up before recording
+        recorded = make_recorded_frame(self.production, batch, fit)
+        if fit and recorded is None:
             raise ValueError(
                 "Engine.capture: fit needs replays that serve: all producers on_device, or all "
                 "on_host, without coarse channels"
             )
-        if isinstance(served, HostFrame):
-            self.recorded.append(served)
-        return FrameGraph(self, view, served, again, look_ahead)
+        if isinstance(recorded, HostFrame):
+            self.recorded.append(recorded)
+        return FrameGraph(self, view, recorded, render_frame, look_ahead)
 
     @property
     def steady(self) -> bool:
@@ -516,7 +525,9 @@ class Engine:
     @property
     def changed(self) -> bool:
         """Whether a producer's content has changed since its tree was last renewed."""
-        return any(one.producer.version != self._versions[n] for n, one in self.trees.items())
+        return any(
+            source.producer.version != self._versions[name] for name, source in self.trees.items()
+        )
 
     @cached_property
     def box(self) -> Tensor:
@@ -528,7 +539,7 @@ class Engine:
         """The newest nodes that could not be produced, at most 1000; `stats.failed` counts all."""
         return list(self.production.failures.newest)
 
-    @_alone
+    @_locked
     def forget_failures(self) -> None:
         """Lets failed nodes be requested again, and files that servers refused be read again."""
         ask_again()
@@ -539,15 +550,15 @@ class Engine:
         """Returns bytes by name: content of each pool, and bookkeeping."""
         return self.cache.memory()
 
-    @_alone
+    @_locked
     def report(self) -> Report:
         """Returns times and rates of the last frames: print it, or `as_dict()` for JSON."""
         tiles, bricks = self.cache.nodes.parent_t, self.cache.bricks.owner_b
         slots = {"tiles": tiles, "bricks": bricks}
         occupancy = {name: float((owner >= 0).float().mean()) for name, owner in slots.items()}
-        return Report(self._last, occupancy, self.memory())
+        return Report(self._recent_stats, occupancy, self.memory())
 
-    @_alone
+    @_locked
     def validate(self) -> None:
         """Raises ValueError unless the pools are consistent: see `N3Tree` and `Cache`."""
         for source in self.trees.values():
@@ -560,8 +571,8 @@ class Engine:
         """
         self._closed = True  # another thread's picture gets no further frame
         with self.lock:
-            for one in self.recorded:
-                one.close()
+            for host_frame in self.recorded:
+                host_frame.close()
             self.production.close()
             for source in self.trees.values():
                 source.producer.close()

@@ -25,8 +25,8 @@ from .host_frame import HostFrame
 from .stats import Collected, FrameStats, Readbacks
 
 _STRIDE = 4  # pixels between look-ahead rays
-_RAREST = 4  # most frames between two look-aheads
-_LOOKS = 4  # look-aheads before the camera arrives: each deepens a tree by a level
+_MAX_INTERVAL = 4  # most frames between two look-aheads
+_LOOKS_AHEAD = 4  # look-aheads before the camera arrives: each deepens a tree by a level
 
 
 class Steps(Protocol):
@@ -70,40 +70,40 @@ class FrameGraph:
         self,
         engine: Steps,
         view: View,
-        served: DeviceFrame | HostFrame | None,
-        again: Callable[[Camera | Rays], tuple[Picture, FrameStats]],
+        recorded: DeviceFrame | HostFrame | None,
+        render_frame: Callable[[Camera | Rays], tuple[Picture, FrameStats]],
         look_ahead: float = 0,
     ) -> None:
-        """Records the frame; see `Engine.capture`. `again` renders a frame that the host serves."""
-        self._engine, self._served, self._again = engine, served, again
+        """Records the frame; see `Engine.capture`. The host serves frames of `render_frame`."""
+        self._engine, self._recorded, self._render_frame = engine, recorded, render_frame
         self._view = view = replace(view, numbers=view.numbers.clone())  # written by replays
-        self._number = -1  # of the last replay's picture
-        self._ahead = LookAhead(view, look_ahead) if served and look_ahead else None
+        self._frame_number = -1  # of the last replay's picture
+        self._look_ahead = LookAhead(view, look_ahead) if recorded and look_ahead else None
         graphs = [torch.cuda.CUDAGraph() for _ in range(5)]
         self._serve, self._deepen, self._draw, self._look, self._finish = graphs
-        if served is not None:
-            with _recorded(self._serve, engine.device):
-                served.serve()
-        if isinstance(served, DeviceFrame):
-            with _recorded(self._deepen, engine.device):
-                served.deepen()
-        with _recorded(self._draw, engine.device):
-            ahead = self._ahead is not None
-            self._hits = view.hits() if served is None else served.draw(view, ahead)
+        if recorded is not None:
+            with _record_graph(self._serve, engine.device):
+                recorded.serve()
+        if isinstance(recorded, DeviceFrame):
+            with _record_graph(self._deepen, engine.device):
+                recorded.deepen()
+        with _record_graph(self._draw, engine.device):
+            looks_ahead = self._look_ahead is not None
+            self._hits = view.hits() if recorded is None else recorded.draw(view, looks_ahead)
             self._picture = view.picture(self._hits, FrameStats())
-            if self._ahead is None:
+            if self._look_ahead is None:
                 self._collected = self._collect()
-        if served is not None and self._ahead is not None:
-            with _recorded(self._look, engine.device):
-                served.look(self._ahead.hits)
-            with _recorded(self._finish, engine.device):
+        if recorded is not None and self._look_ahead is not None:
+            with _record_graph(self._look, engine.device):
+                recorded.look_ahead(self._look_ahead.hits)
+            with _record_graph(self._finish, engine.device):
                 self._collected = self._collect()
 
     def _collect(self) -> Collected:
         """Lists the picture's requests, sorts the slots by use, and counts."""
-        if self._served is None:
+        if self._recorded is None:
             return self._engine.collect_requests_and_use(self._hits.samples)
-        return self._served.finish(self._hits)
+        return self._recorded.finish(self._hits)
 
     def replay(self, camera: Camera | Rays) -> tuple[Picture, FrameStats]:
         """Renders a frame; the host does not wait for the device.
@@ -118,57 +118,57 @@ class FrameGraph:
             ValueError: The camera differs in number, size or model, or the engine is closed.
         """
         camera = as_camera("replay", camera)
-        form, own = camera.form, self._view.camera.form
-        if form != own:
+        form, captured = camera.form, self._view.camera.form
+        if form != captured:
             raise ValueError(
-                f"replay: camera must be {own[0]} of {own[2]}x{own[1]} pixels as captured "
-                f"({own[4]}), got {form[0]} of {form[2]}x{form[1]} ({form[4]})"
+                f"replay: camera must be {captured[0]} of {captured[2]}x{captured[1]} pixels as "
+                f"captured ({captured[4]}), got {form[0]} of {form[2]}x{form[1]} ({form[4]})"
             )
         with self._engine.lock:
             return self._replay(camera)
 
     def _replay(self, camera: Camera) -> tuple[Picture, FrameStats]:
         """See `replay`."""
-        engine, served = self._engine, self._served
+        engine, recorded = self._engine, self._recorded
         if engine.changed:
-            return self._again(camera)  # which renews the changed trees
-        if served is not None and (
-            engine.readbacks.failed or served.host_needed or len(engine.cache.aliases)
+            return self._render_frame(camera)  # which renews the changed trees
+        if recorded is not None and (
+            engine.readbacks.failed or recorded.host_needed or len(engine.cache.aliases)
         ):
-            served.host_needed = False
+            recorded.host_needed = False
             # `Engine.frame` names the nodes that fail, and requests targets of aliases.
-            return self._again(camera)
+            return self._render_frame(camera)
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
-            stale = engine.frames != self._number
-            if served is not None:
-                engine.release(but=served if isinstance(served, HostFrame) else None)
+            stale = engine.frames != self._frame_number
+            if recorded is not None:
+                engine.release(but=recorded if isinstance(recorded, HostFrame) else None)
                 engine.readbacks.take_arrived()
-                steady = engine.steady and not (self._ahead and self._ahead.due)
+                steady = engine.steady and not (self._look_ahead and self._look_ahead.due)
                 with stage("serve"):
-                    if served.begin(stale, steady, stats):
+                    if recorded.begin(stale, steady, stats):
                         self._serve.replay()
-                        for _ in range(served.deeper(engine.readbacks)):
+                        for _ in range(recorded.deeper(engine.readbacks)):
                             self._deepen.replay()
-            engine.number_picture(on_device=served is None)
-            self._number = engine.frames
+            engine.number_picture(on_device=recorded is None)
+            self._frame_number = engine.frames
             self._draw_from(camera.placed(self._view.box), stale)
             collected = self._collected
-            if isinstance(served, HostFrame):
-                collected = collected._replace(ask=partial(served.ask, served.turn))
+            if isinstance(recorded, HostFrame):
+                collected = collected._replace(ask=partial(recorded.ask, recorded.generation))
             engine.read_back(stats, self._hits, collected)
         engine.readbacks.hold_back()
         return replace(self._picture, stats=stats), stats
 
     def _draw_from(self, camera: Camera, stale: bool) -> None:
         """Draws what a placed camera sees; `stale`: other frames came since the last replay."""
-        ahead, numbers = self._ahead, camera.numbers(self._engine.device)
-        if ahead is not None:
-            ahead.follow(camera, numbers, stale)
+        look_ahead, numbers = self._look_ahead, camera.numbers(self._engine.device)
+        if look_ahead is not None:
+            look_ahead.follow(camera, numbers, stale)
         self._view.numbers.copy_(numbers)
         with stage("replay"):
             self._draw.replay()
-            if ahead is not None:
-                if ahead.due:
+            if look_ahead is not None:
+                if look_ahead.due:
                     self._look.replay()
                 self._finish.replay()
 
@@ -191,43 +191,45 @@ class LookAhead:
 
     def __init__(self, view: View, frames: float) -> None:
         """Prepares rays that look `frames` ahead of a picture's view."""
-        self._now, self._camera, self._frames = view.numbers, view.camera, frames
-        self._before, self._last = self._now.clone(), view.camera
-        self._every = max(1, min(_RAREST, int(frames / _LOOKS)))
-        self._moves, self.due = 0, False
+        self._numbers, self._camera, self._frames = view.numbers, view.camera, frames
+        self._numbers_before, self._camera_before = self._numbers.clone(), view.camera
+        self._interval = max(1, min(_MAX_INTERVAL, int(frames / _LOOKS_AHEAD)))
+        self._moved_frames, self.due = 0, False
         options = replace(view.options, layer=None)
         thinned = view.camera.thinned(_STRIDE)
-        self._view = replace(view, camera=thinned, numbers=self._numbers(), options=options)
+        self._view = replace(view, camera=thinned, numbers=self._numbers_ahead(), options=options)
 
     def follow(self, camera: Camera, numbers: Tensor, stale: bool) -> None:
         """Updates `due` and the last frame's numbers, before those of the next picture's placed
         camera are written to `View.numbers`. `stale`: other frames were rendered since the last
         one.
         """
-        self._before.copy_(numbers if stale else self._now)
-        moves = not (stale or camera.same(self._last))
-        self.due, self._last = moves and self._moves % self._every == 0, camera
-        self._moves += moves
+        self._numbers_before.copy_(numbers if stale else self._numbers)
+        moving = not (stale or camera.same(self._camera_before))
+        self.due, self._camera_before = moving and self._moved_frames % self._interval == 0, camera
+        self._moved_frames += moving
 
     def hits(self) -> Hits:
         """Traces the rays; only their usage stamps and requests matter."""
-        self._view.numbers.copy_(self._numbers())
+        self._view.numbers.copy_(self._numbers_ahead())
         return self._view.hits()
 
-    def _numbers(self) -> Tensor:
-        return self._camera.numbers_ahead(self._now, self._before, self._frames, _STRIDE)
+    def _numbers_ahead(self) -> Tensor:
+        return self._camera.numbers_ahead(
+            self._numbers, self._numbers_before, self._frames, _STRIDE
+        )
 
 
 @contextmanager
-def _recorded(graph: torch.cuda.CUDAGraph, device: torch.device) -> Iterator[None]:
+def _record_graph(graph: torch.cuda.CUDAGraph, device: torch.device) -> Iterator[None]:
     """Records the block's device work as a graph. Meanwhile Python collects no garbage: freeing
     what an old engine held, such as locked host memory, would abort the recording.
     """
-    collects = gc.isenabled()
+    gc_was_enabled = gc.isenabled()
     gc.disable()
     try:
         with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
             yield
     finally:
-        if collects:
+        if gc_was_enabled:
             gc.enable()

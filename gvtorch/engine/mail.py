@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-Form = Mapping[str, tuple[tuple[int, ...], torch.dtype]]  # shape and dtype of a row's fields
+RowForm = Mapping[str, tuple[tuple[int, ...], torch.dtype]]  # shape and dtype of a row's fields
 
 _BUFFERS = 3  # one is filled while the others may still be copied
 _ALIGN = 16  # bytes: alignment of fields
@@ -23,102 +23,104 @@ class Mail:
     """Boxes with room for `rows` rows each. A row's field `node` is -1 where the row is empty.
 
     Attributes:
-        there: For each box, its fields (rows, ...) on the device.
+        device_boxes: For each box, its fields (rows, ...) on the device.
         sent: Number of rows sent since `HostFrame.release` last reset it.
     """
 
-    def __init__(self, boxes: Mapping[str, Form], rows: int, device: torch.device) -> None:
+    def __init__(self, boxes: Mapping[str, RowForm], rows: int, device: torch.device) -> None:
         """Allocates the buffers."""
         self.rows, self.sent = rows, 0
         self._lock = threading.Lock()
         self._queue: deque[tuple[str, Mapping[str, Tensor], int]] = deque()
-        self._taken = dict.fromkeys(boxes, 0)
-        self._nodes = rows * len(boxes)  # node fields, at the front of a buffer
-        places: dict[tuple[str, str], tuple[int, tuple[int, ...], torch.dtype]] = {}
-        end = 8 * self._nodes
-        for number, (box, form) in enumerate(boxes.items()):
-            places[box, "node"] = (8 * rows * number, (rows,), torch.int64)
+        self._filled_rows = dict.fromkeys(boxes, 0)
+        self._node_rows = rows * len(boxes)  # node fields, at the front of a buffer
+        fields: dict[tuple[str, str], tuple[int, tuple[int, ...], torch.dtype]] = {}
+        size = 8 * self._node_rows
+        for box_index, (box, form) in enumerate(boxes.items()):
+            fields[box, "node"] = (8 * rows * box_index, (rows,), torch.int64)
             for name, (shape, dtype) in form.items():
-                end = -(-end // _ALIGN) * _ALIGN
-                places[box, name] = (end, (rows, *shape), dtype)
-                end += math.prod((rows, *shape)) * dtype.itemsize
+                size = -(-size // _ALIGN) * _ALIGN
+                fields[box, name] = (size, (rows, *shape), dtype)
+                size += math.prod((rows, *shape)) * dtype.itemsize
         self._cuda = device.type == "cuda"
-        self._target = torch.zeros(end, dtype=torch.uint8, device=device)
-        self._buffers = [
-            torch.zeros(end, dtype=torch.uint8, pin_memory=self._cuda) for _ in range(_BUFFERS)
+        self._device_buffer = torch.zeros(size, dtype=torch.uint8, device=device)
+        self._host_buffers = [
+            torch.zeros(size, dtype=torch.uint8, pin_memory=self._cuda) for _ in range(_BUFFERS)
         ]
-        self.there = _views(self._target, places)
-        self._here = [_views(buffer, places) for buffer in self._buffers]
-        self._copied: list[Any] = [None] * _BUFFERS  # CUDA events
-        self._open = 0
-        for buffer in (self._target, *self._buffers):
-            self._empty(buffer)
+        self.device_boxes = _views(self._device_buffer, fields)
+        self._host_boxes = [_views(buffer, fields) for buffer in self._host_buffers]
+        self._copy_events: list[Any] = [None] * _BUFFERS  # CUDA events
+        self._open = 0  # index of the buffer that is being filled
+        for buffer in (self._device_buffer, *self._host_buffers):
+            self._clear_buffer(buffer)
 
     def post(self, box: str, rows: Mapping[str, Tensor]) -> None:
         """Queues rows (k, ...) for a box, in host memory; rows that find no room are sent later."""
         if len(rows["node"]):
             with self._lock:
                 self._queue.append((box, rows, 0))
-                self._fill()
+                self._fill_open_buffer()
 
     def send(self) -> bool:
         """Starts copying the posted rows to the device, unless all buffers are still being copied;
         rows sent before must have been processed (`clear`). Returns whether anything was sent.
         """
         with self._lock:
-            following = (self._open + 1) % _BUFFERS
-            copied = self._copied[following]
-            if not any(self._taken.values()) or (copied is not None and not copied.query()):
+            next_index = (self._open + 1) % _BUFFERS
+            event = self._copy_events[next_index]
+            if not any(self._filled_rows.values()) or (event is not None and not event.query()):
                 return False
-            self._target.copy_(self._buffers[self._open], non_blocking=True)
+            self._device_buffer.copy_(self._host_buffers[self._open], non_blocking=True)
             if self._cuda:
-                self._copied[self._open] = torch.cuda.current_stream().record_event()
-            self.sent += sum(self._taken.values())
-            self._open = following
-            self._begin()
-            self._fill()
+                self._copy_events[self._open] = torch.cuda.current_stream().record_event()
+            self.sent += sum(self._filled_rows.values())
+            self._open = next_index
+            self._reset_open_buffer()
+            self._fill_open_buffer()
             return True
 
     def clear(self) -> None:
         """Empties all boxes on the device."""
-        self._empty(self._target)
+        self._clear_buffer(self._device_buffer)
 
     def forget(self) -> None:
         """Drops all rows that were not sent yet."""
         with self._lock:
             self._queue.clear()
-            self._begin()
+            self._reset_open_buffer()
 
-    def _begin(self) -> None:
-        self._empty(self._buffers[self._open])
-        self._taken = dict.fromkeys(self._taken, 0)
+    def _reset_open_buffer(self) -> None:
+        self._clear_buffer(self._host_buffers[self._open])
+        self._filled_rows = dict.fromkeys(self._filled_rows, 0)
 
-    def _fill(self) -> None:
+    def _fill_open_buffer(self) -> None:
         """Moves rows from the queue to the open buffer, in their order."""
         while self._queue:
-            box, rows, begin = self._queue.popleft()
-            at, total = self._taken[box], len(rows["node"])
-            count = min(self.rows - at, total - begin)
+            box, rows, first = self._queue.popleft()
+            row, total = self._filled_rows[box], len(rows["node"])
+            count = min(self.rows - row, total - first)
             for name, values in rows.items():
-                self._here[self._open][box][name][at : at + count] = values[begin : begin + count]
-            self._taken[box] += count
-            if begin + count < total:
-                self._queue.appendleft((box, rows, begin + count))
+                self._host_boxes[self._open][box][name][row : row + count] = values[
+                    first : first + count
+                ]
+            self._filled_rows[box] += count
+            if first + count < total:
+                self._queue.appendleft((box, rows, first + count))
                 return
 
-    def _empty(self, buffer: Tensor) -> None:
-        buffer[: 8 * self._nodes].view(torch.int64).fill_(-1)
+    def _clear_buffer(self, buffer: Tensor) -> None:
+        buffer[: 8 * self._node_rows].view(torch.int64).fill_(-1)
 
     def __repr__(self) -> str:
-        return f"Mail({', '.join(self._taken)}; {self.rows} rows each)"
+        return f"Mail({', '.join(self._filled_rows)}; {self.rows} rows each)"
 
 
 def _views(
-    buffer: Tensor, places: Mapping[tuple[str, str], tuple[int, tuple[int, ...], torch.dtype]]
+    buffer: Tensor, fields: Mapping[tuple[str, str], tuple[int, tuple[int, ...], torch.dtype]]
 ) -> dict[str, dict[str, Tensor]]:
     """Returns views of the fields of each box in a buffer."""
-    made: dict[str, dict[str, Tensor]] = {}
-    for (box, name), (begin, shape, dtype) in places.items():
-        part = buffer[begin : begin + math.prod(shape) * dtype.itemsize]
-        made.setdefault(box, {})[name] = part.view(dtype).view(shape)
-    return made
+    boxes: dict[str, dict[str, Tensor]] = {}
+    for (box, name), (offset, shape, dtype) in fields.items():
+        field_bytes = buffer[offset : offset + math.prod(shape) * dtype.itemsize]
+        boxes.setdefault(box, {})[name] = field_bytes.view(dtype).view(shape)
+    return boxes

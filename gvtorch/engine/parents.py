@@ -14,24 +14,24 @@ from ..ops import unlink
 from .request_batch import ProducedTree
 
 
-def ready(cache: Cache, node: Tensor, depth: int) -> Tensor:
+def nearest_loadable(cache: Cache, node: Tensor, depth: int) -> Tensor:
     """Returns for each of (k,) int64 nodes, -1 for none, its nearest ancestor, itself included,
     whose parent has a brick or needs none. `depth` is that of the tree. The host does not wait.
     """
     words = cache.nodes.brick_tn.view(-1)
     for _ in range(depth):
         parent = _parent(cache, node)
-        bare = (parent >= 0) & (words[parent.clamp(min=0)] == ABSENT)
-        node = torch.where(bare, parent, node)
+        lacks_brick = (parent >= 0) & (words[parent.clamp(min=0)] == ABSENT)
+        node = torch.where(lacks_brick, parent, node)
     return node
 
 
-def first_ones(node: Tensor) -> Tensor:
+def without_repeats(node: Tensor) -> Tensor:
     """Returns nodes (k,) with -1 in place of every repetition. The host does not wait."""
-    held, order = node.sort(stable=True)
-    again = torch.zeros_like(held, dtype=torch.bool)
-    again[1:] = held[1:] == held[:-1]
-    return torch.where(torch.zeros_like(again).scatter(0, order, again), -1, node)
+    sorted_node, order = node.sort(stable=True)
+    repeated = torch.zeros_like(sorted_node, dtype=torch.bool)
+    repeated[1:] = sorted_node[1:] == sorted_node[:-1]
+    return torch.where(torch.zeros_like(repeated).scatter(0, order, repeated), -1, node)
 
 
 def parent_bricks(cache: Cache, source: ProducedTree, node: Tensor) -> dict[str, Tensor]:
@@ -41,29 +41,29 @@ def parent_bricks(cache: Cache, source: ProducedTree, node: Tensor) -> dict[str,
     """
     parent = _parent(cache, node)
     parent = torch.where(parent >= 0, parent, node)
-    word, found = cache.nodes.brick_tn.view(-1)[parent], {}
+    word, bricks = cache.nodes.brick_tn.view(-1)[parent], {}
     for name, channel in source.producer.channels.items():
         if channel.coarse:
             continue
-        held, constants = cache.bricks.bricks[name].detach(), cache.nodes.constants[name]
-        rows = movable(held)[word.clamp(min=0).to(torch.int64)]
-        one = movable(constants).flatten(0, 1)[parent][:, None, None, None]
+        pool, constants = cache.bricks.bricks[name].detach(), cache.nodes.constants[name]
+        rows = movable(pool)[word.clamp(min=0).to(torch.int64)]
+        constant = movable(constants).flatten(0, 1)[parent][:, None, None, None]
         uniform = (word < ABSENT)[:, None, None, None, None]  # EMPTY, CONSTANT
-        rows = torch.where(uniform, one, rows)
-        found[name] = rows.view(held.dtype)
-    return found
+        rows = torch.where(uniform, constant, rows)
+        bricks[name] = rows.view(pool.dtype)
+    return bricks
 
 
-def unlink_lost(cache: Cache, node: Tensor) -> Tensor:
+def unlink_alias_only(cache: Cache, node: Tensor) -> Tensor:
     """Returns (k,) bool, which of (k,) nodes lie in tiles with a known parent, or in a root tile.
     The other tiles are reached through aliases only: they are unlinked, so that rays ask for them
     again where they belong.
     """
     tile = node // cache.nodes.nodes_per_tile
-    hangs = (cache.nodes.parent_t[tile] >= 0) | (tile < len(cache.aliases.trees))
-    lost = tile[~hangs].unique().to(torch.int32)
-    unlink(cache.nodes.child_tn, cache.nodes.parent_t, cache.nodes.shared_t, lost)
-    return hangs
+    has_parent = (cache.nodes.parent_t[tile] >= 0) | (tile < len(cache.aliases.trees))
+    alias_only = tile[~has_parent].unique().to(torch.int32)
+    unlink(cache.nodes.child_tn, cache.nodes.parent_t, cache.nodes.shared_t, alias_only)
+    return has_parent
 
 
 def _parent(cache: Cache, node: Tensor) -> Tensor:

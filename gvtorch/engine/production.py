@@ -31,15 +31,15 @@ from .request_batch import (
     RequestBatch,
     brick_words,
     by_kind,
+    check_and_ship,
     children_of,
-    send_ahead,
-    shipped,
+    ship_voxels,
 )
 from .stats import Counts, FrameStats
 
-_MOST_RAISES = 256  # calls in one frame that may raise before whole batches are given up
-_LONGEST = 1e6  # seconds
-_KEPT = 1000  # most failures kept by name; all are counted
+_MAX_RAISING_CALLS = 256  # calls in one frame that may raise before whole batches are given up
+_MAX_WAIT_SECONDS = 1e6  # seconds
+_MAX_NAMED_FAILURES = 1000  # most failures kept by name; all are counted
 
 
 class ProductionError(RuntimeError):
@@ -66,18 +66,18 @@ class Failures:
 
     def __init__(self, strict: bool) -> None:
         self.strict = strict
-        self.newest: deque[Failure] = deque(maxlen=_KEPT)
-        self._places: set[tuple[str, int, tuple[int, ...]]] = set()  # tree, kind, loc
-        self._first: tuple[Failure, BaseException | None] | None = None
-        self._known = 0
+        self.newest: deque[Failure] = deque(maxlen=_MAX_NAMED_FAILURES)
+        self._failed: set[tuple[str, int, tuple[int, ...]]] = set()  # tree, kind, loc
+        self._first_failure: tuple[Failure, BaseException | None] | None = None
+        self._last_count = 0
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._failed)
 
     def changed(self) -> bool:
         """Returns whether their number has changed since the last call."""
-        before, self._known = self._known, len(self)
-        return before != self._known
+        last_count, self._last_count = self._last_count, len(self)
+        return last_count != self._last_count
 
     def add(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
         """Records the nodes of a batch as failed."""
@@ -85,51 +85,51 @@ class Failures:
         kind = next(name for name, kind in KINDS.items() if kind == batch.kind)
         for loc in map(tuple, batch.targets.loc.tolist()):
             self.newest.append(Failure(tree=tree, kind=kind, loc=loc, message=text))
-            self._places.add((tree, batch.kind, loc))
-        self._first = self._first or (self.newest[-1], cause)
+            self._failed.add((tree, batch.kind, loc))
+        self._first_failure = self._first_failure or (self.newest[-1], cause)
 
     def among(self, batch: RequestBatch) -> Tensor | None:
         """Returns (k,) bool, which nodes of a batch failed before; None if none did."""
-        if not self._places:
+        if not self._failed:
             return None
         name, kind = batch.source.name, batch.kind
-        failed = [(name, kind, tuple(loc)) in self._places for loc in batch.targets.loc.tolist()]
+        failed = [(name, kind, tuple(loc)) in self._failed for loc in batch.targets.loc.tolist()]
         return torch.tensor(failed, device=batch.targets.node.device) if any(failed) else None
 
     def raise_if_strict(self) -> None:
         """Raises `ProductionError` for the first failure since the last call, if strict: at the end
         of a frame, when the pools are consistent.
         """
-        first, self._first = self._first, None
-        if self.strict and first is not None:
-            failure, cause = first
+        first_failure, self._first_failure = self._first_failure, None
+        if self.strict and first_failure is not None:
+            failure, cause = first_failure
             raise ProductionError(str(failure)) from cause
 
     def forget(self, tree: str | None = None) -> None:
         """Forgets the failures of a tree, or all."""
-        kept = [one for one in self.newest if tree not in (None, one.tree)]
+        kept_failures = [failure for failure in self.newest if tree not in (None, failure.tree)]
         self.newest.clear()
-        self.newest.extend(kept)
-        self._places = {place for place in self._places if tree not in (None, place[0])}
+        self.newest.extend(kept_failures)
+        self._failed = {node for node in self._failed if tree not in (None, node[0])}
 
 
 @dataclass(frozen=True, eq=False)
-class _Waiting:
+class _PendingBatch:
     """A batch whose answer is on its way."""
 
     batch: RequestBatch
-    asked: Future  # what the producer returned
-    future: Future  # of the same answer, after bricks on the host were checked and sent
+    producer_future: Future  # what the producer returned
+    answer_future: Future  # of the same answer, after bricks on the host were checked and sent
     patience: float  # seconds
-    since: float  # time.monotonic()
+    asked_at: float  # time.monotonic()
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Seconds until it is given up."""
-        return self.since + self.patience - time.monotonic()
+        return self.asked_at + self.patience - time.monotonic()
 
 
-def _outcome(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
+def _try_call(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
     """Calls a producer; returns its answer and None, or None and the error that it raised."""
     try:
         return call(), None
@@ -151,39 +151,39 @@ class Production:
         self.cache, self.scheduler, self.by_level = cache, scheduler, by_level
         self.trees: dict[str, ProducedTree] = {}
         self.failures = Failures(strict)
-        self._raised = self._skipped = 0
-        self._waiting: list[_Waiting] = []
-        self._held: list[Answered] = []  # found no room in the staging ring
+        self._raise_count = self._skipped_count = 0
+        self._waiting: list[_PendingBatch] = []
+        self._held_back: list[Answered] = []  # found no room in the staging ring
         self.staging: Staging | None = None
         pool = cache.bricks
         if pool.stamp_b.device.type == "cuda":
-            brick = sum(bricks[:1].nbytes for bricks in pool.bricks.values())
-            most = scheduler.most[REQUEST_LOAD] * brick
-            self.staging = Staging(most, brick, pool.stamp_b.device)
+            brick_nbytes = sum(bricks[:1].nbytes for bricks in pool.bricks.values())
+            max_nbytes = scheduler.most[REQUEST_LOAD] * brick_nbytes
+            self.staging = Staging(max_nbytes, brick_nbytes, pool.stamp_b.device)
 
     @property
     def due(self) -> bool:
         """Whether an answer has come, waits for room in the staging ring, or is overdue."""
-        return bool(self._held) or any(
-            item.future.done() or item.left < 0 for item in self._waiting
+        return bool(self._held_back) or any(
+            item.answer_future.done() or item.seconds_left < 0 for item in self._waiting
         )
 
     @property
     def pending(self) -> dict[int, int]:
         """For each kind, the number of nodes whose answers are on their way."""
-        batches = self._under_way()
+        batches = self._pending_batches()
         return {kind: sum(len(b) for b in batches if b.kind == kind) for kind in KINDS.values()}
 
     def room(self) -> dict[int, list[int]]:
         """Returns for each kind how many slots no pending answer needs; see `Cache.room`."""
-        room, batches = self.cache.room(), self._under_way()
+        room, batches = self.cache.room(), self._pending_batches()
         for kind, free in room.items():
-            for number in range(len(free)):
-                known = (b for b in batches if b.kind == kind and b.coarse == number)
-                free[number] = max(0, free[number] - sum(map(len, known)))
+            for coarse in range(len(free)):
+                pending = (b for b in batches if b.kind == kind and b.coarse == coarse)
+                free[coarse] = max(0, free[coarse] - sum(map(len, pending)))
         return room
 
-    def serve(self, listed: RequestList, counts: Counts, stats: FrameStats) -> None:
+    def serve(self, request_list: RequestList, counts: Counts, stats: FrameStats) -> None:
         """Makes unused slots available, chooses requests, asks the producers, and writes the
         answers that come at once. Recorded frames choose on the device (`RecordedFrame`).
         """
@@ -192,7 +192,7 @@ class Production:
         if not counts.listed:
             return
         with stage("schedule"):
-            requests = listed.by_kind(cache, counts.by_kind())
+            requests = request_list.by_kind(cache, counts.by_kind())
             room = self.room()
             nodes, deferred, exceeded = scheduler.choose(requests, room)
             if exceeded:
@@ -210,15 +210,15 @@ class Production:
         with stage("write"):
             self.write(answers, stats)
 
-    def _deepen(self, asked: Requests, stats: FrameStats) -> None:
+    def _deepen(self, subdivisions: Requests, stats: FrameStats) -> None:
         """Subdivides the nodes just made as well, where rays will want finer ones, before they ask:
         by as many levels as the subdivisions want on average.
         """
         branching = max(source.layout.branching for source in self.trees.values())
-        for _ in range(deeper(levels_wanted(asked.priority, branching).tolist())):
+        for _ in range(deeper(levels_wanted(subdivisions.priority, branching).tolist())):
             with stage("schedule"):
-                requests = requests_below(self.cache, asked, branching)
-                asked = requests[REQUEST_SUBDIVIDE]
+                requests = requests_below(self.cache, subdivisions, branching)
+                subdivisions = requests[REQUEST_SUBDIVIDE]
                 nodes = self.scheduler.choose(requests, self.room()).nodes
             if not any(map(len, nodes.values())):
                 break
@@ -226,7 +226,7 @@ class Production:
 
     def ask(self, chosen: Mapping[int, Tensor]) -> list[Answered]:
         """Asks for the chosen (k,) nodes of each kind; returns answers that are here at once."""
-        self._raised = 0
+        self._raise_count = 0
         answered: list[Answered] = []
         for kind, nodes in chosen.items():
             self.scheduler.spent[kind] += len(nodes)
@@ -237,36 +237,36 @@ class Production:
                     batch = self._with_parents(batch)
                 failed = self.failures.among(batch)
                 if failed is not None:  # before its tile was given away: mark it again
-                    again, batch = batch[failed], batch[~failed]
-                    self._mark(again)
-                    self._skipped += len(again)
+                    failed_before, batch = batch[failed], batch[~failed]
+                    self._mark(failed_before)
+                    self._skipped_count += len(failed_before)
                 for part in batch.by_slots():
                     answered += self._submit(part)
         return answered
 
-    def late(self) -> list[Answered]:
+    def late_answers(self) -> list[Answered]:
         """Returns the answers that came since the last call; gives up those that are overdue."""
-        answered = [*self._held]
-        self._held.clear()
+        answered = [*self._held_back]
+        self._held_back.clear()
         for item in list(self._waiting):
-            if item.future.done():
-                seconds = time.monotonic() - item.since
+            if item.answer_future.done():
+                seconds = time.monotonic() - item.asked_at
                 self.scheduler.learn(item.batch.kind, len(item.batch), 1e3 * seconds)
-                answered += self._settle(item.batch, *_outcome(item.future.result))
+                answered += self._settle(item.batch, *_try_call(item.answer_future.result))
                 self._waiting.remove(item)
-            elif item.left < 0:
+            elif item.seconds_left < 0:
                 self._waiting.remove(item)
-                item.asked.cancel()
+                item.producer_future.cancel()
                 self._fail(item.batch, f"no answer within {item.patience:g} s")
         return answered
 
     def write(self, answers: Sequence[Answered], stats: FrameStats) -> None:
         """Writes answers into the pools and adds them to `stats`."""
-        stats.stale, self._skipped = stats.stale + self._skipped, 0
+        stats.stale, self._skipped_count = stats.stale + self._skipped_count, 0
         for batch, answer in answers:
             if isinstance(answer, Regions):
                 children = children_of(batch, answer, self.cache)
-                self._add_up(batch, write.tiles(self.cache, batch.targets, children), stats)
+                self._count_written(batch, write.tiles(self.cache, batch.targets, children), stats)
             elif isinstance(answer, Shipment):
                 self._write_shipment(batch, answer, stats)
             else:
@@ -276,38 +276,40 @@ class Production:
             self.cache.aliases.update()
         stats.pending, stats.failed = sum(self.pending.values()), len(self.failures)
 
-    def wait(self, more: float = 0.0, limit: float = _LONGEST) -> None:
-        """Waits for one answer, at most for patience or `limit` seconds; then `more` for others."""
-        if self._waiting and not self._held:
-            left = min(item.left for item in self._waiting)
-            futures = [item.future for item in self._waiting]
-            longest = min(limit, max(0.0, left) + 1e-3)
-            wait_for(futures, timeout=longest, return_when=FIRST_COMPLETED)
-            wait_for(futures, timeout=more)
+    def wait(self, extra: float = 0.0, limit: float = _MAX_WAIT_SECONDS) -> None:
+        """Waits for an answer, at most its patience or `limit` seconds; then `extra` for others."""
+        if self._waiting and not self._held_back:
+            shortest_patience = min(item.seconds_left for item in self._waiting)
+            futures = [item.answer_future for item in self._waiting]
+            timeout = min(limit, max(0.0, shortest_patience) + 1e-3)
+            wait_for(futures, timeout=timeout, return_when=FIRST_COMPLETED)
+            wait_for(futures, timeout=extra)
 
     def restore_pending(self) -> None:
         """Marks the nodes whose answers are on their way as pending, and no others."""
-        words = self.cache.nodes.request_tn
-        everything = torch.arange(words.numel(), device=words.device)
+        request_words = self.cache.nodes.request_tn
+        all_nodes = torch.arange(request_words.numel(), device=request_words.device)
         for kind in KINDS.values():
-            self.cache.mark_pending(everything, kind, False)
-        for batch in self._under_way():
+            self.cache.mark_pending(all_nodes, kind, False)
+        for batch in self._pending_batches():
             self._mark(batch)
 
     def forget(self, source: ProducedTree) -> None:
         """Drops the answers that are on their way to a tree, and forgets its failures."""
         for item in [item for item in self._waiting if item.batch.source is source]:
-            item.asked.cancel()
+            item.producer_future.cancel()
             self._waiting.remove(item)
-        self._held = [one for one in self._held if one.batch.source is not source]
+        self._held_back = [
+            answered for answered in self._held_back if answered.batch.source is not source
+        ]
         self.failures.forget(source.name)
 
     def close(self) -> None:
         """Drops all answers that are on their way."""
         for item in self._waiting:
-            item.asked.cancel()
+            item.producer_future.cancel()
         self._waiting.clear()
-        self._held.clear()
+        self._held_back.clear()
 
     def __repr__(self) -> str:
         pending = sum(self.pending.values())
@@ -315,16 +317,16 @@ class Production:
 
     def _by_tree(self, node: Tensor) -> list[tuple[ProducedTree, Tensor]]:
         """Groups nodes by tree; trees without any are left out."""
-        trees = [*self.trees.values()]
+        sources = [*self.trees.values()]
         if not len(node):
             return []
-        if len(trees) == 1:
-            return [(trees[0], node)]
-        number = self.cache.nodes.tree_t[node // self.cache.nodes.nodes_per_tile]
-        masks = number == torch.arange(len(trees), device=number.device)[:, None]
+        if len(sources) == 1:
+            return [(sources[0], node)]
+        tree_number = self.cache.nodes.tree_t[node // self.cache.nodes.nodes_per_tile]
+        masks = tree_number == torch.arange(len(sources), device=tree_number.device)[:, None]
         return [
-            (tree, node[torch.nonzero_static(mask, size=count)[:, 0]])
-            for tree, mask, count in zip(trees, masks, masks.sum(1).tolist(), strict=True)
+            (source, node[torch.nonzero_static(mask, size=count)[:, 0]])
+            for source, mask, count in zip(sources, masks, masks.sum(1).tolist(), strict=True)
             if count
         ]
 
@@ -333,60 +335,62 @@ class Production:
         brick wait until they have: ancestors take their place in the batch.
         """
         cache, source = self.cache, batch.source
-        batch = batch[parents.unlink_lost(cache, batch.targets.node).nonzero()[:, 0]]
-        node = parents.ready(cache, batch.targets.node, source.layout.depth)
+        batch = batch[parents.unlink_alias_only(cache, batch.targets.node).nonzero()[:, 0]]
+        node = parents.nearest_loadable(cache, batch.targets.node, source.layout.depth)
         words, bit = cache.nodes.request_tn.view(-1), REQUEST_LOAD << REQUEST_PENDING_SHIFT
         pending = (words[node] & bit) != 0
-        above = replace(batch, targets=Targets(source.tree, node, source.tree.loc(node)))
-        failed = self.failures.among(above)
+        ancestors = replace(batch, targets=Targets(source.tree, node, source.tree.loc(node)))
+        failed = self.failures.among(ancestors)
         if failed is not None:
-            lost = (failed & (node != batch.targets.node)).nonzero()[:, 0]
-            if len(lost):
-                self._fail(batch[lost], "the brick of its parent can't be made")
-        first = parents.first_ones(torch.where(pending, -1, node))
-        asked = above[(first >= 0).nonzero()[:, 0]]
-        bricks = parents.parent_bricks(cache, source, asked.targets.node)
-        return replace(asked, parents=bricks)
+            unfillable = (failed & (node != batch.targets.node)).nonzero()[:, 0]
+            if len(unfillable):
+                self._fail(batch[unfillable], "the brick of its parent can't be made")
+        to_load = parents.without_repeats(torch.where(pending, -1, node))
+        load_batch = ancestors[(to_load >= 0).nonzero()[:, 0]]
+        bricks = parents.parent_bricks(cache, source, load_batch.targets.node)
+        return replace(load_batch, parents=bricks)
 
     def _submit(self, batch: RequestBatch) -> list[Answered]:
         """Asks for a batch; returns the answers that come at once."""
         start = time.perf_counter()
-        answer, raised = _outcome(batch.ask)
+        answer, raised = _try_call(batch.ask)
         if isinstance(answer, Future):
             if not answer.done():
                 self._mark(batch)
-                ahead, patience = self._sent_ahead(batch, answer), batch.source.patience
-                self._waiting.append(_Waiting(batch, answer, ahead, patience, time.monotonic()))
+                future, patience = self._ship_on_arrival(batch, answer), batch.source.patience
+                self._waiting.append(
+                    _PendingBatch(batch, answer, future, patience, time.monotonic())
+                )
                 return []
-            answer, raised = _outcome(answer.result)
+            answer, raised = _try_call(answer.result)
         answered = self._settle(batch, answer, raised)
         self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
         return answered
 
-    def _sent_ahead(self, batch: RequestBatch, asked: Future) -> Future:
+    def _ship_on_arrival(self, batch: RequestBatch, producer_future: Future) -> Future:
         """Returns a future of the answer, after sending bricks on the host to the device."""
         staging = self.staging
         if staging is None or batch.kind != REQUEST_LOAD:
-            return asked
-        ahead: Future = Future()
+            return producer_future
+        answer_future: Future = Future()
 
-        def send(asked: Future) -> None:
+        def send(done_future: Future) -> None:
             try:
-                ahead.set_result(send_ahead(batch, asked.result(), staging))
+                answer_future.set_result(check_and_ship(batch, done_future.result(), staging))
             except BaseException as error:
-                ahead.set_exception(error)
+                answer_future.set_exception(error)
 
-        asked.add_done_callback(send)
-        return ahead
+        producer_future.add_done_callback(send)
+        return answer_future
 
     def _settle(self, batch: RequestBatch, answer: Any, raised: Exception | None) -> list[Answered]:
         """Checks an answer; if the producer raised, asks it again for each half of the batch."""
         if raised is not None:
-            self._raised += 1
-            if len(batch) == 1 or self._raised > _MOST_RAISES:
+            self._raise_count += 1
+            if len(batch) == 1 or self._raise_count > _MAX_RAISING_CALLS:
                 self._fail(batch, f"{type(raised).__name__}: {raised}", raised)
                 return []
-            return [one for half in batch.halves() for one in self._submit(half)]
+            return [answered for half in batch.halves() for answered in self._submit(half)]
         if isinstance(answer, Shipment):
             return [Answered(batch, answer)]
         try:
@@ -395,12 +399,12 @@ class Production:
             self._fail(batch, str(error), error)
             return []
         if checked.errors:
-            failed, keep = batch.failed(checked)
-            for node, message in failed.items():
-                self._fail(batch[node : node + 1], message)
-            rows = keep.repeat_interleave(batch.per_node).nonzero()[:, 0]
-            batch, checked = batch[keep.nonzero()[:, 0]], checked.rows(rows)
-        return [Answered(batch, shipped(batch, checked, self.staging))] if len(batch) else []
+            reasons, kept = batch.node_errors(checked)
+            for index, message in reasons.items():
+                self._fail(batch[index : index + 1], message)
+            rows = kept.repeat_interleave(batch.per_node).nonzero()[:, 0]
+            batch, checked = batch[kept.nonzero()[:, 0]], checked.rows(rows)
+        return [Answered(batch, ship_voxels(batch, checked, self.staging))] if len(batch) else []
 
     def _write_bricks(
         self, kind: Region, batch: RequestBatch, answer: Any, stats: FrameStats
@@ -409,44 +413,46 @@ class Production:
         if kind is Region.ALIAS:
             goal = upload(answer.alias, batch.targets.node.device)
             written = write.aliases(self.cache, batch.targets, goal, batch.alias_tree(answer))
-            self._add_up(batch, written, stats)
+            self._count_written(batch, written, stats)
             return
         if kind is Region.EMPTY:
             device = batch.targets.node.device
-            word = upload(brick_words(answer.kind), device)
+            brick_word = upload(brick_words(answer.kind), device)
             constants = {name: upload(rows, device) for name, rows in answer.constants.items()}
-            written = write.uniform(self.cache, batch.targets, word, constants)
-            self._add_up(batch, written, stats)
+            written = write.uniform(self.cache, batch.targets, brick_word, constants)
+            self._count_written(batch, written, stats)
             return
-        sent = shipped(batch, answer, self.staging)
-        if isinstance(sent, Shipment):
-            self._write_shipment(batch, sent, stats)
+        shipped = ship_voxels(batch, answer, self.staging)
+        if isinstance(shipped, Shipment):
+            self._write_shipment(batch, shipped, stats)
         else:
-            self._add_up(batch, write.bricks(self.cache, batch.targets, answer.data), stats)
+            self._count_written(batch, write.bricks(self.cache, batch.targets, answer.data), stats)
 
     def _write_shipment(self, batch: RequestBatch, shipment: Shipment, stats: FrameStats) -> None:
         """Writes the bricks that are being sent to the device; holds back those without room."""
-        sent, rest = batch[: shipment.sent], batch[shipment.sent :]
-        if len(rest):
-            self._mark(rest)
-            self._held.append(Answered(rest, Bricks(data=shipment.rest)))
+        sent, held_back = batch[: shipment.sent], batch[shipment.sent :]
+        if len(held_back):
+            self._mark(held_back)
+            self._held_back.append(Answered(held_back, Bricks(data=shipment.rest)))
         if len(sent):
-            self._add_up(sent, write.bricks(self.cache, sent.targets, shipment.chunks), stats)
+            self._count_written(
+                sent, write.bricks(self.cache, sent.targets, shipment.chunks), stats
+            )
 
-    def _add_up(self, batch: RequestBatch, written: Written, stats: FrameStats) -> None:
+    def _count_written(self, batch: RequestBatch, written: Written, stats: FrameStats) -> None:
         """Adds a write to `stats`; nodes that found no slot may be requested again."""
-        name = "bricks" if batch.kind == REQUEST_LOAD else "tiles"
-        stats.produced[name] += written.items
+        item_name = "bricks" if batch.kind == REQUEST_LOAD else "tiles"
+        stats.produced[item_name] += written.items
         stats.produced["constant"] += written.constant
-        stats.evicted[name] += written.evicted
+        stats.evicted[item_name] += written.evicted
         stats.stale += written.stale
         stats.bytes_uploaded += written.nbytes
         stats.capacity_exceeded |= written.unplaced > 0
         if written.lost is not None:
             self.cache.mark_pending(batch.targets.node[written.lost], batch.kind, False)
 
-    def _under_way(self) -> list[RequestBatch]:
-        return [item.batch for item in self._waiting] + [one.batch for one in self._held]
+    def _pending_batches(self) -> list[RequestBatch]:
+        return [item.batch for item in self._waiting] + [item.batch for item in self._held_back]
 
     def _mark(self, batch: RequestBatch) -> None:
         """Marks a batch as pending, where its nodes still lack what was asked for."""

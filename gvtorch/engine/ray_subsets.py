@@ -19,7 +19,7 @@ from torch import Tensor
 from .stats import FrameStats
 
 _STRIDES = (16, 4)  # pixels between scouts
-_FEW = 16  # if at most one scout in this many is left, the next rays are traced with it
+_FEW_DIVISOR = 16  # if at most one scout in this many is left, the next rays are traced with it
 
 
 class RaySubsets:
@@ -32,23 +32,23 @@ class RaySubsets:
         crowded: True if the pools were too small for all rays at once.
     """
 
-    def __init__(self, count: int, width: int, device: torch.device, *, ahead: bool) -> None:
-        """Starts with scouts if `ahead` is true, because something will be missing, else with all
-        rays; `width` is the number of pixels in a row.
+    def __init__(self, count: int, width: int, device: torch.device, *, scouts_first: bool) -> None:
+        """Starts with scouts if `scouts_first` is true, because something will be missing, else
+        with all rays; `width` is the number of pixels in a row.
         """
         self.count = count
         self._grids = [_grid(count, width, stride, device) for stride in _STRIDES]
-        self._sizes = [int(grid.sum()) for grid in self._grids]
-        self._open = torch.ones(count, dtype=torch.bool, device=device)
-        self._size = count
-        self.next, self._scouts = self._open.clone(), 0
-        if ahead:
-            self._choose(self._open, self._sizes)
+        self._grid_sizes = [int(grid.sum()) for grid in self._grids]
+        self._unfinished = torch.ones(count, dtype=torch.bool, device=device)
+        self._subset_size = count
+        self.next, self._scout_count = self._unfinished.clone(), 0
+        if scouts_first:
+            self._choose(self._unfinished, self._grid_sizes)
         self.over = self.crowded = self._given_up = False
         self.done = 0
 
     @property
-    def whole(self) -> bool:
+    def complete(self) -> bool:
         """True if every ray got all that could be served."""
         return not self._given_up and self.done == self.count
 
@@ -58,49 +58,49 @@ class RaySubsets:
         """
         # A converged pass can't be improved: what its rays still miss has failed.
         finished = self.next if stats.converged else self.next & ~missed
-        self._open &= ~finished
-        left = self.next & self._open
-        counted = [finished, left, self._open]
-        counted += [group & grid for group in (left, self._open) for grid in self._grids]
-        sums = torch.stack([rays.sum() for rays in counted]).tolist()
-        just_done, remaining, unfinished, *scouts = sums
-        of_left, of_open = scouts[: len(_STRIDES)], scouts[len(_STRIDES) :]
-        moved = sum(stats.produced.values()) + stats.stale > 0 or stats.failed > failed
-        self.done = self.count - unfinished
-        if not (moved or just_done or stats.pending):
+        self._unfinished &= ~finished
+        remaining = self.next & self._unfinished
+        masks = [finished, remaining, self._unfinished]
+        masks += [group & grid for group in (remaining, self._unfinished) for grid in self._grids]
+        sums = torch.stack([rays.sum() for rays in masks]).tolist()
+        finished_count, remaining_count, unfinished_count, *grid_counts = sums
+        of_remaining, of_unfinished = grid_counts[: len(_STRIDES)], grid_counts[len(_STRIDES) :]
+        progressed = sum(stats.produced.values()) + stats.stale > 0 or stats.failed > failed
+        self.done = self.count - unfinished_count
+        if not (progressed or finished_count or stats.pending):
             if not stats.capacity_exceeded:
-                self.over = remaining == unfinished
+                self.over = remaining_count == unfinished_count
                 self.trace_all()  # the rays that waited for scouts
                 return
             self.crowded = True
-            self._size = remaining // 2
-            if self._size == 0:  # one ray alone does not fit
+            self._subset_size = remaining_count // 2
+            if self._subset_size == 0:  # one ray alone does not fit
                 self._given_up = True
-                self._open &= ~left
-                self.done += remaining
-                self._size, remaining = 1, 0
-        elif not remaining:
-            self._size = min(self.count, 2 * self._size)
-        if remaining * _FEW <= self._scouts:
-            self._choose(self._open, of_open)
+                self._unfinished &= ~remaining
+                self.done += remaining_count
+                self._subset_size, remaining_count = 1, 0
+        elif not remaining_count:
+            self._subset_size = min(self.count, 2 * self._subset_size)
+        if remaining_count * _FEW_DIVISOR <= self._scout_count:
+            self._choose(self._unfinished, of_unfinished)
         else:
-            self._choose(left, of_left)
-        self.next &= self.next.cumsum(0) <= self._size
+            self._choose(remaining, of_remaining)
+        self.next &= self.next.cumsum(0) <= self._subset_size
         self.over = self.done == self.count
 
     def _choose(self, group: Tensor, in_grids: Sequence[int]) -> None:
         """Sets the next pass to the group's rays on the coarsest grid of which more than 1/16 is in
         the group, else to the whole group; `in_grids` is the number of its rays on each grid.
         """
-        for grid, size, here in zip(self._grids, self._sizes, in_grids, strict=True):
-            if here * _FEW > size:
-                self.next, self._scouts = group & grid, size
+        for grid, size, in_grid in zip(self._grids, self._grid_sizes, in_grids, strict=True):
+            if in_grid * _FEW_DIVISOR > size:
+                self.next, self._scout_count = group & grid, size
                 return
-        self.next, self._scouts = group.clone(), 0
+        self.next, self._scout_count = group.clone(), 0
 
     def trace_all(self) -> None:
         """Sets the next pass to all rays that are not done."""
-        self.next, self._scouts = self._open.clone(), 0
+        self.next, self._scout_count = self._unfinished.clone(), 0
 
 
 def scouts(missed: Tensor, width: int) -> Tensor:

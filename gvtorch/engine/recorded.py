@@ -22,10 +22,11 @@ from ..tracing.pixels import View
 from .production import Production
 from .stats import COARSER_UNIT, Collected, Readbacks
 
-_MOST_LISTED = 1 << 14  # most nodes whose requests are listed, unless a batch holds more
-_WIDEN, _NARROW = 1.2, 0.97  # most by which a frame widens cones, and by which it narrows them
-_WIDEST = 64.0
-_ROOMY = 0.85  # share of a pool: if less is used, cones become narrower
+_MAX_LISTED_NODES = 1 << 14  # most nodes whose requests are listed, unless a batch holds more
+# Factors: most by which a frame widens cones, by which it narrows them, and widest cones.
+_MAX_WIDENING, _NARROWING = 1.2, 0.97
+_MAX_CONE_FACTOR = 64.0
+_ROOMY_FRACTION = 0.85  # share of a pool: if less is used, cones become narrower
 
 
 class Chosen(NamedTuple):
@@ -36,8 +37,8 @@ class Chosen(NamedTuple):
 
 
 class RecordedFrame:
-    """What `DeviceFrame` and `HostFrame` share. A frame is `draw`, then `look` where its camera
-    moves, then `finish`.
+    """What `DeviceFrame` and `HostFrame` share. A frame is `draw`, then `look_ahead` where its
+    camera moves, then `finish`.
 
     Attributes:
         batch: Most bricks, and most node tiles, that are chosen in a frame.
@@ -51,45 +52,45 @@ class RecordedFrame:
         self._production, self.batch = production, batch
         self.trees = [*production.trees.values()]
         self.cache = cache = production.cache
-        self._most = min(max(_MOST_LISTED, batch), cache.nodes.request_tn.numel())
+        self._list_capacity = min(max(_MAX_LISTED_NODES, batch), cache.nodes.request_tn.numel())
         device = cache.frame_1.device
         # Requests of the last picture, and of the look-ahead: nodes and their words.
-        self._requests = torch.zeros((2, 2, self._most), dtype=torch.int32, device=device)
-        self._unused = torch.zeros(2, dtype=torch.int64, device=device)  # tiles, bricks
+        self._requests = torch.zeros((2, 2, self._list_capacity), dtype=torch.int32, device=device)
+        self._unused_slots = torch.zeros(2, dtype=torch.int64, device=device)  # tiles, bricks
         # Counts since the last frame: tiles and bricks made, nodes that need none, tiles and bricks
         # replaced, nodes failed.
-        self._made = self._unused.new_zeros(6)
-        self._none = self._unused.new_zeros(1)
+        self._outcomes = self._unused_slots.new_zeros(6)
+        self._zero = self._unused_slots.new_zeros(1)
         self._fit = fit
         # Factor by which cones are wider than the camera's, so that a view fits the pools.
-        self._coarser = torch.ones(1, dtype=torch.float64, device=device)
+        self._cone_factor = torch.ones(1, dtype=torch.float64, device=device)
 
-    def draw(self, view: View, ahead: bool = False) -> Hits:
-        """Traces the picture, and lists its requests. `ahead`: `look` may follow."""
+    def draw(self, view: View, looks_ahead: bool = False) -> Hits:
+        """Traces the picture, and lists its requests. `looks_ahead`: `look_ahead` may follow."""
         self.cache.frame_1.add_(1)
         if self._fit:
-            view.numbers[:, CONE].mul_(self._coarser)
+            view.numbers[:, CONE].mul_(self._cone_factor)
         hits = view.hits()
-        self._seen, self._ahead = self._list(0), ahead
-        if ahead:
+        self._listed, self._looks_ahead = self._list_requests(0), looks_ahead
+        if looks_ahead:
             self._requests[1].zero_()
-            self._used = self.cache.used()
+            self._picture_use = self.cache.used()
         return hits
 
-    def look(self, trace: Callable[[], Hits]) -> None:
+    def look_ahead(self, trace: Callable[[], Hits]) -> None:
         """Traces the look-ahead rays; what they alone request is listed separately."""
-        words, node = self.cache.nodes.request_tn.view(-1, 1), self._seen.node.to(torch.int64)
+        words, node = self.cache.nodes.request_tn.view(-1, 1), self._listed.node.to(torch.int64)
         before = words[node.clamp(min=0)]
-        listed = (self._seen.word & REQUEST_KINDS) << REQUEST_PENDING_SHIFT
-        put_rows_of(words, node, before | listed[:, None])  # else these would be listed again
+        pending_bits = (self._listed.word & REQUEST_KINDS) << REQUEST_PENDING_SHIFT
+        put_rows_of(words, node, before | pending_bits[:, None])  # else these would be listed again
         trace()
-        self._list(1)
+        self._list_requests(1)
         put_rows_of(words, node, before)
 
-    def _list(self, which: int) -> RequestList:
+    def _list_requests(self, list_index: int) -> RequestList:
         """Lists the requests of the picture (0) or of the look-ahead (1)."""
-        listed = RequestList.collect(self.cache, self._most)
-        torch.stack((listed.node, listed.word), out=self._requests[which])
+        listed = RequestList.collect(self.cache, self._list_capacity)
+        torch.stack((listed.node, listed.word), out=self._requests[list_index])
         return listed
 
     def deeper(self, readbacks: Readbacks) -> int:
@@ -97,37 +98,49 @@ class RecordedFrame:
         return 0
 
     def finish(self, hits: Hits) -> Collected:
-        """Sorts slots by use and counts; those used are the picture's, without those of `look`."""
+        """Sorts slots by use and counts; those used are the picture's, without `look_ahead`'s."""
         use, samples = in_branches(
             self.cache.sort_by_use, lambda: hits.samples.sum(dtype=torch.int64).view(1)
         )
-        ahead = self._none
-        self._unused.copy_(use[0:4:2])
-        if self._ahead:
-            use[1:4:2] = self._used
-            ahead = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
-        told = (self._seen.count, use, samples, self._made, ahead, self._levels())
-        numbers = torch.cat((*told, (self._coarser * COARSER_UNIT).to(torch.int64)))
+        ahead_count = self._zero
+        self._unused_slots.copy_(use[0:4:2])
+        if self._looks_ahead:
+            use[1:4:2] = self._picture_use
+            ahead_count = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
+        counts = (
+            self._listed.count,
+            use,
+            samples,
+            self._outcomes,
+            ahead_count,
+            self._count_levels(),
+        )
+        numbers = torch.cat((*counts, (self._cone_factor * COARSER_UNIT).to(torch.int64)))
         if self._fit:
-            self._widen_cones(use, self._seen.count)
-        self._made.zero_()
-        return Collected(self._seen, numbers)
+            self._widen_cones(use, self._listed.count)
+        self._outcomes.zero_()
+        return Collected(self._listed, numbers)
 
-    def _widen_cones(self, use: Tensor, count: Tensor) -> None:
+    def _widen_cones(self, use: Tensor, request_counts: Tensor) -> None:
         """Widens the next frame's cones if the pools can't hold what this one used and requested,
         and narrows them again, down to the camera's, if there is room. A surface needs bricks in
         proportion to the inverse square of the cones' width. `use` is from `Cache.sort_by_use`,
-        `count` from `compact_requests`: every requested node, pending or not, may need a brick.
+        `request_counts` from `compact_requests`: every requested node, pending or not, may need a
+        brick.
         """
         nodes, bricks = self.cache.nodes.capacity, self.cache.bricks.capacity
-        taken = torch.stack(((use[3] + count[2]) / bricks, (use[1] + count[4]) / nodes)).amax()
-        wider = self._coarser * torch.where(taken > 1, taken.sqrt().clamp(max=_WIDEN), 1.0)
-        narrower = torch.where(taken < _ROOMY, self._coarser * _NARROW, wider)
-        self._coarser.copy_(narrower.clamp(1.0, _WIDEST))
+        needed = torch.stack(
+            ((use[3] + request_counts[2]) / bricks, (use[1] + request_counts[4]) / nodes)
+        ).amax()
+        wider = self._cone_factor * torch.where(
+            needed > 1, needed.sqrt().clamp(max=_MAX_WIDENING), 1.0
+        )
+        narrower = torch.where(needed < _ROOMY_FRACTION, self._cone_factor * _NARROWING, wider)
+        self._cone_factor.copy_(narrower.clamp(1.0, _MAX_CONE_FACTOR))
 
-    def _levels(self) -> Tensor:
+    def _count_levels(self) -> Tensor:
         """Returns `levels_wanted` of the requests; 0 where frames deepen by one level only."""
-        return self._none.expand(1 + DEEPER)
+        return self._zero.expand(1 + DEEPER)
 
     def choose(self) -> tuple[Chosen, Chosen]:
         """Returns the loads and the subdivisions to serve first, in the order of
@@ -138,7 +151,7 @@ class RecordedFrame:
         node, priority = choose_requests(
             self._requests,
             nodes.loc_t4,
-            self._unused,
+            self._unused_slots,
             nodes.nodes_per_tile,
             self.batch,
             self._production.scheduler.order == "coarse",

@@ -41,8 +41,8 @@ class ProducedTree:
     @property
     def patience(self) -> float:
         """Seconds after which an answer that has not come is given up."""
-        own = self.producer.patience
-        return self.engine_patience if own is None else own
+        producer_patience = self.producer.patience
+        return self.engine_patience if producer_patience is None else producer_patience
 
     def wait(self, answer: Any) -> Any:
         """Returns the producer's answer; waits for a future, at most for `patience`."""
@@ -68,7 +68,7 @@ class RequestBatch:
     targets: Targets  # nodes to fill, or to subdivide
     parents: Mapping[str, Tensor] | None = None  # (k, z, y, x, c) bricks, where needed
     coarse: bool = False  # their bricks take coarse slots
-    turn: int | None = None  # of the `HostFrame` that asks; targets are then on the host
+    generation: int | None = None  # of the `HostFrame` that asks; targets are then on the host
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -76,7 +76,7 @@ class RequestBatch:
     def by_slots(self) -> list[RequestBatch]:
         """Returns the batch; or, where its bricks take both kinds of slots, a batch for each."""
         channels = self.source.producer.channels.values()
-        if not len(self) or self.kind != REQUEST_LOAD or not any(one.coarse for one in channels):
+        if not len(self) or self.kind != REQUEST_LOAD or not any(c.coarse for c in channels):
             return [self] if len(self) else []
         coarse = self.loc[:, 3] < self.source.tree.depth
         count, parts = int(coarse.sum()), []
@@ -89,8 +89,8 @@ class RequestBatch:
 
     def halves(self) -> tuple[RequestBatch, RequestBatch]:
         """Returns the first half, and the rest: asked separately, a bad node fails alone."""
-        half = len(self) // 2
-        return self[:half], self[half:]
+        middle = len(self) // 2
+        return self[:middle], self[middle:]
 
     def __getitem__(self, index: slice | Tensor) -> RequestBatch:
         if isinstance(index, Tensor):
@@ -103,7 +103,7 @@ class RequestBatch:
     @property
     def nodes(self) -> Nodes:
         """The nodes that the producer is asked for; a new object: `Nodes` caches positions."""
-        layout = self.source.layout if self.turn is None else self.source.host_layout
+        layout = self.source.layout if self.generation is None else self.source.host_layout
         return Nodes(self.loc, layout, coarse=self.coarse, parents=self.parents)
 
     @cached_property
@@ -122,16 +122,16 @@ class RequestBatch:
         """How many items an answer has for each node of the batch."""
         return len(self.loc) // len(self)
 
-    def failed(self, answer: Regions | Bricks) -> tuple[dict[int, str], Tensor]:
+    def node_errors(self, answer: Regions | Bricks) -> tuple[dict[int, str], Tensor]:
         """Returns why nodes failed, by index in the batch: the first error among a node's items;
         and (k,) bool, which nodes did not fail.
         """
-        found: dict[int, str] = {}
+        reasons: dict[int, str] = {}
         for index in sorted(answer.errors):
-            found.setdefault(index // self.per_node, answer.errors[index])
-        keep = torch.ones(len(self), dtype=torch.bool)
-        keep[list(found)] = False
-        return found, keep
+            reasons.setdefault(index // self.per_node, answer.errors[index])
+        kept = torch.ones(len(self), dtype=torch.bool)
+        kept[list(reasons)] = False
+        return reasons, kept
 
     def alias_tree(self, answer: Regions | Bricks) -> int:
         """Number of the tree in which the alias targets of an answer lie."""
@@ -141,13 +141,13 @@ class RequestBatch:
     def ask(self) -> Any:
         """Calls the producer."""
         producer = self.source.producer
-        ask = producer.fill if self.kind == REQUEST_LOAD else producer.classify
-        return ask(self.nodes)
+        producer_call = producer.fill if self.kind == REQUEST_LOAD else producer.classify
+        return producer_call(self.nodes)
 
     def check(self, answer: Any) -> Regions | Bricks:
         """Checks an answer; see producers/answer.py."""
-        check = checked_bricks if self.kind == REQUEST_LOAD else checked_regions
-        return check(answer, self.nodes, self.source.producer)
+        check_answer = checked_bricks if self.kind == REQUEST_LOAD else checked_regions
+        return check_answer(answer, self.nodes, self.source.producer)
 
 
 class Answered(NamedTuple):
@@ -172,15 +172,15 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
     low = nodes.loc[:, :3] * (nodes.scale * layout.brick_size)[:, None]
     kind = torch.where((low >= layout.extent_3).any(1), Region.EMPTY, answer.kind)
     brick = brick_words(kind)
-    leaf = (brick != ABSENT) | (kind == Region.DATA_MAX_DEPTH) | (nodes.depth >= layout.depth)
-    child = torch.where(leaf, TERMINAL, ABSENT).to(torch.int32)
+    is_leaf = (brick != ABSENT) | (kind == Region.DATA_MAX_DEPTH) | (nodes.depth >= layout.depth)
+    child = torch.where(is_leaf, TERMINAL, ABSENT).to(torch.int32)
     constants, ranges = dict(answer.constants), dict(answer.ranges)
-    for name, words in cache.nodes.constants.items():  # overwrites what other trees left there
+    for name, stored in cache.nodes.constants.items():  # overwrites what other trees left there
         if name not in constants:
-            shape = (len(kind), words.shape[-1])
-            constants[name] = torch.zeros(shape, dtype=words.dtype, device=kind.device)
+            shape = (len(kind), stored.shape[-1])
+            constants[name] = torch.zeros(shape, dtype=stored.dtype, device=kind.device)
         if name not in ranges:
-            ranges[name] = _untold_range(cache, name, kind, answer.constants.get(name))
+            ranges[name] = _default_range(cache, name, kind, answer.constants.get(name))
 
     def by_tile(values: Tensor) -> Tensor:
         return values.unflatten(0, (len(batch), -1))
@@ -196,16 +196,16 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
     )
 
 
-def _untold_range(cache: Cache, name: str, kind: Tensor, constant: Tensor | None) -> Tensor:
+def _default_range(cache: Cache, name: str, kind: Tensor, constant: Tensor | None) -> Tensor:
     """Returns (k, 2, c) ranges not given: constants (k, c) of CONSTANT nodes, else the dtype's."""
     channel = cache.bricks.channels[name]
     shape, dtype, device = (len(kind), channel.width), channel.dtype, kind.device
-    ends = [torch.full(shape, end, dtype=dtype, device=device) for end in channel.limits]
-    widest = torch.stack([movable(end) for end in ends], 1)
+    limits = [torch.full(shape, limit, dtype=dtype, device=device) for limit in channel.limits]
+    ranges = torch.stack([movable(limit) for limit in limits], 1)
     if constant is not None:
         uniform = (kind == Region.CONSTANT)[:, None, None]
-        widest = torch.where(uniform, movable(constant)[:, None].expand(-1, 2, -1), widest)
-    return widest.view(channel.dtype)
+        ranges = torch.where(uniform, movable(constant)[:, None].expand(-1, 2, -1), ranges)
+    return ranges.view(channel.dtype)
 
 
 def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, tuple[RequestBatch, Bricks]]:
@@ -224,7 +224,7 @@ def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, tuple[RequestBa
     return groups
 
 
-def shipped(
+def ship_voxels(
     batch: RequestBatch, answer: Regions | Bricks, staging: Staging | None
 ) -> Regions | Bricks | Shipment:
     """Sends a checked answer to the device if it is only voxels, on the host; else returns it."""
@@ -236,7 +236,7 @@ def shipped(
     return staging.send(answer.data)
 
 
-def send_ahead(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
+def check_and_ship(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
     """Sends an answer to the device if it is only valid voxels, on the host; else returns it."""
     data = answer.data if isinstance(answer, Bricks) else answer
     if not isinstance(data, Mapping) or not all(
@@ -248,5 +248,5 @@ def send_ahead(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
         checked = batch.check(answer)
     except ValueError:
         return answer  # the frame reports it
-    sent = answer if checked.errors else shipped(batch, checked, staging)
-    return sent if isinstance(sent, Shipment) else answer
+    shipped = answer if checked.errors else ship_voxels(batch, checked, staging)
+    return shipped if isinstance(shipped, Shipment) else answer

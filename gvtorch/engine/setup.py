@@ -114,18 +114,26 @@ def make_pools(
     if not fine:
         raise ValueError("Engine: producers must have a channel that is not coarse")
     branching = max(producer.branching for producer in producers.values())
-    tile = branching**3 * (8 + 3 * sum(channel.nbytes for channel in fine.values()))
-    brick, whole = brick_bytes(fine, options), brick_bytes(channels, options)
+    tile_nbytes = branching**3 * (8 + 3 * sum(channel.nbytes for channel in fine.values()))
+    fine_nbytes, all_nbytes = brick_bytes(fine, options), brick_bytes(channels, options)
     roots, coarse = len(producers), 0
-    if whole > brick:
-        size = check.nbytes("Engine", "brick_pool", options.brick_pool)
-        average = brick + options.coarse_share * (whole - brick)
-        coarse = max(roots + 1, int(options.coarse_share * size / average))
-    beside = coarse * (whole - brick)
-    tiles = _slots("node_pool", options.node_pool, tile, roots + 1 + branching)
-    bricks = _slots("brick_pool", options.brick_pool, brick, max(roots, coarse) + 1, beside)
+    if all_nbytes > fine_nbytes:
+        pool_nbytes = check.nbytes("Engine", "brick_pool", options.brick_pool)
+        mean_nbytes = fine_nbytes + options.coarse_share * (all_nbytes - fine_nbytes)
+        coarse = max(roots + 1, int(options.coarse_share * pool_nbytes / mean_nbytes))
+    coarse_nbytes = coarse * (all_nbytes - fine_nbytes)
+    tiles = _count_slots("node_pool", options.node_pool, tile_nbytes, roots + 1 + branching)
+    bricks = _count_slots(
+        "brick_pool", options.brick_pool, fine_nbytes, max(roots, coarse) + 1, coarse_nbytes
+    )
     _check_memory(
-        producers, tiles, tiles * tile, bricks, bricks * brick + beside, branching, device
+        producers,
+        tiles,
+        tiles * tile_nbytes,
+        bricks,
+        bricks * fine_nbytes + coarse_nbytes,
+        branching,
+        device,
     )
     nodes = NodePool(tiles, channels, branching=branching, device=device)
     shape = {"brick_size": options.brick_size, "border": options.border, "coarse": coarse}
@@ -142,30 +150,34 @@ def _check_memory(
     device: torch.device,
 ) -> None:
     """Raises ValueError if an engine would take more memory than is free."""
-    rest = tiles * (_TILE_BYTES + 2 * branching**3) + bricks * _BRICK_BYTES
-    caches = sum(producer.host_bytes for producer in producers.values())
-    parts = {"node_pool": node_bytes, "brick_pool": brick_bytes, "their bookkeeping": rest}
-    needs = [(device, parts), (torch.device("cpu"), {"host caches": caches})]
+    bookkeeping = tiles * (_TILE_BYTES + 2 * branching**3) + bricks * _BRICK_BYTES
+    cache_nbytes = sum(producer.host_bytes for producer in producers.values())
+    parts = {"node_pool": node_bytes, "brick_pool": brick_bytes, "their bookkeeping": bookkeeping}
+    needs = [(device, parts), (torch.device("cpu"), {"host caches": cache_nbytes})]
     if device.type == "cpu":
-        needs = [(device, parts | {"host caches": caches})]
-    for place, taken in needs:
-        cuda = place.type == "cuda"
-        free = torch.cuda.mem_get_info(place)[0] if cuda else memory_free()
-        if sum(taken.values()) > free:
-            told = ", ".join(f"{name} {amount(size)}" for name, size in taken.items() if size)
-            total = amount(sum(taken.values()))
-            raise ValueError(f"Engine: {told} take {total}, {place} has {amount(free)} free")
+        needs = [(device, parts | {"host caches": cache_nbytes})]
+    for memory_device, needed in needs:
+        cuda = memory_device.type == "cuda"
+        free = torch.cuda.mem_get_info(memory_device)[0] if cuda else memory_free()
+        if sum(needed.values()) > free:
+            listing = ", ".join(f"{name} {amount(size)}" for name, size in needed.items() if size)
+            total = amount(sum(needed.values()))
+            raise ValueError(
+                f"Engine: {listing} take {total}, {memory_device} has {amount(free)} free"
+            )
 
 
-def _slots(name: str, given: int | str, slot: int, least: int, coarse: int = 0) -> int:
+def _count_slots(
+    name: str, pool_size: int | str, slot_nbytes: int, min_count: int, coarse_nbytes: int = 0
+) -> int:
     """Returns how many slots fit into a pool's bytes, less those set aside for coarse channels."""
-    size = check.nbytes("Engine", name, given)
-    count = max(0, size - coarse) // slot
-    if count < least:
-        kinds = f" beside {coarse} bytes for coarse channels" if coarse else ""
+    size = check.nbytes("Engine", name, pool_size)
+    count = max(0, size - coarse_nbytes) // slot_nbytes
+    if count < min_count:
+        beside = f" beside {coarse_nbytes} bytes for coarse channels" if coarse_nbytes else ""
         raise ValueError(
-            f"Engine: {name} of {size} bytes holds {count} slots of {slot} bytes{kinds}, "
-            f"at least {least} are needed ({least * slot + coarse} bytes)"
+            f"Engine: {name} of {size} bytes holds {count} slots of {slot_nbytes} bytes{beside}, "
+            f"at least {min_count} are needed ({min_count * slot_nbytes + coarse_nbytes} bytes)"
         )
     return count
 
@@ -178,10 +190,11 @@ def _all_channels(producers: Mapping[str, Producer]) -> dict[str, Channel]:
         if "channels" not in vars(producer):
             kind = type(producer).__name__
             raise ValueError(f"Engine: {kind}.__init__ must call super().__init__(extent, ...)")
-        for channel, what in producer.channels.items():
-            if channels.setdefault(channel, what) != what:
+        for channel_name, channel in producer.channels.items():
+            if channels.setdefault(channel_name, channel) != channel:
                 raise ValueError(
-                    f"Engine: trees disagree on channel {channel!r}: {channels[channel]} and {what}"
+                    f"Engine: trees disagree on channel {channel_name!r}: "
+                    f"{channels[channel_name]} and {channel}"
                 )
     return channels
 
@@ -226,46 +239,48 @@ def make_tree(
     nodes.tree_t[number] = number
     if any(channel.coarse for channel in producer.channels.values()):
         cache.finest[number] = layout.depth
-    made = ProducedTree(name, tree, producer, layout, options.patience)
+    source = ProducedTree(name, tree, producer, layout, options.patience)
     try:
-        fill_root(cache, made)
+        fill_root(cache, source)
     except Exception as error:
         producer.close()
-        said = one_line(error)
+        message = one_line(error)
         if not isinstance(error, (ValueError, ProductionError)):
-            said = f"{type(error).__name__}: {said}"  # "division by zero" alone tells little
-        raise ProductionError(f"Engine: the root of tree {name!r} can't be made: {said}") from error
+            message = f"{type(error).__name__}: {message}"  # "division by zero" alone tells little
+        raise ProductionError(
+            f"Engine: the root of tree {name!r} can't be made: {message}"
+        ) from error
     producer.layout = layout  # it serves this engine now
-    return made
+    return source
 
 
-def fill_root(cache: Cache, made: ProducedTree) -> None:
+def fill_root(cache: Cache, source: ProducedTree) -> None:
     """Writes the root's content into its slots, which are reserved for it."""
-    nodes, index, producer = cache.nodes, made.tree.root, made.producer
-    number = index // nodes.nodes_per_tile
+    nodes, index, producer = cache.nodes, source.tree.root, source.producer
+    tile = index // nodes.nodes_per_tile
     loc = torch.zeros((1, 4), dtype=torch.int64, device=nodes.child_tn.device)
-    root = Nodes(loc, made.layout, coarse=bool(cache.finest[number] > 0))
-    regions = checked_regions(made.wait(producer.classify(root)), root, producer)
+    root = Nodes(loc, source.layout, coarse=bool(cache.finest[tile] > 0))
+    regions = checked_regions(source.wait(producer.classify(root)), root, producer)
     _raise_first(regions.errors)
     for channel, tensor in regions.ranges.items():
-        movable(nodes.ranges[channel])[number, 0] = movable(tensor)[0]
+        movable(nodes.ranges[channel])[tile, 0] = movable(tensor)[0]
     kind, constants = Region(int(regions.kind[0])), regions.constants
     if kind in (Region.DATA, Region.DATA_MAX_DEPTH):
-        bricks = checked_bricks(made.wait(producer.fill(root)), root, producer)
+        bricks = checked_bricks(source.wait(producer.fill(root)), root, producer)
         _raise_first(bricks.errors)
-        found = kind if bricks.kind is None else Region(int(bricks.kind[0]))
-        if found not in (Region.DATA, Region.DATA_MAX_DEPTH):
-            kind, constants = found, bricks.constants
+        brick_kind = kind if bricks.kind is None else Region(int(bricks.kind[0]))
+        if brick_kind not in (Region.DATA, Region.DATA_MAX_DEPTH):
+            kind, constants = brick_kind, bricks.constants
     if kind == Region.ALIAS:
         raise ValueError("the root can't be an ALIAS")
     for channel, tensor in constants.items():
-        movable(nodes.constants[channel])[number, 0] = movable(tensor)[0]
+        movable(nodes.constants[channel])[tile, 0] = movable(tensor)[0]
     if kind in (Region.EMPTY, Region.CONSTANT):
         nodes.brick_tn.view(-1)[index] = EMPTY if kind == Region.EMPTY else CONSTANT
         return
-    if made.layout.depth > 0 and kind != Region.DATA_MAX_DEPTH:
+    if source.layout.depth > 0 and kind != Region.DATA_MAX_DEPTH:
         nodes.child_tn.view(-1)[index] = ABSENT
-    slot = torch.tensor([number], device=root.loc.device)
+    slot = torch.tensor([tile], device=root.loc.device)
     write_slots(cache, slot, slot * nodes.nodes_per_tile, bricks.data)
 
 
@@ -280,11 +295,11 @@ def make_recorded_frame(
     """Returns the recorded frame of these producers; None where they answer neither all on the
     device nor all from the host, have coarse channels, or need parents' bricks on the host.
     """
-    producers = [one.producer for one in production.trees.values()]
-    if any(channel.coarse for one in producers for channel in one.channels.values()):
+    producers = [source.producer for source in production.trees.values()]
+    if any(channel.coarse for producer in producers for channel in producer.channels.values()):
         return None
-    if all(one.on_device for one in producers):
+    if all(producer.on_device for producer in producers):
         return DeviceFrame(production, batch, fit)
-    if all(one.on_host and not one.needs_parent for one in producers):
+    if all(producer.on_host and not producer.needs_parent for producer in producers):
         return HostFrame(production, batch, fit)
     return None

@@ -19,12 +19,12 @@ from ..base.records import RenderStats, add
 from ..cache import KINDS, RequestList
 from ..cache.requests import deeper
 
-_AHEAD = 3  # most frames that the host may be ahead of the device
+_MAX_FRAMES_AHEAD = 3  # most frames that the host may be ahead of the device
 #: Fields of `FrameStats` that are known when the device has finished the frame.
-_LATE = {"milliseconds", "stages", "samples", "tiles_used", "bricks_used"}
-_LATE |= {"requests", "misses", "overflow", "converged", "ahead", "coarser"}
+_DEVICE_FIELDS = {"milliseconds", "stages", "samples", "tiles_used", "bricks_used"}
+_DEVICE_FIELDS |= {"requests", "misses", "overflow", "converged", "ahead", "coarser"}
 COARSER_UNIT = 1 << 20  # 1.0 in `Counts.coarser`, which is fixed-point
-_settling = threading.RLock()  # one thread completes statistics, others wait for it
+_settle_lock = threading.RLock()  # one thread completes statistics, others wait for it
 
 
 @dataclass(kw_only=True, repr=False)
@@ -61,29 +61,29 @@ class FrameStats(RenderStats):
     capacity_exceeded: bool = False  # a request found no slot: all were in use
 
     def __post_init__(self) -> None:
-        self._unread: tuple[Callable[[], None], ...] = ()
-        self._begun = False  # a thread is completing them
+        self._completions: tuple[Callable[[], None], ...] = ()
+        self._is_settling = False  # a thread is completing them
 
     def __getattribute__(self, name: str) -> Any:
-        if name in _LATE and (self._unread or self._begun):
+        if name in _DEVICE_FIELDS and (self._completions or self._is_settling):
             self.settle()
         return super().__getattribute__(name)
 
     def later(self, complete: Callable[[], None]) -> None:
         """Lets `settle` call `complete`, which waits for the device and sets fields."""
-        self._unread = (*self._unread, complete)
+        self._completions = (*self._completions, complete)
 
     def settle(self) -> FrameStats:
         """Waits until the device has finished the frame; returns the statistics, now complete."""
-        with _settling:
-            if self._unread:
-                self._begun = True
-                unread, self._unread = self._unread, ()
+        with _settle_lock:
+            if self._completions:
+                self._is_settling = True
+                completions, self._completions = self._completions, ()
                 try:
-                    for complete in unread:
+                    for complete in completions:
                         complete()
                 finally:
-                    self._begun = False
+                    self._is_settling = False
         return self
 
     def following(self, before: FrameStats) -> FrameStats:
@@ -103,27 +103,29 @@ class FrameStats(RenderStats):
 
     def after(self, before: RenderStats) -> RenderStats:
         """See `RenderStats.after`; the whole has converged if both parts have."""
-        whole = super().after(before)
-        if isinstance(whole, FrameStats) and isinstance(before, FrameStats):
-            whole.converged &= before.converged
-            whole.capacity_exceeded |= before.capacity_exceeded
-        return whole
+        combined = super().after(before)
+        if isinstance(combined, FrameStats) and isinstance(before, FrameStats):
+            combined.converged &= before.converged
+            combined.capacity_exceeded |= before.capacity_exceeded
+        return combined
 
     @property
     def miss_rate(self) -> float:
         """Requested bricks over requested and used ones. A pending brick counts once."""
-        asked = self.requests.get("load", 0)
-        return asked / max(1, asked + self.bricks_used)
+        requested = self.requests.get("load", 0)
+        return requested / max(1, requested + self.bricks_used)
 
     def as_dict(self) -> dict[str, object]:
         """Returns plain values, ready for JSON."""
         return {**asdict(self), "miss_rate": self.miss_rate}
 
     def __repr__(self) -> str:
-        made = ", ".join(f"{number} {name}" for name, number in self.produced.items())
-        known = "not read back" if self._unread else "converged" * self.converged or "misses some"
-        lost = f"; {self.failed} nodes failed: Engine.failures" if self.failed else ""
-        return f"FrameStats(frame {self.frame}: produced {made}; {known}{lost})"
+        produced = ", ".join(f"{number} {name}" for name, number in self.produced.items())
+        state = (
+            "not read back" if self._completions else "converged" * self.converged or "misses some"
+        )
+        failures = f"; {self.failed} nodes failed: Engine.failures" if self.failed else ""
+        return f"FrameStats(frame {self.frame}: produced {produced}; {state}{failures})"
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self.settle())
@@ -133,7 +135,7 @@ class Counts(NamedTuple):
     """The counts of a frame that are copied to the host."""
 
     listed: int  # requested nodes in the list
-    found: int  # requested nodes that are not pending
+    not_pending: int  # requested nodes that are not pending
     misses: int  # requested nodes, pending or not
     load: int  # requests of each kind in the list
     subdivide: int
@@ -176,9 +178,9 @@ class Readback:
         self, stats: FrameStats, collected: Collected, earlier: Iterable[Readback] = ()
     ) -> None:
         """Starts the copy. `earlier`: readbacks of earlier frames, which may not have asked yet."""
-        self.stats, (self.requests, numbers, self._ask) = stats, collected
-        self._earlier = tuple(earlier)
-        self._asked: int | None = None
+        self.stats, (self.requests, numbers, self._ask_producers) = stats, collected
+        self._earlier_readbacks = tuple(earlier)
+        self._asked_count: int | None = None
         self.pending = stats.pending > 0  # answers were on their way while it was traced
         self._numbers, self._event = numbers, None
         self._counts: Counts | None = None
@@ -207,24 +209,25 @@ class Readback:
 
     def ask(self) -> int:
         """Asks producers for the nodes that the device chose, once; returns how many. Waits."""
-        with _settling:  # only one of the threads that render and settle asks
-            if self._asked is None:
+        with _settle_lock:  # only one of the threads that render and settle asks
+            if self._asked_count is None:
                 self.wait()
-                ask, numbers = self._ask, self._numbers[len(Counts._fields) :]
-                self._asked = 0 if ask is None else ask(numbers)
-        return self._asked
+                ask_producers, numbers = self._ask_producers, self._numbers[len(Counts._fields) :]
+                self._asked_count = 0 if ask_producers is None else ask_producers(numbers)
+        return self._asked_count
 
     def converged(self) -> bool:
         """Returns whether nothing that could be served was missing; waits for the counts."""
-        for one in self._earlier:  # their nodes are pending, so this frame does not find them
-            self.pending |= one.ask() > 0
-        self._earlier = ()
-        return not (self.wait().found or self.pending)
+        # The nodes of earlier frames are pending, so this frame does not find them.
+        for readback in self._earlier_readbacks:
+            self.pending |= readback.ask() > 0
+        self._earlier_readbacks = ()
+        return not (self.wait().not_pending or self.pending)
 
     def _complete(self) -> None:
         stats, counts = self.stats, self.wait()
         add(stats.requests, counts.by_kind())
-        stats.overflow, stats.converged = counts.found - counts.listed, self.converged()
+        stats.overflow, stats.converged = counts.not_pending - counts.listed, self.converged()
         for name in stats.produced:
             stats.produced[name] += getattr(counts, name)
         for name in stats.evicted:
@@ -249,7 +252,7 @@ class Readbacks(deque[Readback]):
         newest = None
         while self and (
             self[0].arrived
-            or (wait or len(self) > _AHEAD)
+            or (wait or len(self) > _MAX_FRAMES_AHEAD)
             or (newest is not None and newest.wait().listed > 0)
         ):
             newest = self._take()
@@ -262,7 +265,7 @@ class Readbacks(deque[Readback]):
 
     def hold_back(self) -> None:
         """Waits for the oldest frames while the host is too far ahead of the device."""
-        while len(self) > _AHEAD:
+        while len(self) > _MAX_FRAMES_AHEAD:
             self._take()
 
     @property
@@ -332,10 +335,10 @@ class Report:
         for name in ("samples", "bricks", "tiles", "megabytes"):
             table.add_row(f"{name} / s", f"{content[f'{name}_per_second']:,.0f}", "")
         table.add_row("bricks missed, of those wanted", f"{content['miss_rate']:.2%}", "")
-        for name, share in content["occupancy"].items():
-            table.add_row(f"{name} in use", f"{share:.1%}", "")
-        for name, size in content["memory"].items():
-            table.add_row(f"{name}, MB", f"{size / 1e6:.1f}", "")
+        for name, fraction in content["occupancy"].items():
+            table.add_row(f"{name} in use", f"{fraction:.1%}", "")
+        for name, nbytes in content["memory"].items():
+            table.add_row(f"{name}, MB", f"{nbytes / 1e6:.1f}", "")
         return table
 
     def __repr__(self) -> str:

@@ -22,7 +22,7 @@ from .thin_lens import ThinLens, ThroughLens
 from .tracer import Tracer
 
 
-def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRays:
+def with_effects(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRays:
     """Wraps a tree's tracer in the effects of the options. Each ray passes through lighting, then
     the clip, then the lens, then the tree; cones to the lights only through clip and tree. `box`:
     (2, 3) world corners of the scene, all trees together. Raises ValueError if the shader must see
@@ -34,21 +34,21 @@ def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRays:
     if options.lighting is None:
         return _clipped(tracer, options, box, lens)
     shader = tracer.shader
-    unlit = _clipped(tracer.seeing(shader.unlit(), options), options, box, lens)
-    lit = shader.transfer if isinstance(shader, Filtered) else shader
-    assert isinstance(lit, LitShader)  # others raise
+    unlit = _clipped(tracer.with_shader(shader.unlit(), options), options, box, lens)
+    lit_shader = shader.transfer if isinstance(shader, Filtered) else shader
+    assert isinstance(lit_shader, LitShader)  # others raise
     lights = options.lighting.lights
-    cones = replace(options, lod="auto")
+    cone_options = replace(options, lod="auto")
     matter = None
     if options.lighting.indirect:
-        early = replace(cones, depth_alpha=0.25 * options.stop_alpha)
-        matter = _clipped(tracer.seeing(shader.matter(), early), options, box)
+        matter_options = replace(cone_options, depth_alpha=0.25 * options.stop_alpha)
+        matter = _clipped(tracer.with_shader(shader.matter(), matter_options), options, box)
     return Lighted(
         trace=unlit,
-        blocker=_clipped(tracer.seeing(shader.blocker(), cones), options, box),
+        blocker=_clipped(tracer.with_shader(shader.blocker(), cone_options), options, box),
         matter=matter,
         lighting=options.lighting.placed(box),
-        lights=(lit.light,) if lights is None else lights,
+        lights=(lit_shader.light,) if lights is None else lights,
         material=shader.material(),
         voxel=max(tracer.tree.spacing),
         cone_scale=options.cone_scale,
@@ -57,20 +57,20 @@ def around(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRays:
 
 
 def check_fits(shader: Shader, options: RenderOptions) -> None:
-    """Raises ValueError if a shader does not support the options: see `around`."""
+    """Raises ValueError if a shader does not support the options: see `with_effects`."""
     if options.lighting is not None:
         shader.unlit()
         if options.lighting.indirect:
             shader.matter()
     clip, layer = options.clip, options.layer
-    cuts = {
+    features = {
         "lens": options.lens is not None,
         "clip with caps": clip is not None and clip.caps,
         "clip of several pieces": clip is not None and not clip.whole and not shader.projection,
         "translucent layer": layer is not None and layer.alpha is not None,
     }
-    for name, cut in cuts.items():
-        if cut and shader.whole_ray:
+    for name, is_used in features.items():
+        if is_used and shader.whole_ray:
             kind = type(shader).__name__
             raise ValueError(f"render: {kind} sees a ray in one go, so it has no {name}")
 
@@ -79,9 +79,9 @@ def _clipped(
     tracer: Tracer, options: RenderOptions, box: Tensor, lens: ThinLens | None = None
 ) -> TraceRays:
     """Wraps a tracer in the lens (in world units) and the options' clip."""
-    opened = tracer.shader if options.clip is None else tracer.shader.opened()
-    if opened is not tracer.shader:
-        tracer = tracer.seeing(opened, options)
+    opened_shader = tracer.shader if options.clip is None else tracer.shader.opened()
+    if opened_shader is not tracer.shader:
+        tracer = tracer.with_shader(opened_shader, options)
     trace: TraceRays = tracer
     if lens is not None:
         trace = ThroughLens(trace, lens, options.cone_scale)
@@ -109,13 +109,13 @@ def _slab(
     """Returns the tracer of the intervals behind cuts; None: `trace` traces them, too."""
     if surface is not None:
         return _surface_slab(surface, tracer, options)
-    if tracer.names is None:
+    if tracer.label_names is None:
         return None
     # A cap shows the label right behind the cut, however thin the matter is there.
-    first = tracer.seeing(tracer.shader, replace(options, depth_alpha=0.0))
+    trace_label = tracer.with_shader(tracer.shader, replace(options, depth_alpha=0.0))
 
     def slab(rays: Rays) -> Hits:
-        return replace(trace(rays), label=first(replace(rays, transmittance=None)).label)
+        return replace(trace(rays), label=trace_label(replace(rays, transmittance=None)).label)
 
     return slab
 
@@ -124,8 +124,8 @@ def _surface_slab(surface: CutSurface, tracer: Tracer, options: RenderOptions) -
     """Returns the tracer of the intervals behind cuts through isosurfaces: opaque where the first
     value is inside the surface, in its unlit colour. Under a clip the isosurface itself is hollow.
     """
-    trace_value = tracer.seeing(surface.value, options)
-    trace_colors = surface.colors and tracer.seeing(surface.colors, options)
+    trace_value = tracer.with_shader(surface.value, options)
+    trace_colors = surface.colors and tracer.with_shader(surface.colors, options)
 
     def slab(rays: Rays) -> Hits:
         hits = trace_value(rays)
@@ -150,20 +150,22 @@ def _project_pieces(tracer: Tracer, pieces: Iterable[Rays]) -> Hits:
     """Projects pieces of the same rays: to the largest or smallest value of all, at the nearest
     point that has it, or to the mean, weighted by the pieces' lengths inside the tree's box.
     """
-    rays, which = list(pieces), tracer.shader.projection
+    rays, kind = list(pieces), tracer.shader.projection
     hits = [tracer(piece) for piece in rays]
-    depths = torch.stack([one.depth for one in hits])  # (pieces, r, 1)
-    known = depths < torch.inf
-    values = torch.stack([one.features for one in hits if one.features is not None])
-    if which == "mean":
+    depths = torch.stack([piece_hits.depth for piece_hits in hits])  # (pieces, r, 1)
+    is_hit = depths < torch.inf
+    values = torch.stack(
+        [piece_hits.features for piece_hits in hits if piece_hits.features is not None]
+    )
+    if kind == "mean":
         lengths = torch.stack([_length_inside(tracer, piece) for piece in rays])
-        lengths = torch.where(known, lengths.to(values)[..., None], 0)
+        lengths = torch.where(is_hit, lengths.to(values)[..., None], 0)
         value = (values * lengths).sum(0) / lengths.sum(0).clamp(min=1e-30)
     else:
-        sign = 1 if which == "maximum" else -1
-        best = torch.where(known, sign * values, -torch.inf).amax(0)
-        known, value = known & (sign * values == best), sign * best
-    depth = torch.where(known, depths, torch.inf).amin(0)
+        sign = 1 if kind == "maximum" else -1
+        best = torch.where(is_hit, sign * values, -torch.inf).amax(0)
+        is_hit, value = is_hit & (sign * values == best), sign * best
+    depth = torch.where(is_hit, depths, torch.inf).amin(0)
     seen = depth < torch.inf
     value = torch.where(seen, value, 0)
     light = rays[0].light().to(depth)
@@ -171,8 +173,8 @@ def _project_pieces(tracer: Tracer, pieces: Iterable[Rays]) -> Hits:
         color=torch.where(seen, light * _table_color(tracer, value), 0),
         alpha=torch.where(seen, 1, 1 - light),
         depth=depth,
-        samples=torch.stack([one.samples for one in hits]).sum(0, dtype=torch.int32),
-        missed=torch.stack([one.missed for one in hits]).any(0),
+        samples=torch.stack([piece_hits.samples for piece_hits in hits]).sum(0, dtype=torch.int32),
+        missed=torch.stack([piece_hits.missed for piece_hits in hits]).any(0),
         normal=hits[0].normal,
         features=value,
     )
@@ -180,8 +182,8 @@ def _project_pieces(tracer: Tracer, pieces: Iterable[Rays]) -> Hits:
 
 def _length_inside(tracer: Tracer, rays: Rays) -> Tensor:
     """Returns (r,) the world length of each ray inside the tree's box."""
-    own = tracer.inside(rays)
-    enter, leave = tree_span(tracer.tree.place, own.origin, own.direction)
+    tree_rays = tracer.to_tree(rays)
+    enter, leave = tree_span(tracer.tree.place, tree_rays.origin, tree_rays.direction)
     first, last = rays.range.unbind(1)
     return (torch.minimum(last, leave) - torch.maximum(first, enter)).clamp(min=0)
 
@@ -191,7 +193,7 @@ def _table_color(tracer: Tracer, value: Tensor) -> Tensor:
     table = tracer.arguments.table_lm4[0, :, :3]  # (m, 3), evenly spaced
     low, high = tracer.arguments.domain_2.unbind(0)
     last = len(table) - 1
-    place = ((value - low) / (high - low) * last).clamp(0, last)
-    row = place.to(torch.int64).clamp(max=last - 1)
+    position = ((value - low) / (high - low) * last).clamp(0, last)
+    row = position.to(torch.int64).clamp(max=last - 1)
     a, b = (table[(row + k)[:, 0]] for k in (0, 1))
-    return a + (place - row) * (b - a)
+    return a + (position - row) * (b - a)

@@ -16,11 +16,11 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
-from .composite import TraceRays, if_few, scatter_hits, trace_pieces
+from .composite import TraceRays, indices_if_few, scatter_hits, trace_pieces
 
 Face = tuple[float, ...]  # unit normal and offset (a, b, c, d): inside, a x + b y + c z + d >= 0
 Numbers = Sequence[Sequence[float]] | Tensor
-_SEEN = 1e-4  # a cap is drawn where one interval behind the cut has more alpha than this
+_MIN_CAP_ALPHA = 1e-4  # a cap is drawn where one interval behind the cut has more alpha than this
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +44,7 @@ class Clip:
         object.__setattr__(self, "frame", Frame.of("Clip", self.frame))
         check.number("Clip", "cap_opacity", self.cap_opacity, low=0, high=1, open_low=True)
         check.number("Clip", "cap_light", self.cap_light, low=0, high=1)
-        _ = self._own
+        _ = self._checked_faces
 
     def __repr__(self) -> str:
         counts = [f"{name}={len(getattr(self, name))}" for name in Faces._fields]
@@ -57,7 +57,7 @@ class Clip:
         return len(self.boxes) <= 1 and not len(self.without) and not self.caps
 
     @cached_property
-    def _own(self) -> Faces:
+    def _checked_faces(self) -> Faces:
         """The faces in the units of `frame`."""
         for name in Faces._fields:
             if not isinstance(getattr(self, name), (Sequence, Tensor)):
@@ -73,14 +73,14 @@ class Clip:
     def faces(self, box: Tensor) -> Faces:
         """Returns the faces in world units, given the (2, 3) box of the scene."""
         if self.frame is Frame.WORLD:
-            return self._own
+            return self._checked_faces
         centre, side = ((box[0] + box[1]) / 2).tolist(), Frame.BOX.unit(box)
 
-        def place(faces: list[Face]) -> list[Face]:
+        def to_world(faces: list[Face]) -> list[Face]:
             return [(*n, d * side - _dot(n, centre)) for *n, d in faces]
 
-        planes, boxes, without = self._own
-        return Faces(place(planes), [*map(place, boxes)], [*map(place, without)])
+        planes, boxes, without = self._checked_faces
+        return Faces(to_world(planes), [*map(to_world, boxes)], [*map(to_world, without)])
 
 
 class Faces(NamedTuple):
@@ -91,7 +91,7 @@ class Faces(NamedTuple):
     without: list[list[Face]]
 
 
-class _Met(NamedTuple):
+class _FaceCrossing(NamedTuple):
     """A face and rays, in float64. The face's numbers stay on the host, so nothing blocks."""
 
     normal: Sequence[float]
@@ -99,32 +99,44 @@ class _Met(NamedTuple):
     rate: Tensor  # (r,) growth of the height per unit distance along the ray
 
 
-class _MetFaces(NamedTuple):
+class _FaceCrossings(NamedTuple):
     """`Faces`, and where rays meet them: computed once for all pieces and caps."""
 
-    planes: list[_Met]
-    boxes: list[list[_Met]]
-    without: list[list[_Met]]
+    planes: list[_FaceCrossing]
+    boxes: list[list[_FaceCrossing]]
+    without: list[list[_FaceCrossing]]
 
     @staticmethod
-    def of(faces: Faces, rays: Rays) -> _MetFaces:
+    def of(faces: Faces, rays: Rays) -> _FaceCrossings:
         """Computes where rays meet the faces."""
         origin, direction = (
-            one.to(torch.float64).mT.contiguous() for one in (rays.origin, rays.direction)
+            vectors.to(torch.float64).mT.contiguous() for vectors in (rays.origin, rays.direction)
         )
 
-        def meet(some: list[Face]) -> list[_Met]:
-            return [_Met(n, _dot(n, [*origin]) + d, _dot(n, [*direction])) for *n, d in some]
+        def meet(face_list: list[Face]) -> list[_FaceCrossing]:
+            return [
+                _FaceCrossing(n, _dot(n, [*origin]) + d, _dot(n, [*direction]))
+                for *n, d in face_list
+            ]
 
-        return _MetFaces(meet(faces.planes), [*map(meet, faces.boxes)], [*map(meet, faces.without)])
+        return _FaceCrossings(
+            meet(faces.planes), [*map(meet, faces.boxes)], [*map(meet, faces.without)]
+        )
 
-    def of_some(self, which: Tensor) -> _MetFaces:
+    def select(self, index: Tensor) -> _FaceCrossings:
         """Returns the same for some of the rays."""
 
-        def some(met: list[_Met]) -> list[_Met]:
-            return [_Met(one.normal, one.height[which], one.rate[which]) for one in met]
+        def select_rays(crossings: list[_FaceCrossing]) -> list[_FaceCrossing]:
+            return [
+                _FaceCrossing(crossing.normal, crossing.height[index], crossing.rate[index])
+                for crossing in crossings
+            ]
 
-        return _MetFaces(some(self.planes), [*map(some, self.boxes)], [*map(some, self.without)])
+        return _FaceCrossings(
+            select_rays(self.planes),
+            [*map(select_rays, self.boxes)],
+            [*map(select_rays, self.without)],
+        )
 
     def pieces(self, limits: Tensor) -> list[Tensor]:
         """Returns the kept pieces (r, 2) of the limits (r, 2), nearest first. There are as many as
@@ -134,8 +146,8 @@ class _MetFaces(NamedTuple):
         last = torch.maximum(first, last)
         if not (self.boxes or self.without):
             return [torch.stack((first, last), 1)]
-        everything = torch.full_like(first, -torch.inf), torch.full_like(first, torch.inf)
-        boxes, without = ([_convex_span(faces, *everything) for faces in sets] for sets in self[1:])
+        unbounded = torch.full_like(first, -torch.inf), torch.full_like(first, torch.inf)
+        boxes, without = ([_convex_span(faces, *unbounded) for faces in sets] for sets in self[1:])
         all_ends = [end.clamp(first, last) for span in boxes + without for end in span]
         ends = torch.stack([first, last, *all_ends], 1).sort(1).values
         low, high = ends[:, :-1], ends[:, 1:]
@@ -147,12 +159,12 @@ class _MetFaces(NamedTuple):
             kept = kept & ~((a[:, None] <= middle) & (middle <= b[:, None]))
         begins = kept.clone()
         begins[:, 1:] &= ~kept[:, :-1]
-        number = begins.cumsum(1)
+        piece_number = begins.cumsum(1)
         pieces = []
         for piece in range(1, max(1, len(boxes)) + len(without) + 1):
-            own = kept & (number == piece)
-            a = torch.where(own, low, torch.inf).amin(1)
-            b = torch.where(own, high, -torch.inf).amax(1)
+            in_piece = kept & (piece_number == piece)
+            a = torch.where(in_piece, low, torch.inf).amin(1)
+            b = torch.where(in_piece, high, -torch.inf).amax(1)
             span = torch.stack((a, b), 1)
             pieces.append(torch.where((a < b)[:, None], span, first[:, None]))
         return pieces
@@ -167,13 +179,13 @@ class _MetFaces(NamedTuple):
         planes, boxes, without = self
         kept = [(1, face) for faces in (planes, *boxes) for face in faces]
         cut = [(-1, face) for faces in without for face in faces]
-        for side, (own, height, rate) in kept + cut:
-            away = torch.where(side * rate > 0, (height + t * rate).abs(), torch.inf)
-            nearer = away < nearest
+        for side, (face_normal, height, rate) in kept + cut:
+            distance = torch.where(side * rate > 0, (height + t * rate).abs(), torch.inf)
+            nearer = distance < nearest
             cosine = torch.where(nearer, rate.abs(), cosine)
-            sides = zip(own, normal, strict=True)
-            normal = [torch.where(nearer, -side * n, known) for n, known in sides]
-            nearest = torch.minimum(away, nearest)
+            sides = zip(face_normal, normal, strict=True)
+            normal = [torch.where(nearer, -side * n, old) for n, old in sides]
+            nearest = torch.minimum(distance, nearest)
         return cosine, torch.stack(normal, 1)
 
 
@@ -198,36 +210,38 @@ class Clipped:
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
         rays = replace(rays, range=rays.range.to(torch.float64))
-        met = self.meet(rays)
-        pieces = [replace(rays, range=kept) for kept in met.pieces(rays.range)]
+        crossings = self.meet(rays)
+        pieces = [replace(rays, range=kept) for kept in crossings.pieces(rays.range)]
         if self.together is not None and not self.clip.caps:
             return self.together(pieces)
-        cap = partial(self._cap, met, rays.range[:, 0]) if self.clip.caps else None
+        cap = partial(self._cap, crossings, rays.range[:, 0]) if self.clip.caps else None
         return trace_pieces(self.trace, pieces, cap=cap)
 
-    def meet(self, rays: Rays) -> _MetFaces:
+    def meet(self, rays: Rays) -> _FaceCrossings:
         """Computes where rays in world units meet the faces."""
-        return _MetFaces.of(self._faces, rays)
+        return _FaceCrossings.of(self._faces, rays)
 
-    def _cap(self, met: _MetFaces, begin: Tensor, piece: Rays) -> Hits:
-        """Returns the caps of pieces that begin at a cut, not at `begin` (r,). One interval behind
-        the cut gives the colour, the features, and whether there is matter at all.
+    def _cap(self, crossings: _FaceCrossings, range_start: Tensor, piece: Rays) -> Hits:
+        """Returns the caps of pieces that begin at a cut, not at `range_start` (r,). One interval
+        behind the cut gives the colour, the features, and whether there is matter at all.
         """
         first, last = piece.range.unbind(1)
-        end = torch.where(first > begin, torch.minimum(first + self.step, last), first)
-        which = if_few(first < end)
-        if which is not None:
-            caps = self._cap(met.of_some(which), begin[which], piece[which])
-            return scatter_hits(piece, which, caps)
+        end = torch.where(first > range_start, torch.minimum(first + self.step, last), first)
+        index = indices_if_few(first < end)
+        if index is not None:
+            caps = self._cap(crossings.select(index), range_start[index], piece[index])
+            return scatter_hits(piece, index, caps)
         slab = (self.slab or self.trace)(replace(piece, range=torch.stack((first, end), 1)))
         before = piece.light()[:, 0].to(slab.color)  # transmittance before the cap
-        taken = before - (1 - slab.alpha[:, 0])  # light absorbed by the slab
-        alpha = torch.where(taken > _SEEN * before, self.clip.cap_opacity, 0.0).to(before)
-        facing, normal = met.facing(first)
+        absorbed = before - (1 - slab.alpha[:, 0])  # light absorbed by the slab
+        alpha = torch.where(absorbed > _MIN_CAP_ALPHA * before, self.clip.cap_opacity, 0.0).to(
+            before
+        )
+        facing, normal = crossings.facing(first)
         light = 1 - (0.0 if self.unlit else self.clip.cap_light) * (1 - facing)
-        taken = torch.where(alpha > 0, taken, 1.0)
-        part = before * alpha / taken
-        scale = before * alpha * light.to(before) / taken
+        absorbed = torch.where(alpha > 0, absorbed, 1.0)
+        feature_scale = before * alpha / absorbed
+        scale = before * alpha * light.to(before) / absorbed
         after = before * (1 - alpha)
         hit_clear = 1 - self.depth_alpha
         hit = (after < hit_clear) & (before >= hit_clear)
@@ -238,7 +252,7 @@ class Clipped:
             samples=slab.samples,
             missed=slab.missed,
             normal=None if slab.normal is None else normal.to(before) * (alpha > 0)[:, None],
-            features=None if slab.features is None else slab.features * part[:, None],
+            features=None if slab.features is None else slab.features * feature_scale[:, None],
             label=None if slab.label is None else torch.where(hit[:, None], slab.label, -1),
         )
 
@@ -280,7 +294,9 @@ def _box(name: str, numbers: Any) -> list[Face]:
     return faces
 
 
-def _convex_span(faces: Sequence[_Met], first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+def _convex_span(
+    faces: Sequence[_FaceCrossing], first: Tensor, last: Tensor
+) -> tuple[Tensor, Tensor]:
     """Returns (r,) first and last distance, within [first, last], at which rays are inside all
     faces; last < first where they miss.
     """

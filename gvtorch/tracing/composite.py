@@ -25,15 +25,15 @@ def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
     alpha includes that of `front`; else with rays of full light.
     """
     color, alpha, features = back.color, back.alpha, back.features
-    taken = None if back.normal is None else back.normal * (alpha - front.alpha)
+    absorbed = None if back.normal is None else back.normal * (alpha - front.alpha)
     if not dimmed:
         transmittance = 1 - front.alpha
         color, alpha = transmittance * color, front.alpha + transmittance * alpha
         features = None if features is None else transmittance * features
-        taken = None if back.normal is None else transmittance * (back.normal * back.alpha)
+        absorbed = None if back.normal is None else transmittance * (back.normal * back.alpha)
     normal = front.normal if back.normal is None else back.normal
-    if front.normal is not None and taken is not None:
-        normal = normalize(front.normal * front.alpha + taken, dim=1)
+    if front.normal is not None and absorbed is not None:
+        normal = normalize(front.normal * front.alpha + absorbed, dim=1)
     if front.features is not None:
         features = front.features if features is None else front.features + features
     return Hits(
@@ -50,11 +50,11 @@ def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
 
 def _nearer_label(front: Hits, back: Hits) -> Tensor | None:
     """Returns (r, 1) the label of whichever is hit first; None if neither has labels."""
-    given = front.label if front.label is not None else back.label
-    if given is None:
+    label = front.label if front.label is not None else back.label
+    if label is None:
         return None
-    nothing = torch.full_like(given, -1)
-    near, far = (nothing if one.label is None else one.label for one in (front, back))
+    no_label = torch.full_like(label, -1)
+    near, far = (no_label if hits.label is None else hits.label for hits in (front, back))
     return torch.where(front.depth <= back.depth, near, far)
 
 
@@ -69,29 +69,29 @@ def behind(rays: Rays, front: Hits) -> Rays:
     return replace(rays, transmittance=1 - front.alpha[:, 0].to(torch.float64))
 
 
-def if_few(some: Tensor) -> Tensor | None:
-    """Returns the indices where `some` (r,) is true if they are less than half, on the CPU; else
+def indices_if_few(mask: Tensor) -> Tensor | None:
+    """Returns the indices where `mask` (r,) is true if they are less than half, on the CPU; else
     None: for more of them a separate trace saves no time, and on the GPU the host would wait.
     """
-    if some.device.type != "cpu":
+    if mask.device.type != "cpu":
         return None
-    which = some.nonzero()[:, 0]
-    return which if 2 * len(which) < len(some) else None
+    index = mask.nonzero()[:, 0]
+    return index if 2 * len(index) < len(mask) else None
 
 
-def scatter_hits(rays: Rays, which: Tensor, hits: Hits) -> Hits:
-    """Returns the hits of all rays (r), given those of the rays `which` (k,): the others have empty
+def scatter_hits(rays: Rays, index: Tensor, hits: Hits) -> Hits:
+    """Returns the hits of all rays (r), given those of the rays `index` (k,): the others have empty
     ranges, so they hit nothing and keep their transmittance.
     """
     columns: dict[str, Any] = {}
-    for name, found in vars(hits).items():
-        if found is not None:
-            nothing = nothing_like(found, len(rays.origin))
+    for name, values in vars(hits).items():
+        if values is not None:
+            filler = nothing_like(values, len(rays.origin))
             if name == "alpha":
-                nothing = 1 - rays.light().to(found)
+                filler = 1 - rays.light().to(values)
             elif name == "depth":
-                nothing.fill_(torch.inf)
-            columns[name] = nothing.index_put((which,), found)
+                filler.fill_(torch.inf)
+            columns[name] = filler.index_put((index,), values)
     return Hits(**columns)
 
 
@@ -102,14 +102,14 @@ def trace_pieces(trace: TraceRays, pieces: Iterable[Rays], *, cap: TraceRays | N
     """
 
     def trace_open(rays: Rays) -> Hits:
-        which = if_few(rays.range[:, 0] < rays.range[:, 1])
-        return trace(rays) if which is None else scatter_hits(rays, which, trace(rays[which]))
+        index = indices_if_few(rays.range[:, 0] < rays.range[:, 1])
+        return trace(rays) if index is None else scatter_hits(rays, index, trace(rays[index]))
 
-    steps = ((one, piece) for piece in pieces for one in (cap, trace_open) if one is not None)
+    steps = ((step, piece) for piece in pieces for step in (cap, trace_open) if step is not None)
     first, piece = next(steps)
     front = first(piece)
-    for one, piece in steps:
-        front = over(front, one(behind(piece, front)), dimmed=True)
+    for step, piece in steps:
+        front = over(front, step(behind(piece, front)), dimmed=True)
     return front
 
 

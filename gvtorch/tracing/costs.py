@@ -23,7 +23,7 @@ from ..pool import N3Tree
 from ..shaders.module import TransferModule
 from ..shaders.shader import Shader
 from ..shaders.transfer_function import TransferFunction
-from .around import around
+from .around import with_effects
 from .options import RenderOptions, RenderSettings, render_options
 from .pixels import View, tree_stats, using
 from .tracer import Batch, Tracer, march
@@ -32,8 +32,8 @@ from .trees import box_around
 Image = Literal["samples", "nodes", "lod", "age", "fill"]
 IMAGES = get_args(Image)
 
-_RAYS_A_BLOCK = 1 << 16
-_BRICKS_AT_ONCE = 1024
+_RAYS_PER_BLOCK = 1 << 16
+_BRICKS_PER_BATCH = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,21 +73,21 @@ class Cost:
 
         check.one_of("Cost", "image", name, IMAGES)
         if colormap not in ColorMapType.__members__:
-            known = ", ".join(sorted(ColorMapType.__members__))
-            raise ValueError(f"Cost: unknown colormap {colormap!r}; known: {known}")
+            names = ", ".join(sorted(ColorMapType.__members__))
+            raise ValueError(f"Cost: unknown colormap {colormap!r}; known: {names}")
         image = getattr(self, name).to("cpu", torch.float32)
-        known = ~image.isnan()
+        valid = ~image.isnan()
         if high is None:
-            high = float(image[known].max()) if known.any() else 1.0
-        place = ((image - low) / max(high - low, 1e-6)).clamp(0, 1)
+            high = float(image[valid].max()) if valid.any() else 1.0
+        position = ((image - low) / max(high - low, 1e-6)).clamp(0, 1)
         colors = rgb_to_linear_rgb(ColorMap(colormap, 256).colors[:, :, None])[:, :, 0].T
-        color = colors[torch.where(known, place * 255, 0).round().long()[..., 0]] * known
-        nothing = torch.full_like(image, torch.inf)
+        color = colors[torch.where(valid, position * 255, 0).round().long()[..., 0]] * valid
+        no_depth = torch.full_like(image, torch.inf)
         return Picture(
             color=color,
-            alpha=known.float(),
-            depth=nothing,
-            nearest=nothing,
+            alpha=valid.float(),
+            depth=no_depth,
+            nearest=no_depth,
             samples=self.samples.cpu(),
             stats=self.stats,
         )
@@ -127,13 +127,13 @@ def cost(
     box = box_around("cost", {"": tree}, chosen.pose)
     placed = camera.placed(box)
     counter = _Counter(tree, transfer, chosen)
-    traced = around(counter, chosen, box)
+    trace_rays = with_effects(counter, chosen, box)
     numbers = placed.numbers(tree.device)
-    view = View(placed, numbers, lambda rays: traced(counter.begin(rays)), chosen, box)
+    view = View(placed, numbers, lambda rays: trace_rays(counter.begin(rays)), chosen, box)
     with using("cost", [tree]):
         columns = [
             (hits.samples, counter.take_nodes(), *_means(hits))
-            for _, hits in view.blocks(_RAYS_A_BLOCK, progress)
+            for _, hits in view.blocks(_RAYS_PER_BLOCK, progress)
         ]
     joined = [torch.cat(parts) for parts in zip(*columns, strict=True)]
     stats = tree_stats([tree], chosen, joined[0])
@@ -157,24 +157,24 @@ class _Counter(Tracer):
 
     def __init__(self, tree: N3Tree, shader: TransferFunction, options: RenderOptions) -> None:
         super().__init__(tree, shader, options)
-        marks = ("request_tn", "stamp_t", "stamp_b")
-        copies = {name: getattr(self.arguments, name).clone() for name in marks}
+        copied = ("request_tn", "stamp_t", "stamp_b")
+        copies = {name: getattr(self.arguments, name).clone() for name in copied}
         self.arguments = self.arguments._replace(**copies)
         self.component = self.arguments.component
         self.module = TransferModule(shader, min(tree.spacing)).to(tree.device)
         self.fill_b = torch.full_like(tree.bricks.born_b, -1, dtype=torch.float32)
-        self._nodes: Tensor | None = None
+        self._visited_nodes: Tensor | None = None
 
     def begin(self, rays: Rays) -> Rays:
         """Begins a block, and returns its rays numbered, since some may be traced separately."""
         count, device = len(rays.origin), rays.origin.device
-        if self._nodes is None:
-            self._nodes = torch.zeros(count, dtype=torch.int32, device=device)
+        if self._visited_nodes is None:
+            self._visited_nodes = torch.zeros(count, dtype=torch.int32, device=device)
         return replace(rays, sample=torch.arange(count, device=device))
 
     def take_nodes(self) -> Tensor:
         """Ends a block, and returns (r,) int32 nodes that its rays visited."""
-        nodes, self._nodes = self._nodes, None
+        nodes, self._visited_nodes = self._visited_nodes, None
         assert nodes is not None
         return nodes
 
@@ -182,10 +182,10 @@ class _Counter(Tracer):
         """Traces rays. Features are sums over a ray's samples, weighted by what they add to alpha,
         of 1, the node's depth, whether it has a brick, and the brick's age and fill.
         """
-        sums, hits, nodes = march(self, self.inside(rays), self.shade, 5, limit=1, by_node=False)
-        assert self._nodes is not None
+        sums, hits, nodes = march(self, self.to_tree(rays), self.shade, 5, limit=1, by_node=False)
+        assert self._visited_nodes is not None
         assert rays.sample is not None
-        self._nodes.index_add_(0, rays.sample, nodes)
+        self._visited_nodes.index_add_(0, rays.sample, nodes)
         return replace(hits, features=sums)
 
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:
@@ -195,25 +195,28 @@ class _Counter(Tracer):
         values = batch.values()[:, self.component, None]
         _, alpha = self.module(values, values, values, batch.lengths)  # it reads no positions
         slot = batch.segments.brick[batch.segment, 0].to(torch.int64)
-        has, known = slot >= 0, slot.clamp(min=0)
+        has_brick, valid_slot = slot >= 0, slot.clamp(min=0)
         if not self.tree.bricks.capacity:
             age = fill = torch.zeros_like(alpha[:, 0])
         else:
-            self._fill(slot[has & (alpha[:, 0] > 0)])
-            age, fill = self.tree.frame - self.tree.bricks.born_b[known], self.fill_b[known]
+            self._fill(slot[has_brick & (alpha[:, 0] > 0)])
+            age, fill = (
+                self.tree.frame - self.tree.bricks.born_b[valid_slot],
+                self.fill_b[valid_slot],
+            )
         depth = batch.segments.depth[batch.segment, 0]
-        columns = (torch.ones_like(depth), depth, has, age * has, fill * has)
+        columns = (torch.ones_like(depth), depth, has_brick, age * has_brick, fill * has_brick)
         return torch.stack([c.to(alpha.dtype) for c in columns], 1), alpha[:, 0]
 
     def _fill(self, slots: Tensor) -> None:
         """Computes the fill of bricks, once for each brick."""
-        wanted = torch.zeros_like(self.fill_b, dtype=torch.bool)
-        wanted[slots] = True
-        fresh = (wanted & (self.fill_b < 0)).nonzero()[:, 0]
+        is_wanted = torch.zeros_like(self.fill_b, dtype=torch.bool)
+        is_wanted[slots] = True
+        missing = (is_wanted & (self.fill_b < 0)).nonzero()[:, 0]
         border, size = self.tree.bricks.border, self.tree.bricks.brick_size
         inner = slice(border, border + size)
         pool = self.tree.bricks.bricks[self.channel]
-        for part in fresh.split(_BRICKS_AT_ONCE):
-            bricks = movable(pool)[part].view(pool.dtype)[:, inner, inner, inner]
+        for batch in missing.split(_BRICKS_PER_BATCH):
+            bricks = movable(pool)[batch].view(pool.dtype)[:, inner, inner, inner]
             voxels = bricks[..., self.component].flatten(1).float()
-            self.fill_b[part] = self.module.shows(voxels).float().mean(1)
+            self.fill_b[batch] = self.module.shows(voxels).float().mean(1)

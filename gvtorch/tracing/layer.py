@@ -40,20 +40,20 @@ class Layer:
     alpha: Tensor | None = None
 
     def __post_init__(self) -> None:
-        for name, part in vars(self).items():
-            if part is None and name == "alpha":
+        for name, image in vars(self).items():
+            if image is None and name == "alpha":
                 continue
-            check.images("Layer", name, part, 3 if name == "color" else 1)
-            if part.shape[:-1] != self.color.shape[:-1]:
+            check.images("Layer", name, image, 3 if name == "color" else 1)
+            if image.shape[:-1] != self.color.shape[:-1]:
                 raise ValueError(
                     f"Layer: {name} must have the pixels of color, {check.describe(self.color)}, "
-                    f"got {check.describe(part)}"
+                    f"got {check.describe(image)}"
                 )
         if not bool(torch.isfinite(self.color).all()):
             raise ValueError("Layer: color must be finite, got NaN or infinity")
         if not bool((self.depth >= 0).all()):
-            what = "NaN" if bool(self.depth.isnan().any()) else f"{float(self.depth.min()):g}"
-            raise ValueError(f"Layer: depth must be >= 0, +inf where nothing is, got {what}")
+            problem = "NaN" if bool(self.depth.isnan().any()) else f"{float(self.depth.min()):g}"
+            raise ValueError(f"Layer: depth must be >= 0, +inf where nothing is, got {problem}")
         if self.alpha is not None and not bool(((self.alpha >= 0) & (self.alpha <= 1)).all()):
             raise ValueError("Layer: alpha must be finite and >= 0 and <= 1")
 
@@ -61,9 +61,9 @@ class Layer:
         kind = "opaque" if self.alpha is None else "translucent"
         return f"Layer({kind}, color={check.describe(self.color)})"
 
-    def _parts(self) -> list[tuple[str, Tensor]]:
+    def _images(self) -> list[tuple[str, Tensor]]:
         """Returns the tensors that are not None, by name."""
-        return [(name, part) for name, part in vars(self).items() if part is not None]
+        return [(name, image) for name, image in vars(self).items() if image is not None]
 
     def cut(self, where: str, camera: Camera) -> Layer:
         """Returns the part of the layer that a camera sees: if the camera is a strip of rows, views
@@ -82,34 +82,34 @@ class Layer:
                 f"{where}: layer must have the camera's {wanted} pixels (rows, columns), got {got}"
             )
         strip = copy.copy(self)  # checked already
-        for name, part in self._parts():
-            object.__setattr__(strip, name, part[..., top : top + camera.height, :, :])
+        for name, image in self._images():
+            object.__setattr__(strip, name, image[..., top : top + camera.height, :, :])
         return strip
 
     def check_device(self, device: torch.device) -> None:
         """Raises ValueError unless all tensors are on the device."""
-        for _, part in self._parts():
-            if part.device != device:
+        for _, image in self._images():
+            if image.device != device:
                 raise ValueError(
                     f"capture: layer must lie on {device}, where the graph reads it, "
-                    f"got {part.device}"
+                    f"got {image.device}"
                 )
 
     def distance(self, device: torch.device) -> Tensor:
         """Returns (p, 1) the distance of the layer at every pixel, +inf where it shows nothing."""
-        depth = _flat(self.depth, device)
+        depth = _as_rows(self.depth, device)
         shown = depth < torch.inf
         if self.alpha is not None:
-            shown = shown & (_flat(self.alpha, device) > 0)
+            shown = shown & (_as_rows(self.alpha, device) > 0)
         return torch.where(shown, depth, torch.inf)
 
     def pixels(self, device: torch.device) -> LayerPixels:
         """Returns all pixels on a device, row by row through the batch."""
-        alpha = None if self.alpha is None else _flat(self.alpha, device)
-        return LayerPixels(_flat(self.color, device), self.distance(device), alpha)
+        alpha = None if self.alpha is None else _as_rows(self.alpha, device)
+        return LayerPixels(_as_rows(self.color, device), self.distance(device), alpha)
 
 
-def _flat(image: Tensor, device: torch.device) -> Tensor:
+def _as_rows(image: Tensor, device: torch.device) -> Tensor:
     """Returns (p, c) of (..., h, w, c), a view if it is on the device already."""
     flat = image.reshape(-1, image.shape[-1])
     return flat.to(device, non_blocking=device.type == "cuda")  # to the CPU it must block
@@ -123,10 +123,10 @@ class LayerPixels:
     distance: Tensor  # (r, 1), +inf where nothing is shown
     alpha: Tensor | None  # (r, 1)
 
-    def __getitem__(self, which: slice | Tensor) -> LayerPixels:
+    def __getitem__(self, index: slice | Tensor) -> LayerPixels:
         """Returns some of the pixels."""
-        alpha = None if self.alpha is None else self.alpha[which]
-        return LayerPixels(self.color[which], self.distance[which], alpha)
+        alpha = None if self.alpha is None else self.alpha[index]
+        return LayerPixels(self.color[index], self.distance[index], alpha)
 
     def trace(self, trace_rays: TraceRays, rays: Rays, stop_alpha: float) -> Hits:
         """Traces the rays of these pixels and composites voxels and layer. Depth, normal and
@@ -135,9 +135,9 @@ class LayerPixels:
         ends there.
         """
         near, far = rays.range.split(1, dim=1)
-        stop = self.distance.to(rays.range.dtype)
-        first = torch.cat((near, torch.maximum(near, torch.minimum(far, stop))), 1)
-        front = trace_rays(replace(rays, range=first))
+        layer_distance = self.distance.to(rays.range.dtype)
+        front_range = torch.cat((near, torch.maximum(near, torch.minimum(far, layer_distance))), 1)
+        front = trace_rays(replace(rays, range=front_range))
         shown = self.distance < torch.inf
         alpha = shown if self.alpha is None else torch.where(shown, self.alpha, 0)
         layer = Hits(
@@ -147,16 +147,17 @@ class LayerPixels:
             samples=torch.zeros_like(front.samples),
             missed=torch.zeros_like(front.missed),
         )
-        mixed = over(front, layer)
+        front_and_layer = over(front, layer)
         if self.alpha is None:
-            return mixed
-        onward = (stop < torch.inf) & (mixed.alpha < stop_alpha)
-        start = torch.where(onward, torch.maximum(near, stop), near)
+            return front_and_layer
+        onward = (layer_distance < torch.inf) & (front_and_layer.alpha < stop_alpha)
+        start = torch.where(onward, torch.maximum(near, layer_distance), near)
         end = torch.where(onward, torch.maximum(start, far), start)
         back = trace_rays(replace(rays, range=torch.cat((start, end), 1)))
-        total = over(mixed, back)
+        total = over(front_and_layer, back)
         if front.normal is None or back.normal is None:
             return total
-        taken = (1 - mixed.alpha) * back.alpha  # light absorbed by the voxels behind the layer
-        normal = normalize(front.normal * front.alpha + back.normal * taken, dim=1)
-        return replace(total, normal=torch.where(taken > 0, normal, front.normal))
+        # Light absorbed by the voxels behind the layer.
+        absorbed = (1 - front_and_layer.alpha) * back.alpha
+        normal = normalize(front.normal * front.alpha + back.normal * absorbed, dim=1)
+        return replace(total, normal=torch.where(absorbed > 0, normal, front.normal))

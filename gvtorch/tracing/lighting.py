@@ -35,18 +35,21 @@ from ..shaders.lights import (
     a_triple,
     check_light,
 )
-from .composite import TraceRays, behind, if_few, over
+from .composite import TraceRays, behind, indices_if_few, over
 from .thin_lens import ThinLens
 
-#: Where cones begin, in voxels. Cones to lights are lifted `_OFF` above the surface. Hemisphere
-#: cones are lifted less, `_CLOSE`, to sample crevices, and start marching after `_WAY` voxels.
-_OFF, _CLOSE, _WAY = 1.5, 1.0, 1.5
-_GRAZING = 0.5  # smallest cosine to the normal along which a light's cone is lifted
-_WIDE = 2 * math.tan(math.radians(1))  # growth of hemisphere cones; wider ones blur what they meet
+#: Where cones begin, in voxels. Cones to lights are lifted `_SHADOW_LIFT` above the surface.
+#: Hemisphere cones are lifted less, `_HEMISPHERE_LIFT`, to sample crevices, and start marching
+#: after `_HEMISPHERE_START`.
+_SHADOW_LIFT, _HEMISPHERE_LIFT, _HEMISPHERE_START = 1.5, 1.0, 1.5
+_MIN_LIFT_COSINE = 0.5  # smallest cosine to the normal along which a light's cone is lifted
+#: Growth of hemisphere cones; wider ones blur what they meet.
+_MAX_CONE_GROWTH = 2 * math.tan(math.radians(1))
 #: Steps of the sequence of directions: 2^32 over the plastic number, and over its square.
-_STEPS = (3242174889, 2447445414)
-_WORD = (1 << 32) - 1
-_FINER = 0.5  # width of the shadow cones of bounced light, relative to the cone that met matter
+_SEQUENCE_STEPS = (3242174889, 2447445414)
+_MASK_32 = (1 << 32) - 1
+#: Width of the shadow cones of bounced light, relative to the cone that met matter.
+_BOUNCE_CONE_SCALE = 0.5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,20 +72,20 @@ class Lighting:
     ambient: Triple = (1.0, 1.0, 1.0)  # light from all directions, linear RGB
 
     def __post_init__(self) -> None:
-        where = "Lighting"
+        context = "Lighting"
         if not isinstance(self.lights, Sequence | None):
             kind = type(self.lights).__name__
-            raise ValueError(f"{where}: lights must be a sequence of lights, got {kind}")
+            raise ValueError(f"{context}: lights must be a sequence of lights, got {kind}")
         for number, light in enumerate(self.lights or ()):
-            check_light(f"{where}: lights[{number}]", light)
-        check.number(where, "shadows", self.shadows, low=0, high=1)
-        check.whole(where, "shadow_cones", self.shadow_cones, low=1, high=1024)
-        check.number(where, "occlusion", self.occlusion, low=0, high=1)
-        check.number(where, "indirect", self.indirect, low=0)
-        check.whole(where, "cones", self.cones, low=1, high=1024)
+            check_light(f"{context}: lights[{number}]", light)
+        check.number(context, "shadows", self.shadows, low=0, high=1)
+        check.whole(context, "shadow_cones", self.shadow_cones, low=1, high=1024)
+        check.number(context, "occlusion", self.occlusion, low=0, high=1)
+        check.number(context, "indirect", self.indirect, low=0)
+        check.whole(context, "cones", self.cones, low=1, high=1024)
         if self.reach is not None:
-            check.number(where, "reach", self.reach, low=0, open_low=True)
-        object.__setattr__(self, "frame", Frame.of(where, self.frame))
+            check.number(context, "reach", self.reach, low=0, open_low=True)
+        object.__setattr__(self, "frame", Frame.of(context, self.frame))
         a_triple(low=0)(self, "ambient", self.ambient)
 
     __repr__ = check.brief
@@ -102,17 +105,19 @@ class _Points:
     has_normal: Tensor  # (r,) bool, the shader gave the normal; else it is the direction to the eye
     eye: Tensor  # (r, 3) unit direction, back along the ray
     width: Tensor  # (r,) of the ray's cone there
-    seen: Tensor  # (r,) bool, the ray met matter
+    is_hit: Tensor  # (r,) bool, the ray met matter
     headlight: Tensor | None  # (r, 3) a headlight's position; None: the origin of these rays
-    row: int  # pixels of a row, see `Rays.width`
+    row_width: int  # pixels of a row, see `Rays.width`
     tally: _Tally  # of all rays of the pixels
 
-    def of_some(self, which: Tensor) -> _Points:
+    def select(self, index: Tensor) -> _Points:
         """Returns some of the points, with a new tally."""
-        columns = {name: one[which] for name, one in vars(self).items() if isinstance(one, Tensor)}
-        counts = (self.tally.samples, self.tally.missed)
-        tally = _Tally(*(count.new_zeros(len(which)) for count in counts))
-        return replace(self, **columns, row=0, tally=tally)
+        columns = {
+            name: column[index] for name, column in vars(self).items() if isinstance(column, Tensor)
+        }
+        counters = (self.tally.samples, self.tally.missed)
+        tally = _Tally(*(count.new_zeros(len(index)) for count in counters))
+        return replace(self, **columns, row_width=0, tally=tally)
 
 
 class _Tally:
@@ -126,10 +131,10 @@ class _Tally:
         self.samples, self.missed = self.samples + hits.samples, self.missed | hits.missed
         return hits
 
-    def add_some(self, which: Tensor, other: _Tally) -> None:
+    def add_some(self, index: Tensor, other: _Tally) -> None:
         """Adds the counts of some pixels."""
-        self.samples = self.samples.index_add(0, which, other.samples)
-        self.missed = self.missed.index_put((which,), self.missed[which] | other.missed)
+        self.samples = self.samples.index_add(0, index, other.samples)
+        self.missed = self.missed.index_put((index,), self.missed[index] | other.missed)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,16 +155,17 @@ class Lighted:
         """Traces rays in world units."""
         hits = self.trace(rays)
         color, m = hits.color, self.material
-        look = (self.lighting.ambient, m.ambient, m.diffuse, m.specular)
-        sky, (ambient, diffuse, specular) = pack(look, color.dtype, color.device).split(3)
+        factors = (self.lighting.ambient, m.ambient, m.diffuse, m.specular)
+        sky, (ambient, diffuse, specular) = pack(factors, color.dtype, color.device).split(3)
         tally = _Tally(hits.samples, hits.missed)
         points = self._points(rays, hits, tally)
-        direct, highlight = self._direct(points, self.lighting.shadow_cones)
+        direct, highlight = self._direct_light(points, self.lighting.shadow_cones)
         unblocked, bounced = self._hemisphere(points, rays)
         light = ambient * sky * unblocked.to(color)
         light = light + diffuse * (direct + bounced).to(color)
-        taken = hits.alpha - (1 - rays.light()).to(color)  # light absorbed by this piece of the ray
-        color = color * light + taken * specular * highlight.to(color)
+        # Light absorbed by this piece of the ray.
+        absorbed = hits.alpha - (1 - rays.light()).to(color)
+        color = color * light + absorbed * specular * highlight.to(color)
         color = torch.where(hits.alpha > 0, color, 0.0)  # a closed ray may have no direction
         return replace(hits, color=color, samples=tally.samples, missed=tally.missed)
 
@@ -169,11 +175,11 @@ class Lighted:
         """Returns the points that the eye's rays hit, or, given a `headlight`, those of cones."""
         origin, direction, cone = RayArguments.of(rays)[:3]
         depth = hits.depth[:, 0].to(torch.float64)
-        seen = depth < torch.inf
-        t = torch.where(seen, depth, 0.0)
+        is_hit = depth < torch.inf
+        t = torch.where(is_hit, depth, 0.0)
         width = (cone[:, 0] + cone[:, 1] * t) * self.cone_scale
         if headlight is not None:
-            width = _FINER * width
+            width = _BOUNCE_CONE_SCALE * width
         elif self.lens is not None:
             width = width + self.lens.cone(t)
         eye = -direction
@@ -182,58 +188,66 @@ class Lighted:
         return _Points(
             position=origin + t[:, None] * direction,
             normal=torch.where(has_normal[:, None], normalize(normal, dim=1), eye),
-            has_normal=has_normal & seen,
+            has_normal=has_normal & is_hit,
             eye=eye,
             width=width,
-            seen=seen,
+            is_hit=is_hit,
             headlight=headlight,
-            row=rays.width,
+            row_width=rays.width,
             tally=tally,
         )
 
-    def _direct(self, points: _Points, cones: int) -> tuple[Tensor, Tensor]:
+    def _direct_light(self, points: _Points, cones: int) -> tuple[Tensor, Tensor]:
         """Returns (r, 3) diffuse light and (r, 3) highlights of all lights, with their shadows. A
         point without a normal faces every light and has no highlight.
         """
         (shininess,) = pack((self.material.shininess,), torch.float64, points.eye.device)
-        diffuse = shine = torch.zeros_like(points.position)
+        diffuse = highlights = torch.zeros_like(points.position)
         for light in self.lights:
             color = pack((light.color,), torch.float64, points.eye.device)
-            beam, *_ = _towards(light, points)
+            beam, *_ = _light_direction(light, points)
             facing = (points.normal * beam).sum(1).clamp(min=0)
             facing = torch.where(points.has_normal, facing, 1.0)
-            half = normalize(beam + points.eye, dim=1)
-            highlight = (points.normal * half).sum(1).clamp(0, 1) ** shininess
+            half_vector = normalize(beam + points.eye, dim=1)
+            highlight = (points.normal * half_vector).sum(1).clamp(0, 1) ** shininess
             highlight = torch.where(points.has_normal & (facing > 0), highlight, 0.0)
-            wide = getattr(light, "angle", getattr(light, "radius", 0.0))
-            count = cones if isinstance(wide, Tensor) or wide else 1  # reading a tensor would block
-            lit = self._visible(light, count, points, beam, facing > 0)[:, None] * color
-            diffuse, shine = diffuse + facing[:, None] * lit, shine + highlight[:, None] * lit
-        return diffuse, shine
+            light_size = getattr(light, "angle", getattr(light, "radius", 0.0))
+            # A tensor is not read: that would block.
+            count = cones if isinstance(light_size, Tensor) or light_size else 1
+            light_color = (
+                self._visible_fraction(light, count, points, beam, facing > 0)[:, None] * color
+            )
+            diffuse, highlights = (
+                diffuse + facing[:, None] * light_color,
+                highlights + highlight[:, None] * light_color,
+            )
+        return diffuse, highlights
 
-    def _visible(
+    def _visible_fraction(
         self, light: Light, cones: int, points: _Points, beam: Tensor, facing: Tensor
     ) -> Tensor:
         """Returns (r,) the share of a light that reaches points; all of the eye's `Headlight`."""
         at_eye = isinstance(light, Headlight) and points.headlight is None
         if not self.lighting.shadows or at_eye:
             return torch.ones_like(points.width)
-        which = if_few(facing & points.seen)
-        if which is not None:
-            some = points.of_some(which)
-            part = self._visible(light, cones, some, beam[which], facing[which])
-            points.tally.add_some(which, some.tally)
-            return torch.ones_like(points.width).index_put((which,), part)
-        points = self._lifted(points, _OFF, beam)
-        beam, distance, size = _towards(light, points)
+        index = indices_if_few(facing & points.is_hit)
+        if index is not None:
+            subset = points.select(index)
+            fraction = self._visible_fraction(light, cones, subset, beam[index], facing[index])
+            points.tally.add_some(index, subset.tally)
+            return torch.ones_like(points.width).index_put((index,), fraction)
+        points = self._lifted_points(points, _SHADOW_LIFT, beam)
+        beam, distance, size = _light_direction(light, points)
         growth = 2 * CONE_OF_DISC / math.sqrt(cones) * size
-        right, up = _beside(beam)
+        right, up = _orthogonal_pair(beam)
         start = torch.zeros_like(distance)
-        end = torch.where(facing & points.seen, distance, start)
+        end = torch.where(facing & points.is_hit, distance, start)
         blocked = torch.zeros_like(distance)
-        for x, y in _disc(cones):
-            aim = normalize(beam + size[:, None] * (x * right + y * up), dim=1)
-            hits = points.tally(self.blocker(self._cone(points, aim, growth, start, end)))
+        for x, y in _disc_points(cones):
+            cone_direction = normalize(beam + size[:, None] * (x * right + y * up), dim=1)
+            hits = points.tally(
+                self.blocker(self._cones_from(points, cone_direction, growth, start, end))
+            )
             blocked = blocked + hits.alpha[:, 0] / cones
         return 1 - self.lighting.shadows * blocked
 
@@ -250,50 +264,51 @@ class Lighted:
         assert reach is not None
         if rays.sample is None:
             rays = replace(rays, sample=torch.arange(len(unblocked), device=unblocked.device))
-        which = if_few(points.seen)
-        if which is not None:
-            some = points.of_some(which)
-            share, light = self._hemisphere(some, rays[which])
-            points.tally.add_some(which, some.tally)
-            return unblocked.index_put((which,), share), bounced.index_put((which,), light)
+        index = indices_if_few(points.is_hit)
+        if index is not None:
+            subset = points.select(index)
+            fraction, light = self._hemisphere(subset, rays[index])
+            points.tally.add_some(index, subset.tally)
+            return unblocked.index_put((index,), fraction), bounced.index_put((index,), light)
         trace = self.blocker if self.matter is None else self.matter
-        seen = points.seen.to(torch.float64)
-        start = _WAY * seen * points.width.clamp(min=self.voxel)
-        end = torch.maximum(start, reach * seen)
-        middle = torch.maximum(start, reach / 2 * seen)
-        lifted = self._lifted(points, _CLOSE)
+        is_hit = points.is_hit.to(torch.float64)
+        start = _HEMISPHERE_START * is_hit * points.width.clamp(min=self.voxel)
+        end = torch.maximum(start, reach * is_hit)
+        middle = torch.maximum(start, reach / 2 * is_hit)
+        lifted = self._lifted_points(points, _HEMISPHERE_LIFT)
         eye, weight = rays.origin.to(torch.float64), 1 / lighting.cones
         (diffuse,) = pack((self.material.diffuse,), torch.float64, eye.device)
         assert rays.sample is not None
-        for direction in _cones_over(points.normal, rays.sample, lighting.cones):
-            growth = dot(direction, points.normal).clamp(0, _WIDE)  # keeps cones above the surface
-            first, second = (
-                self._cone(lifted, direction, growth, *span)
+        for direction in _hemisphere_directions(points.normal, rays.sample, lighting.cones):
+            # Cones stay above the surface.
+            growth = dot(direction, points.normal).clamp(0, _MAX_CONE_GROWTH)
+            near_cones, far_cones = (
+                self._cones_from(lifted, direction, growth, *span)
                 for span in ((start, middle), (middle, end))
             )
-            front = trace(first)
-            hits = points.tally(over(front, trace(behind(second, front)), dimmed=True))
-            taken = (front.alpha + hits.alpha).to(unblocked) / 2
-            unblocked = unblocked - lighting.occlusion * weight * taken
+            front = trace(near_cones)
+            hits = points.tally(over(front, trace(behind(far_cones, front)), dimmed=True))
+            absorbed = (front.alpha + hits.alpha).to(unblocked) / 2
+            unblocked = unblocked - lighting.occlusion * weight * absorbed
             if self.matter is not None:
-                met = self._points(first, hits, points.tally, eye)
-                lit = diffuse * self._direct(met, 1)[0] * hits.color
-                bounced = bounced + weight * torch.where(met.seen[:, None], lit, 0.0)
+                matter = self._points(near_cones, hits, points.tally, eye)
+                reflected = diffuse * self._direct_light(matter, 1)[0] * hits.color
+                bounced = bounced + weight * torch.where(matter.is_hit[:, None], reflected, 0.0)
         return unblocked, lighting.indirect * bounced
 
-    def _lifted(self, points: _Points, off: float, beam: Tensor | None = None) -> _Points:
-        """Returns the points lifted `off` voxels above the surface, or, where the eye's ray is
-        wider than a voxel, `off` of its widths: along `beam` (r, 3) if given and not grazing, so
+    def _lifted_points(self, points: _Points, lift: float, beam: Tensor | None = None) -> _Points:
+        """Returns the points lifted `lift` voxels above the surface, or, where the eye's ray is
+        wider than a voxel, `lift` of its widths: along `beam` (r, 3) if given and not grazing, so
         that the shadow stays where it is; else along the normal.
         """
-        way = points.normal
+        direction = points.normal
         if beam is not None:
-            rise = (way * beam).sum(1, keepdim=True)
-            way = way + (beam - rise * way) / rise.clamp(min=_GRAZING)
-        height = off * points.width.clamp(min=self.voxel)[:, None]
-        return replace(points, position=points.position + height * way)
+            cosine = (direction * beam).sum(1, keepdim=True)
+            direction = direction + (beam - cosine * direction) / cosine.clamp(min=_MIN_LIFT_COSINE)
+        height = lift * points.width.clamp(min=self.voxel)[:, None]
+        return replace(points, position=points.position + height * direction)
 
-    def _cone(
+    def _cones_from(
         self, points: _Points, direction: Tensor, growth: Tensor, start: Tensor, end: Tensor
     ) -> Rays:
         """Returns cones from points, as wide there as the eye's ray; their width grows by `growth`
@@ -304,16 +319,16 @@ class Lighted:
             direction=direction,
             cone=torch.stack((points.width, growth), 1) / self.cone_scale,
             range=torch.stack((start, end), 1),
-            width=points.row,
+            width=points.row_width,
         )
 
 
-def _towards(light: Light, points: _Points) -> tuple[Tensor, Tensor, Tensor]:
+def _light_direction(light: Light, points: _Points) -> tuple[Tensor, Tensor, Tensor]:
     """Returns (r, 3) unit directions and (r,) distances to a light, and (r,) radius / distance."""
     nothing, device = torch.zeros_like(points.width), points.eye.device
     if isinstance(light, DirectionalLight):
-        way = -pack((light.direction,), torch.float64, device)
-        beam = unit(way.expand_as(points.position))  # of any length but 0
+        to_light = -pack((light.direction,), torch.float64, device)
+        beam = unit(to_light.expand_as(points.position))  # of any length but 0
         angle = pack((light.angle,), torch.float64, device)
         size = torch.tan(torch.deg2rad(angle) / 2).expand_as(nothing)
         return beam, torch.full_like(nothing, torch.inf), size
@@ -323,20 +338,20 @@ def _towards(light: Light, points: _Points) -> tuple[Tensor, Tensor, Tensor]:
         return points.eye, nothing, nothing
     else:
         position, radius = points.headlight, nothing
-    way = position - points.position
-    distance = way.norm(dim=1)
-    return normalize(way, dim=1), distance, radius / distance.clamp(min=1e-30)
+    to_light = position - points.position
+    distance = to_light.norm(dim=1)
+    return normalize(to_light, dim=1), distance, radius / distance.clamp(min=1e-30)
 
 
-def _disc(count: int) -> Iterator[tuple[float, float]]:
+def _disc_points(count: int) -> Iterator[tuple[float, float]]:
     """Yields points (x, y) spread evenly over the unit disc; for one, its centre (Vogel, 1979)."""
     for number in range(count):
         radius = math.sqrt((number + 0.5) / count) if count > 1 else 0.0
-        turn = number * math.pi * (3 - math.sqrt(5))
-        yield radius * math.cos(turn), radius * math.sin(turn)
+        angle = number * math.pi * (3 - math.sqrt(5))
+        yield radius * math.cos(angle), radius * math.sin(angle)
 
 
-def _beside(axis: Tensor) -> tuple[Tensor, Tensor]:
+def _orthogonal_pair(axis: Tensor) -> tuple[Tensor, Tensor]:
     """Returns two (r, 3) unit vectors orthogonal to (r, 3) unit vectors and to each other (Duff et
     al., "Building an orthonormal basis, revisited", 2017).
     """
@@ -348,41 +363,41 @@ def _beside(axis: Tensor) -> tuple[Tensor, Tensor]:
     return right, torch.stack((b, sign + y * y * a, -y), 1)
 
 
-def _cones_over(normal: Tensor, sample: Tensor, count: int) -> Iterator[Tensor]:
+def _hemisphere_directions(normal: Tensor, sample: Tensor, count: int) -> Iterator[Tensor]:
     """Yields `count` directions (r, 3), cosine-weighted around (r, 3) normals, from a sequence that
     fills the unit square evenly (Roberts, 2018). It begins at a different position for each pixel,
     and continues from sample to sample. Made of integers, + - * / and roots: equal to an ulp on
     every device.
     """
-    right, up = _beside(normal)
-    begin_x = _scrambled((sample & _WORD) + 1)
-    begin_y = _scrambled(begin_x + _STEPS[0])
-    first = (sample >> 32) * count
+    right, up = _orthogonal_pair(normal)
+    begin_x = _hash_32((sample & _MASK_32) + 1)
+    begin_y = _hash_32(begin_x + _SEQUENCE_STEPS[0])
+    first_index = (sample >> 32) * count
     for number in range(count):
         x, y = (
-            ((begin + (first + number) * step) & _WORD).to(torch.float64) * 2.0**-32
-            for begin, step in zip((begin_x, begin_y), _STEPS, strict=True)
+            ((begin + (first_index + number) * step) & _MASK_32).to(torch.float64) * 2.0**-32
+            for begin, step in zip((begin_x, begin_y), _SEQUENCE_STEPS, strict=True)
         )
-        cosine, sine = _turned(y)
-        flat = cosine[:, None] * right + sine[:, None] * up
-        yield unit((1 - x).sqrt()[:, None] * normal + x.sqrt()[:, None] * flat)
+        cosine, sine = _cosine_sine(y)
+        tangent = cosine[:, None] * right + sine[:, None] * up
+        yield unit((1 - x).sqrt()[:, None] * normal + x.sqrt()[:, None] * tangent)
 
 
-def _scrambled(number: Tensor) -> Tensor:
+def _hash_32(number: Tensor) -> Tensor:
     """Returns (r,) hashes below 2^32, uncorrelated for neighbours (as Wellons' lowbias32, 2018)."""
     for shift in (16, 15):
-        number = ((number ^ (number >> shift)) * 0x7FEB352D) & _WORD
+        number = ((number ^ (number >> shift)) * 0x7FEB352D) & _MASK_32
     return number ^ (number >> 16)
 
 
-def _turned(turns: Tensor) -> tuple[Tensor, Tensor]:
+def _cosine_sine(turns: Tensor) -> tuple[Tensor, Tensor]:
     """Returns cosine and sine of (r,) turns in [0, 1), to 4e-6."""
     quarter = torch.floor(4 * turns + 0.5)
     angle = (4 * turns - quarter) * (math.pi / 2)
     square = angle * angle
     cosine = 1 - square * (1 / 2 - square * (1 / 24 - square * (1 / 720)))
     sine = angle * (1 - square * (1 / 6 - square * (1 / 120 - square * (1 / 5040))))
-    odd, far = quarter % 2 == 1, (quarter == 2) | (quarter == 3)
-    far_x = (quarter == 1) | (quarter == 2)
-    a, b = torch.where(odd, sine, cosine), torch.where(odd, cosine, sine)
-    return torch.where(far_x, -a, a), torch.where(far, -b, b)
+    swapped, flips_sine = quarter % 2 == 1, (quarter == 2) | (quarter == 3)
+    flips_cosine = (quarter == 1) | (quarter == 2)
+    a, b = torch.where(swapped, sine, cosine), torch.where(swapped, cosine, sine)
+    return torch.where(flips_cosine, -a, a), torch.where(flips_sine, -b, b)

@@ -64,28 +64,28 @@ class RenderOptions:
     dtype: torch.dtype = torch.float32
 
     def __post_init__(self) -> None:
-        where = "render"
-        check.number(where, "step", self.step, low=0, open_low=True)
-        check.one_of(where, "lod", self.lod, ("auto", "finest"))
-        object.__setattr__(self, "background", checked_background(where, self.background))
-        check.number(where, "stop_alpha", self.stop_alpha, low=0, high=1, open_low=True)
-        check.number(where, "depth_alpha", self.depth_alpha, low=0, high=1)
+        context = "render"
+        check.number(context, "step", self.step, low=0, open_low=True)
+        check.one_of(context, "lod", self.lod, ("auto", "finest"))
+        object.__setattr__(self, "background", checked_background(context, self.background))
+        check.number(context, "stop_alpha", self.stop_alpha, low=0, high=1, open_low=True)
+        check.number(context, "depth_alpha", self.depth_alpha, low=0, high=1)
         if self.depth_alpha >= self.stop_alpha:
             raise ValueError(
-                f"{where}: depth_alpha must be below stop_alpha, "
+                f"{context}: depth_alpha must be below stop_alpha, "
                 f"got {self.depth_alpha} and {self.stop_alpha}"
             )
-        check.number(where, "cone_scale", self.cone_scale, low=0, open_low=True)
-        check.whole(where, "component", self.component, low=0)
+        check.number(context, "cone_scale", self.cone_scale, low=0, open_low=True)
+        check.whole(context, "component", self.component, low=0)
         kinds = dict(channel=str, clip=Clip, layer=Layer, lens=ThinLens, lighting=Lighting)
         for name, kind in kinds.items():
             if getattr(self, name) is not None:
-                check.instance(where, name, getattr(self, name), kind)
-        object.__setattr__(self, "pose", checked_poses(where, self.pose))
+                check.instance(context, name, getattr(self, name), kind)
+        object.__setattr__(self, "pose", checked_poses(context, self.pose))
         if self.lens is not None and self.lod == "finest":
-            raise ValueError(f"{where}: a lens blurs by level of detail: lod must be 'auto'")
+            raise ValueError(f"{context}: a lens blurs by level of detail: lod must be 'auto'")
         if self.dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"{where}: dtype must be float32 or float64, got {self.dtype}")
+            raise ValueError(f"{context}: dtype must be float32 or float64, got {self.dtype}")
 
     __repr__ = check.brief
 
@@ -111,17 +111,17 @@ class RenderSettings(TypedDict, total=False):
 
 
 def render_options(
-    where: str, settings: Mapping[str, Any], camera: Camera | None = None
+    context: str, settings: Mapping[str, Any], camera: Camera | None = None
 ) -> RenderOptions:
     """Returns a user's options, with the layer cut to the camera if there is one. Raises ValueError
     if one is unknown, of the wrong type or out of its range, or does not fit the camera's pictures.
     """
-    check.known(where, settings, RenderSettings)
+    check.known(context, settings, RenderSettings)
     options = RenderOptions(**settings)
     if camera is None:
         return options
     if isinstance(options.background, Background):
-        options.background.check(where, camera)
+        options.background.check(context, camera)
     if options.layer is None:
         return options
-    return replace(options, layer=options.layer.cut(where, camera))
+    return replace(options, layer=options.layer.cut(context, camera))

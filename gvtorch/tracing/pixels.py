@@ -27,7 +27,7 @@ from ..ops.trace import choose_backend
 from ..pictures.background import Background
 from ..pictures.picture import Picture
 from ..pool import N3Tree
-from .around import around
+from .around import with_effects
 from .composite import TraceRays, nothing_like
 from .options import RenderOptions, RenderSettings, render_options
 from .tracer import Tracer
@@ -38,8 +38,9 @@ Scene = N3Tree | Mapping[str, N3Tree]
 Pixels = slice | Tensor  # some of the pixels of all pictures of a camera, row by row
 #: Hits of an earlier pass, which are overwritten, and which (r,) bool of their rays to trace again.
 Again = tuple[Hits, Tensor]
-_RAYS_A_BLOCK = 1 << 22  # rays that are traced at once
-_WATCHED = 1 << 16  # the same on a CPU: progress is reported, and Ctrl-C noticed, after each block
+_RAYS_PER_BLOCK = 1 << 22  # rays that are traced at once
+#: The same on a CPU: progress is reported, and Ctrl-C noticed, after each block.
+_RAYS_PER_REPORT = 1 << 16
 
 
 @explicit(RenderOptions)
@@ -81,13 +82,13 @@ def render(
     device, start = trees[0].device, time.perf_counter()
     with using("render", trees), collect_timings(device) as timings:
         with stage("prepare"):
-            traced, box = _traced("render", scene, shader, chosen)
-            numbers = [one.frame for one in trees]
+            trace_rays, box = _begin_frame("render", scene, shader, chosen)
+            first_frames = [each_tree.frame for each_tree in trees]
         placed = camera.placed(box)
-        view = View(placed, placed.numbers(device), traced, chosen, box)
+        view = View(placed, placed.numbers(device), trace_rays, chosen, box)
         hits = view.hits(progress)
         with stage("picture"):
-            stats = tree_stats(trees, chosen, hits.samples, numbers)
+            stats = tree_stats(trees, chosen, hits.samples, first_frames)
             picture = view.picture(hits, stats)
     stats.stages = timings.as_dict()
     stats.milliseconds = 1e3 * (time.perf_counter() - start)
@@ -115,65 +116,65 @@ def trace(tree: Scene, rays: Rays, shader: Shaders, **options: Unpack[RenderSett
     chosen = render_options("trace", options)
     check.instance("trace", "rays", rays, Rays)
     with using("trace", _trees("trace", tree)):
-        return _traced("trace", tree, shader, chosen)[0](rays)
+        return _begin_frame("trace", tree, shader, chosen)[0](rays)
 
 
-def _resident(where: str, scene: Any) -> Scene:
+def _resident(context: str, scene: Any) -> Scene:
     """Returns the scene with trees made of its volumes and arrays."""
 
-    def tree_of(one: Any) -> N3Tree:
-        if isinstance(one, N3Tree):
-            return one
-        if isinstance(one, (str, PathLike)):
-            raise ValueError(f"{where}: {str(one)!r} is a path: gv.read_volume reads it")
+    def as_tree(value: Any) -> N3Tree:
+        if isinstance(value, N3Tree):
+            return value
+        if isinstance(value, (str, PathLike)):
+            raise ValueError(f"{context}: {str(value)!r} is a path: gv.read_volume reads it")
         try:
-            return N3Tree.from_volume(as_volume(one, where=where))
+            return N3Tree.from_volume(as_volume(value, where=context))
         except ValueError as error:
             raise ValueError(f"{error}; gv.as_volume takes axes, nan and more") from None
 
     if isinstance(scene, Mapping):
-        return {name: tree_of(one) for name, one in scene.items()}
-    return tree_of(scene)
+        return {name: as_tree(value) for name, value in scene.items()}
+    return as_tree(scene)
 
 
-def _trees(where: str, scene: Scene) -> list[N3Tree]:
+def _trees(context: str, scene: Scene) -> list[N3Tree]:
     """Returns the trees of a scene; raises ValueError if there are none, or not on one device."""
     trees = [*scene.values()] if isinstance(scene, Mapping) else [scene]
     if not trees:
-        raise ValueError(f"{where}: there must be a tree, got none")
+        raise ValueError(f"{context}: there must be a tree, got none")
     for tree in trees:
-        check.instance(where, "tree", tree, N3Tree)
+        check.instance(context, "tree", tree, N3Tree)
     devices = sorted({str(tree.device) for tree in trees})
     if len(devices) > 1:
-        raise ValueError(f"{where}: trees must be on one device, got {', '.join(devices)}")
+        raise ValueError(f"{context}: trees must be on one device, got {', '.join(devices)}")
     return trees
 
 
-def using(where: str, trees: Sequence[N3Tree]) -> ExitStack:
+def using(context: str, trees: Sequence[N3Tree]) -> ExitStack:
     """Returns a context for rendering trees; raises RuntimeError while a thread changes one."""
     with ExitStack() as stack:
         for tree in trees:
-            stack.enter_context(tree.turns.using(where))
+            stack.enter_context(tree.turns.using(context))
         return stack.pop_all()
 
 
-def _traced(
-    where: str, scene: Scene, shaders: Shaders, options: RenderOptions
+def _begin_frame(
+    context: str, scene: Scene, shaders: Shaders, options: RenderOptions
 ) -> tuple[TraceRays, Tensor]:
     """Begins a frame, and returns its tracer and the scene's box."""
-    trees = _trees(where, scene)
+    trees = _trees(context, scene)
     for tree in trees:
         tree.next_frame()
     if not isinstance(scene, Mapping):
         if isinstance(shaders, Mapping):
-            raise ValueError(f"{where}: shaders by name are for trees by name")
+            raise ValueError(f"{context}: shaders by name are for trees by name")
         if isinstance(options.pose, Mapping):
-            raise ValueError(f"{where}: poses by name are for trees by name")
-        box = box_around(where, {"": scene}, options.pose)
-        return around(Tracer(scene, shaders, options), options, box), box
-    box = box_around(where, scene, options.pose)
-    named = {name: (tree, tree.channel_names) for name, tree in scene.items()}
-    return partial(trace_trees, tree_traces(where, named, shaders, options, box)), box
+            raise ValueError(f"{context}: poses by name are for trees by name")
+        box = box_around(context, {"": scene}, options.pose)
+        return with_effects(Tracer(scene, shaders, options), options, box), box
+    box = box_around(context, scene, options.pose)
+    channels_by_tree = {name: (tree, tree.channel_names) for name, tree in scene.items()}
+    return partial(trace_trees, tree_traces(context, channels_by_tree, shaders, options, box)), box
 
 
 def tree_stats(
@@ -226,46 +227,48 @@ class View:
         at_once = device.type == "cuda" or (
             len(self.camera) > 1 and progress is no_progress and isinstance(self.trace_rays, Tracer)
         )
-        block = _RAYS_A_BLOCK if at_once else _WATCHED
+        block = _RAYS_PER_BLOCK if at_once else _RAYS_PER_REPORT
         size = self.rays * (8 * self.options.dtype.itemsize + 5)  # the colour twice
         check.memory("render", f"a picture of {self.rays} pixels", size, device)
-        hits, where = again or (None, None)
+        hits, mask = again or (None, None)
         if hits is None and len(list(self.camera.blocks(block))) > 1:  # allocates before any ray
             hits = empty_hits(device, self.options.dtype, self.rays)
-        for pixels, part in self.blocks(block, progress, where):
+        for pixels, block_hits in self.blocks(block, progress, mask):
             if hits is None:
-                hits = part  # the only block
+                hits = block_hits  # the only block
             else:
-                _write(hits, pixels, part, self.rays)
+                _write_hits(hits, pixels, block_hits, self.rays)
         assert hits is not None
         return hits
 
     def blocks(
-        self, pixels: int, progress: Progress, where: Tensor | None = None
+        self, pixels: int, progress: Progress, mask: Tensor | None = None
     ) -> Iterator[tuple[Pixels, Hits]]:
-        """Traces all pixels, or those where `where` (p,) is true, in blocks of whole rows, since
+        """Traces all pixels, or those where `mask` (p,) is true, in blocks of whole rows, since
         rays take more memory than their picture. Yields the traced pixels of each block, and their
         hits, composited with the layer.
         """
         camera, numbers, layer = self.camera, self.numbers, self.options.layer
         rows, width = len(camera) * camera.height, camera.width
-        drawn = None if layer is None else layer.pixels(numbers.device)
+        layer_pixels = None if layer is None else layer.pixels(numbers.device)
         for first, end in camera.blocks(pixels):
-            some: Pixels = slice(first * width, end * width)
+            traced: Pixels = slice(first * width, end * width)
             with stage("rays"):
-                if where is None:
+                if mask is None:
                     rays = self._rows((first, end))
                 else:
-                    which = where[some].nonzero()[:, 0]
-                    rays = self._some_rays(first, which)
-                    some = which + first * width
+                    index = mask[traced].nonzero()[:, 0]
+                    rays = self._some_rays(first, index)
+                    traced = index + first * width
             if len(rays.origin):
                 with stage("trace"):
-                    if drawn is None:
+                    if layer_pixels is None:
                         hits = self.trace_rays(rays)
                     else:
-                        hits = drawn[some].trace(self.trace_rays, rays, self.options.stop_alpha)
-                yield some, hits
+                        hits = layer_pixels[traced].trace(
+                            self.trace_rays, rays, self.options.stop_alpha
+                        )
+                yield traced, hits
             progress("rays", end, rows)
 
     def _rows(self, rows: tuple[int, int]) -> Rays:
@@ -275,12 +278,12 @@ class View:
             return rays
         return replace(rays, sample=self.camera.pixel_samples(self.numbers, rows))
 
-    def _some_rays(self, top: int, which: Tensor) -> Rays:
-        """Returns the rays of the pixels `which` (k,), rising indices counted from row `top`."""
+    def _some_rays(self, top: int, index: Tensor) -> Rays:
+        """Returns the rays of the pixels `index` (k,), rising indices counted from row `top`."""
         width = self.camera.width
-        ends = torch.stack((which[0], which[-1])).tolist() if len(which) else (0, -1)
+        ends = torch.stack((index[0], index[-1])).tolist() if len(index) else (0, -1)
         first, last = (end // width for end in ends)
-        return self._rows((top + first, top + last + 1))[which - first * width]
+        return self._rows((top + first, top + last + 1))[index - first * width]
 
     def picture(self, hits: Hits, stats: RenderStats) -> Picture:
         """Composites the hits of all rays over the background, in the camera's shape."""
@@ -298,15 +301,15 @@ class View:
         return Picture(**images, transparent=background is None, stats=stats)
 
 
-def _write(hits: Hits, pixels: Pixels, part: Hits, count: int) -> None:
+def _write_hits(hits: Hits, pixels: Pixels, block_hits: Hits, count: int) -> None:
     """Writes the hits of some pixels into those of all; missing fields become `nothing_like`."""
-    for name, field in vars(part).items():
+    for name, field in vars(block_hits).items():
         if vars(hits)[name] is None:
             if field is None:
                 continue
             vars(hits)[name] = nothing_like(field, count)
-        whole = vars(hits)[name]
-        whole[pixels] = nothing_like(whole, len(part.alpha)) if field is None else field
+        target = vars(hits)[name]
+        target[pixels] = nothing_like(target, len(block_hits.alpha)) if field is None else field
 
 
 def empty_hits(device: torch.device, dtype: torch.dtype, pixels: int) -> Hits:

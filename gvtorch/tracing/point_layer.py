@@ -18,9 +18,9 @@ from ..points.splat import narrow_near
 from ..producers.points import PointProducer
 from .layer import Layer
 
-_BLOCK = 1 << 17  # points drawn together
-_LEAST = 1e-7  # opacity of pixels that emit light and hide nothing
-_NEAREST = 1e-3  # finest voxels from the eye; nothing is drawn nearer
+_POINTS_PER_BLOCK = 1 << 17  # points drawn together
+_MIN_ALPHA = 1e-7  # opacity of pixels that emit light and hide nothing
+_MIN_DEPTH_VOXELS = 1e-3  # finest voxels from the eye; nothing is drawn nearer
 
 
 def point_layer(
@@ -46,16 +46,18 @@ def point_layer(
         ValueError: The producer draws no points or has other values, or the camera is of another
             kind.
     """
-    where = "point_layer"
-    check.instance(where, "producer", producer, PointProducer)
+    context = "point_layer"
+    check.instance(context, "producer", producer, PointProducer)
     if not producer.drawn or producer.points.width != 4:
-        raise ValueError(f"{where}: needs PointProducer(drawn=True) of 4 values, as of Points.lit")
+        raise ValueError(
+            f"{context}: needs PointProducer(drawn=True) of 4 values, as of Points.lit"
+        )
     if camera.model != "pinhole" or camera.batched:
-        raise ValueError(f"{where}: the camera must be one pinhole camera, got {camera!r}")
-    check.number(where, "size", size, low=0.5, high=64)
-    check.number(where, "cone_scale", cone_scale, low=0, open_low=True)
+        raise ValueError(f"{context}: the camera must be one pinhole camera, got {camera!r}")
+    check.number(context, "size", size, low=0.5, high=64)
+    check.number(context, "cone_scale", cone_scale, low=0, open_low=True)
     if reference is not None:
-        check.number(where, "reference", reference, low=0, open_low=True)
+        check.number(context, "reference", reference, low=0, open_low=True)
     points, grid = producer.points, producer.points.grid
     placed = camera.placed(torch.tensor([grid.low, grid.high], dtype=torch.float64))
     view, K = placed.viewmats[0].numpy(), placed.Ks[0].numpy()
@@ -69,23 +71,26 @@ def point_layer(
     )
     height, width = placed.height, placed.width
     total = np.zeros((height * width, 5))  # of a pixel: light, opacity, light * distance
-    found = narrow_near(points, eye, reach + grid.branching * 2 * finest)
-    for begin in range(0, len(found), _BLOCK):
-        rows = {n: one[found[begin : begin + _BLOCK]] for n, one in points.points[0].rows.items()}
-        place = rows["position"].astype(np.float64)
-        seen = place @ view[:3, :3].T + view[:3, 3]
+    near_points = narrow_near(points, eye, reach + grid.branching * 2 * finest)
+    for start in range(0, len(near_points), _POINTS_PER_BLOCK):
+        rows = {
+            name: column[near_points[start : start + _POINTS_PER_BLOCK]]
+            for name, column in points.points[0].rows.items()
+        }
+        position = rows["position"].astype(np.float64)
+        xyz = position @ view[:3, :3].T + view[:3, 3]
         coarse = grid.spacing_3 * grid.branching
-        middle = (np.floor((place - grid.low) / coarse) + 0.5) * coarse + grid.low
-        cone = growth * np.linalg.norm(middle - eye, axis=1)
-        share = np.clip((finest * grid.branching - cone) / (finest * (grid.branching - 1)), 0, 1)
-        some = (share > 0) & (seen[:, 2] > _NEAREST * finest)
-        seen, share, value = seen[some], share[some], rows["value"][some].astype(np.float64)
-        depth, away = seen[:, 2], np.linalg.norm(seen, axis=1)
+        coarse_center = (np.floor((position - grid.low) / coarse) + 0.5) * coarse + grid.low
+        cone = growth * np.linalg.norm(coarse_center - eye, axis=1)
+        fraction = np.clip((finest * grid.branching - cone) / (finest * (grid.branching - 1)), 0, 1)
+        shown = (fraction > 0) & (xyz[:, 2] > _MIN_DEPTH_VOXELS * finest)
+        xyz, fraction, value = xyz[shown], fraction[shown], rows["value"][shown].astype(np.float64)
+        depth, distance = xyz[:, 2], np.linalg.norm(xyz, axis=1)
         # A pixel's solid angle is z^3 / (distance^3 fx fy).
-        share *= voxel_light * K[0, 0] * K[1, 1] * away / depth**3
-        x = K[0, 0] * seen[:, 0] / depth + K[0, 2]
-        y = K[1, 1] * seen[:, 1] / depth + K[1, 2]
-        _draw(total, (height, width), (x, y), size, np.c_[share[:, None] * value, away])
+        fraction *= voxel_light * K[0, 0] * K[1, 1] * distance / depth**3
+        x = K[0, 0] * xyz[:, 0] / depth + K[0, 2]
+        y = K[1, 1] * xyz[:, 1] / depth + K[1, 2]
+        _draw(total, (height, width), (x, y), size, np.c_[fraction[:, None] * value, distance])
     return _layer(total, (height, width))
 
 
@@ -97,9 +102,9 @@ def _layer(total: np.ndarray, shape: tuple[int, int]) -> Layer:
     mean = np.divide(
         total[:, 4], bright + total[:, 3], where=shown, out=np.full(len(bright), np.inf)
     )
-    alpha = np.where(shown, np.clip(1 - np.exp(-total[:, 3]), _LEAST, 1), 0)
+    alpha = np.where(shown, np.clip(1 - np.exp(-total[:, 3]), _MIN_ALPHA, 1), 0)
     images = (
-        torch.from_numpy(one).to(torch.float32).view(*shape, -1) for one in (light, mean, alpha)
+        torch.from_numpy(image).to(torch.float32).view(*shape, -1) for image in (light, mean, alpha)
     )
     return Layer(*images)
 
@@ -107,31 +112,31 @@ def _layer(total: np.ndarray, shape: tuple[int, int]) -> Layer:
 def _draw(
     total: np.ndarray,
     shape: tuple[int, int],
-    at: tuple[np.ndarray, np.ndarray],
+    pixel_xy: tuple[np.ndarray, np.ndarray],
     size: float,
     point_k5: np.ndarray,
 ) -> None:
-    """Adds points' light and opacity (k, 4) and distance, at `at` (k,) pixels, to pixels (p, 5)."""
+    """Adds points' light and opacity (k, 4) and distance, at `pixel_xy` (k,), to pixels (p, 5)."""
     height, width = shape
-    x, y = at
+    x, y = pixel_xy
     inside = (x > -size) & (x < width + size) & (y > -size) & (y < height + size)
     x, y, point = x[inside], y[inside], point_k5[inside]
     weight = point[:, :4].sum(1)
     point = np.c_[point[:, :4], weight * point[:, 4]]
     count = int(np.ceil(2 * size)) + 1
-    first = [np.floor(one - size).astype(np.int64) for one in (x, y)]
+    first = [np.floor(coordinate - size).astype(np.int64) for coordinate in (x, y)]
     edge = np.arange(count + 1)
     reach = np.full(len(x), size)
     along, down = (
-        point_shares((start[:, None] + edge).astype(np.float64), one, reach)
-        for start, one in zip(first, (x, y), strict=True)
+        point_shares((start[:, None] + edge).astype(np.float64), coordinate, reach)
+        for start, coordinate in zip(first, (x, y), strict=True)
     )
     for dy in range(count):
         for dx in range(count):
             column, row = first[0] + dx, first[1] + dy
-            here = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            pixel = row[here] * width + column[here]
-            share = (along[:, dx] * down[:, dy])[here]
+            in_picture = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            pixel = row[in_picture] * width + column[in_picture]
+            fraction = (along[:, dx] * down[:, dy])[in_picture]
             for number in range(5):
-                weights = share * point[here, number]
+                weights = fraction * point[in_picture, number]
                 total[:, number] += np.bincount(pixel, weights, len(total))

@@ -28,65 +28,69 @@ class Pose:
     shift: tuple[float, ...]  # (3,) world position of the tree's origin
 
     @classmethod
-    def of(cls, where: str, name: str, matrix: Any) -> Pose:
+    def of(cls, context: str, name: str, matrix: Any) -> Pose:
         """Returns the pose of a (4, 4) matrix from the tree's axes to the world's; a pose as it is.
         Raises ValueError if it is no such matrix, or stretches or shears.
         """
         if isinstance(matrix, Pose):
             return matrix
-        numbers = check.reals(where, name, matrix, (4, 4))
+        numbers = check.reals(context, name, matrix, (4, 4))
         turn = numbers[:3, :3]
-        off = float((turn.T @ turn - torch.eye(3, dtype=torch.float64)).abs().max())
-        if numbers[3].tolist() != [0, 0, 0, 1] or off > _ROUNDING:
+        deviation = float((turn.T @ turn - torch.eye(3, dtype=torch.float64)).abs().max())
+        if numbers[3].tolist() != [0, 0, 0, 1] or deviation > _ROUNDING:
             raise ValueError(
-                f"{where}: {name} must turn and shift, and neither stretch nor shear, "
+                f"{context}: {name} must turn and shift, and neither stretch nor shear, "
                 f"got {numbers.tolist()}"
             )
         left, _, right = torch.linalg.svd(turn)  # their product: the nearest orthogonal matrix
         return cls(tuple(map(tuple, (left @ right).tolist())), tuple(numbers[:3, 3].tolist()))
 
-    def inside(self, rays: Rays) -> Rays:
+    def to_tree(self, rays: Rays) -> Rays:
         """Returns world rays in the tree's axes, in float64."""
         origin, direction = rays.origin.double(), rays.direction.double()
         columns = [o - s for o, s in zip(origin.unbind(1), self.shift, strict=True)]
-        back = tuple(zip(*self.turn, strict=True))
-        own = rays.to(dtype=torch.float64)
+        inverse = tuple(zip(*self.turn, strict=True))
+        float_rays = rays.to(dtype=torch.float64)
         return replace(
-            own, origin=_turned(back, columns), direction=_turned(back, direction.unbind(1))
+            float_rays,
+            origin=_rotate(inverse, columns),
+            direction=_rotate(inverse, direction.unbind(1)),
         )
 
-    def outside(self, hits: Hits) -> Hits:
+    def to_world(self, hits: Hits) -> Hits:
         """Returns hits with their normals in the world's axes."""
-        return hits if hits.normal is None else replace(hits, normal=self.ways(hits.normal))
+        return (
+            hits if hits.normal is None else replace(hits, normal=self.world_vectors(hits.normal))
+        )
 
-    def ways(self, own: Tensor) -> Tensor:
+    def world_vectors(self, directions: Tensor) -> Tensor:
         """Returns world directions (r, 3) of directions in the tree's axes."""
-        return _turned(self.turn, own.unbind(1))
+        return _rotate(self.turn, directions.unbind(1))
 
-    def places(self, own: Tensor) -> Tensor:
+    def world_positions(self, positions: Tensor) -> Tensor:
         """Returns world positions (r, 3) of positions in the tree's axes."""
-        turned = self.ways(own).unbind(1)
-        return torch.stack([p + s for p, s in zip(turned, self.shift, strict=True)], 1)
+        rotated = self.world_vectors(positions).unbind(1)
+        return torch.stack([p + s for p, s in zip(rotated, self.shift, strict=True)], 1)
 
-    def lit(self, parameter_54: Tensor) -> Tensor:
+    def light_to_tree(self, parameter_54: Tensor) -> Tensor:
         """Returns `ShadeParameters` (5, 4) with the light in the tree's axes."""
-        given = ShadeParameters.read(parameter_54)
-        light = torch.as_tensor(given.light).double()
-        at_a_place = torch.as_tensor(given.light_kind) == LightKind.POINT
-        moved = [
-            torch.where(at_a_place, a - s, a)
+        parameters = ShadeParameters.read(parameter_54)
+        light = torch.as_tensor(parameters.light).double()
+        is_point = torch.as_tensor(parameters.light_kind) == LightKind.POINT
+        columns = [
+            torch.where(is_point, a - s, a)
             for a, s in zip(light.unbind(0), self.shift, strict=True)
         ]
-        back = tuple(zip(*self.turn, strict=True))
-        own = _turned(back, [column[None] for column in moved])[0].to(parameter_54)
-        return torch.cat((own, parameter_54.reshape(-1)[3:])).view_as(parameter_54)
+        inverse = tuple(zip(*self.turn, strict=True))
+        light_3 = _rotate(inverse, [column[None] for column in columns])[0].to(parameter_54)
+        return torch.cat((light_3, parameter_54.reshape(-1)[3:])).view_as(parameter_54)
 
-    def box(self, own: Tensor) -> Tensor:
+    def box(self, tree_box: Tensor) -> Tensor:
         """Returns (2, 3) corners of the world box around a box in the tree's axes."""
-        columns = own.unbind(1)
-        corners = torch.stack([torch.stack(one) for one in product(*columns)])
-        placed = self.places(corners)
-        return torch.stack((placed.amin(0), placed.amax(0)))
+        columns = tree_box.unbind(1)
+        corners = torch.stack([torch.stack(corner) for corner in product(*columns)])
+        world_corners = self.world_positions(corners)
+        return torch.stack((world_corners.amin(0), world_corners.amax(0)))
 
     def __repr__(self) -> str:
         return f"Pose(turn={self.turn}, shift={self.shift})"
@@ -96,38 +100,41 @@ class Pose:
 Matrix = Pose | Tensor | np.ndarray | Sequence[Sequence[float]]
 
 
-def checked_poses(where: str, given: Any) -> Any:
+def checked_poses(context: str, poses: Any) -> Any:
     """Returns a matrix as a `Pose`, and matrices by name as poses by name; None as it is."""
-    if given is None:
+    if poses is None:
         return None
-    if isinstance(given, Mapping):
-        return {name: Pose.of(where, f"pose of {name!r}", one) for name, one in given.items()}
-    return Pose.of(where, "pose", given)
+    if isinstance(poses, Mapping):
+        return {
+            name: Pose.of(context, f"pose of {name!r}", matrix) for name, matrix in poses.items()
+        }
+    return Pose.of(context, "pose", poses)
 
 
-def poses_of(where: str, names: Collection[str], given: Any) -> dict[str, Pose | None]:
+def poses_of(context: str, names: Collection[str], poses: Any) -> dict[str, Pose | None]:
     """Returns the pose of each tree, given a result of `checked_poses`; raises ValueError if a name
     is that of no tree, or there is one pose for several trees.
     """
-    if given is None or isinstance(given, Mapping):
-        by_name: Mapping[str, Pose] = given or {}
+    if poses is None or isinstance(poses, Mapping):
+        by_name: Mapping[str, Pose] = poses or {}
         for name in by_name:
             if name not in names:
                 raise ValueError(
-                    f"{where}: pose of {name!r}: there is no such tree; there is {', '.join(names)}"
+                    f"{context}: pose of {name!r}: there is no such tree; "
+                    f"there is {', '.join(names)}"
                 )
         return {name: by_name.get(name) for name in names}
     if len(names) > 1:
-        raise ValueError(f"{where}: poses of several trees must be given by name")
-    return dict.fromkeys(names, given)
+        raise ValueError(f"{context}: poses of several trees must be given by name")
+    return dict.fromkeys(names, poses)
 
 
-def world_box(own: Tensor, pose: Pose | None) -> Tensor:
+def world_box(tree_box: Tensor, pose: Pose | None) -> Tensor:
     """Returns (2, 3) corners of the world box around a tree's box."""
-    return own if pose is None else pose.box(own)
+    return tree_box if pose is None else pose.box(tree_box)
 
 
-def _turned(rows: Sequence[Sequence[float]], columns: Sequence[Tensor]) -> Tensor:
+def _rotate(rows: Sequence[Sequence[float]], columns: Sequence[Tensor]) -> Tensor:
     """Returns (r, 3) products of a matrix and columns (r,), in one order: equal bits everywhere."""
     x, y, z = columns
     return torch.stack([a * x + b * y + c * z for a, b, c in rows], 1)

@@ -29,13 +29,19 @@ Colors = Callable[[np.ndarray], np.ndarray]
 #: Up in the picture of the plane across each axis: rows of files run down, and heads are up.
 UP = {"x": "+z", "y": "+z", "z": "-y"}
 #: Letters of the words for an axis' direction in `ImageInfo.space`.
-_LETTERS = {w: w[0].upper() for w in ("right", "left", "anterior", "posterior", "superior")}
-_LETTERS["inferior"] = "I"
+_DIRECTION_LETTERS = {
+    w: w[0].upper() for w in ("right", "left", "anterior", "posterior", "superior")
+}
+_DIRECTION_LETTERS["inferior"] = "I"
 _OPPOSITE = {**dict(zip("RAS", "LPI", strict=True)), **dict(zip("LPI", "RAS", strict=True))}
 #: Radiological planes, by the letter of the axis across them: name, what is up, what is left.
-_VIEWS = {"S": ("axial", "A", "R"), "A": ("coronal", "S", "R"), "R": ("sagittal", "S", "A")}
+_RADIOLOGICAL_PLANES = {
+    "S": ("axial", "A", "R"),
+    "A": ("coronal", "S", "R"),
+    "R": ("sagittal", "S", "A"),
+}
 _GAP = 4  # pixels between the three planes
-_MOST = 65536  # pixels along a side
+_MAX_PIXELS = 65536  # pixels along a side
 
 
 def slice_picture(
@@ -80,44 +86,46 @@ def slice_picture(
         ValueError: An argument is unknown, or out of its range.
         OSError: The store can't be read.
     """
-    where = "slice_picture"
-    check.one_of(where, "axis", axis, ("x", "y", "z", "all"))
-    check.instance(where, "data", data, Volume, Store)
-    scale = check.number(where, "scale", scale, low=0, high=_MOST, open_low=True)
-    plane = _Plane(data, component, level)
+    context = "slice_picture"
+    check.one_of(context, "axis", axis, ("x", "y", "z", "all"))
+    check.instance(context, "data", data, Volume, Store)
+    scale = check.number(context, "scale", scale, low=0, high=_MAX_PIXELS, open_low=True)
+    reader = _PlaneReader(data, component, level)
     colors = _colors(data, span, colors, component)
     views = _views(data.info.space, up, radiological=radiological, letters=letters)
     if axis == "all":
         if up is not None:
-            raise ValueError(f"{where}: up is for one plane, not for axis 'all'")
+            raise ValueError(f"{context}: up is for one plane, not for axis 'all'")
         if isinstance(at, tuple) and len(at) != 3:
-            raise ValueError(f"{where}: at must be one place or three, for x, y and z, got {at!r}")
-        places = dict(zip("xyz", at if isinstance(at, tuple) else (at, at, at), strict=True))
-        pixel = min(plane.spacing.values()) / scale
-        shown = (plane.colored(n, places[n], views[n], pixel, colors) for n in "xyz")
-        return _picture(_in_line(*shown))
+            raise ValueError(
+                f"{context}: at must be one place or three, for x, y and z, got {at!r}"
+            )
+        positions = dict(zip("xyz", at if isinstance(at, tuple) else (at, at, at), strict=True))
+        pixel = min(reader.spacing.values()) / scale
+        planes = (reader.colored(n, positions[n], views[n], pixel, colors) for n in "xyz")
+        return _picture(_arranged(*planes))
     if isinstance(at, tuple):
-        raise ValueError(f"{where}: at must be one place for axis {axis}, got {at!r}")
-    pixel = min(plane.spacing[n] for n in "xyz" if n != axis) / scale
+        raise ValueError(f"{context}: at must be one place for axis {axis}, got {at!r}")
+    pixel = min(reader.spacing[n] for n in "xyz" if n != axis) / scale
     view = views[axis] if up is None else PlaneView("", up)
-    return _picture(plane.colored(axis, at, view, pixel, colors))
+    return _picture(reader.colored(axis, at, view, pixel, colors))
 
 
 def _colors(
     data: Volume | Store, span: tuple[float, float] | None, colors: Colors | None, component: int
 ) -> Colors:
     """Returns the colours of values: those given, or grays over a span."""
-    where = "slice_picture"
+    context = "slice_picture"
     if colors is None:
-        ends = window(data, component=component, background=True) if span is None else span
-        if not isinstance(ends, (tuple, list)) or len(ends) != 2:
-            raise ValueError(f"{where}: span must be the values of black and white, got {span!r}")
-        return TransferFunction(*display_grays()).stretched(*ends)
+        black_white = window(data, component=component, background=True) if span is None else span
+        if not isinstance(black_white, (tuple, list)) or len(black_white) != 2:
+            raise ValueError(f"{context}: span must be the values of black and white, got {span!r}")
+        return TransferFunction(*display_grays()).stretched(*black_white)
     if span is not None:
-        raise ValueError(f"{where}: span is for grays; colors have their own values")
+        raise ValueError(f"{context}: span is for grays; colors have their own values")
     if not callable(colors) or isinstance(colors, type):
         kind = type(colors).__name__
-        raise ValueError(f"{where}: colors must be a function of values or Labels, got a {kind}")
+        raise ValueError(f"{context}: colors must be a function of values or Labels, got a {kind}")
     return colors
 
 
@@ -125,20 +133,20 @@ def _views(
     space: str | None, up: str | None, *, radiological: bool, letters: bool
 ) -> dict[str, PlaneView]:
     """Returns the view of the plane across each axis."""
-    where = "slice_picture"
+    context = "slice_picture"
     if not radiological:
         if letters:
-            raise ValueError(f"{where}: letters are for radiological planes")
-        return {n: PlaneView("", above) for n, above in UP.items()}
+            raise ValueError(f"{context}: letters are for radiological planes")
+        return {axis: PlaneView("", up_axis) for axis, up_axis in UP.items()}
     if up is not None:
-        raise ValueError(f"{where}: radiological planes have a fixed up")
+        raise ValueError(f"{context}: radiological planes have a fixed up")
     views = radiological_views(space)
     if not views:
-        raise ValueError(f"{where}: the data does not say where its axes point (info.space)")
-    return views if letters else {n: one._replace(letters="") for n, one in views.items()}
+        raise ValueError(f"{context}: the data does not say where its axes point (info.space)")
+    return views if letters else {axis: view._replace(letters="") for axis, view in views.items()}
 
 
-def _in_line(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _arranged(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Joins three planes: those across y and x, side by side, above the one across z."""
     (top, left), (bottom, right) = y.shape[:2], (z.shape[0], x.shape[1])
     image = np.zeros((top + _GAP + bottom, left + _GAP + right, 3), np.float32)
@@ -160,34 +168,40 @@ def radiological_views(space: str | None) -> dict[str, PlaneView]:
     that does not name the axes' directions.
     """
     words = (space or "").split("-")
-    if len(words) != 3 or not _LETTERS.keys() >= set(words):
+    if len(words) != 3 or not _DIRECTION_LETTERS.keys() >= set(words):
         return {}
-    towards = {axis: _LETTERS[word] for axis, word in zip("xyz", words, strict=True)}
+    towards = {axis: _DIRECTION_LETTERS[word] for axis, word in zip("xyz", words, strict=True)}
     views = {}
     for axis, letter in towards.items():
-        name, above, left = _VIEWS[letter if letter in _VIEWS else _OPPOSITE[letter]]
-        found = {n: to for n, to in towards.items() if n != axis}
-        rows = next((n for n, to in found.items() if to in (above, _OPPOSITE[above])), "")
-        columns = next((n for n, to in found.items() if to in (left, _OPPOSITE[left])), "")
+        name, above, left = _RADIOLOGICAL_PLANES[
+            letter if letter in _RADIOLOGICAL_PLANES else _OPPOSITE[letter]
+        ]
+        in_plane = {n: direction for n, direction in towards.items() if n != axis}
+        rows = next(
+            (n for n, direction in in_plane.items() if direction in (above, _OPPOSITE[above])), ""
+        )
+        columns = next(
+            (n for n, direction in in_plane.items() if direction in (left, _OPPOSITE[left])), ""
+        )
         if not rows or not columns:
             return {}
-        up = ("+" if found[rows] == above else "-") + rows
+        up = ("+" if in_plane[rows] == above else "-") + rows
         letters = above + _OPPOSITE[left] + _OPPOSITE[above] + left
-        views[axis] = PlaneView(name, up, found[columns] == left, letters)
+        views[axis] = PlaneView(name, up, in_plane[columns] == left, letters)
     return views
 
 
-class _Plane:
+class _PlaneReader:
     """Planes of voxels of one component and level."""
 
     def __init__(self, data: Volume | Store, component: int, level: int) -> None:
-        where = "slice_picture"
+        context = "slice_picture"
         self.data, self.component = data, component
-        stored = isinstance(data, Store)
-        check.whole(where, "component", component, low=0, high=data.width - 1)
-        self.level = check.whole(where, "level", level, low=0)
-        if level and not stored:
-            raise ValueError(f"{where}: level is for stores, a volume has one, got {level}")
+        is_store = isinstance(data, Store)
+        check.whole(context, "component", component, low=0, high=data.width - 1)
+        self.level = check.whole(context, "level", level, low=0)
+        if level and not is_store:
+            raise ValueError(f"{context}: level is for stores, a volume has one, got {level}")
         extent = data.level_extent(level) if isinstance(data, Store) else data.extent
         self.extent = dict(zip("xyz", extent, strict=True))
         self.finest = dict(zip("xyz", data.extent, strict=True))
@@ -198,36 +212,36 @@ class _Plane:
 
     def index(self, axis: str, at: At) -> int:
         """Returns the index of a voxel of the finest level along an axis."""
-        where, count = "slice_picture", self.finest[axis]
+        context, count = "slice_picture", self.finest[axis]
         if isinstance(at, str):
             text = at.strip()
             if text.endswith("%"):
-                at = check.number(where, "at", text[:-1], low=0, high=100) / 100
+                at = check.number(context, "at", text[:-1], low=0, high=100) / 100
             elif re.fullmatch(r"[+-]?\d+", text):
                 at = int(text)
             else:
-                return self._place(axis, text)
+                return self._index_at_position(axis, text)
         if isinstance(at, float):
-            share = check.number(where, "at", at, low=0, high=1)
-            return min(int(share * count), count - 1)
-        return check.whole(where, f"at along {axis}", at, low=0, high=count - 1)
+            fraction = check.number(context, "at", at, low=0, high=1)
+            return min(int(fraction * count), count - 1)
+        return check.whole(context, f"at along {axis}", at, low=0, high=count - 1)
 
-    def _place(self, axis: str, text: str) -> int:
+    def _index_at_position(self, axis: str, text: str) -> int:
         """Returns the index of the voxel at a world position, as in "12.5mm"."""
-        found = re.fullmatch(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµ]+)", text)
-        unit = None if found is None else length_unit(found[2])
-        if found is None or unit is None:
+        match = re.fullmatch(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµ]+)", text)
+        unit = None if match is None else length_unit(match[2])
+        if match is None or unit is None:
             raise ValueError(
                 f"slice_picture: at must be a share such as 50%, the index of a voxel, or a place "
                 f"such as 12.5mm, got {text!r}"
             )
-        place = float(found[1])
+        position = float(match[1])
         if self.unit is not None and unit != self.unit:
-            size, own = metres(unit), metres(self.unit)
-            if size is None or own is None:
+            text_metres, data_metres = metres(unit), metres(self.unit)
+            if text_metres is None or data_metres is None:
                 raise ValueError(f"slice_picture: the unit of the data is {self.unit}, got {text}")
-            place *= size / own
-        index = int(np.floor((place - self.origin[axis]) / self.step[axis] + 0.5))
+            position *= text_metres / data_metres
+        index = int(np.floor((position - self.origin[axis]) / self.step[axis] + 0.5))
         low, high = (
             self.origin[axis] + (n - 0.5) * self.step[axis] for n in (0, self.finest[axis])
         )
@@ -240,14 +254,14 @@ class _Plane:
         """Returns the plane across an axis, with the other two in the order z, y, x."""
         index = self.index(axis, at) >> self.level
         low, high = [0, 0, 0], [self.extent[n] for n in "zyx"]
-        number = "zyx".index(axis)
-        low[number], high[number] = index, index + 1
+        dimension = "zyx".index(axis)
+        low[dimension], high[dimension] = index, index + 1
         if isinstance(self.data, Store):
-            part = self.data.read_region(self.level, low, high)
+            region = self.data.read_region(self.level, low, high)
         else:
             box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-            part = to_numpy(self.data.data[box])
-        return part[..., self.component].squeeze(number)
+            region = to_numpy(self.data.data[box])
+        return region[..., self.component].squeeze(dimension)
 
     def colored(
         self, axis: str, at: At, view: PlaneView, pixel: float, colors: Colors
@@ -263,7 +277,7 @@ class _Plane:
         values = self.values(axis, at)
         if up[1] != others[0]:
             values, others = values.T, others[::-1]
-        rows, columns = (_pixels(self.extent[n], self.spacing[n] / pixel) for n in others)
+        rows, columns = (_voxel_of_pixels(self.extent[n], self.spacing[n] / pixel) for n in others)
         rows = rows[::-1] if up[0] == "+" else rows
         columns = columns[::-1] if view.mirrored else columns
         image = colors(values)[..., :3].astype(np.float32)[np.ix_(rows, columns)]
@@ -272,24 +286,24 @@ class _Plane:
         return image
 
 
-def _pixels(count: int, size: float) -> np.ndarray:
+def _voxel_of_pixels(count: int, size: float) -> np.ndarray:
     """Returns the voxel of each pixel along an axis, for `count` voxels of `size` pixels each."""
     pixels = max(1, round(count * size))
-    if pixels > _MOST:
+    if pixels > _MAX_PIXELS:
         raise ValueError(
-            f"slice_picture: {pixels} pixels are more than {_MOST}: use a smaller scale"
+            f"slice_picture: {pixels} pixels are more than {_MAX_PIXELS}: use a smaller scale"
         )
     return ((np.arange(pixels) + 0.5) * (count / pixels)).astype(np.int64)
 
 
 def _picture(image: np.ndarray) -> Picture:
     color = torch.from_numpy(np.ascontiguousarray(image))
-    one = torch.ones_like(color[..., :1])
+    ones = torch.ones_like(color[..., :1])
     return Picture(
         color=color,
-        alpha=one,
-        depth=0 * one,
-        nearest=0 * one,
-        samples=one.int(),
+        alpha=ones,
+        depth=0 * ones,
+        nearest=0 * ones,
+        samples=ones.int(),
         stats=RenderStats(),
     )

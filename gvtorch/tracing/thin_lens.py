@@ -73,10 +73,12 @@ class ThroughLens:
         """Returns the pieces of rays before the focus (`side` -1) or behind it (1)."""
         cone, (first, last) = rays.cone.to(torch.float64), rays.range.to(torch.float64).unbind(1)
         focus = self.lens.focus
-        wide = _CONE_OF_DISC * self.lens.aperture / self.cone_scale  # its cone at the eye
-        near, far = cone[:, 0] - side * wide, cone[:, 1] + side * wide / focus
+        lens_width = _CONE_OF_DISC * self.lens.aperture / self.cone_scale  # its cone at the eye
+        width, growth = cone[:, 0] - side * lens_width, cone[:, 1] + side * lens_width / focus
         if side < 0:
             last = last.clamp(max=focus)
         else:
             first = first.clamp(min=focus)
-        return replace(rays, cone=torch.stack((near, far), 1), range=torch.stack((first, last), 1))
+        return replace(
+            rays, cone=torch.stack((width, growth), 1), range=torch.stack((first, last), 1)
+        )

@@ -27,7 +27,7 @@ from .composite import tree_span
 from .options import RenderOptions
 from .pose import Pose
 
-_SAMPLES = {"cpu": 1 << 20, "cuda": 1 << 24}  # shaded at once
+_MAX_SAMPLES = {"cpu": 1 << 20, "cuda": 1 << 24}  # shaded at once
 
 
 class Tracer:
@@ -48,7 +48,7 @@ class Tracer:
         """
         check_shader("render", "shader", shader)
         choose_backend(options.backend, tree.device)
-        channel = _channel_of(tree, shader, options)
+        channel = _checked_channel(tree, shader, options)
         step = options.step * min(tree.spacing)
         _check_step(tree, step, options)
         tree.warn_if_edited(learned=isinstance(shader, ModuleShader))
@@ -65,7 +65,7 @@ class Tracer:
             device=tree.device,
         )
         self.dtype, self.backend = options.dtype, options.backend
-        self.names = shader.label_names(tree, channel)
+        self.label_names = shader.label_names(tree, channel)
         self.shading = shader.shading("render", tree)
         self.arguments = ops.TraceArguments(
             place_33=tree.place,
@@ -92,38 +92,43 @@ class Tracer:
             by_level=by_level,
         )
 
-    def seeing(self, shader: Shader, options: RenderOptions) -> Tracer:
+    def with_shader(self, shader: Shader, options: RenderOptions) -> Tracer:
         """Returns a tracer of the same frame with another shader."""
-        known = self.arguments
-        return Tracer(self.tree, shader, options, by_level=known.by_level, frame_1=known.frame_1)
+        arguments = self.arguments
+        return Tracer(
+            self.tree, shader, options, by_level=arguments.by_level, frame_1=arguments.frame_1
+        )
 
-    def inside(self, rays: Rays) -> Rays:
+    def to_tree(self, rays: Rays) -> Rays:
         """Returns world rays in the tree's axes."""
-        return rays if self.pose is None else self.pose.inside(rays)
+        return rays if self.pose is None else self.pose.to_tree(rays)
 
     def __call__(self, rays: Rays) -> Hits:
         """Traces rays in world units."""
-        hits = self._trace(self.inside(rays))
-        return hits if self.pose is None else self.pose.outside(hits)
+        hits = self._trace(self.to_tree(rays))
+        return hits if self.pose is None else self.pose.to_world(hits)
 
     def _trace(self, rays: Rays) -> Hits:
         """Traces rays in the tree's axes."""
         if isinstance(self.shader, ModuleShader):
             return self._march_module(self.shader, rays)
-        given = ops.RayArguments.of(rays)
+        ray_arguments = ops.RayArguments.of(rays)
         fields: tuple[Tensor, ...]
         if self.shading is None:
-            fields = ops.trace_rays(given, self.arguments, backend=self.backend)
+            fields = ops.trace_rays(ray_arguments, self.arguments, backend=self.backend)
         else:
-            numbers = self.shader.parameter_tensor(self.tree, self.dtype)
-            own = (self.shading, numbers if self.pose is None else self.pose.lit(numbers))
+            parameters = self.shader.parameter_tensor(self.tree, self.dtype)
+            shading = (
+                self.shading,
+                parameters if self.pose is None else self.pose.light_to_tree(parameters),
+            )
             fields = ops.shade_rays(
-                given, self.arguments, *own, op=self.shader.op, backend=self.backend
+                ray_arguments, self.arguments, *shading, op=self.shader.op, backend=self.backend
             )
         hits = Hits(**dict(zip(Hits.__annotations__, fields, strict=False)))
-        if self.names is None or hits.features is None:
+        if self.label_names is None or hits.features is None:
             return hits
-        label = self.names[hits.features.to(torch.int64)]
+        label = self.label_names[hits.features.to(torch.int64)]
         return replace(hits, features=hits.features[:, :0], label=label)
 
     def _march_module(self, shader: ModuleShader, rays: Rays) -> Hits:
@@ -131,38 +136,41 @@ class Tracer:
 
         def shade(batch: Batch) -> tuple[Tensor, Tensor]:
             values = batch.values(shader.channels)
-            places, ways = batch.positions, batch.directions
+            positions, directions = batch.positions, batch.directions
             if self.pose is not None:
-                places, ways = self.pose.places(places), self.pose.ways(ways)
-            color, alpha = shader(values, places, ways, batch.lengths)
+                positions, directions = (
+                    self.pose.world_positions(positions),
+                    self.pose.world_vectors(directions),
+                )
+            color, alpha = shader(values, positions, directions, batch.lengths)
             return color, alpha[:, 0]
 
-        def block(rays: Rays) -> Hits:
+        def trace_block(rays: Rays) -> Hits:
             color, hits, _ = march(self, rays, shade, 3)
             return replace(hits, color=color)
 
         count = len(rays.origin)
-        size = (shader.samples or _SAMPLES[rays.origin.device.type]) // PART_SAMPLES
+        size = (shader.samples or _MAX_SAMPLES[rays.origin.device.type]) // PART_SAMPLES
         if count <= size:
-            return block(rays)
-        parts = [vars(block(rays[at : at + size])) for at in range(0, count, size)]
-        given = [name for name, field in parts[0].items() if field is not None]
-        return Hits(**{name: torch.cat([part[name] for part in parts]) for name in given})
+            return trace_block(rays)
+        blocks = [vars(trace_block(rays[start : start + size])) for start in range(0, count, size)]
+        names = [name for name, field in blocks[0].items() if field is not None]
+        return Hits(**{name: torch.cat([block[name] for block in blocks]) for name in names})
 
 
-def _channel_of(tree: N3Tree, shader: Shader, options: RenderOptions) -> str:
+def _checked_channel(tree: N3Tree, shader: Shader, options: RenderOptions) -> str:
     """Returns the channel that the shader colours; raises ValueError if it does not fit."""
-    first, channels = tree.channel_names[0], tree.bricks.channels
-    channel = check.text("render", "channel", shader.channel) or options.channel or first
+    first_channel, channels = tree.channel_names[0], tree.bricks.channels
+    channel = check.text("render", "channel", shader.channel) or options.channel or first_channel
     if channel not in channels:
-        known = ", ".join(tree.channel_names)
-        raise ValueError(f"render: unknown channel {check.given(channel)}; the tree has {known}")
+        names = ", ".join(tree.channel_names)
+        raise ValueError(f"render: unknown channel {check.given(channel)}; the tree has {names}")
     if channels[channel].coarse:
         raise ValueError(f"render: only coarse bricks have channel {channel!r}")
-    other = channels.get(str(shader.other))
-    if other is not None and other.coarse and channel != first:
+    other_channel = channels.get(str(shader.other))
+    if other_channel is not None and other_channel.coarse and channel != first_channel:
         raise ValueError(
-            f"render: channel {shader.other!r} was made of {first!r}, not of {channel!r}"
+            f"render: channel {shader.other!r} was made of {first_channel!r}, not of {channel!r}"
         )
     _check_labels(tree, shader, channel)
     return channel
@@ -191,15 +199,15 @@ def _check_step(tree: N3Tree, step: float, options: RenderOptions) -> None:
     allow more intervals: each is about as long as its cone is wide, far above the rounding.
     """
     length = math.dist(*tree.box.tolist())
-    most, hint = 2**46, "take a longer step"
+    limit, hint = 2**46, "take a longer step"
     if options.lod == "finest":
-        most, hint = 2**50, "lod='auto' takes longer ones where voxels are small"
+        limit, hint = 2**50, "lod='auto' takes longer ones where voxels are small"
         if options.dtype == torch.float32:
-            most, hint = MAX_INTERVALS, f"{hint}; dtype=torch.float64 tells more apart"
-    if not length / step <= most:
+            limit, hint = MAX_INTERVALS, f"{hint}; dtype=torch.float64 tells more apart"
+    if not length / step <= limit:
         raise ValueError(
             f"render: step cuts a ray of {length:g} into {length / step:.4g} intervals of "
-            f"{step:g}, more than {most:.4g} ({hint})"
+            f"{step:g}, more than {limit:.4g} ({hint})"
         )
 
 
@@ -210,23 +218,23 @@ class Batch:
     tracer: Tracer
     rays: ops.RayArguments
     segments: ops.Segments
-    listed: ops.Samples
+    samples: ops.Samples
 
     def values(self, channels: Sequence[str] = ()) -> Tensor:
         """Returns (k, c) values of channels side by side, by default of the tracer's one."""
-        found, tree = [], self.tracer.tree
+        columns, tree = [], self.tracer.tree
         for name in channels or (self.tracer.channel,):
             arguments = self.tracer.arguments._replace(
                 bricks_bzyxc=tree.bricks.bricks[name], constant_tnc=tree.nodes.constants[name]
             )
-            reads = (arguments, self.segments, self.listed)
-            found.append(ops.sample_bricks(self.rays, *reads, backend=self.tracer.backend))
-        return found[0] if len(found) == 1 else torch.cat(found, 1)
+            reads = (arguments, self.segments, self.samples)
+            columns.append(ops.sample_bricks(self.rays, *reads, backend=self.tracer.backend))
+        return columns[0] if len(columns) == 1 else torch.cat(columns, 1)
 
     @cached_property
     def segment(self) -> Tensor:
         """(k,) int64 segment of each sample."""
-        return self.listed.segment.to(torch.int64)
+        return self.samples.segment.to(torch.int64)
 
     @cached_property
     def ray(self) -> Tensor:
@@ -243,18 +251,18 @@ class Batch:
         """(k, 1) world length of each interval."""
         base, end, _ = self.segments.distance[self.segment].unbind(1)
         level = self.segments.interval[self.segment, 2]
-        whole = self.tracer.arguments.step * 2.0 ** level.clamp(min=0).to(base.dtype)
-        return torch.where(level < 0, end - base, whole)[:, None]
+        full = self.tracer.arguments.step * 2.0 ** level.clamp(min=0).to(base.dtype)
+        return torch.where(level < 0, end - base, full)[:, None]
 
     @cached_property
     def starts(self) -> Tensor:
         """(k,) distance from where the ray enters the tree's box to where each interval starts."""
         first, _, level = self.segments.interval[self.segment].unbind(1)
-        base, number = self.segments.distance[self.segment, 0], first + self.listed.number
-        return base + torch.where(level < 0, 0, number).to(base.dtype) * self.lengths[:, 0]
+        base, index = self.segments.distance[self.segment, 0], first + self.samples.number
+        return base + torch.where(level < 0, 0, index).to(base.dtype) * self.lengths[:, 0]
 
     @cached_property
-    def moved(self) -> Tensor:
+    def entry_distance(self) -> Tensor:
         """(r,) float64 distances from the camera to where rays enter the tree's box."""
         near, _ = tree_span(self.tracer.arguments.place_33, *self.rays[:2])
         return torch.where((near > 0) & (near < torch.inf), near, 0.0)
@@ -262,7 +270,7 @@ class Batch:
     @cached_property
     def positions(self) -> Tensor:
         """(k, 3) world positions of the samples, the middles of their intervals."""
-        t = self.moved[self.ray] + self.starts + 0.5 * self.lengths[:, 0]
+        t = self.entry_distance[self.ray] + self.starts + 0.5 * self.lengths[:, 0]
         origin, direction = (column[self.ray] for column in self.rays[:2])
         return (origin + t[:, None] * direction).to(self.starts.dtype)
 
@@ -285,43 +293,49 @@ def march(
     arguments, backend = tracer.arguments, tracer.backend
     like, count = arguments.domain_2, len(rays.origin)
     stop_alpha, hit_clear = arguments.stop_alpha, 1 - arguments.depth_alpha
-    going_on = ops.RayArguments.of(rays)._replace(clear_r=None)  # a walk has no transmittance
+    open_rays = ops.RayArguments.of(rays)._replace(clear_r=None)  # a walk has no transmittance
     sums = like.new_zeros((count, features))
     clear = rays.light()[:, 0].to(like.dtype)
     depth = like.new_full((count,), torch.inf)
     samples, nodes = like.new_zeros((2, count), dtype=torch.int32)
     missed = like.new_zeros(count, dtype=torch.bool)
-    which, state = torch.arange(count, device=like.device), None
+    open_index, state = torch.arange(count, device=like.device), None
     if rays.transmittance is not None:  # some may have ended in an earlier piece
-        which = (clear > 1 - stop_alpha).nonzero()[:, 0]
-        going_on = going_on.some(which)
-    while len(which):
+        open_index = (clear > 1 - stop_alpha).nonzero()[:, 0]
+        open_rays = open_rays.some(open_index)
+    while len(open_index):
         segments = ops.trace_segments(
-            going_on, arguments, state, limit=limit, by_node=by_node, backend=backend
+            open_rays, arguments, state, limit=limit, by_node=by_node, backend=backend
         )
-        missed[which] |= segments.missed
-        nodes[which] += segments.counts[:, 2]
-        batch = Batch(tracer, going_on, segments, ops.list_samples(segments))
+        missed[open_index] |= segments.missed
+        nodes[open_index] += segments.counts[:, 2]
+        batch = Batch(tracer, open_rays, segments, ops.list_samples(segments))
         if not len(batch.segment):
             break  # all have ended
         feature, alpha = shade(batch)
-        total, left, before = ops.composite(
-            *(alpha.contiguous(), feature.contiguous(), batch.listed.offset, clear[which]),
+        part_sums, clear_after, clear_before = ops.composite(
+            *(alpha.contiguous(), feature.contiguous(), batch.samples.offset, clear[open_index]),
             stop_alpha=stop_alpha,
             backend=backend,
         )
-        sums = sums.index_add(0, which, total)
-        clear = clear.index_put((which,), left)
+        sums = sums.index_add(0, open_index, part_sums)
+        clear = clear.index_put((open_index,), clear_after)
         with torch.no_grad():
-            samples.index_add_(0, which[batch.ray], (before > 0).to(torch.int32))
-            hit = ((before >= hit_clear) & (before * (1 - alpha) < hit_clear)).nonzero()[:, 0]
-            share = torch.log(hit_clear / before[hit]) / torch.log1p(-alpha[hit])
-            share = torch.where(alpha[hit] < 1, share.clamp(0, 1), 0.0)
-            place = batch.starts[hit] + share * batch.lengths[hit, 0] + batch.moved[batch.ray[hit]]
-            depth[which[batch.ray[hit]]] = place.to(like.dtype)
-            going = (segments.counts[:, 1] >= limit) & (left > 1 - stop_alpha)
-            on = going.nonzero()[:, 0]
-        going_on, which, state = going_on.some(on), which[on], segments.state[on]
+            samples.index_add_(0, open_index[batch.ray], (clear_before > 0).to(torch.int32))
+            hit = (
+                (clear_before >= hit_clear) & (clear_before * (1 - alpha) < hit_clear)
+            ).nonzero()[:, 0]
+            fraction = torch.log(hit_clear / clear_before[hit]) / torch.log1p(-alpha[hit])
+            fraction = torch.where(alpha[hit] < 1, fraction.clamp(0, 1), 0.0)
+            hit_depth = (
+                batch.starts[hit]
+                + fraction * batch.lengths[hit, 0]
+                + batch.entry_distance[batch.ray[hit]]
+            )
+            depth[open_index[batch.ray[hit]]] = hit_depth.to(like.dtype)
+            is_open = (segments.counts[:, 1] >= limit) & (clear_after > 1 - stop_alpha)
+            left = is_open.nonzero()[:, 0]
+        open_rays, open_index, state = open_rays.some(left), open_index[left], segments.state[left]
     colorless = like.new_zeros((count, 3))
     alpha, depth = (1 - clear)[:, None], depth[:, None]
     hits = Hits(color=colorless, alpha=alpha, depth=depth, samples=samples, missed=missed)

@@ -85,7 +85,7 @@ class TreeTracer(torch.nn.Module):
             stamp_b=arguments.stamp_b.clone(),
             frame_1=torch.zeros_like(arguments.frame_1),
         )
-        nothing = parameters = torch.zeros(0, device=tree.device)
+        empty = parameters = torch.zeros(0, device=tree.device)
         self.plain = tracer.shading is None  # the kernel of `trace_rays` draws it
         if not self.plain:
             parameters = shader.parameter_tensor(tree, options.dtype)
@@ -94,7 +94,7 @@ class TreeTracer(torch.nn.Module):
             if isinstance(value, (int, float)):
                 setattr(self, name, value)
             else:
-                self.register_buffer(name, nothing if value is None else value)
+                self.register_buffer(name, empty if value is None else value)
         self.register_buffer("parameter_54", parameters)
         self.box = tree.box  # (2, 3) on the CPU, where `rays` places cameras
         self.about = f"{tree!r}, {shader!r}"
@@ -105,11 +105,11 @@ class TreeTracer(torch.nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Moves the buffers without changing their dtypes."""
 
-        def moved(tensor: Tensor) -> Tensor:
-            made = fn(tensor)
-            return made if made.dtype == tensor.dtype else tensor.to(made.device)
+        def convert(tensor: Tensor) -> Tensor:
+            converted = fn(tensor)
+            return converted if converted.dtype == tensor.dtype else tensor.to(converted.device)
 
-        return super()._apply(moved, recurse)
+        return super()._apply(convert, recurse)
 
     @torch.jit.unused
     def rays(self, camera: Camera | Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -119,10 +119,10 @@ class TreeTracer(torch.nn.Module):
         """
         placed = as_camera("TreeTracer.rays", camera).placed(self.box)
         rays = placed.rays(self.place_33.device)
-        origin, direction, cone, limits = (
+        origin, direction, cone, ranges = (
             placed.image(column) for column in (rays.origin, rays.direction, rays.cone, rays.range)
         )
-        return origin, direction, cone, limits
+        return origin, direction, cone, ranges
 
     def __getstate__(self) -> dict[str, Any]:
         """Replaces the op, which can't be pickled, by its name."""
@@ -146,7 +146,7 @@ class TreeTracer(torch.nn.Module):
 
     @torch.jit.unused
     def _load_from_state_dict(
-        self, state: dict[str, Any], prefix: str, _told: Any, strict: bool, *lists: list[str]
+        self, state: dict[str, Any], prefix: str, _metadata: Any, strict: bool, *lists: list[str]
     ) -> None:
         """Loads nothing, and reports an error, if words point outside the pools."""
         try:
@@ -154,7 +154,7 @@ class TreeTracer(torch.nn.Module):
         except ValueError as error:
             lists[-1].append(str(error))
             return
-        super()._load_from_state_dict(state, prefix, _told, strict, *lists)
+        super()._load_from_state_dict(state, prefix, _metadata, strict, *lists)
 
     def forward(
         self, origin: Tensor, direction: Tensor, cone: Tensor, range: Tensor
@@ -182,10 +182,10 @@ class TreeTracer(torch.nn.Module):
         """As `forward`; also returns normal (..., 3) and features (..., c), which are (0, 3) and
         (0, 0) where the shader gives none.
         """
-        lead = list(origin.shape[:-1])
+        leading = list(origin.shape[:-1])
         columns = [
-            c.to(torch.float64).reshape(-1, c.shape[-1]).contiguous()
-            for c in (origin, direction, cone, range)
+            column.to(torch.float64).reshape(-1, column.shape[-1]).contiguous()
+            for column in (origin, direction, cone, range)
         ]
         rays = RayArguments(columns[0], columns[1], columns[2], columns[3], 0, None)
         arguments = self.arguments()
@@ -196,9 +196,13 @@ class TreeTracer(torch.nn.Module):
             color, alpha, depth, samples, _, normal, features = self.shade_rays(
                 *rays, *arguments, *self.shading(), self.parameter_54
             )
-            normal, features = _led(normal, lead), _led(features, lead)
-        color, alpha, depth = _led(color, lead), _led(alpha, lead), _led(depth, lead)
-        return color, alpha, depth, samples.reshape(lead), normal, features
+            normal, features = _unflatten(normal, leading), _unflatten(features, leading)
+        color, alpha, depth = (
+            _unflatten(color, leading),
+            _unflatten(alpha, leading),
+            _unflatten(depth, leading),
+        )
+        return color, alpha, depth, samples.reshape(leading), normal, features
 
     def arguments(self) -> TraceArguments:
         """Returns the op's arguments on the tree."""
@@ -234,10 +238,10 @@ class TreeTracer(torch.nn.Module):
         return ShadeArguments(
             shader=self.shader,
             features=self.features,
-            normal_bzyxc=_given(self.normal_bzyxc),
-            normal_tnc=_given(self.normal_tnc),
-            other_bzyxc=_given(self.other_bzyxc),
-            other_tnc=_given(self.other_tnc),
+            normal_bzyxc=_none_if_empty(self.normal_bzyxc),
+            normal_tnc=_none_if_empty(self.normal_tnc),
+            other_bzyxc=_none_if_empty(self.other_bzyxc),
+            other_tnc=_none_if_empty(self.other_tnc),
             other_component=self.other_component,
         )
 
@@ -245,19 +249,19 @@ class TreeTracer(torch.nn.Module):
 def _check_words(tensors: Mapping[str, Any], prefix: str) -> None:
     """Raises ValueError if words in `tensors` point outside the pools there."""
     names = ("child_tn", "brick_tn", "bricks_bzyxc")
-    given: list[Any] = [tensors.get(prefix + name) for name in names]
-    if not all(isinstance(one, Tensor) for one in given):
+    pools: list[Any] = [tensors.get(prefix + name) for name in names]
+    if not all(isinstance(pool, Tensor) for pool in pools):
         return  # only some tensors are loaded: kernels treat such words as absent
-    child, brick, bricks = given
+    child, brick, bricks = pools
     check.words("TreeTracer", f"{prefix}child_tn", child, config.TERMINAL, len(child) - 1)
     check.words("TreeTracer", f"{prefix}brick_tn", brick, config.CONSTANT, len(bricks) - 1)
 
 
-def _led(rows: Tensor, lead: list[int]) -> Tensor:
+def _unflatten(rows: Tensor, leading: list[int]) -> Tensor:
     """Returns rows (r, c) as (..., c)."""
-    return rows.reshape(lead + [rows.shape[1]])  # noqa: RUF005  (TorchScript has no stars here)
+    return rows.reshape(leading + [rows.shape[1]])  # noqa: RUF005  (TorchScript has no stars here)
 
 
-def _given(buffer: Tensor) -> Tensor | None:
+def _none_if_empty(buffer: Tensor) -> Tensor | None:
     """Returns the buffer, or None if it is the empty one that represents None."""
     return buffer if buffer.dim() > 1 else None

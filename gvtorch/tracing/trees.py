@@ -28,16 +28,17 @@ from ..shaders.built_in import Lit
 from ..shaders.filtered import Filtered
 from ..shaders.shader import Shader, check_shader
 from ..shaders.transfer_function import TransferFunction
-from .around import around
+from .around import with_effects
 from .composite import TraceRays, box_span, nothing_like, over
 from .options import RenderOptions
 from .pose import poses_of, world_box
 from .tracer import Batch, Tracer
 
-_PARTS = 8  # of a stretch where trees overlap, front to back: ended rays request nothing behind
-_RAYS = {"cpu": 1 << 14, "cuda": 1 << 18}  # composited by sample at once
-_SLIVER = 1e-3  # steps: ends of intervals that are closer count as one
-_MOST_ALPHA = 1 - 1e-9  # of a sample: the extinction of an opaque one would be infinite
+#: Parts of a stretch where trees overlap, front to back: ended rays request nothing behind.
+_PARTS_PER_STRETCH = 8
+_RAYS_PER_BLOCK = {"cpu": 1 << 14, "cuda": 1 << 18}  # composited by sample at once
+_SLIVER_STEPS = 1e-3  # steps: ends of intervals that are closer count as one
+_MAX_ALPHA = 1 - 1e-9  # of a sample: the extinction of an opaque one would be infinite
 
 #: A shader for all trees, or one for each by name.
 Shaders = Shader | Mapping[str, Shader]
@@ -48,12 +49,12 @@ class TreeTrace:
     """The tracers of one of several trees."""
 
     box: Tensor  # (2, 3) float64 world corners around the tree
-    trace: TraceRays  # the tracer, wrapped by `around`
+    trace: TraceRays  # the tracer, wrapped by `with_effects`
     tracer: Tracer  # the tree alone
 
 
 def tree_traces(
-    where: str,
+    context: str,
     scene: Mapping[str, tuple[N3Tree, Collection[str]]],  # by name: the tree, and its channel names
     shaders: Shaders,
     options: RenderOptions,  # its channel is the first of each tree if left out
@@ -61,30 +62,30 @@ def tree_traces(
     **settings: Any,  # of `Tracer`
 ) -> list[TreeTrace]:
     """Prepares the tracers of all trees for one frame. Raises ValueError if a shader is missing, or
-    a tree has no such channel; see `Tracer` and `around`.
+    a tree has no such channel; see `Tracer` and `with_effects`.
     """
-    traces, poses = [], poses_of(where, scene, options.pose)
+    traces, poses = [], poses_of(context, scene, options.pose)
     for name, (tree, channels) in scene.items():
         shader: Any = shaders.get(name) if isinstance(shaders, Mapping) else shaders
-        check_shader(where, f"shader of tree {name!r}", shader)
+        check_shader(context, f"shader of tree {name!r}", shader)
         channel = options.channel or next(iter(channels))
         for needed in (channel, *shader.channels):
             if needed not in channels:
-                known = ", ".join(channels)
+                channel_list = ", ".join(channels)
                 raise ValueError(
-                    f"{where}: tree {name!r} has no channel {needed!r}; it has {known}"
+                    f"{context}: tree {name!r} has no channel {needed!r}; it has {channel_list}"
                 )
-        chosen = replace(options, channel=channel, pose=poses[name])
-        tracer = Tracer(tree, shader, chosen, **settings)
-        here = world_box(tree.box, poses[name])
-        traces.append(TreeTrace(here, around(tracer, chosen, box), tracer))
+        tree_options = replace(options, channel=channel, pose=poses[name])
+        tracer = Tracer(tree, shader, tree_options, **settings)
+        tree_box = world_box(tree.box, poses[name])
+        traces.append(TreeTrace(tree_box, with_effects(tracer, tree_options, box), tracer))
     return traces
 
 
-def box_around(where: str, trees: Mapping[str, N3Tree], poses: Any = None) -> Tensor:
+def box_around(context: str, trees: Mapping[str, N3Tree], poses: Any = None) -> Tensor:
     """Returns (2, 3) float64 world corners around all trees, given `RenderOptions.pose`."""
-    placed = poses_of(where, trees, poses)
-    boxes = [world_box(tree.box, placed[name]) for name, tree in trees.items()]
+    tree_poses = poses_of(context, trees, poses)
+    boxes = [world_box(tree.box, tree_poses[name]) for name, tree in trees.items()]
     if len(boxes) == 1:
         return boxes[0]
     low, high = torch.stack(boxes).unbind(1)
@@ -100,27 +101,27 @@ def trace_trees(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     if len(trees) == 1:
         return trees[0].trace(rays)
     if not overlaps(trees):
-        return _in_order(trees, rays)
-    trees = [one for one in trees if _shows(one)] or trees[:1]
+        return _trace_in_order(trees, rays)
+    trees = [tree for tree in trees if _has_opacity(tree)] or trees[:1]
     if len(trees) == 1:
         return trees[0].trace(rays)
-    span = _spans(trees, rays)
-    first, last = span.unbind(2)
+    spans = _box_spans(trees, rays)
+    first, last = spans.unbind(2)
     pairs = combinations(range(len(trees)), 2)
     shared = [torch.maximum(first[a], first[b]) < torch.minimum(last[a], last[b]) for a, b in pairs]
-    both = torch.stack(shared).any(0)
-    mixed, apart = both.nonzero()[:, 0], (~both).nonzero()[:, 0]
-    if not len(mixed):
-        return _in_order(trees, rays)
-    if not len(apart):
-        return _by_sample(trees, rays)
-    found = _in_order(trees, rays[apart]), _by_sample(trees, rays[mixed])
-    return _scattered(found, (apart, mixed))
+    is_shared = torch.stack(shared).any(0)
+    mixed_rays, separate_rays = is_shared.nonzero()[:, 0], (~is_shared).nonzero()[:, 0]
+    if not len(mixed_rays):
+        return _trace_in_order(trees, rays)
+    if not len(separate_rays):
+        return _mix_by_sample(trees, rays)
+    parts = _trace_in_order(trees, rays[separate_rays]), _mix_by_sample(trees, rays[mixed_rays])
+    return _join_hits(parts, (separate_rays, mixed_rays))
 
 
 def overlaps(trees: Sequence[TreeTrace]) -> bool:
     """Returns whether trees are composited by sample, which makes the host wait for the device."""
-    if any(one.tracer.shader.projection or one.tracer.shader.whole_ray for one in trees):
+    if any(tree.tracer.shader.projection or tree.tracer.shader.whole_ray for tree in trees):
         return False
     return any(
         bool((torch.maximum(a.box[0], b.box[0]) < torch.minimum(a.box[1], b.box[1])).all())
@@ -128,9 +129,9 @@ def overlaps(trees: Sequence[TreeTrace]) -> bool:
     )
 
 
-def _shows(one: TreeTrace) -> bool:
+def _has_opacity(tree: TreeTrace) -> bool:
     """Returns False if a tree is hidden by a transfer function without any opacity."""
-    shader = one.tracer.shader  # surfaces and others only use the colour of a transfer function
+    shader = tree.tracer.shader  # surfaces and others only use the colour of a transfer function
     transfer = shader.transfer if isinstance(shader, Lit) else shader
     transfer = shader.function if isinstance(shader, Filtered) else transfer
     return not isinstance(transfer, TransferFunction) or bool(transfer.opacity[:, 1].any())
@@ -139,34 +140,37 @@ def _shows(one: TreeTrace) -> bool:
 # --- one tree behind the other
 
 
-def _in_order(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+def _trace_in_order(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Composites trees in the order in which rays enter their boxes."""
-    first, last = _spans(trees, rays).unbind(2)
+    first, last = _box_spans(trees, rays).unbind(2)
     order = torch.where(first <= last, first, torch.inf).argsort(dim=0, stable=True)  # (m, r)
-    hits = [one.trace(rays) for one in trees]
-    fields = {name: _ranked(hits, name, order) for name in vars(hits[0])}
-    ranked = [Hits(**{name: f[rank] for name, f in fields.items()}) for rank in range(len(trees))]
+    hits = [tree.trace(rays) for tree in trees]
+    ordered = {name: _in_ray_order(hits, name, order) for name in vars(hits[0])}
+    ranked = [
+        Hits(**{name: values[rank] for name, values in ordered.items()})
+        for rank in range(len(trees))
+    ]
     return replace(reduce(over, ranked), normal=_mean_normal(ranked))
 
 
 def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
     """Returns (r, 3) mean normals, weighted by the light each tree absorbs; None if none exist."""
-    taken = [one.normal * one.alpha for one in ranked if one.normal is not None]
-    if not taken:
+    weighted = [hits.normal * hits.alpha for hits in ranked if hits.normal is not None]
+    if not weighted:
         return None
-    total, alpha = taken[0], ranked[0].alpha
-    for more, one in zip(taken[1:], ranked[1:], strict=True):
-        total = total + (1 - alpha) * more
-        alpha = alpha + (1 - alpha) * one.alpha
+    total, alpha = weighted[0], ranked[0].alpha
+    for behind, hits in zip(weighted[1:], ranked[1:], strict=True):
+        total = total + (1 - alpha) * behind
+        alpha = alpha + (1 - alpha) * hits.alpha
     return normalize(total, dim=1)
 
 
-def _ranked(hits: Sequence[Hits], name: str, order: Tensor) -> Sequence[Any]:
+def _in_ray_order(hits: Sequence[Hits], name: str, order: Tensor) -> Sequence[Any]:
     """Returns a field (r, ...) of m trees, in the order (m, r) of the trees along each ray."""
-    filled = _filled(hits, name)
-    if filled is None:
+    columns = _filled(hits, name)
+    if columns is None:
         return [None] * len(hits)
-    stacked = torch.stack(filled)
+    stacked = torch.stack(columns)
     if stacked.dim() == 3:
         order = order[:, :, None].expand_as(stacked)
     return stacked.gather(0, order).unbind(0)
@@ -174,161 +178,174 @@ def _ranked(hits: Sequence[Hits], name: str, order: Tensor) -> Sequence[Any]:
 
 def _filled(hits: Sequence[Hits], name: str) -> list[Tensor] | None:
     """Returns a field (r, ...) of all `hits`, zeros or -1 where one lacks it; None if all do."""
-    fields = [getattr(one, name) for one in hits]
-    given = [field for field in fields if field is not None]
-    if not given:
+    fields = [getattr(tree_hits, name) for tree_hits in hits]
+    present = [field for field in fields if field is not None]
+    if not present:
         return None
-    if len({field.shape[1:] for field in given}) > 1:
+    if len({field.shape[1:] for field in present}) > 1:
         raise ValueError("render: all trees must give the same number of features")
     return [
-        nothing_like(given[0], len(one.alpha)) if field is None else field
-        for one, field in zip(hits, fields, strict=True)
+        nothing_like(present[0], len(tree_hits.alpha)) if field is None else field
+        for tree_hits, field in zip(hits, fields, strict=True)
     ]
 
 
 # --- several trees in the same space
 
 
-def _by_sample(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+def _mix_by_sample(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Composites trees by sample, a block of rays at a time."""
-    size = _RAYS[rays.origin.device.type]
+    size = _RAYS_PER_BLOCK[rays.origin.device.type]
     blocks = [
-        torch.arange(at, min(at + size, len(rays.origin)), device=rays.origin.device)
-        for at in range(0, len(rays.origin), size)
+        torch.arange(start, min(start + size, len(rays.origin)), device=rays.origin.device)
+        for start in range(0, len(rays.origin), size)
     ]
-    return _scattered([_block(trees, rays[block]) for block in blocks], blocks)
+    return _join_hits([_trace_block(trees, rays[block]) for block in blocks], blocks)
 
 
-def _block(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+def _trace_block(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Traces the nearest surface, and composites the media in front over it."""
-    surfaces = [one for one in trees if one.tracer.shader.cut_surface() is not None]
+    surfaces = [tree for tree in trees if tree.tracer.shader.cut_surface() is not None]
     if not surfaces:
-        return _media(trees, rays)
-    media = [one for one in trees if one not in surfaces]
-    back = reduce(_nearer, [one.trace(replace(rays, transmittance=None)) for one in surfaces])
+        return _trace_media(trees, rays)
+    media = [tree for tree in trees if tree not in surfaces]
+    back = reduce(
+        _nearer_hits, [tree.trace(replace(rays, transmittance=None)) for tree in surfaces]
+    )
     depth = back.depth.to(rays.range.dtype)
     front_range = torch.cat((rays.range[:, :1], torch.minimum(rays.range[:, 1:], depth)), 1)
-    front = _nothing(rays, trees[0].tracer.dtype)
+    front = _no_hits(rays, trees[0].tracer.dtype)
     if media:
-        front = _media(media, replace(rays, range=front_range))
+        front = _trace_media(media, replace(rays, range=front_range))
     hit_clear = 1 - trees[0].tracer.arguments.depth_alpha
-    gone = rays.light() < hit_clear  # depth was found before these rays begin
-    return over(front, replace(back, depth=torch.where(gone, torch.inf, back.depth)))
+    depth_passed = rays.light() < hit_clear  # depth was found before these rays begin
+    return over(front, replace(back, depth=torch.where(depth_passed, torch.inf, back.depth)))
 
 
-def _nearer(one: Hits, two: Hits) -> Hits:
+def _nearer_hits(hits_a: Hits, hits_b: Hits) -> Hits:
     """Returns the nearer of two hits of each ray."""
-    first, fields = (one.depth <= two.depth)[:, 0], {}
-    for name in vars(one):
-        pair = _filled((one, two), name)
+    a_is_nearer, fields = (hits_a.depth <= hits_b.depth)[:, 0], {}
+    for name in vars(hits_a):
+        pair = _filled((hits_a, hits_b), name)
         if pair is not None:
             a, b = pair
-            fields[name] = torch.where(first if a.dim() == 1 else first[:, None], a, b)
-    fields |= {"samples": one.samples + two.samples, "missed": one.missed | two.missed}
+            fields[name] = torch.where(a_is_nearer if a.dim() == 1 else a_is_nearer[:, None], a, b)
+    fields |= {"samples": hits_a.samples + hits_b.samples, "missed": hits_a.missed | hits_b.missed}
     return Hits(**fields)
 
 
-def _media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+def _trace_media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Traces rays from box to box: where a ray is in one box only, its tree is traced as usual."""
-    span = _spans(trees, rays)
+    span = _box_spans(trees, rays)
     ends = span.transpose(0, 1).flatten(1).sort(1).values  # (r, 2m)
-    hits = _nothing(rays, trees[0].tracer.dtype, trees)
+    hits = _no_hits(rays, trees[0].tracer.dtype, trees)
     stop = trees[0].tracer.arguments.stop_alpha
     for near, far in pairwise(ends.unbind(1)):
         middle = (near + far) / 2
         inside = (span[:, :, 0] <= middle) & (middle <= span[:, :, 1]) & (near < far)  # (m, r)
-        for one, mine in zip(trees, inside, strict=True):
-            alone = mine & (inside.sum(0) == 1)
-            hits = _further(hits, rays, alone, (near, far), stop, one.trace)
+        for tree, in_tree in zip(trees, inside, strict=True):
+            alone = in_tree & (inside.sum(0) == 1)
+            hits = _add_stretch(hits, rays, alone, (near, far), stop, tree.trace)
         several = inside.sum(0) > 1
         if not bool(several.any()):
             continue
-        for part in range(_PARTS):
-            low, high = (near + (far - near) * (at / _PARTS) for at in (part, part + 1))
-            high = far if part == _PARTS - 1 else high
-            hits = _further(hits, rays, several, (low, high), stop, lambda r: _together(trees, r))
-    return hits if hits.normal is None else replace(hits, normal=_unit(hits.normal))
+        for part in range(_PARTS_PER_STRETCH):
+            low, high = (
+                near + (far - near) * (index / _PARTS_PER_STRETCH) for index in (part, part + 1)
+            )
+            high = far if part == _PARTS_PER_STRETCH - 1 else high
+            hits = _add_stretch(
+                hits, rays, several, (low, high), stop, lambda piece: _trace_mixed(trees, piece)
+            )
+    return hits if hits.normal is None else replace(hits, normal=_unit_vectors(hits.normal))
 
 
-def _further(
+def _add_stretch(
     hits: Hits,
     rays: Rays,
-    which: Tensor,
+    mask: Tensor,
     span: tuple[Tensor, Tensor],
     stop: float,
     trace: TraceRays,
 ) -> Hits:
-    """Traces a stretch of those rays `which` (r,) bool that have not ended, and adds it behind
+    """Traces a stretch of those rays `mask` (r,) bool that have not ended, and adds it behind
     their `hits`, whose normals are sums weighted by light.
     """
-    at = (which & (hits.alpha[:, 0] < stop)).nonzero()[:, 0]
-    if not len(at):
+    index = (mask & (hits.alpha[:, 0] < stop)).nonzero()[:, 0]
+    if not len(index):
         return hits
-    before = hits.alpha[at]
-    light = (1 - before[:, 0]).to(torch.float64)
-    part = replace(rays[at], range=torch.stack(span, 1)[at], transmittance=light)
-    found = vars(trace(part)).copy()
-    if found["normal"] is not None:
-        found["normal"] = found["normal"] * (found["alpha"] - before)
-    join: dict[str, Any] = {"depth": torch.minimum, "missed": torch.logical_or}
-    join |= {"alpha": lambda _, whole: whole, "label": torch.maximum}  # only one is hit
+    alpha_before = hits.alpha[index]
+    transmittance = (1 - alpha_before[:, 0]).to(torch.float64)
+    stretch = replace(rays[index], range=torch.stack(span, 1)[index], transmittance=transmittance)
+    fields_behind = vars(trace(stretch)).copy()
+    if fields_behind["normal"] is not None:
+        fields_behind["normal"] = fields_behind["normal"] * (fields_behind["alpha"] - alpha_before)
+    joins: dict[str, Any] = {"depth": torch.minimum, "missed": torch.logical_or}
+    joins |= {"alpha": lambda _, total: total, "label": torch.maximum}  # only one is hit
     fields: dict[str, Any] = vars(hits).copy()
-    for name, more in found.items():
-        if more is None:
+    for name, values in fields_behind.items():
+        if values is None:
             continue
-        known = fields[name]
-        if known is None:
-            known = nothing_like(more, len(which))
-        fields[name] = known.index_copy(0, at, join.get(name, torch.add)(known[at], more))
+        values_before = fields[name]
+        if values_before is None:
+            values_before = nothing_like(values, len(mask))
+        fields[name] = values_before.index_copy(
+            0, index, joins.get(name, torch.add)(values_before[index], values)
+        )
     return Hits(**fields)
 
 
-def _together(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+def _trace_mixed(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Traces rays through media that fill the same space."""
-    pieces, missed = _cut(trees, rays)
-    shown = _Shown(pieces, trees[0].tracer.dtype)
-    for one, covered in zip(trees, pieces.covered, strict=True):
-        at = covered.nonzero()[:, 0]
-        if len(at):
-            hits = one.trace(pieces.rays(rays, at))
-            shown.add(at, hits)
-            missed = missed.index_put((pieces.ray[at[hits.missed]],), missed.new_ones(()))
-    known, backend = trees[0].tracer.arguments, trees[0].tracer.backend
+    pieces, missed = _cut_into_pieces(trees, rays)
+    piece_sums = _PieceSums(pieces, trees[0].tracer.dtype)
+    for tree, covered in zip(trees, pieces.covered, strict=True):
+        piece_index = covered.nonzero()[:, 0]
+        if len(piece_index):
+            hits = tree.trace(pieces.rays(rays, piece_index))
+            piece_sums.add(piece_index, hits)
+            missed = missed.index_put((pieces.ray[piece_index[hits.missed]],), missed.new_ones(()))
+    arguments, backend = trees[0].tracer.arguments, trees[0].tracer.backend
     clear = rays.light()[:, 0].contiguous()
-    alpha, features = shown.alpha(), shown.features()
-    total, left, before = ops.composite(
+    alpha, features = piece_sums.alpha(), piece_sums.features()
+    sums, clear_after, clear_before = ops.composite(
         *(alpha, features, pieces.offset(len(clear)), clear),
-        stop_alpha=known.stop_alpha,
+        stop_alpha=arguments.stop_alpha,
         backend=backend,
     )
-    hit_clear = 1 - known.depth_alpha
-    hit = ((before >= hit_clear) & (before * (1 - alpha) < hit_clear)).nonzero()[:, 0]
+    hit_clear = 1 - arguments.depth_alpha
+    hit = ((clear_before >= hit_clear) & (clear_before * (1 - alpha) < hit_clear)).nonzero()[:, 0]
     near, far = pieces.span[hit].unbind(1)
-    place = near + torch.log(before[hit] / hit_clear) / shown.extinction[hit, 0] * (far - near)
+    hit_depth = near + torch.log(clear_before[hit] / hit_clear) / piece_sums.extinction[hit, 0] * (
+        far - near
+    )
     label, samples = None, torch.zeros(len(clear), dtype=torch.int32, device=clear.device)
-    if any(one.tracer.shader.reads_labels for one in trees):
+    if any(tree.tracer.shader.reads_labels for tree in trees):
         label = samples.new_full((len(clear), 1), -1, dtype=torch.int64)
     single = pieces.covered.sum(0)[hit] == 1
-    for one, covered in zip(trees, pieces.covered, strict=True):
-        mine, light = covered[hit], before[hit]
-        if label is not None and one.tracer.shader.reads_labels:
-            light = torch.where(single, light, hit_clear)  # among others: any alpha is a hit
+    for tree, covered in zip(trees, pieces.covered, strict=True):
+        candidates, transmittance = covered[hit], clear_before[hit]
+        if label is not None and tree.tracer.shader.reads_labels:
+            # Among other trees any alpha is a hit.
+            transmittance = torch.where(single, transmittance, hit_clear)
         else:
-            mine = mine & single  # a run of samples: its tree finds the depth
-        at = mine.nonzero()[:, 0]
-        if not len(at):
+            candidates = candidates & single  # a run of samples: its tree finds the depth
+        piece_index = candidates.nonzero()[:, 0]
+        if not len(piece_index):
             continue
-        found = one.trace(pieces.rays(rays, hit[at], light[at]))
-        far = found.depth[:, 0].to(place)
-        place[at] = torch.where(single[at] & (far < torch.inf), far, place[at])
-        if found.label is not None and label is not None:
-            label[pieces.ray[hit[at]]] = found.label
-    depth = left.new_full((len(clear),), torch.inf).index_put((pieces.ray[hit],), place)
-    samples.index_add_(0, pieces.ray, torch.where(before > 0, shown.samples, 0))
-    return replace(shown.hits(total, left, depth, samples, missed), label=label)
+        hits = tree.trace(pieces.rays(rays, hit[piece_index], transmittance[piece_index]))
+        far = hits.depth[:, 0].to(hit_depth)
+        hit_depth[piece_index] = torch.where(
+            single[piece_index] & (far < torch.inf), far, hit_depth[piece_index]
+        )
+        if hits.label is not None and label is not None:
+            label[pieces.ray[hit[piece_index]]] = hits.label
+    depth = clear_after.new_full((len(clear),), torch.inf).index_put((pieces.ray[hit],), hit_depth)
+    samples.index_add_(0, pieces.ray, torch.where(clear_before > 0, piece_sums.samples, 0))
+    return replace(piece_sums.hits(sums, clear_after, depth, samples, missed), label=label)
 
 
-class _Shown:
+class _PieceSums:
     """Colours, normals and features of pieces: sums over trees, weighted by extinction."""
 
     def __init__(self, pieces: _Pieces, dtype: torch.dtype) -> None:
@@ -338,23 +355,24 @@ class _Shown:
         self.samples = torch.zeros(count, dtype=torch.int32, device=device)
         self.sums: dict[str, Tensor] = {}
 
-    def add(self, at: Tensor, hits: Hits) -> None:
-        """Adds a tree's hits in the pieces `at` (k,)."""
+    def add(self, index: Tensor, hits: Hits) -> None:
+        """Adds a tree's hits in the pieces `index` (k,)."""
         alpha = hits.alpha.to(torch.float64)
-        thick = -torch.log1p(-alpha.clamp(max=_MOST_ALPHA))
-        self.extinction.index_add_(0, at, thick)
-        self.samples.index_add_(0, at, hits.samples)
-        share = thick / alpha.clamp(min=1e-300)  # from weights of alpha to weights of extinction
+        extinction = -torch.log1p(-alpha.clamp(max=_MAX_ALPHA))
+        self.extinction.index_add_(0, index, extinction)
+        self.samples.index_add_(0, index, hits.samples)
+        # From weights of alpha to weights of extinction.
+        weight = extinction / alpha.clamp(min=1e-300)
         normal = None if hits.normal is None else hits.normal * hits.alpha
-        given = {"color": hits.color, "normal": normal, "features": hits.features}
-        for name, field in given.items():
+        fields = {"color": hits.color, "normal": normal, "features": hits.features}
+        for name, field in fields.items():
             if field is None:
                 continue
             shape = (len(self.extinction), field.shape[1])
-            known = self.sums.setdefault(name, self.extinction.new_zeros(shape))
-            if known.shape != shape:
+            sums = self.sums.setdefault(name, self.extinction.new_zeros(shape))
+            if sums.shape != shape:
                 raise ValueError("render: all trees must give the same number of features")
-            known.index_add_(0, at, share * field)
+            sums.index_add_(0, index, weight * field)
 
     def alpha(self) -> Tensor:
         """Returns (k,) alphas of the pieces."""
@@ -366,20 +384,20 @@ class _Shown:
         return torch.cat(columns, 1) / self.extinction.clamp(min=1e-300)
 
     def hits(
-        self, total: Tensor, left: Tensor, depth: Tensor, samples: Tensor, missed: Tensor
+        self, sums: Tensor, clear: Tensor, depth: Tensor, samples: Tensor, missed: Tensor
     ) -> Hits:
         """Returns the hits of rays, given sums (r, c) of `features` and the transmittance left."""
-        widths = [one.shape[1] for one in self.sums.values()]
-        given = dict(zip(self.sums, total.to(self.dtype).split(widths, 1), strict=True))
-        color = given.get("color", total.new_zeros((len(total), 3), dtype=self.dtype))
+        widths = [columns.shape[1] for columns in self.sums.values()]
+        fields = dict(zip(self.sums, sums.to(self.dtype).split(widths, 1), strict=True))
+        color = fields.get("color", sums.new_zeros((len(sums), 3), dtype=self.dtype))
         return Hits(
             color=color,
-            alpha=(1 - left)[:, None].to(self.dtype),
+            alpha=(1 - clear)[:, None].to(self.dtype),
             depth=depth[:, None].to(self.dtype),
             samples=samples,
             missed=missed,
-            normal=_unit(given["normal"]) if "normal" in given else None,
-            features=given.get("features"),
+            normal=_unit_vectors(fields["normal"]) if "normal" in fields else None,
+            features=fields.get("features"),
         )
 
 
@@ -391,9 +409,9 @@ class _Pieces:
     span: Tensor  # (k, 2) float64 distances from the camera
     covered: Tensor  # (m, k) bool, the trees sampled there
 
-    def rays(self, rays: Rays, at: Tensor, transmittance: Tensor | None = None) -> Rays:
-        """Returns the pieces `at` (k,) as separate rays."""
-        return replace(rays[self.ray[at]], range=self.span[at], transmittance=transmittance)
+    def rays(self, rays: Rays, index: Tensor, transmittance: Tensor | None = None) -> Rays:
+        """Returns the pieces `index` (k,) as separate rays."""
+        return replace(rays[self.ray[index]], range=self.span[index], transmittance=transmittance)
 
     def offset(self, rays: int) -> Tensor:
         """Returns (r + 1,) int64 indices of each ray's first piece; the last is their number."""
@@ -401,46 +419,50 @@ class _Pieces:
         return torch.cat((count.new_zeros(1), count.cumsum(0)))
 
 
-def _cut(trees: Sequence[TreeTrace], rays: Rays) -> tuple[_Pieces, Tensor]:
+def _cut_into_pieces(trees: Sequence[TreeTrace], rays: Rays) -> tuple[_Pieces, Tensor]:
     """Cuts rays wherever an interval that one of the trees samples begins or ends; where only one
     is sampled, its intervals stay together. Also returns (r,) bool: the ray missed something.
     """
     missed = torch.zeros(len(rays.origin), dtype=torch.bool, device=rays.origin.device)
-    ray, place, change = [], [], []
-    for number, one in enumerate(trees):
-        tracer = one.tracer
-        given = ops.RayArguments.of(tracer.inside(replace(rays, transmittance=None)))
-        known, table = tracer.arguments, tracer.arguments.table_lm4
+    ray_parts, distance_parts, change_parts = [], [], []
+    for tree_index, tree in enumerate(trees):
+        tracer = tree.tracer
+        ray_arguments = ops.RayArguments.of(tracer.to_tree(replace(rays, transmittance=None)))
+        arguments, table = tracer.arguments, tracer.arguments.table_lm4
         if table.dim() == 4:  # pre-integrated, (l, m, m, 4): use intervals of one value
-            known = known._replace(table_lm4=table.diagonal(dim1=1, dim2=2).mT.contiguous())
-        segments = ops.trace_segments(given, known, by_node=True, backend=tracer.backend)
+            arguments = arguments._replace(table_lm4=table.diagonal(dim1=1, dim2=2).mT.contiguous())
+        segments = ops.trace_segments(
+            ray_arguments, arguments, by_node=True, backend=tracer.backend
+        )
         missed |= segments.missed
-        batch = Batch(tracer, given, segments, ops.list_samples(segments))
-        first = batch.moved[batch.ray] + batch.starts
+        batch = Batch(tracer, ray_arguments, segments, ops.list_samples(segments))
+        first = batch.entry_distance[batch.ray] + batch.starts
         last = first + batch.lengths[:, 0]
         ends = [end.to(torch.float64).clamp(*rays.range[batch.ray].T) for end in (first, last)]
         for end, step in zip(ends, (1, -1), strict=True):
-            ray.append(batch.ray)
-            place.append(end)
-            change.append(torch.zeros(len(end), len(trees), dtype=torch.int32, device=end.device))
-            change[-1][:, number] = step
-    rays_k, places_k = torch.cat(ray), torch.cat(place)
-    order = places_k.argsort(stable=True)
-    order = order[rays_k[order].argsort(stable=True)]
-    rays_k, places_k = rays_k[order], places_k[order]
-    covered = torch.cat(change)[order].cumsum(0) > 0  # just behind each end
-    sliver = _SLIVER * min(one.tracer.arguments.step for one in trees)
-    return _joined(rays_k, places_k, covered, sliver), missed
+            ray_parts.append(batch.ray)
+            distance_parts.append(end)
+            change_parts.append(
+                torch.zeros(len(end), len(trees), dtype=torch.int32, device=end.device)
+            )
+            change_parts[-1][:, tree_index] = step
+    ray_k, distance_k = torch.cat(ray_parts), torch.cat(distance_parts)
+    order = distance_k.argsort(stable=True)
+    order = order[ray_k[order].argsort(stable=True)]
+    ray_k, distance_k = ray_k[order], distance_k[order]
+    covered = torch.cat(change_parts)[order].cumsum(0) > 0  # just behind each end
+    sliver = _SLIVER_STEPS * min(tree.tracer.arguments.step for tree in trees)
+    return _join_intervals(ray_k, distance_k, covered, sliver), missed
 
 
-def _joined(ray: Tensor, place: Tensor, covered: Tensor, sliver: float) -> _Pieces:
+def _join_intervals(ray: Tensor, distance: Tensor, covered: Tensor, sliver: float) -> _Pieces:
     """Makes pieces from the sorted ends (k,) of intervals; `covered` (k, m): trees just behind."""
-    same = ray[1:] == ray[:-1]
-    near, far = place[:-1], place[1:]
-    kept = (same & covered[:-1].any(1) & (far - near > sliver)).nonzero()[:, 0]
+    same_ray = ray[1:] == ray[:-1]
+    near, far = distance[:-1], distance[1:]
+    kept = (same_ray & covered[:-1].any(1) & (far - near > sliver)).nonzero()[:, 0]
     ray, near, far, covered = ray[:-1][kept], near[kept], far[kept], covered[:-1][kept]
     if not len(ray):
-        return _Pieces(ray, place.new_zeros((0, 2)), covered.T)
+        return _Pieces(ray, distance.new_zeros((0, 2)), covered.T)
     # Slivers between pieces are added to the piece behind; a run of one tree stays one piece.
     joins = (ray[1:] == ray[:-1]) & (near[1:] - far[:-1] <= 8 * sliver)
     near = torch.cat((near[:1], torch.where(joins, far[:-1], near[1:])))
@@ -454,24 +476,28 @@ def _joined(ray: Tensor, place: Tensor, covered: Tensor, sliver: float) -> _Piec
 # --- helpers
 
 
-def _spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
+def _box_spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
     """Returns (m, r, 2) distances of rays in the trees' boxes; last < first where they miss."""
     spans = []
-    for one in trees:
-        own = one.tracer.inside(rays)
-        low, high = pack((one.tracer.tree.box,), own.origin.dtype, own.origin.device).view(2, 3)
-        first, last = box_span(low, high, own.origin, own.direction)
+    for tree in trees:
+        tree_rays = tree.tracer.to_tree(rays)
+        low, high = pack(
+            (tree.tracer.tree.box,), tree_rays.origin.dtype, tree_rays.origin.device
+        ).view(2, 3)
+        first, last = box_span(low, high, tree_rays.origin, tree_rays.direction)
         near, far = rays.range.to(first).unbind(1)
         spans.append(torch.stack((torch.maximum(first, near), torch.minimum(last, far)), 1))
     return torch.stack(spans)
 
 
-def _nothing(rays: Rays, dtype: torch.dtype, trees: Sequence[TreeTrace] = ()) -> Hits:
+def _no_hits(rays: Rays, dtype: torch.dtype, trees: Sequence[TreeTrace] = ()) -> Hits:
     """Returns hits of rays that have met nothing yet, with all fields that the trees give."""
     column = torch.zeros(len(rays.origin), 1, dtype=dtype, device=rays.origin.device)
     color = column.expand(-1, 3).contiguous()
     shaded = [
-        (one.tracer.names, shading) for one in trees if (shading := one.tracer.shading) is not None
+        (tree.tracer.label_names, shading)
+        for tree in trees
+        if (shading := tree.tracer.shading) is not None
     ]
     # The kernel returns a label as its only feature, which the tracer turns into `label`.
     widths = [shading.features if names is None else 0 for names, shading in shaded]
@@ -488,19 +514,19 @@ def _nothing(rays: Rays, dtype: torch.dtype, trees: Sequence[TreeTrace] = ()) ->
     )
 
 
-def _scattered(found: Sequence[Hits], places: Sequence[Tensor]) -> Hits:
-    """Joins hits to (r,); each of `found` holds those at its indices `places` (k,)."""
-    if len(found) == 1:
-        return found[0]
-    at = torch.cat(list(places)).argsort()
+def _join_hits(parts: Sequence[Hits], indices: Sequence[Tensor]) -> Hits:
+    """Joins hits to (r,); each of `parts` holds those at its indices `indices` (k,)."""
+    if len(parts) == 1:
+        return parts[0]
+    order = torch.cat(list(indices)).argsort()
     fields = {}
-    for name in vars(found[0]):
-        if (parts := _filled(found, name)) is not None:
-            fields[name] = torch.cat(parts)[at]
+    for name in vars(parts[0]):
+        if (columns := _filled(parts, name)) is not None:
+            fields[name] = torch.cat(columns)[order]
     return Hits(**fields)
 
 
-def _unit(vectors: Tensor) -> Tensor:
+def _unit_vectors(vectors: Tensor) -> Tensor:
     """Returns vectors (r, 3) of unit length, zeros as they are; the bits do not depend on r."""
     x, y, z = vectors.unbind(1)
     length = (x * x + y * y + z * z).sqrt()

@@ -108,10 +108,10 @@ class Frames:
             self.view.numbers.copy_(numbers)
             hits = self.served.draw(self.view, ahead is not None)
             if ahead is not None and ahead.due:
-                self.served.look(ahead.hits)
+                self.served.look_ahead(ahead.hits)
             collected = self.served.finish(hits)
             if isinstance(self.served, HostFrame):
-                collected = collected._replace(ask=partial(self.served.ask, self.served.turn))
+                collected = collected._replace(ask=partial(self.served.ask, self.served.generation))
             self.engine.read_back(stats, hits, collected)
         self.engine.readbacks.hold_back()
         return hits, stats.settle()
