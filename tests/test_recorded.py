@@ -6,10 +6,8 @@ from __future__ import annotations
 
 import gc
 import math
-import threading
 import time
 import weakref
-from concurrent.futures import Future
 from typing import Any
 
 import pytest
@@ -24,7 +22,6 @@ from gvtorch.base.branches import in_branches
 from gvtorch.base.constants import REQUEST_PENDING_SHIFT
 from gvtorch.cache import Cache
 from gvtorch.cache.requests import DEEPER, deeper, levels_wanted
-from gvtorch.engine import host_frame
 from gvtorch.engine.device_frame import DeviceFrame
 from gvtorch.engine.stats import Collected, Counts, Readback
 from gvtorch.io.stores.conversion import convert
@@ -100,205 +97,6 @@ def test_joined_producers_are_recorded_where_all_are(backend):
     cast = Ball(64)
     cast.on_device = False
     assert not gv.JoinedProducer({"a": Ball(64), "b": cast}).on_device
-
-
-def on_the_host(blobs, tmp_path, which: str) -> gv.Producer:
-    """Returns a producer that answers from the host: at once, by rows of a table, or later."""
-    if which == "store":
-        return gv.StoredProducer(convert(blobs, tmp_path))
-    return gv.VolumeProducer(blobs, hold=which)
-
-
-@pytest.mark.parametrize("backend", COMPILED)
-@pytest.mark.parametrize("which", ["voxels", "bricks", "store"])
-@pytest.mark.parametrize("batch, pool", [(5, "4 MB"), (200, "4 MB"), (64, "150 kB")])
-def test_producers_on_the_host_answer_while_frames_go_on(
-    blobs, tmp_path, which, batch, pool, backend
-):
-    device = DEVICES[backend]
-    camera = view(24 if pool == "4 MB" else 6)
-    options = {"brick_size": 4, "brick_pool": pool, "device": device}
-    with gv.Engine(on_the_host(blobs, tmp_path / "one", which), **options) as engine:
-        expected = engine.render(camera, LOOK)
-        assert (expected.alpha > 0.5).any()
-    with gv.Engine(on_the_host(blobs, tmp_path / "two", which), **options) as engine:
-        frames, made = Frames(engine, camera, LOOK, batch), 0
-        for _ in range(600):
-            hits, stats = frames.frame()
-            made += stats.produced["bricks"]
-            time.sleep(0.002 * (which == "store"))
-            if stats.converged:
-                break
-        assert stats.converged and made > 8
-        engine.validate()
-        assert frames.served.pending == 0
-        picture, _ = engine.frame(camera, LOOK)  # the host continues from there
-        assert torch.equal(picture.color, expected.color)
-        frames.frame()  # its record of slots is stale
-        engine.validate()
-    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
-    assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
-
-
-@pytest.mark.parametrize("backend", COMPILED)
-def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs, backend):
-    class Slow(gv.VolumeProducer):
-        gate = threading.Event()
-
-        def fill(self, nodes):
-            if threading.current_thread().name.startswith("gvtorch-ask"):
-                self.gate.wait()
-            return super().fill(nodes)
-
-    with gv.Engine(Slow(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        Slow.gate.set()
-        frames, asker = Frames(engine, view(24), LOOK, 64), engine.recorded[0]
-        while not frames.frame()[1].requests["load"]:
-            asker._executor.submit(int).result()
-        Slow.gate.clear()
-        frames.frame()  # requests these, and is held up
-        engine.release()
-        for _ in range(2):
-            frames.frame()  # requests them again
-        Slow.gate.set()
-        asker._executor.submit(int).result()  # both answers have arrived
-        for _ in range(3):
-            frames.frame()
-            engine.validate()  # no node has two slots
-        for _ in range(200):
-            _, stats = frames.frame()
-            asker._executor.submit(int).result()
-            if stats.converged:
-                break
-        assert stats.converged and engine.render(view(24), LOOK).stats.produced["bricks"] == 0
-
-
-@pytest.mark.parametrize("backend", COMPILED)
-@pytest.mark.parametrize("slow", [False, True])
-def test_a_busy_producer_is_asked_for_several_frames_at_once(blobs, backend, slow, monkeypatch):
-    class Later(gv.VolumeProducer):
-        late: list[tuple[Future, Any]] | None = None
-
-        def fill(self, nodes):
-            if self.late is None:
-                return super().fill(nodes)
-            self.late.append((Future(), super().fill(nodes)))
-            return self.late[-1][0]
-
-    monkeypatch.setattr(host_frame, "_CALL_GAP", 0.0 if slow else math.inf)
-    with gv.Engine(Later(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        engine.render(view(24), LOOK)
-        late = engine.trees["scene"].producer.late = []
-        frames, listed = Frames(engine, view(24), LOOK, 3), 0
-        for angle in (90, 180, 270):
-            frames.look_from(view(24, angle))
-            for _ in range(6):
-                listed += frames.frame()[1].requests["load"] > 0
-                frames.served._executor.submit(int).result()  # until its requests are passed on
-        assert listed > 3
-        if slow:  # it does not wait for answers
-            assert len(late) > 3
-        else:
-            assert len(late) == 1
-            late[0][0].set_result(late[0][1])
-            frames.served._executor.submit(int).result()
-            assert len(late) == 2
-            assert len(late[1][1].data["value"]) > 2 * 3, "of more than two frames"
-        for _ in range(3):
-            frames.frame()
-        engine.validate()
-
-
-class Guarded(dict[Any, Any]):
-    """Lists its methods that are called while nobody holds a lock."""
-
-    def __init__(self, lock: threading.Lock) -> None:
-        super().__init__()
-        self.lock, self.unlocked = lock, []
-
-    def __getattribute__(self, name: str) -> Any:
-        if name in ("pop", "clear", "values", "items") and not self.lock.locked():
-            self.unlocked.append(name)
-        return super().__getattribute__(name)
-
-    def __setitem__(self, key: Any, value: Any) -> None:
-        if not self.lock.locked():
-            self.unlocked.append("set")
-        super().__setitem__(key, value)
-
-    def __delitem__(self, key: Any) -> None:
-        if not self.lock.locked():
-            self.unlocked.append("delete")
-        super().__delitem__(key)
-
-
-@pytest.mark.parametrize("backend", COMPILED)
-def test_answers_on_their_way_are_listed_under_a_lock(blobs, backend):
-    """Frames read and change the list, and so do the threads in which answers arrive."""
-
-    class Later(gv.VolumeProducer):
-        patience = 0.2
-        late: list[tuple[Future, Any]] | None = None
-
-        def fill(self, nodes):
-            if self.late is None:
-                return super().fill(nodes)
-            self.late.append((Future(), super().fill(nodes)))
-            return self.late[-1][0]
-
-    with gv.Engine(Later(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        engine.frame(view(24), LOOK)
-        frames = Frames(engine, view(24), LOOK, 3)
-        late = engine.trees["scene"].producer.late = []
-        waiting = frames.served._waiting = Guarded(frames.served._lock)
-        while not (late and waiting):
-            frames.frame()
-        late[0][0].set_result(late[0][1])
-        while not any("no answer within" in failure.message for failure in engine.failures):
-            frames.frame()
-        engine.release()
-        assert not waiting and not waiting.unlocked
-
-
-@pytest.mark.parametrize("backend", COMPILED)
-def test_what_fails_on_the_host_is_named_and_not_asked_for_again(blobs, backend):
-    class Spoiled(gv.VolumeProducer):
-        def fill(self, nodes):
-            bricks = super().fill(nodes)
-            errors = {n: "spoiled" for n, d in enumerate(nodes.depth.tolist()) if d == 3}
-            return gv.Bricks(data=bricks.data, errors=errors)
-
-    with gv.Engine(Spoiled(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(24), LOOK, 64)
-        hits, stats = frames.whole()
-        assert stats.failed == len(engine.failures) > 4
-        assert all(one.message == "spoiled" and one.loc[3] == 3 for one in engine.failures)
-        engine.validate()
-    assert bool(torch.isfinite(hits.color).all())
-
-
-@pytest.mark.parametrize("backend", COMPILED)
-def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, backend):
-    class Unruly(gv.VolumeProducer):
-        patience = 0.2
-
-        def fill(self, nodes):
-            if bool((nodes.loc[:, 0] == 1).any()):
-                raise OSError("no such column")
-            if bool((nodes.loc[:, 0] == 2).all()):
-                return Future()  # never done
-            return super().fill(nodes)
-
-    with gv.Engine(Unruly(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(16), LOOK, 64)
-        hits, _ = frames.whole(400, 0.002)
-        told = {one.message for one in engine.failures}
-        assert "OSError: no such column" in told
-        assert told <= {"OSError: no such column", "no answer within 0.2 s"}
-        raised = [one for one in engine.failures if one.message.startswith("OSError")]
-        assert all(one.loc[0] == 1 for one in raised)
-        engine.validate()
-    assert bool(torch.isfinite(hits.color).all())
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -512,7 +310,7 @@ def test_a_long_flight_does_not_wait(blobs, tmp_path, scene, look_ahead, backend
     monkeypatch.setattr(staging, "_MAX_COPIED_BYTES", 100_000)  # bytes: the voxels are more
     device, options = DEVICES[backend], {"brick_pool": "12 MB"}
     if scene == "store":
-        producer = on_the_host(blobs, tmp_path / "store", "store")
+        producer = gv.StoredProducer(convert(blobs, tmp_path / "store"))
         options = {"brick_pool": "150 kB", "brick_size": 4}
     elif scene == "mapped":
         values = torch.rand((128,) * 3, generator=torch.Generator().manual_seed(2))
