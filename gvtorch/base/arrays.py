@@ -123,7 +123,7 @@ def as_volume(
     spacing: Sequence[float] | None = None,
     origin: Sequence[float] | None = None,
     nan: float | None = None,
-    where: str = "as_volume",
+    context: str = "as_volume",
 ) -> Volume:
     """Returns an array of any library as a volume in memory.
 
@@ -137,7 +137,7 @@ def as_volume(
         spacing: (x, y, z) world units; overrides the array's metadata.
         origin: (x, y, z) world position of the first voxel's centre; overrides the metadata.
         nan: Value for voxels that are NaN or infinite; they are an error if left out.
-        where: The caller's name, for messages.
+        context: The caller's name, for messages.
 
     Raises:
         ValueError: It is not an array of real numbers, does not fit into memory, or `axes` is
@@ -146,23 +146,23 @@ def as_volume(
     if isinstance(given, Volume):
         return given
     if isinstance(given, Tensor):
-        axis_letters = ask_axes(where, given.shape, axes)
+        axis_letters = ask_axes(context, given.shape, axes)
         if axis_letters in ("zyx", "zyxc"):  # not by way of NumPy, which lacks bfloat16
             return Volume(given, spacing or (1, 1, 1), origin or (0, 0, 0), nan=nan)
-        array = ArrayLike.of(where, given.detach().cpu().numpy(), axis_letters)
+        array = ArrayLike.of(context, given.detach().cpu().numpy(), axis_letters)
     else:
-        array = ArrayLike.of(where, given, axes)
+        array = ArrayLike.of(context, given, axes)
     times = array.shape[array.axes.index("t")] if "t" in array.axes else 1
-    check_extent(where, [n for n, a in zip(array.shape, array.axes, strict=True) if a != "t"])
+    check_extent(context, [n for n, a in zip(array.shape, array.axes, strict=True) if a != "t"])
     if time is None and times > 1:
         warnings.warn(
-            f"{where}: has {times} time points, this is the first; time=N takes another, up to "
+            f"{context}: has {times} time points, this is the first; time=N takes another, up to "
             f"{times - 1}",
             stacklevel=2,
         )
-    time_index = check.whole(where, "time", time or 0, low=0, high=max(times - 1, 0))
+    time_index = check.whole(context, "time", time or 0, low=0, high=max(times - 1, 0))
     if array.lost:
-        warnings.warn(f"{where}: not kept: {'; '.join(array.lost)}", stacklevel=2)
+        warnings.warn(f"{context}: not kept: {'; '.join(array.lost)}", stacklevel=2)
     return Volume(
         array.grid(time_index),
         array.spacing if spacing is None else spacing,

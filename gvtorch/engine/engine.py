@@ -182,13 +182,13 @@ class Engine:
         return view.picture(hits, stats), stats
 
     def view(
-        self, where: str, camera: Camera | Rays, shader: Shaders, options: RenderSettings
+        self, context: str, camera: Camera | Rays, shader: Shaders, options: RenderSettings
     ) -> View:
-        """Checks the arguments of `frame`, and returns its view. Errors begin with `where`."""
-        camera = as_camera(where, camera)
-        chosen = render_options(where, options, camera)
+        """Checks the arguments of `frame`, and returns its view. Errors begin with `context`."""
+        camera = as_camera(context, camera)
+        chosen = render_options(context, options, camera)
         trees = {name: source.tree for name, source in self.trees.items()}
-        box = box_around(where, trees, chosen.pose)
+        box = box_around(context, trees, chosen.pose)
         placed, trace = camera.placed(box), partial(trace_trees, self._tracers(shader, chosen, box))
         return View(placed, placed.numbers(self.device), trace, chosen, box)
 

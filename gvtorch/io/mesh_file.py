@@ -131,10 +131,10 @@ def _read_content(path: Path, packed: bool) -> bytes:
     return content
 
 
-def _check_size(label: str, size: int) -> None:
+def _check_size(context: str, size: int) -> None:
     if size * _MEMORY_PER_BYTE > (free := memory_free()):
         needs, has = amount(size * _MEMORY_PER_BYTE), amount(free)
-        raise ValueError(f"{label}: takes {needs} of memory, {has} are free")
+        raise ValueError(f"{context}: takes {needs} of memory, {has} are free")
 
 
 def _images(loaded: Any) -> list[Any]:

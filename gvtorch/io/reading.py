@@ -198,7 +198,7 @@ def _find_opener(
 
 
 def with_placement(
-    label: str,
+    context: str,
     source: VolumeSource,
     spacing: Sequence[float] | None,
     origin: Sequence[float] | None,
@@ -206,7 +206,7 @@ def with_placement(
     """Returns the source with the user's spacing and origin; None keeps those of the file."""
     steps = source.spacing if spacing is None else spacing
     position = source.origin if origin is None else origin
-    steps, position = check.placed(label, steps, position, source.extent)
+    steps, position = check.placed(context, steps, position, source.extent)
     return dataclasses.replace(source, spacing=steps, origin=position)
 
 
@@ -242,15 +242,15 @@ class ObjectSource(VolumeSource):
         return self.array.read(index)
 
 
-def as_source(label: str, data: Any, axes: str | None = None) -> VolumeSource:
+def as_source(context: str, data: Any, axes: str | None = None) -> VolumeSource:
     """Returns a volume or an array as a source; see `ArrayLike.of` for arguments and errors."""
     if isinstance(data, Volume):
         placement: dict[str, Any] = {"spacing": data.spacing, "origin": data.origin}
         return MemorySource.of(data.data.cpu().numpy(), path=data.name, info=data.info, **placement)
     if not hasattr(data, "shape") or not hasattr(data, "dtype") or hasattr(data, "device"):
         if not isinstance(data, np.ndarray):
-            return as_source(label, as_volume(data, axes=axes, where=label))
-    array = ArrayLike.of(label, data, axes)
+            return as_source(context, as_volume(data, axes=axes, context=context))
+    array = ArrayLike.of(context, data, axes)
     described = {name: getattr(array, name) for name in ("spacing", "origin", "info", "lost")}
     described["path"] = array.name or "array"
     fields = {name: getattr(array, name) for name in ("shape", "axes", "flips")}

@@ -343,12 +343,12 @@ def open_unpacked(file: str, member: str = "") -> IO[bytes]:
     return bz2.open(file, "rb") if file.lower().endswith(".bz2") else open(file, "rb")
 
 
-def no_time_message(label: str, time: object, times: int) -> str:
+def no_time_message(context: str, time: object, times: int) -> str:
     """Returns the message about a time point that does not exist."""
     available = (
         "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
     )
-    return f"{label}: has no time {time!r}; it has {available}"
+    return f"{context}: has no time {time!r}; it has {available}"
 
 
 @contextmanager

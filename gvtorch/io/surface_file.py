@@ -27,14 +27,14 @@ _COPY_BYTES = 1 << 24  # at a time
 _CHUNK_ALIGNMENT = 4  # chunks of a .glb end at multiples of this
 
 
-def check_surface_path(caller: str, path: Path) -> None:
+def check_surface_path(context: str, path: Path) -> None:
     """Raises ValueError unless a surface may be written there, FileNotFoundError if there is no
     such folder.
     """
     if path.suffix not in ENDINGS:
-        raise ValueError(f"{caller}: path must end in {' or '.join(ENDINGS)}, got {str(path)!r}")
+        raise ValueError(f"{context}: path must end in {' or '.join(ENDINGS)}, got {str(path)!r}")
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{caller}: folder not found: {path.parent}")
+        raise FileNotFoundError(f"{context}: folder not found: {path.parent}")
 
 
 class SurfaceFile:

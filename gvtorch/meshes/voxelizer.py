@@ -45,13 +45,15 @@ class GridSettings(TypedDict, total=False):
     solid: SolidParts
 
 
-def check_channels(where: str, channels: str | Sequence[str]) -> tuple[str, ...]:
+def check_channels(context: str, channels: str | Sequence[str]) -> tuple[str, ...]:
     """Returns the names as a tuple; ValueError if there are none, or unknown or repeated ones."""
     names = (channels,) if isinstance(channels, str) else tuple(channels)
     unknown = [name for name in names if name not in CHANNELS]
     if unknown or not names or len({*names}) < len(names):
         rejected = f"{unknown[0]!r}" if unknown else f"{names!r}"
-        raise ValueError(f"{where}: channels must be some of {', '.join(CHANNELS)}, got {rejected}")
+        raise ValueError(
+            f"{context}: channels must be some of {', '.join(CHANNELS)}, got {rejected}"
+        )
     return names
 
 
@@ -104,10 +106,10 @@ class Voxelizer:
         Raises:
             ValueError: An unknown channel, or a number out of its range.
         """
-        where = "voxelize"
-        check.whole(where, "resolution", resolution, low=8, high=2**30)
-        check.one_of(where, "solid", solid, get_args(SolidParts))
-        channels = check_channels(where, channels)
+        context = "voxelize"
+        check.whole(context, "resolution", resolution, low=8, high=2**30)
+        check.one_of(context, "solid", solid, get_args(SolidParts))
+        channels = check_channels(context, channels)
         mesh = filled(mesh) if solid == "always" else mesh
         if "material" in channels and len(mesh.materials) > 255:
             raise ValueError(
@@ -125,8 +127,8 @@ class Voxelizer:
         middle, half_extent = 0.5 * (low + high), [0.5 * (n - 1) * self.spacing for n in counts]
         x, y, z = (float(m - h) for m, h in zip(middle, half_extent, strict=True))
         self.origin = (x, y, z)
-        self.band = check.number(where, "band", band, low=2) * self.spacing
-        self.thickness = check.number(where, "thickness", thickness, low=0.1) * self.spacing
+        self.band = check.number(context, "band", band, low=2) * self.spacing
+        self.thickness = check.number(context, "thickness", thickness, low=0.1) * self.spacing
         self.device = torch.device(device)
         self.geometry = Geometry(mesh, self.device, solid=solid != "never")
         self._wide = self.geometry.largest >= _FLOAT32_VOXELS * self.spacing

@@ -57,13 +57,13 @@ def matrices(
     Raises:
         ValueError: The camera is an orbit camera without a position, or not 0 < near < far.
     """
-    where = "opengl.matrices"
+    context = "opengl.matrices"
     if camera.frame is not Frame.WORLD:
-        raise ValueError(f"{where}: an orbit camera has no position yet, call placed(tree.box)")
-    check.number(where, "near", near, low=0, open_low=True)
+        raise ValueError(f"{context}: an orbit camera has no position yet, call placed(tree.box)")
+    check.number(context, "near", near, low=0, open_low=True)
     if far != math.inf:
-        check.number(where, "far", far, low=near, open_low=True)
-    check.instance(where, "clip_depth", clip_depth, ClipDepth)
+        check.number(context, "far", far, low=near, open_low=True)
+    check.instance(context, "clip_depth", clip_depth, ClipDepth)
     (fx, fy), (cx, cy) = camera.Ks[:, (0, 1), (0, 1)].unbind(1), camera.Ks[:, :2, 2].unbind(1)
     projection = torch.zeros(len(camera), 4, 4, dtype=torch.float64)
     projection[:, 0, 0], projection[:, 0, 2] = 2 * fx / camera.width, 1 - 2 * cx / camera.width
@@ -93,12 +93,12 @@ def camera(projection: Tensor, modelview: Tensor, width: int, height: int) -> Ca
     Raises:
         ValueError: `projection` is not that of a pinhole camera, or `Camera` refuses the matrices.
     """
-    where = "opengl.camera"
-    matrix, orthographic = _projection(where, projection)
+    context = "opengl.camera"
+    matrix, orthographic = _projection(context, projection)
     if orthographic:
-        raise ValueError(f"{where}: projection must be perspective, got an orthographic one")
-    check.whole(where, "width", width, low=1)
-    check.whole(where, "height", height, low=1)
+        raise ValueError(f"{context}: projection must be perspective, got an orthographic one")
+    check.whole(context, "width", width, low=1)
+    check.whole(context, "height", height, low=1)
     intrinsics = torch.zeros_like(matrix[..., :3, :3])
     intrinsics[..., 0, 0] = matrix[..., 0, 0] * width / 2
     intrinsics[..., 0, 2] = (1 - matrix[..., 0, 2]) * width / 2
@@ -135,8 +135,8 @@ def ray_distance(
     Raises:
         ValueError: A wrong shape or dtype, or another kind of projection.
     """
-    where = "opengl.ray_distance"
-    pixels = _Pixels.of(where, "window_depth", window_depth, projection, clip_depth)
+    context = "opengl.ray_distance"
+    pixels = _Pixels.of(context, "window_depth", window_depth, projection, clip_depth)
     depth = window_depth.to(torch.float64)
     if pixels.orthographic:
         z = (pixels.offset - depth) / pixels.slope
@@ -186,17 +186,17 @@ class _Pixels(NamedTuple):
 
     @classmethod
     def of(
-        cls, where: str, name: str, image: Tensor, projection: Tensor, clip_depth: ClipDepth
+        cls, context: str, name: str, image: Tensor, projection: Tensor, clip_depth: ClipDepth
     ) -> _Pixels:
         """Checks an image and its projection, and returns the coefficients."""
-        matrix, orthographic = _projection(where, projection)
-        check.instance(where, "clip_depth", clip_depth, ClipDepth)
+        matrix, orthographic = _projection(context, projection)
+        check.instance(context, "clip_depth", clip_depth, ClipDepth)
         batch = matrix.shape[:-2]
         fits = isinstance(image, Tensor) and image.is_floating_point() and image.shape[-1:] == (1,)
         if not (fits and image.dim() == matrix.dim() + 1 and image.shape[:-3] == batch):
             expected = f"({batch[0]}, h, w, 1)" if batch else "(h, w, 1)"
             raise ValueError(
-                f"{where}: {name} must be {expected} floats as projection is "
+                f"{context}: {name} must be {expected} floats as projection is "
                 f"{'a batch' if batch else 'one'}, got {check.describe(image)}"
             )
         slope, offset = matrix[..., 2, 2], matrix[..., 2, 3]
@@ -221,19 +221,19 @@ class _Pixels(NamedTuple):
         return cls(slope, offset, far, stretch, orthographic)
 
 
-def _projection(where: str, projection: Tensor) -> tuple[Tensor, bool]:
+def _projection(context: str, projection: Tensor) -> tuple[Tensor, bool]:
     """Returns a projection, checked, in float64 on the CPU, and whether it is orthographic."""
     matrix = torch.as_tensor(projection).detach().to("cpu", torch.float64)
     if matrix.dim() not in (2, 3) or matrix.shape[-2:] != (4, 4):
         raise ValueError(
-            f"{where}: projection must be (4, 4) or (n, 4, 4), got {tuple(matrix.shape)}"
+            f"{context}: projection must be (4, 4) or (n, 4, 4), got {tuple(matrix.shape)}"
         )
     p = matrix.view(-1, 4, 4)
     last_row = p[0, 3].tolist()
     orthographic = last_row == [0, 0, 0, 1]
     if not (orthographic or last_row == [0, 0, -1, 0]) or bool((p[:, 3] != p[:1, 3]).any()):
         raise ValueError(
-            f"{where}: projection must end in the row (0, 0, -1, 0) (perspective) or "
+            f"{context}: projection must end in the row (0, 0, -1, 0) (perspective) or "
             f"(0, 0, 0, 1) (orthographic), got {last_row}"
         )
     zero_column = 2 if orthographic else 3  # column whose x and y must be 0
@@ -243,7 +243,7 @@ def _projection(where: str, projection: Tensor) -> tuple[Tensor, bool]:
     valid = torch.isfinite(p).all() & (zeros == 0).all() & (depth_scale != 0).all()
     if not bool(valid & (p[:, 0, 0] > 0).all() & (p[:, 1, 1] > 0).all()):
         raise ValueError(
-            f"{where}: projection must be finite, without skew or rotation, scale x and y by "
+            f"{context}: projection must be finite, without skew or rotation, scale x and y by "
             f"more than 0 and keep depths apart, got {matrix.tolist()}"
         )
     return matrix, orthographic

@@ -91,19 +91,19 @@ class Exchange:
             RuntimeError: There is no context, its OpenGL is too old, or `share` is true and CUDA
                 can't map its buffers.
         """
-        where = "opengl.Exchange"
+        context = "opengl.Exchange"
         if not (share is None or isinstance(share, bool)):
-            raise ValueError(f"{where}: share must be bool or None, got {share!r}")
-        self.device = check.device(where, device)
-        self._gl = gl.Functions(where, load)
+            raise ValueError(f"{context}: share must be bool or None, got {share!r}")
+        self.device = check.device(context, device)
+        self._gl = gl.Functions(context, load)
         limit = self._gl.integer(gl.MAX_TEXTURE_SIZE)
-        self.width = check.whole(where, "width", width, low=1, high=limit)
-        self.height = check.whole(where, "height", height, low=1, high=limit)
+        self.width = check.whole(context, "width", width, low=1, high=limit)
+        self.height = check.whole(context, "height", height, low=1, high=limit)
         self._size = [self.width, self.height]
         declined = share is False
         self.reason = "share is False" if declined else _why_not_shared(self._gl, self.device)
         if share and self.reason:
-            raise RuntimeError(f"{where}: buffers can't be shared: {self.reason}")
+            raise RuntimeError(f"{context}: buffers can't be shared: {self.reason}")
         self.shared = not self.reason
         self._byte_max = torch.full((1,), 255.0, device=self.device)  # all devices divide alike
         transfer_type = _SharedTransfer if self.shared else _HostTransfer
@@ -242,14 +242,14 @@ class Exchange:
 
     def _require_context(self, method: str) -> None:
         """Raises unless the exchange is open and its context current."""
-        where = self._gl.where = f"opengl.Exchange.{method}"
+        context = self._gl.where = f"opengl.Exchange.{method}"
         if not self._program:
-            raise RuntimeError(f"{where}: the exchange is closed")
+            raise RuntimeError(f"{context}: the exchange is closed")
         self._gl.require_context()
         is_own = self._gl.GetFragDataLocation(self._program, self._output_name.encode()) >= 0
         self._gl.forget_errors()  # of a context without this program
         if not is_own:
-            raise RuntimeError(f"{where}: another OpenGL context is current than the exchange's")
+            raise RuntimeError(f"{context}: another OpenGL context is current than the exchange's")
 
     def _read_pixels(self, kind: str, channels: int, dtype: torch.dtype) -> Tensor:
         """Reads RGBA (h, w, 4) or RED (h, w, 1), float32, of the framebuffer bound for reading."""

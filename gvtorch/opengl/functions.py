@@ -145,21 +145,21 @@ class Functions:
     """The OpenGL 3.2 functions of the current context, by their names without `gl`.
 
     Attributes:
-        where: Name of the caller, for messages.
+        context: Name of the caller, for messages.
     """
 
-    def __init__(self, where: str, load: Loader | None = None) -> None:
+    def __init__(self, context: str, load: Loader | None = None) -> None:
         """Loads the functions by `load` or from the system's library; raises as `Exchange`."""
-        self.where = where
-        load = _system_loader(where) if load is None else load
+        self.where = context
+        load = _system_loader(context) if load is None else load
         if not callable(load):
-            raise ValueError(f"{where}: load must be a function of a name, got {load!r}")
+            raise ValueError(f"{context}: load must be a function of a name, got {load!r}")
         self._load_functions(load, _FUNCTIONS)
         self.require_context()
         version = self.integer(MAJOR_VERSION), self.integer(MINOR_VERSION)
         version_text = self.GetString(VERSION).decode(errors="replace")
         if version < (3, 2) or version_text.startswith("OpenGL ES"):
-            raise RuntimeError(f"{where}: OpenGL 3.2 is needed, got {version_text}")
+            raise RuntimeError(f"{context}: OpenGL 3.2 is needed, got {version_text}")
         self._samplers = version >= (3, 3)  # there are sampler objects
         self._viewports = version >= (4, 1)  # and several viewports
         self._legacy = not self.integer(PROFILE) & CORE_PROFILE
@@ -347,7 +347,7 @@ class Functions:
         self.PolygonMode(FRONT_AND_BACK, FILL)
 
 
-def _system_loader(where: str) -> Loader:
+def _system_loader(context: str) -> Loader:
     """Returns the loader of the system's library that knows the current context. Libglvnd's (the
     first two) forward calls to any driver; OSMesa knows only its own contexts.
     """
@@ -362,9 +362,9 @@ def _system_loader(where: str) -> Loader:
         if library.glGetString(VERSION):
             return partial(_address, library)
     if has_library:
-        raise RuntimeError(f"{where}: {_NO_CONTEXT}")
+        raise RuntimeError(f"{context}: {_NO_CONTEXT}")
     raise RuntimeError(
-        f"{where}: found no OpenGL library; pass load=..., such as glfw.get_proc_address"
+        f"{context}: found no OpenGL library; pass load=..., such as glfw.get_proc_address"
     )
 
 

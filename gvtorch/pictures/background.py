@@ -32,9 +32,9 @@ class Background(ABC):
             dtype: Dtype of the colours.
         """
 
-    def check(self, where: str, camera: Camera) -> None:
+    def check(self, context: str, camera: Camera) -> None:
         """Raises ValueError if this background does not fit a camera's pictures."""
-        del where, camera
+        del context, camera
 
 
 class Gradient(Background):
@@ -73,11 +73,11 @@ class Backdrop(Background):
     def __repr__(self) -> str:
         return f"Backdrop({check.describe(self.image)})"
 
-    def check(self, where: str, camera: Camera) -> None:
+    def check(self, context: str, camera: Camera) -> None:
         shape, size = tuple(self.image.shape), (camera.window[1], camera.width, 3)
         if shape[-3:] != size or (len(shape) == 4 and shape[0] not in (1, len(camera))):
             wanted = (len(camera), *size) if camera.batched else size
-            raise ValueError(f"{where}: background image must be {wanted}, got {shape}")
+            raise ValueError(f"{context}: background image must be {wanted}, got {shape}")
 
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
         device = numbers.device
@@ -154,19 +154,19 @@ class Environment(Background):
         return torch.cat([self.look_up(block_rays.direction, dtype) for block_rays in rays])
 
 
-def checked_background(where: str, value: Any) -> Background | Color | None:
+def checked_background(context: str, value: Any) -> Background | Color | None:
     """Returns a user's background: an object of this file, a colour, or None (transparent)."""
     if value is None or isinstance(value, Background):
         return value
     if isinstance(value, Tensor) and value.dim() > 1:
         return Backdrop(value)
-    return _color(where, "background", value, high=1)
+    return _color(context, "background", value, high=1)
 
 
-def _color(where: str, name: str, value: Sequence[float], high: float = math.inf) -> Color:
-    color = check.triple(where, name, value)
+def _color(context: str, name: str, value: Sequence[float], high: float = math.inf) -> Color:
+    color = check.triple(context, name, value)
     for number in color:
-        check.number(where, name, number, low=0, high=high)
+        check.number(context, name, number, low=0, high=high)
     return color
 
 

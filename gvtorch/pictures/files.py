@@ -31,19 +31,19 @@ _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _BITS = {".png": (8, 16), ".tif": (8, 16, 32), ".exr": (32, 16), ".npy": (32,), ".npz": (32,)}
 
 
-def checked_path(where: str, path: Path, bits: int | None, suffixes: tuple[str, ...]) -> int:
+def checked_path(context: str, path: Path, bits: int | None, suffixes: tuple[str, ...]) -> int:
     """Returns the bits per number of a file to be written; raises ValueError if the ending is
     unknown or does not allow `bits`, FileNotFoundError if there is no such folder.
     """
     if path.suffix not in suffixes:
         expected = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
-        raise ValueError(f"{where}: path must end in {expected}, got {str(path)!r}")
+        raise ValueError(f"{context}: path must end in {expected}, got {str(path)!r}")
     allowed_bits = _BITS[path.suffix]
     if bits is not None and bits not in allowed_bits:
         choices = " or ".join(str(n) for n in allowed_bits)
-        raise ValueError(f"{where}: {path.suffix} has {choices} bits, got {bits!r}")
+        raise ValueError(f"{context}: {path.suffix} has {choices} bits, got {bits!r}")
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{where}: folder not found: {path.parent}")
+        raise FileNotFoundError(f"{context}: folder not found: {path.parent}")
     return allowed_bits[0] if bits is None else bits
 
 

@@ -44,10 +44,10 @@ def jitter(index: int) -> tuple[float, float]:
     return x, y
 
 
-def _renderer(where: str, render: Callable[[Camera], Any]) -> Callable[[Camera], Picture]:
+def _renderer(context: str, render: Callable[[Camera], Any]) -> Callable[[Camera], Picture]:
     """Wraps `render`, which may return statistics with its picture, to return the picture alone."""
     if not callable(render):
-        raise ValueError(f"{where}: render must be callable, got {type(render).__name__}")
+        raise ValueError(f"{context}: render must be callable, got {type(render).__name__}")
 
     def picture(camera: Camera) -> Picture:
         result = render(camera)

@@ -37,10 +37,10 @@ def tone_map(
     return color.clamp(0, 1)
 
 
-def checked_curve(where: str, curve: str, exposure: float) -> float:
+def checked_curve(context: str, curve: str, exposure: float) -> float:
     """Returns the exposure; raises ValueError if it or the curve's name is wrong."""
-    check.one_of(where, "curve", curve, CURVES)
-    return check.number(where, "exposure", exposure, low=-100, high=100)
+    check.one_of(context, "curve", curve, CURVES)
+    return check.number(context, "exposure", exposure, low=-100, high=100)
 
 
 def finite(color: Tensor) -> Tensor:

@@ -77,19 +77,19 @@ class PointGrid:
     @classmethod
     def around(
         cls,
-        where: str,
+        context: str,
         blocks: Iterable[Points],
         extent: int | Sequence[int],
         box: Sequence[Sequence[float]] | None,
         branching: int,
     ) -> PointGrid:
         """Returns the grid of a user's extent and box; without a box, one around all points."""
-        check.whole(where, "branching", branching, low=2, high=16)
-        low, high = check.box(where, _bounds(blocks) if box is None else box)
-        extent = extent_in(where, extent, (low, high))
+        check.whole(context, "branching", branching, low=2, high=16)
+        low, high = check.box(context, _bounds(blocks) if box is None else box)
+        extent = extent_in(context, extent, (low, high))
         if len(extent) != 3:
-            raise ValueError(f"{where}: extent must be a number or (x, y, z), got {extent!r}")
-        x, y, z = (check.whole(where, "extent", size, low=1, high=2**40) for size in extent)
+            raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
+        x, y, z = (check.whole(context, "extent", size, low=1, high=2**40) for size in extent)
         return cls((x, y, z), low, high, branching)
 
     @property

@@ -166,10 +166,10 @@ def sort_points(
         FileExistsError: The folder exists.
         OSError: The disk is full.
     """
-    where, target = "sort_points", None if folder is None else Path(folder)
+    context, target = "sort_points", None if folder is None else Path(folder)
     if not isinstance(points, PointSource):
         kind = type(points).__name__
-        raise ValueError(f"{where}: points must be Points or a PointFile, got a {kind}")
+        raise ValueError(f"{context}: points must be Points or a PointFile, got a {kind}")
     if target is not None and target.exists():
         raise FileExistsError(f"{target}: is there already; remove it or choose a new name")
     first = next(iter(points.blocks(1)))
@@ -178,15 +178,17 @@ def sort_points(
     )
     block_rows = len(points)
     if target is not None:
-        block_rows = max(4096, check.nbytes(where, "memory", memory) // (_BLOCK_COPIES * row_bytes))
-    grid = PointGrid.around(where, points.blocks(block_rows), extent, box, branching)
+        block_rows = max(
+            4096, check.nbytes(context, "memory", memory) // (_BLOCK_COPIES * row_bytes)
+        )
+    grid = PointGrid.around(context, points.blocks(block_rows), extent, box, branching)
     draft = None if target is None else target.with_name(f".{target.name}.draft")
     if draft is not None:
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir(parents=True)
     try:
         sorter = _Sorter(grid, draft, block_rows, progress)
-        sorter.read(where, points)
+        sorter.read(context, points)
         sorter.add_up()
         sorted_points = SortedPoints(grid, first.width, sorter.points, sorter.sums, draft)
         if draft is None or target is None:
@@ -218,7 +220,7 @@ class _Sorter:
         self.sums: dict[int, Table] = {}
         self.progress = progress
 
-    def read(self, where: str, source: PointSource) -> None:
+    def read(self, context: str, source: PointSource) -> None:
         """Sorts the points by level and code."""
         runs: dict[int, Runs] = {}
         total, done = len(source), 0
@@ -239,7 +241,7 @@ class _Sorter:
                 )
         runs = {level: level_runs for level, level_runs in sorted(runs.items()) if len(level_runs)}
         if not runs:
-            raise ValueError(f"{where}: no point lies in the box")
+            raise ValueError(f"{context}: no point lies in the box")
         for level, unsorted in runs.items():
             self.points[level] = Table(self.folder, f"points_{level}")
             for rows in unsorted.sorted():

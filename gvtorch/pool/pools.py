@@ -74,7 +74,7 @@ def volumes_by_channel(context: str, volume: Volume | Mapping[str, Volume]) -> d
     """
     by_name = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
     volumes = {
-        name: as_volume(array, where=f"{context}: channel {name!r}")
+        name: as_volume(array, context=f"{context}: channel {name!r}")
         for name, array in by_name.items()
     }
     if not volumes:

@@ -77,19 +77,21 @@ def _checked(
     look: bool,
 ) -> Form:
     """Returns the answer with a width in every shape, and with an error for each bad item."""
-    where = f"{type(producer).__name__}.{method}"
+    context = f"{type(producer).__name__}.{method}"
     if not isinstance(answer, answer_type):
         got = type(answer).__name__
-        raise ValueError(f"{where}: must return {answer_type.__name__} or {alternative}, got {got}")
+        raise ValueError(
+            f"{context}: must return {answer_type.__name__} or {alternative}, got {got}"
+        )
     kind: Any
     layout, count, kind, errors = nodes.layout, len(nodes), answer.kind, dict(answer.errors)
     if any(not 0 <= index < count for index in errors):
-        raise ValueError(f"{where}: errors names an item that is not in the batch of {count}")
+        raise ValueError(f"{context}: errors names an item that is not in the batch of {count}")
     if kind is not None or isinstance(answer, Regions):
         is_integer = isinstance(kind, Tensor) and not kind.is_floating_point()
         if not is_integer or kind.shape != (count,) or kind.dtype == torch.bool:
             got = check.describe(kind)
-            raise ValueError(f"{where}: kind must be ({count},) of Region, got {got}")
+            raise ValueError(f"{context}: kind must be ({count},) of Region, got {got}")
         kind = kind.to(torch.int64)
     brick_shape = (layout.side,) * 3
     shapes: dict[str, tuple[int, ...]] = {"data": brick_shape, "constants": (), "ranges": (2,)}
@@ -97,51 +99,53 @@ def _checked(
     fine_channels = {name for name, channel in producer.channels.items() if not channel.coarse}
     required = {*producer.channels} if nodes.coarse else fine_channels
     if missing := sorted(required - {*by_field.get("data", required)}):
-        raise ValueError(f"{where}: channel {missing[0]!r} is missing")
+        raise ValueError(f"{context}: channel {missing[0]!r} is missing")
     for name, values in by_field.items():
         unexpected = {*values} & {*producer.channels} - (
             required if name == "data" else fine_channels
         )
         if unexpected:
             rule = "only bricks above the finest level hold"
-            raise ValueError(f"{where}: {name} has channel {min(unexpected)!r}, which {rule}")
+            raise ValueError(f"{context}: {name} has channel {min(unexpected)!r}, which {rule}")
     fields: dict[str, Any] = {
-        name: _by_channel(where, name, by_channel, (count, *shapes[name]), producer)
+        name: _by_channel(context, name, by_channel, (count, *shapes[name]), producer)
         for name, by_channel in by_field.items()
     }
     if not look:
-        _refuse_late(where, answer, [*fields.values()], layout.device)
+        _refuse_late(context, answer, [*fields.values()], layout.device)
         return answer_type(kind=kind, **fields)
     counts = _refuse_bad(answer_type, kind, [*fields.values()], errors)
     missing = sorted(fine_channels - {*fields["constants"]})
     if missing and counts[Region.CONSTANT]:
-        raise ValueError(f"{where}: constants must hold channel {missing[0]!r} of CONSTANT items")
+        raise ValueError(f"{context}: constants must hold channel {missing[0]!r} of CONSTANT items")
     if not counts[Region.ALIAS]:
         return answer_type(kind=kind, errors=errors, **fields)
-    alias = _checked_alias(where, answer, kind, nodes, errors)
+    alias = _checked_alias(context, answer, kind, nodes, errors)
     tree = answer.alias_tree
     return answer_type(kind=kind, alias=alias, alias_tree=tree, errors=errors, **fields)
 
 
 def _refuse_late(
-    where: str,
+    context: str,
     answer: Any,
     fields: Sequence[Mapping[str, Tensor | TableRows]],
     device: torch.device,
 ) -> None:
     """Raises ValueError if an answer that must stay on the device needs the host."""
     if answer.alias is not None or answer.errors:
-        raise ValueError(f"{where}: a producer that is on_device answers without alias and errors")
+        raise ValueError(
+            f"{context}: a producer that is on_device answers without alias and errors"
+        )
     for by_channel in fields:
         for name, values in by_channel.items():
             if isinstance(values, TableRows) or values.device != device:
                 raise ValueError(
-                    f"{where}: channel {name!r} of a producer that is on_device is not"
+                    f"{context}: channel {name!r} of a producer that is on_device is not"
                 )
 
 
 def _by_channel(
-    where: str, name: str, values: Mapping[str, Any], shape: tuple[int, ...], producer: Producer
+    context: str, name: str, values: Mapping[str, Any], shape: tuple[int, ...], producer: Producer
 ) -> dict[str, Any]:
     """Returns the values of each channel as (*shape, width); a width of 1 may be left out."""
     result = {}
@@ -149,7 +153,7 @@ def _by_channel(
         if channel not in producer.channels:
             channel_names = ", ".join(producer.channels)
             raise ValueError(
-                f"{where}: {name} has channel {channel!r}; the producer has {channel_names}"
+                f"{context}: {name} has channel {channel!r}; the producer has {channel_names}"
             )
         spec: Channel = producer.channels[channel]
         expected_shape = (*shape, spec.width)
@@ -165,7 +169,7 @@ def _by_channel(
             sizes = ", ".join(str(size) for size in expected_shape)
             dtype = str(spec.dtype).removeprefix("torch.")
             raise ValueError(
-                f"{where}: {name}[{channel!r}] must be ({sizes}) {dtype}, "
+                f"{context}: {name}[{channel!r}] must be ({sizes}) {dtype}, "
                 f"got {check.describe(tensor)}"
             )
         result[channel] = tensor.detach() if isinstance(tensor, Tensor) else tensor
@@ -173,7 +177,7 @@ def _by_channel(
 
 
 def _checked_alias(
-    where: str, answer: Regions | Bricks, kind: Tensor, nodes: Nodes, errors: dict[int, str]
+    context: str, answer: Regions | Bricks, kind: Tensor, nodes: Nodes, errors: dict[int, str]
 ) -> Tensor:
     """Returns (k, 4) alias targets; adds an error for each that is not a node of its tree, or lies
     in the node itself.
@@ -181,16 +185,16 @@ def _checked_alias(
     alias: Any = answer.alias
     layout, name = nodes.layout, answer.alias_tree
     if name is not None:
-        check.one_of(where, "alias_tree", name, layout.scene)
+        check.one_of(context, "alias_tree", name, layout.scene)
         layout = layout.scene[name]
         if layout.branching != nodes.layout.branching:
             own_branching = nodes.layout.branching
             raise ValueError(
-                f"{where}: tree {name!r} has N={layout.branching}, this one N={own_branching}"
+                f"{context}: tree {name!r} has N={layout.branching}, this one N={own_branching}"
             )
     if not isinstance(alias, Tensor) or alias.shape != (len(kind), 4):
         raise ValueError(
-            f"{where}: alias must be ({len(kind)}, 4) where an item is ALIAS, "
+            f"{context}: alias must be ({len(kind)}, 4) where an item is ALIAS, "
             f"got {check.describe(alias)}"
         )
     alias = alias.to(device=kind.device, dtype=torch.int64)

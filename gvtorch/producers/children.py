@@ -45,18 +45,18 @@ class FromChildren(OfProducers):
             ValueError: It makes labels, whose means are meaningless, or coarse channels, or it
                 needs its parents' bricks. Answers with aliases raise when they come.
         """
-        where = type(self).__name__
-        check.instance(where, "producer", producer, Producer)
+        context = type(self).__name__
+        check.instance(context, "producer", producer, Producer)
         if producer.labels or producer.needs_parent:
             reason = "makes labels" if producer.labels else "needs its parents' bricks"
-            raise ValueError(f"{where}: {type(producer).__name__} {reason}")
+            raise ValueError(f"{context}: {type(producer).__name__} {reason}")
         if any(channel.coarse for channel in producer.channels.values()):
-            raise ValueError(f"{where}: {type(producer).__name__} makes coarse channels itself")
+            raise ValueError(f"{context}: {type(producer).__name__} makes coarse channels itself")
         super().__init__(
             **grid_of(producer), channels=producer.channels, value_range=producer.value_range
         )
         self.producer, self.patience = producer, producer.patience
-        self.levels = check.whole(where, "levels", levels, low=1, high=10)
+        self.levels = check.whole(context, "levels", levels, low=1, high=10)
         self._cache: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by loc
         self._cached_version = producer.version  # the version that these blocks were made from
 

@@ -75,15 +75,15 @@ class FieldProducer(Producer):
             ValueError: The field fails or returns no values of the shapes above, a channel has
                 another width, the box is unknown or infinite, or a number is out of its range.
         """
-        where = type(self).__name__
-        checked_field(where, "field", field)
+        context = type(self).__name__
+        checked_field(context, "field", field)
         field = Solid(field) if isinstance(field, Distance) else field
         known_field = field if isinstance(field, Field) else None
         if box is None:
-            extent, box = _grid_around(where, known_field, extent)
+            extent, box = _grid_around(context, known_field, extent)
         else:
-            extent = extent_in(where, extent, box)
-        field_widths = _channel_widths(where, field)
+            extent = extent_in(context, extent, box)
+        field_widths = _channel_widths(context, field)
         dtypes: Mapping[str, torch.dtype] = getattr(field, "dtypes", {})
         default_channels = {
             n: Channel(dtypes.get(n, torch.float32), width) for n, width in field_widths.items()
@@ -97,21 +97,25 @@ class FieldProducer(Producer):
         )
         widths = {name: channel.width for name, channel in self.channels.items()}
         if widths != field_widths:
-            raise ValueError(f"{where}: channels must be {field_widths} numbers wide, got {widths}")
+            raise ValueError(
+                f"{context}: channels must be {field_widths} numbers wide, got {widths}"
+            )
         if dtype not in (None, torch.float32, torch.float64):
-            raise ValueError(f"{where}: dtype must be torch.float32 or torch.float64, got {dtype}")
+            raise ValueError(
+                f"{context}: dtype must be torch.float32 or torch.float64, got {dtype}"
+            )
         self.field = field
         count = branching if samples is None else samples
-        self.samples = check.whole(where, "samples", count, low=1, high=64)
+        self.samples = check.whole(context, "samples", count, low=1, high=64)
         axis_offsets = (torch.arange(self.samples, dtype=torch.float64) + 0.5) / self.samples - 0.5
         self.register_buffer(
             "offsets", torch.cartesian_prod(axis_offsets, axis_offsets, axis_offsets)
         )
-        self.threshold = self._thresholds(where, known_field, threshold)
+        self.threshold = self._thresholds(context, known_field, threshold)
         self.dtype = dtype or position_dtype(box, self.spacing)
 
     def _thresholds(
-        self, where: str, field: Field | None, threshold: float | Mapping[str, float] | None
+        self, context: str, field: Field | None, threshold: float | Mapping[str, float] | None
     ) -> Mapping[str, float] | None:
         """Returns, by channel, the value up to which it shows nothing."""
         if threshold is None:
@@ -122,9 +126,9 @@ class FieldProducer(Producer):
             if name not in self.channels:
                 channel_names = ", ".join(self.channels)
                 raise ValueError(
-                    f"{where}: threshold has channel {name!r}; there are {channel_names}"
+                    f"{context}: threshold has channel {name!r}; there are {channel_names}"
                 )
-        return {n: check.number(where, "threshold", value) for n, value in threshold.items()}
+        return {n: check.number(context, "threshold", value) for n, value in threshold.items()}
 
     def classify(self, nodes: Nodes) -> Regions:
         """Returns EMPTY where all channels that have a threshold are proven not to exceed it, else
@@ -193,31 +197,31 @@ class FieldProducer(Producer):
         """Returns the field's own values at points (..., 3), for each channel (..., c), in the
         dtype of the points: not filtered and not rounded. Needs no engine.
         """
-        where = type(self).__name__
-        check_points(f"{where}.at", points)
+        context = type(self).__name__
+        check_points(f"{context}.at", points)
         if points.dim() == 1:  # () values would be promoted to the dtype of the field's numbers
             return {name: values[0] for name, values in self.at(points[None]).items()}
-        return _by_channel(where, _call_field(where, self.field, self.field, points), points)
+        return _by_channel(context, _call_field(context, self.field, self.field, points), points)
 
     def _evaluate(self, nodes: Nodes, field: nn.Module) -> dict[str, Tensor]:
         """Returns the voxels of k bricks, (k, z, y, x, c) by channel, before rounding."""
-        where = type(self).__name__
+        context = type(self).__name__
         size = nodes.voxel_size.to(self.dtype)[:, None, None, None]
         if isinstance(field, Field) and field.prefiltered:
             points = nodes.wider(field.margin).points(self.dtype)
-            values = _call_field(where, field, field.filtered, points, size)
-            filtered = _by_channel(where, values, points)
+            values = _call_field(context, field, field.filtered, points, size)
+            filtered = _by_channel(context, values, points)
             if field.margin == 0:
                 return filtered
             side = nodes.layout.side
             brick_points = points[:, :side, :side, :side]
-            values = _call_field(where, field, field.finish, filtered, size[:, 0, 0, 0])
-            return _by_channel(where, values, brick_points)
+            values = _call_field(context, field, field.finish, filtered, size[:, 0, 0, 0])
+            return _by_channel(context, values, brick_points)
         points = nodes.points(self.dtype)
         total: dict[str, Any] = {}
         for offset in self.offsets.to(size).unbind(0):
-            result = _call_field(where, field, field, points + size * offset)
-            values = _by_channel(where, result, points)
+            result = _call_field(context, field, field, points + size * offset)
+            values = _by_channel(context, result, points)
             total = {name: total.get(name, 0) + value for name, value in values.items()}
         return {name: value / len(self.offsets) for name, value in total.items()}
 
@@ -261,25 +265,26 @@ def interval_of(field: nn.Module, name: str, ends: Any, count: int, width: int) 
     """Returns the interval that a field's `bounds` returned for a channel of `width` numbers, as
     (k, width) each, k = `count`; raises ValueError if it is not one.
     """
-    where = f"{type(field).__name__}.bounds"
+    context = f"{type(field).__name__}.bounds"
     if not isinstance(ends, tuple) or [isinstance(end, Tensor) for end in ends] != [True, True]:
         got = f"{len(ends)} items" if isinstance(ends, tuple) else type(ends).__name__
-        raise ValueError(f"{where}: {name!r} must be two tensors, low and high, got {got}")
+        raise ValueError(f"{context}: {name!r} must be two tensors, low and high, got {got}")
     if any(tuple(end.shape) not in ((count,), (count, width)) for end in ends):
         low, high = (check.describe(end) for end in ends)
         raise ValueError(
-            f"{where}: {name!r} must be ({count},) or ({count}, {width}) each, got {low} and {high}"
+            f"{context}: {name!r} must be ({count},) or ({count}, {width}) each, "
+            f"got {low} and {high}"
         )
     low, high = (end[:, None].expand(-1, width) if end.dim() == 1 else end for end in ends)
     check_values = low.device.type == "cpu" and not torch.compiler.is_compiling()
     if check_values and not bool((low <= high).all()):
-        raise ValueError(f"{where}: {name!r} must be low <= high everywhere, and not NaN")
+        raise ValueError(f"{context}: {name!r} must be low <= high everywhere, and not NaN")
     return low, high
 
 
-def distances_of(where: str, shape: nn.Module, points: Tensor) -> Tensor:
+def distances_of(context: str, shape: nn.Module, points: Tensor) -> Tensor:
     """Returns a shape's distances (...,) at points (..., 3); ValueError for any other result."""
-    distances = _call_field(where, shape, shape, points)
+    distances = _call_field(context, shape, shape, points)
     leading_shape = points.shape[:-1]
     if (
         not isinstance(distances, Tensor)
@@ -288,7 +293,7 @@ def distances_of(where: str, shape: nn.Module, points: Tensor) -> Tensor:
     ):
         sizes = ", ".join(str(size) for size in leading_shape)
         raise ValueError(
-            f"{where}: shape {type(shape).__name__} must give ({sizes}) distances "
+            f"{context}: shape {type(shape).__name__} must give ({sizes}) distances "
             f"at ({sizes}, 3) points, got {check.describe(distances)}"
         )
     return distances
@@ -338,7 +343,7 @@ def moving_nodes(
     return moves
 
 
-def _call_field(where: str, field: nn.Module, method: Callable[..., Any], *arguments: Any) -> Any:
+def _call_field(context: str, field: nn.Module, method: Callable[..., Any], *arguments: Any) -> Any:
     """Calls a method of a field; if it fails, raises a ValueError of one line, naming the field."""
     try:
         return method(*arguments)
@@ -346,56 +351,56 @@ def _call_field(where: str, field: nn.Module, method: Callable[..., Any], *argum
         raise  # not the field's fault
     except Exception as error:
         reason = f"{type(error).__name__}: {one_line(error)}"
-        raise ValueError(f"{where}: field {type(field).__name__} failed: {reason}") from error
+        raise ValueError(f"{context}: field {type(field).__name__} failed: {reason}") from error
 
 
-def _by_channel(where: str, values: Any, points: Tensor) -> dict[str, Tensor]:
+def _by_channel(context: str, values: Any, points: Tensor) -> dict[str, Tensor]:
     """Returns a field's values at points (..., 3) as (..., c) by channel; ValueError if invalid."""
     if isinstance(values, Tensor):
         values = {"value": values}
     if not isinstance(values, Mapping) or not values:
         raise ValueError(
-            f"{where}: field must give a tensor, or a dict of them, got {type(values).__name__}"
+            f"{context}: field must give a tensor, or a dict of them, got {type(values).__name__}"
         )
     by_channel, leading_shape = {}, points.shape[:-1]
     for name, value in values.items():
         if not isinstance(value, Tensor) or not value.dtype.is_floating_point:
             raise ValueError(
-                f"{where}: field must give floats for {name!r}, got {check.describe(value)}"
+                f"{context}: field must give floats for {name!r}, got {check.describe(value)}"
             )
         with_width = value[..., None] if value.shape == leading_shape else value
         if with_width.shape[:-1] != leading_shape:
             sizes = ", ".join(str(size) for size in leading_shape)
             raise ValueError(
-                f"{where}: field must give ({sizes}) or ({sizes}, c) for {name!r} "
+                f"{context}: field must give ({sizes}) or ({sizes}, c) for {name!r} "
                 f"at ({sizes}, 3) points, got {check.describe(value)}"
             )
         by_channel[name] = with_width
     return by_channel
 
 
-def _channel_widths(where: str, field: nn.Module) -> dict[str, int]:
+def _channel_widths(context: str, field: nn.Module) -> dict[str, int]:
     """Returns the width of each channel of a field, found by evaluating it at 2 x 5 points."""
     tensors = [*field.parameters(), *field.buffers()]
     device = tensors[0].device if tensors else torch.device("cpu")
     points = torch.full((2, 5, 3), 0.25, device=device)
     with torch.no_grad():
         if isinstance(field, Field) and field.prefiltered:
-            values = _call_field(where, field, field.filtered, points, points)
+            values = _call_field(context, field, field.filtered, points, points)
         else:
-            values = _call_field(where, field, field, points)
-    return {n: value.shape[-1] for n, value in _by_channel(where, values, points).items()}
+            values = _call_field(context, field, field, points)
+    return {n: value.shape[-1] for n, value in _by_channel(context, values, points).items()}
 
 
-def _grid_around(where: str, field: Field | None, extent: int | Sequence[int]) -> tuple[Any, Any]:
+def _grid_around(context: str, field: Field | None, extent: int | Sequence[int]) -> tuple[Any, Any]:
     """Returns extent and box of a grid around a field's box, 2 voxels wider on each side."""
     box = None if field is None else field.box()
     if box is None or not bool(torch.isfinite(box).all()) or not bool((box[1] > box[0]).all()):
-        raise ValueError(f"{where}: box must be given: the field does not say where it ends")
+        raise ValueError(f"{context}: box must be given: the field does not say where it ends")
     box = box.cpu()
     sides, middle = box[1] - box[0], box.mean(0)
     if isinstance(extent, int):
-        check.whole(where, "extent", extent, low=5, high=2**40)
+        check.whole(context, "extent", extent, low=5, high=2**40)
         voxel = sides.max() / (extent - 4)
         extent = [math.ceil(float(side / voxel) - 1e-9) + 4 for side in sides]
         half_size = torch.tensor(extent, dtype=torch.float64) * voxel / 2

@@ -99,23 +99,23 @@ class Hypertexture(Tally, Producer):
         Raises:
             ValueError: A number is out of range, the dtype is another, or the box is unknown.
         """
-        where = type(self).__name__
-        check.instance(where, "shape", shape, Distance)
-        thickness = check.number(where, "thickness", thickness, low=0, open_low=True)
-        amplitude = check.number(where, "amplitude", amplitude, low=0)
-        softness = check.number(where, "softness", softness, low=0, open_low=True)
-        series = octaves_of(where, octaves, lacunarity, gain, seed, frequency)
+        context = type(self).__name__
+        check.instance(context, "shape", shape, Distance)
+        thickness = check.number(context, "thickness", thickness, low=0, open_low=True)
+        amplitude = check.number(context, "amplitude", amplitude, low=0)
+        softness = check.number(context, "softness", softness, low=0, open_low=True)
+        series = octaves_of(context, octaves, lacunarity, gain, seed, frequency)
         peak = amplitude * sum(o.amplitude for o in series) * noise.bounds(noise.perlin).high
         max_offset = thickness * max(peak + softness - 0.5, 0.0)
         if box is None:
             shape_box = shape.box()
             if shape_box is None or not bool(shape_box.isfinite().all()):
                 reason = "box must be given: the shape does not tell where it ends"
-                raise ValueError(f"{where}: {reason}")
+                raise ValueError(f"{context}: {reason}")
             box = [(shape_box[0] - max_offset).tolist(), (shape_box[1] + max_offset).tolist()]
-        extent = extent_in(where, extent, box)
-        if not check.instance(where, "dtype", dtype, torch.dtype).is_floating_point:
-            raise ValueError(f"{where}: dtype must be one of floats, got {dtype}")
+        extent = extent_in(context, extent, box)
+        if not check.instance(context, "dtype", dtype, torch.dtype).is_floating_point:
+            raise ValueError(f"{context}: dtype must be one of floats, got {dtype}")
         channels = {"density": Channel(dtype)}
         if distances:
             channels["distance"] = Channel(dtype)

@@ -42,22 +42,22 @@ class JoinedProducer(OfProducers):
             ValueError: One has several channels or needs its parents' bricks, or extent, spacing,
                 origin or branching differ.
         """
-        where = type(self).__name__
+        context = type(self).__name__
         if not isinstance(producers, Mapping):
             got = type(producers).__name__
-            raise ValueError(f"{where}: producers must be producers by name, got a {got}")
+            raise ValueError(f"{context}: producers must be producers by name, got a {got}")
         if not producers:
-            raise ValueError(f"{where}: producers must hold at least one")
+            raise ValueError(f"{context}: producers must hold at least one")
         channels, ranges, labels = dict[str, Any](), dict[str, Any](), dict[str, Any]()
         for name, producer in producers.items():
-            check.instance(where, f"producers[{name!r}]", producer, Producer)
+            check.instance(context, f"producers[{name!r}]", producer, Producer)
             if len(producer.channels) != 1:
                 names = ", ".join(producer.channels)
                 raise ValueError(
-                    f"{where}: each producer must have one channel, {name!r} has {names}"
+                    f"{context}: each producer must have one channel, {name!r} has {names}"
                 )
             if producer.needs_parent:
-                raise ValueError(f"{where}: {name!r} needs its parents' bricks")
+                raise ValueError(f"{context}: {name!r} needs its parents' bricks")
             ((channel_name, channel),) = producer.channels.items()
             channels[name] = channel
             ranges |= (
@@ -74,7 +74,8 @@ class JoinedProducer(OfProducers):
             for (attribute, value), expected in pairs:
                 if value != expected:
                     raise ValueError(
-                        f"{where}: {attribute} of {name!r} is {value}, that of the first {expected}"
+                        f"{context}: {attribute} of {name!r} is {value}, "
+                        f"that of the first {expected}"
                     )
         super().__init__(**grid_of(first), channels=channels, value_range=ranges, labels=labels)
         self.producers = torch.nn.ModuleDict(producers)

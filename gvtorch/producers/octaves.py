@@ -52,12 +52,12 @@ class OctaveProducer(Producer):
         Raises:
             ValueError: Voxels are not cubes, N is not 2 for a `SplineSum`, or see `Producer`.
         """
-        where = type(self).__name__
+        context = type(self).__name__
         if not isinstance(total, (OctaveSum, SplineSum)):
             kind = type(total).__name__
-            raise ValueError(f"{where}: total must be a SplineSum or an OctaveSum, got {kind}")
+            raise ValueError(f"{context}: total must be a SplineSum or an OctaveSum, got {kind}")
         if isinstance(total, SplineSum):
-            check.halves(where, branching, "a SplineSum")
+            check.halves(context, branching, "a SplineSum")
         self._names = ["value"]
         if isinstance(total, OctaveSum) or values is not None:
             self._names.append("inherited")
@@ -69,7 +69,7 @@ class OctaveProducer(Producer):
             value_range=None if value_range is None else {"value": value_range},
         )
         if max(self.spacing) > min(self.spacing) * (1 + 1e-9):
-            raise ValueError(f"{where}: voxels must be cubes, got sides {self.spacing}")
+            raise ValueError(f"{context}: voxels must be cubes, got sides {self.spacing}")
         self.total, self.values = total, values
 
     def fill(self, nodes: Nodes) -> dict[str, Tensor]:

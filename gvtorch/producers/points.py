@@ -70,17 +70,17 @@ class PointProducer(Producer):
             ValueError: A tensor is of the wrong shape, empty or not finite, no point lies in the
                 box, or a number is out of its range.
         """
-        where = type(self).__name__
-        if not check.instance(where, "dtype", dtype, torch.dtype).is_floating_point:
-            raise ValueError(f"{where}: dtype must be one of floats, got {dtype}")
+        context = type(self).__name__
+        if not check.instance(context, "dtype", dtype, torch.dtype).is_floating_point:
+            raise ValueError(f"{context}: dtype must be one of floats, got {dtype}")
         if isinstance(positions, (str, Path)):
             positions = SortedPoints.open(positions)
         if isinstance(positions, (Points, SortedPoints)) and not (values is radius is None):
-            raise ValueError(f"{where}: values and radius go with positions, not with points")
+            raise ValueError(f"{context}: values and radius go with positions, not with points")
         if isinstance(positions, SortedPoints):
             sorted_points = positions
             if box is not None or extent != 1024 or branching != 2:
-                raise ValueError(f"{where}: sorted points have an extent, a box and N already")
+                raise ValueError(f"{context}: sorted points have an extent, a box and N already")
         else:
             if not isinstance(positions, Points):
                 positions = Points(positions, values, radius=radius)

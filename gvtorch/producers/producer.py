@@ -146,11 +146,11 @@ class CoarseColors(Protocol):
         """Yields (z, y, x, width) of each coarse level, the finest of them first, on the CPU."""
 
 
-def check_filtered(where: str, value: Any) -> None:
+def check_filtered(context: str, value: Any) -> None:
     """Raises ValueError unless a user's argument has the form of `CoarseColors`."""
     if not isinstance(value, CoarseColors):
         kind = type(value).__name__
-        raise ValueError(f"{where}: filtered must be a Filtered, got {kind}")
+        raise ValueError(f"{context}: filtered must be a Filtered, got {kind}")
 
 
 class Producer(torch.nn.Module):
@@ -218,38 +218,40 @@ class Producer(torch.nn.Module):
             ValueError: A number is out of its range.
         """
         super().__init__()
-        where = type(self).__name__
+        context = type(self).__name__
         sizes = tuple(extent) if isinstance(extent, Sequence) else (extent,) * 3
         if len(sizes) != 3:
-            raise ValueError(f"{where}: extent must be a number or (x, y, z), got {extent!r}")
-        x, y, z = (check.whole(where, "extent", size, low=1, high=2**40) for size in sizes)
+            raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
+        x, y, z = (check.whole(context, "extent", size, low=1, high=2**40) for size in sizes)
         self.extent = (x, y, z)
         if box is not None:
-            low, high = check.box(where, box)
+            low, high = check.box(context, box)
             spacing = [(b - a) / n for a, b, n in zip(low, high, self.extent, strict=True)]
             origin = [a + 0.5 * s for a, s in zip(low, spacing, strict=True)]
         if isinstance(spacing, (int, float)):
             spacing = (spacing,) * 3
-        self.spacing, self.origin = check.placed(where, spacing, origin, self.extent)
-        self.branching = check.whole(where, "branching", branching, low=2, high=16)
+        self.spacing, self.origin = check.placed(context, spacing, origin, self.extent)
+        self.branching = check.whole(context, "branching", branching, low=2, high=16)
         if channels is not None and not isinstance(channels, Mapping):
             kind = type(channels).__name__
-            raise ValueError(f"{where}: channels must be Channel objects by name, got a {kind}")
+            raise ValueError(f"{context}: channels must be Channel objects by name, got a {kind}")
         self.channels = dict(channels) if channels is not None else {"value": Channel()}
         for name, channel in self.channels.items():
             if not isinstance(channel, Channel):
-                raise ValueError(f"{where}: channels[{name!r}] must be a Channel, got {channel!r}")
+                raise ValueError(
+                    f"{context}: channels[{name!r}] must be a Channel, got {channel!r}"
+                )
         self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
         for argument, by_channel in (("value_range", self.value_range), ("labels", self.labels)):
             if unknown := sorted(map(str, {*by_channel} - {*self.channels})):
                 channel_names = ", ".join(self.channels)
                 raise ValueError(
-                    f"{where}: {argument} has channel {unknown[0]!r}; there are {channel_names}"
+                    f"{context}: {argument} has channel {unknown[0]!r}; there are {channel_names}"
                 )
         for name, bounds in self.value_range.items():
             if len(bounds) != 2 or not -math.inf < bounds[0] <= bounds[1] < math.inf:
                 raise ValueError(
-                    f"{where}: value_range[{name!r}] must be (smallest, largest), got {bounds!r}"
+                    f"{context}: value_range[{name!r}] must be (smallest, largest), got {bounds!r}"
                 )
         self.made_of: dict[str, Any] = {}
         self._changes: deque[tuple[int, Where | None]] = deque(maxlen=_MAX_CHANGES)
@@ -463,12 +465,12 @@ class OfProducers(Producer):
             part.close()
 
 
-def check_points(where: str, points: Any) -> None:
+def check_points(context: str, points: Any) -> None:
     """Raises ValueError unless points are (..., 3) and finite."""
-    if check.instance(where, "points", points, Tensor).shape[-1:] != (3,):
-        raise ValueError(f"{where}: points must be (..., 3), got {check.describe(points)}")
+    if check.instance(context, "points", points, Tensor).shape[-1:] != (3,):
+        raise ValueError(f"{context}: points must be (..., 3), got {check.describe(points)}")
     if not bool(torch.isfinite(points).all()):
-        raise ValueError(f"{where}: points must be finite")
+        raise ValueError(f"{context}: points must be finite")
 
 
 def clocks_of(module: torch.nn.Module) -> list[Tensor]:

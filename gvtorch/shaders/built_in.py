@@ -180,19 +180,19 @@ class StoredColor(LitShader):
         blocker.octaves = 0
         return blocker
 
-    def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
+    def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         channel = tree.bricks.channels.get(str(self.channel), Channel(width=4))
         if channel.width not in (4, 24):
             raise ValueError(
-                f"{where}: stored colour needs 4 numbers a voxel, or 24 for six directions, "
+                f"{context}: stored colour needs 4 numbers a voxel, or 24 for six directions, "
                 f"{self.channel!r} has {channel.width}"
             )
         if channel.width == 24 and self.reference not in (None, min(tree.spacing)):
             raise ValueError(
-                f"{where}: {self.channel!r} has six directions, so its opacity is that of the "
+                f"{context}: {self.channel!r} has six directions, so its opacity is that of the "
                 f"smallest spacing, {min(tree.spacing):g}; got reference {self.reference:g}"
             )
-        return super().shading(where, tree)
+        return super().shading(context, tree)
 
 
 class Isosurface(LitShader):
@@ -255,15 +255,15 @@ class Isosurface(LitShader):
                 f"{kind}: a transfer function or color=None and color_channel belong together"
             )
 
-    def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
+    def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         self._check_color()
         if self.color is None:
             width = tree.bricks.channels.get(str(self.other), Channel(width=4)).width
             if width != 4:
                 raise ValueError(
-                    f"{where}: stored colour needs 4 numbers a voxel, {self.other!r} has {width}"
+                    f"{context}: stored colour needs 4 numbers a voxel, {self.other!r} has {width}"
                 )
-        return super().shading(where, tree)
+        return super().shading(context, tree)
 
     def table(self, sampling: Sampling) -> ColorTable:
         if isinstance(self.color, TransferFunction):

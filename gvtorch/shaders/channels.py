@@ -74,22 +74,22 @@ class ChannelLook:
             ValueError: A number is out of its range, the window is missing, or the look has a
                 transfer function and also a colour, window or opacity.
         """
-        where = f"Channels: channel {place}" + (f" ({self.name})" if self.name else "")
+        context = f"Channels: channel {place}" + (f" ({self.name})" if self.name else "")
         if self.transfer is not None:
             for name in ("color", "window", "opacity"):
                 if getattr(self, name) is not None:
-                    raise ValueError(f"{where}: it has a transfer function, so no {name}")
-            return check.instance(where, "transfer", self.transfer, TransferFunction)
+                    raise ValueError(f"{context}: it has a transfer function, so no {name}")
+            return check.instance(context, "transfer", self.transfer, TransferFunction)
         if self.window is None:
             raise ValueError(
-                f"{where}: window=(low, high) or a transfer function is missing; "
+                f"{context}: window=(low, high) or a transfer function is missing; "
                 "Channels.of(volume) finds windows"
             )
-        low, high = window_of(where, self.window)
+        low, high = window_of(context, self.window)
         default = DEFAULT_COLORS[place] if count > 1 else "white"
-        color = channel_color(where, default if self.color is None else self.color)
+        color = channel_color(context, default if self.color is None else self.color)
         opacity = _DEFAULT_OPACITY if self.opacity is None else self.opacity
-        opacity = check.number(where, "opacity", opacity, low=0, high=1)
+        opacity = check.number(context, "opacity", opacity, low=0, high=1)
         fractions = [piece / _RAMP_PIECES for piece in range(_RAMP_PIECES)]
         rising = [
             (low + fraction * (high - low), opacity * fraction * fraction) for fraction in fractions
@@ -221,15 +221,15 @@ class Channels(Shader):
 
     def _visible_functions(self) -> list[tuple[int, TransferFunction]]:
         """Returns component and current transfer function of each visible channel."""
-        where, looks = "Channels", self.looks
-        check.one_of(where, "mode", self.mode, get_args(Mode))
+        context, looks = "Channels", self.looks
+        check.one_of(context, "mode", self.mode, get_args(Mode))
         if not 1 <= len(looks) <= MAX_CHANNELS:
-            raise ValueError(f"{where}: takes 1 to {MAX_CHANNELS} channels, got {len(looks)}")
+            raise ValueError(f"{context}: takes 1 to {MAX_CHANNELS} channels, got {len(looks)}")
         visible = []
         for index, look in enumerate(looks):
-            check.instance(where, f"channel {index}", look, ChannelLook)
+            check.instance(context, f"channel {index}", look, ChannelLook)
             component = index if look.component is None else look.component
-            check.whole(where, f"component of channel {index}", component, low=0)
+            check.whole(context, f"component of channel {index}", component, low=0)
             function = look.function(index, len(looks))
             if look.visible:
                 visible.append((component, function))
@@ -277,17 +277,17 @@ def _make_table(
     )
 
 
-def window_of(where: str, window: Sequence[float]) -> tuple[float, float]:
+def window_of(context: str, window: Sequence[float]) -> tuple[float, float]:
     """Returns (low, high) of a window; raises ValueError if it is not one."""
     if not isinstance(window, Sequence) or len(window) != 2:
-        raise ValueError(f"{where}: window must be (low, high), got {window!r}")
-    low, high = (check.number(where, "window", end) for end in window)
+        raise ValueError(f"{context}: window must be (low, high), got {window!r}")
+    low, high = (check.number(context, "window", end) for end in window)
     if not low < high:
-        raise ValueError(f"{where}: window must rise, got {low:g} to {high:g}")
+        raise ValueError(f"{context}: window must rise, got {low:g} to {high:g}")
     return low, high
 
 
-def channel_color(where: str, color: Triple | str) -> Triple:
+def channel_color(context: str, color: Triple | str) -> Triple:
     """Returns a colour as linear RGB; names are those of microscopy lookup tables (`COLORS`)."""
     named = {name: f"#{to_hex(rgb)}" for name, rgb in COLORS.items()}
-    return named_color(where, color, named)
+    return named_color(context, color, named)

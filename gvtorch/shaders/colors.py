@@ -27,20 +27,20 @@ _LIGHTNESS_STEP = 0x57AE147AE147B001  # 2^64 * 0.3425: this makes the first 64 c
 
 
 def linear_color(
-    where: str, value: Any, named: Mapping[str, str] = NAMED
+    context: str, value: Any, named: Mapping[str, str] = NAMED
 ) -> tuple[float, float, float]:
     """Returns a colour as linear red, green, blue: one of the names or #RRGGBB, which are sRGB, or
     three numbers in [0, 1], which are linear; raises ValueError if it is neither.
     """
     if not isinstance(value, str):
-        color = check.triple(where, "colour", value)
+        color = check.triple(context, "colour", value)
         for component in color:
-            check.number(where, "colour", component, low=0, high=1)
+            check.number(context, "colour", component, low=0, high=1)
         return color
     text = named.get(value.lower(), value)
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
         names = ", ".join(named)
-        raise ValueError(f"{where}: {value!r} is not a colour; known: #RRGGBB, {names}")
+        raise ValueError(f"{context}: {value!r} is not a colour; known: #RRGGBB, {names}")
     red, green, blue = array_from_srgb(np.array(from_hex(text[1:]))).tolist()
     return (red, green, blue)
 

@@ -112,11 +112,11 @@ class CompiledShader(LitShader):
         numbers = self._uniform_values()
         return torch.cat((fixed, pack(numbers, dtype, tree.device))) if numbers else fixed
 
-    def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
+    def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         """See `Shader`; compiles for CUDA if the tree is there, and raises as `__init__` does."""
         if tree.device.type == "cuda":
             user.load_cuda(self._compiled)
-        return super().shading(where, tree)
+        return super().shading(context, tree)
 
     def _uniform_values(self) -> list[Any]:
         """Returns the uniforms in the struct's order, checked."""

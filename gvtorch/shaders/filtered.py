@@ -59,13 +59,13 @@ _BATCH_BRICKS = 4096  # bricks cut at a time
 
 def _check_filterable(owner: Any, name: str, value: Any) -> TransferFunction | Lit:
     """Checks that a value is a shader that can be filtered."""
-    where = kind_of(owner)
+    context = kind_of(owner)
     if not isinstance(value, TransferFunction | Lit):
         got = type(value).__name__
-        raise ValueError(f"{where}: {name} must be a TransferFunction or a Lit, got {got}")
+        raise ValueError(f"{context}: {name} must be a TransferFunction or a Lit, got {got}")
     if isinstance(value, Lit) and (value.normals or value.shadows or value.octaves):
         raise ValueError(
-            f"{where}: a Lit must take its normals from the gradient, without shadows per sample "
+            f"{context}: a Lit must take its normals from the gradient, without shadows per sample "
             "and octaves of scattering"
         )
     return value
@@ -348,20 +348,21 @@ class Filtered(Shader):
         unlit.transfer = self.transfer.unlit()
         return unlit
 
-    def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
+    def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         if tree.made_of.get(str(self.other), self.made_of) != self.made_of:
             raise ValueError(
-                f"{where}: the colours {self.other!r} were made of another function or component, "
-                "or it was edited: make them again (Filtered.of, Filtered.add_to, a new producer)"
+                f"{context}: the colours {self.other!r} were made of another function or "
+                "component, or it was edited: make them again (Filtered.of, Filtered.add_to, a new "
+                "producer)"
             )
         numbers = self.numbers
         channel = tree.bricks.channels.get(str(self.other), Channel(width=numbers))
         if channel.width not in (numbers, 6 * numbers):
             raise ValueError(
-                f"{where}: filtered colours need {numbers} numbers a voxel, or {6 * numbers} for "
+                f"{context}: filtered colours need {numbers} numbers a voxel, or {6 * numbers} for "
                 f"six directions, {self.other!r} has {channel.width}"
             )
-        arguments = super().shading(where, tree)
+        arguments = super().shading(context, tree)
         if arguments is None or self.numbers == PLAIN:
             return arguments
         return arguments._replace(shader=shader_number(self.lit_kind))

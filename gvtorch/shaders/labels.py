@@ -199,28 +199,28 @@ class _Appearance:
     """How each label looks; two looks with equal `key` are the same."""
 
     def __init__(self, colors: Any, opacity: Any, visible: Any) -> None:
-        where = "Labels"
+        context = "Labels"
         self.listed_colors = np.zeros((0, 3))  # colours of labels 0, 1, ...
         self.color_by_label: dict[int, tuple[float, float, float]] = {}
         if isinstance(colors, Mapping):
             self.color_by_label = {
-                _checked_label(n): linear_color(where, color) for n, color in colors.items()
+                _checked_label(n): linear_color(context, color) for n, color in colors.items()
             }
         elif colors is not None:
-            self.listed_colors = _listed_colors(where, colors)
+            self.listed_colors = _listed_colors(context, colors)
         self.opacity, self.opacity_by_label = 1.0, dict[int, float]()
         if isinstance(opacity, Mapping):
             self.opacity_by_label = {
-                _checked_label(n): _checked_opacity(where, alpha) for n, alpha in opacity.items()
+                _checked_label(n): _checked_opacity(context, alpha) for n, alpha in opacity.items()
             }
         else:
-            self.opacity = _checked_opacity(where, opacity)
+            self.opacity = _checked_opacity(context, opacity)
         self.show_all = isinstance(visible, str) and visible == "all"
         self.visible: frozenset[int] | None = None
         if isinstance(visible, Iterable) and not isinstance(visible, str):
             self.visible = frozenset(_checked_label(number) for number in visible)
         elif visible is not None and not self.show_all:
-            raise ValueError(f"{where}: visible must be labels, 'all' or None, got {visible!r}")
+            raise ValueError(f"{context}: visible must be labels, 'all' or None, got {visible!r}")
         self.key = (
             *(self.listed_colors.tobytes(), tuple(self.color_by_label.items())),
             *(self.opacity, tuple(self.opacity_by_label.items()), self.show_all, self.visible),
@@ -265,22 +265,22 @@ def _checked_label(number: Any) -> int:
     return as_int()
 
 
-def _checked_opacity(where: str, value: Any) -> float:
-    return check.number(where, "opacity", value, low=0, high=1)
+def _checked_opacity(context: str, value: Any) -> float:
+    return check.number(context, "opacity", value, low=0, high=1)
 
 
-def _listed_colors(where: str, colors: Any) -> np.ndarray:
+def _listed_colors(context: str, colors: Any) -> np.ndarray:
     """Returns colours (k, 3) of labels 0, 1, ..."""
     if isinstance(colors, Tensor):
         colors = colors.detach().cpu().numpy()
     if isinstance(colors, np.ndarray):
         if colors.ndim != 2 or colors.shape[1] != 3:
-            raise ValueError(f"{where}: colors must be (k, 3), got {check.shown(colors)}")
+            raise ValueError(f"{context}: colors must be (k, 3), got {check.shown(colors)}")
         rgb = colors.astype(np.float64)
         rgb = array_from_srgb(rgb / 255) if colors.dtype == np.uint8 else rgb
         if not ((rgb >= 0) & (rgb <= 1)).all():
-            raise ValueError(f"{where}: colors must lie in [0, 1]")
+            raise ValueError(f"{context}: colors must lie in [0, 1]")
         return rgb
     if isinstance(colors, str) or not isinstance(colors, Sequence):
-        raise ValueError(f"{where}: colors must be by label, or a list, got {colors!r}")
-    return np.array([linear_color(where, color) for color in colors]).reshape(-1, 3)
+        raise ValueError(f"{context}: colors must be by label, or a list, got {colors!r}")
+    return np.array([linear_color(context, color) for color in colors]).reshape(-1, 3)

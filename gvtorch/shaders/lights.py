@@ -35,16 +35,18 @@ def a_number(low: float = -inf, high: float = inf) -> Check:
     """
 
     def checked(owner: Any, name: str, value: Any) -> Any:
-        where, number = kind_of(owner), value
-        check.no_gradient(where, name, value)
+        context, number = kind_of(owner), value
+        check.no_gradient(context, name, value)
         if isinstance(value, Tensor):
             if value.numel() != 1:
                 got = check.describe(value)
-                raise ValueError(f"{where}: {name} must be a number or a tensor of one, got {got}")
+                raise ValueError(
+                    f"{context}: {name} must be a number or a tensor of one, got {got}"
+                )
             if value.is_cuda:
                 return value
             number = value.item()
-        number = check.number(where, name, number, low=low, high=high)
+        number = check.number(context, name, number, low=low, high=high)
         return number if isinstance(value, np.ndarray) else value
 
     return checked
@@ -56,17 +58,17 @@ def a_triple(low: float = -inf, high: float = inf, zero: bool = True) -> Check:
     """
 
     def checked(owner: Any, name: str, value: Any) -> Any:
-        where = kind_of(owner)
-        check.no_gradient(where, name, value)
+        context = kind_of(owner)
+        check.no_gradient(context, name, value)
         if isinstance(value, Tensor) and value.is_cuda:
             if value.shape != (3,):
-                raise ValueError(f"{where}: {name} must be (3,), got {check.describe(value)}")
+                raise ValueError(f"{context}: {name} must be (3,), got {check.describe(value)}")
             return value
-        numbers = check.triple(where, name, value)
+        numbers = check.triple(context, name, value)
         for number in numbers:
-            check.number(where, name, number, low=low, high=high)
+            check.number(context, name, number, low=low, high=high)
         if not zero and not any(numbers):
-            raise ValueError(f"{where}: {name} must not be zero")
+            raise ValueError(f"{context}: {name} must not be zero")
         return numbers if isinstance(value, np.ndarray) else value
 
     return checked
@@ -199,14 +201,16 @@ class LitShader(Shader):
     def material(self) -> ShadeParameters:
         return self.light.parameters()._replace(**{name: getattr(self, name) for name in _MATERIAL})
 
-    def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
-        arguments = super().shading(where, tree)
+    def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
+        arguments = super().shading(context, tree)
         if arguments is None or not (self.shadows or self.octaves):
             return arguments
         if self.shadowed_kind is None:
-            raise ValueError(f"{where}: shadows per sample are for Lit and StoredColor")
+            raise ValueError(f"{context}: shadows per sample are for Lit and StoredColor")
         if self.octaves and isinstance(self.light, Headlight):
-            raise ValueError(f"{where}: octaves of scattering need a sun or lamp, got a Headlight")
+            raise ValueError(
+                f"{context}: octaves of scattering need a sun or lamp, got a Headlight"
+            )
         return arguments._replace(shader=shader_number(self.shadowed_kind))
 
     def unlit(self) -> Self:

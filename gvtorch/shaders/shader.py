@@ -188,7 +188,7 @@ class Shader(Checked):
         )
         return parameters.pack(dtype, tree.device)
 
-    def shading(self, where: str, tree: N3Tree) -> ShadeArguments | None:
+    def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         """Returns the arguments of `shade_rays` that this shader adds to its table and parameters;
         None: `trace_rays` draws it from the table alone.
 
@@ -199,19 +199,21 @@ class Shader(Checked):
         for name in self.channels:
             if name not in channels:
                 channel_names = ", ".join(tree.channel_names)
-                raise ValueError(f"{where}: unknown channel {name!r}; the tree has {channel_names}")
+                raise ValueError(
+                    f"{context}: unknown channel {name!r}; the tree has {channel_names}"
+                )
             if channels[name].coarse and not (self.reads_coarse and name == self.other):
-                raise ValueError(f"{where}: only coarse bricks have channel {name!r}")
+                raise ValueError(f"{context}: only coarse bricks have channel {name!r}")
         if self.kind is None:
             return None
         if self.normals is not None and channels[self.normals].width != 3:
             raise ValueError(
-                f"{where}: normals need 3 numbers a voxel, "
+                f"{context}: normals need 3 numbers a voxel, "
                 f"{self.normals!r} has {channels[self.normals].width}"
             )
         if self.other is not None:
             last = channels[self.other].width - 1
-            check.whole(where, "component of the colour", self.other_component, low=0, high=last)
+            check.whole(context, "component of the colour", self.other_component, low=0, high=last)
         bricks, constants = dict(tree.bricks.bricks), tree.nodes.constants
         if tree.depth == 0:  # the root is the finest level, so there are no coarse bricks
             bricks |= {
@@ -275,12 +277,12 @@ def interval_levels(root_voxel: float, step: float) -> int:
     return max(1, math.ceil(math.log2(root_voxel / step)) + 1)
 
 
-def check_shader(where: str, name: str, value: Any) -> None:
+def check_shader(context: str, name: str, value: Any) -> None:
     """Raises ValueError unless a user's argument is a shader."""
     if not isinstance(value, Shader):
         kind = type(value).__name__
         raise ValueError(
-            f"{where}: {name} must be a TransferFunction or another shader, got {kind}"
+            f"{context}: {name} must be a TransferFunction or another shader, got {kind}"
         )
 
 

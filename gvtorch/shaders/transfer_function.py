@@ -157,8 +157,8 @@ class TransferFunction(Shader):
         """Returns the function with its first corner point moved to `low` and its last to `high`. A
         `high` that is not above `low` becomes low + max(1, 1e-6 |low|).
         """
-        where = "TransferFunction.stretched"
-        low, high = (check.number(where, n, v) for n, v in (("low", low), ("high", high)))
+        context = "TransferFunction.stretched"
+        low, high = (check.number(context, n, v) for n, v in (("low", low), ("high", high)))
         if not high > low:
             high = low + max(1.0, 1e-6 * abs(low))
         first, last, _ = self.corners()
@@ -359,32 +359,32 @@ def _common_cells(
     return cells
 
 
-def _checked_points(where: str, name: str, points: Points, width: int) -> np.ndarray:
+def _checked_points(context: str, name: str, points: Points, width: int) -> np.ndarray:
     names = "(value, alpha)" if width == 2 else "(value, red, green, blue)"
     try:
         rows = [list(point) for point in points]
         for number in (number for row in rows for number in row):
-            check.no_gradient(where, name, number)
+            check.no_gradient(context, name, number)
         array = np.array([[float(number) for number in row] for row in rows])
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{where}: {name} must be a list of points {names}") from None
+        raise ValueError(f"{context}: {name} must be a list of points {names}") from None
     if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != width:
         raise ValueError(
-            f"{where}: {name} must be a list of points {names}, got {check.given(points)}"
+            f"{context}: {name} must be a list of points {names}, got {check.given(points)}"
         )
     points = array.tolist()
     if not (np.abs(array) <= _LARGEST).all():
         raise ValueError(
-            f"{where}: {name} must be finite and at most {_LARGEST:g}, got {check.given(points)}"
+            f"{context}: {name} must be finite and at most {_LARGEST:g}, got {check.given(points)}"
         )
     steps = np.diff(array[:, 0])
     if (steps <= 0).any():
         index = int(np.argmax(steps <= 0))
         raise ValueError(
-            f"{where}: {name} values must increase, "
+            f"{context}: {name} values must increase, "
             f"got {array[index, 0]:g} before {array[index + 1, 0]:g} "
             "(for a jump use two values close to each other)"
         )
     if (array[:, 1:] < 0).any() or (array[:, 1:] > 1).any():
-        raise ValueError(f"{where}: {name} numbers must lie in [0, 1], got {check.given(points)}")
+        raise ValueError(f"{context}: {name} numbers must lie in [0, 1], got {check.given(points)}")
     return array

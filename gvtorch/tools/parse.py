@@ -122,12 +122,12 @@ def parse_channels(text: str | None, image: Volume | Store) -> Channels:
     shader = Channels.of(image, mode, components=list(wanted))
     for look, (component, told) in zip(shader.looks, wanted.items(), strict=True):
         color, window = (*told, "auto", "auto")[:2]
-        where = f"--channel {component}"
+        context = f"--channel {component}"
         if color not in ("", "auto"):
-            look.color = channel_color(where, color)
+            look.color = channel_color(context, color)
         if window not in ("", "auto"):
-            low, high = numbers(f"{where}: window", window, 2, float)
-            look.window = window_of(where, (low, high))
+            low, high = numbers(f"{context}: window", window, 2, float)
+            look.window = window_of(context, (low, high))
     return shader
 
 

@@ -65,7 +65,7 @@ class Layer:
         """Returns the tensors that are not None, by name."""
         return [(name, image) for name, image in vars(self).items() if image is not None]
 
-    def cut(self, where: str, camera: Camera) -> Layer:
+    def cut(self, context: str, camera: Camera) -> Layer:
         """Returns the part of the layer that a camera sees: if the camera is a strip of rows, views
         of these rows.
 
@@ -79,7 +79,8 @@ class Layer:
             return self
         if got != wanted:
             raise ValueError(
-                f"{where}: layer must have the camera's {wanted} pixels (rows, columns), got {got}"
+                f"{context}: layer must have the camera's {wanted} pixels (rows, columns), "
+                f"got {got}"
             )
         strip = copy.copy(self)  # checked already
         for name, image in self._images():

@@ -128,7 +128,7 @@ def _resident(context: str, scene: Any) -> Scene:
         if isinstance(value, (str, PathLike)):
             raise ValueError(f"{context}: {str(value)!r} is a path: gv.read_volume reads it")
         try:
-            return N3Tree.from_volume(as_volume(value, where=context))
+            return N3Tree.from_volume(as_volume(value, context=context))
         except ValueError as error:
             raise ValueError(f"{error}; gv.as_volume takes axes, nan and more") from None
 

@@ -353,7 +353,7 @@ def _open_data(what: Any) -> Volume | Store:
         path = fspath(what)
         return Store.open(path) if is_zarr(path) else read_volume(path)
     try:
-        return as_volume(what, where="view")
+        return as_volume(what, context="view")
     except ValueError as error:
         accepted = "an Engine, Producer, N3Tree, Volume, Store, array or path"
         raise ValueError(f"view: takes {accepted}: {error}") from None

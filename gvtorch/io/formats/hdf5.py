@@ -209,7 +209,7 @@ def _check_dataset(path: str, name: str, dataset: Any) -> None:
 
 
 def _axes(
-    label: str, dataset: Any, shape: tuple[int, ...], axes: str | None
+    context: str, dataset: Any, shape: tuple[int, ...], axes: str | None
 ) -> tuple[str, list[tuple[float, float] | None], list[str | None], list[str]]:
     """Returns letter, (step, first position) and unit of each axis, and metadata not kept."""
     rank = len(shape)
@@ -229,7 +229,7 @@ def _axes(
         if _text(attributes.get("NAME")).startswith("This is a netCDF dimension but not"):
             continue
         if scale is not None:
-            _check_files(label, scale.file, scale.name or "/")
+            _check_files(context, scale.file, scale.name or "/")
         if shape[axis] > _MAX_COORDINATES:
             continue
         if (
@@ -251,7 +251,7 @@ def _axes(
     axis_order = named_axes(names, shape) if axes is None else None
     if axis_order is None and axes is None and rank > 3 and set(shape[:-3]) == {1}:
         axis_order = "-" * (rank - 3) + "zyx"
-    return axis_order or ask_axes(label, shape, axes), steps, units, lost
+    return axis_order or ask_axes(context, shape, axes), steps, units, lost
 
 
 def _tags(dataset: Any) -> list[Any]:

@@ -33,14 +33,14 @@ def channel_names(location: str | Path) -> tuple[str, ...]:
         ValueError: The metadata is damaged.
         OSError: It can't be read.
     """
-    label = str(location)
-    group = read_json(label, kvstore(location), "zarr.json", Deadline(_TIMEOUT)) or {}
+    context = str(location)
+    group = read_json(context, kvstore(location), "zarr.json", Deadline(_TIMEOUT)) or {}
     attributes = group.get("attributes")
     names = attributes.get(CHANNELS_ATTRIBUTE) if isinstance(attributes, dict) else None
     if names is None:
         return ()
     if not isinstance(names, list) or not names or not all(is_name(name) for name in names):
-        raise ValueError(f"{label}: damaged: {CHANNELS_ATTRIBUTE} is {names!r}")
+        raise ValueError(f"{context}: damaged: {CHANNELS_ATTRIBUTE} is {names!r}")
     return tuple(names)
 
 

@@ -89,13 +89,13 @@ class Checksums:
         if self._checksums is None:
             self._checksums = self._read_list(deadline)
         expected = self._checksums.get(path)
-        label = f"{self._location}/{path}"
+        context = f"{self._location}/{path}"
         if expected is not None:  # None: no file was written, so there is nothing to compare
             content = _read_covered_bytes(self._location, self._root, spec, path, deadline)
             if content is None:
                 return  # it reads as zeros, and the store then finds out why
             if zlib.crc32(content) != expected:
-                raise StoreError(f"{label}: its checksum is not the one that was written")
+                raise StoreError(f"{context}: its checksum is not the one that was written")
         self._checked_paths.add(path)
 
     def _read_list(self, deadline: Deadline) -> Mapping[str, Any]:

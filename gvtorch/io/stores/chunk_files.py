@@ -59,17 +59,17 @@ def check_file(path: str, max_bytes: int) -> int | None:
     return status.st_size
 
 
-def files_of(label: str, array: Any) -> ChunkFiles:
+def files_of(context: str, array: Any) -> ChunkFiles:
     """Returns the file metadata of one of tensorstore's arrays; raises ValueError if reading a
     chunk takes too much memory, or if that can't be checked.
     """
     try:
         files = ChunkFiles.of(array)
     except Endless as error:
-        raise ValueError(f"{label}: {error}") from None
+        raise ValueError(f"{context}: {error}") from None
     if files.chunk_bytes > _MAX_CHUNK_BYTES:
         raise ValueError(
-            f"{label}: a chunk takes {files.chunk_bytes} bytes, more than {_MAX_CHUNK_BYTES}"
+            f"{context}: a chunk takes {files.chunk_bytes} bytes, more than {_MAX_CHUNK_BYTES}"
         )
     return files
 

@@ -46,7 +46,7 @@ class StoredArray:
     files: ChunkFiles
     axes: str  # letters among c, z, y, x in stored order
     factors: tuple[int, int, int]  # z y x, finest voxels along a side of one of its voxels
-    label: str
+    context: str
 
     def size(self, axis: str) -> int:
         """Returns the voxels along an axis; 1 if the array lacks the axis."""
@@ -57,7 +57,7 @@ class StoredArray:
         start, stop = boxes.clamped_box(low, high, [self.size(axis) for axis in "zyx"])
         slices = dict(zip("zyx", boxes.index(start, stop), strict=True))
         index = tuple(slices.get(axis, slice(None)) for axis in self.axes)
-        data = deadline.wait(begin_read(self.array[index], self.files), self.label)
+        data = deadline.wait(begin_read(self.array[index], self.files), self.context)
         return boxes.repeat_edges(boxes.to_zyxc(data, self.axes), start, low, high)
 
 
@@ -80,12 +80,12 @@ def open_arrays(
     futures = [begin_open(root, {"driver": driver, "path": scale.path}) for scale in image.scales]
     stored: list[StoredArray] = []
     for scale, future in zip(image.scales, futures, strict=True):
-        label = f"{location}/{scale.path}"
+        context = f"{location}/{scale.path}"
         try:
-            array = deadline.wait(future, label)
+            array = deadline.wait(future, context)
         except StoreError as error:
-            raise ValueError(f"{label}: can't be opened: {one_line_error(error)}") from None
-        files = _check_array(label, array, image.axes)
+            raise ValueError(f"{context}: can't be opened: {one_line_error(error)}") from None
+        files = _check_array(context, array, image.axes)
         if not stored:
             channel_index = _channel_index(location, array, image.axes, time, channels)
             sizes = dict(zip(image.axes, map(int, array.shape), strict=True))
@@ -93,7 +93,7 @@ def open_arrays(
         # An index array of channels would move its axis: oindex leaves every axis in place.
         array = array.oindex[tuple(selection.get(axis, slice(None)) for axis in image.axes)]
         axes = image.axes.replace("t", "").replace("-", "")
-        opened = StoredArray(array, files, axes, (1, 1, 1), label)
+        opened = StoredArray(array, files, axes, (1, 1, 1), context)
         factors = _factors(stored[0], opened, finest, scale) if stored else opened.factors
         if factors is not None:
             stored.append(replace(opened, factors=factors))
@@ -116,31 +116,31 @@ def keep_channels(
     image.info = replace(image.info, channels=channels)
 
 
-def _check_array(label: str, array: Any, axes: str) -> ChunkFiles:
+def _check_array(context: str, array: Any, axes: str) -> ChunkFiles:
     if array.rank != len(axes):
-        raise ValueError(f"{label}: has {array.rank} axes, the metadata {len(axes)}: {axes}")
+        raise ValueError(f"{context}: has {array.rank} axes, the metadata {len(axes)}: {axes}")
     voxels = math.prod(array.shape[axes.index(axis)] for axis in "zyx" if axis in axes)
     if voxels > MAX_STORE_VOXELS:
         raise ValueError(
-            f"{label}: {voxels} voxels are more than the {MAX_STORE_VOXELS} of a store"
+            f"{context}: {voxels} voxels are more than the {MAX_STORE_VOXELS} of a store"
         )
     if min(array.shape) < 1 or math.prod(array.shape) > MAX_STORE_VOXELS * 2**10:
-        raise ValueError(f"{label}: extent {tuple(array.shape)} is empty or far too large")
-    return files_of(label, array)
+        raise ValueError(f"{context}: extent {tuple(array.shape)} is empty or far too large")
+    return files_of(context, array)
 
 
 def _channel_index(
-    label: str, array: Any, axes: str, time: int, channels: Sequence[int] | None
+    context: str, array: Any, axes: str, time: int, channels: Sequence[int] | None
 ) -> slice | list[int]:
     size = {axis: int(n) for axis, n in zip(axes, array.shape, strict=True)}
     times, width = size.get("t", 1), size.get("c", 1)
     if isinstance(time, bool) or not isinstance(time, int) or not 0 <= time < times:
-        raise ValueError(no_time_message(label, time, times))
+        raise ValueError(no_time_message(context, time, times))
     if channels is None:
         return slice(None)
-    selected = list(check.instance(label, "channels", channels, tuple, list, range))
+    selected = list(check.instance(context, "channels", channels, tuple, list, range))
     if not selected or not all(isinstance(c, int) and 0 <= c < width for c in selected):
-        raise ValueError(f"{label}: has no channels {selected!r}; it has {width}, from 0")
+        raise ValueError(f"{context}: has no channels {selected!r}; it has {width}, from 0")
     return selected if "c" in axes else slice(None)
 
 
@@ -208,7 +208,7 @@ class LevelReader:
         stop = [min(b * r, n) for b, r, n in zip(high, remaining, base_shape, strict=True)]
         data = base.read(start, stop, deadline)
         if self._layout.dtype == "float32":
-            check_narrowed(base.label, data)
+            check_narrowed(base.context, data)
         data = data.astype(self._layout.dtype, copy=False)
         return data if math.prod(remaining) == 1 else self._pool(data, remaining)
 

@@ -199,15 +199,15 @@ def begin_write(
     return array[boxes.index(low, np.add(low, data.shape).tolist())].write(data)
 
 
-def finish_write(future: Any, label: str, advice: str = "--resume (resume=True) goes on") -> None:
+def finish_write(future: Any, context: str, advice: str = "--resume (resume=True) goes on") -> None:
     """Waits for a write; `advice` ends the error message if the disk is full."""
     try:
         future.result()
     except Exception as error:  # tensorstore raises exceptions of several types
         if "No space left" in str(error):
             text = f"the disk is full; with room again, {advice}"
-            raise OSError(errno.ENOSPC, text, label) from None
-        raise StoreError(f"{label}: can't be written: {one_line_error(error)}") from None
+            raise OSError(errno.ENOSPC, text, context) from None
+        raise StoreError(f"{context}: can't be written: {one_line_error(error)}") from None
 
 
 def create_arrays(conversion: Conversion, level: int) -> None:

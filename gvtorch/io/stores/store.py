@@ -93,25 +93,25 @@ class Store:
         """See `open`."""
         arguments = {"image": image, "time": time, "channels": channels}
         self._arguments: dict[str, Any] = {"location": location, **arguments}
-        label, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
-        check.text(label, "image", image)
+        context, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
+        check.text(context, "image", image)
         parent = root
-        root, pyramid, own_layout = find_image(label, root, image, deadline)
+        root, pyramid, own_layout = find_image(context, root, image, deadline)
         # A channel of a store of several: its folder is a store, too.
         if own_layout and root != parent:
-            label = root if isinstance(root, str) else root["path"].rstrip("/")
-        arrays, channel_index, sizes = open_arrays(label, root, pyramid, time, channels, deadline)
+            context = root if isinstance(root, str) else root["path"].rstrip("/")
+        arrays, channel_index, sizes = open_arrays(context, root, pyramid, time, channels, deadline)
         dtype = value_dtype(arrays[0].array.dtype.numpy_dtype)
         if dtype not in DTYPES:
-            raise ValueError(f"{label}: dtype {dtype} is unknown; known: {', '.join(DTYPES)}")
+            raise ValueError(f"{context}: dtype {dtype} is unknown; known: {', '.join(DTYPES)}")
         x, y, z, width = (arrays[0].size(axis) for axis in "xyzc")
         self.time, self.times = time, sizes.get("t", 1)
         self.layout = layout = own_layout or StoreLayout(extent=(x, y, z), dtype=dtype, width=width)
         differs = (layout.extent, layout.dtype) != ((x, y, z), dtype)
         if differs or (own_layout and own_layout.times != self.times):
-            raise ValueError(f"{label}: damaged: metadata and level 0 differ in extent or dtype")
+            raise ValueError(f"{context}: damaged: metadata and level 0 differ in extent or dtype")
         label_values = (
-            None if layout.label_count is None else _read_labels(label, root, layout, deadline)
+            None if layout.label_count is None else _read_labels(context, root, layout, deadline)
         )
         self.label_values = None if label_values is None else torch.from_numpy(label_values)
         self.pool: Pool = pool_mean
@@ -119,10 +119,14 @@ class Store:
             self.pool = partial(pool_majority, background=background(label_values))
         self._levels = LevelReader(arrays, layout, self.pool)
         keep_channels(pyramid, sizes, channel_index)
-        self.location, self.root, self.has_blocks = label, kvstore(label), own_layout is not None
+        self.location, self.root, self.has_blocks = (
+            context,
+            kvstore(context),
+            own_layout is not None,
+        )
         self.name, self.info, self.lost = pyramid.name, pyramid.info, tuple(pyramid.dropped)
         spacing, origin = pyramid.scales[0].scale[::-1], pyramid.scales[0].translation[::-1]
-        self.spacing, self.origin = check.placed(label, spacing, origin, layout.extent)
+        self.spacing, self.origin = check.placed(context, spacing, origin, layout.extent)
         self.extent, self.levels, self.block = layout.extent, layout.levels, layout.block
         self.border, self.cell, self.threshold = BORDER, CELL, layout.threshold
         self.dtype: torch.dtype = getattr(torch, dtype)
@@ -136,14 +140,14 @@ class Store:
         self._blocks: list[ChunkedArray] = []
         self._cells: list[ChunkedArray] = []
         self._known_shards: set[tuple[Any, ...]] = set()
-        self._checksums = Checksums(label, self.root, layout, time)
+        self._checksums = Checksums(context, self.root, layout, time)
         if own_layout:
             self._open_blocks_and_cells(deadline)
             if (
                 pyramid.store_json.get("checksum", (computed := json_checksum(pyramid.store_json)))
                 != computed
             ):
-                raise ValueError(f"{label}: damaged: gvtorch's metadata is not what was written")
+                raise ValueError(f"{context}: damaged: gvtorch's metadata is not what was written")
 
     @classmethod
     def open(
@@ -483,7 +487,7 @@ class Store:
         that was written, or if zeros come from a missing shard: these arrays are written in full,
         zeros included.
         """
-        label, is_coarse = f"{self.location}/{spec['path']}", "coarse" in spec["path"]
+        context, is_coarse = f"{self.location}/{spec['path']}", "coarse" in spec["path"]
         shape = spec["metadata"]["chunk_grid"]["configuration"]["chunk_shape"]
         time_index = (self.time,) if self.times > 1 and not is_coarse else ()
         shape = shape[len(time_index) :]
@@ -500,7 +504,7 @@ class Store:
                 continue
             name = shard_path(spec, (*time_index, *shard_index))
             if read_key(self.location, self.root, name, deadline, slice(0, 1)) is None:
-                raise StoreError(f"{label}: shard {shard_index} z y x: missing chunk")
+                raise StoreError(f"{context}: shard {shard_index} z y x: missing chunk")
             self._known_shards.add(key)
 
     def _cut_blocks(
@@ -544,21 +548,21 @@ def _wait_for_array(
     location: str, spec: dict[str, Any], future: Any, deadline: Deadline
 ) -> ChunkedArray:
     """Waits for an array to open; raises ValueError if its shape or dtype is not its spec's."""
-    label, expected = f"{location}/{spec['path']}", spec["metadata"]
-    array = deadline.wait(future, label)
+    context, expected = f"{location}/{spec['path']}", spec["metadata"]
+    array = deadline.wait(future, context)
     if list(array.shape) != expected["shape"] or array.dtype.name != expected["data_type"]:
-        raise ValueError(f"{label}: damaged: {array.shape} {array.dtype.name}")
-    return array, files_of(label, array)
+        raise ValueError(f"{context}: damaged: {array.shape} {array.dtype.name}")
+    return array, files_of(context, array)
 
 
 def _read_labels(location: str, root: Any, layout: StoreLayout, deadline: Deadline) -> np.ndarray:
     """Returns (k,) int64 the table of indexed labels."""
     spec = layout.labels()
-    label = f"{location}/{spec['path']}"
+    context = f"{location}/{spec['path']}"
     chunked = _wait_for_array(location, spec, begin_open(root, spec), deadline)
-    labels: np.ndarray = deadline.wait(begin_read(*chunked), label)
+    labels: np.ndarray = deadline.wait(begin_read(*chunked), context)
     if not (labels[1:] > labels[:-1]).all():
-        raise ValueError(f"{label}: damaged: labels must be ascending")
+        raise ValueError(f"{context}: damaged: labels must be ascending")
     return labels
 
 

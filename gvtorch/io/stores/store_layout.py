@@ -402,11 +402,11 @@ class Deadline:
         """Seconds until then."""
         return max(0.0, self._end - time.monotonic())
 
-    def timeout_error(self, label: str) -> TimeoutError:
+    def timeout_error(self, context: str) -> TimeoutError:
         """Returns the error of a read that took too long."""
-        return TimeoutError(f"{label}: no answer within {self.timeout:g} s")
+        return TimeoutError(f"{context}: no answer within {self.timeout:g} s")
 
-    def wait(self, future: Any, label: str) -> Any:
+    def wait(self, future: Any, context: str) -> Any:
         """Returns the result of one of tensorstore's futures; raises TimeoutError if it took too
         long, StoreError if it failed.
         """
@@ -414,9 +414,9 @@ class Deadline:
             return future.result(timeout=self.left)
         except TimeoutError:
             future.cancel()
-            raise self.timeout_error(label) from None
+            raise self.timeout_error(context) from None
         except Exception as error:  # tensorstore raises exceptions of several types
-            raise StoreError(f"{label}: {one_line_error(error)}") from None
+            raise StoreError(f"{context}: {one_line_error(error)}") from None
 
 
 def one_line_error(error: BaseException) -> str:
