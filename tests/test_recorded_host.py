@@ -25,6 +25,20 @@ def on_the_host(blobs, tmp_path, which: str) -> gv.Producer:
     return gv.VolumeProducer(blobs, hold=which)
 
 
+class Later(gv.VolumeProducer):
+    """Answers with bricks once the test says so."""
+
+    late: list[tuple[Future, Any]] | None = (
+        None  # answers, and what they are to hold; None: at once
+    )
+
+    def fill(self, nodes):
+        if self.late is None:
+            return super().fill(nodes)
+        self.late.append((Future(), super().fill(nodes)))
+        return self.late[-1][0]
+
+
 @pytest.mark.parametrize("backend", COMPILED)
 @pytest.mark.parametrize("which", ["voxels", "bricks", "store"])
 @pytest.mark.parametrize("batch, pool", [(5, "4 MB"), (200, "4 MB"), (64, "150 kB")])
@@ -92,15 +106,6 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
 @pytest.mark.parametrize("backend", COMPILED)
 @pytest.mark.parametrize("slow", [False, True])
 def test_a_busy_producer_is_asked_for_several_frames_at_once(blobs, backend, slow, monkeypatch):
-    class Later(gv.VolumeProducer):
-        late: list[tuple[Future, Any]] | None = None
-
-        def fill(self, nodes):
-            if self.late is None:
-                return super().fill(nodes)
-            self.late.append((Future(), super().fill(nodes)))
-            return self.late[-1][0]
-
     monkeypatch.setattr(host_frame, "_CALL_GAP", 0.0 if slow else math.inf)
     with gv.Engine(Later(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         engine.render(view(24), LOOK)
@@ -123,6 +128,25 @@ def test_a_busy_producer_is_asked_for_several_frames_at_once(blobs, backend, slo
         for _ in range(3):
             frames.frame()
         engine.validate()
+
+
+@pytest.mark.backend("cpp")
+def test_a_batch_whose_frames_were_dropped_while_it_was_asked_for_is_not_waited_for(blobs):
+    class Ended(Later):
+        def fill(self, nodes):
+            answer = super().fill(nodes)
+            if self.late:
+                frames.served.release()
+            return answer
+
+    with gv.Engine(Ended(blobs), brick_size=4) as engine:
+        engine.frame(view(24), LOOK)
+        frames = Frames(engine, view(24), LOOK, 3)
+        late = engine.trees["scene"].producer.late = []
+        while not late:
+            frames.frame()
+            frames.served._executor.submit(int).result()  # until its requests are passed on
+        assert not frames.served._waiting, "its kind would count as busy"
 
 
 class Guarded(dict[Any, Any]):
@@ -152,17 +176,10 @@ class Guarded(dict[Any, Any]):
 def test_answers_on_their_way_are_listed_under_a_lock(blobs, backend):
     """Frames read and change the list, and so do the threads in which answers arrive."""
 
-    class Later(gv.VolumeProducer):
+    class Impatient(Later):
         patience = 0.2
-        late: list[tuple[Future, Any]] | None = None
 
-        def fill(self, nodes):
-            if self.late is None:
-                return super().fill(nodes)
-            self.late.append((Future(), super().fill(nodes)))
-            return self.late[-1][0]
-
-    with gv.Engine(Later(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+    with gv.Engine(Impatient(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         engine.frame(view(24), LOOK)
         frames = Frames(engine, view(24), LOOK, 3)
         late = engine.trees["scene"].producer.late = []

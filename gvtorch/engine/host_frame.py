@@ -228,7 +228,8 @@ class HostFrame(RecordedFrame):
             return
         if isinstance(answer, Future):
             with self._lock:  # not while a callback is added: it may be called at once
-                self._waiting[answer] = time.monotonic() + batch.source.patience, batch
+                if batch.generation == self.generation:
+                    self._waiting[answer] = time.monotonic() + batch.source.patience, batch
             answer.add_done_callback(on_arrival)
         else:
             self._settle(batch, lambda: answer)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..base.stage import Progress
 from ..base.volume import Volume, movable
-from ..ops.shading import FAINT as _FAINT
+from ..ops.shading import FAINT
 from .shader import ColorTable
 
 _TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # finest voxels that are processed at a time
@@ -307,7 +307,7 @@ class _Columns:
 def _weighted_moments(color: Tensor, alpha: Tensor, light: Tensor, direction: int) -> Tensor:
     """Returns the moments of intervals (c - 3, n, a, b), weighted by light. Rays also blend in the
     inside of solids, which no light reaches: there an interval takes the moments of the last one
-    before it that light reaches, divided by `_FAINT`, so that other directions count more.
+    before it that light reaches, divided by `FAINT`, so that other directions count more.
     """
     index = torch.arange(len(alpha), device=alpha.device)[:, None, None]
     lit = light > 2 * _MIN_LIGHT
@@ -319,7 +319,7 @@ def _weighted_moments(color: Tensor, alpha: Tensor, light: Tensor, direction: in
     weight = light * torch.where(
         source_alpha > 0, alpha / torch.where(source_alpha > 0, source_alpha, 1.0), 0.0
     )
-    weight = torch.where(lit, weight, weight / _FAINT)
+    weight = torch.where(lit, weight, weight / FAINT)
     return color[3:].gather(1, source_index.expand_as(color[3:])) * weight
 
 
@@ -386,7 +386,7 @@ def without_light(colors: Tensor) -> Tensor:
 
 
 def mean_of_directions(colors: Tensor) -> Tensor:
-    """Returns the mean (..., n) of (..., 6 * n), of the same dtype. Moments are divided by _FAINT,
+    """Returns the mean (..., n) of (..., 6 * n), of the same dtype. Moments are divided by FAINT,
     which the shader multiplies their trace by: light reaches all of such matter, so the product is
     the share of it that has a normal.
     """
@@ -395,7 +395,7 @@ def mean_of_directions(colors: Tensor) -> Tensor:
     for direction in others:
         total += direction
     mean = total / _DIRECTIONS
-    mean[..., PLAIN:] /= _FAINT
+    mean[..., PLAIN:] /= FAINT
     return mean.to(colors.dtype)
 
 
