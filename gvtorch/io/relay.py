@@ -225,10 +225,11 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         path_match = re.fullmatch(r"/([\w-]+)/(\d{1,9})/(.+)", self.path, re.ASCII)
-        if path_match is None or not hmac.compare_digest(path_match[1], self.server.secret):
-            self._respond(403)
-            return
-        if int(path_match[2]) >= len(self.server.folders):
+        if (
+            path_match is None
+            or not hmac.compare_digest(path_match[1], self.server.secret)
+            or int(path_match[2]) >= len(self.server.folders)
+        ):
             self._respond(403)
             return
         byte_range = _parse_range(self.headers.get("Range", ""))

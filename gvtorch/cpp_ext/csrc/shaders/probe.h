@@ -35,8 +35,8 @@ struct ChannelView {
 };
 
 // A call, not inlined: shaders read in many places, and each would hold the code of seven dtypes. Arguments are passed
-// by value, because an address would put the whole kernel's arguments on the stack; positions as three numbers, because
-// a CPU would write a struct to the stack in eights and read it back in sixteens, and wait.
+// by value, because an address would put the whole kernel's arguments on the stack; a position as three numbers,
+// because a struct would go over the stack in 8-byte stores and 16-byte loads, for which a CPU waits.
 template <class T>
 GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, T x, T y, T z) {
   T out = 0;
