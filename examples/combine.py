@@ -47,7 +47,7 @@ def world() -> torch.nn.Module:
     ramp = Of(lambda p: (0.5 + 0.9 * p[..., 0] + 0.2 * p[..., 2]).clamp(0, 1))
     ball = Of(lambda p: (0.5 + 12 * (1 - p.norm(dim=-1))).clamp(0, 1))
     swirl = Of(lambda p: 0.12 * torch.sin(2.2 * p.roll(1, -1) + 0.7))
-    shape = gv.warp(gv.mask(gv.blend(gyroid, stone, ramp), ball), swirl, most=0.25)
+    shape = gv.warp(gv.mask(gv.blend(gyroid, stone, ramp), ball), swirl, max_offset=0.25)
     return gv.stack(shape=shape, side=ramp)
 
 

@@ -12,7 +12,7 @@ from helpers import meshes
 from helpers.pictures import GRAY, camera
 
 import gvtorch as gv
-from gvtorch.producers.producer import Layout, Producer, arrived
+from gvtorch.producers.producer import Layout, Producer, wait_for
 
 BOX = ((-1, -1, -1), (1, 1, 1))
 EXTENT = 36  # bricks of 4: trees 4, 2 and 2 levels deep
@@ -166,7 +166,7 @@ def test_regions_hold_in_trees_of_any_n(kind, branching):
     fine = level(producer, layout, layout.depth)
     for depth in range(layout.depth + 1):
         loc = places(layout, depth)
-        regions = arrived(producer.classify(gv.Nodes(loc, layout)))
+        regions = wait_for(producer.classify(gv.Nodes(loc, layout)))
         regions = regions if isinstance(regions, gv.Regions) else gv.Regions(kind=regions)
         side = layout.brick_size * branching ** (layout.depth - depth)
         for row in (regions.kind <= gv.Region.CONSTANT).nonzero()[:, 0].tolist():

@@ -54,7 +54,7 @@ def random_points(count=4000):
 
 
 FIELDS = {
-    "warp": lambda: gv.warp(Pulse(), Sway(), most=0.2),
+    "warp": lambda: gv.warp(Pulse(), Sway(), max_offset=0.2),
     "blend": lambda: gv.blend(Ramp(0.2, 0.4), Pulse(), Ramp()),
     "mask": lambda: gv.mask(Pulse(), Ramp()),
     "stack": lambda: gv.stack(a=Ramp(), b=Pulse(), rock=gv.stack(c=Ramp(0.1, 0.3))),
@@ -85,7 +85,7 @@ def test_combinations_are_what_their_words_say():
     assert torch.allclose(blend, (1 - ramp) * Ramp(0.2, 0.4)(points) + ramp * pulse)
     way = Sway()(points)
     way = way * (0.2 / way.norm(dim=1, keepdim=True)).clamp(max=1)
-    assert torch.allclose(gv.warp(Pulse(), Sway(), most=0.2)(points), Pulse()(points + way))
+    assert torch.allclose(gv.warp(Pulse(), Sway(), max_offset=0.2)(points), Pulse()(points + way))
     stack = gv.stack(a=Ramp(), rock=gv.stack(c=Ramp(0.1, 0.3)))(points)
     assert [*stack] == ["a", "rock_c"] and torch.equal(stack["a"], ramp)
     shape = gv.Painted(gv.sdf.Sphere(), Sway())
@@ -163,8 +163,8 @@ def test_only_the_tree_that_changed_is_made_anew():
         (lambda p: gv.blend(Ramp(), Ramp(), p), "Blend: mask"),
         (lambda p: gv.mask(p, Ramp()), "Mask: field"),
         (lambda p: gv.mask(Ramp(), p), "Mask: mask"),
-        (lambda p: gv.warp(p, Sway(), most=0.2), "Warp: field"),
-        (lambda p: gv.warp(Ramp(), p, most=0.2), "Warp: way"),
+        (lambda p: gv.warp(p, Sway(), max_offset=0.2), "Warp: field"),
+        (lambda p: gv.warp(Ramp(), p, max_offset=0.2), "Warp: offset"),
         (lambda p: gv.Painted(gv.sdf.Sphere(), p), "Painted: colors"),
         (lambda p: gv.FieldProducer(p, 32, box=BOX), "FieldProducer: field"),
     ],

@@ -122,7 +122,7 @@ def rough() -> gv.Producer:
 def variances(octaves, side: float):
     """Yields for each octave: variance of its noise, share of it in means, and cells a voxel."""
     for one in octaves:
-        share = math.exp(-noise.LOST * (side * one.frequency) ** 2)
+        share = math.exp(-noise.MEAN_DECAY * (side * one.frequency) ** 2)
         yield one.amplitude**2 * noise.VARIANCE, share, side * one.frequency
 
 

@@ -122,7 +122,7 @@ def mended(server: Server, read: Callable[[], Any]) -> Any:
     """Returns what a read gives once the server works again and its failure is forgotten."""
     server.bad = ""
     for _ in range(40):
-        http.ask_again()
+        http.retry_refused()
         try:
             return read()
         except OSError:
@@ -322,7 +322,7 @@ def test_parts_of_files_that_never_end(server, tmp_path):
     http._refused.clear()
     assert read_http(url, 90, slice(0, 90), max_file_bytes=1000) == content[:90]
     for part in (None, slice(-20, None), slice(10**7, 10**7 + 5)):
-        http.ask_again()
+        http.retry_refused()
         with pytest.raises(OSError, match=r"more than 1\d* bytes"):
             read_http(url, 10**6, part, max_file_bytes=10**6)
     server.how = "slow"
@@ -341,7 +341,7 @@ class _Racing(dict):
 
     def __iter__(self):
         keys = super().__iter__()
-        for change in (http.ask_again, lambda: http.keep_reason("other", OSError("other"))):
+        for change in (http.retry_refused, lambda: http.keep_reason("other", OSError("other"))):
             self.threads.append(threading.Thread(target=change))
             self.threads[-1].start()
             self.threads[-1].join(0.2)

@@ -52,7 +52,7 @@ def contents(folder: Path) -> dict[str, str]:
 def test_each_channel_is_a_store_of_its_own(store, mesh):
     assert channel_names(store) == NAMES and not (store / WORK).exists()
     first = gv.Store.open(store)
-    assert first.info.quantity == "coverage" and "color, normal" in first.lost[0]
+    assert first.info.quantity == "coverage" and "color, normal" in first.dropped[0]
     grid = Voxelizer(mesh, resolution=70, channels=NAMES)
     whole = ((0, 0, 0), grid.extent[::-1])
     expected = grid.region(*whole)

@@ -11,7 +11,7 @@ import torch
 from helpers import gvtorch, meshes, shared
 
 import gvtorch as gv
-from gvtorch.meshes.holes import filled, rims, told_of_holes
+from gvtorch.meshes.holes import filled, rims, warning_of_holes
 from gvtorch.meshes.mesh import facing_away, solids
 from gvtorch.meshes.voxelizer import Voxelizer
 from gvtorch.meshes.winding import WindingNumber
@@ -217,4 +217,4 @@ def test_few_holes_are_told_in_a_line(tmp_path):
     assert run.returncode == 0 and not run.stderr
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert told_of_holes(meshes.sphere(3)) == told_of_holes(meshes.sheet(4)) == ""
+        assert warning_of_holes(meshes.sphere(3)) == warning_of_holes(meshes.sheet(4)) == ""

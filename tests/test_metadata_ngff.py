@@ -78,7 +78,7 @@ def test_what_ngff_holds_comes_back(tmp_path, info, times, spacing, origin, dtyp
         store = convert("a", tmp_path / "a.zarr", workers=1)
     yaozarrs.validate_zarr_store(str(tmp_path / "a.zarr"))
     for found in (store, convert(tmp_path / "a.zarr", tmp_path / "b.zarr", workers=1)):
-        assert found.info == expected and not found.lost
+        assert found.info == expected and not found.dropped
         assert found.spacing == spacing and found.origin == origin and found.times == times
         for time in range(times):
             region = Store.open(found.location, time=time).read_region(0, (0, 0, 0), (4, 5, 6))
@@ -154,14 +154,14 @@ def test_an_image_that_yaozarrs_wrote(tmp_path):
         assert (info.unit, info.time_unit) == ("micrometer", "second")
         assert (info.time_step, info.time_origin) == (30, 60)
         assert found.spacing == (0.25, 0.5, 2) and found.origin == (30, 20, 10)
-    assert Store.open(tmp_path / "a.zarr").lost == ("the labels labels/nuclei",)
+    assert Store.open(tmp_path / "a.zarr").dropped == ("the labels labels/nuclei",)
     volume, told = read(tmp_path / "b.zarr", time=2)
     assert np.array_equal(volume.data.numpy(), data[2].transpose(1, 2, 3, 0)) and not told
     nuclei = Store.open(tmp_path / "a.zarr", image="labels/nuclei")
-    assert nuclei.info.labels and nuclei.lost == ("colors of the labels",)
+    assert nuclei.info.labels and nuclei.dropped == ("colors of the labels",)
     series = {name: (image(axes, [1.0] * 5, [0] * 5), data) for name in ("0", "1")}
     write_bioformats2raw(tmp_path / "two.zarr", series)
-    assert Store.open(tmp_path / "two.zarr").lost == (
+    assert Store.open(tmp_path / "two.zarr").dropped == (
         "the images 1 beside 'cells' (key= or image= names one)",
     )
 
@@ -211,7 +211,7 @@ def with_omero(folder: Path, omero: object, version: int) -> Path:
 def test_channels_of_foreign_images(tmp_path, version):
     folder = with_omero(tmp_path / "a", OMERO, version)
     store = Store.open(folder)
-    assert store.info.channels == TOLD and not store.lost
+    assert store.info.channels == TOLD and not store.dropped
     assert Store.open(folder, channels=[1]).info.channels == TOLD[1:]
     volume, told = read(folder)
     assert volume.info.channels == TOLD and not told

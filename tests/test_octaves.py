@@ -69,19 +69,19 @@ def test_what_is_never_settled_is_the_direct_sum():
     for axes, side, found, settled in descent(total, 5):
         torch.testing.assert_close(found, direct(total, axes, side), atol=1e-12, rtol=0)
         assert not settled.any()
-    assert total.made == total.wanted
+    assert total.evaluations == total.plain_evaluations
 
 
 def test_a_level_evaluates_four_octaves_however_many_there_are():
     total = noise.OctaveSum(octaves=14, settled=16)
     before = 0
     for depth, (_, side, found, _) in enumerate(descent(total, 11)):
-        made, before = total.made - before, total.made
+        made, before = total.evaluations - before, total.evaluations
         held = len(total.held(side))
         assert held == min(depth + 4, 14)
         # Octaves whose cells are 2, 4, 8 and, for the last time, 16 voxels wide.
         assert made == min(4, 14 - depth) * found.numel()
-    assert total.made < 0.45 * total.wanted
+    assert total.evaluations < 0.45 * total.plain_evaluations
 
 
 def test_bricks_without_parents_are_whole():

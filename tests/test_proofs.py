@@ -67,7 +67,7 @@ PRODUCERS = {
     "differences": of_field(lambda: gv.Solid(ball() | block(), differences=True)),
     "painted": of_field(lambda: gv.Painted(sdf.SmoothUnion(ball(), block(), 0.2), Stripes())),
     "warped": of_field(
-        lambda: gv.warp(gv.Solid(ball(), colors=False), Sway(), most=0.1), threshold=0.0
+        lambda: gv.warp(gv.Solid(ball(), colors=False), Sway(), max_offset=0.1), threshold=0.0
     ),
     "masked": of_field(lambda: gv.mask(Stripes(), gv.Solid(ball(), colors=False)), threshold=0.0),
     "blended": of_field(

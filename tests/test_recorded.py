@@ -21,7 +21,7 @@ import gvtorch as gv
 from gvtorch.base.branches import in_branches
 from gvtorch.base.constants import REQUEST_PENDING_SHIFT
 from gvtorch.cache import Cache
-from gvtorch.cache.requests import DEEPER, deeper, levels_wanted
+from gvtorch.cache.requests import MAX_EXTRA_LEVELS, extra_levels, levels_wanted
 from gvtorch.engine.device_frame import DeviceFrame
 from gvtorch.engine.stats import Collected, Counts, Readback
 from gvtorch.io.stores.conversion import convert
@@ -45,7 +45,7 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
         for _ in range(400):
             hits, stats = frames.frame()
             assert stats.produced["bricks"] <= batch
-            assert stats.produced["tiles"] <= batch * (1 + DEEPER)
+            assert stats.produced["tiles"] <= batch * (1 + MAX_EXTRA_LEVELS)
             made = {name: made[name] + stats.produced[name] for name in made}
             if stats.converged:
                 break
@@ -254,16 +254,20 @@ def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
 @pytest.mark.parametrize("backend", COMPILED)
 def test_a_frame_deepens_by_no_more_than_its_most(backend):
     """Whatever look-ahead rays request, which may be far more than the frame itself requests."""
-    for priority, most in (([1024] * 3 + [-1] * 500, DEEPER), ([0, 16, 32, -1], 0), ([-1], 0)):
-        assert deeper(levels_wanted(torch.tensor(priority), 2).tolist()) == most
+    for priority, most in (
+        ([1024] * 3 + [-1] * 500, MAX_EXTRA_LEVELS),
+        ([0, 16, 32, -1], 0),
+        ([-1], 0),
+    ):
+        assert extra_levels(levels_wanted(torch.tensor(priority), 2).tolist()) == most
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
         frames, levels = Frames(engine, view(64, 0), LOOK, 256, 8), []
         for turn in range(20):
             frames.look_from(view(64, 3.0 * turn))
             frames.frame()
             engine.readbacks.catch_up(wait=True)
-            levels.append(engine.readbacks.deeper)
-    assert 0 < max(levels) <= DEEPER
+            levels.append(engine.readbacks.extra_levels)
+    assert 0 < max(levels) <= MAX_EXTRA_LEVELS
 
 
 class Unsaid(Ball):

@@ -15,7 +15,7 @@ from torch import Tensor
 from . import boxes, check
 from .image_info import ChannelInfo, ImageInfo
 from .labels import check_narrowed
-from .named_axes import ask_axes, even_steps, named_axes, place_named
+from .named_axes import ask_axes, even_steps, grid_placement, named_axes
 from .units import spacing_of
 from .volume import Volume, check_extent
 
@@ -45,7 +45,7 @@ class ArrayLike:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     flips: str = ""  # letters of axes that run backwards
     info: ImageInfo = field(default_factory=ImageInfo)
-    lost: tuple[str, ...] = ()  # phrases: metadata that is not kept
+    dropped: tuple[str, ...] = ()  # phrases: metadata that is not kept
 
     def grid(self, time: int) -> np.ndarray:
         """Returns a time point, (z, y, x, c), with axes that run backwards flipped."""
@@ -84,15 +84,15 @@ class ArrayLike:
         dtype = np.dtype(str(array.dtype)) if not isinstance(array.dtype, np.dtype) else array.dtype
         if dtype.kind not in "biuf":
             raise ValueError(f"{context}: data must hold real numbers, got dtype {dtype}")
-        names, steps, units, lost = _axis_metadata(array, len(shape))
+        names, steps, units, dropped = _axis_metadata(array, len(shape))
         axis_letters = None if axes else named_axes(names, shape)
         axis_letters = axis_letters or ask_axes(context, shape, axes)
-        placement, info_fields = place_named(axis_letters, shape, steps, units)
+        placement, info_fields = grid_placement(axis_letters, shape, steps, units)
         attrs = _attributes(array)
         # A NaN differs from itself: it packs nothing.
         packing = [n for n in _PACKING_ATTRIBUTES if n in attrs and np.any(attrs[n] == attrs[n])]
         if packing:
-            lost = [*lost, f"{', '.join(packing)}: values are taken as they are stored"]
+            dropped = [*dropped, f"{', '.join(packing)}: values are taken as they are stored"]
         sizes = np.ravel(attrs.get("spacing", attrs.get("element_size_um", ()))).tolist()
         if not any(steps) and len(sizes) >= 3 and all(isinstance(n, (int, float)) for n in sizes):
             unit = "um" if "element_size_um" in attrs else str(attrs.get("unit", ""))
@@ -110,7 +110,7 @@ class ArrayLike:
                 quantity=str(attrs["units"]) if isinstance(attrs.get("units"), str) else None,
                 **info_fields,
             ),
-            lost=tuple(lost),
+            dropped=tuple(dropped),
             **placement,
         )
 
@@ -160,9 +160,9 @@ def as_volume(
             f"{times - 1}",
             stacklevel=2,
         )
-    time_index = check.whole(context, "time", time or 0, low=0, high=max(times - 1, 0))
-    if array.lost:
-        warnings.warn(f"{context}: not kept: {'; '.join(array.lost)}", stacklevel=2)
+    time_index = check.integer(context, "time", time or 0, low=0, high=max(times - 1, 0))
+    if array.dropped:
+        warnings.warn(f"{context}: not kept: {'; '.join(array.dropped)}", stacklevel=2)
     return Volume(
         array.grid(time_index),
         array.spacing if spacing is None else spacing,
@@ -219,7 +219,7 @@ def _axis_metadata(
         names = [""] * rank
     steps: list[tuple[float, float] | None] = [None] * rank
     units: list[str | None] = [None] * rank
-    lost = []
+    dropped = []
     coords = getattr(array, "coords", {})
     for axis, name in enumerate(names):
         if name and name in coords:
@@ -228,8 +228,8 @@ def _axis_metadata(
             steps[axis], even = even_steps(values)
             units[axis] = str(coordinate.attrs.get("units", "")) or None
             if not even:
-                lost.append(f"that coordinates along {name} are not evenly spaced")
-    return names, steps, units, lost
+                dropped.append(f"that coordinates along {name} are not evenly spaced")
+    return names, steps, units, dropped
 
 
 def _channel_infos(array: Any, axis_letters: str, width: int) -> tuple[ChannelInfo, ...]:

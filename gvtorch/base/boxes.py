@@ -46,7 +46,7 @@ def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
     return data[(None,) * len(missing)].transpose([all_axes.index(axis) for axis in order])
 
 
-def rows_by_place(positions: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+def group_rows(positions: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns the distinct places (m, n) of (k, n), sorted, and the row indices of each."""
     order = np.lexsort(positions.T[::-1])
     positions = positions[order]
@@ -64,6 +64,6 @@ def extent_in(
     if not isinstance(extent, int):
         return extent
     low, high = check.box(context, box)
-    check.whole(context, "extent", extent, low=1, high=2**40)
+    check.integer(context, "extent", extent, low=1, high=2**40)
     sides = [b - a for a, b in zip(low, high, strict=True)]
     return [max(1, round(extent * side / max(sides))) for side in sides]

@@ -29,33 +29,33 @@ def describe(tensor: Any) -> str:
     """Returns shape, dtype and device of a tensor as one phrase, or the type of anything else."""
     if not isinstance(tensor, Tensor):
         return type(tensor).__name__
-    return f"{shown(tensor)} on {tensor.device}"
+    return f"{as_text(tensor)} on {tensor.device}"
 
 
-def brief(record: Any) -> str:
+def summary(record: Any) -> str:
     """Returns one line on a dataclass: what differs from defaults, tensors by shape and dtype."""
     parts = []
     for field in fields(record):
         value = getattr(record, field.name)
         if field.repr and (isinstance(value, Tensor) or value not in (field.default, {})):
-            parts.append(f"{field.name}={shown(value)}")
+            parts.append(f"{field.name}={as_text(value)}")
     return f"{type(record).__name__}({', '.join(parts)})"
 
 
-def shown(value: Any) -> str:
+def as_text(value: Any) -> str:
     """Returns a value as text; for a tensor or array only its shape and dtype."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key}: {shown(item)}" for key, item in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {as_text(item)}" for key, item in value.items()) + "}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
     return repr(value)
 
 
-def given(value: Any) -> str:
+def quoted(value: Any) -> str:
     """Returns a value as an error message shows it: one line of about 200 characters at most."""
     if isinstance(value, int) and value.bit_length() > 1000:
         return f"a number of {value.bit_length()} bits"  # Python refuses to print over 4,300 digits
-    return one_line(shown(value), 200)
+    return one_line(as_text(value), 200)
 
 
 def tensor(
@@ -150,7 +150,7 @@ def one_of(context: str, name: str, value: Any, allowed: Iterable[Any]) -> None:
         raise ValueError(f"{context}: {name} must be {listing}, got {value!r}")
 
 
-def known(context: str, options: Mapping[str, Any], typed_dict: type) -> None:
+def known_options(context: str, options: Mapping[str, Any], typed_dict: type) -> None:
     """Raises ValueError unless all options are keys of a `TypedDict`."""
     names = typed_dict.__annotations__
     unknown = sorted(set(options) - set(names))
@@ -237,12 +237,14 @@ def nbytes(context: str, name: str, value: Any) -> int:
         match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", value)
         unit = _BYTE_UNITS.get(match[2].upper()) if match else None
         if match is None or unit is None:
-            raise ValueError(f'{context}: {name} must be bytes, as in "256 MB", got {given(value)}')
+            raise ValueError(
+                f'{context}: {name} must be bytes, as in "256 MB", got {quoted(value)}'
+            )
         value = int(float(match[1]) * unit)
-    return whole(context, name, value, low=1, high=2**62)
+    return integer(context, name, value, low=1, high=2**62)
 
 
-def words(context: str, name: str, value: Tensor, low: int, high: int) -> None:
+def integers_in(context: str, name: str, value: Tensor, low: int, high: int) -> None:
     """Raises ValueError unless all integers of a tensor are in [low, high]."""
     extremes = (int(value.amin()), int(value.amax())) if value.numel() else ()
     bad = next((extreme for extreme in extremes if not low <= extreme <= high), None)
@@ -264,16 +266,16 @@ def number(
     try:
         result = float(value)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{context}: {name} must be a number, got {given(value)}") from None
+        raise ValueError(f"{context}: {name} must be a number, got {quoted(value)}") from None
     inside = low < result <= high if open_low else low <= result <= high
     if not (math.isfinite(result) and inside):
         lower = f" and {'>' if open_low else '>='} {low:g}" if low > -math.inf else ""
         upper = f" and <= {high:g}" if high < math.inf else ""
-        raise ValueError(f"{context}: {name} must be finite{lower}{upper}, got {given(value)}")
+        raise ValueError(f"{context}: {name} must be finite{lower}{upper}, got {quoted(value)}")
     return result
 
 
-def whole(context: str, name: str, value: Any, *, low: int, high: int = sys.maxsize) -> int:
+def integer(context: str, name: str, value: Any, *, low: int, high: int = sys.maxsize) -> int:
     """Returns `value` as an int; raises ValueError unless it is a whole number in [low, high]."""
     try:
         integer = operator.index(value)
@@ -281,14 +283,14 @@ def whole(context: str, name: str, value: Any, *, low: int, high: int = sys.maxs
         integer = None
     if isinstance(value, bool) or integer is None or not low <= integer <= high:
         upper = f" and <= {high}" if high < sys.maxsize else ""
-        raise ValueError(f"{context}: {name} must be an int >= {low}{upper}, got {given(value)}")
+        raise ValueError(f"{context}: {name} must be an int >= {low}{upper}, got {quoted(value)}")
     return integer
 
 
-def halves(context: str, branching: Any, feature: str) -> None:
+def branching_two(context: str, branching: Any, feature: str) -> None:
     """Raises ValueError unless N is 2, as `feature` requires: its levels halve the resolution."""
     if branching != 2:
-        raise ValueError(f"{context}: branching must be 2 for {feature}, got {given(branching)}")
+        raise ValueError(f"{context}: branching must be 2 for {feature}, got {quoted(branching)}")
 
 
 def triple(
@@ -301,10 +303,10 @@ def triple(
     try:
         items = tuple(value)
     except TypeError:
-        raise ValueError(f"{context}: {name} must be three numbers, got {given(value)}") from None
+        raise ValueError(f"{context}: {name} must be three numbers, got {quoted(value)}") from None
     if len(items) != 3:
         raise ValueError(
-            f"{context}: {name} must be three numbers, got {len(items)}: {given(value)}"
+            f"{context}: {name} must be three numbers, got {len(items)}: {quoted(value)}"
         )
     x, y, z = (number(context, name, item) for item in items)
     if positive and min(x, y, z) <= 0:
@@ -326,7 +328,7 @@ def box(context: str, value: Any) -> tuple[tuple[float, float, float], tuple[flo
     return low, high
 
 
-def placed(
+def grid_placement(
     context: str, spacing: Any, origin: Any, extent: Sequence[int]
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Returns spacing and origin, (x, y, z) each, of a grid of `extent` voxels (x, y, z); raises
@@ -362,10 +364,10 @@ def reals(context: str, name: str, value: Any, shape: tuple[int, ...] | None = N
     try:
         numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
     except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise ValueError(f"{context}: {name} must be numbers, got {given(value)}") from None
+        raise ValueError(f"{context}: {name} must be numbers, got {quoted(value)}") from None
     if shape is not None and numbers.shape != shape:
         raise ValueError(f"{context}: {name} must be {shape} numbers, got {tuple(numbers.shape)}")
     if not bool(torch.isfinite(numbers).all()):
-        got = "NaN or infinity" if hasattr(value, "dtype") else given(value)
+        got = "NaN or infinity" if hasattr(value, "dtype") else quoted(value)
         raise ValueError(f"{context}: {name} must be finite, got {got}")
     return numbers

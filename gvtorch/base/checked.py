@@ -40,40 +40,42 @@ class Checked:
                 checker(self, name, attributes[name])
 
 
-def kind_of(owner: Any) -> str:
+def class_name(owner: Any) -> str:
     """Returns the name of an object's class, the start of its error messages."""
     return type(owner).__name__
 
 
 def instance_of(kind: type) -> Check:
     """Returns a check that a value is an instance of a class."""
-    return lambda owner, name, value: check.instance(kind_of(owner), name, value, kind)
+    return lambda owner, name, value: check.instance(class_name(owner), name, value, kind)
 
 
-def or_none(checker: Check) -> Check:
+def optional(checker: Check) -> Check:
     """Returns a check that also accepts None."""
     return lambda owner, name, value: None if value is None else checker(owner, name, value)
 
 
 def positive(owner: Any, name: str, value: Any) -> float:
     """Checks that a value is a finite number above 0; stores it as a float."""
-    return check.number(kind_of(owner), name, value, low=0, open_low=True)
+    return check.number(class_name(owner), name, value, low=0, open_low=True)
 
 
 def whole_between(low: int, high: int = sys.maxsize) -> Check:
     """Returns a check for a whole number from `low` to `high`."""
-    return lambda owner, name, value: check.whole(kind_of(owner), name, value, low=low, high=high)
+    return lambda owner, name, value: check.integer(
+        class_name(owner), name, value, low=low, high=high
+    )
 
 
-def as_name(owner: Any, name: str, value: Any) -> str:
+def name_text(owner: Any, name: str, value: Any) -> str:
     """Checks that a value is a str."""
     if not isinstance(value, str):
-        raise ValueError(f"{kind_of(owner)}: {name} must be a name, got {value!r}")
+        raise ValueError(f"{class_name(owner)}: {name} must be a name, got {value!r}")
     return value
 
 
 def flag(owner: Any, name: str, value: Any) -> bool:
     """Checks that a value is a bool."""
     if not isinstance(value, bool):
-        raise ValueError(f"{kind_of(owner)}: {name} must be true or false, got {value!r}")
+        raise ValueError(f"{class_name(owner)}: {name} must be true or false, got {value!r}")
     return value

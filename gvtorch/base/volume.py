@@ -33,9 +33,9 @@ DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
 def check_extent(
-    context: str, shape: Sequence[int], *, what: str = "extent", most: int = config.MAX_VOXELS
+    context: str, shape: Sequence[int], *, what: str = "extent", max_values: int = config.MAX_VOXELS
 ) -> None:
-    """Raises ValueError unless all sizes are positive and their product is at most `most`.
+    """Raises ValueError unless all sizes are positive and their product is at most `max_values`.
 
     Readers call it with the sizes in a file's header, before they allocate memory.
     """
@@ -43,11 +43,11 @@ def check_extent(
     if any(size < 1 for size in shape):
         raise ValueError(f"{context}: {what} must be at least 1 in every direction, got {sizes}")
     voxels = math.prod(int(size) for size in shape)
-    if voxels > most:
-        destination = "in memory at once" if most == config.MAX_VOXELS else "into a store"
+    if voxels > max_values:
+        destination = "in memory at once" if max_values == config.MAX_VOXELS else "into a store"
         raise ValueError(
             f"{context}: {what} {sizes} is {voxels} voxels, "
-            f"more than the {most} that fit {destination}"
+            f"more than the {max_values} that fit {destination}"
         )
 
 
@@ -115,14 +115,14 @@ class Volume:
             data, self.label_values = _as_labels(context, data, nan)
         tensor = _as_tensor(context, data)
         if tensor.dim() not in (3, 4):
-            got = check.shown(data)
+            got = check.as_text(data)
             raise ValueError(f"{context}: data must be (z, y, x) or (z, y, x, c), got {got}")
         if tensor.dim() == 3:
             tensor = tensor[..., None]
         check_extent(context, tensor.shape[:3], what="data")
         check_extent(context, tensor.shape, what="data with its channels")
         self.data = _finite_values(context, tensor.contiguous(), nan)
-        self.spacing, self.origin = check.placed(context, spacing, origin, self.extent)
+        self.spacing, self.origin = check.grid_placement(context, spacing, origin, self.extent)
         self.name, self.info = name, info
 
     @property
@@ -196,7 +196,7 @@ class Volume:
 
     def describe(self, bins: int = 32) -> dict[str, Any]:
         """Returns extent, dtype, position, range, a histogram of `bins` etc. as plain values."""
-        check.whole("Volume.describe", "bins", bins, low=1)
+        check.integer("Volume.describe", "bins", bins, low=1)
         low, high = self.value_range
         values = to_numpy(self.data)
         limits = (low, high) if high > low else (low, low + max(1.0, abs(low)))

@@ -1,4 +1,4 @@
-"""`whole_file`, `write_whole`, `durable_file`: files that appear only when complete; `write_npy`:
+"""`whole_file`, `write_text`, `durable_file`: files that appear only when complete; `write_npy`:
 arrays, without losing write errors; `text_path`: paths for libraries that reject some paths;
 `cache_folder`: where caches on disk lie.
 NumPy is not imported here, so that `gvtorch --help` does not wait for it.
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def told_of(path: Path, *drafts: str) -> Iterator[None]:
+def errors_name(path: Path, *drafts: str) -> Iterator[None]:
     """Makes an OSError of the block name `path`, if it names no file (a full disk) or one of the
     drafts of this file.
     """
@@ -46,7 +46,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise OSError(error.errno, error.strerror, str(path)) from None
     try:
         draft = os.path.join(text_path(os.path.abspath(path.parent)), os.path.basename(temp_path))
-        with told_of(path, temp_path, draft):  # on an error, an existing file stays as it is
+        with errors_name(path, temp_path, draft):  # on an error, an existing file stays as it is
             os.close(handle)
             yield Path(draft)
         mask = os.umask(0)
@@ -57,7 +57,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         Path(temp_path).unlink(missing_ok=True)
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
     """Writes a text file; on a full disk an existing file stays as it is."""
     with whole_file(path) as draft:
         draft.write_text(text, encoding="utf-8")
@@ -69,7 +69,7 @@ def durable_file(path: Path) -> Iterator[IO[bytes]]:
     leaves the whole file or none.
     """
     draft = path.with_name(f".{path.name}.draft")
-    with told_of(path), draft.open("wb") as file:
+    with errors_name(path), draft.open("wb") as file:
         yield file
         file.flush()
         os.fsync(file.fileno())

@@ -52,7 +52,7 @@ class Settings:
     tell: Callable[[str], None] = lambda _: None  # called with each step's name
 
     def __post_init__(self) -> None:
-        check.whole("bench", "repeats", self.repeats, low=1)
+        check.integer("bench", "repeats", self.repeats, low=1)
         check.number("bench", "seconds", self.seconds, low=0)
         if self.device.type == "cuda":
             choose_backend("cuda", self.device)

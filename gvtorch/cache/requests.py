@@ -27,7 +27,7 @@ from .cache import Cache
 #: The kinds of request by the names that statistics show.
 KINDS = {"load": REQUEST_LOAD, "subdivide": REQUEST_SUBDIVIDE}
 #: Most levels beyond the first by which a tree deepens in a frame.
-DEEPER = 2
+MAX_EXTRA_LEVELS = 2
 _PIXEL_PRIORITY = 16  # of a node whose voxels are a pixel wide: wider ones are to be subdivided
 _NEWEST_WEIGHT = 0.3  # of the newest call
 _MIN_SPREAD = 0.1  # relative spread of batch sizes from which both parts of a cost are fitted
@@ -71,14 +71,14 @@ class Requests:
 
 
 def levels_wanted(priority: Tensor, branching: int) -> Tensor:
-    """Returns (DEEPER + 1,) int64 how many subdivisions there are, with priorities (k,), -1 for
-    none, and how many of them want at least one more level, and two; see `deeper`.
+    """Returns (MAX_EXTRA_LEVELS + 1,) int64 how many subdivisions there are, with priorities (k,),
+    -1 for none, and how many of them want at least one more level, and two; see `extra_levels`.
     """
-    widths = [0, *(_PIXEL_PRIORITY * branching**level for level in range(1, DEEPER + 1))]
+    widths = [0, *(_PIXEL_PRIORITY * branching**level for level in range(1, MAX_EXTRA_LEVELS + 1))]
     return torch.stack([priority >= width for width in widths]).sum(1)
 
 
-def deeper(wanted: Sequence[int]) -> int:
+def extra_levels(wanted: Sequence[int]) -> int:
     """Returns by how many levels beyond the first a frame deepens a tree: the mean of what its
     subdivisions want. `wanted` is from `levels_wanted`.
     """
@@ -86,7 +86,7 @@ def deeper(wanted: Sequence[int]) -> int:
     return round(sum(more) / max(1, count))
 
 
-def below(
+def nodes_to_subdivide(
     cache: Cache, tile: Tensor, priority: Tensor, free: Tensor | int
 ) -> tuple[Tensor, Tensor]:
     """Chooses nodes of tiles (k,), -1 for none, that rays will want subdivided: those that hold
@@ -144,7 +144,7 @@ def requests_below(cache: Cache, subdivisions: Requests, branching: int) -> Requ
     tile = cache.nodes.child_tn.view(-1)[subdivisions.node].to(torch.int64)
     priority = subdivisions.priority // branching
     free = sum(lru.unused for lru in cache.lru[REQUEST_SUBDIVIDE])
-    node, split = below(cache, tile, priority, free)
+    node, split = nodes_to_subdivide(cache, tile, priority, free)
     node, priority = node[split], priority[:, None].expand_as(split)[split]
     no_requests = node[:0], priority[:0]
     return _requests_of_targets(

@@ -64,7 +64,7 @@ class Written:
     stale: int = 0  # answers whose node is gone, or served already
     unplaced: int = 0  # answers for which no slot was free
     nbytes: int = 0  # bytes of voxels written into the pool
-    lost: Tensor | None = field(default=None, repr=False)  # (k,) bool, may be requested again
+    retry: Tensor | None = field(default=None, repr=False)  # (k,) bool, may be requested again
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -94,7 +94,7 @@ def tiles(cache: Cache, targets: Targets, children: Children) -> Written:
     return written
 
 
-class Put(NamedTuple):
+class WriteOutcome(NamedTuple):
     """The outcome of writing (k,) targets, on the device."""
 
     wanted: Tensor  # (k,) bool, which still lacked what was made for them
@@ -102,26 +102,26 @@ class Put(NamedTuple):
     counts: Tensor  # (3,) int64 targets that lacked it, targets that got a slot, slots occupied
 
     @classmethod
-    def of(cls, wanted: Tensor, slot: Tensor, owner: Tensor) -> Put:
+    def of(cls, wanted: Tensor, slot: Tensor, owner: Tensor) -> WriteOutcome:
         """Adds the counts; `owner` (s,) is -1 for slots that were free before."""
         placed = slot >= 0
         evicted = placed & (owner[slot.clamp(min=0)] >= 0)
         return cls(wanted, slot, torch.stack((wanted, placed, evicted)).sum(1))
 
 
-def _read_outcome(outcome: Put, targets: Targets, lru: LRU) -> Written:
+def _read_outcome(outcome: WriteOutcome, targets: Targets, lru: LRU) -> Written:
     """Returns the outcome on the host, which waits for it, and subtracts the slots that were taken
     from `lru.unused`.
     """
     wanted_count, items, evicted = outcome.counts.tolist()
     lru.unused -= items
     unplaced = wanted_count - items
-    lost = outcome.wanted & (outcome.slot < 0) if unplaced else None
+    retry = outcome.wanted & (outcome.slot < 0) if unplaced else None
     stale = len(targets) - wanted_count
-    return Written(items=items, evicted=evicted, stale=stale, unplaced=unplaced, lost=lost)
+    return Written(items=items, evicted=evicted, stale=stale, unplaced=unplaced, retry=retry)
 
 
-def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) -> Put:
+def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) -> WriteOutcome:
     """Gives nodes, index -1 left out, their children: takes at most `free` (1,) tiles, unlinks,
     writes and links them. The host does not wait: every shape follows from that of the targets.
     """
@@ -136,14 +136,14 @@ def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) 
     leaving[front] = torch.arange(len(front), device=node.device) < limit
     staying = wanted & ~leaving[node.clamp(min=0) // per_tile]
     slot = lru.give(staying, limit)
-    outcome = Put.of(wanted, slot, pool.parent_t)
+    outcome = WriteOutcome.of(wanted, slot, pool.parent_t)
     tile_k = slot.to(torch.int32)
     unlink(pool.child_tn, pool.parent_t, pool.shared_t, tile_k)
     orphan(pool.child_tn, pool.parent_t, tile_k)
     orphan(pool.brick_tn, cache.bricks.owner_b, tile_k)
     for stored, values in ((pool.constants, children.constants), (pool.ranges, children.ranges)):
         for name, rows in values.items():
-            put_rows_of(stored[name], slot, rows)
+            write_rows(stored[name], slot, rows)
     words = (pool.child_tn, pool.brick_tn, pool.request_tn)
     tile_fields = (pool.loc_t4, pool.parent_t, pool.tree_t, pool.stamp_t, pool.shared_t)
     contents = (children.child.contiguous(), children.brick.contiguous(), node, targets.loc)
@@ -152,7 +152,7 @@ def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) 
     return outcome
 
 
-def put_rows_of(pool_rows: Tensor, slot: Tensor, rows: Tensor) -> None:
+def write_rows(pool_rows: Tensor, slot: Tensor, rows: Tensor) -> None:
     """Writes rows (k, ...) into slots (k,) of a pool (s, ...), those of slot -1 left out; a row may
     be shorter than a slot.
     """
@@ -187,7 +187,7 @@ def put_bricks(
     data: Voxels | Sequence[Chunk],
     free: Tensor,
     coarse: bool = False,
-) -> Put:
+) -> WriteOutcome:
     """Gives (k,) nodes, index -1 left out, their bricks: takes at most `free` (1,) slots, unlinks,
     writes and links them. The host does not wait.
 
@@ -200,7 +200,7 @@ def put_bricks(
     """
     wanted = targets.lacking(cache, REQUEST_LOAD)
     slot = cache.lru[REQUEST_LOAD][coarse].give(wanted, free)
-    outcome = Put.of(wanted, slot, cache.bricks.owner_b)
+    outcome = WriteOutcome.of(wanted, slot, cache.bricks.owner_b)
     write_slots(cache, slot, targets.node, data)
     return outcome
 
@@ -230,9 +230,9 @@ def _fill_slots(cache: Cache, slot: Tensor, data: Mapping[str, Tensor]) -> None:
     """Writes voxels that are on the device."""
     for name, stored in cache.bricks.bricks.items():
         if name in data:
-            put_rows_of(stored, slot, data[name])
+            write_rows(stored, slot, data[name])
         elif not cache.bricks.channels[name].coarse:  # a tree without this channel
-            put_rows_of(stored, slot, stored.new_zeros(1).expand(len(slot), *stored.shape[1:]))
+            write_rows(stored, slot, stored.new_zeros(1).expand(len(slot), *stored.shape[1:]))
 
 
 def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, Tensor]) -> None:
@@ -253,7 +253,7 @@ def _narrow_ranges(cache: Cache, slot: Tensor, node: Tensor, data: Mapping[str, 
             if voxels.dtype == torch.uint16:  # which torch can't compare
                 voxels = voxels.to(torch.int32)
             extremes = torch.stack(torch.aminmax(voxels, dim=1), 1)
-            put_rows_of(ranges.flatten(0, 1), index, extremes)
+            write_rows(ranges.flatten(0, 1), index, extremes)
 
 
 def uniform(
@@ -279,11 +279,11 @@ def put_uniform(
     for name, stored in pool.constants.items():
         flat = stored.flatten(0, 1)
         zeros = flat.new_zeros(1).expand(len(node), flat.shape[1])
-        put_rows_of(flat, node, constants.get(name, zeros))
+        write_rows(flat, node, constants.get(name, zeros))
     link(pool.brick_tn, pool.request_tn, node.to(torch.int32), word, REQUEST_LOAD)
     child = pool.child_tn.view(-1, 1)
     child_word = child[node.clamp(min=0)]
-    put_rows_of(child, node, torch.where(child_word == ABSENT, TERMINAL, child_word))
+    write_rows(child, node, torch.where(child_word == ABSENT, TERMINAL, child_word))
     return wanted.sum()
 
 

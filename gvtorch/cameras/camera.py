@@ -102,8 +102,8 @@ class Camera:
         """
         model_of("Camera", model)
         self.model, self.frame = model, frame
-        self.width = check.whole("Camera", "width", width, low=1, high=65536)
-        self.height = check.whole("Camera", "height", height, low=1, high=65536)
+        self.width = check.integer("Camera", "width", width, low=1, high=65536)
+        self.height = check.integer("Camera", "height", height, low=1, high=65536)
         self.window = (0, self.height)
         view, K = _batch("Camera", viewmats=(viewmats, (4, 4)), Ks=(Ks, (3, 3)))
         self.batched = view.dim() == 3
@@ -587,8 +587,8 @@ def _aimed(
         raise ValueError(
             f"{context}: fov must be at least {_MIN_FOV_DEGREES:g} degrees, got {fov!r}"
         )
-    check.whole(context, "width", width, low=1, high=65536)
-    check.whole(context, "height", height, low=1, high=65536)
+    check.integer(context, "width", width, low=1, high=65536)
+    check.integer(context, "height", height, low=1, high=65536)
     fx, fy = camera_model.focal(math.radians(fov), width, height)
     Ks = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float64)
     if camera_model.parallel:

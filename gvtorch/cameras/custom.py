@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ..base.check import describe, instance, whole
+from ..base.check import describe, instance, integer
 from ..base.records import Rays
 from ..pool.staging import upload
 from .camera import Camera, Frame, continued
@@ -51,9 +51,9 @@ class CustomCamera(Camera):
             raise ValueError("CustomCamera: rays of a picture must have no transmittance, got some")
         count = len(rays.origin)
         width = rays.width or count if width is None else width
-        self.width = whole("CustomCamera", "width", width, low=1)
+        self.width = integer("CustomCamera", "width", width, low=1)
         rows = count // self.width
-        self.height = whole("CustomCamera", "height", rows if height is None else height, low=1)
+        self.height = integer("CustomCamera", "height", rows if height is None else height, low=1)
         self.window = (0, self.height)
         if count % (self.width * self.height):
             raise ValueError(

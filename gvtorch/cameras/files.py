@@ -27,7 +27,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.messages import one_line
-from ..base.whole_file import write_whole
+from ..base.whole_file import write_text
 from .camera import Camera, Frame
 from .motion import quaternion_of, rotation_of
 
@@ -131,14 +131,14 @@ def write_cameras(
         raise FileNotFoundError(f"{context}: folder not found: {path.parent}")
     if path.suffix == ".pvcc":
         eye_distance = check.number(context, "distance", distance, low=0, open_low=True)
-        write_whole(path, _pvcc_text(cameras, eye_distance))
+        write_text(path, _pvcc_text(cameras, eye_distance))
     elif path.suffix == ".json":
-        write_whole(path, json.dumps(_transforms_content(cameras), indent=1) + "\n")
+        write_text(path, json.dumps(_transforms_content(cameras), indent=1) + "\n")
     elif path.suffix == "" and (path.is_dir() or not path.exists()):
         texts = _colmap_texts(cameras)
         path.mkdir(exist_ok=True)
         for name, text in texts.items():
-            write_whole(path / name, text)
+            write_text(path / name, text)
     else:
         raise ValueError(f"{context}: path must end in .pvcc or .json or be a folder, got {path}")
 

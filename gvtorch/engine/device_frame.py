@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ..base.branches import in_branches
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
-from ..cache.requests import below, levels_wanted
-from ..cache.write import Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
+from ..cache.requests import levels_wanted, nodes_to_subdivide
+from ..cache.write import Targets, WriteOutcome, put_bricks, put_tiles, put_uniform, write_rows
 from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
 from .parents import nearest_loadable, parent_bricks, without_repeats
@@ -47,7 +47,7 @@ class DeviceFrame(RecordedFrame):
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
         """Returns, before a frame, whether the listed requests are to be served. `stale`: another
         frame was rendered since this graph's last one; `steady`: the newest frame that was read
-        back missed nothing, and the last replay did not look ahead.
+        back missed nothing, and the last replay did not check_values ahead.
         """
         if stale:
             self._requests.zero_()  # the listed requests are out of date: the rays ask again
@@ -72,9 +72,9 @@ class DeviceFrame(RecordedFrame):
         chosen, priority = self._next_subdivisions.unbind(1)
         self._subdivide(self._ask_producers(REQUEST_SUBDIVIDE, chosen), chosen, priority)
 
-    def deeper(self, readbacks: Readbacks) -> int:
+    def extra_levels(self, readbacks: Readbacks) -> int:
         """Returns how many more levels the last readback wanted on average; 0 if `by_level`."""
-        return 0 if self._production.by_level else readbacks.deeper
+        return 0 if self._production.by_level else readbacks.extra_levels
 
     def _count_levels(self) -> Tensor:
         request_word = self._requests[:, 1].flatten()
@@ -123,19 +123,21 @@ class DeviceFrame(RecordedFrame):
             child_priority = torch.where(
                 in_tree, priority // source.layout.branching, child_priority
             )
-        node, split = below(self.cache, slot, child_priority, free_slots)
+        node, split = nodes_to_subdivide(self.cache, slot, child_priority, free_slots)
         rank = split.flatten().cumsum(0)
         rows = torch.stack((node, child_priority[:, None].expand_as(node)), 2).flatten(0, 1)
         self._next_subdivisions.fill_(-1)
         listed = split.flatten() & (rank <= self.batch)
-        put_rows_of(self._next_subdivisions, torch.where(listed, rank - 1, -1), rows)
+        write_rows(self._next_subdivisions, torch.where(listed, rank - 1, -1), rows)
 
     def _check_and_put_bricks(
         self, unchecked: UncheckedAnswer, free_slots: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Loads nodes (k,). Returns `Put.counts`, how many need no brick (1,), and failed (1,)."""
+        """Loads nodes (k,). Returns `WriteOutcome.counts`, how many need no brick (1,), and how
+        many failed (1,).
+        """
         node, batch, fill_answer = unchecked
-        bricks = checked_bricks(fill_answer, batch.nodes, batch.source.producer, look=False)
+        bricks = checked_bricks(fill_answer, batch.nodes, batch.source.producer, check_values=False)
         valid = _finite([bricks.data, bricks.constants], len(node), node.device)
         has_data, uniform_count = valid, torch.zeros_like(node[:1])
         if bricks.kind is not None:
@@ -156,10 +158,12 @@ class DeviceFrame(RecordedFrame):
 
     def _check_and_put_tiles(
         self, unchecked: UncheckedAnswer, free_slots: Tensor
-    ) -> tuple[Put, Tensor]:
+    ) -> tuple[WriteOutcome, Tensor]:
         """Subdivides nodes (k,); returns the outcome, and how many failed (1,)."""
         node, batch, classify_answer = unchecked
-        regions = checked_regions(classify_answer, batch.nodes, batch.source.producer, look=False)
+        regions = checked_regions(
+            classify_answer, batch.nodes, batch.source.producer, check_values=False
+        )
         count = len(regions.kind)
         valid = _finite([regions.constants, regions.ranges], count, node.device)
         valid = valid & (regions.kind >= Region.EMPTY) & (regions.kind <= Region.DATA_MAX_DEPTH)

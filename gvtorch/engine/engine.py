@@ -24,7 +24,7 @@ from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progr
 from ..cache import Cache, RequestList, Scheduler
 from ..cameras import Camera
 from ..cameras.custom import as_camera
-from ..io.http import ask_again
+from ..io.http import retry_refused
 from ..ops.trace import choose_backend
 from ..pictures import Picture
 from ..producers import Layout, Producer
@@ -106,7 +106,7 @@ class Engine:
                 roots, or producers do not agree on a channel.
             ProductionError: A root can't be produced.
         """
-        check.known("Engine", options, EngineSettings)
+        check.known_options("Engine", options, EngineSettings)
         self.options, self.lock = EngineOptions(**options), threading.RLock()
         self._rendering = False
         self.device = check.device("Engine", self.options.device)
@@ -282,10 +282,10 @@ class Engine:
             self._versions[source.name] = producer.version
         self._missed = None
 
-    def release(self, but: HostFrame | None = None) -> None:
+    def release(self, keep: HostFrame | None = None) -> None:
         """Drops the answers that are on their way to captured frames, except those of `but`."""
         for host_frame in self.recorded:
-            if host_frame is not but:
+            if host_frame is not keep:
                 host_frame.release()
 
     def scout(self, view: View, stats: FrameStats) -> None:
@@ -389,8 +389,8 @@ class Engine:
             ValueError: The mode is unknown, or see `frame`.
             ProductionError: See `frame`.
         """
-        check.whole("render", "productions", productions, low=1)
-        check.whole("render", "max_frames", max_frames, low=1)
+        check.integer("render", "productions", productions, low=1)
+        check.integer("render", "max_frames", max_frames, low=1)
         check.one_of("render", "mode", mode, ("interactive", "balanced", "converge"))
         if mode == "interactive":
             return self.frame(camera, shader, **options)[0]
@@ -502,7 +502,7 @@ class Engine:
             )
         if view.options.layer is not None:
             view.options.layer.check_device(self.device)
-        check.whole("capture", "batch", batch, low=1, high=1 << 18)
+        check.integer("capture", "batch", batch, low=1, high=1 << 18)
         check.number("capture", "look_ahead", look_ahead, low=0, high=1000)
         check.instance("capture", "fit", fit, bool)
         render_frame = partial(self.frame, shader=shader, **options)
@@ -542,7 +542,7 @@ class Engine:
     @_locked
     def forget_failures(self) -> None:
         """Lets failed nodes be requested again, and files that servers refused be read again."""
-        ask_again()
+        retry_refused()
         self.production.failures.forget()
         self.production.restore_pending()
 

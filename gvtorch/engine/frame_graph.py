@@ -44,7 +44,7 @@ class Steps(Protocol):
     @property
     def changed(self) -> bool: ...
     def new_frame(self, options: RenderOptions) -> AbstractContextManager[FrameStats]: ...
-    def release(self, but: HostFrame | None = None) -> None: ...
+    def release(self, keep: HostFrame | None = None) -> None: ...
     def number_picture(self, on_device: bool = True) -> None: ...
     def collect_requests_and_use(self, samples: Tensor) -> Collected: ...
     def read_back(self, stats: FrameStats, hits: Hits, collected: Collected) -> None: ...
@@ -141,13 +141,13 @@ class FrameGraph:
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
             stale = engine.frames != self._frame_number
             if recorded is not None:
-                engine.release(but=recorded if isinstance(recorded, HostFrame) else None)
+                engine.release(keep=recorded if isinstance(recorded, HostFrame) else None)
                 engine.readbacks.take_arrived()
                 steady = engine.steady and not (self._look_ahead and self._look_ahead.due)
                 with stage("serve"):
                     if recorded.begin(stale, steady, stats):
                         self._serve.replay()
-                        for _ in range(recorded.deeper(engine.readbacks)):
+                        for _ in range(recorded.extra_levels(engine.readbacks)):
                             self._deepen.replay()
             engine.number_picture(on_device=recorded is None)
             self._frame_number = engine.frames

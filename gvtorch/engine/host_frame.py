@@ -17,7 +17,15 @@ from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUES
 from ..base.records import Hits
 from ..base.volume import movable
 from ..cache import KINDS, Cache
-from ..cache.write import Children, Put, Targets, put_bricks, put_rows_of, put_tiles, put_uniform
+from ..cache.write import (
+    Children,
+    Targets,
+    WriteOutcome,
+    put_bricks,
+    put_tiles,
+    put_uniform,
+    write_rows,
+)
 from ..pool.staging import TableRows
 from ..producers import Bricks, Region, Regions
 from .mail import Mail, RowForm
@@ -111,7 +119,7 @@ class HostFrame(RecordedFrame):
         request_words, chosen = self.cache.nodes.request_tn.view(-1), self.choose()
         for kind, (node, _) in zip(KINDS.values(), chosen, strict=True):
             marked = request_words[node.clamp(min=0)] | kind << REQUEST_PENDING_SHIFT
-            put_rows_of(request_words[:, None], node, marked[:, None])
+            write_rows(request_words[:, None], node, marked[:, None])
         node = torch.cat([group.node for group in chosen])
         tree_number = self.tree_of(node)
         loc = self.trees[0].tree.loc(node)
@@ -150,7 +158,9 @@ class HostFrame(RecordedFrame):
         self._clear_pending(to_host["node"], to_host["bit"])
         mail.clear()
 
-    def _count_outcome(self, kind: int, targets: Targets, outcome: Put, index: int) -> None:
+    def _count_outcome(
+        self, kind: int, targets: Targets, outcome: WriteOutcome, index: int
+    ) -> None:
         _, placed, evicted = outcome.counts
         self._unused_slots[index] -= placed
         self._outcomes[index] += placed
@@ -161,7 +171,7 @@ class HostFrame(RecordedFrame):
 
     def _clear_pending(self, node: Tensor, bit: Tensor) -> None:
         request_words = self.cache.nodes.request_tn.view(-1, 1)
-        put_rows_of(request_words, node, request_words[node.clamp(min=0)] & ~bit[:, None])
+        write_rows(request_words, node, request_words[node.clamp(min=0)] & ~bit[:, None])
 
     def ask(self, generation: int, chosen_rows: Tensor) -> int:
         """Queues the nodes that a frame chose for the thread that asks producers: (2 * batch * 6,)

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
 from ..base.stage import stage
 from ..cache import KINDS, Cache, RequestList, Scheduler, write
-from ..cache.requests import Requests, coarser_requests, deeper, levels_wanted, requests_below
+from ..cache.requests import Requests, coarser_requests, extra_levels, levels_wanted, requests_below
 from ..cache.write import Targets, Written
 from ..pool import Staging
 from ..pool.staging import Shipment, upload
@@ -215,7 +215,7 @@ class Production:
         by as many levels as the subdivisions want on average.
         """
         branching = max(source.layout.branching for source in self.trees.values())
-        for _ in range(deeper(levels_wanted(subdivisions.priority, branching).tolist())):
+        for _ in range(extra_levels(levels_wanted(subdivisions.priority, branching).tolist())):
             with stage("schedule"):
                 requests = requests_below(self.cache, subdivisions, branching)
                 subdivisions = requests[REQUEST_SUBDIVIDE]
@@ -448,8 +448,8 @@ class Production:
         stats.stale += written.stale
         stats.bytes_uploaded += written.nbytes
         stats.capacity_exceeded |= written.unplaced > 0
-        if written.lost is not None:
-            self.cache.mark_pending(batch.targets.node[written.lost], batch.kind, False)
+        if written.retry is not None:
+            self.cache.mark_pending(batch.targets.node[written.retry], batch.kind, False)
 
     def _pending_batches(self) -> list[RequestBatch]:
         return [item.batch for item in self._waiting] + [item.batch for item in self._held_back]

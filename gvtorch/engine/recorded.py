@@ -14,8 +14,8 @@ from ..base.branches import in_branches
 from ..base.constants import REQUEST_KINDS, REQUEST_PENDING_SHIFT
 from ..base.records import Hits
 from ..cache import RequestList
-from ..cache.requests import DEEPER
-from ..cache.write import put_rows_of
+from ..cache.requests import MAX_EXTRA_LEVELS
+from ..cache.write import write_rows
 from ..cameras.camera import CONE
 from ..ops import choose_requests
 from ..tracing.pixels import View
@@ -82,10 +82,10 @@ class RecordedFrame:
         words, node = self.cache.nodes.request_tn.view(-1, 1), self._listed.node.to(torch.int64)
         before = words[node.clamp(min=0)]
         pending_bits = (self._listed.word & REQUEST_KINDS) << REQUEST_PENDING_SHIFT
-        put_rows_of(words, node, before | pending_bits[:, None])  # else these would be listed again
+        write_rows(words, node, before | pending_bits[:, None])  # else these would be listed again
         trace()
         self._list_requests(1)
-        put_rows_of(words, node, before)
+        write_rows(words, node, before)
 
     def _list_requests(self, list_index: int) -> RequestList:
         """Lists the requests of the picture (0) or of the look-ahead (1)."""
@@ -93,7 +93,7 @@ class RecordedFrame:
         torch.stack((listed.node, listed.word), out=self._requests[list_index])
         return listed
 
-    def deeper(self, readbacks: Readbacks) -> int:
+    def extra_levels(self, readbacks: Readbacks) -> int:
         """Returns how many times `DeviceFrame.deepen` is to follow `serve`."""
         return 0
 
@@ -140,7 +140,7 @@ class RecordedFrame:
 
     def _count_levels(self) -> Tensor:
         """Returns `levels_wanted` of the requests; 0 where frames deepen by one level only."""
-        return self._zero.expand(1 + DEEPER)
+        return self._zero.expand(1 + MAX_EXTRA_LEVELS)
 
     def choose(self) -> tuple[Chosen, Chosen]:
         """Returns the loads and the subdivisions to serve first, in the order of

@@ -14,12 +14,12 @@ from ..cache.write import Targets
 from ..ops import unlink
 from ..producers import Nodes
 from ..producers.answer import checked_regions
-from ..producers.producer import Where, touched
+from ..producers.producer import ChangeTest, changed_nodes
 from .request_batch import ProducedTree, RequestBatch, children_of
 from .setup import fill_root
 
 
-def renew_tree(cache: Cache, source: ProducedTree, changes: Sequence[Where] | None) -> None:
+def renew_tree(cache: Cache, source: ProducedTree, changes: Sequence[ChangeTest] | None) -> None:
     """Remakes a tree's root. Nodes for which one of `changes` is true are classified again and lose
     their bricks; those that no longer have children lose the subtree below them. The whole tree is
     dropped if `changes` is None (not known), if bricks are made from their parents' bricks, if
@@ -42,7 +42,7 @@ def renew_tree(cache: Cache, source: ProducedTree, changes: Sequence[Where] | No
             nodes.child_tn[root, 0] = TERMINAL
 
 
-def _renew_parts(cache: Cache, source: ProducedTree, changes: Sequence[Where]) -> bool:
+def _renew_parts(cache: Cache, source: ProducedTree, changes: Sequence[ChangeTest]) -> bool:
     """Classifies the changed nodes again, all but the root, and drops their bricks. Returns False
     if the producer fails to classify one, or answers with aliases; then only requests are cleared.
     """
@@ -51,7 +51,7 @@ def _renew_parts(cache: Cache, source: ProducedTree, changes: Sequence[Where]) -
     nodes.request_tn[tile] = 0
     node = tile[:, None] * nodes.nodes_per_tile + torch.arange(n, device=tile.device)
     candidates = Nodes(source.tree.loc(node.flatten()), source.layout)
-    changed = touched(changes, candidates).view(-1, n)
+    changed = changed_nodes(changes, candidates).view(-1, n)
     changed_tiles = changed.any(1).nonzero()[:, 0]
     if not len(changed_tiles):
         return True

@@ -67,7 +67,7 @@ class EngineOptions:
     strict: bool = False
     monitor: bool = True
 
-    __repr__ = check.brief
+    __repr__ = check.summary
 
     def __post_init__(self) -> None:
         check.one_of("Engine", "loading", self.loading, ("straight", "levels"))
@@ -77,7 +77,7 @@ class EngineOptions:
         if self.time_budget is not None:
             check.number("Engine", "time_budget", self.time_budget, low=0, open_low=True)
         for name, low in (("load_budget", 1), ("subdivide_budget", 1), ("scout_rounds", 0)):
-            check.whole("Engine", name, getattr(self, name), low=low)
+            check.integer("Engine", name, getattr(self, name), low=low)
         for name in ("strict", "monitor"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"Engine: {name} must be bool, got {getattr(self, name)!r}")
@@ -201,8 +201,8 @@ def _all_channels(producers: Mapping[str, Producer]) -> dict[str, Channel]:
 
 def brick_bytes(channels: Mapping[str, Channel], options: EngineOptions) -> int:
     """Returns the bytes of a brick's voxels, its border and all channels counted."""
-    size = check.whole("Engine", "brick_size", options.brick_size, low=2, high=256)
-    border = check.whole("Engine", "border", options.border, low=0, high=16)
+    size = check.integer("Engine", "brick_size", options.brick_size, low=2, high=256)
+    border = check.integer("Engine", "border", options.border, low=0, high=16)
     return (size + 2 * border) ** 3 * sum(channel.nbytes for channel in channels.values())
 
 

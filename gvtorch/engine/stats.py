@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..base.records import RenderStats, add
 from ..cache import KINDS, RequestList
-from ..cache.requests import deeper
+from ..cache.requests import extra_levels
 
 _MAX_FRAMES_AHEAD = 3  # most frames that the host may be ahead of the device
 #: Fields of `FrameStats` that are known when the device has finished the frame.
@@ -243,7 +243,7 @@ class Readbacks(deque[Readback]):
     _steady = False
     # Of the newest frame read back, if it was recorded:
     failed = False  # whether a node failed
-    deeper = 0  # by how many levels beyond the first the next frame deepens trees
+    extra_levels = 0  # by how many levels beyond the first the next frame deepens trees
 
     def catch_up(self, wait: bool) -> Readback | None:
         """Takes all frames whose counts have arrived. Waits for those of the others if `wait` is
@@ -282,7 +282,9 @@ class Readbacks(deque[Readback]):
         self._steady = readback.converged()
         counts = readback.wait()
         self.failed = counts.failed > 0
-        self.deeper = deeper((counts.subdivisions, counts.one_deeper, counts.two_deeper))
+        self.extra_levels = extra_levels(
+            (counts.subdivisions, counts.one_deeper, counts.two_deeper)
+        )
         readback.stats.settle()
         return readback
 

@@ -38,40 +38,40 @@ class Painted(Changed):
 class Warp(Field):
     """A field evaluated at points that another field displaces."""
 
-    def __init__(self, field: nn.Module, way: nn.Module, most: float) -> None:
+    def __init__(self, field: nn.Module, offset: nn.Module, max_offset: float) -> None:
         """Sets the field and the displacement.
 
         Args:
             field: The field that is evaluated.
-            way: Returns displacements (..., 3), which are added to points (..., 3).
-            most: World units to which longer displacements are shortened, so that bounds can be
-                those of the field over a box grown by this on all sides.
+            offset: Returns displacements (..., 3), which are added to points (..., 3).
+            max_offset: World units to which longer displacements are shortened, so that bounds can
+                be those of the field over a box grown by this on all sides.
         """
         super().__init__()
         self.field = checked_field("Warp", "field", field)
-        self.way = checked_field("Warp", "way", way)
-        self.most = self.number("most", most, low=0)
+        self.offset = checked_field("Warp", "offset", offset)
+        self.max_offset = self.number("max_offset", max_offset, low=0)
         if isinstance(field, Field) and not field.prefiltered:
             self.threshold, self.dtypes = field.threshold, field.dtypes
 
     def forward(self, points: Tensor) -> Values:
-        displacement = self.way(points)
+        displacement = self.offset(points)
         magnitude = torch.linalg.vector_norm(displacement, dim=-1, keepdim=True)
         return self.field(
-            points + displacement * (self.most / magnitude.clamp(min=1e-30)).clamp(max=1)
+            points + displacement * (self.max_offset / magnitude.clamp(min=1e-30)).clamp(max=1)
         )
 
     def bounds(self, center: Tensor, half: Tensor) -> Bounds:
-        return _bounds_of(self.field, center, half + self.most, None)
+        return _bounds_of(self.field, center, half + self.max_offset, None)
 
     def near(self, center: Tensor, half: Tensor) -> Self:
-        return self.replaced(field=_reduce(self.field, center, half + self.most))
+        return self.replaced(field=_reduce(self.field, center, half + self.max_offset))
 
     def alike(self, center: Tensor, half: Tensor) -> Tensor:
-        return _alike((self.field,), center, half + self.most)
+        return _alike((self.field,), center, half + self.max_offset)
 
     def box(self) -> Tensor | None:
-        return grown(self.field.box() if isinstance(self.field, Field) else None, self.most)
+        return grown(self.field.box() if isinstance(self.field, Field) else None, self.max_offset)
 
 
 class Stack(Field):

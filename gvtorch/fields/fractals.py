@@ -54,7 +54,7 @@ class Power(Iteration):
     def __init__(self, power: int) -> None:
         """Takes n."""
         super().__init__()
-        self.power = check.whole("Power", "power", power, low=2, high=64)
+        self.power = check.integer("Power", "power", power, low=2, high=64)
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
         return twin.spherical_power(z, self.power)
@@ -123,7 +123,7 @@ class Fractal(Distance):
         super().__init__()
         context = type(self).__name__
         self.iteration = check.instance(context, "iteration", iteration, Iteration)
-        self.iterations = check.whole(context, "iterations", iterations, low=1, high=1000)
+        self.iterations = check.integer(context, "iterations", iterations, low=1, high=1000)
         self.bailout = self.number("bailout", bailout, low=1, open_low=True)
         self.julia = constant is not None
         self.constant = self.vector("constant", (0.0, 0.0, 0.0) if constant is None else constant)

@@ -56,7 +56,7 @@ class Fur(OfShape):
         self.length = self.number("length", length, low=0, open_low=True)
         self.frequency = self.number("frequency", frequency, low=0, open_low=True)
         self.fall = self.vector("fall", fall)
-        self.seed = check.whole("Fur", "seed", seed, low=-(2**62), high=2**62)
+        self.seed = check.integer("Fur", "seed", seed, low=-(2**62), high=2**62)
 
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:
         return self.filtered(points, torch.zeros_like(points))
@@ -68,7 +68,7 @@ class Fur(OfShape):
         displacement = (height * height * self.length)[..., None] * self.fall.to(points)
         root = points - distance[..., None] * normal - displacement
         side_cells = size.amax(-1).to(points) * self.frequency
-        contrast = torch.exp(-noise.LOST * side_cells * side_cells)
+        contrast = torch.exp(-noise.MEAN_DECAY * side_cells * side_cells)
         hairs = noise.perlin(root * self.frequency, seed=self.seed) * contrast
         inside = ((_MEAN_HEIGHT + _HEIGHT_SPREAD * hairs - height) * _END_SLOPE).clamp(0, 1)
         return {"value": inside * (_SKIN_VALUE + (1 - _SKIN_VALUE) * height.clamp(0, 1))}

@@ -174,7 +174,7 @@ class Menger(Distance):
     def __init__(self, levels: int = 4, *, color: Color = WHITE) -> None:
         """Takes the number of times that parts are removed, at most 30."""
         super().__init__(color)
-        self.levels = check.whole("Menger", "levels", levels, low=0, high=30)
+        self.levels = check.integer("Menger", "levels", levels, low=0, high=30)
 
     def forward(self, points: Tensor) -> Tensor:
         distance = box_distance(points.abs() - 0.5)

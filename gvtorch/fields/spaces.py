@@ -170,7 +170,10 @@ class Repeat(Space):
             raise ValueError(f"{context}: the shape must lie within its cell, it has {size}")
         counts = (None,) * 3 if count is None else tuple(count)
         for axis_count in counts:
-            if axis_count is not None and check.whole(context, "count", axis_count, low=1) % 2 == 0:
+            if (
+                axis_count is not None
+                and check.integer(context, "count", axis_count, low=1) % 2 == 0
+            ):
                 raise ValueError(f"{context}: count must be odd, got {counts}")
         self._max_cell = [
             math.inf if axis_count is None else (axis_count - 1) // 2 for axis_count in counts

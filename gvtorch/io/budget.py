@@ -25,7 +25,7 @@ SECONDS = 5.0  # of processor time for any header
 SECONDS_A_BYTE = 5e-7  # and for each byte of its file
 MEMORY = 512 * 10**6  # bytes of memory for any header
 MEMORY_A_BYTE = 40  # and for each byte of its file
-MOST_PACKED = 1032  # largest ratio of unpacked to packed bytes in DEFLATE
+MAX_UNPACK_RATIO = 1032  # largest ratio of unpacked to packed bytes in DEFLATE
 _MEMORY_GRACE_SECONDS = 0.5  # seconds of processor time before memory counts
 _CHECK_SECONDS = 0.05  # seconds between two checks
 

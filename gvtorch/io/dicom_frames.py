@@ -146,16 +146,16 @@ def order_frames(path: str, frames: Sequence[DicomFrame]) -> Ordered:
     positions = np.array([slice_frames[0].position for slice_frames in slices])
     affine[:3, 3] = positions[0]
     affine[:3, 0] = np.cross(rows, columns) * (first.slice_spacing or 1.0)
-    lost = []
+    dropped = []
     if len(slices) > 1:
         affine[:3, 0] = _step(path, positions, np.cross(rows, columns))
     elif first.slice_spacing is None:
-        lost.append("how thick its only slice is: it is 1 thick here")
+        dropped.append("how thick its only slice is: it is 1 thick here")
     if attribute is not None and attribute not in (*_TIME_UNITS, *_DISTINGUISHING[:2]):
-        lost.append(
+        dropped.append(
             f"{count} images of each slice differ in {attribute}: they are read as time points"
         )
-    return ordered, affine, lost, _time_fields(ordered, attribute)
+    return ordered, affine, dropped, _time_fields(ordered, attribute)
 
 
 def _directions(path: str, frame: DicomFrame) -> tuple[np.ndarray, np.ndarray]:
@@ -179,10 +179,10 @@ def _order_by_number(
     )
     slice_spacing = ordered[0].slice_spacing
     affine[:3, 0] = normal * (slice_spacing or 1.0)
-    lost = ["slices have no place: they follow their numbers, from 0"]
+    dropped = ["slices have no place: they follow their numbers, from 0"]
     if slice_spacing is None:
-        lost[0] += ", 1 apart"
-    return [ordered], affine, lost if len(ordered) > 1 else [], {}
+        dropped[0] += ", 1 apart"
+    return [ordered], affine, dropped if len(ordered) > 1 else [], {}
 
 
 def _group_by_position(frames: Sequence[DicomFrame], normal: np.ndarray) -> list[list[DicomFrame]]:
@@ -273,15 +273,15 @@ def image_info(
     header: Any, samples: int, time_fields: dict[str, Any]
 ) -> tuple[ImageInfo, list[str]]:
     """Returns the header's metadata of the values, and which metadata is not kept."""
-    lost = []
+    dropped = []
     photometric = str(header.get("PhotometricInterpretation", ""))
     if photometric == "PALETTE COLOR":
-        lost.append("the colours of its palette: values are numbers of its entries")
+        dropped.append("the colours of its palette: values are numbers of its entries")
     if photometric == "MONOCHROME1":
-        lost.append("that high values are meant to be dark (MONOCHROME1)")
+        dropped.append("that high values are meant to be dark (MONOCHROME1)")
     uses_table = header.get("ModalityLUTSequence") and header.get("RescaleSlope") is None
     if uses_table:
-        lost.append("the modality's table: values are those that it looks up")
+        dropped.append("the modality's table: values are those that it looks up")
     quantity = str(
         header.get("RescaleType") or header.get("Units") or header.get("DoseUnits") or ""
     )
@@ -306,7 +306,7 @@ def image_info(
         space="right-anterior-superior",
         **time_fields,
     )
-    return info, lost
+    return info, dropped
 
 
 def _first_item(sequence: Any) -> Any:

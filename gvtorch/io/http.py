@@ -30,7 +30,7 @@ _refused: dict[str, tuple[float, str]] = {}  # by URL: until when it is refused,
 _refused_lock = threading.Lock()  # held while it is changed
 EXTRA_BYTES = 1 << 20  # bytes that any file may take in addition to what its content may take
 _PART_BYTES = 1 << 16  # bytes
-_SILENT_SECONDS = 1.0  # seconds without a byte after which `ask_again` aborts a request
+_SILENT_SECONDS = 1.0  # seconds without a byte after which `retry_refused` aborts a request
 _MAX_IDLE = 16  # idle connections that are kept open to a server
 REQUEST_HEADERS = {"Accept-Encoding": "identity", "User-Agent": "gvtorch"}
 MISSING_STATUS = (404, 410)  # status codes for a file that does not exist
@@ -129,7 +129,7 @@ def refused(url: str) -> str:
     return _refused.get(url, _NOT_REFUSED)[1]
 
 
-def ask_again() -> None:
+def retry_refused() -> None:
     """Makes the next read of any file try again at once: no file is refused any longer, and
     requests that wait for a silent server are aborted.
     """

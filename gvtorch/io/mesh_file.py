@@ -22,7 +22,7 @@ from ..base.messages import need_library, one_line
 from ..meshes.mesh import MOST_FACES, Material, Mesh
 from .polygons import cut_polygons
 from .resources import amount, memory_free
-from .source import told_as
+from .source import convert_errors
 
 #: Endings that are read, also followed by .gz. Other formats of trimesh need more libraries, or
 #: unpickle the content of files.
@@ -189,7 +189,7 @@ def _check_claims(path: Path, ending: str, content: bytes) -> None:
     """
     claimed = None
     if ending in ("gltf", "glb"):
-        with told_as(ValueError, str(path), f"can't be read as {ending}"):
+        with convert_errors(ValueError, str(path), f"can't be read as {ending}"):
             _check_gltf(ending, content)
     if ending == "stl" and len(content) >= 84 and not content[:5].lower() == b"solid":
         claimed = int.from_bytes(content[80:84], "little")

@@ -23,7 +23,7 @@ import torch
 from ..base import check
 from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
-from ..meshes.holes import SolidParts, once_filled, told_of_holes
+from ..meshes.holes import SolidParts, solid_when_filled, warning_of_holes
 from ..meshes.mesh import Material, Mesh
 from ..meshes.voxelizer import CHANNELS, GridSettings, Voxelizer, check_channels
 from .mesh_file import read_mesh
@@ -62,7 +62,7 @@ class MeshSource(VolumeSource):
         texture: str | Path | None = None,
     ) -> dict[str, MeshSource]:
         """Reads a mesh, lays a grid around it, and returns a source per channel; see `voxelize`."""
-        check.whole("voxelize", "resolution", resolution, low=8, high=2**20)
+        check.integer("voxelize", "resolution", resolution, low=8, high=2**20)
         check.instance("voxelize", "mesh", mesh_or_path, Mesh, str, PathLike)
         check.one_of("voxelize", "solid", solid, get_args(SolidParts))
         names = check_channels("voxelize", channels)
@@ -76,7 +76,7 @@ class MeshSource(VolumeSource):
                 fingerprint(mesh_or_path),
                 str(mesh_or_path),
             )
-        if solid == "auto" and (hole_warning := told_of_holes(mesh)):
+        if solid == "auto" and (hole_warning := warning_of_holes(mesh)):
             warnings.warn(hole_warning, stacklevel=3)
         identity.insert(0, checksum(v for name, v in _mesh_arrays(mesh).items() if name != "name"))
         settings: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
@@ -144,7 +144,7 @@ def _voxelizer(source: MeshSource) -> Voxelizer:
     return Voxelizer(
         mesh,
         channels=(source.channel,),
-        solid=once_filled(source.solid),
+        solid=solid_when_filled(source.solid),
         **dict(source.settings),
     )
 
@@ -184,7 +184,7 @@ def voxelize(
     Raises:
         ValueError, OSError, KeyboardInterrupt: As in `read_mesh` and `convert`.
     """
-    check.known("voxelize", settings, GridSettings)
+    check.known_options("voxelize", settings, GridSettings)
     sources = MeshSource.of(mesh, channels, **settings, texture=texture)
     options: dict[str, Any] = {"block": block, "executor": executor, "workers": workers}
     options |= {"resume": resume, "progress": progress}

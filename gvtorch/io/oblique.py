@@ -170,7 +170,7 @@ def straighten(
         "voxels as they are",
         stacklevel=3,
     )
-    fields = {name: getattr(source, name) for name in ("path", "info", "lost", "time", "whole")}
+    fields = {name: getattr(source, name) for name in ("path", "info", "dropped", "time", "whole")}
     return StraightSource(
         shape=(source.times, z, y, x, source.width),
         axes="tzyxc",

@@ -21,10 +21,10 @@ from ..base import check
 from ..base.image_info import array_from_srgb
 from ..base.messages import need_library
 from ..points.points import Points
-from .budget import MOST_PACKED, header_budget
+from .budget import MAX_UNPACK_RATIO, header_budget
 from .packed import is_packed_fits
 from .resources import amount, memory_free
-from .source import number_type, told_as
+from .source import convert_errors, number_type
 
 ENDINGS = ("npz", "ply", "fits", "fit", "fits.gz")
 _ALL_POINTS = 2**62
@@ -56,7 +56,7 @@ class PointFile:
 
     def __init__(self, path: str | Path, **names: Unpack[ColumnNames]) -> None:
         """Opens the file, see `read_points`."""
-        check.known("read_points", names, ColumnNames)
+        check.known_options("read_points", names, ColumnNames)
         self.path = Path(path)
         self.columns = _read_columns(self.path)
         radius = names.get("radius")
@@ -70,7 +70,7 @@ class PointFile:
         """Yields all points, `count` at a time; raises ValueError if a number is not finite."""
         for start in range(0, len(self), count):
             part = slice(start, start + count)
-            with told_as(ValueError, str(self.path), "can't be read"):
+            with convert_errors(ValueError, str(self.path), "can't be read"):
                 fields = {name: self._join_columns(used, part) for name, used in self.used.items()}
                 if "colors" in fields:
                     dtypes = {self.columns[name].dtype for name in self.used["colors"]}
@@ -120,7 +120,7 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise FileNotFoundError(f"file not found: {path}")
     reader = {"npz": _read_npz, "ply": _read_ply}.get(ending, _read_fits)
-    with told_as(ValueError, str(path), f"can't be read as {ending}"):
+    with convert_errors(ValueError, str(path), f"can't be read as {ending}"):
         columns = {
             n: column
             for n, column in reader(path).items()
@@ -167,7 +167,7 @@ def _read_fits(path: Path) -> dict[str, np.ndarray]:
             if table is None:
                 raise ValueError("it has no table with rows")
             start, size = int(table.fileinfo()["datLoc"]), path.stat().st_size
-            limit = min(size * MOST_PACKED, memory_free()) if packed else size - start
+            limit = min(size * MAX_UNPACK_RATIO, memory_free()) if packed else size - start
             if table.size > limit:
                 raise ValueError(f"its rows take {table.size} bytes, at most {limit} can be there")
             column_formats = zip(table.columns.names, table.columns.formats, strict=True)

@@ -24,7 +24,7 @@ from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten
 from .remote import fetch, is_file_url, split_url
 from .resources import amount, memory_free
-from .source import ArraySource, Index, MemorySource, VolumeSource, no_time_message, told_as
+from .source import ArraySource, Index, MemorySource, VolumeSource, convert_errors, no_time_message
 from .stores.ngff import is_zarr
 from .stores.store_layout import DTYPES, MAX_STORE_VOXELS, MAX_TIMES, StoreError
 
@@ -92,7 +92,7 @@ def read_volume(
         "time": time,
         "oblique": oblique,
     }
-    source = open_source(path, most=MAX_VOXELS, labels=labels, **placement, **options)
+    source = open_source(path, max_values=MAX_VOXELS, labels=labels, **placement, **options)
     if time is None and source.times > 1:
         warnings.warn(
             f"{source.path}: has {source.times} time points, this is the first; "
@@ -116,32 +116,32 @@ def open_source(
     time: int | None = None,
     oblique: Oblique | None = None,
     labels: bool = False,
-    most: int = MAX_STORE_VOXELS * _MAX_CHANNELS,
+    max_values: int = MAX_STORE_VOXELS * _MAX_CHANNELS,
     **options: Unpack[FormatSettings],
 ) -> VolumeSource:
     """Reads a volume's header and returns a source, from which its voxels can be read by region.
 
     Args, Raises: as `read_volume`, and
-        most: Values (voxels times channels) of a time point; a larger volume is refused.
+        max_values: Values (voxels times channels) of a time point; a larger volume is refused.
 
     Returns:
         The source, its `time` as asked for, or 0.
     """
-    check.known("read_volume", options, FormatSettings)
+    check.known_options("read_volume", options, FormatSettings)
     arguments: dict[str, Any] = {name: v for name, v in options.items() if v is not None}
     text, kind, opener = _find_opener(path, arguments)
     for name in ("key", "axes"):
         check.text(text, name, arguments.get(name))
     check.instance(text, "labels", labels, bool)
-    with told_as(ValueError, text, f"can't be read as {kind}", StoreError, TimeoutError):
+    with convert_errors(ValueError, text, f"can't be read as {kind}", StoreError, TimeoutError):
         # Numbers out of range are refused below; NumPy would print its warnings before the error.
         with header_budget(text), np.errstate(all="ignore"):
             source = opener(**arguments)
         check_files(source)
         if labels:
             source = source.as_labels()
-        check_extent(text, (*source.extent, source.width), most=most)
-        check_extent(text, source.extent, most=MAX_STORE_VOXELS)
+        check_extent(text, (*source.extent, source.width), max_values=max_values)
+        check_extent(text, source.extent, max_values=MAX_STORE_VOXELS)
         if not 1 <= source.times <= MAX_TIMES or min(source.shape) < 1:
             raise ValueError(f"{text}: expected 1 to {MAX_TIMES} time points, got {source.times}")
         if time is not None and (type(time) is not int or not 0 <= time < source.times):
@@ -158,8 +158,8 @@ def open_source(
             )
         with np.errstate(all="ignore"):
             source = straighten(source, oblique, first_voxel=origin)
-    if source.lost:
-        dropped = " ".join("; ".join(source.lost).split())  # in one line, whatever the file says
+    if source.dropped:
+        dropped = " ".join("; ".join(source.dropped).split())  # in one line, whatever the file says
         warnings.warn(f"{text}: not kept: {dropped}", stacklevel=2)
     return with_placement(text, source, spacing, origin)
 
@@ -206,7 +206,7 @@ def with_placement(
     """Returns the source with the user's spacing and origin; None keeps those of the file."""
     steps = source.spacing if spacing is None else spacing
     position = source.origin if origin is None else origin
-    steps, position = check.placed(context, steps, position, source.extent)
+    steps, position = check.grid_placement(context, steps, position, source.extent)
     return dataclasses.replace(source, spacing=steps, origin=position)
 
 
@@ -223,7 +223,9 @@ def read_time_points(source: VolumeSource, first: int = 0, times: int = 1) -> np
                 f"{source.path}: takes {amount(needed)} of memory, {amount(free)} are free"
             )
     kind = "an array" if is_array else find_format(source.path, raw=True).name
-    with told_as(ValueError, source.path, f"can't be read as {kind}", StoreError, TimeoutError):
+    with convert_errors(
+        ValueError, source.path, f"can't be read as {kind}", StoreError, TimeoutError
+    ):
         return source.read_times(first, first + times)
 
 
@@ -251,7 +253,7 @@ def as_source(context: str, data: Any, axes: str | None = None) -> VolumeSource:
         if not isinstance(data, np.ndarray):
             return as_source(context, as_volume(data, axes=axes, context=context))
     array = ArrayLike.of(context, data, axes)
-    described = {name: getattr(array, name) for name in ("spacing", "origin", "info", "lost")}
+    described = {name: getattr(array, name) for name in ("spacing", "origin", "info", "dropped")}
     described["path"] = array.name or "array"
     fields = {name: getattr(array, name) for name in ("shape", "axes", "flips")}
     fields |= {"stored": array.dtype, **described}

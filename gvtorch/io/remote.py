@@ -24,7 +24,7 @@ from urllib.parse import unquote, urlsplit
 
 from ..base.digits import whole_number
 from ..base.messages import need_library, one_line
-from ..base.whole_file import cache_folder, write_whole
+from ..base.whole_file import cache_folder, write_text
 from .http import MISSING_STATUS, REQUEST_HEADERS, HttpStatus, ask_by_urllib
 from .resources import amount
 
@@ -105,7 +105,7 @@ def fetch(url: str) -> Path:
     except OSError:  # another process has written it already
         shutil.rmtree(file.parent, ignore_errors=True)
     record = {"url": url, "name": file.name, "place": version_folder.name, "version": version}
-    write_whole(folder / "about.json", json.dumps(record))
+    write_text(folder / "about.json", json.dumps(record))
     _evict(version_folder)
     return version_folder / file.name
 

@@ -29,12 +29,12 @@ from ..base import boxes
 from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
-from ..base.whole_file import save_npy, told_of
+from ..base.whole_file import errors_name, save_npy
 from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
 Triple = tuple[float, float, float]
-Told = tuple[ImageInfo, Triple, list[str]]  # info, spacing, metadata that is not kept
+FileMetadata = tuple[ImageInfo, Triple, list[str]]  # info, spacing, metadata that is not kept
 _PART_BYTES = 1 << 20  # bytes that are unpacked at a time
 _INTEGER_NAMES = {
     1: ("char", "int8"),
@@ -68,7 +68,7 @@ class VolumeSource(ABC):
     # (3, 4) from voxels to the world, if the axes x, y, z are not parallel to the world's.
     oblique: tuple[tuple[float, ...], ...] | None = None
     info: ImageInfo = dataclasses.field(default_factory=ImageInfo)  # unit, channels, ...
-    lost: tuple[str, ...] = ()  # metadata of the file that is not kept, a few words each
+    dropped: tuple[str, ...] = ()  # metadata of the file that is not kept, a few words each
     time: int = 0  # the time point that is read
     whole: bool = False  # every read unpacks the whole file: one read of all is better
     unpacked_bytes: int = 0  # size of the largest piece that is unpacked at once
@@ -152,7 +152,7 @@ class VolumeSource(ABC):
         Raises:
             OSError: The file can't be read any more, or is damaged.
         """
-        with told_as(OSError, self.path, "can't be read", OSError):
+        with convert_errors(OSError, self.path, "can't be read", OSError):
             data = self.read_box(low, high, (self.time, self.time + 1))[0]
             # A copy, because pages of a mapping that is kept would count as this process's memory.
             return data.copy() if isinstance(data.base, np.memmap) else data
@@ -246,7 +246,7 @@ class MemorySource(VolumeSource):
     def staged(self, folder: Path) -> VolumeSource:
         """Writes the values to a file in the folder."""
         file = folder / "source.npy"
-        with told_of(file):
+        with errors_name(file):
             save_npy(file, self.data)
         return ArraySource(
             path=str(file),
@@ -352,7 +352,7 @@ def no_time_message(context: str, time: object, times: int) -> str:
 
 
 @contextmanager
-def told_as(
+def convert_errors(
     kind: type[Exception], path: str, problem: str, *passed: type[Exception]
 ) -> Iterator[None]:
     """Converts whatever a format library raises for a damaged file to `kind`, with the one-line

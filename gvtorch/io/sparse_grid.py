@@ -232,7 +232,7 @@ class SparseSource(VolumeSource):
         size = [int(n) for n in high - low]
         if min(size) < 1 or np.abs((low, high)).max() > MAX_INDEX:
             raise ValueError(f"{path}: grid {name!r} has no active voxel")
-        check_extent(path, size, most=1 << 62)
+        check_extent(path, size, max_values=1 << 62)
         shifted = affine.astype(np.float64)
         shifted[:3, 3] += shifted[:3, :3] @ low
         shape = (*size, width) if width > 1 else tuple(size)

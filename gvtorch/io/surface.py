@@ -149,8 +149,8 @@ class _Grid:
             if channel is not None:
                 raise ValueError(f"{caller}: channel is for trees, got {channel!r}")
             width, label_values, is_labelled = source.width, source.label_values, source.info.labels
-        self.level = check.whole(caller, "level", level, low=0, high=levels - 1)
-        self.component = check.whole(caller, "component", component, low=0, high=width - 1)
+        self.level = check.integer(caller, "level", level, low=0, high=levels - 1)
+        self.component = check.integer(caller, "component", component, low=0, high=width - 1)
         if is_labelled:
             self.label, self.value = _stored_label(self.value, label_values), 0.5
         scale = branching**level
@@ -225,7 +225,7 @@ class _Grid:
 
 def _stored_label(label: float, label_values: torch.Tensor | None) -> int:
     """Returns the number by which a label is stored: its index in `label_values`, or itself."""
-    value = check.whole(
+    value = check.integer(
         "extract_surface", "value of labels", int(label) if label % 1 == 0 else label, low=0
     )
     if label_values is None:

@@ -22,7 +22,7 @@ from ..base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ..base.units import NO_DEPTH, spacing_of, time_unit
 from .budget import check_beside
 from .picture_size import picture_size
-from .source import Told
+from .source import FileMetadata
 
 JPEG = (6, 7, 34892, 33007)
 _LERC = 34887
@@ -164,7 +164,7 @@ class _TiffLog(logging.Handler):
             (self.damage if is_error else self.warnings).append(text)
 
 
-def ome_info(xml: str, number: int, name: str, width: int) -> Told:
+def ome_info(xml: str, number: int, name: str, width: int) -> FileMetadata:
     """Reads the OME-XML of an image, found by its name, or by its number if that is not unique."""
     root = ElementTree.fromstring(xml)
     images = [child for child in root.iter() if _tag(child) == "Image"]
@@ -180,9 +180,9 @@ def ome_info(xml: str, number: int, name: str, width: int) -> Told:
     sizes = [finite_number(pixels.get(f"PhysicalSize{axis}")) for axis in "XYZ"]
     units = [pixels.get(f"PhysicalSize{axis}Unit", "\u00b5m") for axis in "XYZ"]
     spacing, unit = spacing_of(sizes, units)
-    lost = []
+    dropped = []
     if unit and sizes[2] is None and int(finite_number(pixels.get("SizeZ")) or 1) > 1:
-        lost.append(NO_DEPTH)
+        dropped.append(NO_DEPTH)
     step, step_unit = (
         finite_number(pixels.get("TimeIncrement")),
         pixels.get("TimeIncrementUnit", "s"),
@@ -194,14 +194,14 @@ def ome_info(xml: str, number: int, name: str, width: int) -> Told:
     if samples == [3] and width == 3:
         channels = [*color_channels()]
     if any(_tag(child) == "ROI" for child in root):
-        lost.append("regions of interest (ROI)")
+        dropped.append("regions of interest (ROI)")
     info = ImageInfo(
         unit=unit,
         channels=tuple(channels) if len(channels) == width else (),
         time_step=step if step else None,
         time_unit=time_unit(step_unit) if step else None,
     )
-    return info, spacing, lost
+    return info, spacing, dropped
 
 
 def _ome_channel(element: Any) -> ChannelInfo:
@@ -228,7 +228,9 @@ def _step_of_planes(pixels: Any) -> tuple[float | None, str]:
     return (step if step > 0 else None), unit
 
 
-def imagej_info(metadata: dict[str, Any], resolution: list[float | None], width: int) -> Told:
+def imagej_info(
+    metadata: dict[str, Any], resolution: list[float | None], width: int
+) -> FileMetadata:
     """Reads ImageJ's metadata; `resolution` is the width and height of a pixel."""
     unit = str(metadata.get("unit", "")).replace("\\u00B5", "\u00b5").replace("\\u00b5", "\u00b5")
     distance = finite_number(metadata.get("spacing"))
@@ -238,9 +240,9 @@ def imagej_info(metadata: dict[str, Any], resolution: list[float | None], width:
         None if distance is None else abs(distance),
     ]
     spacing, unit_name = spacing_of(sizes, [unit] * 3)
-    lost = []
+    dropped = []
     if unit and unit_name is None and unit.lower() not in ("pixel", "pixels", "inch"):
-        lost.append(f"the unit {unit!r}, which is unknown")
+        dropped.append(f"the unit {unit!r}, which is unknown")
     step = finite_number(metadata.get("finterval")) or None
     ranges = [float(v) for v in metadata.get("Ranges", ())]
     if not ranges and {"min", "max"} <= set(metadata):
@@ -254,7 +256,7 @@ def imagej_info(metadata: dict[str, Any], resolution: list[float | None], width:
         color = _color(tables[channel]) if width > 1 and channel < len(tables) else None
         channels.append(ChannelInfo(color=color, window=(low, high) if low < high else None))
     if any(name in metadata for name in ("Overlays", "ROI")):
-        lost.append("overlays and regions of interest")
+        dropped.append("overlays and regions of interest")
     displayed = [c for c in channels if c.color or c.window]
     info = ImageInfo(
         unit=unit_name,
@@ -262,7 +264,7 @@ def imagej_info(metadata: dict[str, Any], resolution: list[float | None], width:
         time_step=step,
         time_unit=time_unit(metadata.get("tunit", "sec")) if step else None,
     )
-    return info, spacing, lost
+    return info, spacing, dropped
 
 
 def _color(table: Any) -> Rgb | None:

@@ -56,8 +56,8 @@ def window(
         low, high = (check.number("window", "percent", p, low=0, high=100) for p in percent)
         if low >= high:
             raise ValueError(f"window: percent must be a low and a high one, got {percent}")
-    check.whole("window", "component", component, low=0, high=data.width - 1)
-    values = looked_at(data)[..., component].ravel()
+    check.integer("window", "component", component, low=0, high=data.width - 1)
+    values = sample_values(data)[..., component].ravel()
     if percent is not None:
         return _nonempty_window(*np.percentile(values, percent))
     low, high = np.percentile(values, (_TAIL_PERCENT, 100 - _TAIL_PERCENT))
@@ -74,7 +74,7 @@ def windows(
     """Returns the `window` of several components, between the same percentiles (not checked). If
     both percentiles of a component are the same value, its window ends at its largest value.
     """
-    values, spans = looked_at(data), []
+    values, spans = sample_values(data), []
     for component in components:
         low, high = np.percentile(values[..., component], percent)
         spans.append(_nonempty_window(low, high if high > low else values[..., component].max()))
@@ -89,7 +89,7 @@ def value_range(data: Volume | Store) -> tuple[float, float]:
         return data.value_range
     if data.value_range is not None:
         return min(low for low, _ in data.value_range), max(high for _, high in data.value_range)
-    values = looked_at(data)
+    values = sample_values(data)
     return float(values.min()), float(values.max())
 
 
@@ -99,7 +99,7 @@ def _nonempty_window(low: float, high: float) -> tuple[float, float]:
     return (low, high) if high > low else (low, low + max(1.0, 1e-6 * abs(low)))
 
 
-def looked_at(data: Volume | Store) -> np.ndarray:
+def sample_values(data: Volume | Store) -> np.ndarray:
     """Returns a sample of the values, (..., c)."""
     if isinstance(data, Volume):
         values = to_numpy(data.data)

@@ -95,7 +95,7 @@ def _loops(begin: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
     return loops
 
 
-def told_of_holes(mesh: Mesh) -> str:
+def warning_of_holes(mesh: Mesh) -> str:
     """Returns a warning if parts are nearly closed, or few triangles turned; else an empty text."""
     kept, solid = solids(mesh)
     if solid.all():
@@ -123,7 +123,7 @@ def told_of_holes(mesh: Mesh) -> str:
     )
 
 
-def once_filled(solid: SolidParts) -> SolidParts:
+def solid_when_filled(solid: SolidParts) -> SolidParts:
     """Returns `solid` for a mesh whose holes are filled already."""
     return "auto" if solid == "always" else solid
 

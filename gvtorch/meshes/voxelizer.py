@@ -107,7 +107,7 @@ class Voxelizer:
             ValueError: An unknown channel, or a number out of its range.
         """
         context = "voxelize"
-        check.whole(context, "resolution", resolution, low=8, high=2**30)
+        check.integer(context, "resolution", resolution, low=8, high=2**30)
         check.one_of(context, "solid", solid, get_args(SolidParts))
         channels = check_channels(context, channels)
         mesh = filled(mesh) if solid == "always" else mesh

@@ -97,8 +97,8 @@ def camera(projection: Tensor, modelview: Tensor, width: int, height: int) -> Ca
     matrix, orthographic = _projection(context, projection)
     if orthographic:
         raise ValueError(f"{context}: projection must be perspective, got an orthographic one")
-    check.whole(context, "width", width, low=1)
-    check.whole(context, "height", height, low=1)
+    check.integer(context, "width", width, low=1)
+    check.integer(context, "height", height, low=1)
     intrinsics = torch.zeros_like(matrix[..., :3, :3])
     intrinsics[..., 0, 0] = matrix[..., 0, 0] * width / 2
     intrinsics[..., 0, 2] = (1 - matrix[..., 0, 2]) * width / 2

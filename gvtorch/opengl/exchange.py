@@ -97,8 +97,8 @@ class Exchange:
         self.device = check.device(context, device)
         self._gl = gl.Functions(context, load)
         limit = self._gl.integer(gl.MAX_TEXTURE_SIZE)
-        self.width = check.whole(context, "width", width, low=1, high=limit)
-        self.height = check.whole(context, "height", height, low=1, high=limit)
+        self.width = check.integer(context, "width", width, low=1, high=limit)
+        self.height = check.integer(context, "height", height, low=1, high=limit)
         self._size = [self.width, self.height]
         declined = share is False
         self.reason = "share is False" if declined else _why_not_shared(self._gl, self.device)

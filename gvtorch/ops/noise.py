@@ -51,14 +51,14 @@ def noise(
         got = check.describe(point_pn)
         raise ValueError(f"{context}: point_pn must be (p, 2) or (p, 3) floats, got {got}")
     check.one_of(context, "kind", kind, KINDS)
-    check.whole(context, "seed", seed, low=-(2**63))
+    check.integer(context, "seed", seed, low=-(2**63))
     jitter = check.number(context, "jitter", jitter, low=0, high=1)
-    check.whole(context, "reach", reach, low=1, high=2)
+    check.integer(context, "reach", reach, low=1, high=2)
     if not isinstance(period, Sequence):
         raise ValueError(f"{context}: period must be numbers of cells, one an axis, got {period!r}")
     x, y, z = (*period, 0, 0, 0)[:3]
     for axis_period in (x, y, z):
-        check.whole(context, "period", axis_period, low=0, high=2**28)
+        check.integer(context, "period", axis_period, low=0, high=2**28)
     kind_index, arguments = (
         KINDS.index(kind),
         twin.NoiseArguments(twin.salts(seed), (x, y, z), jitter, reach),

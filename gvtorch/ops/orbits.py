@@ -38,10 +38,10 @@ class Orbit(NamedTuple):
         )
         check.one_of(context, "kind", self.kind, KINDS)
         if self.kind == "power":
-            check.whole(context, "amount", self.amount, low=2, high=64)
+            check.integer(context, "amount", self.amount, low=2, high=64)
         else:
             check.number(context, "amount", self.amount)
-        check.whole(context, "iterations", self.iterations, low=1, high=1000)
+        check.integer(context, "iterations", self.iterations, low=1, high=1000)
 
     def arguments(self) -> tuple[Any, ...]:
         """Returns the arguments of the compiled ops that come after the points or balls."""

@@ -101,7 +101,9 @@ def op(extra_check: Callable[..., None] | None = None) -> Callable[[_Twin], _Twi
                 if dtype == torch.float64:
                     check.no_gradient(op_name, name, args[position])
             for name, allowed in ranges.items():
-                check.whole(op_name, name, args[positions[name]], low=allowed[0], high=allowed[-1])
+                check.integer(
+                    op_name, name, args[positions[name]], low=allowed[0], high=allowed[-1]
+                )
             if extra_check is not None:
                 extra_check(**dict(zip(names, args, strict=True)))
             if choose_backend(backend, device) == "reference":

@@ -37,7 +37,7 @@ def check_rays(context: str, rays: RayArguments) -> dict[str, int]:
     names += "" if rays.clear_r is None else " clear_r"
     fields = _fields(rays, torch.float64, names)
     sizes = check.tensors(context, rays.origin_r3.device, fields)
-    check.whole(context, "width", rays.width, low=0)
+    check.integer(context, "width", rays.width, low=0)
     if rays.width and sizes["r"] % rays.width:
         raise ValueError(f"{context}: {sizes['r']} rays are not whole rows of {rays.width} pixels")
     return sizes
@@ -45,17 +45,17 @@ def check_rays(context: str, rays: RayArguments) -> dict[str, int]:
 
 def check_channel(context: str, arguments: TraceArguments, device: torch.device) -> dict[str, int]:
     """Checks the fields of `TraceArguments.channel`: placement, bricks and constants."""
-    check.whole(context, "branching", arguments.branching, low=2, high=16)
+    check.integer(context, "branching", arguments.branching, low=2, high=16)
     fields = _fields(arguments, arguments.bricks_bzyxc.dtype, "bricks_bzyxc constant_tnc")
     placement = _fields(arguments, torch.float64, "place_33")
     sizes = check.tensors(context, device, placement + fields)
-    check.whole(context, "max_depth", arguments.max_depth, low=0, high=62)
+    check.integer(context, "max_depth", arguments.max_depth, low=0, high=62)
     if arguments.branching**arguments.max_depth > config.MOST_NODES:
         raise ValueError(
             f"{context}: branching {arguments.branching} and max_depth {arguments.max_depth} make "
             f"more than 2^50 nodes a side"
         )
-    check.whole(context, "border", arguments.border, low=0, high=(sizes["s"] - 1) // 2)
+    check.integer(context, "border", arguments.border, low=0, high=(sizes["s"] - 1) // 2)
     check.number(context, "root_voxel", arguments.root_voxel, low=0, open_low=True)
     check.number(context, "step", arguments.step, low=0, open_low=True)
     check.number(context, "cone_scale", arguments.cone_scale, low=0)
@@ -99,8 +99,8 @@ def check_trace(
     if sizes["l"] < 1 or sizes["m"] < 2:
         got = check.describe(table)
         raise ValueError(f"{context}: table_lm4 needs at least 1 length and 2 rows, got {got}")
-    check.whole(context, "root", arguments.root, low=0, high=sizes["t"] * sizes["n"] - 1)
-    check.whole(context, "component", arguments.component, low=0, high=sizes["c"] - 1)
+    check.integer(context, "root", arguments.root, low=0, high=sizes["t"] * sizes["n"] - 1)
+    check.integer(context, "component", arguments.component, low=0, high=sizes["c"] - 1)
     check.number(context, "stop_alpha", arguments.stop_alpha, low=0, high=1)
     check.number(context, "depth_alpha", arguments.depth_alpha, low=0, high=1)
     return sizes
@@ -116,7 +116,7 @@ def check_shade(
     """Checks everything that a shader reads; `user_op` is true for a user's shader."""
     context = "shade_rays"
     kinds = ("",) if user_op else SHADER_KINDS
-    kind = kinds[check.whole(context, "shader", shading.shader, low=0, high=len(kinds) - 1)]
+    kind = kinds[check.integer(context, "shader", shading.shader, low=0, high=len(kinds) - 1)]
     sizes = check_trace(context, rays, arguments, "lmm4" if kind == "PreIntegrated" else "lm4")
     device, shape = rays.origin_r3.device, "k" if user_op else "54"
     parameters = ("parameter_54", parameter_54, shape, arguments.table_lm4.dtype)
@@ -135,7 +135,7 @@ def check_shade(
             if constants is not None:
                 fields.append((f"{name}_tnc", constants, f"tn{width}", bricks.dtype))
             other_width = check.tensors(context, device, fields, sizes).get("d", 0)
-            check.whole(context, f"bricks of {name}_bzyxc", len(bricks), low=0, high=sizes["b"])
+            check.integer(context, f"bricks of {name}_bzyxc", len(bricks), low=0, high=sizes["b"])
     colored = sizes["c"] in (4, 24) and arguments.component == 3
     if kind in ("StoredColor", "ShadowedColor") and not colored:
         raise ValueError(
@@ -148,11 +148,11 @@ def check_shade(
         raise ValueError(f"{context}: filtered colours need an other_bzyxc of {wanted}")
     expected = {"Features": other_width, "Projection": 1, "Labels": 1}.get(kind, 0)
     if user_op:
-        check.whole(context, "features", shading.features, low=0)
+        check.integer(context, "features", shading.features, low=0)
     else:
-        check.whole(context, "features", shading.features, low=expected, high=expected)
+        check.integer(context, "features", shading.features, low=expected, high=expected)
     high = max(0, other_width - 1)
-    check.whole(context, "other_component", shading.other_component, low=0, high=high)
+    check.integer(context, "other_component", shading.other_component, low=0, high=high)
 
 
 def _refuse_gradients(context: str, *records: Any) -> None:
@@ -213,7 +213,7 @@ def shade_rays(
     """
     check_shade(rays, arguments, shading, parameter_54, user_op=op is not None)
     if choose_backend(backend, rays.origin_r3.device) != "reference":
-        return op_of(op)(*rays, *arguments, *shading, parameter_54)
+        return shade_op(op)(*rays, *arguments, *shading, parameter_54)
     if op is not None:
         raise ValueError("shade_rays: a shader in C++ has no reference: write a ModuleShader")
     _refuse_gradients("shade_rays", rays, arguments, shading)
@@ -255,7 +255,7 @@ def trace_segments(
     if state_r3 is not None:
         fields = [("state_r3", state_r3, "r3", arguments.table_lm4.dtype)]
         check.tensors(context, device, fields, sizes)
-    check.whole(context, "limit", limit, low=0, high=2**31 - 1)
+    check.integer(context, "limit", limit, low=0, high=2**31 - 1)
     op_arguments = (*rays, *arguments, state_r3, limit, by_node)
     with torch.no_grad():
         if choose_backend(backend, device) == "reference":
@@ -280,7 +280,7 @@ def list_samples(segments: Segments) -> Samples:
     torch.cumsum(segments.counts[:, 1], 0, dtype=torch.int64, out=offset[1:])
     total = int(offset[-1])
     check.memory("list_samples", f"a list of {total} samples", 8 * total, device)
-    check.whole("list_samples", "the number of samples", total, low=0, high=2**31 - 1)
+    check.integer("list_samples", "the number of samples", total, low=0, high=2**31 - 1)
     first = count.cumsum(0) - count
     segment_index = torch.arange(len(count), device=device)
     segment = torch.repeat_interleave(segment_index, count, output_size=total)
@@ -354,7 +354,7 @@ def composite(
     device, dtype = alpha_k.device, alpha_k.dtype
     check_real(context, "alpha_k", alpha_k, "(k,)")
     length = len(offset_r) if check.instance(context, "offset_r", offset_r, Tensor).dim() else 0
-    rays = check.whole(context, "offset_r's length", length, low=1) - 1
+    rays = check.integer(context, "offset_r's length", length, low=1) - 1
     clear = alpha_k.new_ones(rays) if clear_r is None else clear_r
     fields = (
         ("alpha_k", alpha_k, "k", dtype),
@@ -371,7 +371,7 @@ def composite(
     return torch.ops.gvtorch.composite(*op_arguments)
 
 
-def op_of(name: str | None) -> Any:
+def shade_op(name: str | None) -> Any:
     """Returns the op of a user's shader, or for None that of the fused shaders."""
     if name is None:
         return torch.ops.gvtorch.shade_rays

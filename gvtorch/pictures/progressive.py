@@ -143,7 +143,7 @@ class Progressive:
         Raises:
             ValueError: `samples` is no whole number >= 1.
         """
-        target = check.whole("Progressive", "samples", samples, low=1)
+        target = check.integer("Progressive", "samples", samples, low=1)
         camera = as_camera("Progressive", camera)
         while True:
             picture = self.frame(camera)

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from ..base.messages import need_library
-from ..io.budget import MOST_PACKED, check_regular, header_budget
+from ..io.budget import MAX_UNPACK_RATIO, check_regular, header_budget
 from ..io.picture_size import picture_size
 from ..io.resources import amount, memory_free
-from ..io.source import told_as
+from ..io.source import convert_errors
 from ..io.tiff_info import check_pictures, opened_tiff
 from .tone import from_srgb
 
@@ -52,7 +52,7 @@ def read_image(path: str | Path) -> Tensor:
         raise ValueError(f"read_image: path must end in {', '.join(_READERS)}, got {str(path)!r}")
     if not path.exists():
         raise FileNotFoundError(f"image not found: {path}")
-    with told_as(ValueError, str(path), "can't be read"):
+    with convert_errors(ValueError, str(path), "can't be read"):
         check_regular(path)
         with header_budget(str(path)):
             pixels = _READERS[path.suffix](path)
@@ -92,7 +92,7 @@ def _read_png(path: Path) -> np.ndarray:
     if bits not in (8, 16) or color_type not in modes:
         raise ValueError("a PNG must have 8 or 16 bits and no palette")
     mode, channels = modes[color_type]
-    _check_size(path, (*size[::-1], channels), bits // 8, MOST_PACKED * path.stat().st_size)
+    _check_size(path, (*size[::-1], channels), bits // 8, MAX_UNPACK_RATIO * path.stat().st_size)
     read = read_image_png_u8 if bits == 8 else read_image_png_u16
     pixels = read(str(path), mode)
     return np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, -1) if color_type == 0 else pixels
@@ -148,7 +148,7 @@ def _check_exr(path: Path) -> None:
     shape = (lines, right - left + 1, count)
     if min(shape) < 1 or lines // 256 * 8 > size:
         raise ValueError(f"damaged: declares {shape} numbers in {size} bytes")
-    _check_size(path, shape, 1, MOST_PACKED * size * 4)
+    _check_size(path, shape, 1, MAX_UNPACK_RATIO * size * 4)
 
 
 def _attributes(header: bytes) -> Iterator[tuple[str, bytes]]:
@@ -185,7 +185,7 @@ def _read_tiff(path: Path) -> np.ndarray:
     need_library(".tif", "tifffile", extra="image")
     with opened_tiff(str(path)) as (file, _):
         series = file.series[0]
-        max_bytes = MOST_PACKED * path.stat().st_size
+        max_bytes = MAX_UNPACK_RATIO * path.stat().st_size
         _check_size(path, tuple(series.shape), series.dtype.itemsize, max_bytes)
         check_pictures(series.pages)
         return series.asarray()

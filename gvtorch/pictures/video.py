@@ -46,7 +46,7 @@ class Video:
             raise ValueError(f"Video: path must end in {', '.join(FILMS)}, got {str(path)!r}")
         if not self._path.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self._path.parent}")
-        check.whole("Video", "fps", fps, low=1, high=_MAX_GIF_FPS if suffix == ".gif" else 1000)
+        check.integer("Video", "fps", fps, low=1, high=_MAX_GIF_FPS if suffix == ".gif" else 1000)
         if suffix == ".mp4" and (width % 2 or height % 2):
             raise ValueError(f"Video: size must be even for .mp4, got {width}x{height}")
         self._stack = ExitStack()

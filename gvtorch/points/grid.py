@@ -84,12 +84,12 @@ class PointGrid:
         branching: int,
     ) -> PointGrid:
         """Returns the grid of a user's extent and box; without a box, one around all points."""
-        check.whole(context, "branching", branching, low=2, high=16)
+        check.integer(context, "branching", branching, low=2, high=16)
         low, high = check.box(context, _bounds(blocks) if box is None else box)
         extent = extent_in(context, extent, (low, high))
         if len(extent) != 3:
             raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
-        x, y, z = (check.whole(context, "extent", size, low=1, high=2**40) for size in extent)
+        x, y, z = (check.integer(context, "extent", size, low=1, high=2**40) for size in extent)
         return cls((x, y, z), low, high, branching)
 
     @property

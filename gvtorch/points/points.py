@@ -98,7 +98,7 @@ def _checked_array(name: str, value: Any) -> np.ndarray:
         if array.dtype != np.float32:
             array = array.astype(np.float64, copy=False)
     except (TypeError, ValueError, RuntimeError):
-        raise ValueError(f"Points: {name} must be numbers, got {check.shown(value)}") from None
+        raise ValueError(f"Points: {name} must be numbers, got {check.as_text(value)}") from None
     if not bool(np.isfinite(array).all()):
         raise ValueError(f"Points: {name} must be finite, got NaN or infinity")
     return array

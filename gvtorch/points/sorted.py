@@ -17,7 +17,7 @@ import numpy as np
 
 from ..base import check
 from ..base.stage import Progress, no_progress
-from ..base.whole_file import told_of
+from ..base.whole_file import errors_name
 from .grid import Codes, PointGrid, peak, point_shares
 from .points import Points
 from .table import Fold, Rows, Runs, Table, grouped
@@ -95,7 +95,7 @@ class SortedPoints:
                     int(level): Table.mapped(
                         folder,
                         f"{table_kind}_{int(level)}",
-                        check.whole("rows", "count", table_fields["count"], low=1),
+                        check.integer("rows", "count", table_fields["count"], low=1),
                         {
                             name: (str(d), tuple(s))
                             for name, (d, s) in table_fields["kinds"].items()
@@ -132,7 +132,7 @@ class SortedPoints:
         grid = dataclasses.asdict(self.grid)
         meta = {"version": _VERSION, "width": self.width, "grid": grid, **tables_by_kind}
         path = self.folder / _META
-        with told_of(path), path.open("w", encoding="utf-8") as file:
+        with errors_name(path), path.open("w", encoding="utf-8") as file:
             json.dump(meta, file)
             file.flush()
             os.fsync(file.fileno())

@@ -87,7 +87,7 @@ class N3Tree:
         """
         self.nodes, self.bricks = nodes, bricks
         self.branching = nodes.branching if branching is None else branching
-        check.whole("N3Tree", "branching", self.branching, low=2, high=nodes.branching)
+        check.integer("N3Tree", "branching", self.branching, low=2, high=nodes.branching)
         self.root, self.depth, self.extent, self.spacing = root, depth, extent, spacing
         self.origin = origin
         low = [o - 0.5 * s for o, s in zip(origin, spacing, strict=True)]
@@ -214,8 +214,8 @@ class N3Tree:
 
     def _check_words(self) -> None:
         nodes, last_slot = self.nodes, self.bricks.capacity - 1
-        check.words("N3Tree", "child_tn", nodes.child_tn, TERMINAL, nodes.capacity - 1)
-        check.words("N3Tree", "brick_tn", nodes.brick_tn, CONSTANT, last_slot)
+        check.integers_in("N3Tree", "child_tn", nodes.child_tn, TERMINAL, nodes.capacity - 1)
+        check.integers_in("N3Tree", "brick_tn", nodes.brick_tn, CONSTANT, last_slot)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restores a pickled tree. Raises ValueError if its pointers lead out of the pools."""
@@ -263,7 +263,7 @@ class N3Tree:
         build_device = choose_build_device(originals.values(), device)
         volumes = {name: volume.to(build_device) for name, volume in originals.items()}
         first = next(iter(volumes.values()))
-        check.whole("from_volume", "branching", branching, low=2, high=16)
+        check.integer("from_volume", "branching", branching, low=2, high=16)
         threshold = checked_threshold("from_volume", threshold, volumes)
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
         BrickPool(0, channels, brick_size=brick_size, border=border)  # its checks, before the work
@@ -376,7 +376,7 @@ class N3Tree:
         name = check.text(context, "channel", channel) or self.channel_names[0]
         if name not in self.bricks.channels or self.bricks.channels[name].coarse:
             raise ValueError(
-                f"{context}: the finest bricks have no channel {check.given(name)}; "
+                f"{context}: the finest bricks have no channel {check.quoted(name)}; "
                 f"the tree has {', '.join(self.channel_names)}"
             )
         return name

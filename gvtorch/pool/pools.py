@@ -36,7 +36,7 @@ class Channel:
         if self.dtype not in CHANNEL_DTYPES:
             names = ", ".join(str(dtype).removeprefix("torch.") for dtype in CHANNEL_DTYPES)
             raise ValueError(f"Channel: dtype must be one of {names}, got {self.dtype}")
-        check.whole("Channel", "width", self.width, low=1)
+        check.integer("Channel", "width", self.width, low=1)
 
     @classmethod
     def of(cls, volume: Volume) -> Channel:
@@ -204,8 +204,8 @@ class NodePool(_Pool):
         Raises:
             ValueError: A number is out of its range, or node indices would not fit into int32.
         """
-        check.whole("NodePool", "capacity", capacity, low=1)
-        check.whole("NodePool", "branching", branching, low=2, high=16)
+        check.integer("NodePool", "capacity", capacity, low=1)
+        check.integer("NodePool", "branching", branching, low=2, high=16)
         n = branching**3
         if capacity * n >= 2**31:
             raise ValueError(
@@ -278,13 +278,13 @@ class BrickPool(_Pool):
         Raises:
             ValueError: A number is out of its range, or there is no channel.
         """
-        check.whole("BrickPool", "capacity", capacity, low=0, high=2**31 - 1)
-        check.whole("BrickPool", "brick_size", brick_size, low=2, high=256)
-        check.whole("BrickPool", "border", border, low=0, high=16)
+        check.integer("BrickPool", "capacity", capacity, low=0, high=2**31 - 1)
+        check.integer("BrickPool", "brick_size", brick_size, low=2, high=256)
+        check.integer("BrickPool", "border", border, low=0, high=16)
         if not channels:
             raise ValueError("BrickPool: channels must name at least one channel")
         self.brick_size, self.border = brick_size, border
-        self.coarse = check.whole("BrickPool", "coarse", coarse, low=0, high=capacity)
+        self.coarse = check.integer("BrickPool", "coarse", coarse, low=0, high=capacity)
         self.channels = dict(channels)
         cube = (brick_size + 2 * border,) * 3
         self.bricks = {

@@ -20,23 +20,27 @@ from .producer import Bricks, Nodes, Producer, Region, Regions
 Form = TypeVar("Form", bound=Regions | Bricks)
 
 
-def checked_regions(answer: Any, nodes: Nodes, producer: Producer, *, look: bool = True) -> Regions:
+def checked_regions(
+    answer: Any, nodes: Nodes, producer: Producer, *, check_values: bool = True
+) -> Regions:
     """Returns a producer's answer to `classify(nodes)` as `Regions` on the layout's device. With
-    `look` false only types and shapes are checked, not values, and the host does not wait.
+    `check_values` false only types and shapes are checked, not values, and the host does not wait.
     """
     if isinstance(answer, Tensor):
         answer = Regions(kind=answer)
-    regions = _checked("classify", answer, Regions, "a tensor", nodes, producer, look)
+    regions = _checked("classify", answer, Regions, "a tensor", nodes, producer, check_values)
     return regions.each(lambda tensor: upload(tensor, nodes.layout.device))
 
 
-def checked_bricks(answer: Any, nodes: Nodes, producer: Producer, *, look: bool = True) -> Bricks:
+def checked_bricks(
+    answer: Any, nodes: Nodes, producer: Producer, *, check_values: bool = True
+) -> Bricks:
     """Returns a producer's answer to `fill(nodes)` as `Bricks`. Voxels stay where they are, unless
     some channels are on the host and others on the device: then all are copied to the device. For
-    `look` see `checked_regions`.
+    `check_values` see `checked_regions`.
     """
     wrapped = producer.as_bricks(answer)
-    bricks = _checked("fill", wrapped, Bricks, "a dict of tensors", nodes, producer, look)
+    bricks = _checked("fill", wrapped, Bricks, "a dict of tensors", nodes, producer, check_values)
     if len({on_host({name: rows}) for name, rows in bricks.data.items()}) == 1:
         return bricks
     device = nodes.layout.device
@@ -74,7 +78,7 @@ def _checked(
     alternative: str,
     nodes: Nodes,
     producer: Producer,
-    look: bool,
+    check_values: bool,
 ) -> Form:
     """Returns the answer with a width in every shape, and with an error for each bad item."""
     context = f"{type(producer).__name__}.{method}"
@@ -111,7 +115,7 @@ def _checked(
         name: _by_channel(context, name, by_channel, (count, *shapes[name]), producer)
         for name, by_channel in by_field.items()
     }
-    if not look:
+    if not check_values:
         _refuse_late(context, answer, [*fields.values()], layout.device)
         return answer_type(kind=kind, **fields)
     counts = _refuse_bad(answer_type, kind, [*fields.values()], errors)

@@ -16,7 +16,16 @@ from ..pool.pyramid import coarser
 from ..pool.staging import on_device
 from .answer import checked_bricks, checked_regions
 from .nodes import Layout, Nodes, grid_of
-from .producer import Bricks, OfProducers, Producer, Region, Regions, arrived, by_depth, touched
+from .producer import (
+    Bricks,
+    OfProducers,
+    Producer,
+    Region,
+    Regions,
+    by_depth,
+    changed_nodes,
+    wait_for,
+)
 
 _BATCH_BLOCKS = 64  # blocks of a level that are made together, from N^3 times as many below
 
@@ -56,7 +65,7 @@ class FromChildren(OfProducers):
             **grid_of(producer), channels=producer.channels, value_range=producer.value_range
         )
         self.producer, self.patience = producer, producer.patience
-        self.levels = check.whole(context, "levels", levels, low=1, high=10)
+        self.levels = check.integer(context, "levels", levels, low=1, high=10)
         self._cache: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by loc
         self._cached_version = producer.version  # the version that these blocks were made from
 
@@ -101,7 +110,7 @@ class FromChildren(OfProducers):
         if changes is None or not locs:
             self._cache.clear()
             return
-        stale = touched(changes, Nodes(torch.tensor(locs, device=layout.device), layout))
+        stale = changed_nodes(changes, Nodes(torch.tensor(locs, device=layout.device), layout))
         for row in stale.nonzero()[:, 0].tolist():
             del self._cache[locs[row]]
 
@@ -130,7 +139,7 @@ class FromChildren(OfProducers):
 
     def _producer_bricks(self, nodes: Nodes) -> Bricks:
         """Returns the producer's answer, checked."""
-        bricks = checked_bricks(arrived(self.producer.fill(nodes)), nodes, self.producer)
+        bricks = checked_bricks(wait_for(self.producer.fill(nodes)), nodes, self.producer)
         if bricks.kind is not None:
             self._refuse_alias(bricks.kind)
         return bricks
@@ -192,7 +201,7 @@ class FromChildren(OfProducers):
     def _make_blocks(self, layout: Layout, loc: Tensor) -> Blocks:
         """Makes the voxels of nodes of one level; where they are uniform, without making bricks."""
         nodes = Nodes(loc.to(layout.device), layout)
-        regions = checked_regions(arrived(self.producer.classify(nodes)), nodes, self.producer)
+        regions = checked_regions(wait_for(self.producer.classify(nodes)), nodes, self.producer)
         _raise_first(regions.errors)
         kind = regions.kind.cpu()
         self._refuse_alias(kind)

@@ -106,7 +106,7 @@ class FieldProducer(Producer):
             )
         self.field = field
         count = branching if samples is None else samples
-        self.samples = check.whole(context, "samples", count, low=1, high=64)
+        self.samples = check.integer(context, "samples", count, low=1, high=64)
         axis_offsets = (torch.arange(self.samples, dtype=torch.float64) + 0.5) / self.samples - 0.5
         self.register_buffer(
             "offsets", torch.cartesian_prod(axis_offsets, axis_offsets, axis_offsets)
@@ -312,7 +312,7 @@ def group_alike(
     center, layout = nodes.center, nodes.layout
     half_extent = nodes.voxel_size * (0.5 * layout.brick_size + layout.border + margin)
     name, part_keys = type(field).__name__, field.alike(center, half_extent)
-    if check.shown(part_keys) != f"({len(nodes)},) int64":
+    if check.as_text(part_keys) != f"({len(nodes)},) int64":
         got = check.describe(part_keys)
         raise ValueError(f"{name}.alike: must give ({len(nodes)},) int64 numbers, got {got}")
     _, group_index = part_keys.unique(return_inverse=True)
@@ -400,7 +400,7 @@ def _grid_around(context: str, field: Field | None, extent: int | Sequence[int])
     box = box.cpu()
     sides, middle = box[1] - box[0], box.mean(0)
     if isinstance(extent, int):
-        check.whole(context, "extent", extent, low=5, high=2**40)
+        check.integer(context, "extent", extent, low=5, high=2**40)
         voxel = sides.max() / (extent - 4)
         extent = [math.ceil(float(side / voxel) - 1e-9) + 4 for side in sides]
         half_size = torch.tensor(extent, dtype=torch.float64) * voxel / 2

@@ -54,8 +54,9 @@ class Hypertexture(Tally, Producer):
     can be coloured by a transfer function (`Isosurface(0.5, colors, color_channel="distance")`).
 
     Attributes:
-        wanted: Evaluations, octaves times voxels, that a plain sum would have needed so far.
-        made: Evaluations that were actually made.
+        plain_evaluations: Evaluations, octaves times voxels, that a plain sum would have needed so
+            far.
+        evaluations: Evaluations that were actually made.
         skip: Whether octaves are left out; may be changed at any time.
     """
 
@@ -135,7 +136,7 @@ class Hypertexture(Tally, Producer):
     @property
     def saved(self) -> float:
         """The share of octaves that were not evaluated, 0 to 1."""
-        return 1 - self.made / max(self.wanted, 1)
+        return 1 - self.evaluations / max(self.plain_evaluations, 1)
 
     def prepare(self, layout: Layout) -> None:
         """Computes the parameters of each level."""
@@ -155,7 +156,7 @@ class Hypertexture(Tally, Producer):
         weighted, variance = [], self.softness**2 / 5 + (side / self.thickness) ** 2 / 12
         for octave in self.octaves:
             cells = side * octave.frequency
-            weight = math.exp(-noise.LOST * cells * cells) if cells <= _MAX_CELLS else 0.0
+            weight = math.exp(-noise.MEAN_DECAY * cells * cells) if cells <= _MAX_CELLS else 0.0
             variance += octave.amplitude**2 * noise.VARIANCE * (1 - weight * weight)
             if weight:
                 weighted.append(octave._replace(amplitude=octave.amplitude * weight))
@@ -228,7 +229,7 @@ class Hypertexture(Tally, Producer):
         total = distance * (-1 / self.thickness)
         active = torch.arange(len(nodes), device=total.device)
         values = total.clone()
-        self._count(wanted=total.numel() * len(level.octaves))
+        self._count(plain_evaluations=total.numel() * len(level.octaves))
         for index, octave in enumerate(level.octaves):
             if self.skip:
                 edge_distance = (values - 0.5).abs().flatten(1).amin(1)
@@ -238,7 +239,7 @@ class Hypertexture(Tally, Producer):
                     active, values, points = active[needed], values[needed], points[needed]
             if not len(active):
                 break
-            self._count(made=values.numel())
+            self._count(evaluations=values.numel())
             values = values + octave.amplitude * noise.perlin(
                 points * octave.frequency, seed=octave.seed
             )

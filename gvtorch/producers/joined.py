@@ -18,7 +18,7 @@ from ..base import check
 from ..io.stores.channels import channel_names
 from ..io.stores.store import Store
 from .nodes import grid_of
-from .producer import Bricks, Nodes, OfProducers, Producer, Region, Regions, arrived
+from .producer import Bricks, Nodes, OfProducers, Producer, Region, Regions, wait_for
 from .stored import StoredProducer
 
 
@@ -209,7 +209,7 @@ def _when_all(answers: Mapping[str, Any], join: Callable[[Mapping[str, Any]], An
             if remaining:
                 return
         try:
-            joined.set_result(join({name: arrived(answer) for name, answer in answers.items()}))
+            joined.set_result(join({name: wait_for(answer) for name, answer in answers.items()}))
         except BaseException as error:  # a read that failed or was cancelled
             joined.set_exception(error)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..base import check
 from ..io.mesh_file import read_mesh
-from ..meshes.holes import once_filled, told_of_holes
+from ..meshes.holes import solid_when_filled, warning_of_holes
 from ..meshes.mesh import Mesh
 from ..meshes.voxelizer import CHANNELS, GridSettings, Voxelizer
 from ..pool import Channel
@@ -57,12 +57,12 @@ class MeshProducer(Producer):
         """
         check.instance("MeshProducer", "mesh", mesh, Mesh, str, Path)
         mesh = mesh if isinstance(mesh, Mesh) else read_mesh(mesh)
-        check.known("MeshProducer", settings, GridSettings)
+        check.known_options("MeshProducer", settings, GridSettings)
         solid = settings.get("solid", "auto")
-        if solid == "auto" and (warning := told_of_holes(mesh)):
+        if solid == "auto" and (warning := warning_of_holes(mesh)):
             warnings.warn(warning, stacklevel=2)
         grid = Voxelizer(mesh, channels=channels, **settings)
-        self._settings: GridSettings = {**settings, "solid": once_filled(solid)}
+        self._settings: GridSettings = {**settings, "solid": solid_when_filled(solid)}
         ranges = {"coverage": (0.0, 255.0), "distance": (-grid.band, grid.band)}
         super().__init__(
             grid.extent,

@@ -57,7 +57,7 @@ class OctaveProducer(Producer):
             kind = type(total).__name__
             raise ValueError(f"{context}: total must be a SplineSum or an OctaveSum, got {kind}")
         if isinstance(total, SplineSum):
-            check.halves(context, branching, "a SplineSum")
+            check.branching_two(context, branching, "a SplineSum")
         self._names = ["value"]
         if isinstance(total, OctaveSum) or values is not None:
             self._names.append("inherited")

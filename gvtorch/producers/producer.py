@@ -29,7 +29,7 @@ from ..pool.staging import TableRows, Voxels, on_device
 from .nodes import Layout, Nodes
 
 #: Returns (k,) bool: which of k nodes have changed, in their own voxels or in those below them.
-Where = Callable[[Nodes], Tensor]
+ChangeTest = Callable[[Nodes], Tensor]
 # Versions, shared by all producers: a later change has a larger one.
 _version_numbers = itertools.count(1)
 _MAX_CHANGES = 64  # changes that are kept; if more are asked for, everything may have changed
@@ -93,7 +93,7 @@ class Answer:
         return type(self)(**fields | others)
 
     def __repr__(self) -> str:
-        return check.brief(self)
+        return check.summary(self)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -222,7 +222,7 @@ class Producer(torch.nn.Module):
         sizes = tuple(extent) if isinstance(extent, Sequence) else (extent,) * 3
         if len(sizes) != 3:
             raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
-        x, y, z = (check.whole(context, "extent", size, low=1, high=2**40) for size in sizes)
+        x, y, z = (check.integer(context, "extent", size, low=1, high=2**40) for size in sizes)
         self.extent = (x, y, z)
         if box is not None:
             low, high = check.box(context, box)
@@ -230,8 +230,8 @@ class Producer(torch.nn.Module):
             origin = [a + 0.5 * s for a, s in zip(low, spacing, strict=True)]
         if isinstance(spacing, (int, float)):
             spacing = (spacing,) * 3
-        self.spacing, self.origin = check.placed(context, spacing, origin, self.extent)
-        self.branching = check.whole(context, "branching", branching, low=2, high=16)
+        self.spacing, self.origin = check.grid_placement(context, spacing, origin, self.extent)
+        self.branching = check.integer(context, "branching", branching, low=2, high=16)
         if channels is not None and not isinstance(channels, Mapping):
             kind = type(channels).__name__
             raise ValueError(f"{context}: channels must be Channel objects by name, got a {kind}")
@@ -254,7 +254,7 @@ class Producer(torch.nn.Module):
                     f"{context}: value_range[{name!r}] must be (smallest, largest), got {bounds!r}"
                 )
         self.made_of: dict[str, Any] = {}
-        self._changes: deque[tuple[int, Where | None]] = deque(maxlen=_MAX_CHANGES)
+        self._changes: deque[tuple[int, ChangeTest | None]] = deque(maxlen=_MAX_CHANGES)
 
     def prepare(self, layout: Layout) -> None:
         """Prepares for nodes of a layout. The engine calls it once, before any other method."""
@@ -282,7 +282,7 @@ class Producer(torch.nn.Module):
         """
         raise NotImplementedError(f"{type(self).__name__}: fill is not implemented")
 
-    def changed(self, where: Where | Tensor | Sequence[Any] | None = None) -> None:
+    def changed(self, where: ChangeTest | Tensor | Sequence[Any] | None = None) -> None:
         """Declares that the content has changed, for example to another time: in its next frame the
         engine drops what it holds of the changed nodes, and asks for them again.
 
@@ -299,13 +299,13 @@ class Producer(torch.nn.Module):
             if boxes.dim() not in (2, 3) or boxes.shape[-2:] != (2, 3):
                 raise ValueError(
                     f"{type(self).__name__}.changed: where must be (2, 3) or (m, 2, 3) corners, "
-                    f"got {check.shown(boxes)}"
+                    f"got {check.as_text(boxes)}"
                 )
             where = partial(Nodes.touch, boxes=boxes.view(-1, 2, 3))
         self.version = next(_version_numbers)
         self._changes.append((self.version, where))
 
-    def changes(self, since: int) -> list[Where] | None:
+    def changes(self, since: int) -> list[ChangeTest] | None:
         """Returns functions that find the nodes changed since a version; None: any may have."""
         newer = [finder for version, finder in self._changes if version > since]
         finders = [finder for finder in newer if finder is not None]
@@ -393,7 +393,7 @@ class Producer(torch.nn.Module):
             parent_loc, row = parent_loc.unique(dim=0, return_inverse=True)
             parent_bricks = self.bricks_at(parent_loc, layout)
             parents = {name: bricks[row] for name, bricks in parent_bricks.items()}
-        answer = arrived(self.fill(Nodes(loc, layout, parents=parents)))
+        answer = wait_for(self.fill(Nodes(loc, layout, parents=parents)))
         answer = self.as_bricks(answer)
         for message in answer.errors.values():
             raise ValueError(f"{type(self).__name__}.at: {message}")
@@ -437,7 +437,7 @@ class OfProducers(Producer):
         for part in self.parts().values():
             part.changed(where)
 
-    def changes(self, since: int) -> list[Where] | None:
+    def changes(self, since: int) -> list[ChangeTest] | None:
         """See `Producer.changes`; returns the changes of all parts."""
         part_changes = [
             part.changes(since) for part in self.parts().values() if part.version > since
@@ -478,11 +478,11 @@ def clocks_of(module: torch.nn.Module) -> list[Tensor]:
     return [buffer for name, buffer in module.named_buffers() if name.rpartition(".")[2] == "time"]
 
 
-def touched(changes: Sequence[Where], nodes: Nodes) -> Tensor:
+def changed_nodes(changes: Sequence[ChangeTest], nodes: Nodes) -> Tensor:
     """Returns (k,) bool: which nodes any of the changes affects."""
     return torch.stack([finder(nodes) for finder in changes]).any(0)
 
 
-def arrived(answer: Any) -> Any:
+def wait_for(answer: Any) -> Any:
     """Returns a producer's answer; waits for it if it is a future."""
     return answer.result() if isinstance(answer, Future) else answer

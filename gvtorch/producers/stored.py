@@ -19,7 +19,7 @@ import torch
 from numpy.lib.stride_tricks import as_strided
 
 from ..base import check
-from ..base.boxes import rows_by_place
+from ..base.boxes import group_rows
 from ..base.stage import stage
 from ..io.stores.store import Store
 from ..pool import Channel
@@ -168,7 +168,7 @@ class StoredProducer(Producer):
         """
         limit = check.nbytes("StoredProducer", "host_cache", host_cache)
         if workers is not None:
-            check.whole("StoredProducer", "workers", workers, low=1, high=64)
+            check.integer("StoredProducer", "workers", workers, low=1, high=64)
         seconds = check.number("StoredProducer", "timeout", timeout, low=0, open_low=True)
         if not isinstance(store, Store):
             store = Store.open(store, image=image, time=time, channels=channels)
@@ -291,7 +291,7 @@ class StoredProducer(Producer):
         store, grid = self.store, self.store.cell_grid(level)
         out = np.zeros((len(cells), 3, store.width), np.float32)
         errors: dict[int, str] = {}
-        tile_positions, tile_rows = rows_by_place(cells // _TILE_CELLS)
+        tile_positions, tile_rows = group_rows(cells // _TILE_CELLS)
         keys: list[Key] = [("cells", level, *tile) for tile in tile_positions.tolist()]
 
         def read(missing: list[Key]) -> dict[Key, ArrayOrMessage]:
@@ -353,7 +353,7 @@ class StoredProducer(Producer):
         is read.
         """
         cubes = _Cubes.of(self.store, layout)
-        cube_positions, cube_rows = rows_by_place(zyx // cubes.bricks_per_side)
+        cube_positions, cube_rows = group_rows(zyx // cubes.bricks_per_side)
         corner = zyx % cubes.bricks_per_side * cubes.brick_size + cubes.border - layout.border
         errors: dict[int, str] = {}
         timeout_message = ""

@@ -65,7 +65,7 @@ class VolumeProducer(Producer):
             check_filtered("VolumeProducer", filtered)
             name, last = str(filtered.other), first.width - 1
             label = "component of filtered"
-            check.whole("VolumeProducer", label, filtered.component, low=0, high=last)
+            check.integer("VolumeProducer", label, filtered.component, low=0, high=last)
             if name in channels:
                 raise ValueError(f"VolumeProducer: channel {name!r} is a volume's")
             channels[name] = filtered.colors(first.spacing)

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 
 from ..base import check
-from ..base.checked import Check, as_name, flag, instance_of, kind_of, or_none, positive
+from ..base.checked import Check, class_name, flag, instance_of, name_text, optional, positive
 from ..ops import ShadeArguments
 from ..ops.shading import (
     GradientMagnitudeNumbers,
@@ -65,7 +65,7 @@ class Lit(LitShader):
     transfer: TransferFunction
     checks: ClassVar[Mapping[str, Check]] = {
         "transfer": _TRANSFER_CHECK,
-        "in_the_way": or_none(instance_of(Shader)),
+        "in_the_way": optional(instance_of(Shader)),
     }
 
     def __init__(
@@ -120,8 +120,8 @@ class StoredColor(LitShader):
     shadowed_kind = "ShadowedColor"
     component = 3
     checks: ClassVar[Mapping[str, Check]] = {
-        "channel": as_name,
-        "reference": or_none(positive),
+        "channel": name_text,
+        "reference": optional(positive),
         "premultiplied": flag,
         "lit": flag,
     }
@@ -250,7 +250,7 @@ class Isosurface(LitShader):
 
     def _check_color(self) -> None:
         if (self.color is None or isinstance(self.color, TransferFunction)) == (self.other is None):
-            kind = kind_of(self)
+            kind = class_name(self)
             raise ValueError(
                 f"{kind}: a transfer function or color=None and color_channel belong together"
             )
@@ -426,7 +426,7 @@ class Features(Shader):
     kind = "Features"
     checks: ClassVar[Mapping[str, Check]] = {
         "transfer": _TRANSFER_CHECK,
-        "other": lambda owner, _, value: as_name(owner, "channel", value),
+        "other": lambda owner, _, value: name_text(owner, "channel", value),
     }
 
     def __init__(self, transfer: TransferFunction, channel: str) -> None:
@@ -448,7 +448,7 @@ class GradientMagnitude(Shader):
     transfer: TransferFunction
     checks: ClassVar[Mapping[str, Check]] = {
         "transfer": _TRANSFER_CHECK,
-        "full": or_none(a_number(low=1e-30)),
+        "full": optional(a_number(low=1e-30)),
     }
 
     def __init__(self, transfer: TransferFunction, full: Number | None = None) -> None:

@@ -65,7 +65,7 @@ class ChannelLook:
     opacity: float | None = None
     name: str = ""
 
-    __repr__ = check.brief
+    __repr__ = check.summary
 
     def function(self, place: int, count: int) -> TransferFunction:
         """Returns its transfer function, if it is the channel at index `place` of `count` channels.
@@ -183,7 +183,7 @@ class Channels(Shader):
                 f"got {len(chosen)}; choose some: components=[0, 1, ...]"
             )
         for component in chosen:
-            check.whole("Channels.of", "component", component, low=0, high=width - 1)
+            check.integer("Channels.of", "component", component, low=0, high=width - 1)
         infos = {c: info for c, info in enumerate(image.info.channels) if c in chosen}
         show_all = not any(info.active for info in infos.values()) or components is not None
         unset = [c for c in chosen if c not in infos or infos[c].window is None]
@@ -229,7 +229,7 @@ class Channels(Shader):
         for index, look in enumerate(looks):
             check.instance(context, f"channel {index}", look, ChannelLook)
             component = index if look.component is None else look.component
-            check.whole(context, f"component of channel {index}", component, low=0)
+            check.integer(context, f"component of channel {index}", component, low=0)
             function = look.function(index, len(looks))
             if look.visible:
                 visible.append((component, function))

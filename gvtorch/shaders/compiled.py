@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, instance_of, or_none
+from ..base.checked import Check, instance_of, optional
 from ..cpp_ext import user
 from ..ops import ShadeArguments
 from ..ops.registry import add_user_op
@@ -39,7 +39,7 @@ class CompiledShader(LitShader):
     """
 
     op: str
-    checks: ClassVar[Mapping[str, Check]] = {"transfer": or_none(instance_of(TransferFunction))}
+    checks: ClassVar[Mapping[str, Check]] = {"transfer": optional(instance_of(TransferFunction))}
 
     def __init__(
         self,

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, kind_of, whole_between
+from ..base.checked import Check, class_name, whole_between
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume
 from ..io.stores.coarse import make_channel
@@ -59,7 +59,7 @@ _BATCH_BRICKS = 4096  # bricks cut at a time
 
 def _check_filterable(owner: Any, name: str, value: Any) -> TransferFunction | Lit:
     """Checks that a value is a shader that can be filtered."""
-    context = kind_of(owner)
+    context = class_name(owner)
     if not isinstance(value, TransferFunction | Lit):
         got = type(value).__name__
         raise ValueError(f"{context}: {name} must be a TransferFunction or a Lit, got {got}")
@@ -143,7 +143,7 @@ class Filtered(Shader):
             ValueError: Tree and volume do not belong together, or an argument is out of its range.
         """
         check.instance("Filtered", "volume", volume, Volume)
-        check.whole("Filtered", "component", component, low=0, high=volume.width - 1)
+        check.integer("Filtered", "component", component, low=0, high=volume.width - 1)
         shader = cls(transfer, channel, component, directions=directions)
         if (volume.extent, volume.spacing) != (tree.extent, tree.spacing):
             raise ValueError(f"Filtered: tree and volume must have one placement: {tree}, {volume}")
@@ -202,7 +202,7 @@ class Filtered(Shader):
             OSError: It can't be read or written.
         """
         opened = store if isinstance(store, Store) else Store.open(store)
-        check.whole("Filtered", "component", component, low=0, high=opened.width - 1)
+        check.integer("Filtered", "component", component, low=0, high=opened.width - 1)
         shader = cls(transfer, channel, component, directions=directions)
         torch_device = check.device("Filtered", device)
         color_channel, made_of = shader.colors(opened.spacing), shader.made_of
@@ -245,7 +245,7 @@ class Filtered(Shader):
         opacity, color, reference, component = (coarse.made_of[name] for name in names)
         try:
             transfer = TransferFunction(opacity, color, reference)
-            check.whole("Filtered", "component", component, low=0, high=opened.width - 1)
+            check.integer("Filtered", "component", component, low=0, high=opened.width - 1)
         except ValueError as error:
             raise ValueError(f"{opened.location}: damaged: {channel!r}: {error}") from None
         shader = Lit(transfer) if lit else transfer

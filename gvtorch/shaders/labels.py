@@ -90,7 +90,9 @@ class Labels(LitShader):
         """Returns the arguments that differ from the defaults."""
         arguments = {"colors": self.colors, "visible": self.visible}
         parts = [
-            f"{name}={check.shown(value)}" for name, value in arguments.items() if value is not None
+            f"{name}={check.as_text(value)}"
+            for name, value in arguments.items()
+            if value is not None
         ]
         if isinstance(self.opacity, Mapping) or self.opacity < 1:
             parts.append(f"opacity={self.opacity}")
@@ -275,7 +277,7 @@ def _listed_colors(context: str, colors: Any) -> np.ndarray:
         colors = colors.detach().cpu().numpy()
     if isinstance(colors, np.ndarray):
         if colors.ndim != 2 or colors.shape[1] != 3:
-            raise ValueError(f"{context}: colors must be (k, 3), got {check.shown(colors)}")
+            raise ValueError(f"{context}: colors must be (k, 3), got {check.as_text(colors)}")
         rgb = colors.astype(np.float64)
         rgb = array_from_srgb(rgb / 255) if colors.dtype == np.uint8 else rgb
         if not ((rgb >= 0) & (rgb <= 1)).all():

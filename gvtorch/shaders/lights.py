@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, Checked, kind_of, whole_between
+from ..base.checked import Check, Checked, class_name, whole_between
 from ..ops import ShadeArguments
 from ..ops.shading import LightKind, Number, ShadeParameters, Triple, shader_number
 from ..pool import N3Tree
@@ -35,7 +35,7 @@ def a_number(low: float = -inf, high: float = inf) -> Check:
     """
 
     def checked(owner: Any, name: str, value: Any) -> Any:
-        context, number = kind_of(owner), value
+        context, number = class_name(owner), value
         check.no_gradient(context, name, value)
         if isinstance(value, Tensor):
             if value.numel() != 1:
@@ -58,7 +58,7 @@ def a_triple(low: float = -inf, high: float = inf, zero: bool = True) -> Check:
     """
 
     def checked(owner: Any, name: str, value: Any) -> Any:
-        context = kind_of(owner)
+        context = class_name(owner)
         check.no_gradient(context, name, value)
         if isinstance(value, Tensor) and value.is_cuda:
             if value.shape != (3,):
@@ -156,7 +156,7 @@ class LitShader(Shader):
     shadows = False
     shadowed_kind: str | None = None
     checks: ClassVar[Mapping[str, Check]] = {
-        "light": lambda owner, name, value: check_light(f"{kind_of(owner)}: {name}", value),
+        "light": lambda owner, name, value: check_light(f"{class_name(owner)}: {name}", value),
         **dict.fromkeys(_MATERIAL[:4], a_number(low=0)),
         "octaves": whole_between(0, MOST_OCTAVES),
         "anisotropy": a_number(low=-0.95, high=0.95),

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, instance_of, or_none, whole_between
+from ..base.checked import Check, instance_of, optional, whole_between
 from .shader import ColorTable, Sampling, Shader
 from .transfer_function import TransferFunction
 
@@ -52,8 +52,8 @@ class ModuleShader(Shader, torch.nn.Module):
     checks: ClassVar[Mapping[str, Check]] = {
         "module": lambda owner, name, value: _callable(value),
         "channels": lambda owner, name, value: _names(value),
-        "hidden_by": or_none(instance_of(TransferFunction)),
-        "samples": or_none(whole_between(PART_SAMPLES)),
+        "hidden_by": optional(instance_of(TransferFunction)),
+        "samples": optional(whole_between(PART_SAMPLES)),
     }
 
     def __init__(
@@ -136,7 +136,7 @@ class TransferModule(torch.nn.Module):
         self.rows = torch.nn.Parameter(table.table_lm4[0].clone())
 
     def __repr__(self) -> str:
-        return f"TransferModule(rows={check.shown(self.rows)}, from {self.low:g})"
+        return f"TransferModule(rows={check.as_text(self.rows)}, from {self.low:g})"
 
     def shows(self, values: Tensor) -> Tensor:
         """Returns which values have an opacity, a bool tensor of the same shape."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, Checked, as_name, flag, or_none, whole_between
+from ..base.checked import Check, Checked, flag, name_text, optional, whole_between
 from ..ops import ShadeArguments
 from ..ops.shading import Number, ShadeParameters, Triple, pack, shader_number
 from ..pool import N3Tree
@@ -112,10 +112,10 @@ class Shader(Checked):
     whole_ray: bool = False
     uses_torch: bool = False
     checks: ClassVar[Mapping[str, Check]] = {
-        "channel": or_none(as_name),
-        "component": or_none(whole_between(0)),
-        "normals": or_none(as_name),
-        "other": or_none(as_name),
+        "channel": optional(name_text),
+        "component": optional(whole_between(0)),
+        "normals": optional(name_text),
+        "other": optional(name_text),
         "other_component": whole_between(0),
         "shadows": flag,
     }
@@ -125,7 +125,7 @@ class Shader(Checked):
         names = ("channel", "normals", "transfer", "value", "which", "color", "other", "light")
         attributes = {name: getattr(self, name, None) for name in names}
         parts = [
-            f"{name}={check.shown(value)}"
+            f"{name}={check.as_text(value)}"
             for name, value in attributes.items()
             if value is not None
         ]
@@ -213,7 +213,9 @@ class Shader(Checked):
             )
         if self.other is not None:
             last = channels[self.other].width - 1
-            check.whole(context, "component of the colour", self.other_component, low=0, high=last)
+            check.integer(
+                context, "component of the colour", self.other_component, low=0, high=last
+            )
         bricks, constants = dict(tree.bricks.bricks), tree.nodes.constants
         if tree.depth == 0:  # the root is the finest level, so there are no coarse bricks
             bricks |= {

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
-from ..base.checked import Check, kind_of, or_none, positive
+from ..base.checked import Check, class_name, optional, positive
 from ..base.messages import one_line
-from ..base.whole_file import write_whole
+from ..base.whole_file import write_text
 from .preset_files import paraview_item, read_preset
 from .presets import CT_PRESETS, Points, preset_points
 from .shader import ColorTable, Sampling, Shader
@@ -54,9 +54,9 @@ class TransferFunction(Shader):
     reference: float | None
     relative = False
     checks: ClassVar[Mapping[str, Check]] = {
-        "opacity": lambda owner, name, points: _checked_points(kind_of(owner), name, points, 2),
-        "color": lambda owner, name, points: _checked_points(kind_of(owner), name, points, 4),
-        "reference": or_none(positive),
+        "opacity": lambda owner, name, points: _checked_points(class_name(owner), name, points, 2),
+        "color": lambda owner, name, points: _checked_points(class_name(owner), name, points, 4),
+        "reference": optional(positive),
     }
 
     def __init__(
@@ -172,7 +172,7 @@ class TransferFunction(Shader):
         """Writes the .json that `from_file` reads; ValueError if the path has another ending."""
         if Path(path).suffix != ".json":
             raise ValueError(f"TransferFunction.save: path must end in .json, got {str(path)!r}")
-        write_whole(Path(path), self.to_json() + "\n")
+        write_text(Path(path), self.to_json() + "\n")
 
     def to_json(self) -> str:
         """Returns the text that `from_json` reads."""
@@ -370,12 +370,12 @@ def _checked_points(context: str, name: str, points: Points, width: int) -> np.n
         raise ValueError(f"{context}: {name} must be a list of points {names}") from None
     if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != width:
         raise ValueError(
-            f"{context}: {name} must be a list of points {names}, got {check.given(points)}"
+            f"{context}: {name} must be a list of points {names}, got {check.quoted(points)}"
         )
     points = array.tolist()
     if not (np.abs(array) <= _LARGEST).all():
         raise ValueError(
-            f"{context}: {name} must be finite and at most {_LARGEST:g}, got {check.given(points)}"
+            f"{context}: {name} must be finite and at most {_LARGEST:g}, got {check.quoted(points)}"
         )
     steps = np.diff(array[:, 0])
     if (steps <= 0).any():
@@ -386,5 +386,7 @@ def _checked_points(context: str, name: str, points: Points, width: int) -> np.n
             "(for a jump use two values close to each other)"
         )
     if (array[:, 1:] < 0).any() or (array[:, 1:] > 1).any():
-        raise ValueError(f"{context}: {name} numbers must lie in [0, 1], got {check.given(points)}")
+        raise ValueError(
+            f"{context}: {name} numbers must lie in [0, 1], got {check.quoted(points)}"
+        )
     return array

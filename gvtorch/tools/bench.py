@@ -61,7 +61,7 @@ class Bench:
         import torch
         from rich.console import Console
 
-        from ..base.whole_file import write_whole
+        from ..base.whole_file import write_text
         from ..bench import run, tables
         from ..bench.record import Settings
 
@@ -86,7 +86,7 @@ class Bench:
         if self.output is not None:
             self.output.mkdir(parents=True, exist_ok=True)
             text = json.dumps(content, indent=1) + "\n"
-            write_whole(self.output / tables.file_name(content), text)
+            write_text(self.output / tables.file_name(content), text)
         if self.json:
             print(json.dumps(content), flush=True)
             return

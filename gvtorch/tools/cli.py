@@ -68,14 +68,16 @@ class Info:
             nan = options.pop("nan")
             with Bar() as bar:
                 bar("reading", 0, 0)
-                source = open_source(self.path, most=MAX_VOXELS, **options)
+                source = open_source(self.path, max_values=MAX_VOXELS, **options)
                 try:
                     content = volume_of(source, nan).describe()
                 except ValueError as error:
                     if "--labels" not in str(error):
                         raise
                     warnings.warn(f"{error}; shown as labels", stacklevel=2)
-                    source = open_source(self.path, most=MAX_VOXELS, **options | {"labels": True})
+                    source = open_source(
+                        self.path, max_values=MAX_VOXELS, **options | {"labels": True}
+                    )
                     content = volume_of(source, nan).describe()
             if source.times > 1:
                 content |= {"times": source.times, "time": source.time}

@@ -18,7 +18,7 @@ from tyro.conf import Positional
 from ..base.declared import declared_names
 from ..base.digits import whole_number
 from ..base.messages import one_line, printable
-from ..base.whole_file import write_whole
+from ..base.whole_file import write_text
 from ..io.stores.ngff import is_zarr
 from .common import Bar, check_outputs, flags_given, option, size, volume_formats
 from .drawn import Drawn
@@ -280,16 +280,16 @@ class Fly:
         """Returns the number of pictures, and pictures a second."""
         from ..base import check
 
-        fps = check.whole("fly", "--fps", 25 if self.fps is None else self.fps, low=1, high=1000)
+        fps = check.integer("fly", "--fps", 25 if self.fps is None else self.fps, low=1, high=1000)
         if self.keys is not None:
             count = self._bare_flight.count(fps) if self.frames is None else self.frames
-            return check.whole("fly", "--frames", count, low=1), fps
+            return check.integer("fly", "--frames", count, low=1), fps
         if self.turntable is None:
             if self.fps is not None and self.output.suffix not in _FILMS:
                 raise ValueError("--fps is for a film or --turntable: pictures have no speed")
             most = 100 if self.times is None else len(self._moments())
             frames = most if self.frames is None else self.frames
-            return check.whole("fly", "--frames", frames, low=1), fps
+            return check.integer("fly", "--frames", frames, low=1), fps
         if self.frames is not None:
             raise ValueError(
                 "--turntable and --frames both set the number of pictures: leave one out"
@@ -391,4 +391,4 @@ class _Kept:
     def tell(self, stats: Path) -> None:
         """Writes the statistics of the pictures, if there are any."""
         if self.lines:
-            write_whole(stats, "".join(self.lines))
+            write_text(stats, "".join(self.lines))

@@ -14,7 +14,7 @@ import tyro
 from tyro.conf import Positional
 
 from ..base.messages import printable
-from ..base.whole_file import write_whole
+from ..base.whole_file import write_text
 from .common import Bar, check_outputs, flags_given, option, size, volume_formats
 from .drawn import Drawn
 from .look import parse_camera
@@ -48,7 +48,7 @@ class Develop:
         from ..pictures import Progressive
         from ..pictures.tone import checked_curve
 
-        check.whole("render", "--samples", self.samples, low=1)
+        check.integer("render", "--samples", self.samples, low=1)
         checked_curve("render", self.tone, self.exposure)
 
         def developed(camera: Camera) -> Picture:
@@ -113,7 +113,7 @@ class Render:
                 stats = self._take_saved(opened, now, bar)
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": opened.data.extent}
-            write_whole(self.stats, json.dumps(content, indent=2) + "\n")
+            write_text(self.stats, json.dumps(content, indent=2) + "\n")
         print(f"{printable(self.output)}: {width}x{height}, {cost_in_words(stats)}")
 
     def _at_saved_time(self) -> SceneFlags:

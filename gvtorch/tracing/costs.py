@@ -23,7 +23,7 @@ from ..pool import N3Tree
 from ..shaders.module import TransferModule
 from ..shaders.shader import Shader
 from ..shaders.transfer_function import TransferFunction
-from .around import with_effects
+from .effects import with_effects
 from .options import RenderOptions, RenderSettings, render_options
 from .pixels import View, tree_stats, using
 from .tracer import Batch, Tracer, march

@@ -79,16 +79,16 @@ class Lighting:
         for number, light in enumerate(self.lights or ()):
             check_light(f"{context}: lights[{number}]", light)
         check.number(context, "shadows", self.shadows, low=0, high=1)
-        check.whole(context, "shadow_cones", self.shadow_cones, low=1, high=1024)
+        check.integer(context, "shadow_cones", self.shadow_cones, low=1, high=1024)
         check.number(context, "occlusion", self.occlusion, low=0, high=1)
         check.number(context, "indirect", self.indirect, low=0)
-        check.whole(context, "cones", self.cones, low=1, high=1024)
+        check.integer(context, "cones", self.cones, low=1, high=1024)
         if self.reach is not None:
             check.number(context, "reach", self.reach, low=0, open_low=True)
         object.__setattr__(self, "frame", Frame.of(context, self.frame))
         a_triple(low=0)(self, "ambient", self.ambient)
 
-    __repr__ = check.brief
+    __repr__ = check.summary
 
     def placed(self, box: Tensor) -> Lighting:
         """Returns the lighting with its reach in world units, given the scene's (2, 3) box."""

@@ -76,7 +76,7 @@ class RenderOptions:
                 f"got {self.depth_alpha} and {self.stop_alpha}"
             )
         check.number(context, "cone_scale", self.cone_scale, low=0, open_low=True)
-        check.whole(context, "component", self.component, low=0)
+        check.integer(context, "component", self.component, low=0)
         kinds = dict(channel=str, clip=Clip, layer=Layer, lens=ThinLens, lighting=Lighting)
         for name, kind in kinds.items():
             if getattr(self, name) is not None:
@@ -87,7 +87,7 @@ class RenderOptions:
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{context}: dtype must be float32 or float64, got {self.dtype}")
 
-    __repr__ = check.brief
+    __repr__ = check.summary
 
 
 class RenderSettings(TypedDict, total=False):
@@ -116,7 +116,7 @@ def render_options(
     """Returns a user's options, with the layer cut to the camera if there is one. Raises ValueError
     if one is unknown, of the wrong type or out of its range, or does not fit the camera's pictures.
     """
-    check.known(context, settings, RenderSettings)
+    check.known_options(context, settings, RenderSettings)
     options = RenderOptions(**settings)
     if camera is None:
         return options

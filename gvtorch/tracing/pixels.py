@@ -27,8 +27,8 @@ from ..ops.trace import choose_backend
 from ..pictures.background import Background
 from ..pictures.picture import Picture
 from ..pool import N3Tree
-from .around import with_effects
 from .composite import TraceRays, nothing_like
+from .effects import with_effects
 from .options import RenderOptions, RenderSettings, render_options
 from .tracer import Tracer
 from .trees import Shaders, box_around, trace_trees, tree_traces

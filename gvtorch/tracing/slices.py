@@ -198,8 +198,8 @@ class _PlaneReader:
         context = "slice_picture"
         self.data, self.component = data, component
         is_store = isinstance(data, Store)
-        check.whole(context, "component", component, low=0, high=data.width - 1)
-        self.level = check.whole(context, "level", level, low=0)
+        check.integer(context, "component", component, low=0, high=data.width - 1)
+        self.level = check.integer(context, "level", level, low=0)
         if level and not is_store:
             raise ValueError(f"{context}: level is for stores, a volume has one, got {level}")
         extent = data.level_extent(level) if isinstance(data, Store) else data.extent
@@ -224,7 +224,7 @@ class _PlaneReader:
         if isinstance(at, float):
             fraction = check.number(context, "at", at, low=0, high=1)
             return min(int(fraction * count), count - 1)
-        return check.whole(context, f"at along {axis}", at, low=0, high=count - 1)
+        return check.integer(context, f"at along {axis}", at, low=0, high=count - 1)
 
     def _index_at_position(self, axis: str, text: str) -> int:
         """Returns the index of the voxel at a world position, as in "12.5mm"."""

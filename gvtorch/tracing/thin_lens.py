@@ -45,7 +45,7 @@ class ThinLens:
         check.number("ThinLens", "focus", self.focus, low=0, open_low=True)
         object.__setattr__(self, "frame", Frame.of("ThinLens", self.frame))
 
-    __repr__ = check.brief
+    __repr__ = check.summary
 
     def placed(self, box: Tensor) -> ThinLens:
         """Returns the lens in world units, given the (2, 3) box of the scene."""

@@ -164,7 +164,7 @@ def _checked_channel(tree: N3Tree, shader: Shader, options: RenderOptions) -> st
     channel = check.text("render", "channel", shader.channel) or options.channel or first_channel
     if channel not in channels:
         names = ", ".join(tree.channel_names)
-        raise ValueError(f"render: unknown channel {check.given(channel)}; the tree has {names}")
+        raise ValueError(f"render: unknown channel {check.quoted(channel)}; the tree has {names}")
     if channels[channel].coarse:
         raise ValueError(f"render: only coarse bricks have channel {channel!r}")
     other_channel = channels.get(str(shader.other))

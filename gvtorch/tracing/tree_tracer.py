@@ -18,7 +18,7 @@ from ..base.records import Rays
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
 from ..ops import RayArguments, ShadeArguments, TraceArguments, unavailable
-from ..ops.trace import op_of
+from ..ops.trace import shade_op
 from ..pool import N3Tree
 from ..shaders.shader import Shader, check_shader
 from .options import RenderOptions
@@ -79,7 +79,7 @@ class TreeTracer(torch.nn.Module):
         tracer = Tracer(tree, shader, options)
         arguments, shading = tracer.arguments, tracer.shading or ShadeArguments()
         width = arguments.bricks_bzyxc.shape[4]
-        check.whole("TreeTracer", "component", arguments.component, low=0, high=width - 1)
+        check.integer("TreeTracer", "component", arguments.component, low=0, high=width - 1)
         arguments = arguments._replace(
             stamp_t=arguments.stamp_t.clone(),  # not the tree's: frames are counted separately
             stamp_b=arguments.stamp_b.clone(),
@@ -89,7 +89,7 @@ class TreeTracer(torch.nn.Module):
         self.plain = tracer.shading is None  # the kernel of `trace_rays` draws it
         if not self.plain:
             parameters = shader.parameter_tensor(tree, options.dtype)
-        self.shade_rays = op_of(shader.op)
+        self.shade_rays = shade_op(shader.op)
         for name, value in {**arguments._asdict(), **shading._asdict()}.items():
             if isinstance(value, (int, float)):
                 setattr(self, name, value)
@@ -253,8 +253,8 @@ def _check_words(tensors: Mapping[str, Any], prefix: str) -> None:
     if not all(isinstance(pool, Tensor) for pool in pools):
         return  # only some tensors are loaded: kernels treat such words as absent
     child, brick, bricks = pools
-    check.words("TreeTracer", f"{prefix}child_tn", child, config.TERMINAL, len(child) - 1)
-    check.words("TreeTracer", f"{prefix}brick_tn", brick, config.CONSTANT, len(bricks) - 1)
+    check.integers_in("TreeTracer", f"{prefix}child_tn", child, config.TERMINAL, len(child) - 1)
+    check.integers_in("TreeTracer", f"{prefix}brick_tn", brick, config.CONSTANT, len(bricks) - 1)
 
 
 def _unflatten(rows: Tensor, leading: list[int]) -> Tensor:

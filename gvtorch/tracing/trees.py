@@ -28,8 +28,8 @@ from ..shaders.built_in import Lit
 from ..shaders.filtered import Filtered
 from ..shaders.shader import Shader, check_shader
 from ..shaders.transfer_function import TransferFunction
-from .around import with_effects
 from .composite import TraceRays, box_span, nothing_like, over
+from .effects import with_effects
 from .options import RenderOptions
 from .pose import poses_of, world_box
 from .tracer import Batch, Tracer

@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ..tracing import Clip, Lighting, RenderOptions, ThinLens
-from ..tracing.around import check_fits
+from ..tracing.effects import check_fits
 from .state import ViewState, costed
 
 _DEFAULTS = RenderOptions()

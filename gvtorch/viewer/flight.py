@@ -25,7 +25,7 @@ from torch import Tensor
 from ..base import check
 from ..base.messages import one_line
 from ..base.smooth import Smooth
-from ..base.whole_file import write_whole
+from ..base.whole_file import write_text
 from ..cameras import Camera
 from ..cameras.motion import Motion
 from .state import Eye, ViewState, saved_state
@@ -125,7 +125,7 @@ class Flight:
         if Path(path).suffix != ".json":
             raise ValueError(f"Flight: path must end in .json, got {str(path)!r}")
         content = [{"time": time, "state": state.to_json()} for time, state in self.keys]
-        write_whole(Path(path), json.dumps(content, indent=1) + "\n")
+        write_text(Path(path), json.dumps(content, indent=1) + "\n")
 
     @property
     def seconds(self) -> float:
@@ -166,7 +166,7 @@ class Flight:
             frames: Number of pictures, evenly spaced, instead of `fps`.
         """
         count = (
-            self.count(fps) if frames is None else check.whole("Flight", "frames", frames, low=1)
+            self.count(fps) if frames is None else check.integer("Flight", "frames", frames, low=1)
         )
         steps = max(1, count if self.closed else count - 1)
         for n in range(count):

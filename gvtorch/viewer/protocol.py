@@ -31,7 +31,9 @@ class Hello:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            check.whole("hello", name, getattr(self, name), low=_SIDE_RANGE[0], high=_SIDE_RANGE[1])
+            check.integer(
+                "hello", name, getattr(self, name), low=_SIDE_RANGE[0], high=_SIDE_RANGE[1]
+            )
         check.number("hello", "rate", self.rate, low=1, high=240)
 
 
@@ -51,7 +53,7 @@ class Ack:
     number: int
 
     def __post_init__(self) -> None:
-        check.whole("ack", "number", self.number, low=0, high=2**53)
+        check.integer("ack", "number", self.number, low=0, high=2**53)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +156,7 @@ class Still:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            check.whole("still", name, getattr(self, name), low=_SIDE_RANGE[0], high=16384)
+            check.integer("still", name, getattr(self, name), low=_SIDE_RANGE[0], high=16384)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,7 +169,7 @@ class Surface:
 
     def __post_init__(self) -> None:
         check.number("surface", "value", self.value)
-        check.whole("surface", "level", self.level, low=0)
+        check.integer("surface", "level", self.level, low=0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from ..engine import Engine, EngineOptions, FrameStats
 from ..io.reading import open_source, read_volume
 from ..io.stores.ngff import is_zarr
 from ..io.stores.store import Store
-from ..io.window import looked_at, window
+from ..io.window import sample_values, window
 from ..ops import unavailable
 from ..pictures import Picture
 from ..pool import N3Tree
@@ -154,7 +154,7 @@ class Scene:
         """
         values = self._values_in_view(component) if in_view or self.data is None else None
         if values is None and self.data is not None:
-            values = looked_at(self.data)[..., component].ravel()
+            values = sample_values(self.data)[..., component].ravel()
         if values is None or not len(values):
             return {"low": 0.0, "high": 1.0, "counts": [0] * BINS}
         low, high = float(values.min()), float(values.max())

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..base.messages import one_line
 from ..base.volume import Volume
-from ..io.http import ask_again
+from ..io.http import retry_refused
 from ..io.stores.store import Store
 from ..io.window import window
 from ..pictures import Picture
@@ -287,7 +287,7 @@ class Planes:
 
     def retry(self) -> None:
         """Allows planes that could not be read to be read again."""
-        ask_again()
+        retry_refused()
         self._failures.clear()
 
     def close(self) -> None:

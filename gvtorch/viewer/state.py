@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.messages import one_line
-from ..base.whole_file import write_whole
+from ..base.whole_file import write_text
 from ..cameras import Camera
 from ..cameras.models import MODELS, CameraModel, model_of
 from ..engine import Engine
@@ -122,7 +122,7 @@ class Development:
     exposure: float = 0.0
 
     def __post_init__(self) -> None:
-        check.whole("Development", "samples", self.samples, low=1, high=4096)
+        check.integer("Development", "samples", self.samples, low=1, high=4096)
         checked_curve("Development", self.tone, self.exposure)
 
     def develop(self, picture: Picture) -> Picture:
@@ -185,7 +185,7 @@ class ViewState:
     camera: Eye | None = None
 
     def __post_init__(self) -> None:
-        check.whole("ViewState", "component", self.component, low=0)
+        check.integer("ViewState", "component", self.component, low=0)
         check.number("ViewState", "blend", self.blend, low=0, high=1)
         check.number("ViewState", "time", self.time)
         if self.component != self.options.component:
@@ -243,7 +243,7 @@ class ViewState:
         if Path(path).suffix != ".json":
             raise ValueError(f"state: path must end in .json, got {str(path)!r}")
         text = json.dumps(self.to_json(), indent=1)
-        write_whole(Path(path), text + "\n")
+        write_text(Path(path), text + "\n")
 
     def read(self, path: str | Path) -> ViewState:
         """Returns the state with the fields of a .json file in place of its own.

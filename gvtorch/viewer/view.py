@@ -119,7 +119,7 @@ def view(
         ImportError: `gvtorch[view]` is not installed.
     """
     aiohttp_web()
-    check.whole("view", "port", port, low=0, high=65535)
+    check.integer("view", "port", port, low=0, high=65535)
     session = new_session(what, shader, camera, up=up, state=state, engine=engine, **options)
     if in_notebook() and wait is None and browser is None:
         from .notebook import widget

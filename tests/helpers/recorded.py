@@ -92,13 +92,13 @@ class Frames:
 
     def frame(self) -> tuple[gv.Hits, gv.FrameStats]:
         with self.engine.new_frame(self.view.options) as stats:
-            self.engine.release(but=self.served)
+            self.engine.release(keep=self.served)
             self.engine.readbacks.take_arrived()
             stale, ahead = self.engine.frames != self.number, self.ahead
             steady = self.engine.steady and not (ahead and ahead.due)
             if self.served.begin(stale, steady, stats):
                 self.served.serve()
-                for _ in range(self.served.deeper(self.engine.readbacks)):
+                for _ in range(self.served.extra_levels(self.engine.readbacks)):
                     self.served.deepen()
             self.engine.number_picture(on_device=False)
             self.number = self.engine.frames

@@ -2,13 +2,13 @@
 seed, periodic on request, float32 or float64, and its bounds are known.
 """
 
-from .basis import LOST, VARIANCE, Bounds, bounds, cellular, perlin, simplex, value
+from .basis import MEAN_DECAY, VARIANCE, Bounds, bounds, cellular, perlin, simplex, value
 from .fractal import fbm, fbm_bounds, ridged, turbulence, warp
 from .levels import OctaveSum, inherit
 from .spline import SplineSum
 
 __all__ = [
-    "LOST",
+    "MEAN_DECAY",
     "VARIANCE",
     "Bounds",
     "OctaveSum",

@@ -35,9 +35,9 @@ Points = Tensor | Sequence[Tensor]
 Period = int | Sequence[int] | None
 Feature = Literal["F1", "F2", "F2-F1"]
 FEATURES: tuple[Feature, ...] = ("F1", "F2", "F2-F1")
-#: The mean of gradient noise over a cube is about exp(-LOST * (side / cell)^2) times the noise at
-#: its centre: fitted, within 0.03 for cubes of up to 1.5 cells.
-LOST = 0.82
+#: The mean of gradient noise over a cube is about exp(-MEAN_DECAY * (side / cell)^2) times the
+#: noise at its centre: fitted, within 0.03 for cubes of up to 1.5 cells.
+MEAN_DECAY = 0.82
 #: Mean square of gradient noise in 3D.
 VARIANCE = 0.0728
 
@@ -121,7 +121,7 @@ def cellular(
     """
     context = "noise.cellular"
     check.number(context, "jitter", jitter, low=0, high=1)
-    check.whole(context, "reach", reach, low=1, high=2)
+    check.integer(context, "reach", reach, low=1, high=2)
     check.one_of(context, "feature", feature, FEATURES)
     return at_points(context, feature, points, seed, period, jitter=jitter, reach=reach)
 
@@ -158,7 +158,7 @@ def periods(context: str, period: Period, n: int, multiple: int = 1) -> tuple[in
     if len(axis_periods) != n:
         raise ValueError(f"{context}: period must be an int or {n} of them, got {period!r}")
     for axis_period in axis_periods:
-        check.whole(context, "period", axis_period, low=1, high=2**28)
+        check.integer(context, "period", axis_period, low=1, high=2**28)
         if axis_period % multiple:
             raise ValueError(f"{context}: period must be a multiple of {multiple}, got {period!r}")
     return axis_periods

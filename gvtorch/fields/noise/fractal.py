@@ -48,16 +48,16 @@ class Tally:
     a function that changes one at each call.
 
     Attributes:
-        made: Units that were evaluated so far.
-        wanted: Units that were asked for, whether they had to be evaluated or not.
+        evaluations: Units that were evaluated so far.
+        plain_evaluations: Units that were asked for, whether they had to be evaluated or not.
     """
 
-    made = wanted = 0
+    evaluations = plain_evaluations = 0
 
-    def _count(self, made: int = 0, wanted: int = 0) -> None:
+    def _count(self, evaluations: int = 0, plain_evaluations: int = 0) -> None:
         if not torch.compiler.is_compiling():
-            self.made += made
-            self.wanted += wanted
+            self.evaluations += evaluations
+            self.plain_evaluations += plain_evaluations
 
 
 def octaves_of(
@@ -70,10 +70,10 @@ def octaves_of(
         ValueError: There are none, more than 64, or a number is not positive.
     """
     check.number(context, "frequency", frequency, low=0, open_low=True)
-    check.whole(context, "octaves", octaves, low=1, high=64)
+    check.integer(context, "octaves", octaves, low=1, high=64)
     check.number(context, "lacunarity", lacunarity, low=0, open_low=True)
     check.number(context, "gain", gain, low=0, open_low=True)
-    check.whole(context, "seed", seed, low=-(2**62), high=2**62)
+    check.integer(context, "seed", seed, low=-(2**62), high=2**62)
     return [
         Octave(gain**index, lacunarity**index * frequency, seed + index * _NEXT_OCTAVE)
         for index in range(octaves)

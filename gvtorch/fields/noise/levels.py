@@ -63,8 +63,8 @@ def inherit(
         shape = f"({len(parents)}, 3)"
         raise ValueError(f"{context}: child must be {shape} int64, got {check.describe(child)}")
     side = parents.shape[1]
-    check.whole(context, "border", border, low=1, high=(side - 1) // 2)
-    check.whole(context, "points", points, low=2, high=side)
+    check.integer(context, "border", border, low=1, high=(side - 1) // 2)
+    check.integer(context, "points", points, low=2, high=side)
     weights = _weights(side, border, branching, points, parents.dtype, parents.device)
     x, y, z = (weights[child[:, axis]] for axis in range(3))  # (k, s, s) each
     values = parents.flatten(1, 2) @ x.mT  # along x
@@ -78,8 +78,8 @@ class OctaveSum(Tally):
 
     Attributes:
         octaves: All of them.
-        made: Evaluations, octaves times voxels, so far.
-        wanted: Evaluations that a plain sum would have needed.
+        evaluations: Evaluations, octaves times voxels, so far.
+        plain_evaluations: Evaluations that a plain sum would have needed.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class OctaveSum(Tally):
         settled_octaves = self._octaves_wider(side, self.settled)
         octaves = self.held(side)
         size = axes[0].shape[0] * axes[0].shape[1] * axes[1].shape[1] * axes[2].shape[1]
-        self._count(wanted=size * len(octaves))
+        self._count(plain_evaluations=size * len(octaves))
         if parents is None or child is None or not inherited:
             settled = self._evaluate(axes, settled_octaves)
         else:
@@ -161,7 +161,7 @@ class OctaveSum(Tally):
         positions = as_points("noise.OctaveSum", axes)
         for octave in octaves:
             total += octave.amplitude * perlin(positions * octave.frequency, seed=octave.seed)
-            self._count(made=total.numel())
+            self._count(evaluations=total.numel())
         return total
 
 

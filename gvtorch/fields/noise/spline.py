@@ -40,8 +40,8 @@ class SplineSum(Tally):
 
     Attributes:
         octaves: All of them.
-        made: Random numbers that were made so far.
-        wanted: Random numbers that the same bricks would have needed without parents.
+        evaluations: Random numbers that were made so far.
+        plain_evaluations: Random numbers that the same bricks would have needed without parents.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class SplineSum(Tally):
             ValueError: No octave's cells are as wide as the level's voxels, or N is not 2.
         """
         context = "noise.SplineSum"
-        check.halves(context, branching, "sums of splines")
+        check.branching_two(context, branching, "sums of splines")
         steps = math.log2(side * self.octaves[0].frequency)
         if abs(steps - round(steps)) > _TOLERANCE:
             raise ValueError(
@@ -100,7 +100,7 @@ class SplineSum(Tally):
                 (coordinate + border) // inner // 2 * inner - border for coordinate in low
             ]
             values = self._add_octave(_refine(parents, parent_low, low, size), low, side)
-        self._count(wanted=len(values) * self._random_count(size, side))
+        self._count(plain_evaluations=len(values) * self._random_count(size, side))
         return values, values
 
     def _sum_from_coarsest(self, low: Sequence[Tensor], size: int, side: float) -> Tensor:
@@ -124,7 +124,7 @@ class SplineSum(Tally):
                 bits = twin.join(x[:, None], y[:, :, None])
                 bits = twin.join(bits[:, None], z[:, :, None, None])
                 values = values + bits.to(values.dtype) * (octave.amplitude * 2.0**-31)
-                self._count(made=values.numel())
+                self._count(evaluations=values.numel())
         return values
 
     def _random_count(self, size: int, side: float) -> int:

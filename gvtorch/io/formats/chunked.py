@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...base.image_info import ImageInfo
-from ...base.named_axes import ask_axes, even_steps, named_axes, place_named
+from ...base.named_axes import ask_axes, even_steps, grid_placement, named_axes
 from ...base.units import spacing_of
 from ..source import Index, Triple, VolumeSource
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
@@ -120,7 +120,7 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
     names = [str(name or "") for name in names] if isinstance(names, list) else []
     steps: list[tuple[float, float] | None] = [None] * len(shape)
     units: list[str | None] = [None] * len(shape)
-    axis_order, lost = None, []
+    axis_order, dropped = None, []
     if len(names) == len(shape):
         axis_order = named_axes(names, shape) if axes is None else None
         for axis, name in enumerate(names):
@@ -139,14 +139,14 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
                     )
                     steps[axis], is_even = even_steps(values)
                     units[axis] = str(_read_attributes(str(sibling)).get("units", "")) or None
-                    lost += (
+                    dropped += (
                         [] if is_even else [f"that coordinates along {name} are not evenly spaced"]
                     )
     axis_order = axis_order or ask_axes(path, shape, axes)
-    placement, info_fields = place_named(axis_order, shape, steps, units)
+    placement, info_fields = grid_placement(axis_order, shape, steps, units)
     quantity = attributes.get("units")
     info = ImageInfo(quantity=quantity if isinstance(quantity, str) else None, **info_fields)
-    return replace(source, axes=axis_order, info=info, lost=tuple(lost), **placement)
+    return replace(source, axes=axis_order, info=info, dropped=tuple(dropped), **placement)
 
 
 def _is_n5(path: str) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from ...base.digits import finite_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels, from_hex
 from ...base.units import NO_DEPTH, spacing_of
-from ..source import Index, Told, VolumeSource
+from ..source import FileMetadata, Index, VolumeSource
 from .format import Format, choose
 
 _DTYPES = {
@@ -94,7 +94,7 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
     counts = [box.get(name, (0, 1))[1] - first for name, first in starts]
     if counts[1] > 1 and colors > 1:
         raise ValueError(f"{path}: {counts[1]} channels of colours; expected one")
-    info, spacing, lost = _read_metadata(xml, counts[1], colors, stored)
+    info, spacing, dropped = _read_metadata(xml, counts[1], colors, stored)
     return CziSource(
         path=path,
         shape=(*counts, bounds.h, bounds.w, colors),
@@ -102,14 +102,14 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
         stored=stored,
         spacing=spacing,
         info=info,
-        lost=(*lost, *others),
+        dropped=(*dropped, *others),
         scene=scene,
         corner=(bounds.x, bounds.y),
         starts=starts,
     )
 
 
-def _read_metadata(xml: str, width: int, colors: int, stored: str) -> Told:
+def _read_metadata(xml: str, width: int, colors: int, stored: str) -> FileMetadata:
     """Returns info and spacing from the metadata, and which metadata is not kept."""
     root = ElementTree.fromstring(xml)
     sizes: dict[str, float | None] = {}
@@ -130,16 +130,16 @@ def _read_metadata(xml: str, width: int, colors: int, stored: str) -> Told:
     time_step = finite_number(
         root.findtext(".//Information/Image/Dimensions/T/Positions/Interval/Increment")
     )
-    lost = []
+    dropped = []
     if unit and sizes.get("Z") is None and int(root.findtext(".//Image/SizeZ") or 1) > 1:
-        lost.append(NO_DEPTH)
+        dropped.append(NO_DEPTH)
     info = ImageInfo(
         unit=unit,
         channels=tuple(channels) if len(channels) == width * colors else (),
         time_step=time_step if time_step and time_step > 0 else None,
         time_unit="second" if time_step and time_step > 0 else None,
     )
-    return info, spacing, lost
+    return info, spacing, dropped
 
 
 def _channel(element: Any, display: Any, stored: str) -> ChannelInfo:

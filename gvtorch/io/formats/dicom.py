@@ -208,19 +208,19 @@ def _series_source(path: str, headers: list[Any]) -> DicomSource:
     frames: list[DicomFrame] = []
     for header in headers:
         count = _frame_count(header)
-        check_extent(header.filename, (count, rows, columns), most=1 << 40)
+        check_extent(header.filename, (count, rows, columns), max_values=1 << 40)
         if _image_shape(header) != (rows, columns, samples):
             raise ValueError(
                 f"{path}: a series of images of different sizes: {(rows, columns, samples)} and "
                 f"{_image_shape(header)} (rows, columns, samples, {Path(header.filename).name})"
             )
         frames += frames_of(header, count)
-    times, affine, lost, time_fields = order_frames(path, frames)
+    times, affine, dropped, time_fields = order_frames(path, frames)
     depth, frames = len(times[0]), list(chain(*times))
     placement = place_axes(path, LPS_TO_RAS @ affine, (depth, rows, columns))
     color = (samples,) if samples > 1 else ()
     placement["axes"] = "t" + placement["axes"] + "c" * len(color)
-    info, info_lost = image_info(first, samples, time_fields)
+    info, info_dropped = image_info(first, samples, time_fields)
     if any(frame.position is None for frame in frames):
         info = replace(info, unit=info.unit if first.get("PixelSpacing") else None)
     return DicomSource(
@@ -229,7 +229,7 @@ def _series_source(path: str, headers: list[Any]) -> DicomSource:
         stored=_dtype(first, frames),
         frames=tuple((f.file, f.number, f.slope, f.intercept) for f in frames),
         info=info,
-        lost=(*lost, *info_lost),
+        dropped=(*dropped, *info_dropped),
         **placement,
     )
 

@@ -89,8 +89,8 @@ def choose(
         preferred: The name to choose if `key` is left out; if there is none, the first is chosen.
 
     Returns:
-        Its index among `names`, and an entry about the others for `VolumeSource.lost` if `key` is
-        left out.
+        Its index among `names`, and an entry about the others for `VolumeSource.dropped` if `key`
+        is left out.
 
     Raises:
         ValueError: There are no items, or none that matches `key`.
@@ -102,8 +102,8 @@ def choose(
     ]
     if key is None and names:
         others = f"{len(names) - 1} other {_plural(noun)}; key (--key) chooses among"
-        lost = (f"{others} {_join_names(listed)}",) if len(names) > 1 else ()
-        return names.index(preferred) if preferred in names else 0, lost
+        dropped = (f"{others} {_join_names(listed)}",) if len(names) > 1 else ()
+        return names.index(preferred) if preferred in names else 0, dropped
     plain_key = (key or "").removeprefix("/")
     for wanted, candidates in (
         (key, names),

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.labels import check_narrowed
-from ...base.named_axes import ask_axes, even_steps, letter_of, named_axes, place_named
+from ...base.named_axes import ask_axes, even_steps, grid_placement, letter_of, named_axes
 from ...base.units import spacing_of
 from ..budget import check_beside
 from ..source import Index, VolumeSource
@@ -87,9 +87,11 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         dataset = file[name]
         _check_dataset(path, name, dataset)
         shape = tuple(int(n) for n in dataset.shape)
-        axis_order, steps, units, lost = _axes(f"{path}:/{name.strip('/')}", dataset, shape, axes)
+        axis_order, steps, units, dropped = _axes(
+            f"{path}:/{name.strip('/')}", dataset, shape, axes
+        )
         info, value_fields = _info(dataset, axis_order, shape), _value_fields(dataset)
-        placement, info_fields = place_named(axis_order, shape, steps, units)
+        placement, info_fields = grid_placement(axis_order, shape, steps, units)
         element_size = np.ravel(dataset.attrs.get("element_size_um", ())).tolist()
         if info_fields["unit"] is None and len(element_size) == 3:
             placement["spacing"], info_fields["unit"] = spacing_of(element_size[::-1], ["um"] * 3)
@@ -101,7 +103,7 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         name=name,
         **value_fields,
         info=info,
-        lost=tuple(lost),
+        dropped=tuple(dropped),
         **placement,
     )
 
@@ -216,7 +218,7 @@ def _axes(
     names: list[str] = [""] * rank
     steps: list[tuple[float, float] | None] = [None] * rank
     units: list[str | None] = [None] * rank
-    lost: list[str] = []
+    dropped: list[str] = []
     for axis, dimension in enumerate(dataset.dims):
         scale = dimension[0] if len(dimension) else None
         attributes = dict(scale.attrs) if scale is not None else {}
@@ -239,7 +241,7 @@ def _axes(
         ):
             steps[axis], is_even = even_steps(scale[()])
             if not is_even:
-                lost.append(f"that coordinates along {names[axis]} are not evenly spaced")
+                dropped.append(f"that coordinates along {names[axis]} are not evenly spaced")
     tags = _tags(dataset)
     if len(tags) == rank:
         names = [str(tag.get("key", "")) for tag in tags]
@@ -251,7 +253,7 @@ def _axes(
     axis_order = named_axes(names, shape) if axes is None else None
     if axis_order is None and axes is None and rank > 3 and set(shape[:-3]) == {1}:
         axis_order = "-" * (rank - 3) + "zyx"
-    return axis_order or ask_axes(context, shape, axes), steps, units, lost
+    return axis_order or ask_axes(context, shape, axes), steps, units, dropped
 
 
 def _tags(dataset: Any) -> list[Any]:

@@ -20,7 +20,7 @@ from ...base.image_info import ImageInfo, color_channels
 from ...base.volume import check_extent
 from ..picture_size import has_jpeg_end, picture_size
 from ..resources import amount, memory_free
-from ..source import Index, VolumeSource, told_as
+from ..source import Index, VolumeSource, convert_errors
 from ..stores.ngff import is_zarr
 from ..tiff_info import check_pictures, opened_tiff
 from .format import Format
@@ -87,7 +87,7 @@ def open_folder(path: str) -> SlicesSource:
         )
     files.sort(key=lambda file: _natural_key(file.name))
     shape, free = _header_shape(str(files[0])), memory_free()
-    check_extent(str(files[0]), shape, most=_MAX_PIXELS)
+    check_extent(str(files[0]), shape, max_values=_MAX_PIXELS)
     if 8 * math.prod(shape) > free:
         raise ValueError(
             f"{files[0]}: {shape} pixels may take more than {amount(free)}, what is free"
@@ -120,7 +120,7 @@ def _decode_image(file: str) -> np.ndarray:
     packed = Path(file).read_bytes()
     if codec == "jpeg8" and not has_jpeg_end(packed):
         raise ValueError(f"{file}: is truncated: the picture has no end")
-    with told_as(ValueError, file, f"can't be read as {codec.rstrip('8').upper()}"):
+    with convert_errors(ValueError, file, f"can't be read as {codec.rstrip('8').upper()}"):
         pixels = np.asarray(getattr(imagecodecs, f"{codec}_decode")(packed))
     return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
 

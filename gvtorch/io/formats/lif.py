@@ -55,7 +55,7 @@ def open_lif(path: str, key: str | None = None) -> LifSource:
 
 
 def _image_source(
-    path: str, element: Any, blocks: dict[str, tuple[int, int]], lost: list[str]
+    path: str, element: Any, blocks: dict[str, tuple[int, int]], dropped: list[str]
 ) -> LifSource:
     channels = element.findall("./Data/Image/ImageDescription/Channels/ChannelDescription")
     axes = element.findall("./Data/Image/ImageDescription/Dimensions/DimensionDescription")
@@ -105,7 +105,7 @@ def _image_source(
         x, y, z = (1e6 * side for side in spacing)
         spacing, unit = (x, y, z), "micrometer"
     if unit and sampling.get("z", (1.0, None))[0] is None:
-        lost.append(NO_DEPTH)
+        dropped.append(NO_DEPTH)
     step = sampling.get("t", (None, None))[0]
     return LifSource(
         path=path,
@@ -119,7 +119,7 @@ def _image_source(
             time_step=step,
             time_unit="second" if step else None,
         ),
-        lost=tuple(lost),
+        dropped=tuple(dropped),
         offset=offset,
         length=image_bytes,
         strides=tuple(strides),

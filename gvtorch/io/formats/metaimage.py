@@ -49,13 +49,13 @@ def open_metaimage(path: str) -> VolumeSource:
     if width < 1:
         raise ValueError(f"{path}: {width} channels")
     is_big = header.get("ElementByteOrderMSB", header.get("BinaryDataByteOrderMSB", "False"))
-    lost = [f"{name} of the header" for name in sorted(set(header) - _KNOWN_FIELDS)][:8]
+    dropped = [f"{name} of the header" for name in sorted(set(header) - _KNOWN_FIELDS)][:8]
     fields: dict[str, Any] = {
         "path": path,
         "stored": np.dtype((">" if is_big.lower() == "true" else "<") + number_dtype).str,
         "shape": ((width,) if width > 1 else ()) + shape,
         "info": _info(header, width, rank),
-        "lost": tuple(lost),
+        "dropped": tuple(dropped),
         **_placement(path, header, shape, width),
     }
     data_name = header["ElementDataFile"].strip()

@@ -32,8 +32,8 @@ def open_mrc(path: str) -> ArraySource:
             if header is None:
                 raise ValueError("the header can't be read")
             fields, order = header.copy(), header.mode.dtype.byteorder
-    lost = [one_line(warning.message) for warning in caught]
-    serious = [text for text in lost if "machine stamp" not in text and "Map ID" not in text]
+    dropped = [one_line(warning.message) for warning in caught]
+    serious = [text for text in dropped if "machine stamp" not in text and "Map ID" not in text]
     if serious:
         raise ValueError(serious[0])
     sizes = [int(fields[name]) for name in ("nz", "ny", "nx")]
@@ -54,7 +54,7 @@ def open_mrc(path: str) -> ArraySource:
             [sizes[0] // slices_per_map, slices_per_map, *sizes[1:]],
             "t" + axis_order,
         )
-        lost.append(f"that its {sizes[0]} maps are separate: they are read as time points")
+        dropped.append(f"that its {sizes[0]} maps are separate: they are read as time points")
     return ArraySource(
         path=path,
         file=path,
@@ -66,7 +66,7 @@ def open_mrc(path: str) -> ArraySource:
         spacing=spacing,
         origin=origin,
         info=ImageInfo(unit=unit),
-        lost=tuple(lost),
+        dropped=tuple(dropped),
     )
 
 

@@ -84,7 +84,7 @@ class GridMetadata(NamedTuple):
 def open_nanovdb(path: str, key: str | None = None) -> SparseSource:
     """Opens the grid `key` (its name or number); "density" or the first, if left out."""
     grids = _list_grids(path)
-    chosen, lost = choose(path, "grid", [grid.name for grid in grids], key, preferred="density")
+    chosen, dropped = choose(path, "grid", [grid.name for grid in grids], key, preferred="density")
     grid = grids[chosen]
     if grid.type_code not in _TYPES:
         type_name = _REFUSED_TYPES.get(grid.type_code, f"type {grid.type_code}")
@@ -99,7 +99,7 @@ def open_nanovdb(path: str, key: str | None = None) -> SparseSource:
         grid_type=NanoGrid,
         number=chosen,
         held=grid_bytes,
-        lost=lost,
+        dropped=dropped,
     )
 
 

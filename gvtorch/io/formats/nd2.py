@@ -11,7 +11,7 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import spacing_of
-from ..source import Index, Told, VolumeSource
+from ..source import FileMetadata, Index, VolumeSource
 from .format import Format, choose
 
 
@@ -55,7 +55,7 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
             raise ValueError(f"{path}: has axes other than T, P, Z, C, Y, X: {extra_axes}")
         position, others = choose(path, "position", range(sizes.get("P", 1)), key)
         dtype = np.dtype(file.dtype).str
-        info, spacing, lost = _read_metadata(file, sizes)
+        info, spacing, dropped = _read_metadata(file, sizes)
     width, colors = int(sizes.get("C", 1)), int(sizes.get("S", 1))
     if width > 1 and colors > 1:
         raise ValueError(f"{path}: {width} channels of colours; expected one")
@@ -67,12 +67,12 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
         stored=dtype,
         spacing=spacing,
         info=info,
-        lost=(*lost, *others),
+        dropped=(*dropped, *others),
         position=position,
     )
 
 
-def _read_metadata(file: Any, sizes: Mapping[str, int]) -> Told:
+def _read_metadata(file: Any, sizes: Mapping[str, int]) -> FileMetadata:
     """Returns info and spacing from the metadata, and which metadata is not kept."""
     voxel = file.voxel_size()
     spacing, unit = spacing_of([float(side) for side in voxel], ["um"] * 3)
@@ -94,11 +94,11 @@ def _read_metadata(file: Any, sizes: Mapping[str, int]) -> Told:
         None,
     )
     width = sizes.get("C", 1) * sizes.get("S", 1)
-    lost = ["regions of interest (ROI)"] if getattr(file, "rois", None) else []
+    dropped = ["regions of interest (ROI)"] if getattr(file, "rois", None) else []
     info = ImageInfo(
         unit=unit,
         channels=tuple(channels) if len(channels) == width else (),
         time_step=step,
         time_unit="millisecond" if step else None,
     )
-    return info, spacing, lost
+    return info, spacing, dropped

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo, color_channels
 from ...base.units import length_unit, time_unit
-from ..budget import MOST_PACKED
+from ..budget import MAX_UNPACK_RATIO
 from ..source import ArraySource, Index, VolumeSource, place_axes
 from .format import Format
 
@@ -51,7 +51,7 @@ def open_nifti(path: str) -> NiftiSource:
         os.stat(path).st_size,
     )
     if (
-        packed and needed_bytes > MOST_PACKED * file_bytes
+        packed and needed_bytes > MAX_UNPACK_RATIO * file_bytes
     ):  # nibabel allocates memory for all of it at once
         raise ValueError(f"{path}: takes {needed_bytes} bytes, which {file_bytes} can't unpack to")
     first_voxel = np.asanyarray(image.dataobj[(slice(0, 1),) * len(shape)])
@@ -67,40 +67,40 @@ def open_nifti(path: str) -> NiftiSource:
         4 if len(shape) > 4 else None,
         3 if len(shape) > 3 else None,
     )
-    info, lost = _info(image, shape)
+    info, dropped = _info(image, shape)
     return NiftiSource(
         path=path,
         shape=shape,
         stored=first_voxel.dtype.str,
         whole=packed,
         info=info,
-        lost=(*corrections, *lost),
+        dropped=(*corrections, *dropped),
         **placement | {"axes": placement["axes"] + "-" * len(shape[5:])},
     )
 
 
 def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
     """Returns the header's metadata of the values, and which metadata is not kept."""
-    header, lost = image.header, []
+    header, dropped = image.header, []
     try:
         length, period = header.get_xyzt_units()
     except KeyError:
         length = period = "unknown"
-        lost.append(f"xyzt_units {int(header['xyzt_units'])}, which are none")
+        dropped.append(f"xyzt_units {int(header['xyzt_units'])}, which are none")
     step: float | None = None
     origin = 0.0
     if len(shape) > 3 and shape[3] > 1:
         step, origin = float(header["pixdim"][4]), float(header["toffset"])
         if time_unit(period) is None and period != "unknown":
-            lost.append(f"the fourth axis counts {period}, and is read as time")
+            dropped.append(f"the fourth axis counts {period}, and is read as time")
         step = step if math.isfinite(step) and step > 0 else None
         origin = origin if math.isfinite(origin) else 0.0
     if int(header["qform_code"]) > 0 and int(header["sform_code"]) > 0:
         forms = header.get_qform(), header.get_sform()
         if not np.allclose(*forms, rtol=1e-3, atol=1e-2 * float(header["pixdim"][1:4].min())):
-            lost.append("the qform, which differs from the sform")
+            dropped.append("the qform, which differs from the sform")
     if len(header.extensions):
-        lost.append(f"{len(header.extensions)} header extensions")
+        dropped.append(f"{len(header.extensions)} header extensions")
     window = (float(header["cal_min"]), float(header["cal_max"]))
     windowed = ChannelInfo(window=window if all(map(math.isfinite, window)) else None)
     channels = [windowed] * (shape[4] if len(shape) > 4 else 1) if window[0] < window[1] else []
@@ -115,7 +115,7 @@ def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
         time_origin=origin,
         time_unit=time_unit(period) if step is not None else None,
     )
-    return info, lost
+    return info, dropped
 
 
 def _components(data: np.ndarray) -> np.ndarray:

@@ -66,13 +66,13 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     if header.get("endian", "little") not in ("little", "big"):
         raise ValueError(f"{path}: endian {header['endian']!r} is neither little nor big")
     axis_roles = _axis_roles(path, header, shape, axes)
-    info, lost = _info(header, axis_roles, shape)
+    info, dropped = _info(header, axis_roles, shape)
     fields: dict[str, Any] = {
         "path": path,
         "shape": shape,
         "stored": np.dtype((">" if header.get("endian") == "big" else "<") + number_dtype).str,
         "info": info,
-        "lost": tuple(lost),
+        "dropped": tuple(dropped),
         **place_axes(
             *(path, _affine(header, axis_roles), shape),
             *(axis_roles.index(role) if role in axis_roles else None for role in "ct"),
@@ -214,10 +214,10 @@ def _info(
 ) -> tuple[ImageInfo, list[str]]:
     """Returns the header's metadata of the values, and which metadata is not kept."""
     key_values = [str(name) for name in header if str(name).lower() not in _FIELDS]
-    lost = [f"the field {name!r}" for name in header if str(name).lower() in _DROPPED_FIELDS]
+    dropped = [f"the field {name!r}" for name in header if str(name).lower() in _DROPPED_FIELDS]
     if key_values:
         more = f" and {len(key_values) - 3} more" if len(key_values) > 3 else ""
-        lost.append(f"key/value pairs {', '.join(key_values[:3])}{more}")
+        dropped.append(f"key/value pairs {', '.join(key_values[:3])}{more}")
     units = [str(unit) for unit in header.get("units", ())]
     units = units if len(units) == len(axis_roles) else [""] * len(axis_roles)
     spatial = [str(unit) for unit in header.get("space units", ())][:3]
@@ -225,7 +225,7 @@ def _info(
     unit_names = {length_unit(unit) for unit in spatial}
     unit = unit_names.pop() if len(unit_names) == 1 else None
     if unit is None and any(spatial):
-        lost.append(f"units of space {', '.join(spatial)}")
+        dropped.append(f"units of space {', '.join(spatial)}")
     step: float | None = None
     step_unit = None
     if "t" in axis_roles:
@@ -249,7 +249,7 @@ def _info(
         time_step=step,
         time_unit=step_unit,
     )
-    return info, lost
+    return info, dropped
 
 
 def _channels(

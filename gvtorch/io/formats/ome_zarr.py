@@ -52,6 +52,6 @@ def open_ome_zarr(path: str, key: str | None = None) -> OmeZarrSource:
         spacing=store.spacing,
         origin=store.origin,
         info=store.info,
-        lost=store.lost,
+        dropped=store.dropped,
         key=key,
     )

@@ -157,7 +157,7 @@ def open_openvdb(path: str, key: str | None = None) -> SparseSource:
     with _map_file(path) as data:
         version, grids = _read_descriptors(data)
         names = [grid.name for grid in grids]
-        chosen, lost = choose(path, "grid", names, key, preferred="density")
+        chosen, dropped = choose(path, "grid", names, key, preferred="density")
         grid = grids[chosen]
         tree_number = chosen  # index of the grid that has the tree
         if grid.parent:
@@ -182,7 +182,7 @@ def open_openvdb(path: str, key: str | None = None) -> SparseSource:
         *(path, grid.name, grid_class, dtype, width, low, high, grid.affine),
         grid_type=VdbGrid,
         number=tree_number,
-        lost=lost,
+        dropped=dropped,
     )
 
 

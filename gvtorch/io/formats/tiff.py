@@ -12,11 +12,11 @@ import numpy as np
 
 from ...base import boxes
 from ...base.image_info import ImageInfo, color_channels
-from ..source import ArraySource, Index, Told, VolumeSource
+from ..source import ArraySource, FileMetadata, Index, VolumeSource
 from ..tiff_info import JPEG, check_pictures, imagej_info, ome_info, opened_tiff
 from .format import Format, choose
 
-_PHOTOMETRIC_LOST = {  # by the tag PhotometricInterpretation
+_PHOTOMETRIC_DROPPED = {  # by the tag PhotometricInterpretation
     0: "that high values are meant to be dark (MinIsWhite)",
     3: "the colours of its palette: values are numbers of its entries",
 }
@@ -112,9 +112,9 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
         series = file.series[chosen]
         shape = tuple(int(n) for n in series.shape)
         axes = _axes(path, shape, series.axes)
-        info, spacing, lost = _read_metadata(file, series, chosen, axes, shape)
-        lost += others
-        lost += [f"what tifffile warns of ({text})" for text in dict.fromkeys(tiff_warnings)]
+        info, spacing, dropped = _read_metadata(file, series, chosen, axes, shape)
+        dropped += others
+        dropped += [f"what tifffile warns of ({text})" for text in dict.fromkeys(tiff_warnings)]
         fields: dict[str, Any] = {
             "path": path,
             "shape": shape,
@@ -125,7 +125,9 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
         if series.dataoffset is not None:
             stored = series.dtype.newbyteorder(file.byteorder).str
             offset = int(series.dataoffset)
-            return ArraySource(file=path, stored=stored, offset=offset, lost=tuple(lost), **fields)
+            return ArraySource(
+                file=path, stored=stored, offset=offset, dropped=tuple(dropped), **fields
+            )
         page_shape = tuple(series.keyframe.shape)
         leading = len(shape) - len(page_shape)
         by_page = shape[leading:] == page_shape and len(series.pages) == math.prod(shape[:leading])
@@ -134,10 +136,10 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
         piece_values = int(np.prod(keyframe.chunks)) if by_page else math.prod(shape)
         missing_pages = sum(page is None for page in series.pages)
         if missing_pages:
-            lost.append(f"{missing_pages} of {len(series.pages)} pages, which are not there")
+            dropped.append(f"{missing_pages} of {len(series.pages)} pages, which are not there")
     fields["unpacked_bytes"] = piece_values * series.dtype.itemsize
     return TiffSource(
-        stored=series.dtype.str, whole=not by_page, series=chosen, lost=tuple(lost), **fields
+        stored=series.dtype.str, whole=not by_page, series=chosen, dropped=tuple(dropped), **fields
     )
 
 
@@ -159,7 +161,9 @@ def _axes(path: str, shape: Sequence[int], axes: str) -> str:
     return axis_order.replace("S", "C").lower()
 
 
-def _read_metadata(file: Any, series: Any, number: int, axes: str, shape: Sequence[int]) -> Told:
+def _read_metadata(
+    file: Any, series: Any, number: int, axes: str, shape: Sequence[int]
+) -> FileMetadata:
     """Returns info and spacing of a series, and which metadata is not kept."""
     width = shape[axes.index("c")] if "c" in axes else 1
     if series.kind == "ome":
@@ -167,16 +171,20 @@ def _read_metadata(file: Any, series: Any, number: int, axes: str, shape: Sequen
     photometric = int(series.keyframe.photometric)
     is_color = width in (3, 4) and photometric in (2, 6)  # RGB, YCbCr
     channels = color_channels(width) if is_color else ()
-    lost = [_PHOTOMETRIC_LOST[photometric]] if photometric in _PHOTOMETRIC_LOST else []
+    dropped = [_PHOTOMETRIC_DROPPED[photometric]] if photometric in _PHOTOMETRIC_DROPPED else []
     if series.kind == "imagej":
-        info, spacing, also_lost = imagej_info(file.imagej_metadata, _resolution(file), width)
-        return replace(info, channels=channels) if is_color else info, spacing, [*also_lost, *lost]
+        info, spacing, also_dropped = imagej_info(file.imagej_metadata, _resolution(file), width)
+        return (
+            replace(info, channels=channels) if is_color else info,
+            spacing,
+            [*also_dropped, *dropped],
+        )
     tags = series.keyframe.tags
     if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are for printers
-        lost.append("the size of a pixel in centimeters: the distance between pages is missing")
+        dropped.append("the size of a pixel in centimeters: the distance between pages is missing")
     if tags.valueof("Orientation", 1) != 1:
-        lost.append("that its pages are to be shown turned or mirrored")
-    return ImageInfo(channels=channels), (1.0, 1.0, 1.0), lost
+        dropped.append("that its pages are to be shown turned or mirrored")
+    return ImageInfo(channels=channels), (1.0, 1.0, 1.0), dropped
 
 
 def _resolution(file: Any) -> list[float | None]:

@@ -118,11 +118,11 @@ def _source_fields(
     points: Sequence[int],
     affine: np.ndarray,
     array: dict[str, Any],
-    lost: tuple[str, ...],
+    dropped: tuple[str, ...],
 ) -> dict[str, Any]:
     """Returns the fields of a source of (z, y, x) or (z, y, x, c) values at points, or in cells."""
     size = [max(n - 1, 1) for n in points] if array["cells"] else list(points)
-    check_extent(path, size, most=_MAX_VALUES)
+    check_extent(path, size, max_values=_MAX_VALUES)
     if array["cells"]:
         affine = affine.copy()
         half_voxel = [0.5 * (n > 1) for n in points]
@@ -134,7 +134,7 @@ def _source_fields(
         "path": path,
         "shape": (*size[::-1], *((width,) if width > 1 else ())),
         "info": ImageInfo(channels=(ChannelInfo(name=array["name"]),) if width == 1 else ()),
-        "lost": lost,
+        "dropped": dropped,
         **placement,
     }
 
@@ -163,7 +163,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
         raise ValueError(f"{path}: has no extent")
     low, high = extent[::2], extent[1::2]
     arrays = _xml_arrays(root, piece)
-    chosen, lost = choose(path, "array", [array["name"] for array in arrays], key)
+    chosen, dropped = choose(path, "array", [array["name"] for array in arrays], key)
     array = arrays[chosen]
     if (number_dtype := number_type(array["kind"])) is None:
         raise ValueError(f"{path}: {array['name']} is of {array['kind']}; expected numbers")
@@ -177,7 +177,7 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     affine[:3, :3] = numbers["Direction"].reshape(3, 3) * numbers["Spacing"]
     affine[:3, 3] = numbers["Origin"] + affine[:3, :3] @ low
     points = [b - a + 1 for a, b in zip(low, high, strict=True)]
-    fields = _source_fields(path, points, affine, array, lost)
+    fields = _source_fields(path, points, affine, array, dropped)
     byte_order = {"LittleEndian": "<", "BigEndian": ">"}[root.get("byte_order", "LittleEndian")]
     size_dtype = byte_order + {"UInt32": "u4", "UInt64": "u8"}[root.get("header_type", "UInt32")]
     compressor = {"": "", "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma",
@@ -303,9 +303,9 @@ def _open_legacy(path: str, key: str | None) -> VolumeSource:
         binary = lines[2].strip().upper() == b"BINARY"
         header_bytes = sum(len(line) + 1 for line in lines[:4])
         affine, points, arrays = _legacy_parts(path, content, header_bytes, binary)
-    chosen, lost = choose(path, "array", [array["name"] for array in arrays], key)
+    chosen, dropped = choose(path, "array", [array["name"] for array in arrays], key)
     array = arrays[chosen]
-    fields = _source_fields(path, points, affine, array, lost)
+    fields = _source_fields(path, points, affine, array, dropped)
     fields |= {"file": path, "offset": array["offset"], "stored": array["stored"]}
     if binary:
         return ArraySource(**fields)
@@ -369,7 +369,7 @@ def _legacy_array(
         width = 3 if kind == "VECTORS" else int(tokens[3]) if len(tokens) > 3 else 1
     if not dtype:
         raise ValueError(f"{path}: {' '.join(tokens)[:80]!r} is not an array of numbers")
-    check_extent(path, (*points, width), most=_MAX_VALUES)
+    check_extent(path, (*points, width), max_values=_MAX_VALUES)
     count = math.prod(max(n - 1, 1) if cells else n for n in points) * width
     size = np.dtype(dtype).itemsize
     return {

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ...base.boxes import rows_by_place
+from ...base.boxes import group_rows
 from ..http import EXTRA_BYTES, Endless
 
 METADATA_FILES = ("zarr.json", ".zarray", "attributes.json")  # an array's metadata files
@@ -404,6 +404,6 @@ def _group_by_row(rows: np.ndarray, numbers: np.ndarray) -> Iterator[tuple[list[
         if len(rows):
             yield rows[0].tolist(), numbers
         return
-    distinct_rows, members = rows_by_place(rows)
+    distinct_rows, members = group_rows(rows)
     for row, selected in zip(distinct_rows.tolist(), members, strict=True):
         yield row, numbers[selected]

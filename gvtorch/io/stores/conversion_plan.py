@@ -91,7 +91,7 @@ def source_of(
     """Opens the source. One that can only be read as a whole is read here, once, unless `read` is
     False; it then holds only the time points to be written.
     """
-    check.known("convert", options, FormatSettings)
+    check.known_options("convert", options, FormatSettings)
     if isinstance(source, VolumeSource):
         return source
     if isinstance(source, Volume):
@@ -167,7 +167,7 @@ def plan_of(
             f"{source.path}: its info names {info_channels} channels, it has {source.width}"
         )
     workers = resources.cores() if workers is None else workers
-    workers = check.whole("convert", "workers", workers, low=1)
+    workers = check.integer("convert", "workers", workers, low=1)
     tasks = [layout.times * math.prod(layout.shards(level)) for level in range(layout.levels)]
     fields = ("extent", "dtype", "spacing", "origin")
     settings = {

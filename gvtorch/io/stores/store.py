@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from ...base import boxes, check
-from ...base.boxes import Zyx, rows_by_place
+from ...base.boxes import Zyx, group_rows
 from ...base.labels import background, counted
 from ...pool.downsample import pool_majority, pool_mean
 from .checksums import Checksums, json_checksum, shard_path
@@ -61,7 +61,7 @@ class Store:
         spacing: (x, y, z) world size of a finest voxel.
         origin: (x, y, z) world position of the centre of voxel 0.
         info: Unit, names and colours of channels, time step, ...
-        lost: Phrases on metadata that is not kept.
+        dropped: Phrases on metadata that is not kept.
         times: Number of time points.
         time: The time point that is read.
         dtype: torch dtype of the values.
@@ -124,9 +124,9 @@ class Store:
             kvstore(context),
             own_layout is not None,
         )
-        self.name, self.info, self.lost = pyramid.name, pyramid.info, tuple(pyramid.dropped)
+        self.name, self.info, self.dropped = pyramid.name, pyramid.info, tuple(pyramid.dropped)
         spacing, origin = pyramid.scales[0].scale[::-1], pyramid.scales[0].translation[::-1]
-        self.spacing, self.origin = check.placed(context, spacing, origin, layout.extent)
+        self.spacing, self.origin = check.grid_placement(context, spacing, origin, layout.extent)
         self.extent, self.levels, self.block = layout.extent, layout.levels, layout.block
         self.border, self.cell, self.threshold = BORDER, CELL, layout.threshold
         self.dtype: torch.dtype = getattr(torch, dtype)
@@ -233,7 +233,7 @@ class Store:
             "range": [list(pair) for pair in self.value_range] if self.value_range else None,
             "coarse channels": ", ".join(self.coarse) or "none",
             "disk bytes": sum(file.stat().st_size for file in files),
-            **({"not kept": list(self.lost)} if self.lost else {}),
+            **({"not kept": list(self.dropped)} if self.dropped else {}),
         }
 
     def level_extent(self, level: int) -> tuple[int, int, int]:
@@ -541,7 +541,7 @@ class Store:
         return f"{self.location}: block ({z}, {y}, {x}) z y x of level {level}: {text}"
 
     def _checked_level(self, level: int) -> int:
-        return check.whole(self.location, "level", level, low=0, high=self.levels - 1)
+        return check.integer(self.location, "level", level, low=0, high=self.levels - 1)
 
 
 def _wait_for_array(
@@ -585,7 +585,7 @@ def _zero_rows(out: np.ndarray) -> list[int]:
 def _group_blocks(zyx: np.ndarray, side: int) -> list[np.ndarray]:
     """Returns groups of indices of blocks, each to be read as one region."""
     groups = []
-    for rows in rows_by_place(zyx // _GROUP_BLOCKS)[1]:
+    for rows in group_rows(zyx // _GROUP_BLOCKS)[1]:
         extent = (zyx[rows].max(0) - zyx[rows].min(0) + 1) * (side - 2 * BORDER) + 2 * BORDER
         if math.prod(extent.tolist()) <= 2 * len(rows) * side**3:
             groups.append(rows)
