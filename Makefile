@@ -25,6 +25,8 @@ REQUIRE := $(REQUIRE)$(if $(CI)$(shell command -v chromium chromium-browser goog
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint .ci/constraints.txt
 ARCHS_GIVEN := $(GVTORCH_CUDA_ARCHS)
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
+# Containers often set this; the tests' many processes would each compile all of gvtorch's Python.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo gallery test soak fuzz asan tsan lint format bench wheel clean
 .DELETE_ON_ERROR:

@@ -15,7 +15,7 @@ from torch import Tensor
 from . import boxes, check
 from .image_info import ChannelInfo, ImageInfo
 from .labels import check_narrowed
-from .named_axes import ask_axes, even_steps, grid_placement, named_axes
+from .named_axes import ask_axes, axes_placement, even_steps, named_axes
 from .units import spacing_of
 from .volume import Volume, check_extent
 
@@ -87,7 +87,7 @@ class ArrayLike:
         names, steps, units, dropped = _axis_metadata(array, len(shape))
         axis_letters = None if axes else named_axes(names, shape)
         axis_letters = axis_letters or ask_axes(context, shape, axes)
-        placement, info_fields = grid_placement(axis_letters, shape, steps, units)
+        placement, info_fields = axes_placement(axis_letters, shape, steps, units)
         attrs = _attributes(array)
         # A NaN differs from itself: it packs nothing.
         packing = [n for n in _PACKING_ATTRIBUTES if n in attrs and np.any(attrs[n] == attrs[n])]

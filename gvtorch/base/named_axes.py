@@ -84,7 +84,7 @@ def even_steps(coordinates: Any) -> tuple[tuple[float, float] | None, bool]:
     return ((step, float(values[0])) if even else None), even
 
 
-def grid_placement(
+def axes_placement(
     axes: str, shape: Sequence[int], steps: Steps, units: Sequence[str | None]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Returns spacing, origin and flips of a grid from the coordinates along its axes, and the

@@ -76,7 +76,7 @@ class Planes:
         self.data, self._on_read = data, on_read
         self._images: OrderedDict[Any, np.ndarray] = OrderedDict()
         self._newest_images: dict[str, np.ndarray] = {}  # by axis
-        self._failures: dict[Any, str] = {}
+        self._failed: set[Any] = set()
         self._windows: dict[int, tuple[float, float]] = {}
         self._requests: dict[str, tuple[Any, ViewState, float]] = {}  # by axis
         self._reading_key: Any = None
@@ -204,10 +204,10 @@ class Planes:
             if image is not None:
                 self._images.move_to_end(key)
                 self._newest_images[axis] = image
-            elif key not in self._failures and key != self._reading_key:
+            elif key not in self._failed and key != self._reading_key:
                 self._requests[axis] = key, state, pixel_size
                 self._wake.notify()
-            return self._newest_images.get(axis), image is not None or key in self._failures
+            return self._newest_images.get(axis), image is not None or key in self._failed
 
     def _read_planes(self) -> None:
         """Runs in the thread that reads: for each axis, the plane that was wanted last."""
@@ -219,14 +219,16 @@ class Planes:
                     return
                 axis, (key, state, pixel_size) = self._requests.popitem()
                 self._reading_key = key
+            reason = ""
             try:
                 self._cache_image(key, self._render_plane(axis, state, pixel_size))
-                problem = ""
             except Exception as error:  # whatever it was, the view goes on
-                self._failures[key] = one_line(error)
-                problem = f"a slice can't be read: {self._failures[key]}"
-            self._reading_key = None
-            self._on_read(problem)
+                reason = one_line(error)
+            with self._wake:
+                self._reading_key = None
+                if reason:
+                    self._failed.add(key)
+            self._on_read(reason and f"a slice can't be read: {reason}")
 
     def _cache_image(self, key: Any, image: np.ndarray) -> None:
         with self._wake:
@@ -288,7 +290,8 @@ class Planes:
     def retry(self) -> None:
         """Allows planes that could not be read to be read again."""
         retry_refused()
-        self._failures.clear()
+        with self._wake:
+            self._failed.clear()
 
     def close(self) -> None:
         """Ends the thread; does not wait for what it reads."""

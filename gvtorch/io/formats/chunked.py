@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...base.image_info import ImageInfo
-from ...base.named_axes import ask_axes, even_steps, grid_placement, named_axes
+from ...base.named_axes import ask_axes, axes_placement, even_steps, named_axes
 from ...base.units import spacing_of
 from ..source import Index, Triple, VolumeSource
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
@@ -143,7 +143,7 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
                         [] if is_even else [f"that coordinates along {name} are not evenly spaced"]
                     )
     axis_order = axis_order or ask_axes(path, shape, axes)
-    placement, info_fields = grid_placement(axis_order, shape, steps, units)
+    placement, info_fields = axes_placement(axis_order, shape, steps, units)
     quantity = attributes.get("units")
     info = ImageInfo(quantity=quantity if isinstance(quantity, str) else None, **info_fields)
     return replace(source, axes=axis_order, info=info, dropped=tuple(dropped), **placement)

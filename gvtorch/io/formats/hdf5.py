@@ -18,7 +18,7 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.labels import check_narrowed
-from ...base.named_axes import ask_axes, even_steps, grid_placement, letter_of, named_axes
+from ...base.named_axes import ask_axes, axes_placement, even_steps, letter_of, named_axes
 from ...base.units import spacing_of
 from ..budget import check_beside
 from ..source import Index, VolumeSource
@@ -91,7 +91,7 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
             f"{path}:/{name.strip('/')}", dataset, shape, axes
         )
         info, value_fields = _info(dataset, axis_order, shape), _value_fields(dataset)
-        placement, info_fields = grid_placement(axis_order, shape, steps, units)
+        placement, info_fields = axes_placement(axis_order, shape, steps, units)
         element_size = np.ravel(dataset.attrs.get("element_size_um", ())).tolist()
         if info_fields["unit"] is None and len(element_size) == 3:
             placement["spacing"], info_fields["unit"] = spacing_of(element_size[::-1], ["um"] * 3)
