@@ -161,9 +161,9 @@ def session():
 @pytest.fixture(scope="module")
 def chromium():
     """The browser; without one, a skip that the summary reports."""
-    if reason := browser.absent():
+    if reason := browser.why_no_browser():
         pytest.skip(f"browser: {reason}")
-    with browser.running() as found:
+    with browser.running_chromium() as found:
         yield found
 
 
@@ -216,7 +216,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for name, reason in unavailable().items():
         if reason:
             terminalreporter.write_line(f"backend {name} did not run: {reason}")
-    if reason := browser.absent():
+    if reason := browser.why_no_browser():
         terminalreporter.write_line(f"browser did not run: {reason}")
     for name in _missing():
         terminalreporter.write_line(f"GVTORCH_REQUIRE: {name} did not run, so the tests failed")

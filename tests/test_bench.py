@@ -16,9 +16,9 @@ from gvtorch import bench
 from gvtorch.bench import browser, scenes, tables
 from gvtorch.bench import record as record_module
 from gvtorch.bench.peers import pages
-from gvtorch.bench.peers.peer import Task, find
+from gvtorch.bench.peers.peer import Task, find_peers
 from gvtorch.bench.record import Record, Settings, clock
-from gvtorch.bench.shaders import LOOKS
+from gvtorch.bench.shaders import VARIANTS
 from gvtorch.tools.bench import Bench
 
 QUICK = {"quick": True, "repeats": 1}
@@ -97,7 +97,7 @@ def test_twins_and_streamed_shaders_draw_the_same(compiled):
     rows = bench.run("shaders", chosen).rows
     twins = [row for row in rows if row["who"] in ("module", "user's header")]
     streamed = [row for row in rows if "engine" in row["case"]]
-    assert len(twins) == 4 and len(streamed) == len(LOOKS) == len(rows) / 2
+    assert len(twins) == 4 and len(streamed) == len(VARIANTS) == len(rows) / 2
     assert max(row["max_difference"] for row in twins + streamed) <= 1e-4
     for row in rows:
         (beside,) = (r for r in rows if (r["case"], r["who"]) == (row["case"], row["beside"]))
@@ -116,7 +116,7 @@ def test_grid_sample_agrees_with_the_picture():
     scene = scenes.clouds(48)
     camera = scene.camera(40, 30)
     tree = gv.N3Tree.from_volume(scene.volume)
-    marcher = find(Record("march", Settings(device=CPU.device, peers=("grid_sample",))))
+    marcher = find_peers(Record("march", Settings(device=CPU.device, peers=("grid_sample",))))
     for stop, bound in ((1.0, 1e-5), (0.99, 1e-2)):
         options = {"step": scene.step, "lod": "finest", "stop_alpha": stop}
         picture = gv.render(tree, camera, scene.shader, **options)
@@ -189,7 +189,7 @@ def test_a_busy_machine_is_noted(monkeypatch):
         seconds = iter((0.0, others))
         monkeypatch.setattr(record_module, "_busy_seconds", lambda s=seconds: next(s))
         record = Record("lru", CPU)
-        with record_module.elsewhere(record):
+        with record_module.noting_other_processes(record):
             pass
         assert any("Other processes took" in note for note in record.notes) is noted
 
@@ -242,8 +242,8 @@ def test_a_hand_in_a_browser_sees_its_jump(chromium, viewer):
     page = browser.Page(chromium, viewer.url, pages.PAGES["gvtorch"][1], (320, 200))
     try:
         shown = page.page.evaluate("() => document.querySelector('.gv-picture').clientWidth")
-        seen = page.drag(0.3, 1)
+        result = page.drag(0.3, 1)
     finally:
         page.close()
-    assert shown == 320 and seen.rate > 0
-    assert len(seen.waited) == 1 and 0 < seen.waited[0] < 60e3
+    assert shown == 320 and result.rate > 0
+    assert len(result.delays) == 1 and 0 < result.delays[0] < 60e3

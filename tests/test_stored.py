@@ -15,7 +15,7 @@ from helpers.pictures import PARTS, assert_same_picture, camera
 from helpers.stores import Handler, serving
 
 import gvtorch as gv
-from gvtorch.bench.storage import Memory
+from gvtorch.bench.storage import MemorySampler
 from gvtorch.engine import ProductionError
 from gvtorch.io.stores.conversion import convert
 from gvtorch.io.stores.store import Store
@@ -348,9 +348,9 @@ def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
     raw.flush()
     del raw
     folder = tmp_path / "big.zarr"
-    with Memory() as memory:
+    with MemorySampler() as memory:
         convert(tmp_path / "big.npy", folder)
-    assert 1e8 < memory.most - memory.first < 2e9, "all processes, without what was there before"
+    assert 1e8 < memory.peak - memory.initial < 2e9, "all processes, without what was there before"
     (tmp_path / "big.npy").unlink()
     views = [camera(64, distance=d, azimuth=a) for d, a in ((1.3, 20), (0.3, 200))]
     with gv.Engine(gv.StoredProducer(folder), brick_pool="900 MB", node_pool="40 MB") as engine:

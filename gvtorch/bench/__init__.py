@@ -11,28 +11,28 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .record import Record, Settings
 
-#: What each workload does; the function of that name is in the module given by `_HOME`.
+#: What each workload does; the function of that name is in the module given by `_MODULES`.
 WORKLOADS = {
-    "march": "rays through resident trees: fog, shell, clouds and a scan, beside peers",
-    "first_hit": "the first opaque voxel of a thin shell, 1920x1080, beside peers",
-    "calls": "what a call costs beside its rays: small pictures, one by one and 1,000 at once",
-    "bricks": "marching with brick sizes 4 to 32 and borders 0 to 2, and their memory",
-    "shaders": "each shader beside the plain transfer function, resident and in the engine",
-    "lens": "the engine through lenses: more blur, coarser levels, fewer bricks",
-    "opengl": "pictures out of OpenGL and into it, in shared buffers and through the host",
-    "view": "a page of the viewer: pictures a second, from the hand to the picture; beside peers",
-    "frame": "the engine: a steady frame and the cache's share of it, a cold start",
-    "deep": "steady frames of a surface in a tree of 13 levels, and of its patch in one of 9",
-    "lru": "1 M slots ordered by use, beside torch.sort",
-    "compact": "requests listed out of 8 M nodes, beside torch.nonzero",
-    "produce": "10^3-voxel bricks made by the producers of the library, eager and compiled",
-    "noise": "noise at points, beside its twin, NumPy and libraries of noise",
-    "stream": "10^3-voxel bricks from host memory into the pool, beside a plain copy",
-    "convert": "a volume file to a store",
-    "voxelize": "a mesh of 100,000 triangles to voxels and to a store, beside peers",
-    "blocks": "random blocks with border out of a store, beside tensorstore and zarr",
+    "march": "ray marching in memory: fog, a shell, clouds and a scan; also by other renderers",
+    "first_hit": "the first opaque voxel of a thin shell, 1920x1080; also by other renderers",
+    "calls": "the overhead of a call: small pictures, one by one and 1,000 in one batch",
+    "bricks": "time and memory of ray marching with brick sizes 4 to 32 and borders 0 to 2",
+    "shaders": "each shader compared with a simpler one, in memory and in the engine",
+    "lens": "depth of field in the engine: more blur needs coarser levels and fewer bricks",
+    "opengl": "pictures read from OpenGL and drawn to it, in shared buffers or through the host",
+    "view": "the viewer: pictures a second, and the delay after a mouse move; also other viewers",
+    "frame": "the engine: frames that load nothing, the cache's share of them, and a cold start",
+    "deep": "frames of a patch of a surface, in a tree of the patch and in one 16 times as wide",
+    "lru": "1 M slots sorted by last use, compared with torch.sort",
+    "compact": "the requests of 8 M nodes collected, compared with torch.nonzero",
+    "produce": "10^3-voxel bricks computed by the library's producers, eager and compiled",
+    "noise": "noise at points, compared with its torch twin, NumPy and noise libraries",
+    "stream": "10^3-voxel bricks loaded from host memory into the pool, compared with a plain copy",
+    "convert": "a volume file converted to a store",
+    "voxelize": "a mesh of 100,000 triangles to voxels and to a store; also by other libraries",
+    "blocks": "random blocks with borders read from a store, compared with tensorstore and zarr",
 }
-_HOME = {
+_MODULES = {
     **dict.fromkeys(("march", "first_hit", "calls", "bricks"), "march"),
     **{"frame": "frames", "deep": "frames"},
     **{"shaders": "shaders", "lens": "lens", "opengl": "exchange"},
@@ -53,18 +53,18 @@ def run(name: str, settings: Settings) -> Record:
         ValueError: There is no such workload or peer, or no case has `only` in its name.
         Unavailable: The workload can't run here.
     """
-    from .record import PEERS, Record, elsewhere
+    from .record import PEERS, Record, noting_other_processes
 
-    for what, wanted, known in (
+    for noun, requested, known in (
         ("workload", (name,), WORKLOADS),
         ("peer", settings.peers or (), PEERS),
     ):
-        unknown = sorted(set(wanted) - set(known))
+        unknown = sorted(set(requested) - set(known))
         if unknown:
-            raise ValueError(f"bench: unknown {what} {unknown[0]!r}; known: {', '.join(known)}")
+            raise ValueError(f"bench: unknown {noun} {unknown[0]!r}; known: {', '.join(known)}")
     record = Record(name, settings)
-    with elsewhere(record):
-        getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)(record)
+    with noting_other_processes(record):
+        getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)(record)
     if not record.rows:
         raise ValueError(f"bench: no case of {name} has {settings.only!r} in its name")
     return record

@@ -40,7 +40,7 @@ def lru(record: Record) -> None:
         times=theirs.median / ours.median,
         same=same,
     )
-    record.note("same: the slots that may be taken come in the same order.")
+    record.note("same: both list the slots that can be reused in the same order")
 
 
 def compact(record: Record) -> None:
@@ -50,35 +50,35 @@ def compact(record: Record) -> None:
     case = f"{nodes:,} nodes, {_REQUESTS:,} requests"
     if not record.wants(case):
         return
-    some = torch.randperm(nodes, generator=torch.Generator().manual_seed(2))[:_REQUESTS]
+    requesting = torch.randperm(nodes, generator=torch.Generator().manual_seed(2))[:_REQUESTS]
     words = torch.zeros(nodes, dtype=torch.int16)
-    words[some] = REQUEST_LOAD | 77
+    words[requesting] = REQUEST_LOAD | 77
     words = words.view(-1, 8).to(settings.device)
     count = 16 if settings.device.type == "cuda" else 4
     copies = [words.clone() for _ in range(count)]
-    turn = itertools.cycle(copies)
+    cycle = itertools.cycle(copies)
 
     def refill() -> None:
         for copy in copies:
             copy.copy_(words)
 
-    def peer() -> torch.Tensor:
-        return torch.nonzero(next(turn).view(-1) & REQUEST_KINDS)
+    def list_nonzero() -> torch.Tensor:
+        return torch.nonzero(next(cycle).view(-1) & REQUEST_KINDS)
 
     capacity = 1 << 17
     ours = clock(
-        lambda: compact_requests(next(turn), capacity), settings, calls=count, prepare=refill
+        lambda: compact_requests(next(cycle), capacity), settings, calls=count, prepare=refill
     )
-    theirs = clock(peer, settings, calls=count, prepare=refill)
+    theirs = clock(list_nonzero, settings, calls=count, prepare=refill)
     refill()
-    requested = peer()[:, 0]
+    requested = list_nonzero()[:, 0]
     node, _, counts = compact_requests(copies[0], capacity)
     same = torch.equal(node[: int(counts[0])].long(), requested)
     for who, timing in (("gvtorch", ours), ("torch.nonzero", theirs)):
-        more = {} if who == "gvtorch" else {"times": timing.median / ours.median, "same": same}
+        figures = {} if who == "gvtorch" else {"times": timing.median / ours.median, "same": same}
         rate = 1e3 * words.nbytes / timing.median
-        record.add(case, who, timing, words_bytes_per_second=rate, **more)
+        record.add(case, who, timing, words_bytes_per_second=rate, **figures)
     record.note(
-        "words bytes / s: the request words, 2 bytes a node, over the time; torch.nonzero lists "
-        "nodes and clears no words, and waits for the count"
+        "words bytes / s: bytes of request words (2 a node) read per second; torch.nonzero only "
+        "lists the nodes: it does not clear their words, and it waits for the count"
     )

@@ -11,7 +11,7 @@ import torch
 
 from .. import opengl as gl
 from . import Unavailable
-from .record import Record, Settings, Timing, spread, synchronize
+from .record import Record, Settings, Timing, summarize, synchronize
 
 #: Colour formats, as moderngl's dtype and torch's.
 _FORMATS = {
@@ -26,54 +26,54 @@ def opengl(record: Record) -> None:
     settings = record.settings
     size = (64, 48) if settings.quick else (1920, 1080)
     context = _context()
-    record.note(f"OpenGL: {context.info['GL_RENDERER']}, without a window (EGL); depth: 24 bits")
+    record.note(f"OpenGL: {context.info['GL_RENDERER']}, without a window (EGL); 24-bit depth")
     with (
-        gl.Exchange(*size, settings.device) as first,
-        gl.Exchange(*size, settings.device, share=False) as second,
+        gl.Exchange(*size, settings.device) as direct,
+        gl.Exchange(*size, settings.device, share=False) as indirect,
     ):
-        if not first.shared:
-            record.note(f"no buffers are shared: {first.reason}")
+        if not direct.shared:
+            record.note(f"OpenGL and torch share no buffers here: {direct.reason}")
         for name in _FORMATS:
-            _measure(record, context, name, [first, second] if first.shared else [second])
+            _measure(record, context, name, [direct, indirect] if direct.shared else [indirect])
     record.note(
-        "ms: until both sides are done; host ms: until the calls return; draw: colour and depth "
-        "into a framebuffer; read: both out of it as float32; same: what is read is what the "
-        "case's first way reads, in every bit"
+        "ms: until OpenGL and torch are done; host ms: until the calls return; draw: colour and "
+        "depth into a framebuffer; read: both from it, as float32; same: what is read equals what "
+        "the case's first row reads, bit for bit"
     )
 
 
-def _measure(record: Record, context: Any, name: str, ways: list[gl.Exchange]) -> None:
-    """Draws and reads random pictures of a format through each exchange of `ways`."""
-    settings, (width, height) = record.settings, (ways[0].width, ways[0].height)
-    kind, dtype = _FORMATS[name]
+def _measure(record: Record, context: Any, name: str, exchanges: list[gl.Exchange]) -> None:
+    """Draws and reads random pictures of a format through each of the exchanges."""
+    settings, (width, height) = record.settings, (exchanges[0].width, exchanges[0].height)
+    gl_dtype, dtype = _FORMATS[name]
     generator = torch.Generator().manual_seed(1)
-    numbers = torch.rand(height, width, 5, generator=generator).to(settings.device)
-    color, depth = numbers[..., :4] * (255 if dtype == torch.uint8 else 1), numbers[..., 4:]
+    values = torch.rand(height, width, 5, generator=generator).to(settings.device)
+    color, depth = values[..., :4] * (255 if dtype == torch.uint8 else 1), values[..., 4:]
     color = color.to(dtype)
-    texture = context.texture((width, height), 4, dtype=kind)
-    frame = context.framebuffer([texture], context.depth_texture((width, height)))
-    frame.use()
+    texture = context.texture((width, height), 4, dtype=gl_dtype)
+    framebuffer = context.framebuffer([texture], context.depth_texture((width, height)))
+    framebuffer.use()
 
-    def draw(way: gl.Exchange) -> None:
-        way.draw(color, depth)
+    def draw(exchange: gl.Exchange) -> None:
+        exchange.draw(color, depth)
 
-    def read(way: gl.Exchange) -> tuple[torch.Tensor, torch.Tensor]:
-        return way.read_color(), way.read_depth()
+    def read(exchange: gl.Exchange) -> tuple[torch.Tensor, torch.Tensor]:
+        return exchange.read_color(), exchange.read_depth()
 
     for run in (draw, read):
         case = f"{run.__name__}, {name}, {width}x{height}"
         if not record.wants(case):
             continue
         settings.tell(case)
-        seen = []
-        for way in ways:
-            draw(way)
-            seen.append(read(way))
-            timing, host = _clock(partial(run, way), settings, context)
-            who = "shared" if way.shared else "through the host"
-            same = all(map(torch.equal, seen[0], seen[-1]))
-            record.add(case, who, timing, host_ms=host, same=same)
-    frame.release()
+        results = []
+        for exchange in exchanges:
+            draw(exchange)
+            results.append(read(exchange))
+            timing, host_ms = _clock(partial(run, exchange), settings, context)
+            who = "shared" if exchange.shared else "through the host"
+            same = all(map(torch.equal, results[0], results[-1]))
+            record.add(case, who, timing, host_ms=host_ms, same=same)
+    framebuffer.release()
 
 
 def _context() -> Any:
@@ -91,14 +91,14 @@ def _context() -> Any:
 
 def _clock(run: Callable[[], object], settings: Settings, context: Any) -> tuple[Timing, float]:
     """Returns the time until OpenGL and torch are done, and the median until a call returns, ms."""
-    times, host = [], []
+    times, host_times = [], []
     for _ in range(settings.repeats + 1):  # the first warms up
         context.finish()
         synchronize(settings.device)
         start = time.perf_counter()
         run()
-        host.append(1e3 * (time.perf_counter() - start))
+        host_times.append(1e3 * (time.perf_counter() - start))
         context.finish()
         synchronize(settings.device)
         times.append(1e3 * (time.perf_counter() - start))
-    return spread(times[1:]), spread(host[1:]).median
+    return summarize(times[1:]), summarize(host_times[1:]).median

@@ -8,7 +8,7 @@ from ..cameras import Camera
 from ..engine.engine import Engine
 from ..producers import VolumeProducer
 from ..tracing import ThinLens
-from .frames import converging
+from .frames import until_converged
 from .record import Record, clock
 from .scenes import worn
 
@@ -29,7 +29,7 @@ def lens(record: Record) -> None:
         if not record.wants(case):
             continue
         settings.tell(case)
-        view = ThinLens(aperture=aperture, focus=_FOCUS, frame="box") if aperture else None
+        thin_lens = ThinLens(aperture=aperture, focus=_FOCUS, frame="box") if aperture else None
         producer = VolumeProducer(scene.volume)
         with Engine(
             producer,
@@ -38,31 +38,31 @@ def lens(record: Record) -> None:
             device=settings.device,
             monitor=False,
         ) as engine:
-            see = partial(engine.frame, camera, scene.shader, lens=view)
+            render_frame = partial(engine.frame, camera, scene.shader, lens=thin_lens)
             loaded, moved = 0, 0
-            for _, stats in converging(see):
+            for _, stats in until_converged(render_frame):
                 loaded, moved = loaded + stats.produced["bricks"], moved + stats.bytes_uploaded
             if not stats.converged:
-                record.note(f"{case}: it was not steady")
-            timings = {"gvtorch": clock(see, settings)}
-            _, last = timings["gvtorch"].last
+                record.note(f"{case}: the picture had not converged when it was timed")
+            timings = {"gvtorch": clock(render_frame, settings)}
+            _, last_stats = timings["gvtorch"].last
             if settings.device.type == "cuda":
-                graph = engine.capture(camera, scene.shader, lens=view)
+                graph = engine.capture(camera, scene.shader, lens=thin_lens)
                 timings["captured"] = clock(partial(graph.replay, camera), settings, calls=20)
-            one = engine.memory()["brick_pool"] // engine.cache.bricks.capacity
+            brick_bytes = engine.memory()["brick_pool"] // engine.cache.bricks.capacity
         for who, timing in timings.items():
             record.add(
                 *(case, who, timing),
                 aperture=aperture,
-                samples=last.samples,
-                bricks=last.bricks_used,
-                brick_bytes=last.bricks_used * one,
+                samples=last_stats.samples,
+                bricks=last_stats.bricks_used,
+                brick_bytes=last_stats.bricks_used * brick_bytes,
                 loaded=loaded,
                 moved_bytes=moved,
             )
     record.note(
-        "aperture: diameter of the lens in sides of the box, focused at 0.9 of them, 0: no lens; "
-        "bricks: used by a steady frame; loaded: from an empty engine to the whole picture"
+        "aperture: the lens's diameter relative to the box's largest side (0: no lens), focused at "
+        "0.9 sides; bricks: used by a frame that loads nothing; loaded: until the picture converged"
     )
     if settings.device.type == "cuda":
-        record.note("captured: replayed as a CUDA graph, so that the host no longer bounds a frame")
+        record.note("captured: replayed as a CUDA graph, so that the host does not limit a frame")

@@ -21,11 +21,11 @@ from ..io.resources import memory_free
 from ..pictures import Picture
 from ..pool import N3Tree
 from ..tracing import render, trace
-from .peers.peer import Peer, Task, find
-from .record import Record, Settings, Timing, clock, once
+from .peers.peer import Peer, Task, find_peers
+from .record import Record, Settings, Timing, clock, time_once
 from .scenes import SCENES, BenchScene, shell_sparse
 
-_STOP = 0.99
+_STOP_ALPHA = 0.99
 Size = tuple[int, int]
 
 
@@ -33,25 +33,26 @@ def march(record: Record) -> None:
     """Measures all scenes at two sizes, with the finest level and levels by cone, and the peers."""
     quick = record.settings.quick
     sizes = [(24, 16)] if quick else [(512, 512), (1920, 1080)]
-    peers = find(record)
+    peers = find_peers(record)
     for name, make in SCENES.items():
-        wanted = [size for size in sizes if record.wants(_case(name, size))]
+        chosen_sizes = [size for size in sizes if record.wants(_case_name(name, size))]
         if name == "clouds":
-            wanted = wanted[:1]
-        if not wanted:
+            chosen_sizes = chosen_sizes[:1]
+        if not chosen_sizes:
             continue
         record.settings.tell(f"march: making {name}")
         try:
             scene = make(32 if quick else 256)
         except FileNotFoundError:
-            record.note(f"{name}: left out, its file comes with the source and is not here")
+            record.note(f"{name}: left out, its file is missing (it comes with the source code)")
             continue
         tree = N3Tree.from_volume(scene.volume, device=record.settings.device)
-        for size in wanted:
+        for size in chosen_sizes:
             _compare(record, scene, tree, size, peers, ("finest", "auto"))
     record.note(
-        "auto: levels by cone. Differences are from the finest level's picture, over colour and "
-        "alpha. op_ms: the compiled op alone; ms: the whole of `trace`."
+        "gvtorch auto: levels of detail chosen by the width of each ray's cone; differences are "
+        "from the finest level's picture, over colour and alpha; op ms: the compiled op alone; ms: "
+        "all of `trace`; times: relative to the case's first row"
     )
 
 
@@ -60,8 +61,8 @@ def first_hit(record: Record) -> None:
     quick = record.settings.quick
     size = (24, 16) if quick else (1920, 1080)
     scene = replace(shell_sparse(32 if quick else 256), name="first hit")
-    peers = find(record)
-    if record.wants(_case(scene.name, size)):
+    peers = find_peers(record)
+    if record.wants(_case_name(scene.name, size)):
         tree = N3Tree.from_volume(scene.volume, device=record.settings.device)
         _compare(record, scene, tree, size, peers, ("finest",))
 
@@ -69,14 +70,14 @@ def first_hit(record: Record) -> None:
 def calls(record: Record) -> None:
     """Measures pictures of a thin shell so small that the overhead of a call dominates."""
     settings = record.settings
-    count, small = (3, 8) if settings.quick else (1000, 64)
+    count, small_side = (3, 8) if settings.quick else (1000, 64)
     scene = shell_sparse(32 if settings.quick else 64)
     tree = N3Tree.from_volume(scene.volume, device=settings.device)
-    for size in (1, small):
-        case = f"one picture, {size}x{size}"
+    for side in (1, small_side):
+        case = f"one picture, {side}x{side}"
         if not record.wants(case):
             continue
-        camera = scene.camera(size, size)
+        camera = scene.camera(side, side)
         rays = camera.rays(settings.device)
         for who, run in (
             ("render", partial(render, tree, camera, scene.shader)),
@@ -85,21 +86,21 @@ def calls(record: Record) -> None:
             settings.tell(f"{case}: {who}")
             timing = clock(run, settings, calls=1 if settings.quick else 100)
             record.add(case, who, timing, op_ms=op_milliseconds(run, settings))
-    case = f"{count:,} pictures, {small}x{small}"
+    case = f"{count:,} pictures, {small_side}x{small_side}"
     if not record.wants(case):
         return
     settings.tell(case)
-    around = torch.linspace(0, 360, count + 1, dtype=torch.float64)[:-1]
-    cameras = Camera.orbit(around, 20, 2.0, 30, small, small).placed(scene.box)
-    alone = [cameras[n] for n in range(count)]
-    at_once = partial(render, tree, cameras, scene.shader)
+    angles = torch.linspace(0, 360, count + 1, dtype=torch.float64)[:-1]
+    cameras = Camera.orbit(angles, 20, 2.0, 30, small_side, small_side).placed(scene.box)
+    single_cameras = [cameras[n] for n in range(count)]
+    one_batch = partial(render, tree, cameras, scene.shader)
 
     def one_by_one() -> list[Picture]:
-        return [render(tree, camera, scene.shader) for camera in alone]
+        return [render(tree, camera, scene.shader) for camera in single_cameras]
 
     singles = torch.stack([picture.color for picture in one_by_one()])
-    same = bool(torch.equal(at_once().color, singles))
-    timings = {"one by one": clock(one_by_one, settings), "one batch": clock(at_once, settings)}
+    same = bool(torch.equal(one_batch().color, singles))
+    timings = {"one by one": clock(one_by_one, settings), "one batch": clock(one_batch, settings)}
     for who, timing in timings.items():
         times = timing.median / timings["one by one"].median
         record.add(case, who, timing, times=times, same=same)
@@ -110,7 +111,7 @@ def bricks(record: Record) -> None:
     quick, device = record.settings.quick, record.settings.device
     size = (24, 16) if quick else (512, 512)
     for name in ("fog dense", "shell sparse", "aneurism"):
-        scene, first = None, None
+        scene, first_picture = None, None
         for brick_size in (4, 8, 16, 32):
             for border in (1, 0, 2):  # 1 first: the others are compared with it
                 case = f"{name}, {brick_size}^3 + {border}"
@@ -118,25 +119,25 @@ def bricks(record: Record) -> None:
                     continue
                 record.settings.tell(f"bricks: {case}")
                 scene = scene or SCENES[name](32 if quick else 256)
-                needed = _tree_bytes(scene, brick_size, border)
-                if needed > _memory_free(device):
-                    record.note(f"{case}: left out, the tree may take {needed / 1e9:.1f} GB")
+                needed_bytes = _tree_bytes(scene, brick_size, border)
+                if needed_bytes > _memory_free(device):
+                    record.note(f"{case}: left out, the tree may take {needed_bytes / 1e9:.1f} GB")
                     continue
                 tree = N3Tree.from_volume(scene.volume, brick_size, border, device=device)
                 camera = scene.camera(*size)
-                run = _tracing(tree, scene, camera, "finest", device)
+                run = _trace_call(tree, scene, camera, "finest", device)
                 hits = run()
                 picture = rgba(hits)
-                first = picture if first is None else first
+                first_picture = picture if first_picture is None else first_picture
                 timing = clock(run, record.settings)
                 sizes = {"scene": name, "brick_size": brick_size, "border": border}
                 memory = {"tree_bytes": tree.nbytes, "bricks": tree.bricks.capacity}
-                figures = sizes | rates(hits, timing) | difference(picture, first) | memory
+                figures = sizes | rates(hits, timing) | difference(picture, first_picture) | memory
                 record.add(case, "gvtorch", timing, **figures)
-    record.note("Differences are from the picture of the scene's first row.")
+    record.note("differences are from the picture of the scene's first row")
 
 
-def _case(name: str, size: Size) -> str:
+def _case_name(name: str, size: Size) -> str:
     return f"{name}, {size[0]}x{size[1]}"
 
 
@@ -149,17 +150,17 @@ def _compare(
     lods: tuple[str, ...],
 ) -> None:
     """Adds a row for each level of detail, then one for each peer."""
-    settings, case = record.settings, _case(scene.name, size)
+    settings, case = record.settings, _case_name(scene.name, size)
     device, camera = settings.device, scene.camera(*size)
     finest = torch.empty(0)
     for lod in lods:
         who = "gvtorch" if lod == "finest" else f"gvtorch {lod}"
         settings.tell(f"{case}: {who}")
-        run = _tracing(tree, scene, camera, lod, device)
+        run = _trace_call(tree, scene, camera, lod, device)
         hits = run()
         timing = clock(run, settings)
         figures = rates(hits, timing) | {"op_ms": op_milliseconds(run, settings)}
-        figures |= record.beside_first(case, timing)
+        figures |= record.relative_to_first(case, timing)
         picture = rgba(hits)
         if lod == "finest":
             finest = picture
@@ -168,24 +169,24 @@ def _compare(
         record.add(case, who, timing, **figures)
         _save(record, picture, f"{case} {who}", size)
     rays = camera.rays(device)
-    task = Task(scene=scene, camera=camera, rays=rays, stop_alpha=_STOP, device=device)
-    for name, kind in peers.items():
+    task = Task(scene=scene, camera=camera, rays=rays, stop_alpha=_STOP_ALPHA, device=device)
+    for name, peer_class in peers.items():
         settings.tell(f"{case}: {name}")
-        peer = kind(task)
+        peer = peer_class(task)
         timing = clock(peer.render, settings)
         picture = peer.picture().cpu()
         figures = {"rays_per_second": 1e3 * len(picture) / timing.median}
-        figures |= record.beside_first(case, timing) | difference(picture, finest)
+        figures |= record.relative_to_first(case, timing) | difference(picture, finest)
         record.add(case, name, timing, **figures)
         _save(record, picture, f"{case} {name}", size)
 
 
-def _tracing(
+def _trace_call(
     tree: N3Tree, scene: BenchScene, camera: Camera, lod: str, device: torch.device
 ) -> Callable[[], Hits]:
     """Returns the call that is timed; its rays are made here."""
     rays = camera.rays(device)
-    options: Any = {"lod": lod, "step": scene.step, "stop_alpha": _STOP}
+    options: Any = {"lod": lod, "step": scene.step, "stop_alpha": _STOP_ALPHA}
     return lambda: trace(tree, rays, scene.shader, **options)
 
 
@@ -206,23 +207,23 @@ def rgba(hits: Hits | Picture) -> Tensor:
 
 def difference(picture: Tensor, other: Tensor) -> dict[str, float]:
     """Returns the largest, mean and rms difference of two pictures of one shape."""
-    apart = (picture - other).double().abs()
+    deviation = (picture - other).double().abs()
     return {
-        "max_difference": float(apart.max()),
-        "mean_difference": float(apart.mean()),
-        "rms_difference": float(apart.square().mean().sqrt()),
+        "max_difference": float(deviation.max()),
+        "mean_difference": float(deviation.mean()),
+        "rms_difference": float(deviation.square().mean().sqrt()),
     }
 
 
 def op_milliseconds(run: Callable[[], object], settings: Settings) -> float | None:
     """Returns median milliseconds inside the op of a fused shader; None if none is called."""
-    with _OpTimer(settings.device) as watch:
+    with _OpTimer(settings.device) as timer:
         began = time.perf_counter()
         for _ in range(settings.repeats):
             run()
             if time.perf_counter() - began > settings.seconds:
                 break
-    return statistics.median(watch.times) if watch.times else None
+    return statistics.median(timer.times) if timer.times else None
 
 
 class _OpTimer(TorchDispatchMode):
@@ -239,9 +240,9 @@ class _OpTimer(TorchDispatchMode):
         call = partial(func, *args, **(kwargs or {}))
         if func.name() not in ("gvtorch::trace_rays", "gvtorch::shade_rays"):
             return call()
-        milliseconds, answer = once(call, self.device)
+        milliseconds, result = time_once(call, self.device)
         self.times.append(milliseconds)
-        return answer
+        return result
 
 
 def _tree_bytes(scene: BenchScene, brick_size: int, border: int) -> int:
@@ -263,12 +264,12 @@ def _save(record: Record, picture: Tensor, name: str, size: Size) -> None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     image = picture.reshape(size[1], size[0], 4)
-    nothing = torch.zeros_like(image[..., 3:])
+    zeros = torch.zeros_like(image[..., 3:])
     Picture(
         color=image[..., :3],
         alpha=image[..., 3:],
-        depth=nothing,
-        nearest=nothing,
-        samples=nothing.int(),
+        depth=zeros,
+        nearest=zeros,
+        samples=zeros.int(),
         stats=RenderStats(),
     ).save(folder / f"{name.replace(', ', ' ').replace(' ', '_')}.png")

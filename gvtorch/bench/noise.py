@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..fields import noise as gv_noise
-from ..ops import noise as op
+from ..ops import noise as noise_op
 from .record import Record, clock, synchronize
 
 _CHUNK = 1 << 13  # points at a time, so that NumPy's temporaries stay in the caches
@@ -23,33 +23,33 @@ def noise(record: Record) -> None:
     points = 100 * torch.rand((count, 3), generator=torch.Generator().manual_seed(5))
     case = f"{count:,} points"
     if record.wants(case):
-        _points(record, case, points)
-    kinds: dict[str, Callable[..., Any]] = {
+        _measure_perlin(record, case, points)
+    functions: dict[str, Callable[..., Any]] = {
         **{"value": gv_noise.value, "simplex": gv_noise.simplex, "cellular": gv_noise.cellular},
         **{"6 octaves": gv_noise.fbm},
     }
-    for name, kind in kinds.items():
+    for name, function in functions.items():
         case = f"{count:,} points, {name}"
         if record.wants(case):
-            _add(record, case, "op", count, partial(kind, points.to(settings.device)))
+            _add(record, case, "op", count, partial(function, points.to(settings.device)))
 
 
-def _points(record: Record, case: str, points: torch.Tensor) -> None:
+def _measure_perlin(record: Record, case: str, points: torch.Tensor) -> None:
     """Measures all at the same points; peers hash differently, so values can't be compared."""
     device = record.settings.device
     on_device, in_numpy = points.to(device), points.numpy()
     _add(record, case, "op", len(points), lambda: gv_noise.perlin(on_device))
-    twin = partial(op, kind="perlin", backend="reference")
-    apart = float((twin(on_device) - gv_noise.perlin(on_device)).abs().max())
-    _add(record, case, "twin", len(points), lambda: twin(on_device), max_difference=apart)
+    twin = partial(noise_op, kind="perlin", backend="reference")
+    deviation = float((twin(on_device) - gv_noise.perlin(on_device)).abs().max())
+    _add(record, case, "twin", len(points), lambda: twin(on_device), max_difference=deviation)
     compiled = torch.compile(twin, fullgraph=True, dynamic=False)
     try:
         compiled(on_device)
         synchronize(device)
         _add(record, case, "twin, compiled", len(points), lambda: compiled(on_device))
     except Exception as error:  # whatever the compiler finds missing here
-        reason = str(error).strip().splitlines()
-        record.note(f"compiled: it does not work here: {reason[0] if reason else type(error)}")
+        lines = str(error).strip().splitlines()
+        record.note(f"twin: torch.compile fails here: {lines[0] if lines else type(error)}")
     if device.type == "cuda":
         return
     table = np.tile(np.random.default_rng(0).permutation(256), 3)
@@ -62,7 +62,7 @@ def _points(record: Record, case: str, points: torch.Tensor) -> None:
     for who, make in (("pyfastnoiselite", _fastnoiselite), ("pyfastnoisesimd", _fastnoisesimd)):
         if record.has_peer(who):
             _add(record, case, who, len(points), make(in_numpy))
-    record.note("pyfast...: C++ on one thread, without torch; NumPy is on one thread as well")
+    record.note("the pyfast... libraries are C++ without torch; they and NumPy run on one thread")
 
 
 def perlin_numpy(points: np.ndarray, table: np.ndarray) -> np.ndarray:
@@ -88,19 +88,19 @@ def perlin_numpy(points: np.ndarray, table: np.ndarray) -> np.ndarray:
 def _fastnoiselite(points: np.ndarray) -> Callable[[], object]:
     from pyfastnoiselite.pyfastnoiselite import FastNoiseLite, NoiseType
 
-    source, places = FastNoiseLite(1), np.ascontiguousarray(points.T)
-    source.noise_type, source.frequency = NoiseType.NoiseType_Perlin, 1.0
-    return lambda: source.gen_from_coords(places)
+    generator, coordinates = FastNoiseLite(1), np.ascontiguousarray(points.T)
+    generator.noise_type, generator.frequency = NoiseType.NoiseType_Perlin, 1.0
+    return lambda: generator.gen_from_coords(coordinates)
 
 
 def _fastnoisesimd(points: np.ndarray) -> Callable[[], object]:
     import pyfastnoisesimd
 
-    source = pyfastnoisesimd.Noise(seed=1, numWorkers=1)
-    source.noiseType, source.frequency = pyfastnoisesimd.NoiseType.Perlin, 1.0
-    places = pyfastnoisesimd.empty_coords(len(points))
-    places[:3, : len(points)] = points.T
-    return lambda: source.genFromCoords(places)
+    generator = pyfastnoisesimd.Noise(seed=1, numWorkers=1)
+    generator.noiseType, generator.frequency = pyfastnoisesimd.NoiseType.Perlin, 1.0
+    coordinates = pyfastnoisesimd.empty_coords(len(points))
+    coordinates[:3, : len(points)] = points.T
+    return lambda: generator.genFromCoords(coordinates)
 
 
 def _add(
@@ -108,4 +108,4 @@ def _add(
 ) -> None:
     timing = clock(run, record.settings)
     rates = {"values_per_second": 1e3 * count / timing.median}
-    record.add(case, who, timing, **rates, **record.beside_first(case, timing), **figures)
+    record.add(case, who, timing, **rates, **record.relative_to_first(case, timing), **figures)

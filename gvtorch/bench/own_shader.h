@@ -4,7 +4,7 @@
 #include "user_shader.h"
 
 template <class T>
-struct Own : gv::UserShader<T> {
+struct PlainTransfer : gv::UserShader<T> {
   using gv::UserShader<T>::UserShader;
 
   GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {

@@ -25,7 +25,7 @@ from ..producers import (
     Regions,
 )
 from .record import Record, clock, synchronize
-from .voxelize import bumps
+from .voxelize import bumpy_sphere
 
 _SIDE = 4096  # finest voxels along a side of the scene
 _BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -62,7 +62,7 @@ def library() -> dict[str, Producer]:
         "noise of 6 octaves": FieldProducer(_Clouds(), _SIDE, box=_BOX, samples=1),
         "octaves by level": OctaveProducer(octaves, _SIDE, box=_BOX),
         "hypertexture": Hypertexture(ball, _SIDE, thickness=0.1, frequency=4.0, octaves=6),
-        "mesh of 100,000 triangles": MeshProducer(bumps(100_000), resolution=1024),
+        "mesh of 100,000 triangles": MeshProducer(bumpy_sphere(100_000), resolution=1024),
         "1,000,000 points": PointProducer(points, extent=1024),
     }
 
@@ -81,42 +81,42 @@ def produce(record: Record) -> None:
         if not record.wants(name):
             continue
         settings.tell(f"produce: {name}")
-        most = {"cpu": 1 << 8, "cuda": 1 << 13}[settings.device.type] >> (4 * settings.quick)
+        max_count = {"cpu": 1 << 8, "cuda": 1 << 13}[settings.device.type] >> (4 * settings.quick)
         with closing(producer):
-            nodes = some_nodes(producer.to(settings.device), most, settings.device)
+            nodes = random_nodes(producer.to(settings.device), max_count, settings.device)
             compiles = name == "rings" or not settings.quick
-            _both(record, f"{name}: {len(nodes):,} bricks", producer, nodes, compiles)
+            _measure(record, f"{name}: {len(nodes):,} bricks", producer, nodes, compiles)
     record.note(
-        "max difference: of compiled numbers from eager ones, beside the largest. Places are made "
-        "of nodes in float64, as producers do it."
+        "max difference: of compiled values from eager ones, relative to the largest value; voxel "
+        "positions are computed from nodes in float64, as producers do it"
     )
 
 
-def some_nodes(producer: Producer, most: int, device: torch.device) -> Nodes:
+def random_nodes(producer: Producer, max_count: int, device: torch.device) -> Nodes:
     """Returns at most `most` random nodes of the finest level that have data."""
     layout = Layout.of(producer, 8, 1, device)
     producer.prepare(layout)
     generator = torch.Generator().manual_seed(3)
     side = -(-min(producer.extent) // 8)
-    found: list[Tensor] = []
+    data_locs: list[Tensor] = []
     for _ in range(64):
-        loc = torch.randint(0, side, (8 * most, 4), generator=generator)
+        loc = torch.randint(0, side, (8 * max_count, 4), generator=generator)
         loc[:, 3] = layout.depth
         loc = loc.to(device)
         regions: Any = producer.classify(Nodes(loc, layout))
-        kind = regions.kind if isinstance(regions, Regions) else regions
-        found.append(loc[kind.to(device) == Region.DATA])
-        if sum(map(len, found)) >= most:
+        region = regions.kind if isinstance(regions, Regions) else regions
+        data_locs.append(loc[region.to(device) == Region.DATA])
+        if sum(map(len, data_locs)) >= max_count:
             break
-    loc = torch.cat(found)[:most]
+    loc = torch.cat(data_locs)[:max_count]
     parents = None
     if producer.needs_parent:
-        above = torch.cat((loc[:, :3] // layout.branching, loc[:, 3:] - 1), 1)
-        parents = producer.bricks_at(above, layout)
+        parent_locs = torch.cat((loc[:, :3] // layout.branching, loc[:, 3:] - 1), 1)
+        parents = producer.bricks_at(parent_locs, layout)
     return Nodes(loc, layout, parents=parents)
 
 
-def _both(record: Record, case: str, producer: Producer, nodes: Nodes, compiles: bool) -> None:
+def _measure(record: Record, case: str, producer: Producer, nodes: Nodes, compiles: bool) -> None:
     """Measures `fill` eager, then compiled; compiling takes many seconds."""
     settings = record.settings
 
@@ -135,18 +135,18 @@ def _both(record: Record, case: str, producer: Producer, nodes: Nodes, compiles:
         compiled()
         synchronize(settings.device)
     except Exception as error:  # whatever the compiler finds missing here
-        reason = str(error).strip().splitlines()
-        record.note(f"{case}: not compiled: {reason[0] if reason else type(error)}")
+        lines = str(error).strip().splitlines()
+        record.note(f"{case}: torch.compile fails here: {lines[0] if lines else type(error)}")
         return
     _add(record, case, "compiled", compiled, expected)
 
 
 def _add(record: Record, case: str, who: str, run: Callable[[], Tensor], expected: Tensor) -> None:
     timing = clock(run, record.settings)
-    apart = (timing.last - expected).abs().max() / expected.abs().max().clamp(min=1e-30)
+    deviation = (timing.last - expected).abs().max() / expected.abs().max().clamp(min=1e-30)
     rates = {
         "bricks_per_second": 1e3 * len(expected) / timing.median,
         "voxels_per_second": 1e3 * len(expected) * 1000 / timing.median,
-        "max_difference": float(apart),
+        "max_difference": float(deviation),
     }
-    record.add(case, who, timing, **rates, **record.beside_first(case, timing))
+    record.add(case, who, timing, **rates, **record.relative_to_first(case, timing))

@@ -35,7 +35,7 @@ PEERS = {
     "viser": "viser",
     "trame": "trame-vtk",
 }
-_DISTURBED = 0.05  # share of the cores that other processes may use without a note
+_MAX_OTHER_SHARE = 0.05  # share of the cores that other processes may use without a note
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +70,8 @@ class Timing:
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the columns of a row."""
-        spread = {"ms": self.median, "ms_low": self.low, "ms_high": self.high}
-        return {**spread, "repeats": self.repeats}
+        times = {"ms": self.median, "ms_low": self.low, "ms_high": self.high}
+        return {**times, "repeats": self.repeats}
 
 
 def clock(
@@ -97,17 +97,17 @@ def clock(
             prepare()
         synchronize(device)
         last = None
-        milliseconds, last = once(run, device, calls)
+        milliseconds, last = time_once(run, device, calls)
         times.append(milliseconds / calls)
         if number == 0:
             times.clear()  # the warm-up
             began = time.perf_counter()
         elif time.perf_counter() - began > settings.seconds:
             break
-    return spread(times, last)
+    return summarize(times, last)
 
 
-def spread(milliseconds: list[float], last: Any = None) -> Timing:
+def summarize(milliseconds: list[float], last: Any = None) -> Timing:
     """Returns median, smallest and largest of some times."""
     return Timing(
         last=last,
@@ -118,23 +118,23 @@ def spread(milliseconds: list[float], last: Any = None) -> Timing:
     )
 
 
-def once(run: Callable[[], Any], device: torch.device, calls: int = 1) -> tuple[float, Any]:
+def time_once(run: Callable[[], Any], device: torch.device, calls: int = 1) -> tuple[float, Any]:
     """Returns the milliseconds of `calls` calls together, and what the last one returned."""
     if device.type == "cuda":
-        first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         with torch.cuda.device(device):
-            first.record()
+            begin.record()
             for _ in range(calls - 1):
                 run()
-            given = run()
-            last.record()
-        last.synchronize()
-        return first.elapsed_time(last), given
+            result = run()
+            end.record()
+        end.synchronize()
+        return begin.elapsed_time(end), result
     start = time.perf_counter()
     for _ in range(calls - 1):
         run()
-    given = run()
-    return 1e3 * (time.perf_counter() - start), given
+    result = run()
+    return 1e3 * (time.perf_counter() - start), result
 
 
 def synchronize(device: torch.device) -> None:
@@ -168,7 +168,7 @@ class Record:
             {"case": case, "who": who, **(timing.as_dict() if timing else {}), **figures}
         )
 
-    def beside_first(self, case: str, timing: Timing) -> dict[str, float]:
+    def relative_to_first(self, case: str, timing: Timing) -> dict[str, float]:
         """Returns `times`: the time relative to the case's first row; nothing for that row."""
         first = next((row for row in self.rows if row["case"] == case), None)
         return {} if first is None else {"times": timing.median / first["ms"]}
@@ -179,8 +179,8 @@ class Record:
         """
         if self.settings.peers is not None and name not in self.settings.peers:
             return False
-        here = importlib.util.find_spec(module or name) is not None
-        self.peers[name] = why_not or ("ran" if here else f"not installed ({PEERS[name]})")
+        installed = importlib.util.find_spec(module or name) is not None
+        self.peers[name] = why_not or ("ran" if installed else f"not installed ({PEERS[name]})")
         return self.peers[name] == "ran"
 
     def note(self, sentence: str) -> None:
@@ -201,16 +201,16 @@ class Record:
 
 
 @contextmanager
-def elsewhere(record: Record) -> Iterator[None]:
+def noting_other_processes(record: Record) -> Iterator[None]:
     """Adds a note if other processes used much of the cores while a workload ran (Linux)."""
-    start, busy, own = time.perf_counter(), _busy_seconds(), _own_seconds()
+    start, busy_before, own_before = time.perf_counter(), _busy_seconds(), _own_seconds()
     yield
-    others = _busy_seconds() - busy - (_own_seconds() - own)
-    share = others / (time.perf_counter() - start) / (os.cpu_count() or 1)
-    if share > _DISTURBED:
+    other_seconds = _busy_seconds() - busy_before - (_own_seconds() - own_before)
+    share = other_seconds / (time.perf_counter() - start) / (os.cpu_count() or 1)
+    if share > _MAX_OTHER_SHARE:
         record.note(
-            f"Other processes took {share:.0%} of this machine's cores meanwhile: the times are "
-            "longer than they need be"
+            f"Other processes took {share:.0%} of this machine's CPU time meanwhile: the times may "
+            "be too long"
         )
 
 
@@ -232,13 +232,13 @@ def _own_seconds() -> float:
 
 def machine(device: torch.device) -> dict[str, Any]:
     """Returns the name of the device, the backend, and the versions of torch and gvtorch."""
-    known = {"torch": torch.__version__, "gvtorch": __version__}
+    versions = {"torch": torch.__version__, "gvtorch": __version__}
     backend = choose_backend("auto", device)
     if device.type == "cuda":
-        return {"name": torch.cuda.get_device_name(device), "backend": backend, **known}
+        return {"name": torch.cuda.get_device_name(device), "backend": backend, **versions}
     threads = torch.get_num_threads()
     name = f"{_processor()}, {threads} thread{'s' if threads > 1 else ''}"
-    return {"name": name, "backend": backend, **known}
+    return {"name": name, "backend": backend, **versions}
 
 
 def _processor() -> str:
@@ -246,6 +246,6 @@ def _processor() -> str:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:
         text = ""
-    found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
-    name = found[1] if found else platform.processor() or platform.machine()
+    match = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    name = match[1] if match else platform.processor() or platform.machine()
     return " ".join(re.sub(r"\((R|TM)\)|\bProcessor\b|\bCPU\b", "", name).split())

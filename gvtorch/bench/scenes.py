@@ -104,9 +104,9 @@ def clouds(side: int) -> BenchScene:
         field += (
             torch.sin(k * x + phase) * torch.sin(k * y - z) * torch.cos(k * z + x) / 1.7**octave
         )
-    rank = field.flatten()[:: max(1, field.numel() // 10**6)].sort().values
-    edge = float(rank[int(0.68 * len(rank))])
-    values = 128 + 127 * (field - edge) / float(field.max() - edge)
+    ordered = field.flatten()[:: max(1, field.numel() // 10**6)].sort().values
+    threshold = float(ordered[int(0.68 * len(ordered))])
+    values = 128 + 127 * (field - threshold) / float(field.max() - threshold)
     opacity, color = [(128, 0), (255, 0.3)], [(128, 0.2, 0.4, 0.8), (255, 1, 0.9, 0.7)]
     shader = TransferFunction.from_points(opacity, color)
     return BenchScene(name="clouds", volume=_uint8(values.floor()), shader=shader, step=1.0)
@@ -119,8 +119,8 @@ def aneurism(side: int) -> BenchScene:
         FileNotFoundError: The scan's file is missing; it comes with the source.
     """
     data = read_volume(SCAN).data[..., 0]
-    every = max(1, data.shape[0] // side)
-    volume = Volume(data[::every, ::every, ::every].contiguous())
+    stride = max(1, data.shape[0] // side)
+    volume = Volume(data[::stride, ::stride, ::stride].contiguous())
     vessels = TransferFunction.preset("vessels", 0, 255)
     return BenchScene(name="aneurism", volume=volume, shader=vessels, surface=76.0)
 
@@ -131,7 +131,7 @@ def scan_or_fog(side: int, note: Callable[[str], None] | None = None) -> BenchSc
         return aneurism(side)
     except FileNotFoundError:
         if note is not None:
-            note("the scan comes with the source and is not here: fog takes its place")
+            note("the scan's file is missing (it comes with the source code): fog is used instead")
         return fog_dense(side)
 
 
@@ -139,17 +139,17 @@ def worn_planes(side: int) -> Iterator[np.ndarray]:
     """Yields a sphere eroded by gyroids of five scales, a solid with holes, as uint8 planes (y, x)
     from low z to high.
     """
-    line = np.linspace(-1, 1, side, dtype=np.float32)
-    y, x = line[:, None], line[None, :]
-    for z in line:
-        worn = np.zeros((side, side), np.float32)
+    axis = np.linspace(-1, 1, side, dtype=np.float32)
+    y, x = axis[:, None], axis[None, :]
+    for z in axis:
+        erosion = np.zeros((side, side), np.float32)
         for octave in range(5):
             k = 7.0 * 2.1**octave
             gyroid = np.sin(k * x) * np.cos(k * y) + np.sin(k * y) * np.cos(k * z)
             gyroid += np.sin(k * z) * np.cos(k * x)
-            worn += gyroid / 1.9**octave
-        inside = 0.9 - np.sqrt(x * x + y * y + z * z) + 0.12 * worn
-        yield np.clip(128 + 20 * side / 8 * inside, 0, 255).astype(np.uint8)
+            erosion += gyroid / 1.9**octave
+        distance = 0.9 - np.sqrt(x * x + y * y + z * z) + 0.12 * erosion
+        yield np.clip(128 + 20 * side / 8 * distance, 0, 255).astype(np.uint8)
 
 
 def worn(side: int) -> BenchScene:

@@ -21,9 +21,9 @@ import numpy as np
 
 from ..io.stores.conversion import convert as convert_volume
 from ..io.stores.store import Store
-from .record import Record, clock, spread
+from .record import Record, clock, summarize
 
-_BLOCK = 32
+_BLOCK_SIDE = 32
 Reader = Callable[[np.ndarray], object]
 
 
@@ -34,8 +34,8 @@ def convert(record: Record) -> None:
     case = f"{side}^3 uint8"
     if not record.wants(case):
         return
-    with tempfile.TemporaryDirectory() as name:
-        raw, path = _raw(Path(name), side), Path(name) / "ball.zarr"
+    with tempfile.TemporaryDirectory() as directory:
+        raw, path = _write_raw(Path(directory), side), Path(directory) / "ball.zarr"
         clock_store(record, case, path, lambda: convert_volume(raw, path), source_bytes=side**3)
 
 
@@ -44,34 +44,34 @@ def blocks(record: Record) -> None:
     settings = record.settings
     side = 64 if settings.quick else 1024
     counts = (8,) if settings.quick else (64, 256, 1024, 4096)
-    cases = {count: f"{count:,} blocks of {_BLOCK}^3 and border" for count in counts}
+    cases = {count: f"{count:,} blocks of {_BLOCK_SIDE}^3 and border" for count in counts}
     cases = {count: case for count, case in cases.items() if record.wants(case)}
     if not cases:
         return
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as directory:
+        folder = Path(directory)
         settings.tell("blocks: making a store")
-        store = convert_volume(_raw(folder, side), folder / "ball.zarr")
+        store = convert_volume(_write_raw(folder, side), folder / "ball.zarr")
         readers = dict(_readers(record, folder, store))
         cells = store.read_cells(0, (0, 0, 0), store.cell_grid(0))
-        grid = np.argwhere((cells[..., 0, 0] != cells[..., 1, 0])[::4, ::4, ::4])
+        indices = np.argwhere((cells[..., 0, 0] != cells[..., 1, 0])[::4, ::4, ::4])
         rng = np.random.default_rng(4)
         for count, case in cases.items():
             for who, read in readers.items():
                 if who == "zarr" and count > 64:
                     continue
                 settings.tell(f"{case}: {who}")
-                timing = clock(functools.partial(_read, read, rng, grid, count), settings)
-                rate, times = 1e3 * count / timing.median, record.beside_first(case, timing)
+                timing = clock(functools.partial(_read_random, read, rng, indices, count), settings)
+                rate, times = 1e3 * count / timing.median, record.relative_to_first(case, timing)
                 record.add(case, who, timing, blocks_per_second=rate, **times)
-    record.note("peers read aligned chunks of the same size and gather; zarr, 64 at most")
+    record.note("peers gather blocks from aligned chunks of the same size; zarr: only 64 blocks")
 
 
-def _read(read: Reader, rng: np.random.Generator, grid: np.ndarray, count: int) -> None:
-    read(grid[rng.integers(0, len(grid), count)])
+def _read_random(read: Reader, rng: np.random.Generator, indices: np.ndarray, count: int) -> None:
+    read(indices[rng.integers(0, len(indices), count)])
 
 
-def _raw(folder: Path, side: int) -> Path:
+def _write_raw(folder: Path, side: int) -> Path:
     """Writes the volume plane by plane."""
     file = folder / f"ball_{side}x{side}x{side}_uint8.raw"
     noise = np.random.default_rng(0).random((side, side), dtype=np.float32) * 6
@@ -102,14 +102,14 @@ def _readers(record: Record, folder: Path, store: Store) -> Iterator[tuple[str, 
         spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{aligned}/"}}
         array = ts.open(spec).result()
 
-        def batch(zyx: np.ndarray) -> None:
-            for future in _gather(lambda place: array[place].read(), zyx, side):
+        def read_all(zyx: np.ndarray) -> None:
+            for future in _gather(lambda region: array[region].read(), zyx, side):
                 future.result()
 
-        yield "tensorstore", batch
+        yield "tensorstore", read_all
     if "zarr" in peers:
-        plain = zarr.open_array(aligned, mode="r")
-        yield "zarr", lambda zyx: _gather(lambda place: plain[place], zyx, side)
+        zarr_array = zarr.open_array(aligned, mode="r")
+        yield "zarr", lambda zyx: _gather(lambda region: zarr_array[region], zyx, side)
 
 
 def _write_aligned(path: Path, store: Store) -> None:
@@ -119,7 +119,7 @@ def _write_aligned(path: Path, store: Store) -> None:
     x, y, z = store.extent
     shard = min(256, x)
     array = zarr.create_array(
-        path, shape=(z, y, x), dtype="uint8", chunks=(_BLOCK,) * 3, shards=(shard,) * 3
+        path, shape=(z, y, x), dtype="uint8", chunks=(_BLOCK_SIDE,) * 3, shards=(shard,) * 3
     )
     for k in range(0, z, shard):
         array[k : k + shard] = store.read_region(0, (k, 0, 0), (min(k + shard, z), y, x))[..., 0]
@@ -127,8 +127,8 @@ def _write_aligned(path: Path, store: Store) -> None:
 
 def _gather(read: Callable[[tuple[slice, ...]], Any], zyx: np.ndarray, side: int) -> list[Any]:
     """Reads bordered blocks as regions; those at the volume's faces are smaller."""
-    low = np.maximum(zyx * _BLOCK - 1, 0)
-    high = np.minimum((zyx + 1) * _BLOCK + 1, side)
+    low = np.maximum(zyx * _BLOCK_SIDE - 1, 0)
+    high = np.minimum((zyx + 1) * _BLOCK_SIDE + 1, side)
     return [read(tuple(map(slice, a, b))) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
 
 
@@ -138,53 +138,53 @@ def clock_store(
     """Times `make`, which writes a store at a path, repeatedly; adds a row with its memory and disk
     use, and with each of the `amounts` per second.
     """
-    settings, times, most = record.settings, list[float](), 0
+    settings, times, peak = record.settings, list[float](), 0
     began = time.perf_counter()
     while not times or (
         len(times) < settings.repeats and time.perf_counter() - began < settings.seconds
     ):
         settings.tell(f"{case}: {len(times) + 1}")
         shutil.rmtree(path, ignore_errors=True)
-        with Memory() as memory:
+        with MemorySampler() as memory:
             start = time.perf_counter()
             store = make()
             times.append(1e3 * (time.perf_counter() - start))
-        most = max(most, memory.most)
-    timing = spread(times)
+        peak = max(peak, memory.peak)
+    timing = summarize(times)
     speeds = {f"{name}_per_second": 1e3 * n / timing.median for name, n in amounts.items()}
     disk = store.describe()["disk bytes"]
-    record.add(case, "gvtorch", timing, **speeds, memory_bytes=most, disk_bytes=disk)
-    record.note("memory: the most that this process and its workers held together, not warmed up")
+    record.add(case, "gvtorch", timing, **speeds, memory_bytes=peak, disk_bytes=disk)
+    record.note("memory bytes: the peak of this process and its workers; there is no warm-up run")
 
 
-class Memory:
-    """Samples the memory of this process and its children together while it is entered; `most` and
-    `first` are the largest and the first sample, in bytes (Linux).
+class MemorySampler:
+    """Samples the memory of this process and its children together while it is entered; `peak` and
+    `initial` are the largest and the first sample, in bytes (Linux).
     """
 
     def __init__(self) -> None:
-        self.most, self.first, self._ends = 0, 0, threading.Event()
+        self.peak, self.initial, self._stopped = 0, 0, threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
-    def __enter__(self) -> Memory:
+    def __enter__(self) -> MemorySampler:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ends.set()
+        self._stopped.set()
         self._thread.join()
 
     def _watch(self) -> None:
-        while not self._ends.wait(0.05):
-            own = str(os.getpid())
+        while not self._stopped.wait(0.05):
+            own_id = str(os.getpid())
             total = 0
             for folder in Path("/proc").glob("[0-9]*"):
                 try:
                     parent = (folder / "stat").read_text().rsplit(")", 1)[1].split()[1]
-                    if own in (folder.name, parent):
+                    if own_id in (folder.name, parent):
                         lines = (folder / "smaps_rollup").read_text().splitlines()
                         total += next(int(line.split()[1]) for line in lines if "Pss:" in line)
                 except OSError:
                     continue
-            self.first = self.first or total * 1024
-            self.most = max(self.most, total * 1024)
+            self.initial = self.initial or total * 1024
+            self.peak = max(self.peak, total * 1024)

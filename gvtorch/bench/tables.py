@@ -31,9 +31,9 @@ def cell(name: str, value: Any) -> str:
 
 
 def _prefixed(value: float) -> str:
-    for size, prefix in _PREFIXES:
-        if abs(value) >= size:
-            return f"{value / size:.3g} {prefix}"
+    for factor, prefix in _PREFIXES:
+        if abs(value) >= factor:
+            return f"{value / factor:.3g} {prefix}"
     return f"{value:.3g} "
 
 
@@ -48,9 +48,9 @@ def markdown(record: dict[str, Any]) -> str:
             for row in record["rows"]
         ),
     ]
-    absent = [f"{name}: {why}." for name, why in record["peers"].items() if why != "ran"]
-    said = [f"- {text.removesuffix('.')}." for text in (*absent, *record["notes"])]
-    return "\n".join((*lines, *(("", *said) if said else ())))
+    missing = [f"{name}: {reason}." for name, reason in record["peers"].items() if reason != "ran"]
+    note_lines = [f"- {note.removesuffix('.')}." for note in (*missing, *record["notes"])]
+    return "\n".join((*lines, *(("", *note_lines) if note_lines else ())))
 
 
 def title(record: dict[str, Any]) -> str:
@@ -74,9 +74,9 @@ def rich_table(record: dict[str, Any]) -> Any:
     table = Table(title=title(record), title_justify="left")
     names = columns(record)
     for name in names:
-        left = name in ("case", "who")
+        is_text = name in ("case", "who")
         table.add_column(
-            heading(name), justify="left" if left else "right", overflow="fold", no_wrap=left
+            heading(name), justify="left" if is_text else "right", overflow="fold", no_wrap=is_text
         )
     for row in record["rows"]:
         table.add_row(*(cell(name, row.get(name)) for name in names))

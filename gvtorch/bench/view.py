@@ -16,12 +16,12 @@ from typing import Any
 import torch
 
 from . import Unavailable, browser
-from .peers.pages import DIFFERS, NEEDS, PAGES, Site, served
-from .record import Record, spread
+from .peers.pages import DIFFERENCES, PAGES, PEER_MODULES, PageSetup, served_page
+from .record import Record, summarize
 from .scenes import BenchScene, scan_or_fog
 
 _RATES = (25.0, 60.0)  # requested pictures a second
-_HELD = 1 / 60  # seconds between camera messages, as when a user drags
+_MOVE_INTERVAL = 1 / 60  # seconds between camera messages, as when a user drags
 
 
 def view(record: Record) -> None:
@@ -41,11 +41,11 @@ def view(record: Record) -> None:
                 record.settings.tell(f"view: {case}")
                 _turn(record, case, scene, size, rate)
     record.note(
-        "ms: from the camera's message to decoded pixels, of a page without a browser; p95 of the "
-        "same; share: of the pixels that were rendered while it moved; first: to the first picture "
-        "of a page, rest: until the first at full resolution"
+        "page: a client without a browser; ms: from the camera's message to decoded pixels; p95 "
+        "ms: 95 % are faster; share: rendered pixels while the camera moves, relative to full "
+        "resolution; first ms: to the first picture; rest ms: to the first at full resolution"
     )
-    _beside(record, scene, sizes)
+    _drag_pages(record, scene, sizes)
 
 
 def _turn(record: Record, case: str, scene: BenchScene, size: tuple[int, int], rate: float) -> None:
@@ -56,16 +56,18 @@ def _turn(record: Record, case: str, scene: BenchScene, size: tuple[int, int], r
     seconds = 0.5 if record.settings.quick else min(10.0, record.settings.seconds)
     opened = new_session(scene.volume, scene.shader, scene.camera(*size), engine=options)
     with closing(opened) as session, closing(Server(session)) as server:
-        waited, first, rest, shares, lasted = asyncio.run(_page(server.url, size, rate, seconds))
+        delays, first_ms, rest_ms, shares, duration = asyncio.run(
+            _client(server.url, size, rate, seconds)
+        )
     record.add(
         case,
         "page",
-        spread(waited),
-        p95_ms=_p95(waited),
-        pictures_per_second=len(waited) / lasted,
+        summarize(delays),
+        p95_ms=_p95(delays),
+        pictures_per_second=len(delays) / duration,
         share=statistics.median(shares),
-        first_ms=first,
-        rest_ms=rest,
+        first_ms=first_ms,
+        rest_ms=rest_ms,
     )
 
 
@@ -73,49 +75,49 @@ def _p95(times: list[float]) -> float:
     return sorted(times)[math.ceil(0.95 * len(times)) - 1]
 
 
-def _beside(record: Record, scene: BenchScene, sizes: tuple[tuple[int, int], ...]) -> None:
+def _drag_pages(record: Record, scene: BenchScene, sizes: tuple[tuple[int, int], ...]) -> None:
     """Measures our page and those of peers in a browser, dragged in the same way."""
     settings = record.settings
-    why = browser.absent()
-    peers = [name for name, module in NEEDS.items() if record.has_peer(name, module, why)]
-    shown = [one for one in PAGES if one.split()[0] in peers]
-    if why:
-        record.note(f"in a browser: left out, {why}")
-    if why or (settings.quick and not shown):
+    reason = browser.why_no_browser()
+    peers = [name for name, module in PEER_MODULES.items() if record.has_peer(name, module, reason)]
+    pages = [name for name in PAGES if name.split()[0] in peers]
+    if reason:
+        record.note(f"measurements in a browser are left out: {reason}")
+    if reason or (settings.quick and not pages):
         return
     seconds, jumps = (0.5, 1) if settings.quick else (settings.seconds, 16)
     from playwright.sync_api import Error
 
     threads = torch.get_num_threads()
-    with browser.running() as chromium:
+    with browser.running_chromium() as chromium:
         for size in ((960, 540),) if settings.quick else sizes:
             case = f"{scene.name}, {size[0]}x{size[1]}, in a browser"
             if not record.wants(case):
                 continue
             side = scene.volume.extent[0]
-            site = Site(side=side, size=size, device=str(settings.device), threads=threads)
-            for who in ("gvtorch", *shown):
+            setup = PageSetup(side=side, size=size, device=str(settings.device), threads=threads)
+            for who in ("gvtorch", *pages):
                 settings.tell(f"view: {case}: {who}")
                 try:
-                    with served(who, site) as url:
+                    with served_page(who, setup) as url:
                         page = browser.Page(chromium, url, PAGES[who][1], size)
-                        seen = page.drag(seconds, jumps)
+                        result = page.drag(seconds, jumps)
                         page.close()
                 except (RuntimeError, Error) as error:
                     record.note(f"{case}: {who}: {' '.join(str(error).split())[:120]}")
                     continue
-                timing = spread(seen.waited)
-                rate = {"p95_ms": _p95(seen.waited), "pictures_per_second": seen.rate}
-                record.add(case, who, timing, **rate, **record.beside_first(case, timing))
-                record.note(f"{who}: {DIFFERS[who]}")
+                timing = summarize(result.delays)
+                figures = {"p95_ms": _p95(result.delays), "pictures_per_second": result.rate}
+                record.add(case, who, timing, **figures, **record.relative_to_first(case, timing))
+                record.note(f"{who}: {DIFFERENCES[who]}")
     record.note(
-        "in a browser: ms from a jump of the pointer, after 0.4 s of dragging, to the first of the "
-        "browser's frames that shows it; pictures / s while it drags; Chromium without a window, "
-        "which draws and decodes on the same cores"
+        "in a browser: ms: from a jump of the pointer, after 0.4 s of dragging, to the browser's "
+        "first frame that shows it; pictures / s: while the mouse drags; Chromium has no window, "
+        "and draws and decodes on the same cores"
     )
 
 
-async def _page(url: str, size: tuple[int, int], rate: float, seconds: float) -> tuple[Any, ...]:
+async def _client(url: str, size: tuple[int, int], rate: float, seconds: float) -> tuple[Any, ...]:
     """Acts as a page does: waits until the picture is final, then turns the camera. Returns the
     milliseconds of each picture, of the first one and of the first at full resolution, the share of
     the pixels that each picture has, and the seconds of turning.
@@ -129,13 +131,13 @@ async def _page(url: str, size: tuple[int, int], rate: float, seconds: float) ->
         client.ws_connect(f"{address}ws?{query}", max_msg_size=0) as ws,
     ):
         welcome = json.loads(await ws.receive_str())
-        eye = {n: v for n, v in welcome["state"]["camera"].items() if n != "kind"}
+        camera = {n: v for n, v in welcome["state"]["camera"].items() if n != "kind"}
         start = time.perf_counter()
         width, height = size
         await ws.send_json({"type": "hello", "width": width, "height": height, "rate": rate})
         await ws.send_json({"type": "change", "state": {"develop": {"samples": 1}}})
 
-        async def picture() -> tuple[dict[str, Any], tuple[int, int]]:
+        async def receive_picture() -> tuple[dict[str, Any], tuple[int, int]]:
             while True:
                 message = await ws.receive()
                 if message.type == aiohttp.WSMsgType.BINARY:
@@ -143,45 +145,45 @@ async def _page(url: str, size: tuple[int, int], rate: float, seconds: float) ->
                 if message.type != aiohttp.WSMsgType.TEXT:
                     raise RuntimeError(f"view: the socket closed: {message}")
             (length,) = struct.unpack("<I", message.data[:4])
-            head = json.loads(message.data[4 : 4 + length])
+            header = json.loads(message.data[4 : 4 + length])
             image = Image.open(io.BytesIO(message.data[4 + length :]))
             image.load()
-            await ws.send_json({"type": "ack", "number": head["number"]})
-            return head, image.size
+            await ws.send_json({"type": "ack", "number": header["number"]})
+            return header, image.size
 
-        first = rest = 0.0
+        first_ms = rest_ms = 0.0
         while True:
-            head, shown = await picture()
+            header, shown_size = await receive_picture()
             now = 1e3 * (time.perf_counter() - start)
-            first = first or now
-            rest = rest or (now if shown == size else 0.0)
-            if head["final"] and shown == size:
+            first_ms = first_ms or now
+            rest_ms = rest_ms or (now if shown_size == size else 0.0)
+            if header["final"] and shown_size == size:
                 break
-        waited, shares = [], []
-        begun = time.perf_counter()
+        delays, shares = [], []
+        turn_start = time.perf_counter()
 
         async def turn() -> None:
             angle = 0.0
-            while (now := time.perf_counter()) < begun + seconds:
+            while (now := time.perf_counter()) < turn_start + seconds:
                 angle += 0.01
-                camera = {**eye, "eye": _around(eye, angle)}
-                sent = 1e3 * (now - begun) + 1e-3
-                await ws.send_json({"type": "move", "camera": camera, "moving": True, "sent": sent})
-                await asyncio.sleep(_HELD)
+                turned = {**camera, "eye": _turned_eye(camera, angle)}
+                sent = 1e3 * (now - turn_start) + 1e-3
+                await ws.send_json({"type": "move", "camera": turned, "moving": True, "sent": sent})
+                await asyncio.sleep(_MOVE_INTERVAL)
 
-        hand = asyncio.ensure_future(turn())
-        while time.perf_counter() < begun + seconds:
-            head, shown = await picture()
-            if head["sent"]:
-                waited.append(1e3 * (time.perf_counter() - begun) - head["sent"])
-                shares.append(shown[0] * shown[1] / (width * height))
-        await hand
-        return waited, first, rest, shares, time.perf_counter() - begun
+        turn_task = asyncio.ensure_future(turn())
+        while time.perf_counter() < turn_start + seconds:
+            header, shown_size = await receive_picture()
+            if header["sent"]:
+                delays.append(1e3 * (time.perf_counter() - turn_start) - header["sent"])
+                shares.append(shown_size[0] * shown_size[1] / (width * height))
+        await turn_task
+        return delays, first_ms, rest_ms, shares, time.perf_counter() - turn_start
 
 
-def _around(eye: dict[str, Any], angle: float) -> list[float]:
-    """Returns the eye, turned about +y through the target."""
-    x, y, z = (a - b for a, b in zip(eye["eye"], eye["target"], strict=True))
+def _turned_eye(camera: dict[str, Any], angle: float) -> list[float]:
+    """Returns a camera's eye, turned about +y through its target."""
+    x, y, z = (a - b for a, b in zip(camera["eye"], camera["target"], strict=True))
     c, s = math.cos(angle), math.sin(angle)
     turned = (c * x + s * z, y, c * z - s * x)
-    return [a + b for a, b in zip(turned, eye["target"], strict=True)]
+    return [a + b for a, b in zip(turned, camera["target"], strict=True)]

@@ -20,14 +20,14 @@ from ..meshes.voxelizer import Voxelizer
 from .record import Record, clock
 from .storage import clock_store
 
-_PART = 512  # voxels along a side of the regions that are computed at once
+_REGION_SIDE = 512  # voxels along a side of the regions that are computed at once
 
 
 def voxelize(record: Record) -> None:
     """Computes the coverage of 100,000 triangles: all finest voxels in memory, then a store."""
     settings = record.settings
     faces, side = (2_000, 64) if settings.quick else (100_000, 1024)
-    mesh = bumps(faces)
+    mesh = bumpy_sphere(faces)
     count = f"{len(mesh.faces):,} triangles"
     device = settings.device
     case = f"{count}, {side}^3 in memory"
@@ -43,32 +43,32 @@ def voxelize(record: Record) -> None:
         )
     case = f"{count}, {side}^3 to a store"
     if record.wants(case):
-        _store(record, case, mesh, side)
-    _peers(record, mesh, 64 if settings.quick else 256)
-    record.note("difference: of the volume from the mesh's own, relative to it")
+        _measure_store(record, case, mesh, side)
+    _measure_peers(record, mesh, 64 if settings.quick else 256)
+    record.note("max difference: of the voxels' volume from the mesh's, relative to the mesh's")
 
 
-def _volume(grid: Voxelizer) -> float:
+def _volume(voxelizer: Voxelizer) -> float:
     """Computes all finest voxels, part by part; returns the volume that they cover."""
-    total = torch.zeros((), dtype=torch.int64, device=grid.device)
-    x, y, z = grid.extent
-    for k in range(0, z, _PART):
-        for j in range(0, y, _PART):
-            for i in range(0, x, _PART):
-                high = min(k + _PART, z), min(j + _PART, y), min(i + _PART, x)
-                part = grid.region((k, j, i), high)["coverage"]
-                total += part.sum(dtype=torch.int64)
-    return float(total) / 255 * grid.spacing**3
+    total = torch.zeros((), dtype=torch.int64, device=voxelizer.device)
+    x, y, z = voxelizer.extent
+    for k in range(0, z, _REGION_SIDE):
+        for j in range(0, y, _REGION_SIDE):
+            for i in range(0, x, _REGION_SIDE):
+                high = min(k + _REGION_SIDE, z), min(j + _REGION_SIDE, y), min(i + _REGION_SIDE, x)
+                coverage = voxelizer.region((k, j, i), high)["coverage"]
+                total += coverage.sum(dtype=torch.int64)
+    return float(total) / 255 * voxelizer.spacing**3
 
 
-def _store(record: Record, case: str, mesh: Mesh, side: int) -> None:
-    with tempfile.TemporaryDirectory() as name:
-        path = Path(name) / "mesh.zarr"
+def _measure_store(record: Record, case: str, mesh: Mesh, side: int) -> None:
+    with tempfile.TemporaryDirectory() as directory:
+        path = Path(directory) / "mesh.zarr"
         make = functools.partial(voxelize_store, mesh, path, resolution=side)
         clock_store(record, case, path, make, voxels=side**3)
 
 
-def _peers(record: Record, mesh: Mesh, side: int) -> None:
+def _measure_peers(record: Record, mesh: Mesh, side: int) -> None:
     """Compares coverage of all voxels (gvtorch) with a filled grid of as many voxels (trimesh) and
     signed distances at every 64th voxel's centre (igl).
     """
@@ -76,35 +76,36 @@ def _peers(record: Record, mesh: Mesh, side: int) -> None:
     case = f"{len(mesh.faces):,} triangles, {side}^3 beside peers"
     if not record.wants(case):
         return
-    grid = Voxelizer(mesh, resolution=side, device=settings.device)
+    voxelizer = Voxelizer(mesh, resolution=side, device=settings.device)
     runs: dict[str, Callable[[], object]] = {
         "gvtorch": lambda: _volume(Voxelizer(mesh, resolution=side, device=settings.device))
     }
     if record.has_peer("trimesh"):
         import trimesh
 
-        other = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        runs["trimesh"] = lambda: other.voxelized(grid.spacing).fill()
-        record.note("trimesh: voxelized().fill(): whole voxels, by cutting triangles until small")
+        other_mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        runs["trimesh"] = lambda: other_mesh.voxelized(voxelizer.spacing).fill()
+        record.note("trimesh: voxelized().fill(): whole voxels; it cuts triangles until small")
     if record.has_peer("igl"):
         import igl
 
-        at = [
-            np.arange(n) * grid.spacing + o for n, o in zip(grid.extent, grid.origin, strict=True)
+        axes = [
+            np.arange(n) * voxelizer.spacing + o
+            for n, o in zip(voxelizer.extent, voxelizer.origin, strict=True)
         ]
-        place = np.stack(np.meshgrid(*at, indexing="ij"), -1).reshape(-1, 3)[::64]
-        runs["igl"] = lambda: igl.signed_distance(place, mesh.vertices, mesh.faces)
-        record.note("igl: signed_distance of every 64th voxel's centre, its rate for all")
+        centers = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)[::64]
+        runs["igl"] = lambda: igl.signed_distance(centers, mesh.vertices, mesh.faces)
+        record.note("igl: signed_distance at every 64th voxel's centre; times: as if at all")
     for who, run in runs.items():
         settings.tell(f"{case}: {who}")
         timing = clock(run, settings)
-        share = 64 if who == "igl" else 1
-        times = {name: share * one for name, one in record.beside_first(case, timing).items()}
-        rate = 1e3 * side**3 / share / timing.median
+        stride = 64 if who == "igl" else 1
+        times = {name: stride * v for name, v in record.relative_to_first(case, timing).items()}
+        rate = 1e3 * side**3 / stride / timing.median
         record.add(case, who, timing, voxels_per_second=rate, **times)
 
 
-def bumps(faces: int) -> Mesh:
+def bumpy_sphere(faces: int) -> Mesh:
     """Returns a closed sphere with bumps of two sizes, of about `faces` triangles."""
     rows = max(4, round((faces / 4) ** 0.5))
     columns = 2 * rows
@@ -112,15 +113,15 @@ def bumps(faces: int) -> Mesh:
         np.arange(1, rows) * np.pi / rows, np.arange(columns) * 2 * np.pi / columns, indexing="ij"
     )
     radius = 1 + 0.08 * np.sin(9 * a) * np.sin(8 * b) + 0.02 * np.sin(40 * a) * np.cos(36 * b)
-    ring = np.stack((np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)), -1)
-    points = np.concatenate(((radius[..., None] * ring).reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]))
+    sphere = np.stack((np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)), -1)
+    points = np.concatenate(((radius[..., None] * sphere).reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]))
     index = np.arange((rows - 1) * columns).reshape(rows - 1, columns)
-    beside = np.roll(index, -1, 1)
-    p, q, r, s = index[:-1], index[1:], beside[1:], beside[:-1]
+    next_index = np.roll(index, -1, 1)
+    p, q, r, s = index[:-1], index[1:], next_index[1:], next_index[:-1]
     top, bottom = np.full(columns, len(points) - 2), np.full(columns, len(points) - 1)
     parts = (
         *(np.stack((p, q, r), -1), np.stack((p, r, s), -1)),
-        *(np.stack((top, index[0], beside[0]), -1),),
-        *(np.stack((bottom, beside[-1], index[-1]), -1),),
+        *(np.stack((top, index[0], next_index[0]), -1),),
+        *(np.stack((bottom, next_index[-1], index[-1]), -1),),
     )
     return Mesh(vertices=points, faces=np.concatenate([part.reshape(-1, 3) for part in parts]))

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from gvtorch.bench.browser import absent, executable, running
+from gvtorch.bench.browser import chromium_path, running_chromium, why_no_browser
 
 from .viewer import SOON
 
-__all__ = ["Tab", "absent", "executable", "running"]
+__all__ = ["Tab", "chromium_path", "running_chromium", "why_no_browser"]
 
 
 class Tab:

@@ -16,14 +16,14 @@ _LLVM = dr.has_backend(dr.JitBackend.LLVM) and ".".join(map(str, dr.detail.llvm_
 class Marcher(Peer):
     """Dr.Jit's vectorised kernel, on all threads."""
 
-    differs = (
+    differences = (
         f"compiled by LLVM {_LLVM} (newer ones make it faster: DRJIT_LIBLLVM_PATH); float32 voxels "
-        "in a texture, nothing is skipped; opacity from the nearest of 4081 rows, linear in the "
-        "last interval"
+        "in a texture, no empty space is skipped; opacity from the nearest of 4081 table rows, "
+        "scaled linearly in a ray's last, shorter interval"
     )
 
     @classmethod
-    def refuses(cls, device: torch.device) -> str:
+    def why_unavailable(cls, device: torch.device) -> str:
         """Returns why it can't run: it needs LLVM, and is compared on the CPU only."""
         if device.type != "cpu":
             return "compared on the CPU only"
@@ -49,33 +49,33 @@ class Marcher(Peer):
         table = bake(task.scene.shader, task.scene.step, _ROWS)
         table[:, :3] *= table[:, 3:]
         self.table = llvm.Float(torch.from_numpy(table).float().flatten().numpy())
-        self.step, self.stop = task.scene.step, task.stop_alpha
-        self.color, self.clear = llvm.Array3f(0), llvm.Float(1)
+        self.step, self.stop_alpha = task.scene.step, task.stop_alpha
+        self.color, self.transmittance = llvm.Array3f(0), llvm.Float(1)
         dr.eval(self.origin, self.direction, self.first, self.last, self.table)
         dr.sync_thread()
 
     def render(self) -> None:
         scale, step = (_ROWS - 1) / 255, self.step
 
-        def goes_on(t: llvm.Float, clear: llvm.Float, color: llvm.Array3f) -> llvm.Bool:
-            return (t < self.last) & (clear > 1 - self.stop)
+        def is_active(t: llvm.Float, transmittance: llvm.Float, color: llvm.Array3f) -> llvm.Bool:
+            return (t < self.last) & (transmittance > 1 - self.stop_alpha)
 
         def march(
-            t: llvm.Float, clear: llvm.Float, color: llvm.Array3f
+            t: llvm.Float, transmittance: llvm.Float, color: llvm.Array3f
         ) -> tuple[llvm.Float, llvm.Float, llvm.Array3f]:
             length = dr.select(t + step < self.last, llvm.Float(step), self.last - t)
-            place = dr.fma(self.direction, t + 0.5 * length, self.origin)
-            value = self.texture.eval(place)[0]
+            position = dr.fma(self.direction, t + 0.5 * length, self.origin)
+            value = self.texture.eval(position)[0]
             row = dr.gather(llvm.Array4f, self.table, llvm.UInt32(dr.fma(value, scale, 0.5)))
-            share = length * (1 / step)
-            color = dr.fma(row.xyz, clear * share, color)
-            return t + step, clear * (1 - share * row.w), color
+            fraction = length * (1 / step)
+            color = dr.fma(row.xyz, transmittance * fraction, color)
+            return t + step, transmittance * (1 - fraction * row.w), color
 
         start = (self.first, llvm.Float(1), dr.zeros(llvm.Array3f, dr.width(self.first)))
-        _, self.clear, self.color = dr.while_loop(start, goes_on, march)
-        dr.eval(self.clear, self.color)
+        _, self.transmittance, self.color = dr.while_loop(start, is_active, march)
+        dr.eval(self.transmittance, self.color)
         dr.sync_thread()
 
     def picture(self) -> Tensor:
         planes = [torch.from_numpy(self.color[axis].numpy().copy()) for axis in range(3)]
-        return torch.stack([*planes, 1 - torch.from_numpy(self.clear.numpy().copy())], 1)
+        return torch.stack([*planes, 1 - torch.from_numpy(self.transmittance.numpy().copy())], 1)

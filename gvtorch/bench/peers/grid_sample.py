@@ -15,7 +15,7 @@ _ROWS = 255 * 16 + 1
 class Marcher(Peer):
     """The same samples, in float32, of the whole volume."""
 
-    differs = "the same samples; torch on the same threads, nothing is skipped"
+    differences = "the same samples; torch on the same threads, no empty space is skipped"
 
     def __init__(self, task: Task) -> None:
         """Converts the volume to float32, and the rays to grid_sample's coordinates."""
@@ -27,31 +27,31 @@ class Marcher(Peer):
         self.first, self.last = spans(task).float().unbind(1)
         table = bake(task.scene.shader, 1.0, _ROWS)
         self.table = torch.tensor(table, dtype=torch.float32, device=device)
-        self.step, self.stop = task.scene.step, task.stop_alpha
+        self.step, self.stop_alpha = task.scene.step, task.stop_alpha
         self.color = torch.zeros_like(self.origin)
-        self.clear = torch.ones_like(self.first)
+        self.transmittance = torch.ones_like(self.first)
 
     def render(self) -> None:
         self.color.zero_()
-        self.clear.fill_(1)
+        self.transmittance.fill_(1)
         start = self.first.clone()
         alive = (start < self.last).nonzero()[:, 0]
         while alive.numel():
             t = start[alive]
             end = torch.minimum(t + self.step, self.last[alive])
-            place = self.origin[alive] + (0.5 * (t + end))[:, None] * self.direction[alive]
+            position = self.origin[alive] + (0.5 * (t + end))[:, None] * self.direction[alive]
             value = torch.nn.functional.grid_sample(
-                self.data, place[None, None, None], padding_mode="border", align_corners=False
+                self.data, position[None, None, None], padding_mode="border", align_corners=False
             )[0, 0, 0, 0]
             row = value * ((_ROWS - 1) / 255)
             cell = row.floor().clamp(max=_ROWS - 2)
-            below = self.table[cell.long()]
-            rgba = below + (row - cell)[:, None] * (self.table[cell.long() + 1] - below)
-            kept = self.clear[alive] * (1 - rgba[:, 3]) ** (end - t)
-            self.color[alive] += (self.clear[alive] - kept)[:, None] * rgba[:, :3]
-            self.clear[alive] = kept
+            lower = self.table[cell.long()]
+            rgba = lower + (row - cell)[:, None] * (self.table[cell.long() + 1] - lower)
+            remaining = self.transmittance[alive] * (1 - rgba[:, 3]) ** (end - t)
+            self.color[alive] += (self.transmittance[alive] - remaining)[:, None] * rgba[:, :3]
+            self.transmittance[alive] = remaining
             start[alive] = t + self.step
-            alive = alive[(t + self.step < self.last[alive]) & (kept > 1 - self.stop)]
+            alive = alive[(t + self.step < self.last[alive]) & (remaining > 1 - self.stop_alpha)]
 
     def picture(self) -> Tensor:
-        return torch.cat((self.color, 1 - self.clear[:, None]), 1)
+        return torch.cat((self.color, 1 - self.transmittance[:, None]), 1)

@@ -17,7 +17,7 @@ from ..record import PEERS, Record
 from ..scenes import BenchScene
 
 #: The module of each renderer.
-_HOME = {
+_MODULES = {
     "grid_sample": "grid_sample",
     "warp": "warp_nanovdb",
     "drjit": "drjit_loop",
@@ -40,10 +40,10 @@ class Peer(ABC):
     """A renderer that is prepared for a task; its construction is not timed."""
 
     #: How its picture differs from what the task specifies, and where it runs, in a sentence.
-    differs: str
+    differences: str
 
     @classmethod
-    def refuses(cls, device: torch.device) -> str:
+    def why_unavailable(cls, device: torch.device) -> str:
         """Returns why it can't run on a device; an empty string if it can."""
         return ""
 
@@ -80,21 +80,21 @@ def bake(shader: TransferFunction, step: float, rows: int) -> np.ndarray:
     return table
 
 
-def find(record: Record) -> dict[str, type[Peer]]:
+def find_peers(record: Record) -> dict[str, type[Peer]]:
     """Returns the renderers that can run; stores in the record why others can't."""
-    wanted = record.settings.peers
-    ready = {}
-    for name, module in _HOME.items():
-        if wanted is not None and name not in wanted:
+    chosen = record.settings.peers
+    available = {}
+    for name, module in _MODULES.items():
+        if chosen is not None and name not in chosen:
             continue
         try:
             peer = importlib.import_module(f".{module}", __package__).Marcher
         except ImportError:
             record.peers[name] = f"not installed ({PEERS[name]})"
             continue
-        reason = peer.refuses(record.settings.device)
+        reason = peer.why_unavailable(record.settings.device)
         record.peers[name] = reason or "ran"
         if not reason:
-            ready[name] = peer
-            record.note(f"{name}: {peer.differs}")
-    return ready
+            available[name] = peer
+            record.note(f"{name}: {peer.differences}")
+    return available

@@ -34,14 +34,14 @@ _ONE = 0x7FFF  # 1.0 in VTK's pictures
 class Marcher(Peer):
     """The mapper with linear interpolation, no shading, one ray a pixel."""
 
-    differs = (
+    differences = (
         "15-bit fixed point, interpolated values rounded to whole numbers; the box ends at the "
-        "outermost voxel centres, half a voxel earlier; rays are sampled from planes of their own; "
+        "outermost voxel centres, half a voxel earlier; samples lie elsewhere along a ray; "
         "a ray ends at alpha 0.992"
     )
 
     @classmethod
-    def refuses(cls, device: torch.device) -> str:
+    def why_unavailable(cls, device: torch.device) -> str:
         return "" if device.type == "cpu" else "runs on the CPU only"
 
     def __init__(self, task: Task) -> None:
@@ -64,15 +64,15 @@ class Marcher(Peer):
         for value, (red, green, blue, alpha) in enumerate(scene.shader(np.arange(256.0)).tolist()):
             opacity.AddPoint(value, alpha)
             color.AddRGBPoint(value, red, green, blue)
-        look = vtkVolumeProperty()
-        look.SetInterpolationTypeToLinear()
-        look.ShadeOff()
-        look.SetScalarOpacity(opacity)
-        look.SetColor(color)
-        look.SetScalarOpacityUnitDistance(scene.shader.reference or 1.0)
+        properties = vtkVolumeProperty()
+        properties.SetInterpolationTypeToLinear()
+        properties.ShadeOff()
+        properties.SetScalarOpacity(opacity)
+        properties.SetColor(color)
+        properties.SetScalarOpacityUnitDistance(scene.shader.reference or 1.0)
         self.volume = vtkVolume()
         self.volume.SetMapper(self.mapper)
-        self.volume.SetProperty(look)
+        self.volume.SetProperty(properties)
         self.renderer, self.window = vtkRenderer(), vtkRenderWindow()
         self.renderer.AddVolume(self.volume)
         self.window.SetOffScreenRendering(1)
@@ -80,12 +80,12 @@ class Marcher(Peer):
         self.window.AddRenderer(self.renderer)
         view = camera.viewmats[0].numpy()
         eye = -view[:3, :3].T @ view[:3, 3]
-        eyes = self.renderer.GetActiveCamera()
-        eyes.SetPosition(*eye)
-        eyes.SetFocalPoint(*(eye + view[2, :3]))
-        eyes.SetViewUp(*-view[1, :3])
-        half = 0.5 * self.height / float(camera.Ks[0, 1, 1])
-        eyes.SetViewAngle(2 * np.degrees(np.arctan(half)))
+        vtk_camera = self.renderer.GetActiveCamera()
+        vtk_camera.SetPosition(*eye)
+        vtk_camera.SetFocalPoint(*(eye + view[2, :3]))
+        vtk_camera.SetViewUp(*-view[1, :3])
+        tangent = 0.5 * self.height / float(camera.Ks[0, 1, 1])
+        vtk_camera.SetViewAngle(2 * np.degrees(np.arctan(tangent)))
         self.renderer.ResetCameraClippingRange()
 
     def render(self) -> None:
@@ -105,6 +105,6 @@ class Marcher(Peer):
         address = int(image.GetImage().split("_")[1], 16)
         memory = (ctypes.c_uint16 * (4 * stride * rows)).from_address(address)
         used = np.ctypeslib.as_array(memory).reshape(rows, stride, 4)[:height, :width]
-        whole = np.zeros((self.height, self.width, 4), np.float32)
-        whole[y : y + height, x : x + width] = used / np.float32(_ONE)
-        return torch.from_numpy(whole[::-1].copy()).reshape(-1, 4)
+        full = np.zeros((self.height, self.width, 4), np.float32)
+        full[y : y + height, x : x + width] = used / np.float32(_ONE)
+        return torch.from_numpy(full[::-1].copy()).reshape(-1, 4)
