@@ -47,6 +47,7 @@ class Info:
     # print JSON
     json: Switch = False
 
+    # How to read a volume file that does not say so itself; a store takes only --time and --key.
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
@@ -250,12 +251,15 @@ _COMMANDS: dict[str, Any] = {
 def _unboxed(said: str) -> str:
     """Returns the parser's boxed error as one line, with suggestions for an unknown flag."""
     box = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", said)  # without frame and title
-    words = " ".join(box.split())
-    unknown = re.match(r"Unrecognized options: (--[\w-]+)", words)
+    words = re.sub(r" \(applied to [^)]*\)", "", " ".join(box.split()))
+    unknown = re.match(r"Unrecognized (or misplaced )?options: (--[\w-]+)", words)
     if unknown is None:
         return words
-    close = did_you_mean(unknown[1], set(re.findall(r"--[\w-]+", words)) - {unknown[1], "--help"})
-    first = re.split(r" Perhaps you meant| Available subcommands| For full helptext", words)[0]
+    elsewhere, flag = unknown.groups()  # a flag that another command has is "misplaced"
+    known = set(re.findall(r"--[\w-]+", words)) - {flag, "--help"}
+    close = "" if elsewhere else did_you_mean(flag, known)
+    rest = r" Arguments are applied| Perhaps you meant| Available subcommands| For full helptext"
+    first = re.split(rest, words)[0].replace(" or misplaced", "")
     return f"{first}{close}; gvtorch COMMAND --help tells all"
 
 

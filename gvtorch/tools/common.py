@@ -187,7 +187,7 @@ def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:
     return values
 
 
-def size(text: str) -> tuple[int, int]:
+def parse_size(text: str) -> tuple[int, int]:
     """Returns width and height of WIDTHxHEIGHT; raises ValueError if the text is anything else."""
     width, height = (whole_number(n) for n in text.lower().partition("x")[::2])
     if not width or not height:

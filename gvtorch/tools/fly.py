@@ -20,7 +20,7 @@ from ..base.digits import whole_number
 from ..base.messages import one_line, printable
 from ..base.whole_file import write_text
 from ..io.stores.ngff import is_zarr
-from .common import Bar, check_outputs, flags_given, option, size, volume_formats
+from .common import Bar, check_outputs, flags_given, option, parse_size, volume_formats
 from .drawn import Drawn
 from .look import first_orbit, parse_camera, parse_orbit, stance
 from .scene import RenderedScene, SceneFlags
@@ -42,6 +42,8 @@ class Fly:
     path: Positional[Annotated[str, option(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     # film to write, .mp4, or .gif or .webp, which loop; or a folder for 0000.png, 0001.png, ...
     output: Annotated[Path, option(aliases=["-o"], metavar="DIR|OUT.mp4")]
+    # width and height of each picture in pixels
+    size: Annotated[str, option(metavar="WxH")] = "512x512"
     # camera path: orbit (once around), or a file of keys [{"eye": [x, y, z], "target": [x, y,
     # z], "up": ..., "fov": ...}, ...]
     flight: Annotated[str, option(name="path", metavar="orbit|FILE.json")] = "orbit"
@@ -80,7 +82,7 @@ class Fly:
         from ..pictures import Video
 
         look = self.scene.look
-        width, height = size(look.size)
+        width, height = parse_size(self.size)
         frames, fps = self._length()
         options = look.options()
         self._check_output(options)

@@ -56,8 +56,6 @@ class Look:
     camera_model: Annotated[CameraModel, option(metavar="MODEL")] = "pinhole"
     # vertical field of view in degrees; if left out: 30, or 180 for fisheye and panorama
     fov: Annotated[float | None, option(metavar="DEG")] = None
-    # width and height of the picture in pixels
-    size: Annotated[str, option(metavar="WxH")] = "512x512"
     # up direction in the picture: +x, -x, +y, -y, +z, -z or X,Y,Z; if left out: +z, the head, for
     # scans of patients, else +y
     up: Annotated[str | None, option(metavar="+z|X,Y,Z")] = None

@@ -15,7 +15,7 @@ from tyro.conf import Positional
 
 from ..base.messages import printable
 from ..base.whole_file import write_text
-from .common import Bar, check_outputs, flags_given, option, size, volume_formats
+from .common import Bar, check_outputs, flags_given, option, parse_size, volume_formats
 from .drawn import Drawn
 from .look import parse_camera
 from .scene import RenderedScene, SceneFlags
@@ -70,6 +70,8 @@ class Render:
     path: Positional[Annotated[str, option(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     # picture to write: .png, .exr, .tif, .npy or .npz; .png, .tif and .npy may exceed memory
     output: Annotated[Path, option(aliases=["-o"], metavar="OUT.png")]
+    # width and height of the picture in pixels
+    size: Annotated[str, option(metavar="WxH")] = "512x512"
     # bits of each number: 8 or 16 for .png; 8, 16 or 32 (float) for .tif; 32 or 16 (float)
     # for .exr; if left out: the first of these
     bits: Annotated[int | None, option(metavar="N")] = None
@@ -99,7 +101,7 @@ class Render:
 
     def run(self) -> None:
         look = self.scene.look
-        width, height = size(look.size)
+        width, height = parse_size(self.size)
         self._check()
         parse_camera(self.camera, look, width, height)
         options = look.options()
@@ -177,7 +179,7 @@ class Render:
         render, cost = partial(opened.render, **own), partial(opened.cost, **own)
         scene = replace(opened, shader=now.shader, render=render, cost=cost)
         taking = replace(self, show=now.show, develop=Develop(**vars(now.develop)))
-        width, height = size(self.scene.look.size)
+        width, height = parse_size(self.size)
         if now.slices is not None:
             _, _, width, height = panes(width, height)["view"]
         if now.camera is None:
@@ -221,7 +223,7 @@ class Render:
                 from ..viewer.slices import Planes
 
                 planes = Planes(scene.data, lambda problem: None)
-                shown = planes.composed(shown, now, *size(self.scene.look.size), wait=True).picture
+                shown = planes.composed(shown, now, *parse_size(self.size), wait=True).picture
                 planes.close()
             shown = shown if overlay is None else overlay.over(shown)
             shown.save(self.output, bits=self.bits)

@@ -69,6 +69,7 @@ class SceneFlags:
 
     look: tyro.conf.OmitArgPrefixes[Look] = Look()
     streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()
+    # How to read a volume file that does not say so itself; a store takes only --time.
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     @contextmanager

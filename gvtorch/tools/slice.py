@@ -48,6 +48,7 @@ class Slice:
     # image of a store to show, by name or number, if there are several
     image: Annotated[str | None, option(metavar="NAME")] = None
 
+    # How to read a volume file that does not say so itself; a store takes only --time.
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:

@@ -33,6 +33,7 @@ class Surface:
     # image of a store to read, by name or number, if there are several
     image: Annotated[str | None, option(metavar="NAME")] = None
 
+    # How to read a volume file that does not say so itself; a store takes only --time.
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:

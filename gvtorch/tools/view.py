@@ -59,8 +59,6 @@ class View:
         from ..viewer.server import aiohttp_web
 
         aiohttp_web()
-        if self.scene.look.size != type(self.scene.look)().size:
-            raise ValueError("--size is for pictures: a page has its own")
         self._check_state()
         what, shader, camera, options = self._opened()
         view(
