@@ -47,13 +47,13 @@ class Surface:
         with Bar() as bar:
             bar("reading", 0, 0)
             data = open_data(self.path, self.source, image=self.image, level=self.level)
-            size = export_surface(
+            mesh_size = export_surface(
                 *(data, self.value, self.output),
                 level=self.level,
                 component=self.component,
                 caps=self.caps,
                 progress=bar,
             )
-        seconds, written = time.perf_counter() - start, amount(self.output.stat().st_size)
-        counts = f"{size.triangles} triangles, {size.vertices} vertices"
-        print(f"{printable(self.output)}: {counts}, {written} in {seconds:.1f} s")
+        seconds, file_size = time.perf_counter() - start, amount(self.output.stat().st_size)
+        counts = f"{mesh_size.triangles} triangles, {mesh_size.vertices} vertices"
+        print(f"{printable(self.output)}: {counts}, {file_size} in {seconds:.1f} s")
