@@ -79,12 +79,12 @@ def test_what_cant_run_here_is_left_out_of_all(monkeypatch, capsys):
         bench.run("opengl", CPU)
     asked = []
 
-    def one(self, name):
+    def run_workload(self, name):
         asked.append(name)
         if name == "opengl":
             raise bench.Unavailable("no OpenGL")
 
-    monkeypatch.setattr(Bench, "_one", one)
+    monkeypatch.setattr(Bench, "_run_workload", run_workload)
     Bench(name="all").run()
     assert asked == [*bench.WORKLOADS]
     assert capsys.readouterr().err == "opengl is left out: no OpenGL\n"

@@ -104,6 +104,7 @@ def test_a_misspelt_word_gets_the_right_one(small, tmp_path):
         (["rendr", small], "(did you mean render?)"),
         (["render", small, "-o", "a.png", "--camra", "orbit:1,2"], "(did you mean --camera?)"),
         (["slice", small, "-o", "a.png", "--axiz", "z"], "Unrecognized options: --axiz"),
+        (["info", small, "--size", "8x8"], "Unrecognized options: --size 8x8; gvtorch COMMAND"),
         (["render", small, "-o", "a.png", "--tf", "bnoe"], "(did you mean bone"),
         (["render", small, "-o", "a.png", "--tf", "virids"], "(did you mean viridis"),
     ):
@@ -209,6 +210,17 @@ def test_a_component_that_is_not_there_names_what_is(small, scan_store, tmp_path
             run = gvtorch(command, path, "-o", tmp_path / "a.png", "--component", "2")
             assert run.returncode == 2 and len(run.stderr.splitlines()) == 1, run.stderr
             assert f"--component 2: a voxel has {told}" in run.stderr, run.stderr
+
+
+def test_help_offers_what_a_command_takes(scan_store, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    for command in ("info", "surface", "slice", "view", "render", "fly", "convert"):
+        text = gvtorch(command, "--help").stdout
+        assert ("a store takes only --time" in text) == (command != "convert")
+        assert ("a store takes only --time and --key" in text) == (command == "info")
+        assert ("--size WxH" in text) == (command in ("render", "fly"))
+    run = gvtorch("info", scan_store, "--time", "0", "--key", "0")
+    assert run.returncode == 0, run.stderr
 
 
 def test_values_may_begin_with_a_minus(small, tmp_path):

@@ -30,7 +30,7 @@ from gvtorch.bench import tables
 from gvtorch.points.table import Table
 from gvtorch.tools import cli
 from gvtorch.tools.bench import Bench
-from gvtorch.tools.common import size
+from gvtorch.tools.common import parse_size
 from gvtorch.tools.parse import parse_channels
 
 HUGE = 10**400
@@ -191,7 +191,7 @@ def test_only_plain_digits_are_numbers_of_keys_and_flags(text):
     assert whole_number("007") == 7
     for flag in (f"{text}x8", f"8x{text}"):
         with pytest.raises(ValueError, match="--size must be WIDTHxHEIGHT"):
-            size(flag)
+            parse_size(flag)
     with pytest.raises(ValueError, match="--channel must hold NUMBER"):
         parse_channels(f"{text}:green", _volume())
 

@@ -235,7 +235,7 @@ def test_the_command(tmp_path, small, scan_store, monkeypatch):
     assert seen[2]["state"]["shader"]["kind"] == "Isosurface"
     for args, message in (
         ((tmp_path / "no.npy",), "not found"),
-        ((small, "--size", "8x8"), "--size is for pictures"),
+        ((small, "--size", "8x8"), "Unrecognized options: --size 8x8;"),
         ((script, "--tf", "hot"), "--tf is for files"),
         ((small, "--state", tmp_path / "no.json"), "state not found"),
     ):

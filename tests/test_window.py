@@ -9,7 +9,7 @@ from helpers import SHARED, shared
 
 import gvtorch as gv
 from gvtorch.io.window import _SAMPLE_VOXELS, value_range
-from gvtorch.tools.parse import chosen_transfer
+from gvtorch.tools.parse import parse_transfer
 
 FILES = [
     "aneurism_256x256x256_uint8.raw.gz",
@@ -41,7 +41,7 @@ def test_every_shared_volume_shows_at_once(name):
     camera = gv.Camera.orbit(fit=True, width=192, height=192)
     box = gv.render(tree, camera, gv.TransferFunction([(0, 1)])).alpha > 0.05
     for preset in SENSIBLE + ["bone", "tissue"] * name.startswith(tuple(DENSE)):
-        picture = gv.render(tree, camera, chosen_transfer(preset, None, volume, 0))
+        picture = gv.render(tree, camera, parse_transfer(preset, None, volume, 0))
         seen = picture.alpha > 0.05
         share, inside = (float(part) for part in (seen.float().mean(), seen.sum() / box.sum()))
         fewest = 0.05 if preset == "gray" else 0.03
@@ -156,14 +156,14 @@ def test_names_in_hounsfield_units_where_a_scan_has_them():
     for name, own in (("bone", "ct-bone"), ("tissue", "ct-soft"), ("vessels", "ct-vessels")):
         expected = gv.TransferFunction.preset(own)
         for text in (None, "auto"):
-            assert np.array_equal(chosen_transfer(name, text, scan, 0).opacity, expected.opacity)
-        spanned = chosen_transfer(name, "-100,500", scan, 0).corners()[:2]
+            assert np.array_equal(parse_transfer(name, text, scan, 0).opacity, expected.opacity)
+        spanned = parse_transfer(name, "-100,500", scan, 0).corners()[:2]
         assert spanned == (-100, 500)
-        assert chosen_transfer(name, None, gv.Volume(data), 0).corners()[0] != expected.corners()[0]
+        assert parse_transfer(name, None, gv.Volume(data), 0).corners()[0] != expected.corners()[0]
         assert np.array_equal(
-            chosen_transfer(own, None, gv.Volume(data), 0).opacity, expected.opacity
+            parse_transfer(own, None, gv.Volume(data), 0).opacity, expected.opacity
         )
-    assert chosen_transfer("ct-lung", "full", scan, 0).corners()[:2] == scan.value_range
+    assert parse_transfer("ct-lung", "full", scan, 0).corners()[:2] == scan.value_range
 
 
 def test_files_keep_their_values_unless_a_window_is_given(tmp_path):
@@ -172,11 +172,11 @@ def test_files_keep_their_values_unless_a_window_is_given(tmp_path):
     (tmp_path / "pv.json").write_text('[{"Name": "a b", "RGBPoints": [0,0,0,0, 1,1,1,1]}]')
     volume = gv.Volume(noise())
     for name in (f"{tmp_path}/own.json",):
-        assert chosen_transfer(name, None, volume, 0).corners()[:2] == (5, 7)
-        assert chosen_transfer(name, "1,2", volume, 0).corners()[:2] == (1, 2)
+        assert parse_transfer(name, None, volume, 0).corners()[:2] == (5, 7)
+        assert parse_transfer(name, "1,2", volume, 0).corners()[:2] == (1, 2)
     for name in (f"{tmp_path}/pv.json", f"{tmp_path}/pv.json:a b"):
         expected = gv.window(volume)
-        assert chosen_transfer(name, None, volume, 0).corners()[:2] == pytest.approx(expected)
+        assert parse_transfer(name, None, volume, 0).corners()[:2] == pytest.approx(expected)
 
 
 def test_bounded():

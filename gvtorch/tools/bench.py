@@ -42,22 +42,22 @@ class Bench:
         from ..bench import WORKLOADS, Unavailable
 
         if self.name is None:
-            for name, what in WORKLOADS.items():
-                print(f"{name:10} {what}")
+            for name, description in WORKLOADS.items():
+                print(f"{name:10} {description}")
             return
         names = [*WORKLOADS] if self.name == "all" else [self.name]
         if names[0] not in WORKLOADS:
-            known = ", ".join((*WORKLOADS, "all"))
-            raise ValueError(f"bench: unknown workload {self.name!r}; known: {known}")
+            known_names = ", ".join((*WORKLOADS, "all"))
+            raise ValueError(f"bench: unknown workload {self.name!r}; known: {known_names}")
         for name in names:
             try:
-                self._one(name)
-            except Unavailable as why:
+                self._run_workload(name)
+            except Unavailable as reason:
                 if self.name != "all":
                     raise
-                print(f"{name} is left out: {why}", file=sys.stderr)
+                print(f"{name} is left out: {reason}", file=sys.stderr)
 
-    def _one(self, name: str) -> None:
+    def _run_workload(self, name: str) -> None:
         import torch
         from rich.console import Console
 
@@ -70,8 +70,8 @@ class Bench:
         except RuntimeError:
             raise ValueError(f"--device must be cpu, cuda or cuda:N, got {self.device!r}") from None
         peers = None if self.peers is None else tuple(p for p in self.peers.split(",") if p)
-        errors = Console(stderr=True)
-        with errors.status(name) as status:
+        error_console = Console(stderr=True)
+        with error_console.status(name) as status:
             settings = Settings(
                 device=device,
                 quick=self.quick,
@@ -92,8 +92,8 @@ class Bench:
             return
         console = Console(width=None if sys.stdout.isatty() else 200)
         console.print(tables.rich_table(content))
-        for peer, why in content["peers"].items():
-            if why != "ran":
-                console.print(f"{peer}: {why}", highlight=False, markup=False)
+        for peer, outcome in content["peers"].items():
+            if outcome != "ran":
+                console.print(f"{peer}: {outcome}", highlight=False, markup=False)
         for note in content["notes"]:
             console.print(note, highlight=False, markup=False)

@@ -29,9 +29,9 @@ from ..base.declared import did_you_mean
 from ..base.messages import one_line, printable
 from ..io.stores.ngff import is_zarr
 from .bench import Bench
-from .common import Bar, ReadOptions, Switch, flags_given, option, refuse_for_store, volume_formats
+from .common import Bar, ReadOptions, Switch, given_flags, option, refuse_file_flags, volume_formats
 from .fly import Fly
-from .making import Making, Splat, Voxelize, told_store
+from .making import Making, Splat, Voxelize, store_summary
 from .render import Render
 from .slice import Slice
 from .surface import Surface
@@ -47,18 +47,19 @@ class Info:
     # print JSON
     json: Switch = False
 
+    # How to read a volume file that does not say so itself; a store takes only --time and --key.
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
         if self.path is None:
-            flags = flags_given(self.source)
+            flags = given_flags(self.source)
             if flags:
                 raise ValueError(f"{flags[0]} is for volume files: name one")
             content = installation()
         elif is_zarr(self.path):
             from ..io.stores.store import Store
 
-            refuse_for_store(self.source, "--key")
+            refuse_file_flags(self.source, "--key")
             store = Store.open(self.path, image=self.source.key, time=self.source.time or 0)
             content = store.describe()
         else:
@@ -108,7 +109,7 @@ class Convert:
         from ..io.stores.conversion import convert, estimate
 
         self.making.check()
-        common: dict[str, Any] = {**self.source.options(), "threshold": self.threshold}
+        arguments: dict[str, Any] = {**self.source.options(), "threshold": self.threshold}
         if self.dry_run:
             from ..base import check
             from ..io.stores.unfinished import is_begun
@@ -116,16 +117,16 @@ class Convert:
             is_begun(self.store, resume=self.making.resume)  # raises as `convert` would
             if self.memory is not None:
                 check.nbytes("convert", "--memory", self.memory)
-            common |= {"block": self.making.block, "workers": self.making.workers}
-            _print_table(_readable(estimate(self.path, self.store, **common).as_dict()))
+            arguments |= {"block": self.making.block, "workers": self.making.workers}
+            _print_table(_readable(estimate(self.path, self.store, **arguments).as_dict()))
             return
-        start, finished = time.perf_counter(), (self.store / "zarr.json").exists()
-        with self.making.working(speed=True) as work:
-            store = convert(self.path, self.store, **common, memory=self.memory, **work)
-        if finished:  # --resume had nothing to do
+        start, was_finished = time.perf_counter(), (self.store / "zarr.json").exists()
+        with self.making.arguments(speed=True) as store_options:
+            store = convert(self.path, self.store, **arguments, memory=self.memory, **store_options)
+        if was_finished:  # --resume had nothing to do
             print(f"{printable(self.store)}: is finished already")
             return
-        print(told_store(self.store, [store], start))
+        print(store_summary(self.store, [store], start))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,23 +154,23 @@ class Filter:
         from ..io.stores.store import Store
         from ..ops import unavailable
         from ..shaders import Filtered, Lit
-        from .parse import chosen_transfer
+        from .parse import parse_transfer
 
         on_cuda = self.backend == "cuda" or (self.backend is None and not unavailable()["cuda"])
         start, store = time.perf_counter(), Store.open(self.store)
-        before = store.describe()["disk bytes"]
+        bytes_before = store.describe()["disk bytes"]
         with Bar() as bar:
-            transfer = chosen_transfer(self.tf, self.window, store, self.component)
-            for moment in range(store.times):
+            transfer = parse_transfer(self.tf, self.window, store, self.component)
+            for time_index in range(store.times):
                 Filtered.add_to(
-                    store if moment == 0 else Store.open(self.store, time=moment),
+                    store if time_index == 0 else Store.open(self.store, time=time_index),
                     Lit(transfer) if self.lit else transfer,
                     component=self.component,
                     directions={"auto": None, "six": True, "one": False}[self.directions],
                     device="cuda" if on_cuda else "cpu",
                     progress=bar,
                 )
-        added = amount(max(0, store.describe()["disk bytes"] - before))
+        added = amount(max(0, store.describe()["disk bytes"] - bytes_before))
         print(f"{printable(self.store)}: {added} of colours in {time.perf_counter() - start:.1f} s")
 
 
@@ -183,7 +184,7 @@ def installation() -> dict[str, Any]:
     from ..io.formats import FORMATS
     from ..ops import unavailable
 
-    cards = range(torch.cuda.device_count()) if torch.cuda.is_available() else ()
+    gpu_indices = range(torch.cuda.device_count()) if torch.cuda.is_available() else ()
     return {
         "gvtorch": __version__,
         "python": platform.python_version(),
@@ -191,9 +192,9 @@ def installation() -> dict[str, Any]:
         "backends": {name: reason or "ready" for name, reason in unavailable().items()},
         "devices": [
             f"cpu ({torch.get_num_threads()} threads)",
-            *(f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in cards),
+            *(f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in gpu_indices),
         ],
-        "formats": {found.name: found.status for found in FORMATS},
+        "formats": {file_format.name: file_format.status for file_format in FORMATS},
     }
 
 
@@ -234,42 +235,45 @@ def _sparkline(counts: list[int]) -> str:
     """Returns bars of the counts' logarithms, because most volumes are mostly air."""
     import math
 
-    most = math.log1p(max(1, *counts))
+    max_log = math.log1p(max(1, *counts))
     if not (sys.stdout.encoding or "ascii").lower().startswith("utf"):
         return ", ".join(str(count) for count in counts)
-    bars = (min(8, math.ceil(8 * math.log1p(count) / most)) for count in counts)
+    bars = (min(8, math.ceil(8 * math.log1p(count) / max_log)) for count in counts)
     return "".join(" ▁▂▃▄▅▆▇█"[bar] for bar in bars)
 
 
 _COMMANDS: dict[str, Any] = {
-    one.__name__.lower(): one
-    for one in (Info, View, Render, Fly, Slice, Surface, Convert, Voxelize, Splat, Filter, Bench)
+    cls.__name__.lower(): cls
+    for cls in (Info, View, Render, Fly, Slice, Surface, Convert, Voxelize, Splat, Filter, Bench)
 }
 
 
-def _unboxed(said: str) -> str:
+def _unbox_error(error_text: str) -> str:
     """Returns the parser's boxed error as one line, with suggestions for an unknown flag."""
-    box = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", said)  # without frame and title
-    words = " ".join(box.split())
-    unknown = re.match(r"Unrecognized options: (--[\w-]+)", words)
+    text = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", error_text)  # without frame and title
+    message = re.sub(r" \(applied to [^)]*\)", "", " ".join(text.split()))
+    unknown = re.match(r"Unrecognized (or misplaced )?options: (--[\w-]+)", message)
     if unknown is None:
-        return words
-    close = did_you_mean(unknown[1], set(re.findall(r"--[\w-]+", words)) - {unknown[1], "--help"})
-    first = re.split(r" Perhaps you meant| Available subcommands| For full helptext", words)[0]
-    return f"{first}{close}; gvtorch COMMAND --help tells all"
+        return message
+    elsewhere, flag = unknown.groups()  # a flag that another command has is "misplaced"
+    known_flags = set(re.findall(r"--[\w-]+", message)) - {flag, "--help"}
+    suggestion = "" if elsewhere else did_you_mean(flag, known_flags)
+    ending = r" Arguments are applied| Perhaps you meant| Available subcommands| For full helptext"
+    sentence = re.split(ending, message)[0].replace(" or misplaced", "")
+    return f"{sentence}{suggestion}; gvtorch COMMAND --help tells all"
 
 
-def _joined(args: list[str]) -> list[str]:
+def _join_minus_values(args: list[str]) -> list[str]:
     """Joins values that begin with a minus to their flags, as in `--up=-z` and `--at=-4mm`, because
     the parser would take them for flags.
     """
     joined: list[str] = []
-    for word in args:
-        value = re.fullmatch(r"-([xyz]|\.?\d.*)", word)
+    for arg in args:
+        value = re.fullmatch(r"-([xyz]|\.?\d.*)", arg)
         if value and joined and re.fullmatch(r"--[a-z][\w-]*", joined[-1]):
-            joined[-1] += f"={word}"
+            joined[-1] += f"={arg}"
         else:
-            joined.append(word)
+            joined.append(arg)
     return joined
 
 
@@ -278,18 +282,18 @@ def _interruptible() -> Iterator[None]:
     """Makes Ctrl-C raise KeyboardInterrupt while a command runs, if it ended the process at once
     before (`__main__`), and end it at once again afterwards.
     """
-    at_once = signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-    if at_once:
+    ends_at_once = signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+    if ends_at_once:
         signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
         signal.signal(signal.SIGINT, _interrupt)
     try:
         yield
     finally:
-        if at_once:
+        if ends_at_once:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def _interrupt(_number: int, frame: FrameType | None) -> None:
+def _interrupt(_signum: int, frame: FrameType | None) -> None:
     """Raises KeyboardInterrupt; during an import it tries again a moment later, because some
     modules catch it and others would stay half initialised.
     """
@@ -319,19 +323,19 @@ def main(args: list[str] | None = None) -> None:
 def _run(args: list[str] | None) -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):  # file names may hold what it can't encode
         sys.stdout.reconfigure(errors="backslashreplace")
-    args = _joined(sys.argv[1:] if args is None else args)
+    args = _join_minus_values(sys.argv[1:] if args is None else args)
     if args == ["--version"]:
         from .. import __version__
 
         print(f"gvtorch {__version__}")
         return
     if args and not args[0].startswith("-") and args[0] not in _COMMANDS:
-        known = f"{', '.join(_COMMANDS)}{did_you_mean(args[0], _COMMANDS)}"
-        print(f"gvtorch: error: unknown command {args[0]!r}; known: {known}", file=sys.stderr)
+        listing = f"{', '.join(_COMMANDS)}{did_you_mean(args[0], _COMMANDS)}"
+        print(f"gvtorch: error: unknown command {args[0]!r}; known: {listing}", file=sys.stderr)
         sys.exit(2)
-    said = io.StringIO()
+    parser_output = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(parser_output):
             command = tyro.extras.subcommand_cli_from_dict(
                 _COMMANDS,
                 args=args,
@@ -341,7 +345,7 @@ def _run(args: list[str] | None) -> None:
             )
     except SystemExit as end:
         if end.code:
-            print(f"gvtorch: error: {_unboxed(said.getvalue())}", file=sys.stderr)
+            print(f"gvtorch: error: {_unbox_error(parser_output.getvalue())}", file=sys.stderr)
         raise
     warnings.showwarning = lambda message, *_rest, **_more: print(
         f"gvtorch: {one_line(message)}", file=sys.stderr
@@ -362,9 +366,9 @@ def _run(args: list[str] | None) -> None:
             raise
         print(f"gvtorch: error: not enough memory: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt as stop:
-        if str(stop):
-            print(f"gvtorch: {printable(stop)}", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        if str(interrupt):
+            print(f"gvtorch: {printable(interrupt)}", file=sys.stderr)
         sys.exit(130)
 
 

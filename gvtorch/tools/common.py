@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 def option(**options: Any) -> Any:
     """Returns tyro's `arg` for a flag whose help names its default only if there is one."""
-    return arg(help_behavior_hint=_default, **options)
+    return arg(help_behavior_hint=_default_hint, **options)
 
 
-def _default(value: str) -> str:
+def _default_hint(value: str) -> str:
     return "" if value in ("None", "False", "''") else f"(default: {value})"
 
 
@@ -75,8 +75,8 @@ class ReadOptions:
 
     def options(self) -> dict[str, Any]:
         """Returns the options as arguments of `read_volume` and `convert`."""
-        shape = numbers("--shape", self.shape, 3, int) if self.shape else None
-        spacing = numbers("--spacing", self.spacing, 3, float) if self.spacing else None
+        shape = parse_numbers("--shape", self.shape, 3, int) if self.shape else None
+        spacing = parse_numbers("--spacing", self.spacing, 3, float) if self.spacing else None
         return {**vars(self), "shape": shape, "spacing": spacing}
 
 
@@ -115,79 +115,79 @@ class Bar:
         if self._progress.live.is_started:
             self._progress.stop()
 
-    def __call__(self, what: str, done: int, total: int) -> None:
-        """Shows that `done` of `total` (0: unknown) parts of `what` are done."""
-        if what not in self._tasks:
-            for task in self._tasks.values():
-                self._progress.update(task, visible=False)
-            self._tasks[what] = self._progress.add_task(what, total=total or None)
-        self._progress.update(self._tasks[what], completed=done, total=total or None)
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Shows that `done` of `total` (0: unknown) parts of a stage are done."""
+        if stage not in self._tasks:
+            for task_id in self._tasks.values():
+                self._progress.update(task_id, visible=False)
+            self._tasks[stage] = self._progress.add_task(stage, total=total or None)
+        self._progress.update(self._tasks[stage], completed=done, total=total or None)
 
 
-def flags_given(options: Any) -> list[str]:
+def given_flags(options: Any) -> list[str]:
     """Returns the flags of a group of options that differ from their defaults."""
-    plain = vars(type(options)())
-    return [f"--{n.replace('_', '-')}" for n, v in vars(options).items() if v != plain[n]]
+    defaults = vars(type(options)())
+    return [f"--{n.replace('_', '-')}" for n, v in vars(options).items() if v != defaults[n]]
 
 
-def refuse_for_store(source: ReadOptions, *known: str) -> None:
+def refuse_file_flags(options: ReadOptions, *allowed: str) -> None:
     """Raises ValueError if flags for volume files are given with a store; --time and the flags in
-    `known` are for stores too.
+    `allowed` are for stores too.
     """
-    flags = [flag for flag in flags_given(source) if flag not in ("--time", *known)]
+    flags = [flag for flag in given_flags(options) if flag not in ("--time", *allowed)]
     if flags:
         raise ValueError(f"{flags[0]} is for volume files; a store has it in its metadata")
 
 
-def open_data(path: str, source: ReadOptions, *, image: str | None, level: int) -> Volume | Store:
+def open_data(path: str, options: ReadOptions, *, image: str | None, level: int) -> Volume | Store:
     """Opens a store, or reads a volume; raises ValueError if a flag is for the other kind."""
     from ..io.stores.store import Store
 
     if is_zarr(path):
-        refuse_for_store(source)
-        return Store.open(path, image=image, time=source.time or 0)
+        refuse_file_flags(options)
+        return Store.open(path, image=image, time=options.time or 0)
     for flag, value in (("image", image), ("level", level)):
         if value:
             raise ValueError(f"--{flag} is for stores; make one: gvtorch convert {path} STORE.zarr")
-    return source.read(path)
+    return options.read(path)
 
 
-def check_outputs(read: Mapping[str, Any], written: Mapping[str, Path | None]) -> None:
+def check_outputs(inputs: Mapping[str, Any], outputs: Mapping[str, Path | None]) -> None:
     """Raises ValueError if a command would overwrite a file that it reads, or one in a folder that
-    it reads, or write a file twice. `read` and `written` map flags to paths; a text in `read` may
-    also be FILE:NAME, or no path at all.
+    it reads, or write a file twice. `inputs` and `outputs` map flags to paths; a text in `inputs`
+    may also be FILE:NAME, or no path at all.
     """
-    sources: dict[Path, str] = {}
-    for flag, text in read.items():
-        for name in (str(text), str(text).rpartition(":")[0]) if text is not None else ():
-            if os.path.exists(name):
-                sources[Path(os.path.realpath(name))] = flag
-    taken: dict[Path, str] = {}
-    for flag, path in written.items():
+    input_flags: dict[Path, str] = {}
+    for flag, text in inputs.items():
+        for file in (str(text), str(text).rpartition(":")[0]) if text is not None else ():
+            if os.path.exists(file):
+                input_flags[Path(os.path.realpath(file))] = flag
+    output_flags: dict[Path, str] = {}
+    for flag, path in outputs.items():
         if path is None:
             continue
-        place = Path(os.path.realpath(path))
-        source = sources.get(place, sources.get(place.parent))
-        if source is not None:
-            raise ValueError(f"{flag} {path} would be written over what {source} reads")
-        if place in taken:
-            raise ValueError(f"{flag} and {taken[place]} are one file: {path}")
-        taken[place] = flag
+        real_path = Path(os.path.realpath(path))
+        input_flag = input_flags.get(real_path, input_flags.get(real_path.parent))
+        if input_flag is not None:
+            raise ValueError(f"{flag} {path} would be written over what {input_flag} reads")
+        if real_path in output_flags:
+            raise ValueError(f"{flag} and {output_flags[real_path]} are one file: {path}")
+        output_flags[real_path] = flag
 
 
-def numbers(name: str, text: str, count: int, kind: type) -> list[Any]:
+def parse_numbers(flag: str, text: str, count: int, number_type: type) -> list[Any]:
     """Returns the `count` numbers of a flag's text; raises ValueError if it is anything else."""
     try:
-        values = [kind(part) for part in text.split(",")]
+        values = [number_type(part) for part in text.split(",")]
     except ValueError:
         values = []
     if len(values) != count:
-        wanted = "whole numbers" if kind is int else "numbers"
-        raise ValueError(f"{name} must be {count} {wanted} with commas between them, got {text!r}")
+        noun = "whole numbers" if number_type is int else "numbers"
+        raise ValueError(f"{flag} must be {count} {noun} with commas between them, got {text!r}")
     return values
 
 
-def size(text: str) -> tuple[int, int]:
+def parse_size(text: str) -> tuple[int, int]:
     """Returns width and height of WIDTHxHEIGHT; raises ValueError if the text is anything else."""
     width, height = (whole_number(n) for n in text.lower().partition("x")[::2])
     if not width or not height:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from .common import Switch, flags_given, option
+from .common import Switch, given_flags, option
 
 if TYPE_CHECKING:
     from ..base.image_info import ImageInfo
@@ -36,7 +36,7 @@ class Drawn:
         """
         from ..pictures import Overlay
 
-        if not flags_given(self):
+        if not given_flags(self):
             return None
         return Overlay(
             camera.width,
@@ -57,6 +57,6 @@ def _color_bar(shader: Shader, info: ImageInfo, component: int) -> ColorBar:
     if transfer is None:
         raise ValueError(f"--bar is for transfer functions, not for {type(shader).__name__}")
     values = [*transfer.opacity[:, 0], *transfer.color[:, 0]]
-    told = [info.channels[component].name] if component < len(info.channels) else []
-    title = ", ".join(part for part in (*told, info.quantity) if part)
+    names = [info.channels[component].name] if component < len(info.channels) else []
+    title = ", ".join(part for part in (*names, info.quantity) if part)
     return ColorBar(colors=transfer, low=min(values), high=max(values), title=title)

@@ -20,9 +20,9 @@ from ..base.digits import whole_number
 from ..base.messages import one_line, printable
 from ..base.whole_file import write_text
 from ..io.stores.ngff import is_zarr
-from .common import Bar, check_outputs, flags_given, option, size, volume_formats
+from .common import Bar, check_outputs, given_flags, option, parse_size, volume_formats
 from .drawn import Drawn
-from .look import first_orbit, parse_camera, parse_orbit, stance
+from .look import default_orbit, parse_camera, parse_orbit, up_and_front
 from .scene import RenderedScene, SceneFlags
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ..viewer.flight import Flight, KeyFile
     from ..viewer.state import ViewState
 
-_FILMS = tuple(declared_names("pictures.video", "FILMS"))
+_FILM_SUFFIXES = tuple(declared_names("pictures.video", "FILMS"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +42,8 @@ class Fly:
     path: Positional[Annotated[str, option(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     # film to write, .mp4, or .gif or .webp, which loop; or a folder for 0000.png, 0001.png, ...
     output: Annotated[Path, option(aliases=["-o"], metavar="DIR|OUT.mp4")]
+    # width and height of each picture in pixels
+    size: Annotated[str, option(metavar="WxH")] = "512x512"
     # camera path: orbit (once around), or a file of keys [{"eye": [x, y, z], "target": [x, y,
     # z], "up": ..., "fov": ...}, ...]
     flight: Annotated[str, option(name="path", metavar="orbit|FILE.json")] = "orbit"
@@ -80,8 +82,8 @@ class Fly:
         from ..pictures import Video
 
         look = self.scene.look
-        width, height = size(look.size)
-        frames, fps = self._length()
+        width, height = parse_size(self.size)
+        frames, fps = self._frames_and_fps()
         options = look.options()
         self._check_output(options)
         self._check_path()
@@ -90,101 +92,101 @@ class Fly:
             if self.trace is not None:
                 stack.enter_context(Trace(self.trace, look.device()))
             bar = stack.enter_context(Bar())
-            is_film = self.output.suffix in _FILMS
+            is_film = self.output.suffix in _FILM_SUFFIXES
             film = Video(self.output, width, height, fps=fps) if is_film else None
-            kept = _Kept(self.output, film)
+            writer = _FrameWriter(self.output, film)
             if self.stats is not None:  # at the end: a full disk leaves the old file
-                kept.lines = []
-                stack.callback(kept.tell, self.stats)
-            steps = math.inf if self._stands() else max(1, frames - 1 + self._loops())
-            for moment, numbers in self._parts(frames):
+                writer.stats_lines = []
+                stack.callback(writer.write_stats, self.stats)
+            steps = math.inf if self._stands_still() else max(1, frames - 1 + self._loops())
+            for time, frame_numbers in self._time_parts(frames):
                 source = self.scene.source
-                source = source if moment is None else replace(source, time=moment)
+                source = source if time is None else replace(source, time=time)
                 with replace(self.scene, source=source).open(self.path, options, bar) as scene:
-                    taken = self._taken(scene, options, width, height)
-                    if numbers.start == 0 and film is not None:  # data could be read
+                    take_picture = self._picture_taker(scene, options, width, height)
+                    if frame_numbers.start == 0 and film is not None:  # data could be read
                         stack.enter_context(film)
                     elif film is None:
                         self.output.mkdir(exist_ok=True)
-                    for number in numbers:
+                    for number in frame_numbers:
                         bar("frames", number, frames)
                         with stage("frame"):
-                            camera, picture = taken(number / steps)
+                            camera, picture = take_picture(number / steps)
                         with stage("save"):
-                            kept.add(number, camera, picture)
+                            writer.add(number, camera, picture)
             bar("frames", frames, frames)
         if self.poses is not None:
-            write_cameras(self.poses, kept.cameras)
-        missing = f", {kept.coarse} of them are not complete" if kept.coarse else ""
-        print(f"{printable(self.output)}: {frames} pictures{missing}")
+            write_cameras(self.poses, writer.cameras)
+        note = f", {writer.incomplete} of them are not complete" if writer.incomplete else ""
+        print(f"{printable(self.output)}: {frames} pictures{note}")
 
     def _check_output(self, options: dict[str, Any]) -> None:
         """Raises ValueError or FileNotFoundError for wrong outputs before the volume is read."""
-        is_film = self.output.suffix in _FILMS
+        is_film = self.output.suffix in _FILM_SUFFIXES
         if not self.output.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self.output.parent}")
         if self.stats is not None and not self.stats.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self.stats.parent}")
         if self.output.suffix and not is_film:
-            kinds = ", ".join(_FILMS)
+            suffixes = ", ".join(_FILM_SUFFIXES)
             raise ValueError(
-                f"--output must be a folder or end in {kinds}, got {str(self.output)!r}"
+                f"--output must be a folder or end in {suffixes}, got {str(self.output)!r}"
             )
         flight = self.flight if self.flight != "orbit" else None
-        read = {"PATH": self.path, "--state": self.state, "--keys": self.keys, "--path": flight}
-        written = {"--output": self.output, "--stats": self.stats, "--poses": self.poses}
+        inputs = {"PATH": self.path, "--state": self.state, "--keys": self.keys, "--path": flight}
+        outputs = {"--output": self.output, "--stats": self.stats, "--poses": self.poses}
         files = self.scene.look.files()
-        check_outputs({**read, **files}, {**written, "--trace": self.trace})
+        check_outputs({**inputs, **files}, {**outputs, "--trace": self.trace})
         if is_film and options["background"] is None:
             raise ValueError(f"--background transparent is for pictures, not {self.output.suffix}")
 
     def _loops(self) -> bool:
         """Whether the path ends where it begins, so that its last picture is left out."""
-        return self._bare_flight.closed if self._saved is not None else self.flight == "orbit"
+        return self._bare_flight.closed if self._state_file is not None else self.flight == "orbit"
 
     @property
-    def _saved(self) -> Path | None:
+    def _state_file(self) -> Path | None:
         """The file of states that define the flight: key frames, or one state to circle around."""
         return self.state if self.keys is None else self.keys
 
-    def _stands(self) -> bool:
+    def _stands_still(self) -> bool:
         """Whether the camera stands still: a film over time."""
-        moves = self._saved is not None or self.turntable is not None or self.flight != "orbit"
+        moves = self._state_file is not None or self.turntable is not None or self.flight != "orbit"
         return self.times is not None and not moves
 
-    def _taken(
+    def _picture_taker(
         self, scene: RenderedScene, options: dict[str, Any], width: int, height: int
     ) -> Callable[[float], tuple[Camera, Picture]]:
         """Returns a function that takes the picture at a position along the path, 0 to 1."""
         from ..viewer.state import Eye
 
         look = self.scene.look
-        first = parse_camera(None, look, width, height, scene.info.space)
-        now = replace(scene.state(options), camera=Eye.of(first, scene.box))
-        if self._saved is None:
-            path = self._path(scene, width, height)
+        first_camera = parse_camera(None, look, width, height, scene.info.space)
+        base_state = replace(scene.state(options), camera=Eye.of(first_camera, scene.box))
+        if self._state_file is None:
+            path = self._camera_path(scene, width, height)
 
-            def shot(at: float) -> tuple[ViewState, Camera, Picture]:
-                camera = path.camera(at, width, height, look.camera_model)
-                eye = Eye.of(camera, scene.box) if flags_given(self.drawn) else now.camera
-                return replace(now, camera=eye), camera, scene.render(camera)
+            def render_at(position: float) -> tuple[ViewState, Camera, Picture]:
+                camera = path.camera(position, width, height, look.camera_model)
+                eye = Eye.of(camera, scene.box) if given_flags(self.drawn) else base_state.camera
+                return replace(base_state, camera=eye), camera, scene.render(camera)
         else:
-            flight = self._flight_from(now)
+            flight = self._flight_from(base_state)
 
-            def shot(at: float) -> tuple[ViewState, Camera, Picture]:
-                state = flight.along(at)
+            def render_at(position: float) -> tuple[ViewState, Camera, Picture]:
+                state = flight.along(position)
                 assert state.camera is not None
                 camera = state.camera.camera(width, height, scene.box)
                 return state, camera, scene.picture(state, camera)
 
-        def picture(at: float) -> tuple[Camera, Picture]:
-            state, camera, made = shot(at)
+        def take_picture(position: float) -> tuple[Camera, Picture]:
+            state, camera, picture = render_at(position)
             assert state.camera is not None
-            told = (state.shader, scene.info, state.component, camera, state.camera)
-            overlay = self.drawn.overlay(*told)
-            return camera, made if overlay is None else overlay.over(made)
+            overlay_arguments = (state.shader, scene.info, state.component, camera, state.camera)
+            overlay = self.drawn.overlay(*overlay_arguments)
+            return camera, picture if overlay is None else overlay.over(picture)
 
-        return picture
+        return take_picture
 
     @cached_property
     def _key_file(self) -> KeyFile:
@@ -204,14 +206,14 @@ class Fly:
         assert self.state is not None
         return saved_state(self.state)
 
-    def _flight_from(self, now: ViewState) -> Flight:
-        """Returns the flight; `now` supplies what its states leave out."""
+    def _flight_from(self, base_state: ViewState) -> Flight:
+        """Returns the flight; `base_state` supplies what its states leave out."""
         from ..viewer.flight import Flight
 
         if self.keys is not None:
-            return self._key_file.flight(now)
+            return self._key_file.flight(base_state)
         try:
-            state = now.changed(self._first_fields)
+            state = base_state.changed(self._first_fields)
         except ValueError as error:
             raise ValueError(f"{self.state}: {one_line(error)}") from None
         return Flight.turntable(state)
@@ -222,36 +224,36 @@ class Fly:
         from ..shaders import TransferFunction
         from ..viewer.state import Eye, ViewState
 
-        anywhere = Eye(eye=(0, 0, 1), target=(0, 0, 0))
-        return self._flight_from(ViewState(shader=TransferFunction([(0, 1)]), camera=anywhere))
+        placeholder = Eye(eye=(0, 0, 1), target=(0, 0, 0))
+        return self._flight_from(ViewState(shader=TransferFunction([(0, 1)]), camera=placeholder))
 
-    def _parts(self, frames: int) -> list[tuple[int | None, range]]:
+    def _time_parts(self, frames: int) -> list[tuple[int | None, range]]:
         """Returns time points and the numbers of their pictures; None: the one of --time."""
         if self.times is None:
-            return [(None, range(frames))] if self._saved is None else self._parts_of_keys(frames)
-        moments = self._moments()
-        ends = [-(-number * frames // len(moments)) for number in range(len(moments) + 1)]
-        return [(m, range(a, b)) for m, a, b in zip(moments, ends, ends[1:], strict=False) if a < b]
+            return [(None, range(frames))] if self._state_file is None else self._key_parts(frames)
+        times = self._selected_times()
+        ends = [-(-number * frames // len(times)) for number in range(len(times) + 1)]
+        return [(t, range(a, b)) for t, a, b in zip(times, ends, ends[1:], strict=False) if a < b]
 
-    def _parts_of_keys(self, frames: int) -> list[tuple[int | None, range]]:
+    def _key_parts(self, frames: int) -> list[tuple[int | None, range]]:
         """Returns the same by the times of key frames: runs of pictures of one time point."""
         flight = self._bare_flight
         if all(state.time == 0 for _, state in flight.keys):
             return [(None, range(frames))]
         if self.scene.source.time is not None:
-            raise ValueError(f"{self._flag} sets what --time sets: leave one out")
+            raise ValueError(f"{self._state_flag} sets what --time sets: leave one out")
         steps = max(1, frames - 1 + flight.closed)
-        shown = [round(flight.along(n / steps).time) for n in range(frames)]
-        count = self._times_there()
-        if not 0 <= min(shown) <= max(shown) < count:
-            wrong = next(moment for moment in shown if not 0 <= moment < count)
+        times = [round(flight.along(n / steps).time) for n in range(frames)]
+        count = self._time_count()
+        if not 0 <= min(times) <= max(times) < count:
+            time = next(t for t in times if not 0 <= t < count)
             raise ValueError(
-                f"{self._saved}: time must be from 0 to {count - 1} of {self.path}, got {wrong}"
+                f"{self._state_file}: time must be from 0 to {count - 1} of {self.path}, got {time}"
             )
-        starts = [n for n in range(frames) if n == 0 or shown[n] != shown[n - 1]]
-        return [(shown[a], range(a, b)) for a, b in pairwise((*starts, frames))]
+        starts = [n for n in range(frames) if n == 0 or times[n] != times[n - 1]]
+        return [(times[a], range(a, b)) for a, b in pairwise((*starts, frames))]
 
-    def _times_there(self) -> int:
+    def _time_count(self) -> int:
         """Returns the number of time points of the data."""
         from ..io.reading import open_source
         from ..io.stores.store import Store
@@ -262,11 +264,11 @@ class Fly:
         del options["nan"]
         return open_source(self.path, **options).times
 
-    def _moments(self) -> range:
+    def _selected_times(self) -> range:
         """Returns the time points that `--times` selects."""
         if self.scene.source.time is not None:
             raise ValueError("--times and --time both choose time points: leave one out")
-        count = self._times_there()
+        count = self._time_count()
         first, last = (whole_number(n) for n in (self.times or "").partition("-")[::2])
         if self.times == "all":
             return range(count)
@@ -276,19 +278,19 @@ class Fly:
             f"--times must be all or A-B, from 0 to {count - 1} of {self.path}, got {self.times!r}"
         )
 
-    def _length(self) -> tuple[int, int]:
+    def _frames_and_fps(self) -> tuple[int, int]:
         """Returns the number of pictures, and pictures a second."""
         from ..base import check
 
         fps = check.integer("fly", "--fps", 25 if self.fps is None else self.fps, low=1, high=1000)
         if self.keys is not None:
-            count = self._bare_flight.count(fps) if self.frames is None else self.frames
-            return check.integer("fly", "--frames", count, low=1), fps
+            frames = self._bare_flight.count(fps) if self.frames is None else self.frames
+            return check.integer("fly", "--frames", frames, low=1), fps
         if self.turntable is None:
-            if self.fps is not None and self.output.suffix not in _FILMS:
+            if self.fps is not None and self.output.suffix not in _FILM_SUFFIXES:
                 raise ValueError("--fps is for a film or --turntable: pictures have no speed")
-            most = 100 if self.times is None else len(self._moments())
-            frames = most if self.frames is None else self.frames
+            default_frames = 100 if self.times is None else len(self._selected_times())
+            frames = default_frames if self.frames is None else self.frames
             return check.integer("fly", "--frames", frames, low=1), fps
         if self.frames is not None:
             raise ValueError(
@@ -301,12 +303,12 @@ class Fly:
 
     def _check_path(self) -> None:
         """Raises ValueError for a wrong path before the volume is read."""
-        if self._saved is not None:
-            self._check_saved()
+        if self._state_file is not None:
+            self._check_states()
         elif self.flight != "orbit":
             if self.orbit is not None:
                 raise ValueError("--orbit is for --path orbit, not for keys")
-            self._keys()
+            self._read_path()
         elif self.orbit is not None:
             parse_orbit("--orbit", self.orbit)
 
@@ -320,42 +322,42 @@ class Fly:
         if not self.poses.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self.poses.parent}")
         models = [self.scene.look.camera_model]
-        if self._saved is not None:
+        if self._state_file is not None:
             models = [s.camera.model for _, s in self._bare_flight.keys if s.camera is not None]
-        other = next((one for one in models if one not in ("pinhole", "fisheye")), None)
-        if other is not None:
-            raise ValueError(f"--poses can write pinhole and fisheye, not {other}")
+        unsupported = next((model for model in models if model not in ("pinhole", "fisheye")), None)
+        if unsupported is not None:
+            raise ValueError(f"--poses can write pinhole and fisheye, not {unsupported}")
 
-    def _check_saved(self) -> None:
+    def _check_states(self) -> None:
         """Raises ValueError if a flag sets what the saved states set."""
         flight = self._bare_flight  # raises if it is wrong
         path = self.flight if self.flight != "orbit" else None
-        paths: dict[str, Any] = {"--path": path, "--orbit": self.orbit}
+        flag_values: dict[str, Any] = {"--path": path, "--orbit": self.orbit}
         if self.keys is not None:
-            paths |= {"--turntable": self.turntable, "--state": self.state}
-        flags = [name for name, value in paths.items() if value]
+            flag_values |= {"--turntable": self.turntable, "--state": self.state}
+        flags = [name for name, value in flag_values.items() if value]
         if self.times is not None and any(state.time != 0 for _, state in flight.keys):
             flags.append("--times")
-        flags += self.scene.look.told_by(self._first_fields)
+        flags += self.scene.look.flags_set_by(self._first_fields)
         if flags:
-            raise ValueError(f"{self._flag} sets what {flags[0]} sets: leave one out")
+            raise ValueError(f"{self._state_flag} sets what {flags[0]} sets: leave one out")
 
     @property
-    def _flag(self) -> str:
+    def _state_flag(self) -> str:
         return "--state" if self.keys is None else "--keys"
 
-    def _keys(self) -> CameraPath:
+    def _read_path(self) -> CameraPath:
         from ..cameras.path import CameraPath
 
         look = self.scene.look
-        return CameraPath.from_json(self.flight, up=look.upward(), fov=look.fov)
+        return CameraPath.from_json(self.flight, up=look.up_direction(), fov=look.fov)
 
-    def _path(self, scene: RenderedScene, width: int, height: int) -> CameraPath:
+    def _camera_path(self, scene: RenderedScene, width: int, height: int) -> CameraPath:
         from ..cameras.path import CameraPath
 
         if self.flight != "orbit":
-            return self._keys()
-        text = self.orbit or first_orbit(scene.info.space)
+            return self._read_path()
+        text = self.orbit or default_orbit(scene.info.space)
         azimuth, elevation, distance = parse_orbit("--orbit", text)
         look = self.scene.look
         return CameraPath.orbit(
@@ -363,32 +365,32 @@ class Fly:
             azimuth=azimuth,
             elevation=elevation,
             distance=distance,
-            up=look.upward() or stance(scene.info.space)[0],
+            up=look.up_direction() or up_and_front(scene.info.space)[0],
             fit=(width, height) if distance is None else None,
         )
 
 
-class _Kept:
+class _FrameWriter:
     """Writes a flight's pictures to a film or a folder, and their statistics to a file."""
 
     def __init__(self, output: Path, film: Video | None) -> None:
         self._output, self._film = output, film
-        self.lines: list[str] | None = None  # of JSON, if statistics are wanted
-        self.coarse = 0
+        self.stats_lines: list[str] | None = None  # of JSON, if statistics are wanted
+        self.incomplete = 0
         self.cameras: dict[str, Camera] = {}
 
     def add(self, number: int, camera: Camera, picture: Picture) -> None:
-        name, told = f"{number:04d}.png", picture.stats.as_dict()
+        name, stats = f"{number:04d}.png", picture.stats.as_dict()
         self.cameras[name] = camera
-        self.coarse += not told.get("converged", True)
-        if self.lines is not None:
-            self.lines.append(json.dumps({"picture": number, **told}) + "\n")
+        self.incomplete += not stats.get("converged", True)
+        if self.stats_lines is not None:
+            self.stats_lines.append(json.dumps({"picture": number, **stats}) + "\n")
         if self._film is not None:
             self._film.add(picture)
         else:
             picture.save(self._output / name)
 
-    def tell(self, stats: Path) -> None:
+    def write_stats(self, path: Path) -> None:
         """Writes the statistics of the pictures, if there are any."""
-        if self.lines:
-            write_text(stats, "".join(self.lines))
+        if self.stats_lines:
+            write_text(path, "".join(self.stats_lines))

@@ -1,4 +1,4 @@
-"""`Look`: the flags that say how a scene is shown, of `gvtorch render` and `gvtorch fly`."""
+"""`Look`: the flags that say how a scene is shown, of `gvtorch view`, `render` and `fly`."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..base.declared import declared_names
-from .common import flags_given, numbers, option
+from .common import given_flags, option, parse_numbers
 from .parse import (
     check_component,
-    chosen_transfer,
     parse_background,
     parse_channels,
     parse_clip,
     parse_lens,
     parse_lighting,
+    parse_transfer,
 )
 
 if TYPE_CHECKING:
@@ -40,12 +40,12 @@ else:
         )
     ]
 
-_OF_STATE = {  # fields that a part of a saved state sets too
+_STATE_FIELDS = {  # fields that a part of a saved state sets too
     "shader": ("tf", "window", "shader", "channel", "value"),
     "camera": ("camera_model", "fov", "up"),
     "component": ("component",),
 }
-_WHOLE = ("isosurface", "maximum", "minimum", "mean")  # use one value, or a whole ray
+_WHOLE_RAY_SHADERS = ("isosurface", "maximum", "minimum", "mean")  # use one value, or a whole ray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +56,6 @@ class Look:
     camera_model: Annotated[CameraModel, option(metavar="MODEL")] = "pinhole"
     # vertical field of view in degrees; if left out: 30, or 180 for fisheye and panorama
     fov: Annotated[float | None, option(metavar="DEG")] = None
-    # width and height of the picture in pixels
-    size: Annotated[str, option(metavar="WxH")] = "512x512"
     # up direction in the picture: +x, -x, +y, -y, +z, -z or X,Y,Z; if left out: +z, the head, for
     # scans of patients, else +y
     up: Annotated[str | None, option(metavar="+z|X,Y,Z")] = None
@@ -118,7 +116,7 @@ class Look:
 
     def options(self) -> dict[str, Any]:
         """Returns fields of `RenderOptions`."""
-        if self.shader in _WHOLE and self.stop_alpha != Look().stop_alpha:
+        if self.shader in _WHOLE_RAY_SHADERS and self.stop_alpha != Look().stop_alpha:
             raise ValueError(f"--stop-alpha is for what adds up along a ray, not for {self.shader}")
         names = ("step", "lod", "stop_alpha", "component", "backend")
         return {
@@ -134,13 +132,13 @@ class Look:
         """Returns the files that are read in addition to the volume, by flag."""
         return {"--tf": self.tf, "--background": self.background}
 
-    def told_by(self, state: Mapping[str, Any]) -> list[str]:
+    def flags_set_by(self, state: Mapping[str, Any]) -> list[str]:
         """Returns the given flags that a saved state sets as well, so that they would have no
         effect.
         """
-        names = {one for part, those in _OF_STATE.items() if part in state for one in those}
-        names |= set(state.get("options", ()))
-        return [flag for flag in flags_given(self) if flag[2:].replace("-", "_") in names]
+        fields = {name for part, names in _STATE_FIELDS.items() if part in state for name in names}
+        fields |= set(state.get("options", ()))
+        return [flag for flag in given_flags(self) if flag[2:].replace("-", "_") in fields]
 
     def device(self) -> torch.device:
         """Returns the device that the backend needs; for auto, CUDA if it can be used."""
@@ -156,12 +154,12 @@ class Look:
         choose_backend(self.backend, device)
         return device
 
-    def bricks(self, data: Volume | Store) -> tuple[int, int]:
+    def brick_layout(self, data: Volume | Store) -> tuple[int, int]:
         """Returns the side of a brick, and the voxels around it."""
         border = 2 if data.info.labels else 1
         return self.brick_size, border if self.border is None else self.border
 
-    def upward(self) -> Up | None:
+    def up_direction(self) -> Up | None:
         """Returns the up direction of `--up`, or None if it is left out."""
         if self.up is None or (self.up[:1] in ("+", "-") and self.up[1:].isalpha()):
             return self.up
@@ -169,26 +167,26 @@ class Look:
             return f"+{self.up}"
         if "," not in self.up:
             raise ValueError(f"--up must be +x, -x, +y, -y, +z, -z or X,Y,Z, got {self.up!r}")
-        return numbers("--up", self.up, 3, float)
+        return parse_numbers("--up", self.up, 3, float)
 
-    def stored_colors(self, store: Store, names: tuple[str, ...]) -> StoredColor:
+    def stored_color_shader(self, store: Store, names: tuple[str, ...]) -> StoredColor:
         """Returns the shader of a mesh's stored colours, and of its normals if `names` has them."""
         from ..shaders import StoredColor
 
-        self._refuse("colours are stored", "component")
+        self._refuse_flags("colours are stored", "component")
         # An opaque voxel must be opaque within its own width: light enters no farther.
-        told: dict[str, Any] = {"reference": 0.3 * min(store.spacing), "premultiplied": True}
+        options: dict[str, Any] = {"reference": 0.3 * min(store.spacing), "premultiplied": True}
         if len(names) == 1:
-            return StoredColor("value", lit=True, **told)
-        return StoredColor("color", normals="normal", **told)
+            return StoredColor("value", lit=True, **options)
+        return StoredColor("color", normals="normal", **options)
 
-    def _refuse(self, why: str, *more: str) -> None:
-        """Raises ValueError if a flag of transfer functions, or one of `more`, is given."""
-        for name in ("tf", "window", "value", *more):
+    def _refuse_flags(self, reason: str, *more_names: str) -> None:
+        """Raises ValueError if a flag of transfer functions, or one of `more_names`, is given."""
+        for name in ("tf", "window", "value", *more_names):
             if getattr(self, name) != getattr(Look(), name):
-                raise ValueError(f"--{name} is not for --shader {self.shader}: {why}")
+                raise ValueError(f"--{name} is not for --shader {self.shader}: {reason}")
 
-    def chosen(self, data: Volume | Store) -> Shader:
+    def make_shader(self, data: Volume | Store) -> Shader:
         """Returns the shader that the flags choose, with its transfer function read from a file or
         stretched over the data; `Labels` for data that holds labels.
         """
@@ -196,39 +194,39 @@ class Look:
         from ..shaders.built_in import BY_NAME
 
         if self.shader == "channels":
-            self._refuse("it takes --channel", "component")
+            self._refuse_flags("it takes --channel", "component")
             return parse_channels(self.channel, data)
         if self.channel is not None:
             raise ValueError("--channel is for --shader channels")
         if self.shader == "colors":
             raise ValueError("--shader colors is for stores of meshes: --channels color,normal")
         if self.shader == "labels" or (self.shader == "plain" and data.info.labels):
-            self._refuse("labels have colours of their own")
+            self._refuse_flags("labels have colours of their own")
             check_component(data, self.component)
             return Labels()
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
         if self.shader == "isosurface":
-            for flag, given in (("--tf", self.tf), ("--window", self.window)):
-                if given is not None:
+            for flag, value in (("--tf", self.tf), ("--window", self.window)):
+                if value is not None:
                     raise ValueError(f"{flag} is for values: an isosurface has one")
             check_component(data, self.component)
             return BY_NAME[self.shader](TransferFunction([(0, 1)]), self.value or 0.0)
-        _tell_of_others(data, self.component)
-        transfer = chosen_transfer(self.tf, self.window, data, self.component)
+        _warn_of_other_channels(data, self.component)
+        transfer = parse_transfer(self.tf, self.window, data, self.component)
         if self.shader in ("filtered", "filtered-lit"):  # its colours are made with the tree
-            shown = Lit(transfer) if self.shader == "filtered-lit" else transfer
-            return Filtered(shown, component=self.component)
+            lit_or_plain = Lit(transfer) if self.shader == "filtered-lit" else transfer
+            return Filtered(lit_or_plain, component=self.component)
         return BY_NAME[self.shader](transfer, 0.0)
 
 
-def _tell_of_others(data: Volume | Store, component: int) -> None:
+def _warn_of_other_channels(data: Volume | Store, component: int) -> None:
     """Warns if the first of several channels is shown, as it is by default."""
-    names = [one.name for one in data.info.channels]
+    names = [channel.name for channel in data.info.channels]
     if len(names) > 1 and component == 0:
-        first = f" ({names[0]})" if names[0] else ""
+        first_name = f" ({names[0]})" if names[0] else ""
         warnings.warn(
-            f"channel 0{first} of {len(names)} is shown: --component N shows another, "
+            f"channel 0{first_name} of {len(names)} is shown: --component N shows another, "
             "--shader channels all",
             stacklevel=2,
         )
@@ -239,25 +237,25 @@ def parse_orbit(flag: str, text: str) -> tuple[float, float, float | None]:
     None if the whole box is to be in the picture. Raises ValueError for any other text.
     """
     if text.count(",") == 1 or text.endswith(",fit"):
-        azimuth, elevation = numbers(flag, text.removesuffix(",fit"), 2, float)
+        azimuth, elevation = parse_numbers(flag, text.removesuffix(",fit"), 2, float)
         return azimuth, elevation, None
-    azimuth, elevation, distance = numbers(flag, text, 3, float)
+    azimuth, elevation, distance = parse_numbers(flag, text, 3, float)
     return azimuth, elevation, distance
 
 
-def stance(space: str | None) -> tuple[Up, float]:
+def up_and_front(space: str | None) -> tuple[Up, float]:
     """Returns the up direction and the azimuth of the front, given where x, y and z point
     (`ImageInfo.space`): for patients, the directions of the head and of the face.
     """
-    words = (space or "").split("-")
-    if len(words) == 3 and words[2] == "superior" and words[1] in ("anterior", "posterior"):
-        return "+z", 180.0 if words[1] == "anterior" else 0.0
+    axes = (space or "").split("-")
+    if len(axes) == 3 and axes[2] == "superior" and axes[1] in ("anterior", "posterior"):
+        return "+z", 180.0 if axes[1] == "anterior" else 0.0
     return "+y", 0.0
 
 
-def first_orbit(space: str | None) -> str:
+def default_orbit(space: str | None) -> str:
     """Returns AZ,EL of the default camera: a little from the side, and from above."""
-    return f"{stance(space)[1] + 30:g},20"
+    return f"{up_and_front(space)[1] + 30:g},20"
 
 
 def parse_camera(
@@ -265,21 +263,21 @@ def parse_camera(
 ) -> Camera:
     """Makes a camera from `orbit:AZ,EL`, `orbit:AZ,EL,DIST`, `look:ex,ey,ez,tx,ty,tz`, or
     `file:PATH` or `file:PATH,NAME`; the defaults of the up direction and of the position depend on
-    `space` (see `stance`). Raises ValueError for anything else.
+    `space` (see `up_and_front`). Raises ValueError for anything else.
     """
     from ..cameras import Camera
 
-    up = look.upward() or stance(space)[0]
-    shape = (look.fov, width, height, look.camera_model)
-    text = f"orbit:{first_orbit(space)}" if text is None else text
+    up = look.up_direction() or up_and_front(space)[0]
+    projection = (look.fov, width, height, look.camera_model)
+    text = f"orbit:{default_orbit(space)}" if text is None else text
     kind, _, rest = text.partition(":")
     if kind == "orbit":
         azimuth, elevation, distance = parse_orbit("--camera orbit", rest)
         fit = distance is None
-        return Camera.orbit(azimuth, elevation, distance, *shape, up=up, fit=fit)
+        return Camera.orbit(azimuth, elevation, distance, *projection, up=up, fit=fit)
     if kind == "look":
-        values = numbers("--camera look", rest, 6, float)
-        return Camera.look_at(values[:3], values[3:], up, *shape)
+        values = parse_numbers("--camera look", rest, 6, float)
+        return Camera.look_at(values[:3], values[3:], up, *projection)
     if kind == "file":
         return _camera_of_file(rest, look, width, height)
     raise ValueError(
@@ -303,6 +301,6 @@ def _camera_of_file(text: str, look: Look, width: int, height: int) -> Camera:
     if not name and len(cameras) == 1:
         return next(iter(cameras.values()))
     if name not in cameras:
-        known = ", ".join(list(cameras)[:5]) + (", ..." if len(cameras) > 5 else "")
-        raise ValueError(f"--camera file:{path},NAME must name one of {known}, got {name!r}")
+        listing = ", ".join(list(cameras)[:5]) + (", ..." if len(cameras) > 5 else "")
+        raise ValueError(f"--camera file:{path},NAME must name one of {listing}, got {name!r}")
     return cameras[name]

@@ -15,14 +15,14 @@ import tyro
 from tyro.conf import Positional
 
 from ..base.messages import printable
-from .common import Bar, Switch, numbers, option
+from .common import Bar, Switch, option, parse_numbers
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..io.stores.store import Store
 
-_MESHES = "OBJ, PLY, STL, glTF or OFF, also compressed (.gz)"
+_MESH_FORMATS = "OBJ, PLY, STL, glTF or OFF, also compressed (.gz)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,10 +45,10 @@ class Making:
             raise ValueError("--scheduler brings its own workers: leave --workers out")
 
     @contextlib.contextmanager
-    def working(self, *, speed: bool = False) -> Iterator[dict[str, Any]]:
+    def arguments(self, *, speed: bool = False) -> Iterator[dict[str, Any]]:
         """Yields arguments of `convert`, `voxelize` and `splat`; for `speed` see `Bar`."""
         self.check()
-        with Bar(speed=speed) as bar, cluster(self.scheduler) as executor:
+        with Bar(speed=speed) as bar, cluster_executor(self.scheduler) as executor:
             yield {
                 "block": self.block,
                 "workers": self.workers,
@@ -62,7 +62,7 @@ class Making:
 class Voxelize:
     """Voxelize a mesh into a store, of any resolution: OME-Zarr with bordered blocks."""
 
-    path: Positional[Annotated[str, option(metavar="MESH", help=f"mesh: {_MESHES}")]]
+    path: Positional[Annotated[str, option(metavar="MESH", help=f"mesh: {_MESH_FORMATS}")]]
     # folder to create
     output: Annotated[Path, option(aliases=["-o"], metavar="STORE.zarr")]
     # voxels along the mesh's longest side, including a margin of 2 at either end
@@ -89,7 +89,7 @@ class Voxelize:
         from ..io.stores.store import Store
 
         start = time.perf_counter()
-        with self.making.working(speed=True) as work:
+        with self.making.arguments(speed=True) as store_options:
             store = voxelize(
                 *(self.path, self.output),
                 resolution=self.resolution,
@@ -98,11 +98,11 @@ class Voxelize:
                 thickness=self.thickness,
                 solid=self.solid,
                 texture=self.texture,
-                **work,
+                **store_options,
             )
         names = channel_names(self.output)
         stores = [Store.open(self.output, image=name) for name in names] or [store]
-        print(told_store(self.output, stores, start))
+        print(store_summary(self.output, stores, start))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,49 +140,49 @@ class Splat:
         from ..io.point_source import splat
 
         start = time.perf_counter()
-        with self.making.working() as work:
+        with self.making.arguments() as store_options:
             store = splat(
                 self.path,
                 self.output,
                 opacity=self.opacity,
                 channel=self.channels,
                 memory=self.memory,
-                **work,
-                **self._places(),
+                **store_options,
+                **self._point_arguments(),
             )
-        print(told_store(self.output, [store], start))
+        print(store_summary(self.output, [store], start))
 
-    def _places(self) -> dict[str, Any]:
+    def _point_arguments(self) -> dict[str, Any]:
         """Returns extent, box and columns as arguments of `splat`, those that are given."""
         count = 3 if "," in self.extent else 1
-        extent = numbers("--extent", self.extent, count, int)
-        found: dict[str, Any] = {"extent": extent if count > 1 else extent[0]}
+        extent = parse_numbers("--extent", self.extent, count, int)
+        arguments: dict[str, Any] = {"extent": extent if count > 1 else extent[0]}
         if self.box is not None:
-            corners = numbers("--box", self.box, 6, float)
-            found["box"] = (corners[:3], corners[3:])
+            corners = parse_numbers("--box", self.box, 6, float)
+            arguments["box"] = (corners[:3], corners[3:])
         for name in ("positions", "values", "colors", "radius"):
-            if (given := getattr(self, name)) is not None:
-                found[name] = given
+            if (value := getattr(self, name)) is not None:
+                arguments[name] = value
         try:
-            found["radius"] = float(self.radius or "")
+            arguments["radius"] = float(self.radius or "")
         except ValueError:
             pass
-        return found
+        return arguments
 
 
-def told_store(output: Path, stores: list[Store], start: float) -> str:
+def store_summary(output: Path, stores: list[Store], start: float) -> str:
     """Returns a line on the stores: extent of the first, size of all, time since `start`."""
     from ..io.resources import amount
 
     seconds, first = time.perf_counter() - start, stores[0]
-    size = amount(sum(one.describe()["disk bytes"] for one in stores))
+    size = amount(sum(store.describe()["disk bytes"] for store in stores))
     extent = "x".join(str(n) for n in first.extent)
     times = f" at {first.times} times" if first.times > 1 else ""
     return f"{printable(output)}: {extent}{times}, {first.levels} levels, {size} in {seconds:.1f} s"
 
 
 @contextlib.contextmanager
-def cluster(address: str | None) -> Iterator[Executor | None]:
+def cluster_executor(address: str | None) -> Iterator[Executor | None]:
     """Yields the executor of a dask cluster, or None without an address."""
     if address is None:
         yield None

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..base.digits import whole_number
-from .common import numbers
+from .common import parse_numbers
 
 if TYPE_CHECKING:
     from ..base.volume import Volume
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from ..shaders import Channels, TransferFunction
     from ..tracing import Clip, Lighting, ThinLens
 
-_ENDINGS = (".json", ".vp", ".xml")  # of files of transfer functions
-_FACTORS = ("shadows", "occlusion", "indirect", "reach")
+_TRANSFER_SUFFIXES = (".json", ".vp", ".xml")  # of files of transfer functions
+_LIGHTING_FACTORS = ("shadows", "occlusion", "indirect", "reach")
 
 
 def check_component(data: Volume | Store, component: int) -> None:
@@ -27,14 +27,14 @@ def check_component(data: Volume | Store, component: int) -> None:
         return
     names = [channel.name for channel in data.info.channels]
     names += [""] * (width - len(names))
-    told = ", ".join(f"{n} ({name})" if name else str(n) for n, name in enumerate(names))
-    what = "one number" if width == 1 else f"{width} numbers"
-    raise ValueError(f"--component {component}: a voxel has {what}: {told}")
+    listing = ", ".join(f"{n} ({name})" if name else str(n) for n, name in enumerate(names))
+    count = "one number" if width == 1 else f"{width} numbers"
+    raise ValueError(f"--component {component}: a voxel has {count}: {listing}")
 
 
-def chosen_transfer(
+def parse_transfer(
     name: str | None,
-    span: str | None,
+    window_text: str | None,
     data: Volume | Store,
     component: int,
     *,
@@ -50,21 +50,21 @@ def chosen_transfer(
 
     check_component(data, component)
     name = name or "gray"
-    file, _, inner = name.rpartition(":")
-    if Path(name).is_file() or name.endswith(_ENDINGS):
+    file, _, preset = name.rpartition(":")
+    if Path(name).is_file() or name.endswith(_TRANSFER_SUFFIXES):
         transfer = TransferFunction.from_file(name)
-    elif file and (Path(file).is_file() or file.endswith(_ENDINGS)):
-        transfer = TransferFunction.from_file(file, inner)
+    elif file and (Path(file).is_file() or file.endswith(_TRANSFER_SUFFIXES)):
+        transfer = TransferFunction.from_file(file, preset)
     elif name in CT_PRESETS:
         transfer = TransferFunction.preset(name)
-    elif span in (None, "auto") and name in IN_HU and data.info.quantity == "HU":
+    elif window_text in (None, "auto") and name in IN_HU and data.info.quantity == "HU":
         return TransferFunction.preset(IN_HU[name])
     else:
         transfer = TransferFunction.preset(name, 0, 1)
         transfer.relative = True
-    if span is None and not transfer.relative:
+    if window_text is None and not transfer.relative:
         return transfer
-    values = parse_window(span or "auto", data, component, background=background)
+    values = parse_window(window_text or "auto", data, component, background=background)
     return transfer.stretched(*values)
 
 
@@ -80,10 +80,10 @@ def parse_window(
     if text == "full":
         return value_range(data)
     try:
-        low, high = numbers("--window", text.replace("%", ""), 2, float)
+        low, high = parse_numbers("--window", text.replace("%", ""), 2, float)
     except ValueError:
-        wanted = "--window must be LO,HI, P%,P%, auto or full"
-        raise ValueError(f"{wanted}, got {text!r}") from None
+        expected = "--window must be LO,HI, P%,P%, auto or full"
+        raise ValueError(f"{expected}, got {text!r}") from None
     if text.count("%") == 2 and all(part.endswith("%") for part in text.split(",")):
         return window(data, (low, high), component=component)
     if "%" in text or not low < high:
@@ -101,32 +101,32 @@ def parse_channels(text: str | None, image: Volume | Store) -> Channels:
     if text is None:
         return Channels.of(image)
     items = [item.strip() for item in text.split(";")]
-    names = {one.name: str(number) for number, one in enumerate(image.info.channels) if one.name}
-    wanted: dict[int, list[str]] = {}
+    number_of = {c.name: str(number) for number, c in enumerate(image.info.channels) if c.name}
+    settings_by_number: dict[int, list[str]] = {}
     for item in items:
-        name, *rest = item.split(":")
-        number = whole_number(names.get(name, name))
+        name, *settings = item.split(":")
+        number = whole_number(number_of.get(name, name))
         if item == "opacity":
             continue
-        if number is None or len(rest) > 2:
+        if number is None or len(settings) > 2:
             raise ValueError(
                 "--channel must hold NUMBER:COLOR:LO,HI, or a name for the number, where what is "
                 f"left out or auto is the image's, or opacity; got {item!r}"
             )
-        if number in wanted:
+        if number in settings_by_number:
             raise ValueError(f"--channel names channel {number} twice")
-        wanted[number] = rest
-    if not wanted:
+        settings_by_number[number] = settings
+    if not settings_by_number:
         raise ValueError("--channel opacity: name channels, too, as in 0;1;opacity")
     mode: Any = "opacity" if "opacity" in items else "additive"
-    shader = Channels.of(image, mode, components=list(wanted))
-    for look, (component, told) in zip(shader.looks, wanted.items(), strict=True):
-        color, window = (*told, "auto", "auto")[:2]
+    shader = Channels.of(image, mode, components=list(settings_by_number))
+    for look, (component, settings) in zip(shader.looks, settings_by_number.items(), strict=True):
+        color, window = (*settings, "auto", "auto")[:2]
         context = f"--channel {component}"
         if color not in ("", "auto"):
             look.color = channel_color(context, color)
         if window not in ("", "auto"):
-            low, high = numbers(f"{context}: window", window, 2, float)
+            low, high = parse_numbers(f"{context}: window", window, 2, float)
             look.window = window_of(context, (low, high))
     return shader
 
@@ -137,45 +137,45 @@ def parse_lighting(text: str) -> Lighting:
     from ..tracing import Lighting
 
     lights: list[Any] = []
-    given: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for item in text.split(";"):
         kind, _, rest = item.strip().partition(":")
         flag = f"--lighting {kind}"
         if kind in ("sun", "lamp"):
-            *place, size = numbers(flag, rest, 4, float)
-            sun = kind == "sun"
+            *vector, size = parse_numbers(flag, rest, 4, float)
+            is_sun = kind == "sun"
             lights.append(
-                DirectionalLight(place, angle=size) if sun else PointLight(place, radius=size)
+                DirectionalLight(vector, angle=size) if is_sun else PointLight(vector, radius=size)
             )
         elif kind == "sky":
-            given["ambient"] = numbers(flag, rest, 3, float)
-        elif kind in _FACTORS:
-            (given[kind],) = numbers(flag, rest, 1, float)
+            options["ambient"] = parse_numbers(flag, rest, 3, float)
+        elif kind in _LIGHTING_FACTORS:
+            (options[kind],) = parse_numbers(flag, rest, 1, float)
         else:
             raise ValueError(
-                f"--lighting must hold sun:, lamp:, sky:, {':, '.join(_FACTORS)}:, "
+                f"--lighting must hold sun:, lamp:, sky:, {':, '.join(_LIGHTING_FACTORS)}:, "
                 f"got {item.strip()!r}"
             )
-    return Lighting(lights=lights or None, frame="box", **given)
+    return Lighting(lights=lights or None, frame="box", **options)
 
 
 def parse_clip(text: str) -> Clip:
     """Makes a clip from items such as `plane:0,0,1,0;cut:0,0,0,1,1,1;caps`."""
     from ..tracing import Clip
 
-    found: dict[str, list[Any]] = {"plane": [], "box": [], "cut": []}
+    shapes: dict[str, list[Any]] = {"plane": [], "box": [], "cut": []}
     caps = False
     for item in text.split(";"):
         kind, _, rest = item.strip().partition(":")
         if kind == "caps" and not rest:
             caps = True
-        elif kind in found:
-            values = numbers(f"--clip {kind}", rest, 4 if kind == "plane" else 6, float)
-            found[kind].append(values if kind == "plane" else (values[:3], values[3:]))
+        elif kind in shapes:
+            values = parse_numbers(f"--clip {kind}", rest, 4 if kind == "plane" else 6, float)
+            shapes[kind].append(values if kind == "plane" else (values[:3], values[3:]))
         else:
             raise ValueError(f"--clip must hold plane:, box:, cut: or caps, got {item.strip()!r}")
     return Clip(
-        planes=found["plane"], boxes=found["box"], without=found["cut"], frame="box", caps=caps
+        planes=shapes["plane"], boxes=shapes["box"], without=shapes["cut"], frame="box", caps=caps
     )
 
 
@@ -183,7 +183,7 @@ def parse_lens(text: str) -> ThinLens:
     """Makes a lens from `APERTURE,FOCUS`."""
     from ..tracing import ThinLens
 
-    aperture, focus = numbers("--lens", text, 2, float)
+    aperture, focus = parse_numbers("--lens", text, 2, float)
     return ThinLens(aperture=aperture, focus=focus, frame="box")
 
 
@@ -199,5 +199,7 @@ def parse_background(text: str) -> Any:
         return Environment.read(text)
     top, slash, bottom = text.partition("/")
     if slash:
-        return Gradient(*(tuple(numbers("--background", part, 3, float)) for part in (top, bottom)))
-    return tuple(numbers("--background", text, 3, float))
+        return Gradient(
+            *(tuple(parse_numbers("--background", part, 3, float)) for part in (top, bottom))
+        )
+    return tuple(parse_numbers("--background", text, 3, float))

@@ -15,11 +15,11 @@ from tyro.conf import Positional
 
 from ..base.messages import printable
 from ..base.whole_file import write_text
-from .common import Bar, check_outputs, flags_given, option, size, volume_formats
+from .common import Bar, check_outputs, given_flags, option, parse_size, volume_formats
 from .drawn import Drawn
 from .look import parse_camera
 from .scene import RenderedScene, SceneFlags
-from .streaming import cost_in_words
+from .streaming import cost_summary
 
 if TYPE_CHECKING:
     from ..base.records import RenderStats
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from ..pictures import Overlay, Picture
     from ..viewer.state import Eye, ViewState
 
-KINDS = (".png", ".exr", ".npy", ".npz", ".tif")
-STRIPS = (".npy", ".tif")  # written strip by strip: the picture may be larger than memory
+PICTURE_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif")
+STRIP_SUFFIXES = (".npy", ".tif")  # written strip by strip: the picture may be larger than memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +70,8 @@ class Render:
     path: Positional[Annotated[str, option(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     # picture to write: .png, .exr, .tif, .npy or .npz; .png, .tif and .npy may exceed memory
     output: Annotated[Path, option(aliases=["-o"], metavar="OUT.png")]
+    # width and height of the picture in pixels
+    size: Annotated[str, option(metavar="WxH")] = "512x512"
     # bits of each number: 8 or 16 for .png; 8, 16 or 32 (float) for .tif; 32 or 16 (float)
     # for .exr; if left out: the first of these
     bits: Annotated[int | None, option(metavar="N")] = None
@@ -99,22 +101,22 @@ class Render:
 
     def run(self) -> None:
         look = self.scene.look
-        width, height = size(look.size)
+        width, height = parse_size(self.size)
         self._check()
         parse_camera(self.camera, look, width, height)
         options = look.options()
         flags = self._at_saved_time()
-        with Bar() as bar, flags.open(self.path, options, bar) as opened:
+        with Bar() as bar, flags.open(self.path, options, bar) as scene:
             if self.state is None:
-                camera = parse_camera(self.camera, look, width, height, opened.info.space)
-                stats = self._take(opened, camera, None, bar)
+                camera = parse_camera(self.camera, look, width, height, scene.info.space)
+                stats = self._write_picture(scene, camera, None, bar)
             else:
-                now = opened.state(options).read(self.state)
-                stats = self._take_saved(opened, now, bar)
+                state = scene.state(options).read(self.state)
+                stats = self._write_saved(scene, state, bar)
         if self.stats is not None:
-            content = {**stats.as_dict(), "extent": opened.data.extent}
+            content = {**stats.as_dict(), "extent": scene.data.extent}
             write_text(self.stats, json.dumps(content, indent=2) + "\n")
-        print(f"{printable(self.output)}: {width}x{height}, {cost_in_words(stats)}")
+        print(f"{printable(self.output)}: {width}x{height}, {cost_summary(stats)}")
 
     def _at_saved_time(self) -> SceneFlags:
         """Returns the scene's flags; without --time, at the time point of the saved state."""
@@ -124,8 +126,8 @@ class Render:
         from ..base import check
         from ..viewer.state import saved_state
 
-        told = saved_state(self.state).get("time", 0.0)
-        time = check.number(f"{self.state}: state", "time", told)
+        saved_time = saved_state(self.state).get("time", 0.0)
+        time = check.number(f"{self.state}: state", "time", saved_time)
         if time != int(time):
             raise ValueError(f"{self.state}: time must be the number of a time point, got {time:g}")
         return replace(self.scene, source=replace(source, time=int(time))) if time else self.scene
@@ -137,7 +139,7 @@ class Render:
         from ..viewer.state import saved_state
 
         state = saved_state(self.state)
-        flags = self.scene.look.told_by(state) + flags_given(self.develop)
+        flags = self.scene.look.flags_set_by(state) + given_flags(self.develop)
         flags += ["--camera"] * (self.camera is not None) + ["--show"] * (self.show != "picture")
         if flags:
             raise ValueError(f"--state sets what {flags[0]} sets: leave one out")
@@ -147,47 +149,47 @@ class Render:
         self._check_state()
         from ..pictures.files import checked_path
 
-        _check_suffix("--output", self.output, *KINDS)
+        _check_suffix("--output", self.output, *PICTURE_SUFFIXES)
         if self.npz is not None:
-            if self.output.suffix in STRIPS:
+            if self.output.suffix in STRIP_SUFFIXES:
                 raise ValueError(f"--npz holds a whole picture: not with {self.output.suffix}")
             _check_suffix("--npz", self.npz, ".npz")
         for file in (self.output, self.npz, self.stats):
             if file is not None and not file.parent.is_dir():
                 raise FileNotFoundError(f"folder not found: {file.parent}")
-        checked_path("--output", self.output, self.bits, KINDS)
+        checked_path("--output", self.output, self.bits, PICTURE_SUFFIXES)
         check_outputs(
             {"PATH": self.path, "--state": self.state, **self.scene.look.files()},
             {"--output": self.output, "--npz": self.npz, "--stats": self.stats},
         )
         if self.show != "picture":
-            flags = flags_given(self.drawn)
+            flags = given_flags(self.drawn)
             if self.npz is None:
-                flags = flags_given(self.develop) + flags
+                flags = given_flags(self.develop) + flags
             if flags:
                 raise ValueError(f"{flags[0]} is for pictures, not for --show {self.show}")
 
-    def _take_saved(self, opened: RenderedScene, now: ViewState, bar: Bar) -> RenderStats:
-        """Takes the picture of a saved state, as a page shows it."""
+    def _write_saved(self, scene: RenderedScene, state: ViewState, bar: Bar) -> RenderStats:
+        """Renders and writes the picture of a saved state, as a page shows it."""
         from ..viewer.slices import panes
 
-        if now.composed and (flags := flags_given(self.drawn)):
+        if state.composed and (flags := given_flags(self.drawn)):
             raise ValueError(f"{flags[0]} is for a picture alone: {self.state} has slices or costs")
-        own = {"shader": now.shader, **now.settings()}
-        render, cost = partial(opened.render, **own), partial(opened.cost, **own)
-        scene = replace(opened, shader=now.shader, render=render, cost=cost)
-        taking = replace(self, show=now.show, develop=Develop(**vars(now.develop)))
-        width, height = size(self.scene.look.size)
-        if now.slices is not None:
+        settings = {"shader": state.shader, **state.settings()}
+        render, cost = partial(scene.render, **settings), partial(scene.cost, **settings)
+        saved_scene = replace(scene, shader=state.shader, render=render, cost=cost)
+        command = replace(self, show=state.show, develop=Develop(**vars(state.develop)))
+        width, height = parse_size(self.size)
+        if state.slices is not None:
             _, _, width, height = panes(width, height)["view"]
-        if now.camera is None:
-            camera = parse_camera(None, self.scene.look, width, height, scene.info.space)
+        if state.camera is None:
+            camera = parse_camera(None, self.scene.look, width, height, saved_scene.info.space)
         else:
-            camera = now.camera.camera(width, height, scene.box)
-        return taking._take(scene, camera, now, bar)
+            camera = state.camera.camera(width, height, saved_scene.box)
+        return command._write_picture(saved_scene, camera, state, bar)
 
-    def _take(
-        self, scene: RenderedScene, camera: Camera, now: ViewState | None, bar: Bar
+    def _write_picture(
+        self, scene: RenderedScene, camera: Camera, state: ViewState | None, bar: Bar
     ) -> RenderStats:
         """Renders and writes the files, strip by strip where the file format allows it; a saved
         state may add slices beside the picture and costs over it.
@@ -195,53 +197,53 @@ class Render:
         from ..pictures import render_tiles
         from ..viewer.state import blended
 
-        composed = now is not None and now.composed
-        whole = self.npz is not None or self.show != "picture" or composed
-        strips = not whole and in_strips(self.output.suffix, camera.width, camera.height)
+        composed = state is not None and state.composed
+        needs_whole = self.npz is not None or self.show != "picture" or composed
+        strips = not needs_whole and in_strips(self.output.suffix, camera.width, camera.height)
         render = self.develop.wrap(scene.render if strips else partial(scene.render, progress=bar))
-        seen = False
+        anything_seen = False
 
-        def taken(camera: Camera) -> Picture:
-            nonlocal seen
+        def noting_render(camera: Camera) -> Picture:
+            nonlocal anything_seen
             picture = render(camera)
-            seen = seen or bool(picture.alpha.any())
+            anything_seen = anything_seen or bool(picture.alpha.any())
             return picture
 
-        overlay = self._overlay(scene, camera, None if now is None else now.camera)
+        overlay = self._overlay(scene, camera, None if state is None else state.camera)
         if strips:
             stats = render_tiles(
-                *(taken, camera, self.output), bits=self.bits, overlay=overlay, progress=bar
+                *(noting_render, camera, self.output), bits=self.bits, overlay=overlay, progress=bar
             )
         else:
-            picture = shown = taken(camera)
+            picture = canvas = noting_render(camera)
             if self.show != "picture":
                 cost = scene.cost(camera).picture(self.show)
-                shown = blended(picture, cost, 1 if now is None else now.blend)
-            if now is not None and now.slices is not None:
+                canvas = blended(picture, cost, 1 if state is None else state.blend)
+            if state is not None and state.slices is not None:
                 from ..viewer.slices import Planes
 
                 planes = Planes(scene.data, lambda problem: None)
-                shown = planes.composed(shown, now, *size(self.scene.look.size), wait=True).picture
+                canvas = planes.composed(canvas, state, *parse_size(self.size), wait=True).picture
                 planes.close()
-            shown = shown if overlay is None else overlay.over(shown)
-            shown.save(self.output, bits=self.bits)
+            canvas = canvas if overlay is None else overlay.over(canvas)
+            canvas.save(self.output, bits=self.bits)
             if self.npz is not None:
                 picture.save(self.npz)
             stats = picture.stats
-        if not (seen or composed or self.show != "picture"):
-            ends = getattr(scene.data, "value_range", None)
-            if isinstance(ends, list):  # a store has one for each channel
-                ends = ends[self.scene.look.component]
-            known = "" if ends is None else f": values range from {ends[0]:g} to {ends[1]:g}"
-            warnings.warn(f"nothing is seen{known}", stacklevel=2)
+        if not (anything_seen or composed or self.show != "picture"):
+            limits = getattr(scene.data, "value_range", None)
+            if isinstance(limits, list):  # a store has one for each channel
+                limits = limits[self.scene.look.component]
+            note = "" if limits is None else f": values range from {limits[0]:g} to {limits[1]:g}"
+            warnings.warn(f"nothing is seen{note}", stacklevel=2)
         return stats
 
     def _overlay(self, scene: RenderedScene, camera: Camera, eye: Eye | None) -> Overlay | None:
         from ..viewer.state import Eye
 
-        placed, component = camera.placed(scene.box), self.scene.look.component
+        world_camera, component = camera.placed(scene.box), self.scene.look.component
         eye = Eye.of(camera, scene.box) if eye is None else eye
-        return self.drawn.overlay(scene.shader, scene.info, component, placed, eye)
+        return self.drawn.overlay(scene.shader, scene.info, component, world_camera, eye)
 
 
 def in_strips(suffix: str, width: int, height: int) -> bool:
@@ -250,9 +252,9 @@ def in_strips(suffix: str, width: int, height: int) -> bool:
     from ..pictures.progressive import STRIP, strip_rows
 
     rows = strip_rows(check.nbytes("render", "memory", STRIP), width, height)
-    return suffix in STRIPS or (suffix == ".png" and rows < height)
+    return suffix in STRIP_SUFFIXES or (suffix == ".png" and rows < height)
 
 
-def _check_suffix(flag: str, path: Path, *kinds: str) -> None:
-    if path.suffix not in kinds:
-        raise ValueError(f"{flag} must end in {', '.join(kinds)}, got {str(path)!r}")
+def _check_suffix(flag: str, path: Path, *suffixes: str) -> None:
+    if path.suffix not in suffixes:
+        raise ValueError(f"{flag} must end in {', '.join(suffixes)}, got {str(path)!r}")

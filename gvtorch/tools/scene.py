@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from ..io.stores.ngff import is_zarr
-from .common import Bar, ReadOptions, flags_given, option, refuse_for_store
+from .common import Bar, ReadOptions, given_flags, option, refuse_file_flags
 from .look import Look
-from .streaming import Streaming, tell_failures
+from .streaming import Streaming, print_failures
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -50,8 +50,8 @@ class RenderedScene:
         from ..tracing import RenderOptions
         from ..viewer.state import ViewState
 
-        told = RenderOptions(**options)
-        return ViewState(shader=self.shader, options=told, component=told.component)
+        checked = RenderOptions(**options)
+        return ViewState(shader=self.shader, options=checked, component=checked.component)
 
     def picture(self, state: ViewState, camera: Camera) -> Picture:
         """Returns the picture of a state, or the cost that it shows, from the given camera."""
@@ -69,6 +69,7 @@ class SceneFlags:
 
     look: tyro.conf.OmitArgPrefixes[Look] = Look()
     streaming: tyro.conf.OmitArgPrefixes[Streaming] = Streaming()
+    # How to read a volume file that does not say so itself; a store takes only --time.
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     @contextmanager
@@ -81,7 +82,7 @@ class SceneFlags:
             with self._stream(path, options) as scene:
                 yield scene
             return
-        flags = flags_given(self.streaming)
+        flags = given_flags(self.streaming)
         if flags:
             raise ValueError(
                 f"{flags[0]} is for stores; make one: gvtorch convert {path} STORE.zarr"
@@ -95,9 +96,9 @@ class SceneFlags:
         from ..tracing import cost, render
 
         volume, look = self.source.read(path), self.look
-        shader = look.chosen(volume)
+        shader = look.make_shader(volume)
         tree = N3Tree.from_volume(
-            *(volume, *look.bricks(volume)),
+            *(volume, *look.brick_layout(volume)),
             threshold=self.threshold,
             device=look.device(),
             progress=bar,
@@ -113,12 +114,12 @@ class SceneFlags:
             *(tree.box, volume),
         )
 
-    def store(self, path: str) -> Store:
+    def open_store(self, path: str) -> Store:
         """Opens a store; raises ValueError where a flag is for volume files."""
         if self.threshold is not None:
             raise ValueError("--threshold is for volumes; a store's is set by gvtorch convert")
-        refuse_for_store(self.source)
-        return self.streaming.store(path, self.source.time)
+        refuse_file_flags(self.source)
+        return self.streaming.open_store(path, self.source.time)
 
     @contextmanager
     def _stream(self, path: str, options: dict[str, Any]) -> Iterator[RenderedScene]:
@@ -126,17 +127,17 @@ class SceneFlags:
         from ..engine.engine import Engine
         from ..tracing import cost
 
-        store, streaming, most = self.store(path), self.streaming, self.streaming.max_frames
+        store, streaming, limit = self.open_store(path), self.streaming, self.streaming.max_frames
         mode = streaming.mode or "converge"
-        if mode != "converge" and most != Streaming().max_frames:
+        if mode != "converge" and limit != Streaming().max_frames:
             raise ValueError(f"--max-frames is for --mode converge, not {mode}")
-        producer, shader = streaming.content(store, self.look)
-        with Engine(producer, **streaming.memory(self.look, store)) as engine:
+        producer, shader = streaming.producer_and_shader(store, self.look)
+        with Engine(producer, **streaming.engine_options(self.look, store)) as engine:
             (tree,) = (source.tree for source in engine.trees.values())
             yield RenderedScene(
-                partial(engine.render, shader=shader, mode=mode, max_frames=most, **options),
+                partial(engine.render, shader=shader, mode=mode, max_frames=limit, **options),
                 shader,
                 partial(cost, tree, shader=shader, **options),
                 *(tree.box, store),
             )
-            tell_failures(engine)
+            print_failures(engine)

@@ -11,8 +11,8 @@ from tyro.conf import Positional
 
 from ..base.messages import printable
 from .common import Bar, ReadOptions, check_outputs, open_data, option, volume_formats
-from .parse import chosen_transfer, parse_window
-from .render import KINDS
+from .parse import parse_transfer, parse_window
+from .render import PICTURE_SUFFIXES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +48,7 @@ class Slice:
     # image of a store to show, by name or number, if there are several
     image: Annotated[str | None, option(metavar="NAME")] = None
 
+    # How to read a volume file that does not say so itself; a store takes only --time.
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
@@ -55,10 +56,10 @@ class Slice:
         from ..tracing import slice_picture
         from ..tracing.slices import radiological_views
 
-        checked_path("--output", self.output, self.bits, KINDS)
+        checked_path("--output", self.output, self.bits, PICTURE_SUFFIXES)
         check_outputs({"PATH": self.path, "--tf": self.tf}, {"--output": self.output})
-        places: Any = tuple(self.at.split(","))
-        if len(places) not in ((1, 3) if self.axis == "all" else (1,)):
+        positions: Any = tuple(self.at.split(","))
+        if len(positions) not in ((1, 3) if self.axis == "all" else (1,)):
             raise ValueError(f"--at must be one place, or three for --axis all, got {self.at!r}")
         with Bar() as bar:
             bar("reading", 0, 0)
@@ -69,10 +70,10 @@ class Slice:
                 text = self.window or "auto"
                 span = parse_window(text, data, self.component, background=True)
             else:
-                given = self.tf, self.window, data, self.component
-                colors = chosen_transfer(*given, background=True)
+                transfer_arguments = self.tf, self.window, data, self.component
+                colors = parse_transfer(*transfer_arguments, background=True)
             picture = slice_picture(
-                *(data, self.axis, places if len(places) == 3 else places[0]),
+                *(data, self.axis, positions if len(positions) == 3 else positions[0]),
                 span=span,
                 colors=colors,
                 component=self.component,
@@ -85,5 +86,5 @@ class Slice:
         height, width, _ = picture.color.shape
         picture.save(self.output, bits=self.bits)
         names = [view.name for axis, view in views.items() if self.axis in (axis, "all")]
-        shown = f", {' and '.join(names)}: right is on the left" if names else ""
-        print(f"{printable(self.output)}: {width}x{height}{shown}")
+        note = f", {' and '.join(names)}: right is on the left" if names else ""
+        print(f"{printable(self.output)}: {width}x{height}{note}")

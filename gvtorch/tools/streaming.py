@@ -44,23 +44,23 @@ class Streaming:
     # stop with an error if a block can't be read; otherwise that part is drawn coarser
     strict: Switch = False
 
-    def store(self, path: str, time: int | None) -> Store:
+    def open_store(self, path: str, time: int | None) -> Store:
         """Opens a store at a time point; warns if it has several and none was chosen."""
         from ..io.stores.channels import channel_names
         from ..io.stores.store import Store
 
         names = channel_names(path) if self.image is None else ()
         image = "color" if "color" in names else self.image
-        found = Store.open(path, image=image, time=time or 0)
-        if time is None and found.times > 1:
+        store = Store.open(path, image=image, time=time or 0)
+        if time is None and store.times > 1:
             warnings.warn(
-                f"{path}: has {found.times} time points, this is the first; --time N shows "
-                f"another, up to {found.times - 1}",
+                f"{path}: has {store.times} time points, this is the first; --time N shows "
+                f"another, up to {store.times - 1}",
                 stacklevel=2,
             )
-        return found
+        return store
 
-    def _drawn(self, store: Store, look: Look) -> tuple[str, ...]:
+    def _mesh_channels(self, store: Store, look: Look) -> tuple[str, ...]:
         """Returns the stored channels of a mesh that are drawn directly: color, and normal if there
         is one for lighting; none if the flags choose another shader.
         """
@@ -71,23 +71,23 @@ class Streaming:
         if store.info.quantity != "color" or store.width != 4:
             return ()
         folder = store.location.rpartition("/")[0]
-        beside = self.image is None and "normal" in channel_names(folder)
-        return ("color", "normal") if beside else ("color",)
+        has_normals = self.image is None and "normal" in channel_names(folder)
+        return ("color", "normal") if has_normals else ("color",)
 
-    def content(self, store: Store, look: Look) -> tuple[Producer, Shader]:
+    def producer_and_shader(self, store: Store, look: Look) -> tuple[Producer, Shader]:
         """Returns the producer that streams a store, and the shader."""
         from ..producers import StoredChannels, StoredProducer
         from ..shaders import Filtered, Lit
 
-        names = self._drawn(store, look)
-        shader = look.stored_colors(store, names) if names else look.chosen(store)
+        names = self._mesh_channels(store, look)
+        shader = look.stored_color_shader(store, names) if names else look.make_shader(store)
         filtered = shader if isinstance(shader, Filtered) else None
         if filtered is not None and look.tf is None:
             stored = Filtered.stored(store)
             if stored.numbers != filtered.numbers:
-                wanted = "--shader filtered" + "-lit" * isinstance(stored.transfer, Lit)
+                shader_flags = "--shader filtered" + "-lit" * isinstance(stored.transfer, Lit)
                 raise ValueError(
-                    f"{store.location}: its filtered colours are for {wanted}; "
+                    f"{store.location}: its filtered colours are for {shader_flags}; "
                     "gvtorch filter, with --lit or without, makes others"
                 )
             shader = filtered = stored
@@ -98,9 +98,9 @@ class Streaming:
             return StoredChannels(folder, names, host_cache=self.host_cache), shader
         return StoredProducer(store, host_cache=self.host_cache, filtered=filtered), shader
 
-    def memory(self, look: Look, data: Volume | Store) -> dict[str, Any]:
+    def engine_options(self, look: Look, data: Volume | Store) -> dict[str, Any]:
         """Returns fields of `EngineOptions`."""
-        brick_size, border = look.bricks(data)
+        brick_size, border = look.brick_layout(data)
         return {
             "node_pool": self.node_pool,
             "brick_pool": self.brick_pool,
@@ -112,7 +112,7 @@ class Streaming:
         }
 
 
-def cost_in_words(stats: RenderStats) -> str:
+def cost_summary(stats: RenderStats) -> str:
     """Returns what a picture cost, in a few words."""
     from ..engine import FrameStats
 
@@ -133,7 +133,7 @@ def _shortfall(stats: FrameStats) -> str:
     return "" if stats.converged else "; not converged"
 
 
-def tell_failures(engine: Engine) -> None:
+def print_failures(engine: Engine) -> None:
     for failure in engine.failures[:3]:
         print(f"gvtorch: {one_line(failure)}", file=sys.stderr)
     if len(engine.failures) > 3:

@@ -33,6 +33,7 @@ class Surface:
     # image of a store to read, by name or number, if there are several
     image: Annotated[str | None, option(metavar="NAME")] = None
 
+    # How to read a volume file that does not say so itself; a store takes only --time.
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
@@ -46,13 +47,13 @@ class Surface:
         with Bar() as bar:
             bar("reading", 0, 0)
             data = open_data(self.path, self.source, image=self.image, level=self.level)
-            size = export_surface(
+            mesh_size = export_surface(
                 *(data, self.value, self.output),
                 level=self.level,
                 component=self.component,
                 caps=self.caps,
                 progress=bar,
             )
-        seconds, written = time.perf_counter() - start, amount(self.output.stat().st_size)
-        counts = f"{size.triangles} triangles, {size.vertices} vertices"
-        print(f"{printable(self.output)}: {counts}, {written} in {seconds:.1f} s")
+        seconds, file_size = time.perf_counter() - start, amount(self.output.stat().st_size)
+        counts = f"{mesh_size.triangles} triangles, {mesh_size.vertices} vertices"
+        print(f"{printable(self.output)}: {counts}, {file_size} in {seconds:.1f} s")

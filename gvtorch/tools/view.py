@@ -11,7 +11,7 @@ import tyro
 from tyro.conf import Positional
 
 from ..io.stores.ngff import is_zarr
-from .common import Bar, flags_given, option, volume_formats
+from .common import Bar, given_flags, option, volume_formats
 from .look import parse_camera
 from .scene import SceneFlags
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..shaders import Shader
     from ..viewer.scene import Scene
 
-_NAMES = ("scene", "shader", "camera", "options")  # that a script may set
+_SCRIPT_NAMES = ("scene", "shader", "camera", "options")  # that a script may set
 
 
 def _path_help() -> str:
@@ -59,12 +59,10 @@ class View:
         from ..viewer.server import aiohttp_web
 
         aiohttp_web()
-        if self.scene.look.size != type(self.scene.look)().size:
-            raise ValueError("--size is for pictures: a page has its own")
         self._check_state()
-        what, shader, camera, options = self._opened()
+        scene, shader, camera, options = self._open_path()
         view(
-            *(what, shader, camera),
+            *(scene, shader, camera),
             state=self.state,
             host=self.host,
             port=self.port,
@@ -81,12 +79,12 @@ class View:
         from ..viewer.state import saved_state
 
         state = saved_state(self.state)
-        flags = self.scene.look.told_by(state)
+        flags = self.scene.look.flags_set_by(state)
         flags += ["--camera"] * (self.camera is not None and "camera" in state)
         if flags:
             raise ValueError(f"--state sets what {flags[0]} sets: leave one out")
 
-    def _opened(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
+    def _open_path(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
         """Returns the scene, its shader, its camera, and fields of `RenderOptions`."""
         if self.path.endswith(".py"):
             return self._run_script()
@@ -96,10 +94,10 @@ class View:
         source = replace(self.scene.source, time=self.scene.source.time or 0)
         with Bar() as bar:
             bar("reading", 0, 0)
-            scene, shader = self._scene(replace(self.scene, source=source))
+            scene, shader = self._make_scene(replace(self.scene, source=source))
         return scene, shader, parse_camera(self.camera, look, 16, 9, scene.info.space), options
 
-    def _scene(self, flags: SceneFlags) -> tuple[Scene, Shader]:
+    def _make_scene(self, flags: SceneFlags) -> tuple[Scene, Shader]:
         """Returns the scene of a page, at a time point, and its shader."""
         from ..engine.engine import Engine
         from ..producers import VolumeProducer
@@ -109,16 +107,16 @@ class View:
         look, streaming = flags.look, flags.streaming
         data: Volume | Store
         if is_zarr(self.path):
-            data = store = flags.store(self.path)
-            producer, shader = streaming.content(store, look)
+            data = store = flags.open_store(self.path)
+            producer, shader = streaming.producer_and_shader(store, look)
 
             def remake(data: Any) -> Producer:
-                return streaming.content(data, look)[0]
+                return streaming.producer_and_shader(data, look)[0]
 
             series = series_of(store)
         else:
             data = flags.source.read(self.path)
-            shader = look.chosen(data)
+            shader = look.make_shader(data)
             filtered = shader if isinstance(shader, Filtered) else None
 
             def remake(data: Any) -> Producer:
@@ -126,16 +124,16 @@ class View:
 
             producer = remake(data)
             series = series_of(self.path, **flags.source.options())
-        engine = Engine(producer, **streaming.memory(look, data))
+        engine = Engine(producer, **streaming.engine_options(look, data))
         return Scene(data.name, engine, data=data, remake=remake, **series), shader
 
     def _run_script(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
         import runpy
 
         flags = [
-            one
+            flag
             for group in ("look", "streaming", "source")
-            for one in flags_given(getattr(self.scene, group))
+            for flag in given_flags(getattr(self.scene, group))
         ]
         flags += ["--camera"] * (self.camera is not None)
         flags += ["--threshold"] * (self.scene.threshold is not None)
@@ -144,10 +142,10 @@ class View:
         if not Path(self.path).is_file():
             raise FileNotFoundError(f"script not found: {self.path}")
         sys.path.insert(0, str(Path(self.path).resolve().parent))
-        found = runpy.run_path(self.path)
-        if "scene" not in found:
+        namespace = runpy.run_path(self.path)
+        if "scene" not in namespace:
             raise ValueError(f"{self.path}: must set scene, as in scene = gv.FieldProducer(...)")
-        what, shader, camera, options = (found.get(name) for name in _NAMES)
+        scene, shader, camera, options = (namespace.get(name) for name in _SCRIPT_NAMES)
         if not isinstance(options or {}, dict):
             raise ValueError(f"{self.path}: options must be a dict, got {type(options).__name__}")
-        return what, shader, camera, dict(options or {})
+        return scene, shader, camera, dict(options or {})
