@@ -49,7 +49,7 @@ class Settings:
     )
 
 
-def class_name(kernel: str) -> str:
+def kernel_kind(kernel: str) -> str:
     """Returns the kind that a kernel belongs to."""
     return next(kind for kind, words in KINDS.items() if any(word in kernel for word in words))
 
@@ -112,11 +112,11 @@ def draw(stages: list[dict[str, Any]], kernels: list[dict[str, Any]], output: Pa
     counted: dict[str, int] = defaultdict(int)
     first = min(event["ts"] for event in kernels)
     for event in kernels:
-        kind = class_name(event["name"])
+        kind = kernel_kind(event["name"])
         spent[kind], counted[kind] = spent[kind] + event["dur"], counted[kind] + 1
     order = sorted(spent, key=lambda kind: spent[kind])
     for event in kernels:
-        place = order.index(class_name(event["name"]))
+        place = order.index(kernel_kind(event["name"]))
         span = [((event["ts"] - first) / 1e3, event["dur"] / 1e3)]
         below.broken_barh(span, (place - 0.4, 0.8), color=f"C{place}")
     labels = [f"{kind}\n{counted[kind]}, {spent[kind]:.0f} us" for kind in order]
