@@ -8,7 +8,7 @@ import torch
 from helpers import DEVICES, gvtorch
 from helpers.marcher import box_of, orbit_rays, trilinear
 from helpers.rays import camera_rays
-from helpers.traces import assert_equal, run
+from helpers.traces import assert_equal, trace
 
 import gvtorch as gv
 from gvtorch.base.image_info import COLORS
@@ -85,7 +85,7 @@ def test_the_picture_is_that_of_a_dense_marcher(backend, mode, dtype):
         range=torch.tensor([0.0, np.inf], dtype=torch.float64).repeat(len(eye), 1),
     )
     options = {"lod": "finest", "step": 0.5, "stop_alpha": 1.0, "dtype": dtype}
-    found, _ = run(tree, backend, rays, gv.Channels(looks(), mode), **options)
+    found, _ = trace(tree, backend, rays, gv.Channels(looks(), mode), **options)
     color, alpha = dense(data, (eye, direction), mode, 0.5 * min(SPACING))
     assert alpha.max() > 0.9 and len(np.unique(color.round(2), axis=0)) > 50
     assert np.abs(found["color"].numpy() - color).max() < 1e-4
@@ -120,7 +120,7 @@ def test_no_step_and_no_level_changes_even_matter(backend, mode, regions):
     for distance in (0.8, 6.0, 60.0):
         for step in (0.25, 0.5, 2.0):
             rays = camera_rays(tree, 7, distance=distance)
-            found, _ = run(tree, backend, rays, shader, step=step, stop_alpha=1.0)
+            found, _ = trace(tree, backend, rays, shader, step=step, stop_alpha=1.0)
             alpha = 1 - 2.0 ** -(total * ways(tree, rays))
             assert 0.2 < alpha.max() < 0.95
             assert np.abs(found["alpha"].numpy()[:, 0] - alpha).max() < 2e-5
@@ -135,8 +135,8 @@ def test_a_channel_alone_is_its_transfer_function(backend, mode):
     function = FUNCTIONS[0][2]
     for distance in (0.3, 1.6, 5.0):
         rays = camera_rays(tree, 12, distance=distance)
-        alone, _ = run(tree, backend, rays, function)
-        found, _ = run(tree, backend, rays, gv.Channels([function], mode))
+        alone, _ = trace(tree, backend, rays, function)
+        found, _ = trace(tree, backend, rays, gv.Channels([function], mode))
         for name in ("color", "alpha"):
             torch.testing.assert_close(found[name], alone[name], atol=2e-5, rtol=0)
     assert alone["alpha"].max() > 0.3
@@ -149,11 +149,11 @@ def test_what_is_added_keeps_its_brightness_and_what_is_mixed_does_not(backend):
     two = [gv.ChannelLook(color=c, window=(0, 100), opacity=0.9) for c in ("red", "green")]
     rays = camera_rays(tree, 5, distance=1.2)
     for mode, bright in (("additive", 1.0), ("opacity", 0.5)):
-        found, _ = run(tree, backend, rays, gv.Channels(two, mode))
+        found, _ = trace(tree, backend, rays, gv.Channels(two, mode))
         middle = found["color"][12] / found["alpha"][12]
         torch.testing.assert_close(middle, torch.tensor([bright, bright, 0.0]))
-    wanted, _ = run(tree, backend, rays, gv.Channels(two[:1]))
-    found, _ = run(tree, backend, rays, gv.Channels(two))
+    wanted, _ = trace(tree, backend, rays, gv.Channels(two[:1]))
+    found, _ = trace(tree, backend, rays, gv.Channels(two))
     torch.testing.assert_close(found["alpha"], wanted["alpha"]), "it hides as much as one alone"
 
 
@@ -172,10 +172,10 @@ def test_every_dtype_and_width(compiled, dtype, width):
         for mode in MODES:
             shader = gv.Channels(mixed, mode)
             expected, *_ = assert_equal(tree, compiled, rays, shader)
-            actual, _ = run(tree, compiled, rays, shader)
+            actual, _ = trace(tree, compiled, rays, shader)
             for name in ("color", "alpha", "depth", "samples"):
                 assert torch.equal(actual[name], expected[name]), name
-            backwards, _ = run(tree, compiled, rays, gv.Channels(mixed[::-1], mode))
+            backwards, _ = trace(tree, compiled, rays, gv.Channels(mixed[::-1], mode))
             torch.testing.assert_close(backwards["color"], expected["color"], atol=1e-5, rtol=0)
     assert expected["alpha"].max() > 0.1
 

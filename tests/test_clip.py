@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.clips import CLIPS, inside, shown, turned
+from helpers.clips import CLIPS, inside, is_kept, turned_box
 from helpers.rays import camera_rays, rays_along
-from helpers.traces import SHADER, assert_equal, run
-from helpers.trees import forget
+from helpers.traces import SHADER, assert_equal, trace
+from helpers.trees import with_holes
 
 import gvtorch as gv
 from gvtorch.tracing.clip import Clipped
@@ -42,7 +42,7 @@ def test_pieces_hold_what_is_kept_and_nothing_else(boxes, cuts, seed):
             centre = tuple(generator.uniform(-0.6, 0.6, 3))
             if generator.random() < 0.5:
                 made.append(
-                    turned(generator.uniform(0, 90), scale * generator.uniform(0.3, 1), centre)
+                    turned_box(generator.uniform(0, 90), scale * generator.uniform(0.3, 1), centre)
                 )
             else:
                 half = scale * generator.uniform(0.1, 0.6, 3)
@@ -61,7 +61,7 @@ def test_pieces_hold_what_is_kept_and_nothing_else(boxes, cuts, seed):
     t = np.arange(0.0005, 5, 0.013)
     places = rays.origin.numpy()[:, None] + t[:, None] * rays.direction.numpy()[:, None]
     flat = places.reshape(-1, 3)
-    wanted = shown(clip, flat)
+    wanted = is_kept(clip, flat)
     within = (spans[..., :1] < t) & (t < spans[..., 1:])  # (k, r, t)
     assert (within.sum(0) <= 1).all(), "pieces do not overlap"
     assert np.array_equal(within.any(0).ravel(), wanted)
@@ -90,7 +90,7 @@ def test_compiled_equals_reference_clipped(blobs, compiled, name, caps):
     tree = gv.N3Tree.from_volume(blobs, 4)
     clip = dataclasses.replace(CLIPS[name], caps=caps)
     result, *_ = assert_equal(tree, compiled, camera_rays(tree, distance=1.2), clip=clip)
-    whole, _ = run(tree, compiled, camera_rays(tree, distance=1.2))
+    whole, _ = trace(tree, compiled, camera_rays(tree, distance=1.2))
     assert 0.3 < result["alpha"].max() and 0.05 < (whole["alpha"] - result["alpha"]).abs().max()
 
 
@@ -108,7 +108,7 @@ def closed_form(name: str) -> tuple[np.ndarray, np.ndarray]:
     places = rays.origin.numpy()[:, None] + t[:, None] * rays.direction.numpy()[:, None]
     low, high = tree.box.numpy()
     kept = ((places >= low) & (places <= high)).all(-1)
-    kept &= shown(CLIPS[name], places.reshape(-1, 3)).reshape(kept.shape)
+    kept &= is_kept(CLIPS[name], places.reshape(-1, 3)).reshape(kept.shape)
     length = step * kept.cumsum(1)
     enough = length >= math.log(0.9) / math.log(0.99)
     return 1 - 0.99 ** length[:, -1], np.where(enough.any(1), t[enough.argmax(1)], np.inf)
@@ -144,8 +144,8 @@ def test_nothing_that_is_clipped_is_sampled_or_asked_for(blobs, backend, name):
     rays = camera_rays(tree, 12 if backend == "reference" else 60, distance=1.1)
     gone = wholly_clipped(tree, clip)
     assert len(gone) > 50, "the test must clip something"
-    _, whole = run(tree, backend, rays, thin, lod="finest")
-    _, marks = run(tree, backend, rays, thin, lod="finest", clip=clip)
+    _, whole = trace(tree, backend, rays, thin, lod="finest")
+    _, marks = trace(tree, backend, rays, thin, lod="finest", clip=clip)
     for used, sees_gone in ((whole, True), (marks, False)):
         owner = tree.nodes.brick_tn.flatten()
         bricks = {n for n in gone if owner[n] >= 0 and used["brick"][owner[n]] == 1}
@@ -153,11 +153,11 @@ def test_nothing_that_is_clipped_is_sampled_or_asked_for(blobs, backend, name):
         tiles = {t for t in range(len(parent)) if int(parent[t]) in gone and used["tile"][t] == 1}
         assert bool(bricks) == sees_gone and bool(tiles) == sees_gone
     assert (marks["brick"] == 1).sum() > 10
-    poor = forget(tree, 0.4, 7)
-    _, marks = run(poor, backend, rays, thin, lod="finest", clip=clip)
+    poor = with_holes(tree, 0.4, 7)
+    _, marks = trace(poor, backend, rays, thin, lod="finest", clip=clip)
     asked = set(marks["request"].flatten().nonzero()[:, 0].tolist())
     assert asked and not asked & gone
-    _, marks = run(poor, backend, rays, thin, lod="finest")
+    _, marks = trace(poor, backend, rays, thin, lod="finest")
     assert set(marks["request"].flatten().nonzero()[:, 0].tolist()) & gone
 
 
@@ -289,14 +289,14 @@ def test_a_cut_through_a_surface_is_filled(backend, kind, opacity):
     cut = {"planes": [(0, 0, -1, 0)], "frame": "box", "cap_light": 1.0}
     clip = gv.Clip(**cut, caps=True, cap_opacity=opacity)
     camera = gv.Camera.orbit(0, 0, 1.6, None, 48, 48, "ortho")
-    shown = gv.render(tree, camera, shader, clip=clip, **options)
+    clipped = gv.render(tree, camera, shader, clip=clip, **options)
     bare = gv.render(tree, camera, shader, clip=gv.Clip(**cut), **options)
     origin = camera.placed(tree.box).rays().origin[:, :2] - 19.5
     off = origin.norm(dim=1).reshape(48, 48) - 11
     inside, outside = off < -0.1, off > 0.1
     right = origin[:, 0].reshape(48, 48) > 1.1
-    color, depth = shown.color.cpu(), shown.depth.cpu()[..., 0]
-    assert bool((shown.alpha.cpu()[inside] == 1).all()) and not shown.alpha.cpu()[outside].any()
+    color, depth = clipped.color.cpu(), clipped.depth.cpu()[..., 0]
+    assert bool((clipped.alpha.cpu()[inside] == 1).all()) and not clipped.alpha.cpu()[outside].any()
     if kind.startswith("by "):
         inside = inside & right
         assert not color[~right & (origin[:, 0].reshape(48, 48) < -1.1)].any()

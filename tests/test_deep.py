@@ -10,8 +10,8 @@ import pytest
 import torch
 from helpers import DEVICES
 from helpers.rays import camera_rays
-from helpers.traces import SHADER, arguments, assert_equal, run
-from helpers.trees import forget, on
+from helpers.traces import SHADER, arguments, assert_equal, trace
+from helpers.trees import copy_to, with_holes
 from helpers.worlds import Menger, Solid, ball, bulb, meets_menger, torus
 
 import gvtorch as gv
@@ -188,7 +188,7 @@ def test_compiled_equals_reference(compiled, deep, look):
 def test_missing_nodes_give_equal_pictures_and_requests(compiled, deep, share):
     tree, rays = deep
     for seed in range(3):
-        _, marks, _ = assert_equal(forget(tree, share, seed), compiled, rays, LIT.transfer)
+        _, marks, _ = assert_equal(with_holes(tree, share, seed), compiled, rays, LIT.transfer)
         assert marks["request"].any()
 
 
@@ -197,7 +197,7 @@ def test_segments_and_samples_are_equal(compiled, deep):
     for dtype in (torch.float32, torch.float64):
         found = []
         for backend in ("reference", compiled):
-            copy = on(tree, DEVICES[backend])
+            copy = copy_to(tree, DEVICES[backend])
             traced = Tracer(copy, LIT.transfer, gv.RenderOptions(dtype=dtype)).arguments
             given = RayArguments.of(rays.to(DEVICES[backend]))
             segments = trace_segments(given, traced, backend=backend)
@@ -212,8 +212,8 @@ def test_single_and_double_agree(compiled, deep):
     """Shadows, too: a cone to the light begins at a position as precise as the eye's."""
     tree, rays = deep
     for name, look in LOOKS.items():
-        single, _ = run(tree, compiled, rays, look)
-        double, _ = run(tree, compiled, rays, look, dtype=torch.float64)
+        single, _ = trace(tree, compiled, rays, look)
+        double, _ = trace(tree, compiled, rays, look, dtype=torch.float64)
         beside = (single["color"].double() - double["color"]).abs().max()
         assert beside < 2e-3, (name, beside)
 
@@ -252,7 +252,7 @@ def test_counting_goes_on_from_a_new_base(blobs, compiled):
     rays = camera_rays(tree, 6, distance=1.3)
     found = []
     for backend in ("reference", compiled):
-        copy = on(tree, DEVICES[backend])
+        copy = copy_to(tree, DEVICES[backend])
         options = gv.RenderOptions(lod="finest", dtype=torch.float64)
         traced = Tracer(copy, SHADER, options).arguments
         given = RayArguments.of(rays.to(DEVICES[backend]))

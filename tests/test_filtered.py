@@ -11,7 +11,7 @@ import torch
 from helpers.afar import assert_same_bits, compare, filtered, matter, picture, rays, walls
 from helpers.packets import INSTRUCTIONS, result, start
 from helpers.rays import camera_rays
-from helpers.traces import SHADER, run
+from helpers.traces import SHADER, trace
 
 import gvtorch as gv
 from gvtorch.shaders import coarse_colors
@@ -44,7 +44,7 @@ def shaded(backend: str) -> list[torch.Tensor]:
             tree, shader = filtered(look, directions=directions)
             for size, distance in ((21, 1.5), (9, 1.5), (13, 4.0)):
                 rays = camera_rays(tree, size, distance=distance)
-                result, marks = run(tree, backend, rays, shader)
+                result, marks = trace(tree, backend, rays, shader)
                 found += [*result.values(), *marks.values()]
     return found
 

@@ -44,10 +44,10 @@ from helpers.golden_scenes import (
     LATER,
     LIGHTS,
     LOOKS,
+    METHODS,
     MODULES,
     SCENES,
-    SPANS,
-    WAYS,
+    VALUE_RANGES,
     Settings,
     box_of,
     camera_of,
@@ -77,7 +77,7 @@ def traced(s: Settings, backend: str) -> Found:
     device = "cuda" if backend == "cuda" else "cpu"
     if s["way"] in ("engine", "levels"):
         return _streamed(s, backend, device)
-    low, high = SPANS[s["value"]]
+    low, high = VALUE_RANGES[s["value"]]
     threshold = None if s["threshold"] is None else low + (high - low) * s["threshold"]
     sizes = {"branching": s["branching"], "threshold": threshold, "device": device}
     tree = gv.N3Tree.from_volume(volumes(s), s["brick"], s["border"], **sizes)
@@ -260,8 +260,8 @@ def test_every_setting_is_drawn():
     """Every option occurs at least a few times."""
     scenes = [settings(seed) for seed in range(SCENES)]
     known = {
-        **{"look": (*LOOKS, *LATER), "way": WAYS, "camera": CAMERAS, "light": LIGHTS},
-        "value": SPANS,
+        **{"look": (*LOOKS, *LATER), "way": METHODS, "camera": CAMERAS, "light": LIGHTS},
+        "value": VALUE_RANGES,
         **{"branching": (2, 3, 4), "brick": (4, 8, 16), "border": (0, 1, 2), "width": (1, 2, 3)},
         **{"lod": ("auto", "finest"), "hashed": ("raw", "float32"), "inside": (True, False)},
         "clip": ("planes", "box", "boxes", "matrix", "without"),

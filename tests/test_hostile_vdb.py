@@ -15,7 +15,7 @@ from helpers.vdb import (
     NANO,
     Grid,
     VdbWriter,
-    check,
+    assert_reads,
     leaf_values,
     nano_file,
     nano_grid,
@@ -35,7 +35,7 @@ def refused(path, content: bytes, reason: str) -> None:
 
 
 def test_hostile_files_of_openvdb(tmp_path):
-    grid = Grid("float", 7, told=BOX)
+    grid = Grid("float", 7, metadata=BOX)
     leaf_values(grid, np.random.default_rng(3))
     path = tmp_path / "a.vdb"
     good = VdbWriter().write(path, grid).read_bytes()
@@ -44,14 +44,14 @@ def test_hostile_files_of_openvdb(tmp_path):
     refused(path, good[:-700], "in a file of")
     huge = {name: (kind, struct.pack("<3i", *(n,) * 3)) for (name, (kind, _)), n in
             zip(BOX.items(), (-(2**31), 2**31 - 1), strict=True)}  # fmt: skip
-    refused(path, VdbWriter().write(path, Grid("float", 7, told=huge)).read_bytes(), "voxels")
+    refused(path, VdbWriter().write(path, Grid("float", 7, metadata=huge)).read_bytes(), "voxels")
     refused(path, VdbWriter().write(path, Grid("float", 7)).read_bytes(), "the grid is empty")
-    frustum = Grid("float", 7, told=BOX, map=("NonlinearFrustumMap", b"\0" * 200))
+    frustum = Grid("float", 7, metadata=BOX, map=("NonlinearFrustumMap", b"\0" * 200))
     refused(path, VdbWriter().write(path, frustum).read_bytes(), "NonlinearFrustumMap")
     points = VdbWriter().write(path, grid).read_bytes()
     points = points.replace(b"Tree_float_5_4_3", b"Tree_ptdat_5_4_3")
     refused(path, points, "is a Tree_ptdat_5_4_3; known are")
-    lonely = Grid("float", 7, told=BOX, parent="other")
+    lonely = Grid("float", 7, metadata=BOX, parent="other")
     refused(path, VdbWriter().write(path, lonely).read_bytes(), "shares the tree of 'other'")
     stream = VdbWriter().write(path, grid, places=False).read_bytes()
     refused(path, stream, "a stream without the positions of its grids")
@@ -77,16 +77,16 @@ def test_entries_of_a_root_lie_on_its_grid(tmp_path, x):
 
 def test_a_shared_tree_is_of_the_same_kind(tmp_path):
     """A vector grid was once read from a tree of scalars, three voxels at a time."""
-    owner = Grid("float", 7, told=BOX, name="heat", leaves={(0, 0, 0): whole_leaf()})
+    owner = Grid("float", 7, metadata=BOX, name="heat", leaves={(0, 0, 0): whole_leaf()})
     for kind in ("vec3s", "double", "int32", "mask"):
         path = tmp_path / f"{kind}.vdb"
-        VdbWriter().write(path, owner, Grid(kind, 0, told=BOX, name="other", parent="heat"))
+        VdbWriter().write(path, owner, Grid(kind, 0, metadata=BOX, name="other", parent="heat"))
         with pytest.raises(
             ValueError, match=f"'other' is a Tree_{kind}_5_4_3, the tree that it sh"
         ):
             open_source(path, key="other")
-    half = Grid("float", 0, told=BOX, name="half", parent="heat", half=True)
-    check(VdbWriter().write(path, owner, half), owner.dense(LOW, HIGH), key="half")
+    half = Grid("float", 0, metadata=BOX, name="half", parent="heat", half=True)
+    assert_reads(VdbWriter().write(path, owner, half), owner.dense(LOW, HIGH), key="half")
 
 
 def test_places_of_grids_and_leaves_are_in_order(tmp_path):
@@ -169,7 +169,7 @@ def test_thin_boxes_take_no_more_than_they_hold(tmp_path, axis):
     places = [
         tuple(n // 8 * 8 if k == axis else 0 for k in range(3)) for n in (0, 65536, 1_000_000)
     ]
-    grid = Grid("float", 7, told=box, leaves=dict.fromkeys(places, whole_leaf()))
+    grid = Grid("float", 7, metadata=box, leaves=dict.fromkeys(places, whole_leaf()))
     source = open_source(VdbWriter().write(tmp_path / "a.vdb", grid))
     source.grid()
     tracemalloc.start()
@@ -283,7 +283,7 @@ def test_only_the_first_block_of_blosc_is_unpacked_for_a_head(tmp_path, compress
     taken = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert path.stat().st_size < 2 << 20 and taken < 4 << 20
-    check(path, box)
+    assert_reads(path, box)
     good = path.read_bytes()
     at = good.index(b"a\0") + 2 + 8  # after the name and the part's length
     for place, number, message in (

@@ -14,8 +14,8 @@ from helpers import DEVICES
 from helpers.labels import SPACING, WIDE, cells, numbers
 from helpers.marcher import box_of, orbit_rays
 from helpers.rays import camera_rays, rays_along
-from helpers.traces import run
-from helpers.trees import on
+from helpers.traces import trace
+from helpers.trees import copy_to
 
 import gvtorch as gv
 from gvtorch.base.image_info import array_from_srgb
@@ -73,9 +73,9 @@ def dense(data, rays, colors, alphas, reference, step, depth_alpha=0.1):
 
 
 SCENES = {
-    "noise": lambda: numbers(13, 17, 11, most=6, seed=3),
+    "noise": lambda: numbers(13, 17, 11, count=6, seed=3),
     "cells": lambda: cells((18, 21, 25), 12, seed=4),
-    "many": lambda: numbers(11, 12, 13, most=1000, seed=5),
+    "many": lambda: numbers(11, 12, 13, count=1000, seed=5),
 }
 
 
@@ -172,7 +172,9 @@ def test_what_shows_no_visible_label_is_not_sampled(compiled):
     rays = rays_along(torch.tensor([[16.2, 13.7, -9.0]]).double(), (0.01, 0.02, 1.0))
     samples = {
         str(visible): int(
-            run(tree, compiled, rays, gv.Labels(opacity=0.01, visible=visible))[0]["samples"].sum()
+            trace(tree, compiled, rays, gv.Labels(opacity=0.01, visible=visible))[0][
+                "samples"
+            ].sum()
         )
         for visible in ([4, 6], [5], [99], [])
     }
@@ -250,7 +252,7 @@ def test_normals_are_those_of_a_smooth_boundary(compiled, border, mean):
     volume = gv.Volume(data, labels=True)
     tree = gv.N3Tree.from_volume(volume, 8, border, device=DEVICES[compiled])
     rays = camera_rays(tree, 24, distance=1.5)
-    hits, _ = run(tree, compiled, rays, gv.Labels(), lod="finest", step=0.1)
+    hits, _ = trace(tree, compiled, rays, gv.Labels(), lod="finest", step=0.1)
     hit = hits["depth"][:, 0] < math.inf
     place = rays.origin + hits["depth"].double() * rays.direction
     outward = torch.nn.functional.normalize(place - 15.5, dim=1)[hit]
@@ -267,8 +269,8 @@ def test_within_a_label_there_is_no_normal(backend):
     data = cells((24, 24, 24), 6) + WIDE
     tree = gv.N3Tree.from_volume(gv.Volume(data, labels=True), 4, device=DEVICES[backend])
     rays = camera_rays(tree, 24, distance=1.5)
-    flat, _ = run(tree, backend, rays, gv.Labels(lit=False), lod="finest")
-    lit, _ = run(tree, backend, rays, gv.Labels(ambient=0.3, diffuse=0.7), lod="finest")
+    flat, _ = trace(tree, backend, rays, gv.Labels(lit=False), lod="finest")
+    lit, _ = trace(tree, backend, rays, gv.Labels(ambient=0.3, diffuse=0.7), lod="finest")
     inside = lit["normal"].norm(dim=1) == 0
     assert 0.3 < inside.double().mean() < 0.97
     assert torch.allclose(lit["color"][inside], flat["color"][inside], atol=1e-6)
@@ -305,7 +307,7 @@ def label_at(tree: gv.N3Tree, place: torch.Tensor) -> torch.Tensor:
 
 def test_the_label_is_that_of_the_place_at_the_depth(scene, backend):
     rays = camera_rays(scene, 32, distance=2.4)
-    hits, _ = run(scene, backend, rays, gv.Labels(), lod="finest")
+    hits, _ = trace(scene, backend, rays, gv.Labels(), lod="finest")
     hit = hits["depth"][:, 0] < math.inf
     place = rays.origin + (hits["depth"].double() + 0.25 * min(SPACING)) * rays.direction
     assert torch.equal(hits["label"][hit, 0], label_at(scene, place[hit]))
@@ -316,9 +318,9 @@ def test_what_lies_behind_thin_labels_is_picked_by_the_depth_rule(scene, backend
     """The depth is where alpha reaches 0.1, within the labels; the label is of that interval."""
     rays = camera_rays(scene, 24, distance=1.2)
     options = {"lod": "finest", "depth_alpha": 0.5, "step": 0.25}
-    hits, _ = run(scene, backend, rays, gv.Labels(opacity=0.1, lit=False), **options)
+    hits, _ = trace(scene, backend, rays, gv.Labels(opacity=0.1, lit=False), **options)
     hit = hits["depth"][:, 0] < math.inf
-    first, _ = run(scene, backend, rays, gv.Labels(lit=False), lod="finest")
+    first, _ = trace(scene, backend, rays, gv.Labels(lit=False), lod="finest")
     place = rays.origin + hits["depth"].double() * rays.direction
     same = hits["label"][hit, 0] == label_at(scene, place[hit])
     assert same.double().mean() > 0.93, "but where the depth lies beside a face"
@@ -328,7 +330,7 @@ def test_what_lies_behind_thin_labels_is_picked_by_the_depth_rule(scene, backend
 @pytest.mark.parametrize("opacity", [1.0, 0.02])
 def test_caps_are_picked_and_drawn(scene, compiled, opacity):
     """Also where labels are so thin that nothing else is hit."""
-    tree = on(scene, DEVICES[compiled])
+    tree = copy_to(scene, DEVICES[compiled])
     middle = (scene.box[0] + scene.box[1]) / 2
     clip = gv.Clip(planes=[(0.0, 0.0, -1.0, float(middle[2]))], caps=True)
     camera = gv.Camera.orbit(0, 0, 1.5, width=24, height=24)
@@ -343,7 +345,7 @@ def test_caps_are_picked_and_drawn(scene, compiled, opacity):
 
 
 def test_clips_lenses_and_strips_tell_labels(scene, compiled):
-    tree = on(scene, DEVICES[compiled])
+    tree = copy_to(scene, DEVICES[compiled])
     camera, shader = gv.Camera.orbit(30, 20, 1.3, width=24, height=20), gv.Labels()
     plain = gv.render(tree, camera, shader)
     boxes = gv.Clip(boxes=[((-9, -9, -9), (9, 9, 0)), ((-9, -9, 0), (9, 9, 9))], frame="box")
@@ -356,7 +358,7 @@ def test_clips_lenses_and_strips_tell_labels(scene, compiled):
 
 
 def test_a_layer_hides_labels_and_lets_them_through(scene, compiled):
-    tree, shader = on(scene, DEVICES[compiled]), gv.Labels()
+    tree, shader = copy_to(scene, DEVICES[compiled]), gv.Labels()
     camera = gv.Camera.orbit(30, 20, 1.3, width=24, height=20)
     plain = gv.render(tree, camera, shader)
     depth = torch.full_like(plain.depth, 1.0)
@@ -413,7 +415,7 @@ def test_seventy_thousand_labels(compiled):
     tree = gv.N3Tree.from_volume(gv.Volume(data, labels=True), 8, device=DEVICES[compiled])
     assert tree.bricks.channels["value"].dtype == torch.float32
     rays = camera_rays(tree, 24, distance=1.3)
-    hits, _ = run(tree, compiled, rays, gv.Labels(), lod="finest")
+    hits, _ = trace(tree, compiled, rays, gv.Labels(), lod="finest")
     hit = hits["depth"][:, 0] < math.inf
     place = rays.origin + (hits["depth"].double() + 0.25) * rays.direction
     x, y, z = ((place[hit] + 0.5).floor().long()[:, a].clamp(0, 41) for a in range(3))
@@ -429,7 +431,7 @@ def test_streamed_is_resident_in_every_bit(scene, compiled, hold):
     with gv.Engine(producer, **options) as engine:
         for distance in (0.8, 1.3, 4.0):
             camera = gv.Camera.orbit(30, 20, distance, width=24, height=20)
-            resident = gv.render(on(scene, DEVICES[compiled]), camera, shader)
+            resident = gv.render(copy_to(scene, DEVICES[compiled]), camera, shader)
             picture = engine.render(camera, shader)
             assert picture.stats.converged
             for name in ("color", "alpha", "depth", "label", "normal"):

@@ -295,7 +295,7 @@ def test_volume_of_the_closed_parts_of_a_castle():
     """Two parts that cross, each one alone."""
     mesh = gv.read_mesh(shared(SHARED["castle"]))
     geometry = Geometry(mesh)
-    closed = meshes.parts(mesh.only(geometry.mesh_face.numpy()[geometry.solid.numpy()]))
+    closed = meshes.components(mesh.only(geometry.mesh_face.numpy()[geometry.solid.numpy()]))
     assert [len(part.faces) for part in closed] == [98, 200]
     for part in closed:
         assert sums(part, 96) == pytest.approx(meshes.volume(part), rel=1e-3)

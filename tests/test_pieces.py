@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.clips import CLIPS, shown
+from helpers.clips import CLIPS, is_kept
 from helpers.marcher import trilinear
 from helpers.rays import camera_rays
 from helpers.shaders import SHADERS
-from helpers.traces import SHADER, assert_equal, run
-from helpers.trees import forget
+from helpers.traces import SHADER, assert_equal, trace
+from helpers.trees import with_holes
 from helpers.waits import nobody_waits
 
 import gvtorch as gv
@@ -51,7 +51,7 @@ def test_narrowing_cones_equal_the_reference(blobs, compiled, branching, near, e
 
 @pytest.mark.parametrize("seed", range(3))
 def test_narrowing_cones_ask_for_the_same(blobs, compiled, seed):
-    tree = forget(gv.N3Tree.from_volume(blobs, 4), 0.5, seed)
+    tree = with_holes(gv.N3Tree.from_volume(blobs, 4), 0.5, seed)
     rays = narrowing(camera_rays(tree, distance=1.3), 12.0, 90.0)
     result, marks, _ = assert_equal(tree, compiled, rays)
     assert marks["request"].any() and result["missed"].any()
@@ -69,7 +69,7 @@ def test_intervals_are_as_long_as_the_cone_is_wide_where_they_start(noise, backe
         cone=torch.tensor([[near, growth]], dtype=torch.float64),
         range=torch.tensor([[0.0, torch.inf]], dtype=torch.float64),
     )
-    result, _ = run(tree, backend, rays, shader, cone_scale=1.0, stop_alpha=1.0)
+    result, _ = trace(tree, backend, rays, shader, cone_scale=1.0, stop_alpha=1.0)
     start, stop, count = 9.5, 49.5, 0  # the box begins half a voxel before the first centre
     while start < stop:
         length = 0.5
@@ -125,8 +125,8 @@ def test_the_share_that_a_ray_begins_with_equals_the_reference(blobs, compiled, 
     )
     closed = clear == 0
     assert not result["samples"][closed].any() and (result["alpha"][closed] == 1).all()
-    full, _ = run(tree, compiled, rays, dtype=dtype, stop_alpha=1.0)
-    part, _ = run(tree, compiled, dataclasses.replace(rays, transmittance=clear), stop_alpha=1.0)
+    full, _ = trace(tree, compiled, rays, dtype=dtype, stop_alpha=1.0)
+    part, _ = trace(tree, compiled, dataclasses.replace(rays, transmittance=clear), stop_alpha=1.0)
     np.testing.assert_allclose(part["color"], full["color"] * clear[:, None], atol=2e-6)
 
 
@@ -155,9 +155,9 @@ def test_every_shader_is_cut_by_planes_and_boxes(channels, compiled, name):
     first = torch.where(inward, torch.maximum(rays.range[:, 0], -height / rate), rays.range[:, 0])
     last = torch.where(inward, rays.range[:, 1], torch.minimum(rays.range[:, 1], -height / rate))
     ends = torch.stack((first, torch.maximum(first, last)), 1)
-    cut, _ = run(tree, compiled, dataclasses.replace(rays, range=ends), shader.opened())
-    clipped, _ = run(tree, compiled, rays, shader, clip=gv.Clip(planes=[plane]))
-    whole, _ = run(tree, compiled, rays, shader)
+    cut, _ = trace(tree, compiled, dataclasses.replace(rays, range=ends), shader.opened())
+    clipped, _ = trace(tree, compiled, rays, shader, clip=gv.Clip(planes=[plane]))
+    whole, _ = trace(tree, compiled, rays, shader)
     for field in ("color", "alpha", "depth", "features"):
         torch.testing.assert_close(clipped[field], cut[field], rtol=1e-4, atol=1e-4)
     assert (whole["color"] - clipped["color"]).abs().max() > 0.05
@@ -182,12 +182,12 @@ def test_a_projection_is_that_of_all_that_is_kept(blobs, compiled, which):
     low, high = tree.box.numpy()
     pick = {"maximum": np.max, "minimum": np.min, "mean": np.mean}[which]
     for name in ("cut", "union", "all"):
-        found, _ = run(tree, compiled, rays, shader, clip=CLIPS[name], **options)
-        dimmed, _ = run(tree, compiled, part, shader, clip=CLIPS[name], **options)
+        found, _ = trace(tree, compiled, rays, shader, clip=CLIPS[name], **options)
+        dimmed, _ = trace(tree, compiled, part, shader, clip=CLIPS[name], **options)
         compared = 0
         for ray in range(0, len(rays.origin), 5):
             places = rays.origin[ray].numpy() + t[:, None] * rays.direction[ray].numpy()
-            kept = ((places >= low) & (places <= high)).all(1) & shown(CLIPS[name], places)
+            kept = ((places >= low) & (places <= high)).all(1) & is_kept(CLIPS[name], places)
             if not kept.any():
                 assert found["alpha"][ray] == 0 and torch.isinf(found["depth"][ray])
             if kept.sum() < 100:
@@ -206,7 +206,7 @@ def test_a_projection_is_that_of_all_that_is_kept(blobs, compiled, which):
             compared += 1
         assert compared > 15 and len(found["features"].unique()) > 40
     with pytest.raises(ValueError, match="Projection sees a ray in one go, so it has no clip with"):
-        run(tree, compiled, rays, shader, clip=dataclasses.replace(CLIPS["cut"], caps=True))
+        trace(tree, compiled, rays, shader, clip=dataclasses.replace(CLIPS["cut"], caps=True))
 
 
 @pytest.mark.parametrize("which", ["maximum", "minimum", "mean"])

@@ -14,7 +14,7 @@ import torch
 from helpers import DEVICES
 from helpers.shaders import SHADERS
 from helpers.traces import SHADER
-from helpers.trees import on
+from helpers.trees import copy_to
 
 import gvtorch as gv
 from gvtorch.tracing.pose import Pose
@@ -99,7 +99,7 @@ NEAR = {"atol": 1e-9, "rtol": 1e-9}  # for float64
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", SHADERS)
 def test_a_tree_that_is_turned_is_seen_by_a_camera_that_is_turned(channels, name, backend):
-    tree = on(gv.N3Tree.from_volume(channels, 4), DEVICES[backend])
+    tree = copy_to(gv.N3Tree.from_volume(channels, 4), DEVICES[backend])
     rays, shader = camera(tree, 8 if backend == "reference" else 20), SHADERS[name]
     options = {"dtype": torch.float64, "backend": backend}
     own = gv.trace(tree, rays.to(tree.device), shader, **options)

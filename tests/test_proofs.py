@@ -10,7 +10,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from helpers import meshes
-from helpers.shapes import ALL, BOXES, ball, block, inside, nodes_of, random_boxes
+from helpers.shapes import ALL, BOXES, ball, block, nodes_of, points_inside, random_boxes
 
 import gvtorch as gv
 from gvtorch.producers import Layout
@@ -225,7 +225,7 @@ def test_noise_passes_no_proof_in_random_boxes(octaves):
     half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border - 0.5)
     for region, value in ((gv.Region.EMPTY, 0.0), (gv.Region.CONSTANT, 1.0)):
         rows = (kind == region).nonzero()[:, 0]
-        points = inside(nodes.center[rows], half[rows], 32)
+        points = points_inside(nodes.center[rows], half[rows], 32)
         assert (producer.at(points)["density"] == value).all() and len(rows) > BOXES / 20
 
 
@@ -241,12 +241,12 @@ def test_intervals_of_fields_hold_in_random_boxes(name):
     size = (10 ** (-3 * torch.rand(len(center), 1, generator=random).double())).expand(-1, 3)
     if isinstance(producer, gv.Hypertexture):
         low, high = producer.shape.bounds(center, half)
-        value = producer.shape(inside(center, half, 12))
+        value = producer.shape(points_inside(center, half, 12))
         assert (value >= low[:, None]).all() and (value <= high[:, None]).all()
         return
     field, known = producer.field, producer.field.filtered_bounds(center, half, size)
     for at in torch.arange(len(center)).split(20_000):
-        points = inside(center[at], half[at], 12)
+        points = points_inside(center[at], half[at], 12)
         sides = size[at, None].expand_as(points)
         found = field.filtered(points, sides) if field.prefiltered else field(points)
         by_name = found if isinstance(found, dict) else {"value": found}

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.recorded import COMPILED, LOOK, Ball, Frames, recorded, view
+from helpers.recorded import COMPILED, TRANSFER, Ball, Frames, recorded, view
 from helpers.waits import nobody_waits
 from torch import Tensor
 
@@ -32,15 +32,15 @@ from gvtorch.pool import staging
 @pytest.mark.parametrize("branching, kinds, batch", [(2, False, 64), (2, True, 7), (3, False, 300)])
 def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kinds, batch):
     def engine() -> gv.Engine:
-        producer = Ball(branching=branching, kinds=kinds)
+        producer = Ball(branching=branching, fill_kinds=kinds)
         return gv.Engine(producer, brick_pool="16 MB", device=DEVICES[backend])
 
     with engine() as served:
-        expected = served.render(view(), LOOK)
+        expected = served.render(view(), TRANSFER)
         assert expected.stats.converged and (expected.alpha > 0.5).any()
     with engine() as own:
-        frames = Frames(own, view(), LOOK, batch)
-        own.trees["scene"].producer.asked.clear()
+        frames = Frames(own, view(), TRANSFER, batch)
+        own.trees["scene"].producer.batch_sizes.clear()
         made = {"tiles": 0, "bricks": 0, "constant": 0}
         for _ in range(400):
             hits, stats = frames.frame()
@@ -51,7 +51,7 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
                 break
         assert stats.converged and not stats.capacity_exceeded
         own.validate()
-        assert set(own.trees["scene"].producer.asked) == {batch * branching**3}
+        assert set(own.trees["scene"].producer.batch_sizes) == {batch * branching**3}
         there = int((own.cache.bricks.owner_b >= 0).sum())
         assert made["bricks"] == there - 1, "the root was there"
         assert made["tiles"] > 20 and (made["constant"] > 0) == kinds
@@ -65,10 +65,10 @@ def test_a_volume_that_the_device_reads_in_place_is_recorded(backend, monkeypatc
     values = torch.rand((48, 52, 44, 2), generator=torch.Generator().manual_seed(2))
     volume = gv.Volume(values, (1, 1.5, 1), (-20, 3, 4))
     tree = gv.N3Tree.from_volume(volume, device=DEVICES[backend])
-    expected = gv.render(tree, view(), LOOK, backend=backend)
+    expected = gv.render(tree, view(), TRANSFER, backend=backend)
     options = {"brick_pool": "8 MB", "device": DEVICES[backend]}
     with gv.Engine(gv.VolumeProducer(volume, hold="mapped"), **options) as engine:
-        frames = Frames(engine, view(), LOOK, 64)
+        frames = Frames(engine, view(), TRANSFER, 64)
         assert isinstance(frames.served, DeviceFrame)
         hits, _ = frames.whole()
         assert expected.alpha.max() > 0.5
@@ -81,17 +81,17 @@ def test_joined_producers_are_recorded_where_all_are(backend):
     """Two channels, of which only one has EMPTY regions."""
 
     def joined() -> gv.JoinedProducer:
-        return gv.JoinedProducer({"a": Ball(64), "b": Ball(64, kinds=True)})
+        return gv.JoinedProducer({"a": Ball(64), "b": Ball(64, fill_kinds=True)})
 
     options = {"brick_pool": "16 MB", "device": DEVICES[backend]}
     with gv.Engine(joined(), **options) as served:
-        expected, other = (served.render(view(), LOOK, channel=name) for name in "ab")
+        expected, other = (served.render(view(), TRANSFER, channel=name) for name in "ab")
     with gv.Engine(joined(), **options) as own:
-        frames = Frames(own, view(), LOOK, 64)
+        frames = Frames(own, view(), TRANSFER, 64)
         assert isinstance(frames.served, DeviceFrame)
         hits, stats = frames.whole()
         own.validate()
-        assert torch.equal(own.render(view(), LOOK, channel="b").color, other.color)
+        assert torch.equal(own.render(view(), TRANSFER, channel="b").color, other.color)
     assert stats.converged and (expected.alpha > 0.5).any()
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     cast = Ball(64)
@@ -112,16 +112,16 @@ def test_aliases_are_left_to_the_host(blobs, backend):
             return gv.Bricks(data=bricks.data, kind=kind, alias=alias)
 
     with gv.Engine(Twice(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        expected = engine.render(view(16), LOOK)
+        expected = engine.render(view(16), TRANSFER)
     with gv.Engine(Twice(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(16), LOOK, 64)
+        frames = Frames(engine, view(16), TRANSFER, 64)
         for _ in range(100):
             frames.frame()
             time.sleep(0.001)
             if frames.served.host_needed:
                 break
         assert frames.served.host_needed
-        picture = engine.render(view(16), LOOK)
+        picture = engine.render(view(16), TRANSFER)
         engine.validate()
     assert torch.equal(picture.color, expected.color)
 
@@ -132,7 +132,7 @@ def test_a_pool_that_is_too_small_gives_away_what_is_used_least(backend):
     with gv.Engine(Ball(), brick_pool="1 MB", node_pool="60 kB", device=DEVICES[backend]) as engine:
         evicted = 0
         for angle in (0, 50, 100, 180, 270, 0):
-            frames = Frames(engine, view(24, angle), LOOK, 32)
+            frames = Frames(engine, view(24, angle), TRANSFER, 32)
             for _ in range(200):
                 hits, stats = frames.frame()
                 evicted += stats.evicted["bricks"] + stats.evicted["tiles"]
@@ -141,21 +141,21 @@ def test_a_pool_that_is_too_small_gives_away_what_is_used_least(backend):
             engine.validate()
             assert stats.converged, angle
         assert evicted > 50
-        picture = engine.render(view(24, 0), LOOK)
+        picture = engine.render(view(24, 0), TRANSFER)
     assert torch.equal(hits.color, picture.color.reshape(-1, 3))
 
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_bricks_with_nan_are_left_out_and_counted(backend):
     with gv.Engine(Ball(), brick_pool="16 MB", device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(), LOOK, 512)
+        frames = Frames(engine, view(), TRANSFER, 512)
         engine.trees["scene"].producer.spoiled.fill_(1)
         for _ in range(12):
             hits, _ = frames.frame()
         assert engine.readbacks.failed or engine.readbacks[-1].wait().failed > 0
         engine.validate()
         assert bool(torch.isfinite(hits.color).all())
-        picture = engine.render(view(), LOOK)  # the host names them
+        picture = engine.render(view(), TRANSFER)  # the host names them
         assert len(engine.failures) > 0 and "NaN" in engine.failures[0].message
         assert torch.isfinite(picture.color).all()
 
@@ -167,7 +167,7 @@ def test_what_the_host_would_have_to_see_to_is_refused():
             return gv.Bricks(data=super().fill(nodes), errors={0: "no"})
 
     with gv.Engine(Ball(), brick_pool="16 MB") as engine:
-        frames = Frames(engine, view(), LOOK, 8)
+        frames = Frames(engine, view(), TRANSFER, 8)
         engine.trees["scene"].producer.__class__ = Named
         with pytest.raises(ValueError, match="without alias and errors"):
             frames.frame()
@@ -177,8 +177,8 @@ def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, g
     """Returns the number of nodes that a turning camera missed, and its final view."""
     missed, looks = 0, 0
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
-        engine.render(view(64, 0), LOOK)
-        frames = Frames(engine, view(64, 0), LOOK, 256, look_ahead)
+        engine.render(view(64, 0), TRANSFER)
+        frames = Frames(engine, view(64, 0), TRANSFER, 256, look_ahead)
         for step in range(1, 25):
             frames.look_from(view(64, 1.5 * step))
             hits, stats = frames.frame()
@@ -191,7 +191,7 @@ def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, g
                 break
         engine.validate()
         assert stats.converged
-        expected = engine.render(view(64, 1.5 * step), LOOK)
+        expected = engine.render(view(64, 1.5 * step), TRANSFER)
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     return missed, hits, stats
 
@@ -211,7 +211,7 @@ def test_what_the_picture_misses_comes_before_what_the_next_ones_will():
     told = []
     for look_ahead in (0, 5):
         with gv.Engine(Ball(1024), brick_pool="64 MB") as engine:
-            frames = Frames(engine, view(64, 0), LOOK, 8, look_ahead)
+            frames = Frames(engine, view(64, 0), TRANSFER, 8, look_ahead)
             for angle in (0, 0, 1, 3):
                 frames.look_from(view(64, angle))
                 _, stats = frames.frame()
@@ -232,7 +232,7 @@ def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
     device = DEVICES[backend]
     options = {"brick_pool": "64 MB", "loading": loading, "device": device}
     with gv.Engine(Ball(1024, branching), **options) as engine:
-        frames, depth = Frames(engine, view(64), LOOK, 4096), []
+        frames, depth = Frames(engine, view(64), TRANSFER, 4096), []
         for _ in range(60):
             _, stats = frames.frame()
             there = engine.cache.nodes.parent_t >= 0
@@ -261,7 +261,7 @@ def test_a_frame_deepens_by_no_more_than_its_most(backend):
     ):
         assert extra_levels(levels_wanted(torch.tensor(priority), 2).tolist()) == most
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
-        frames, levels = Frames(engine, view(64, 0), LOOK, 256, 8), []
+        frames, levels = Frames(engine, view(64, 0), TRANSFER, 256, 8), []
         for turn in range(20):
             frames.look_from(view(64, 3.0 * turn))
             frames.frame()
@@ -282,7 +282,7 @@ def flown(
     """Replays a flight without the host waiting, then its last view until it is complete; also
     returns how many nodes were missed on the flight.
     """
-    graph = engine.capture(path[0], LOOK, batch=batch, look_ahead=look_ahead)
+    graph = engine.capture(path[0], TRANSFER, batch=batch, look_ahead=look_ahead)
     with nobody_waits():
         flight = [graph.replay(camera)[1] for camera in path]
     missed = sum(stats.misses for stats in flight)
@@ -323,7 +323,7 @@ def test_a_long_flight_does_not_wait(blobs, tmp_path, scene, look_ahead, backend
         producer = Ball(1024)
     path = [winding(number) for number in range(1000 if device == "cuda" else 30)]
     with gv.Engine(producer, device=device, **options) as engine:
-        replay = recorded(engine, path[0], LOOK, batch=64, look_ahead=look_ahead)
+        replay = recorded(engine, path[0], TRANSFER, batch=64, look_ahead=look_ahead)
         with nobody_waits(device=device):
             flight = [replay(camera)[1] for camera in path]
         for _ in range(600):
@@ -335,7 +335,7 @@ def test_a_long_flight_does_not_wait(blobs, tmp_path, scene, look_ahead, backend
         assert any(stats.ahead for stats in flight) == (look_ahead > 0)
         engine.validate()
         shown = color.clone()
-        assert torch.equal(engine.render(path[-1], LOOK).color.reshape(-1, 3), shown)
+        assert torch.equal(engine.render(path[-1], TRANSFER).color.reshape(-1, 3), shown)
 
 
 @pytest.mark.backend("cuda")
@@ -345,17 +345,17 @@ def test_a_flight_is_replayed_without_the_host():
         graph, picture, _, missed = flown(engine, PATH, 256)
         assert sum(graph.replay(PATH[-1])[1].settle().produced.values()) == 0
         shown = picture.color.clone()
-        served = engine.render(PATH[-1], LOOK)
+        served = engine.render(PATH[-1], TRANSFER)
         assert torch.equal(served.color, shown)
-        engine.frame(view(96, 200), LOOK)  # another frame between two replays
+        engine.frame(view(96, 200), TRANSFER)  # another frame between two replays
         picture, stats = graph.replay(PATH[-1])
         assert stats.settle().converged and torch.equal(picture.color, shown)
     with gv.Engine(Ball(1024), brick_pool="64 MB", device="cuda") as engine:
         _, picture, _, left = flown(engine, PATH, 256, look_ahead=6)
         assert torch.equal(picture.color, shown) and left < 0.8 * missed
     with gv.Engine(Unsaid(1024), brick_pool="64 MB", device="cuda") as engine:
-        expected = engine.render(PATH[-1], LOOK)
-        graph = engine.capture(PATH[-1], LOOK)
+        expected = engine.render(PATH[-1], TRANSFER)
+        graph = engine.capture(PATH[-1], TRANSFER)
         picture, stats = graph.replay(view(96, 200))
         assert not stats.settle().converged and sum(stats.produced.values()) == 0
     assert torch.equal(expected.color, shown)
@@ -364,7 +364,7 @@ def test_a_flight_is_replayed_without_the_host():
 @pytest.mark.backend("cuda")
 def test_a_node_that_fails_in_a_replay_is_named_by_the_host():
     with gv.Engine(Ball(), brick_pool="16 MB", device="cuda") as engine:
-        graph = engine.capture(view(), LOOK)
+        graph = engine.capture(view(), TRANSFER)
         engine.trees["scene"].producer.spoiled.fill_(1)
         for _ in range(40):
             picture, _ = graph.replay(view())
@@ -418,7 +418,7 @@ def test_garbage_of_other_engines_does_not_end_a_recording(blobs, monkeypatch):
     monkeypatch.setattr(Cache, "sort_by_use", collecting)
     with gv.Engine(gv.VolumeProducer(blobs), device="cuda") as engine:
         try:
-            graph = engine.capture(view(24), LOOK)
+            graph = engine.capture(view(24), TRANSFER)
         finally:
             gc.set_threshold(*thresholds)
         assert not held and gc.isenabled()

@@ -11,7 +11,7 @@ import torch
 from helpers import DEVICES
 from helpers.rays import camera_rays
 from helpers.traces import SHADER, arguments, changed, packed
-from helpers.trees import forget, on
+from helpers.trees import copy_to, with_holes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -36,7 +36,7 @@ def tracing(
     tree, backend, rays, shader=SHADER, *, stop_alpha=0.99, hides=True, **options
 ) -> tuple[RayArguments, TraceArguments]:
     """Returns arguments of `trace_rays` for rays through a clean copy of a tree."""
-    copy = on(tree, DEVICES[backend])
+    copy = copy_to(tree, DEVICES[backend])
     copy.frame += 1
     chosen = gv.RenderOptions(backend=backend, stop_alpha=stop_alpha, **options)
     traced = Tracer(copy, shader, chosen).arguments
@@ -109,7 +109,7 @@ def test_compiled_equals_reference_for_dtypes(blobs, compiled, voxel, dtype):
 def test_missing_nodes_give_equal_segments_and_requests(
     blobs, share, seed, lod, limit, distance, azimuth, elevation
 ):
-    tree = forget(gv.N3Tree.from_volume(blobs, 4), share, seed)
+    tree = with_holes(gv.N3Tree.from_volume(blobs, 4), share, seed)
     rays = camera_rays(tree, 12, distance=distance, azimuth=azimuth, elevation=elevation)
     assert_same_walk(tree, "cpp", rays, lod=lod, limit=limit)
 
@@ -118,7 +118,7 @@ def test_missing_nodes_give_equal_segments_and_requests(
 @pytest.mark.parametrize("distance", [0.2, 1.3, 6.0])
 def test_segments_are_what_trace_rays_samples(blobs, backend, lod, distance):
     """Same number of samples, same marks, same requests, in a tree with missing parts."""
-    tree = forget(gv.N3Tree.from_volume(blobs, 4), 0.3, 7)
+    tree = with_holes(gv.N3Tree.from_volume(blobs, 4), 0.3, 7)
     rays = camera_rays(tree, distance=distance)
     given, drawn = tracing(tree, backend, rays, stop_alpha=1.0, lod=lod)
     haze = gv.TransferFunction.from_points([(0, 0), (0.2, 0), (1, 0.1)])  # nothing is opaque

@@ -13,8 +13,8 @@ import torch
 from helpers import DEVICES, ROOT
 from helpers.rays import camera_rays, rays_along, world_rays
 from helpers.shaders import POINT, SHADERS
-from helpers.traces import SHADER, assert_equal, changed, op_arguments, run
-from helpers.trees import forget, on
+from helpers.traces import SHADER, assert_equal, changed, op_arguments, trace
+from helpers.trees import copy_to, with_holes
 
 import gvtorch as gv
 from gvtorch import cpp_ext
@@ -115,7 +115,7 @@ def test_every_channel_dtype(blobs, compiled, dtype):
 @pytest.mark.parametrize("name", SHADERS)
 def test_missing_nodes_give_equal_pictures_and_requests(tree, compiled, name):
     for seed, share in ((1, 0.3), (2, 0.7)):
-        holes = forget(tree, share, seed)
+        holes = with_holes(tree, share, seed)
         rays = camera_rays(holes, 8, distance=1.4)
         _, marks, _ = assert_equal(holes, compiled, rays, SHADERS[name])
         assert marks["request"].any()
@@ -125,7 +125,7 @@ def test_missing_nodes_give_equal_pictures_and_requests(tree, compiled, name):
 @pytest.mark.parametrize("name", SHADERS)
 def test_what_ranges_hide_changes_no_bit(channels, name, threshold):
     known = gv.N3Tree.from_volume(channels, 4, threshold=threshold)
-    unknown = on(known, "cpu")
+    unknown = copy_to(known, "cpu")
     for channel, ranges in unknown.nodes.ranges.items():
         ranges[:, :, 0], ranges[:, :, 1] = known.bricks.channels[channel].limits
     rays = camera_rays(known, 16, distance=1.6)
@@ -145,7 +145,7 @@ def test_rays_that_have_lost_light_bring_back_the_rest(tree, compiled, name):
     rays = camera_rays(tree, 16, distance=1.6)
     dimmed = replace(rays, transmittance=torch.full((len(rays.origin),), 0.25))
     options = gv.RenderOptions(stop_alpha=1.0, backend=compiled)
-    tracer = Tracer(on(tree, DEVICES[compiled]), SHADERS[name], options)
+    tracer = Tracer(copy_to(tree, DEVICES[compiled]), SHADERS[name], options)
     full, rest = (tracer(some.to(DEVICES[compiled])) for some in (rays, dimmed))
     torch.testing.assert_close(rest.color, 0.25 * full.color)
     torch.testing.assert_close(1 - rest.alpha, 0.25 * (1 - full.alpha))
@@ -157,19 +157,19 @@ def test_a_surface_has_the_colour_that_its_voxels_hold(tree, compiled):
     rays, flat = camera_rays(tree, 16), {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0}
     ramp = gv.TransferFunction.from_points([(0, 1)], [(0, 0, 0, 0), (255, 1, 1, 1)])
     stored = gv.Isosurface(0.4, None, color_channel="rgba", **flat)
-    found, _ = run(tree, compiled, rays, stored)
+    found, _ = trace(tree, compiled, rays, stored)
     for number in range(3):
         grey = gv.Isosurface(0.4, ramp, color_channel="rgba", color_component=number, **flat)
-        by_function, _ = run(tree, compiled, rays, grey)
+        by_function, _ = trace(tree, compiled, rays, grey)
         assert (found["color"][:, number] - by_function["color"][:, 0]).abs().max() < 2e-3
     assert found["color"].std(0).min() > 0.05, "of many colours"
-    times, _ = run(tree, compiled, rays, gv.Isosurface(
+    times, _ = trace(tree, compiled, rays, gv.Isosurface(
         0.4, None, color_channel="premultiplied", premultiplied=True, **flat
     ))  # fmt: skip
     apart = (times["color"] - found["color"]).abs()  # there, voxels are weighted by opacity
     assert apart.max() < 0.1 and apart.mean() < 0.01
     with pytest.raises(ValueError, match="stored colour needs 4 numbers a voxel, 'normal' has 3"):
-        run(tree, compiled, rays, gv.Isosurface(0.4, None, color_channel="normal"))
+        trace(tree, compiled, rays, gv.Isosurface(0.4, None, color_channel="normal"))
 
 
 @pytest.mark.parametrize("name", ["lit", "stored colour"])
@@ -224,7 +224,7 @@ def test_each_parameter_is_a_tensor_that_may_be_edited(tree, compiled, edited):
     """The next frame equals, to the bit, that of a new shader with those numbers. The colour is
     copied to a frame's table; everything else is read while rays are traced.
     """
-    tree, rays = on(tree, DEVICES[compiled]), camera_rays(tree, 16).to(DEVICES[compiled])
+    tree, rays = copy_to(tree, DEVICES[compiled]), camera_rays(tree, 16).to(DEVICES[compiled])
     numbers = {n: torch.tensor(before, device=tree.device) for n, (before, _) in NUMBERS.items()}
     shader, options = gv.Isosurface(light=POINT, **numbers), gv.RenderOptions()
     tracer = Tracer(tree, shader, options)
@@ -241,7 +241,10 @@ def test_each_parameter_is_a_tensor_that_may_be_edited(tree, compiled, edited):
 def test_an_edited_transfer_function_is_the_next_picture_s(tree, compiled, kind, which):
     """It equals that of a new function with those points, without another tree."""
     points = {"opacity": [(0, 0), (1, 0.4)], "color": [(0, 1, 0, 0), (1, 0.2, 0.6, 1)]}
-    tree, camera = on(tree, DEVICES[compiled]), gv.Camera.orbit(width=16, height=16, distance=1.3)
+    tree, camera = (
+        copy_to(tree, DEVICES[compiled]),
+        gv.Camera.orbit(width=16, height=16, distance=1.3),
+    )
     function = gv.TransferFunction.from_points(**points)
     shader = kind(function) if kind else function
     before = gv.render(tree, camera, shader).color
@@ -283,7 +286,7 @@ def test_golden_image(tree, name):
 
 
 def module(tree, name, compiled) -> tuple[gv.TreeTracer, tuple[torch.Tensor, ...]]:
-    tree = on(tree, DEVICES[compiled])
+    tree = copy_to(tree, DEVICES[compiled])
     return gv.TreeTracer(tree, SHADERS[name]), world_rays(tree.box, 33, tree.device)
 
 
@@ -316,7 +319,7 @@ def test_script_compile_and_export(tree, compiled, name):
 @pytest.mark.parametrize("name", SHADERS)
 def test_opcheck(tree, compiled, name):
     """In one dtype per shader, alternating; test_op_contract.py checks the other op in both."""
-    tree = on(tree, DEVICES[compiled])
+    tree = copy_to(tree, DEVICES[compiled])
     dtype = (torch.float32, torch.float64)[[*SHADERS].index(name) % 2]
     rays, traced, shading, parameters = op_arguments(tree, SHADERS[name], dtype)
     op = torch.ops.gvtorch.shade_rays.default
@@ -456,7 +459,7 @@ def test_a_surface_is_filled(backend, kind):
         shader = gv.DistanceField(filled=filled) if field else gv.Isosurface(0, filled=filled)
         assert shader.opened().filled is False and shader.filled is filled
         for name, rays in (("down", down), ("within", within)):
-            result, _ = run(tree, backend, rays, shader)
+            result, _ = trace(tree, backend, rays, shader)
             met[name, filled] = result
     cut = beside < 12
     assert 3 < cut.sum() < 9
@@ -469,6 +472,6 @@ def test_a_surface_is_filled(backend, kind):
     assert float(met["within", True]["depth"]) == 0
     assert 8 < float(met["within", False]["depth"]) < 12
     assert float(met["within", True]["alpha"]) == float(met["within", False]["alpha"]) == 1
-    bare, _ = run(tree, backend, down, shader.opened(), clip=gv.Clip(planes=[(0, 0, -1, 20)]))
-    clip, _ = run(tree, backend, down, shader, clip=gv.Clip(planes=[(0, 0, -1, 20)]))
+    bare, _ = trace(tree, backend, down, shader.opened(), clip=gv.Clip(planes=[(0, 0, -1, 20)]))
+    clip, _ = trace(tree, backend, down, shader, clip=gv.Clip(planes=[(0, 0, -1, 20)]))
     assert torch.equal(bare["depth"], clip["depth"]), "a clip without caps opens it"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import gvtorch, run
+from helpers import gvtorch, run_cli
 from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
@@ -248,27 +248,27 @@ def test_each_time_is_streamed_as_its_volume_is_rendered(store, data):
 @pytest.mark.backend("cpp")
 def test_the_command_line_takes_a_time(tmp_path, npy, capsys):
     target, picture = tmp_path / "a b.zarr", tmp_path / "a.npy"
-    code, out, err = run(capsys, "convert", npy, target)
+    code, out, err = run_cli(capsys, "convert", npy, target)
     assert code == 2 and err.count("\n") == 1 and "--axes" in err and "'tzyx'" in err
-    code, out, err = run(capsys, "convert", npy, target, "--axes", "tzyx")
+    code, out, err = run_cli(capsys, "convert", npy, target, "--axes", "tzyx")
     assert (code, err) == (0, "") and "150x37x20 at 3 times, 6 levels" in out
-    code, out, err = run(capsys, "info", target, "--time", 2, "--json")
+    code, out, err = run_cli(capsys, "info", target, "--time", 2, "--json")
     assert code == 0 and (json.loads(out)["times"], json.loads(out)["time"]) == (3, 2)
-    code, out, err = run(capsys, "info", target, "--time", 3)
+    code, out, err = run_cli(capsys, "info", target, "--time", 3)
     assert code == 2 and "has no time 3; it has 3 time points, 0 to 2" in err
     pictures = []
     size = ("--size", "16x16", "--brick-pool", "9 MB")
     for time in (0, 2):
-        code, out, err = run(capsys, "render", target, "-o", picture, "--time", time, *size)
+        code, out, err = run_cli(capsys, "render", target, "-o", picture, "--time", time, *size)
         assert (code, err) == (0, "")
         pictures.append(np.load(picture)[..., :3])
-        code, out, err = run(
+        code, out, err = run_cli(
             *(capsys, "render", npy, "-o", picture, "--time", time, "--axes", "tzyx"),
             *("--size", "16x16"),
         )
         assert (code, err) == (0, "")
     assert np.abs(pictures[0] - pictures[1]).max() > 0.01
-    code, out, err = run(
+    code, out, err = run_cli(
         *(capsys, "fly", target, "-o", tmp_path / "f", "--time", 1, "--frames", 1, *size)
     )
     assert (code, err) == (0, "")
@@ -278,7 +278,7 @@ def test_the_command_line_takes_a_time(tmp_path, npy, capsys):
 def test_filtered_colours_of_every_time(tmp_path, npy, capsys):
     target = tmp_path / "a.zarr"
     convert(npy, target, axes="tzyx")
-    code, _, err = run(capsys, "filter", target, "--tf", "gray", "--directions", "one")
+    code, _, err = run_cli(capsys, "filter", target, "--tf", "gray", "--directions", "one")
     assert (code, err) == (0, "")
     camera = gv.Camera.orbit(30, 20, 9, 30, 16, 16)
     for time in range(TIMES):

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import ROOT
-from helpers.compiled import ADD, HEADER, only_included, users_shader, write
-from helpers.packets import INSTRUCTIONS, LAMP, TRANSFER, cut, result, scene, shaded, start
+from helpers.compiled import ADD, HEADER, only_included, users_shader, write_header
+from helpers.packets import INSTRUCTIONS, LAMP, TRANSFER, cut_rays, result, scene, shaded, start
 from helpers.rays import camera_rays
-from helpers.traces import run
+from helpers.traces import trace
 from torch import Tensor
 
 import gvtorch as gv
@@ -59,7 +59,7 @@ def given(name: str, folder: Path | None = None) -> list[Tensor]:
     channels = {"value": values, "rgba": values, "normal": values[..., None].expand(6, 6, 6, 3)}
     tree = gv.N3Tree.from_volume({key: gv.Volume(some) for key, some in channels.items()}, 8)
     assert tree.bricks.capacity == 1
-    hits, marks = run(tree, "cpp", camera_rays(tree, 9), own)
+    hits, marks = trace(tree, "cpp", camera_rays(tree, 9), own)
     return [*found, *hits.values(), *marks.values()]
 
 
@@ -104,8 +104,8 @@ def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch, quick)
     alone = shader("ink", tmp_path)
     assert b"PacketWalk" not in alone.libraries[0].read_bytes()
     tree = scene()
-    rays = cut(camera_rays(tree, 11, distance=1.5))
-    one, other = (run(tree, "cpp", rays, each, dtype=torch.float64)[0] for each in (own, alone))
+    rays = cut_rays(camera_rays(tree, 11, distance=1.5))
+    one, other = (trace(tree, "cpp", rays, each, dtype=torch.float64)[0] for each in (own, alone))
     assert all(torch.equal(one[key].nan_to_num(7), other[key].nan_to_num(7)) for key in other)
     assert one["color"].unique().numel() > 20
 
@@ -115,7 +115,7 @@ def test_a_folder_serves_several_instruction_sets(tmp_path, monkeypatch):
     """Each has its own library, of one op."""
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path))
     monkeypatch.setenv("CXX", only_included(tmp_path))
-    source = user.ShaderSource.read(write(tmp_path, ADD), "Own")
+    source = user.ShaderSource.read(write_header(tmp_path, ADD), "Own")
     made = []
     for name in ("baseline", "avx512", "baseline"):
         monkeypatch.setattr(user, "instructions", lambda name=name: name)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.pictures import GRAY
-from helpers.viewer import FUNCTION, Page, bright_ball, pixels, turned
+from helpers.viewer import FUNCTION, Page, bright_ball, pixels, turned_camera
 
 import gvtorch as gv
 from gvtorch.io.surface import export_surface
@@ -47,18 +47,22 @@ def test_pictures_stop_when_nothing_changes_and_go_on_when_something_does(sessio
     count = len(page.pictures)
     assert session.ask(lambda: [one.wants_picture() for one in session.clients.values()]) == [False]
     _, before = page.final()
-    _, after = page.moved(turned(page.camera, 1.0))
+    _, after = page.moved(turned_camera(page.camera, 1.0))
     assert len(page.pictures) > count and np.abs(before.astype(int) - after).max() > 60
     page.send("change", state={"options": {"background": [0.0, 0.5, 0.0]}})
     page.until(
         lambda: page.pictures[-1][0]["final"] and pixels(page.pictures[-1][1])[0, 0, 1] > 150
     )
-    state = page.of("state")[-1]["state"]
+    state = page.of_type("state")[-1]["state"]
     assert state["options"]["background"] == [0.0, 0.5, 0.0] and state["options"]["step"] == 0.5
-    whole = {name: one for name, one in page.of("welcome")[0]["state"].items() if name != "camera"}
+    whole = {
+        name: one for name, one in page.of_type("welcome")[0]["state"].items() if name != "camera"
+    }
     page.send("change", state=whole)  # as undo does
-    page.until(lambda: page.of("state")[-1]["state"]["options"]["background"] == [0.0, 0.0, 0.0])
-    assert not page.of("refused")
+    page.until(
+        lambda: page.of_type("state")[-1]["state"]["options"]["background"] == [0.0, 0.0, 0.0]
+    )
+    assert not page.of_type("refused")
 
 
 def test_at_most_one_picture_is_on_its_way(session):
@@ -67,7 +71,7 @@ def test_at_most_one_picture_is_on_its_way(session):
     slow.until(lambda: slow.pictures)
     camera = page.camera
     for step in range(20):
-        camera = turned(camera, 0.2)
+        camera = turned_camera(camera, 0.2)
         for one in (slow, page):
             one.send("move", camera=camera, moving=step < 19)
     page.until(lambda: page.pictures and page.pictures[-1][0]["camera"]["eye"] == camera["eye"])
@@ -82,18 +86,18 @@ def test_at_most_one_picture_is_on_its_way(session):
 def test_two_pages_have_cameras_of_their_own_and_may_follow(session):
     one, other = Page(session), Page(session)
     _, still = other.final()
-    there = turned(one.camera, 0.7)
+    there = turned_camera(one.camera, 0.7)
     _, moved = one.moved(there)
     assert np.array_equal(other.final()[1], still) and not np.array_equal(moved, still)
     other.send("follow", client=one.client.number)
-    other.until(lambda: other.of("camera"))
-    further = turned(there, 0.7)
+    other.until(lambda: other.of_type("camera"))
+    further = turned_camera(there, 0.7)
     _, seen = one.moved(further)
     other.until(lambda: np.allclose(other.pictures[-1][0]["camera"]["eye"], further["eye"]))
     assert np.array_equal(other.final()[1], seen)
-    assert other.of("clients")[-1]["clients"] == {"1": None, "2": 1}
+    assert other.of_type("clients")[-1]["clients"] == {"1": None, "2": 1}
     session.leave(one.client)
-    other.until(lambda: other.of("clients")[-1]["clients"] == {"2": None})
+    other.until(lambda: other.of_type("clients")[-1]["clients"] == {"2": None})
     other.moved(there)
     other.send("follow", client=7)
     assert "there is no client 7" in other.next("refused", 0)["text"]
@@ -104,21 +108,21 @@ def test_a_change_is_seen_by_all_and_a_wrong_one_by_nobody(session):
     _, before = other.final()
     function = {"kind": "TransferFunction", "opacity": [[20, 0], [60, 1]], "color": [[0, 0, 1, 0]]}
     one.send("change", state={"shader": function})
-    other.until(lambda: other.of("state"))
+    other.until(lambda: other.of_type("state"))
     other.until(
         lambda: other.pictures[-1][0]["final"] and pixels(other.pictures[-1][1])[..., 0].max() < 60
     )
     assert pixels(other.pictures[-1][1])[..., 1].max() > 200 > before[..., 1].min()
-    told = len(other.of("state"))
+    told = len(other.of_type("state"))
     for wrong in ({"shader": {"kind": "Lit"}}, {"options": {"step": -1}}, {"nothing": 1}):
-        count = len(one.of("refused"))
+        count = len(one.of_type("refused"))
         one.send("change", state=wrong)
         text = one.next("refused", count)["text"]
         assert "\n" not in text and text
     one.session.receive(one.client, b"\xff\xfe")
     one.session.receive(one.client, "[1, 2]")
-    one.until(lambda: len(one.of("refused")) == 5)
-    assert len(other.of("state")) == told and not other.of("refused")
+    one.until(lambda: len(one.of_type("refused")) == 5)
+    assert len(other.of_type("state")) == told and not other.of_type("refused")
     assert session.state.shader.opacity.tolist() == [[20, 0], [60, 1]]
 
 
@@ -131,7 +135,7 @@ def test_a_state_that_can_not_be_drawn_gives_way_to_the_last_that_could(session)
         state={
             "shader": {
                 "kind": "Features",
-                "transfer": page.of("welcome")[0]["state"]["shader"],
+                "transfer": page.of_type("welcome")[0]["state"]["shader"],
                 "channel": "none",
             }
         },
@@ -139,11 +143,11 @@ def test_a_state_that_can_not_be_drawn_gives_way_to_the_last_that_could(session)
     assert "has no channel 'none'" in page.next("error", 0)["text"]
     page.until(
         lambda: (
-            page.of("state")
-            and page.of("state")[-1]["state"]["shader"]["kind"] == "TransferFunction"
+            page.of_type("state")
+            and page.of_type("state")[-1]["state"]["shader"]["kind"] == "TransferFunction"
         )
     )
-    page.moved(turned(page.camera, 0.1))
+    page.moved(turned_camera(page.camera, 0.1))
     _, after = page.moved(page.camera)
     assert np.abs(after.astype(int) - before).max() <= 2
 
@@ -154,8 +158,8 @@ def test_what_is_hit_histograms_presets_and_stills(session):
     page.send("pick", x=0.5, y=0.5, purpose="focus")
     corner = {"x": 0.0, "y": 0.0}
     page.send("pick", **corner)
-    page.until(lambda: len(page.of("picked")) == 2)
-    hit, missed = page.of("picked")
+    page.until(lambda: len(page.of_type("picked")) == 2)
+    hit, missed = page.of_type("picked")
     assert missed["place"] is None and hit["purpose"] == "focus"
     if hit["place"] is None:  # the ball is not in the middle
         rows, columns = np.nonzero(page.final()[1].max(-1) > 120)
@@ -198,7 +202,7 @@ def test_figures_and_cost_pictures(session):
     )
     assert told["rays"] == 64 * 48
     page.send("change", state={"show": "samples"})
-    page.until(lambda: page.of("state"))
+    page.until(lambda: page.of_type("state"))
     page.until(lambda: pixels(page.pictures[-1][1]).shape == (24, 32, 3))
     page.send("do", what="fit")
     page.next("camera", 0)
@@ -233,7 +237,7 @@ def test_a_scene_that_dies_is_told_and_the_picture_goes_on():
         assert seen.max() > 0
         producer.alive = True
         page.send("do", what="retry")
-        page.until(lambda: not page.of("busy") or page.of("busy")[-1]["misses"] == 0)
+        page.until(lambda: not page.of_type("busy") or page.of_type("busy")[-1]["misses"] == 0)
         page.final()
         assert session.ask(lambda: len(session.scene.engine.production.failures)) == 0
     finally:
@@ -267,7 +271,7 @@ def test_fields_of_a_dataclass_and_parameters_of_a_module_become_controls():
     try:
         page = Page(session)
         _, before = page.final()
-        told = page.of("welcome")[0]["parameters"]
+        told = page.of_type("welcome")[0]["parameters"]
         assert told["radius"] == {"type": "number", "range": [1, 20], "value": 10.0}
         assert told["hollow"] == {"type": "flag", "value": False}
         page.send("set", name="radius", value=4.0)
@@ -297,7 +301,7 @@ def test_fields_of_a_dataclass_and_parameters_of_a_module_become_controls():
     try:
         page = Page(session)
         _, before = page.final()
-        value = page.of("welcome")[0]["parameters"]["level"]
+        value = page.of_type("welcome")[0]["parameters"]["level"]
         assert value["type"] == "number" and abs(value["value"] - 0.1) < 1e-6
         page.send("set", name="level", value=0.9)
         page.until(lambda: page.final()[1].max() > before.max())
@@ -310,14 +314,14 @@ def test_memory_is_set_while_it_is_looked_at(session):
     _, before = page.final()
     page.send("resize", engine={"brick_pool": "2 MB"})
     page.until(lambda: session.ask(lambda: session.scene.engine.options.brick_pool) == "2 MB")
-    page.moved(turned(page.camera, 0.1))
+    page.moved(turned_camera(page.camera, 0.1))
     _, after = page.moved(page.camera)
     assert np.abs(after.astype(int) - before).max() <= 2
     page.send("resize", engine={"brick_pool": "2 B"})
     page.next("refused", 0)
     page.send("resize", engine={"device": "cuda"})
     assert "'device' can't be set" in page.next("refused", 1)["text"]
-    page.moved(turned(page.camera, 0.2))
+    page.moved(turned_camera(page.camera, 0.2))
 
 
 @pytest.mark.parametrize("kind", ["tree", "engine", "producer", "store", "array", "path", "labels"])
@@ -357,7 +361,7 @@ def test_a_thousand_moves_leave_nothing_behind(session):
     def wander(times: int) -> None:
         nonlocal camera
         for _ in range(times):
-            camera = turned(camera, 0.05)
+            camera = turned_camera(camera, 0.05)
             page.send("move", camera=camera, moving=True)
             if len(page.pictures) > 20:
                 del page.pictures[:-5]
@@ -387,7 +391,7 @@ def test_a_surface_is_handed_over_as_a_file(session, monkeypatch, tmp_path):
     page.send("surface", value=100.0, format="ply")
     page.until(lambda: "surface.ply" in page.files)
     assert page.files["surface.ply"] == expected.read_bytes()
-    assert all(0 < one["done"] < one["total"] for one in page.of("exporting"))
+    assert all(0 < one["done"] < one["total"] for one in page.of_type("exporting"))
     page.until(lambda: session._export and not session._export.busy)
     page.send("surface", value=1e6)
     assert "1e+06" in page.next("refused", 0)["text"]
@@ -405,8 +409,8 @@ def test_who_follows_one_that_follows_moves_too(session):
     third.send("follow", client=second.client.number)
     first.send("follow", client=third.client.number)  # in a circle
     circle = {"1": 3, "2": 1, "3": 2}
-    third.until(lambda: [one["clients"] for one in third.of("clients")][-1:] == [circle])
-    there = turned(first.camera, 0.5)
+    third.until(lambda: [one["clients"] for one in third.of_type("clients")][-1:] == [circle])
+    there = turned_camera(first.camera, 0.5)
     first.moved(there)
 
     def seen(page: Page) -> bool:
@@ -442,11 +446,11 @@ def test_whole_states_with_what_json_can_not_tell_are_taken():
     session = new_session(bright_ball(), module)
     try:
         page = Page(session)
-        page.until(lambda: page.of("welcome"))
-        state = page.of("welcome")[0]["state"]
+        page.until(lambda: page.of_type("welcome"))
+        state = page.of_type("welcome")[0]["state"]
         assert set(state["shader"]) == {"kept"}
         page.send("change", state={**state, "develop": {"exposure": 1.0}}, rest=True)
         page.until(lambda: session.state.develop.exposure == 1.0)
-        assert session.state.shader is module and not page.of("refused")
+        assert session.state.shader is module and not page.of_type("refused")
     finally:
         session.close()

@@ -13,7 +13,7 @@ from helpers import ROOT, gvtorch
 from helpers.labels import cells
 from helpers.pictures import GRAY
 from helpers.stores import noise
-from helpers.viewer import FUNCTION, SOON, Grown, Page, bright_ball, pixels, turned
+from helpers.viewer import FUNCTION, TIMEOUT, Grown, Page, bright_ball, pixels, turned_camera
 
 import gvtorch as gv
 from gvtorch.io.stores.conversion import convert
@@ -118,14 +118,14 @@ def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypat
     go, real = threading.Event(), Planes._render_plane
 
     def slow(self, axis, state, pixel):
-        assert go.wait(SOON)
+        assert go.wait(TIMEOUT)
         if state.slices.at[2] == 30:
             raise OSError("chunk 3\nis gone")
         return real(self, axis, state, pixel)
 
     monkeypatch.setattr(Planes, "_render_plane", slow)
     page.send("change", state={"slices": {"at": [10.0, 10.0, 20.0]}})
-    camera = turned(page.camera, 0.5)
+    camera = turned_camera(page.camera, 0.5)
     page.send("move", camera=camera, moving=False)
     page.until(lambda: page.pictures[-1][0]["camera"]["eye"] == camera["eye"])
     page.until(lambda: page.pictures[-1][0]["samples"] == 16)
@@ -138,7 +138,7 @@ def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypat
     page.final()
     monkeypatch.setattr(Planes, "_render_plane", real)
     page.send("do", what="retry")
-    page.until(lambda: page.pictures[-1][0]["final"] and page.of("error")[-1]["text"] == told)
+    page.until(lambda: page.pictures[-1][0]["final"] and page.of_type("error")[-1]["text"] == told)
 
 
 def test_slices_of_a_store_read_no_finer_than_pixels(scan_store, monkeypatch):
@@ -176,7 +176,7 @@ def test_slices_of_labels_have_their_colours():
     try:
         page = Page(session, 204, 154)
         page.final()
-        told = page.of("welcome")[0]["labels"]
+        told = page.of_type("welcome")[0]["labels"]
         assert told["names"] == sorted(set(data.ravel().tolist())) and told["count"] == 9
         layout = sliced(page, at=[7.0, 6.0, 5.0])[0]["layout"]
         page.send("still", width=204, height=154)
@@ -201,7 +201,7 @@ def test_what_has_no_voxels_has_no_slices(session):
         page.final()
         page.send("change", state={"slices": {}})
         assert "no voxels of its own" in page.next("refused", 0)["text"]
-        assert page.of("state")[-1]["state"]["slices"] is None
+        assert page.of_type("state")[-1]["state"]["slices"] is None
     finally:
         session_.close()
     page = Page(session)
@@ -210,7 +210,7 @@ def test_what_has_no_voxels_has_no_slices(session):
         ({"window": [3, 3]}, "a low and a high"),
         ({"colors": "red"}, "'gray' or 'shader'"),
     ):
-        count = len(page.of("refused"))
+        count = len(page.of_type("refused"))
         page.send("change", state={"slices": wrong})
         assert message in page.next("refused", count)["text"]
 
@@ -275,7 +275,7 @@ def test_time_points_of_a_store_are_gone_through(beat, tmp_path):
     try:
         page = Page(session, 96, 64)
         _, first = page.final()
-        assert page.of("welcome")[0]["time"]["times"] == TIMES
+        assert page.of_type("welcome")[0]["time"]["times"] == TIMES
         pictures = [first]
         for time in (1, 2):
             page.send("change", state={"time": time})
@@ -286,7 +286,7 @@ def test_time_points_of_a_store_are_gone_through(beat, tmp_path):
         one, other, last = (image.astype(int) for image in pictures)
         assert np.abs(one - other).max() > 20 and np.abs(other - last).max() > 20
         for wrong in (3, 0.5, -1):
-            count = len(page.of("refused"))
+            count = len(page.of_type("refused"))
             page.send("change", state={"time": wrong})
             assert "one of 3 time points, 0 to 2" in page.next("refused", count)["text"]
         assert session.state.time == 2
@@ -315,7 +315,7 @@ def test_a_time_point_that_can_not_be_read_is_told_and_the_one_before_stays(beat
         real, go = session.scene.reopen, threading.Event()
 
         def reopen(time: int):
-            assert go.wait(SOON)
+            assert go.wait(TIMEOUT)
             if time == 1:
                 raise OSError("the disk\nis gone")
             return real(time)
@@ -326,7 +326,7 @@ def test_a_time_point_that_can_not_be_read_is_told_and_the_one_before_stays(beat
         assert np.array_equal(still, before)
         go.set()
         assert page.next("error", 0)["text"] == "time 1: the disk is gone"
-        page.until(lambda: page.of("state")[-1]["state"]["time"] == 0)
+        page.until(lambda: page.of_type("state")[-1]["state"]["time"] == 0)
         page.send("change", state={"time": 2})
         page.until(lambda: page.pictures[-1][0]["time"] == 2 and page.pictures[-1][0]["final"])
     finally:
@@ -339,8 +339,8 @@ def test_a_clock_of_a_producer_is_set():
     try:
         page = Page(session)
         _, before = page.final()
-        assert page.of("welcome")[0]["time"] == {"times": None}
-        assert page.of("welcome")[0]["state"]["time"] == 3.0
+        assert page.of_type("welcome")[0]["time"] == {"times": None}
+        assert page.of_type("welcome")[0]["state"]["time"] == 3.0
         page.send("change", state={"time": 8.0})
         page.until(lambda: page.pictures[-1][0]["time"] == 8 and page.pictures[-1][0]["final"])
         assert (page.final()[1] > 100).sum() > 3 * (before > 100).sum() > 0
@@ -349,7 +349,7 @@ def test_a_clock_of_a_producer_is_set():
     session = new_session(bright_ball(), FUNCTION)
     try:
         page = Page(session)
-        assert page.camera and page.of("welcome")[0]["time"] is None
+        assert page.camera and page.of_type("welcome")[0]["time"] is None
         page.send("change", state={"time": 1})
         assert "nothing changes with time" in page.next("refused", 0)["text"]
     finally:
@@ -393,14 +393,14 @@ def test_node_boxes_come_with_each_picture_as_long_as_they_are_wanted(session):
     page.send("nodes", on=True)
     told = page.next("nodes", 0)
     assert 0 < len(told["boxes"]) <= told["count"]
-    count = len(page.of("nodes"))
-    page.moved(turned(page.camera, 1.0))
-    assert len(page.of("nodes")) > count
+    count = len(page.of_type("nodes"))
+    page.moved(turned_camera(page.camera, 1.0))
+    assert len(page.of_type("nodes")) > count
     page.send("nodes", on=False)
     session.ask(lambda: None)
-    count = len(page.of("nodes"))
+    count = len(page.of_type("nodes"))
     page.moved(page.camera)
-    assert len(page.of("nodes")) == count
+    assert len(page.of_type("nodes")) == count
 
 
 # Labels, and files of presets.
@@ -412,19 +412,19 @@ def test_the_table_of_labels_changes_colours_and_what_is_shown():
     try:
         page = Page(session)
         page.final()
-        told = page.of("welcome")[0]["labels"]
+        told = page.of_type("welcome")[0]["labels"]
         assert told["names"] == [0, 1, 2, 3, 4, 5] and told["count"] == 6
         assert np.allclose(told["colors"], gv.Labels()(np.arange(6))[:, :3], atol=1e-4)
-        shader = {**page.of("welcome")[0]["state"]["shader"], "lit": False}
+        shader = {**page.of_type("welcome")[0]["state"]["shader"], "lit": False}
         shader |= {"visible": [2], "colors": {"2": [1.0, 0.0, 0.0]}}
         page.send("change", state={"shader": shader})
-        page.until(lambda: page.of("state"))
+        page.until(lambda: page.of_type("state"))
         page.until(lambda: page.pictures[-1][0]["final"])
-        _, seen = page.moved(turned(page.camera, 0.2))
+        _, seen = page.moved(turned_camera(page.camera, 0.2))
         assert seen[..., 0].max() > 200 and seen[..., 1:].max() < 60
         assert session.state.shader.visible == [2]
         for wrong in ({"visible": ["two"]}, {"colors": {"two": [1, 0, 0]}}, {"visible": [0.5]}):
-            count = len(page.of("refused"))
+            count = len(page.of_type("refused"))
             page.send("change", state={"shader": {**shader, **wrong}})
             assert "\n" not in page.next("refused", count)["text"]
     finally:
@@ -497,7 +497,7 @@ def test_what_is_no_preset_is_refused_in_a_line(session, file, text, message):
     page.send("read", file=file, text=text)
     told = page.next("refused", 0)["text"]
     assert message in told and "\n" not in told and "/tmp" not in told and len(told) < 600
-    page.moved(turned(page.camera, 0.1))
+    page.moved(turned_camera(page.camera, 0.1))
 
 
 @pytest.mark.parametrize("name", ["mr", "em", "cloud", "galaxy"])
