@@ -35,9 +35,9 @@ CAMERA = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
 def channels(blobs) -> dict[str, gv.Volume]:
     """The blobs, with a four-component colour and a normal in each voxel."""
     values = torch.rand(*blobs.data.shape[:3], 7, generator=torch.Generator().manual_seed(3))
-    place = blobs.spacing, blobs.origin
-    normal = gv.Volume(2 * values[..., :3] - 1, *place)
-    return {"value": blobs, "normal": normal, "rgba": gv.Volume(values[..., 3:], *place)}
+    placement = blobs.spacing, blobs.origin
+    normal = gv.Volume(2 * values[..., :3] - 1, *placement)
+    return {"value": blobs, "normal": normal, "rgba": gv.Volume(values[..., 3:], *placement)}
 
 
 @pytest.fixture(scope="module")
@@ -75,15 +75,15 @@ FIELDS = ("color", "alpha", "depth", "samples", "missed")
 @pytest.mark.parametrize("lod", ["finest", "auto"])
 def test_a_copy_of_the_transfer_function_has_the_same_bits(tree, compiled, lod, dtype):
     holes = with_holes(tree, 0.3, 1)
-    for place in (tree, holes):
-        rays = camera_rays(place, 16, distance=1.3)
+    for t in (tree, holes):
+        rays = camera_rays(t, 16, distance=1.3)
         options = {"lod": lod, "dtype": dtype}
-        expected, marks = trace(place, compiled, rays, SHADER, **options)
-        actual, own_marks = trace(place, compiled, rays, mine("Plain", transfer=SHADER), **options)
+        expected, marks = trace(t, compiled, rays, SHADER, **options)
+        actual, own_marks = trace(t, compiled, rays, mine("Plain", transfer=SHADER), **options)
         assert_same(compiled, actual, expected, FIELDS)
         assert_same(compiled, own_marks, marks, marks)
-        assert bool(marks["request"].any()) == (place is holes)
-        assert place is holes or expected["alpha"].max() > 0.9
+        assert bool(marks["request"].any()) == (t is holes)
+        assert t is holes or expected["alpha"].max() > 0.9
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -217,8 +217,8 @@ def test_it_goes_through_lenses_clips_layers_and_scenes(blobs):
 def test_script_compile_export_and_pickle(tree, compiled, name):
     torch._dynamo.reset()
     tree = copy_to(tree, DEVICES[compiled])
-    own = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
-    tracer, rays = gv.TreeTracer(tree, mine(name, **own)), world_rays(tree.box, 33, tree.device)
+    options = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
+    tracer, rays = gv.TreeTracer(tree, mine(name, **options)), world_rays(tree.box, 33, tree.device)
     expected = tracer.hits(*rays)
     file = io.BytesIO()
     torch.jit.save(torch.jit.script(tracer), file)
@@ -235,8 +235,8 @@ def test_script_compile_export_and_pickle(tree, compiled, name):
 @pytest.mark.parametrize("name", ["Bands", "LitFeatures"])
 def test_opcheck_and_memory_safety(tree, compiled, name, dtype):
     tree = copy_to(tree, DEVICES[compiled])
-    own = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
-    shader = mine(name, **own)
+    options = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
+    shader = mine(name, **options)
     rays, traced, shading, parameters = op_arguments(tree, shader, dtype)
     op = getattr(torch.ops.gvtorch_user, shader.op).default
     torch.library.opcheck(op, (*rays, *traced, *shading, parameters))
@@ -294,8 +294,8 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path, mo
     body = '  // #include "none.h"\n' + ADD.replace("COLOR", "kColor")
     header = write_header(tmp_path, body)
     header.write_text('#include "color.h"\n' + header.read_text())
-    own = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": compiler}
-    for name, value in own.items():
+    environment = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": compiler}
+    for name, value in environment.items():
         monkeypatch.setenv(name, value)
     assert in_processes(2, header) == ["0.25", "0.25"]
     calls = count.read_text()
@@ -329,16 +329,16 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path, mo
 )
 @pytest.mark.backend("cpp")
 def test_the_compilers_words_are_shown_as_they_are(tmp_path, monkeypatch, body, name, message):
-    own, header = tmp_path / "cache", write_header(tmp_path, body)
-    monkeypatch.setenv("GVTORCH_CACHE", str(own))
+    cache_folder, header = tmp_path / "cache", write_header(tmp_path, body)
+    monkeypatch.setenv("GVTORCH_CACHE", str(cache_folder))
     with pytest.raises(gv.CompileError) as caught:
         gv.CompiledShader(header, name)
     first, *rest = str(caught.value).splitlines()
     assert first.startswith(f"{header}: {name} did not compile for the CPU with: ")
     assert compilers.find_cxx()[0] in first and "-ffp-contract=off" in first
-    said = "\n".join(rest).replace("\u2018", "'").replace("\u2019", "'")
-    assert re.search(message if "\\" in message else re.escape(message), said), said
-    assert not built(own), "nothing of it is kept"
+    text = "\n".join(rest).replace("\u2018", "'").replace("\u2019", "'")
+    assert re.search(message if "\\" in message else re.escape(message), text), text
+    assert not built(cache_folder), "nothing of it is kept"
 
 
 @pytest.mark.backend("cpp")
@@ -413,8 +413,8 @@ def test_a_damaged_library_is_compiled_again(tmp_path, monkeypatch):
     """The file is cut to nothing, to half (which crashes the loader), and by its last byte; the
     compiler copies a library that was made once.
     """
-    made = user.compiled(user.ShaderSource.read(HEADER, "mine::Plain"), ()).read_bytes()[:-32]
-    (tmp_path / "made.so").write_bytes(made)
+    content = user.compiled(user.ShaderSource.read(HEADER, "mine::Plain"), ()).read_bytes()[:-32]
+    (tmp_path / "made.so").write_bytes(content)
     compiler = tmp_path / "c++"
     compiler.write_text(f"#!/bin/sh\ncp {tmp_path}/made.so shader.so\n")
     compiler.chmod(0o755)
@@ -423,7 +423,7 @@ def test_a_damaged_library_is_compiled_again(tmp_path, monkeypatch):
     source = user.ShaderSource.read(write_header(tmp_path, ADD.replace("COLOR", "0.5")), "Own")
     library = user.compiled(source, ())
     whole = library.read_bytes()
-    assert whole[:-32] == made and whole.startswith(b"\x7fELF")
+    assert whole[:-32] == content and whole.startswith(b"\x7fELF")
     for left in (0, len(whole) // 2, -1):
         library.write_bytes(whole[:left])
         assert user.compiled(source, ()) == library and library.read_bytes() == whole
@@ -499,8 +499,8 @@ def test_folders_of_headers_that_the_environment_names_count(tmp_path, monkeypat
 def test_what_is_included_otherwise_counts_as_well(tmp_path, monkeypatch):
     """Included by a macro, over two lines, or in brackets: no stale library is used."""
     header = write_header(tmp_path, ADD.replace("COLOR", "kA + kB + kC"))
-    ways = '#define FILE_A "a.h"\n#include FILE_A\n#include \\\n"b.h"\n#include <c.h>\n'
-    header.write_text(ways + header.read_text())
+    includes = '#define FILE_A "a.h"\n#include FILE_A\n#include \\\n"b.h"\n#include <c.h>\n'
+    header.write_text(includes + header.read_text())
     (tmp_path / "found").mkdir()
     folders = {"a": tmp_path, "b": tmp_path, "c": tmp_path / "found"}
     values = dict.fromkeys("abc", 0.125)
@@ -512,9 +512,9 @@ def test_what_is_included_otherwise_counts_as_well(tmp_path, monkeypatch):
         for name, value in values.items():
             text = f"constexpr float k{name.upper()} = {value}f;\n"
             (folders[name] / f"{name}.h").write_text(text)
-        found = made(header).read_text(errors="replace")
+        compiled_text = made(header).read_text(errors="replace")
         for name, value in values.items():
-            assert f"k{name.upper()} = {value}f;" in found, (changed, name)
+            assert f"k{name.upper()} = {value}f;" in compiled_text, (changed, name)
 
 
 @pytest.mark.backend("cpp")
@@ -570,12 +570,12 @@ def test_folders_above_and_libraries_are_looked_at(tmp_path, monkeypatch):
     library = made(header)
     assert not left.exists(), "what a killed compilation left is gone"
     assert [*(cache / "shaders").iterdir()] == [library]
-    for place in (library, cache.parent):
-        mode = place.stat().st_mode
-        place.chmod(0o777)
-        with pytest.raises(RuntimeError, match=rf"others may write to {place}; GVTORCH_CACHE"):
+    for path in (library, cache.parent):
+        mode = path.stat().st_mode
+        path.chmod(0o777)
+        with pytest.raises(RuntimeError, match=rf"others may write to {path}; GVTORCH_CACHE"):
             gv.CompiledShader(header, "Own")
-        place.chmod(mode)
+        path.chmod(mode)
 
 
 @pytest.mark.backend("cpp")

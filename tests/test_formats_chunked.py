@@ -128,7 +128,7 @@ def test_broken_arrays_give_one_line(tmp_path, grid, kind):
         zarr_format=int(kind[1]),
     )
     made[:] = grid
-    assert_robust(tmp_path / "a", tmp_path / "broken", least=8)
+    assert_robust(tmp_path / "a", tmp_path / "broken", min_refused=8)
 
 
 # --- raw

@@ -326,7 +326,7 @@ def test_broken_vtk_gives_one_line(tmp_path, grid, kind):
     writer.SetInputData(vtk_image(grid))
     getattr(writer, f"SetFileTypeTo{kind}")()
     writer.Write()
-    assert_robust(tmp_path / "a.vtk", tmp_path / "broken", least=8)
+    assert_robust(tmp_path / "a.vtk", tmp_path / "broken", min_refused=8)
 
 
 def vti_of_text(path, arrays: str, before: str = ""):

@@ -283,11 +283,13 @@ def test_the_command_line_and_stores(tmp_path, monkeypatch):
 def test_broken_files_of_openvdb(tmp_path, packing):
     grid = Grid("float", 7, metadata=BOX)
     leaf_values(grid, np.random.default_rng(3))
-    assert_robust(VdbWriter(packing=packing).write(tmp_path / "a.vdb", grid), tmp_path, least=20)
+    assert_robust(
+        VdbWriter(packing=packing).write(tmp_path / "a.vdb", grid), tmp_path, min_refused=20
+    )
 
 
 @pytest.mark.parametrize("codec", [0, 1, 2])
 def test_broken_files_of_nanovdb(tmp_path, codec):
     content, (number, _) = nano_grid("float", np.random.default_rng(1))
     path = nano_file(tmp_path / "a.nvdb", ("a", number, content), codec=codec)
-    assert_robust(path, tmp_path, least=20)
+    assert_robust(path, tmp_path, min_refused=20)

@@ -38,23 +38,23 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
     with engine() as served:
         expected = served.render(view(), TRANSFER)
         assert expected.stats.converged and (expected.alpha > 0.5).any()
-    with engine() as own:
-        frames = Frames(own, view(), TRANSFER, batch)
-        own.trees["scene"].producer.batch_sizes.clear()
-        made = {"tiles": 0, "bricks": 0, "constant": 0}
+    with engine() as recorder:
+        frames = Frames(recorder, view(), TRANSFER, batch)
+        recorder.trees["scene"].producer.batch_sizes.clear()
+        produced = {"tiles": 0, "bricks": 0, "constant": 0}
         for _ in range(400):
             hits, stats = frames.frame()
             assert stats.produced["bricks"] <= batch
             assert stats.produced["tiles"] <= batch * (1 + MAX_EXTRA_LEVELS)
-            made = {name: made[name] + stats.produced[name] for name in made}
+            produced = {name: produced[name] + stats.produced[name] for name in produced}
             if stats.converged:
                 break
         assert stats.converged and not stats.capacity_exceeded
-        own.validate()
-        assert set(own.trees["scene"].producer.batch_sizes) == {batch * branching**3}
-        there = int((own.cache.bricks.owner_b >= 0).sum())
-        assert made["bricks"] == there - 1, "the root was there"
-        assert made["tiles"] > 20 and (made["constant"] > 0) == kinds
+        recorder.validate()
+        assert set(recorder.trees["scene"].producer.batch_sizes) == {batch * branching**3}
+        there = int((recorder.cache.bricks.owner_b >= 0).sum())
+        assert produced["bricks"] == there - 1, "the root was there"
+        assert produced["tiles"] > 20 and (produced["constant"] > 0) == kinds
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
 
@@ -86,12 +86,12 @@ def test_joined_producers_are_recorded_where_all_are(backend):
     options = {"brick_pool": "16 MB", "device": DEVICES[backend]}
     with gv.Engine(joined(), **options) as served:
         expected, other = (served.render(view(), TRANSFER, channel=name) for name in "ab")
-    with gv.Engine(joined(), **options) as own:
-        frames = Frames(own, view(), TRANSFER, 64)
+    with gv.Engine(joined(), **options) as recorder:
+        frames = Frames(recorder, view(), TRANSFER, 64)
         assert isinstance(frames.served, DeviceFrame)
         hits, stats = frames.whole()
-        own.validate()
-        assert torch.equal(own.render(view(), TRANSFER, channel="b").color, other.color)
+        recorder.validate()
+        assert torch.equal(recorder.render(view(), TRANSFER, channel="b").color, other.color)
     assert stats.converged and (expected.alpha > 0.5).any()
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     cast = Ball(64)
@@ -175,15 +175,15 @@ def test_what_the_host_would_have_to_see_to_is_refused():
 
 def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, gv.FrameStats]:
     """Returns the number of nodes that a turning camera missed, and its final view."""
-    missed, looks = 0, 0
+    missed, looked_ahead = 0, 0
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
         engine.render(view(64, 0), TRANSFER)
         frames = Frames(engine, view(64, 0), TRANSFER, 256, look_ahead)
         for step in range(1, 25):
             frames.look_from(view(64, 1.5 * step))
             hits, stats = frames.frame()
-            missed, looks = missed + stats.misses, looks + (stats.ahead > 0)
-        assert looks == (0 if look_ahead == 0 else 23 if look_ahead < 8 else 6)
+            missed, looked_ahead = missed + stats.misses, looked_ahead + (stats.ahead > 0)
+        assert looked_ahead == (0 if look_ahead == 0 else 23 if look_ahead < 8 else 6)
         for _ in range(30):
             hits, stats = frames.frame()
             assert stats.ahead == 0, "it stands still"
@@ -200,29 +200,29 @@ def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, g
 @pytest.mark.parametrize("look_ahead, fewer", [(3, 2), (16, 2)])
 def test_rays_ahead_of_a_moving_camera_ask_for_what_it_would_miss(look_ahead, fewer):
     missed, hits, stats = missed_on_a_flight("cpp", 0)
-    left, same, own = missed_on_a_flight("cpp", look_ahead)
+    left, same, last_stats = missed_on_a_flight("cpp", look_ahead)
     assert left * fewer < missed and missed > 100
-    assert torch.equal(hits.color, same.color) and own.bricks_used == stats.bricks_used
+    assert torch.equal(hits.color, same.color) and last_stats.bricks_used == stats.bricks_used
 
 
 @pytest.mark.backend("cpp")
 def test_what_the_picture_misses_comes_before_what_the_next_ones_will():
     """The picture's misses are counted as without look-ahead rays."""
-    told = []
+    counts = []
     for look_ahead in (0, 5):
         with gv.Engine(Ball(1024), brick_pool="64 MB") as engine:
             frames = Frames(engine, view(64, 0), TRANSFER, 8, look_ahead)
             for angle in (0, 0, 1, 3):
                 frames.look_from(view(64, angle))
                 _, stats = frames.frame()
-            told.append((stats.requests, stats.misses, stats.bricks_used, stats.tiles_used))
-            wanted = frames.served._requests[0, 0]
-            chosen = torch.cat([one.node for one in frames.served.choose()])
+            counts.append((stats.requests, stats.misses, stats.bricks_used, stats.tiles_used))
+            requested = frames.served._requests[0, 0]
+            chosen = torch.cat([choice.node for choice in frames.served.choose()])
             assert (chosen >= 0).any() and (stats.ahead > 0) == (look_ahead > 0)
-            assert torch.isin(chosen[chosen >= 0], wanted.long()).all()
-            words = engine.cache.nodes.request_tn
-            assert not (words >> REQUEST_PENDING_SHIFT).any(), "nothing is on its way"
-    assert told[0] == told[1] and told[0][1] > 16
+            assert torch.isin(chosen[chosen >= 0], requested.long()).all()
+            request_words = engine.cache.nodes.request_tn
+            assert not (request_words >> REQUEST_PENDING_SHIFT).any(), "nothing is on its way"
+    assert counts[0] == counts[1] and counts[0][1] > 16
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -242,24 +242,24 @@ def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
         engine.validate()
         assert stats.converged
         seen = stats.tiles_used
-        made = int((engine.cache.nodes.parent_t >= 0).sum())
+        tiles = int((engine.cache.nodes.parent_t >= 0).sum())
     deepest = depth[-1]
     reached = depth.index(deepest)
     if loading == "levels":
         assert reached >= deepest, "a level needs its bricks first"
     else:
-        assert deepest > 3 and reached <= 2 < deepest and made < 3 * seen
+        assert deepest > 3 and reached <= 2 < deepest and tiles < 3 * seen
 
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_a_frame_deepens_by_no_more_than_its_most(backend):
     """Whatever look-ahead rays request, which may be far more than the frame itself requests."""
-    for priority, most in (
+    for priority, max_levels in (
         ([1024] * 3 + [-1] * 500, MAX_EXTRA_LEVELS),
         ([0, 16, 32, -1], 0),
         ([-1], 0),
     ):
-        assert extra_levels(levels_wanted(torch.tensor(priority), 2).tolist()) == most
+        assert extra_levels(levels_wanted(torch.tensor(priority), 2).tolist()) == max_levels
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
         frames, levels = Frames(engine, view(64, 0), TRANSFER, 256, 8), []
         for turn in range(20):
@@ -334,8 +334,8 @@ def test_a_long_flight_does_not_wait(blobs, tmp_path, scene, look_ahead, backend
         assert stats.converged and sum(stats.misses > 0 for stats in flight) > 0.1 * len(path)
         assert any(stats.ahead for stats in flight) == (look_ahead > 0)
         engine.validate()
-        shown = color.clone()
-        assert torch.equal(engine.render(path[-1], TRANSFER).color.reshape(-1, 3), shown)
+        last_color = color.clone()
+        assert torch.equal(engine.render(path[-1], TRANSFER).color.reshape(-1, 3), last_color)
 
 
 @pytest.mark.backend("cuda")
@@ -344,21 +344,21 @@ def test_a_flight_is_replayed_without_the_host():
     with gv.Engine(Ball(1024), brick_pool="64 MB", device="cuda") as engine:
         graph, picture, _, missed = flown(engine, PATH, 256)
         assert sum(graph.replay(PATH[-1])[1].settle().produced.values()) == 0
-        shown = picture.color.clone()
+        last_color = picture.color.clone()
         served = engine.render(PATH[-1], TRANSFER)
-        assert torch.equal(served.color, shown)
+        assert torch.equal(served.color, last_color)
         engine.frame(view(96, 200), TRANSFER)  # another frame between two replays
         picture, stats = graph.replay(PATH[-1])
-        assert stats.settle().converged and torch.equal(picture.color, shown)
+        assert stats.settle().converged and torch.equal(picture.color, last_color)
     with gv.Engine(Ball(1024), brick_pool="64 MB", device="cuda") as engine:
         _, picture, _, left = flown(engine, PATH, 256, look_ahead=6)
-        assert torch.equal(picture.color, shown) and left < 0.8 * missed
+        assert torch.equal(picture.color, last_color) and left < 0.8 * missed
     with gv.Engine(Unsaid(1024), brick_pool="64 MB", device="cuda") as engine:
         expected = engine.render(PATH[-1], TRANSFER)
         graph = engine.capture(PATH[-1], TRANSFER)
         picture, stats = graph.replay(view(96, 200))
         assert not stats.settle().converged and sum(stats.produced.values()) == 0
-    assert torch.equal(expected.color, shown)
+    assert torch.equal(expected.color, last_color)
 
 
 @pytest.mark.backend("cuda")
@@ -384,18 +384,18 @@ def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
         few.copy_(least)
         return torch.cat((total, few.double()))
 
-    found, replay = step(), None
+    results, replay = step(), None
     if device.type == "cuda":
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
-            found = step()
+            results = step()
         replay = graph.replay
     for turn in range(2, 40):
         if replay is None:
-            found = step()
+            results = step()
         else:
             replay()
-        assert found.tolist() == [turn * (1 << 20), turn, turn, turn]
+        assert results.tolist() == [turn * (1 << 20), turn, turn, turn]
 
 
 @pytest.mark.backend("cuda")
@@ -432,10 +432,10 @@ def test_what_the_frame_before_asks_for_is_on_its_way(chosen):
     """The earlier frame's rays marked nodes as pending, so the next frame does not report them; and
     it may be settled before the host has requested any.
     """
-    asked = []
+    requests = []
 
     def ask(numbers: Tensor) -> int:
-        asked.append(numbers.tolist())
+        requests.append(numbers.tolist())
         return chosen
 
     counts = torch.zeros(len(Counts._fields) + 3, dtype=torch.int64)
@@ -444,4 +444,4 @@ def test_what_the_frame_before_asks_for_is_on_its_way(chosen):
     after = Readback(stats[1], Collected(None, counts), (before,))
     Readback(stats[2], Collected(None, counts), (before, after))
     assert stats[2].settle().converged == stats[1].settle().converged == (chosen == 0)
-    assert before.ask() == chosen and asked == [[0, 0, 0]], "it asks once"
+    assert before.ask() == chosen and requests == [[0, 0, 0]], "it asks once"
