@@ -31,11 +31,11 @@ class Cloud:
     g: float = 0.0  # mean cosine of scattering
     to_sun: np.ndarray = field(default_factory=lambda: np.array((0.0, 0.0, 1.0)))
 
-    def at(self, places: np.ndarray) -> np.ndarray:
+    def at(self, points: np.ndarray) -> np.ndarray:
         """Returns (k,) extinction at places (k, 3): trilinear, 0 outside."""
         size = np.array(self.density.shape)
-        inside = ((places > 0) & (places < size - 1)).all(1)
-        p = np.clip(places, 0, size - 1.001)
+        inside = ((points > 0) & (points < size - 1)).all(1)
+        p = np.clip(points, 0, size - 1.001)
         low = p.astype(np.int64)
         f = (p - low).astype(np.float32)
         x, y, z = low.T
@@ -51,19 +51,19 @@ class Cloud:
         far = line(row + right) + fy * (line(row + right + up) - line(row + right))
         return np.where(inside, near + fx * (far - near), 0)
 
-    def exits(self, places: np.ndarray, ways: np.ndarray) -> np.ndarray:
-        """Returns (k,) distances from places to where rays along `ways` leave the box."""
+    def exits(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Returns (k,) distances from places to where rays along `directions` leave the box."""
         size = np.array(self.density.shape) - 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
-            ends = np.maximum((0 - places) / ways, (size - places) / ways)
-        return np.nanmin(np.where(ways == 0, np.inf, ends), 1)
+            ends = np.maximum((0 - points) / directions, (size - points) / directions)
+        return np.nanmin(np.where(directions == 0, np.inf, ends), 1)
 
-    def enters(self, places: np.ndarray, ways: np.ndarray) -> np.ndarray:
+    def enters(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Returns (k,) distances to where rays enter the box; beyond `exits` if they miss it."""
         size = np.array(self.density.shape) - 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
-            begins = np.minimum((0 - places) / ways, (size - places) / ways)
-        return np.maximum(np.where(ways == 0, -np.inf, begins).max(1), 0)
+            begins = np.minimum((0 - points) / directions, (size - points) / directions)
+        return np.maximum(np.where(directions == 0, -np.inf, begins).max(1), 0)
 
 
 def phase(g: float, cosine: np.ndarray) -> np.ndarray:
@@ -71,61 +71,61 @@ def phase(g: float, cosine: np.ndarray) -> np.ndarray:
     return (1 - g * g) / (1 + g * g - 2 * g * cosine) ** 1.5
 
 
-def scatter(ways: np.ndarray, g: float, rng: np.random.Generator) -> np.ndarray:
+def scatter(directions: np.ndarray, g: float, rng: np.random.Generator) -> np.ndarray:
     """Returns random directions (k, 3) after a scattering event."""
-    u, turn = rng.random(len(ways)), 2 * np.pi * rng.random(len(ways))
+    u, angle = rng.random(len(directions)), 2 * np.pi * rng.random(len(directions))
     if abs(g) < 1e-3:
         cosine = 2 * u - 1
     else:
         cosine = (1 + g * g - ((1 - g * g) / (1 - g + 2 * g * u)) ** 2) / (2 * g)
     sine = np.sqrt(np.maximum(1 - cosine**2, 0))
-    x, y, z = ways.T
+    x, y, z = directions.T
     sign = np.where(z >= 0, 1.0, -1.0)  # an orthonormal frame, without branches
     a = -1 / (sign + z)
     b = x * y * a
-    one = np.stack((1 + sign * x * x * a, sign * b, -sign * x), 1)
-    other = np.stack((b, sign + y * y * a, -y), 1)
-    around = one * np.cos(turn)[:, None] + other * np.sin(turn)[:, None]
-    return around * sine[:, None] + ways * cosine[:, None]
+    u_axis = np.stack((1 + sign * x * x * a, sign * b, -sign * x), 1)
+    v_axis = np.stack((b, sign + y * y * a, -y), 1)
+    perpendicular = u_axis * np.cos(angle)[:, None] + v_axis * np.sin(angle)[:, None]
+    return perpendicular * sine[:, None] + directions * cosine[:, None]
 
 
 def track(
-    cloud: Cloud, places: np.ndarray, ways: np.ndarray, rng: np.random.Generator
+    cloud: Cloud, points: np.ndarray, directions: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns (k,) distances to the next collision, and whether there is one inside the box."""
-    most = float(cloud.density.max())
-    ends, t = cloud.exits(places, ways), np.zeros(len(places))
-    hit = np.zeros(len(places), bool)
-    going = np.arange(len(places))
-    while len(going):
-        t[going] -= np.log1p(-rng.random(len(going))) / most
-        going = going[t[going] < ends[going]]
-        found = cloud.at(places[going] + t[going, None] * ways[going])
-        real = rng.random(len(going)) * most < found
-        hit[going[real]] = True
-        going = going[~real]
+    peak = float(cloud.density.max())
+    ends, t = cloud.exits(points, directions), np.zeros(len(points))
+    hit = np.zeros(len(points), bool)
+    live = np.arange(len(points))
+    while len(live):
+        t[live] -= np.log1p(-rng.random(len(live))) / peak
+        live = live[t[live] < ends[live]]
+        density = cloud.at(points[live] + t[live, None] * directions[live])
+        real = rng.random(len(live)) * peak < density
+        hit[live[real]] = True
+        live = live[~real]
     return t, hit
 
 
-def clearness(cloud: Cloud, places: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def clearness(cloud: Cloud, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Returns (k,) estimates of the share of sunlight that reaches places, by ratio tracking."""
-    most = float(cloud.density.max())
-    ways = np.broadcast_to(cloud.to_sun, places.shape)
-    ends, t, clear = cloud.exits(places, ways), np.zeros(len(places)), np.ones(len(places))
-    going = np.arange(len(places))
-    while len(going):
-        t[going] -= np.log1p(-rng.random(len(going))) / most
-        going = going[t[going] < ends[going]]
-        clear[going] *= 1 - cloud.at(places[going] + t[going, None] * ways[going]) / most
-        kept = clear[going] > rng.random(len(going)) * 0.1  # roulette below a tenth
-        clear[going] = np.where(clear[going] < 0.1, 0.1, clear[going])
-        clear[going[~kept]] = 0
-        going = going[kept]
+    peak = float(cloud.density.max())
+    directions = np.broadcast_to(cloud.to_sun, points.shape)
+    ends, t, clear = cloud.exits(points, directions), np.zeros(len(points)), np.ones(len(points))
+    live = np.arange(len(points))
+    while len(live):
+        t[live] -= np.log1p(-rng.random(len(live))) / peak
+        live = live[t[live] < ends[live]]
+        clear[live] *= 1 - cloud.at(points[live] + t[live, None] * directions[live]) / peak
+        kept = clear[live] > rng.random(len(live)) * 0.1  # roulette below a tenth
+        clear[live] = np.where(clear[live] < 0.1, 0.1, clear[live])
+        clear[live[~kept]] = 0
+        live = live[kept]
     return clear
 
 
 def path_trace(
-    cloud: Cloud, eyes: np.ndarray, ways: np.ndarray, samples: int, seed: int = 0
+    cloud: Cloud, eyes: np.ndarray, directions: np.ndarray, samples: int, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Estimates the light that comes along rays (r, 3) from a sun of irradiance 4 pi.
 
@@ -135,28 +135,28 @@ def path_trace(
     rng = np.random.default_rng(seed)
     total, square = np.zeros(len(eyes)), np.zeros(len(eyes))
     for _ in range(samples):
-        one = _paths(cloud, eyes, ways, rng)
-        total, square = total + one, square + one**2
+        radiance = _paths(cloud, eyes, directions, rng)
+        total, square = total + radiance, square + radiance**2
     mean = total / samples
     return mean, np.sqrt(np.maximum(square / samples - mean**2, 0) / max(samples - 1, 1))
 
 
 def _paths(
-    cloud: Cloud, eyes: np.ndarray, ways: np.ndarray, rng: np.random.Generator
+    cloud: Cloud, eyes: np.ndarray, directions: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """Returns (r,) radiance, estimated by one path of each ray."""
-    light, begin = np.zeros(len(eyes)), cloud.enters(eyes, ways)
-    which = np.flatnonzero(begin < cloud.exits(eyes, ways))
-    place, way = eyes[which] + begin[which, None] * ways[which], ways[which]
+    light, begin = np.zeros(len(eyes)), cloud.enters(eyes, directions)
+    alive = np.flatnonzero(begin < cloud.exits(eyes, directions))
+    point, direction = eyes[alive] + begin[alive, None] * directions[alive], directions[alive]
     weight = 1.0
-    while len(which) and weight > 1e-3:
-        t, hit = track(cloud, place, way, rng)
-        which, place, way = which[hit], (place + t[:, None] * way)[hit], way[hit]
+    while len(alive) and weight > 1e-3:
+        t, hit = track(cloud, point, direction, rng)
+        alive, point, direction = alive[hit], (point + t[:, None] * direction)[hit], direction[hit]
         weight *= cloud.albedo
-        cosine = way @ cloud.to_sun
-        # `way` is opposite to the light's: a ray that continues towards the sun scatters forwards
-        light[which] += weight * phase(cloud.g, cosine) * clearness(cloud, place, rng)
-        way = scatter(way, cloud.g, rng)
+        cosine = direction @ cloud.to_sun
+        # `direction` is opposite to the light's: a ray on to the sun scatters forwards
+        light[alive] += weight * phase(cloud.g, cosine) * clearness(cloud, point, rng)
+        direction = scatter(direction, cloud.g, rng)
     return light
 
 
@@ -166,10 +166,10 @@ def _paths(
 def noisy(side: int = 48, seed: int = 7) -> np.ndarray:
     """Returns the density (x, y, z) of a round cloud of noise, 0 to 1, zero at the faces."""
     axis = (torch.arange(side) - (side - 1) / 2) / (side / 2)
-    places = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    rough = gv.noise.fbm(3 * places, octaves=4, seed=seed)
-    away = (places * torch.tensor([1.0, 1.3, 1.0])).norm(dim=-1)
-    density = (3 * (0.7 - away + 0.45 * rough)).clamp(0, 1).numpy()
+    positions = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    noise = gv.noise.fbm(3 * positions, octaves=4, seed=seed)
+    distance = (positions * torch.tensor([1.0, 1.3, 1.0])).norm(dim=-1)
+    density = (3 * (0.7 - distance + 0.45 * noise)).clamp(0, 1).numpy()
     density[[0, -1]] = density[:, [0, -1]] = density[:, :, [0, -1]] = 0
     return density
 
@@ -188,15 +188,15 @@ def from_file(path: Path, side: int = 64) -> np.ndarray:
 
 def shader(cloud: Cloud, octaves: int) -> gv.Lit:
     """Returns the shader of a tree whose voxels hold the cloud's extinction."""
-    most = float(cloud.density.max())
-    values = [most * n / 256 for n in range(257)]
+    peak = float(cloud.density.max())
+    values = [peak * n / 256 for n in range(257)]
     albedo = (cloud.albedo,) * 3
     transfer = gv.TransferFunction(
         [(value, 1 - math.exp(-value)) for value in values], [(0.0, *albedo)], 1.0
     )
     sun = gv.DirectionalLight(tuple((-cloud.to_sun).tolist()))
-    look = {"ambient": 0.0, "diffuse": 1.0, "specular": 0.0, "anisotropy": cloud.g}
-    return gv.Lit(transfer, light=sun, octaves=octaves, **look)
+    shading = {"ambient": 0.0, "diffuse": 1.0, "specular": 0.0, "anisotropy": cloud.g}
+    return gv.Lit(transfer, light=sun, octaves=octaves, **shading)
 
 
 def compare(cloud: Cloud, pixels: int, samples: int, octaves: list[int]) -> dict[int, list[float]]:
@@ -207,15 +207,15 @@ def compare(cloud: Cloud, pixels: int, samples: int, octaves: list[int]) -> dict
     camera = gv.Camera.orbit(30, 10, 1.3, fov=40, width=pixels * 4 // 3, height=pixels)
     rays = camera.placed(tree.box).rays()
     truth, error = path_trace(cloud, rays.origin.numpy(), rays.direction.numpy(), samples)
-    found = {}
+    results = {}
     for count in octaves:
         hits = gv.trace(tree, rays, shader(cloud, count), lod="finest", step=0.5, stop_alpha=0.999)
-        shown = hits.alpha[:, 0].numpy() > 0.05
-        light, wanted = hits.color[:, 0].double().numpy()[shown], truth[shown]
-        off = ((light - wanted) ** 2 - error[shown] ** 2).mean()
-        found[count] = [light.mean() / wanted.mean(), math.sqrt(max(off, 0)) / wanted.mean()]
-    found[0] = [1.0, math.sqrt((error[shown] ** 2).mean()) / wanted.mean()]
-    return found
+        visible = hits.alpha[:, 0].numpy() > 0.05
+        light, expected = hits.color[:, 0].double().numpy()[visible], truth[visible]
+        mse = ((light - expected) ** 2 - error[visible] ** 2).mean()
+        results[count] = [light.mean() / expected.mean(), math.sqrt(max(mse, 0)) / expected.mean()]
+    results[0] = [1.0, math.sqrt((error[visible] ** 2).mean()) / expected.mean()]
+    return results
 
 
 #: Directions to the sun: right, up, away from the camera.
@@ -243,26 +243,26 @@ class Settings:
 def main(settings: Settings) -> None:
     """Compares all clouds, and prints the table."""
     shapes = {"noise": noisy()} | {path.stem: from_file(path) for path in settings.files}
-    heads = [f"octaves {n}" for n in settings.octaves]
-    print("| cloud | extinction | albedo | g | sun | paths' noise |", " | ".join(heads), "|")
-    print("|---" * (6 + len(heads)) + "|")
-    all_off: dict[int, list[float]] = {n: [] for n in settings.octaves}
+    titles = [f"octaves {n}" for n in settings.octaves]
+    print("| cloud | extinction | albedo | g | sun | paths' noise |", " | ".join(titles), "|")
+    print("|---" * (6 + len(titles)) + "|")
+    errors: dict[int, list[float]] = {n: [] for n in settings.octaves}
     for name, shape in shapes.items():
-        for most, albedo, g in product(settings.optical, settings.albedo, settings.g):
-            for sun, way in SUNS.items():
-                to_sun = eye_to_world(np.array(way))
-                cloud = Cloud(most * shape, albedo, g, to_sun)
-                found = compare(cloud, settings.pixels, settings.samples, list(settings.octaves))
-                cells = [f"{found[n][0]:.2f} / {found[n][1]:.2f}" for n in settings.octaves]
+        for max_extinction, albedo, g in product(settings.optical, settings.albedo, settings.g):
+            for sun, direction in SUNS.items():
+                to_sun = eye_to_world(np.array(direction))
+                cloud = Cloud(max_extinction * shape, albedo, g, to_sun)
+                results = compare(cloud, settings.pixels, settings.samples, list(settings.octaves))
+                cells = [f"{results[n][0]:.2f} / {results[n][1]:.2f}" for n in settings.octaves]
                 for n in settings.octaves:
-                    all_off[n].append(found[n][1])
-                words = (name, most, albedo, g, sun, f"{found[0][1]:.2f}")
-                print("|", " | ".join(map(str, words)), "|", " | ".join(cells), "|", flush=True)
-    rms = [f"{math.sqrt(np.mean(np.square(all_off[n]))):.2f}" for n in settings.octaves]
+                    errors[n].append(results[n][1])
+                columns = (name, max_extinction, albedo, g, sun, f"{results[0][1]:.2f}")
+                print("|", " | ".join(map(str, columns)), "|", " | ".join(cells), "|", flush=True)
+    rms = [f"{math.sqrt(np.mean(np.square(errors[n]))):.2f}" for n in settings.octaves]
     print("| all | | | | | |", " | ".join(rms), "|")
 
 
-def eye_to_world(way: np.ndarray) -> np.ndarray:
+def eye_to_world(direction: np.ndarray) -> np.ndarray:
     """Returns a unit vector (3,) in the world, from (right, up, away from the camera)."""
     camera = gv.Camera.orbit(30, 10, 1.3, width=3, height=3).placed(
         torch.tensor([[-1.0] * 3, [1.0] * 3], dtype=torch.float64)
@@ -270,8 +270,8 @@ def eye_to_world(way: np.ndarray) -> np.ndarray:
     ahead = camera.rays().direction[4].numpy()
     right = np.cross(ahead, (0.0, 1.0, 0.0))
     right /= np.linalg.norm(right)
-    found = way[0] * right + way[1] * np.cross(right, ahead) + way[2] * ahead
-    return found / np.linalg.norm(found)
+    vector = direction[0] * right + direction[1] * np.cross(right, ahead) + direction[2] * ahead
+    return vector / np.linalg.norm(vector)
 
 
 if __name__ == "__main__":

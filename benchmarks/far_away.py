@@ -60,11 +60,11 @@ class Settings:
 
 def functions(scan: str) -> dict[str, gv.TransferFunction]:
     """Returns the two transfer functions of a scan."""
-    _, (low, high, most), (clear, solid) = SCANS[scan]
+    _, (low, high, max_opacity), (clear, solid) = SCANS[scan]
     ramp = [(low, 0.5, 0.2, 0.1), ((low + high) / 2, 0.9, 0.7, 0.4), (high, 1, 1, 1)]
     skin = [(clear, 0.8, 0.4, 0.25), (2 * solid, 1, 0.9, 0.7)]
     return {
-        "translucent": gv.TransferFunction([(low, 0), (high, most)], ramp),
+        "translucent": gv.TransferFunction([(low, 0), (high, max_opacity)], ramp),
         "opaque": gv.TransferFunction([(clear, 0), (solid, 0.95)], skin),
     }
 
@@ -72,19 +72,19 @@ def functions(scan: str) -> dict[str, gv.TransferFunction]:
 def parallel(tree: gv.N3Tree, pixel: float, parts: int) -> gv.Rays:
     """Returns parallel rays through the tree, parts^2 a pixel, each as wide as its part."""
     real = {"dtype": torch.float64}
-    way = torch.nn.functional.normalize(torch.tensor([0.37, 0.23, 1.0], **real), dim=0)
-    across = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], **real), way)
+    view = torch.nn.functional.normalize(torch.tensor([0.37, 0.23, 1.0], **real), dim=0)
+    across = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], **real), view)
     across = across / across.norm()
-    up = torch.linalg.cross(way, across)
+    up = torch.linalg.cross(view, across)
     reach = float((tree.box[1] - tree.box[0]).norm()) / 2
     pixel = pixel * min(tree.spacing)
     side = math.ceil(2 * reach / pixel)
-    at = ((torch.arange(side * parts, **real) + 0.5) / parts - side / 2 + 0.37) * pixel
-    y, x = torch.meshgrid(at, at, indexing="ij")
-    origin = tree.box.mean(0) + x.reshape(-1, 1) * across + y.reshape(-1, 1) * up - 2 * reach * way
-    wide = torch.tensor([pixel / parts, 0.0], **real)
-    columns = (way, wide, torch.tensor([0.0, 1e9], **real))
-    direction, cone, limits = (one.expand(len(origin), -1).contiguous() for one in columns)
+    offsets = ((torch.arange(side * parts, **real) + 0.5) / parts - side / 2 + 0.37) * pixel
+    y, x = torch.meshgrid(offsets, offsets, indexing="ij")
+    origin = tree.box.mean(0) + x.reshape(-1, 1) * across + y.reshape(-1, 1) * up - 2 * reach * view
+    cone_width = torch.tensor([pixel / parts, 0.0], **real)
+    columns = (view, cone_width, torch.tensor([0.0, 1e9], **real))
+    direction, cone, limits = (column.expand(len(origin), -1).contiguous() for column in columns)
     rays = gv.Rays(origin=origin, direction=direction, cone=cone, range=limits)
     return rays.to(tree.device)
 
@@ -96,18 +96,18 @@ def draw(
     rays = parallel(tree, pixel, parts)
     hits = gv.trace(tree, rays, shader, lod=lod)
     side = math.isqrt(len(rays.origin)) // parts
-    found = torch.cat((hits.color, hits.alpha), 1).double()
-    found = found.reshape(side, parts, side, parts, 4).mean((1, 3)).cpu()
-    return found, int(hits.samples.sum())
+    image = torch.cat((hits.color, hits.alpha), 1).double()
+    image = image.reshape(side, parts, side, parts, 4).mean((1, 3)).cpu()
+    return image, int(hits.samples.sum())
 
 
-def compare(found: Tensor, truth: Tensor) -> str:
+def compare(image: Tensor, truth: Tensor) -> str:
     """Returns light, PSNR and SSIM as text."""
-    shown = (truth[..., 3] > 1e-3) | (found[..., 3] > 1e-3)
-    error = float((found - truth)[..., :3][shown].square().mean())
-    planes = (one[..., :3].movedim(-1, 0)[None].float() for one in (found, truth))
-    alike = float(ssim(*planes, window_size=7).mean(1)[0][shown].mean())
-    light = float(found[..., :3].sum() / truth[..., :3].sum())
+    visible = (truth[..., 3] > 1e-3) | (image[..., 3] > 1e-3)
+    error = float((image - truth)[..., :3][visible].square().mean())
+    images = (picture[..., :3].movedim(-1, 0)[None].float() for picture in (image, truth))
+    alike = float(ssim(*images, window_size=7).mean(1)[0][visible].mean())
+    light = float(image[..., :3].sum() / truth[..., :3].sum())
     return f"{light:.2f} / {-10 * math.log10(error + 1e-12):.1f} / {alike:.2f}"
 
 
@@ -117,28 +117,28 @@ def main(settings: Settings) -> None:
     print("| scan | function | voxels a pixel | one ray | means | filtered | samples | 16 rays |")
     print("|---|---|---|---|---|---|---|---|")
     for scan in SCANS:
-        if not any(one in scan for one in settings.only.split(",")):
+        if not any(one_ray in scan for one_ray in settings.only.split(",")):
             continue
         volume = gv.read_volume(settings.folder / SCANS[scan][0])
         tree = gv.N3Tree.from_volume(volume, device=settings.device)
         for name, transfer in functions(scan).items():
-            look = gv.Lit(transfer, light=SUN) if settings.lit else transfer
-            begin = time.perf_counter()
-            shader = gv.Filtered.of(tree, volume, look)
-            took = time.perf_counter() - begin
+            base_shader = gv.Lit(transfer, light=SUN) if settings.lit else transfer
+            start = time.perf_counter()
+            shader = gv.Filtered.of(tree, volume, base_shader)
+            seconds = time.perf_counter() - start
             size = tree.bricks.bricks["filtered"].nbytes / volume.data[..., 0].numel()
-            print(f"{scan}, {name}: {took:.1f} s, {size:.2f} bytes a voxel", file=sys.stderr)
+            print(f"{scan}, {name}: {seconds:.1f} s, {size:.2f} bytes a voxel", file=sys.stderr)
             for pixel in settings.pixels:
-                truth, _ = draw(tree, look, pixel, PARTS, "finest")
-                one, _ = draw(tree, look, pixel, 1, "finest")
-                means, before = draw(tree, look, pixel)
-                found, after = draw(tree, shader, pixel)
+                truth, _ = draw(tree, base_shader, pixel, PARTS, "finest")
+                one_ray, _ = draw(tree, base_shader, pixel, 1, "finest")
+                means, before = draw(tree, base_shader, pixel)
+                filtered, after = draw(tree, shader, pixel)
                 still, _ = draw(tree, shader, pixel, STILL)
-                scores = " | ".join(compare(each, truth) for each in (one, means, found))
+                scores = " | ".join(compare(image, truth) for image in (one_ray, means, filtered))
                 last = f"{after / before:.2f} | {compare(still, truth)}"
                 print(f"| {scan} | {name} | {pixel:g} | {scores} | {last} |", flush=True)
                 if pixel == settings.pixels[min(1, len(settings.pixels) - 1)]:
-                    rows.append(torch.stack((truth, found, means, one)))
+                    rows.append(torch.stack((truth, filtered, means, one_ray)))
     if settings.picture is not None:
         save(rows, settings.picture)
 
@@ -147,13 +147,13 @@ def save(rows: list[Tensor], path: Path) -> None:
     """Draws the rows, two side by side, each cut to what it shows."""
     boxes = []
     for row in rows:
-        shown = row[0, ..., 3] > 0.02
-        y, x = (shown.any(axis).nonzero()[:, 0] for axis in (1, 0))
+        visible = row[0, ..., 3] > 0.02
+        y, x = (visible.any(axis).nonzero()[:, 0] for axis in (1, 0))
         boxes.append((int(y[0]), int(y[-1]) + 1, int(x[0]), int(x[-1]) + 1))
-    wide = max(right - left for _, _, left, right in boxes) + 2
+    width = max(right - left for _, _, left, right in boxes) + 2
     tiles = []
     for row, (top, bottom, left, right) in zip(rows, boxes, strict=True):
-        missing = wide - (right - left)
+        missing = width - (right - left)
         cut = row[:, top:bottom, left:right, :3]
         cut = torch.nn.functional.pad(cut, (0, 0, missing // 2, missing - missing // 2, 1, 1))
         cut = cut.repeat_interleave(SCALE, 1).repeat_interleave(SCALE, 2)

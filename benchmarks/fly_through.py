@@ -84,11 +84,11 @@ class Worn(gv.Producer):
         #: Largest change of a value from one voxel of the finest level to the next.
         self.steepest = 5.1 * (1 + self.wear * sum(2 * k * weight for k, weight in self.octaves))
 
-    def value(self, places, voxel):
+    def value(self, axes, voxel):
         """Returns values at places x, y, z, which broadcast, for voxels of a width; the caller
         clamps them to 0..255.
         """
-        x, y, z = (2 / (self.extent[0] - 1) * place - 1 for place in places)
+        x, y, z = (2 / (self.extent[0] - 1) * place - 1 for place in axes)
         inside = 0.9 - (x * x + y * y + z * z).sqrt()
         for k, weight in self.octaves:
             (sx, cx), (sy, cy), (sz, cz) = (((k * a).sin(), (k * a).cos()) for a in (x, y, z))
@@ -147,8 +147,8 @@ def scene(settings: Settings) -> tuple[gv.Shader, list[gv.Camera]]:
         color = [(100, 0.3, 0.1, 0.05), (160, 0.9, 0.6, 0.3), (255, 1, 0.95, 0.8)]
         shader = gv.TransferFunction.from_points(opacity, color, reference=4.0)
         path = flight(settings.side / 2, settings.side / 2)
-    places = np.linspace(0, 1, settings.frames)
-    return shader, [path.camera(float(t), *settings.size) for t in places]
+    times = np.linspace(0, 1, settings.frames)
+    return shader, [path.camera(float(t), *settings.size) for t in times]
 
 
 def source(settings: Settings, store: Path) -> gv.Producer:
@@ -183,9 +183,9 @@ def fits(stats: gv.FrameStats) -> bool:
 
 def miss_rate(all_stats: list[gv.FrameStats]) -> str:
     """Returns bricks requested / (bricks requested + bricks used), summed over frames."""
-    asked = sum(stats.requests["load"] for stats in all_stats)
+    requested = sum(stats.requests["load"] for stats in all_stats)
     used = sum(stats.bricks_used for stats in all_stats)
-    return f"{asked / max(1, used + asked):.2%}"
+    return f"{requested / max(1, used + requested):.2%}"
 
 
 def fly_resident(store: Path, settings: Settings, console: Console) -> list[str]:
@@ -208,8 +208,12 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
     with gv.Engine(producer, device=settings.device, **options) as engine:
         engine.render(cameras[0], shader)  # the flight begins with its first view loaded
         if engine.device.type == "cuda" and settings.graph:
-            how = {"batch": settings.batch, "look_ahead": settings.look_ahead, "fit": settings.fit}
-            draw = engine.capture(cameras[0], shader, **how).replay
+            graph_options = {
+                "batch": settings.batch,
+                "look_ahead": settings.look_ahead,
+                "fit": settings.fit,
+            }
+            draw = engine.capture(cameras[0], shader, **graph_options).replay
         else:
             draw = partial(engine.frame, shader=shader)
         start = time.perf_counter()
@@ -235,8 +239,8 @@ def fly(producer: gv.Producer, pool: str, settings: Settings, console: Console) 
 def main(settings: Settings) -> None:
     """Makes the store once, then flies with each pool."""
     console = Console(stderr=True)
-    kept = nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory()
-    with kept as name:
+    context = nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory()
+    with context as name:
         folder = Path(str(name))
         store, raw = folder / "worn.zarr", folder / f"worn_{settings.side}.raw"
         if settings.source == "store" and not store.exists():

@@ -31,10 +31,10 @@ class Settings:
 
 def read(folder: Path) -> list[tuple[str, dict[str, Any]]]:
     """Returns name and content of each record, in the order of the workloads."""
-    found = [(file.stem, json.loads(file.read_text())) for file in sorted(folder.glob("*.json"))]
+    records = [(file.stem, json.loads(file.read_text())) for file in sorted(folder.glob("*.json"))]
     order = [*WORKLOADS]
-    kept = [(name, record) for name, record in found if not record["quick"]]
-    return sorted(kept, key=lambda item: order.index(item[1]["workload"]))
+    full_size = [(name, record) for name, record in records if not record["quick"]]
+    return sorted(full_size, key=lambda item: order.index(item[1]["workload"]))
 
 
 def section(folder: str, name: str, record: dict[str, Any], drawn: bool) -> str:
@@ -84,13 +84,13 @@ def _bars(pyplot: Any, record: dict[str, Any]) -> Any:
     )
     moves = all("bytes_per_second" in row for row in rows)
     middles = []
-    for place, row in enumerate(rows):
+    for y, row in enumerate(rows):
         ends = [row[name] for name in ("ms_low", "ms", "ms_high")]
         if moves:  # not all rows move as many bytes
             ends = [1e-6 * row["moved_bytes"] / ms for ms in reversed(ends)]
         low, middle, high = ends
         color = f"C{names.index(row['who']) % 10}"
-        axes.barh(place, middle, color=color, xerr=[[middle - low], [high - middle]], ecolor="0.4")
+        axes.barh(y, middle, color=color, xerr=[[middle - low], [high - middle]], ecolor="0.4")
         middles.append(middle)
     axes.set_yticks(range(len(rows)), [f"{row['case']}: {row['who']}" for row in rows], fontsize=7)
     axes.margins(y=0.01)

@@ -51,7 +51,7 @@ class Settings:
 
 def kernel_kind(kernel: str) -> str:
     """Returns the kind that a kernel belongs to."""
-    return next(kind for kind, words in KINDS.items() if any(word in kernel for word in words))
+    return next(kind for kind, parts in KINDS.items() if any(part in kernel for part in parts))
 
 
 def fly(settings: Settings, store: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -99,11 +99,11 @@ def draw(stages: list[dict[str, Any]], kernels: list[dict[str, Any]], output: Pa
     spans = [e for e in stages if e["ph"] == "X" and (e["tid"] or e["name"] != "read")]
     spans.sort(key=lambda event: -event["dur"])
     names = list(dict.fromkeys(e["name"] for e in spans))
-    rows = {tid: place for place, tid in enumerate(sorted(tracks, reverse=True))}
+    rows = {tid: y for y, tid in enumerate(sorted(tracks, reverse=True))}
     for event in spans:
-        place, color = rows[event["tid"]], f"C{names.index(event['name']) % 10}"
+        y, color = rows[event["tid"]], f"C{names.index(event['name']) % 10}"
         span = [(event["ts"] / 1e3, event["dur"] / 1e3)]
-        above.broken_barh(span, (place - 0.4, 0.8), color=color, edgecolor="white", linewidth=0.3)
+        above.broken_barh(span, (y - 0.4, 0.8), color=color, edgecolor="white", linewidth=0.3)
     above.set_yticks(list(rows.values()), [tracks[tid] for tid in rows])
     marks = [pyplot.Rectangle((0, 0), 1, 1, color=f"C{i % 10}") for i in range(len(names))]
     above.legend(marks, names, fontsize=8, ncols=4, loc="upper right")
@@ -116,9 +116,9 @@ def draw(stages: list[dict[str, Any]], kernels: list[dict[str, Any]], output: Pa
         spent[kind], counted[kind] = spent[kind] + event["dur"], counted[kind] + 1
     order = sorted(spent, key=lambda kind: spent[kind])
     for event in kernels:
-        place = order.index(kernel_kind(event["name"]))
+        y = order.index(kernel_kind(event["name"]))
         span = [((event["ts"] - first) / 1e3, event["dur"] / 1e3)]
-        below.broken_barh(span, (place - 0.4, 0.8), color=f"C{place}")
+        below.broken_barh(span, (y - 0.4, 0.8), color=f"C{y}")
     labels = [f"{kind}\n{counted[kind]}, {spent[kind]:.0f} us" for kind in order]
     below.set_yticks(range(len(order)), labels, fontsize=8)
     below.set_xlabel("milliseconds of one frame on the device, after the march of the one before")

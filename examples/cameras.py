@@ -34,13 +34,13 @@ def main(settings: Settings) -> None:
         gv.read_volume(DATA / "stent_256x128x128_int16.npz"), device=settings.device
     )
     shader = gv.TransferFunction.from_json(DATA / "stent.json")
-    high, low = settings.size, settings.size * 4 // 9  # a panorama is twice as wide as high
-    rest = high - low
+    height, lower = settings.size, settings.size * 4 // 9  # a panorama is twice as wide as high
+    upper = height - lower
     views = [
-        gv.Camera.look_at(OUTSIDE, AXIS, UP, 42, 2 * low, high),
-        gv.Camera.look_at(OUTSIDE, AXIS, UP, 48, 2 * low - rest, rest, "ortho"),
-        gv.Camera.look_at(INSIDE, AHEAD, (0, 1, 0), 180, rest, rest, "fisheye"),
-        gv.Camera.look_at(INSIDE, AHEAD, (0, 1, 0), 180, 2 * low, low, "panorama"),
+        gv.Camera.look_at(OUTSIDE, AXIS, UP, 42, 2 * lower, height),
+        gv.Camera.look_at(OUTSIDE, AXIS, UP, 48, 2 * lower - upper, upper, "ortho"),
+        gv.Camera.look_at(INSIDE, AHEAD, (0, 1, 0), 180, upper, upper, "fisheye"),
+        gv.Camera.look_at(INSIDE, AHEAD, (0, 1, 0), 180, 2 * lower, lower, "panorama"),
     ]
     render = partial(gv.render, tree, shader=gv.Lit(shader), background=SKY)
     pictures = [gv.Progressive(render).refine(view, settings.samples) for view in views]

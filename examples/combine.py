@@ -18,7 +18,7 @@ BOX = ((-1.3,) * 3, (1.3,) * 3)
 VIEW = (-0.9, -3.3, 1.1), (0, 0, 0), (0, 0, 1), 35
 
 
-class Of(torch.nn.Module):
+class Function(torch.nn.Module):
     """A function of points and of submodules, which move to the engine's device with it."""
 
     def __init__(self, function: Callable[..., torch.Tensor], *parts: torch.nn.Module) -> None:
@@ -42,11 +42,11 @@ class Settings:
 def world() -> torch.nn.Module:
     """Returns a field of two channels: "shape", whose surface is at 1/2, and "side", its colour."""
     cells = gv.sdf.Shell(gv.sdf.Gyroid(0.55), 0.06)
-    gyroid = Of(lambda p, shape: (0.5 - 12 * shape(p)).clamp(0, 1), cells)
-    stone = Of(lambda p: (0.6 + 2 * gv.noise.fbm(1.8 * p, octaves=5, seed=3)).clamp(0, 1))
-    ramp = Of(lambda p: (0.5 + 0.9 * p[..., 0] + 0.2 * p[..., 2]).clamp(0, 1))
-    ball = Of(lambda p: (0.5 + 12 * (1 - p.norm(dim=-1))).clamp(0, 1))
-    swirl = Of(lambda p: 0.12 * torch.sin(2.2 * p.roll(1, -1) + 0.7))
+    gyroid = Function(lambda p, shape: (0.5 - 12 * shape(p)).clamp(0, 1), cells)
+    stone = Function(lambda p: (0.6 + 2 * gv.noise.fbm(1.8 * p, octaves=5, seed=3)).clamp(0, 1))
+    ramp = Function(lambda p: (0.5 + 0.9 * p[..., 0] + 0.2 * p[..., 2]).clamp(0, 1))
+    ball = Function(lambda p: (0.5 + 12 * (1 - p.norm(dim=-1))).clamp(0, 1))
+    swirl = Function(lambda p: 0.12 * torch.sin(2.2 * p.roll(1, -1) + 0.7))
     shape = gv.warp(gv.mask(gv.blend(gyroid, stone, ramp), ball), swirl, max_offset=0.25)
     return gv.stack(shape=shape, side=ramp)
 
@@ -54,10 +54,10 @@ def world() -> torch.nn.Module:
 def main(settings: Settings) -> None:
     """Renders the picture."""
     producer = gv.FieldProducer(world(), settings.extent, box=BOX, samples=1)
-    look = gv.Isosurface(0.5, COLORS, color_channel="side")
+    shader = gv.Isosurface(0.5, COLORS, color_channel="side")
     camera = gv.Camera.look_at(*VIEW, settings.size * 16 // 9, settings.size)
     with gv.Engine(producer, device=settings.device, brick_pool="512 MB") as engine:
-        picture = engine.render(camera, look, lighting=LIGHT, background=WALL)
+        picture = engine.render(camera, shader, lighting=LIGHT, background=WALL)
     picture.save(settings.output)
     print(f"{settings.output}: {picture.stats.bricks_used} bricks")
 

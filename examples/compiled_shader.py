@@ -35,9 +35,9 @@ def main(settings: Settings) -> None:
     volume = gv.read_volume(HERE / "data" / "aneurism_256x256x256_uint8.raw.gz")
     tree = gv.N3Tree.from_volume(volume, device=settings.device)
     plain = gv.TransferFunction.preset("vessels", *volume.value_range)
-    numbers = {"steep": 20, "sharpness": 2, "wash": 0, "near": 200, "far": 520, "paper": PAPER[0]}
+    uniforms = {"steep": 20, "sharpness": 2, "wash": 0, "near": 200, "far": 520, "paper": PAPER[0]}
     start = time.perf_counter()
-    ink = gv.CompiledShader(HERE / "ink.h", "Ink", uniforms=numbers, transfer=INK)
+    ink = gv.CompiledShader(HERE / "ink.h", "Ink", uniforms=uniforms, transfer=INK)
     print(f"{ink.name} is there after {time.perf_counter() - start:.2f} s")
 
     def draw(shader: gv.Shader, fov: float, width: int, height: int) -> gv.Picture:
@@ -47,11 +47,11 @@ def main(settings: Settings) -> None:
         print(f"{picture.stats.milliseconds:.0f} ms, {picture.stats.samples} samples")
         return picture
 
-    high, half = settings.size, settings.size // 2
-    wide = -(-settings.size * 16 // 27)  # a third of 16:9
-    left = draw(ink, 27, 2 * wide, high)
+    full_height, half_height = settings.size, settings.size // 2
+    third_width = -(-settings.size * 16 // 27)  # a third of 16:9
+    left = draw(ink, 27, 2 * third_width, full_height)
     ink.uniforms.update(sharpness=6, wash=0.02, far=1000)
-    right = [draw(shader, 30, wide, half).color for shader in (plain, ink)]
+    right = [draw(shader, 30, third_width, half_height).color for shader in (plain, ink)]
     color = torch.cat([left.color, torch.cat(right)], dim=1)
     dataclasses.replace(left, color=color).save(settings.output)
     print(settings.output)

@@ -41,10 +41,10 @@ def main(settings: Settings) -> None:
         picture = gv.Progressive(partial(gv.render, tree, shader=shader)).refine(camera, 4)
     for name in IMAGES:
         image = getattr(cost, name).float()
-        seen = image[~image.isnan()]
-        print(f"{name:8s} mean {float(seen.mean()):7.2f}  most {float(seen.max()):7.2f}")
+        valid = image[~image.isnan()]
+        print(f"{name:8s} mean {float(valid.mean()):7.2f}  most {float(valid.max()):7.2f}")
     panels = [picture.color.cpu(), *(cost.picture(name).color for name in IMAGES)]
-    rows = [torch.cat(panels[at : at + 3], 1) for at in (0, 3)]
+    rows = [torch.cat(panels[first : first + 3], 1) for first in (0, 3)]
     dataclasses.replace(picture, color=torch.cat(rows, 0)).save(settings.output)
     print(f"{settings.output}: {cost.stats.milliseconds:.0f} ms")
 

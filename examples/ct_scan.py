@@ -29,8 +29,8 @@ def main(settings: Settings) -> None:
     tree = gv.N3Tree.from_volume(volume, brick_size=8, device=settings.device)
     print(tree)
     camera = gv.Camera.look_at(EYE, TARGET, UP, 25, settings.size * 16 // 9, settings.size)
-    look = gv.Lit(gv.TransferFunction.from_json(DATA / "stent.json"), ambient=0.3)
-    render = partial(gv.render, tree, shader=look, background=SKY)
+    shader = gv.Lit(gv.TransferFunction.from_json(DATA / "stent.json"), ambient=0.3)
+    render = partial(gv.render, tree, shader=shader, background=SKY)
     picture = gv.Progressive(render).refine(camera, settings.samples)
     picture.save(settings.output)
     stats = picture.stats

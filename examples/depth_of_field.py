@@ -30,9 +30,9 @@ class Settings:
     device: str = "cpu"
 
 
-def seen(volume: gv.Volume, function: gv.TransferFunction) -> gv.Volume:
+def colored(volume: gv.Volume, transfer: gv.TransferFunction) -> gv.Volume:
     """Returns premultiplied colour and opacity of every voxel."""
-    rgba = torch.from_numpy(function(volume.data[..., 0].numpy()))
+    rgba = torch.from_numpy(transfer(volume.data[..., 0].numpy()))
     rgba[..., :3] *= rgba[..., 3:]
     return gv.Volume(rgba.half(), spacing=volume.spacing, origin=volume.origin)
 
@@ -41,22 +41,22 @@ def thin_lens(
     tree: gv.N3Tree, camera: gv.Camera, shader: gv.StoredColor, aperture: float, pinholes: int
 ):
     """Returns (h, w, 3): mean colour of rays from all over the lens to each pixel's focal point."""
-    placed = camera.placed(tree.box)
-    rays, side = placed.rays(tree.device), float((tree.box[1] - tree.box[0]).max())
-    right, down = placed.viewmats[0, :2, :3].to(tree.device)
-    sharp, total = rays.origin + FOCUS * side * rays.direction, torch.zeros_like(rays.origin)
-    for number in range(pinholes):
-        radius = side * aperture / 2 * math.sqrt((number + 0.5) / pinholes)
-        turn = number * math.pi * (3 - math.sqrt(5))
-        origin = rays.origin + radius * (math.cos(turn) * right + math.sin(turn) * down)
-        direction = torch.nn.functional.normalize(sharp - origin)
+    placed_camera = camera.placed(tree.box)
+    rays, side = placed_camera.rays(tree.device), float((tree.box[1] - tree.box[0]).max())
+    right, down = placed_camera.viewmats[0, :2, :3].to(tree.device)
+    focal_points, total = rays.origin + FOCUS * side * rays.direction, torch.zeros_like(rays.origin)
+    for index in range(pinholes):
+        radius = side * aperture / 2 * math.sqrt((index + 0.5) / pinholes)
+        angle = index * math.pi * (3 - math.sqrt(5))
+        origin = rays.origin + radius * (math.cos(angle) * right + math.sin(angle) * down)
+        direction = torch.nn.functional.normalize(focal_points - origin)
         total += gv.trace(tree, replace(rays, origin=origin, direction=direction), shader).color
     return (total / pinholes).reshape(camera.height, camera.width, 3).float()
 
 
 def main(settings: Settings) -> None:
     """Renders four pictures."""
-    volume = seen(gv.read_volume(SCAN), gv.TransferFunction.from_points(OPACITY, COLOR))
+    volume = colored(gv.read_volume(SCAN), gv.TransferFunction.from_points(OPACITY, COLOR))
     tree = gv.N3Tree.from_volume(volume, device=settings.device)
     shader = gv.StoredColor("value", premultiplied=True)
     camera = gv.Camera.orbit(60, 12, 1.1, 32, settings.size * 8 // 9, settings.size // 2)
@@ -68,8 +68,8 @@ def main(settings: Settings) -> None:
         tiles.append(picture.color)
     if settings.pinholes:
         expected = thin_lens(tree, camera, shader, APERTURES[-1], settings.pinholes)
-        planes = (one.movedim(-1, 0)[None].clamp(0, 1) for one in (tiles[-1], expected))
-        print(f"SSIM {float(ssim(*planes, window_size=11).mean()):.3f}")
+        images = (image.movedim(-1, 0)[None].clamp(0, 1) for image in (tiles[-1], expected))
+        print(f"SSIM {float(ssim(*images, window_size=11).mean()):.3f}")
     rows = [torch.cat(tiles[first : first + 2], 1) for first in (0, 2)]
     replace(picture, color=torch.cat(rows)).save(settings.output)
     print(settings.output)

@@ -47,16 +47,16 @@ class Settings:
 def main(settings: Settings) -> None:
     """Streams what a small picture needs, which is nearly all, then renders the large one."""
     producer = gv.FieldProducer(gv.Solid(lantern(), differences=True), settings.extent)
-    paint = gv.StoredColor(
+    shader = gv.StoredColor(
         "rgba", premultiplied=True, normals="normal", light=SUN, ambient=0.4, diffuse=0.9
     )
     light = gv.Lighting(ambient=(0.65, 0.75, 0.9), occlusion=0.9, reach=0.1, frame="box", cones=3)
     with gv.Engine(producer, brick_pool="256 MB", device=settings.device) as engine:
-        for part in (3, 1):
-            size = {"width": settings.size * 16 // 9 // part, "height": settings.size // part}
+        for divisor in (3, 1):
+            size = {"width": settings.size * 16 // 9 // divisor, "height": settings.size // divisor}
             camera = gv.Camera.look_at((2.5, -4.2, 1.7), (0, 0, -0.52), (0, 0, 1), 36, **size)
-            options = {"cone_scale": 1.4 / part, "lighting": light, "background": SKY}
-            picture = engine.render(camera, paint, **options)
+            options = {"cone_scale": 1.4 / divisor, "lighting": light, "background": SKY}
+            picture = engine.render(camera, shader, **options)
             print(f"{producer}: {picture.stats}")
     picture.save(settings.output)
     print(f"{settings.output}: {picture.stats.bricks_used} bricks in use")

@@ -38,41 +38,41 @@ def streams(stars: int, steps: int = 700, step: float = 0.02) -> torch.Tensor:
     """Returns (n, 3) positions of the stars of 40 satellites after some orbits in the potential
     ln(0.1 + x^2 + y^2 + z^2 / 0.8) / 2 (Binney, Tremaine, "Galactic Dynamics", 2008, 2.71)."""
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(6))
-    of = (40 * torch.linspace(0, 1, stars) ** 2).long().clamp(max=39)  # satellites differ in size
-    place = 0.4 * normal(40, 3)[of] + 0.03 * normal(stars, 3)
-    speed = 0.5 * normal(40, 3)[of] + 0.04 * normal(stars, 3)
-    flat = torch.tensor([1.0, 1.0, 1 / 0.8])
+    satellite = (40 * torch.linspace(0, 1, stars) ** 2).long().clamp(max=39)  # they differ in size
+    position = 0.4 * normal(40, 3)[satellite] + 0.03 * normal(stars, 3)
+    velocity = 0.5 * normal(40, 3)[satellite] + 0.04 * normal(stars, 3)
+    scale = torch.tensor([1.0, 1.0, 1 / 0.8])
     for _ in range(steps):  # leapfrog
-        place += 0.5 * step * speed
-        speed -= step * flat * place / (0.1 + (flat * place**2).sum(1, keepdim=True))
-        place += 0.5 * step * speed
-    return place
+        position += 0.5 * step * velocity
+        velocity -= step * scale * position / (0.1 + (scale * position**2).sum(1, keepdim=True))
+        position += 0.5 * step * velocity
+    return position
 
 
-def made(stars: int = 200_000, side: int = 128) -> torch.Tensor:
+def star_density(stars: int = 200_000, side: int = 128) -> torch.Tensor:
     """Returns the logarithm of the stars' density, side^3 uint8."""
     points = gv.Points(streams(stars), radius=0.05)
     producer = gv.PointProducer(points, extent=side, box=((-1, -1, -1), (1, 1, 1)))
     axis = (torch.arange(side) + 0.5) / side * 2 - 1
-    places = torch.cartesian_prod(axis, axis, axis).flip(1)  # x runs fastest
-    density = producer.at(places)["value"].view(side, side, side)
+    positions = torch.cartesian_prod(axis, axis, axis).flip(1)  # x runs fastest
+    density = producer.at(positions)["value"].view(side, side, side)
     value = 100 + 16 * torch.log2(density / density.mean() + 1e-3)
     return value.clamp(0, 255).to(torch.uint8)
 
 
 def main(settings: Settings) -> None:
     """Makes the picture."""
-    value = made() if settings.volume is None else np.load(bz2.open(settings.volume))
+    value = star_density() if settings.volume is None else np.load(bz2.open(settings.volume))
     tree = gv.N3Tree.from_volume(gv.Volume(value), device=settings.device)
     opacity = [(0.0, 0.0)]
-    for at, (most, *_) in SURFACES.items():
-        opacity += [(at - 5, most / 8), (at, most), (at + 5, most / 8)]
-    color = [(at, *rgb) for at, (_, *rgb) in SURFACES.items()]
+    for density, (peak, *_) in SURFACES.items():
+        opacity += [(density - 5, peak / 8), (density, peak), (density + 5, peak / 8)]
+    color = [(density, *rgb) for density, (_, *rgb) in SURFACES.items()]
     transfer = gv.TransferFunction(opacity, color)
     shader = gv.Lit(transfer, light=gv.DirectionalLight((-1, 0.6, -0.5)), diffuse=0.9)
     camera = gv.Camera.orbit(35, 25, 1.95, 30, settings.size * 16 // 9, settings.size, up="+z")
-    show = gv.Progressive(partial(gv.render, tree, shader=shader, step=0.5))
-    show.refine(camera, settings.samples).tone_map("aces", exposure=0.6).save(settings.output)
+    mean = gv.Progressive(partial(gv.render, tree, shader=shader, step=0.5))
+    mean.refine(camera, settings.samples).tone_map("aces", exposure=0.6).save(settings.output)
     print(settings.output)
 
 

@@ -10,7 +10,7 @@ import gvtorch as gv
 
 BOX = ((-1, -1, -1), (1, 1, 1))
 SUN = gv.DirectionalLight((-0.9, -0.4, -0.8), (1.25, 1.15, 1.0))
-LOOK = {"premultiplied": True, "normals": "normal", "ambient": 0.003, "diffuse": 1, "specular": 0}
+PAINT = {"premultiplied": True, "normals": "normal", "ambient": 0.003, "diffuse": 1, "specular": 0}
 EARTH, SAND, CREAM = torch.tensor([(0.3, 0.08, 0.03), (0.85, 0.5, 0.24), (0.95, 0.9, 0.8)])
 NIGHT = gv.Gradient((0.001, 0.001, 0.002), (0.003, 0.005, 0.012))
 
@@ -30,9 +30,9 @@ def main(output: str = "hello_sphere.png", device: str = "cpu", size: int = 720)
     planet = gv.Painted(gv.sdf.Sphere(0.99), Bands())
     producer = gv.FieldProducer(gv.Solid(planet), 65536, box=BOX)
     engine = gv.Engine(producer, device=device, load_budget=4096)
-    look = gv.StoredColor("rgba", light=SUN, **LOOK)
+    shader = gv.StoredColor("rgba", light=SUN, **PAINT)
     camera = gv.Camera.look_at((0, 0.5, 3.2), (0.1, 0, 0), (-0.4, 1, 0), 38, size * 16 // 9, size)
-    mean = gv.Progressive(lambda view: engine.render(view, look, cone_scale=2, background=NIGHT))
+    mean = gv.Progressive(lambda view: engine.render(view, shader, cone_scale=2, background=NIGHT))
     mean.refine(camera, 3).save(output)
     print(f"{output}: {engine}")
 

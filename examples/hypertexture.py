@@ -44,20 +44,20 @@ def main(settings: Settings) -> None:
     if settings.mesh is not None:
         mesh = gv.read_mesh(settings.mesh)
         low, high = mesh.bounds
-        moved = (mesh.vertices - (low + high) / 2) * (2 / (high - low).max())
-        shape = gv.SampledDistance.of_mesh(replace(mesh, vertices=moved), reach=0.1)
+        vertices = (mesh.vertices - (low + high) / 2) * (2 / (high - low).max())
+        shape = gv.SampledDistance.of_mesh(replace(mesh, vertices=vertices), reach=0.1)
     elif settings.volume is not None:
         shape = gv.SampledDistance(gv.read_volume(settings.volume))
-    rough = {"thickness": 0.075, "frequency": 6, "gain": 0.55, "softness": 0.12}
+    noise = {"thickness": 0.075, "frequency": 6, "gain": 0.55, "softness": 0.12}
     # Grown by the depth at which density 1/2 lies below the surface.
     grown = gv.sdf.Offset(shape, 0.03)
-    rock = gv.Hypertexture(grown, settings.extent, octaves=6, distances=True, **rough)
+    rock = gv.Hypertexture(grown, settings.extent, octaves=6, distances=True, **noise)
     fur = gv.Fur(shape, length=0.11, frequency=36, fall=(-0.12, -0.5, -0.05))
     stone = gv.TransferFunction.from_points([(-1, 1), (1, 1)], STONE)
     hair = gv.TransferFunction.from_points([(0.02, 0), (0.1, 0.5), (1, 0.6)], HAIR)
-    light = {"light": SUN, "ambient": 0.35, "diffuse": 0.85, "specular": 0.05, "shininess": 12}
-    looks = {
-        rock: gv.Isosurface(0.5, stone, color_channel="distance", **light),
+    shading = {"light": SUN, "ambient": 0.35, "diffuse": 0.85, "specular": 0.05, "shininess": 12}
+    shaders = {
+        rock: gv.Isosurface(0.5, stone, color_channel="distance", **shading),
         gv.FieldProducer(fur, settings.extent): hair,
     }
     lighting = gv.Lighting(
@@ -65,12 +65,12 @@ def main(settings: Settings) -> None:
     )
     camera = gv.Camera.orbit(-30, 16, 1.55, 36, settings.size * 8 // 9, settings.size)
     pictures = []
-    for producer, look in looks.items():
+    for producer, shader in shaders.items():
         engine = gv.Engine(producer, device=settings.device, brick_pool="256 MB")
-        lit = {"lighting": lighting} if producer is rock else {}
-        pictures.append(engine.render(camera, look, background=SKY, **lit))
-    both = torch.cat([picture.color for picture in pictures], dim=1)
-    replace(pictures[0], color=both).save(settings.output)
+        options = {"lighting": lighting} if producer is rock else {}
+        pictures.append(engine.render(camera, shader, background=SKY, **options))
+    color = torch.cat([picture.color for picture in pictures], dim=1)
+    replace(pictures[0], color=color).save(settings.output)
     print(f"{settings.output}: {rock.saved:.0%} of the rock's octaves were not evaluated")
 
 

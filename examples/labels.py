@@ -11,7 +11,7 @@ import tyro
 
 import gvtorch as gv
 
-FIRST, NUCLEUS = 720_575_940_000_000_000, 1_000_000  # first label; offset of a nucleus's
+FIRST_LABEL, NUCLEUS = 720_575_940_000_000_000, 1_000_000  # NUCLEUS: added to its cell's label
 CELLS, REACH = 360, 0.2  # REACH: more than the radius of any cell, in sides of the box
 GAP, RADIUS, CORE = 0.012, 0.47, 0.42  # in sides of the box; CORE relative to a cell's size
 BONE, SKY = (0.86, 0.80, 0.66), gv.Gradient((0.030, 0.036, 0.052), (0.004, 0.005, 0.008))
@@ -33,37 +33,37 @@ class Settings:
 
 def tissue(side: int) -> gv.Volume:
     """Returns side^3 int64 labels of cells that are spread evenly in a ball."""
-    places = torch.rand((40 * CELLS, 3), generator=torch.Generator().manual_seed(4)) - 0.5
-    places = places[places.norm(dim=1) < RADIUS]
-    centre = places[:CELLS]
+    positions = torch.rand((40 * CELLS, 3), generator=torch.Generator().manual_seed(4)) - 0.5
+    positions = positions[positions.norm(dim=1) < RADIUS]
+    centres = positions[:CELLS]
     for _ in range(12):  # Lloyd: each centre moves to the mean of its neighbourhood
-        nearest = torch.cdist(places, centre).argmin(1)
-        middle = torch.zeros_like(centre).index_add(0, nearest, places)
-        centre = middle / nearest.bincount(minlength=len(centre)).clamp(min=1)[:, None]
-    size = torch.cdist(centre, centre).fill_diagonal_(torch.inf).min(1).values / 2  # of each cell
+        nearest = torch.cdist(positions, centres).argmin(1)
+        sums = torch.zeros_like(centres).index_add(0, nearest, positions)
+        centres = sums / nearest.bincount(minlength=len(centres)).clamp(min=1)[:, None]
+    size = torch.cdist(centres, centres).fill_diagonal_(torch.inf).min(1).values / 2  # of each cell
     near, far = torch.full((2, side, side, side), torch.inf)  # squared distances to two centres
     cell, other = torch.zeros((2, side, side, side), dtype=torch.int64)
     axis = (torch.arange(side) + 0.5) / side - 0.5
-    for number, middle in enumerate(centre):
-        low, high = (((middle.flip(0) + 0.5 + r) * side).int().clamp(0) for r in (-REACH, REACH))
-        part = tuple(map(slice, low, high))  # of z, y, x
-        z, y, x = ((axis[one] - at) ** 2 for one, at in zip(part, middle.flip(0), strict=True))
-        apart, a, b = z[:, None, None] + y[:, None] + x, near[part], far[part]
-        other[part] = torch.where(apart < a, cell[part], other[part].where(apart >= b, number))
-        far[part] = torch.where(apart < a, a, torch.minimum(apart, b))
-        cell[part], near[part] = torch.where(apart < a, number, cell[part]), apart.minimum(a)
-    wall = (far - near) / 2 / (centre[cell] - centre[other]).norm(dim=-1)  # distance to it
-    depth = RADIUS - sum(one**2 for one in torch.meshgrid(axis, axis, axis, indexing="ij")).sqrt()
+    for number, centre in enumerate(centres):
+        low, high = (((centre.flip(0) + 0.5 + r) * side).int().clamp(0) for r in (-REACH, REACH))
+        block = tuple(map(slice, low, high))  # of z, y, x
+        z, y, x = ((axis[rows] - c) ** 2 for rows, c in zip(block, centre.flip(0), strict=True))
+        d2, a, b = z[:, None, None] + y[:, None] + x, near[block], far[block]
+        other[block] = torch.where(d2 < a, cell[block], other[block].where(d2 >= b, number))
+        far[block] = torch.where(d2 < a, a, torch.minimum(d2, b))
+        cell[block], near[block] = torch.where(d2 < a, number, cell[block]), d2.minimum(a)
+    wall = (far - near) / 2 / (centres[cell] - centres[other]).norm(dim=-1)  # distance to it
+    depth = RADIUS - sum(a**2 for a in torch.meshgrid(axis, axis, axis, indexing="ij")).sqrt()
     inside = (wall > GAP / 2) & (depth > -0.3 * wall.clamp(max=0.08))
-    number = FIRST + cell + NUCLEUS * (near.sqrt() < CORE * size[cell])
-    return gv.Volume(torch.where(inside, number, 0), labels=True)
+    labels = FIRST_LABEL + cell + NUCLEUS * (near.sqrt() < CORE * size[cell])
+    return gv.Volume(torch.where(inside, labels, 0), labels=True)
 
 
 def main(settings: Settings) -> None:
     """Renders the cells, and prints which label is in the middle of the picture."""
     volume = tissue(settings.side)
     tree = gv.N3Tree.from_volume(volume, 10, border=3, device=settings.device)
-    nuclei = [label for label in volume.label_values.tolist() if label >= FIRST + NUCLEUS]
+    nuclei = [label for label in volume.label_values.tolist() if label >= FIRST_LABEL + NUCLEUS]
     shader = gv.Labels(
         dict.fromkeys(nuclei, BONE), light=SUN, ambient=0.55, diffuse=0.75, specular=0.12
     )

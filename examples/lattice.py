@@ -24,12 +24,12 @@ VIEW = (2.1, -4.3, 2.5), (0, 0, -0.12), (0, 0, 1), 28
 def lattice() -> sdf.Distance:
     """Returns the shapes, z up: a lattice within a lattice around a core, a part cut away."""
     foot = sdf.Extrusion(sdf.Sphere(1.7, color=SLATE), 0.12)
-    parts = sdf.Sphere(0.27, color=CORE) | sdf.moved(foot, z=-1.06)
+    shapes = sdf.Sphere(0.27, color=CORE) | sdf.moved(foot, z=-1.06)
     for radius, depth, period, wall, color in BALLS:
         cells = sdf.Shell(sdf.Gyroid(period, color=color), wall)
         ball = cells & sdf.Shell(sdf.Sphere(radius - depth / 2, color=color), depth)
-        parts = parts | (ball - sdf.moved(sdf.Box((1, 1, 1), color=color), 0.53, -0.53, 0.53))
-    return parts
+        shapes = shapes | (ball - sdf.moved(sdf.Box((1, 1, 1), color=color), 0.53, -0.53, 0.53))
+    return shapes
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Settings:
 
 def main(settings: Settings) -> None:
     producer = gv.FieldProducer(gv.Solid(lattice(), differences=True), settings.extent)
-    look = gv.StoredColor(
+    shader = gv.StoredColor(
         "rgba",
         premultiplied=True,
         normals="normal",
@@ -54,10 +54,12 @@ def main(settings: Settings) -> None:
         diffuse=1,
     )
     with gv.Engine(producer, device=settings.device, brick_pool="512 MB") as engine:
-        for part, mode in ((6, "converge"), (1, "interactive")):
-            view = gv.Camera.look_at(*VIEW, settings.size * 16 // 9 // part, settings.size // part)
-            options = {"lighting": LIGHT, "background": WALL, "cone_scale": 1.3 / part}
-            picture = engine.render(view, look, mode, **options)
+        for divisor, mode in ((6, "converge"), (1, "interactive")):
+            view = gv.Camera.look_at(
+                *VIEW, settings.size * 16 // 9 // divisor, settings.size // divisor
+            )
+            options = {"lighting": LIGHT, "background": WALL, "cone_scale": 1.3 / divisor}
+            picture = engine.render(view, shader, mode, **options)
             print(picture.stats)
     picture.tone_map("aces").save(settings.output)
     print(f"{settings.output}: {picture.stats}")

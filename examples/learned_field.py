@@ -11,7 +11,7 @@ from torch import nn
 import gvtorch as gv
 
 sdf = gv.sdf
-BOX, SHOWN = ((-1.1, -1.1, -1.1), (1.1, 1.1, 1.1)), (20, 80, 240)
+BOX, PICTURE_STEPS = ((-1.1, -1.1, -1.1), (1.1, 1.1, 1.1)), (20, 80, 240)
 SUN = gv.DirectionalLight((0.8, -0.9, -0.7), (1.05, 0.82, 0.56), angle=8)
 DAY = gv.DirectionalLight((-0.5, -1.0, 0.1), (0.07, 0.13, 0.26), angle=70)
 LIGHT = gv.Lighting(lights=(SUN, DAY), ambient=(0.07, 0.09, 0.14))
@@ -28,11 +28,11 @@ class Network(nn.Module):
 
     def surface(self, points):
         waves = [wave(points * 2**n) for n in range(5) for wave in (torch.sin, torch.cos)]
-        made = self.layers(torch.cat((points, *waves), -1))
-        return made[..., 0], made[..., 1:].sigmoid()
+        outputs = self.layers(torch.cat((points, *waves), -1))
+        return outputs[..., 0], outputs[..., 1:].sigmoid()
 
 
-class Shown(nn.Module):
+class ColorField(nn.Module):
     def __init__(self, shape: nn.Module) -> None:
         super().__init__()
         self.shape = shape
@@ -45,9 +45,9 @@ class Shown(nn.Module):
     def picture(self, width, height, extent, device):
         producer = gv.cache_field(self.to(device), extent, box=BOX, samples=1, threshold=0.0)
         engine = gv.Engine(producer, device=device)
-        for part, mode in ((4, "converge"), (1, "interactive")):
-            camera = gv.Camera.orbit(32, 24, 1.36, 34, width // part, height // part)
-            options = {"background": WALL, "lighting": LIGHT, "cone_scale": 1.5 / part}
+        for divisor, mode in ((4, "converge"), (1, "interactive")):
+            camera = gv.Camera.orbit(32, 24, 1.36, 34, width // divisor, height // divisor)
+            options = {"background": WALL, "lighting": LIGHT, "cone_scale": 1.5 / divisor}
             picture = engine.render(camera, LOOK, mode, **options)
         return picture
 
@@ -55,25 +55,25 @@ class Shown(nn.Module):
 def main(output: str = "learned_field.png", device: str = "cpu", size: int = 720) -> None:
     """Learns, and renders four pictures."""
     torch.manual_seed(1)
-    aim = sdf.Sphere(0.3, color=(0.8, 0.78, 0.72)) | sdf.Torus(0.62, 0.15, color=(0.8, 0.13, 0.06))
-    aim = aim | sdf.rotated(sdf.Torus(0.62, 0.15, color=(0.85, 0.55, 0.12)), (1, 0, 0), 90)
-    aim = aim | sdf.rotated(sdf.Torus(0.62, 0.15, color=(0.05, 0.3, 0.42)), (0, 1, 0), 90)
-    network, tiles, numbers = Network(), [], (-(-size * 8 // 9), size // 2, min(96, size), device)
+    goal = sdf.Sphere(0.3, color=(0.8, 0.78, 0.72)) | sdf.Torus(0.62, 0.15, color=(0.8, 0.13, 0.06))
+    goal = goal | sdf.rotated(sdf.Torus(0.62, 0.15, color=(0.85, 0.55, 0.12)), (1, 0, 0), 90)
+    goal = goal | sdf.rotated(sdf.Torus(0.62, 0.15, color=(0.05, 0.3, 0.42)), (0, 1, 0), 90)
+    network, tiles, arguments = Network(), [], (-(-size * 8 // 9), size // 2, min(96, size), device)
     optimizer = torch.optim.Adam(network.parameters(), lr=4e-3)
-    for step in range(1, SHOWN[-1] + 1):
+    for step in range(1, PICTURE_STEPS[-1] + 1):
         points = torch.rand(4 * size, 3) * 2.2 - 1.1
-        (found, paint), (distance, color) = network.surface(points), aim.surface(points)
-        near, apart = torch.exp(-4 * distance.abs()), (paint - color).abs().mean(-1)
-        loss = (near * ((found - distance).abs() + 0.9 * apart)).mean()
+        (guess, guess_color), (distance, color) = network.surface(points), goal.surface(points)
+        weight, color_error = torch.exp(-4 * distance.abs()), (guess_color - color).abs().mean(-1)
+        loss = (weight * ((guess - distance).abs() + 0.9 * color_error)).mean()
         network.zero_grad()
         loss.backward()
         optimizer.step()
-        if step in SHOWN:
-            tiles.append(Shown(deepcopy(network)).picture(*numbers))
-    tiles.append(Shown(aim).picture(*numbers))
+        if step in PICTURE_STEPS:
+            tiles.append(ColorField(deepcopy(network)).picture(*arguments))
+    tiles.append(ColorField(goal).picture(*arguments))
     rows = [torch.cat([tile.color for tile in tiles[n : n + 2]], 1) for n in (0, 2)]
     replace(tiles[0], color=torch.cat(rows)).tone_map("aces").save(output)
-    print(f"{output}: error {loss.item():.3f} after {SHOWN[-1]} steps")
+    print(f"{output}: error {loss.item():.3f} after {PICTURE_STEPS[-1]} steps")
 
 
 tyro.cli(main)

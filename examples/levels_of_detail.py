@@ -11,7 +11,7 @@ import gvtorch as gv
 
 SCAN = Path(__file__).parent / "data" / "aneurism_256x256x256_uint8.raw.gz"
 DISTANCES = [1.2, 2.4, 4.8, 9.6]
-ROWS, APART = 10, 305.0  # voxels
+ROWS, SPACING = 10, 305.0  # voxels
 EYE, TARGET = (0.0, 175.0, 560.0), (0.0, 110.0, -300.0)
 SKY = gv.Gradient((0.004, 0.005, 0.01), (0.02, 0.028, 0.05))
 
@@ -46,7 +46,7 @@ def main(settings: Settings) -> None:
         for number in range(2 * ROWS)[::-1]:  # the farthest first: the next is drawn over it
             row, column = number // 2, number % 2
             pose = torch.eye(4, dtype=torch.float64)
-            pose[0, 3], pose[2, 3] = APART * (column - 1) + 25, -APART * row
+            pose[0, 3], pose[2, 3] = SPACING * (column - 1) + 25, -SPACING * row
             picture = gv.render(tree, camera, shader, pose=pose, background=behind)
             behind = picture.color
         return picture

@@ -35,8 +35,8 @@ class Settings:
 
 def room() -> gv.Volume:
     """Returns premultiplied colour and opacity of walls, a block and a ball."""
-    place = torch.arange(SIDE, dtype=torch.float32)
-    z, y, x = torch.meshgrid(place, place, place, indexing="ij")
+    axis = torch.arange(SIDE, dtype=torch.float32)
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     u, v = (math.cos(a) * (x - 32) + math.sin(a) * (z - 34) for a in (0.35, 0.35 + math.pi / 2))
     block = torch.maximum(torch.maximum(u.abs() - 13, v.abs() - 13), y - 44)
     ball = ((x - 64) ** 2 + (y - WALL - 15) ** 2 + (z - 50) ** 2).sqrt() - 15
@@ -65,8 +65,8 @@ def main(settings: Settings) -> None:
     dim = gv.Lighting(ambient=(0.3, 0.3, 0.3), occlusion=0.9, cones=7)
     bounce = replace(dim, ambient=(0.1, 0.1, 0.1), indirect=1.0, reach=SIDE)
     images = []
-    both = (vessels, orbit, VESSELS, (None, soft, near)), (box, front, PAINT, (lamp, dim, bounce))
-    for tree, camera, shader, lights in both:
+    cases = (vessels, orbit, VESSELS, (None, soft, near)), (box, front, PAINT, (lamp, dim, bounce))
+    for tree, camera, shader, lights in cases:
         for lighting in lights:
             render = partial(gv.render, tree, shader=shader, lighting=lighting, background=EVENING)
             picture = gv.Progressive(render).refine(camera, settings.samples)

@@ -35,16 +35,16 @@ def main(settings: Settings) -> None:
         "box": gv.Mandelbox(2.0, iterations=12, colors=COLORS),
     }[settings.fractal]
     producer = gv.FieldProducer(gv.Solid(shape, normals=False), settings.extent)
-    stone = gv.StoredColor(
+    shader = gv.StoredColor(
         "rgba", premultiplied=True, lit=True, light=SUN, ambient=0.4, diffuse=0.85, specular=0.15
     )
     light = gv.Lighting(ambient=(0.6, 0.75, 1.0), occlusion=0.9, reach=0.1, frame="box", cones=4)
     with gv.Engine(producer, brick_pool="512 MB", device=settings.device) as engine:
-        for part in (3, 1):
-            size = {"width": settings.size * 16 // 9 // part, "height": settings.size // part}
+        for divisor in (3, 1):
+            size = {"width": settings.size * 16 // 9 // divisor, "height": settings.size // divisor}
             camera = gv.Camera.orbit(35, 28, distance=2.05, **size)
-            options = {"cone_scale": 2.0 / part, "lighting": light, "background": SKY}
-            picture = engine.render(camera, stone, **options)
+            options = {"cone_scale": 2.0 / divisor, "lighting": light, "background": SKY}
+            picture = engine.render(camera, shader, **options)
             print(f"{producer}: {picture.stats}")
     picture.save(settings.output)
     print(f"{settings.output}: {picture.stats.bricks_used} bricks in use")

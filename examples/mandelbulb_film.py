@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 import tyro
-from mandelbulb_zoom import bulb, look, ways
+from mandelbulb_zoom import bulb_engine, eye_directions, view
 from rich.progress import track
 
 import gvtorch as gv
@@ -30,30 +30,30 @@ class Settings:
 
 def main(settings: Settings) -> None:
     """Loads the first view level by level, so that every ray finds a brick, then flies."""
-    route, took = ways(), []
+    directions, times = eye_directions(), []
     size = settings.size * 16 // 9 // 2 * 2, settings.size
     pools = {"brick_pool": "512 MB", "load_budget": settings.budget, "loading": "levels"}
     with (
-        bulb(20, settings.device, **pools) as engine,
+        bulb_engine(20, settings.device, **pools) as engine,
         gv.Video(settings.film, *size, fps=30) as film,
     ):
-        camera, shader = look(route, 4.0, *size, engine.device)
+        camera, shader = view(directions, 4.0, *size, engine.device)
         options = {"cone_scale": settings.cone_scale}
         engine.render(camera, shader, **options)  # loads the first view
         draw = partial(engine.frame, shader=shader, **options)
         if engine.device.type == "cuda":
             draw = engine.capture(camera, shader, batch=settings.budget, fit=True, **options).replay
         for level in track(torch.linspace(4, 30, settings.frames).tolist()):
-            camera, lit = look(route, level, *size, engine.device)
-            began = time.perf_counter()
-            shader.light.direction.copy_(lit.light.direction)
+            camera, next_shader = view(directions, level, *size, engine.device)
+            start = time.perf_counter()
+            shader.light.direction.copy_(next_shader.light.direction)
             picture, stats = draw(camera)
             stats.settle()  # waits for the device
-            took.append(1e3 * (time.perf_counter() - began))
+            times.append(1e3 * (time.perf_counter() - start))
             film.add(picture)
         picture.save(settings.output)
-    late, middle = sum(one > 1e3 / 30 for one in took), sorted(took)[len(took) // 2]
-    print(f"{len(took)} frames: {middle:.1f} ms, at most {max(took):.1f}; {late} over 1/30 s")
+    late, median = sum(ms > 1e3 / 30 for ms in times), sorted(times)[len(times) // 2]
+    print(f"{len(times)} frames: {median:.1f} ms, at most {max(times):.1f}; {late} over 1/30 s")
     print(f"{settings.film}, {settings.output}")
 
 

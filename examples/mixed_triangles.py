@@ -33,22 +33,24 @@ def rasterise(parts, camera: gv.Camera, near: float, far: float, device="cpu") -
     window.SetMultiSamples(0)  # a pixel has one depth
     window.SetSize(camera.width, camera.height)
     window.AddRenderer(renderer)
-    for source, place, color in parts:
-        actor = vtk.vtkActor(mapper=vtk.vtkPolyDataMapper(scalar_visibility=False), position=place)
+    for source, position, color in parts:
+        actor = vtk.vtkActor(
+            mapper=vtk.vtkPolyDataMapper(scalar_visibility=False), position=position
+        )
         actor.mapper.SetInputConnection(source.GetOutputPort())
         actor.property.color, actor.property.ambient, actor.property.specular = color, 0.25, 0.3
         renderer.AddActor(actor)
     projection, modelview = gv.opengl.matrices(camera, near, far)
     _, up, back = modelview[:3, :3]
-    place = -(modelview[:3, :3].T @ modelview[:3, 3])
-    view, matrix = renderer.GetActiveCamera(), vtk.vtkMatrix4x4()
-    view.SetPosition(*place.tolist())
-    view.SetFocalPoint(*(place - back).tolist())
-    view.SetViewUp(*up.tolist())
-    view.clipping_range = near, far
+    eye = -(modelview[:3, :3].T @ modelview[:3, 3])
+    vtk_camera, matrix = renderer.GetActiveCamera(), vtk.vtkMatrix4x4()
+    vtk_camera.SetPosition(*eye.tolist())
+    vtk_camera.SetFocalPoint(*(eye - back).tolist())
+    vtk_camera.SetViewUp(*up.tolist())
+    vtk_camera.clipping_range = near, far
     matrix.DeepCopy(projection.flatten().tolist())
-    view.SetExplicitProjectionTransformMatrix(matrix)
-    view.UseExplicitProjectionTransformMatrixOn()
+    vtk_camera.SetExplicitProjectionTransformMatrix(matrix)
+    vtk_camera.UseExplicitProjectionTransformMatrixOn()
     window.Render()
     window.MakeCurrent()
     window.GetRenderFramebuffer().Bind(window.GetRenderFramebuffer().GetReadMode())
@@ -65,7 +67,7 @@ def main(output: Path = Path("mixed_triangles.png"), size: int = 720, device: st
     ring = vtk.vtkParametricFunctionSource(u_resolution=200, v_resolution=40)
     ring.SetParametricFunction(torus)
     disk = vtk.vtkDiskSource(inner_radius=44, outer_radius=64, circumferential_resolution=200)
-    parts = [(disk, DISK, BLUE), *((ring, place, GREEN) for place in RINGS)]
+    parts = [(disk, DISK, BLUE), *((ring, position, GREEN) for position in RINGS)]
     layer = rasterise(parts, camera, near=100, far=1000, device=device)
     tree = gv.N3Tree.from_volume(gv.read_volume(SCAN), device=device)
     shader = gv.Lit(gv.TransferFunction.from_json(SCAN.with_name("stent.json")), ambient=0.3)

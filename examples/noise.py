@@ -31,21 +31,21 @@ BALLS = {
 class Ball(gv.Field):
     """Premultiplied colour and opacity of a ball that is displaced by noise."""
 
-    def __init__(self, noise, frequency, ends, colors):
+    def __init__(self, function, frequency, value_range, colors):
         super().__init__()
-        self.noise, self.frequency, self.ends = noise, frequency, ends
+        self.noise, self.frequency, self.ends = function, frequency, value_range
         self.register_buffer("colors", torch.tensor(colors))
         self.prefiltered, self.threshold = True, {"rgba": 0.0}
 
     def filtered(self, points, size):
         """Evaluates noise in the middle of each voxel; the edge is three voxels wide."""
-        noise, (low, high) = self.noise(points * self.frequency), self.ends
-        share = ((noise - low) / (high - low)).clamp(0, 1)
+        values, (low, high) = self.noise(points * self.frequency), self.ends
+        share = ((values - low) / (high - low)).clamp(0, 1)
         gap = 0.88 + 0.1 * share - points.norm(dim=-1)
         alpha = (0.5 + gap / (3 * size[..., 0])).clamp(0, 1)[..., None]
-        at = share * (len(self.colors) - 1)
-        first = at.long().clamp(max=len(self.colors) - 2)
-        color = torch.lerp(self.colors[first], self.colors[first + 1], (at - first)[..., None])
+        row = share * (len(self.colors) - 1)
+        first = row.long().clamp(max=len(self.colors) - 2)
+        color = torch.lerp(self.colors[first], self.colors[first + 1], (row - first)[..., None])
         return {"rgba": torch.cat((color * alpha, alpha), -1)}
 
     def bounds(self, center, half):
@@ -65,12 +65,12 @@ class Settings:
 
 def main(settings: Settings) -> None:
     camera = gv.Camera.orbit(25, 15, 1.85, 36, settings.size * 4 // 9, settings.size // 2)
-    light = {"light": SUN, "ambient": 0.25, "diffuse": 0.85, "specular": 0.1}
-    look = gv.StoredColor("rgba", premultiplied=True, lit=True, **light)
+    shading = {"light": SUN, "ambient": 0.25, "diffuse": 0.85, "specular": 0.1}
+    shader = gv.StoredColor("rgba", premultiplied=True, lit=True, **shading)
     tiles, box = [], ((-1, -1, -1), (1, 1, 1))
     for ball in BALLS.values():
         engine = gv.Engine(gv.FieldProducer(Ball(*ball), 160, box=box), device=settings.device)
-        tiles.append(engine.render(camera, look, background=(0.02, 0.024, 0.032)))
+        tiles.append(engine.render(camera, shader, background=(0.02, 0.024, 0.032)))
     rows = [torch.cat([tile.color for tile in tiles[n : n + 4]], 1) for n in (0, 4)]
     replace(tiles[0], color=torch.cat(rows)).save(settings.output)
     print(f"{settings.output}: {', '.join(BALLS)}")

@@ -24,8 +24,8 @@ BALL, RADIUS, TEAL, SIDES = (82.0, 46.0, 130.0), 30.0, (0.05, 0.55, 0.4), 192
 SUN, GOLD, NIGHT = torch.tensor([(0.6, -0.7, -0.3), (0.9, 0.5, 0.1), (0.01, 0.013, 0.022)])
 EDGES = torch.tensor([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
 VERTEX = """#version 330
-uniform mat4 camera; in vec3 place, color; out vec3 tint;
-void main() { tint = color; gl_Position = camera * vec4(place, 1); }"""
+uniform mat4 camera; in vec3 position, color; out vec3 tint;
+void main() { tint = color; gl_Position = camera * vec4(position, 1); }"""
 FRAGMENT = """#version 330
 in vec3 tint; out vec4 result;
 void main() { result = vec4(tint, 1); }"""
@@ -33,8 +33,8 @@ void main() { result = vec4(tint, 1); }"""
 
 def ball() -> Tensor:
     """Returns (k, 6): position and colour of a triangle strip that winds from pole to pole."""
-    turn = (torch.arange(-SIDES, SIDES**2 + 1)[:, None] / SIDES + torch.arange(2)).flatten()
-    u, v = 2 * torch.pi * turn, torch.pi * (turn / SIDES).clamp(0, 1)
+    turns = (torch.arange(-SIDES, SIDES**2 + 1)[:, None] / SIDES + torch.arange(2)).flatten()
+    u, v = 2 * torch.pi * turns, torch.pi * (turns / SIDES).clamp(0, 1)
     normals = torch.stack((v.sin() * u.cos(), v.sin() * u.sin(), v.cos()), 1)
     light = 0.25 + 0.75 * (normals @ SUN).clamp(min=0)[:, None]
     return torch.cat((torch.tensor(BALL) + RADIUS * normals, light * torch.tensor(TEAL)), 1)
@@ -57,7 +57,7 @@ def main(output: Path = Path("opengl_frame.png"), size: int = 720, device: str =
 
     def draw(corners: Tensor, mode: int) -> None:
         buffer = context.buffer(corners.contiguous().numpy())
-        context.vertex_array(program, [(buffer, "3f 3f", "place", "color")]).render(mode)
+        context.vertex_array(program, [(buffer, "3f 3f", "position", "color")]).render(mode)
 
     frame.use()
     frame.clear(*NIGHT, 1.0)
@@ -65,14 +65,14 @@ def main(output: Path = Path("opengl_frame.png"), size: int = 720, device: str =
     context.line_width = 3.0
     draw(ball(), moderngl.TRIANGLE_STRIP)
     with gv.opengl.Exchange(width, height, device) as exchange:
-        drawn, depth = exchange.read_color()[..., :3], exchange.read_depth()
-        layer = gv.Layer(drawn, gv.opengl.ray_distance(depth, projection))
-        picture = gv.render(tree, camera, shader, layer=layer, background=drawn)
+        drawn_color, depth = exchange.read_color()[..., :3], exchange.read_depth()
+        layer = gv.Layer(drawn_color, gv.opengl.ray_distance(depth, projection))
+        picture = gv.render(tree, camera, shader, layer=layer, background=drawn_color)
         exchange.draw(picture.color, gv.opengl.window_depth(picture.nearest, projection))
-        places = tree.box[EDGES.flatten()[:, None] >> torch.arange(3) & 1, torch.arange(3)].float()
-        draw(torch.cat((places, GOLD.expand_as(places)), 1), moderngl.LINES)
-        whole = exchange.read_color()[..., :3].movedim(-1, 0)
-    replace(picture, color=avg_pool2d(whole, 2).movedim(0, -1)).save(output)
+        points = tree.box[EDGES.flatten()[:, None] >> torch.arange(3) & 1, torch.arange(3)].float()
+        draw(torch.cat((points, GOLD.expand_as(points)), 1), moderngl.LINES)
+        color = exchange.read_color()[..., :3].movedim(-1, 0)
+    replace(picture, color=avg_pool2d(color, 2).movedim(0, -1)).save(output)
     print(f"{output}: {exchange}")
 
 

@@ -26,12 +26,12 @@ UPTAKE = gv.TransferFunction(
 )
 
 
-def pose_about(middle: torch.Tensor) -> torch.Tensor:
-    """Returns the pose (4, 4) from the uptake's axes to the world: a turn about `middle`."""
+def pose_about(center: torch.Tensor) -> torch.Tensor:
+    """Returns the pose (4, 4) from the uptake's axes to the world: a turn about `center`."""
     cos, sin = math.cos(math.radians(TILT)), math.sin(math.radians(TILT))
     pose = torch.eye(4, dtype=torch.float64)
     pose[1:3, 1:3] = torch.tensor([[cos, -sin], [sin, cos]])
-    pose[:3, 3] = middle - pose[:3, :3] @ middle
+    pose[:3, 3] = center - pose[:3, :3] @ center
     return pose
 
 
@@ -44,14 +44,14 @@ def uptake_of(scan: gv.Volume) -> tuple[gv.Volume, torch.Tensor]:
             kernel = [size if axis == other else 1 for other in range(3)]
             blurred = avg_pool3d(blurred, kernel, 1, [side // 2 for side in kernel])
     extent = torch.tensor(scan.extent, dtype=torch.float64)
-    middle = (extent - 1) / 2
-    pose, count = pose_about(middle), (1.3 * extent / COARSE).long()  # wider, because it is turned
-    origin = middle - (count - 1) / 2 * COARSE
+    center = (extent - 1) / 2
+    pose, count = pose_about(center), (1.3 * extent / COARSE).long()  # wider, because it is turned
+    origin = center - (count - 1) / 2 * COARSE
     axes = [o + COARSE * torch.arange(int(n)) for o, n in zip(origin, count, strict=True)]
-    own = torch.stack(torch.meshgrid(*axes[::-1], indexing="ij")[::-1], -1)  # x, y, z
-    world = own @ pose[:3, :3].T + pose[:3, 3]
-    place = (world - middle) / (extent / 2)  # -1 to 1 from face to face
-    coarse = grid_sample(blurred, place[None].float(), align_corners=False)[0, 0]
+    points = torch.stack(torch.meshgrid(*axes[::-1], indexing="ij")[::-1], -1)  # x, y, z
+    world = points @ pose[:3, :3].T + pose[:3, 3]
+    coordinates = (world - center) / (extent / 2)  # -1 to 1 from face to face
+    coarse = grid_sample(blurred, coordinates[None].float(), align_corners=False)[0, 0]
     spacing, first = (float(COARSE),) * 3, tuple(origin.tolist())
     return gv.Volume(coarse / coarse.max(), spacing, first, name="uptake"), pose
 

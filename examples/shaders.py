@@ -33,8 +33,8 @@ def channels(scan: gv.Volume, transfer: gv.TransferFunction) -> dict[str, gv.Vol
     value = scan.data[..., 0].float()
     normal = torch.nn.functional.normalize(-torch.stack(torch.gradient(value)[::-1], -1), dim=-1)
     z, y, x = torch.meshgrid(*(torch.arange(float(n)) for n in value.shape), indexing="ij")
-    ways = [(r * (z / 22).cos(), r * (z / 22).sin()) for r in (-38, 38)]
-    strands = [torch.hypot(x - 64 - u, y - 64 - v) for u, v in ways]
+    offsets = [(r * (z / 22).cos(), r * (z / 22).sin()) for r in (-38, 38)]
+    strands = [torch.hypot(x - 64 - u, y - 64 - v) for u, v in offsets]
     helix = torch.minimum(0.5 * torch.minimum(*strands) - 5, torch.hypot(x - 64, y - 64) - 9)
     parts = {
         "rgba": torch.from_numpy(transfer(value.numpy())).half(),
@@ -59,7 +59,7 @@ def main(settings: Settings) -> None:
     helix.channel = "helix"
     slab = {"clip": gv.Clip(planes=[(0.6, 0.8, 0, -86), (-0.6, -0.8, 0, 96)])}
     stored = gv.StoredColor("rgba", normals="normal", **light)
-    looks = (
+    cases = (
         *((transfer, {}), (gv.Lit(transfer, **light), {}), (surface, {})),
         *((gv.Projection("maximum", wide), {}), (SHELL, {"step": 1.0})),
         *((gv.PreIntegrated(SHELL), {"step": 1.0}), (SHELL, {"step": 0.02})),
@@ -67,12 +67,12 @@ def main(settings: Settings) -> None:
         *((gv.Projection("minimum", soft), slab), (features, {})),
     )
     render = partial(gv.render, tree, lod="finest")
-    means = [gv.Progressive(partial(render, shader=look, **more)) for look, more in looks]
-    made = [mean.refine(camera, settings.samples) for mean in means]
-    tiles = [one.color for one in made]
-    tiles[-1] = 0.5 * (made[-1].features / 127 + made[-1].alpha)  # -127 to 127 become 0 to 1
+    means = [gv.Progressive(partial(render, shader=shader, **options)) for shader, options in cases]
+    images = [mean.refine(camera, settings.samples) for mean in means]
+    tiles = [image.color for image in images]
+    tiles[-1] = 0.5 * (images[-1].features / 127 + images[-1].alpha)  # -127 to 127 become 0 to 1
     rows = [torch.cat(tiles[first : first + 6], dim=1) for first in (0, 6)]
-    replace(made[0], color=torch.cat(rows)).save(settings.output)
+    replace(images[0], color=torch.cat(rows)).save(settings.output)
     print(settings.output)
 
 

@@ -43,8 +43,8 @@ def hare(voxels: int) -> gv.N3Tree:
     shape = gv.Solid(reduce(partial(sdf.SmoothUnion, width=0.12), starmap(sdf.Capsule, LIMBS)))
     step = 2.6 / voxels
     axis = (torch.arange(voxels) + 0.5) * step - 1.3
-    places = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")[::-1], -1)
-    filled = shape.filtered(places, places.new_tensor([2 * step] * 3))["rgba"][..., 3:]
+    positions = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")[::-1], -1)
+    filled = shape.filtered(positions, positions.new_tensor([2 * step] * 3))["rgba"][..., 3:]
     return gv.N3Tree.from_volume(gv.Volume(filled, (step,) * 3, (-1.3 + step / 2,) * 3))
 
 
@@ -61,16 +61,16 @@ def main(settings: Settings) -> None:
     colors = np.concatenate([np.full((len(part), 3, 4), (*color, 1.0)) for part, color in parts])
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     mesh = gv.Mesh(vertices=corners.reshape(-1, 3), faces=faces, color=colors)
-    paint = {"resolution": settings.size * 7 // 9, "channels": ("color", "normal")}
-    producer = gv.MeshProducer(mesh, **paint)
-    fine = {"reference": 0.3 * producer.spacing[0], "premultiplied": True, "normals": "normal"}
-    look = gv.StoredColor("color", **fine, ambient=1, diffuse=1, specular=0.08, shininess=30)
+    mesh_options = {"resolution": settings.size * 7 // 9, "channels": ("color", "normal")}
+    producer = gv.MeshProducer(mesh, **mesh_options)
+    paint = {"reference": 0.3 * producer.spacing[0], "premultiplied": True, "normals": "normal"}
+    shader = gv.StoredColor("color", **paint, ambient=1, diffuse=1, specular=0.08, shininess=30)
     with gv.Engine(producer, device=settings.device) as engine:
         for part, mode in ((4, "converge"), (1, "interactive")):  # the small picture loads all
             size = settings.size * 16 // 9 // part, settings.size // part
             camera = gv.Camera.look_at((-1.6, 2.2, 8.5), (0, 0.12, 0), (0, 1, 0), 27, *size)
             options = {"lighting": LIGHT, "background": WALL, "cone_scale": 1.2 / part}
-            picture = engine.render(camera, look, mode, **options)
+            picture = engine.render(camera, shader, mode, **options)
     picture.save(settings.output)
     print(f"{settings.output}: {', '.join(counts)}")
 

@@ -15,21 +15,21 @@ SUN = gv.DirectionalLight((0.86, -0.3, 0.42), (4.0, 2.1, 0.95), angle=2)
 DAY = gv.DirectionalLight((-0.3, -1.0, -0.2), (0.2, 0.36, 0.8), angle=60)  # the whole blue sky
 LIGHT = gv.Lighting(lights=(SUN, DAY), ambient=(0.07, 0.1, 0.18))
 SNOW, ROCK, GRASS = tensor([(0.9, 0.92, 0.95), (0.23, 0.2, 0.19), (0.17, 0.16, 0.09)])
-APART = tensor([(0.0, 0.0), (0.01, 0.0), (0.0, 0.01)])
+OFFSETS = tensor([(0.0, 0.0), (0.01, 0.0), (0.0, 0.01)])
 HAZE, GLOW, ZENITH = tensor([(0.2, 0.26, 0.4), (2.2, 0.85, 0.25), (0.02, 0.06, 0.2)])
 
 
 def height(x, z):
     total = slope = 0
     for n in range(11):
-        at = 0.8 * 2**n * torch.stack((0.6 * x - 0.8 * z, 0.8 * x + 0.6 * z), -1)
-        here, *ahead = (noise.perlin(at + one, seed=n + 3) for one in APART)
-        slope = 0.8 * slope + 100 * torch.stack([one - here for one in ahead])
+        p = 0.8 * 2**n * torch.stack((0.6 * x - 0.8 * z, 0.8 * x + 0.6 * z), -1)
+        here, *ahead = (noise.perlin(p + offset, seed=n + 3) for offset in OFFSETS)
+        slope = 0.8 * slope + 100 * torch.stack([value - here for value in ahead])
         total = total + here / 2**n / (1 + 0.6 * slope.square().sum(0))
     return 0.42 + 0.83 * total
 
 
-def step(start, end, value):
+def fade(start, end, value):
     return 0.5 - 0.5 * (torch.pi * ((value - start) / (end - start)).clamp(0, 1)).cos()
 
 
@@ -41,19 +41,19 @@ class Ground(gv.Producer):
         return torch.where(ground.amax(1) + gap < low[:, 1], gv.Region.EMPTY, gv.Region.DATA)
 
     def fill(self, nodes):
-        at = nodes.wider(1).positions[:, :, 1].float()  # (k, z, x, 3): heights do not depend on y
-        ground, side = height(at[..., 0], at[..., 2]), nodes.voxel_size[:, 0, None, None].float()
+        p = nodes.wider(1).positions[:, :, 1].float()  # (k, z, x, 3): heights do not depend on y
+        ground, side = height(p[..., 0], p[..., 2]), nodes.voxel_size[:, 0, None, None].float()
         slope = torch.stack(torch.gradient(ground, dim=(2, 1)), -1)[:, 1:-1, 1:-1] / side[..., None]
         normal = normalize(pad(-slope, (1, 0), value=1)[..., [1, 0, 2]], dim=-1)
-        level, flat = ground[:, 1:-1, 1:-1, None], normal[..., 1:2]
-        rough = noise.fbm(9 * at[:, 1:-1, 1:-1, ::2], octaves=4)[..., None]
-        color = ROCK.lerp(GRASS, step(0.62, 0.8, flat + 0.05 * rough))
-        snow = step(0.62, 0.78, level + 0.12 * rough) * step(0.5, 0.66, flat)
-        gap = (nodes.positions[..., 1:2].float() - level[:, :, None]) * flat[:, :, None]
+        level, flatness = ground[:, 1:-1, 1:-1, None], normal[..., 1:2]
+        roughness = noise.fbm(9 * p[:, 1:-1, 1:-1, ::2], octaves=4)[..., None]
+        color = ROCK.lerp(GRASS, fade(0.62, 0.8, flatness + 0.05 * roughness))
+        snow = fade(0.62, 0.78, level + 0.12 * roughness) * fade(0.5, 0.66, flatness)
+        gap = (nodes.positions[..., 1:2].float() - level[:, :, None]) * flatness[:, :, None]
         alpha = (0.5 - gap / side[..., None, None]).clamp(0, 1)
         rgba = pad(color.lerp(SNOW, snow), (0, 1), value=1)[:, :, None] * alpha
-        turned = (127 * normal[:, :, None]).round().char().expand(*alpha.shape[:4], 3)
-        return {"rgba": rgba.half(), "normal": turned}
+        packed_normal = (127 * normal[:, :, None]).round().char().expand(*alpha.shape[:4], 3)
+        return {"rgba": rgba.half(), "normal": packed_normal}
 
 
 def main(output: str = "terrain.png", device: str = "cpu", size: int = 720) -> None:
@@ -61,19 +61,19 @@ def main(output: str = "terrain.png", device: str = "cpu", size: int = 720) -> N
     camera = gv.Camera.look_at(EYE, TARGET, (0, 1, 0), 40, size * 16 // 9, size)
     ground = Ground(EXTENT, channels=channels, box=BOX)
     engine = gv.Engine(ground, device=device, brick_pool="512 MB")
-    matt = {"normals": "normal", "ambient": 1, "diffuse": 1, "specular": 0}
-    look = gv.StoredColor("rgba", premultiplied=True, **matt)
-    seen = engine.render(camera, look, lighting=LIGHT, background=None, cone_scale=1.2)
-    way = camera.rays().direction.float().reshape(*seen.color.shape)
-    sun, up = (way * -normalize(tensor(SUN.direction), dim=0)).sum(-1, True), way[..., 1:2].clamp(0)
-    haze, plane = HAZE.lerp(GLOW, (0.5 + 0.5 * sun) ** 3), way[..., ::2] / (up + 0.08)
+    shading = {"normals": "normal", "ambient": 1, "diffuse": 1, "specular": 0}
+    shader = gv.StoredColor("rgba", premultiplied=True, **shading)
+    picture = engine.render(camera, shader, lighting=LIGHT, background=None, cone_scale=1.2)
+    ray = camera.rays().direction.float().reshape(*picture.color.shape)
+    sun, up = (ray * -normalize(tensor(SUN.direction), dim=0)).sum(-1, True), ray[..., 1:2].clamp(0)
+    haze, plane = HAZE.lerp(GLOW, (0.5 + 0.5 * sun) ** 3), ray[..., ::2] / (up + 0.08)
     streaks = noise.fbm(noise.warp(plane * tensor([0.5, 1.3]), amplitude=0.5), octaves=6, seed=2)
-    cirrus = step(-0.1, 0.7, streaks)[..., None] * step(0.0, 0.12, up)
+    cirrus = fade(-0.1, 0.7, streaks)[..., None] * fade(0.0, 0.12, up)
     sky = haze.lerp(ZENITH, 1 - (-4 * up).exp()).lerp(1.5 * haze + 0.1, 0.45 * cirrus)
-    depth, alpha = seen.depth.cpu().clamp(max=30), seen.alpha.cpu()
-    mist = 0.035 + 0.22 * (-7 * (EYE[1] + way[..., 1:2] * depth).clamp(0, 2)).exp()
-    color = haze.lerp(seen.color.cpu(), (-depth * mist).exp()) * alpha + sky * (1 - alpha)
-    replace(seen, color=color, alpha=torch.ones_like(alpha)).tone_map("aces").save(output)
+    depth, alpha = picture.depth.cpu().clamp(max=30), picture.alpha.cpu()
+    mist = 0.035 + 0.22 * (-7 * (EYE[1] + ray[..., 1:2] * depth).clamp(0, 2)).exp()
+    color = haze.lerp(picture.color.cpu(), (-depth * mist).exp()) * alpha + sky * (1 - alpha)
+    replace(picture, color=color, alpha=torch.ones_like(alpha)).tone_map("aces").save(output)
     print(f"{output}: {engine}")
 
 

@@ -32,13 +32,13 @@ def sky(height: int = 768) -> torch.Tensor:
     above = up.abs()  # the sea mirrors the sky
     light = torch.tensor([1.1, 0.4, 0.12]) * (-7 * above).exp()
     light = light + torch.tensor([0.06, 0.14, 0.4]) * above.sqrt()
-    away = (across + 0.01) ** 2 + (0.5 * (above - 0.12)) ** 2
-    glow = 12 * (-4000 * away).exp() + 1.5 * (-250 * away).exp()
-    place = torch.cat(torch.broadcast_tensors(14 * across, 60 * above, 0 * up), -1)
-    cloud = (1.4 * gv.noise.fbm(place, octaves=6) + 0.15).clamp(0, 1)[..., None]
-    lit = light * 0.35 + (0.35 * glow + 0.25 * (-6 * away).exp()) * torch.tensor([1.0, 0.4, 0.2])
+    r2 = (across + 0.01) ** 2 + (0.5 * (above - 0.12)) ** 2
+    glow = 12 * (-4000 * r2).exp() + 1.5 * (-250 * r2).exp()
+    points = torch.cat(torch.broadcast_tensors(14 * across, 60 * above, 0 * up), -1)
+    cloud = (1.4 * gv.noise.fbm(points, octaves=6) + 0.15).clamp(0, 1)[..., None]
+    lit = light * 0.35 + (0.35 * glow + 0.25 * (-6 * r2).exp()) * torch.tensor([1.0, 0.4, 0.2])
     light = (light + glow * torch.tensor([1.0, 0.85, 0.6])).lerp(lit, cloud)
-    ripples = 0.35 + 0.3 * gv.noise.fbm(place * torch.tensor([2.0, 9.0, 1.0]), octaves=4)
+    ripples = 0.35 + 0.3 * gv.noise.fbm(points * torch.tensor([2.0, 9.0, 1.0]), octaves=4)
     return torch.where(up > 0, light, light * ripples[..., None].clamp(min=0))
 
 
@@ -50,14 +50,14 @@ def main(settings: Settings) -> None:
     width = -(-settings.size * 16 // 27)  # a third of 16:9
     camera = gv.Camera.orbit(10, 3, 1.5, 52, width, settings.size)
     render = partial(gv.render, tree, shader=shader)
-    behind = gv.Environment(sky())
-    picture = gv.Progressive(partial(render, background=behind)).refine(camera, RAYS)
+    background = gv.Environment(sky())
+    picture = gv.Progressive(partial(render, background=background)).refine(camera, RAYS)
     curves = [picture.tone_map(curve) for curve in ("none", "reinhard", "aces")]
-    color = torch.cat([one.color for one in curves], dim=1)
+    color = torch.cat([toned.color for toned in curves], dim=1)
     replace(picture, color=color).save(settings.output)
-    cut = settings.output.with_name(f"{settings.output.stem}_transparent.png")
-    gv.Progressive(partial(render, background=None)).refine(camera, RAYS).save(cut, bits=16)
-    print(f"{settings.output} and {cut}: {RAYS} rays a pixel")
+    transparent = settings.output.with_name(f"{settings.output.stem}_transparent.png")
+    gv.Progressive(partial(render, background=None)).refine(camera, RAYS).save(transparent, bits=16)
+    print(f"{settings.output} and {transparent}: {RAYS} rays a pixel")
 
 
 if __name__ == "__main__":

@@ -77,11 +77,11 @@ def quick(cache: Path) -> str:
     """A compiler that does not optimise, shared by all processes so that they share its cache."""
     folder = cache.parent / "quick"
     if not folder.exists():
-        made = cache.parent / f"quick-{os.getpid()}"
-        made.mkdir()
-        quick_compiler(made)
+        new_folder = cache.parent / f"quick-{os.getpid()}"
+        new_folder.mkdir()
+        quick_compiler(new_folder)
         with contextlib.suppress(OSError):  # another process was first
-            made.rename(folder)
+            new_folder.rename(folder)
     return str(folder / "c++")
 
 
@@ -134,28 +134,28 @@ def channels(blobs) -> dict[str, gv.Volume]:
     rgba = torch.stack((x, y, z, value), -1)
     normal = torch.stack(torch.gradient(value)[::-1], -1)
     normal = torch.nn.functional.normalize(normal, dim=-1) * 0.5 + 0.5
-    place = blobs.spacing, blobs.origin
-    six = gv.Volume(rgba, *place).directional()
+    placement = blobs.spacing, blobs.origin
+    six = gv.Volume(rgba, *placement).directional()
     six.data = six.data * torch.linspace(0.6, 1.0, 24).to(six.data)  # all six differ
     return {
         "value": blobs,
-        "rgba": gv.Volume((rgba * 255).round().to(torch.uint8), *place),
+        "rgba": gv.Volume((rgba * 255).round().to(torch.uint8), *placement),
         "premultiplied": gv.Volume(
-            torch.cat((rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]), -1), *place
+            torch.cat((rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]), -1), *placement
         ),
         "six": six,
-        "normal": gv.Volume((normal * 255).round().to(torch.uint8), *place),
-        "label": gv.Volume((value * 6).to(torch.int64) * 1000, *place, labels=True),
+        "normal": gv.Volume((normal * 255).round().to(torch.uint8), *placement),
+        "label": gv.Volume((value * 6).to(torch.int64) * 1000, *placement, labels=True),
     }
 
 
 @pytest.fixture
 def session():
     """A view of a ball, without a server."""
-    made = new_session(bright_ball(), FUNCTION, engine={"time_budget": None})
-    yield made
-    made.close()
-    assert not made._thread.is_alive()
+    opened = new_session(bright_ball(), FUNCTION, engine={"time_budget": None})
+    yield opened
+    opened.close()
+    assert not opened._thread.is_alive()
 
 
 @pytest.fixture(scope="module")
@@ -163,27 +163,27 @@ def chromium():
     """The browser; without one, a skip that the summary reports."""
     if reason := browser.why_no_browser():
         pytest.skip(f"browser: {reason}")
-    with browser.running_chromium() as found:
-        yield found
+    with browser.running_chromium() as process:
+        yield process
 
 
 @pytest.fixture
 def viewer():
     """A view of a ball, served."""
     state = gv.ViewState(shader=BANDS, develop=Development(samples=2))
-    with gv.view(bright_ball(), state=state, browser=False, wait=False) as made:
-        yield made
+    with gv.view(bright_ball(), state=state, browser=False, wait=False) as served_view:
+        yield served_view
 
 
 @pytest.fixture
 def tab(chromium, viewer):
     """The viewer's page in the browser; fails if the page has logged errors or warnings."""
-    made = browser.Tab(chromium, viewer.url)
-    made.until("app?.state")
-    made.final()
-    yield made
-    complaints = made.complaints
-    made.close()
+    opened_tab = browser.Tab(chromium, viewer.url)
+    opened_tab.until("app?.state")
+    opened_tab.final()
+    yield opened_tab
+    complaints = opened_tab.complaints
+    opened_tab.close()
     assert not complaints
 
 
@@ -202,11 +202,11 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    noted = [value for name, value in report.user_properties if name == "backend"]
+    backends = [value for name, value in report.user_properties if name == "backend"]
     if report.skipped and isinstance(report.longrepr, tuple) and ABSENT in report.longrepr[2]:
         _absent.add(report.longrepr[2].partition(ABSENT)[2])
     if report.when == "call" and report.passed:
-        _ran.update(noted)
+        _ran.update(backends)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

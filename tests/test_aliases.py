@@ -35,9 +35,9 @@ class Cells(gv.VolumeProducer):
 
     later = False
 
-    def __init__(self, volume: gv.Volume, one=(0, 0, 0), by_fill: bool = False, **options) -> None:
+    def __init__(self, volume: gv.Volume, cell=(0, 0, 0), by_fill: bool = False, **options) -> None:
         super().__init__(volume, **options)
-        self.one, self.by_fill = torch.tensor(one), by_fill
+        self.one, self.by_fill = torch.tensor(cell), by_fill
         self.filled = self.asked = 0
 
     def same(self, nodes):
@@ -49,20 +49,20 @@ class Cells(gv.VolumeProducer):
 
     def classify(self, nodes):
         self.asked += len(nodes)
-        found = super().classify(nodes)
+        regions = super().classify(nodes)
         goal, is_alias = self.same(nodes)
-        is_alias = is_alias & (found.kind == gv.Region.DATA) & (not self.by_fill)
-        kind = torch.where(is_alias, gv.Region.ALIAS, found.kind)
-        return gv.Regions(kind=kind, constants=found.constants, ranges=found.ranges, alias=goal)
+        is_alias = is_alias & (regions.kind == gv.Region.DATA) & (not self.by_fill)
+        kind = torch.where(is_alias, gv.Region.ALIAS, regions.kind)
+        return gv.Regions(kind=kind, constants=regions.constants, ranges=regions.ranges, alias=goal)
 
     def fill(self, nodes):
         self.filled += len(nodes)
-        found = super().fill(nodes)
+        regions = super().fill(nodes)
         goal, is_alias = self.same(nodes)
         if not (self.by_fill and is_alias.any()):
-            return found
+            return regions
         kind = torch.where(is_alias, gv.Region.ALIAS, gv.Region.DATA)
-        answer = gv.Bricks(data=found.data, kind=kind, alias=goal)
+        answer = gv.Bricks(data=regions.data, kind=kind, alias=goal)
         if not self.later:
             return answer
         future: Future = Future()
@@ -72,27 +72,27 @@ class Cells(gv.VolumeProducer):
 
 def views(size=24):
     middle = CELL * CELLS / 2
-    place = (middle,) * 3
+    target = (middle,) * 3
     for azimuth, elevation, away in ((20, 30, 2.0), (200, -10, 0.9), (77, 70, 0.4)):
         camera = gv.Camera.orbit(azimuth, elevation, away, None, size, size)
         yield camera
-    yield gv.Camera.look_at((place[0], place[1], -9.0), place, (0, 1, 0), 60, size, size)
+    yield gv.Camera.look_at((target[0], target[1], -9.0), target, (0, 1, 0), 60, size, size)
 
 
 @pytest.mark.parametrize("backend", COMPILED)
 @pytest.mark.parametrize(
     ("loading", "by_fill"), [("straight", False), ("levels", False), ("levels", True)]
 )
-@pytest.mark.parametrize("one", [(0, 0, 0), (3, 1, 2)])
-def test_equal_cells_are_made_once(backend, loading, by_fill, one):
+@pytest.mark.parametrize("cell", [(0, 0, 0), (3, 1, 2)])
+def test_equal_cells_are_made_once(backend, loading, by_fill, cell):
     """It takes no more bricks than one cell; pictures equal the resident tree's in every bit."""
     volume, device = world(), DEVICES[backend]
     tree = gv.N3Tree.from_volume(volume, 4, threshold=0.0, device=device)
     options = {"brick_size": 4, "brick_pool": "16 MB", "loading": loading, "device": device}
     counts = []
-    for producer in (Cells(volume, one, by_fill, threshold=0.0), None):
-        made = producer or gv.VolumeProducer(volume, threshold=0.0)
-        with gv.Engine(made, **options) as engine:
+    for producer in (Cells(volume, cell, by_fill, threshold=0.0), None):
+        source = producer or gv.VolumeProducer(volume, threshold=0.0)
+        with gv.Engine(source, **options) as engine:
             for view in views():
                 picture = engine.render(view, LOOK, lod="finest")
                 expected = gv.render(tree, view, LOOK, lod="finest")
@@ -117,13 +117,13 @@ def test_a_target_that_no_ray_sees_is_made_and_stays():
         picture = engine.render(view, LOOK, lod="finest")
         expected = gv.render(tree, view, LOOK, lod="finest")
         assert picture.stats.converged and torch.equal(picture.color, expected.color)
-        place = torch.tensor([[0, 0, 0, 2]])
-        assert int(engine.trees["scene"].tree.find(place)) >= 0
+        loc = torch.tensor([[0, 0, 0, 2]])
+        assert int(engine.trees["scene"].tree.find(loc)) >= 0
         filled = producer.filled
         for _ in range(5):
             engine.frame(view, LOOK, lod="finest")
         assert producer.filled == filled, "nothing is made again"
-        assert int(engine.trees["scene"].tree.find(place)) >= 0
+        assert int(engine.trees["scene"].tree.find(loc)) >= 0
 
 
 class Chain(gv.Producer):
@@ -153,8 +153,8 @@ class Chain(gv.Producer):
 def at(engine, loc):
     """Returns the brick words of the nodes at locs, -9 where there is no node."""
     node = engine.trees["scene"].tree.find(torch.tensor(loc))
-    words = engine.cache.nodes.brick_tn.view(-1)
-    return torch.where(node >= 0, words[node.clamp(min=0)], -9).tolist()
+    pointers = engine.cache.nodes.brick_tn.view(-1)
+    return torch.where(node >= 0, pointers[node.clamp(min=0)], -9).tolist()
 
 
 @pytest.mark.backend("cpp")
@@ -164,8 +164,8 @@ def test_an_alias_of_an_alias_is_the_last_one():
         picture = engine.render(gv.Camera.orbit(30, 20, 1.2, None, 24, 24), LOOK, lod="finest")
         engine.validate()
         assert picture.stats.converged
-        words = at(engine, [[1, 1, 0, 1], [0, 1, 0, 1], [1, 0, 0, 1], [0, 1, 1, 1]])
-        assert len({*words}) == 1
+        slots = at(engine, [[1, 1, 0, 1], [0, 1, 0, 1], [1, 0, 0, 1], [0, 1, 1, 1]])
+        assert len({*slots}) == 1
         octants = {tuple(c >> loc[3] - 1 for c in loc[:3]) for loc in chain.filled if loc[3]}
         assert not octants & {(0, 1, 0), (1, 1, 0), (0, 1, 1)}, "they are never asked for"
         assert len(octants) == 5
@@ -201,7 +201,7 @@ def test_an_alias_of_what_lies_in_it_fails(goal):
     with gv.Engine(Chain({1: goal}), brick_size=4) as engine:
         engine.render(next(views()), LOOK, lod="finest")
         engine.validate()
-        assert [one.message for one in engine.failures] == [
+        assert [failure.message for failure in engine.failures] == [
             f"alias {goal} lies in the node itself, (1, 0, 0, 1)"
         ]
 
@@ -242,9 +242,9 @@ def test_renewed_content_is_shared_again():
 @pytest.mark.backend("cpp")
 def test_a_sponge_of_one_tile_is_cut_as_whole_numbers_tell():
     """Menger's, 3^19 cells a side: one tile and one brick, from 10^-8 of the box away."""
-    place = torch.tensor([0.25, 0.75, 0.25], dtype=torch.float64)
+    point = torch.tensor([0.25, 0.75, 0.25], dtype=torch.float64)
     size = 3.0**-17  # of the cell in whose hole the eye stands
-    low = (place / size).floor() * size
+    low = (point / size).floor() * size
     eye, target = (low + size * torch.tensor(v) for v in ([0.5, 0.47, 0.52], [0.2, 0.85, 0.3]))
     view = gv.Camera.look_at(tuple(eye.tolist()), tuple(target.tolist()), (0, 0, 1), 70, 16, 16)
     rays, sponge = view.rays(), Sponge(19)
@@ -256,9 +256,9 @@ def test_a_sponge_of_one_tile_is_cut_as_whole_numbers_tell():
         picture = engine.render(view, shader)
         engine.validate()
         assert picture.stats.converged and sponge.classified == 1 + 27 and sponge.filled == 1
-    beside = (picture.depth.flatten().double() - t).abs() / (rays.cone[:, 1].double() * t)
-    print(beside.quantile(0.5), beside.quantile(0.75), beside.max())
-    assert (picture.depth < torch.inf).all() and beside.quantile(0.75) < 1
+    error = (picture.depth.flatten().double() - t).abs() / (rays.cone[:, 1].double() * t)
+    print(error.quantile(0.5), error.quantile(0.75), error.max())
+    assert (picture.depth < torch.inf).all() and error.quantile(0.75) < 1
 
 
 class Forest(gv.Producer):
@@ -271,8 +271,8 @@ class Forest(gv.Producer):
         self.tree, self.goal, self.filled = tree, goal, 0
 
     def classify(self, nodes):
-        place = nodes.loc[:, :3].sum(1)
-        alias = (nodes.depth == 2) & (place % 3 == 0) | (nodes.depth == 3) & (place % 2 == 0)
+        diagonal = nodes.loc[:, :3].sum(1)
+        alias = (nodes.depth == 2) & (diagonal % 3 == 0) | (nodes.depth == 3) & (diagonal % 2 == 0)
         kind = torch.where(nodes.depth < 3, gv.Region.DATA, gv.Region.EMPTY)
         kind = torch.where(alias, int(gv.Region.ALIAS), kind)
         goal = torch.tensor(self.goal).expand(len(nodes), 4)
@@ -284,7 +284,7 @@ class Forest(gv.Producer):
     def whole(self, plant: gv.VolumeProducer) -> gv.Volume:
         """Returns the scene as a volume."""
         small, large = (level[..., 0].cpu() for level in plant._values["value"][-2:])
-        found = torch.zeros((128, 128, 128))
+        voxels = torch.zeros((128, 128, 128))
         for z, y, x in itertools.product(range(8), repeat=3):
             if (x // 2 + y // 2 + z // 2) % 3 == 0:
                 part = large[tuple(slice(c % 2 * 16, c % 2 * 16 + 16) for c in (z, y, x))]
@@ -292,8 +292,8 @@ class Forest(gv.Producer):
                 part = small
             else:
                 continue
-            found[tuple(slice(c * 16, c * 16 + 16) for c in (z, y, x))] = part
-        return gv.Volume(found)
+            voxels[tuple(slice(c * 16, c * 16 + 16) for c in (z, y, x))] = part
+        return gv.Volume(voxels)
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -303,14 +303,14 @@ def test_a_forest_is_made_of_another_producers_tree(backend):
     plant = gv.VolumeProducer(world(1), threshold=0.0)
     forest = Forest("plant")
     unseen = gv.TransferFunction.from_points([(0, 0), (1, 0)])
-    looks = {"plant": unseen, "forest": LOOK}
+    shaders = {"plant": unseen, "forest": LOOK}
     with gv.Engine({"plant": plant, "forest": forest}, **options) as engine:
         for _ in range(2):
             tree = gv.N3Tree.from_volume(
                 forest.whole(plant), 4, threshold=0.0, device=DEVICES[backend]
             )
             for view in views():
-                picture = engine.render(view, looks, lod="finest")
+                picture = engine.render(view, shaders, lod="finest")
                 expected = gv.render(tree, view, LOOK, lod="finest")
                 engine.validate()
                 assert picture.stats.converged and not picture.stats.failed
@@ -338,8 +338,8 @@ def test_wrong_targets_in_other_trees_are_named(forest, message):
     with gv.Engine(trees, brick_size=4) as engine:
         engine.render(next(views()), LOOK, lod="finest")
         engine.validate()
-        told = [one.message for one in engine.failures]
-        assert all(message in one for one in told) and (told or forest.tree is None)
+        messages = [failure.message for failure in engine.failures]
+        assert all(message in failure for failure in messages) and (messages or forest.tree is None)
 
 
 @pytest.mark.backend("cuda")
@@ -362,9 +362,9 @@ def flight(seed: int, volume: gv.Volume, tree: gv.N3Tree, device: torch.device) 
     equals the resident tree's), and how many tiles and bricks were evicted.
     """
     pick = random.Random(seed)
-    one = tuple(pick.randrange(CELLS) for _ in range(3))
+    cell = tuple(pick.randrange(CELLS) for _ in range(3))
     hold = pick.choice(["voxels", "bricks"])
-    producer = Cells(volume, one, pick.random() < 0.4, threshold=0.0, hold=hold)
+    producer = Cells(volume, cell, pick.random() < 0.4, threshold=0.0, hold=hold)
     producer.later = pick.random() < 0.5
     options = {
         "brick_pool": pick.choice([20, 40, 150, 600]) * 6**3 * 4,

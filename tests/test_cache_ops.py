@@ -66,34 +66,34 @@ def test_requests_are_chosen_by_list_level_and_size(
     """There are few levels and sizes, so that many requests tie and their order decides; some nodes
     lie outside the pool of 10 tiles.
     """
-    device, place = DEVICES[backend], torch.zeros((10, 4), dtype=torch.int32)
-    place[:, 3] = torch.tensor(data.draw(st.lists(st.integers(0, 2), min_size=10, max_size=10)))
+    device, loc = DEVICES[backend], torch.zeros((10, 4), dtype=torch.int32)
+    loc[:, 3] = torch.tensor(data.draw(st.lists(st.integers(0, 2), min_size=10, max_size=10)))
     numbers = st.lists(st.integers(-1, 85), min_size=listed, max_size=listed)
     sizes = st.sampled_from([0, 7, config.REQUEST_PRIORITY])
     kinds = st.sampled_from([0, LOAD, SUBDIVIDE, LOAD | SUBDIVIDE])
     asked = [[], []]
     for rows in asked:
-        words = st.lists(st.tuples(kinds, sizes).map(sum), min_size=listed, max_size=listed)
-        rows += [data.draw(numbers), data.draw(words)]
+        list_words = st.lists(st.tuples(kinds, sizes).map(sum), min_size=listed, max_size=listed)
+        rows += [data.draw(numbers), data.draw(list_words)]
     node, priority = ops.choose_requests(
         int32(asked, device),
-        place.to(device),
+        loc.to(device),
         torch.tensor(room, device=device),
         8,
         batch,
         coarse_first,
         backend=backend,
     )
-    wanted = []
-    for number, (nodes, words) in enumerate(asked):
-        for at, (one, word) in enumerate(zip(nodes, words, strict=True)):
-            if 0 <= one < 80:
-                level = int(place[one // 8, 3]) * (1 if coarse_first else -1)
+    candidates = []
+    for number, (nodes, list_words) in enumerate(asked):
+        for index, (n, word) in enumerate(zip(nodes, list_words, strict=True)):
+            if 0 <= n < 80:
+                level = int(loc[n // 8, 3]) * (1 if coarse_first else -1)
                 size = word & config.REQUEST_PRIORITY
-                wanted.append(((number, level, -size, at), one, word, size))
-    wanted.sort()
-    for row, (kind, most) in enumerate(((LOAD, room[1]), (SUBDIVIDE, room[0]))):
-        chosen = [(one, size) for _, one, word, size in wanted if word & kind][: min(batch, most)]
+                candidates.append(((number, level, -size, index), n, word, size))
+    candidates.sort()
+    for row, (kind, limit) in enumerate(((LOAD, room[1]), (SUBDIVIDE, room[0]))):
+        chosen = [(n, size) for _, n, word, size in candidates if word & kind][: min(batch, limit)]
         expected = [*chosen, *[(-1, 0)] * (batch - len(chosen))]
         assert list(zip(node[row].tolist(), priority[row].tolist(), strict=True)) == expected
 
@@ -220,18 +220,18 @@ def test_link_tiles_writes_tiles_and_hangs_them_below_nodes(backend, data, tiles
     pool = [draw(tiles, per_tile), draw(tiles, per_tile), requests(request)]
     pool += [draw(tiles, 4), draw(tiles), draw(tiles), draw(tiles)]
     pool.append(torch.ones(tiles, dtype=torch.bool))
-    made = [draw(len(asking), width), draw(len(asking), width), torch.tensor(asking).long()]
-    made.append(draw(len(asking), 4).long())
+    tile_values = [draw(len(asking), width), draw(len(asking), width), torch.tensor(asking).long()]
+    tile_values.append(draw(len(asking), 4).long())
     there = [t.to(device) for t in pool]
     row_k, tile_k = torch.tensor([*rows, -1]), int32([*sorted(fresh), 0])
-    given_ = [t.to(device) for t in (*made, row_k, tile_k)]
+    given_ = [t.to(device) for t in (*tile_values, row_k, tile_k)]
     ops.link_tiles(*there, *given_, 5, int32([9], device), backend=backend)
 
     child, brick, asked, loc, parent, tree, stamp, shared = pool
     for row, tile in zip(rows, sorted(fresh), strict=True):
         child[tile], brick[tile], asked[tile] = config.TERMINAL, config.EMPTY, 0
-        child[tile, :width], brick[tile, :width] = made[0][row], made[1][row]
-        x, y, z, depth = made[3][row].tolist()
+        child[tile, :width], brick[tile, :width] = tile_values[0][row], tile_values[1][row]
+        x, y, z, depth = tile_values[3][row].tolist()
         loc[tile] = int32([x, y, z, depth + 1])
         parent[tile], tree[tile], stamp[tile], shared[tile] = asking[row], 5, 9, False
     for row, tile in zip(rows, sorted(fresh), strict=True):
@@ -245,18 +245,18 @@ def test_link_tiles_writes_tiles_and_hangs_them_below_nodes(backend, data, tiles
 def test_put_rows_writes_rows_into_slots(backend, data, slots, width):
     device = DEVICES[backend]
     chosen = data.draw(st.lists(st.integers(0, slots - 1), unique=True, max_size=slots))
-    places = data.draw(st.permutations([*chosen, -1, slots]))
+    slots_of_rows = data.draw(st.permutations([*chosen, -1, slots]))
     generator = torch.Generator().manual_seed(data.draw(st.integers(0, 2**20)))
     target, rows = (
         torch.randint(256, (n, width), dtype=torch.uint8, generator=generator)
-        for n in (slots, len(places))
+        for n in (slots, len(slots_of_rows))
     )
     there = target.to(device)
-    slot_k = torch.tensor(places, device=device)
+    slot_k = torch.tensor(slots_of_rows, device=device)
     ops.put_rows(there, slot_k, rows.to(device), backend=backend)
-    for place, row in zip(places, rows, strict=True):
-        if 0 <= place < slots:
-            target[place] = row
+    for slot, row in zip(slots_of_rows, rows, strict=True):
+        if 0 <= slot < slots:
+            target[slot] = row
     assert torch.equal(there.cpu(), target)
 
 
@@ -293,21 +293,21 @@ def test_nodes_tell_their_places_and_what_they_lack(backend, data, branching, ti
     there = {name: words_.to(DEVICES[backend]) for name, words_ in pool.items()}
     node_k = torch.tensor([*node, -1, tiles * per_tile], device=DEVICES[backend])
     loc = ops.locate(there["loc_t4"], node_k, branching, per_tile, backend=backend)
-    assert loc.tolist() == [list(place) for place in expected] + [[-1] * 4] * 2
+    assert loc.tolist() == [list(position) for position in expected] + [[-1] * 4] * 2
 
     moved = data.draw(st.sets(st.integers(0, len(node) - 1)))
-    asked = loc.clone()
-    asked[torch.tensor(sorted(moved), dtype=torch.int64, device=loc.device), 1] += 1
+    asked_loc = loc.clone()
+    asked_loc[torch.tensor(sorted(moved), dtype=torch.int64, device=loc.device), 1] += 1
     tree, root = 1, data.draw(st.sampled_from(node))
     lacks = ops.lacking(
-        *there.values(), node_k, asked, tree, root, branching, backend=backend
+        *there.values(), node_k, asked_loc, tree, root, branching, backend=backend
     ).tolist()
     for row, index in enumerate(node):
         tile = index // per_tile
         hangs = pool["parent_t"][tile] >= 0 or pool["shared_t"][tile] or index == root
         bare = pool["pointer_tn"].view(-1)[index] == config.ABSENT
-        own = pool["tree_t"][tile] == tree and row not in moved
-        assert lacks[row] == bool(hangs and bare and own)
+        in_tree = pool["tree_t"][tile] == tree and row not in moved
+        assert lacks[row] == bool(hangs and bare and in_tree)
     assert lacks[len(node) :] == [False, False]
 
 
@@ -361,13 +361,13 @@ def test_cache_ops_pass_opcheck(compiled):
     words = int32([[5, 0, 2, -3]], device)
     request = torch.tensor([[1 << 11, 0, 3 << 11, 9 << 11]], dtype=torch.int16, device=device)
     table, frame = torch.ops.gvtorch, int32([1], device)
-    place = torch.zeros((1, 4), dtype=torch.int64, device=device)
+    node_locs = torch.zeros((1, 4), dtype=torch.int64, device=device)
     row, none = torch.zeros_like(frame).long(), torch.zeros_like(frame)
     for op, arguments in (
         (table.compact_requests, (request, 3)),
         (
             table.choose_requests,
-            (int32([[[1, 0], [LOAD, 9]]], device), words, place[0, :2].clone(), 4, 3, True),
+            (int32([[[1, 0], [LOAD, 9]]], device), words, node_locs[0, :2].clone(), 4, 3, True),
         ),
         (table.lru_partition, (int32([2, 0, 1], device), int32([1, 0, 1], device), frame)),
         (table.unlink, (words, frame.clone(), frame.bool(), int32([0, -1], device))),
@@ -391,7 +391,7 @@ def test_cache_ops_pass_opcheck(compiled):
                 *(words.clone(), words.clone(), request, words.clone()),
                 *[frame.clone() for _ in range(3)],
                 frame.bool(),
-                *(words, words, row, place, row, none),
+                *(words, words, row, node_locs, row, none),
                 *(1, frame),
             ),
         ),
@@ -399,7 +399,7 @@ def test_cache_ops_pass_opcheck(compiled):
         (table.locate, (words, frame.long(), 2, 4)),
         (
             table.lacking,
-            (*(words, words, frame, frame, frame.bool(), frame.long(), place), 1, 0, 2),
+            (*(words, words, frame, frame, frame.bool(), frame.long(), node_locs), 1, 0, 2),
         ),
     ):
         torch.library.opcheck(op.default, arguments)
@@ -408,8 +408,8 @@ def test_cache_ops_pass_opcheck(compiled):
 def test_slots_that_do_not_exist_were_not_used(backend):
     device = DEVICES[backend]
     order, stamp = int32([0, -1, 5, 1], device), int32([3, 3], device)
-    found, unused = ops.lru_partition(order, stamp, int32([3], device), backend=backend)
-    assert found.tolist() == [-1, 5, 0, 1] and int(unused) == 2
+    sorted_slots, unused = ops.lru_partition(order, stamp, int32([3], device), backend=backend)
+    assert sorted_slots.tolist() == [-1, 5, 0, 1] and int(unused) == 2
 
 
 def test_nothing_to_do(backend):
@@ -421,9 +421,9 @@ def test_nothing_to_do(backend):
     ops.unlink(words, none, none.bool(), none, backend=backend)
     ops.orphan(words, none, none, backend=backend)
     ops.link(words, request, none, none, LOAD, backend=backend)
-    places = torch.zeros((1, 4), dtype=torch.int32, device=device)
-    loc = ops.locate(places, none.long(), 2, 8, backend=backend)
-    pool = words, places, frame, frame, frame.bool()
+    locs = torch.zeros((1, 4), dtype=torch.int32, device=device)
+    loc = ops.locate(locs, none.long(), 2, 8, backend=backend)
+    pool = words, locs, frame, frame, frame.bool()
     lacks = ops.lacking(*pool, none.long(), loc, 0, 0, 2, backend=backend)
     assert loc.shape == (0, 4) and lacks.shape == (0,)
     assert not request.any()

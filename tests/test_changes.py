@@ -54,8 +54,8 @@ class Steps(gv.Producer):
         size, total = nodes.voxel_size[:, 0, None, None, None], 0
         for low, value in ((7.5, 1.0), (39.5, self.value)):
             x, y, z = (
-                ((at + size / 2).clamp(max=low + 8) - (at - size / 2).clamp(min=low)).clamp(min=0)
-                for at in nodes.axes
+                ((u + size / 2).clamp(max=low + 8) - (u - size / 2).clamp(min=low)).clamp(min=0)
+                for u in nodes.axes
             )
             total = total + value * x * y * z / size**3
         return {"value": total.float()}
@@ -95,7 +95,7 @@ MADE = {
 def content(engine):
     """Returns for each node of a tree, by its loc, its region and its voxels."""
     (source,) = engine.trees.values()
-    nodes, bricks, found = engine.cache.nodes, engine.cache.bricks, {}
+    nodes, bricks, contents = engine.cache.nodes, engine.cache.bricks, {}
     tile = (nodes.parent_t >= 0).nonzero()[:, 0]
     node = (tile[:, None] * nodes.nodes_per_tile + torch.arange(nodes.nodes_per_tile)).flatten()
     for index, loc in zip(node.tolist(), source.tree.loc(node).tolist(), strict=True):
@@ -103,46 +103,46 @@ def content(engine):
         held = [rows.flatten(0, 1)[index] for rows in nodes.constants.values()]
         if word >= 0:
             held += [rows[word] for rows in bricks.bricks.values()]
-        found[tuple(loc)] = (
+        contents[tuple(loc)] = (
             min(word, 0),
             held,
             [r.flatten(0, 1)[index] for r in nodes.ranges.values()],
         )
-    return found
+    return contents
 
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("name", MADE)
 def test_what_lies_elsewhere_stays_and_all_is_as_if_it_had_always_been(name, monkeypatch):
     views = [(camera(24, distance=1.6), {"lod": "finest"}), (camera(16, distance=4), {})]
-    asked, (first, second) = [], (0.2, 0.6)
+    locs, (first, second) = [], (0.2, 0.6)
     producer, late = MADE[name](first), MADE[name](second)
     fill = producer.fill
-    monkeypatch.setattr(producer, "fill", lambda nodes: (asked.append(nodes.loc), fill(nodes))[1])
+    monkeypatch.setattr(producer, "fill", lambda nodes: (locs.append(nodes.loc), fill(nodes))[1])
     with gv.Engine(producer, **SMALL) as engine, gv.Engine(late, **SMALL) as fresh:
         before = [engine.render(view, GRAY, **options).color for view, options in views]
         seen = []
-        begun = torch.cat(asked)
-        asked.clear()
+        begun = torch.cat(locs)
+        locs.clear()
         producer.time = second
         for (view, options), old in zip(views, before, strict=True):
-            found, expected = (one.render(view, GRAY, **options) for one in (engine, fresh))
-            assert torch.equal(found.color, expected.color)
-            assert torch.equal(found.depth, expected.depth)
-            seen.append(not torch.equal(found.color, old))
+            actual, expected = (e.render(view, GRAY, **options) for e in (engine, fresh))
+            assert torch.equal(actual.color, expected.color)
+            assert torch.equal(actual.depth, expected.depth)
+            seen.append(not torch.equal(actual.color, old))
         assert any(seen)
         engine.validate()
-        made, there = content(engine), content(fresh)
-        both = {*made} & {*there}
+        actual_nodes, there = content(engine), content(fresh)
+        both = {*actual_nodes} & {*there}
         assert len(both) > 0.9 * len(there)
         for loc in both:
-            word, held, ranges = made[loc]
+            word, held, ranges = actual_nodes[loc]
             expected_word, expected_held, expected_ranges = there[loc]
             assert word == expected_word or {word, expected_word} <= {0, -1}, loc
             if word == expected_word:
-                for one, other in zip(held + ranges, expected_held + expected_ranges, strict=True):
-                    assert torch.equal(one, other), loc
-    assert 0 < len(torch.cat(asked)) < 0.5 * len(begun)
+                for e, other in zip(held + ranges, expected_held + expected_ranges, strict=True):
+                    assert torch.equal(e, other), loc
+    assert 0 < len(torch.cat(locs)) < 0.5 * len(begun)
 
 
 @pytest.mark.backend("cpp")
@@ -174,40 +174,40 @@ def test_where_nodes_can_not_be_told_everything_is_asked_for_again():
         producer.time = 0
         assert engine.render(view, GRAY).stats.failed > 0
         engine.validate()
-        assert {str(one).rpartition(": ")[2] for one in engine.failures} == {"no power"}
+        assert {str(failure).rpartition(": ")[2] for failure in engine.failures} == {"no power"}
         producer.time = 0.5
         again = engine.render(view, GRAY)
         assert torch.equal(again.color, first.color) and not again.stats.failed
 
 
 def test_where_it_has_changed_is_known_as_far_as_it_was_told():
-    one, other = field(density(Bead(0.0))), field(density(Bead(0.3)))
-    both, box = gv.JoinedProducer({"a": one, "b": other}), torch.tensor(BOX)
-    one.changed(box)
-    known = one.version
-    other.changed(torch.stack((box, box + 2)))
-    assert len(both.changes(0)) == 2 and len(both.changes(known)) == 1
+    first, second = field(density(Bead(0.0))), field(density(Bead(0.3)))
+    both, box = gv.JoinedProducer({"a": first, "b": second}), torch.tensor(BOX)
+    first.changed(box)
+    version = first.version
+    second.changed(torch.stack((box, box + 2)))
+    assert len(both.changes(0)) == 2 and len(both.changes(version)) == 1
     both.time = 0.5  # their clocks differed
-    assert both.changes(known) is None
-    known = both.version
+    assert both.changes(version) is None
+    version = both.version
     both.time = 0.7
-    assert len(both.changes(known)) == 1 and one.changes(known) == other.changes(known)
+    assert len(both.changes(version)) == 1 and first.changes(version) == second.changes(version)
     for _ in range(99):
-        one.changed(box)
-    assert both.changes(known) is None, "too many to remember"
+        first.changed(box)
+    assert both.changes(version) is None, "too many to remember"
     for wrong in (box[0], box.flatten(), "here", box + torch.nan):
         with pytest.raises(ValueError, match=r"FieldProducer\.changed: where must be"):
-            one.changed(wrong)
+            first.changed(wrong)
 
 
 @pytest.mark.parametrize("name", ["stack", "blend", "mask", "warp", "smooth"])
 def test_what_matters_near_boxes_has_the_same_bits(name):
     """Bricks made with `Field.near`, which drops distant parts, equal those of the whole field."""
-    made = MADE[name](0.2)
-    layout = Layout.of(made, 4, 1, torch.device("cpu"))
+    producer = MADE[name](0.2)
+    layout = Layout.of(producer, 4, 1, torch.device("cpu"))
     axis = torch.arange(8)
-    place = torch.cartesian_prod(axis, axis, axis)
-    nodes = gv.Nodes(torch.cat((place, torch.full_like(place[:, :1], 3)), 1), layout)
-    whole, some = made._evaluate(nodes, made.field), made.fill(nodes).data
+    positions = torch.cartesian_prod(axis, axis, axis)
+    nodes = gv.Nodes(torch.cat((positions, torch.full_like(positions[:, :1], 3)), 1), layout)
+    whole, some = producer._evaluate(nodes, producer.field), producer.fill(nodes).data
     for channel, values in whole.items():
         assert torch.equal(values, some[channel]), channel

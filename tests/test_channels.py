@@ -8,7 +8,7 @@ import torch
 from helpers import DEVICES, gvtorch
 from helpers.marcher import box_of, orbit_rays, trilinear
 from helpers.rays import camera_rays
-from helpers.traces import assert_equal, run
+from helpers.traces import assert_equal, trace
 
 import gvtorch as gv
 from gvtorch.base.image_info import COLORS
@@ -53,18 +53,18 @@ def dense(data, rays, mode, step):
         end = np.minimum(start + step, far)
         on = start < far
         middle, length = ((start + end) / 2)[:, None], (end - start)
-        place = (eye + middle * direction - ORIGIN) / SPACING
-        shown = []
+        index = (eye + middle * direction - ORIGIN) / SPACING
+        layers = []
         for component, reference, function in FUNCTIONS:
-            value = trilinear(data[..., component].astype(np.float64), place)
+            value = trilinear(data[..., component].astype(np.float64), index)
             rgb = np.stack(
                 [np.interp(value, function.color[:, 0], c) for c in function.color.T[1:]]
             )
             alpha = np.interp(value, *function.opacity.T)
-            shown.append((rgb.T, -np.log2(1 - alpha) * length / (reference or min(SPACING))))
-        each = np.array([halvings for _, halvings in shown])
+            layers.append((rgb.T, -np.log2(1 - alpha) * length / (reference or min(SPACING))))
+        each = np.array([halvings for _, halvings in layers])
         total = each.max(0) if mode == "additive" else each.sum(0)
-        glow = sum(rgb * halvings[:, None] for rgb, halvings in shown)
+        glow = sum(rgb * halvings[:, None] for rgb, halvings in layers)
         on &= total > 0
         alpha = np.where(on, 1 - 2.0**-total, 0)
         color += (clear * alpha / np.where(on, total, 1))[:, None] * glow
@@ -85,11 +85,11 @@ def test_the_picture_is_that_of_a_dense_marcher(backend, mode, dtype):
         range=torch.tensor([0.0, np.inf], dtype=torch.float64).repeat(len(eye), 1),
     )
     options = {"lod": "finest", "step": 0.5, "stop_alpha": 1.0, "dtype": dtype}
-    found, _ = run(tree, backend, rays, gv.Channels(looks(), mode), **options)
+    hits, _ = trace(tree, backend, rays, gv.Channels(looks(), mode), **options)
     color, alpha = dense(data, (eye, direction), mode, 0.5 * min(SPACING))
     assert alpha.max() > 0.9 and len(np.unique(color.round(2), axis=0)) > 50
-    assert np.abs(found["color"].numpy() - color).max() < 1e-4
-    assert np.abs(found["alpha"].numpy()[:, 0] - alpha).max() < 1e-4
+    assert np.abs(hits["color"].numpy() - color).max() < 1e-4
+    assert np.abs(hits["alpha"].numpy()[:, 0] - alpha).max() < 1e-4
 
 
 def ways(tree: gv.N3Tree, rays: gv.Rays) -> np.ndarray:
@@ -114,18 +114,18 @@ def test_no_step_and_no_level_changes_even_matter(backend, mode, regions):
     assert bool(tree.bricks.capacity) is (regions == "bricks")
     shader = gv.Channels(looks(), mode)
     rgba = {c: (f(np.array(values[c])), reference or 1.0) for c, reference, f in FUNCTIONS}
-    each = np.array([-np.log2(1 - one[3]) / reference for one, reference in rgba.values()])
-    glow = sum(one[:3] * h for (one, _), h in zip(rgba.values(), each, strict=True))
+    each = np.array([-np.log2(1 - r[3]) / reference for r, reference in rgba.values()])
+    glow = sum(r[:3] * h for (r, _), h in zip(rgba.values(), each, strict=True))
     total = each.max() if mode == "additive" else each.sum()
     for distance in (0.8, 6.0, 60.0):
         for step in (0.25, 0.5, 2.0):
             rays = camera_rays(tree, 7, distance=distance)
-            found, _ = run(tree, backend, rays, shader, step=step, stop_alpha=1.0)
+            hits, _ = trace(tree, backend, rays, shader, step=step, stop_alpha=1.0)
             alpha = 1 - 2.0 ** -(total * ways(tree, rays))
             assert 0.2 < alpha.max() < 0.95
-            assert np.abs(found["alpha"].numpy()[:, 0] - alpha).max() < 2e-5
+            assert np.abs(hits["alpha"].numpy()[:, 0] - alpha).max() < 2e-5
             color = alpha[:, None] * (glow / total)
-            assert np.abs(found["color"].numpy() - color).max() < 2e-5
+            assert np.abs(hits["color"].numpy() - color).max() < 2e-5
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -135,10 +135,10 @@ def test_a_channel_alone_is_its_transfer_function(backend, mode):
     function = FUNCTIONS[0][2]
     for distance in (0.3, 1.6, 5.0):
         rays = camera_rays(tree, 12, distance=distance)
-        alone, _ = run(tree, backend, rays, function)
-        found, _ = run(tree, backend, rays, gv.Channels([function], mode))
+        alone, _ = trace(tree, backend, rays, function)
+        hits, _ = trace(tree, backend, rays, gv.Channels([function], mode))
         for name in ("color", "alpha"):
-            torch.testing.assert_close(found[name], alone[name], atol=2e-5, rtol=0)
+            torch.testing.assert_close(hits[name], alone[name], atol=2e-5, rtol=0)
     assert alone["alpha"].max() > 0.3
 
 
@@ -149,12 +149,12 @@ def test_what_is_added_keeps_its_brightness_and_what_is_mixed_does_not(backend):
     two = [gv.ChannelLook(color=c, window=(0, 100), opacity=0.9) for c in ("red", "green")]
     rays = camera_rays(tree, 5, distance=1.2)
     for mode, bright in (("additive", 1.0), ("opacity", 0.5)):
-        found, _ = run(tree, backend, rays, gv.Channels(two, mode))
-        middle = found["color"][12] / found["alpha"][12]
+        hits, _ = trace(tree, backend, rays, gv.Channels(two, mode))
+        middle = hits["color"][12] / hits["alpha"][12]
         torch.testing.assert_close(middle, torch.tensor([bright, bright, 0.0]))
-    wanted, _ = run(tree, backend, rays, gv.Channels(two[:1]))
-    found, _ = run(tree, backend, rays, gv.Channels(two))
-    torch.testing.assert_close(found["alpha"], wanted["alpha"]), "it hides as much as one alone"
+    expected, _ = trace(tree, backend, rays, gv.Channels(two[:1]))
+    hits, _ = trace(tree, backend, rays, gv.Channels(two))
+    torch.testing.assert_close(hits["alpha"], expected["alpha"]), "it hides as much as one alone"
 
 
 @pytest.mark.parametrize("width", [1, 2, 3, 5, 16])
@@ -172,10 +172,10 @@ def test_every_dtype_and_width(compiled, dtype, width):
         for mode in MODES:
             shader = gv.Channels(mixed, mode)
             expected, *_ = assert_equal(tree, compiled, rays, shader)
-            actual, _ = run(tree, compiled, rays, shader)
+            actual, _ = trace(tree, compiled, rays, shader)
             for name in ("color", "alpha", "depth", "samples"):
                 assert torch.equal(actual[name], expected[name]), name
-            backwards, _ = run(tree, compiled, rays, gv.Channels(mixed[::-1], mode))
+            backwards, _ = trace(tree, compiled, rays, gv.Channels(mixed[::-1], mode))
             torch.testing.assert_close(backwards["color"], expected["color"], atol=1e-5, rtol=0)
     assert expected["alpha"].max() > 0.1
 
@@ -189,15 +189,15 @@ def test_a_node_is_left_out_where_no_channel_shows_anything():
     data[:, :, 50:, 1] += 100
     tree = gv.N3Tree.from_volume(gv.Volume(data), 4)
     rays = camera_rays(tree, 24, distance=1.4)
-    one, two = (gv.ChannelLook(window=(50, 120), component=c) for c in (0, 1))
-    both = gv.Channels([one, two])
+    first, second = (gv.ChannelLook(window=(50, 120), component=c) for c in (0, 1))
+    both = gv.Channels([first, second])
     samples = {}
     for name, visible in (("one", (True, False)), ("two", (False, True)), ("both", (True, True))):
-        one.visible, two.visible = visible
+        first.visible, second.visible = visible
         samples[name] = int(gv.trace(tree, rays, both).samples.sum())
     assert samples["both"] <= samples["one"] + samples["two"]
     assert max(samples["one"], samples["two"]) < samples["both"]
-    one.visible = two.visible = False
+    first.visible = second.visible = False
     hits = gv.trace(tree, rays, both)
     assert int(hits.samples.sum()) == 0 and float(hits.alpha.max()) == 0
 
@@ -275,7 +275,7 @@ def test_clip_layer_and_lens_take_channels(mode):
 
 def test_what_an_image_tells_of_its_channels_is_how_they_look():
     data = blobs(4)
-    told = gv.ImageInfo(
+    image_info = gv.ImageInfo(
         channels=(
             gv.ChannelInfo(name="DAPI", color=(0.0, 0.0, 1.0), window=(10, 200)),
             gv.ChannelInfo(name="GFP", color=(0.0, 0.5, 0.0), active=False),
@@ -283,7 +283,7 @@ def test_what_an_image_tells_of_its_channels_is_how_they_look():
             gv.ChannelInfo(window=(5, 6)),
         )
     )
-    shader = gv.Channels.of(gv.Volume(data, info=told), opacity=0.3)
+    shader = gv.Channels.of(gv.Volume(data, info=image_info), opacity=0.3)
     first, second, third, last = shader.looks
     assert (first.name, first.color, first.window) == ("DAPI", (0.0, 0.0, 1.0), (10, 200))
     assert second.visible is False and second.color == pytest.approx((0, 0.21404, 0), abs=1e-5)
@@ -291,7 +291,7 @@ def test_what_an_image_tells_of_its_channels_is_how_they_look():
     low, high = np.percentile(data[..., 2], (50, 99.9))
     assert third.window == pytest.approx((low, high), rel=1e-5)
     assert [look.component for look in shader.looks] == [0, 1, 2, 3] and first.opacity == 0.3
-    some = gv.Channels.of(gv.Volume(data, info=told), "opacity", components=(2, 1))
+    some = gv.Channels.of(gv.Volume(data, info=image_info), "opacity", components=(2, 1))
     assert [look.name for look in some.looks] == ["actin", "GFP"] and some.looks[1].visible
     assert repr(some) == "Channels([actin, GFP], 'opacity')"
     look = gv.ChannelLook(window=(0, 1), name="GFP")
@@ -300,7 +300,7 @@ def test_what_an_image_tells_of_its_channels_is_how_they_look():
 
 def test_channels_that_are_not_told_are_told_apart():
     many = gv.Channels.of(gv.Volume(blobs(16)))
-    colors = [look.function(place, 16).color[-1, 1:] for place, look in enumerate(many.looks)]
+    colors = [look.function(index, 16).color[-1, 1:] for index, look in enumerate(many.looks)]
     far = [np.abs(a - b).max() for i, a in enumerate(colors) for b in colors[:i]]
     assert len(colors) == 16 and min(far) > 0.1
     assert [tuple(c) for c in colors[1:3]] == [(0, 1, 0), (1, 0, 0)]
@@ -318,18 +318,18 @@ def test_channels_that_are_not_told_are_told_apart():
 )
 def test_windows_are_robust(values, window):
     data = np.array(values, np.float32).reshape(10, 10, 100)
-    found = gv.Channels.of(gv.Volume(data)).looks[0].window
-    assert found == pytest.approx(window, rel=1e-4)
+    actual = gv.Channels.of(gv.Volume(data)).looks[0].window
+    assert actual == pytest.approx(window, rel=1e-4)
 
 
 def test_a_store_tells_windows_by_a_coarse_level(tmp_path):
     data = blobs(2, (40, 36, 44)).round().astype(np.uint8)
     np.save(tmp_path / "v.npy", data)
     assert gvtorch("convert", tmp_path / "v.npy", tmp_path / "v.zarr").returncode == 0
-    found = gv.Channels.of(gv.Store.open(tmp_path / "v.zarr"))
+    coarse = gv.Channels.of(gv.Store.open(tmp_path / "v.zarr"))
     exact = gv.Channels.of(gv.Volume(data))
-    for one, other in zip(found.looks, exact.looks, strict=True):
-        assert one.window == pytest.approx(other.window, abs=1)
+    for look, other in zip(coarse.looks, exact.looks, strict=True):
+        assert look.window == pytest.approx(other.window, abs=1)
 
 
 @pytest.mark.backend("cpp")
@@ -359,26 +359,26 @@ def test_colors_by_name_number_and_value(color, linear):
     assert all(len(channel_color("x", name)) == 3 for name in COLORS)
 
 
-def shown(**look) -> list[gv.ChannelLook]:
-    return [gv.ChannelLook(**{"window": (0, 1), **look})]
+def looks_of(**options) -> list[gv.ChannelLook]:
+    return [gv.ChannelLook(**{"window": (0, 1), **options})]
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: gv.Channels([]), "takes 1 to 16 channels, got 0"),
-        (lambda: gv.Channels(shown() * 17), "takes 1 to 16 channels, got 17"),
-        (lambda: gv.Channels(shown(), "sum"), "mode must be 'additive' or 'opacity', got 'sum'"),
+        (lambda: gv.Channels(looks_of() * 17), "takes 1 to 16 channels, got 17"),
+        (lambda: gv.Channels(looks_of(), "sum"), "mode must be 'additive' or 'opacity', got 'sum'"),
         (lambda: gv.Channels(["red"]), "channel 0 must be a ChannelLook, got str"),
         (lambda: gv.Channels([gv.ChannelLook()]), "window=(low, high) or a transfer function is"),
-        (lambda: gv.Channels(shown(window=(2, 2))), "channel 0: window must rise, got 2 to 2"),
-        (lambda: gv.Channels(shown(window=3)), "window must be (low, high), got 3"),
-        (lambda: gv.Channels(shown(color="blurple")), "is not a colour; known: #RRGGBB"),
-        (lambda: gv.Channels(shown(color=(0, 0, 2))), "colour must be finite and >= 0 and <= 1"),
-        (lambda: gv.Channels(shown(opacity=2)), "channel 0: opacity must be finite"),
-        (lambda: gv.Channels(shown(component=-1)), "component of channel 0 must be an int >= 0"),
+        (lambda: gv.Channels(looks_of(window=(2, 2))), "channel 0: window must rise, got 2 to 2"),
+        (lambda: gv.Channels(looks_of(window=3)), "window must be (low, high), got 3"),
+        (lambda: gv.Channels(looks_of(color="blurple")), "is not a colour; known: #RRGGBB"),
+        (lambda: gv.Channels(looks_of(color=(0, 0, 2))), "colour must be finite and >= 0 and <= 1"),
+        (lambda: gv.Channels(looks_of(opacity=2)), "channel 0: opacity must be finite"),
+        (lambda: gv.Channels(looks_of(component=-1)), "component of channel 0 must be an int >= 0"),
         (
-            lambda: gv.Channels(shown(transfer=FUNCTIONS[0][2], name="GFP")),
+            lambda: gv.Channels(looks_of(transfer=FUNCTIONS[0][2], name="GFP")),
             "channel 0 (GFP): it has a transfer function, so no window",
         ),
         (lambda: gv.Channels.of(3), "image must be a Volume or a Store, got int"),
@@ -398,7 +398,7 @@ def test_bad_looks_have_one_clear_message(make, message):
 def test_a_component_that_is_not_there_is_one_clear_error(compiled):
     tree = gv.N3Tree.from_volume(gv.Volume(blobs(2)), 8, device=DEVICES[compiled])
     with pytest.raises(ValueError, match="component must be an int >= 0 and <= 1, got 3"):
-        gv.render(tree, gv.Camera.orbit(width=4, height=4), gv.Channels(shown(component=3)))
+        gv.render(tree, gv.Camera.orbit(width=4, height=4), gv.Channels(looks_of(component=3)))
 
 
 @pytest.mark.backend("cpp")
@@ -437,17 +437,17 @@ def two_channels(tmp_path_factory):
 def test_the_command_line_shows_channels(two_channels, tmp_path, name):
     def picture(*flags: str) -> np.ndarray:
         out = tmp_path / "out.npy"
-        where = ("--camera", "orbit:0,0,1.6", "--size", "32x32", "-o", out, "--shader", "channels")
-        done = gvtorch("render", two_channels / name, *where, *flags)
+        camera = ("--camera", "orbit:0,0,1.6", "--size", "32x32", "-o", out, "--shader", "channels")
+        done = gvtorch("render", two_channels / name, *camera, *flags)
         assert done.returncode == 0, done.stderr
         return np.load(out)[..., :3]
 
     left, right = np.s_[14:18, 8:11], np.s_[14:18, 21:24]
     auto = picture()
     assert auto[left].mean((0, 1)).argmax() == 2 and auto[right].mean((0, 1)).argmax() == 1
-    told = picture("--channel", "1:#ff0000:100,4000;0:yellow:auto")
-    assert told[left].min((0, 1))[:2].min() > 0.3 and told[left].max((0, 1))[2] < 0.01
-    assert told[right][..., 0].min() > 0.3 and told[right][..., 1:].max() < 0.01
+    image = picture("--channel", "1:#ff0000:100,4000;0:yellow:auto")
+    assert image[left].min((0, 1))[:2].min() > 0.3 and image[left].max((0, 1))[2] < 0.01
+    assert image[right][..., 0].min() > 0.3 and image[right][..., 1:].max() < 0.01
     alone = picture("--channel", "1")
     assert alone[right].min() > 0.3 and alone[left].max() < 0.01
     half, whole = (picture("--channel", f"0:red:0,{high};opacity") for high in (8000, 4000))

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.clips import CLIPS, inside, shown, turned
+from helpers.clips import CLIPS, inside, is_kept, turned_box
 from helpers.rays import camera_rays, rays_along
-from helpers.traces import SHADER, assert_equal, run
-from helpers.trees import forget
+from helpers.traces import SHADER, assert_equal, trace
+from helpers.trees import with_holes
 
 import gvtorch as gv
 from gvtorch.tracing.clip import Clipped
@@ -37,17 +37,17 @@ def test_pieces_hold_what_is_kept_and_nothing_else(boxes, cuts, seed):
     generator = np.random.default_rng([boxes, cuts, seed])
 
     def some(count: int, scale: float) -> list:
-        made = []
+        turned = []
         for _ in range(count):
             centre = tuple(generator.uniform(-0.6, 0.6, 3))
             if generator.random() < 0.5:
-                made.append(
-                    turned(generator.uniform(0, 90), scale * generator.uniform(0.3, 1), centre)
+                turned.append(
+                    turned_box(generator.uniform(0, 90), scale * generator.uniform(0.3, 1), centre)
                 )
             else:
                 half = scale * generator.uniform(0.1, 0.6, 3)
-                made.append((np.array(centre) - half, np.array(centre) + half))
-        return [box if isinstance(box, torch.Tensor) else tuple(map(tuple, box)) for box in made]
+                turned.append((np.array(centre) - half, np.array(centre) + half))
+        return [box if isinstance(box, torch.Tensor) else tuple(map(tuple, box)) for box in turned]
 
     kept, cut, plane = some(boxes, 1.0), some(cuts, 0.6), (0.3, -0.4, 0.5, 0.6)
     clip = gv.Clip(planes=[plane], boxes=kept, without=cut)
@@ -59,17 +59,17 @@ def test_pieces_hold_what_is_kept_and_nothing_else(boxes, cuts, seed):
     spans = torch.stack(pieces).numpy()  # (k, r, 2)
     assert (spans[..., 0] <= spans[..., 1]).all()
     t = np.arange(0.0005, 5, 0.013)
-    places = rays.origin.numpy()[:, None] + t[:, None] * rays.direction.numpy()[:, None]
-    flat = places.reshape(-1, 3)
-    wanted = shown(clip, flat)
+    positions = rays.origin.numpy()[:, None] + t[:, None] * rays.direction.numpy()[:, None]
+    flat = positions.reshape(-1, 3)
+    expected = is_kept(clip, flat)
     within = (spans[..., :1] < t) & (t < spans[..., 1:])  # (k, r, t)
     assert (within.sum(0) <= 1).all(), "pieces do not overlap"
-    assert np.array_equal(within.any(0).ravel(), wanted)
+    assert np.array_equal(within.any(0).ravel(), expected)
     real = spans[..., 0] < spans[..., 1]
-    for one, two in itertools.pairwise(spans):  # nearest first, none that touch
-        both = (one[:, 0] < one[:, 1]) & (two[:, 0] < two[:, 1])
-        assert (one[both, 1] < two[both, 0]).all()
-    assert wanted.any() and real.any()
+    for near, far in itertools.pairwise(spans):  # nearest first, none that touch
+        both = (near[:, 0] < near[:, 1]) & (far[:, 0] < far[:, 1])
+        assert (near[both, 1] < far[both, 0]).all()
+    assert expected.any() and real.any()
 
 
 def test_boxes_that_touch_are_one_piece():
@@ -90,7 +90,7 @@ def test_compiled_equals_reference_clipped(blobs, compiled, name, caps):
     tree = gv.N3Tree.from_volume(blobs, 4)
     clip = dataclasses.replace(CLIPS[name], caps=caps)
     result, *_ = assert_equal(tree, compiled, camera_rays(tree, distance=1.2), clip=clip)
-    whole, _ = run(tree, compiled, camera_rays(tree, distance=1.2))
+    whole, _ = trace(tree, compiled, camera_rays(tree, distance=1.2))
     assert 0.3 < result["alpha"].max() and 0.05 < (whole["alpha"] - result["alpha"]).abs().max()
 
 
@@ -105,10 +105,10 @@ def closed_form(name: str) -> tuple[np.ndarray, np.ndarray]:
     tree = gv.N3Tree.from_volume(EVEN, 8)
     rays, step = camera_rays(tree, 20, distance=1.2), 0.01
     t = 20 + step * (np.arange(10000) + 0.5)
-    places = rays.origin.numpy()[:, None] + t[:, None] * rays.direction.numpy()[:, None]
+    positions = rays.origin.numpy()[:, None] + t[:, None] * rays.direction.numpy()[:, None]
     low, high = tree.box.numpy()
-    kept = ((places >= low) & (places <= high)).all(-1)
-    kept &= shown(CLIPS[name], places.reshape(-1, 3)).reshape(kept.shape)
+    kept = ((positions >= low) & (positions <= high)).all(-1)
+    kept &= is_kept(CLIPS[name], positions.reshape(-1, 3)).reshape(kept.shape)
     length = step * kept.cumsum(1)
     enough = length >= math.log(0.9) / math.log(0.99)
     return 1 - 0.99 ** length[:, -1], np.where(enough.any(1), t[enough.argmax(1)], np.inf)
@@ -144,8 +144,8 @@ def test_nothing_that_is_clipped_is_sampled_or_asked_for(blobs, backend, name):
     rays = camera_rays(tree, 12 if backend == "reference" else 60, distance=1.1)
     gone = wholly_clipped(tree, clip)
     assert len(gone) > 50, "the test must clip something"
-    _, whole = run(tree, backend, rays, thin, lod="finest")
-    _, marks = run(tree, backend, rays, thin, lod="finest", clip=clip)
+    _, whole = trace(tree, backend, rays, thin, lod="finest")
+    _, marks = trace(tree, backend, rays, thin, lod="finest", clip=clip)
     for used, sees_gone in ((whole, True), (marks, False)):
         owner = tree.nodes.brick_tn.flatten()
         bricks = {n for n in gone if owner[n] >= 0 and used["brick"][owner[n]] == 1}
@@ -153,11 +153,11 @@ def test_nothing_that_is_clipped_is_sampled_or_asked_for(blobs, backend, name):
         tiles = {t for t in range(len(parent)) if int(parent[t]) in gone and used["tile"][t] == 1}
         assert bool(bricks) == sees_gone and bool(tiles) == sees_gone
     assert (marks["brick"] == 1).sum() > 10
-    poor = forget(tree, 0.4, 7)
-    _, marks = run(poor, backend, rays, thin, lod="finest", clip=clip)
-    asked = set(marks["request"].flatten().nonzero()[:, 0].tolist())
-    assert asked and not asked & gone
-    _, marks = run(poor, backend, rays, thin, lod="finest")
+    poor = with_holes(tree, 0.4, 7)
+    _, marks = trace(poor, backend, rays, thin, lod="finest", clip=clip)
+    requested = set(marks["request"].flatten().nonzero()[:, 0].tolist())
+    assert requested and not requested & gone
+    _, marks = trace(poor, backend, rays, thin, lod="finest")
     assert set(marks["request"].flatten().nonzero()[:, 0].tolist()) & gone
 
 
@@ -168,10 +168,10 @@ def wholly_clipped(tree: gv.N3Tree, clip: gv.Clip) -> set[int]:
     n, size = tree.branching, np.array(tree.spacing) * tree.side
     loc, child = tree.nodes.loc_t4.numpy()[:, None], np.arange(n**3)
     depth = np.broadcast_to(loc[..., 3], (len(loc), n**3))
-    place = loc[..., :3] * n + np.stack((child % n, child // n % n, child // n**2), -1)
+    position = loc[..., :3] * n + np.stack((child % n, child // n % n, child // n**2), -1)
     bits = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)]) * 0.998 + 0.001
     cell = size / float(n) ** depth[..., None, None]
-    corners = tree.box[0].numpy() + (place[:, :, None] + bits) * cell  # (t, n^3, 8, 3)
+    corners = tree.box[0].numpy() + (position[:, :, None] + bits) * cell  # (t, n^3, 8, 3)
     beyond = np.zeros(depth.shape, bool)
     for *normal, offset in clip.planes:
         beyond |= (corners @ np.array(normal) + offset < 0).all(-1)
@@ -186,11 +186,11 @@ def wholly_clipped(tree: gv.N3Tree, clip: gv.Clip) -> set[int]:
 def beside(box, corners: np.ndarray) -> np.ndarray:
     """Returns (t, n): true if all corners (t, n, 8, 3) of a node lie beyond one face of the box."""
     if len(box) == 2:
-        (low, high), own = np.array(box), corners
+        (low, high), local = np.array(box), corners
     else:
-        own = (corners - box[:3, 3].numpy()) @ np.linalg.inv(box[:3, :3].numpy()).T
+        local = (corners - box[:3, 3].numpy()) @ np.linalg.inv(box[:3, :3].numpy()).T
         low, high = 0, 1
-    return (own < low).all(-2).any(-1) | (own > high).all(-2).any(-1)
+    return (local < low).all(-2).any(-1) | (local > high).all(-2).any(-1)
 
 
 def test_a_ray_that_has_ended_takes_no_sample_behind_a_gap(backend):
@@ -200,9 +200,9 @@ def test_a_ray_that_has_ended_takes_no_sample_behind_a_gap(backend):
     near = gv.Clip(boxes=[((-1, -1, 20), (40, 40, 40))])
     both = gv.Clip(boxes=[((-1, -1, 20), (40, 40, 40)), ((-1, -1, -1), (40, 40, 10))])
     camera = gv.Camera.orbit(0, 0, 2.0, 20, 8, 8)
-    one, two = (gv.render(tree, camera, shader, clip=c, backend=backend) for c in (near, both))
-    assert one.stats.samples == two.stats.samples > 0
-    assert torch.equal(one.color, two.color)
+    first, second = (gv.render(tree, camera, shader, clip=c, backend=backend) for c in (near, both))
+    assert first.stats.samples == second.stats.samples > 0
+    assert torch.equal(first.color, second.color)
 
 
 CUT = gv.Clip(planes=[(0, 0, -1, 20.0)], caps=True, cap_light=0.6)  # what lies at z > 20 is gone
@@ -222,10 +222,10 @@ def test_a_cap_has_the_colour_of_the_cut_and_faces_the_eye(backend, opacity):
     bare = gv.render(tree, camera, shader, clip=dataclasses.replace(clip, caps=False), **options)
     rays = camera.placed(tree.box).rays()
     t = (20 - rays.origin[:, 2]) / rays.direction[:, 2]
-    at = rays.origin + t[:, None] * rays.direction
+    hit = rays.origin + t[:, None] * rays.direction
     margin = 1.0
-    face = ((at[:, :2] > -0.5 + margin) & (at[:, :2] < 31.5 - margin)).all(1)
-    solid, empty = face & (at[:, 0] > 17.5), face & (at[:, 0] < 10)
+    face = ((hit[:, :2] > -0.5 + margin) & (hit[:, :2] < 31.5 - margin)).all(1)
+    solid, empty = face & (hit[:, 0] > 17.5), face & (hit[:, 0] < 10)
     assert solid.sum() > 20 and empty.sum() > 20
     light = 1 - 0.6 + 0.6 * rays.direction[:, 2].abs()
     rgb = torch.tensor([1, 0.5, 0.2], dtype=torch.float64)
@@ -233,8 +233,8 @@ def test_a_cap_has_the_colour_of_the_cut_and_faces_the_eye(backend, opacity):
         getattr(cap, n).cpu().double().flatten(0, 1) for n in ("color", "alpha", "depth")
     )
     behind = bare.alpha.cpu().double().flatten(0, 1)
-    wanted = opacity * light[:, None] * rgb + (1 - opacity) * behind * rgb
-    torch.testing.assert_close(color[solid], wanted[solid], rtol=0, atol=2e-3)
+    expected = opacity * light[:, None] * rgb + (1 - opacity) * behind * rgb
+    torch.testing.assert_close(color[solid], expected[solid], rtol=0, atol=2e-3)
     torch.testing.assert_close(
         alpha[solid], (opacity + (1 - opacity) * behind)[solid], rtol=0, atol=1e-5
     )
@@ -252,10 +252,10 @@ def test_a_cap_has_features_and_a_normal(backend):
     camera = gv.Camera.orbit(0, 0, 2.0, None, 20, 20, "ortho")
     inside = camera.placed(tree.box).rays().origin[:, :2] - 11.5
     inside = (inside.abs() < 11).all(1).view(20, 20)
-    given = {"clip": gv.Clip(planes=[(0, 0, -1, 15.0)], caps=True), "backend": backend}
-    features = gv.render(tree, camera, gv.Features(thin, "pair"), **given).features.cpu()
+    options = {"clip": gv.Clip(planes=[(0, 0, -1, 15.0)], caps=True), "backend": backend}
+    features = gv.render(tree, camera, gv.Features(thin, "pair"), **options).features.cpu()
     torch.testing.assert_close(features[inside], pair[0, 0, 0].expand_as(features[inside]))
-    normal = gv.render(tree, camera, gv.Lit(thin), **given).normal.cpu()
+    normal = gv.render(tree, camera, gv.Lit(thin), **options).normal.cpu()
     torch.testing.assert_close(
         normal[inside], torch.tensor([0.0, 0, 1]).expand(normal[inside].shape)
     )
@@ -273,30 +273,30 @@ def test_a_cut_through_a_surface_is_filled(backend, kind, opacity):
     channels = {"distance": radius - 11, "height": 20 - radius, "x": x, "rgba": 0.5 * sided}
     volumes = {name: gv.Volume(data) for name, data in channels.items()}
     tree = gv.N3Tree.from_volume(volumes, 8, device=DEVICES[backend])
-    look = {"light": gv.DirectionalLight((0, 0, 1)), "ambient": 1.0, "specular": 0.0}
-    look["diffuse"] = 0.0  # the surface behind has the same colour everywhere
+    shading = {"light": gv.DirectionalLight((0, 0, 1)), "ambient": 1.0, "specular": 0.0}
+    shading["diffuse"] = 0.0  # the surface behind has the same colour everywhere
     options = {"backend": backend, "background": None, "channel": "height"}
     if kind == "isosurface":
-        shader = gv.Isosurface(9.0, base, **look)
+        shader = gv.Isosurface(9.0, base, **shading)
     elif kind == "by voxel":
         stored = {"color_channel": "rgba", "premultiplied": True}
-        shader = gv.Isosurface(9.0, None, **stored, **look)
+        shader = gv.Isosurface(9.0, None, **stored, **shading)
     elif kind == "by function":
         sides = gv.TransferFunction.from_points([(0, 1)], [(-1, 0, 0, 0), (1, *base.tolist())])
-        shader = gv.Isosurface(9.0, sides, color_channel="x", **look)
+        shader = gv.Isosurface(9.0, sides, color_channel="x", **shading)
     else:
-        shader, options["channel"] = gv.DistanceField(base, **look), "distance"
+        shader, options["channel"] = gv.DistanceField(base, **shading), "distance"
     cut = {"planes": [(0, 0, -1, 0)], "frame": "box", "cap_light": 1.0}
     clip = gv.Clip(**cut, caps=True, cap_opacity=opacity)
     camera = gv.Camera.orbit(0, 0, 1.6, None, 48, 48, "ortho")
-    shown = gv.render(tree, camera, shader, clip=clip, **options)
+    clipped = gv.render(tree, camera, shader, clip=clip, **options)
     bare = gv.render(tree, camera, shader, clip=gv.Clip(**cut), **options)
     origin = camera.placed(tree.box).rays().origin[:, :2] - 19.5
     off = origin.norm(dim=1).reshape(48, 48) - 11
     inside, outside = off < -0.1, off > 0.1
     right = origin[:, 0].reshape(48, 48) > 1.1
-    color, depth = shown.color.cpu(), shown.depth.cpu()[..., 0]
-    assert bool((shown.alpha.cpu()[inside] == 1).all()) and not shown.alpha.cpu()[outside].any()
+    color, depth = clipped.color.cpu(), clipped.depth.cpu()[..., 0]
+    assert bool((clipped.alpha.cpu()[inside] == 1).all()) and not clipped.alpha.cpu()[outside].any()
     if kind.startswith("by "):
         inside = inside & right
         assert not color[~right & (origin[:, 0].reshape(48, 48) < -1.1)].any()

@@ -66,13 +66,13 @@ def test_intervals_of_combinations_hold(name):
     field, generator = FIELDS[name](), torch.Generator().manual_seed(6)
     center = random_points(20_000)
     half = 10 ** (-2 * torch.rand(20_000, 1, generator=generator).double()) * torch.ones(3)
-    at = 2 * torch.rand(20_000, 30, 3, generator=generator).double() - 1
-    values, known = field(center[:, None] + half[:, None] * at), field.bounds(center, half)
+    offsets = 2 * torch.rand(20_000, 30, 3, generator=generator).double() - 1
+    values, bounds = field(center[:, None] + half[:, None] * offsets), field.bounds(center, half)
     if isinstance(values, torch.Tensor):
-        values, known = {"value": values}, {"value": known}
-    assert {*values} == {*known}
+        values, bounds = {"value": values}, {"value": bounds}
+    assert {*values} == {*bounds}
     for channel, rows in values.items():
-        low, high = known[channel]
+        low, high = bounds[channel]
         assert (rows >= low[:, None] - 1e-12).all() and (rows <= high[:, None] + 1e-12).all()
         assert ((high - low) < 0.5).double().mean() > 0.2
 
@@ -83,9 +83,9 @@ def test_combinations_are_what_their_words_say():
     assert torch.allclose(gv.mask(Pulse(), Ramp())(points), ramp * pulse)
     blend = gv.blend(Ramp(0.2, 0.4), Pulse(), Ramp())(points)
     assert torch.allclose(blend, (1 - ramp) * Ramp(0.2, 0.4)(points) + ramp * pulse)
-    way = Sway()(points)
-    way = way * (0.2 / way.norm(dim=1, keepdim=True)).clamp(max=1)
-    assert torch.allclose(gv.warp(Pulse(), Sway(), max_offset=0.2)(points), Pulse()(points + way))
+    sway = Sway()(points)
+    sway = sway * (0.2 / sway.norm(dim=1, keepdim=True)).clamp(max=1)
+    assert torch.allclose(gv.warp(Pulse(), Sway(), max_offset=0.2)(points), Pulse()(points + sway))
     stack = gv.stack(a=Ramp(), rock=gv.stack(c=Ramp(0.1, 0.3)))(points)
     assert [*stack] == ["a", "rock_c"] and torch.equal(stack["a"], ramp)
     shape = gv.Painted(gv.sdf.Sphere(), Sway())
@@ -155,7 +155,7 @@ def test_only_the_tree_that_changed_is_made_anew():
 
 
 @pytest.mark.parametrize(
-    ("make", "where"),
+    ("make", "context"),
     [
         (lambda p: gv.stack(a=Ramp(), b=p), "Stack: b"),
         (lambda p: gv.blend(p, Ramp(), Ramp()), "Blend: first"),
@@ -169,8 +169,8 @@ def test_only_the_tree_that_changed_is_made_anew():
         (lambda p: gv.FieldProducer(p, 32, box=BOX), "FieldProducer: field"),
     ],
 )
-def test_a_producer_is_no_field(make, where):
-    with pytest.raises(ValueError, match=f"^{where} must be a field, got FieldProducer") as error:
+def test_a_producer_is_no_field(make, context):
+    with pytest.raises(ValueError, match=f"^{context} must be a field, got FieldProducer") as error:
         make(gv.FieldProducer(Ramp(), 32, box=BOX))
     assert "gv.JoinedProducer" in str(error.value) and "\n" not in str(error.value)
 
@@ -216,17 +216,17 @@ def test_time_is_that_of_the_parts(name):
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("how", ["time", "changed"])
-def test_a_picture_of_joined_producers_follows_each_of_them(how):
-    view, one = camera(32, distance=1.6), pulse()
+@pytest.mark.parametrize("change", ["time", "changed"])
+def test_a_picture_of_joined_producers_follows_each_of_them(change):
+    view, moving = camera(32, distance=1.6), pulse()
     still = gv.FieldProducer(Ramp(), 32, box=BOX)
-    with gv.Engine(gv.JoinedProducer({"moving": one, "still": still}), brick_size=4) as engine:
+    with gv.Engine(gv.JoinedProducer({"moving": moving, "still": still}), brick_size=4) as engine:
         first = engine.render(view, GRAY).color
-        if how == "time":
-            one.time = 0.9
+        if change == "time":
+            moving.time = 0.9
         else:
-            one.field.time.fill_(0.9)
-            one.changed()
+            moving.field.time.fill_(0.9)
+            moving.changed()
         assert engine.changed
         assert not torch.equal(engine.render(view, GRAY).color, first)
         still.changed()
@@ -276,17 +276,17 @@ def test_producers_of_any_kind_tell_values_at_points(blobs):
     """Trilinear between voxels, equal to a dense interpolation by torch."""
     points = torch.rand(500, 3).double() * 60 - 5
     producer = gv.VolumeProducer(blobs)
-    found = producer.at(points)["value"][:, 0]
+    values = producer.at(points)["value"][:, 0]
     data = blobs.data[..., 0].float()
     z, y, x = data.shape
     size = torch.tensor((x, y, z)).double()
-    place = (points - torch.tensor(blobs.origin)) / torch.tensor(blobs.spacing)
-    place = torch.minimum(place.clamp(min=0), size - 1)
-    grid = (2 * place / (size - 1) - 1).float().view(1, 1, 1, -1, 3)
+    index = (points - torch.tensor(blobs.origin)) / torch.tensor(blobs.spacing)
+    index = torch.minimum(index.clamp(min=0), size - 1)
+    grid = (2 * index / (size - 1) - 1).float().view(1, 1, 1, -1, 3)
     expected = torch.nn.functional.grid_sample(data[None, None], grid, align_corners=True)
-    assert (found - expected.flatten()).abs().max() < 1e-3 * data.abs().max()
+    assert (values - expected.flatten()).abs().max() < 1e-3 * data.abs().max()
     with gv.Engine(producer, brick_size=8) as engine:
-        assert torch.allclose(producer.at(points)["value"][:, 0], found, atol=1e-4)
+        assert torch.allclose(producer.at(points)["value"][:, 0], values, atol=1e-4)
         assert engine.trees
 
 
@@ -300,19 +300,19 @@ def test_producers_of_any_kind_tell_values_at_points(blobs):
 )
 def test_points_to_look_at_are_checked(make):
     producer = make()
-    one = producer.at(torch.zeros(3))
+    single = producer.at(torch.zeros(3))
     many = producer.at(torch.zeros(2, 3))
-    for name, values in one.items():
+    for name, values in single.items():
         assert values.dim() == 1 and torch.equal(values, many[name][1])
         assert values.dtype == many[name].dtype
-    for points, told in (
+    for points, message in (
         ([0.0, 0.0, 0.0], "points must be a Tensor, got list"),
         (torch.zeros(6), r"points must be (..., 3), got (6,)"),
         (torch.full((2, 3), torch.nan), "points must be finite"),
     ):
         with pytest.raises(ValueError) as caught:
             producer.at(points)
-        assert told in str(caught.value)
+        assert message in str(caught.value)
 
 
 def test_wider_nodes_are_the_same_voxels_and_more():

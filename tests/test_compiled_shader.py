@@ -17,12 +17,12 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import DEVICES, TESTS
-from helpers.compiled import ADD, HEADER, only_included, quick_compiler, users_shader, write
+from helpers.compiled import ADD, HEADER, only_included, quick_compiler, users_shader, write_header
 from helpers.pictures import assert_close_picture
 from helpers.rays import camera_rays, world_rays
 from helpers.shaders import POINT
-from helpers.traces import SHADER, op_arguments, run
-from helpers.trees import forget, on
+from helpers.traces import SHADER, op_arguments, trace
+from helpers.trees import copy_to, with_holes
 
 import gvtorch as gv
 from gvtorch.cpp_ext import compilers, user
@@ -35,9 +35,9 @@ CAMERA = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
 def channels(blobs) -> dict[str, gv.Volume]:
     """The blobs, with a four-component colour and a normal in each voxel."""
     values = torch.rand(*blobs.data.shape[:3], 7, generator=torch.Generator().manual_seed(3))
-    place = blobs.spacing, blobs.origin
-    normal = gv.Volume(2 * values[..., :3] - 1, *place)
-    return {"value": blobs, "normal": normal, "rgba": gv.Volume(values[..., 3:], *place)}
+    placement = blobs.spacing, blobs.origin
+    normal = gv.Volume(2 * values[..., :3] - 1, *placement)
+    return {"value": blobs, "normal": normal, "rgba": gv.Volume(values[..., 3:], *placement)}
 
 
 @pytest.fixture(scope="module")
@@ -74,16 +74,16 @@ FIELDS = ("color", "alpha", "depth", "samples", "missed")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("lod", ["finest", "auto"])
 def test_a_copy_of_the_transfer_function_has_the_same_bits(tree, compiled, lod, dtype):
-    holes = forget(tree, 0.3, 1)
-    for place in (tree, holes):
-        rays = camera_rays(place, 16, distance=1.3)
+    holes = with_holes(tree, 0.3, 1)
+    for t in (tree, holes):
+        rays = camera_rays(t, 16, distance=1.3)
         options = {"lod": lod, "dtype": dtype}
-        expected, marks = run(place, compiled, rays, SHADER, **options)
-        actual, own_marks = run(place, compiled, rays, mine("Plain", transfer=SHADER), **options)
+        expected, marks = trace(t, compiled, rays, SHADER, **options)
+        actual, own_marks = trace(t, compiled, rays, mine("Plain", transfer=SHADER), **options)
         assert_same(compiled, actual, expected, FIELDS)
         assert_same(compiled, own_marks, marks, marks)
-        assert bool(marks["request"].any()) == (place is holes)
-        assert place is holes or expected["alpha"].max() > 0.9
+        assert bool(marks["request"].any()) == (t is holes)
+        assert t is holes or expected["alpha"].max() > 0.9
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -91,19 +91,19 @@ def test_lights_normals_and_features_are_those_of_the_built_in(tree, compiled, d
     light = {"normals": "normal", "light": POINT, "ambient": 0.3}
     rays = camera_rays(tree, 16)
     shader = mine("LitFeatures", transfer=SHADER, other="rgba", **light)
-    actual, _ = run(tree, compiled, rays, shader, dtype=dtype)
-    lit, _ = run(tree, compiled, rays, gv.Lit(SHADER, **light), dtype=dtype)
+    actual, _ = trace(tree, compiled, rays, shader, dtype=dtype)
+    lit, _ = trace(tree, compiled, rays, gv.Lit(SHADER, **light), dtype=dtype)
     assert_same(compiled, actual, lit, (*FIELDS, "normal"))
     assert lit["alpha"].max() > 0.9 and lit["normal"].norm(dim=1).max() > 0.99
-    features, _ = run(tree, compiled, rays, gv.Features(SHADER, "rgba"), dtype=dtype)
+    features, _ = trace(tree, compiled, rays, gv.Features(SHADER, "rgba"), dtype=dtype)
     assert actual["features"].shape[1] == 4
     assert_same(compiled, actual, features, ("features",))
 
 
 def test_sums_of_ones_own_and_hiding(tree, compiled):
     rays = camera_rays(tree, 16)
-    actual, marks = run(tree, compiled, rays, mine("Highest", transfer=SHADER))
-    expected, own_marks = run(tree, compiled, rays, gv.Projection("maximum", SHADER))
+    actual, marks = trace(tree, compiled, rays, mine("Highest", transfer=SHADER))
+    expected, own_marks = trace(tree, compiled, rays, gv.Projection("maximum", SHADER))
     assert expected["features"].max() > 0.9
     assert_same(compiled, actual, expected, (*FIELDS, "features"))
     assert all(torch.equal(mark, own_marks[name]) for name, mark in marks.items())
@@ -113,8 +113,8 @@ def test_ends_and_surfaces(tree, compiled):
     """Its depth is the end of the interval in which the built-in shader finds the crossing."""
     rays = camera_rays(tree, 24, distance=1.2)
     options = {"lod": "finest", "step": 0.5}
-    actual, _ = run(tree, compiled, rays, mine("FirstEnd", uniforms={"level": 0.5}), **options)
-    surface, _ = run(tree, compiled, rays, gv.Isosurface(0.5), **options)
+    actual, _ = trace(tree, compiled, rays, mine("FirstEnd", uniforms={"level": 0.5}), **options)
+    surface, _ = trace(tree, compiled, rays, gv.Isosurface(0.5), **options)
     hit = torch.isfinite(surface["depth"])[:, 0]
     assert hit.sum() > 20 and torch.equal(torch.isfinite(actual["depth"])[:, 0], hit)
     behind = (actual["depth"] - surface["depth"])[hit]
@@ -161,7 +161,7 @@ def test_an_engine_streams_what_it_sees(channels):
 
 
 def test_uniforms_are_edited_without_a_compiler(tree, compiled, monkeypatch):
-    tree = on(tree, DEVICES[compiled])
+    tree = copy_to(tree, DEVICES[compiled])
     width = torch.tensor(3.0, device=tree.device)
     shader = mine("Bands", uniforms={**BANDS, "width": width})
     whole = mine("Bands", uniforms=torch.tensor([0.4, 3.0, 0.005], device=tree.device))
@@ -216,9 +216,9 @@ def test_it_goes_through_lenses_clips_layers_and_scenes(blobs):
 @pytest.mark.parametrize("name", ["Bands", "LitFeatures"])
 def test_script_compile_export_and_pickle(tree, compiled, name):
     torch._dynamo.reset()
-    tree = on(tree, DEVICES[compiled])
-    own = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
-    tracer, rays = gv.TreeTracer(tree, mine(name, **own)), world_rays(tree.box, 33, tree.device)
+    tree = copy_to(tree, DEVICES[compiled])
+    options = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
+    tracer, rays = gv.TreeTracer(tree, mine(name, **options)), world_rays(tree.box, 33, tree.device)
     expected = tracer.hits(*rays)
     file = io.BytesIO()
     torch.jit.save(torch.jit.script(tracer), file)
@@ -234,9 +234,9 @@ def test_script_compile_export_and_pickle(tree, compiled, name):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["Bands", "LitFeatures"])
 def test_opcheck_and_memory_safety(tree, compiled, name, dtype):
-    tree = on(tree, DEVICES[compiled])
-    own = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
-    shader = mine(name, **own)
+    tree = copy_to(tree, DEVICES[compiled])
+    options = {"uniforms": BANDS} if name == "Bands" else {"transfer": SHADER, "other": "rgba"}
+    shader = mine(name, **options)
     rays, traced, shading, parameters = op_arguments(tree, shader, dtype)
     op = getattr(torch.ops.gvtorch_user, shader.op).default
     torch.library.opcheck(op, (*rays, *traced, *shading, parameters))
@@ -292,10 +292,10 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path, mo
     compiler = quick_compiler(tmp_path, f"echo call >> {count}")
     (tmp_path / "color.h").write_text("constexpr float kColor = 0.25f;\n")
     body = '  // #include "none.h"\n' + ADD.replace("COLOR", "kColor")
-    header = write(tmp_path, body)
+    header = write_header(tmp_path, body)
     header.write_text('#include "color.h"\n' + header.read_text())
-    own = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": compiler}
-    for name, value in own.items():
+    environment = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": compiler}
+    for name, value in environment.items():
         monkeypatch.setenv(name, value)
     assert in_processes(2, header) == ["0.25", "0.25"]
     calls = count.read_text()
@@ -329,21 +329,21 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path, mo
 )
 @pytest.mark.backend("cpp")
 def test_the_compilers_words_are_shown_as_they_are(tmp_path, monkeypatch, body, name, message):
-    own, header = tmp_path / "cache", write(tmp_path, body)
-    monkeypatch.setenv("GVTORCH_CACHE", str(own))
+    cache_folder, header = tmp_path / "cache", write_header(tmp_path, body)
+    monkeypatch.setenv("GVTORCH_CACHE", str(cache_folder))
     with pytest.raises(gv.CompileError) as caught:
         gv.CompiledShader(header, name)
     first, *rest = str(caught.value).splitlines()
     assert first.startswith(f"{header}: {name} did not compile for the CPU with: ")
     assert compilers.find_cxx()[0] in first and "-ffp-contract=off" in first
-    said = "\n".join(rest).replace("\u2018", "'").replace("\u2019", "'")
-    assert re.search(message if "\\" in message else re.escape(message), said), said
-    assert not built(own), "nothing of it is kept"
+    text = "\n".join(rest).replace("\u2018", "'").replace("\u2019", "'")
+    assert re.search(message if "\\" in message else re.escape(message), text), text
+    assert not built(cache_folder), "nothing of it is kept"
 
 
 @pytest.mark.backend("cpp")
 def test_without_a_compiler_or_a_folder_there_is_one_clear_line(tmp_path, monkeypatch):
-    header = write(tmp_path, ADD.replace("COLOR", "1"))
+    header = write_header(tmp_path, ADD.replace("COLOR", "1"))
     with monkeypatch.context() as patch:
         patch.setenv("CXX", "no-such-compiler -O1")
         with pytest.raises(RuntimeError) as caught:
@@ -413,17 +413,17 @@ def test_a_damaged_library_is_compiled_again(tmp_path, monkeypatch):
     """The file is cut to nothing, to half (which crashes the loader), and by its last byte; the
     compiler copies a library that was made once.
     """
-    made = user.compiled(user.ShaderSource.read(HEADER, "mine::Plain"), ()).read_bytes()[:-32]
-    (tmp_path / "made.so").write_bytes(made)
+    content = user.compiled(user.ShaderSource.read(HEADER, "mine::Plain"), ()).read_bytes()[:-32]
+    (tmp_path / "made.so").write_bytes(content)
     compiler = tmp_path / "c++"
     compiler.write_text(f"#!/bin/sh\ncp {tmp_path}/made.so shader.so\n")
     compiler.chmod(0o755)
     monkeypatch.setenv("CXX", str(compiler))
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
-    source = user.ShaderSource.read(write(tmp_path, ADD.replace("COLOR", "0.5")), "Own")
+    source = user.ShaderSource.read(write_header(tmp_path, ADD.replace("COLOR", "0.5")), "Own")
     library = user.compiled(source, ())
     whole = library.read_bytes()
-    assert whole[:-32] == made and whole.startswith(b"\x7fELF")
+    assert whole[:-32] == content and whole.startswith(b"\x7fELF")
     for left in (0, len(whole) // 2, -1):
         library.write_bytes(whole[:left])
         assert user.compiled(source, ()) == library and library.read_bytes() == whole
@@ -431,7 +431,10 @@ def test_a_damaged_library_is_compiled_again(tmp_path, monkeypatch):
 
 @pytest.mark.backend("cpp")
 def test_only_its_owner_writes_to_the_folder_of_libraries(tmp_path, monkeypatch):
-    header, folder = write(tmp_path, ADD.replace("COLOR", "0.5")), tmp_path / "cache" / "shaders"
+    header, folder = (
+        write_header(tmp_path, ADD.replace("COLOR", "0.5")),
+        tmp_path / "cache" / "shaders",
+    )
     monkeypatch.setenv("GVTORCH_CACHE", str(folder.parent))
     monkeypatch.setenv("CXX", only_included(tmp_path))
     old = os.umask(0)
@@ -457,7 +460,7 @@ def test_only_its_owner_writes_to_the_folder_of_libraries(tmp_path, monkeypatch)
 @pytest.mark.backend("cpp")
 def test_what_the_loader_refuses_is_told_in_its_words(tmp_path, monkeypatch):
     """The compiler writes no library; a folder mounted noexec has the same effect."""
-    header, compiler = write(tmp_path, ADD.replace("COLOR", "0.5")), tmp_path / "c++"
+    header, compiler = write_header(tmp_path, ADD.replace("COLOR", "0.5")), tmp_path / "c++"
     compiler.write_text(
         '#!/bin/sh\nfor word; do case $word in *.so) echo no > "$word"; esac; done\n'
     )
@@ -470,7 +473,7 @@ def test_what_the_loader_refuses_is_told_in_its_words(tmp_path, monkeypatch):
 @pytest.mark.backend("cpp")
 def test_a_header_that_changes_meanwhile_is_not_kept(tmp_path, monkeypatch):
     """Otherwise its last content would be found under its first."""
-    header = write(tmp_path, ADD.replace("COLOR", "0.5"))
+    header = write_header(tmp_path, ADD.replace("COLOR", "0.5"))
     monkeypatch.setenv("CXX", only_included(tmp_path, f"echo '// more' >> {header}"))
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
     with pytest.raises(RuntimeError, match=r"own.h has changed: create the shader again"):
@@ -480,7 +483,7 @@ def test_a_header_that_changes_meanwhile_is_not_kept(tmp_path, monkeypatch):
 
 @pytest.mark.backend("cpp")
 def test_folders_of_headers_that_the_environment_names_count(tmp_path, monkeypatch):
-    header = write(tmp_path, ADD.replace("COLOR", "kColor"))
+    header = write_header(tmp_path, ADD.replace("COLOR", "kColor"))
     header.write_text("#include <color.h>\n" + header.read_text())
     monkeypatch.setenv("CXX", only_included(tmp_path))
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
@@ -495,9 +498,9 @@ def test_folders_of_headers_that_the_environment_names_count(tmp_path, monkeypat
 @pytest.mark.backend("cpp")
 def test_what_is_included_otherwise_counts_as_well(tmp_path, monkeypatch):
     """Included by a macro, over two lines, or in brackets: no stale library is used."""
-    header = write(tmp_path, ADD.replace("COLOR", "kA + kB + kC"))
-    ways = '#define FILE_A "a.h"\n#include FILE_A\n#include \\\n"b.h"\n#include <c.h>\n'
-    header.write_text(ways + header.read_text())
+    header = write_header(tmp_path, ADD.replace("COLOR", "kA + kB + kC"))
+    includes = '#define FILE_A "a.h"\n#include FILE_A\n#include \\\n"b.h"\n#include <c.h>\n'
+    header.write_text(includes + header.read_text())
     (tmp_path / "found").mkdir()
     folders = {"a": tmp_path, "b": tmp_path, "c": tmp_path / "found"}
     values = dict.fromkeys("abc", 0.125)
@@ -509,15 +512,15 @@ def test_what_is_included_otherwise_counts_as_well(tmp_path, monkeypatch):
         for name, value in values.items():
             text = f"constexpr float k{name.upper()} = {value}f;\n"
             (folders[name] / f"{name}.h").write_text(text)
-        found = made(header).read_text(errors="replace")
+        compiled_text = made(header).read_text(errors="replace")
         for name, value in values.items():
-            assert f"k{name.upper()} = {value}f;" in found, (changed, name)
+            assert f"k{name.upper()} = {value}f;" in compiled_text, (changed, name)
 
 
 @pytest.mark.backend("cpp")
 def test_what_another_process_has_noted_meanwhile_is_no_change(tmp_path, monkeypatch):
     """Two compile at once: one has noted an included file before the other has finished."""
-    header = write(tmp_path, ADD)
+    header = write_header(tmp_path, ADD)
     part = tmp_path / "part.h"
     part.write_text("")
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
@@ -546,7 +549,7 @@ def test_no_name_of_a_user_comes_to_a_shell(tmp_path, monkeypatch):
     folder = tmp_path / "a b;touch $(touch beside)`touch beside`"
     folder.mkdir()
     (folder / "color.h").write_text("constexpr float kColor = 0.5f;\n")
-    header = write(folder, ADD.replace("COLOR", "kColor"), "own $(touch here);'\".h")
+    header = write_header(folder, ADD.replace("COLOR", "kColor"), "own $(touch here);'\".h")
     header.write_text('#include "color.h"\n' + header.read_text())
     monkeypatch.setenv("CXX", str(compiler))
     monkeypatch.setenv("GVTORCH_CACHE", str(folder / "cache"))
@@ -557,7 +560,7 @@ def test_no_name_of_a_user_comes_to_a_shell(tmp_path, monkeypatch):
 
 @pytest.mark.backend("cpp")
 def test_folders_above_and_libraries_are_looked_at(tmp_path, monkeypatch):
-    header = write(tmp_path, ADD.replace("COLOR", "0.5"))
+    header = write_header(tmp_path, ADD.replace("COLOR", "0.5"))
     cache = tmp_path / "above" / "cache"
     monkeypatch.setenv("GVTORCH_CACHE", str(cache))
     monkeypatch.setenv("CXX", only_included(tmp_path))
@@ -567,17 +570,17 @@ def test_folders_above_and_libraries_are_looked_at(tmp_path, monkeypatch):
     library = made(header)
     assert not left.exists(), "what a killed compilation left is gone"
     assert [*(cache / "shaders").iterdir()] == [library]
-    for place in (library, cache.parent):
-        mode = place.stat().st_mode
-        place.chmod(0o777)
-        with pytest.raises(RuntimeError, match=rf"others may write to {place}; GVTORCH_CACHE"):
+    for path in (library, cache.parent):
+        mode = path.stat().st_mode
+        path.chmod(0o777)
+        with pytest.raises(RuntimeError, match=rf"others may write to {path}; GVTORCH_CACHE"):
             gv.CompiledShader(header, "Own")
-        place.chmod(mode)
+        path.chmod(mode)
 
 
 @pytest.mark.backend("cpp")
 def test_it_is_unpickled_in_another_process(tmp_path):
-    shader = gv.CompiledShader(write(tmp_path, ADD.replace("COLOR", "0.5")), "Own")
+    shader = gv.CompiledShader(write_header(tmp_path, ADD.replace("COLOR", "0.5")), "Own")
     kept, tracer = tmp_path / "shader.pkl", tmp_path / "tracer.pkl"
     kept.write_bytes(pickle.dumps(shader))
     assert in_processes(1, kept, make="pickle.load(open(given, 'rb'))") == ["0.5"]
@@ -591,6 +594,6 @@ def test_it_is_unpickled_in_another_process(tmp_path):
 
 @pytest.mark.backend("cpp")
 def test_cuda_gets_no_other_content_than_the_cpu_has(tmp_path):
-    edited = replace(user.load_op(HEADER, "mine::Plain"), header=write(tmp_path, ADD))
+    edited = replace(user.load_op(HEADER, "mine::Plain"), header=write_header(tmp_path, ADD))
     with pytest.raises(RuntimeError, match=r"own.h has changed: create the shader again"):
         user.load_cuda(edited)

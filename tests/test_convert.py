@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import run
+from helpers import run_cli
 from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
@@ -376,22 +376,22 @@ def test_a_dask_cluster(tmp_path, data, raw):
 
 def test_command_converts_and_tells(tmp_path, raw, data, capsys):
     target = tmp_path / "a.zarr"
-    code, out, err = run(capsys, "convert", raw, target, "--dry-run")
+    code, out, err = run_cli(capsys, "convert", raw, target, "--dry-run")
     assert code == 0 and not err and not target.exists()
     assert "disk free" in out and "memory" in out and "seconds" in out
-    code, out, err = run(
+    code, out, err = run_cli(
         capsys, "convert", raw, target, "--block", 64, "--spacing", "1,2,3", "--threshold", 4
     )
     assert (code, err) == (0, "") and "300x20x9, 7 levels" in out
     store = Store.open(target)
     assert (store.block, store.spacing, store.threshold) == (64, (1, 2, 3), 4)
-    code, out, err = run(capsys, "info", target, "--json")
+    code, out, err = run_cli(capsys, "info", target, "--json")
     told = json.loads(out)
     assert told["extent"] == [300, 20, 9] and told["dtype"] == "uint8" and told["levels"] == 7
     assert told["range"] == [[float(data.min()), float(data.max())]] and told["disk bytes"] > 0
-    code, out, err = run(capsys, "convert", raw, target)
+    code, out, err = run_cli(capsys, "convert", raw, target)
     assert code == 2 and err.count("\n") == 1 and "there is a store already" in err
-    code, out, err = run(
+    code, out, err = run_cli(
         capsys, "convert", raw, tmp_path / "b", "--workers", 2, "--scheduler", "tcp://x:1"
     )
     assert code == 2 and "leave --workers out" in err

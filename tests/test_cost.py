@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import DEVICES
 from helpers.traces import SHADER, arguments
-from helpers.trees import on
+from helpers.trees import copy_to
 
 import gvtorch as gv
 from gvtorch.ops import RayArguments, trace_segments
@@ -77,7 +77,7 @@ def test_nodes_are_counted_up_to_where_a_ray_ends(blobs, compiled):
     wall = gv.TransferFunction.from_points([(0, 1), (1, 1)])
     found = gv.cost(tree, CAMERA, haze, lod="finest").nodes
     rays = CAMERA.placed(tree.box).rays().to(tree.device)
-    _, given = arguments(on(tree, DEVICES[compiled]), 1, SHADER)
+    _, given = arguments(copy_to(tree, DEVICES[compiled]), 1, SHADER)
     hides_none = torch.arange(1, len(given.opaque_m) + 1, dtype=torch.int32, device=tree.device)
     given = given._replace(opaque_m=hides_none, table_lm4=given.table_lm4[:1], cone_scale=0.0)
     segments = trace_segments(RayArguments.of(rays), given)

@@ -10,8 +10,8 @@ import pytest
 import torch
 from helpers import DEVICES
 from helpers.rays import camera_rays
-from helpers.traces import SHADER, arguments, assert_equal, run
-from helpers.trees import forget, on
+from helpers.traces import SHADER, arguments, assert_equal, trace
+from helpers.trees import copy_to, with_holes
 from helpers.worlds import Menger, Solid, ball, bulb, meets_menger, torus
 
 import gvtorch as gv
@@ -30,15 +30,15 @@ def engine(world: gv.Producer, **options) -> gv.Engine:
     return gv.Engine(world, **{"brick_pool": 96 << 20, "node_pool": 24 << 20} | options)
 
 
-def camera_above(place, normal, size=32, height=NEAR, **how) -> gv.Camera:
+def camera_above(point, normal, size=32, height=NEAR, **options) -> gv.Camera:
     """Returns a camera `height` above a point of a surface, looking along the surface and down."""
-    place, normal = (torch.tensor(v, dtype=torch.float64) for v in (place, normal))
+    point, normal = (torch.tensor(v, dtype=torch.float64) for v in (point, normal))
     normal = normal / normal.norm()
     side = torch.linalg.cross(normal, torch.tensor([0.1, 0.7, 0.7], dtype=torch.float64))
-    eye = place + height * normal
+    eye = point + height * normal
     target = eye + height * (side / side.norm() - 0.5 * normal)
-    given = {"up": tuple(normal.tolist()), "width": size, "height": size} | how
-    return gv.Camera.look_at(tuple(eye.tolist()), tuple(target.tolist()), **given)
+    view_options = {"up": tuple(normal.tolist()), "width": size, "height": size} | options
+    return gv.Camera.look_at(tuple(eye.tolist()), tuple(target.tolist()), **view_options)
 
 
 def ball_meets(rays: gv.Rays, radius: float):
@@ -57,11 +57,11 @@ def torus_meets(rays: gv.Rays, ring: float, tube: float):
     gap = torus(ring, tube)
     t = torch.zeros_like(origin[:, 0])
     for step in range(300):
-        place = origin + t[:, None] * direction
-        flat = place * torch.tensor([1.0, 1.0, 0.0])
-        normal = (place - ring * flat / flat.norm(dim=1, keepdim=True)) / tube
+        hit = origin + t[:, None] * direction
+        flat = hit * torch.tensor([1.0, 1.0, 0.0])
+        normal = (hit - ring * flat / flat.norm(dim=1, keepdim=True)) / tube
         fall = (normal * direction).sum(1) if step > 250 else -1.0
-        t = t + gap(*place.unbind(1)) / fall
+        t = t + gap(*hit.unbind(1)) / fall
     return t, normal
 
 
@@ -69,8 +69,8 @@ def pixels_beside(picture, rays, t, normal):
     """Returns (r,): the surface's displacement across the ray, in pixels; -1: no hit."""
     depth = picture.depth.flatten().double()
     cosine = -(normal * rays.direction.double()).sum(1)
-    beside = (depth - t).abs() * cosine / (rays.cone[:, 1].double() * t)
-    return torch.where(depth < torch.inf, beside, -1.0)
+    error = (depth - t).abs() * cosine / (rays.cone[:, 1].double() * t)
+    return torch.where(depth < torch.inf, error, -1.0)
 
 
 @pytest.mark.parametrize("shape", ["ball", "torus"])
@@ -79,22 +79,22 @@ def test_a_surface_is_where_it_should_be(branching, depth, shape):
     """Far better than a tenth of a pixel, though a pixel is 10^-12 of the box there."""
     if shape == "ball":
         up = torch.tensor([0.36, 0.48, 0.8], dtype=torch.float64)
-        world, place = Solid(ball(0.8), depth, branching), 0.8 * up
+        world, point = Solid(ball(0.8), depth, branching), 0.8 * up
     else:
         up = torch.tensor([0.6, 0.64, 0.48], dtype=torch.float64)
         ring = 0.6 * torch.tensor([0.6, 0.64, 0.0]) / math.hypot(0.6, 0.64)
-        world, place = Solid(torus(0.6, 0.3), depth, branching), ring.double() + 0.3 * up
-    camera = camera_above(place.tolist(), up.tolist())
+        world, point = Solid(torus(0.6, 0.3), depth, branching), ring.double() + 0.3 * up
+    camera = camera_above(point.tolist(), up.tolist())
     rays = camera.rays()
     t, normal = ball_meets(rays, 0.8) if shape == "ball" else torus_meets(rays, 0.6, 0.3)
     with engine(world) as scene:
         for dtype in (torch.float32, torch.float64):
             picture = scene.render(camera, SURFACE, dtype=dtype)
             assert picture.stats.converged
-            beside = pixels_beside(picture, rays, t, normal)
-            assert (beside >= 0).all() and beside.quantile(0.99) < 1e-4
+            error = pixels_beside(picture, rays, t, normal)
+            assert (error >= 0).all() and error.quantile(0.99) < 1e-4
             # Where N > 2, some intervals end more than a fine voxel behind their brick's border.
-            assert beside.max() < (1e-4 if branching == 2 else 0.2)
+            assert error.max() < (1e-4 if branching == 2 else 0.2)
             off = (picture.normal.reshape(-1, 3).double() - normal).norm(dim=1)
             assert off.max() < 2e-3, "the normal's angle"
 
@@ -110,15 +110,15 @@ def test_a_camera_outside_the_box(height):
         picture = scene.render(camera, SURFACE)
         normal = torch.tensor([[1.0, 0, 0]], dtype=torch.float64).expand(len(t), 3)
         seen = picture.depth.flatten() < torch.inf
-        beside = pixels_beside(picture, rays, t, normal)[seen]
-        assert seen.float().mean() > 0.5 and beside.max() < 0.1, beside.max()
+        error = pixels_beside(picture, rays, t, normal)[seen]
+        assert seen.float().mean() > 0.5 and error.max() < 0.1, error.max()
 
 
 def test_a_sponge_is_cut_as_whole_numbers_tell():
     """Menger's, N = 3, depth 19: rays meet the cells that exact arithmetic meets."""
-    depth, place = 19, torch.tensor([0.25, 0.75, 0.25], dtype=torch.float64)
+    depth, point = 19, torch.tensor([0.25, 0.75, 0.25], dtype=torch.float64)
     size = 3.0**-17  # of the cell in whose hole the eye is: nine of the smallest cells
-    low = (place / size).floor() * size
+    low = (point / size).floor() * size
     eye, target = (low + size * torch.tensor(v) for v in ([0.5, 0.47, 0.52], [0.2, 0.85, 0.3]))
     camera = gv.Camera.look_at(
         tuple(eye.tolist()), tuple(target.tolist()), up=(0, 0, 1), fov=70, width=24, height=24
@@ -129,10 +129,10 @@ def test_a_sponge_is_cut_as_whole_numbers_tell():
     )
     with engine(Menger(depth, depth), brick_size=9) as scene:
         depth_r = scene.render(camera, SURFACE).depth.flatten().double()
-    beside = (depth_r - t).abs() / (rays.cone[:, 1].double() * t)
+    error = (depth_r - t).abs() / (rays.cone[:, 1].double() * t)
     assert (depth_r < torch.inf).all()
     # Edges are rounded by half a voxel; rays that hit faces agree.
-    assert (beside < 0.1).float().mean() > 0.75, beside.quantile(0.75)
+    assert (error < 0.1).float().mean() > 0.75, error.quantile(0.75)
 
 
 def test_a_fractal_is_the_same_in_float64():
@@ -150,9 +150,9 @@ def test_a_fractal_is_the_same_in_float64():
     seen = (single.depth < torch.inf) & (double.depth < torch.inf)
     assert ((single.depth < torch.inf) != (double.depth < torch.inf)).float().mean() < 0.01
     assert seen.float().mean() > 0.3
-    beside = (single.depth - double.depth).abs()[seen] / double.depth[seen]
+    error = (single.depth - double.depth).abs()[seen] / double.depth[seen]
     pixel = float(camera.rays().cone[0, 1])
-    assert beside.double().quantile(0.8) < 1e-3 * pixel, "rays that graze it aside"
+    assert error.double().quantile(0.8) < 1e-3 * pixel, "rays that graze it aside"
 
 
 # --- backends, requests, shaders
@@ -176,11 +176,11 @@ def deep(request):
         yield tree, camera.rays()
 
 
-@pytest.mark.parametrize("look", LOOKS)
-def test_compiled_equals_reference(compiled, deep, look):
+@pytest.mark.parametrize("name", LOOKS)
+def test_compiled_equals_reference(compiled, deep, name):
     tree, rays = deep
     for options in ({}, {"dtype": torch.float64}):
-        result, marks, _ = assert_equal(tree, compiled, rays, LOOKS[look], **options)
+        result, marks, _ = assert_equal(tree, compiled, rays, LOOKS[name], **options)
         assert result["alpha"].max() > 0.9 and (marks["brick"] > 0).any()
 
 
@@ -188,45 +188,45 @@ def test_compiled_equals_reference(compiled, deep, look):
 def test_missing_nodes_give_equal_pictures_and_requests(compiled, deep, share):
     tree, rays = deep
     for seed in range(3):
-        _, marks, _ = assert_equal(forget(tree, share, seed), compiled, rays, LIT.transfer)
+        _, marks, _ = assert_equal(with_holes(tree, share, seed), compiled, rays, LIT.transfer)
         assert marks["request"].any()
 
 
 def test_segments_and_samples_are_equal(compiled, deep):
     tree, rays = deep
     for dtype in (torch.float32, torch.float64):
-        found = []
+        results = []
         for backend in ("reference", compiled):
-            copy = on(tree, DEVICES[backend])
+            copy = copy_to(tree, DEVICES[backend])
             traced = Tracer(copy, LIT.transfer, gv.RenderOptions(dtype=dtype)).arguments
-            given = RayArguments.of(rays.to(DEVICES[backend]))
-            segments = trace_segments(given, traced, backend=backend)
-            values = sample_bricks(given, traced, segments, list_samples(segments), backend=backend)
-            found.append([*segments, values])
-        assert len(found[0][0]) > 1000
-        for expected, actual in zip(*found, strict=True):
+            args = RayArguments.of(rays.to(DEVICES[backend]))
+            segments = trace_segments(args, traced, backend=backend)
+            values = sample_bricks(args, traced, segments, list_samples(segments), backend=backend)
+            results.append([*segments, values])
+        assert len(results[0][0]) > 1000
+        for expected, actual in zip(*results, strict=True):
             assert torch.equal(actual.cpu(), expected)
 
 
 def test_single_and_double_agree(compiled, deep):
     """Shadows, too: a cone to the light begins at a position as precise as the eye's."""
     tree, rays = deep
-    for name, look in LOOKS.items():
-        single, _ = run(tree, compiled, rays, look)
-        double, _ = run(tree, compiled, rays, look, dtype=torch.float64)
-        beside = (single["color"].double() - double["color"]).abs().max()
-        assert beside < 2e-3, (name, beside)
+    for name, shader in LOOKS.items():
+        single, _ = trace(tree, compiled, rays, shader)
+        double, _ = trace(tree, compiled, rays, shader, dtype=torch.float64)
+        error = (single["color"].double() - double["color"]).abs().max()
+        assert error < 2e-3, (name, error)
 
 
 def test_a_sponge_zoomed_in_is_itself():
     """No jitter, no cracks: Menger's sponge, magnified 81 times, is the sponge, down to 10^-7."""
-    place = torch.tensor([0.25, 0.75, 0.25], dtype=torch.float64)
+    point = torch.tensor([0.25, 0.75, 0.25], dtype=torch.float64)
     pictures = []
     with engine(Menger(19, 21), brick_size=9, brick_pool="64 MB") as scene:
         used = []
         for level in (2, 6, 10, 14):
             size = 3.0**-level
-            low = (place / size).floor() * size
+            low = (point / size).floor() * size
             eye, target = (
                 low + size * torch.tensor(v) for v in ([0.5, 0.47, 0.52], [0.9, 0.6, 0.3])
             )
@@ -238,8 +238,8 @@ def test_a_sponge_zoomed_in_is_itself():
             pictures.append(picture.depth.double() / size)
             used.append(picture.stats.bricks_used)
     for picture in pictures[1:]:
-        beside = (picture - pictures[0]).abs() / pictures[0]
-        assert beside.quantile(0.9) < 0.02 and beside.median() < 0.003
+        error = (picture - pictures[0]).abs() / pictures[0]
+        assert error.quantile(0.9) < 0.02 and error.median() < 0.003
     assert max(used) < 1.2 * min(used), "as much memory at every depth"
 
 
@@ -250,23 +250,23 @@ def test_counting_goes_on_from_a_new_base(blobs, compiled):
     """After 2^23 intervals of one length: the same segments, and no interval is skipped."""
     tree = gv.N3Tree.from_volume(blobs, 4)
     rays = camera_rays(tree, 6, distance=1.3)
-    found = []
+    results = []
     for backend in ("reference", compiled):
-        copy = on(tree, DEVICES[backend])
+        copy = copy_to(tree, DEVICES[backend])
         options = gv.RenderOptions(lod="finest", dtype=torch.float64)
         traced = Tracer(copy, SHADER, options).arguments
-        given = RayArguments.of(rays.to(DEVICES[backend]))
-        whole = trace_segments(given, traced, backend=backend)
+        args = RayArguments.of(rays.to(DEVICES[backend]))
+        whole = trace_segments(args, traced, backend=backend)
         state = whole.state.clone()
         count = float(MAX_INTERVALS - 3)
         enters = torch.zeros_like(state[:, 0])
         state[:, 0], state[:, 1], state[:, 2] = enters - count * traced.step, count, 0
-        again = trace_segments(given, traced, state, backend=backend)
+        again = trace_segments(args, traced, state, backend=backend)
         assert int((again.interval[:, 0] == 0).sum()) > 0, "there is a new base"
         assert torch.equal(again.counts[:, 1], whole.counts[:, 1])
         torch.testing.assert_close(again.t1, whole.t1[: len(again.t1)], atol=1e-6, rtol=0)
-        found.append(again)
-    for expected, actual in zip(*found, strict=True):
+        results.append(again)
+    for expected, actual in zip(*results, strict=True):
         assert torch.equal(actual.cpu(), expected)
 
 
@@ -303,9 +303,9 @@ def test_which_trees_are_deep():
 
 def test_a_tree_deeper_than_float64_counts_is_refused(blobs):
     tree = gv.N3Tree.from_volume(blobs, 4)
-    given, traced = arguments(tree, 2)
+    ray_args, traced = arguments(tree, 2)
     with pytest.raises(ValueError, match=r"branching 2 and max_depth 51 make more than 2\^50"):
-        trace_rays(given, traced._replace(max_depth=51))
+        trace_rays(ray_args, traced._replace(max_depth=51))
 
 
 # --- producers

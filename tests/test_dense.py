@@ -38,10 +38,10 @@ class Voxels(NamedTuple):
     producer: gv.Producer
 
     @property
-    def places(self) -> Tensor:
+    def positions(self) -> Tensor:
         """(k, 16^3, 3) points spread over them."""
-        at = (torch.arange(PLACES, dtype=torch.float64) + 0.5) / PLACES
-        return self.low[:, None] + self.side * torch.cartesian_prod(at, at, at)
+        offsets = (torch.arange(PLACES, dtype=torch.float64) + 0.5) / PLACES
+        return self.low[:, None] + self.side * torch.cartesian_prod(offsets, offsets, offsets)
 
     @property
     def middle(self) -> Tensor:
@@ -58,15 +58,15 @@ class Case(NamedTuple):
     bounds: Callable[[float], dict[str, tuple[float, float]]]
 
 
-def both(most: float, share: float) -> tuple[float, float]:
+def both(max_error: float, share: float) -> tuple[float, float]:
     """Returns the largest error, and a share of it as the root mean square error."""
-    return most, share * most
+    return max_error, share * max_error
 
 
 def means(voxels: Voxels) -> dict[str, Tensor]:
     """Returns the means of the producer's unfiltered values at the points."""
-    found = voxels.producer.at(voxels.places)
-    return {name: values.double().mean(1) for name, values in found.items()}
+    by_channel = voxels.producer.at(voxels.positions)
+    return {name: values.double().mean(1) for name, values in by_channel.items()}
 
 
 class Stripes(torch.nn.Module):
@@ -121,9 +121,9 @@ def rough() -> gv.Producer:
 
 def variances(octaves, side: float):
     """Yields for each octave: variance of its noise, share of it in means, and cells a voxel."""
-    for one in octaves:
-        share = math.exp(-noise.MEAN_DECAY * (side * one.frequency) ** 2)
-        yield one.amplitude**2 * noise.VARIANCE, share, side * one.frequency
+    for octave in octaves:
+        share = math.exp(-noise.MEAN_DECAY * (side * octave.frequency) ** 2)
+        yield octave.amplitude**2 * noise.VARIANCE, share, side * octave.frequency
 
 
 def rough_bounds(side: float) -> dict[str, tuple[float, float]]:
@@ -150,7 +150,7 @@ SUM = noise.OctaveSum(frequency=1.5, octaves=6, gain=0.6)
 
 def octave_means(voxels: Voxels) -> dict[str, Tensor]:
     """Returns means of all octaves at every level; cells begin at the low corner of the box."""
-    points = (voxels.places - torch.tensor(BOX[0])) * 1.5
+    points = (voxels.positions - torch.tensor(BOX[0])) * 1.5
     return {"value": noise.fbm(points, octaves=6, gain=0.6).mean(1, keepdim=True)}
 
 
@@ -158,10 +158,10 @@ def octave_bounds(side: float) -> dict[str, tuple[float, float]]:
     """Octaves of a level have the variance of their values in the middle, means have less: they
     differ by at most the difference; for octaves not in the level, by the variance of the means.
     """
-    apart = 0.0
+    total = 0.0
     for variance, share, cells in variances(SUM.octaves, side):
-        apart += variance * (1 - share**2 if cells <= 0.5 else share**2)
-    return {"value": (5 * math.sqrt(apart), 1.35 * math.sqrt(apart))}
+        total += variance * (1 - share**2 if cells <= 0.5 else share**2)
+    return {"value": (5 * math.sqrt(total), 1.35 * math.sqrt(total))}
 
 
 TURN = torch.linalg.qr(torch.randn((3, 3), generator=torch.Generator().manual_seed(4)).double()).Q
@@ -178,7 +178,7 @@ def turned_box(channel: str) -> Callable[[], gv.Producer]:
 def box_means(voxels: Voxels) -> dict[str, Tensor]:
     """Returns coverage by the planes of the box, or distance by its nearest point."""
     producer = voxels.producer
-    q = (voxels.places @ TURN.T).abs() - HALF
+    q = (voxels.positions @ TURN.T).abs() - HALF
     if "coverage" in producer.channels:
         return {"coverage": 255 * (q.amax(-1) < 0).double().mean(1, keepdim=True)}
     distance = q.clamp(min=0).norm(dim=-1) + q.amax(-1).clamp(max=0)
@@ -190,25 +190,25 @@ def box_distance_bounds(side: float) -> dict[str, tuple[float, float]]:
     """Distances change by at most 1 per unit, so the mean over a cube is within 0.48 sides of the
     value in its middle; above the finest level, 2^3 middles are averaged.
     """
-    most = 0.48 * side / (2 if side > 1.01 * turned_box("coverage")().spacing[0] else 1)
-    return {"distance": both(most, 0.25)}
+    max_error = 0.48 * side / (2 if side > 1.01 * turned_box("coverage")().spacing[0] else 1)
+    return {"distance": both(max_error, 0.25)}
 
 
 def scattered() -> tuple[Tensor, Tensor, Tensor]:
     """Returns positions, values and radii of points."""
     random = torch.Generator().manual_seed(3)
-    place = 0.3 * torch.randn((300, 3), generator=random).double().clamp(-3, 3)
+    positions = 0.3 * torch.randn((300, 3), generator=random).double().clamp(-3, 3)
     sizes = torch.tensor([0.0, 0.01, 0.04, 0.1], dtype=torch.float64)
     radius = sizes[torch.randint(0, 4, (300,), generator=random)]
-    return place, torch.rand((300, 2), generator=random).double() - 0.3, radius
+    return positions, torch.rand((300, 2), generator=random).double() - 0.3, radius
 
 
 def point_sums(voxels: Voxels) -> dict[str, Tensor]:
     """Returns sums of points, by the share of each point along each axis."""
     low = voxels.low.numpy()
     total = np.zeros((len(low), 2))
-    for at, value, reach in zip(*(one.numpy() for one in scattered()), strict=True):
-        ends = (share_below(low + side, at, float(reach)) for side in (voxels.side, 0.0))
+    for position, value, reach in zip(*(t.numpy() for t in scattered()), strict=True):
+        ends = (share_below(low + side, position, float(reach)) for side in (voxels.side, 0.0))
         total += (next(ends) - next(ends)).prod(1, keepdims=True) * value
     return {"value": torch.from_numpy(total) * (FINEST / voxels.side) ** 3}
 
@@ -237,11 +237,11 @@ def joined() -> gv.Producer:
 
 
 def joined_means(voxels: Voxels) -> dict[str, Tensor]:
-    found = {}
+    by_channel = {}
     for name, case in PARTS.items():
-        own = voxels._replace(producer=voxels.producer.producers[name])
-        (found[name],) = CASES[case].dense(own).values()
-    return found
+        own_voxels = voxels._replace(producer=voxels.producer.producers[name])
+        (by_channel[name],) = CASES[case].dense(own_voxels).values()
+    return by_channel
 
 
 def joined_bounds(side: float) -> dict[str, tuple[float, float]]:
@@ -290,19 +290,19 @@ CASES = {
 }
 
 
-def held(producer: gv.Producer, nodes: gv.Nodes, at: Tensor) -> dict[str, Tensor]:
-    """Returns by channel (k, c): one voxel `at` (k, 3), z y x, of each node, as a tree holds it."""
-    found = producer.classify(nodes)
-    regions = found if isinstance(found, gv.Regions) else gv.Regions(kind=found)
-    rows, (z, y, x) = torch.arange(len(nodes)), (at + nodes.layout.border).unbind(1)
-    told = {}
+def held(producer: gv.Producer, nodes: gv.Nodes, positions: Tensor) -> dict[str, Tensor]:
+    """Returns by channel (k, c): the voxel at `positions` (k, 3), z y x, of each node."""
+    answer = producer.classify(nodes)
+    regions = answer if isinstance(answer, gv.Regions) else gv.Regions(kind=answer)
+    rows, (z, y, x) = torch.arange(len(nodes)), (positions + nodes.layout.border).unbind(1)
+    by_channel = {}
     for name, bricks in producer.bricks_at(nodes.loc, nodes.layout).items():
         values = bricks[rows, z, y, x].double()
         constant = regions.constants.get(name, torch.zeros(1, 1)).double()
         is_constant = (regions.kind == gv.Region.CONSTANT)[:, None]
         values = torch.where(is_constant, constant, values)
-        told[name] = values * (regions.kind != gv.Region.EMPTY)[:, None]
-    return told
+        by_channel[name] = values * (regions.kind != gv.Region.EMPTY)[:, None]
+    return by_channel
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -321,15 +321,15 @@ def test_every_level_is_the_mean_of_the_formula(name):
         some = (kind == gv.Region.DATA).nonzero()[:, 0]
         rows = some[torch.randint(len(some), (COUNT,), generator=random)]
         rows[::4] = torch.randint(len(nodes), (COUNT // 4,), generator=random)
-        nodes, at = nodes[rows], torch.randint(0, 4, (COUNT, 3), generator=random)
+        nodes, positions = nodes[rows], torch.randint(0, 4, (COUNT, 3), generator=random)
         side = float(nodes.voxel_size[0, 0])
-        voxels = Voxels(nodes.box[:, 0] + at.flip(1) * side, side, producer)
+        voxels = Voxels(nodes.box[:, 0] + positions.flip(1) * side, side, producer)
         dense, bounds = case.dense(voxels), case.bounds(side)
-        found = held(producer, nodes, at)
-        for channel, (most, rms) in bounds.items():
-            known = ~dense[channel].isnan()
-            values = dense[channel][known]
-            apart = (found[channel][known] - values).abs()
+        actual = held(producer, nodes, positions)
+        for channel, (max_error, rms) in bounds.items():
+            defined = ~dense[channel].isnan()
+            values = dense[channel][defined]
+            error = (actual[channel][defined] - values).abs()
             between = (values > values.min()) & (values < values.max())
-            root = float((apart.square().sum() / between.sum()).sqrt())
-            assert apart.max() <= most and root <= rms, (channel, depth)
+            root = float((error.square().sum() / between.sum()).sqrt())
+            assert error.max() <= max_error and root <= rms, (channel, depth)

@@ -7,7 +7,7 @@ import torch
 from helpers.packets import INSTRUCTIONS, result, start
 from helpers.rays import camera_rays
 from helpers.traces import SHADER
-from helpers.trees import on
+from helpers.trees import copy_to
 
 import gvtorch as gv
 
@@ -67,7 +67,7 @@ def test_cuda_sixteen_million_rays_in_one_call(blobs):
 
 @pytest.mark.backend("cuda")
 def test_cuda_streams(blobs):
-    tree = on(gv.N3Tree.from_volume(blobs, 8), "cuda")
+    tree = copy_to(gv.N3Tree.from_volume(blobs, 8), "cuda")
     rays = camera_rays(tree, 64, distance=1.3).to("cuda")
     expected = gv.trace(tree, rays, SHADER)
     stream = torch.cuda.Stream()
@@ -87,7 +87,7 @@ def test_cuda_second_device(blobs):
     rays = camera_rays(tree, 64, distance=1.3)
     expected = gv.trace(tree, rays, SHADER)
     with torch.cuda.device(0):
-        actual = gv.trace(on(tree, "cuda:1"), rays.to("cuda:1"), SHADER)
+        actual = gv.trace(copy_to(tree, "cuda:1"), rays.to("cuda:1"), SHADER)
         producer = gv.VolumeProducer(blobs)
         with gv.Engine(producer, device="cuda:1") as engine:
             camera = gv.Camera.orbit(width=32, height=32, distance=1.3)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import DEVICES, shared
-from helpers.pictures import PARTS, VESSELS, assert_same_picture, camera
+from helpers.pictures import FIELDS, VESSELS, assert_same_picture, camera
 from helpers.producers import Checked, Late
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -136,7 +136,9 @@ def test_pools_stay_in_order_over_random_frames(blobs, data):
     """`Checked` asserts after every frame."""
     branching = data.draw(st.sampled_from([2, 3]))
     loading = data.draw(st.sampled_from(["straight", "levels"]))
-    producer = Late(blobs, most=0.001) if data.draw(st.booleans()) else gv.VolumeProducer(blobs)
+    producer = (
+        Late(blobs, max_delay=0.001) if data.draw(st.booleans()) else gv.VolumeProducer(blobs)
+    )
     producer.branching = branching
     options = {
         "brick_size": 4,
@@ -500,7 +502,7 @@ def test_volumes_of_a_brick_and_less(extent):
         engine.validate()
         assert picture.stats.converged
         expected = gv.render(gv.N3Tree.from_volume(volume), camera(24), shader)
-        for name in PARTS:
+        for name in FIELDS:
             assert torch.equal(getattr(picture, name), getattr(expected, name)), name
         assert expected.alpha.max() > 0
 

@@ -11,7 +11,7 @@ import torch
 from helpers.afar import assert_same_bits, compare, filtered, matter, picture, rays, walls
 from helpers.packets import INSTRUCTIONS, result, start
 from helpers.rays import camera_rays
-from helpers.traces import SHADER, run
+from helpers.traces import SHADER, trace
 
 import gvtorch as gv
 from gvtorch.shaders import coarse_colors
@@ -27,9 +27,9 @@ MISTY = gv.TransferFunction(
 def test_compiled_equals_reference(compiled, directions, branching, dtype):
     tree, shader = filtered(SHADER, directions=directions, branching=branching)
     for distance, step in ((0.3, 0.5), (1.3, 0.4), (5.0, 2.3)):
-        found = assert_same_bits(tree, compiled, distance, shader, dtype=dtype, step=step)
+        hits = assert_same_bits(tree, compiled, distance, shader, dtype=dtype, step=step)
         if distance == 1.3:
-            assert found["alpha"].max() > 0.3, "the test must see something"
+            assert hits["alpha"].max() > 0.3, "the test must see something"
 
 
 def all_shaded() -> list[torch.Tensor]:
@@ -38,51 +38,51 @@ def all_shaded() -> list[torch.Tensor]:
 
 def shaded(backend: str) -> list[torch.Tensor]:
     """Returns all that traces of a plain and a lit function write."""
-    found, lamp = [], gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))
-    for look in (SHADER, gv.Lit(SHADER, light=lamp)):
+    results, lamp = [], gv.PointLight((0.0, 40.0, 60.0), (1.0, 0.9, 0.8))
+    for base_shader in (SHADER, gv.Lit(SHADER, light=lamp)):
         for directions in (True, False):
-            tree, shader = filtered(look, directions=directions)
+            tree, shader = filtered(base_shader, directions=directions)
             for size, distance in ((21, 1.5), (9, 1.5), (13, 4.0)):
                 rays = camera_rays(tree, size, distance=distance)
-                result, marks = run(tree, backend, rays, shader)
-                found += [*result.values(), *marks.values()]
-    return found
+                result, marks = trace(tree, backend, rays, shader)
+                results += [*result.values(), *marks.values()]
+    return results
 
 
 @pytest.mark.backend("cpp")
 def test_every_bit_is_the_same_for_all_instruction_sets(tmp_path):
     expected = shaded("reference")
     runs = [start(all_shaded, tmp_path, name) for name in INSTRUCTIONS]
-    for found in map(result, runs):
-        for one, other in zip(found, expected, strict=True):
-            assert torch.equal(one.nan_to_num(7), other.nan_to_num(7))
+    for actual in map(result, runs):
+        for a, b in zip(actual, expected, strict=True):
+            assert torch.equal(a.nan_to_num(7), b.nan_to_num(7))
 
 
 @pytest.mark.backend("cpp")
 def test_close_by_it_is_the_transfer_function():
     tree, shader = filtered(SHADER)
     rays = camera_rays(tree, 17)
-    near, plain = (gv.trace(tree, rays, one, lod="finest") for one in (shader, SHADER))
+    near, plain = (gv.trace(tree, rays, s, lod="finest") for s in (shader, SHADER))
     for field in ("color", "alpha", "depth", "samples"):
         assert torch.equal(getattr(near, field), getattr(plain, field)), field
 
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("pixel", [4.0, 16.0])
-@pytest.mark.parametrize("way", [(0.0, 0.0, 1.0), (0.37, 0.23, 1.0)])
-@pytest.mark.parametrize("look", ["misty", "opaque"])
-def test_from_afar_it_shows_what_many_fine_rays_show(look, way, pixel):
-    transfer = MISTY if look == "misty" else gv.TransferFunction([(0.4, 0), (0.5, 0.95)])
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.37, 0.23, 1.0)])
+@pytest.mark.parametrize("kind", ["misty", "opaque"])
+def test_from_afar_it_shows_what_many_fine_rays_show(kind, direction, pixel):
+    transfer = MISTY if kind == "misty" else gv.TransferFunction([(0.4, 0), (0.5, 0.95)])
     volume = walls()
     tree = gv.N3Tree.from_volume(volume, 8)
     shader = gv.Filtered.of(tree, volume, transfer)
-    assert tree.bricks.channels["filtered"].width == (4 if look == "misty" else 24)
-    truth = picture(tree, transfer, way, pixel, 16, "finest")
-    light, psnr = compare(picture(tree, shader, way, pixel), truth)
-    means, before = compare(picture(tree, transfer, way, pixel), truth)
-    print(look, way, pixel, f"{light:.3f} {psnr:.1f} dB, means {means:.3f} {before:.1f} dB")
+    assert tree.bricks.channels["filtered"].width == (4 if kind == "misty" else 24)
+    truth = picture(tree, transfer, direction, pixel, 16, "finest")
+    light, psnr = compare(picture(tree, shader, direction, pixel), truth)
+    means, before = compare(picture(tree, transfer, direction, pixel), truth)
+    print(kind, direction, pixel, f"{light:.3f} {psnr:.1f} dB, means {means:.3f} {before:.1f} dB")
     assert psnr > before + 5
-    _, still = compare(picture(tree, shader, way, pixel, 4), truth)
+    _, still = compare(picture(tree, shader, direction, pixel, 4), truth)
     assert still > psnr
 
 
@@ -101,10 +101,10 @@ def test_a_row_of_voxels_lets_through_what_its_columns_do_together():
         shader._directions = directions
         out = [torch.empty((32 >> n, 16 >> n, 16 >> n, 30), dtype=torch.float16) for n in (1, 2, 3)]
         shader.write(field, (1.0, 1.0, 1.0), 2, out, torch.device("cpu"))
-        rows = [one.unflatten(-1, (6, 5))[..., 3].float() for one in out]
+        rows = [row.unflatten(-1, (6, 5))[..., 3].float() for row in out]
         through[directions] = [
-            torch.stack([(1 - one[..., k]).prod(2 - k // 2).mean() for k in range(6)])
-            for one in rows
+            torch.stack([(1 - row[..., k]).prod(2 - k // 2).mean() for k in range(6)])
+            for row in rows
         ]
     finest = through[False][0]
     assert not torch.allclose(finest[:2], finest[4:], rtol=0.05)  # axes differ
@@ -115,35 +115,35 @@ def test_a_row_of_voxels_lets_through_what_its_columns_do_together():
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize(
-    ("way", "most"),
+    ("direction", "growths"),
     [
         ((0.0, 0.0, 1.0), (0.02, 0.05, 0.07)),
         ((0.37, 0.23, 1.0), (0.05, 0.07, 0.06)),
         ((1.0, 1.0, 1.0), (0.10, 0.14, 0.16)),  # each axis' colours count a third
     ],
 )
-def test_a_solid_ball_covers_a_disc_from_afar(way, most):
+def test_a_solid_ball_covers_a_disc_from_afar(direction, growths):
     """Its rim hardly grows, because hidden voxels hold the colours of visible neighbours."""
-    radius, place = 36.0, torch.arange(96) - 47.5
-    z, y, x = torch.meshgrid(place, place, place, indexing="ij")
+    radius, axis = 36.0, torch.arange(96) - 47.5
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     inside = radius - (x * x + y * y + z * z).sqrt()
     volume = gv.Volume((0.5 + inside / 2).clamp(0, 1))
     tree = gv.N3Tree.from_volume(volume, 8)
     shader = gv.Filtered.of(tree, volume, gv.TransferFunction([(0.49, 0), (0.51, 0.999)]))
-    for pixel, grown in zip((4.0, 8.0, 16.0), most, strict=True):
-        covered = picture(tree, shader, way, pixel)[..., 3].sum()
+    for pixel, grown in zip((4.0, 8.0, 16.0), growths, strict=True):
+        covered = picture(tree, shader, direction, pixel)[..., 3].sum()
         assert abs(float(covered) / (math.pi * (radius / pixel) ** 2) - 1) < grown, pixel
 
 
 @pytest.mark.parametrize("directions", [True, False])
-@pytest.mark.parametrize("most", [1, 40, 300])
-def test_colours_are_the_same_whatever_is_worked_out_at_a_time(monkeypatch, most, directions):
+@pytest.mark.parametrize("voxels", [1, 40, 300])
+def test_colours_are_the_same_whatever_is_worked_out_at_a_time(monkeypatch, voxels, directions):
     def colors() -> torch.Tensor:
         tree, shader = filtered(SHADER, directions=directions)
         return tree.bricks.bricks[shader.other]
 
     whole = colors()
-    monkeypatch.setitem(coarse_colors._TILE_VOXELS, "cpu", most)
+    monkeypatch.setitem(coarse_colors._TILE_VOXELS, "cpu", voxels)
     torch.testing.assert_close(colors(), whole, rtol=0, atol=1e-3)
     assert whole.unique().numel() > 1000, "the test must see something"
 
@@ -165,7 +165,7 @@ def test_soft_shadows_are_as_dark_as_those_of_many_fine_rays():
     truth = picture(100, None, lod="finest")
     for cones in (1, 4, 16):
         means, ours = (
-            float((picture(cones, one) - truth).square().mean().sqrt()) for one in (None, filtered)
+            float((picture(cones, s) - truth).square().mean().sqrt()) for s in (None, filtered)
         )
         print(cones, f"means {means:.4f} filtered {ours:.4f}")
         assert ours < 0.7 * means
@@ -181,12 +181,12 @@ def test_homogeneous_matter_stays_as_dense_at_every_level(directions):
     tree = gv.N3Tree.from_volume(volume, 4)
     transfer = gv.TransferFunction([(0, 0.02)], [(0, 0.3, 0.6, 0.9)])
     shader = gv.Filtered.of(tree, volume, transfer, directions=directions)
-    for way, length in (((0.0, 0.0, 1.0), 64.0), ((1.0, 0.0, 0.0), 32.0)):
-        forward = torch.tensor([way], dtype=torch.float64)
+    for direction, length in (((0.0, 0.0, 1.0), 64.0), ((1.0, 0.0, 0.0), 32.0)):
+        forward = torch.tensor([direction], dtype=torch.float64)
         for width in (0.1, 2.0, 9.0):
             cone = torch.tensor([[width, 0.0]], dtype=torch.float64)
-            given = rays(tree.box.mean(0) - 100 * forward, forward, cone)
-            hits = gv.trace(tree, given, shader, stop_alpha=1.0)
+            ray = rays(tree.box.mean(0) - 100 * forward, forward, cone)
+            hits = gv.trace(tree, ray, shader, stop_alpha=1.0)
             alpha = 1 - 0.98**length
             assert float(hits.alpha) == pytest.approx(alpha, rel=2e-3)
             expected = alpha * torch.tensor([[0.3, 0.6, 0.9]])
@@ -210,8 +210,8 @@ def test_a_tree_of_one_brick_has_no_colours():
     shader = gv.Filtered.of(tree, volume, SHADER)
     assert tree.depth == 0 and len(tree.bricks.bricks["filtered"]) == 0
     rays = camera_rays(tree, 9, distance=5.0)
-    found, plain = (gv.trace(tree, rays, one) for one in (shader, SHADER))
-    assert torch.equal(found.color, plain.color) and plain.alpha.max() > 0
+    actual, plain = (gv.trace(tree, rays, s) for s in (shader, SHADER))
+    assert torch.equal(actual.color, plain.color) and plain.alpha.max() > 0
     for hold in ("voxels", "bricks", "mapped"):
         streamed = gv.Filtered(SHADER)
         producer = gv.VolumeProducer(volume, hold=hold, filtered=streamed)
@@ -240,12 +240,12 @@ def test_streamed_equals_resident(compiled, directions, hold):
             assert bricks.coarse == pytest.approx(share * bricks.capacity, rel=0.3)
             for distance in (1.5, 4.0, 10.0, 0.7):
                 camera = gv.Camera.orbit(width=40, height=30, distance=distance)
-                found = engine.render(camera, shader)
+                actual = engine.render(camera, shader)
                 expected = gv.render(tree, camera, resident)
-                assert found.stats.converged
-                crowded |= found.stats.capacity_exceeded
+                assert actual.stats.converged
+                crowded |= actual.stats.capacity_exceeded
                 for field in ("color", "alpha", "depth"):
-                    assert torch.equal(getattr(found, field), getattr(expected, field)), field
+                    assert torch.equal(getattr(actual, field), getattr(expected, field)), field
                 engine.validate()
                 depth = engine.trees["scene"].tree.loc(bricks.owner_b.clamp(min=0).long())[:, 3]
                 coarse = depth[: bricks.coarse][bricks.owner_b[: bricks.coarse] >= 0]
@@ -269,16 +269,16 @@ def test_two_trees_share_coarse_slots():
     with gv.Engine(scene, brick_size=4) as engine:
         for name, view in (("far", 5.0), ("small", 3.0), ("plain", 5.0)):
             alone = {
-                n: one if n == name else gv.TransferFunction([(0, 0)]) for n, one in shaders.items()
+                n: s if n == name else gv.TransferFunction([(0, 0)]) for n, s in shaders.items()
             }
             camera = gv.Camera.orbit(width=30, height=30, distance=view)
-            found = engine.render(camera, alone)
-            assert found.stats.converged and found.alpha.max() > 0.5
+            actual = engine.render(camera, alone)
+            assert actual.stats.converged and actual.alpha.max() > 0.5
             engine.validate()
             if name != "small":
                 placed = camera.placed(engine.box)
                 expected = gv.Filtered.of(tree, volume, SHADER) if name == "far" else SHADER
-                assert torch.equal(found.color, gv.render(tree, placed, expected).color)
+                assert torch.equal(actual.color, gv.render(tree, placed, expected).color)
 
 
 def test_a_streamed_function_may_not_be_edited_nor_another_number_drawn():

@@ -31,17 +31,17 @@ def test_compiled_equals_reference(compiled, directions, branching, dtype):
         (LAMP, 5.0, 2.3),
     ):
         shader.transfer = gv.Lit(SHADER, light=light, specular=0.9, shininess=25.0)
-        found = assert_same_bits(tree, compiled, distance, shader, dtype=dtype, step=step)
+        hits = assert_same_bits(tree, compiled, distance, shader, dtype=dtype, step=step)
         if distance == 1.3:
-            assert found["alpha"].max() > 0.3, "the test must see something"
+            assert hits["alpha"].max() > 0.3, "the test must see something"
 
 
 @pytest.mark.backend("cpp")
 def test_close_by_it_is_the_lit_transfer_function():
-    look = gv.Lit(SHADER, light=SUN)
-    tree, shader = filtered(look)
+    base = gv.Lit(SHADER, light=SUN)
+    tree, shader = filtered(base)
     rays = camera_rays(tree, 17)
-    near, lit = (gv.trace(tree, rays, one, lod="finest") for one in (shader, look))
+    near, lit = (gv.trace(tree, rays, s, lod="finest") for s in (shader, base))
     for field in (*FIELDS, "samples"):
         assert torch.equal(getattr(near, field), getattr(lit, field)), field
 
@@ -64,25 +64,25 @@ SCANS = {
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize(("scan", "look", "pixel", "light", "least", "beside"), CASES)
-def test_from_afar_it_shows_what_many_fine_rays_show(scan, look, pixel, light, least, beside):
-    file, (low, high, most), (clear, solid) = SCANS[scan]
+@pytest.mark.parametrize(("scan", "kind", "pixel", "light", "least", "tolerance"), CASES)
+def test_from_afar_it_shows_what_many_fine_rays_show(scan, kind, pixel, light, least, tolerance):
+    file, (low, high, peak), (clear, solid) = SCANS[scan]
     whole = gv.read_volume(ROOT / "examples" / "data" / file)
     z, y, x = (max(0, size // 2 - 48) for size in whole.data.shape[:3])
     volume = gv.Volume(whole.data[z : z + 96, y : y + 96, x : x + 96].contiguous(), whole.spacing)
     color = [(clear, 0.8, 0.4, 0.25), (2 * solid, 1, 0.9, 0.7)]
-    opacity = [(low, 0), (high, most)] if look == "translucent" else [(clear, 0), (solid, 0.95)]
+    opacity = [(low, 0), (high, peak)] if kind == "translucent" else [(clear, 0), (solid, 0.95)]
     lit = gv.Lit(gv.TransferFunction(opacity, color), light=light)
     tree = gv.N3Tree.from_volume(volume)
     shader = gv.Filtered.of(tree, volume, lit)
-    way = (0.37, 0.23, 1.0)
-    truth = picture(tree, lit, way, pixel, 12, "finest")
-    share, psnr = compare(picture(tree, shader, way, pixel), truth)
-    means, before = compare(picture(tree, lit, way, pixel), truth)
-    one, alone = compare(picture(tree, lit, way, pixel, 1, "finest"), truth)
-    print(f"{share:.3f} {psnr:.1f} dB; means {means:.3f} {before:.1f}; one {one:.3f} {alone:.1f}")
+    direction = (0.37, 0.23, 1.0)
+    truth = picture(tree, lit, direction, pixel, 12, "finest")
+    share, psnr = compare(picture(tree, shader, direction, pixel), truth)
+    means, before = compare(picture(tree, lit, direction, pixel), truth)
+    sharp, alone = compare(picture(tree, lit, direction, pixel, 1, "finest"), truth)
+    print(f"{share:.3f} {psnr:.1f} dB; means {means:.3f} {before:.1f}; one {sharp:.3f} {alone:.1f}")
     assert psnr > least and psnr > before + 5 and psnr > alone
-    assert abs(share - 1) < beside
+    assert abs(share - 1) < tolerance
 
 
 @pytest.mark.backend("cpp")
@@ -99,54 +99,54 @@ def test_highlights_of_rough_matter_widen():
     )[0, 0]
     volume = gv.Volume((0.5 + (38 - radius) / 8 + 1.2 * (rough - 0.5)).clamp(0, 1))
     shine = {"ambient": 0.0, "diffuse": 0.0, "specular": 1.0, "shininess": 60.0}
-    look = gv.Lit(gv.TransferFunction([(0.4, 0), (0.5, 0.95)]), **shine)
+    base = gv.Lit(gv.TransferFunction([(0.4, 0), (0.5, 0.95)]), **shine)
     tree = gv.N3Tree.from_volume(volume)
-    shader = gv.Filtered.of(tree, volume, look)
-    truth = picture(tree, look, (0.37, 0.23, 1.0), 8.0, 16, "finest")[..., 0]
-    smooth = picture(tree, look, (0.37, 0.23, 1.0), 8.0)[..., 0]
-    found = picture(tree, shader, (0.37, 0.23, 1.0), 8.0)[..., 0]
-    assert 0.6 < float(found.sum() / truth.sum()) < 1.6
-    assert float(found.max()) < 1.6 * float(truth.max()) < float(smooth.max())
+    shader = gv.Filtered.of(tree, volume, base)
+    truth = picture(tree, base, (0.37, 0.23, 1.0), 8.0, 16, "finest")[..., 0]
+    smooth = picture(tree, base, (0.37, 0.23, 1.0), 8.0)[..., 0]
+    actual = picture(tree, shader, (0.37, 0.23, 1.0), 8.0)[..., 0]
+    assert 0.6 < float(actual.sum() / truth.sum()) < 1.6
+    assert float(actual.max()) < 1.6 * float(truth.max()) < float(smooth.max())
 
 
 @pytest.mark.parametrize("directions", [True, False])
 def test_streamed_equals_resident(compiled, directions):
     device = "cuda" if compiled == "cuda" else "cpu"
-    volume, look = matter(), gv.Lit(SHADER, light=SUN)
+    volume, base = matter(), gv.Lit(SHADER, light=SUN)
     tree = gv.N3Tree.from_volume(volume, 4, device=device)
-    resident = gv.Filtered.of(tree, volume, look, directions=directions)
+    resident = gv.Filtered.of(tree, volume, base, directions=directions)
     for size in (8_000_000, 400_000):
-        shader = gv.Filtered(look, directions=directions)
+        shader = gv.Filtered(base, directions=directions)
         producer = gv.VolumeProducer(volume, filtered=shader)
         with gv.Engine(producer, brick_size=4, brick_pool=size, device=device) as engine:
             for distance in (1.5, 4.0, 10.0):
                 camera = gv.Camera.orbit(width=40, height=30, distance=distance)
-                found, expected = engine.render(camera, shader), gv.render(tree, camera, resident)
-                assert found.stats.converged and found.alpha.max() > 0.1
+                actual, expected = engine.render(camera, shader), gv.render(tree, camera, resident)
+                assert actual.stats.converged and actual.alpha.max() > 0.1
                 for field in FIELDS:
-                    assert torch.equal(getattr(found, field), getattr(expected, field)), field
+                    assert torch.equal(getattr(actual, field), getattr(expected, field)), field
             engine.validate()
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("most", [0.05, 0.9])
-def test_streamed_from_disk_equals_resident(tmp_path, most):
+@pytest.mark.parametrize("opacity", [0.05, 0.9])
+def test_streamed_from_disk_equals_resident(tmp_path, opacity):
     volume = gv.Volume((200 * matter().data).to(torch.uint8))
-    look = gv.Lit(gv.TransferFunction([(30, 0), (120, most)]))
+    base = gv.Lit(gv.TransferFunction([(30, 0), (120, opacity)]))
     gv.convert(volume, tmp_path / "a.zarr")
-    gv.Filtered.add_to(tmp_path / "a.zarr", look)
-    own = gv.Filtered.stored(tmp_path / "a.zarr")
-    assert isinstance(own.transfer, gv.Lit) and own.made_of["normals"]
-    own.transfer.light = look.light = SUN
+    gv.Filtered.add_to(tmp_path / "a.zarr", base)
+    stored = gv.Filtered.stored(tmp_path / "a.zarr")
+    assert isinstance(stored.transfer, gv.Lit) and stored.made_of["normals"]
+    stored.transfer.light = base.light = SUN
     tree = gv.N3Tree.from_volume(volume, 8)
-    resident = gv.Filtered.of(tree, volume, look)
-    with gv.Engine(gv.StoredProducer(tmp_path / "a.zarr", filtered=own), brick_size=8) as engine:
+    resident = gv.Filtered.of(tree, volume, base)
+    with gv.Engine(gv.StoredProducer(tmp_path / "a.zarr", filtered=stored), brick_size=8) as engine:
         for distance in (1.0, 4.0, 12.0):
             camera = gv.Camera.orbit(width=32, height=24, distance=distance)
-            found, expected = engine.render(camera, own), gv.render(tree, camera, resident)
-            assert found.stats.converged and not engine.failures
+            actual, expected = engine.render(camera, stored), gv.render(tree, camera, resident)
+            assert actual.stats.converged and not engine.failures
             for field in FIELDS:
-                assert torch.equal(getattr(found, field), getattr(expected, field)), field
+                assert torch.equal(getattr(actual, field), getattr(expected, field)), field
 
 
 @pytest.mark.backend("cpp")
@@ -185,13 +185,13 @@ def test_mistakes_are_told(tmp_path):
     tree = gv.N3Tree.from_volume(volume, 4)
     with pytest.raises(ValueError, match="must be a TransferFunction or a Lit, got Isosurface"):
         gv.Filtered(gv.Isosurface(0.5))
-    for look in (
+    for base in (
         gv.Lit(SHADER, normals="normal"),
         gv.Lit(SHADER, shadows=True),
         gv.Lit(SHADER, light=SUN, octaves=2),
     ):
         with pytest.raises(ValueError, match="a Lit must take its normals from the gradient"):
-            gv.Filtered.of(tree, volume, look)
+            gv.Filtered.of(tree, volume, base)
     rays = camera_rays(tree, 3)
     plain = gv.Filtered.of(tree, volume, SHADER)
     with pytest.raises(ValueError, match="made of another function or component"):
@@ -212,8 +212,8 @@ def test_the_command_line(tmp_path):
     far = ("--size", "24x16", "--camera", "orbit:20,10,9", "-o", tmp_path / "a.npy")
     done = gvtorch("filter", tmp_path / "a.zarr", "--tf", "hot", "--lit")
     assert done.returncode == 0, done.stderr
-    for given in ((), ("--tf", "hot")):
-        shader = ("--shader", "filtered-lit", *given)
+    for flags in ((), ("--tf", "hot")):
+        shader = ("--shader", "filtered-lit", *flags)
         done = gvtorch("render", tmp_path / "a.zarr", *shader, *far)
         assert done.returncode == 0, done.stderr
     done = gvtorch("render", tmp_path / "a.zarr", "--shader", "filtered", *far)

@@ -7,7 +7,7 @@ import time
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.recorded import COMPILED, LOOK, Ball, Frames, view
+from helpers.recorded import COMPILED, TRANSFER, Ball, Frames, view
 
 import gvtorch as gv
 from gvtorch.engine import host_frame
@@ -38,7 +38,7 @@ def test_views_that_the_pools_cannot_hold_are_drawn_at_levels_that_fit(backend):
 def test_views_that_fit_again_are_as_asked_for(backend):
     small = {"brick_pool": "1.2 MB", "node_pool": "2 MB", "device": DEVICES[backend]}
     with gv.Engine(Ball(1024), **small) as engine:
-        frames = Frames(engine, view(64, 0), LOOK, 512, 0, True)
+        frames = Frames(engine, view(64, 0), TRANSFER, 512, 0, True)
         for _ in range(12):
             _, stats = frames.frame()
         assert stats.coarser > 1
@@ -57,7 +57,7 @@ def test_views_fit_where_producers_answer_from_the_host(backend):
     for fit in (False, True):
         options = {"brick_pool": "60 kB", "node_pool": "2 MB", "device": DEVICES[backend]}
         with gv.Engine(gv.VolumeProducer(gv.Volume(waves)), **options) as engine:
-            frames = Frames(engine, view(64, 0), LOOK, 512, 0, fit)
+            frames = Frames(engine, view(64, 0), TRANSFER, 512, 0, fit)
             assert isinstance(frames.served, host_frame.HostFrame)
             for _ in range(60):
                 _, stats = frames.frame()
@@ -70,7 +70,7 @@ def test_views_fit_where_producers_answer_from_the_host(backend):
 def test_a_graph_fits_as_well():
     small = {"brick_pool": "1.2 MB", "node_pool": "2 MB", "device": "cuda"}
     with gv.Engine(Ball(1024), **small) as engine:
-        graph = engine.capture(view(64, 0), LOOK, fit=True)
+        graph = engine.capture(view(64, 0), TRANSFER, fit=True)
         for _ in range(40):
             _, stats = graph.replay(view(64, 0))
         assert stats.converged and 1 < stats.coarser < 3
@@ -80,4 +80,4 @@ def test_a_graph_fits_as_well():
         on_device = False
 
     with gv.Engine(Unsaid(), device="cuda") as engine, pytest.raises(ValueError, match="fit needs"):
-        engine.capture(view(64, 0), LOOK, fit=True)
+        engine.capture(view(64, 0), TRANSFER, fit=True)

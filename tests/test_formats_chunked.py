@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import gvtorch as run
-from helpers.damage import assert_told
+from helpers.damage import assert_robust
 from helpers.stores import noise
 
 import gvtorch as gv
@@ -118,7 +118,7 @@ def test_a_folder_of_nothing_is_named(tmp_path):
 @pytest.mark.parametrize("kind", ["v2", "v3", "n5"])
 def test_broken_arrays_give_one_line(tmp_path, grid, kind):
     if kind == "n5":
-        assert_told(n5(tmp_path / "a", grid[:4, :4, :8]), tmp_path / "broken")
+        assert_robust(n5(tmp_path / "a", grid[:4, :4, :8]), tmp_path / "broken")
         return
     made = zarr.create_array(
         str(tmp_path / "a"),
@@ -128,7 +128,7 @@ def test_broken_arrays_give_one_line(tmp_path, grid, kind):
         zarr_format=int(kind[1]),
     )
     made[:] = grid
-    assert_told(tmp_path / "a", tmp_path / "broken", least=8)
+    assert_robust(tmp_path / "a", tmp_path / "broken", min_refused=8)
 
 
 # --- raw

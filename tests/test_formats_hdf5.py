@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.damage import assert_told
+from helpers.damage import assert_robust
 from helpers.stores import noise
 
 import gvtorch as gv
@@ -203,5 +203,5 @@ def test_broken_files_give_one_line(tmp_path, grid, packed):
     with h5py.File(file, "w") as out:
         more = {"chunks": (4, 4, 4), "compression": "gzip", "fletcher32": True} if packed else {}
         out.create_dataset("a", data=grid, **more)
-    assert_told(file, tmp_path / "broken")
-    assert_told(netcdf(tmp_path / "a.nc", grid), tmp_path / "broken2")
+    assert_robust(file, tmp_path / "broken")
+    assert_robust(netcdf(tmp_path / "a.nc", grid), tmp_path / "broken2")

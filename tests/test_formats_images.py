@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.damage import assert_told
+from helpers.damage import assert_robust
 from helpers.stores import noise
 
 import gvtorch as gv
@@ -86,7 +86,7 @@ def test_metaimage_without_its_numbers(tmp_path, grid):
 @pytest.mark.parametrize("packed", [False, True])
 def test_broken_metaimages_give_one_line(tmp_path, grid, packed):
     itk.WriteImage(image(grid), str(tmp_path / "a.mha"), packed)
-    assert_told(tmp_path / "a.mha", tmp_path / "broken")
+    assert_robust(tmp_path / "a.mha", tmp_path / "broken")
 
 
 # --- MRC
@@ -123,7 +123,7 @@ def test_mrc_axes_and_starts(tmp_path, grid):
 
 def test_broken_maps_give_one_line(tmp_path, grid):
     mrcfile.write(tmp_path / "a.mrc", grid)
-    assert_told(tmp_path / "a.mrc", tmp_path / "broken")
+    assert_robust(tmp_path / "a.mrc", tmp_path / "broken")
 
 
 # --- VTK
@@ -316,7 +316,7 @@ def test_a_vti_that_tells_what_is_not_there(tmp_path, grid, told, instead, messa
     ("mode", "packer"), [("Appended", "None"), ("Appended", "ZLib"), ("Binary", "ZLib")]
 )
 def test_broken_vti_gives_one_line(tmp_path, grid, mode, packer):
-    assert_told(write_vti(tmp_path / "a.vti", vtk_image(grid), mode, packer), tmp_path / "broken")
+    assert_robust(write_vti(tmp_path / "a.vti", vtk_image(grid), mode, packer), tmp_path / "broken")
 
 
 @pytest.mark.parametrize("kind", ["Binary", "ASCII"])
@@ -326,7 +326,7 @@ def test_broken_vtk_gives_one_line(tmp_path, grid, kind):
     writer.SetInputData(vtk_image(grid))
     getattr(writer, f"SetFileTypeTo{kind}")()
     writer.Write()
-    assert_told(tmp_path / "a.vtk", tmp_path / "broken", least=8)
+    assert_robust(tmp_path / "a.vtk", tmp_path / "broken", min_refused=8)
 
 
 def vti_of_text(path, arrays: str, before: str = ""):

@@ -12,7 +12,7 @@ import zlib
 import numpy as np
 import pytest
 from helpers import gvtorch, shared
-from helpers.damage import assert_told
+from helpers.damage import assert_robust
 from helpers.vdb import (
     ACTIVE,
     BLOSC,
@@ -23,7 +23,7 @@ from helpers.vdb import (
     ZIP,
     Grid,
     VdbWriter,
-    check,
+    assert_reads,
     leaf_values,
     nano_file,
     nano_grid,
@@ -40,7 +40,7 @@ pytest.importorskip("imagecodecs")
 def test_openvdb_reads_the_same(name):
     path = shared(f"vdb/{name}.vdb")
     dense = np.load(shared(f"vdb/{name}_dense.npz"))
-    check(path, dense["density"][..., None])
+    assert_reads(path, dense["density"][..., None])
     volume = gv.read_volume(path)
     step = float(dense["voxel_size"])
     assert volume.spacing == pytest.approx((step,) * 3)
@@ -130,11 +130,11 @@ np.save(target, out.numpy().reshape(size))
 )
 def test_every_kind_of_openvdb(tmp_path, kind, packing):
     rng = np.random.default_rng(3)
-    grid = Grid(kind, False if kind in ("bool", "mask") else 7, told=BOX)
+    grid = Grid(kind, False if kind in ("bool", "mask") else 7, metadata=BOX)
     leaf_values(grid, rng)
     writer = VdbWriter(packing=packing)
     path = writer.write(tmp_path / "a.vdb", grid)
-    check(path, grid.dense(LOW, HIGH))
+    assert_reads(path, grid.dense(LOW, HIGH))
     if packing & ACTIVE and kind in ("float", "vec3d"):
         assert writer.codes == {0, 1, 2, 3, 4, 5, 6}
 
@@ -142,14 +142,14 @@ def test_every_kind_of_openvdb(tmp_path, kind, packing):
 @pytest.mark.parametrize("version", [220, 221, 222, 223])
 @pytest.mark.parametrize("packing", [0, ZIP])
 def test_older_files(tmp_path, version, packing):
-    grid = Grid("float", 7, told=BOX)
+    grid = Grid("float", 7, metadata=BOX)
     leaf_values(grid, np.random.default_rng(3))
-    check(VdbWriter(version, packing).write(tmp_path / "a.vdb", grid), grid.dense(LOW, HIGH))
+    assert_reads(VdbWriter(version, packing).write(tmp_path / "a.vdb", grid), grid.dense(LOW, HIGH))
 
 
 @pytest.mark.parametrize("kind", ["float", "vec3s"])
 def test_half_floats(tmp_path, kind):
-    grid = Grid(kind, 0.1, told=BOX, half=True)
+    grid = Grid(kind, 0.1, metadata=BOX, half=True)
     rng = np.random.default_rng(3)
     active = rng.random(512) < 0.5
     values = np.where(active[:, None], rng.random((512, len(grid.value(0)))), 0.1)
@@ -182,19 +182,19 @@ def test_tiles_and_far_away_boxes(tmp_path):
 
 def test_several_grids_and_shared_trees(tmp_path):
     rng = np.random.default_rng(3)
-    first = Grid("float", 7, told=BOX, name="heat")
+    first = Grid("float", 7, metadata=BOX, name="heat")
     leaf_values(first, rng)
-    second = Grid("vec3s", 0, told=BOX, name="density")
+    second = Grid("vec3s", 0, metadata=BOX, name="density")
     leaf_values(second, rng)
     move = struct.pack("<18d", 1, 2, 3, *(2.0,) * 3, *(0,) * 12)
-    third = Grid("float", 0, told=BOX, name="density\x1e1", map=("ScaleTranslateMap", move),
+    third = Grid("float", 0, metadata=BOX, name="density\x1e1", map=("ScaleTranslateMap", move),
                  parent="heat")  # fmt: skip
     path = VdbWriter().write(tmp_path / "a.vdb", first, second, third)
     for key in ("heat", "0", "/heat"):
-        check(path, first.dense(LOW, HIGH), key=key)
-    check(path, second.dense(LOW, HIGH), key="density")
+        assert_reads(path, first.dense(LOW, HIGH), key=key)
+    assert_reads(path, second.dense(LOW, HIGH), key="density")
     source = open_source(path, key="density[1]")
-    check(path, first.dense(LOW, HIGH), key="density[1]")
+    assert_reads(path, first.dense(LOW, HIGH), key="density[1]")
     assert source.spacing == (2, 2, 2)
     assert source.origin == tuple(2.0 * n + t for n, t in zip(LOW, (1, 2, 3), strict=True))
     with pytest.warns(
@@ -237,7 +237,7 @@ def test_every_kind_of_nanovdb(tmp_path, kind):
     for codec, bits in zip((0, 1, 2, 1, 0), (1, 2, 4, 8, 16), strict=True):
         content, (number, box) = nano_grid(kind, rng, bits)
         path = nano_file(tmp_path / f"{codec}{bits}.nvdb", ("a", number, content), codec=codec)
-        check(path, box)
+        assert_reads(path, box)
         source = open_source(path)
         assert source.spacing == (0.5, 0.25, 2.0) and source.origin == (6, 20, 30)
         for low, wanted in ((127, (1, 3)), (255, (3, 1)), (8191, (1, 3)), (12287, (3, 1))):
@@ -256,13 +256,13 @@ def test_several_grids_of_nanovdb(tmp_path):
         both = path.read_bytes() * 2  # a second segment
         path.write_bytes(both)
         for key, kind in (("float", "float"), ("3", "Vec3f")):
-            check(path, made[kind][1][1], key=key)
+            assert_reads(path, made[kind][1][1], key=key)
         with pytest.raises(ValueError, match="no grid 'x'; it holds 0 'float', 1 'Vec3f', 2 'flo"):
             open_source(path, key="x")
 
 
 def test_the_command_line_and_stores(tmp_path, monkeypatch):
-    grid = Grid("float", 0.0, told=BOX)
+    grid = Grid("float", 0.0, metadata=BOX)
     leaf_values(grid, np.random.default_rng(3))
     path = VdbWriter(packing=BLOSC | ACTIVE).write(tmp_path / "a.vdb", grid)
     told = gvtorch("info", path)
@@ -281,13 +281,15 @@ def test_the_command_line_and_stores(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("packing", [0, ZIP, ZIP | ACTIVE, BLOSC | ACTIVE])
 def test_broken_files_of_openvdb(tmp_path, packing):
-    grid = Grid("float", 7, told=BOX)
+    grid = Grid("float", 7, metadata=BOX)
     leaf_values(grid, np.random.default_rng(3))
-    assert_told(VdbWriter(packing=packing).write(tmp_path / "a.vdb", grid), tmp_path, least=20)
+    assert_robust(
+        VdbWriter(packing=packing).write(tmp_path / "a.vdb", grid), tmp_path, min_refused=20
+    )
 
 
 @pytest.mark.parametrize("codec", [0, 1, 2])
 def test_broken_files_of_nanovdb(tmp_path, codec):
     content, (number, _) = nano_grid("float", np.random.default_rng(1))
     path = nano_file(tmp_path / "a.nvdb", ("a", number, content), codec=codec)
-    assert_told(path, tmp_path, least=20)
+    assert_robust(path, tmp_path, min_refused=20)

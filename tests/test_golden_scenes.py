@@ -44,10 +44,10 @@ from helpers.golden_scenes import (
     LATER,
     LIGHTS,
     LOOKS,
+    METHODS,
     MODULES,
     SCENES,
-    SPANS,
-    WAYS,
+    VALUE_RANGES,
     Settings,
     box_of,
     camera_of,
@@ -77,7 +77,7 @@ def traced(s: Settings, backend: str) -> Found:
     device = "cuda" if backend == "cuda" else "cpu"
     if s["way"] in ("engine", "levels"):
         return _streamed(s, backend, device)
-    low, high = SPANS[s["value"]]
+    low, high = VALUE_RANGES[s["value"]]
     threshold = None if s["threshold"] is None else low + (high - low) * s["threshold"]
     sizes = {"branching": s["branching"], "threshold": threshold, "device": device}
     tree = gv.N3Tree.from_volume(volumes(s), s["brick"], s["border"], **sizes)
@@ -88,38 +88,38 @@ def traced(s: Settings, backend: str) -> Found:
     if s["way"] == "tracer":
         return _module(s, tree, camera, shader)
     if s["way"] == "holes":
-        for number, words in enumerate((nodes.brick_tn, nodes.child_tn)):
-            gone = numbers(10 * s["seed"] + 6 + number, *words.shape) < 0.3
-            words[torch.from_numpy(gone).to(device) & (words >= 0)] = ABSENT
+        for number, pointers in enumerate((nodes.brick_tn, nodes.child_tn)):
+            gone = numbers(10 * s["seed"] + 6 + number, *pointers.shape) < 0.3
+            pointers[torch.from_numpy(gone).to(device) & (pointers >= 0)] = ABSENT
     options = options_of(s)
     if s["way"] == "cost":
         cost = gv.cost(tree, camera, shader, backend=backend, **options)
         images, counts = [cost.lod, cost.age, cost.fill], [cost.samples, cost.nodes]
         return {"picture": images, "counts": counts, "library": []}
     picture = gv.render(tree, camera, shader, backend=backend, **options)
-    found = _parts(s, picture)
+    parts = _parts(s, picture)
     used = [picture.stats.samples, picture.stats.tiles_used, picture.stats.bricks_used]
-    found["counts"] += [*used, _wide(nodes.request_tn), nodes.stamp_t, bricks.stamp_b]
-    return found
+    parts["counts"] += [*used, _wide(nodes.request_tn), nodes.stamp_t, bricks.stamp_b]
+    return parts
 
 
 def _wide(request_tn: torch.Tensor) -> torch.Tensor:
     """Returns request words as they are hashed: int32, priorities of 16 bits."""
-    words = request_tn.to(torch.int32)
-    priority = words & PRIORITY
+    requests = request_tn.to(torch.int32)
+    priority = requests & PRIORITY
     top = torch.where(priority == PRIORITY, 0xFFFF, priority)
-    return ((words - priority) << 5) | top
+    return ((requests - priority) << 5) | top
 
 
 def _parts(s: Settings, *pictures: gv.Picture) -> Found:
     rounded = by_torch(s)
-    found: Found = {"picture": [], "counts": [], "library": []}
+    parts: Found = {"picture": [], "counts": [], "library": []}
     for picture in pictures:
         for name in PICTURE:
-            found["library" if name in rounded else "picture"].append(getattr(picture, name))
-        found["counts"] += [picture.samples, picture.missed]
-        found["counts"] += [] if picture.label is None else [picture.label]
-    return found
+            parts["library" if name in rounded else "picture"].append(getattr(picture, name))
+        parts["counts"] += [picture.samples, picture.missed]
+        parts["counts"] += [] if picture.label is None else [picture.label]
+    return parts
 
 
 def by_torch(s: Settings) -> set[str]:
@@ -128,9 +128,9 @@ def by_torch(s: Settings) -> set[str]:
         return set()
     pieces = "lens" in s or s.get("caps") or s.get("clip") in ("boxes", "without")
     pieces = pieces or s.get("layer") == "translucent" or s.get("two_trees")
-    found = {"normal"} if pieces else set()
-    found |= {"color"} if "lighting" in s else set()
-    return found | ({"depth", "nearest"} if s["look"] in MODULES else set())
+    names = {"normal"} if pieces else set()
+    names |= {"color"} if "lighting" in s else set()
+    return names | ({"depth", "nearest"} if s["look"] in MODULES else set())
 
 
 def _module(s: Settings, tree: gv.N3Tree, camera: gv.Camera | gv.Rays, shader: Any) -> Found:
@@ -176,32 +176,32 @@ def _streamed(s: Settings, backend: str, device: str) -> Found:
         device=device,
     ) as engine:
         first, stats = engine.frame(camera, shader, backend=backend, **options)
-        asked = [*stats.requests.values(), stats.misses]
+        requests = [*stats.requests.values(), stats.misses]
         last = engine.render(camera, shader, backend=backend, **options)
         assert last.stats.converged
-    found = _parts(s, first, last)
-    found["counts"] += asked
-    return found
+    parts = _parts(s, first, last)
+    parts["counts"] += requests
+    return parts
 
 
 def digest(parts: Iterable[Any], hashed: str) -> str:
     """Returns 16 hex digits of the bytes and shapes of what was returned."""
     total = hashlib.sha256()
     for part in parts:
-        found = str(part).encode()
+        content = str(part).encode()
         if isinstance(part, Tensor):
             rounded = hashed == "float32" and part.dtype == torch.float64
             array = (part.to(torch.float32) if rounded else part).cpu().contiguous().numpy()
-            found = str(array.shape).encode() + array.tobytes()
-        total.update(found)
+            content = str(array.shape).encode() + array.tobytes()
+        total.update(content)
     return total.hexdigest()[:16]
 
 
 def hashes(seed: int, backend: str) -> dict[str, str]:
     """Returns a scene's hash for each group that is not empty."""
     s = settings(seed)
-    found = traced(s, backend)
-    return {group: digest(parts, s["hashed"]) for group, parts in found.items() if parts}
+    groups = traced(s, backend)
+    return {group: digest(parts, s["hashed"]) for group, parts in groups.items() if parts}
 
 
 @cache
@@ -210,9 +210,9 @@ def library() -> str:
     x = torch.from_numpy(numbers(1, 999, 3))
     square = x[:3].T @ x[:3]
     functions = ("sin", "cos", "tan", "asin", "log2", "exp2", "log1p", "expm1", "sqrt")
-    found = [getattr(y, name)() for name in functions for y in (x, x.float())]
-    found += [x**7.3, square, normalize(x, dim=1), normalize(x.float(), dim=1)]
-    return digest(found, "raw")
+    results = [getattr(y, name)() for name in functions for y in (x, x.float())]
+    results += [x**7.3, square, normalize(x, dim=1), normalize(x.float(), dim=1)]
+    return digest(results, "raw")
 
 
 # --- the tests
@@ -247,10 +247,10 @@ def test_every_bit_is_as_it_was(backend, group):
         s = settings(seed)
         if promised(s, backend):
             tried += 1
-            found, expected = hashes(seed, backend), golden()["scenes"][seed]
-            assert found.keys() == expected.keys()
+            actual, expected = hashes(seed, backend), golden()["scenes"][seed]
+            assert actual.keys() == expected.keys()
             parts = sorted(
-                part for part in groups & expected.keys() if found[part] != expected[part]
+                part for part in groups & expected.keys() if actual[part] != expected[part]
             )
             wrong += [f"{' and '.join(parts)} of {described(s)}"] if parts else []
     assert not wrong, f"{len(wrong)} of {tried} scenes changed:\n" + "\n".join(wrong)
@@ -259,9 +259,9 @@ def test_every_bit_is_as_it_was(backend, group):
 def test_every_setting_is_drawn():
     """Every option occurs at least a few times."""
     scenes = [settings(seed) for seed in range(SCENES)]
-    known = {
-        **{"look": (*LOOKS, *LATER), "way": WAYS, "camera": CAMERAS, "light": LIGHTS},
-        "value": SPANS,
+    choices = {
+        **{"look": (*LOOKS, *LATER), "way": METHODS, "camera": CAMERAS, "light": LIGHTS},
+        "value": VALUE_RANGES,
         **{"branching": (2, 3, 4), "brick": (4, 8, 16), "border": (0, 1, 2), "width": (1, 2, 3)},
         **{"lod": ("auto", "finest"), "hashed": ("raw", "float32"), "inside": (True, False)},
         "clip": ("planes", "box", "boxes", "matrix", "without"),
@@ -269,7 +269,7 @@ def test_every_setting_is_drawn():
         "layer": ("opaque", "translucent"),
         "background": ("black", "color", "gradient", "image", "none"),
     }
-    for name, values in known.items():
+    for name, values in choices.items():
         count = Counter(s.get(name) for s in scenes)
         assert all(count[value] >= 3 for value in values), (name, count)
     count = Counter((s["dtype"], s["hashed"]) for s in scenes)

@@ -51,7 +51,7 @@ def thin(origin: Tensor, direction: Tensor, end: float) -> gv.Rays:
 
 
 @cache
-def monte_carlo(look: str, frames: int = 16, count: int = 32) -> Tensor:
+def monte_carlo(kind: str, frames: int = 16, count: int = 32) -> Tensor:
     """Returns (p, 3): the skylight that surrounding matter blocks (half of it beyond half of the
     reach), or the sunlight that it reflects: means of `frames` x `count` thin rays a pixel.
     """
@@ -63,18 +63,18 @@ def monte_carlo(look: str, frames: int = 16, count: int = 32) -> Tensor:
     for frame in range(frames):
         rays = CAMERA.shifted(*jitter(frame)).rays()
         hits = gv.trace(tree, rays, shader)
-        at = rays.origin + hits.depth.double() * rays.direction
+        hit_positions = rays.origin + hits.depth.double() * rays.direction
         normal = normalize(hits.normal.double(), dim=1)
         for _ in range(count):
             ball = torch.randn(normal.shape, generator=generator, dtype=torch.float64)
-            way = normalize(normal + normalize(ball, dim=1), dim=1)  # cosine-weighted
-            met = trace(thin(at + 0.8 * normal, way, REACH))
-            if look == "occlusion":
+            outward = normalize(normal + normalize(ball, dim=1), dim=1)  # cosine-weighted
+            met = trace(thin(hit_positions + 0.8 * normal, outward, REACH))
+            if kind == "occlusion":
                 taken = (met.depth < REACH / 2).double() + (met.depth < torch.inf)
                 total += hits.color * taken / 2
                 continue
             seen = met.depth[:, 0] < torch.inf
-            there = (at + 0.8 * normal + met.depth.double() * way)[seen]
+            there = (hit_positions + 0.8 * normal + met.depth.double() * outward)[seen]
             facing = normalize(met.normal.double(), dim=1)[seen]
             shaded = thin(there + 1.5 * facing, sun.expand_as(there).contiguous(), math.inf)
             light = (1 - trace(shaded).alpha) * (facing * sun).sum(1, keepdim=True).clamp(min=0)
@@ -82,27 +82,27 @@ def monte_carlo(look: str, frames: int = 16, count: int = 32) -> Tensor:
     return total / frames / count
 
 
-@pytest.mark.parametrize("look", LOOKS)
-def test_refined_pictures_converge_to_monte_carlo(compiled, look):
+@pytest.mark.parametrize("kind", LOOKS)
+def test_refined_pictures_converge_to_monte_carlo(compiled, kind):
     """Equal directions in all pixels and frames would leave errors of 0.046 and 0.029 after 32
     frames, 0.049 and 0.032 after one. The rest, with turned ones, is due to cone origin and width.
     """
-    material, given = LOOKS[look]
+    material, options = LOOKS[kind]
     render = partial(gv.render, scene(DEVICES[compiled]), backend=compiled)
     shader = surface(**material)
     with_it = gv.Progressive(
-        partial(render, shader=shader, lighting=gv.Lighting(reach=REACH, **given))
+        partial(render, shader=shader, lighting=gv.Lighting(reach=REACH, **options))
     )
-    bare = {**given, "occlusion": 0, "indirect": 0}
+    bare = {**options, "occlusion": 0, "indirect": 0}
     without = gv.Progressive(partial(render, shader=shader, lighting=gv.Lighting(**bare)))
     errors = {}
     for count in (1, 8, 32):
         change = [run.refine(CAMERA, count).color.double().cpu() for run in (without, with_it)]
-        difference = (change[1] - change[0]).abs().reshape(-1, 3) - monte_carlo(look)
+        difference = (change[1] - change[0]).abs().reshape(-1, 3) - monte_carlo(kind)
         errors[count] = float(difference[:, 0].square().mean().sqrt())
-    print(look, {count: round(error, 4) for count, error in errors.items()})
+    print(kind, {count: round(error, 4) for count, error in errors.items()})
     assert errors[32] < errors[8] < 0.75 * errors[1] and errors[32] < 0.7 * errors[1], errors
-    assert errors[32] < (0.023 if look == "occlusion" else 0.0145)
+    assert errors[32] < (0.023 if kind == "occlusion" else 0.0145)
 
 
 def directions(sample: Tensor, count: int) -> Tensor:
@@ -113,21 +113,21 @@ def directions(sample: Tensor, count: int) -> Tensor:
 
 def test_directions_are_the_same_on_every_device(backend):
     sample = torch.tensor([0, 1, 2, 77, 65535, 2**31, 5 + (3 << 32), 9 + (1000 << 32)])
-    found = directions(sample.to(DEVICES[backend]), 5).cpu()
-    torch.testing.assert_close(found, directions(sample, 5), rtol=0, atol=1e-15)
-    for way, number in zip(found.unbind(1), sample.tolist(), strict=True):
+    actual = directions(sample.to(DEVICES[backend]), 5).cpu()
+    torch.testing.assert_close(actual, directions(sample, 5), rtol=0, atol=1e-15)
+    for vectors, number in zip(actual.unbind(1), sample.tolist(), strict=True):
         pixel, frame = number & 0xFFFFFFFF, number >> 32
         begin = [scrambled(pixel + 1)]
         begin.append(scrambled(begin[0] + 3242174889))
-        for place, one in enumerate(way.tolist()):
-            step = (5 * frame + place) * np.array([3242174889, 2447445414], dtype=object)
+        for index, vector in enumerate(vectors.tolist()):
+            step = (5 * frame + index) * np.array([3242174889, 2447445414], dtype=object)
             u, v = ((np.array(begin, dtype=object) + step) % 2**32) / 2**32
             expected = (
                 math.sqrt(u) * math.cos(2 * math.pi * v),
                 math.sqrt(u) * math.sin(2 * math.pi * v),
                 math.sqrt(1 - u),
             )
-            np.testing.assert_allclose(one, expected, atol=1e-5)
+            np.testing.assert_allclose(vector, expected, atol=1e-5)
 
 
 def scrambled(number: int) -> int:
@@ -142,16 +142,16 @@ def test_directions_are_cosine_weighted_and_even():
     pixel = torch.arange(4096)
     of_pixels = directions(pixel, 1)[0]
     of_frames = directions(5 + (torch.arange(256) << 32), 16).reshape(-1, 3)
-    for found, most in ((of_pixels, 0.03), (of_frames, 1e-3)):
-        torch.testing.assert_close(found.norm(dim=1), torch.ones(4096).double(), rtol=0, atol=1e-12)
-        assert (found.mean(0) - torch.tensor([0, 0, 2 / 3])).abs().max() < most
-        assert abs(float(found[:, 2].square().mean()) - 1 / 2) < most
+    for rays, tolerance in ((of_pixels, 0.03), (of_frames, 1e-3)):
+        torch.testing.assert_close(rays.norm(dim=1), torch.ones(4096).double(), rtol=0, atol=1e-12)
+        assert (rays.mean(0) - torch.tensor([0, 0, 2 / 3])).abs().max() < tolerance
+        assert abs(float(rays[:, 2].square().mean()) - 1 / 2) < tolerance
     assert torch.equal(  # 16 of one frame are 4 of each of four frames
         directions(5 + (3 << 32) + pixel[:1], 16)[:, 0],
         torch.cat([directions(5 + ((12 + k) << 32) + pixel[:1], 4)[:, 0] for k in range(4)]),
     )
-    beside = (of_pixels[1:] * of_pixels[:-1]).sum(1).mean()
-    assert abs(float(beside) - 4 / 9) < 0.03, "neighbours have nothing in common"
+    neighbours = (of_pixels[1:] * of_pixels[:-1]).sum(1).mean()
+    assert abs(float(neighbours) - 4 / 9) < 0.03, "neighbours have nothing in common"
 
 
 @pytest.mark.parametrize("sample", [0, 7])
@@ -159,37 +159,37 @@ def test_parts_of_a_picture_have_its_light(compiled, sample):
     """Strips, blocks of rays, rays instead of a camera, one of a batch: only the pixel matters."""
     tree = scene(DEVICES[compiled])
     camera = CAMERA.shifted(0.2, 0.1, sample)
-    given = {
+    options = {
         "shader": surface(ambient=0.5, diffuse=0.5),
         "lighting": gv.Lighting(occlusion=1, indirect=1, lights=(SUN,), reach=REACH),
         "backend": compiled,
     }
-    whole = gv.render(tree, camera, **given)
+    whole = gv.render(tree, camera, **options)
     strips = [camera.strip(*rows) for rows in ((0, 7), (7, 31), (31, PIXELS))]
     for parts in (strips, [camera.strip(6, PIXELS).strip(k, k + 14) for k in (0, 14, 28)]):
-        color = torch.cat([gv.render(tree, part, **given).color for part in parts])
+        color = torch.cat([gv.render(tree, part, **options).color for part in parts])
         assert torch.equal(color, whole.color[-len(color) :])
     custom = gv.CustomCamera(camera.rays()).shifted(0, 0, sample)
-    for own in (custom, *(custom.strip(k, k + 24) for k in (0, 24))):
-        top = own.window[0]
-        color = gv.render(tree, own, **given).color
-        torch.testing.assert_close(color, whole.color[top : top + own.height], rtol=0, atol=1e-6)
-    other = gv.render(tree, CAMERA.shifted(0.2, 0.1, sample + 1), **given)
+    for view in (custom, *(custom.strip(k, k + 24) for k in (0, 24))):
+        top = view.window[0]
+        color = gv.render(tree, view, **options).color
+        torch.testing.assert_close(color, whole.color[top : top + view.height], rtol=0, atol=1e-6)
+    other = gv.render(tree, CAMERA.shifted(0.2, 0.1, sample + 1), **options)
     assert (other.color - whole.color).abs().mean() > 0.005, "another sample, other directions"
     if not sample:
         rays = camera.rays().to(tree.device)
-        hits = gv.trace(tree, rays, **given)
+        hits = gv.trace(tree, rays, **options)
         torch.testing.assert_close(hits.color, whole.color.reshape(-1, 3), rtol=0, atol=1e-6)
 
 
 @pytest.mark.backend("cuda")
 def test_the_samples_of_a_captured_frame_differ(blobs):
     camera = gv.Camera.orbit(20, 30, 1.2, width=32, height=32)
-    given = {"shader": gv.Isosurface(0.5, ambient=1.0), "lighting": gv.Lighting(occlusion=1)}
+    options = {"shader": gv.Isosurface(0.5, ambient=1.0), "lighting": gv.Lighting(occlusion=1)}
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device="cuda") as engine:
         for sample in (0, 3):
-            engine.render(camera.shifted(0, 0, sample), **given)
-        graph = engine.capture(camera, **given)
+            engine.render(camera.shifted(0, 0, sample), **options)
+        graph = engine.capture(camera, **options)
         for sample in (0, 3):
             view = camera.shifted(0, 0, sample)
-            assert torch.equal(graph.replay(view)[0].color, engine.frame(view, **given)[0].color)
+            assert torch.equal(graph.replay(view)[0].color, engine.frame(view, **options)[0].color)

@@ -71,8 +71,8 @@ def test_files_that_eat_a_machine_are_refused(tmp_path):
         check=False,
     )
     lines = [json.loads(line) for line in run.stdout.splitlines() if line.startswith("[")]
-    at = paths[len(lines)].name if len(lines) < len(paths) else ""
-    assert run.returncode == 0 and not at, f"{at}: {run.returncode} {run.stderr[-2000:]}"
+    failed = paths[len(lines)].name if len(lines) < len(paths) else ""
+    assert run.returncode == 0 and not failed, f"{failed}: {run.returncode} {run.stderr[-2000:]}"
     for path, (kind, message, seconds, other, _, more) in zip(paths, lines, strict=True):
         assert kind == other == ("read" if path.name in HONEST else "refused"), (path.name, message)
         assert kind == "read" or ("\n" not in message and str(tmp_path) in message), message
@@ -93,11 +93,11 @@ def test_what_is_larger_than_memory_is_told_before(tmp_path, monkeypatch):
 @pytest.mark.parametrize("lines", [0, 2])
 def test_nrrd_data_behind_lines_and_bytes(tmp_path, encoding, lines):
     data = np.arange(24, dtype="<i2").reshape(2, 3, 4)
-    words = " ".join(map(str, data.ravel())).encode()
+    numbers = " ".join(map(str, data.ravel())).encode()
     packed = {
         "gzip": lambda: gzip.compress(b"ab" + data.tobytes()),
         "bzip2": lambda: bz2.compress(b"ab" + data.tobytes()),
-        "text": lambda: b"  " + words,
+        "text": lambda: b"  " + numbers,
         "raw": lambda: b"ab" + data.tobytes(),
     }[encoding]()
     Path(tmp_path / "a.nrrd").write_bytes(
@@ -120,17 +120,17 @@ def test_meshes_and_points_unpack_to_no_more_than_free_memory(tmp_path, monkeypa
     assert file.stat().st_size < 10_000
     module = importlib.import_module(f"gvtorch.io.{kind.rstrip('s')}_file")
     monkeypatch.setattr(module, "memory_free", lambda: 10**6)
-    with pytest.raises(ValueError, match=r"unpacks to .*memory") as told:
+    with pytest.raises(ValueError, match=r"unpacks to .*memory") as caught:
         read(file)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 def fits_table(columns: list[str], rows: int, width: int, data: bytes) -> bytes:
     """Returns a FITS file of an empty image and a table with the given header values."""
     cards = ["XTENSION= 'BINTABLE'", "BITPIX  = 8", "NAXIS   = 2", f"NAXIS1  = {width}"]
     cards += [f"NAXIS2  = {rows}", "PCOUNT  = 0", "GCOUNT  = 1", f"TFIELDS = {len(columns)}"]
-    for at, kind in enumerate(columns, 1):
-        cards += [f"TTYPE{at}  = '{'xyzw'[at - 1]}'", f"TFORM{at}  = '{kind}'"]
+    for column, kind in enumerate(columns, 1):
+        cards += [f"TTYPE{column}  = '{'xyzw'[column - 1]}'", f"TFORM{column}  = '{kind}'"]
     head = "".join(card.ljust(80) for card in [*cards, "END"])
     return hostile.fits(["BITPIX  = 8", "NAXIS   = 0"]) + head.ljust(2880).encode() + data
 
@@ -143,10 +143,10 @@ def test_a_table_of_points_is_read_as_far_as_its_header_tells(tmp_path, name):
     honest = fits_table(["1E"] * 3, 10, 12, rows.tobytes().ljust(2880, b"\0"))
     (tmp_path / name).write_bytes(write(honest))
     assert np.array_equal(gv.read_points(tmp_path / name).positions, rows)
-    told = "its rows take 13194139533312" if name == "a.fits.gz" else "may have been truncated"
+    message = "its rows take 13194139533312" if name == "a.fits.gz" else "may have been truncated"
     for count in (2**40, 2**62):
         (tmp_path / name).write_bytes(write(fits_table(["1E"] * 3, count, 12, bytes(2880))))
-        with pytest.raises(ValueError, match=f"{told}|cannot fit 'int'") as error:
+        with pytest.raises(ValueError, match=f"{message}|cannot fit 'int'") as error:
             gv.read_points(tmp_path / name)
         assert "\n" not in str(error.value)
     lists = fits_table(["1E", "1E", "1E", "1PE(9)"], 1, 20, bytes(2880))
@@ -154,20 +154,20 @@ def test_a_table_of_points_is_read_as_far_as_its_header_tells(tmp_path, name):
     assert len(gv.read_points(tmp_path / name)) == 1
 
 
-@pytest.mark.parametrize("what", ["bomb", "no end"])
-def test_a_packed_table_of_points_eats_no_memory(tmp_path, what, monkeypatch):
+@pytest.mark.parametrize("damage", ["bomb", "no end"])
+def test_a_packed_table_of_points_eats_no_memory(tmp_path, damage, monkeypatch):
     pytest.importorskip("astropy")
     monkeypatch.setattr(budget, "SECONDS", 0.3)
     monkeypatch.setattr(budget, "MEMORY", 10**8)
     begin = hostile.fits(["BITPIX  = 8", "NAXIS   = 1", "NAXIS1  = 500000000000"])
-    if what == "no end":
+    if damage == "no end":
         begin = b"SIMPLE  =                    T".ljust(2880)
     blank = gzip.compress(b" " * (1 << 24), 1)
     (tmp_path / "a.fits.gz").write_bytes(gzip.compress(begin) + blank * 60)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(ValueError, match=r"a\.fits\.gz: ") as told:
+    with pytest.raises(ValueError, match=r"a\.fits\.gz: ") as caught:
         gv.read_points(tmp_path / "a.fits.gz")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 400_000
 
 
@@ -201,15 +201,15 @@ def test_a_pipe_is_no_file_of_cameras_meshes_or_points(tmp_path, name):
 
 def gltf(**other: object) -> dict[str, object]:
     """Returns a triangle in glTF, in which some fields are replaced."""
-    places = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
-    content = base64.b64encode(places + np.arange(3, dtype="<u4").tobytes()).decode()
-    own = {"uri": f"data:application/octet-stream;base64,{content}", "byteLength": 48}
+    positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    content = base64.b64encode(positions + np.arange(3, dtype="<u4").tobytes()).decode()
+    buffer = {"uri": f"data:application/octet-stream;base64,{content}", "byteLength": 48}
     return {
         "asset": {"version": "2.0"},
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
-        "buffers": [own],
+        "buffers": [buffer],
         "bufferViews": [VIEW, {"buffer": 0, "byteOffset": 36, "byteLength": 12}],
         "accessors": [POSITIONS, {**POSITIONS, "bufferView": 1, "componentType": 5125}],
         "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
@@ -259,9 +259,9 @@ def test_textures_that_eat_a_machine_are_refused(tmp_path, kind):
     faces = "".join(f"usemtl {name}\nf 1/1 2/1 3/1\n" for name in names)
     text = f"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n{faces}"
     (tmp_path / "a.obj").write_text(text)
-    with pytest.raises(ValueError, match=r"textures take .* GB of memory, at most") as told:
+    with pytest.raises(ValueError, match=r"textures take .* GB of memory, at most") as caught:
         gv.read_mesh(tmp_path / "a.obj", texture=texture)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_mesh_reads_no_more_than_memory_takes(tmp_path, monkeypatch):
@@ -301,21 +301,21 @@ def test_hdf5_reads_regular_files_beside_it(tmp_path, kind):
             file["a"] = data
 
     def write(file: Path, name: str) -> None:
-        with h5py.File(file, "w") as made:
+        with h5py.File(file, "w") as root:
             if kind == "external":
-                made.create_dataset("a", data.shape, "u1", external=[(name, 0, 512)])
+                root.create_dataset("a", data.shape, "u1", external=[(name, 0, 512)])
             elif kind in ("virtual", "behind another"):
                 layout = h5py.VirtualLayout(data.shape, "u1")
                 layout[:] = h5py.VirtualSource(name, "a", data.shape)
-                made.create_virtual_dataset("a", layout)
+                root.create_virtual_dataset("a", layout)
             else:
-                made["b" if kind == "soft link" else "a"] = h5py.ExternalLink(name, "/a")
+                root["b" if kind == "soft link" else "a"] = h5py.ExternalLink(name, "/a")
                 if kind == "soft link":
-                    made["a"] = h5py.SoftLink("/b")
+                    root["a"] = h5py.SoftLink("/b")
 
     file = tmp_path / "in" / "a.h5"
-    beside = str(tmp_path / "in" / "raw") if kind == "external" else "other.h5"
-    write(file, beside)
+    external = str(tmp_path / "in" / "raw") if kind == "external" else "other.h5"
+    write(file, external)
     assert np.array_equal(gv.read_volume(file, key="a", axes="zyx").data[..., 0].numpy(), data)
     (tmp_path / "in" / "pipe.h5").symlink_to("../pipe")
     os.mkfifo(tmp_path / "in" / "own")
@@ -332,13 +332,13 @@ def picture_in_tiff(
     folder: Path, packed: bytes, number: int, *, color: bool = False, tiled: bool = True
 ) -> Path:
     """Writes a TIFF of 16 x 16 whose only tile, or strip, is a packed picture."""
-    place = [(322, 3, 1, 16), (323, 3, 1, 16), (324, 4, 1, 0), (325, 4, 1, len(packed))]
+    tiles = [(322, 3, 1, 16), (323, 3, 1, 16), (324, 4, 1, 0), (325, 4, 1, len(packed))]
     strip = [(278, 3, 1, 16), (279, 4, 1, len(packed))]
     tags = [(256, 3, 1, 16), (257, 3, 1, 16), (259, 3, 1, number), (277, 3, 1, 1 + 2 * color)]
-    tags += [(262, 3, 1, 2)] * color + (place if tiled else strip)
+    tags += [(262, 3, 1, 2)] * color + (tiles if tiled else strip)
     head = hostile.tiff(tags, pixels=0)
-    at = head.index(struct.pack("<HHI", 324 if tiled else 273, 4, 1)) + 8
-    head = head[:at] + struct.pack("<I", len(head)) + head[at + 4 :]
+    offset = head.index(struct.pack("<HHI", 324 if tiled else 273, 4, 1)) + 8
+    head = head[:offset] + struct.pack("<I", len(head)) + head[offset + 4 :]
     (folder / "a.tif").write_bytes(head + packed)
     return folder / "a.tif"
 
@@ -404,21 +404,21 @@ def test_forged_heads_of_pictures_tell_no_size():
     """A second frame of JPEG, and boxes of JPEG 2000 that hide which codestream is unpacked."""
     imagecodecs = pytest.importorskip("imagecodecs")
     small, large = (np.zeros((n, n), np.uint8) for n in (16, 4000))
-    one, other = (imagecodecs.jpeg_encode(data) for data in (small, large))
-    frames = [data[(at := data.index(b"\xff\xc0")) : at + 13] for data in (one, other)]
-    assert picture_size(one) == (16, 16)
-    assert picture_size(one.replace(frames[0], b"".join(frames))) is None
-    one, other = (imagecodecs.jpeg2k_encode(data, codecformat="jp2") for data in (small, large))
-    codestream = other.index(b"jp2c") - 4
-    first = one.index(b"jp2c") - 4
-    assert picture_size(one) == (16, 16) and picture_size(other) == (4000, 4000)
+    head, second = (imagecodecs.jpeg_encode(data) for data in (small, large))
+    frames = [data[(start := data.index(b"\xff\xc0")) : start + 13] for data in (head, second)]
+    assert picture_size(head) == (16, 16)
+    assert picture_size(head.replace(frames[0], b"".join(frames))) is None
+    head, second = (imagecodecs.jpeg2k_encode(data, codecformat="jp2") for data in (small, large))
+    codestream = second.index(b"jp2c") - 4
+    first = head.index(b"jp2c") - 4
+    assert picture_size(head) == (16, 16) and picture_size(second) == (4000, 4000)
     # The size is that of the codestream, whatever the header before claims.
-    assert picture_size(one[:first] + other[codestream:]) == (4000, 4000)
+    assert picture_size(head[:first] + second[codestream:]) == (4000, 4000)
     # A box with a length of 64 bits, and one without an end.
-    wide = struct.pack(">I4sQ", 1, b"free", 16 + 40) + one[first : first + 40]
-    assert picture_size(one[:first] + wide + other[codestream:]) == (4000, 4000)
-    endless = struct.pack(">I4s", 0, b"free") + one[first:]
-    assert picture_size(one[:first] + endless) is None
+    wide = struct.pack(">I4sQ", 1, b"free", 16 + 40) + head[first : first + 40]
+    assert picture_size(head[:first] + wide + second[codestream:]) == (4000, 4000)
+    endless = struct.pack(">I4s", 0, b"free") + head[first:]
+    assert picture_size(head[:first] + endless) is None
 
 
 @pytest.mark.parametrize("name", ["NDTiff.index", "a_MMStack_1.ome.tif"])
@@ -520,13 +520,13 @@ def test_names_of_axes_lead_to_no_other_folder(tmp_path):
         along[:] = np.arange(4) * step
     for name, spacing in (("z", 3), ("../z", 1), (str(tmp_path / "z"), 1)):
         names = (name, "y", "x")
-        made = zarr.create_array(
+        array = zarr.create_array(
             tmp_path / "in" / "a",
             shape=(4, 4, 4),
             dtype="u1",
             dimension_names=names,
             overwrite=True,
         )
-        made[:] = 1
+        array[:] = 1
         volume = gv.read_volume(tmp_path / "in" / "a", axes="zyx")
         assert volume.spacing == (1, 1, spacing), name

@@ -52,9 +52,9 @@ def full_disk(size: int) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def picture() -> gv.Picture:
     tree = gv.N3Tree.from_volume(gv.Volume(torch.rand(8, 8, 8)))
-    found = gv.render(tree, gv.Camera.orbit(width=100, height=80), GRAY)
-    noise = torch.rand(found.color.shape, generator=torch.Generator().manual_seed(0))
-    return replace(found, color=noise)
+    rendered = gv.render(tree, gv.Camera.orbit(width=100, height=80), GRAY)
+    noise = torch.rand(rendered.color.shape, generator=torch.Generator().manual_seed(0))
+    return replace(rendered, color=noise)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -128,18 +128,18 @@ def test_numbers_out_of_range_have_one_clear_line(name):
 WRONG = (None, 3, "x", b"x", ["value"], {}, object(), torch.zeros(3), torch.tensor(0), np.zeros(3))
 CALLS = {
     "slice": gv.slice_picture,
-    "colors": lambda one: gv.slice_picture(_volume(), colors=one),
-    "span": lambda one: gv.slice_picture(_volume(), span=one),
-    "place": lambda one: gv.slice_picture(_volume(), at=one),
-    "places": lambda one: gv.slice_picture(_volume(), at=(torch.zeros(3), one, one)),
+    "colors": lambda x: gv.slice_picture(_volume(), colors=x),
+    "span": lambda x: gv.slice_picture(_volume(), span=x),
+    "place": lambda x: gv.slice_picture(_volume(), at=x),
+    "places": lambda x: gv.slice_picture(_volume(), at=(torch.zeros(3), x, x)),
     "window": gv.window,
-    "percent": lambda one: gv.window(_volume(), one),
+    "percent": lambda x: gv.window(_volume(), x),
     "points": gv.sort_points,
-    "info": lambda one: gv.Volume(torch.zeros(4, 4, 4), info=one),
+    "info": lambda x: gv.Volume(torch.zeros(4, 4, 4), info=x),
     "preset": gv.TransferFunction.preset,
-    "channels": lambda one: gv.Producer(4, channels=one),
-    "voxels": lambda one: gv.N3Tree.from_volume(_volume()).bricks[one],
-    "whole": lambda one: gv.Volume(torch.zeros(4, 4, 4)).describe(one),
+    "channels": lambda x: gv.Producer(4, channels=x),
+    "voxels": lambda x: gv.N3Tree.from_volume(_volume()).bricks[x],
+    "whole": lambda x: gv.Volume(torch.zeros(4, 4, 4)).describe(x),
 }
 FINE = {  # valid arguments of each
     **dict.fromkeys(("colors", "span", "percent", "info"), (type(None),)),
@@ -149,11 +149,11 @@ FINE = {  # valid arguments of each
     "options": (type(None), str),
 }
 NAMED = {  # and None: the first channel
-    "options": lambda one: gv.RenderOptions(channel=one),
-    "shader": lambda one: gv.render(_tree(), VIEW, gv.Channels([gv.ChannelLook()], channel=one)),
-    "volume": lambda one: _tree().to_volume(one),
-    "tracer": lambda one: gv.TreeTracer(_tree(), GRAY, channel=one),
-    "surface": lambda one: gv.extract_surface(_tree(), 0.5, channel=one),
+    "options": lambda x: gv.RenderOptions(channel=x),
+    "shader": lambda x: gv.render(_tree(), VIEW, gv.Channels([gv.ChannelLook()], channel=x)),
+    "volume": lambda x: _tree().to_volume(x),
+    "tracer": lambda x: gv.TreeTracer(_tree(), GRAY, channel=x),
+    "surface": lambda x: gv.extract_surface(_tree(), 0.5, channel=x),
 }
 
 
@@ -237,11 +237,11 @@ def test_a_damaged_directory_of_an_archive_is_told(tmp_path):
 
 def test_lights_take_arrays(picture):
     volume = gv.Volume(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)))
-    expected, made = (
+    expected, actual = (
         gv.render(volume, VIEW, gv.Lit(GRAY, light=gv.Headlight(color))).color
         for color in ((0.5, 0.25, 1.0), np.array([0.5, 0.25, 1.0]))
     )
-    assert torch.equal(made, expected)
+    assert torch.equal(actual, expected)
 
 
 ESCAPES = "\x1b]0;name\x07\x1b[2J\x9b31m\nline \\[bold] [red]"
@@ -260,17 +260,17 @@ def test_no_name_gives_commands_to_a_terminal(tmp_path, capfd):
     for args in (["info", str(tmp_path / "two.npz")], ["render", str(volume), "--level", "1"]):
         with pytest.raises(SystemExit):
             cli.main([*args, "-o", "a.png"] if args[0] == "render" else args)
-    said = "".join(capfd.readouterr())
-    found = [char for char in said if ord(char) < 32 or 127 <= ord(char) < 160]
-    assert set(found) == {"\n"}, said
-    assert said.count("error: ") == 2 and said.splitlines()[-1].startswith("gvtorch: error: ")
-    assert "[bold]" in said and "[red]" in said
+    output = "".join(capfd.readouterr())
+    control_chars = [char for char in output if ord(char) < 32 or 127 <= ord(char) < 160]
+    assert set(control_chars) == {"\n"}, output
+    assert output.count("error: ") == 2 and output.splitlines()[-1].startswith("gvtorch: error: ")
+    assert "[bold]" in output and "[red]" in output
 
 
 def test_a_table_takes_what_looks_like_markup(capfd):
     cli._print_table({"channel info": {"0": "\\[/bold]", "1": "[/x]\x1b[2J"}, "name": "\\[/y]"})
-    said = capfd.readouterr().out
-    assert all(word in said for word in ("0: \\[/bold]", "1: [/x]\\x1b[2J", "\\[/y]"))
+    output = capfd.readouterr().out
+    assert all(word in output for word in ("0: \\[/bold]", "1: [/x]\\x1b[2J", "\\[/y]"))
 
 
 @pytest.mark.parametrize("kind", ["png", "npy", "mp4", "json", "ply"])
@@ -294,7 +294,7 @@ def test_no_link_that_was_planted_is_written_through(tmp_path, picture, monkeypa
     monkeypatch.setattr(tempfile, "_name_sequence", iter(["guessed", *"abcdefgh"]))
     write()
     assert victim.read_bytes() == b"mine" and file.is_file() and not file.is_symlink()
-    assert {path.name for path in tmp_path.iterdir()} == {"victim", *(one.name for one in names)}
+    assert {path.name for path in tmp_path.iterdir()} == {"victim", *(x.name for x in names)}
 
 
 def _as_anybody() -> None:
@@ -311,8 +311,8 @@ def test_a_folder_that_may_not_be_written_is_one_line_of_every_command(tmp_path,
     folder = tmp_path / "closed"
     folder.mkdir()
     shutil.copytree(tmp_path / "s.zarr", folder / "s.zarr")
-    for place in (*folder.rglob("*"), folder):
-        place.chmod(0o555 if place.is_dir() else 0o444)
+    for path in (*folder.rglob("*"), folder):
+        path.chmod(0o555 if path.is_dir() else 0o444)
     size = ("--size", "16x16")
     commands = [
         ("render", small, "-o", folder / "a.png", *size),
@@ -329,7 +329,7 @@ def test_a_folder_that_may_not_be_written_is_one_line_of_every_command(tmp_path,
     program = f"""
 import contextlib, io, sys
 from gvtorch.tools.cli import main
-for words in {[[str(word) for word in words] for words in commands]!r}:
+for words in {[[str(word) for word in command] for command in commands]!r}:
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -340,13 +340,13 @@ for words in {[[str(word) for word in words] for words in commands]!r}:
 """
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
                          preexec_fn=_as_anybody, timeout=300, check=False)  # fmt: skip
-    for place in (folder, *folder.rglob("*")):
-        place.chmod(0o755)
+    for path in (folder, *folder.rglob("*")):
+        path.chmod(0o755)
     lines = run.stdout.splitlines()
     assert run.returncode == 0 and len(lines) == len(commands), run.stdout + run.stderr
-    for words, line in zip(commands, lines, strict=True):
-        told = "2 1 gvtorch: error: [Errno 13] Permission denied: "
-        assert line.startswith(told) and str(folder) in line, (words, line)
+    for command, line in zip(commands, lines, strict=True):
+        prefix = "2 1 gvtorch: error: [Errno 13] Permission denied: "
+        assert line.startswith(prefix) and str(folder) in line, (command, line)
     assert sorted(folder.rglob("*")) == before
 
 
@@ -408,13 +408,13 @@ def test_a_full_disk_is_told_with_the_file_that_is_too_long(tmp_path, size):
     np.savez(tmp_path / "p.npz", positions=rng.random((500, 3)))
     gvtorch("convert", tmp_path / "a.npy", tmp_path / "s.zarr")
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
-    for words in (
+    for command in (
         ("convert", tmp_path / "a.npy", tmp_path / "new.zarr", "--workers", "1"),
         ("splat", tmp_path / "p.npz", "-o", tmp_path / "more.zarr", "--resolution", "64"),
         ("filter", tmp_path / "s.zarr"),
     ):
         with full_disk(size):
-            run = gvtorch(*words)
+            run = gvtorch(*command)
         assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
         assert str(tmp_path) in run.stderr, run.stderr
     assert all(file.read_bytes() == content for file, content in before.items())

@@ -15,7 +15,7 @@ from helpers.vdb import (
     NANO,
     Grid,
     VdbWriter,
-    check,
+    assert_reads,
     leaf_values,
     nano_file,
     nano_grid,
@@ -29,13 +29,13 @@ pytest.importorskip("imagecodecs")
 
 def refused(path, content: bytes, reason: str) -> None:
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=reason) as told:
+    with pytest.raises(ValueError, match=reason) as caught:
         gv.read_volume(path)
-    assert "\n" not in str(told.value) and str(path) in str(told.value)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
 def test_hostile_files_of_openvdb(tmp_path):
-    grid = Grid("float", 7, told=BOX)
+    grid = Grid("float", 7, metadata=BOX)
     leaf_values(grid, np.random.default_rng(3))
     path = tmp_path / "a.vdb"
     good = VdbWriter().write(path, grid).read_bytes()
@@ -44,16 +44,16 @@ def test_hostile_files_of_openvdb(tmp_path):
     refused(path, good[:-700], "in a file of")
     huge = {name: (kind, struct.pack("<3i", *(n,) * 3)) for (name, (kind, _)), n in
             zip(BOX.items(), (-(2**31), 2**31 - 1), strict=True)}  # fmt: skip
-    refused(path, VdbWriter().write(path, Grid("float", 7, told=huge)).read_bytes(), "voxels")
+    refused(path, VdbWriter().write(path, Grid("float", 7, metadata=huge)).read_bytes(), "voxels")
     refused(path, VdbWriter().write(path, Grid("float", 7)).read_bytes(), "the grid is empty")
-    frustum = Grid("float", 7, told=BOX, map=("NonlinearFrustumMap", b"\0" * 200))
+    frustum = Grid("float", 7, metadata=BOX, map=("NonlinearFrustumMap", b"\0" * 200))
     refused(path, VdbWriter().write(path, frustum).read_bytes(), "NonlinearFrustumMap")
     points = VdbWriter().write(path, grid).read_bytes()
     points = points.replace(b"Tree_float_5_4_3", b"Tree_ptdat_5_4_3")
     refused(path, points, "is a Tree_ptdat_5_4_3; known are")
-    lonely = Grid("float", 7, told=BOX, parent="other")
+    lonely = Grid("float", 7, metadata=BOX, parent="other")
     refused(path, VdbWriter().write(path, lonely).read_bytes(), "shares the tree of 'other'")
-    stream = VdbWriter().write(path, grid, places=False).read_bytes()
+    stream = VdbWriter().write(path, grid, has_offsets=False).read_bytes()
     refused(path, stream, "a stream without the positions of its grids")
 
 
@@ -77,16 +77,16 @@ def test_entries_of_a_root_lie_on_its_grid(tmp_path, x):
 
 def test_a_shared_tree_is_of_the_same_kind(tmp_path):
     """A vector grid was once read from a tree of scalars, three voxels at a time."""
-    owner = Grid("float", 7, told=BOX, name="heat", leaves={(0, 0, 0): whole_leaf()})
+    owner = Grid("float", 7, metadata=BOX, name="heat", leaves={(0, 0, 0): whole_leaf()})
     for kind in ("vec3s", "double", "int32", "mask"):
         path = tmp_path / f"{kind}.vdb"
-        VdbWriter().write(path, owner, Grid(kind, 0, told=BOX, name="other", parent="heat"))
+        VdbWriter().write(path, owner, Grid(kind, 0, metadata=BOX, name="other", parent="heat"))
         with pytest.raises(
             ValueError, match=f"'other' is a Tree_{kind}_5_4_3, the tree that it sh"
         ):
             open_source(path, key="other")
-    half = Grid("float", 0, told=BOX, name="half", parent="heat", half=True)
-    check(VdbWriter().write(path, owner, half), owner.dense(LOW, HIGH), key="half")
+    half = Grid("float", 0, metadata=BOX, name="half", parent="heat", half=True)
+    assert_reads(VdbWriter().write(path, owner, half), owner.dense(LOW, HIGH), key="half")
 
 
 def test_places_of_grids_and_leaves_are_in_order(tmp_path):
@@ -96,27 +96,27 @@ def test_places_of_grids_and_leaves_are_in_order(tmp_path):
     good = VdbWriter(packing=0).write(path, *two).read_bytes()
     second = good.index(b"\1\0\0\0b\x10\0\0\0Tree_float")
     first = good.index(b"\1\0\0\0a\x10\0\0\0Tree_float")
-    places = [first + 29, second + 29]  # offsets of three numbers each
-    told = [struct.unpack_from("<3q", good, place) for place in places]
-    assert told[0][2] == second and told[1][2] == len(good)
+    positions = [first + 29, second + 29]  # offsets of three numbers each
+    offsets = [struct.unpack_from("<3q", good, position) for position in positions]
+    assert offsets[0][2] == second and offsets[1][2] == len(good)
 
-    def changed(which: int, number: int, value: int) -> bytes:
+    def changed(grid_index: int, number: int, value: int) -> bytes:
         out = bytearray(good)
-        struct.pack_into("<q", out, places[which] + 8 * number, value)
+        struct.pack_into("<q", out, positions[grid_index] + 8 * number, value)
         return bytes(out)
 
-    for which, number, value, reason in (
-        (1, 0, told[0][0], "from .* expected in this order"),  # the other's head
+    for grid_index, number, value, reason in (
+        (1, 0, offsets[0][0], "from .* expected in this order"),  # the other's head
         (0, 2, first, "expected in this order"),  # backwards, without an end
         (0, 0, -1, "expected in this order"),
-        (1, 1, told[1][2] + 1, "expected in this order"),
-        (0, 1, told[0][1] + 4, r"leaves begin at \d+, the nodes above end at"),
-        (0, 1, told[0][1] - 4, r"leaves begin at \d+, the nodes above end at"),
-        (1, 2, told[1][1] + 100, f"ends at {told[1][1] + 100}, within"),  # within a leaf
+        (1, 1, offsets[1][2] + 1, "expected in this order"),
+        (0, 1, offsets[0][1] + 4, r"leaves begin at \d+, the nodes above end at"),
+        (0, 1, offsets[0][1] - 4, r"leaves begin at \d+, the nodes above end at"),
+        (1, 2, offsets[1][1] + 100, f"ends at {offsets[1][1] + 100}, within"),  # within a leaf
     ):
-        path.write_bytes(changed(which, number, value))
+        path.write_bytes(changed(grid_index, number, value))
         with pytest.raises(ValueError, match=reason):
-            gv.read_volume(path, key="ab"[which])
+            gv.read_volume(path, key="ab"[grid_index])
 
 
 def test_a_background_of_nan_is_no_voxel(tmp_path):
@@ -166,21 +166,21 @@ def test_thin_boxes_take_no_more_than_they_hold(tmp_path, axis):
         "file_bbox_min": ("vec3i", struct.pack("<3i", -3, 0, 0)),
         "file_bbox_max": ("vec3i", struct.pack("<3i", *(n - 1 for n in high))),
     }
-    places = [
+    origins = [
         tuple(n // 8 * 8 if k == axis else 0 for k in range(3)) for n in (0, 65536, 1_000_000)
     ]
-    grid = Grid("float", 7, told=box, leaves=dict.fromkeys(places, whole_leaf()))
+    grid = Grid("float", 7, metadata=box, leaves=dict.fromkeys(origins, whole_leaf()))
     source = open_source(VdbWriter().write(tmp_path / "a.vdb", grid))
     source.grid()
     tracemalloc.start()
-    found = source.read_times(0, 1)[0, ..., 0].T
+    voxels = source.read_times(0, 1)[0, ..., 0].T
     taken = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert found.shape == tuple(b + 3 * (k == 0) for k, b in enumerate(high))
-    assert taken < 2 * found.nbytes + 64 * 2**20
-    for place in (*places, (0, 0, 0)):
-        low = [max(0, p + 3 * (k == 0) - 9) for k, p in enumerate(place)]
-        part = found[tuple(slice(a, a + 30) for a in low)]
+    assert voxels.shape == tuple(b + 3 * (k == 0) for k, b in enumerate(high))
+    assert taken < 2 * voxels.nbytes + 64 * 2**20
+    for origin in (*origins, (0, 0, 0)):
+        low = [max(0, p + 3 * (k == 0) - 9) for k, p in enumerate(origin)]
+        part = voxels[tuple(slice(a, a + 30) for a in low)]
         begin = tuple(a - 3 * (k == 0) for k, a in enumerate(low))
         end = tuple(a + n for a, n in zip(begin, part.shape, strict=True))
         assert np.array_equal(part, grid.dense(begin, end)[..., 0])
@@ -190,15 +190,15 @@ def test_long_names_and_keys_are_short_lines(tmp_path):
     long = "x" * 100_000
     path = tmp_path / "a.vdb"
     values = {(0, 0, 0): whole_leaf()}
-    for told in ({"name": long}, {"map": (long, b"")}):
-        content = VdbWriter().write(path, Grid("float", 0.0, leaves=values, **told)).read_bytes()
+    for options in ({"name": long}, {"map": (long, b"")}):
+        content = VdbWriter().write(path, Grid("float", 0.0, leaves=values, **options)).read_bytes()
         refused(path, content, "a name of 100000 bytes")
     many = [Grid("float", 0.0, name=f"{n}{long[:4000]}", leaves=values) for n in range(9)]
     VdbWriter().write(path, *many)
     for key in (long, "\u00b2", "9" * 5000, "9", "-1"):
-        with pytest.raises(ValueError, match="has no grid") as told:
+        with pytest.raises(ValueError, match="has no grid") as options:
             open_source(path, key=key)
-        assert len(str(told.value)) < 2000 and str(path) in str(told.value)
+        assert len(str(options.value)) < 2000 and str(path) in str(options.value)
 
 
 def test_nan_is_refused_or_replaced(tmp_path):
@@ -217,9 +217,9 @@ def test_hostile_files_of_nanovdb(tmp_path):
     good = nano_file(path, ("a", number, content)).read_bytes()
     begin = len(good) - len(content)
 
-    def changed(at: int, layout: str, *numbers: int) -> bytes:
+    def changed(offset: int, layout: str, *numbers: int) -> bytes:
         out = bytearray(good)
-        struct.pack_into(layout, out, begin + at, *numbers)
+        struct.pack_into(layout, out, begin + offset, *numbers)
         return bytes(out)
 
     refused(path, b"NanoVDB2" + struct.pack("<I", 29 << 21) + good[12:], "of version 29")
@@ -241,16 +241,16 @@ def test_nodes_of_nanovdb_are_those_that_the_grid_tells_of(tmp_path):
     (leaf,) = struct.unpack_from("<q", content, leaf_at)
     assert leaf == 2 * lower_size
 
-    def forged(at: int, layout: str, value: int, kind: int = number) -> bytes:
+    def forged(offset: int, layout: str, value: int, kind: int = number) -> bytes:
         out = bytearray(content)
-        struct.pack_into(layout, out, at, value)
+        struct.pack_into(layout, out, offset, value)
         return nano_file(path, ("a", kind, bytes(out))).read_bytes()
 
     refused(path, forged(0, "<B", content[0], NANO["int16"][0]), "of type 1, its file declares 3")
     for count in (0, 1):
         refused(path, forged(736 + 24, "<I", count), "nodes, leaves first; it declares")
-    for at in range(3):
-        refused(path, forged(672 + 32 + 4 * at, "<I", 9), "nodes, leaves first; it declares")
+    for offset in range(3):
+        refused(path, forged(672 + 32 + 4 * offset, "<I", 9), "nodes, leaves first; it declares")
     (key,) = struct.unpack_from("<Q", content, root)
     for bit in (20, 41, 62, 63):
         refused(path, forged(root, "<Q", key | 1 << bit), "not a voxel's position")
@@ -264,8 +264,8 @@ def test_nodes_of_nanovdb_are_those_that_the_grid_tells_of(tmp_path):
 def test_codes_that_are_no_numbers_are_voxels_that_are_none(tmp_path):
     content, (number, _) = nano_grid("Fp8", np.random.default_rng(1))
     out = bytearray(content)
-    at = len(content) - NANO["Fp8"][-1] + 80
-    out[at : at + 8] = np.float32([np.nan, np.inf]).tobytes()
+    offset = len(content) - NANO["Fp8"][-1] + 80
+    out[offset : offset + 8] = np.float32([np.nan, np.inf]).tobytes()
     path = nano_file(tmp_path / "a.nvdb", ("a", number, bytes(out)))
     with pytest.raises(ValueError, match="holds 512 values that are NaN"):
         gv.read_volume(path)
@@ -283,34 +283,34 @@ def test_only_the_first_block_of_blosc_is_unpacked_for_a_head(tmp_path, compress
     taken = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert path.stat().st_size < 2 << 20 and taken < 4 << 20
-    check(path, box)
+    assert_reads(path, box)
     good = path.read_bytes()
-    at = good.index(b"a\0") + 2 + 8  # after the name and the part's length
-    for place, number, message in (
+    header = good.index(b"a\0") + 2 + 8  # after the name and the part's length
+    for field, number, message in (
         (8, 2**31 - 1, "blosc_decompress"),
         (16, 2**31 - 1, "at byte 2147483647"),
         (8, 100, "a block of 100 bytes"),
     ):
         bad = bytearray(good)
-        struct.pack_into("<I", bad, at + place, number)
+        struct.pack_into("<I", bad, header + field, number)
         refused(path, bytes(bad), message)
 
 
 @pytest.mark.parametrize(
-    ("at", "content", "message"),
+    ("offset", "content", "message"),
     [
         (736 + 24, struct.pack("<I", 10_000_000), "a root of 10000000 entries"),
         (None, b"", "two entries of the root have one position"),
     ],
 )
-def test_roots_of_nanovdb_hold_few_entries_each_at_its_place(tmp_path, at, content, message):
+def test_roots_of_nanovdb_hold_few_entries_each_at_its_place(tmp_path, offset, content, message):
     """With millions of them at one position, every part that was read visited all."""
     data, (number, _) = nano_grid("float", np.random.default_rng(3))
     head = 736 + NANO["float"][1]
     size = NANO["float"][3]
-    if at is None:  # the tile is at the position of the first upper node
-        at, content = head + 2 * size, data[head : head + 8]
-    data = data[:at] + content + data[at + len(content) :]
+    if offset is None:  # the tile is at the position of the first upper node
+        offset, content = head + 2 * size, data[head : head + 8]
+    data = data[:offset] + content + data[offset + len(content) :]
     file = nano_file(tmp_path / "a.nvdb", ("density", number, data))
     with pytest.raises(ValueError, match=message):
         gv.read_volume(file)

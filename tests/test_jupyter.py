@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from helpers.browser import Tab
-from helpers.viewer import SOON
+from helpers.viewer import TIMEOUT
 
 pytestmark = pytest.mark.backend("browser")
 CELLS = (
@@ -56,7 +56,7 @@ def lab(tmp_path: Path) -> Iterator[str]:
     with (tmp_path / "log").open("w") as log:
         server = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
     try:
-        end = time.monotonic() + SOON
+        end = time.monotonic() + TIMEOUT
         while True:
             try:
                 urllib.request.urlopen(f"http://127.0.0.1:{port}/api", timeout=5).close()
@@ -100,7 +100,7 @@ def test_a_cell_shows_the_live_page(chromium, lab):
         tab.drag((x, y), (x + 60, y + 90))
         tab.until(lambda: (tab.final() != before).mean() > 0.02)
         run(1)
-        tab.page.wait_for_selector(".gv-lost", timeout=1e3 * SOON)
+        tab.page.wait_for_selector(".gv-lost", timeout=1e3 * TIMEOUT)
         assert tab.page.locator(".gv-note").inner_text().startswith("The view was closed")
         assert not [one for one in tab.complaints if "gv" in one]
     finally:

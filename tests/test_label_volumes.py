@@ -116,7 +116,7 @@ def brute_majority(values: np.ndarray, factor: int, background: float | None) ->
 @pytest.mark.parametrize("factor", [2, 3])
 def test_majority_is_that_of_every_block(factor, dtype, background):
     for most, seed in ((2, 0), (4, 1), (40, 2)):
-        values = numbers(9, 8, 11, 2, most=most, seed=seed).astype(dtype)
+        values = numbers(9, 8, 11, 2, count=most, seed=seed).astype(dtype)
         values[:4] = values[0, 0, 0]  # blocks of one label
         found = pool_majority(values, factor, background)
         assert found.dtype == values.dtype
@@ -134,7 +134,9 @@ def test_a_sheet_one_voxel_thick_stays():
 
 
 def test_a_tree_holds_no_label_that_the_volume_has_not():
-    volume = gv.Volume(numbers(21, 18, 25, most=9).astype(np.int64) ** 20 + 3, SPACING, labels=True)
+    volume = gv.Volume(
+        numbers(21, 18, 25, count=9).astype(np.int64) ** 20 + 3, SPACING, labels=True
+    )
     there = set(volume.data.unique().tolist())
     for branching, threshold in itertools.product((2, 3), (None, 3.0)):
         channels = {"label": volume, "value": gv.Volume(volume.data.float(), SPACING)}

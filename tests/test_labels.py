@@ -14,8 +14,8 @@ from helpers import DEVICES
 from helpers.labels import SPACING, WIDE, cells, numbers
 from helpers.marcher import box_of, orbit_rays
 from helpers.rays import camera_rays, rays_along
-from helpers.traces import run
-from helpers.trees import on
+from helpers.traces import trace
+from helpers.trees import copy_to
 
 import gvtorch as gv
 from gvtorch.base.image_info import array_from_srgb
@@ -48,15 +48,15 @@ def dense(data, rays, colors, alphas, reference, step, depth_alpha=0.1):
     near, far = np.minimum(a, b).max(1).clip(0), np.maximum(a, b).min(1)
     color, clear = np.zeros_like(direction), np.ones(len(direction))
     label, depth = np.full(len(direction), -1), np.full(len(direction), math.inf)
-    apart = np.full(len(direction), math.inf)
+    edge_distance = np.full(len(direction), math.inf)
     for k in range(math.ceil((far - near).clip(0).max() / step) + 1):
         start = near + k * step
         end = np.minimum(start + step, far)
         here = np.nonzero(start < far)[0]
         middle = (start + (end - start) / 2)[here]
-        place = (eye[here] + middle[:, None] * direction[here] - box[0]) / spacing
-        apart[here] = np.minimum(apart[here], np.abs(place - np.rint(place)).min(1))
-        x, y, z = np.minimum(np.floor(place).astype(int), np.array(data.shape[::-1]) - 1).T
+        index = (eye[here] + middle[:, None] * direction[here] - box[0]) / spacing
+        edge_distance[here] = np.minimum(edge_distance[here], np.abs(index - np.rint(index)).min(1))
+        x, y, z = np.minimum(np.floor(index).astype(int), np.array(data.shape[::-1]) - 1).T
         number = data[z, y, x]
         lengths = (end - start)[here] / reference
         alpha = 1 - (1 - alphas[number]) ** lengths
@@ -69,13 +69,13 @@ def dense(data, rays, colors, alphas, reference, step, depth_alpha=0.1):
         label[here[hit]] = number[hit]
         depth[here[hit]] = (start[here] + part * (end - start)[here])[hit]
         clear[here] = left
-    return color, 1 - clear, label, depth, apart
+    return color, 1 - clear, label, depth, edge_distance
 
 
 SCENES = {
-    "noise": lambda: numbers(13, 17, 11, most=6, seed=3),
+    "noise": lambda: numbers(13, 17, 11, count=6, seed=3),
     "cells": lambda: cells((18, 21, 25), 12, seed=4),
-    "many": lambda: numbers(11, 12, 13, most=1000, seed=5),
+    "many": lambda: numbers(11, 12, 13, count=1000, seed=5),
 }
 
 
@@ -107,11 +107,11 @@ def test_a_picture_is_that_of_a_dense_nearest_marcher(backend, name, dtype):
     picture = gv.render(tree, camera, shader, **options)
     rays = orbit_rays(box_of(data.shape, SPACING, ORIGIN), 40, 25, 1.5, 30, 32, 24)
     step = 0.37 * min(SPACING)
-    color, alpha, label, depth, apart = dense(data, rays, colors, alphas, 0.9, step)
-    sure = apart > (1e-10 if dtype == torch.float64 else 1e-4)
+    color, alpha, label, depth, edge_distance = dense(data, rays, colors, alphas, 0.9, step)
+    sure = edge_distance > (1e-10 if dtype == torch.float64 else 1e-4)
     assert sure.mean() > (0.99 if dtype == torch.float64 else 0.9) and (label >= 0).mean() > 0.2
-    found = picture.label.cpu().numpy().reshape(-1)
-    assert np.array_equal(found[sure], np.where(label >= 0, label * 3_000_000_019 - 5, -1)[sure])
+    actual = picture.label.cpu().numpy().reshape(-1)
+    assert np.array_equal(actual[sure], np.where(label >= 0, label * 3_000_000_019 - 5, -1)[sure])
     tolerance = 1e-9 if dtype == torch.float64 else 2e-5
     for ours, theirs in (
         (picture.color.reshape(-1, 3), color),
@@ -126,11 +126,11 @@ def test_a_face_between_two_voxels_belongs_to_the_upper_one(backend):
     data = np.arange(24).reshape(1, 1, 24).repeat(24, 0).repeat(24, 1)
     data[:, :, 16:] = 16
     tree = gv.N3Tree.from_volume(gv.Volume(data + WIDE, labels=True), 4, device=DEVICES[backend])
-    places = torch.arange(0, 24, 0.5, dtype=torch.float64)
-    origin = torch.stack((places - 0.5, torch.full_like(places, 9.3), torch.full_like(places, -9)))
+    xs = torch.arange(0, 24, 0.5, dtype=torch.float64)
+    origin = torch.stack((xs - 0.5, torch.full_like(xs, 9.3), torch.full_like(xs, -9)))
     rays = rays_along(origin.T.contiguous(), (0.0, 0.0, 1.0), device=DEVICES[backend])
     hits = gv.trace(tree, rays, gv.Labels(), backend=backend)
-    assert (hits.label[:, 0].cpu() - WIDE).tolist() == [min(int(x), 16) for x in places.tolist()]
+    assert (hits.label[:, 0].cpu() - WIDE).tolist() == [min(int(x), 16) for x in xs.tolist()]
 
 
 @pytest.mark.parametrize("brick", [2, 4, 8])
@@ -145,8 +145,8 @@ def test_no_pixel_shows_a_label_that_is_not_there(backend, brick, distance):
         shader = gv.Labels(colors, opacity, lit=False)
         picture = gv.render(tree, camera, shader, backend=backend)
         assert float(picture.color[..., 1].max()) == 0 and float(picture.color[..., 0].max()) > 0.2
-        shown = picture.color.sum(-1, keepdim=True)
-        torch.testing.assert_close(shown, picture.alpha, rtol=1e-4, atol=1e-5)
+        total = picture.color.sum(-1, keepdim=True)
+        torch.testing.assert_close(total, picture.alpha, rtol=1e-4, atol=1e-5)
         assert set(picture.label.unique().tolist()) <= {-1, 1, 3}
 
 
@@ -172,7 +172,9 @@ def test_what_shows_no_visible_label_is_not_sampled(compiled):
     rays = rays_along(torch.tensor([[16.2, 13.7, -9.0]]).double(), (0.01, 0.02, 1.0))
     samples = {
         str(visible): int(
-            run(tree, compiled, rays, gv.Labels(opacity=0.01, visible=visible))[0]["samples"].sum()
+            trace(tree, compiled, rays, gv.Labels(opacity=0.01, visible=visible))[0][
+                "samples"
+            ].sum()
         )
         for visible in ([4, 6], [5], [99], [])
     }
@@ -212,18 +214,18 @@ def test_looks_are_edited_between_pictures(compiled):
 
 def test_colours_in_every_form():
     labels = np.array([-4, 0, 1, 2, 3, 2**40])
-    own = distinct_colors(labels)
-    assert ((own >= 0) & (own <= 1)).all()
+    auto = distinct_colors(labels)
+    assert ((auto >= 0) & (auto <= 1)).all()
     table = np.array([[255, 0, 0], [0, 128, 0], [7, 8, 9]], np.uint8)
-    for colors, wanted in (
-        (None, own),
-        ({1: RED, 2**40: "#0000ff", 77: "tan"}, [own[0], own[1], RED, own[3], own[4], BLUE]),
-        ([RED, GREEN, "blue"], [own[0], RED, GREEN, linear_color("", "blue"), own[4], own[5]]),
-        (table, [own[0], *array_from_srgb(table / 255), own[4], own[5]]),
-        (torch.tensor([GREEN]), [own[0], GREEN, *own[2:]]),
+    for colors, expected in (
+        (None, auto),
+        ({1: RED, 2**40: "#0000ff", 77: "tan"}, [auto[0], auto[1], RED, auto[3], auto[4], BLUE]),
+        ([RED, GREEN, "blue"], [auto[0], RED, GREEN, linear_color("", "blue"), auto[4], auto[5]]),
+        (table, [auto[0], *array_from_srgb(table / 255), auto[4], auto[5]]),
+        (torch.tensor([GREEN]), [auto[0], GREEN, *auto[2:]]),
     ):
-        found = gv.Labels(colors)._appearance().colors_of(labels)
-        np.testing.assert_allclose(found, np.array(wanted), atol=1e-7)
+        actual = gv.Labels(colors)._appearance().colors_of(labels)
+        np.testing.assert_allclose(actual, np.array(expected), atol=1e-7)
     np.testing.assert_allclose(linear_color("", "#bc8f00"), (0.50289, 0.27468, 0), atol=1e-5)
 
 
@@ -231,8 +233,8 @@ def test_colours_of_few_labels_differ():
     """In sRGB, pairwise; a label's colour does not depend on the other labels."""
     colors = distinct_colors(np.arange(1, 13))
     srgb = np.where(colors <= 0.0031308, 12.92 * colors, 1.055 * colors ** (1 / 2.4) - 0.055)
-    apart = np.linalg.norm(srgb[:, None] - srgb[None], axis=-1) + 9 * np.eye(12)
-    assert apart.min() > 0.12 and (srgb.max(1) > 0.55).all()
+    distances = np.linalg.norm(srgb[:, None] - srgb[None], axis=-1) + 9 * np.eye(12)
+    assert distances.min() > 0.12 and (srgb.max(1) > 0.55).all()
     assert np.array_equal(distinct_colors(np.array([5])), colors[4:5])
     for step in (100_003, 2**20, 10**9, 700_000_000_001):
         many = distinct_colors(step * np.arange(1, 65))
@@ -250,10 +252,10 @@ def test_normals_are_those_of_a_smooth_boundary(compiled, border, mean):
     volume = gv.Volume(data, labels=True)
     tree = gv.N3Tree.from_volume(volume, 8, border, device=DEVICES[compiled])
     rays = camera_rays(tree, 24, distance=1.5)
-    hits, _ = run(tree, compiled, rays, gv.Labels(), lod="finest", step=0.1)
+    hits, _ = trace(tree, compiled, rays, gv.Labels(), lod="finest", step=0.1)
     hit = hits["depth"][:, 0] < math.inf
-    place = rays.origin + hits["depth"].double() * rays.direction
-    outward = torch.nn.functional.normalize(place - 15.5, dim=1)[hit]
+    hit_positions = rays.origin + hits["depth"].double() * rays.direction
+    outward = torch.nn.functional.normalize(hit_positions - 15.5, dim=1)[hit]
     normal = hits["normal"][hit].double()
     assert (normal.norm(dim=1) - 1).abs().max() < 1e-6 and hit.sum() > 150
     angle = torch.rad2deg(torch.acos((normal * outward).sum(1).abs().clamp(max=1)))
@@ -267,8 +269,8 @@ def test_within_a_label_there_is_no_normal(backend):
     data = cells((24, 24, 24), 6) + WIDE
     tree = gv.N3Tree.from_volume(gv.Volume(data, labels=True), 4, device=DEVICES[backend])
     rays = camera_rays(tree, 24, distance=1.5)
-    flat, _ = run(tree, backend, rays, gv.Labels(lit=False), lod="finest")
-    lit, _ = run(tree, backend, rays, gv.Labels(ambient=0.3, diffuse=0.7), lod="finest")
+    flat, _ = trace(tree, backend, rays, gv.Labels(lit=False), lod="finest")
+    lit, _ = trace(tree, backend, rays, gv.Labels(ambient=0.3, diffuse=0.7), lod="finest")
     inside = lit["normal"].norm(dim=1) == 0
     assert 0.3 < inside.double().mean() < 0.97
     assert torch.allclose(lit["color"][inside], flat["color"][inside], atol=1e-6)
@@ -295,17 +297,17 @@ def scene() -> gv.N3Tree:
     return gv.N3Tree.from_volume(gv.Volume(data, SPACING, labels=True), 4)
 
 
-def label_at(tree: gv.N3Tree, place: torch.Tensor) -> torch.Tensor:
+def label_at(tree: gv.N3Tree, positions: torch.Tensor) -> torch.Tensor:
     """Returns the labels of the finest voxels in which world positions (r, 3) lie."""
     data = cells((24, 22, 26), 14).astype(np.int64) * WIDE
-    voxel = ((place - tree.box[0]) / torch.tensor(SPACING).double()).floor().long()
+    voxel = ((positions - tree.box[0]) / torch.tensor(SPACING).double()).floor().long()
     x, y, z = (voxel[:, a].clamp(0, n - 1) for a, n in enumerate((26, 22, 24)))
     return torch.from_numpy(data)[z, y, x]
 
 
 def test_the_label_is_that_of_the_place_at_the_depth(scene, backend):
     rays = camera_rays(scene, 32, distance=2.4)
-    hits, _ = run(scene, backend, rays, gv.Labels(), lod="finest")
+    hits, _ = trace(scene, backend, rays, gv.Labels(), lod="finest")
     hit = hits["depth"][:, 0] < math.inf
     place = rays.origin + (hits["depth"].double() + 0.25 * min(SPACING)) * rays.direction
     assert torch.equal(hits["label"][hit, 0], label_at(scene, place[hit]))
@@ -316,9 +318,9 @@ def test_what_lies_behind_thin_labels_is_picked_by_the_depth_rule(scene, backend
     """The depth is where alpha reaches 0.1, within the labels; the label is of that interval."""
     rays = camera_rays(scene, 24, distance=1.2)
     options = {"lod": "finest", "depth_alpha": 0.5, "step": 0.25}
-    hits, _ = run(scene, backend, rays, gv.Labels(opacity=0.1, lit=False), **options)
+    hits, _ = trace(scene, backend, rays, gv.Labels(opacity=0.1, lit=False), **options)
     hit = hits["depth"][:, 0] < math.inf
-    first, _ = run(scene, backend, rays, gv.Labels(lit=False), lod="finest")
+    first, _ = trace(scene, backend, rays, gv.Labels(lit=False), lod="finest")
     place = rays.origin + hits["depth"].double() * rays.direction
     same = hits["label"][hit, 0] == label_at(scene, place[hit])
     assert same.double().mean() > 0.93, "but where the depth lies beside a face"
@@ -328,7 +330,7 @@ def test_what_lies_behind_thin_labels_is_picked_by_the_depth_rule(scene, backend
 @pytest.mark.parametrize("opacity", [1.0, 0.02])
 def test_caps_are_picked_and_drawn(scene, compiled, opacity):
     """Also where labels are so thin that nothing else is hit."""
-    tree = on(scene, DEVICES[compiled])
+    tree = copy_to(scene, DEVICES[compiled])
     middle = (scene.box[0] + scene.box[1]) / 2
     clip = gv.Clip(planes=[(0.0, 0.0, -1.0, float(middle[2]))], caps=True)
     camera = gv.Camera.orbit(0, 0, 1.5, width=24, height=24)
@@ -343,7 +345,7 @@ def test_caps_are_picked_and_drawn(scene, compiled, opacity):
 
 
 def test_clips_lenses_and_strips_tell_labels(scene, compiled):
-    tree = on(scene, DEVICES[compiled])
+    tree = copy_to(scene, DEVICES[compiled])
     camera, shader = gv.Camera.orbit(30, 20, 1.3, width=24, height=20), gv.Labels()
     plain = gv.render(tree, camera, shader)
     boxes = gv.Clip(boxes=[((-9, -9, -9), (9, 9, 0)), ((-9, -9, 0), (9, 9, 9))], frame="box")
@@ -356,7 +358,7 @@ def test_clips_lenses_and_strips_tell_labels(scene, compiled):
 
 
 def test_a_layer_hides_labels_and_lets_them_through(scene, compiled):
-    tree, shader = on(scene, DEVICES[compiled]), gv.Labels()
+    tree, shader = copy_to(scene, DEVICES[compiled]), gv.Labels()
     camera = gv.Camera.orbit(30, 20, 1.3, width=24, height=20)
     plain = gv.render(tree, camera, shader)
     depth = torch.full_like(plain.depth, 1.0)
@@ -371,12 +373,12 @@ def test_a_layer_hides_labels_and_lets_them_through(scene, compiled):
 
 def test_several_trees_tell_the_nearest_label(compiled):
     """Their tables differ, and so do the rows that the kernel returns."""
-    one, two = balls(WIDE, 5), balls(9, 2**40)
-    two = gv.Volume(two.data, origin=(0, 0, 40), info=one.info)
-    two.label_values = torch.tensor([0, 9, 2**40])
+    first, second = balls(WIDE, 5), balls(9, 2**40)
+    second = gv.Volume(second.data, origin=(0, 0, 40), info=first.info)
+    second.label_values = torch.tensor([0, 9, 2**40])
     camera = gv.Camera.orbit(0, 0, 1.6, 40, 40, 24)
     device = DEVICES[compiled]
-    producers = {"one": gv.VolumeProducer(one), "two": gv.VolumeProducer(two)}
+    producers = {"one": gv.VolumeProducer(first), "two": gv.VolumeProducer(second)}
     with gv.Engine(producers, brick_size=4, device=device) as engine:
         picture = engine.render(camera, gv.Labels())
     label, depth = picture.label.cpu(), picture.depth.cpu()
@@ -388,9 +390,9 @@ def test_several_trees_tell_the_nearest_label(compiled):
 def test_files_hold_the_labels(scene, tmp_path):
     picture = gv.render(scene, gv.Camera.orbit(width=12, height=9), gv.Labels())
     picture.save(tmp_path / "picture.npz")
-    with np.load(tmp_path / "picture.npz") as found:
-        assert found["label"].dtype == np.int64 and found["label"].max() > 2**24
-        assert np.array_equal(found["label"], picture.label.numpy())
+    with np.load(tmp_path / "picture.npz") as arrays:
+        assert arrays["label"].dtype == np.int64 and arrays["label"].max() > 2**24
+        assert np.array_equal(arrays["label"], picture.label.numpy())
     picture.save(tmp_path / "picture.png")
     assert "label" in repr(gv.trace(scene, camera_rays(scene, 4), gv.Labels()))
 
@@ -413,7 +415,7 @@ def test_seventy_thousand_labels(compiled):
     tree = gv.N3Tree.from_volume(gv.Volume(data, labels=True), 8, device=DEVICES[compiled])
     assert tree.bricks.channels["value"].dtype == torch.float32
     rays = camera_rays(tree, 24, distance=1.3)
-    hits, _ = run(tree, compiled, rays, gv.Labels(), lod="finest")
+    hits, _ = trace(tree, compiled, rays, gv.Labels(), lod="finest")
     hit = hits["depth"][:, 0] < math.inf
     place = rays.origin + (hits["depth"].double() + 0.25) * rays.direction
     x, y, z = ((place[hit] + 0.5).floor().long()[:, a].clamp(0, 41) for a in range(3))
@@ -429,7 +431,7 @@ def test_streamed_is_resident_in_every_bit(scene, compiled, hold):
     with gv.Engine(producer, **options) as engine:
         for distance in (0.8, 1.3, 4.0):
             camera = gv.Camera.orbit(30, 20, distance, width=24, height=20)
-            resident = gv.render(on(scene, DEVICES[compiled]), camera, shader)
+            resident = gv.render(copy_to(scene, DEVICES[compiled]), camera, shader)
             picture = engine.render(camera, shader)
             assert picture.stats.converged
             for name in ("color", "alpha", "depth", "label", "normal"):

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 from helpers import DEVICES, marcher
-from helpers.layers import BLUE, SOLID, ball, layer_of, screen, seam_error
-from helpers.pictures import GRAY, PARTS, assert_same_picture, camera
-from helpers.trees import on
+from helpers.layers import BLUE, SOLID, ball, layer_of, plane_distances, seam_error
+from helpers.pictures import FIELDS, GRAY, assert_same_picture, camera
+from helpers.trees import copy_to
 from helpers.waits import nobody_waits
 
 import gvtorch as gv
@@ -68,7 +68,7 @@ def test_a_volume_is_cut_as_a_dense_marcher_cuts_it(backend, blobs, alpha):
     device, step = DEVICES[backend], 0.5
     tree = gv.N3Tree.from_volume(blobs, device=device)
     view = camera(40, distance=1.6).placed(tree.box)
-    depth = screen(view, middle(blobs), (0.3, 0.2, 1.0))
+    depth = plane_distances(view, middle(blobs), (0.3, 0.2, 1.0))
     opacity = None if alpha is None else torch.full_like(depth, alpha)
     layer = layer_of(depth, opacity)
     picture = gv.render(
@@ -97,7 +97,7 @@ def test_a_volume_is_cut_as_a_dense_marcher_cuts_it(backend, blobs, alpha):
 def test_alpha_of_one_is_opaque_and_of_zero_nothing(compiled, blobs):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     view = camera(32).placed(tree.box)
-    depth = screen(view, middle(blobs), (0, 0, 1))
+    depth = plane_distances(view, middle(blobs), (0, 0, 1))
     plain = gv.render(tree, view, GRAY)
     solid = gv.render(tree, view, GRAY, layer=layer_of(depth))
     full = gv.render(tree, view, GRAY, layer=layer_of(depth, torch.ones_like(depth)))
@@ -115,7 +115,7 @@ def test_alpha_of_one_is_opaque_and_of_zero_nothing(compiled, blobs):
 
 
 def test_normals_count_by_what_each_part_takes_of_the_light(compiled, blobs):
-    tree = on(gv.N3Tree.from_volume(blobs, 8), DEVICES[compiled])
+    tree = copy_to(gv.N3Tree.from_volume(blobs, 8), DEVICES[compiled])
     view = gv.Camera.orbit(30, 20, 1.3, width=24, height=20).placed(tree.box)
     far = float((tree.box.mean(0) - view.rays().origin[0]).norm())
     shader, color = gv.Lit(GRAY), torch.zeros(20, 24, 3)
@@ -156,13 +156,13 @@ def test_nothing_behind_an_opaque_layer_is_used_or_asked_for(blobs, backend_name
     if unavailable()[backend_name]:
         pytest.skip(unavailable()[backend_name])
     whole = gv.N3Tree.from_volume(blobs, 4)
-    bare = on(whole, "cpu")
+    bare = copy_to(whole, "cpu")
     leaf = whole.nodes.loc_t4[:, 3:] == whole.depth
     bare.nodes.brick_tn[(bare.nodes.brick_tn >= 0) & leaf] = config.ABSENT
     view = camera(32, distance=1.5).placed(whole.box)
     normal = -torch.tensor([0.469846, 0.342020, 0.813798], dtype=torch.float64)  # towards the box
     place = middle(blobs)
-    depth = screen(view, place, tuple(normal.tolist()))
+    depth = plane_distances(view, place, tuple(normal.tolist()))
     behind = behind_nodes(whole, place, normal)
     thin = torch.full_like(depth, 0.5)
     options = {"backend": backend_name, "lod": lod}
@@ -173,7 +173,7 @@ def test_nothing_behind_an_opaque_layer_is_used_or_asked_for(blobs, backend_name
         ("alpha 1", layer_of(depth, torch.ones_like(depth))),
         ("translucent", layer_of(depth, thin)),
     ):
-        used, asked = on(whole, "cpu"), on(bare, "cpu")
+        used, asked = copy_to(whole, "cpu"), copy_to(bare, "cpu")
         gv.render(used, view, GRAY, layer=layer, **options)
         gv.render(asked, view, GRAY, layer=layer, **options)
         brick = used.nodes.brick_tn
@@ -218,7 +218,7 @@ def test_depth_goes_out(compiled, fog):
 def test_batches_and_blocks_of_rays_change_nothing(monkeypatch, blobs):
     tree = gv.N3Tree.from_volume(blobs)
     cameras = gv.Camera.orbit([0, 70, 200], 20, 1.7, width=24, height=18).placed(tree.box)
-    depth = torch.stack([screen(cameras[i], middle(blobs), (0.2, 0, 1)) for i in range(3)])
+    depth = torch.stack([plane_distances(cameras[i], middle(blobs), (0.2, 0, 1)) for i in range(3)])
     for alpha in (None, 0.5 * torch.ones_like(depth)):
         layer = layer_of(depth, alpha)
         monkeypatch.setattr(pixels, "_RAYS_PER_BLOCK", 1 << 16)
@@ -228,7 +228,7 @@ def test_batches_and_blocks_of_rays_change_nothing(monkeypatch, blobs):
         for i in range(3):
             own = layer_of(depth[i], None if alpha is None else alpha[i])
             alone = gv.render(tree, cameras[i], GRAY, layer=own)
-            for name in (*PARTS, "nearest"):
+            for name in (*FIELDS, "nearest"):
                 assert torch.equal(getattr(alone, name), getattr(whole, name)[i]), name
 
 
@@ -239,7 +239,7 @@ def test_streamed_pictures_are_those_of_the_whole(compiled, blobs, alpha, loadin
     device = DEVICES[compiled]
     tree = gv.N3Tree.from_volume(blobs, 4, device=device)
     view = camera(48, distance=1.2).placed(tree.box)
-    depth = screen(view, middle(blobs), (0.3, 0.3, 1))
+    depth = plane_distances(view, middle(blobs), (0.3, 0.3, 1))
     layer = layer_of(depth, None if alpha is None else torch.full_like(depth, alpha))
     whole = gv.render(tree, view, GRAY, layer=layer)
     pool = whole.stats.bricks_used // 2 * 6**3 * 4
@@ -262,7 +262,7 @@ def test_streamed_pictures_are_those_of_the_whole(compiled, blobs, alpha, loadin
 def test_tensors_are_read_where_they_lie(blobs):
     tree = gv.N3Tree.from_volume(blobs)
     view = camera(24).placed(tree.box)
-    depth = screen(view, middle(blobs), (0, 0, 1))
+    depth = plane_distances(view, middle(blobs), (0, 0, 1))
     color = torch.zeros(24, 24, 3)
     layer = gv.Layer(color, depth)
     dark = gv.render(tree, view, GRAY, layer=layer).color
@@ -270,7 +270,7 @@ def test_tensors_are_read_where_they_lie(blobs):
     assert (gv.render(tree, view, GRAY, layer=layer).color - dark).max() > 0.99
     depth[:12] = math.nan  # later edits are not checked: NaN counts as no layer
     plain, picture = gv.render(tree, view, GRAY), gv.render(tree, view, GRAY, layer=layer)
-    for name in (*PARTS, "nearest"):
+    for name in (*FIELDS, "nearest"):
         assert torch.equal(getattr(picture, name)[:12], getattr(plain, name)[:12]), name
 
 
@@ -279,7 +279,7 @@ def test_tensors_are_read_where_they_lie(blobs):
 def test_on_cuda_nobody_waits_and_a_graph_reads_the_layer(blobs, alpha):
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device="cuda") as engine:
         view = camera(64).placed(engine.box)
-        depth = screen(view, middle(blobs), (0, 0, 1)).to(engine.device)
+        depth = plane_distances(view, middle(blobs), (0, 0, 1)).to(engine.device)
         layer = layer_of(depth, None if alpha is None else torch.full_like(depth, alpha))
         engine.render(view, GRAY)
         for move in (5, -5):  # bricks for rays that begin there are loaded, too
@@ -306,7 +306,7 @@ def test_the_seam_of_a_plane_and_a_ball_is_exact_to_a_pixel(compiled, tilt):
     angle = math.radians(tilt)
     eye = (160 * math.sin(angle), 0.0, 160 * math.cos(angle))
     view = gv.Camera.look_at(eye, (0, 0, height), fov=20, width=160, height=160)
-    layer = layer_of(screen(view, torch.tensor([0, 0, height]).double(), (0, 0, 1.0)))
+    layer = layer_of(plane_distances(view, torch.tensor([0, 0, height]).double(), (0, 0, 1.0)))
     picture = gv.render(tree, view, SOLID, layer=layer, step=0.1, lod="finest")
     error = seam_error(picture, view, height, radius)
     print(f"seam: {error:.3f} pixels")

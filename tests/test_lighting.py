@@ -55,19 +55,19 @@ def test_phong_on_a_sphere(backend, kind):
     rays = parallel(15, 9.0, DEVICES[backend])
     t, normal = sphere(rays)
     eye = -rays.direction.cpu().numpy()
-    at = rays.origin.cpu().numpy() - t[:, None] * eye
+    points = rays.origin.cpu().numpy() - t[:, None] * eye
     tint = (1.0, 0.8, 0.5)
     light, to_light = {
         "head": (gv.Headlight(tint), eye),
         "directional": (gv.DirectionalLight((2, -1, 2), tint), np.array([[-2, 1, -2]]) / 3),
-        "point": (gv.PointLight((0.0, 40.0, -20.0), tint), np.array([[0.0, 40.0, -20.0]]) - at),
+        "point": (gv.PointLight((0.0, 40.0, -20.0), tint), np.array([[0.0, 40.0, -20.0]]) - points),
     }[kind]
     to_light = to_light / np.linalg.norm(to_light, axis=1, keepdims=True) + 0 * normal
-    look = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.4, "shininess": 12.0}
+    shading = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.4, "shininess": 12.0}
     base = np.array([0.9, 0.5, 0.3])
-    shader = gv.DistanceField(tuple(base), **look)
+    shader = gv.DistanceField(tuple(base), **shading)
     color = light_on(tree, rays, shader, backend, lights=(light,), ambient=(1.0, 0.5, 0.2))
-    expected = phong(normal, to_light, eye, base, np.array(tint), **look)
+    expected = phong(normal, to_light, eye, base, np.array(tint), **shading)
     expected += base * 0.1 * (np.array([1.0, 0.5, 0.2]) - 1)  # the sky's colour
     assert expected.max() - expected.min() > 0.4
     assert np.abs(color - expected).max() < 0.03, "a convex body casts no shadow on its lit side"
@@ -81,11 +81,11 @@ def test_without_cones_it_is_the_shader_s_own_light(blobs, backend):
         gv.Isosurface(0.5, (0.9, 0.4, 0.2), light=light, shininess=9.0),
         gv.Isosurface(0.5, light=gv.Headlight(), specular=0.0),
     ):
-        own = gv.render(tree, camera, shader, backend=backend)
+        plain = gv.render(tree, camera, shader, backend=backend)
         for lighting in (gv.Lighting(shadows=0), gv.Lighting(shadows=0, lights=(shader.light,))):
             same = gv.render(tree, camera, shader, backend=backend, lighting=lighting)
-            torch.testing.assert_close(same.color, own.color, rtol=0, atol=2e-5)
-            assert torch.equal(same.depth, own.depth) and torch.equal(same.normal, own.normal)
+            torch.testing.assert_close(same.color, plain.color, rtol=0, atol=2e-5)
+            assert torch.equal(same.depth, plain.depth) and torch.equal(same.normal, plain.normal)
         both = gv.Lighting(shadows=0, lights=(shader.light, shader.light), ambient=(0, 0, 0))
         bright = gv.render(tree, camera, shader, backend=backend, lighting=both).color
         dark = gv.render(
@@ -94,7 +94,7 @@ def test_without_cones_it_is_the_shader_s_own_light(blobs, backend):
             lighting=dataclasses.replace(both, lights=(shader.light,)),
         ).color
         torch.testing.assert_close(bright, 2 * dark, rtol=0, atol=1e-5)
-    assert own.alpha.max() == 1
+    assert plain.alpha.max() == 1
 
 
 def test_a_ray_that_begins_behind_something_has_its_share_of_the_light(backend):
@@ -115,10 +115,10 @@ def test_translucent_matter_is_lit_where_it_is_seen(blobs, backend):
     transfer = gv.TransferFunction.from_points([(0, 0), (1, 0.3)], [(0, 0.9, 0.6, 0.3)])
     shader = gv.Lit(transfer, light=gv.DirectionalLight((0.3, -0.5, 1)), shininess=7.0)
     camera = gv.Camera.orbit(175, 10, 1.6, 20, 12, 12)
-    own = gv.render(tree, camera, shader, backend=backend)
+    expected = gv.render(tree, camera, shader, backend=backend)
     same = gv.render(tree, camera, shader, backend=backend, lighting=gv.Lighting(shadows=0))
-    assert own.alpha.max() > 0.8
-    torch.testing.assert_close(same.color, own.color, rtol=0, atol=2e-3)
+    assert expected.alpha.max() > 0.8
+    torch.testing.assert_close(same.color, expected.color, rtol=0, atol=2e-3)
 
 
 # --- shadows
@@ -144,10 +144,10 @@ def over_floor(
 
 
 def sun_seen(
-    at: np.ndarray, targets: np.ndarray, centre: np.ndarray = CENTRE, radius: float = RADIUS
+    points: np.ndarray, targets: np.ndarray, centre: np.ndarray = CENTRE, radius: float = RADIUS
 ) -> np.ndarray:
     """Returns (p,): share of unit directions (p, m, 3) from points that the ball does not block."""
-    away = at - centre
+    away = points - centre
     b = (targets * away[:, None]).sum(-1)
     c = (away**2).sum(-1)[:, None] - radius**2
     return 1 - ((b**2 > c) & (b < 0)).mean(1)
@@ -161,21 +161,21 @@ def disc(count: int = 4000) -> tuple[np.ndarray, np.ndarray]:
 
 def shadow_of(light, x: np.ndarray, *body) -> np.ndarray:
     """Returns the visible share of a light right above the ball, from (x, FLOOR, 32)."""
-    at = np.stack((x, np.full_like(x, FLOOR), np.full_like(x, 32.0)), -1)
+    points = np.stack((x, np.full_like(x, FLOOR), np.full_like(x, 32.0)), -1)
     u, v = disc()
     if isinstance(light, gv.DirectionalLight):
         half = math.tan(math.radians(light.angle) / 2)
-        way = np.stack((u * half, np.ones_like(u), v * half), -1)[None].repeat(len(x), 0)
+        directions = np.stack((u * half, np.ones_like(u), v * half), -1)[None].repeat(len(x), 0)
     else:
-        beam = np.array(light.position) - at
+        beam = np.array(light.position) - points
         axis = beam / np.linalg.norm(beam, axis=1, keepdims=True)
         side = np.cross(axis, [0.0, 0.0, 1.0])
         side /= np.linalg.norm(side, axis=1, keepdims=True)
         up = np.cross(axis, side)
         spread = u[None, :, None] * side[:, None] + v[None, :, None] * up[:, None]
-        way = beam[:, None] + light.radius * spread
-    way /= np.linalg.norm(way, axis=-1, keepdims=True)
-    return sun_seen(at, way, *body)
+        directions = beam[:, None] + light.radius * spread
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return sun_seen(points, directions, *body)
 
 
 def crossing(x: np.ndarray, seen: np.ndarray, share: float) -> float:
@@ -201,9 +201,9 @@ def test_umbra_and_penumbra_of_a_ball(backend, name):
     light, x = LIGHTS[name], np.linspace(32, 56, 97)
     expected = shadow_of(light, x)
     rays = down(x, FLOOR + 8, 32.0, DEVICES[backend])
-    for cones, most, mean in ((1, 0.7, 0.055), (16, 0.45, 0.045)):
-        given = {"lights": (light,), "shadow_cones": cones}
-        seen = light_on(tree, rays, shader, backend, **given)[:, 0]
+    for cones, max_error, mean in ((1, 0.7, 0.055), (16, 0.45, 0.045)):
+        options = {"lights": (light,), "shadow_cones": cones}
+        seen = light_on(tree, rays, shader, backend, **options)[:, 0]
         to_light = np.array(getattr(light, "position", (0, 1e6, 0))) - np.stack(
             (x, np.full_like(x, FLOOR), np.full_like(x, 32.0)), -1
         )
@@ -211,7 +211,7 @@ def test_umbra_and_penumbra_of_a_ball(backend, name):
         wrong = [crossing(x, seen, s) - crossing(x, expected, s) for s in (0.1, 0.5, 0.9)]
         error = float(np.sqrt(((seen - expected) ** 2).mean()))
         print(f"{name}, {cones} cones: {np.round(wrong, 2)} voxels, rms {error:.3f}")
-        assert np.abs(wrong).max() < most and error < mean
+        assert np.abs(wrong).max() < max_error and error < mean
         assert seen[0] < 0.01 and seen[-1] > 0.99
 
 
@@ -223,11 +223,11 @@ def test_a_wide_sun_behind_a_ball(backend):
     expected = shadow_of(light, x, *body)
     assert expected[0] < 0.01 and 0.3 < expected[48] < 0.7 and expected[-1] > 0.97
     rays = down(x, FLOOR + 8, 32.0, DEVICES[backend])
-    for cones, most in ((1, 0.06), (16, 0.04)):
+    for cones, max_error in ((1, 0.06), (16, 0.04)):
         seen = light_on(tree, rays, shader, backend, lights=(light,), shadow_cones=cones)[:, 0]
         error = float(np.sqrt(((seen - expected) ** 2).mean()))
         print(f"{cones} cones: rms {error:.3f}")
-        assert error < most
+        assert error < max_error
 
 
 @pytest.mark.parametrize("degrees", [60.0, 45.0, 30.0])
@@ -242,14 +242,14 @@ def test_a_low_sun_casts_its_shadow_where_it_should(backend, degrees):
     tree = tree_of(np.minimum(body, y - FLOOR), backend)
     light = gv.DirectionalLight((cosine, -sine, 0), angle=4.0)
     u, v = (part * math.tan(math.radians(light.angle) / 2) for part in disc())
-    way = np.stack((-cosine + sine * u, sine + cosine * u, v), -1)
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    at = np.linspace(40, 62, 177)
-    floor = np.stack((at, np.full_like(at, FLOOR), np.full_like(at, 32.0)), -1)
-    expected = sun_seen(floor, way[None].repeat(len(at), 0), centre)
-    rays, shader = down(at, FLOOR + 3, 32.0, DEVICES[backend]), gv.DistanceField((1, 1, 1), **MATT)
+    directions = np.stack((-cosine + sine * u, sine + cosine * u, v), -1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    xs = np.linspace(40, 62, 177)
+    floor = np.stack((xs, np.full_like(xs, FLOOR), np.full_like(xs, 32.0)), -1)
+    expected = sun_seen(floor, directions[None].repeat(len(xs), 0), centre)
+    rays, shader = down(xs, FLOOR + 3, 32.0, DEVICES[backend]), gv.DistanceField((1, 1, 1), **MATT)
     seen = light_on(tree, rays, shader, backend, lights=(light,))[:, 0] / sine
-    wrong = sine * (crossing(at, seen, 0.5) - crossing(at, expected, 0.5))
+    wrong = sine * (crossing(xs, seen, 0.5) - crossing(xs, expected, 0.5))
     print(f"{degrees} degrees: {wrong:.2f} voxels")
     assert abs(wrong) < 0.5
 
@@ -349,9 +349,9 @@ def test_a_cap_stands_in_the_light_alone(backend):
     for sun, expected in ((normal, 1.0), ((0.0, 1.0, 0.0), normal[1]), ((-1.0, 0.1, 0.0), 0.0)):
         light = gv.DirectionalLight(tuple(-n for n in sun))
         clip = gv.Clip(planes=[plane], caps=True)
-        given = {"lights": (light,), "plain": {"clip": clip}}
+        options = {"lights": (light,), "plain": {"clip": clip}}
         np.testing.assert_allclose(
-            light_on(tree, rays, shader, backend, **given), expected, atol=0.02
+            light_on(tree, rays, shader, backend, **options), expected, atol=0.02
         )
 
 
@@ -471,11 +471,11 @@ def test_a_headlight_bounces_as_a_lamp_at_the_eye(backend):
     shader = gv.DistanceField((0.8, 0.8, 0.8), **MATT)
     eye = np.array([40.0, 30.0, 32.0])
     rays = down(FLOOR + np.array([2.0, 4.0, 8.0, 14.0]), 30.0, 32.0, DEVICES[backend])
-    way = rays.origin.cpu().numpy() * [1, 0, 1] + [0, FLOOR, 0] - eye
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    origin, way = (torch.tensor(v + 0 * way).to(rays.origin) for v in (eye, way))
-    rays = dataclasses.replace(rays, origin=origin, direction=way)
-    own, lamp = (
+    direction = rays.origin.cpu().numpy() * [1, 0, 1] + [0, FLOOR, 0] - eye
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    origin, direction = (torch.tensor(v + 0 * direction).to(rays.origin) for v in (eye, direction))
+    rays = dataclasses.replace(rays, origin=origin, direction=direction)
+    headlight, lamp = (
         [
             light_on(tree, rays, shader, backend, lights=(light,), reach=24.0, indirect=factor)
             for tree in (corner(1, backend)[0], wall)
@@ -483,8 +483,8 @@ def test_a_headlight_bounces_as_a_lamp_at_the_eye(backend):
         ]
         for light in (gv.Headlight(), gv.PointLight(tuple(eye)))
     )
-    np.testing.assert_allclose(own[1], lamp[1], atol=1e-6)
-    bare, blocked = own[1] - own[0], own[3] - own[2]
+    np.testing.assert_allclose(headlight[1], lamp[1], atol=1e-6)
+    bare, blocked = headlight[1] - headlight[0], headlight[3] - headlight[2]
     print(np.round((bare[:, 0], blocked[:, 0]), 3))
     assert bare.min() > 0.05 and (blocked[:2] < 0.8 * bare[:2]).all()
 

@@ -33,46 +33,46 @@ SURFACES = {
 }
 
 
-def assert_same(one: gv.Picture, other: gv.Picture) -> None:
+def assert_same(a: gv.Picture, b: gv.Picture) -> None:
     for name in ("color", "alpha", "depth", "normal", "samples", "missed"):
-        assert torch.equal(getattr(one, name), getattr(other, name)), name
+        assert torch.equal(getattr(a, name), getattr(b, name)), name
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize("lighting", LOOKS)
 @pytest.mark.parametrize("surface", SURFACES)
-def test_compiled_equals_reference(blobs, compiled, surface, look, dtype):
+def test_compiled_equals_reference(blobs, compiled, surface, lighting, dtype):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     camera = gv.Camera.orbit(20, 30, 1.2, width=9, height=8)
-    given = {"lighting": LOOKS[look], "dtype": dtype}
-    one, two = (
-        gv.render(tree, camera, SURFACES[surface], backend=backend, **given)
+    options = {"lighting": LOOKS[lighting], "dtype": dtype}
+    a, b = (
+        gv.render(tree, camera, SURFACES[surface], backend=backend, **options)
         for backend in (compiled, "reference")
     )
-    assert one.color.dtype == dtype and one.color.max() > 0.1
-    assert torch.equal(one.samples, two.samples)
-    torch.testing.assert_close(one.color, two.color, rtol=0, atol=1e-5)
+    assert a.color.dtype == dtype and a.color.max() > 0.1
+    assert torch.equal(a.samples, b.samples)
+    torch.testing.assert_close(a.color, b.color, rtol=0, atol=1e-5)
     if compiled == "cpp":  # every bit but the last of colours, which torch sums over cones
         # In float64 log2 and exp2 are torch's, which rounds as the processor's vectors do.
         last = torch.finfo(dtype).eps * (1 if dtype == torch.float32 else 4)
-        torch.testing.assert_close(one.color, two.color, rtol=0, atol=last)
+        torch.testing.assert_close(a.color, b.color, rtol=0, atol=last)
         for name in ("alpha", "depth", "normal", "missed"):
-            assert torch.equal(getattr(one, name), getattr(two, name)), name
+            assert torch.equal(getattr(a, name), getattr(b, name)), name
 
 
-@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize("lighting", LOOKS)
 @pytest.mark.parametrize("surface", SURFACES)
-def test_a_streamed_picture_is_the_resident_one(blobs, compiled, surface, look):
+def test_a_streamed_picture_is_the_resident_one(blobs, compiled, surface, lighting):
     device = DEVICES[compiled]
     tree = gv.N3Tree.from_volume(blobs, 4, device=device)
     camera = gv.Camera.orbit(20, 30, 1.2, width=24, height=20)
-    given = {"lighting": LOOKS[look]}
-    whole = gv.render(tree, camera, SURFACES[surface], **given)
+    options = {"lighting": LOOKS[lighting]}
+    whole = gv.render(tree, camera, SURFACES[surface], **options)
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device=device) as engine:
-        streamed = engine.render(camera, SURFACES[surface], **given)
+        streamed = engine.render(camera, SURFACES[surface], **options)
         assert streamed.stats.converged
         assert_same(streamed, whole)
-        again, stats = engine.frame(camera, SURFACES[surface], **given)
+        again, stats = engine.frame(camera, SURFACES[surface], **options)
         assert stats.converged and not stats.misses
         assert_same(again, whole)
 
@@ -85,18 +85,18 @@ def test_what_is_seen_only_in_a_shadow_is_streamed_at_its_coarser_level(compiled
     camera = gv.Camera.look_at((48, 40, 48), (40, 8, 40), (1, 0, 0), fov=40, width=40, height=40)
     shader = gv.Isosurface(0.5, (1, 1, 1), **MATT)
     sun = gv.DirectionalLight((0, -1, 0), angle=8)
-    found, depths = {}, {}
+    pictures, depths = {}, {}
     for name, lighting in (
         ("none", gv.Lighting(lights=(sun,), shadows=0)),
         ("shadow", gv.Lighting(lights=(sun,))),
     ):
         producer = gv.VolumeProducer(gv.Volume(value))
         with gv.Engine(producer, brick_size=8, device=DEVICES[compiled]) as engine:
-            found[name] = engine.render(camera, shader, lighting=lighting)
-            assert found[name].stats.converged
+            pictures[name] = engine.render(camera, shader, lighting=lighting)
+            assert pictures[name].stats.converged
             tree = engine.trees["scene"].tree
             depths[name] = brick_depths(tree, np.array([40, 96, 40]), 14)
-    assert found["none"].color.min() > 0.9 and found["shadow"].color.min() < 0.01
+    assert pictures["none"].color.min() > 0.9 and pictures["shadow"].color.min() < 0.01
     print("depths of the ball's bricks:", depths, "of", tree.depth)
     assert max(depths["none"], default=0) <= 1
     assert 1 < max(depths["shadow"]) < tree.depth
@@ -106,9 +106,9 @@ def brick_depths(tree: gv.N3Tree, centre: np.ndarray, reach: float) -> set[int]:
     """Returns the depths of bricks within reach of a point, except those of the root."""
     depths: set[int] = set()
     n, size = tree.branching, np.array(tree.spacing) * tree.side
-    bricks, place = tree.nodes.brick_tn.cpu(), tree.nodes.loc_t4.cpu()
+    bricks, locs = tree.nodes.brick_tn.cpu(), tree.nodes.loc_t4.cpu()
     for tile, child in zip(*np.nonzero(bricks.numpy() >= 0), strict=True):
-        x, y, z, depth = place[tile].tolist()
+        x, y, z, depth = locs[tile].tolist()
         if depth < 1:
             continue
         corner = np.array([x * n + child % n, y * n + child // n % n, z * n + child // n**2])
@@ -120,12 +120,12 @@ def brick_depths(tree: gv.N3Tree, centre: np.ndarray, reach: float) -> set[int]:
 
 def test_each_camera_of_a_batch_has_its_own_light(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
-    angles, given = (10.0, 80.0, 200.0), {"lighting": LOOKS["indirect"]}
+    angles, options = (10.0, 80.0, 200.0), {"lighting": LOOKS["indirect"]}
     batch = gv.Camera.orbit(list(angles), 30, 1.2, width=16, height=12)
-    many = gv.render(tree, batch, SURFACES["isosurface"], **given)
+    many = gv.render(tree, batch, SURFACES["isosurface"], **options)
     for number, angle in enumerate(angles):
-        one = gv.Camera.orbit(angle, 30, 1.2, width=16, height=12)
-        alone = gv.render(tree, one, SURFACES["isosurface"], **given)
+        camera = gv.Camera.orbit(angle, 30, 1.2, width=16, height=12)
+        alone = gv.render(tree, camera, SURFACES["isosurface"], **options)
         assert torch.equal(many.color[number], alone.color)
         assert torch.equal(many.samples[number], alone.samples)
 
@@ -136,8 +136,8 @@ def test_rays_that_hit_nothing_go_no_further(blobs, backend):
     fisheye = gv.Camera.orbit(0, 0, 0.8, 180, 24, 24, "fisheye")
     for view in (camera, fisheye):
         plain = gv.render(tree, view, SURFACES["isosurface"], backend=backend)
-        given = {"lighting": LOOKS["indirect"], "background": (0.1, 0.2, 0.3)}
-        lit = gv.render(tree, view, SURFACES["isosurface"], backend=backend, **given)
+        options = {"lighting": LOOKS["indirect"], "background": (0.1, 0.2, 0.3)}
+        lit = gv.render(tree, view, SURFACES["isosurface"], backend=backend, **options)
         nothing = plain.alpha[..., 0] == 0
         assert nothing.sum() > 40 and torch.isfinite(lit.color).all()
         assert torch.equal(lit.samples[nothing], plain.samples[nothing])
@@ -156,34 +156,34 @@ def test_lights_are_tensors_that_may_be_edited(blobs, compiled):
     lighting = gv.Lighting(lights=(gv.PointLight(position, tint, radius),), ambient=ambient)
     shader = SURFACES["isosurface"]
 
-    def look():
+    def draw():
         return gv.trace(tree, rays, shader, lighting=lighting).color
 
-    first = look()
+    first = draw()
     for tensor, value in ((position, 100.0), (tint, 0.5), (ambient, 0.3), (radius, 20.0)):
-        before = look()
+        before = draw()
         tensor.fill_(value)
-        assert (look() - before).abs().max() > 0.01
-    assert (look() - first).abs().max() > 0.1
+        assert (draw() - before).abs().max() > 0.01
+    assert (draw() - first).abs().max() > 0.1
 
 
 def test_light_goes_with_lens_clip_and_layer(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     camera = gv.Camera.orbit(20, 30, 1.2, width=32, height=32)
-    shader, given = SURFACES["isosurface"], {"lighting": LOOKS["shadow"]}
-    sharp = gv.render(tree, camera, shader, **given)
+    shader, options = SURFACES["isosurface"], {"lighting": LOOKS["shadow"]}
+    sharp = gv.render(tree, camera, shader, **options)
     lens = gv.ThinLens(aperture=0.0, focus=1.2, frame="box")
-    seen = gv.render(tree, camera, shader, lens=lens, **given)
+    seen = gv.render(tree, camera, shader, lens=lens, **options)
     assert (seen.color - sharp.color).abs().median() < 1e-4
     wide = dataclasses.replace(lens, aperture=0.05)
-    blurred = gv.render(tree, camera, shader, lens=wide, **given)
+    blurred = gv.render(tree, camera, shader, lens=wide, **options)
     assert (blurred.color - sharp.color).abs().mean() < 0.1
     far = torch.full((32, 32, 1), 1e3)
     layer = gv.Layer(torch.ones(32, 32, 3), far)
-    mixed = gv.render(tree, camera, shader, layer=layer, **given)
+    mixed = gv.render(tree, camera, shader, layer=layer, **options)
     torch.testing.assert_close(mixed.color, sharp.color + (1 - sharp.alpha))
     clip = gv.Clip(planes=[(0, 0, -1, 24.0)], caps=True)
-    cut = gv.render(tree, camera, shader, clip=clip, **given)
+    cut = gv.render(tree, camera, shader, clip=clip, **options)
     assert torch.isfinite(cut.color).all() and cut.color.max() <= 1.5
 
 
@@ -212,17 +212,17 @@ def test_without_lighting_pictures_keep_every_bit(blobs, compiled):
 
 
 @pytest.mark.backend("cuda")
-@pytest.mark.parametrize("look", LOOKS)
-def test_on_cuda_nobody_waits_and_a_graph_is_the_frame(blobs, look):
+@pytest.mark.parametrize("lighting", LOOKS)
+def test_on_cuda_nobody_waits_and_a_graph_is_the_frame(blobs, lighting):
     camera = gv.Camera.orbit(20, 30, 1.2, width=64, height=64)
-    given = {"lighting": LOOKS[look]}
+    options = {"lighting": LOOKS[lighting]}
     shader = SURFACES["isosurface"]
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device="cuda") as engine:
-        whole = engine.render(camera, shader, **given)
-        engine.frame(camera, shader, **given)
-        graph = engine.capture(camera, shader, **given)
+        whole = engine.render(camera, shader, **options)
+        engine.frame(camera, shader, **options)
+        graph = engine.capture(camera, shader, **options)
         with nobody_waits():
-            frame, _ = engine.frame(camera, shader, **given)
+            frame, _ = engine.frame(camera, shader, **options)
             replayed, _ = graph.replay(camera)
         assert_same(frame, whole)
         assert_same(replayed, whole)

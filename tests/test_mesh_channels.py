@@ -57,10 +57,10 @@ def test_each_channel_is_a_store_of_its_own(store, mesh):
     whole = ((0, 0, 0), grid.extent[::-1])
     expected = grid.region(*whole)
     for name in NAMES:
-        one = gv.Store.open(store, image=name)
-        assert one.has_blocks and one.extent == grid.extent
-        found = one.read_region(0, *whole)
-        assert np.array_equal(found, expected[name].numpy()), name
+        opened = gv.Store.open(store, image=name)
+        assert opened.has_blocks and opened.extent == grid.extent
+        actual = opened.read_region(0, *whole)
+        assert np.array_equal(actual, expected[name].numpy()), name
     with pytest.raises(ValueError, match=r"has no image 'normals'.*; it holds .*coverage.*normal"):
         gv.Store.open(store, image="normals")
 
@@ -68,26 +68,26 @@ def test_each_channel_is_a_store_of_its_own(store, mesh):
 def test_channels_are_streamed_together_as_a_resident_tree(store, mesh):
     grid = Voxelizer(mesh, resolution=70, channels=NAMES)
     voxels = grid.region((0, 0, 0), grid.extent[::-1])
-    place = (grid.spacing,) * 3, grid.origin
+    placement = (grid.spacing,) * 3, grid.origin
     names = ("color", "normal")
-    tree = gv.N3Tree.from_volume({n: gv.Volume(voxels[n], *place) for n in names}, 8)
-    look = gv.StoredColor("color", premultiplied=True, normals="normal")
+    tree = gv.N3Tree.from_volume({n: gv.Volume(voxels[n], *placement) for n in names}, 8)
+    shader = gv.StoredColor("color", premultiplied=True, normals="normal")
     camera = gv.Camera.orbit(25, 40, 1.3, width=64, height=48)
-    expected = gv.render(tree, camera, look, lod="finest")
+    expected = gv.render(tree, camera, shader, lod="finest")
     with gv.Engine(gv.StoredChannels(store, names)) as engine:
-        found = engine.render(camera, look, lod="finest")
-    assert torch.equal(found.color, expected.color) and expected.alpha.mean() > 0.2
+        actual = engine.render(camera, shader, lod="finest")
+    assert torch.equal(actual.color, expected.color) and expected.alpha.mean() > 0.2
 
 
 def test_a_node_is_uniform_where_all_channels_are(store):
     joined = gv.StoredChannels(store)
-    assert joined.host_bytes == sum(one.host_bytes for one in joined.producers.values()) > 0
+    assert joined.host_bytes == sum(p.host_bytes for p in joined.producers.values()) > 0
     layout = Layout.of(joined, 8, 1, torch.device("cpu"))
     joined.prepare(layout)
-    at = torch.cartesian_prod(*(torch.arange(-(-n // 8)) for n in joined.extent))
-    nodes = Nodes(torch.cat((at, torch.full((len(at), 1), layout.depth)), 1), layout)
+    positions = torch.cartesian_prod(*(torch.arange(-(-n // 8)) for n in joined.extent))
+    nodes = Nodes(torch.cat((positions, torch.full((len(positions), 1), layout.depth)), 1), layout)
     kind = joined.classify(nodes).result().kind
-    each = [one.classify(nodes).result().kind for one in joined.producers.values()]
+    each = [p.classify(nodes).result().kind for p in joined.producers.values()]
     data = torch.stack(each) == Region.DATA
     assert torch.equal(kind == Region.DATA, data.any(0))
     assert (data.any(0) & ~data.all(0)).any() and (kind != Region.DATA).any()
@@ -95,20 +95,20 @@ def test_a_node_is_uniform_where_all_channels_are(store):
 
 
 def test_producers_that_do_not_go_together_are_told(mesh):
-    one = gv.MeshProducer(mesh, resolution=32)
+    first = gv.MeshProducer(mesh, resolution=32)
     other = gv.MeshProducer(mesh, resolution=48, channels=("distance",))
     both = gv.MeshProducer(mesh, resolution=32, channels=("color", "normal"))
     octaves = gv.OctaveProducer(gv.noise.SplineSum(), 64, box=((0,) * 3, (1,) * 3))
-    for producers, said in (
+    for producers, message in (
         ({}, "at least one"),
-        ({"a": one, "b": other}, "extent of 'b' is"),
+        ({"a": first, "b": other}, "extent of 'b' is"),
         ({"a": both}, "must have one channel"),
         ({"a": 3}, "must be a Producer"),
         ({"a": octaves}, "'a' needs its parents' bricks"),
     ):
         with pytest.raises(ValueError, match="JoinedProducer: ") as error:
             gv.JoinedProducer(producers)
-        assert said in str(error.value) and "\n" not in str(error.value)
+        assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_what_a_store_has_not_is_told(store, tmp_path):
@@ -121,42 +121,42 @@ def test_what_a_store_has_not_is_told(store, tmp_path):
 
 
 def test_colours_are_drawn_lit_in_one_line(store, tmp_path):
-    words = ("--size", "64x48", "--camera", "orbit:25,40", "-o")
-    run = gvtorch("render", store, *words, tmp_path / "a.npy")
+    flags = ("--size", "64x48", "--camera", "orbit:25,40", "-o")
+    run = gvtorch("render", store, *flags, tmp_path / "a.npy")
     assert run.returncode == 0 and not run.stderr, run.stderr
     camera = gv.Camera.orbit(25, 40, width=64, height=48, fit=True)
     producer = gv.StoredChannels(store, ("color", "normal"))
     reference = 0.3 * producer.spacing[0]
-    look = gv.StoredColor("color", premultiplied=True, normals="normal", reference=reference)
+    shader = gv.StoredColor("color", premultiplied=True, normals="normal", reference=reference)
     with gv.Engine(producer) as engine:
-        expected = engine.render(camera, look)
-    found = torch.from_numpy(np.load(tmp_path / "a.npy"))[..., :3].float()
-    assert (found - expected.color.reshape(found.shape)).abs().max() < 2e-3
-    other = gvtorch("render", store, *words, tmp_path / "b.npy", "--image", "coverage")
+        expected = engine.render(camera, shader)
+    actual = torch.from_numpy(np.load(tmp_path / "a.npy"))[..., :3].float()
+    assert (actual - expected.color.reshape(actual.shape)).abs().max() < 2e-3
+    other = gvtorch("render", store, *flags, tmp_path / "b.npy", "--image", "coverage")
     assert other.returncode == 0, other.stderr
     assert not np.array_equal(np.load(tmp_path / "b.npy"), np.load(tmp_path / "a.npy"))
-    bad = gvtorch("render", store, *words, tmp_path / "c.npy", "--image", "glow")
+    bad = gvtorch("render", store, *flags, tmp_path / "c.npy", "--image", "glow")
     assert bad.returncode == 2 and "has no image 'glow'" in bad.stderr
 
 
 def test_a_broken_off_store_goes_on_and_is_the_same(tmp_path, mesh, monkeypatch):
-    told = {"resolution": 150, "channels": NAMES, "workers": 1}
+    options = {"resolution": 150, "channels": NAMES, "workers": 1}
     whole = tmp_path / "whole" / "a.zarr"
     whole.parent.mkdir()
-    gv.voxelize(mesh, whole, **told)
+    gv.voxelize(mesh, whole, **options)
     target = tmp_path / "a.zarr"
-    how = r"--channels coverage,color,normal .*--resume"
-    with stopped_at(monkeypatch, 9), pytest.raises(KeyboardInterrupt, match=how):
-        gv.voxelize(mesh, target, **told)
+    message = r"--channels coverage,color,normal .*--resume"
+    with stopped_at(monkeypatch, 9), pytest.raises(KeyboardInterrupt, match=message):
+        gv.voxelize(mesh, target, **options)
     assert (target / "coverage" / "zarr.json").exists() and not (target / "zarr.json").exists()
     with pytest.raises(FileExistsError, match="half-written"):
-        gv.voxelize(mesh, target, **told)
+        gv.voxelize(mesh, target, **options)
     with pytest.raises(ValueError, match="begun with another source"):
-        gv.voxelize(mesh, target, **told | {"band": 6}, resume=True)
-    gv.voxelize(mesh, target, **told, resume=True)
+        gv.voxelize(mesh, target, **options | {"band": 6}, resume=True)
+    gv.voxelize(mesh, target, **options, resume=True)
     assert contents(target) == contents(whole)
     with pytest.raises(FileExistsError, match="there is a store already"):
-        gv.voxelize(mesh, target, **told)
+        gv.voxelize(mesh, target, **options)
 
 
 @pytest.mark.parametrize(
@@ -179,10 +179,10 @@ def test_a_killed_voxelization_goes_on_and_is_the_same(tmp_path):
     ball = meshes.sphere(5)
     file = tmp_path / "ball.ply"
     trimesh.Trimesh(ball.vertices, ball.faces, process=False).export(file)
-    words = ["--resolution", "300", "--channels", "coverage,distance", "--workers", "1"]
+    flags = ["--resolution", "300", "--channels", "coverage,distance", "--workers", "1"]
     whole, target = tmp_path / "whole.zarr", tmp_path / "killed.zarr"
-    assert gvtorch("voxelize", file, "-o", whole, *words).returncode == 0
-    command = [sys.executable, "-m", "gvtorch", "voxelize", file, "-o", target, *words]
+    assert gvtorch("voxelize", file, "-o", whole, *flags).returncode == 0
+    command = [sys.executable, "-m", "gvtorch", "voxelize", file, "-o", target, *flags]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     journal = target / "coverage" / WORK / "journal.jsonl"
     while process.poll() is None and not (journal.exists() and journal.read_bytes()):
@@ -190,7 +190,7 @@ def test_a_killed_voxelization_goes_on_and_is_the_same(tmp_path):
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert not (target / "zarr.json").exists()
-    done = gvtorch("voxelize", file, "-o", target, *words, "--resume")
+    done = gvtorch("voxelize", file, "-o", target, *flags, "--resume")
     assert done.returncode == 0, done.stderr
     names = {name: digest for name, digest in contents(whole).items() if "/c/" in name}
     assert {n: d for n, d in contents(target).items() if "/c/" in n} == names and len(names) > 20
@@ -199,8 +199,8 @@ def test_a_killed_voxelization_goes_on_and_is_the_same(tmp_path):
 def test_bad_channels_are_told_in_a_line(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     for names in ("colour", "color,color", ""):
-        words = ("-o", tmp_path / "a.zarr", "--channels", names)
-        run = gvtorch("voxelize", tmp_path / "a.obj", *words)
+        flags = ("-o", tmp_path / "a.zarr", "--channels", names)
+        run = gvtorch("voxelize", tmp_path / "a.obj", *flags)
         assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
         assert "channels must be some of coverage, distance" in run.stderr
         assert not (tmp_path / "a.zarr").exists()

@@ -25,8 +25,8 @@ ALL = ("coverage", "distance", "color", "normal", "material")
 
 def all_nodes(layout: Layout, depth: int) -> Nodes:
     count = -(-torch.tensor(layout.extent) // (layout.brick_size << (layout.depth - depth)))
-    place = torch.cartesian_prod(*(torch.arange(int(n)) for n in count))
-    return Nodes(torch.cat((place, torch.full((len(place), 1), depth)), 1), layout)
+    positions = torch.cartesian_prod(*(torch.arange(int(n)) for n in count))
+    return Nodes(torch.cat((positions, torch.full((len(positions), 1), depth)), 1), layout)
 
 
 @pytest.fixture(scope="module")
@@ -55,23 +55,23 @@ def cut(voxels: torch.Tensor, nodes: Nodes) -> torch.Tensor:
 def inner(nodes: Nodes, voxels: torch.Tensor) -> torch.Tensor:
     """Returns (k, s, s, s): true for voxels of finest bricks that lie in the volume."""
     size = torch.tensor(voxels.shape[:3])
-    at = nodes.loc[:, [2, 1, 0], None] * 8 + torch.arange(-1, 9)
-    there = (at >= 0) & (at < size[:, None])
-    return there[:, 0, :, None, None] & there[:, 1, None, :, None] & there[:, 2, None, None, :]
+    indices = nodes.loc[:, [2, 1, 0], None] * 8 + torch.arange(-1, 9)
+    inside = (indices >= 0) & (indices < size[:, None])
+    return inside[:, 0, :, None, None] & inside[:, 1, None, :, None] & inside[:, 2, None, None, :]
 
 
 def test_finest_bricks_hold_the_store_s_voxels(world):
     producer, layout, voxels = world
     nodes = all_nodes(layout, layout.depth)
-    made = producer.fill(nodes).data
+    bricks = producer.fill(nodes).data
     there = inner(nodes, voxels["coverage"])
     for name, expected in voxels.items():
-        found, wanted = (one[there].double() for one in (made[name], cut(expected, nodes)))
-        apart = (found - wanted).abs().amax(1)
+        actual, stored = (values[there].double() for values in (bricks[name], cut(expected, nodes)))
+        error = (actual - stored).abs().amax(1)
         # Cubes begin elsewhere, so float32 rounds differently: of two triangles at equal distance,
         # the other one may give the normal.
         bound, share = BOUNDS[name]
-        assert (apart > bound).double().mean() < share, name
+        assert (error > bound).double().mean() < share, name
 
 
 def test_regions_are_proved_at_every_level(world):
@@ -81,13 +81,13 @@ def test_regions_are_proved_at_every_level(world):
     seen = []
     for depth in range(layout.depth + 1):
         nodes = all_nodes(layout, depth)
-        for one in (producer, alone):
-            regions = one.classify(nodes)
+        for source in (producer, alone):
+            regions = source.classify(nodes)
             proved = regions.kind != Region.DATA
             if not proved.any():
                 continue
-            made = one.fill(nodes[proved]).data
-            for name, values in made.items():
+            bricks = source.fill(nodes[proved]).data
+            for name, values in bricks.items():
                 value = regions.constants[name][proved]
                 assert torch.equal(values, value[:, None, None, None].expand_as(values)), name
             scale = 2 ** (layout.depth - depth)
@@ -115,8 +115,8 @@ def test_a_coarse_voxel_is_nearly_the_mean_below(world):
     for scale, bound in bounds.items():
         depth = layout.depth - scale.bit_length() + 1
         nodes = all_nodes(layout, depth)
-        made = producer.fill(nodes).data
-        for name, unit, (mean, most) in (
+        bricks = producer.fill(nodes).data
+        for name, unit, (mean, max_error) in (
             ("coverage", 255.0, bound[:2]),
             ("distance", producer.spacing[0], bound[2:]),
         ):
@@ -124,12 +124,12 @@ def test_a_coarse_voxel_is_nearly_the_mean_below(world):
             z, y, x = (n // scale for n in values.shape[:3])
             values = values[: z * scale, : y * scale, : x * scale]
             below = values.reshape(z, scale, y, scale, x, scale).mean((1, 3, 5))
-            found = torch.zeros(*(8 * (int(n) + 1) for n in nodes.loc[:, [2, 1, 0]].amax(0)))
-            for (a, b, c, _), brick in zip(nodes.loc.tolist(), made[name], strict=True):
-                own = (slice(8 * n, 8 * n + 8) for n in (c, b, a))
-                found[tuple(own)] = brick[1:-1, 1:-1, 1:-1, 0] / unit
-            apart = (found[:z, :y, :x] - below).abs()
-            assert apart.mean() < mean and apart.max() < most, (name, scale)
+            level = torch.zeros(*(8 * (int(n) + 1) for n in nodes.loc[:, [2, 1, 0]].amax(0)))
+            for (a, b, c, _), brick in zip(nodes.loc.tolist(), bricks[name], strict=True):
+                node_slices = (slice(8 * n, 8 * n + 8) for n in (c, b, a))
+                level[tuple(node_slices)] = brick[1:-1, 1:-1, 1:-1, 0] / unit
+            error = (level[:z, :y, :x] - below).abs()
+            assert error.mean() < mean and error.max() < max_error, (name, scale)
 
 
 def test_bricks_of_all_levels_are_made_together(world):
@@ -139,15 +139,15 @@ def test_bricks_of_all_levels_are_made_together(world):
     producer, layout, _ = world
     assert producer.on_device
     nodes = [all_nodes(layout, depth)[::7] for depth in (layout.depth, 1, layout.depth - 1, 0)]
-    loc = torch.cat([one.loc for one in nodes])
+    loc = torch.cat([part.loc for part in nodes])
     mixed = Nodes(loc[torch.randperm(len(loc), generator=torch.Generator().manual_seed(0))], layout)
     expected = producer.fill(mixed).data
     low = mixed.box[:, 0] - layout.border * mixed.voxel_size
     voxel, coarse = mixed.voxel_size[:, 0], mixed.depth < layout.depth
     assert 0 < coarse.sum() < len(loc)
-    found = producer.voxelizer.cubes(low, voxel, layout.side, coarse_k=coarse)
+    together = producer.voxelizer.cubes(low, voxel, layout.side, coarse_k=coarse)
     for name, values in expected.items():
-        assert torch.equal(found[name], values), name
+        assert torch.equal(together[name], values), name
 
 
 def test_the_volume_stays_from_level_to_level():
@@ -175,29 +175,29 @@ def test_coverage_of_solids_is_the_mean_below_at_every_level():
     whole[tuple(slice(0, n) for n in finest.shape[:3])] = finest[..., 0]
     for depth in range(layout.depth):
         nodes = all_nodes(layout, depth)
-        found = producer.fill(nodes).data["coverage"][:, 1:-1, 1:-1, 1:-1, 0].double()
+        bricks = producer.fill(nodes).data["coverage"][:, 1:-1, 1:-1, 1:-1, 0].double()
         scale, side = 1 << (layout.depth - depth), 8 << depth
         below = whole.view(side, scale, side, scale, side, scale).mean((1, 3, 5))
-        for loc, brick in zip(nodes.loc.tolist(), found, strict=True):
-            own = tuple(slice(8 * n, 8 * n + 8) for n in (loc[2], loc[1], loc[0]))
-            assert (brick - below[own]).abs().max() <= 1.01
+        for loc, brick in zip(nodes.loc.tolist(), bricks, strict=True):
+            node_slices = tuple(slice(8 * n, 8 * n + 8) for n in (loc[2], loc[1], loc[0]))
+            assert (brick - below[node_slices]).abs().max() <= 1.01
 
 
 def test_streamed_is_the_resident_tree_of_its_voxels(world):
     """At the finest level, with small pools."""
     producer, _, voxels = world
-    place = producer.spacing, producer.origin
-    tree = gv.N3Tree.from_volume({"coverage": gv.Volume(voxels["coverage"], *place)}, 8)
+    placement = producer.spacing, producer.origin
+    tree = gv.N3Tree.from_volume({"coverage": gv.Volume(voxels["coverage"], *placement)}, 8)
     alone = gv.MeshProducer(producer.voxelizer.mesh, resolution=100)
     engine = gv.Engine(alone)
     camera = gv.Camera.orbit(25, 50, 1.3, width=64, height=48)
     for lod, bound in (("finest", 0.003), ("auto", 0.02)):
         surface = gv.Isosurface(127, (0.8, 0.7, 0.6))
-        told = {"lod": lod}
-        expected = gv.render(tree, camera, surface, **told)
-        found = engine.render(camera, surface, **told)
-        apart = (found.color - expected.color).abs()
-        assert apart.mean() < bound and (apart > 0.1).double().mean() < 0.02
+        options = {"lod": lod}
+        expected = gv.render(tree, camera, surface, **options)
+        actual = engine.render(camera, surface, **options)
+        error = (actual.color - expected.color).abs()
+        assert error.mean() < bound and (error > 0.1).double().mean() < 0.02
         assert expected.alpha.mean() > 0.2
 
 
@@ -208,19 +208,19 @@ def test_deep_levels_are_made_where_one_looks():
     layout = Layout.of(producer, 8, 1, CPU)
     producer.prepare(layout)
     corner = ball.corners[40]
-    place = corner.mean(0)
-    at = (place - np.array(producer.origin)) / producer.spacing[0] + 0.5
-    loc = torch.tensor([[*(int(n) // 8 for n in at), layout.depth]])
+    point = corner.mean(0)
+    index = (point - np.array(producer.origin)) / producer.spacing[0] + 0.5
+    loc = torch.tensor([[*(int(n) // 8 for n in index), layout.depth]])
     nodes = Nodes(loc, layout)
     assert producer.classify(nodes).kind.item() == Region.DATA
-    found = producer.fill(nodes).data["distance"][0, ..., 0].double()
+    actual = producer.fill(nodes).data["distance"][0, ..., 0].double()
     normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])
     normal /= np.linalg.norm(normal)
-    local = [one[0].double() for one in nodes.local_axes]
-    shift = nodes.center[0].numpy() - place
+    local = [axis[0].double() for axis in nodes.local_axes]
+    shift = nodes.center[0].numpy() - point
     height = sum(n * (x + s) for n, x, s in zip(normal, local, shift, strict=True))
     exact = height.clamp(-producer.voxelizer.band, producer.voxelizer.band)
-    assert (found - exact).abs().max() < 1e-3 * producer.spacing[0]
+    assert (actual - exact).abs().max() < 1e-3 * producer.spacing[0]
 
 
 def test_a_file_is_read(tmp_path):

@@ -30,9 +30,9 @@ def places(mesh: gv.Mesh, count: int, seed: int = 0, wider: float = 0.2) -> np.n
     return low - wider * size + random * (high - low + 2 * wider * size)
 
 
-def sums(mesh: gv.Mesh, resolution: int, **told) -> float:
+def sums(mesh: gv.Mesh, resolution: int, **options) -> float:
     """Returns the sum of the coverage of all voxels, in world units."""
-    grid = Voxelizer(mesh, resolution=resolution, **told)
+    grid = Voxelizer(mesh, resolution=resolution, **options)
     covered = grid.region((0, 0, 0), grid.extent[::-1])["coverage"]
     return float(covered.double().sum()) / 255 * grid.spacing**3
 
@@ -69,7 +69,7 @@ def test_copies_needles_and_points_do_no_harm():
     bad = np.array([[a, a, a], [a, b, b], [a, b, a]])
     corners = np.concatenate((ball.corners[5:9][:, [1, 2, 0]], bad, ball.corners))
     mesh = meshes.of_corners(corners)
-    grid, plain = (Voxelizer(one, resolution=48) for one in (mesh, ball))
+    grid, plain = (Voxelizer(m, resolution=48) for m in (mesh, ball))
     whole = ((0, 0, 0), plain.extent[::-1])
     assert len(grid.geometry.mesh_face) == len(ball.faces) and grid.geometry.solid.all()
     assert torch.equal(grid.region(*whole)["coverage"], plain.region(*whole)["coverage"])
@@ -102,8 +102,8 @@ def test_an_edge_of_three_faces_bounds_no_solid():
     mesh = meshes.joined(meshes.box((-1, -0.7, -0.4), (1, 0.7, 0.4)), meshes.of_corners(fin))
     producer = gv.MeshProducer(mesh, resolution=128)
     assert not producer.voxelizer.geometry.solid.any()
-    found = sums(mesh, 128) / producer.voxelizer.thickness
-    assert found == pytest.approx(meshes.area(mesh), rel=0.01)
+    actual = sums(mesh, 128) / producer.voxelizer.thickness
+    assert actual == pytest.approx(meshes.area(mesh), rel=0.01)
 
 
 def test_an_inside_out_mesh_is_the_same_solid():
@@ -120,8 +120,8 @@ def test_signed_distance_of_a_box_in_closed_form():
     point = places(mesh, 20000)
     q = np.abs(point) - (1, 0.7, 0.4)
     exact = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
-    found = Geometry(mesh).signed_distance(torch.from_numpy(point))
-    assert np.abs(found.numpy() - exact).max() < 1e-12
+    distance = Geometry(mesh).signed_distance(torch.from_numpy(point))
+    assert np.abs(distance.numpy() - exact).max() < 1e-12
 
 
 @pytest.mark.parametrize("name", SHARED)
@@ -134,17 +134,17 @@ def test_signed_distance_is_libigl_s(name):
     size = float((mesh.bounds[1] - mesh.bounds[0]).max())
     point = places(mesh, 10_000 if name == "open bunny" else 100_000)
     geometry = Geometry(mesh)
-    found = geometry.signed_distance(torch.from_numpy(point)).numpy()
+    distance = geometry.signed_distance(torch.from_numpy(point)).numpy()
     squared, *_ = igl.point_mesh_squared_distance(point, mesh.vertices, mesh.faces)
-    assert np.abs(np.abs(found) - np.sqrt(squared)).max() < 1e-5 * size
+    assert np.abs(np.abs(distance) - np.sqrt(squared)).max() < 1e-5 * size
     closed = mesh.faces[geometry.mesh_face.numpy()][geometry.solid.numpy()]
     if not len(closed):
-        assert (found >= 0).all()
+        assert (distance >= 0).all()
         return
     winding = igl.fast_winding_number(mesh.vertices, closed, point)
     exact = igl.winding_number(mesh.vertices, closed, point[:2000])
     assert np.abs(winding[:2000] - exact).max() < 0.01 < np.abs(np.abs(winding) - 0.5).min()
-    assert np.array_equal(np.abs(winding) > 0.5, found < 0) and (found < 0).sum() > 2000
+    assert np.array_equal(np.abs(winding) > 0.5, distance < 0) and (distance < 0).sum() > 2000
 
 
 @pytest.mark.parametrize("name", ["spot", "castle"])
@@ -155,24 +155,24 @@ def test_the_channel_of_distances_is_libigl_s(name):
     igl = pytest.importorskip("igl", reason="the peer libigl is not installed")
     mesh = gv.read_mesh(shared(SHARED[name]))
     grid = Voxelizer(mesh, resolution=64, channels=("distance",), band=8)
-    found = grid.region((0, 0, 0), grid.extent[::-1])["distance"][..., 0]
-    assert found.dtype == torch.float32
-    near = (found.abs() < 0.999 * grid.band).nonzero().numpy()
+    distance = grid.region((0, 0, 0), grid.extent[::-1])["distance"][..., 0]
+    assert distance.dtype == torch.float32
+    near = (distance.abs() < 0.999 * grid.band).nonzero().numpy()
     near = np.random.default_rng(0).permutation(near)[:20_000]
     point = near[:, ::-1] * grid.spacing + np.array(grid.origin)
     squared, *_ = igl.point_mesh_squared_distance(point, mesh.vertices, mesh.faces)
     closed = mesh.faces[grid.geometry.mesh_face.numpy()][grid.geometry.solid.numpy()]
     inside = np.abs(igl.fast_winding_number(mesh.vertices, closed, point)) > 0.5
     expected = np.where(inside, -1, 1) * np.sqrt(squared)
-    apart = np.abs(found.numpy()[tuple(near.T)] - expected)
-    assert apart.max() < 1e-5 * grid.spacing and inside.sum() > 500
+    error = np.abs(distance.numpy()[tuple(near.T)] - expected)
+    assert error.max() < 1e-5 * grid.spacing and inside.sum() > 500
 
 
 def test_nested_and_crossing_parts_have_whole_winding_numbers():
-    one = meshes.sphere(3)
-    other = meshes.of_corners(one.corners * 0.5 + np.array((0.2, 0.0, 0.0)))
-    across = meshes.of_corners(one.corners + np.array((1.5, 0.0, 0.0)))
-    geometry = Geometry(meshes.joined(one, other, across))
+    outer = meshes.sphere(3)
+    inner = meshes.of_corners(outer.corners * 0.5 + np.array((0.2, 0.0, 0.0)))
+    across = meshes.of_corners(outer.corners + np.array((1.5, 0.0, 0.0)))
+    geometry = Geometry(meshes.joined(outer, inner, across))
     point = torch.tensor([[0.2, 0.1, 0.1], [-0.8, 0, 0.1], [0.8, 0.1, 0], [1.5, 0, 0.1], [3, 0, 0]])
     assert geometry.winding(point.double()).tolist() == [2, 1, 2, 1, 0]
 
@@ -180,8 +180,8 @@ def test_nested_and_crossing_parts_have_whole_winding_numbers():
 def test_rays_through_edges_and_corners_count_once():
     """Points whose rays meet edges and corners exactly: a grid through a box's corners."""
     mesh = meshes.box((0, 0, 0), (1, 1, 1))
-    at = torch.linspace(-0.5, 1.5, 9, dtype=torch.float64)
-    point = torch.cartesian_prod(at + 0.125, at, at)
+    axis = torch.linspace(-0.5, 1.5, 9, dtype=torch.float64)
+    point = torch.cartesian_prod(axis + 0.125, axis, axis)
     inside = ((point > 0) & (point < 1)).all(1)
     winding = Geometry(mesh).winding(point)
     sure = ~((point == 0) | (point == 1)).any(1)
@@ -200,43 +200,43 @@ def searched() -> tuple[gv.Mesh, torch.Tensor, torch.Tensor, torch.Tensor]:
     mesh = meshes.joined(meshes.torus(1.0, 0.4, (24, 12)), meshes.sheet(3, 2.0))
     low = torch.from_numpy(places(mesh, 40, 3))
     z, y, x = torch.meshgrid(*[torch.arange(8) * 0.1 + 0.05] * 3, indexing="ij")
-    place = (low[:, None] + torch.stack((x, y, z), -1).view(-1, 3)).view(-1, 3)
+    positions = (low[:, None] + torch.stack((x, y, z), -1).view(-1, 3)).view(-1, 3)
     corner = Geometry(mesh).corner
-    exact = torch.cat([distance_to(corner, part).amin(1) for part in place.split(2000)])
-    return mesh, low, place, exact
+    exact = torch.cat([distance_to(corner, part).amin(1) for part in positions.split(2000)])
+    return mesh, low, positions, exact
 
 
 @pytest.mark.parametrize("reach", [0.05, torch.inf])
 @pytest.mark.parametrize("detail", [0.0, 1.0])
 def test_the_search_misses_no_triangle(searched, reach, detail):
     """20,000 points, one by one and packed: the nearest triangle is that of brute force."""
-    mesh, low, place, exact = searched
+    mesh, low, positions, exact = searched
     geometry = Geometry(mesh)
     geometry.detail = detail
     size = torch.tensor([0.1, 0.1, reach], dtype=torch.float64).expand(len(low), 3).contiguous()
-    found = geometry.cubes(low, size, 8, 0.0, shares=False, weights=True, wide=False)
+    results = geometry.cubes(low, size, 8, 0.0, shares=False, weights=True, wide=False)
     near = exact < reach * (1 - 1e-5)
-    distance, face = 0.1 * found.distance.view(-1), found.nearest.view(-1).long()
+    distance, face = 0.1 * results.distance.view(-1), results.nearest.view(-1).long()
     assert (distance[near] - exact[near]).abs().max() < 1e-5
     assert (face[exact > reach * (1 + 1e-5)] == -1).all() and near.sum() > 300
     # The weights give the position itself.
-    at = (found.weight.view(-1, 3, 1) * geometry.corner[face.clamp(min=0)]).sum(1)
-    assert ((at - place).norm(dim=1) - exact)[near].abs().max() < 1e-5
+    nearest = (results.weight.view(-1, 3, 1) * geometry.corner[face.clamp(min=0)]).sum(1)
+    assert ((nearest - positions).norm(dim=1) - exact)[near].abs().max() < 1e-5
 
 
-def distance_to(corner: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
+def distance_to(corner: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
     """Returns distances (p, f) by projection on the plane, or by dense points along edges."""
     a, b, c = corner.unbind(1)
     normal = torch.linalg.cross(b - a, c - a)
     unit = normal / normal.norm(dim=1, keepdim=True)
-    best = torch.full((len(place), len(corner)), torch.inf, dtype=torch.float64)
+    best = torch.full((len(positions), len(corner)), torch.inf, dtype=torch.float64)
     inside = torch.ones_like(best, dtype=torch.bool)
     for p, q in ((a, b), (b, c), (c, a)):
-        way = place[:, None] - p
-        along = ((way * (q - p)).sum(2) / ((q - p) ** 2).sum(1)).clamp(0, 1)
-        best = torch.minimum(best, (way - along[..., None] * (q - p)).norm(dim=2))
-        inside &= (torch.linalg.cross((q - p).expand_as(way), way) * unit).sum(2) >= 0
-    plane = ((place[:, None] - a) * unit).sum(2).abs()
+        offset = positions[:, None] - p
+        along = ((offset * (q - p)).sum(2) / ((q - p) ** 2).sum(1)).clamp(0, 1)
+        best = torch.minimum(best, (offset - along[..., None] * (q - p)).norm(dim=2))
+        inside &= (torch.linalg.cross((q - p).expand_as(offset), offset) * unit).sum(2) >= 0
+    plane = ((positions[:, None] - a) * unit).sum(2).abs()
     return torch.where(inside, plane, best)
 
 
@@ -281,8 +281,8 @@ def test_area_of_sheets_is_right_to_a_hundredth():
             grid = Voxelizer(mesh, resolution=256)
             thick = thickness * grid.spacing
             rim = 0.25 * np.pi * thick**2 / 2 * 4  # borders are round: half a disc along them
-            found = sums(mesh, 256, thickness=thickness)
-            assert found == pytest.approx(meshes.area(mesh) * thick, rel=0.01, abs=2 * rim)
+            actual = sums(mesh, 256, thickness=thickness)
+            assert actual == pytest.approx(meshes.area(mesh) * thick, rel=0.01, abs=2 * rim)
 
 
 @pytest.mark.parametrize("name", ["bunny", "spot"])
@@ -295,7 +295,7 @@ def test_volume_of_the_closed_parts_of_a_castle():
     """Two parts that cross, each one alone."""
     mesh = gv.read_mesh(shared(SHARED["castle"]))
     geometry = Geometry(mesh)
-    closed = meshes.parts(mesh.only(geometry.mesh_face.numpy()[geometry.solid.numpy()]))
+    closed = meshes.components(mesh.only(geometry.mesh_face.numpy()[geometry.solid.numpy()]))
     assert [len(part.faces) for part in closed] == [98, 200]
     for part in closed:
         assert sums(part, 96) == pytest.approx(meshes.volume(part), rel=1e-3)
@@ -306,14 +306,14 @@ def test_area_of_an_open_scan():
     for name in ("open bunny", "bunny"):
         mesh = gv.read_mesh(shared(SHARED[name]))
         grid = Voxelizer(mesh, resolution=160, solid="never")
-        found = sums(mesh, 160, solid="never") / grid.thickness
-        assert found == pytest.approx(meshes.area(mesh), rel=0.01)
+        actual = sums(mesh, 160, solid="never") / grid.thickness
+        assert actual == pytest.approx(meshes.area(mesh), rel=0.01)
 
 
 def test_a_region_is_the_same_in_parts_and_whole():
     mesh = meshes.torus(1.0, 0.4, (48, 24))
-    told = {"resolution": 90, "channels": ("coverage", "distance", "color", "normal", "material")}
-    grid = Voxelizer(mesh, **told)
+    fields = {"resolution": 90, "channels": ("coverage", "distance", "color", "normal", "material")}
+    grid = Voxelizer(mesh, **fields)
     x, y, z = grid.extent
     whole = grid.region((0, 0, 0), (z, y, x))
     part = grid.region((3, 17, 40), (20, 60, 71))
@@ -326,18 +326,20 @@ def test_channels_are_those_of_a_sphere():
         meshes.sphere(6), resolution=64, channels=("distance", "normal", "coverage"), band=5
     )
     x, y, z = grid.extent
-    found = grid.region((0, 0, 0), (z, y, x))
-    at = [torch.arange(n) * grid.spacing + o for n, o in zip(grid.extent, grid.origin, strict=True)]
-    z, y, x = torch.meshgrid(at[2], at[1], at[0], indexing="ij")
-    place = torch.stack((x, y, z), -1)
-    radius = place.norm(dim=-1)
+    voxels = grid.region((0, 0, 0), (z, y, x))
+    axis = [
+        torch.arange(n) * grid.spacing + o for n, o in zip(grid.extent, grid.origin, strict=True)
+    ]
+    z, y, x = torch.meshgrid(axis[2], axis[1], axis[0], indexing="ij")
+    positions = torch.stack((x, y, z), -1)
+    radius = positions.norm(dim=-1)
     exact = (radius - 1).clamp(-grid.band, grid.band)
-    assert (found["distance"][..., 0] - exact).abs().max() < 1e-3
+    assert (voxels["distance"][..., 0] - exact).abs().max() < 1e-3
     near = (radius - 1).abs() < 0.9 * grid.band
-    unit = place[near] / radius[near][:, None]
-    assert (found["normal"][near] / 127 - unit).norm(dim=1).max() < 0.03
-    assert (found["normal"][(radius - 1).abs() > 1.1 * grid.band] == 0).all()
-    covered = found["coverage"][..., 0]
+    unit = positions[near] / radius[near][:, None]
+    assert (voxels["normal"][near] / 127 - unit).norm(dim=1).max() < 0.03
+    assert (voxels["normal"][(radius - 1).abs() > 1.1 * grid.band] == 0).all()
+    covered = voxels["coverage"][..., 0]
     assert (covered[radius < 0.9] == 255).all() and (covered[radius > 1.1] == 0).all()
 
 
@@ -357,19 +359,19 @@ def test_colours_come_of_textures_corners_and_materials():
     )
     grid = Voxelizer(mesh, resolution=68, channels=("color", "material", "coverage"))
     x, y, z = grid.extent
-    found = grid.region((0, 0, 0), (z, y, x))
+    voxels = grid.region((0, 0, 0), (z, y, x))
     middle = z // 2
-    color = found["color"][middle].float()
+    color = voxels["color"][middle].float()
     opacity = color[..., 3:].clamp(min=0.1)
-    assert (color[..., 3] * 255 - found["coverage"][middle, ..., 0]).abs().max() < 1
+    assert (color[..., 3] * 255 - voxels["coverage"][middle, ..., 0]).abs().max() < 1
     straight = color[..., :3] / opacity
     red, green, blue, black = (straight[r, c] for r, c in ((50, 18), (50, 50), (18, 18), (18, 50)))
     assert torch.allclose(red, torch.tensor([0.5, 0.0, 0.0]), atol=0.02)
     assert torch.allclose(green, torch.tensor([0.0, 0.4, 0.0]), atol=0.02)
     assert torch.allclose(blue, torch.tensor([0.0, 0.0, 0.5]), atol=0.02)
     assert black.abs().max() < 0.02
-    material = found["material"][middle, 4:-4, 4:-4]
-    assert (material[found["coverage"][middle, 4:-4, 4:-4] > 127] == 1).all() and material.any()
+    material = voxels["material"][middle, 4:-4, 4:-4]
+    assert (material[voxels["coverage"][middle, 4:-4, 4:-4] > 127] == 1).all() and material.any()
 
 
 # --- Bad input
@@ -381,7 +383,7 @@ def test_bad_meshes_are_told_in_a_line():
     nan[3, 1] = np.nan
     far = box.faces.copy()
     far[2, 0] = 8
-    for given, said in (
+    for changes, message in (
         ({"faces": np.zeros((0, 3))}, "has no triangles"),
         ({"vertices": nan}, "are NaN or infinite"),
         ({"faces": far}, "refers to vertex 8, there are 8"),
@@ -392,16 +394,16 @@ def test_bad_meshes_are_told_in_a_line():
         ({"vertices": np.zeros((8, 2))}, "vertices must be (n, 3)"),
         ({"uv": np.zeros((3, 3, 2))}, "uv must be (12, 3, 2)"),
     ):
-        told = {"vertices": box.vertices, "faces": box.faces} | given
+        fields = {"vertices": box.vertices, "faces": box.faces} | changes
         with pytest.raises(ValueError, match="mesh: ") as error:
-            gv.Mesh(**told)
-        assert said in str(error.value) and "\n" not in str(error.value)
+            gv.Mesh(**fields)
+        assert message in str(error.value) and "\n" not in str(error.value)
     with pytest.raises(ValueError, match="no triangle has three corners"):
         Voxelizer(gv.Mesh(vertices=box.vertices, faces=[[0, 1, 1]]))
 
 
 def test_bad_settings_are_told_in_a_line():
-    for told, said in (
+    for options, message in (
         ({"resolution": 4}, "resolution must be"),
         ({"channels": ("colour",)}, "channels must be some of coverage"),
         ({"channels": ()}, "channels must be some of"),
@@ -409,8 +411,8 @@ def test_bad_settings_are_told_in_a_line():
         ({"thickness": 0.0}, "thickness must be"),
     ):
         with pytest.raises(ValueError, match="voxelize: ") as error:
-            Voxelizer(meshes.box(), **told)
-        assert said in str(error.value)
+            Voxelizer(meshes.box(), **options)
+        assert message in str(error.value)
 
 
 def test_float32_s_end_does_not_matter():
@@ -419,9 +421,9 @@ def test_float32_s_end_does_not_matter():
     shift = np.array([2.0**20, -(2.0**19), 2.0**18])
     rounded = meshes.of_corners(np.round(ball.corners * 2**20) / 2**20)
     small = meshes.of_corners(rounded.corners * 2.0**-4 + shift)
-    one, other = (Voxelizer(mesh, resolution=40) for mesh in (rounded, small))
-    whole = ((0, 0, 0), one.extent[::-1])
-    first, second = (grid.region(*whole)["coverage"].int() for grid in (one, other))
+    a, b = (Voxelizer(mesh, resolution=40) for mesh in (rounded, small))
+    whole = ((0, 0, 0), a.extent[::-1])
+    first, second = (grid.region(*whole)["coverage"].int() for grid in (a, b))
     assert (first - second).abs().max() <= 1 and first.max() == 255
 
 
@@ -429,5 +431,5 @@ def test_gz_is_what_it_packs(tmp_path):
     text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     (tmp_path / "a.obj").write_text(text)
     (tmp_path / "b.obj.gz").write_bytes(gzip.compress(text.encode()))
-    one, other = gv.read_mesh(tmp_path / "a.obj"), gv.read_mesh(tmp_path / "b.obj.gz")
-    assert np.array_equal(one.corners, other.corners) and meshes.volume(one) == pytest.approx(1 / 6)
+    a, b = gv.read_mesh(tmp_path / "a.obj"), gv.read_mesh(tmp_path / "b.obj.gz")
+    assert np.array_equal(a.corners, b.corners) and meshes.volume(a) == pytest.approx(1 / 6)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.stores import read
+from helpers.stores import read_with_warnings
 
 import gvtorch as gv
 from gvtorch.base.image_info import ChannelInfo
@@ -29,7 +29,7 @@ def test_units_of_nifti(tmp_path, units, expected):
     image.header.set_xyzt_units(*units)
     image.header["pixdim"][4] = 1.5
     nibabel.save(image, tmp_path / "a.nii")
-    volume, told = read(tmp_path / "a.nii", time=1)
+    volume, told = read_with_warnings(tmp_path / "a.nii", time=1)
     assert (volume.info.unit, volume.info.time_unit) == expected and not told
     assert volume.info.time_step == 1.5 and volume.info.space == "right-anterior-superior"
     assert volume.describe().get("unit") == expected[0]
@@ -43,7 +43,7 @@ def test_simpleitk_writes_nifti_that_comes_back(tmp_path):
     image.SetOrigin((10, 20, 30))
     for ending in ("nii", "nii.gz", "nrrd"):
         sitk.WriteImage(image, str(tmp_path / f"a.{ending}"))
-        volume, told = read(tmp_path / f"a.{ending}")
+        volume, told = read_with_warnings(tmp_path / f"a.{ending}")
         assert not told and volume.spacing == (0.5, 1.5, 2.5)
         found = volume.data[..., 0].numpy()
         if ending == "nrrd":  # in the file's space
@@ -55,13 +55,13 @@ def test_simpleitk_writes_nifti_that_comes_back(tmp_path):
             assert np.array_equal(found, data[:, ::-1, ::-1])
     moving = sitk.JoinSeries([image, image + 7], 0.0, 4.0)
     sitk.WriteImage(moving, str(tmp_path / "t.nii"))
-    volume, _ = read(tmp_path / "t.nii", time=1)
+    volume, _ = read_with_warnings(tmp_path / "t.nii", time=1)
     assert np.array_equal(volume.data[..., 0].numpy(), (data + 7)[:, ::-1, ::-1])
     assert volume.info.time_step == 4.0
     vector = sitk.Compose(image, image + 1, image + 2)
     for ending in ("nii", "nrrd"):
         sitk.WriteImage(vector, str(tmp_path / f"v.{ending}"))
-        volume, _ = read(tmp_path / f"v.{ending}")
+        volume, _ = read_with_warnings(tmp_path / f"v.{ending}")
         turned = data if ending == "nrrd" else data[:, ::-1, ::-1]
         expected = np.stack([turned, turned + 1, turned + 2], -1)
         assert np.array_equal(volume.data.numpy(), expected)
@@ -74,7 +74,7 @@ def test_what_a_nifti_header_tells_beside(tmp_path):
     image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", b"hello"))
     image.set_qform(np.diag([3, 3, 3, 1]), code=1)
     nibabel.save(image, tmp_path / "a.nii")
-    volume, told = read(tmp_path / "a.nii")
+    volume, told = read_with_warnings(tmp_path / "a.nii")
     assert volume.info.channels == (ChannelInfo(window=(-100, 300)),)
     assert told == [
         f"{tmp_path}/a.nii: not kept: the qform, which differs from the sform; 1 header extensions"
@@ -82,7 +82,7 @@ def test_what_a_nifti_header_tells_beside(tmp_path):
     content = bytearray((tmp_path / "a.nii").read_bytes())
     content[123] = 7  # xyzt_units
     (tmp_path / "b.nii").write_bytes(content)
-    assert "xyzt_units 7, which are none" in read(tmp_path / "b.nii")[1][0]
+    assert "xyzt_units 7, which are none" in read_with_warnings(tmp_path / "b.nii")[1][0]
 
 
 def test_colours_of_nifti(tmp_path):
@@ -92,7 +92,7 @@ def test_colours_of_nifti(tmp_path):
     nibabel.save(
         nibabel.Nifti1Image(rgb.view(kind).reshape(4, 5, 6), np.eye(4)), tmp_path / "a.nii.gz"
     )
-    volume, _ = read(tmp_path / "a.nii.gz")
+    volume, _ = read_with_warnings(tmp_path / "a.nii.gz")
     assert np.array_equal(volume.data.numpy(), rgb.transpose(2, 1, 0, 3))
     assert [channel.name for channel in volume.info.channels] == ["red", "green", "blue"]
 
@@ -109,7 +109,7 @@ def test_ends_of_axes_of_nrrd(tmp_path, centers, spacing, origin):
     told = f"axis mins: 1 2 3\naxis maxs: 3 8 15\ncenters: {centers} {centers} {centers}\n"
     head = f"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 4 6 6\nencoding: raw\n{told}\n"
     (tmp_path / "a.nrrd").write_bytes(head.encode() + bytes(144))
-    volume, _ = read(tmp_path / "a.nrrd")
+    volume, _ = read_with_warnings(tmp_path / "a.nrrd")
     assert volume.spacing == pytest.approx(spacing) and volume.origin == pytest.approx(origin)
 
 
@@ -126,7 +126,7 @@ def test_kinds_units_and_space_of_nrrd(tmp_path):
         "modality": "CT",
     }
     nrrd.write(str(tmp_path / "a.nrrd"), data, header)
-    volume, told = read(tmp_path / "a.nrrd")
+    volume, told = read_with_warnings(tmp_path / "a.nrrd")
     assert np.array_equal(volume.data.numpy(), data.transpose(3, 2, 1, 0))
     assert volume.spacing == (2, 3, 4) and volume.info.quantity == "HU"
     assert (volume.info.unit, volume.info.space) == ("micrometer", "right-anterior-superior")
@@ -137,14 +137,16 @@ def test_kinds_units_and_space_of_nrrd(tmp_path):
         "units": ["mm", "mm", "mm", "ms"],
     }
     nrrd.write(str(tmp_path / "t.nrrd"), data, header)
-    volume, told = read(tmp_path / "t.nrrd", time=3)
+    volume, told = read_with_warnings(tmp_path / "t.nrrd", time=3)
     assert np.array_equal(volume.data[..., 0].numpy(), data[..., 3].T) and not told
     assert volume.spacing == (0.5, 0.6, 0.7) and volume.info.unit == "millimeter"
     assert (volume.info.time_step, volume.info.time_unit) == (20, "millisecond")
     nrrd.write(
         str(tmp_path / "u.nrrd"), data[0], {"space dimension": 3, "space units": ["furlong"] * 3}
     )
-    assert "units of space furlong, furlong, furlong" in read(tmp_path / "u.nrrd")[1][0]
+    assert (
+        "units of space furlong, furlong, furlong" in read_with_warnings(tmp_path / "u.nrrd")[1][0]
+    )
 
 
 def test_nrrd_without_kinds_is_asked_about(tmp_path):
@@ -153,9 +155,9 @@ def test_nrrd_without_kinds_is_asked_about(tmp_path):
     nrrd.write(str(tmp_path / "a.nrrd"), data, {"encoding": "raw"})
     with pytest.raises(ValueError, match=r"what are the axes of shape \(4, 5, 6, 7\)"):
         gv.read_volume(tmp_path / "a.nrrd")
-    volume, _ = read(tmp_path / "a.nrrd", axes="tzyx", time=2)
+    volume, _ = read_with_warnings(tmp_path / "a.nrrd", axes="tzyx", time=2)
     assert np.array_equal(volume.data[..., 0].numpy(), data[..., 2].T)
-    volume, _ = read(tmp_path / "a.nrrd", axes="zyxc")
+    volume, _ = read_with_warnings(tmp_path / "a.nrrd", axes="zyxc")
     assert np.array_equal(volume.data.numpy(), data.transpose(3, 2, 1, 0))
 
 
@@ -163,7 +165,7 @@ def test_nrrd_colours_have_names(tmp_path):
     nrrd = pytest.importorskip("nrrd")
     data = np.zeros((4, 5, 6, 7), np.uint8)
     nrrd.write(str(tmp_path / "a.nrrd"), data, {"kinds": ["RGBA-color", *["domain"] * 3]})
-    volume, _ = read(tmp_path / "a.nrrd")
+    volume, _ = read_with_warnings(tmp_path / "a.nrrd")
     assert [channel.name for channel in volume.info.channels] == ["red", "green", "blue", "alpha"]
 
 
@@ -189,7 +191,7 @@ def test_shapes_of_numpy_files(tmp_path, shape, axes, extent, width):
     np.save(tmp_path / "a.npy", data)
     np.savez_compressed(tmp_path / "b.npz", data, data)
     for name, options in (("a.npy", {}), ("b.npz", {"key": "arr_1"})):
-        volume, _ = read(tmp_path / name, axes=axes, time=0, **options)
+        volume, _ = read_with_warnings(tmp_path / name, axes=axes, time=0, **options)
         assert volume.extent == extent and volume.data.shape[3] == width
         letters = axes or "zyxc"[: len(shape)]
         place = {"t": 0, "c": width - 1, "z": extent[2] - 1, "y": 3, "x": 2}

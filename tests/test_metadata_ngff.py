@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.stores import noise, read, serving, write_foreign
+from helpers.stores import noise, read_with_warnings, serving, write_foreign
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -77,14 +77,14 @@ def test_what_ngff_holds_comes_back(tmp_path, info, times, spacing, origin, dtyp
         patch.setattr("gvtorch.io.stores.unfinished.fingerprint", lambda _: [])
         store = convert("a", tmp_path / "a.zarr", workers=1)
     yaozarrs.validate_zarr_store(str(tmp_path / "a.zarr"))
-    for found in (store, convert(tmp_path / "a.zarr", tmp_path / "b.zarr", workers=1)):
-        assert found.info == expected and not found.dropped
-        assert found.spacing == spacing and found.origin == origin and found.times == times
+    for reopened in (store, convert(tmp_path / "a.zarr", tmp_path / "b.zarr", workers=1)):
+        assert reopened.info == expected and not reopened.dropped
+        assert reopened.spacing == spacing and reopened.origin == origin and reopened.times == times
         for time in range(times):
-            region = Store.open(found.location, time=time).read_region(0, (0, 0, 0), (4, 5, 6))
+            region = Store.open(reopened.location, time=time).read_region(0, (0, 0, 0), (4, 5, 6))
             assert np.array_equal(region, data[time])
-    volume, told = read(tmp_path / "b.zarr", time=times - 1)
-    assert volume.info == expected and not told
+    volume, warned = read_with_warnings(tmp_path / "b.zarr", time=times - 1)
+    assert volume.info == expected and not warned
     assert volume.spacing == spacing and np.array_equal(volume.data.numpy(), data[-1])
 
 
@@ -148,15 +148,15 @@ def test_an_image_that_yaozarrs_wrote(tmp_path):
     write_image(tmp_path / "a.zarr", whole, data, labels={"nuclei": (label, data[0, 0])})
     with pytest.warns(UserWarning, match=r"a\.zarr: not kept: the labels labels/nuclei"):
         store = convert(tmp_path / "a.zarr", tmp_path / "b.zarr")
-    for found in (Store.open(tmp_path / "a.zarr"), store):
-        info = found.info
-        assert found.times == 3 and info.channels == TOLD
+    for opened in (Store.open(tmp_path / "a.zarr"), store):
+        info = opened.info
+        assert opened.times == 3 and info.channels == TOLD
         assert (info.unit, info.time_unit) == ("micrometer", "second")
         assert (info.time_step, info.time_origin) == (30, 60)
-        assert found.spacing == (0.25, 0.5, 2) and found.origin == (30, 20, 10)
+        assert opened.spacing == (0.25, 0.5, 2) and opened.origin == (30, 20, 10)
     assert Store.open(tmp_path / "a.zarr").dropped == ("the labels labels/nuclei",)
-    volume, told = read(tmp_path / "b.zarr", time=2)
-    assert np.array_equal(volume.data.numpy(), data[2].transpose(1, 2, 3, 0)) and not told
+    volume, warned = read_with_warnings(tmp_path / "b.zarr", time=2)
+    assert np.array_equal(volume.data.numpy(), data[2].transpose(1, 2, 3, 0)) and not warned
     nuclei = Store.open(tmp_path / "a.zarr", image="labels/nuclei")
     assert nuclei.info.labels and nuclei.dropped == ("colors of the labels",)
     series = {name: (image(axes, [1.0] * 5, [0] * 5), data) for name in ("0", "1")}
@@ -174,7 +174,7 @@ def test_an_image_that_ome_zarr_models_wrote(tmp_path):
     from pydantic_zarr.v2 import ArraySpec
 
     data = noise((2 * 9, 20, 30, 1), "int16")[..., 0].reshape(2, 9, 20, 30)
-    made = Image.new(
+    image = Image.new(
         array_specs=[ArraySpec.from_array(data, chunks=(1, 9, 16, 16))],
         paths=["full"],
         axes=[
@@ -185,15 +185,15 @@ def test_an_image_that_ome_zarr_models_wrote(tmp_path):
         translations=[[0, 1, 2, 3]],
         name="heart",
     )
-    group = made.to_zarr(zarr.storage.LocalStore(tmp_path / "a"), path="")
+    group = image.to_zarr(zarr.storage.LocalStore(tmp_path / "a"), path="")
     group["full"][...] = data
     store = convert(tmp_path / "a", tmp_path / "b.zarr")
     assert store.spacing == (1, 2, 3) and store.origin == (3, 2, 1) and store.times == 2
     assert (store.info.unit, store.info.time_unit) == ("millimeter", "hour")
     assert store.info.time_step == 0.5
     for time in range(2):
-        volume, told = read(tmp_path / "a", time=time)
-        assert np.array_equal(volume.data[..., 0].numpy(), data[time]) and not told
+        volume, warned = read_with_warnings(tmp_path / "a", time=time)
+        assert np.array_equal(volume.data[..., 0].numpy(), data[time]) and not warned
 
 
 def with_omero(folder: Path, omero: object, version: int) -> Path:
@@ -213,15 +213,15 @@ def test_channels_of_foreign_images(tmp_path, version):
     store = Store.open(folder)
     assert store.info.channels == TOLD and not store.dropped
     assert Store.open(folder, channels=[1]).info.channels == TOLD[1:]
-    volume, told = read(folder)
-    assert volume.info.channels == TOLD and not told
-    made = convert(folder, tmp_path / "b.zarr")
-    assert made.info.channels == TOLD
+    volume, warned = read_with_warnings(folder)
+    assert volume.info.channels == TOLD and not warned
+    converted = convert(folder, tmp_path / "b.zarr")
+    assert converted.info.channels == TOLD
     attributes = json.loads((tmp_path / "b.zarr/zarr.json").read_text())["attributes"]
     first = attributes["ome"]["omero"]["channels"][0]
     assert (first["label"], first["color"], first["active"]) == ("DAPI", "0000FF", True)
     assert (first["window"]["start"], first["window"]["end"]) == (200, 1500)
-    assert made.describe()["channel info"] == {
+    assert converted.describe()["channel info"] == {
         "0": "DAPI, #0000ff, 200 to 1500",
         "1": "GFP, #00ff00, 10.5 to 900, not shown at first",
     }
@@ -242,15 +242,15 @@ def test_channels_of_foreign_images(tmp_path, version):
 def test_damaged_channels_are_named_and_do_not_keep_it_shut(tmp_path, change, message):
     first, second = OMERO["channels"]
     folder = with_omero(tmp_path / "a", {"channels": [{**first, **change}, second]}, 3)
-    volume, (line,) = read(folder)
+    volume, (line,) = read_with_warnings(folder)
     assert message in line and "\n" not in line and volume.info.channels[1] == TOLD[1]
-    for omero, wanted in (
+    for omero, complaint in (
         ([], "holds no list of channels"),
         ({"channels": [first]}, "metadata of 1 channels, where there are 2"),
     ):
         with_omero(folder, omero, 3)
-        volume, (line,) = read(folder)
-        assert wanted in line and volume.info.channels == ()
+        volume, (line,) = read_with_warnings(folder)
+        assert complaint in line and volume.info.channels == ()
 
 
 def test_what_lies_beside_an_image_is_named(tmp_path):
@@ -262,30 +262,30 @@ def test_what_lies_beside_an_image_is_named(tmp_path):
     (several / ".zattrs").write_text('{"bioformats2raw.layout": 3}')
     (several / "OME").mkdir()
     (several / "OME/.zattrs").write_text('{"series": ["0", "1", "2"]}')
-    volume, (line,) = read(several)
+    volume, (line,) = read_with_warnings(several)
     assert "not kept: the images 1, 2 beside '0'" in line and volume.data[0, 0, 0] == data[0, 0, 0]
-    volume, told = read(several, key="2")
-    assert not told and volume.data[0, 0, 0, 0] == data[0, 0, 0] + 2
+    volume, warned = read_with_warnings(several, key="2")
+    assert not warned and volume.data[0, 0, 0, 0] == data[0, 0, 0] + 2
     assert convert(several, tmp_path / "one.zarr", key="1").info == ImageInfo()
     assert Store.open(tmp_path / "one.zarr").read_region(0, (0,) * 3, (1,) * 3) == data[0, 0, 0] + 1
     labels = write_foreign(tmp_path / "cells.zarr", [data], "zyx", [[1.0] * 3])
     write_foreign(labels / "labels/nuclei", [data], "zyx", [[1.0] * 3])
     group = {"zarr_format": 3, "node_type": "group", "attributes": {"ome": {"labels": ["nuclei"]}}}
     (labels / "labels/zarr.json").write_text(json.dumps(group))
-    assert "the labels labels/nuclei" in read(labels)[1][0]
-    assert read(labels, key="labels/nuclei")[1] == []
+    assert "the labels labels/nuclei" in read_with_warnings(labels)[1][0]
+    assert read_with_warnings(labels, key="labels/nuclei")[1] == []
     with serving(tmp_path) as url:
-        for place in (tmp_path, url):
-            assert read(f"{place}/cells.zarr:/labels/nuclei")[1] == []
+        for base in (tmp_path, url):
+            assert read_with_warnings(f"{base}/cells.zarr:/labels/nuclei")[1] == []
             with pytest.raises(ValueError, match="no image 'labels/none'"):
-                read(f"{place}/cells.zarr:/labels/none")
+                read_with_warnings(f"{base}/cells.zarr:/labels/none")
     (tmp_path / "plate").mkdir()
     (tmp_path / "plate/.zgroup").write_text('{"zarr_format": 2}')
     (tmp_path / "plate/.zattrs").write_text('{"plate": {}}')
     write_foreign(tmp_path / "plate/A/1/0", [data], "zyx", [[1.0] * 3], version=2)
     with pytest.raises(ValueError, match="it is a plate: name a field of view, as in 'A/1/0'"):
         gv.read_volume(tmp_path / "plate")
-    assert read(tmp_path / "plate", key="A/1/0")[0].extent == (8, 7, 6)
+    assert read_with_warnings(tmp_path / "plate", key="A/1/0")[0].extent == (8, 7, 6)
 
 
 def test_axes_and_units_of_other_kinds(tmp_path):
@@ -302,7 +302,7 @@ def test_axes_and_units_of_other_kinds(tmp_path):
     ]
     image["coordinateTransformations"] = [{"type": "rotation", "rotation": []}]
     file.write_text(json.dumps(content))
-    volume, (line,) = read(folder)
+    volume, (line,) = read_with_warnings(folder)
     assert np.array_equal(volume.data[..., 0].numpy(), data[0])
     assert volume.spacing == (4, 3, 2000) and volume.info.unit == "nanometer"
     assert "an axis that is none of t, c, z, y, x: the first of 3 is read" in line
@@ -310,7 +310,7 @@ def test_axes_and_units_of_other_kinds(tmp_path):
     image["axes"][0] = {"name": "lambda", "type": "channel"}
     image["axes"][1]["unit"] = "parsec"
     file.write_text(json.dumps(content))
-    volume, (line,) = read(folder)
+    volume, (line,) = read_with_warnings(folder)
     assert volume.data.shape[3] == 3 and volume.spacing == (4, 3, 2)
     assert "unit 'parsec' of z, where that of x is 'nanometer'" in line
 
@@ -331,12 +331,12 @@ def test_the_command_line_tells_and_names_components(tmp_path, capsys):
 
 def holders(value: Any) -> list[tuple[Any, Any]]:
     """Returns every position in a JSON value, as its container and key."""
-    found = []
+    pairs = []
     for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-        found.append((value, key))
+        pairs.append((value, key))
         if isinstance(inner, (dict, list)):
-            found += holders(inner)
-    return found
+            pairs += holders(inner)
+    return pairs
 
 
 def test_metadata_broken_anywhere_is_one_line(tmp_path):

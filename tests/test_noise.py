@@ -38,9 +38,9 @@ named = pytest.mark.parametrize("name", ALL)
 both = pytest.mark.parametrize("n", [2, 3])
 
 
-def close(found: torch.Tensor, expected: list[float]) -> None:
+def close(actual: torch.Tensor, expected: list[float]) -> None:
     right = torch.tensor(expected, dtype=torch.float64)
-    torch.testing.assert_close(found, right, atol=1e-11, rtol=0)
+    torch.testing.assert_close(actual, right, atol=1e-11, rtol=0)
 
 
 def random_points(count: int, n: int, dtype=torch.float64, size: float = 40.0) -> torch.Tensor:
@@ -54,15 +54,15 @@ def test_noise_is_that_of_plain_numpy(name, n):
     points = random_points(300, n)
     points[:20] = points[:20].round()  # the lattice itself
     expected = [PLAIN[name](point, seed=5) for point in points.tolist()]
-    found = ALL[name](points, seed=5)
+    actual = ALL[name](points, seed=5)
     torch.testing.assert_close(
-        found, torch.tensor(expected, dtype=torch.float64), atol=1e-12, rtol=0
+        actual, torch.tensor(expected, dtype=torch.float64), atol=1e-12, rtol=0
     )
     narrow = ALL[name](points.float(), seed=5)
     assert narrow.dtype == torch.float32
     # float32 resolves positions to 2^-20 here; that times the slope, plus rounding of the sums.
     slope = noise.bounds(ALL[name], n).slope
-    assert (narrow - found).abs().max() < slope * n * 2.0**-20
+    assert (narrow - actual).abs().max() < slope * n * 2.0**-20
 
 
 @named
@@ -70,9 +70,9 @@ def test_periodic_noise_is_that_of_plain_numpy(name):
     points = random_points(100, 3)
     period = (6, 3, 9)
     expected = [PLAIN[name](point, seed=1, period=period) for point in points.tolist()]
-    found = ALL[name](points, seed=1, period=period)
+    actual = ALL[name](points, seed=1, period=period)
     torch.testing.assert_close(
-        found, torch.tensor(expected, dtype=torch.float64), atol=1e-12, rtol=0
+        actual, torch.tensor(expected, dtype=torch.float64), atol=1e-12, rtol=0
     )
 
 
@@ -85,7 +85,7 @@ def test_periods_are_exact(name, n):
     points = (random_points(2000, n) * 64).round() / 64  # so that the shift is exact
     random = torch.Generator().manual_seed(1)
     shift = torch.randint(-4, 5, points.shape, generator=random) * torch.tensor(period)
-    here, there = (ALL[name](one, period=period) for one in (points, points + shift))
+    here, there = (ALL[name](p, period=period) for p in (points, points + shift))
     if name == "simplex":  # the skew rounds differently there
         torch.testing.assert_close(here, there, atol=1e-11, rtol=0)
     else:
@@ -103,7 +103,7 @@ def test_sums_repeat_with_the_period_of_their_first_octave(n):
 
 
 @pytest.mark.parametrize(
-    ("name", "own"),
+    ("name", "changes"),
     [
         ("fbm", {}),
         ("turbulence", {}),
@@ -112,14 +112,14 @@ def test_sums_repeat_with_the_period_of_their_first_octave(n):
         ("warp", {"amplitude": 0.3}),
     ],
 )
-def test_fractal_sums_are_those_of_plain_numpy(name, own):
+def test_fractal_sums_are_those_of_plain_numpy(name, changes):
     """At 10^3 points; one sharpness clamps the weights of ridges to 1, the other hardly does."""
     points = random_points(1000, 3)
-    options = {"octaves": 3, "lacunarity": 1.9, "gain": 0.6, "seed": 3, **own}
+    options = {"octaves": 3, "lacunarity": 1.9, "gain": 0.6, "seed": 3, **changes}
     expected = [getattr(numpy_noise, name)(point, **options) for point in points.tolist()]
-    found = getattr(noise, name)(points, **options)
+    actual = getattr(noise, name)(points, **options)
     right = torch.tensor(expected, dtype=torch.float64)
-    torch.testing.assert_close(found, right, atol=1e-11, rtol=0)
+    torch.testing.assert_close(actual, right, atol=1e-11, rtol=0)
     assert right.std() > 0.1
 
 
@@ -143,7 +143,7 @@ def test_slopes_hold_at_a_million_points(name, n):
         points = random_points(100_000, n)
         step = torch.randn(points.shape, generator=random, dtype=torch.float64)
         step *= 1e-5 / step.norm(dim=1, keepdim=True)
-        ends = (ALL[name](one, seed=seed) for one in (points - step, points + step))
+        ends = (ALL[name](p, seed=seed) for p in (points - step, points + step))
         rise = (next(ends) - next(ends)).abs().max() / 2e-5
         steepest = max(steepest, float(rise))
     assert steepest <= slope * (1 + 1e-6)
@@ -166,12 +166,12 @@ def test_bounds_of_gradient_noise_are_met_by_the_best_gradients(n, height, slope
         steep += float((edges @ (_weight(half, corner) * u + change * (half - corner))).max())
     assert len(edges) >= 8 and high == pytest.approx(height, abs=1e-6)
     assert steep == pytest.approx(slope, abs=1e-9)
-    found = noise.bounds(noise.perlin, n)
-    assert found.high == pytest.approx(height, abs=1e-5) and found.slope == slope
+    bounds = noise.bounds(noise.perlin, n)
+    assert bounds.high == pytest.approx(height, abs=1e-5) and bounds.slope == slope
 
 
-def _weight(place: torch.Tensor, corner: torch.Tensor) -> torch.Tensor:
-    fade = twin.fade(place)
+def _weight(position: torch.Tensor, corner: torch.Tensor) -> torch.Tensor:
+    fade = twin.fade(position)
     return torch.where(corner == 1, fade, 1 - fade).prod()
 
 
@@ -190,11 +190,11 @@ def test_bounds_of_sums_hold():
 
 def test_bits_are_those_that_they_always_were():
     """On every device and in every version: points of whole numbers, hashed with their values."""
-    at = torch.arange(3 * 4096, dtype=torch.float32).view(-1, 3)
-    points = (at * 0.37109375) % 17 - 8.5
-    words = [getattr(noise, name)(points, seed=9) for name in ("perlin", "value", "cellular")]
-    told = hashlib.sha256(torch.stack(words).numpy().tobytes()).hexdigest()
-    assert told[:16] == "c835f2927ff0d01e"
+    index = torch.arange(3 * 4096, dtype=torch.float32).view(-1, 3)
+    points = (index * 0.37109375) % 17 - 8.5
+    values = [getattr(noise, name)(points, seed=9) for name in ("perlin", "value", "cellular")]
+    digest = hashlib.sha256(torch.stack(values).numpy().tobytes()).hexdigest()
+    assert digest[:16] == "c835f2927ff0d01e"
 
 
 @named
@@ -213,23 +213,23 @@ def test_neither_chunks_nor_shapes_change_bits(name):
 
 def test_seeds_are_noises_apart():
     points = random_points(100_000, 3, torch.float32)
-    found = torch.stack([noise.perlin(points, seed=seed) for seed in (0, 1, 2, -1, 2**40)])
-    assert found.corrcoef().fill_diagonal_(0).abs().max() < 0.02
+    values = torch.stack([noise.perlin(points, seed=seed) for seed in (0, 1, 2, -1, 2**40)])
+    assert values.corrcoef().fill_diagonal_(0).abs().max() < 0.02
 
 
 def test_hashes_of_neighbours_share_nothing():
     """Each used bit is set half of the time, and flips half of the time from one lattice point to
     the next.
     """
-    at = torch.arange(-32, 32, dtype=torch.int32)
-    x, y, z = (twin.scramble(at, salt) for salt in twin.salts(4))
-    words = twin.join(twin.join(x, y[:, None]), z[:, None, None])
-    bits = (words[..., None] >> torch.arange(2, 32)) & 1
+    index = torch.arange(-32, 32, dtype=torch.int32)
+    x, y, z = (twin.scramble(index, salt) for salt in twin.salts(4))
+    hashes = twin.join(twin.join(x, y[:, None]), z[:, None, None])
+    bits = (hashes[..., None] >> torch.arange(2, 32)) & 1
     assert (bits.double().mean((0, 1, 2)) - 0.5).abs().max() < 0.01
     for axis in range(3):
         flips = bits.diff(dim=axis).abs().double().mean((0, 1, 2))
         assert (flips - 0.5).abs().max() < 0.01
-    edges = torch.stack(twin.gradient(words, torch.float32), -1).view(-1, 3)
+    edges = torch.stack(twin.gradient(hashes, torch.float32), -1).view(-1, 3)
     kinds, counts = edges.unique(dim=0, return_counts=True)
     assert len(kinds) == 12 and bool((edges.abs().sum(1) == 2).all())
     assert (counts / len(edges) - 1 / 12).abs().max() < 0.002
@@ -237,8 +237,8 @@ def test_hashes_of_neighbours_share_nothing():
 
 def test_gradient_noise_has_the_gradients_of_autograd():
     points = random_points(20, 3).requires_grad_()
-    for one in (noise.perlin, noise.simplex, noise.value, noise.fbm):
-        assert torch.autograd.gradcheck(one, points)
+    for function in (noise.perlin, noise.simplex, noise.value, noise.fbm):
+        assert torch.autograd.gradcheck(function, points)
 
 
 @pytest.mark.parametrize("name", ["perlin", "simplex", "cellular", "fbm", "warp"])

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 
 import pytest
-from helpers.compiled import ADD, write
+from helpers.compiled import ADD, write_header
 
 from gvtorch.cpp_ext import compilers, user
 
@@ -32,7 +32,7 @@ def test_what_only_cuda_includes_counts_and_no_name_comes_to_a_shell(tmp_path, c
     """A file that is included by a macro, and only in CUDA code."""
     folder = tmp_path / "a b;touch $(touch beside)`touch beside`"
     folder.mkdir()
-    header = write(folder, ADD.replace("COLOR", "kColor"), "own $(touch here);'\".h")
+    header = write_header(folder, ADD.replace("COLOR", "kColor"), "own $(touch here);'\".h")
     part = folder / "part.h"
     part.write_text("constexpr float kColor = 0.5f;\n")
     ways = '#ifdef __CUDACC__\n#define PART "part.h"\n#include PART\n#else\n'
@@ -52,7 +52,7 @@ def test_what_only_cuda_includes_counts_and_no_name_comes_to_a_shell(tmp_path, c
 
 
 def test_what_nvcc_says_names_the_file(tmp_path, cache):
-    header = write(tmp_path, "  int broken = nothing;")
+    header = write_header(tmp_path, "  int broken = nothing;")
     with pytest.raises(user.CompileError, match="did not compile for CUDA") as caught:
         user.compiled(user.ShaderSource.read(header, "Own"), ARCHS)
     assert f"{header}" in str(caught.value) and "nothing" in str(caught.value)

@@ -25,15 +25,15 @@ SIZE = (14, 11, 9)  # voxels along the stored axes
 
 def turn(degrees: tuple[float, float, float]) -> np.ndarray:
     """Returns the rotation about x, then y, then z."""
-    made = np.eye(3)
+    matrix = np.eye(3)
     for axis, angle in enumerate(np.radians(degrees)):
         cos, sin = np.cos(angle), np.sin(angle)
         a, b = [n for n in range(3) if n != axis]
-        one = np.eye(3)
-        one[a, a] = one[b, b] = cos
-        one[a, b], one[b, a] = -sin, sin
-        made = one @ made
-    return made
+        rotation = np.eye(3)
+        rotation[a, a] = rotation[b, b] = cos
+        rotation[a, b], rotation[b, a] = -sin, sin
+        matrix = rotation @ matrix
+    return matrix
 
 
 def affine_of(degrees, spacing=(1.0, 1.0, 1.0), origin=(5.0, -7.0, 11.0)) -> np.ndarray:
@@ -77,8 +77,8 @@ def read(path: Path, **options) -> gv.Volume:
 
 def assert_is_ramp(volume: gv.Volume, affine: np.ndarray, size, slope) -> None:
     """Asserts that inside the stored centres values are a linear function of the world."""
-    at = inner_index(volume, affine)
-    inside = ((at >= 0) & (at <= np.array(size) - 1)).all(-1)
+    index = inner_index(volume, affine)
+    inside = ((index >= 0) & (index <= np.array(size) - 1)).all(-1)
     expected = centers(volume) @ slope + 3
     assert inside.sum() > 0.4 * np.prod(size)
     assert np.abs(volume.data[..., 0].numpy() - expected)[inside].max() < 1e-3
@@ -101,25 +101,25 @@ def test_a_linear_ramp_stays_at_its_place(tmp_path, ending, degrees):
     low = np.array(volume.origin) - np.array(volume.spacing) / 2
     high = low + np.array(volume.spacing) * volume.extent
     corners = np.stack(np.meshgrid(*[(-0.5, n - 0.5) for n in SIZE], indexing="ij"), -1)
-    places = corners.reshape(-1, 3) @ affine[:3, :3].T + affine[:3, 3]
-    assert (places >= low - 1e-4).all() and (places <= high + 1e-4).all(), "the whole box"
-    assert (high - low <= np.ptp(places, 0) + np.array(volume.spacing)).all(), "and no more"
-    at = inner_index(volume, affine)
-    beside = ((at < -0.51) | (at > np.array(SIZE) - 0.49)).any(-1)
-    assert beside.any() and (volume.data[..., 0].numpy()[beside] == data.min()).all()
+    positions = corners.reshape(-1, 3) @ affine[:3, :3].T + affine[:3, 3]
+    assert (positions >= low - 1e-4).all() and (positions <= high + 1e-4).all(), "the whole box"
+    assert (high - low <= np.ptp(positions, 0) + np.array(volume.spacing)).all(), "and no more"
+    index = inner_index(volume, affine)
+    outside = ((index < -0.51) | (index > np.array(SIZE) - 0.49)).any(-1)
+    assert outside.any() and (volume.data[..., 0].numpy()[outside] == data.min()).all()
 
 
 def test_as_torch_interpolates(tmp_path):
     affine = affine_of((12, -20, 33), (1.0, 0.8, 2.0))
     data = np.random.default_rng(3).normal(size=SIZE).astype(np.float32)
     volume = read(save(tmp_path / "a.nii", data, affine))
-    at = inner_index(volume, nibabel.load(tmp_path / "a.nii").affine)
-    unit = torch.from_numpy(2 * at / (np.array(SIZE) - 1) - 1)  # -1 to 1 between the centres
+    index = inner_index(volume, nibabel.load(tmp_path / "a.nii").affine)
+    unit = torch.from_numpy(2 * index / (np.array(SIZE) - 1) - 1)  # -1 to 1 between the centres
     values = torch.from_numpy(data.T.astype(np.float64))[None, None]
     expected = torch.nn.functional.grid_sample(
         values, unit[None], padding_mode="border", align_corners=True
     )[0, 0].numpy()
-    inside = ((at > -0.499) & (at < np.array(SIZE) - 0.501)).all(-1)
+    inside = ((index > -0.499) & (index < np.array(SIZE) - 0.501)).all(-1)
     assert inside.sum() > 500
     assert np.abs(volume.data[..., 0].numpy() - expected)[inside].max() < 1e-4
 
@@ -131,41 +131,41 @@ def test_as_simpleitk_resamples(tmp_path):
     data = np.random.default_rng(4).integers(-900, 900, SIZE).astype(np.int16)
     path = save(tmp_path / "a.nii.gz", data, affine)
     volume, image = read(path), sitk.ReadImage(str(path))
-    found, expected = [], []
-    places = centers(volume)
+    actual, expected = [], []
+    positions = centers(volume)
     index = inner_index(volume, affine)
     inside = ((index > 0.01) & (index < np.array(SIZE) - 1.01)).all(-1)
-    for place in np.argwhere(inside)[::23]:
-        x, y, z = places[tuple(place)]
-        at = image.TransformPhysicalPointToContinuousIndex((-x, -y, z))  # ITK's world is LPS
-        expected.append(image.EvaluateAtContinuousIndex(at, sitk.sitkLinear))
-        found.append(float(volume.data[(*place, 0)]))
-    assert len(found) > 20 and np.abs(np.subtract(found, expected)).max() <= 0.51, "rounded"
+    for voxel in np.argwhere(inside)[::23]:
+        x, y, z = positions[tuple(voxel)]
+        itk_index = image.TransformPhysicalPointToContinuousIndex((-x, -y, z))  # ITK's world is LPS
+        expected.append(image.EvaluateAtContinuousIndex(itk_index, sitk.sitkLinear))
+        actual.append(float(volume.data[(*voxel, 0)]))
+    assert len(actual) > 20 and np.abs(np.subtract(actual, expected)).max() <= 0.51, "rounded"
 
 
 def test_steps_are_as_long_as_voxels_in_their_direction():
     shape = (40, 40, 10)
-    told = place_axes("a", affine_of((5, 0, 0), (0.5, 0.5, 5)), shape)
+    fields = place_axes("a", affine_of((5, 0, 0), (0.5, 0.5, 5)), shape)
     source = MemorySource.of(np.zeros((10, 40, 40, 1), np.int16), path="a")
-    told.pop("axes")
+    fields.pop("axes")
     with pytest.warns(UserWarning, match=r"turned by 5 degrees: resampled .*oblique='keep'"):
-        found = straighten(source.__class__(**{**vars(source), **told}))
-    x, y, z = found.spacing
+        straightened = straighten(source.__class__(**{**vars(source), **fields}))
+    x, y, z = straightened.spacing
     assert x == 0.5 and y == pytest.approx(0.502, abs=1e-3) and 3 < z < 5
     with pytest.warns(UserWarning, match="45 degrees"):
-        told = place_axes("a", affine_of((0, 45, 0), (2, 2, 2)), shape)
-        told.pop("axes")
-        found = straighten(source.__class__(**{**vars(source), **told}))
-    assert found.spacing == pytest.approx((2, 2, 2))
+        fields = place_axes("a", affine_of((0, 45, 0), (2, 2, 2)), shape)
+        fields.pop("axes")
+        straightened = straighten(source.__class__(**{**vars(source), **fields}))
+    assert straightened.spacing == pytest.approx((2, 2, 2))
 
 
 def test_one_line_tells_and_keep_keeps(tmp_path):
     data = np.random.default_rng(0).integers(0, 99, SIZE).astype(np.int16)
     path = save(tmp_path / "a.nii", data, affine_of((0, 0, 37)))
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as caught:
         volume = gv.read_volume(path)
     x, y, z = volume.extent
-    assert [str(one.message) for one in told] == [
+    assert [str(warning.message) for warning in caught] == [
         f"a.nii: voxel axes are turned by 37 degrees: resampled along the world's axes, "
         f"{x}x{y}x{z} voxels of 1 x 1 x 1; oblique='keep' (--oblique keep) keeps the voxels as "
         "they are"
@@ -200,22 +200,22 @@ def test_a_tilt_of_less_than_half_a_voxel_is_none(tmp_path):
 def test_regions_have_the_bits_of_the_whole(degrees, spacing, seed, labels):
     rng = np.random.default_rng(seed)
     data = rng.integers(0, 200, (6, 7, 8, 2)).astype(np.uint8)
-    told = place_axes("a", affine_of(degrees, spacing), (8, 7, 6))
-    if told["oblique"] is None:
+    fields = place_axes("a", affine_of(degrees, spacing), (8, 7, 6))
+    if fields["oblique"] is None:
         return
-    told.pop("axes")
+    fields.pop("axes")
     source = MemorySource.of(data, path="a", info=ImageInfo(labels=labels))
     with pytest.warns(UserWarning, match="turned by"):
-        found = straighten(type(source)(**{**vars(source), **told}))
-    whole = found.read_times(0, 1)[0]
-    assert whole.dtype == np.uint8 and whole.shape == (*found.extent[::-1], 2)
+        straightened = straighten(type(source)(**{**vars(source), **fields}))
+    whole = straightened.read_times(0, 1)[0]
+    assert whole.dtype == np.uint8 and whole.shape == (*straightened.extent[::-1], 2)
     assert set(np.unique(whole)) <= ({0, *np.unique(data)} if labels else set(range(200)))
-    found = pickle.loads(pickle.dumps(found))
+    straightened = pickle.loads(pickle.dumps(straightened))
     for _ in range(8):
         low = [int(rng.integers(0, n)) for n in whole.shape[:3]]
         high = [int(rng.integers(a, n)) + 1 for a, n in zip(low, whole.shape[:3], strict=True)]
         box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        assert np.array_equal(found.read_region(low, high), whole[box])
+        assert np.array_equal(straightened.read_region(low, high), whole[box])
 
 
 def test_labels_are_never_blended(tmp_path):
@@ -226,10 +226,10 @@ def test_labels_are_never_blended(tmp_path):
     nibabel.save(image, tmp_path / "labels.nii")
     volume = read(tmp_path / "labels.nii")
     assert volume.info.labels and set(np.unique(volume.data)) == {0, 40, 200}
-    at = inner_index(volume, affine)
-    inside = ((at > -0.49) & (at < np.array(SIZE) - 0.51)).all(-1)
-    i, j, k = (np.floor(at[..., n] + 0.5).clip(0, SIZE[n] - 1).astype(int) for n in range(3))
-    tie = np.abs(at - np.floor(at) - 0.5).min(-1) < 1e-4
+    index = inner_index(volume, affine)
+    inside = ((index > -0.49) & (index < np.array(SIZE) - 0.51)).all(-1)
+    i, j, k = (np.floor(index[..., n] + 0.5).clip(0, SIZE[n] - 1).astype(int) for n in range(3))
+    tie = np.abs(index - np.floor(index) - 0.5).min(-1) < 1e-4
     sure = inside & ~tie
     assert np.array_equal(volume.data[..., 0].numpy()[sure], data[i, j, k][sure])
 
@@ -264,8 +264,8 @@ def test_convert_resamples_as_read_volume_does(tmp_path):
             store = convert(path, tmp_path / f"{ending}.zarr")
         assert store.spacing == pytest.approx(volume.spacing)
         assert store.origin == pytest.approx(volume.origin)
-        found = store.read_region(0, (0, 0, 0), store.extent[::-1])
-        assert np.array_equal(found, volume.data.numpy())
+        actual = store.read_region(0, (0, 0, 0), store.extent[::-1])
+        assert np.array_equal(actual, volume.data.numpy())
     with pytest.warns(UserWarning, match="kept"):
         store = convert(path, tmp_path / "kept.zarr", oblique="keep")
     assert store.extent == (60, 50, 70)
@@ -280,8 +280,8 @@ def test_times_of_a_turned_image(tmp_path):
             convert(path, tmp_path / f"{ending}.zarr")
         for time in range(3):
             alone = save(tmp_path / "alone.nii", data[..., time].copy(), affine)
-            found = gv.Store.open(tmp_path / f"{ending}.zarr", time=time)
-            values = found.read_region(0, (0, 0, 0), found.extent[::-1])
+            actual = gv.Store.open(tmp_path / f"{ending}.zarr", time=time)
+            values = actual.read_region(0, (0, 0, 0), actual.extent[::-1])
             expected = read(alone).data.numpy()
             same = values == expected
             fill = (values == data[..., 0].min()) & (expected == data[..., time].min())

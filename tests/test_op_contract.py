@@ -12,7 +12,7 @@ import torch
 from helpers import DEVICES, ROOT
 from helpers.rays import camera_rays, world_rays
 from helpers.traces import SHADER, arguments
-from helpers.trees import on
+from helpers.trees import copy_to
 
 import gvtorch as gv
 from gvtorch import cpp_ext
@@ -41,7 +41,7 @@ def assert_same(actual, expected) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_opcheck(blobs, compiled, dtype):
-    tree = on(gv.N3Tree.from_volume(blobs, 4), DEVICES[compiled])
+    tree = copy_to(gv.N3Tree.from_volume(blobs, 4), DEVICES[compiled])
     rays, given = arguments(tree, 5, dtype=dtype)
     torch.library.opcheck(torch.ops.gvtorch.trace_rays.default, (*rays, *given))
 

@@ -9,7 +9,7 @@ import sys
 import pytest
 import torch
 from helpers import ROOT
-from helpers.layers import SOLID, ball, layer_of, screen, seam_error
+from helpers.layers import SOLID, ball, layer_of, plane_distances, seam_error
 from helpers.opengl import no_vtk
 
 import gvtorch as gv
@@ -204,7 +204,7 @@ def test_vtk_draws_our_pixels_at_our_distances(vtk):
     sides = corners[1:] - corners[0]
     layer = vtk.rasterise([square(vtk, corners.tolist())], camera, near=40, far=160)
     normal = torch.linalg.cross(sides[0], sides[1])
-    distance = screen(camera, corners[0], tuple(normal.tolist()))
+    distance = plane_distances(camera, corners[0], tuple(normal.tolist()))
     rays = camera.rays()
     place = rays.origin + distance.reshape(-1, 1) * rays.direction - corners[0]
     share = torch.linalg.lstsq(sides.T, place.T).solution.T.reshape(150, 200, 2)  # 0 to 1 inside
@@ -234,7 +234,7 @@ def test_the_seam_of_vtks_triangles_and_a_ball_is_exact_to_a_pixel(vtk, tilt, de
     tree = gv.N3Tree.from_volume(ball(radius, 48), device=device)
     picture = gv.render(tree, view, SOLID, layer=layer, step=0.1, lod="finest")
     error = seam_error(picture, view, height, radius)
-    exact = layer_of(screen(view, torch.tensor([0, 0, height]).double(), (0, 0, 1.0)))
+    exact = layer_of(plane_distances(view, torch.tensor([0, 0, height]).double(), (0, 0, 1.0)))
     other = gv.render(tree, view, SOLID, layer=exact, step=0.1, lod="finest")
     print(f"seam: {error:.3f} pixels; drawn analytically {seam_error(other, view, height, radius)}")
     assert error <= 1.0

@@ -61,14 +61,14 @@ def expected(producer: Grown, loc: list[int], layout: Layout) -> torch.Tensor:
     """Returns the brick of one node, from the root down, by trilinear interpolation in NumPy."""
     brick = None
     for depth in range(loc[3] + 1):
-        own = [c >> (loc[3] - depth) for c in loc[:3]]
-        value = 0.07 * depth + 0.01 * sum(c % 3 for c in own)
+        ancestor = [c >> (loc[3] - depth) for c in loc[:3]]
+        value = 0.07 * depth + 0.01 * sum(c % 3 for c in ancestor)
         side, size = layout.side, layout.brick_size
         if brick is None:
             brick = np.full((side,) * 3, value)
             continue
         above, brick = brick, np.empty((side,) * 3)
-        axis = [((c % 2 * size + np.arange(side) - 1 + 0.5) / 2 - 0.5 + 1) for c in own]
+        axis = [((c % 2 * size + np.arange(side) - 1 + 0.5) / 2 - 0.5 + 1) for c in ancestor]
         low = [np.floor(a).astype(int) for a in axis]
         part = [a - b for a, b in zip(axis, low, strict=True)]
         brick[:] = 0
@@ -92,10 +92,10 @@ def test_children_are_handed_what_their_parents_hold(backend, kind):
         slot = (bricks.owner_b >= 0).nonzero()[:, 0]
         loc = source.tree.loc(bricks.owner_b[slot].to(torch.int64))
         assert len(slot) > 90 and loc[:, 3].max() >= 3
-        for one in range(0, len(slot), 9):
-            found = bricks.bricks["value"][slot[one], ..., 0].cpu().double()
-            whole = expected(source.producer, loc[one].tolist(), source.layout)
-            torch.testing.assert_close(found, whole, atol=1e-5, rtol=0)
+        for i in range(0, len(slot), 9):
+            actual = bricks.bricks["value"][slot[i], ..., 0].cpu().double()
+            whole = expected(source.producer, loc[i].tolist(), source.layout)
+            torch.testing.assert_close(actual, whole, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -104,7 +104,7 @@ def test_small_pools_end_in_the_same_picture(backend):
     options = {"brick_size": 4, "device": DEVICES[backend]}
     with gv.Engine(Grown(128, box=BOX), brick_pool="16 MB", **options) as engine:
         views = [view(16, azimuth, away) for azimuth in (0, 120) for away in (0.3, 1.5)]
-        whole = [engine.render(one, LOOK) for one in views]
+        whole = [engine.render(camera, LOOK) for camera in views]
     pick, evicted = random.Random(1), 0
     for pool in (60, 200, 900):
         size = {"brick_pool": pool * 6**3 * 4, "node_pool": 60 * 8 * 20}
@@ -113,13 +113,13 @@ def test_small_pools_end_in_the_same_picture(backend):
                 number = pick.randrange(4)
                 engine.frame(views[number], LOOK)
                 engine.validate()
-            for one, picture in zip(views, whole, strict=True):
-                found = engine.render(one, LOOK, max_frames=400)
+            for camera, picture in zip(views, whole, strict=True):
+                actual = engine.render(camera, LOOK, max_frames=400)
                 engine.validate()
-                evicted += found.stats.evicted["bricks"]
-                assert found.stats.converged or pool == 60
-                if found.stats.converged:
-                    assert torch.equal(found.color, picture.color)
+                evicted += actual.stats.evicted["bricks"]
+                assert actual.stats.converged or pool == 60
+                if actual.stats.converged:
+                    assert torch.equal(actual.color, picture.color)
     assert evicted > 150
 
 
@@ -160,9 +160,9 @@ def test_children_of_what_can_t_be_made_are_named():
     with gv.Engine(producer, brick_size=4) as engine:
         picture = engine.render(view(), LOOK, lod="finest")
         engine.validate()
-        told = {(one.loc[3], one.message) for one in engine.failures}
-        assert (2, "OSError: no such brick") in told
-        assert (4, "the brick of its parent can't be made") in told
+        failures = {(failure.loc[3], failure.message) for failure in engine.failures}
+        assert (2, "OSError: no such brick") in failures
+        assert (4, "the brick of its parent can't be made") in failures
         assert torch.isfinite(picture.color).all()
         producer.bad = None
         engine.forget_failures()
@@ -200,19 +200,19 @@ def spline(octaves=7, extent=256, **options) -> gv.noise.SplineSum:
 
 def dense(total: gv.noise.SplineSum, side: int, hashed) -> np.ndarray:
     """Returns the sum in side^3 voxels and 2 around, by subdividing whole levels in float64."""
-    found = None
+    result = None
     for number, octave in enumerate(total.octaves):
         cells = side >> (len(total.octaves) - 1 - number)
-        if found is not None:
+        if result is not None:
             for axis in range(3):
-                found = np.moveaxis(found, axis, 0)
-                finer = np.empty((2 * (len(found) - 4) + 4, *found.shape[1:]))
-                finer[0::2] = 0.75 * found[1:-1] + 0.25 * found[:-2]
-                finer[1::2] = 0.75 * found[1:-1] + 0.25 * found[2:]
-                found = np.moveaxis(finer, 0, axis)
-        own = octave.amplitude * hashed(octave, cells)
-        found = own if found is None else found + own
-    return found
+                result = np.moveaxis(result, axis, 0)
+                finer = np.empty((2 * (len(result) - 4) + 4, *result.shape[1:]))
+                finer[0::2] = 0.75 * result[1:-1] + 0.25 * result[:-2]
+                finer[1::2] = 0.75 * result[1:-1] + 0.25 * result[2:]
+                result = np.moveaxis(finer, 0, axis)
+        values = octave.amplitude * hashed(octave, cells)
+        result = values if result is None else result + values
+    return result
 
 
 @pytest.mark.parametrize("octaves", [1, 4, 6])
@@ -228,30 +228,30 @@ def test_voxels_hold_the_direct_sum(octaves):
 
     whole = dense(total, side, hashed)
     reach = (torch.arange(-2, side + 2, dtype=torch.float64)[None] + 0.5) * (2 / side)
-    found, same = total.bricks([reach] * 3, 2 / side)
-    assert found.shape == (1, 36, 36, 36) and same is found
+    bricks, same = total.bricks([reach] * 3, 2 / side)
+    assert bricks.shape == (1, 36, 36, 36) and same is bricks
     inner = (slice(2, -2),) * 3  # whole levels lack coarse neighbours beyond their faces
-    np.testing.assert_allclose(found[0].numpy()[inner], whole[inner], atol=3e-7, rtol=0)
-    assert 0.1 < found.std() < 1.0
+    np.testing.assert_allclose(bricks[0].numpy()[inner], whole[inner], atol=3e-7, rtol=0)
+    assert 0.1 < bricks.std() < 1.0
 
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_streamed_octaves_are_the_direct_sum_in_every_bit(backend):
     options = {"brick_size": 8, "device": DEVICES[backend]}
-    pictures, made = [], []
+    pictures, evaluations = [], []
     for kind, pool in ((Alone, "64 MB"), (gv.OctaveProducer, "64 MB"), (gv.OctaveProducer, "2 MB")):
         producer = kind(spline(gain=0.6), 256, box=BOX)
         with gv.Engine(producer, brick_pool=pool, **options) as engine:
-            found = [engine.render(view(32, 40, away), LOOK) for away in (0.3, 1.2)]
-            assert all(one.stats.converged for one in found)
+            views = [engine.render(view(32, 40, away), LOOK) for away in (0.3, 1.2)]
+            assert all(a.stats.converged for a in views)
             engine.validate()
-        pictures.append(found)
-        made.append(producer.total.evaluations)
-    for found in pictures[1:]:
-        for one, other in zip(found, pictures[0], strict=True):
-            assert torch.equal(one.color, other.color) and torch.equal(one.depth, other.depth)
+        pictures.append(views)
+        evaluations.append(producer.total.evaluations)
+    for views in pictures[1:]:
+        for a, c in zip(views, pictures[0], strict=True):
+            assert torch.equal(a.color, c.color) and torch.equal(a.depth, c.depth)
     if backend == "cpp":  # CUDA must not wait, so it evaluates each level for all nodes
-        assert made[1] < 0.7 * made[0], "numbers that were not made again"
+        assert evaluations[1] < 0.7 * evaluations[0], "numbers that were not made again"
     assert producer.at(torch.tensor([0.1, 0.2, 0.3]))["value"].shape == (1,)
 
 
@@ -286,18 +286,18 @@ def test_octaves_are_made_without_a_look_at_values(total):
     shape = (len(loc), *(layout.side,) * 3, 1)
     parents = {name: torch.rand(shape, generator=random) for name in producer.channels}
 
-    def made(loc):
+    def make(loc):
         return producer.fill(Nodes(loc, layout, parents=parents))
 
-    compiled = torch.compile(made, fullgraph=True, backend="eager")
-    found = compiled(loc)
+    compiled = torch.compile(make, fullgraph=True, backend="eager")
+    actual = compiled(loc)
     with torch._dynamo.config.patch(error_on_recompile=True):
         compiled(loc)
     for rows in ([0], [1, 2, 3, 4]):
-        given = {name: own[rows] for name, own in parents.items()} if rows[0] else None
-        expected = producer.fill(Nodes(loc[rows], layout, parents=given))
+        held = {name: table[rows] for name, table in parents.items()} if rows[0] else None
+        expected = producer.fill(Nodes(loc[rows], layout, parents=held))
         for name, values in expected.items():
-            assert torch.equal(found[name][rows], values)
+            assert torch.equal(actual[name][rows], values)
 
 
 def test_bricks_agree_where_they_meet_in_every_bit():
@@ -305,8 +305,8 @@ def test_bricks_agree_where_they_meet_in_every_bit():
     layout = Layout.of(producer, 8, 1, torch.device("cpu"))
     left = torch.tensor([[3, 7, 12, 5], [15, 0, 31, 5], [7, 7, 7, 5]])
     right = left + torch.tensor([1, 0, 0, 0])
-    one, other = (producer.bricks_at(loc, layout)["value"][..., 0] for loc in (left, right))
-    assert torch.equal(one[..., 8:], other[..., :2])
+    low, high = (producer.bricks_at(loc, layout)["value"][..., 0] for loc in (left, right))
+    assert torch.equal(low[..., 8:], high[..., :2])
 
 
 def test_a_level_makes_one_octave_and_gradient_noise_four():
@@ -322,8 +322,8 @@ def test_a_level_makes_one_octave_and_gradient_noise_four():
         parents, shares = None, []
         for loc in path:
             before = total.evaluations
-            made = producer.fill(Nodes(loc, layout, parents=parents))
-            parents = {n: rows[..., None] for n, rows in made.items()}
+            bricks = producer.fill(Nodes(loc, layout, parents=parents))
+            parents = {n: rows[..., None] for n, rows in bricks.items()}
             shares.append((total.evaluations - before) / 1000)
         counts[name] = shares, total.evaluations / total.plain_evaluations
     assert counts["spline"][0] == [1.0] * 12 and counts["spline"][1] < 0.65
@@ -336,8 +336,8 @@ def test_gradient_noise_is_the_direct_sum_within_its_error():
     points = torch.rand((200, 3), generator=torch.Generator().manual_seed(2)) * 1.8 - 0.9
     producer = gv.OctaveProducer(total, 512, box=BOX)
     alone = Alone(total, 512, box=BOX)
-    found, direct = producer.at(points)["value"], alone.at(points)["value"]
-    assert 0 < (found - direct).abs().max() < 9e-4 and direct.std() > 0.2
+    actual, direct = producer.at(points)["value"], alone.at(points)["value"]
+    assert 0 < (actual - direct).abs().max() < 9e-4 and direct.std() > 0.2
 
 
 @pytest.mark.backend("cpp")

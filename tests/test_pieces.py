@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.clips import CLIPS, shown
+from helpers.clips import CLIPS, is_kept
 from helpers.marcher import trilinear
 from helpers.rays import camera_rays
 from helpers.shaders import SHADERS
-from helpers.traces import SHADER, assert_equal, run
-from helpers.trees import forget
+from helpers.traces import SHADER, assert_equal, trace
+from helpers.trees import with_holes
 from helpers.waits import nobody_waits
 
 import gvtorch as gv
@@ -51,7 +51,7 @@ def test_narrowing_cones_equal_the_reference(blobs, compiled, branching, near, e
 
 @pytest.mark.parametrize("seed", range(3))
 def test_narrowing_cones_ask_for_the_same(blobs, compiled, seed):
-    tree = forget(gv.N3Tree.from_volume(blobs, 4), 0.5, seed)
+    tree = with_holes(gv.N3Tree.from_volume(blobs, 4), 0.5, seed)
     rays = narrowing(camera_rays(tree, distance=1.3), 12.0, 90.0)
     result, marks, _ = assert_equal(tree, compiled, rays)
     assert marks["request"].any() and result["missed"].any()
@@ -69,7 +69,7 @@ def test_intervals_are_as_long_as_the_cone_is_wide_where_they_start(noise, backe
         cone=torch.tensor([[near, growth]], dtype=torch.float64),
         range=torch.tensor([[0.0, torch.inf]], dtype=torch.float64),
     )
-    result, _ = run(tree, backend, rays, shader, cone_scale=1.0, stop_alpha=1.0)
+    result, _ = trace(tree, backend, rays, shader, cone_scale=1.0, stop_alpha=1.0)
     start, stop, count = 9.5, 49.5, 0  # the box begins half a voxel before the first centre
     while start < stop:
         length = 0.5
@@ -125,8 +125,8 @@ def test_the_share_that_a_ray_begins_with_equals_the_reference(blobs, compiled, 
     )
     closed = clear == 0
     assert not result["samples"][closed].any() and (result["alpha"][closed] == 1).all()
-    full, _ = run(tree, compiled, rays, dtype=dtype, stop_alpha=1.0)
-    part, _ = run(tree, compiled, dataclasses.replace(rays, transmittance=clear), stop_alpha=1.0)
+    full, _ = trace(tree, compiled, rays, dtype=dtype, stop_alpha=1.0)
+    part, _ = trace(tree, compiled, dataclasses.replace(rays, transmittance=clear), stop_alpha=1.0)
     np.testing.assert_allclose(part["color"], full["color"] * clear[:, None], atol=2e-6)
 
 
@@ -155,9 +155,9 @@ def test_every_shader_is_cut_by_planes_and_boxes(channels, compiled, name):
     first = torch.where(inward, torch.maximum(rays.range[:, 0], -height / rate), rays.range[:, 0])
     last = torch.where(inward, rays.range[:, 1], torch.minimum(rays.range[:, 1], -height / rate))
     ends = torch.stack((first, torch.maximum(first, last)), 1)
-    cut, _ = run(tree, compiled, dataclasses.replace(rays, range=ends), shader.opened())
-    clipped, _ = run(tree, compiled, rays, shader, clip=gv.Clip(planes=[plane]))
-    whole, _ = run(tree, compiled, rays, shader)
+    cut, _ = trace(tree, compiled, dataclasses.replace(rays, range=ends), shader.opened())
+    clipped, _ = trace(tree, compiled, rays, shader, clip=gv.Clip(planes=[plane]))
+    whole, _ = trace(tree, compiled, rays, shader)
     for field in ("color", "alpha", "depth", "features"):
         torch.testing.assert_close(clipped[field], cut[field], rtol=1e-4, atol=1e-4)
     assert (whole["color"] - clipped["color"]).abs().max() > 0.05
@@ -167,65 +167,65 @@ def test_every_shader_is_cut_by_planes_and_boxes(channels, compiled, name):
     assert (whole["color"] - pieces["color"]).abs().max() > 0.05
 
 
-@pytest.mark.parametrize("which", ["maximum", "minimum", "mean"])
-def test_a_projection_is_that_of_all_that_is_kept(blobs, compiled, which):
+@pytest.mark.parametrize("kind", ["maximum", "minimum", "mean"])
+def test_a_projection_is_that_of_all_that_is_kept(blobs, compiled, kind):
     """Against points along each ray, a hundredth of a voxel apart; caps are refused."""
-    density = 1 - blobs.data if which == "minimum" else blobs.data
+    density = 1 - blobs.data if kind == "minimum" else blobs.data
     tree = gv.N3Tree.from_volume(gv.Volume(density, blobs.spacing, blobs.origin), 4)
     ramp = gv.TransferFunction.from_points([(0, 0)], [(0, 0, 0, 0), (1, 1, 0.5, 0.2)])
-    shader, rays = gv.Projection(which, ramp), camera_rays(tree, 14, distance=1.2)
+    shader, rays = gv.Projection(kind, ramp), camera_rays(tree, 14, distance=1.2)
     options = {"lod": "finest", "step": 0.1}
     clear = torch.full((len(rays.origin),), 0.25, dtype=torch.float64)
     part = dataclasses.replace(rays, transmittance=clear)
     data, spacing = density[..., 0].double().numpy(), np.array(blobs.spacing)
     t = 20 + 0.01 * (np.arange(12000) + 0.5)
     low, high = tree.box.numpy()
-    pick = {"maximum": np.max, "minimum": np.min, "mean": np.mean}[which]
+    pick = {"maximum": np.max, "minimum": np.min, "mean": np.mean}[kind]
     for name in ("cut", "union", "all"):
-        found, _ = run(tree, compiled, rays, shader, clip=CLIPS[name], **options)
-        dimmed, _ = run(tree, compiled, part, shader, clip=CLIPS[name], **options)
+        hits, _ = trace(tree, compiled, rays, shader, clip=CLIPS[name], **options)
+        dimmed, _ = trace(tree, compiled, part, shader, clip=CLIPS[name], **options)
         compared = 0
         for ray in range(0, len(rays.origin), 5):
-            places = rays.origin[ray].numpy() + t[:, None] * rays.direction[ray].numpy()
-            kept = ((places >= low) & (places <= high)).all(1) & shown(CLIPS[name], places)
+            points = rays.origin[ray].numpy() + t[:, None] * rays.direction[ray].numpy()
+            kept = ((points >= low) & (points <= high)).all(1) & is_kept(CLIPS[name], points)
             if not kept.any():
-                assert found["alpha"][ray] == 0 and torch.isinf(found["depth"][ray])
+                assert hits["alpha"][ray] == 0 and torch.isinf(hits["depth"][ray])
             if kept.sum() < 100:
                 continue
-            values = trilinear(data, (places[kept] - np.array(blobs.origin)) / spacing)
+            values = trilinear(data, (points[kept] - np.array(blobs.origin)) / spacing)
             value = pick(values)
-            assert abs(float(found["features"][ray, 0]) - value) < 0.01
+            assert abs(float(hits["features"][ray, 0]) - value) < 0.01
             color = value * np.array([1, 0.5, 0.2])
-            np.testing.assert_allclose(found["color"][ray], color, atol=0.01)
+            np.testing.assert_allclose(hits["color"][ray], color, atol=0.01)
             np.testing.assert_allclose(dimmed["color"][ray], 0.25 * color, atol=0.01)
-            at = float(found["depth"][ray])
-            if which == "mean":
-                assert abs(at - t[kept][0]) < 0.05
+            depth = float(hits["depth"][ray])
+            if kind == "mean":
+                assert abs(depth - t[kept][0]) < 0.05
             else:
-                assert abs(values[np.abs(t[kept] - at).argmin()] - value) < 0.01
+                assert abs(values[np.abs(t[kept] - depth).argmin()] - value) < 0.01
             compared += 1
-        assert compared > 15 and len(found["features"].unique()) > 40
+        assert compared > 15 and len(hits["features"].unique()) > 40
     with pytest.raises(ValueError, match="Projection sees a ray in one go, so it has no clip with"):
-        run(tree, compiled, rays, shader, clip=dataclasses.replace(CLIPS["cut"], caps=True))
+        trace(tree, compiled, rays, shader, clip=dataclasses.replace(CLIPS["cut"], caps=True))
 
 
-@pytest.mark.parametrize("which", ["maximum", "minimum", "mean"])
-def test_a_projection_in_pieces_is_streamed_and_waits_for_nobody(blobs, compiled, which):
+@pytest.mark.parametrize("kind", ["maximum", "minimum", "mean"])
+def test_a_projection_in_pieces_is_streamed_and_waits_for_nobody(blobs, compiled, kind):
     device, camera = DEVICES[compiled], gv.Camera.orbit(30, 20, 1.2, width=24, height=20)
-    shader, given = gv.Projection(which, SHADER), {"clip": CLIPS["all"]}
-    whole = gv.render(gv.N3Tree.from_volume(blobs, 4, device=device), camera, shader, **given)
+    shader, options = gv.Projection(kind, SHADER), {"clip": CLIPS["all"]}
+    whole = gv.render(gv.N3Tree.from_volume(blobs, 4, device=device), camera, shader, **options)
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, device=device) as engine:
-        picture = engine.render(camera, shader, **given)
-        engine.frame(camera, shader, **given)
+        picture = engine.render(camera, shader, **options)
+        engine.frame(camera, shader, **options)
         if compiled == "cuda":
-            graph = engine.capture(camera, shader, **given)
+            graph = engine.capture(camera, shader, **options)
         with nobody_waits(device=device):
-            frame, _ = engine.frame(camera, shader, **given)
+            frame, _ = engine.frame(camera, shader, **options)
             again = graph.replay(camera)[0] if compiled == "cuda" else frame
     assert picture.stats.converged and whole.alpha.max() == 1
-    for one in (picture, frame, again):
+    for drawn in (picture, frame, again):
         for name in ("color", "alpha", "depth", "features"):
-            assert torch.equal(getattr(one, name), getattr(whole, name)), name
+            assert torch.equal(getattr(drawn, name), getattr(whole, name)), name
 
 
 def test_normals_of_three_trees_are_the_mean_by_the_light_that_each_takes():
@@ -252,26 +252,26 @@ def test_normals_of_three_trees_are_the_mean_by_the_light_that_each_takes():
     trees = [
         TreeTrace(
             box.double(),
-            lambda _, one=one: one,
+            lambda _, hit=hit: hit,
             SimpleNamespace(
                 shader=gv.TransferFunction([(0, 0), (1, 1)]),
                 to_tree=lambda rays: rays,
                 tree=SimpleNamespace(box=box),
             ),
         )
-        for box, one in zip(boxes, hits, strict=True)
+        for box, hit in zip(boxes, hits, strict=True)
     ]
-    found = trace_trees(trees, rays)
+    actual = trace_trees(trees, rays)
     for ray, ranked in enumerate((hits, hits[::-1])):
-        a, b, c = (float(one.alpha[ray]) for one in ranked)
+        a, b, c = (float(hit.alpha[ray]) for hit in ranked)
         shares = a, (1 - a) * b, (1 - a) * (1 - b) * c
-        taken = sum(s * one.normal[ray] for s, one in zip(shares, ranked, strict=True))
+        taken = sum(s * hit.normal[ray] for s, hit in zip(shares, ranked, strict=True))
         color = sum(
-            w * one.color[ray] for w, one in zip((1, 1 - a, (1 - a) * (1 - b)), ranked, strict=True)
+            w * hit.color[ray] for w, hit in zip((1, 1 - a, (1 - a) * (1 - b)), ranked, strict=True)
         )
-        torch.testing.assert_close(found.normal[ray], taken / taken.norm())
-        torch.testing.assert_close(found.color[ray], color)
-        assert abs(float(found.alpha[ray]) - sum(shares)) < 1e-6
+        torch.testing.assert_close(actual.normal[ray], taken / taken.norm())
+        torch.testing.assert_close(actual.color[ray], color)
+        assert abs(float(actual.alpha[ray]) - sum(shares)) < 1e-6
 
 
 LEFT_OUT = {
@@ -293,17 +293,17 @@ def test_rays_that_the_cpu_leaves_out_change_no_bit(channels, monkeypatch, name)
     few = composite.indices_if_few
 
     def noted(some):
-        which = few(some)
-        left_out.append(which is not None)
-        return which
+        kept_rays = few(some)
+        left_out.append(kept_rays is not None)
+        return kept_rays
 
     for chosen in (noted, lambda some: None):
         for room in (clip, composite, lighting):
             monkeypatch.setattr(room, "indices_if_few", chosen)
         view = gv.Camera.orbit(30, 20, 1.6, 30, 40, 28)
         pictures.append(gv.render(tree, view, LEFT_OUT[name], **options))
-    one, other = map(vars, pictures)
-    for field, values in one.items():
+    first, second = map(vars, pictures)
+    for field, values in first.items():
         if isinstance(values, torch.Tensor):
-            assert torch.equal(values, other[field]), field
-    assert any(left_out) and one["alpha"].max() > 0.5 and one["samples"].max() > 3
+            assert torch.equal(values, second[field]), field
+    assert any(left_out) and first["alpha"].max() > 0.5 and first["samples"].max() > 3

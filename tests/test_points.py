@@ -21,9 +21,9 @@ def some_points(count: int = 4000, width: int = 2) -> tuple[torch.Tensor, torch.
     """Returns clusters away from the faces; most regions are empty."""
     random = torch.Generator().manual_seed(3)
     middle = torch.rand((12, 3), generator=random) * 1.4 - 0.7
-    place = middle[torch.randint(0, 12, (count,), generator=random)]
-    place = place + 0.06 * torch.randn((count, 3), generator=random).clamp(-2.5, 2.5)
-    return place.double(), torch.rand((count, width), generator=random).double() + 0.1
+    positions = middle[torch.randint(0, 12, (count,), generator=random)]
+    positions = positions + 0.06 * torch.randn((count, 3), generator=random).clamp(-2.5, 2.5)
+    return positions.double(), torch.rand((count, width), generator=random).double() + 0.1
 
 
 def some_radii(count: int = 4000) -> torch.Tensor:
@@ -37,22 +37,22 @@ def some_radii(count: int = 4000) -> torch.Tensor:
 
 
 def dense(
-    place: torch.Tensor, value: torch.Tensor, side: int, radius: torch.Tensor | None = None
+    positions: torch.Tensor, value: torch.Tensor, side: int, radius: torch.Tensor | None = None
 ) -> np.ndarray:
     """Returns (z, y, x, c): sums of the points in voxels, by a histogram, or by the density of sums
     of four uniform random numbers (Irwin, Hall) along each axis."""
     if radius is None:
         parts = [
             np.histogramdd(
-                place.flip(1).numpy(), (side,) * 3, [(-1, 1)] * 3, weights=value[:, c].numpy()
+                positions.flip(1).numpy(), (side,) * 3, [(-1, 1)] * 3, weights=value[:, c].numpy()
             )[0]
             for c in range(value.shape[1])
         ]
         return np.stack(parts, -1)
     edges = np.linspace(-1, 1, side + 1)
     out = np.zeros((side,) * 3 + (value.shape[1],))
-    for at, weight, reach in zip(place.numpy(), value.numpy(), radius.tolist(), strict=True):
-        parts = [np.diff(share_below(edges, at[axis], reach)) for axis in (2, 1, 0)]
+    for mid, weight, reach in zip(positions.numpy(), value.numpy(), radius.tolist(), strict=True):
+        parts = [np.diff(share_below(edges, mid[axis], reach)) for axis in (2, 1, 0)]
         held = tuple(slice(part.nonzero()[0][0], part.nonzero()[0][-1] + 1) for part in parts)
         z, y, x = (part[some] for part, some in zip(parts, held, strict=True))
         out[held] += z[:, None, None, None] * y[:, None, None] * x[:, None] * weight
@@ -62,10 +62,10 @@ def dense(
 def prepared(
     branching: int = 2, side: int = 64, wide: bool = False, **options
 ) -> tuple[gv.PointProducer, Layout]:
-    place, value = some_points()
+    positions, value = some_points()
     radius = some_radii() if wide else None
-    given = {"radius": radius, "box": BOX, "branching": branching, **options}
-    producer = gv.PointProducer(place, value, side, **given)
+    arguments = {"radius": radius, "box": BOX, "branching": branching, **options}
+    producer = gv.PointProducer(positions, value, side, **arguments)
     layout = Layout.of(producer, 4, 1, CPU)
     producer.prepare(layout)
     return producer, layout
@@ -82,17 +82,17 @@ def all_nodes(layout: Layout, depth: int) -> gv.Nodes:
 )
 def test_every_level_is_the_dense_sum_and_its_mean(branching, side, wide):
     producer, layout = prepared(branching, side, wide)
-    place, value = some_points()
+    positions, value = some_points()
     radius = some_radii() if wide else None
-    finest = dense(place, value, side, radius)
+    finest = dense(positions, value, side, radius)
     total = finest.sum((0, 1, 2))
     assert wide or np.allclose(total, value.sum(0).numpy(), rtol=1e-12), "none is outside"
     for depth in range(layout.depth, -1, -1):
         nodes = all_nodes(layout, depth)
         bricks = producer.fill(nodes)["value"]
         along, n = branching**depth, side // branching ** (layout.depth - depth)
-        own = bricks[:, 1:-1, 1:-1, 1:-1].reshape(along, along, along, 4, 4, 4, 2)
-        level = own.permute(0, 3, 1, 4, 2, 5, 6).reshape(n, n, n, 2)
+        inner = bricks[:, 1:-1, 1:-1, 1:-1].reshape(along, along, along, 4, 4, 4, 2)
+        level = inner.permute(0, 3, 1, 4, 2, 5, 6).reshape(n, n, n, 2)
         assert np.allclose(level, finest, rtol=1e-6, atol=1e-7)
         scale = branching ** (3 * (layout.depth - depth))
         assert np.allclose(level.double().sum((0, 1, 2)) * scale, total, rtol=1e-6)
@@ -172,44 +172,44 @@ def test_points_that_are_drawn_are_missing_at_the_finest_level_alone():
 
 @pytest.mark.backend("cpp")
 def test_streamed_points_are_the_picture_of_the_dense_volume():
-    place, value = some_points(width=1)
-    look = gv.TransferFunction.from_points([(0, 0), (3, 0.8)], [(0, 1, 0.5, 0.2), (3, 1, 1, 1)])
+    positions, value = some_points(width=1)
+    transfer = gv.TransferFunction.from_points([(0, 0), (3, 0.8)], [(0, 1, 0.5, 0.2), (3, 1, 1, 1)])
     camera = gv.Camera.orbit(20, 30, 1.2, None, 40, 32)
     volume = gv.Volume(
-        torch.from_numpy(dense(place, value, 64)).float(),
+        torch.from_numpy(dense(positions, value, 64)).float(),
         spacing=(2 / 64,) * 3,
         origin=(-1 + 1 / 64,) * 3,
     )
-    expected = gv.render(gv.N3Tree.from_volume(volume, 4), camera, look)
-    producer = gv.PointProducer(place, value[:, 0], 64, box=BOX)
+    expected = gv.render(gv.N3Tree.from_volume(volume, 4), camera, transfer)
+    producer = gv.PointProducer(positions, value[:, 0], 64, box=BOX)
     with gv.Engine(producer, brick_size=4, brick_pool="300 kB") as engine:
-        picture = engine.render(camera, look)
+        picture = engine.render(camera, transfer)
         engine.validate()
     assert picture.stats.converged and (expected.alpha > 0.2).any()
     assert torch.allclose(picture.color, expected.color, atol=1e-5)
 
 
 def test_the_box_is_around_all_points_unless_given():
-    place, value = some_points()
-    producer = gv.PointProducer(place, value)
+    positions, value = some_points()
+    producer = gv.PointProducer(positions, value)
     held = producer.points.points[0].rows["value"]
     assert max(producer.extent) == 1024 and held.sum() == pytest.approx(float(value.sum()))
-    part = gv.PointProducer(place, value, box=((0, 0, 0), (1, 1, 1)))
-    assert 0 < len(part.points) < len(place), "points outside are left out"
-    one = gv.PointProducer(torch.zeros(1, 3))
-    assert one.extent == (1024, 1024, 1024) and len(one.points) == 1
+    part = gv.PointProducer(positions, value, box=((0, 0, 0), (1, 1, 1)))
+    assert 0 < len(part.points) < len(positions), "points outside are left out"
+    single = gv.PointProducer(torch.zeros(1, 3))
+    assert single.extent == (1024, 1024, 1024) and len(single.points) == 1
 
 
 def test_sums_that_halves_cannot_hold_are_told_once():
-    place, value = torch.rand(50, 3), torch.full((50,), 1e6)
+    positions, value = torch.rand(50, 3), torch.full((50,), 1e6)
     view, shader = gv.Camera.orbit(width=8, height=8), gv.TransferFunction.preset("gray", 0, 1e5)
-    with gv.Engine(gv.PointProducer(place, value, 32)) as engine:
+    with gv.Engine(gv.PointProducer(positions, value, 32)) as engine:
         engine.render(view, shader, lod="finest")
-    half = gv.PointProducer(place, value, 32, dtype=torch.float16)
-    with pytest.warns(UserWarning, match=r"a voxel's sum, .*float16 holds, 65504") as told:
+    half = gv.PointProducer(positions, value, 32, dtype=torch.float16)
+    with pytest.warns(UserWarning, match=r"a voxel's sum, .*float16 holds, 65504") as caught:
         with gv.Engine(half) as engine:
             engine.render(view, shader, lod="finest")
-    assert len(told) == 1
+    assert len(caught) == 1
 
 
 @pytest.mark.parametrize(

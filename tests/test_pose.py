@@ -14,7 +14,7 @@ import torch
 from helpers import DEVICES
 from helpers.shaders import SHADERS
 from helpers.traces import SHADER
-from helpers.trees import on
+from helpers.trees import copy_to
 
 import gvtorch as gv
 from gvtorch.tracing.pose import Pose
@@ -25,15 +25,15 @@ BACKENDS = [pytest.param(b, marks=pytest.mark.backend(b)) for b in DEVICES]
 
 def matrix_of(degrees=DEGREES, shift=(30.0, -12.0, 7.0), mirrored: bool = False) -> np.ndarray:
     """Returns (4, 4): a rotation about x, then y, then z, and a shift."""
-    made = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0, 1.0])
+    matrix = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0, 1.0])
     for axis, angle in enumerate(np.radians(degrees)):
         a, b = [n for n in range(3) if n != axis]
-        one = np.eye(4)
-        one[[a, b], [a, b]] = np.cos(angle)
-        one[a, b], one[b, a] = -np.sin(angle), np.sin(angle)
-        made = one @ made
-    made[:3, 3] = shift
-    return made
+        rotation = np.eye(4)
+        rotation[[a, b], [a, b]] = np.cos(angle)
+        rotation[a, b], rotation[b, a] = -np.sin(angle), np.sin(angle)
+        matrix = rotation @ matrix
+    matrix[:3, 3] = shift
+    return matrix
 
 
 POSES = {
@@ -43,15 +43,15 @@ POSES = {
 }
 
 
-def turned(matrix: np.ndarray, ways: torch.Tensor) -> torch.Tensor:
-    return ways.double() @ torch.from_numpy(matrix[:3, :3]).T
+def turned(matrix: np.ndarray, vectors: torch.Tensor) -> torch.Tensor:
+    return vectors.double() @ torch.from_numpy(matrix[:3, :3]).T
 
 
 def rays_in_the_world(matrix: np.ndarray, rays: gv.Rays) -> gv.Rays:
     """Returns rays that see in the world what `rays` see in the tree's axes."""
-    own = rays.to(dtype=torch.float64)
-    origin = turned(matrix, own.origin) + torch.from_numpy(matrix[:3, 3])
-    return replace(own, origin=origin, direction=turned(matrix, own.direction))
+    rays64 = rays.to(dtype=torch.float64)
+    origin = turned(matrix, rays64.origin) + torch.from_numpy(matrix[:3, 3])
+    return replace(rays64, origin=origin, direction=turned(matrix, rays64.direction))
 
 
 def light_in_the_world(matrix: np.ndarray, shader: gv.Shader) -> gv.Shader:
@@ -63,33 +63,33 @@ def light_in_the_world(matrix: np.ndarray, shader: gv.Shader) -> gv.Shader:
         light = replace(light, position=(matrix @ (*light.position, 1.0))[:3].tolist())
     else:
         return shader
-    made = copy(shader)
-    made.light = light
-    return made
+    copied = copy(shader)
+    copied.light = light
+    return copied
 
 
 def camera(tree: gv.N3Tree, size: int = 20) -> gv.Rays:
     return gv.Camera.orbit(30, 25, 1.6, None, size, size).placed(tree.box).rays()
 
 
-def assert_same_picture(found: gv.Hits, expected: gv.Hits, matrix: np.ndarray, **near) -> None:
+def assert_same_picture(actual: gv.Hits, expected: gv.Hits, matrix: np.ndarray, **near) -> None:
     """Asserts equal hits, except for the normals, which are turned with the tree."""
     for name in ("color", "alpha", "depth", "features"):
-        one, other = (getattr(hits, name) for hits in (found, expected))
-        if other is not None:
-            torch.testing.assert_close(one, other, **near)
+        x, y = (getattr(hits, name) for hits in (actual, expected))
+        if y is not None:
+            torch.testing.assert_close(x, y, **near)
     if expected.normal is not None:
-        normal = turned(matrix, expected.normal.cpu()).to(found.normal)
-        torch.testing.assert_close(found.normal, normal, **near)
+        normal = turned(matrix, expected.normal.cpu()).to(actual.normal)
+        torch.testing.assert_close(actual.normal, normal, **near)
     for name in ("samples", "label"):
         if getattr(expected, name) is not None:
-            assert torch.equal(getattr(found, name), getattr(expected, name)), name
+            assert torch.equal(getattr(actual, name), getattr(expected, name)), name
 
 
-def some(hits: gv.Hits, which: torch.Tensor) -> gv.Hits:
+def some(hits: gv.Hits, mask: torch.Tensor) -> gv.Hits:
     """Returns the hits of some rays, (r,) bool."""
     return replace(
-        hits, **{n: t[which.to(t.device)] for n, t in vars(hits).items() if t is not None}
+        hits, **{n: t[mask.to(t.device)] for n, t in vars(hits).items() if t is not None}
     )
 
 
@@ -99,18 +99,18 @@ NEAR = {"atol": 1e-9, "rtol": 1e-9}  # for float64
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", SHADERS)
 def test_a_tree_that_is_turned_is_seen_by_a_camera_that_is_turned(channels, name, backend):
-    tree = on(gv.N3Tree.from_volume(channels, 4), DEVICES[backend])
+    tree = copy_to(gv.N3Tree.from_volume(channels, 4), DEVICES[backend])
     rays, shader = camera(tree, 8 if backend == "reference" else 20), SHADERS[name]
     options = {"dtype": torch.float64, "backend": backend}
-    own = gv.trace(tree, rays.to(tree.device), shader, **options)
-    assert (own.alpha > 0.1).any()
+    expected = gv.trace(tree, rays.to(tree.device), shader, **options)
+    assert (expected.alpha > 0.1).any()
     for matrix in POSES.values():
         world = rays_in_the_world(matrix, rays).to(tree.device)
         lit = light_in_the_world(matrix, shader)
-        found = gv.trace(tree, world, lit, pose=matrix, **options)
-        same = (found.samples == own.samples).cpu()  # by rounding, a ray may graze a face
+        actual = gv.trace(tree, world, lit, pose=matrix, **options)
+        same = (actual.samples == expected.samples).cpu()  # by rounding, a ray may graze a face
         assert same.float().mean() > 0.95
-        assert_same_picture(*(some(hits, same) for hits in (found, own)), matrix, **NEAR)
+        assert_same_picture(*(some(hits, same) for hits in (actual, expected)), matrix, **NEAR)
 
 
 @pytest.fixture
@@ -136,22 +136,22 @@ def test_clip_lens_and_lighting_stay_in_the_world(tree):
     suns = {"own": SUN, "world": light_in_the_world(matrix, gv.Lit(SHADER, light=SUN)).light}
     for caps in (False, True):
         for lighting in (False, True):
-            made = {}
-            for where, given in (("own", rays), ("world", world)):
+            hits = {}
+            for frame, traced in (("own", rays), ("world", world)):
                 options = {
-                    "clip": gv.Clip(planes=[faces[where]], caps=caps),
+                    "clip": gv.Clip(planes=[faces[frame]], caps=caps),
                     "dtype": torch.float64,
-                    "pose": matrix if where == "world" else None,
+                    "pose": matrix if frame == "world" else None,
                 }
                 if lighting:
-                    options["lighting"] = gv.Lighting(lights=[suns[where]], shadows=True)
-                made[where] = gv.trace(tree, given, gv.Lit(SHADER, light=suns[where]), **options)
-            assert (made["own"].alpha > 0.1).any()
-            torch.testing.assert_close(made["world"].color, made["own"].color, atol=1e-5, rtol=0)
+                    options["lighting"] = gv.Lighting(lights=[suns[frame]], shadows=True)
+                hits[frame] = gv.trace(tree, traced, gv.Lit(SHADER, light=suns[frame]), **options)
+            assert (hits["own"].alpha > 0.1).any()
+            torch.testing.assert_close(hits["world"].color, hits["own"].color, atol=1e-5, rtol=0)
     lens = gv.ThinLens(aperture=2.0, focus=40.0)
     blurred = [
-        gv.trace(tree, given, SHADER, lens=lens, dtype=torch.float64, pose=pose)
-        for given, pose in ((rays, None), (world, matrix))
+        gv.trace(tree, traced, SHADER, lens=lens, dtype=torch.float64, pose=pose)
+        for traced, pose in ((rays, None), (world, matrix))
     ]
     torch.testing.assert_close(blurred[1].color, blurred[0].color, atol=1e-9, rtol=0)
 
@@ -168,13 +168,13 @@ def test_a_module_shader_is_told_places_and_ways_of_the_world(tree):
     rays, matrix = camera(tree, 6), matrix_of()
     shader = gv.ModuleShader(Told())
     options = {"dtype": torch.float64, "stop_alpha": 1}
-    own = gv.trace(tree, rays, shader, **options)
-    found = gv.trace(tree, rays_in_the_world(matrix, rays), shader, pose=matrix, **options)
-    torch.testing.assert_close(found.color, own.color, **NEAR)
-    places, ways, world_places, world_ways = seen
+    expected = gv.trace(tree, rays, shader, **options)
+    actual = gv.trace(tree, rays_in_the_world(matrix, rays), shader, pose=matrix, **options)
+    torch.testing.assert_close(actual.color, expected.color, **NEAR)
+    tree_positions, tree_directions, world_places, world_ways = seen
     shift = torch.from_numpy(matrix[:3, 3])
-    torch.testing.assert_close(world_places, turned(matrix, places) + shift, **NEAR)
-    torch.testing.assert_close(world_ways, turned(matrix, ways), **NEAR)
+    torch.testing.assert_close(world_places, turned(matrix, tree_positions) + shift, **NEAR)
+    torch.testing.assert_close(world_ways, turned(matrix, tree_directions), **NEAR)
 
 
 @pytest.mark.parametrize("shader", [SHADER, gv.Lit(SHADER), gv.Projection("mean", SHADER)])
@@ -202,7 +202,7 @@ def test_a_cost_counts_what_the_picture_samples(tree):
 
 
 @pytest.mark.parametrize(
-    "pose, told",
+    "pose, message",
     [
         (np.diag([2.0, 1, 1, 1]), "neither stretch nor shear"),
         (np.eye(3), r"pose must be \(4, 4\)"),
@@ -212,8 +212,8 @@ def test_a_cost_counts_what_the_picture_samples(tree):
         (torch.eye(4, requires_grad=True), "gradient"),
     ],
 )
-def test_what_is_no_pose_is_told_in_a_line(tree, pose, told):
-    with pytest.raises((ValueError, RuntimeError), match=told) as error:
+def test_what_is_no_pose_is_told_in_a_line(tree, pose, message):
+    with pytest.raises((ValueError, RuntimeError), match=message) as error:
         gv.render(tree, gv.Camera.orbit(0, 0, None, None, 8, 8), SHADER, pose=pose)
     assert "\n" not in str(error.value)
 
@@ -245,16 +245,16 @@ def test_voxels_that_are_kept_tell_how_to_turn_them(tmp_path):
         affine = matrix_of(mirrored=mirrored) @ np.diag([0.7, 1.0, 1.6, 1.0])
         data = np.random.default_rng(0).random((5, 6, 7)).astype(np.float32)
         nibabel.save(nibabel.Nifti1Image(data, affine), tmp_path / "a.nii")
-        for place in (None, (1.0, 2.0, 3.0)):
+        for origin in (None, (1.0, 2.0, 3.0)):
             with pytest.warns(UserWarning, match="info.pose turns them"):
-                volume = gv.read_volume(tmp_path / "a.nii", oblique="keep", origin=place)
+                volume = gv.read_volume(tmp_path / "a.nii", oblique="keep", origin=origin)
             pose = Pose.of("test", "pose", volume.info.pose)
             index = torch.tensor([[0, 0, 0], [4, 5, 6], [2, 0, 5]], dtype=torch.float64)
-            own = index * torch.tensor(volume.spacing) + torch.tensor(volume.origin)
+            local = index * torch.tensor(volume.spacing) + torch.tensor(volume.origin)
             expected = index.numpy() @ affine[:3, :3].T + (
-                affine[:3, 3] if place is None else place
+                affine[:3, 3] if origin is None else origin
             )
-            np.testing.assert_allclose(pose.world_positions(own).numpy(), expected, atol=1e-5)
+            np.testing.assert_allclose(pose.world_positions(local).numpy(), expected, atol=1e-5)
             assert np.array_equal(volume.data[..., 0].numpy(), data.T)
         assert volume.info.describe()["pose"]
     sheared = affine.copy()

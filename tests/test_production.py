@@ -232,10 +232,10 @@ def test_late_answers_never_land_in_the_wrong_place():
                 view = gv.Camera.look_at(eye, target, (0, 1, 0), 30, 8, 8)
                 engine.frame(view, haze)
                 if pick.random() < 0.4:
-                    producer.go()
+                    producer.release()
                 engine.validate()
             producer.hold = False
-            producer.go()
+            producer.release()
             picture = engine.render(view, haze)
             engine.validate()
             if picture.stats.converged:
@@ -252,12 +252,12 @@ def test_a_later_job_may_answer_before_an_earlier_one(blobs):
             engine.frame(view, GRAY)
             first, *others = producer.held
             producer.held = others
-            producer.go()
+            producer.release()
             producer.held = [first]
         _, stats = engine.frame(views[-1], GRAY)
         assert stats.pending > 0 and stats.frame == 5
         producer.hold = False
-        producer.go()
+        producer.release()
         assert engine.render(views[-1], GRAY).stats.converged
         assert len(engine.production.failures) == 0
 

@@ -133,7 +133,7 @@ def test_frames_that_miss_something_do_not_stay_in_the_mean(blobs):
         assert torch.equal(coarse.color[stuck], newest.color[stuck]), "the newest, no mean"
         assert (coarse.color - whole[3].color).abs().max() > 0.02, "the test must see a difference"
         producer.hold = False
-        producer.go()
+        producer.release()
         for _ in range(20):
             picture = progressive.frame(camera)
         assert progressive.count == 24 and not picture.missed.any()

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from helpers import meshes
-from helpers.shapes import ALL, BOXES, ball, block, inside, nodes_of, random_boxes
+from helpers.shapes import ALL, BOXES, ball, block, nodes_of, points_inside, random_boxes
 
 import gvtorch as gv
 from gvtorch.producers import Layout
@@ -45,10 +45,10 @@ class Sway(torch.nn.Module):
 def scattered():
     """Returns points of all sizes, from 0 to many voxels, in clumps."""
     random = torch.Generator().manual_seed(3)
-    place = 0.25 * torch.randn((500, 3), generator=random).double().clamp(-3, 3)
+    positions = 0.25 * torch.randn((500, 3), generator=random).double().clamp(-3, 3)
     sizes = torch.tensor([0.0, 0.005, 0.02, 0.1], dtype=torch.float64)
     radius = sizes[torch.randint(0, 4, (500,), generator=random)]
-    return gv.PointProducer(place, 0.1 + radius, 128, radius=radius, box=BOX)
+    return gv.PointProducer(positions, 0.1 + radius, 128, radius=radius, box=BOX)
 
 
 def of_field(field, **options):
@@ -117,19 +117,19 @@ def check_proofs(producer, regions, ends) -> None:
     """Checks the regions of nodes against the least and the largest voxel in their reach, two
     (k, c) by channel.
     """
-    kind, shown = regions.kind, shown_by(producer)
-    assert shown or not (kind == gv.Region.EMPTY).any()
-    for channel, (least, most) in ends.items():
-        if channel in shown:
-            assert (most <= shown[channel])[kind == gv.Region.EMPTY].all(), channel
+    kind, visible = regions.kind, shown_by(producer)
+    assert visible or not (kind == gv.Region.EMPTY).any()
+    for channel, (least, greatest) in ends.items():
+        if channel in visible:
+            assert (greatest <= visible[channel])[kind == gv.Region.EMPTY].all(), channel
         if channel in regions.constants:
-            same = (least == regions.constants[channel]) & (most == regions.constants[channel])
+            same = (least == regions.constants[channel]) & (greatest == regions.constants[channel])
             assert same[kind == gv.Region.CONSTANT].all(), channel
         else:
             assert not (kind == gv.Region.CONSTANT).any()
         if channel in regions.ranges:
             low, high = regions.ranges[channel].unbind(1)
-            assert (least >= low).all() and (most <= high).all(), channel
+            assert (least >= low).all() and (greatest <= high).all(), channel
 
 
 def halved(cells: torch.Tensor, of: Callable, reach: bool) -> torch.Tensor:
@@ -157,11 +157,11 @@ def whole_level(producer, depth: int, brick_size: int) -> dict[str, torch.Tensor
     """Returns by channel (z, y, x, c) all voxels of a level, made in bricks of a size."""
     producer.prepare(Layout.of(producer, brick_size, 1, torch.device("cpu")))
     nodes, n = nodes_of(producer, depth, brick_size=brick_size), 2**depth
-    found = {}
+    level = {}
     for channel, bricks in voxels(producer, nodes).items():
-        own = bricks[:, 1:-1, 1:-1, 1:-1].unflatten(0, (n, n, n))
-        found[channel] = own.permute(0, 3, 1, 4, 2, 5, 6).reshape(*(n * brick_size,) * 3, -1)
-    return found
+        inner = bricks[:, 1:-1, 1:-1, 1:-1].unflatten(0, (n, n, n))
+        level[channel] = inner.permute(0, 3, 1, 4, 2, 5, 6).reshape(*(n * brick_size,) * 3, -1)
+    return level
 
 
 def test_no_voxel_is_dropped(name):
@@ -169,21 +169,21 @@ def test_no_voxel_is_dropped(name):
     level in their reach. EMPTY and CONSTANT hold for every voxel, and every value is in its range.
     """
     producer = PRODUCERS[name]()
-    levels, told = whole_level(producer, 3, 16), dict.fromkeys(gv.Region, 0)
+    levels, region_counts = whole_level(producer, 3, 16), dict.fromkeys(gv.Region, 0)
     cells = {channel: (level, level) for channel, level in levels.items()}
     producer.prepare(Layout.of(producer, 2, 1, torch.device("cpu")))
     for depth in range(6, -1, -1):
         regions = producer.classify(nodes_of(producer, depth, brick_size=2))
-        ends = {n: each(one, reach=True) for n, one in cells.items()}
+        ends = {n: each(t, reach=True) for n, t in cells.items()}
         check_proofs(
             producer, regions, {n: (a.flatten(0, 2), b.flatten(0, 2)) for n, (a, b) in ends.items()}
         )
-        cells = {n: each(one, reach=False) for n, one in cells.items()}
+        cells = {n: each(t, reach=False) for n, t in cells.items()}
         for region in gv.Region:
-            told[region] += int((regions.kind == region).sum())
+            region_counts[region] += int((regions.kind == region).sum())
     least = 0.001 if name == "mandelbox" else 0.1
-    proven = told[gv.Region.CONSTANT if name == "distances to a mesh" else gv.Region.EMPTY]
-    assert proven > least * sum(told.values())
+    proven = region_counts[gv.Region.CONSTANT if name == "distances to a mesh" else gv.Region.EMPTY]
+    assert proven > least * sum(region_counts.values())
 
 
 def test_no_brick_is_dropped(name):
@@ -192,12 +192,12 @@ def test_no_brick_is_dropped(name):
     """
     producer, random = PRODUCERS[name](), torch.Generator().manual_seed(6)
     producer.prepare(Layout.of(producer, 2, 1, torch.device("cpu")))
-    for depth, most in ((3, 1 << 9), (6, 1 << (18 if os.environ.get("GVTORCH_SOAK") else 12))):
+    for depth, max_nodes in ((3, 1 << 9), (6, 1 << (18 if os.environ.get("GVTORCH_SOAK") else 12))):
         nodes = nodes_of(producer, depth, brick_size=2)
-        nodes = nodes[torch.randperm(len(nodes), generator=random)[:most].sort().values]
+        nodes = nodes[torch.randperm(len(nodes), generator=random)[:max_nodes].sort().values]
         for rows in torch.arange(len(nodes)).split(50_000):
-            made = voxels(producer, nodes[rows]).items()
-            ends = {channel: bricks.flatten(1, 3).aminmax(dim=1) for channel, bricks in made}
+            channels = voxels(producer, nodes[rows]).items()
+            ends = {channel: bricks.flatten(1, 3).aminmax(dim=1) for channel, bricks in channels}
             check_proofs(producer, producer.classify(nodes[rows]), ends)
 
 
@@ -212,20 +212,20 @@ def test_noise_passes_no_proof_in_random_boxes(octaves):
     producer.prepare(layout)
     finest = producer.level_of(layout.depth)
     worn = finest.remaining[0] + finest.half_width
-    begins = [0.7 + producer.thickness * one for one in (worn - 0.5, -worn - 0.5)]
+    begins = [0.7 + producer.thickness * gap for gap in (worn - 0.5, -worn - 0.5)]
     depth = torch.randint(2, layout.depth + 1, (BOXES, 1), generator=random)
     side = layout.spacing[0] * 8 * 2.0 ** (layout.depth - depth)
     away = 1.2 * torch.rand((BOXES, 1), generator=random).double()
     for third, begin in enumerate(begins):
         away[third::3] = begin + 2 * side[third::3] * (away[third::3] - 0.6)
-    way = torch.nn.functional.normalize(torch.randn((BOXES, 3), generator=random).double(), dim=1)
-    place = ((way * away - layout.origin_3) / side).floor().long().clamp(min=0)
-    nodes = gv.Nodes(torch.cat((place.minimum(2**depth - 1), depth), 1), layout)
+    unit = torch.nn.functional.normalize(torch.randn((BOXES, 3), generator=random).double(), dim=1)
+    position = ((unit * away - layout.origin_3) / side).floor().long().clamp(min=0)
+    nodes = gv.Nodes(torch.cat((position.minimum(2**depth - 1), depth), 1), layout)
     kind = producer.classify(nodes).kind
     half = nodes.voxel_size * (0.5 * layout.brick_size + layout.border - 0.5)
     for region, value in ((gv.Region.EMPTY, 0.0), (gv.Region.CONSTANT, 1.0)):
         rows = (kind == region).nonzero()[:, 0]
-        points = inside(nodes.center[rows], half[rows], 32)
+        points = points_inside(nodes.center[rows], half[rows], 32)
         assert (producer.at(points)["density"] == value).all() and len(rows) > BOXES / 20
 
 
@@ -241,20 +241,20 @@ def test_intervals_of_fields_hold_in_random_boxes(name):
     size = (10 ** (-3 * torch.rand(len(center), 1, generator=random).double())).expand(-1, 3)
     if isinstance(producer, gv.Hypertexture):
         low, high = producer.shape.bounds(center, half)
-        value = producer.shape(inside(center, half, 12))
+        value = producer.shape(points_inside(center, half, 12))
         assert (value >= low[:, None]).all() and (value <= high[:, None]).all()
         return
-    field, known = producer.field, producer.field.filtered_bounds(center, half, size)
-    for at in torch.arange(len(center)).split(20_000):
-        points = inside(center[at], half[at], 12)
-        sides = size[at, None].expand_as(points)
-        found = field.filtered(points, sides) if field.prefiltered else field(points)
-        by_name = found if isinstance(found, dict) else {"value": found}
-        ends = known if isinstance(known, dict) else {"value": known}
+    field, bounds = producer.field, producer.field.filtered_bounds(center, half, size)
+    for rows in torch.arange(len(center)).split(20_000):
+        points = points_inside(center[rows], half[rows], 12)
+        sides = size[rows, None].expand_as(points)
+        values = field.filtered(points, sides) if field.prefiltered else field(points)
+        by_name = values if isinstance(values, dict) else {"value": values}
+        ends = bounds if isinstance(bounds, dict) else {"value": bounds}
         for channel, interval in ends.items():
             if channel != "normal":  # `finish` computes them from distances
-                low, high = (end[at].view(len(at), 1, -1) for end in interval)
-                value = by_name[channel].view(len(at), 12, -1)
+                low, high = (end[rows].view(len(rows), 1, -1) for end in interval)
+                value = by_name[channel].view(len(rows), 12, -1)
                 assert (value >= low - 1e-9).all() and (value <= high + 1e-9).all(), channel
 
 
@@ -278,5 +278,5 @@ def test_a_level_is_the_mean_of_the_one_below(name):
             # 2^3 bricks of 4^3 cells of 2^3 voxels
             cells = fine[channel].float().view(len(nodes), 2, 2, 2, 4, 2, 4, 2, 4, 2, -1)
             mean = cells.mean((5, 7, 9)).permute(0, 1, 4, 2, 5, 3, 6, 7).reshape(bricks.shape)
-            apart = (bricks.float() - mean).abs()
-            assert apart.mean() < (error + 0.3 / count) * mean.std(), channel
+            difference = (bricks.float() - mean).abs()
+            assert difference.mean() < (error + 0.3 / count) * mean.std(), channel

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.recorded import COMPILED, LOOK, Ball, Frames, recorded, view
+from helpers.recorded import COMPILED, TRANSFER, Ball, Frames, recorded, view
 from helpers.waits import nobody_waits
 from torch import Tensor
 
@@ -32,29 +32,29 @@ from gvtorch.pool import staging
 @pytest.mark.parametrize("branching, kinds, batch", [(2, False, 64), (2, True, 7), (3, False, 300)])
 def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kinds, batch):
     def engine() -> gv.Engine:
-        producer = Ball(branching=branching, kinds=kinds)
+        producer = Ball(branching=branching, fill_kinds=kinds)
         return gv.Engine(producer, brick_pool="16 MB", device=DEVICES[backend])
 
     with engine() as served:
-        expected = served.render(view(), LOOK)
+        expected = served.render(view(), TRANSFER)
         assert expected.stats.converged and (expected.alpha > 0.5).any()
-    with engine() as own:
-        frames = Frames(own, view(), LOOK, batch)
-        own.trees["scene"].producer.asked.clear()
-        made = {"tiles": 0, "bricks": 0, "constant": 0}
+    with engine() as recorder:
+        frames = Frames(recorder, view(), TRANSFER, batch)
+        recorder.trees["scene"].producer.batch_sizes.clear()
+        produced = {"tiles": 0, "bricks": 0, "constant": 0}
         for _ in range(400):
             hits, stats = frames.frame()
             assert stats.produced["bricks"] <= batch
             assert stats.produced["tiles"] <= batch * (1 + MAX_EXTRA_LEVELS)
-            made = {name: made[name] + stats.produced[name] for name in made}
+            produced = {name: produced[name] + stats.produced[name] for name in produced}
             if stats.converged:
                 break
         assert stats.converged and not stats.capacity_exceeded
-        own.validate()
-        assert set(own.trees["scene"].producer.asked) == {batch * branching**3}
-        there = int((own.cache.bricks.owner_b >= 0).sum())
-        assert made["bricks"] == there - 1, "the root was there"
-        assert made["tiles"] > 20 and (made["constant"] > 0) == kinds
+        recorder.validate()
+        assert set(recorder.trees["scene"].producer.batch_sizes) == {batch * branching**3}
+        there = int((recorder.cache.bricks.owner_b >= 0).sum())
+        assert produced["bricks"] == there - 1, "the root was there"
+        assert produced["tiles"] > 20 and (produced["constant"] > 0) == kinds
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     assert torch.equal(hits.depth, expected.depth.reshape(-1, 1))
 
@@ -65,10 +65,10 @@ def test_a_volume_that_the_device_reads_in_place_is_recorded(backend, monkeypatc
     values = torch.rand((48, 52, 44, 2), generator=torch.Generator().manual_seed(2))
     volume = gv.Volume(values, (1, 1.5, 1), (-20, 3, 4))
     tree = gv.N3Tree.from_volume(volume, device=DEVICES[backend])
-    expected = gv.render(tree, view(), LOOK, backend=backend)
+    expected = gv.render(tree, view(), TRANSFER, backend=backend)
     options = {"brick_pool": "8 MB", "device": DEVICES[backend]}
     with gv.Engine(gv.VolumeProducer(volume, hold="mapped"), **options) as engine:
-        frames = Frames(engine, view(), LOOK, 64)
+        frames = Frames(engine, view(), TRANSFER, 64)
         assert isinstance(frames.served, DeviceFrame)
         hits, _ = frames.whole()
         assert expected.alpha.max() > 0.5
@@ -81,17 +81,17 @@ def test_joined_producers_are_recorded_where_all_are(backend):
     """Two channels, of which only one has EMPTY regions."""
 
     def joined() -> gv.JoinedProducer:
-        return gv.JoinedProducer({"a": Ball(64), "b": Ball(64, kinds=True)})
+        return gv.JoinedProducer({"a": Ball(64), "b": Ball(64, fill_kinds=True)})
 
     options = {"brick_pool": "16 MB", "device": DEVICES[backend]}
     with gv.Engine(joined(), **options) as served:
-        expected, other = (served.render(view(), LOOK, channel=name) for name in "ab")
-    with gv.Engine(joined(), **options) as own:
-        frames = Frames(own, view(), LOOK, 64)
+        expected, other = (served.render(view(), TRANSFER, channel=name) for name in "ab")
+    with gv.Engine(joined(), **options) as recorder:
+        frames = Frames(recorder, view(), TRANSFER, 64)
         assert isinstance(frames.served, DeviceFrame)
         hits, stats = frames.whole()
-        own.validate()
-        assert torch.equal(own.render(view(), LOOK, channel="b").color, other.color)
+        recorder.validate()
+        assert torch.equal(recorder.render(view(), TRANSFER, channel="b").color, other.color)
     assert stats.converged and (expected.alpha > 0.5).any()
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     cast = Ball(64)
@@ -112,16 +112,16 @@ def test_aliases_are_left_to_the_host(blobs, backend):
             return gv.Bricks(data=bricks.data, kind=kind, alias=alias)
 
     with gv.Engine(Twice(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        expected = engine.render(view(16), LOOK)
+        expected = engine.render(view(16), TRANSFER)
     with gv.Engine(Twice(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(16), LOOK, 64)
+        frames = Frames(engine, view(16), TRANSFER, 64)
         for _ in range(100):
             frames.frame()
             time.sleep(0.001)
             if frames.served.host_needed:
                 break
         assert frames.served.host_needed
-        picture = engine.render(view(16), LOOK)
+        picture = engine.render(view(16), TRANSFER)
         engine.validate()
     assert torch.equal(picture.color, expected.color)
 
@@ -132,7 +132,7 @@ def test_a_pool_that_is_too_small_gives_away_what_is_used_least(backend):
     with gv.Engine(Ball(), brick_pool="1 MB", node_pool="60 kB", device=DEVICES[backend]) as engine:
         evicted = 0
         for angle in (0, 50, 100, 180, 270, 0):
-            frames = Frames(engine, view(24, angle), LOOK, 32)
+            frames = Frames(engine, view(24, angle), TRANSFER, 32)
             for _ in range(200):
                 hits, stats = frames.frame()
                 evicted += stats.evicted["bricks"] + stats.evicted["tiles"]
@@ -141,21 +141,21 @@ def test_a_pool_that_is_too_small_gives_away_what_is_used_least(backend):
             engine.validate()
             assert stats.converged, angle
         assert evicted > 50
-        picture = engine.render(view(24, 0), LOOK)
+        picture = engine.render(view(24, 0), TRANSFER)
     assert torch.equal(hits.color, picture.color.reshape(-1, 3))
 
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_bricks_with_nan_are_left_out_and_counted(backend):
     with gv.Engine(Ball(), brick_pool="16 MB", device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(), LOOK, 512)
+        frames = Frames(engine, view(), TRANSFER, 512)
         engine.trees["scene"].producer.spoiled.fill_(1)
         for _ in range(12):
             hits, _ = frames.frame()
         assert engine.readbacks.failed or engine.readbacks[-1].wait().failed > 0
         engine.validate()
         assert bool(torch.isfinite(hits.color).all())
-        picture = engine.render(view(), LOOK)  # the host names them
+        picture = engine.render(view(), TRANSFER)  # the host names them
         assert len(engine.failures) > 0 and "NaN" in engine.failures[0].message
         assert torch.isfinite(picture.color).all()
 
@@ -167,7 +167,7 @@ def test_what_the_host_would_have_to_see_to_is_refused():
             return gv.Bricks(data=super().fill(nodes), errors={0: "no"})
 
     with gv.Engine(Ball(), brick_pool="16 MB") as engine:
-        frames = Frames(engine, view(), LOOK, 8)
+        frames = Frames(engine, view(), TRANSFER, 8)
         engine.trees["scene"].producer.__class__ = Named
         with pytest.raises(ValueError, match="without alias and errors"):
             frames.frame()
@@ -175,15 +175,15 @@ def test_what_the_host_would_have_to_see_to_is_refused():
 
 def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, gv.FrameStats]:
     """Returns the number of nodes that a turning camera missed, and its final view."""
-    missed, looks = 0, 0
+    missed, looked_ahead = 0, 0
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
-        engine.render(view(64, 0), LOOK)
-        frames = Frames(engine, view(64, 0), LOOK, 256, look_ahead)
+        engine.render(view(64, 0), TRANSFER)
+        frames = Frames(engine, view(64, 0), TRANSFER, 256, look_ahead)
         for step in range(1, 25):
             frames.look_from(view(64, 1.5 * step))
             hits, stats = frames.frame()
-            missed, looks = missed + stats.misses, looks + (stats.ahead > 0)
-        assert looks == (0 if look_ahead == 0 else 23 if look_ahead < 8 else 6)
+            missed, looked_ahead = missed + stats.misses, looked_ahead + (stats.ahead > 0)
+        assert looked_ahead == (0 if look_ahead == 0 else 23 if look_ahead < 8 else 6)
         for _ in range(30):
             hits, stats = frames.frame()
             assert stats.ahead == 0, "it stands still"
@@ -191,7 +191,7 @@ def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, g
                 break
         engine.validate()
         assert stats.converged
-        expected = engine.render(view(64, 1.5 * step), LOOK)
+        expected = engine.render(view(64, 1.5 * step), TRANSFER)
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     return missed, hits, stats
 
@@ -200,29 +200,29 @@ def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, g
 @pytest.mark.parametrize("look_ahead, fewer", [(3, 2), (16, 2)])
 def test_rays_ahead_of_a_moving_camera_ask_for_what_it_would_miss(look_ahead, fewer):
     missed, hits, stats = missed_on_a_flight("cpp", 0)
-    left, same, own = missed_on_a_flight("cpp", look_ahead)
+    left, same, last_stats = missed_on_a_flight("cpp", look_ahead)
     assert left * fewer < missed and missed > 100
-    assert torch.equal(hits.color, same.color) and own.bricks_used == stats.bricks_used
+    assert torch.equal(hits.color, same.color) and last_stats.bricks_used == stats.bricks_used
 
 
 @pytest.mark.backend("cpp")
 def test_what_the_picture_misses_comes_before_what_the_next_ones_will():
     """The picture's misses are counted as without look-ahead rays."""
-    told = []
+    counts = []
     for look_ahead in (0, 5):
         with gv.Engine(Ball(1024), brick_pool="64 MB") as engine:
-            frames = Frames(engine, view(64, 0), LOOK, 8, look_ahead)
+            frames = Frames(engine, view(64, 0), TRANSFER, 8, look_ahead)
             for angle in (0, 0, 1, 3):
                 frames.look_from(view(64, angle))
                 _, stats = frames.frame()
-            told.append((stats.requests, stats.misses, stats.bricks_used, stats.tiles_used))
-            wanted = frames.served._requests[0, 0]
-            chosen = torch.cat([one.node for one in frames.served.choose()])
+            counts.append((stats.requests, stats.misses, stats.bricks_used, stats.tiles_used))
+            requested = frames.served._requests[0, 0]
+            chosen = torch.cat([choice.node for choice in frames.served.choose()])
             assert (chosen >= 0).any() and (stats.ahead > 0) == (look_ahead > 0)
-            assert torch.isin(chosen[chosen >= 0], wanted.long()).all()
-            words = engine.cache.nodes.request_tn
-            assert not (words >> REQUEST_PENDING_SHIFT).any(), "nothing is on its way"
-    assert told[0] == told[1] and told[0][1] > 16
+            assert torch.isin(chosen[chosen >= 0], requested.long()).all()
+            request_words = engine.cache.nodes.request_tn
+            assert not (request_words >> REQUEST_PENDING_SHIFT).any(), "nothing is on its way"
+    assert counts[0] == counts[1] and counts[0][1] > 16
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -232,7 +232,7 @@ def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
     device = DEVICES[backend]
     options = {"brick_pool": "64 MB", "loading": loading, "device": device}
     with gv.Engine(Ball(1024, branching), **options) as engine:
-        frames, depth = Frames(engine, view(64), LOOK, 4096), []
+        frames, depth = Frames(engine, view(64), TRANSFER, 4096), []
         for _ in range(60):
             _, stats = frames.frame()
             there = engine.cache.nodes.parent_t >= 0
@@ -242,26 +242,26 @@ def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
         engine.validate()
         assert stats.converged
         seen = stats.tiles_used
-        made = int((engine.cache.nodes.parent_t >= 0).sum())
+        tiles = int((engine.cache.nodes.parent_t >= 0).sum())
     deepest = depth[-1]
     reached = depth.index(deepest)
     if loading == "levels":
         assert reached >= deepest, "a level needs its bricks first"
     else:
-        assert deepest > 3 and reached <= 2 < deepest and made < 3 * seen
+        assert deepest > 3 and reached <= 2 < deepest and tiles < 3 * seen
 
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_a_frame_deepens_by_no_more_than_its_most(backend):
     """Whatever look-ahead rays request, which may be far more than the frame itself requests."""
-    for priority, most in (
+    for priority, max_levels in (
         ([1024] * 3 + [-1] * 500, MAX_EXTRA_LEVELS),
         ([0, 16, 32, -1], 0),
         ([-1], 0),
     ):
-        assert extra_levels(levels_wanted(torch.tensor(priority), 2).tolist()) == most
+        assert extra_levels(levels_wanted(torch.tensor(priority), 2).tolist()) == max_levels
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
-        frames, levels = Frames(engine, view(64, 0), LOOK, 256, 8), []
+        frames, levels = Frames(engine, view(64, 0), TRANSFER, 256, 8), []
         for turn in range(20):
             frames.look_from(view(64, 3.0 * turn))
             frames.frame()
@@ -282,7 +282,7 @@ def flown(
     """Replays a flight without the host waiting, then its last view until it is complete; also
     returns how many nodes were missed on the flight.
     """
-    graph = engine.capture(path[0], LOOK, batch=batch, look_ahead=look_ahead)
+    graph = engine.capture(path[0], TRANSFER, batch=batch, look_ahead=look_ahead)
     with nobody_waits():
         flight = [graph.replay(camera)[1] for camera in path]
     missed = sum(stats.misses for stats in flight)
@@ -323,7 +323,7 @@ def test_a_long_flight_does_not_wait(blobs, tmp_path, scene, look_ahead, backend
         producer = Ball(1024)
     path = [winding(number) for number in range(1000 if device == "cuda" else 30)]
     with gv.Engine(producer, device=device, **options) as engine:
-        replay = recorded(engine, path[0], LOOK, batch=64, look_ahead=look_ahead)
+        replay = recorded(engine, path[0], TRANSFER, batch=64, look_ahead=look_ahead)
         with nobody_waits(device=device):
             flight = [replay(camera)[1] for camera in path]
         for _ in range(600):
@@ -334,8 +334,8 @@ def test_a_long_flight_does_not_wait(blobs, tmp_path, scene, look_ahead, backend
         assert stats.converged and sum(stats.misses > 0 for stats in flight) > 0.1 * len(path)
         assert any(stats.ahead for stats in flight) == (look_ahead > 0)
         engine.validate()
-        shown = color.clone()
-        assert torch.equal(engine.render(path[-1], LOOK).color.reshape(-1, 3), shown)
+        last_color = color.clone()
+        assert torch.equal(engine.render(path[-1], TRANSFER).color.reshape(-1, 3), last_color)
 
 
 @pytest.mark.backend("cuda")
@@ -344,27 +344,27 @@ def test_a_flight_is_replayed_without_the_host():
     with gv.Engine(Ball(1024), brick_pool="64 MB", device="cuda") as engine:
         graph, picture, _, missed = flown(engine, PATH, 256)
         assert sum(graph.replay(PATH[-1])[1].settle().produced.values()) == 0
-        shown = picture.color.clone()
-        served = engine.render(PATH[-1], LOOK)
-        assert torch.equal(served.color, shown)
-        engine.frame(view(96, 200), LOOK)  # another frame between two replays
+        last_color = picture.color.clone()
+        served = engine.render(PATH[-1], TRANSFER)
+        assert torch.equal(served.color, last_color)
+        engine.frame(view(96, 200), TRANSFER)  # another frame between two replays
         picture, stats = graph.replay(PATH[-1])
-        assert stats.settle().converged and torch.equal(picture.color, shown)
+        assert stats.settle().converged and torch.equal(picture.color, last_color)
     with gv.Engine(Ball(1024), brick_pool="64 MB", device="cuda") as engine:
         _, picture, _, left = flown(engine, PATH, 256, look_ahead=6)
-        assert torch.equal(picture.color, shown) and left < 0.8 * missed
+        assert torch.equal(picture.color, last_color) and left < 0.8 * missed
     with gv.Engine(Unsaid(1024), brick_pool="64 MB", device="cuda") as engine:
-        expected = engine.render(PATH[-1], LOOK)
-        graph = engine.capture(PATH[-1], LOOK)
+        expected = engine.render(PATH[-1], TRANSFER)
+        graph = engine.capture(PATH[-1], TRANSFER)
         picture, stats = graph.replay(view(96, 200))
         assert not stats.settle().converged and sum(stats.produced.values()) == 0
-    assert torch.equal(expected.color, shown)
+    assert torch.equal(expected.color, last_color)
 
 
 @pytest.mark.backend("cuda")
 def test_a_node_that_fails_in_a_replay_is_named_by_the_host():
     with gv.Engine(Ball(), brick_pool="16 MB", device="cuda") as engine:
-        graph = engine.capture(view(), LOOK)
+        graph = engine.capture(view(), TRANSFER)
         engine.trees["scene"].producer.spoiled.fill_(1)
         for _ in range(40):
             picture, _ = graph.replay(view())
@@ -384,18 +384,18 @@ def test_jobs_side_by_side_give_what_they_give_one_by_one(compiled):
         few.copy_(least)
         return torch.cat((total, few.double()))
 
-    found, replay = step(), None
+    results, replay = step(), None
     if device.type == "cuda":
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
-            found = step()
+            results = step()
         replay = graph.replay
     for turn in range(2, 40):
         if replay is None:
-            found = step()
+            results = step()
         else:
             replay()
-        assert found.tolist() == [turn * (1 << 20), turn, turn, turn]
+        assert results.tolist() == [turn * (1 << 20), turn, turn, turn]
 
 
 @pytest.mark.backend("cuda")
@@ -418,7 +418,7 @@ def test_garbage_of_other_engines_does_not_end_a_recording(blobs, monkeypatch):
     monkeypatch.setattr(Cache, "sort_by_use", collecting)
     with gv.Engine(gv.VolumeProducer(blobs), device="cuda") as engine:
         try:
-            graph = engine.capture(view(24), LOOK)
+            graph = engine.capture(view(24), TRANSFER)
         finally:
             gc.set_threshold(*thresholds)
         assert not held and gc.isenabled()
@@ -432,10 +432,10 @@ def test_what_the_frame_before_asks_for_is_on_its_way(chosen):
     """The earlier frame's rays marked nodes as pending, so the next frame does not report them; and
     it may be settled before the host has requested any.
     """
-    asked = []
+    requests = []
 
     def ask(numbers: Tensor) -> int:
-        asked.append(numbers.tolist())
+        requests.append(numbers.tolist())
         return chosen
 
     counts = torch.zeros(len(Counts._fields) + 3, dtype=torch.int64)
@@ -444,4 +444,4 @@ def test_what_the_frame_before_asks_for_is_on_its_way(chosen):
     after = Readback(stats[1], Collected(None, counts), (before,))
     Readback(stats[2], Collected(None, counts), (before, after))
     assert stats[2].settle().converged == stats[1].settle().converged == (chosen == 0)
-    assert before.ask() == chosen and asked == [[0, 0, 0]], "it asks once"
+    assert before.ask() == chosen and requests == [[0, 0, 0]], "it asks once"

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.recorded import COMPILED, LOOK, Frames, view
+from helpers.recorded import COMPILED, TRANSFER, Frames, view
 
 import gvtorch as gv
 from gvtorch.engine import host_frame
@@ -49,10 +49,10 @@ def test_producers_on_the_host_answer_while_frames_go_on(
     camera = view(24 if pool == "4 MB" else 6)
     options = {"brick_size": 4, "brick_pool": pool, "device": device}
     with gv.Engine(on_the_host(blobs, tmp_path / "one", which), **options) as engine:
-        expected = engine.render(camera, LOOK)
+        expected = engine.render(camera, TRANSFER)
         assert (expected.alpha > 0.5).any()
     with gv.Engine(on_the_host(blobs, tmp_path / "two", which), **options) as engine:
-        frames, made = Frames(engine, camera, LOOK, batch), 0
+        frames, made = Frames(engine, camera, TRANSFER, batch), 0
         for _ in range(600):
             hits, stats = frames.frame()
             made += stats.produced["bricks"]
@@ -62,7 +62,7 @@ def test_producers_on_the_host_answer_while_frames_go_on(
         assert stats.converged and made > 8
         engine.validate()
         assert frames.served.pending == 0
-        picture, _ = engine.frame(camera, LOOK)  # the host continues from there
+        picture, _ = engine.frame(camera, TRANSFER)  # the host continues from there
         assert torch.equal(picture.color, expected.color)
         frames.frame()  # its record of slots is stale
         engine.validate()
@@ -82,7 +82,7 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
 
     with gv.Engine(Slow(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         Slow.gate.set()
-        frames, asker = Frames(engine, view(24), LOOK, 64), engine.recorded[0]
+        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine.recorded[0]
         while not frames.frame()[1].requests["load"]:
             asker._executor.submit(int).result()
         Slow.gate.clear()
@@ -100,7 +100,7 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
             asker._executor.submit(int).result()
             if stats.converged:
                 break
-        assert stats.converged and engine.render(view(24), LOOK).stats.produced["bricks"] == 0
+        assert stats.converged and engine.render(view(24), TRANSFER).stats.produced["bricks"] == 0
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -108,9 +108,9 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
 def test_a_busy_producer_is_asked_for_several_frames_at_once(blobs, backend, slow, monkeypatch):
     monkeypatch.setattr(host_frame, "_CALL_GAP", 0.0 if slow else math.inf)
     with gv.Engine(Later(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        engine.render(view(24), LOOK)
+        engine.render(view(24), TRANSFER)
         late = engine.trees["scene"].producer.late = []
-        frames, listed = Frames(engine, view(24), LOOK, 3), 0
+        frames, listed = Frames(engine, view(24), TRANSFER, 3), 0
         for angle in (90, 180, 270):
             frames.look_from(view(24, angle))
             for _ in range(6):
@@ -140,8 +140,8 @@ def test_a_batch_whose_frames_were_dropped_while_it_was_asked_for_is_not_waited_
             return answer
 
     with gv.Engine(Ended(blobs), brick_size=4) as engine:
-        engine.frame(view(24), LOOK)
-        frames = Frames(engine, view(24), LOOK, 3)
+        engine.frame(view(24), TRANSFER)
+        frames = Frames(engine, view(24), TRANSFER, 3)
         late = engine.trees["scene"].producer.late = []
         while not late:
             frames.frame()
@@ -180,8 +180,8 @@ def test_answers_on_their_way_are_listed_under_a_lock(blobs, backend):
         patience = 0.2
 
     with gv.Engine(Impatient(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        engine.frame(view(24), LOOK)
-        frames = Frames(engine, view(24), LOOK, 3)
+        engine.frame(view(24), TRANSFER)
+        frames = Frames(engine, view(24), TRANSFER, 3)
         late = engine.trees["scene"].producer.late = []
         waiting = frames.served._waiting = Guarded(frames.served._lock)
         while not (late and waiting):
@@ -202,7 +202,7 @@ def test_what_fails_on_the_host_is_named_and_not_asked_for_again(blobs, backend)
             return gv.Bricks(data=bricks.data, errors=errors)
 
     with gv.Engine(Spoiled(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(24), LOOK, 64)
+        frames = Frames(engine, view(24), TRANSFER, 64)
         hits, stats = frames.whole()
         assert stats.failed == len(engine.failures) > 4
         assert all(one.message == "spoiled" and one.loc[3] == 3 for one in engine.failures)
@@ -223,7 +223,7 @@ def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, 
             return super().fill(nodes)
 
     with gv.Engine(Unruly(blobs), brick_size=4, device=DEVICES[backend]) as engine:
-        frames = Frames(engine, view(16), LOOK, 64)
+        frames = Frames(engine, view(16), TRANSFER, 64)
         hits, _ = frames.whole(400, 0.002)
         told = {one.message for one in engine.failures}
         assert "OSError: no such column" in told

@@ -59,8 +59,8 @@ def test_octaves_in_a_homogeneous_medium(backend, octaves, g, dtype):
     volume = gv.Volume(np.ones((SIDE,) * 3, np.float32))
     tree = gv.N3Tree.from_volume(volume, 4, device=DEVICES[backend])
     depth = torch.tensor([0.5, 2.0, 6.0, 12.0], dtype=torch.float64)
-    places = torch.stack((depth * 0 - 3, SIDE - 0.5 - depth, depth * 0 + 7), 1)
-    rays = rays_along(places, (1.0, 0.0, 0.0), device=DEVICES[backend])
+    positions = torch.stack((depth * 0 - 3, SIDE - 0.5 - depth, depth * 0 + 7), 1)
+    rays = rays_along(positions, (1.0, 0.0, 0.0), device=DEVICES[backend])
     sun = gv.DirectionalLight((0, -1, 0), color=(1.0, 2.0, 0.5))
     shader = gv.Lit(transfer(), light=sun, octaves=octaves, anisotropy=g, ambient=0.1, diffuse=0.7)
     step = 0.25
@@ -70,12 +70,12 @@ def test_octaves_in_a_homogeneous_medium(backend, octaves, g, dtype):
     hits = Tracer(tree, shader, options)(rays)
     clear = np.exp(-EXTINCTION * (depth.numpy() - step))[:, None]  # the first interval is left out
     albedo, light = np.array(ALBEDO), np.array((1.0, 2.0, 0.5))
-    wanted = 0.1 * albedo + 0.7 * light * sum(
+    expected = 0.1 * albedo + 0.7 * light * sum(
         0.55**n * albedo ** (1 + 2 * n) * phase(0.6**n * g, 0.0) * clear ** (0.5**n)
         for n in range(octaves)
     )
-    found = (hits.color / hits.alpha).double().cpu().numpy()
-    np.testing.assert_allclose(found, wanted, rtol=2e-4)
+    actual = (hits.color / hits.alpha).double().cpu().numpy()
+    np.testing.assert_allclose(actual, expected, rtol=2e-4)
 
 
 def test_light_from_ahead_goes_on(backend):
@@ -85,11 +85,11 @@ def test_light_from_ahead_goes_on(backend):
     )
     rays = rays_along(torch.tensor([[4.0, 4.0, -5.0]]).double(), (0, 0, 1), device=DEVICES[backend])
     light = []
-    for way in ((0, 0, -1), (0, 0, 1)):  # against the eye, and with it
-        look = gv.Lit(
-            transfer((1, 1, 1)), light=gv.DirectionalLight(way), octaves=1, anisotropy=0.6
+    for direction in ((0, 0, -1), (0, 0, 1)):  # against the eye, and with it
+        lit = gv.Lit(
+            transfer((1, 1, 1)), light=gv.DirectionalLight(direction), octaves=1, anisotropy=0.6
         )
-        light.append(float(Tracer(tree, look, gv.RenderOptions(backend=backend))(rays).color[0, 0]))
+        light.append(float(Tracer(tree, lit, gv.RenderOptions(backend=backend))(rays).color[0, 0]))
     assert light[0] > 5 * light[1] > 0
 
 
@@ -99,11 +99,11 @@ def test_one_octave_to_all_sides_is_a_medium_without_normals():
     zero = np.zeros((12, 12, 12, 3), np.float32)
     tree = gv.N3Tree.from_volume({"value": gv.Volume(value), "none": gv.Volume(zero)}, 4)
     ramp = gv.TransferFunction([(0.3, 0), (1, 0.5)], [(0, 0.9, 0.8, 0.5)])
-    look = {"light": gv.DirectionalLight(SUN), "ambient": 0.2, "specular": 0.0}
+    options = {"light": gv.DirectionalLight(SUN), "ambient": 0.2, "specular": 0.0}
     rays = camera_rays(tree, 12)
-    bare = gv.trace(tree, rays, gv.Lit(ramp, normals="none", shadows=True, **look))
+    bare = gv.trace(tree, rays, gv.Lit(ramp, normals="none", shadows=True, **options))
     # Octaves follow light further, below a share of 0.01.
-    fine = gv.trace(tree, rays, gv.Lit(ramp, octaves=1, **look))
+    fine = gv.trace(tree, rays, gv.Lit(ramp, octaves=1, **options))
     torch.testing.assert_close(fine.color, bare.color, rtol=1e-5, atol=1e-6)
     assert torch.equal(fine.samples, bare.samples)
 
@@ -115,12 +115,12 @@ def test_thick_clouds_do_not_end_at_the_first_shadow(backend):
     dense = gv.TransferFunction([(0, 1 - np.exp(-3.0))], [(0, 1, 1, 1)], 1.0)
     origin = torch.tensor([[-3.0, SIDE - 10.5, 7.0]]).double()
     rays = rays_along(origin, (1.0, 0.0, 0.0), device=DEVICES[backend])
-    look = gv.Lit(dense, light=gv.DirectionalLight((0, -1, 0)), octaves=5, ambient=0.0, diffuse=1.0)
+    lit = gv.Lit(dense, light=gv.DirectionalLight((0, -1, 0)), octaves=5, ambient=0.0, diffuse=1.0)
     options = gv.RenderOptions(backend=backend, lod="finest", step=0.25)
-    hits = Tracer(tree, look, options)(rays)
+    hits = Tracer(tree, lit, options)(rays)
     clear = np.exp(-3.0 * 9.75)
-    wanted = sum(0.55**n * clear ** (0.5**n) for n in range(5))
-    assert float(hits.color[0, 0] / hits.alpha[0, 0]) == pytest.approx(wanted, rel=1e-3)
+    expected = sum(0.55**n * clear ** (0.5**n) for n in range(5))
+    assert float(hits.color[0, 0] / hits.alpha[0, 0]) == pytest.approx(expected, rel=1e-3)
 
 
 def test_what_is_refused():
@@ -139,16 +139,16 @@ def test_what_is_refused():
 
 def test_the_path_tracer_keeps_energy(script):
     """A ball that absorbs nothing sends out as much light as it gets from the sun."""
-    places = np.stack(np.meshgrid(*(np.arange(14) - 6.5,) * 3, indexing="ij"), -1)
-    ball = (0.5 * (np.linalg.norm(places, axis=-1) < 5)).astype(np.float32)
+    positions = np.stack(np.meshgrid(*(np.arange(14) - 6.5,) * 3, indexing="ij"), -1)
+    ball = (0.5 * (np.linalg.norm(positions, axis=-1) < 5)).astype(np.float32)
     rng, count, reach = np.random.default_rng(0), 30000, 8
     for g in (0.0, 0.6):
         cloud = script.Cloud(ball, 1.0, g)
-        ways = rng.normal(size=(count, 3))
-        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-        beside = np.cross(ways, rng.normal(size=(count, 3)))
-        beside *= (reach * np.sqrt(rng.random(count)) / np.linalg.norm(beside, axis=1))[:, None]
-        sent, error = script.path_trace(cloud, 6.5 + beside - 20 * ways, ways, 2, seed=1)
+        vectors = rng.normal(size=(count, 3))
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        offsets = np.cross(vectors, rng.normal(size=(count, 3)))
+        offsets *= (reach * np.sqrt(rng.random(count)) / np.linalg.norm(offsets, axis=1))[:, None]
+        sent, error = script.path_trace(cloud, 6.5 + offsets - 20 * vectors, vectors, 2, seed=1)
         steps = np.arange(0, 13.001, 0.05)
         grid = np.stack(np.meshgrid(steps, steps, steps[::4], indexing="ij"), -1).reshape(-1, 3)
         depth = cloud.at(grid).reshape(len(steps), len(steps), -1).sum(2) * 0.2
@@ -163,22 +163,22 @@ def test_the_path_tracer_with_hardly_any_albedo_scatters_once(script):
     density[1:-1, 1:-1, 1:-1] = 0.2
     for g in (0.0, 0.5):
         cloud = script.Cloud(density, 1e-4, g)  # the sun is along +z, seen from there
-        eye, way = np.array([[8.5, 8.5, 30.0]]), np.array([[0.0, 0.0, -1.0]])
-        light, error = script.path_trace(cloud, *(np.repeat(a, 4000, 0) for a in (eye, way)), 2)
+        eye, ray = np.array([[8.5, 8.5, 30.0]]), np.array([[0.0, 0.0, -1.0]])
+        light, error = script.path_trace(cloud, *(np.repeat(a, 4000, 0) for a in (eye, ray)), 2)
         depth = 0.2 * 16  # a ramp of one voxel at either end
-        wanted = 1e-4 * phase(g, -1.0) * (1 - np.exp(-2 * depth)) / 2
-        assert light.mean() == pytest.approx(wanted, rel=0.03)
-        assert error.mean() < 2 * wanted
+        expected = 1e-4 * phase(g, -1.0) * (1 - np.exp(-2 * depth)) / 2
+        assert light.mean() == pytest.approx(expected, rel=0.03)
+        assert error.mean() < 2 * expected
 
 
 def test_octaves_come_nearer_to_the_path_tracer(script):
     """On clouds that the constants were not fitted to."""
     off: dict[int, list[float]] = {1: [], 5: []}
     shape = script.noisy(24)
-    for g, way in ((0.0, (0.5, 0.4, -0.8)), (0.5, (0.2, 0.95, -0.1)), (0.85, (-0.4, 0.3, 0.85))):
-        cloud = script.Cloud(0.6 * shape, 1.0, g, script.eye_to_world(np.array(way)))
-        found = script.compare(cloud, 9, 48, [1, 5])
+    for g, sun in ((0.0, (0.5, 0.4, -0.8)), (0.5, (0.2, 0.95, -0.1)), (0.85, (-0.4, 0.3, 0.85))):
+        cloud = script.Cloud(0.6 * shape, 1.0, g, script.eye_to_world(np.array(sun)))
+        results = script.compare(cloud, 9, 48, [1, 5])
         for octaves, differences in off.items():
-            differences.append(found[octaves][1])
-        assert found[1][0] < 0.6 and 0.5 < found[5][0] < 1.5
+            differences.append(results[octaves][1])
+        assert results[1][0] < 0.6 and 0.5 < results[5][0] < 1.5
     assert np.sqrt(np.mean(np.square(off[5]))) < 0.6 * np.sqrt(np.mean(np.square(off[1])))

@@ -14,10 +14,10 @@ from helpers.shapes import (
     SHAPES,
     ball,
     block,
-    inside,
     np_escape,
     np_log,
     np_power,
+    points_inside,
     random_boxes,
     random_points,
 )
@@ -77,7 +77,7 @@ def test_any_iteration_makes_a_fractal_and_what_is_not_known_is_not_proven():
     assert np.isclose(shape(points).numpy(), expected, rtol=1e-6).mean() > 0.995
     center, half = random_boxes(2000)
     low, high = shape.bounds(center, half)
-    value = shape(inside(center, half, 20))
+    value = shape(points_inside(center, half, 20))
     assert (value >= low[:, None]).all() and (value <= high[:, None]).all()
     center, half = torch.full((1, 3), 5.0).double(), torch.full((1, 3), 0.1).double()
     assert shape.bounds(center, half)[0] > 0, "beyond the bailout it escapes at once"
@@ -102,7 +102,7 @@ def test_intervals_hold_in_random_boxes(shape):
     low, high = shape.bounds(center, half)
     steep = shape.slope(center, half)
     for at in torch.arange(len(center)).split(20_000):
-        points = inside(center[at], half[at], 27)
+        points = points_inside(center[at], half[at], 27)
         value = shape(points)
         assert (value >= low[at, None] - 1e-12).all() and (value <= high[at, None] + 1e-12).all()
         change = (value[:, :13] - value[:, 13:26]).abs()
@@ -156,7 +156,7 @@ def test_shapes_have_the_colour_of_what_is_nearer():
     center, half = random_boxes(20_000)
     for shape in (union, ball() - block(), sdf.SmoothUnion(ball(), block(), 0.3)):
         low, high = shape.colors(center, half)
-        found = shape.surface(inside(center, half, 12))[1]
+        found = shape.surface(points_inside(center, half, 12))[1]
         assert (found >= low[:, None] - 1e-6).all() and (found <= high[:, None] + 1e-6).all()
         assert (low == high).all(1).double().mean() > 0.02, "of shapes that nearly touch"
 
@@ -172,7 +172,7 @@ def test_what_matters_near_a_box_has_the_same_bits(name):
             middle = (2 * torch.rand(1, 3, generator=random, dtype=torch.float64) - 1) * size
             center = middle + wide * size * (torch.rand(5, 3, generator=random).double() - 0.5)
             half = torch.full_like(center, 0.2 * wide * size)
-            points = inside(center, half, 30).float()
+            points = points_inside(center, half, 30).float()
             near = shape.near(center, half)
             for one, other in zip(near.surface(points), shape.surface(points), strict=True):
                 assert torch.equal(one, other)

@@ -11,7 +11,7 @@ import torch
 from helpers import DEVICES
 from helpers.rays import camera_rays
 from helpers.traces import SHADER, arguments, changed, packed
-from helpers.trees import forget, on
+from helpers.trees import copy_to, with_holes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -36,7 +36,7 @@ def tracing(
     tree, backend, rays, shader=SHADER, *, stop_alpha=0.99, hides=True, **options
 ) -> tuple[RayArguments, TraceArguments]:
     """Returns arguments of `trace_rays` for rays through a clean copy of a tree."""
-    copy = on(tree, DEVICES[backend])
+    copy = copy_to(tree, DEVICES[backend])
     copy.frame += 1
     chosen = gv.RenderOptions(backend=backend, stop_alpha=stop_alpha, **options)
     traced = Tracer(copy, shader, chosen).arguments
@@ -56,16 +56,16 @@ def tensors(segments) -> dict[str, torch.Tensor]:
 
 def assert_same_walk(tree, compiled, rays, *, hides=True, limit=0, by_node=False, **options):
     """Asserts that segments, marks and samples of the twin and of a kernel are equal."""
-    found = []
+    walks = []
     for backend in ("reference", compiled):
-        given, traced = tracing(tree, backend, rays, hides=hides, **options)
+        ray_args, traced = tracing(tree, backend, rays, hides=hides, **options)
         part = {"limit": limit, "by_node": by_node, "backend": backend}
-        segments = trace_segments(given, traced, **part)
+        segments = trace_segments(ray_args, traced, **part)
         samples = list_samples(segments)
-        values = sample_bricks(given, traced, segments, samples, backend=backend)
+        values = sample_bricks(ray_args, traced, segments, samples, backend=backend)
         marks = {name: getattr(traced, name).cpu() for name in MARKS}
-        found.append({**tensors(segments), **marks, "values": values.cpu()})
-    expected, actual = found
+        walks.append({**tensors(segments), **marks, "values": values.cpu()})
+    expected, actual = walks
     for name in expected:
         assert torch.equal(actual[name], expected[name]), name
     return expected
@@ -109,7 +109,7 @@ def test_compiled_equals_reference_for_dtypes(blobs, compiled, voxel, dtype):
 def test_missing_nodes_give_equal_segments_and_requests(
     blobs, share, seed, lod, limit, distance, azimuth, elevation
 ):
-    tree = forget(gv.N3Tree.from_volume(blobs, 4), share, seed)
+    tree = with_holes(gv.N3Tree.from_volume(blobs, 4), share, seed)
     rays = camera_rays(tree, 12, distance=distance, azimuth=azimuth, elevation=elevation)
     assert_same_walk(tree, "cpp", rays, lod=lod, limit=limit)
 
@@ -118,9 +118,9 @@ def test_missing_nodes_give_equal_segments_and_requests(
 @pytest.mark.parametrize("distance", [0.2, 1.3, 6.0])
 def test_segments_are_what_trace_rays_samples(blobs, backend, lod, distance):
     """Same number of samples, same marks, same requests, in a tree with missing parts."""
-    tree = forget(gv.N3Tree.from_volume(blobs, 4), 0.3, 7)
+    tree = with_holes(gv.N3Tree.from_volume(blobs, 4), 0.3, 7)
     rays = camera_rays(tree, distance=distance)
-    given, drawn = tracing(tree, backend, rays, stop_alpha=1.0, lod=lod)
+    ray_args, drawn = tracing(tree, backend, rays, stop_alpha=1.0, lod=lod)
     haze = gv.TransferFunction.from_points([(0, 0), (0.2, 0), (1, 0.1)])  # nothing is opaque
     sampling = Sampling(
         smallest_spacing=min(tree.spacing),
@@ -131,8 +131,8 @@ def test_segments_are_what_trace_rays_samples(blobs, backend, lod, distance):
     )
     drawn = drawn._replace(**vars(haze.table(sampling)))
     walked = drawn._replace(**{name: getattr(drawn, name).clone() for name in MARKS})
-    *_, samples, missed = trace_rays(given, drawn, backend=backend)
-    segments = trace_segments(given, walked, backend=backend)
+    *_, samples, missed = trace_rays(ray_args, drawn, backend=backend)
+    segments = trace_segments(ray_args, walked, backend=backend)
     assert torch.equal(segments.counts[:, 1], samples) and samples.max() > 10
     assert torch.equal(segments.missed, missed) and missed.any()
     for name in MARKS:
@@ -143,12 +143,12 @@ def table_colors(values_k, level_k, table) -> torch.Tensor:
     """Returns rows (k, 4) of a transfer function's table, by its formula."""
     low, high = table.domain_2
     last = table.table_lm4.shape[1] - 1
-    place = ((values_k - low) / (high - low) * last).clamp(0, last)
-    row = place.long().clamp(max=last - 1)
+    position = ((values_k - low) / (high - low) * last).clamp(0, last)
+    row = position.long().clamp(max=last - 1)
     rows = table.table_lm4[level_k.long()]
     a = rows.gather(1, row[:, None, None].expand(-1, 1, 4))[:, 0]
     b = rows.gather(1, row[:, None, None].expand(-1, 1, 4) + 1)[:, 0]
-    return a + (place - row)[:, None] * (b - a)
+    return a + (position - row)[:, None] * (b - a)
 
 
 @pytest.mark.parametrize("lod", ["finest", "auto"])
@@ -157,30 +157,30 @@ def test_sampled_and_composited_segments_are_the_picture(blobs, backend, lod, li
     """The pipeline of separate ops against the fused one, at once and in parts."""
     tree = gv.N3Tree.from_volume(blobs, 8)
     rays = camera_rays(tree, distance=1.3)
-    given, traced = tracing(tree, backend, rays, lod=lod)
-    color, alpha, _, samples, _ = trace_rays(given, traced, backend=backend)
+    ray_args, traced = tracing(tree, backend, rays, lod=lod)
+    color, alpha, _, samples, _ = trace_rays(ray_args, traced, backend=backend)
     count = len(samples)
     total, clear = torch.zeros_like(color), torch.ones_like(alpha[:, 0])
     taken, state, rounds = torch.zeros_like(samples), None, 0
     while True:
-        segments = trace_segments(given, traced, state, limit=limit, backend=backend)
+        segments = trace_segments(ray_args, traced, state, limit=limit, backend=backend)
         state, listed = segments.state, list_samples(segments)
         if not len(listed.segment):
             break
         rounds += 1
-        values = sample_bricks(given, traced, segments, listed, backend=backend)[:, 0]
-        which = listed.segment.long()
-        level = segments.interval[which, 2]
+        values = sample_bricks(ray_args, traced, segments, listed, backend=backend)[:, 0]
+        segment = listed.segment.long()
+        level = segments.interval[segment, 2]
         piece = level < 0
         rgba = table_colors(values, level.clamp(min=0), traced)
-        length = (segments.t1 - segments.t0)[which] / traced.step
+        length = (segments.t1 - segments.t0)[segment] / traced.step
         alpha_k = torch.where(piece, 1 - (1 - rgba[:, 3]) ** length, rgba[:, 3])
         part, clear, before = composite(
             *(alpha_k, rgba[:, :3].contiguous(), listed.offset, clear),
             stop_alpha=0.99, backend=backend,
         )  # fmt: skip
         total = total + part
-        ray = segments.ray_index.long()[which]
+        ray = segments.ray_index.long()[segment]
         taken.index_add_(0, ray, (before > 0).to(torch.int32))
         if limit == 0:
             break
@@ -193,11 +193,11 @@ def test_sampled_and_composited_segments_are_the_picture(blobs, backend, lod, li
 def test_parts_of_a_walk_are_the_walk(blobs, backend):
     tree = gv.N3Tree.from_volume(blobs, 4)
     rays = camera_rays(tree, distance=1.3)
-    given, traced = tracing(tree, backend, rays)
-    whole = trace_segments(given, traced, backend=backend)
+    ray_args, traced = tracing(tree, backend, rays)
+    whole = trace_segments(ray_args, traced, backend=backend)
     parts, state = [], None
     while not parts or len(parts[-1].ray_index):
-        parts.append(trace_segments(given, traced, state, limit=1, backend=backend))
+        parts.append(trace_segments(ray_args, traced, state, limit=1, backend=backend))
         state = parts[-1].state
     assert len(parts) > 5
     joined = [torch.cat([getattr(part, name) for part in parts]) for name in LISTED]
@@ -212,16 +212,16 @@ def test_distances_cover_the_box(blobs, backend):
     noise = gv.Volume(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)))
     tree = gv.N3Tree.from_volume(noise, 8)
     rays = camera_rays(tree, 8, distance=3, azimuth=0, elevation=0)
-    given, traced = tracing(tree, backend, rays, lod="finest", hides=False)
-    segments = trace_segments(given, traced, backend=backend)
+    ray_args, traced = tracing(tree, backend, rays, lod="finest", hides=False)
+    segments = trace_segments(ray_args, traced, backend=backend)
     assert (segments.t1 > segments.t0).all() and (segments.depth == 0).all()
     ray = segments.ray_index.long()
     covered = torch.zeros(64).to(segments.t0).index_add_(0, ray, segments.t1 - segments.t0)
-    near = (3 * 8 - 4) / -given.direction_r3[:, 2]
-    inner = given.direction_r3[:, :2].abs() * (3 * 8 + 4) / -given.direction_r3[:, 2:] < 4
+    near = (3 * 8 - 4) / -ray_args.direction_r3[:, 2]
+    inner = ray_args.direction_r3[:, :2].abs() * (3 * 8 + 4) / -ray_args.direction_r3[:, 2:] < 4
     inner = inner.all(1)
     assert inner.sum() >= 4
-    expected = 8 / -given.direction_r3[:, 2]
+    expected = 8 / -ray_args.direction_r3[:, 2]
     assert (covered - expected)[inner].abs().max() < 1e-4
     first = (
         torch.full((64,), math.inf).to(near).scatter_reduce_(0, ray, segments.t0.double(), "amin")
@@ -239,12 +239,12 @@ def test_gradient_by_bricks_and_constants(blobs, compiled):
     rays = camera_rays(tree, 16, distance=1.5)
     grads = []
     for backend in ("reference", compiled):
-        given, traced = tracing(tree, backend, rays, dtype=torch.float64, hides=False)
-        segments = trace_segments(given, traced, backend=backend)
+        ray_args, traced = tracing(tree, backend, rays, dtype=torch.float64, hides=False)
+        segments = trace_segments(ray_args, traced, backend=backend)
         pool = (traced.bricks_bzyxc, traced.constant_tnc)
         leaves = [tensor.clone().requires_grad_() for tensor in pool]
         traced = traced._replace(bricks_bzyxc=leaves[0], constant_tnc=leaves[1])
-        values = sample_bricks(given, traced, segments, list_samples(segments), backend=backend)
+        values = sample_bricks(ray_args, traced, segments, list_samples(segments), backend=backend)
         weight = torch.linspace(-1, 1, len(values), dtype=torch.float64).to(values)[:, None]
         (values * weight).sum().backward()
         grads.append([leaf.grad.cpu() for leaf in leaves])
@@ -258,15 +258,15 @@ def test_gradient_by_bricks_against_differences(blobs, backend):
     """gradcheck on a pool of float32: sampling is linear, so a wide step is exact."""
     tree = gv.N3Tree.from_volume(gv.Volume(blobs.data[12:20, 8:16, 10:18].contiguous()), 2)
     rays = camera_rays(tree, 3, distance=1.5)
-    given, traced = tracing(tree, backend, rays, dtype=torch.float64, hides=False)
-    segments = trace_segments(given, traced, backend=backend)
+    ray_args, traced = tracing(tree, backend, rays, dtype=torch.float64, hides=False)
+    segments = trace_segments(ray_args, traced, backend=backend)
     samples, pool = list_samples(segments), traced.bricks_bzyxc
     used = segments.brick[:, 0].long()
     rows = used[used >= 0].unique()[:3]
 
     def read(part: torch.Tensor) -> torch.Tensor:
-        own = traced._replace(bricks_bzyxc=pool.index_copy(0, rows, part))
-        return sample_bricks(given, own, segments, samples, backend=backend).float()
+        changed_args = traced._replace(bricks_bzyxc=pool.index_copy(0, rows, part))
+        return sample_bricks(ray_args, changed_args, segments, samples, backend=backend).float()
 
     part = pool[rows].clone().requires_grad_()
     assert torch.autograd.gradcheck(read, (part,), eps=0.5, atol=1e-4, rtol=1e-4, nondet_tol=1e-5)
@@ -279,30 +279,30 @@ def test_gradient_by_bricks_against_differences(blobs, backend):
 @pytest.fixture
 def walk(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4)
-    given, traced = tracing(tree, compiled, camera_rays(tree, 6, distance=1.3))
-    segments = trace_segments(given, traced)
-    return given, traced, segments, list_samples(segments)
+    ray_args, traced = tracing(tree, compiled, camera_rays(tree, 6, distance=1.3))
+    segments = trace_segments(ray_args, traced)
+    return ray_args, traced, segments, list_samples(segments)
 
 
-def sampling(given, traced, segments, samples) -> list:
+def sampling(ray_args, traced, segments, samples) -> list:
     """Arguments of `torch.ops.gvtorch.sample_bricks` in order."""
-    return [*given, *traced.channel, *segments[:6], samples.segment, samples.number]
+    return [*ray_args, *traced.channel, *segments[:6], samples.segment, samples.number]
 
 
 def test_opcheck(walk):
-    given, traced, segments, samples = walk
+    ray_args, traced, segments, samples = walk
     ops = torch.ops.gvtorch
-    args = (*given, *traced, None, 0, False)
+    args = (*ray_args, *traced, None, 0, False)
     torch.library.opcheck(ops.count_segments.default, args)
     first = (segments.counts[:, 0].cumsum(0) - segments.counts[:, 0]).long()
     torch.library.opcheck(ops.write_segments.default, (*args, first, len(segments.ray_index)))
-    own = {name: getattr(traced, name).clone() for name in ("bricks_bzyxc", "constant_tnc")}
-    leaves = traced._replace(**{name: leaf.requires_grad_() for name, leaf in own.items()})
-    reads = sampling(given, leaves, segments, samples)
+    leaf_fields = {name: getattr(traced, name).clone() for name in ("bricks_bzyxc", "constant_tnc")}
+    leaves = traced._replace(**{name: leaf.requires_grad_() for name, leaf in leaf_fields.items()})
+    reads = sampling(ray_args, leaves, segments, samples)
     torch.library.opcheck(ops.sample_bricks.default, tuple(reads))
     grad = torch.ones(len(samples.segment), 1, device=reads[0].device)
     checks = ("test_schema", "test_faketensor")
-    reads = sampling(given, traced, segments, samples)
+    reads = sampling(ray_args, traced, segments, samples)
     torch.library.opcheck(ops.sample_bricks_backward.default, (grad, *reads), test_utils=checks)
     alpha, feature, offset, clear = packed(device=reads[0].device)
     leaves = (alpha.requires_grad_(), feature.requires_grad_(), offset, clear.requires_grad_())
@@ -327,11 +327,11 @@ class Emission(torch.nn.Module):
 
 @pytest.mark.filterwarnings("ignore")
 def test_scripts_compiles_and_exports(walk):
-    given, traced, segments, samples = walk
+    ray_args, traced, segments, samples = walk
     listed = (*segments[:6], samples.segment, samples.number)
     clear = torch.ones(len(segments.counts), device=traced.child_tn.device)
     module = Emission()
-    inputs = (given, traced.channel, listed, samples.offset, clear)
+    inputs = (ray_args, traced.channel, listed, samples.offset, clear)
     expected = module(*inputs)
     assert expected.max() > 0.3
     assert torch.equal(torch.jit.script(module)(*inputs), expected)
@@ -342,20 +342,20 @@ def test_scripts_compiles_and_exports(walk):
 
 @pytest.mark.filterwarnings("ignore")
 def test_the_walk_compiles_and_exports(walk):
-    given, traced, expected, _ = walk
+    ray_args, traced, expected, _ = walk
 
     class Walk(torch.nn.Module):
         def forward(self, origin: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            args = (origin, *given[1:], *traced, None, 0, False)
+            args = (origin, *ray_args[1:], *traced, None, 0, False)
             count, _, _ = torch.ops.gvtorch.count_segments(*args)
             ends = count[:, 0].cumsum(0, dtype=torch.int64)
             total = ends[-1].item()
             torch._check_is_size(total)
             return torch.ops.gvtorch.write_segments(*args, ends - count[:, 0], total)
 
-    program = torch.export.export(Walk(), (given.origin_r3,))
-    for name, found in zip(expected._fields, program.module()(given.origin_r3), strict=False):
-        assert torch.equal(found, getattr(expected, name)), name
+    program = torch.export.export(Walk(), (ray_args.origin_r3,))
+    for name, actual in zip(expected._fields, program.module()(ray_args.origin_r3), strict=False):
+        assert torch.equal(actual, getattr(expected, name)), name
 
 
 @pytest.mark.backend("cpp")
@@ -375,17 +375,17 @@ def test_the_walk_compiles_and_exports(walk):
 def test_bad_arguments_of_trace_segments(blobs, change, message):
     tree = gv.N3Tree.from_volume(blobs, 8)
     with pytest.raises(ValueError) as caught:
-        own = {name: change[name] for name in ("state_r3", "limit", "backend") if name in change}
-        trace_segments(*changed(arguments(tree, 4), change), **own)
+        limits = {name: change[name] for name in ("state_r3", "limit", "backend") if name in change}
+        trace_segments(*changed(arguments(tree, 4), change), **limits)
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.backend("cpp")
 def test_bad_arguments_of_sampling_and_compositing(blobs):
     tree = gv.N3Tree.from_volume(blobs, 8)
-    given, traced = arguments(tree, 4)
-    segments = trace_segments(given, traced)
-    good = (given, traced, segments, list_samples(segments))
+    ray_args, traced = arguments(tree, 4)
+    segments = trace_segments(ray_args, traced)
+    good = (ray_args, traced, segments, list_samples(segments))
     for change, message in (
         ({"segment": torch.zeros(3)}, "segment must be (k,) int32"),
         ({"distance": segments.distance.half()}, "distance must be (s, 3) float32 or"),
@@ -420,11 +420,11 @@ def test_samples_that_name_nothing_are_zero(walk):
         {"brick": torch.full_like(segments.brick, 10**6)},
         {"depth": torch.full_like(segments.depth, 60)},
     ):
-        given = changed(walk, change)
-        values = sample_bricks(*given)
+        sampling_args = changed(walk, change)
+        values = sample_bricks(*sampling_args)
         assert (values[:2] == 0).all()
         if "segment" in change or "ray_index" in change:
-            assert torch.equal(values, sample_bricks(*given, backend="reference"))
+            assert torch.equal(values, sample_bricks(*sampling_args, backend="reference"))
 
 
 @pytest.mark.backend("cpp")

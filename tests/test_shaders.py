@@ -13,8 +13,8 @@ import torch
 from helpers import DEVICES, ROOT
 from helpers.rays import camera_rays, rays_along, world_rays
 from helpers.shaders import POINT, SHADERS
-from helpers.traces import SHADER, assert_equal, changed, op_arguments, run
-from helpers.trees import forget, on
+from helpers.traces import SHADER, assert_equal, changed, op_arguments, trace
+from helpers.trees import copy_to, with_holes
 
 import gvtorch as gv
 from gvtorch import cpp_ext
@@ -49,20 +49,20 @@ def test_compiled_equals_reference(tree, compiled, name, lod):
     few = "shadows" in name or lod == "finest"  # the twin is slow
     for distance in (1.3,) if few else (0.2, 1.3, 6.0):
         rays = camera_rays(tree, 6 if few else 10, distance=distance)
-        found, _, actual = assert_equal(tree, compiled, rays, SHADERS[name], lod=lod)
+        expected, _, actual = assert_equal(tree, compiled, rays, SHADERS[name], lod=lod)
         if compiled == "cpp":
             for field in ("color", "alpha", "depth", "normal", "features"):
-                assert torch.equal(actual[field], found[field]), field
+                assert torch.equal(actual[field], expected[field]), field
         if distance == 1.3:
-            assert found["alpha"].max() > 0.3, "the test must see something"
+            assert expected["alpha"].max() > 0.3, "the test must see something"
 
 
 @pytest.mark.parametrize("name", SHADERS)
 def test_compiled_equals_reference_in_every_bit_of_float64(tree, compiled, name):
     rays = camera_rays(tree, 6, distance=1.3)
-    found, _, actual = assert_equal(tree, compiled, rays, SHADERS[name], dtype=torch.float64)
+    expected, _, actual = assert_equal(tree, compiled, rays, SHADERS[name], dtype=torch.float64)
     for field in ("color", "alpha", "depth", "normal", "features"):
-        assert torch.equal(actual[field].cpu(), found[field].cpu()), field
+        assert torch.equal(actual[field].cpu(), expected[field].cpu()), field
 
 
 @pytest.mark.parametrize(
@@ -90,11 +90,11 @@ def test_pre_integration_skips_what_its_function_does_not_show(ends):
     values[12:20, 12:20, 4:12] = 0.45 if ends[-1][1] == 0 else 1.0
     tree = gv.N3Tree.from_volume(gv.Volume(values), 4)
     rays, transfer = camera_rays(tree, 16), gv.TransferFunction(ends)
-    plain, found = (
-        gv.trace(tree, rays, one, lod="finest", stop_alpha=1.0)
-        for one in (transfer, gv.PreIntegrated(transfer))
+    plain, integrated = (
+        gv.trace(tree, rays, shader, lod="finest", stop_alpha=1.0)
+        for shader in (transfer, gv.PreIntegrated(transfer))
     )
-    assert 0 < int(found.samples.sum()) <= 1.1 * int(plain.samples.sum())
+    assert 0 < int(integrated.samples.sum()) <= 1.1 * int(plain.samples.sum())
 
 
 @pytest.mark.parametrize(
@@ -104,18 +104,18 @@ def test_every_channel_dtype(blobs, compiled, dtype):
     data = (blobs.data * 100).to(getattr(torch, dtype))
     tree = gv.N3Tree.from_volume(gv.Volume(data), 4)
     rays = camera_rays(tree, 12)
-    found, *_ = assert_equal(tree, compiled, rays, gv.Isosurface(50))
-    assert found["alpha"].max() == 1 and found["normal"].norm(dim=1).max() > 0.99
+    hits, *_ = assert_equal(tree, compiled, rays, gv.Isosurface(50))
+    assert hits["alpha"].max() == 1 and hits["normal"].norm(dim=1).max() > 0.99
     function = gv.TransferFunction([(20, 0), (80, 0.7)], [(20, 1, 0.5, 0.1), (80, 1, 1, 1)])
     for lod in ("finest", "auto"):
-        found, *_ = assert_equal(tree, compiled, rays, gv.Lit(function), lod=lod)
-        assert found["alpha"].max() > 0.7 and found["normal"].norm(dim=1).max() > 0.9
+        hits, *_ = assert_equal(tree, compiled, rays, gv.Lit(function), lod=lod)
+        assert hits["alpha"].max() > 0.7 and hits["normal"].norm(dim=1).max() > 0.9
 
 
 @pytest.mark.parametrize("name", SHADERS)
 def test_missing_nodes_give_equal_pictures_and_requests(tree, compiled, name):
     for seed, share in ((1, 0.3), (2, 0.7)):
-        holes = forget(tree, share, seed)
+        holes = with_holes(tree, share, seed)
         rays = camera_rays(holes, 8, distance=1.4)
         _, marks, _ = assert_equal(holes, compiled, rays, SHADERS[name])
         assert marks["request"].any()
@@ -124,14 +124,14 @@ def test_missing_nodes_give_equal_pictures_and_requests(tree, compiled, name):
 @pytest.mark.parametrize("threshold", [None, 0.2])
 @pytest.mark.parametrize("name", SHADERS)
 def test_what_ranges_hide_changes_no_bit(channels, name, threshold):
-    known = gv.N3Tree.from_volume(channels, 4, threshold=threshold)
-    unknown = on(known, "cpu")
+    ranged = gv.N3Tree.from_volume(channels, 4, threshold=threshold)
+    unknown = copy_to(ranged, "cpu")
     for channel, ranges in unknown.nodes.ranges.items():
-        ranges[:, :, 0], ranges[:, :, 1] = known.bricks.channels[channel].limits
-    rays = camera_rays(known, 16, distance=1.6)
+        ranges[:, :, 0], ranges[:, :, 1] = ranged.bricks.channels[channel].limits
+    rays = camera_rays(ranged, 16, distance=1.6)
     for lod in ("finest", "auto"):
         options = gv.RenderOptions(lod=lod)
-        few, many = (vars(Tracer(t, SHADERS[name], options)(rays)) for t in (known, unknown))
+        few, many = (vars(Tracer(t, SHADERS[name], options)(rays)) for t in (ranged, unknown))
         assert few["samples"].sum() <= many["samples"].sum()
         for field in ("color", "alpha", "depth", "normal", "features"):
             assert torch.equal(few[field], many[field]), field
@@ -145,7 +145,7 @@ def test_rays_that_have_lost_light_bring_back_the_rest(tree, compiled, name):
     rays = camera_rays(tree, 16, distance=1.6)
     dimmed = replace(rays, transmittance=torch.full((len(rays.origin),), 0.25))
     options = gv.RenderOptions(stop_alpha=1.0, backend=compiled)
-    tracer = Tracer(on(tree, DEVICES[compiled]), SHADERS[name], options)
+    tracer = Tracer(copy_to(tree, DEVICES[compiled]), SHADERS[name], options)
     full, rest = (tracer(some.to(DEVICES[compiled])) for some in (rays, dimmed))
     torch.testing.assert_close(rest.color, 0.25 * full.color)
     torch.testing.assert_close(1 - rest.alpha, 0.25 * (1 - full.alpha))
@@ -157,19 +157,19 @@ def test_a_surface_has_the_colour_that_its_voxels_hold(tree, compiled):
     rays, flat = camera_rays(tree, 16), {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0}
     ramp = gv.TransferFunction.from_points([(0, 1)], [(0, 0, 0, 0), (255, 1, 1, 1)])
     stored = gv.Isosurface(0.4, None, color_channel="rgba", **flat)
-    found, _ = run(tree, compiled, rays, stored)
+    hits, _ = trace(tree, compiled, rays, stored)
     for number in range(3):
         grey = gv.Isosurface(0.4, ramp, color_channel="rgba", color_component=number, **flat)
-        by_function, _ = run(tree, compiled, rays, grey)
-        assert (found["color"][:, number] - by_function["color"][:, 0]).abs().max() < 2e-3
-    assert found["color"].std(0).min() > 0.05, "of many colours"
-    times, _ = run(tree, compiled, rays, gv.Isosurface(
+        by_function, _ = trace(tree, compiled, rays, grey)
+        assert (hits["color"][:, number] - by_function["color"][:, 0]).abs().max() < 2e-3
+    assert hits["color"].std(0).min() > 0.05, "of many colours"
+    times, _ = trace(tree, compiled, rays, gv.Isosurface(
         0.4, None, color_channel="premultiplied", premultiplied=True, **flat
     ))  # fmt: skip
-    apart = (times["color"] - found["color"]).abs()  # there, voxels are weighted by opacity
-    assert apart.max() < 0.1 and apart.mean() < 0.01
+    difference = (times["color"] - hits["color"]).abs()  # there, voxels are weighted by opacity
+    assert difference.max() < 0.1 and difference.mean() < 0.01
     with pytest.raises(ValueError, match="stored colour needs 4 numbers a voxel, 'normal' has 3"):
-        run(tree, compiled, rays, gv.Isosurface(0.4, None, color_channel="normal"))
+        trace(tree, compiled, rays, gv.Isosurface(0.4, None, color_channel="normal"))
 
 
 @pytest.mark.parametrize("name", ["lit", "stored colour"])
@@ -183,17 +183,17 @@ def test_a_region_of_one_value_is_lit_as_bricks_are(compiled, name):
     shader: gv.Lit | gv.StoredColor = gv.Lit(SHADER, normals="normal", light=light)
     if name == "stored colour":
         shader = gv.StoredColor("rgba", normals="normal", light=light, reference=10.0)
-    found = []
+    results = []
     for noise in (0.0, 1e-7):  # one region, without any brick; bricks
         rough = {**even, "value": even["value"] + noise * torch.rand(20, 20, 20)}
         tree = gv.N3Tree.from_volume({n: gv.Volume(data) for n, data in rough.items()}, 4)
         assert bool(tree.bricks.capacity) is (noise > 0)
         rays = camera_rays(tree, 12, distance=1.6)
         *_, actual = assert_equal(tree, compiled, rays, shader, lod="finest")
-        found.append(actual)
-    assert found[0]["color"].max() > 0.05
+        results.append(actual)
+    assert results[0]["color"].max() > 0.05
     for field in ("color", "alpha", "normal"):
-        torch.testing.assert_close(found[0][field], found[1][field], rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(results[0][field], results[1][field], rtol=1e-4, atol=1e-4)
 
 
 def test_lights_are_tensors_that_may_be_edited(tree):
@@ -224,7 +224,7 @@ def test_each_parameter_is_a_tensor_that_may_be_edited(tree, compiled, edited):
     """The next frame equals, to the bit, that of a new shader with those numbers. The colour is
     copied to a frame's table; everything else is read while rays are traced.
     """
-    tree, rays = on(tree, DEVICES[compiled]), camera_rays(tree, 16).to(DEVICES[compiled])
+    tree, rays = copy_to(tree, DEVICES[compiled]), camera_rays(tree, 16).to(DEVICES[compiled])
     numbers = {n: torch.tensor(before, device=tree.device) for n, (before, _) in NUMBERS.items()}
     shader, options = gv.Isosurface(light=POINT, **numbers), gv.RenderOptions()
     tracer = Tracer(tree, shader, options)
@@ -236,18 +236,21 @@ def test_each_parameter_is_a_tensor_that_may_be_edited(tree, compiled, edited):
     assert torch.equal(after, new.color) and (after - before).abs().max() > 0.02
 
 
-@pytest.mark.parametrize("which", ["opacity", "color"])
+@pytest.mark.parametrize("table", ["opacity", "color"])
 @pytest.mark.parametrize("kind", [None, gv.Lit, gv.PreIntegrated])
-def test_an_edited_transfer_function_is_the_next_picture_s(tree, compiled, kind, which):
+def test_an_edited_transfer_function_is_the_next_picture_s(tree, compiled, kind, table):
     """It equals that of a new function with those points, without another tree."""
     points = {"opacity": [(0, 0), (1, 0.4)], "color": [(0, 1, 0, 0), (1, 0.2, 0.6, 1)]}
-    tree, camera = on(tree, DEVICES[compiled]), gv.Camera.orbit(width=16, height=16, distance=1.3)
+    tree, camera = (
+        copy_to(tree, DEVICES[compiled]),
+        gv.Camera.orbit(width=16, height=16, distance=1.3),
+    )
     function = gv.TransferFunction.from_points(**points)
     shader = kind(function) if kind else function
     before = gv.render(tree, camera, shader).color
-    getattr(function, which)[1, 1:] = 0.05
+    getattr(function, table)[1, 1:] = 0.05
     after = gv.render(tree, camera, shader).color
-    points[which][1] = (1, 0.05, 0.05, 0.05) if which == "color" else (1, 0.05)
+    points[table][1] = (1, 0.05, 0.05, 0.05) if table == "color" else (1, 0.05)
     new = gv.TransferFunction.from_points(**points)
     assert torch.equal(after, gv.render(tree, camera, kind(new) if kind else new).color)
     assert (after - before).abs().max() > 0.05
@@ -283,7 +286,7 @@ def test_golden_image(tree, name):
 
 
 def module(tree, name, compiled) -> tuple[gv.TreeTracer, tuple[torch.Tensor, ...]]:
-    tree = on(tree, DEVICES[compiled])
+    tree = copy_to(tree, DEVICES[compiled])
     return gv.TreeTracer(tree, SHADERS[name]), world_rays(tree.box, 33, tree.device)
 
 
@@ -316,7 +319,7 @@ def test_script_compile_and_export(tree, compiled, name):
 @pytest.mark.parametrize("name", SHADERS)
 def test_opcheck(tree, compiled, name):
     """In one dtype per shader, alternating; test_op_contract.py checks the other op in both."""
-    tree = on(tree, DEVICES[compiled])
+    tree = copy_to(tree, DEVICES[compiled])
     dtype = (torch.float32, torch.float64)[[*SHADERS].index(name) % 2]
     rays, traced, shading, parameters = op_arguments(tree, SHADERS[name], dtype)
     op = torch.ops.gvtorch.shade_rays.default
@@ -402,12 +405,12 @@ def test_a_kind_has_a_struct_a_twin_and_a_class():
     listed = (folder / "shaders.h").read_text().partition("#define GV_SHADERS(X)")[2]
     listed = listed.partition("#define GV_KIND")[0]
     assert re.findall(r"X\((\w+), \w+, \w+\)", listed) == [*SHADER_KINDS]
-    own = (gv.Filtered, gv.Channels, gv.Labels)
-    classes = [*own, *(getattr(gv, name) for name in built_in.__all__)]
+    others = (gv.Filtered, gv.Channels, gv.Labels)
+    classes = [*others, *(getattr(gv, name) for name in built_in.__all__)]
     for kind in SHADER_KINDS:
         assert f"struct {kind} " in structs or kind.startswith("Shadowed"), kind
         names = ("kind", "shadowed_kind", "lit_kind")
-        assert any(kind in [getattr(one, name, "") for name in names] for one in classes), kind
+        assert any(kind in [getattr(c, name, "") for name in names] for c in classes), kind
     with pytest.raises(ValueError, match=r"shader: kind must be 'Lit', .*, got 'Lamp'"):
         shader_number("Lamp")
 
@@ -441,14 +444,14 @@ def test_a_surface_is_filled(backend, kind):
     """Half a ball under the box's top face: from above its cut is seen, from within its matter; in
     a hollow one, the inner side.
     """
-    place = torch.arange(40.0)
-    z, y, x = torch.meshgrid(place[:28], place, place, indexing="ij")
+    axis = torch.arange(40.0)
+    z, y, x = torch.meshgrid(axis[:28], axis, axis, indexing="ij")
     gap = 12 - ((x - 19.5) ** 2 + (y - 19.5) ** 2 + (z - 27.5) ** 2).sqrt()
     field = kind == "distance field"
     tree = gv.N3Tree.from_volume(gv.Volume(-gap if field else gap), 8)
     across = torch.linspace(5, 34, 9, dtype=torch.float64)
     origin = torch.stack((across, torch.full_like(across, 18.0), torch.full_like(across, 60.0)), 1)
-    beside = ((origin[:, 0] - 19.5) ** 2 + 1.5**2).sqrt()
+    radius = ((origin[:, 0] - 19.5) ** 2 + 1.5**2).sqrt()
     down = rays_along(origin, (0.0, 0.0, -1.0))
     within = rays_along(torch.tensor([[19.0, 19.0, 24.0]]).double(), (0.3, 0.1, -1.0))
     met = {}
@@ -456,19 +459,19 @@ def test_a_surface_is_filled(backend, kind):
         shader = gv.DistanceField(filled=filled) if field else gv.Isosurface(0, filled=filled)
         assert shader.opened().filled is False and shader.filled is filled
         for name, rays in (("down", down), ("within", within)):
-            result, _ = run(tree, backend, rays, shader)
+            result, _ = trace(tree, backend, rays, shader)
             met[name, filled] = result
-    cut = beside < 12
+    cut = radius < 12
     assert 3 < cut.sum() < 9
     depth = met["down", True]["depth"][:, 0]
     assert torch.equal(depth < math.inf, cut)
     assert (depth[cut] - 32.5).abs().max() < 1e-4, "the box's face"
     assert (met["down", True]["color"][cut] > 0.2).all()
     hollow = met["down", False]["depth"][:, 0].double()[cut]
-    assert (hollow - (32.5 + (144 - beside[cut] ** 2).sqrt())).abs().max() < 0.1
+    assert (hollow - (32.5 + (144 - radius[cut] ** 2).sqrt())).abs().max() < 0.1
     assert float(met["within", True]["depth"]) == 0
     assert 8 < float(met["within", False]["depth"]) < 12
     assert float(met["within", True]["alpha"]) == float(met["within", False]["alpha"]) == 1
-    bare, _ = run(tree, backend, down, shader.opened(), clip=gv.Clip(planes=[(0, 0, -1, 20)]))
-    clip, _ = run(tree, backend, down, shader, clip=gv.Clip(planes=[(0, 0, -1, 20)]))
+    bare, _ = trace(tree, backend, down, shader.opened(), clip=gv.Clip(planes=[(0, 0, -1, 20)]))
+    clip, _ = trace(tree, backend, down, shader, clip=gv.Clip(planes=[(0, 0, -1, 20)]))
     assert torch.equal(bare["depth"], clip["depth"]), "a clip without caps opens it"

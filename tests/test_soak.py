@@ -94,7 +94,7 @@ def random_producer(pick: random.Random, blobs: gv.Volume, store: Path) -> gv.Pr
     if kind == "field":
         return Spotted(branching)
     if kind == "late":
-        producer: gv.VolumeProducer = Late(blobs, seed, most=0.001)
+        producer: gv.VolumeProducer = Late(blobs, seed, max_delay=0.001)
     elif kind == "mapped":
         producer = gv.VolumeProducer(blobs, hold="mapped")
     else:

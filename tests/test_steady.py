@@ -9,7 +9,7 @@ import random
 import numpy as np
 import pytest
 import torch
-from helpers.pictures import GRAY, PARTS, VESSELS, assert_same_picture, camera
+from helpers.pictures import FIELDS, GRAY, VESSELS, assert_same_picture, camera
 from helpers.producers import Checked, Held, Late
 from helpers.waits import nobody_waits
 
@@ -140,11 +140,11 @@ def test_a_stalled_producer_stalls_no_frame(slow, blobs):
             _, stats = engine.frame(camera(8), GRAY)
             assert len(slow) == number + 1, "one a frame, of a frame that is long done"
         assert not any(stats.produced.values())
-        producer.go()
+        producer.release()
         _, stats = engine.frame(camera(8), GRAY)
         assert sum(stats.produced.values()) > 0
         producer.hold = False
-        producer.go()  # answers the requests made meanwhile
+        producer.release()  # answers the requests made meanwhile
         assert engine.render(camera(8), GRAY).stats.converged
 
 
@@ -157,11 +157,11 @@ def test_scouts_go_only_where_something_was_written(traced, blobs):
             _, stats = engine.frame(camera(), GRAY)
         assert stats.pending > 0 and traced == [False] * 10
         traced.clear()
-        producer.go()
+        producer.release()
         _, stats = engine.frame(camera(), GRAY)
         assert stats.pending > 0 and traced == [True, False], "what they ask for does not come"
         producer.hold = False
-        producer.go()
+        producer.release()
         traced.clear()
         engine.frame(camera(), GRAY)
         assert traced == [True, True, False]
@@ -196,7 +196,7 @@ def test_pools_stay_in_order_where_counts_come_at_random(blobs, monkeypatch, pro
             engine.validate()
             if picture.stats.converged:
                 expected = gv.render(tree, view, GRAY)
-                assert all(torch.equal(getattr(picture, n), getattr(expected, n)) for n in PARTS)
+                assert all(torch.equal(getattr(picture, n), getattr(expected, n)) for n in FIELDS)
     assert evicted > 100
 
 
@@ -262,9 +262,9 @@ def test_a_replayed_graph_on_cuda_is_the_frame(cuda, blobs, trees):
             replayed = []
             for view in views:
                 picture, stats = graph.replay(view)
-                replayed.append(({n: getattr(picture, n).clone() for n in PARTS}, stats))
+                replayed.append(({n: getattr(picture, n).clone() for n in FIELDS}, stats))
         for (parts, stats), (whole, known) in zip(replayed, expected, strict=True):
-            assert all(torch.equal(parts[name], getattr(whole, name)) for name in PARTS)
+            assert all(torch.equal(parts[name], getattr(whole, name)) for name in FIELDS)
             assert stats.converged and stats.milliseconds > 0 and "replay" in stats.stages
             for name in ("samples", "tiles_used", "bricks_used", "rays", "misses", "bytes"):
                 assert getattr(stats, name) == getattr(known, name), name

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import DEVICES, shared
-from helpers.pictures import PARTS, assert_same_picture, camera
+from helpers.pictures import FIELDS, assert_same_picture, camera
 from helpers.stores import Handler, serving
 
 import gvtorch as gv
@@ -141,7 +141,7 @@ def test_channels_of_a_store_are_components(tmp_path, cloud, channels):
         producer = gv.StoredProducer(tmp_path / "a.zarr", channels=channels)
         with gv.Engine(producer) as engine:
             picture = engine.render(camera(24, distance=1.4), GRAY, component=component)
-        for name in PARTS:
+        for name in FIELDS:
             assert torch.equal(getattr(picture, name), getattr(expected, name)), name
         assert expected.alpha.max() > 0.05
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import gvtorch, run
+from helpers import gvtorch, run_cli
 from helpers.stores import assert_holds, noise, write_foreign
 
 import gvtorch as gv
@@ -58,9 +58,9 @@ def save_nifti(path: Path, data: np.ndarray) -> Path:
 @pytest.mark.parametrize("ending", ["nii", "nii.gz"])
 def test_a_nifti_of_four_dimensions_is_time(tmp_path, data, ending):
     path = save_nifti(tmp_path / f"a.{ending}", data)
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as caught:
         first = gv.read_volume(path)
-    assert [str(one.message) for one in told] == [
+    assert [str(warning.message) for warning in caught] == [
         f"{path}: has 3 time points, this is the first; time=N (--time N) reads another, up to 2"
     ]
     assert np.array_equal(first.data[..., 0].numpy(), data[0])
@@ -102,10 +102,10 @@ def test_one_time_has_none_but_the_first(tmp_path):
 
 def test_every_time_has_the_bits_of_its_own_pyramid(store, data):
     for time in range(TIMES):
-        found = Store.open(store, time=time)
-        assert (found.times, found.time, found.spacing) == (TIMES, time, (1, 2, 3))
-        assert found.value_range == [(float(data.min()), float(data.max()))], "of all times"
-        assert_holds(found, data[time, ..., None])
+        opened = Store.open(store, time=time)
+        assert (opened.times, opened.time, opened.spacing) == (TIMES, time, (1, 2, 3))
+        assert opened.value_range == [(float(data.min()), float(data.max()))], "of all times"
+        assert_holds(opened, data[time, ..., None])
     with pytest.raises(ValueError, match="has no time 3; it has 3 time points, 0 to 2"):
         Store.open(store, time=3)
 
@@ -131,7 +131,7 @@ def test_time_step_and_units_go_all_the_way(tmp_path, data, ending):
     (image,) = attributes["ome"]["multiscales"]
     assert image["axes"][0] == {"name": "t", "type": "time", "unit": "millisecond"}
     assert image["axes"][4] == {"name": "x", "type": "space", "unit": "micrometer"}
-    scale, move = (one.popitem()[1] for one in image["datasets"][1]["coordinateTransformations"])
+    scale, move = (t.popitem()[1] for t in image["datasets"][1]["coordinateTransformations"])
     assert scale == [40, 1, 4, 0.5, 1] and move == [5, 0, 1, 0.125, 0.25]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -139,8 +139,8 @@ def test_time_step_and_units_go_all_the_way(tmp_path, data, ending):
         assert store.info == expected == gv.read_volume(tmp_path / "a.zarr").info
     for time in range(TIMES):
         assert_holds(Store.open(tmp_path / "a.zarr", time=time), data[time, ..., None])
-    told = Store.open(tmp_path / "a.zarr", time=1).describe()
-    assert (told["times"], told["time"], told["time step"]) == (3, 1, "40 millisecond")
+    facts = Store.open(tmp_path / "a.zarr", time=1).describe()
+    assert (facts["times"], facts["time"], facts["time step"]) == (3, 1, "40 millisecond")
 
 
 def test_one_time_makes_a_store_without(tmp_path, npy, data):
@@ -182,12 +182,12 @@ def test_foreign_times_come_over(tmp_path):
 def test_resume_goes_on_in_the_middle_of_times(tmp_path, npy, data, monkeypatch):
     original, ran = shard.write_shard, []
 
-    def crash(task, level, place):
+    def crash(task, level, position):
         if task.root["driver"] == "file":
             if len(ran) == 4:
                 raise RuntimeError("broken off")
-            ran.append((level, *place))
-        return original(task, level, place)
+            ran.append((level, *position))
+        return original(task, level, position)
 
     target = tmp_path / "a.zarr"
     with monkeypatch.context() as patch:
@@ -205,8 +205,8 @@ def test_resume_goes_on_in_the_middle_of_times(tmp_path, npy, data, monkeypatch)
 def test_processes_convert_times(tmp_path, data, monkeypatch):
     monkeypatch.setattr(conversion_plan, "_FEW_TASKS", 1)
     path = save_nifti(tmp_path / "a.nii.gz", data)  # staged, so that all processes read it
-    told = estimate(path, tmp_path / "a.zarr", workers=2)
-    assert told.tasks == 18 and told.source_bytes == data.nbytes
+    estimated = estimate(path, tmp_path / "a.zarr", workers=2)
+    assert estimated.tasks == 18 and estimated.source_bytes == data.nbytes
     convert(path, tmp_path / "a.zarr", workers=2)
     for time in range(TIMES):
         assert_holds(Store.open(tmp_path / "a.zarr", time=time), data[time, ..., None])
@@ -248,27 +248,27 @@ def test_each_time_is_streamed_as_its_volume_is_rendered(store, data):
 @pytest.mark.backend("cpp")
 def test_the_command_line_takes_a_time(tmp_path, npy, capsys):
     target, picture = tmp_path / "a b.zarr", tmp_path / "a.npy"
-    code, out, err = run(capsys, "convert", npy, target)
+    code, out, err = run_cli(capsys, "convert", npy, target)
     assert code == 2 and err.count("\n") == 1 and "--axes" in err and "'tzyx'" in err
-    code, out, err = run(capsys, "convert", npy, target, "--axes", "tzyx")
+    code, out, err = run_cli(capsys, "convert", npy, target, "--axes", "tzyx")
     assert (code, err) == (0, "") and "150x37x20 at 3 times, 6 levels" in out
-    code, out, err = run(capsys, "info", target, "--time", 2, "--json")
+    code, out, err = run_cli(capsys, "info", target, "--time", 2, "--json")
     assert code == 0 and (json.loads(out)["times"], json.loads(out)["time"]) == (3, 2)
-    code, out, err = run(capsys, "info", target, "--time", 3)
+    code, out, err = run_cli(capsys, "info", target, "--time", 3)
     assert code == 2 and "has no time 3; it has 3 time points, 0 to 2" in err
     pictures = []
     size = ("--size", "16x16", "--brick-pool", "9 MB")
     for time in (0, 2):
-        code, out, err = run(capsys, "render", target, "-o", picture, "--time", time, *size)
+        code, out, err = run_cli(capsys, "render", target, "-o", picture, "--time", time, *size)
         assert (code, err) == (0, "")
         pictures.append(np.load(picture)[..., :3])
-        code, out, err = run(
+        code, out, err = run_cli(
             *(capsys, "render", npy, "-o", picture, "--time", time, "--axes", "tzyx"),
             *("--size", "16x16"),
         )
         assert (code, err) == (0, "")
     assert np.abs(pictures[0] - pictures[1]).max() > 0.01
-    code, out, err = run(
+    code, out, err = run_cli(
         *(capsys, "fly", target, "-o", tmp_path / "f", "--time", 1, "--frames", 1, *size)
     )
     assert (code, err) == (0, "")
@@ -278,7 +278,7 @@ def test_the_command_line_takes_a_time(tmp_path, npy, capsys):
 def test_filtered_colours_of_every_time(tmp_path, npy, capsys):
     target = tmp_path / "a.zarr"
     convert(npy, target, axes="tzyx")
-    code, _, err = run(capsys, "filter", target, "--tf", "gray", "--directions", "one")
+    code, _, err = run_cli(capsys, "filter", target, "--tf", "gray", "--directions", "one")
     assert (code, err) == (0, "")
     camera = gv.Camera.orbit(30, 20, 9, 30, 16, 16)
     for time in range(TIMES):
@@ -321,30 +321,30 @@ def test_a_film_over_time(tmp_path, kind):
     if kind == "zarr":
         assert gvtorch("convert", file, tmp_path / "a.zarr", *flags, "--workers", 1).returncode == 0
         file, flags = tmp_path / "a.zarr", ()
-    look = ("--size", "24x24", "--window", "0,200", *flags)
+    options = ("--size", "24x24", "--window", "0,200", *flags)
 
     def fly(*more) -> list[bytes]:
         folder = tmp_path / "f"
         shutil.rmtree(folder, ignore_errors=True)
-        run = gvtorch("fly", file, "-o", folder, *look, *more)
+        run = gvtorch("fly", file, "-o", folder, *options, *more)
         assert run.returncode == 0, run.stderr
         assert "time points" not in run.stderr
-        return [one.read_bytes() for one in sorted(folder.glob("*.png"))]
+        return [frame.read_bytes() for frame in sorted(folder.glob("*.png"))]
 
     whole = fly("--times", "all", "--orbit", "30,20,2.4")
     assert len(whole) == len(set(whole)) == 4
     for moment in range(4):
         out = tmp_path / "one.png"
-        place = ("--camera", "orbit:30,20,2.4", "--time", moment)
-        run = gvtorch("render", file, "-o", out, *look, *place)
+        camera = ("--camera", "orbit:30,20,2.4", "--time", moment)
+        run = gvtorch("render", file, "-o", out, *options, *camera)
         assert run.returncode == 0 and out.read_bytes() == whole[moment]
     some = fly("--times", "1-2", "--frames", 5, "--orbit", "30,20,2.4")
     assert some == [whole[n] for n in (1, 1, 1, 2, 2)]
     assert len(set(fly("--times", "0-0", "--turntable", "0.12"))) == 3, "the camera moves"
     for wrong, message in (("3-9", "from 0 to 3"), ("x", "must be all or A-B")):
-        run = gvtorch("fly", file, "-o", tmp_path / "g", *look, "--times", wrong)
+        run = gvtorch("fly", file, "-o", tmp_path / "g", *options, "--times", wrong)
         assert run.returncode == 2 and message in run.stderr and not (tmp_path / "g").exists()
-    both = gvtorch("fly", file, "-o", tmp_path / "g", *look, "--times", "all", "--time", 1)
+    both = gvtorch("fly", file, "-o", tmp_path / "g", *options, "--times", "all", "--time", 1)
     assert both.returncode == 2 and "leave one out" in both.stderr
 
 
@@ -355,18 +355,18 @@ def test_keys_of_a_film_tell_the_time_point(tmp_path):
         values[:, :, 2 * moment : 2 * moment + 2] = 200
     np.save(tmp_path / "a.npy", data)
     eye = {"eye": [4, 3, 40], "target": [4, 3, 3], "up": [0, 1, 0]}
-    look = ("--axes", "tzyx", "--size", "24x24", "--window", "0,200")
-    look = (*look, "--keys", tmp_path / "keys.json", "--frames", 5)
+    options = ("--axes", "tzyx", "--size", "24x24", "--window", "0,200")
+    options = (*options, "--keys", tmp_path / "keys.json", "--frames", 5)
 
     def fly(last: float, *more):
         keys = [{"time": t, "state": {"time": last * t, "camera": eye}} for t in (0.0, 1.0)]
         (tmp_path / "keys.json").write_text(json.dumps(keys))
-        return gvtorch("fly", tmp_path / "a.npy", "-o", tmp_path / "f", *look, *more)
+        return gvtorch("fly", tmp_path / "a.npy", "-o", tmp_path / "f", *options, *more)
 
     assert fly(2).returncode == 0
-    played = [one.read_bytes() for one in sorted((tmp_path / "f").glob("*.png"))]
-    found = [played.index(one) for one in played]
-    assert len(found) == 5 and len(set(found)) == 3 and found == sorted(found)
+    played = [frame.read_bytes() for frame in sorted((tmp_path / "f").glob("*.png"))]
+    order = [played.index(frame) for frame in played]
+    assert len(order) == 5 and len(set(order)) == 3 and order == sorted(order)
     for last, flags, message in (
         (2, ("--time", 1), "--keys sets what --time sets"),
         (2, ("--times", "all"), "--keys sets what --times sets"),

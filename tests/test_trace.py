@@ -19,7 +19,7 @@ STEPS = {"rays", "trace", "requests", "lru", "schedule", "produce", "write"}
 
 
 def spans(path) -> list[dict]:
-    return [one for one in json.loads(path.read_text())["traceEvents"] if one["ph"] == "X"]
+    return [e for e in json.loads(path.read_text())["traceEvents"] if e["ph"] == "X"]
 
 
 def test_times_and_nesting_are_those_of_the_stages(tmp_path):
@@ -40,24 +40,24 @@ def test_times_and_nesting_are_those_of_the_stages(tmp_path):
     with stage("after"):
         pass
     content = json.loads(path.read_text())["traceEvents"]
-    found = {one["name"]: one for one in spans(path)}
-    assert set(found) == {"outer", "inner", "other"}
+    by_name = {e["name"]: e for e in spans(path)}
+    assert set(by_name) == {"outer", "inner", "other"}
     for name, least in (("inner", 0.03), ("other", 0.02), ("outer", 0.05)):
-        assert found[name]["dur"] >= 1e6 * least - 1
-    outer, inner = found["outer"], found["inner"]
+        assert by_name[name]["dur"] >= 1e6 * least - 1
+    outer, inner = by_name["outer"], by_name["inner"]
     assert outer["ts"] <= inner["ts"]
     assert inner["ts"] + inner["dur"] <= outer["ts"] + outer["dur"] + 1e-3
-    assert found["other"]["tid"] != outer["tid"] == inner["tid"]
-    names = {one["tid"]: one["args"]["name"] for one in content if one["ph"] == "M"}
-    assert names[found["other"]["tid"]] == "host: reader"
-    (count,) = (one for one in content if one["ph"] == "C")
+    assert by_name["other"]["tid"] != outer["tid"] == inner["tid"]
+    names = {e["tid"]: e["args"]["name"] for e in content if e["ph"] == "M"}
+    assert names[by_name["other"]["tid"]] == "host: reader"
+    (count,) = (e for e in content if e["ph"] == "C")
     assert count["args"] == {"loaded": 7} and not stages._traces
 
 
 def test_a_trace_is_written_after_a_mistake_too(tmp_path):
     with pytest.raises(ZeroDivisionError), gv.Trace(tmp_path / "t.json"), stage("broken"):
         raise ZeroDivisionError
-    assert [one["name"] for one in spans(tmp_path / "t.json")] == ["broken"]
+    assert [e["name"] for e in spans(tmp_path / "t.json")] == ["broken"]
     with stage("after"):
         pass
 
@@ -78,19 +78,19 @@ def test_a_flight_is_traced(scan_store, tmp_path):
         *("--trace", tmp_path / "t.json", "--stats", tmp_path / "s.jsonl"),
     )
     assert run.returncode == 0, run.stderr
-    found = spans(tmp_path / "t.json")
-    names = [one["name"] for one in found]
+    events = spans(tmp_path / "t.json")
+    names = [event["name"] for event in events]
     assert set(names) >= STEPS | {"frame", "save", "read"}
     assert names.count("frame") == names.count("save") == 3
-    told = [json.loads(line)["stages"] for line in (tmp_path / "s.jsonl").read_text().splitlines()]
+    lines = [json.loads(line)["stages"] for line in (tmp_path / "s.jsonl").read_text().splitlines()]
     for name in ("rays", "trace"):
-        milliseconds = sum(one["dur"] for one in found if one["name"] == name) / 1e3
-        assert milliseconds == pytest.approx(sum(one[name] for one in told), rel=0.2, abs=2)
-    frames = [one for one in found if one["name"] == "frame"]
-    inside = [one for one in found if one["name"] == "trace"]
-    for one in inside:
-        assert any(f["ts"] <= one["ts"] < f["ts"] + f["dur"] for f in frames)
-    readers = {one["tid"] for one in found if one["name"] == "read"}
+        milliseconds = sum(event["dur"] for event in events if event["name"] == name) / 1e3
+        assert milliseconds == pytest.approx(sum(event[name] for event in lines), rel=0.2, abs=2)
+    frames = [event for event in events if event["name"] == "frame"]
+    inside = [event for event in events if event["name"] == "trace"]
+    for event in inside:
+        assert any(f["ts"] <= event["ts"] < f["ts"] + f["dur"] for f in frames)
+    readers = {event["tid"] for event in events if event["name"] == "read"}
     assert frames[0]["tid"] not in readers
 
 
@@ -108,26 +108,26 @@ def test_pictures_are_the_same_while_traced(blobs, tmp_path):
 
 def test_ranges_of_nvtx_have_the_stages_names(blobs, monkeypatch):
     """As under NVIDIA's tools, but with a library that only records its calls."""
-    told: list[str] = []
+    calls: list[str] = []
 
     @contextmanager
     def named(text: str):
-        told.append(f"+{text}")
+        calls.append(f"+{text}")
         yield
-        told.append(f"-{text}")
+        calls.append(f"-{text}")
 
     monkeypatch.setattr(torch.cuda.nvtx, "range", named)
     with stage("quiet"):
-        assert told == []
+        assert calls == []
     monkeypatch.setattr(stages, "_NVTX_ENABLED", True)
     gv.render(
         gv.N3Tree.from_volume(blobs),
         gv.Camera.orbit(width=4, height=4),
         gv.TransferFunction.preset("gray", 0, 1),
     )
-    assert told[:2] == ["+gvtorch.prepare", "-gvtorch.prepare"]
-    assert {"+gvtorch.rays", "+gvtorch.trace", "-gvtorch.trace"} <= set(told)
-    assert len(told) % 2 == 0
+    assert calls[:2] == ["+gvtorch.prepare", "-gvtorch.prepare"]
+    assert {"+gvtorch.rays", "+gvtorch.trace", "-gvtorch.trace"} <= set(calls)
+    assert len(calls) % 2 == 0
 
 
 @pytest.mark.backend("cuda")
@@ -139,6 +139,6 @@ def test_the_device_has_a_track_of_its_own(blobs, tmp_path):
     gv.render(tree, camera, shader)
     with gv.Trace(tmp_path / "t.json", device="cuda"):
         gv.render(tree, camera, shader)
-    traces = [one for one in spans(tmp_path / "t.json") if one["name"] == "trace"]
-    assert {one["tid"] == 0 for one in traces} == {True, False}
-    assert all(one["ts"] >= 0 and one["dur"] > 0 for one in traces)
+    traces = [e for e in spans(tmp_path / "t.json") if e["name"] == "trace"]
+    assert {e["tid"] == 0 for e in traces} == {True, False}
+    assert all(e["ts"] >= 0 and e["dur"] > 0 for e in traces)

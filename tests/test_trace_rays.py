@@ -10,8 +10,8 @@ import pytest
 import torch
 from helpers import DEVICES
 from helpers.rays import camera_rays
-from helpers.traces import SHADER, arguments, assert_equal, changed, run
-from helpers.trees import forget, on
+from helpers.traces import SHADER, arguments, assert_equal, changed, trace
+from helpers.trees import copy_to, with_holes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -63,9 +63,9 @@ def test_second_channel_and_second_component(blobs, compiled):
         {"air": gv.Volume(blobs.data * 0, blobs.spacing, blobs.origin), "two": other}
     )
     rays = camera_rays(tree)
-    assert run(tree, compiled, rays)[0]["alpha"].max() == 0
+    assert trace(tree, compiled, rays)[0]["alpha"].max() == 0
     result, *_ = assert_equal(tree, compiled, rays, channel="two", component=1)
-    single, _ = run(gv.N3Tree.from_volume(blobs), compiled, rays)
+    single, _ = trace(gv.N3Tree.from_volume(blobs), compiled, rays)
     assert torch.equal(result["alpha"], single["alpha"])
 
 
@@ -82,7 +82,7 @@ def test_second_channel_and_second_component(blobs, compiled):
 def test_missing_nodes_give_equal_pictures_and_requests(
     blobs, share, seed, lod, distance, azimuth, elevation
 ):
-    tree = forget(gv.N3Tree.from_volume(blobs, 4), share, seed)
+    tree = with_holes(gv.N3Tree.from_volume(blobs, 4), share, seed)
     rays = camera_rays(tree, 12, distance=distance, azimuth=azimuth, elevation=elevation)
     assert_equal(tree, "cpp", rays, lod=lod)
 
@@ -90,13 +90,13 @@ def test_missing_nodes_give_equal_pictures_and_requests(
 def test_requests_name_what_is_missing(blobs, backend):
     tree = gv.N3Tree.from_volume(blobs, 4)
     rays = camera_rays(tree, distance=1.2)
-    _, full = run(tree, backend, rays, lod="finest")
+    _, full = trace(tree, backend, rays, lod="finest")
     seen = (full["brick"] == 1).nonzero()[:, 0]
-    gone = on(tree, "cpu")
+    gone = copy_to(tree, "cpu")
     slot = int(seen[-1])  # finest bricks come last
     node = int(tree.bricks.owner_b[slot])
     gone.nodes.brick_tn.view(-1)[node] = config.ABSENT
-    _, marks = run(gone, backend, rays, lod="finest")
+    _, marks = trace(gone, backend, rays, lod="finest")
     word = int(marks["request"].view(-1)[node])
     assert word & config.REQUEST_LOAD and not word & config.REQUEST_SUBDIVIDE
     assert word & config.REQUEST_PRIORITY == config.REQUEST_PRIORITY, (
@@ -105,9 +105,9 @@ def test_requests_name_what_is_missing(blobs, backend):
     marks["request"].view(-1)[node] = 0
     assert not marks["request"].any(), "nothing else is missing"
 
-    gone = on(tree, "cpu")
+    gone = copy_to(tree, "cpu")
     gone.nodes.child_tn.view(-1)[tree.root] = config.ABSENT
-    _, marks = run(gone, backend, rays, lod="finest")
+    _, marks = trace(gone, backend, rays, lod="finest")
     assert int(marks["request"].view(-1)[tree.root]) & config.REQUEST_SUBDIVIDE
     assert (marks["request"] != 0).sum() == 1
 
@@ -116,17 +116,17 @@ def test_a_missing_brick_is_drawn_from_its_ancestor(blobs, backend):
     tree = gv.N3Tree.from_volume(blobs, 4)
     rays = camera_rays(tree, distance=1.2)
     haze = gv.TransferFunction.from_points([(0, 0), (1, 0.01)])  # so thin that alpha adds up
-    full, _ = run(tree, backend, rays, haze)
-    top = on(tree, "cpu")
+    full, _ = trace(tree, backend, rays, haze)
+    top = copy_to(tree, "cpu")
     top.nodes.child_tn.view(-1)[tree.root] = config.ABSENT
-    coarse, _ = run(top, backend, rays, haze)
+    coarse, _ = trace(top, backend, rays, haze)
     ratio = coarse["alpha"].sum() / full["alpha"].sum()
     assert 0.7 < ratio < 1.3, (
         "the root's brick stands in for all: a mean filter keeps what is absorbed"
     )
     assert (coarse["alpha"] - full["alpha"]).abs().max() > 1e-3, "and it is coarser"
     top.nodes.brick_tn.view(-1)[tree.root] = config.ABSENT
-    nothing, marks = run(top, backend, rays, haze)
+    nothing, marks = trace(top, backend, rays, haze)
     assert nothing["alpha"].max() == 0 and torch.isinf(nothing["depth"]).all()
     assert int(marks["request"].view(-1)[tree.root]) & config.REQUEST_LOAD
 
@@ -135,11 +135,11 @@ def test_a_missing_brick_is_drawn_from_its_ancestor(blobs, backend):
 @pytest.mark.parametrize("lod", ["finest", "auto"])
 def test_cuda_equals_cpp_on_a_million_rays(aneurism, compiled, lod):
     """Every bit of it: pictures, samples, stamps and requests, with a tenth of the tree missing."""
-    tree = forget(gv.N3Tree.from_volume(aneurism), 0.1, 0)
+    tree = with_holes(gv.N3Tree.from_volume(aneurism), 0.1, 0)
     rays = camera_rays(tree, 1024, distance=1.4)
     shader = gv.TransferFunction.preset("vessels", 0, 255)
-    expected, expected_marks = run(tree, "cpp", rays, shader, lod=lod)
-    actual, marks = run(tree, compiled, rays, shader, lod=lod)
+    expected, expected_marks = trace(tree, "cpp", rays, shader, lod=lod)
+    actual, marks = trace(tree, compiled, rays, shader, lod=lod)
     for name in expected:
         assert torch.equal(actual[name], expected[name]), name
     for name in marks:
@@ -155,9 +155,9 @@ def test_threads_give_the_same_bits(aneurism):
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        one = run(tree, "cpp", rays, shader)
+        one = trace(tree, "cpp", rays, shader)
         torch.set_num_threads(2)
-        two = run(tree, "cpp", rays, shader)
+        two = trace(tree, "cpp", rays, shader)
     finally:
         torch.set_num_threads(before)
     for first, second in zip(one, two, strict=True):
@@ -174,8 +174,8 @@ def test_skipping_does_not_move_samples(blobs, backend):
     low, high = gv.Channel(torch.float32).limits
     full.nodes.ranges["value"][:, :, 0], full.nodes.ranges["value"][:, :, 1] = low, high
     rays = camera_rays(sparse, distance=1.3)
-    a, _ = run(sparse, backend, rays, lod="finest")
-    b, _ = run(full, backend, rays, lod="finest")
+    a, _ = trace(sparse, backend, rays, lod="finest")
+    b, _ = trace(full, backend, rays, lod="finest")
     assert (a["samples"] < b["samples"]).any()
     assert torch.equal(a["alpha"], b["alpha"]) and torch.equal(a["color"], b["color"])
 
@@ -199,7 +199,7 @@ def test_strange_rays_end(blobs, backend):
     ]
     columns = [torch.tensor(column, dtype=torch.float32) for column in zip(*cases, strict=True)]
     rays = gv.Rays(**dict(zip(("origin", "direction", "cone", "range"), columns, strict=True)))
-    result, _ = run(tree, backend, rays)
+    result, _ = trace(tree, backend, rays)
     assert torch.isfinite(result["color"]).all() and torch.isfinite(result["alpha"]).all()
     assert result["alpha"][0] == 0 and result["alpha"][-1] > 0
 
@@ -209,7 +209,7 @@ def test_no_rays(blobs, backend):
     rays = camera_rays(tree)
     none = rays[:0]
     device = DEVICES[backend]
-    hits = gv.trace(on(tree, device), none.to(device), SHADER)
+    hits = gv.trace(copy_to(tree, device), none.to(device), SHADER)
     assert hits.color.shape == (0, 3) and hits.samples.shape == (0,)
 
 
@@ -333,8 +333,8 @@ def test_transparent_ranges_ask_for_nothing_and_change_no_bit(
     """Nodes whose range is transparent are not requested; a tree with unknown ranges gives the same
     picture in every bit, and requests more."""
     shader = gv.TransferFunction.from_points([(low, 0), (low + 0.1, 0.3)], [(0, 1, 0, 0)])
-    known = forget(gv.N3Tree.from_volume(blobs, 4), share, seed)
-    unknown = on(known, "cpu")
+    known = with_holes(gv.N3Tree.from_volume(blobs, 4), share, seed)
+    unknown = copy_to(known, "cpu")
     limits = gv.Channel(torch.float32).limits
     unknown.nodes.ranges["value"][:, :, 0], unknown.nodes.ranges["value"][:, :, 1] = limits
     rays = camera_rays(known, 16, distance=1.6)
@@ -351,7 +351,7 @@ def run_by_level(tree, rays, shader, lod, by_level):
     """Returns hits and request words; asserts that the twin's and the kernel's are equal."""
     found = []
     for backend in ("reference", "cpp"):
-        copy = on(tree, "cpu")
+        copy = copy_to(tree, "cpu")
         options = gv.RenderOptions(backend=backend, lod=lod)
         found.append((vars(Tracer(copy, shader, options, by_level=by_level)(rays)), copy))
     (expected, twin), (actual, kernel) = found
@@ -363,7 +363,7 @@ def run_by_level(tree, rays, shader, lod, by_level):
 
 
 def test_level_by_level_asks_for_a_brick_before_its_children(blobs, backend):
-    tree = on(gv.N3Tree.from_volume(blobs, 4), DEVICES[backend])
+    tree = copy_to(gv.N3Tree.from_volume(blobs, 4), DEVICES[backend])
     rays = camera_rays(tree, 8, distance=1.3)
     rays = rays.to(tree.device)
     tree.nodes.child_tn.view(-1)[tree.root] = config.ABSENT
@@ -399,7 +399,7 @@ def test_trees_of_smaller_branching_share_wider_tiles(blobs, compiled):
         target = nodes.fields[name]
         (target[:, :8] if target.dim() > 1 and name != "loc_t4" else target).copy_(field)
     rays = camera_rays(narrow)
-    expected, _ = run(narrow, "reference", rays)
+    expected, _ = trace(narrow, "reference", rays)
     for backend in ("reference", compiled):
         if DEVICES[backend] != "cpu":
             continue

@@ -34,9 +34,9 @@ def look_up(function: gv.TransferFunction, value: np.ndarray) -> np.ndarray:
     table = table_of(function, dtype=torch.float64)
     rows = table.table_lm4[0].numpy()
     low, high = table.domain_2.tolist()
-    place = np.clip((value - low) / (high - low) * (len(rows) - 1), 0, len(rows) - 1)
-    cell = np.minimum(np.floor(place), len(rows) - 2).astype(int)
-    weight = (place - cell)[:, None]
+    position = np.clip((value - low) / (high - low) * (len(rows) - 1), 0, len(rows) - 1)
+    cell = np.minimum(np.floor(position), len(rows) - 2).astype(int)
+    weight = (position - cell)[:, None]
     return rows[cell] + weight * (rows[cell + 1] - rows[cell])
 
 
@@ -161,11 +161,13 @@ def test_presets_of_scans_have_values_of_their_own(name):
 def test_colour_maps_are_those_of_matplotlib(name):
     maps = pytest.importorskip("matplotlib").colormaps
     function = gv.TransferFunction.preset(name, 10, 20)
-    at = np.arange(256) / 255
-    expected = maps[name.removeprefix("matplotlib:")](at)[:, :3]
-    found = function(10 + 10 * at)
-    np.testing.assert_allclose(srgb(found[:, :3]), expected, atol=1e-6)
-    assert found[0, 3] == 0 and found[-1, 3] == 0.5 and table_of(function).table_lm4.shape[1] < 5000
+    fractions = np.arange(256) / 255
+    expected = maps[name.removeprefix("matplotlib:")](fractions)[:, :3]
+    actual = function(10 + 10 * fractions)
+    np.testing.assert_allclose(srgb(actual[:, :3]), expected, atol=1e-6)
+    assert (
+        actual[0, 3] == 0 and actual[-1, 3] == 0.5 and table_of(function).table_lm4.shape[1] < 5000
+    )
 
 
 def test_presets_need_values_or_have_them():
@@ -221,13 +223,13 @@ def test_colours_of_paraview_are_those_of_vtk(tmp_path, space, wrap, points):
     expected = vtk.vtkColorTransferFunction()
     getattr(expected, f"SetColorSpaceTo{space}")()
     expected.SetHSVWrap(int(wrap))
-    for at in range(0, len(points), 4):
-        expected.AddRGBPoint(*points[at : at + 4])
+    for i in range(0, len(points), 4):
+        expected.AddRGBPoint(*points[i : i + 4])
     function = paraview(tmp_path, ColorSpace=space, HSVWrap=wrap, RGBPoints=points)
     assert function.relative and table_of(function).table_lm4.shape[1] < 20_000
     values = np.linspace(points[0], points[-4], 301)
-    found = srgb(function(values)[:, :3])
-    np.testing.assert_allclose(found, [expected.GetColor(v) for v in values], atol=0.02)
+    colors = srgb(function(values)[:, :3])
+    np.testing.assert_allclose(colors, [expected.GetColor(v) for v in values], atol=0.02)
 
 
 def test_steps_of_paraview(tmp_path):
@@ -235,8 +237,8 @@ def test_steps_of_paraview(tmp_path):
     points = [0, 1, 0, 0, 4, 0, 1, 0, 10, 0, 0, 1]
     expected = vtk.vtkColorTransferFunction()
     expected.SetColorSpaceToStep()
-    for at in range(0, len(points), 4):
-        expected.AddRGBPoint(*points[at : at + 4])
+    for i in range(0, len(points), 4):
+        expected.AddRGBPoint(*points[i : i + 4])
     function = paraview(tmp_path, ColorSpace="Step", RGBPoints=points)
     for value in (0.01, 1, 3.99, 4.01, 6, 9.9):
         assert function(np.array([value]))[0, :3].tolist() == list(expected.GetColor(value))
@@ -257,8 +259,8 @@ def test_bent_opacities_are_those_of_vtk(tmp_path_factory, middle, sharp, alphas
     folder = tmp_path_factory.mktemp("pv")
     function = paraview(folder, RGBPoints=[-3, 0, 0, 0, 5, 1, 1, 1], Points=points)
     values = np.linspace(-3, 5, 97)
-    found = function(values)[:, 3]
-    np.testing.assert_allclose(found, [expected.GetValue(v) for v in values], atol=0.02)
+    colors = function(values)[:, 3]
+    np.testing.assert_allclose(colors, [expected.GetValue(v) for v in values], atol=0.02)
 
 
 PARAVIEW = Path(__file__).with_name("paraview_presets.json")
@@ -271,9 +273,9 @@ def test_presets_that_paraview_wrote_are_what_it_evaluates(name):
     of each, none of which is a point of the function.
     """
     values, *color, alpha = np.array(EVALUATED[name]).T
-    found = gv.TransferFunction.from_file(PARAVIEW, name)(values)
-    np.testing.assert_allclose(srgb(found[:, :3]), np.transpose(color), atol=0.004)
-    np.testing.assert_allclose(found[:, 3], alpha, atol=0.002)
+    colors = gv.TransferFunction.from_file(PARAVIEW, name)(values)
+    np.testing.assert_allclose(srgb(colors[:, :3]), np.transpose(color), atol=0.004)
+    np.testing.assert_allclose(colors[:, 3], alpha, atol=0.002)
 
 
 def test_categories_among_presets_of_paraview_are_told(tmp_path):
@@ -290,8 +292,8 @@ def test_categories_among_presets_of_paraview_are_told(tmp_path):
 def test_a_space_that_paraview_does_not_know_but_ships_is_straight(tmp_path):
     """Its "Blue - Green - Orange" says CIELAB, which ParaView interprets as RGB."""
     function = paraview(tmp_path, ColorSpace="CIELAB", RGBPoints=COOL_WARM)
-    found = srgb(function(np.array([2.5]))[:, :3])
-    np.testing.assert_allclose(found, [[0.34975, 0.2275, 0.602]], atol=0.004)
+    colors = srgb(function(np.array([2.5]))[:, :3])
+    np.testing.assert_allclose(colors, [[0.34975, 0.2275, 0.602]], atol=0.004)
 
 
 def test_a_narrow_curve_stays_in_its_place(tmp_path):
@@ -299,8 +301,8 @@ def test_a_narrow_curve_stays_in_its_place(tmp_path):
     vtk = pytest.importorskip("vtkmodules.vtkCommonDataModel")
     points = [0, 0.1, 0.5, 0, 100, 0.7, 0.3, 0.1, 104, 0.3, 0.5, 0, 3000, 0.5, 0.5, 0]
     expected = vtk.vtkPiecewiseFunction()
-    for at in range(0, len(points), 4):
-        expected.AddPoint(*points[at : at + 4])
+    for i in range(0, len(points), 4):
+        expected.AddPoint(*points[i : i + 4])
     function = paraview(tmp_path, RGBPoints=[0, 0, 0, 0, 3000, 1, 1, 1], Points=points)
     values = np.linspace(99, 106, 50)
     np.testing.assert_allclose(
@@ -345,10 +347,10 @@ def test_presets_of_slicer(tmp_path):
     (tmp_path / "a.vp.json").write_text(json.dumps(content))
     for file, name in (("a.vp", None), ("presets.xml", "CT-One"), ("a.vp.json", None)):
         function = gv.TransferFunction.from_file(tmp_path / file, name)
-        found = function(np.array([-1000, 100, 1050, 2000.0]))
-        np.testing.assert_allclose(found[:, 3], [0, 0.25, 0.625, 1], atol=1e-4)
+        colors = function(np.array([-1000, 100, 1050, 2000.0]))
+        np.testing.assert_allclose(colors[:, 3], [0, 0.25, 0.625, 1], atol=1e-4)
         expected = np.array([[0, 0, 0], [0.5, 0.25, 0], [0.75, 0.625, 0.5], [1, 1, 1]])
-        np.testing.assert_allclose(srgb(found[:, :3]), expected, atol=2e-3)
+        np.testing.assert_allclose(srgb(colors[:, :3]), expected, atol=2e-3)
         assert not function.relative and function.reference == (2.5 if "json" in file else None)
     with pytest.warns(UserWarning, match="not kept: shading"):
         gv.TransferFunction.from_file(tmp_path / "presets.xml", "CT-Two")
@@ -361,17 +363,17 @@ def test_what_is_saved_for_paraview_comes_back(tmp_path, name):
     (tmp_path / "a.json").write_text(function.to_paraview(name))
     back = gv.TransferFunction.from_file(tmp_path / "a.json", name)
     values = np.linspace(-100, 900, 3001)
-    found, expected = back(values), function(values)
-    np.testing.assert_allclose(found[:, 3], expected[:, 3], atol=2e-3)
-    assert np.abs(srgb(found[:, :3]) - srgb(expected[:, :3])).max() < 4e-3
+    colors, expected = back(values), function(values)
+    np.testing.assert_allclose(colors[:, 3], expected[:, 3], atol=2e-3)
+    assert np.abs(srgb(colors[:, :3]) - srgb(expected[:, :3])).max() < 4e-3
 
 
-def vp_json(tmp_path, **told):
+def vp_json(tmp_path, **fields):
     color = [{"x": 0, "color": [0, 0.2, 1]}, {"x": 10, "color": [1, 0.4, 0.5]}]
     component = {
         "rgbTransferFunction": {"points": color},
         "scalarOpacity": {"points": [{"x": 0, "y": 0}, {"x": 10, "y": 1}]},
-        **told,
+        **fields,
     }
     (tmp_path / "a.vp.json").write_text(
         json.dumps({"volumeProperties": [{"components": [component]}]})
@@ -389,8 +391,8 @@ def test_bent_colours_of_slicer_are_those_of_vtk(tmp_path, middle, sharp):
         expected.AddRGBPoint(p["x"], *p["color"], p["midpoint"], p["sharpness"])
     function = vp_json(tmp_path, rgbTransferFunction={"points": [first, last]})
     values = (np.arange(100) + 0.5) / 10
-    found = srgb(function(values)[:, :3])
-    np.testing.assert_allclose(found, [expected.GetColor(v) for v in values], atol=0.004)
+    colors = srgb(function(values)[:, :3])
+    np.testing.assert_allclose(colors, [expected.GetColor(v) for v in values], atol=0.004)
 
 
 def test_disabled_opacity_by_gradient_is_not_missed(tmp_path, recwarn):

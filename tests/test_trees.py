@@ -14,11 +14,11 @@ WARM = gv.TransferFunction([(0, 0), (0.1, 0), (1, 0.5)], [(0, 0.2, 0, 0), (1, 1,
 COLD = gv.TransferFunction([(0, 0), (0.2, 0), (1, 0.4)], [(0, 0, 0.1, 0.4), (1, 0.4, 0.9, 1)])
 
 
-def blob(extent: tuple[int, int, int], spacing, origin, at, width: float) -> gv.Volume:
+def blob(extent: tuple[int, int, int], spacing, origin, center, width: float) -> gv.Volume:
     """Returns a smooth ball: (z, y, x) values of a Gaussian at a world position."""
     axes = [o + s * np.arange(n) for n, s, o in zip(extent, spacing, origin, strict=True)]
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
-    square = (x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2
+    square = (x - center[0]) ** 2 + (y - center[1]) ** 2 + (z - center[2]) ** 2
     return gv.Volume(np.exp(-square / width**2).astype(np.float32), spacing, origin)
 
 
@@ -33,9 +33,9 @@ def volumes() -> dict[str, gv.Volume]:
 
 def about(middle, turn: np.ndarray) -> np.ndarray:
     """Returns (4, 4): a rotation about a point."""
-    made = np.eye(4)
-    made[:3, :3], made[:3, 3] = turn, middle - turn @ middle
-    return made
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, middle - turn @ middle
+    return pose
 
 
 def view(size: int = 24) -> gv.Camera:
@@ -43,19 +43,19 @@ def view(size: int = 24) -> gv.Camera:
 
 
 def value_at(
-    volume: gv.Volume, place: np.ndarray, pose: np.ndarray
+    volume: gv.Volume, positions: np.ndarray, pose: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns trilinear values (k,) at world positions (k, 3), the outermost voxels repeated to the
     box's faces, and whether they lie in the box, which has a pose (4, 4).
     """
     data = volume.data[..., 0].double().numpy()
-    own = (place - pose[:3, 3]) @ pose[:3, :3]
-    grid = (own - volume.origin) / volume.spacing
+    local = (positions - pose[:3, 3]) @ pose[:3, :3]
+    grid = (local - volume.origin) / volume.spacing
     inside = ((grid >= -0.5) & (grid <= np.array(volume.extent) - 0.5)).all(1)
     grid = grid.clip(0, np.array(volume.extent) - 1)
     low = np.minimum(grid.astype(int), np.array(volume.extent) - 2)
     part = grid - low
-    value = np.zeros(len(place))
+    value = np.zeros(len(positions))
     for corner in np.ndindex(2, 2, 2):
         weight = np.where(corner, part, 1 - part).prod(1)
         x, y, z = (low + corner).T
@@ -74,10 +74,10 @@ def dense(
     origin, direction = rays.origin.numpy(), rays.direction.numpy()
     clear, color = np.ones(len(origin)), np.zeros((len(origin), 3))
     for t in np.arange(0, 110, step) + step / 2:
-        place = origin + t * direction
+        positions = origin + t * direction
         total, glow = np.zeros(len(origin)), np.zeros((len(origin), 3))
         for volume, shader, pose in zip(volumes, shaders, poses, strict=True):
-            value, inside = value_at(volume, place, pose)
+            value, inside = value_at(volume, positions, pose)
             rgba = shader(value)
             thick = -np.log1p(-rgba[:, 3]) / min(volume.spacing) * inside
             total, glow = total + thick, glow + thick[:, None] * rgba[:, :3]
@@ -105,7 +105,7 @@ def test_trees_that_overlap_are_composited_by_sample_as_by_a_dense_marcher(volum
         for name, volume in volumes.items()
     }
     shaders = {"ct": WARM, "pet": COLD}
-    found = gv.render(
+    actual = gv.render(
         *(trees, view(size), shaders),
         step=step,
         lod="finest",
@@ -117,13 +117,13 @@ def test_trees_that_overlap_are_composited_by_sample_as_by_a_dense_marcher(volum
     poses = [np.eye(4), POSES[pose]]
     color, alpha = dense([*volumes.values()], [WARM, COLD], poses, view(size).rays(), 0.02)
     worst = 1e-4 if step < 0.1 else 4e-3
-    assert np.abs(found.color.cpu().numpy().reshape(-1, 3) - color).max() < worst
-    assert np.abs(found.alpha.cpu().numpy().ravel() - alpha).max() < worst
-    apart = [
-        gv.render(trees[n], view(size), shaders[n], lod="finest", pose=place)
-        for n, place in zip(trees, poses, strict=True)
+    assert np.abs(actual.color.cpu().numpy().reshape(-1, 3) - color).max() < worst
+    assert np.abs(actual.alpha.cpu().numpy().ravel() - alpha).max() < worst
+    separate = [
+        gv.render(trees[n], view(size), shaders[n], lod="finest", pose=p)
+        for n, p in zip(trees, poses, strict=True)
     ]
-    both = (apart[0].alpha > 0.1) & (apart[1].alpha > 0.1)
+    both = (separate[0].alpha > 0.1) & (separate[1].alpha > 0.1)
     assert both.float().mean() > 0.05, "they are seen through each other"
 
 
@@ -135,11 +135,11 @@ def pictures(volumes, shaders, order=("ct", "pet"), size=24, **options) -> gv.Pi
 @pytest.mark.backend("cpp")
 def test_the_order_of_trees_does_not_matter(volumes):
     shaders = {"ct": gv.Lit(WARM), "pet": COLD}
-    one, two = (pictures(volumes, shaders, order) for order in (("ct", "pet"), ("pet", "ct")))
+    a, b = (pictures(volumes, shaders, order) for order in (("ct", "pet"), ("pet", "ct")))
     for name in ("color", "alpha", "depth", "normal"):
-        torch.testing.assert_close(getattr(one, name), getattr(two, name), atol=1e-6, rtol=1e-6)
-    assert torch.equal(one.samples, two.samples)
-    assert (one.normal.norm(dim=-1) > 0.9).any()
+        torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=1e-6, rtol=1e-6)
+    assert torch.equal(a.samples, b.samples)
+    assert (a.normal.norm(dim=-1) > 0.9).any()
 
 
 @pytest.mark.backend("cpp")
@@ -185,7 +185,7 @@ def test_a_surface_among_media_ends_the_ray_for_all(volumes):
     """The surface hides what is behind it, and is dimmed by what is in front of it."""
     trees = {name: gv.N3Tree.from_volume(volumes[name], 8) for name in volumes}
     surface = gv.Isosurface(0.6)
-    found = gv.render(trees, view(), {"ct": surface, "pet": COLD}, lod="finest", step=0.1)
+    actual = gv.render(trees, view(), {"ct": surface, "pet": COLD}, lod="finest", step=0.1)
     alone = gv.render(trees["ct"], view(), surface, lod="finest", step=0.1)
     depth = alone.depth.ravel().double()
     hit = depth < torch.inf
@@ -199,8 +199,8 @@ def test_a_surface_among_media_ends_the_ray_for_all(volumes):
         step=0.1,
     )
     expected = front.color + (1 - front.alpha) * alone.color.reshape(-1, 3) * hit[:, None]
-    torch.testing.assert_close(found.color.reshape(-1, 3), expected, atol=2e-5, rtol=0)
-    assert (found.alpha.ravel()[hit] == 1).all() and 20 < int(hit.sum()) < len(hit)
+    torch.testing.assert_close(actual.color.reshape(-1, 3), expected, atol=2e-5, rtol=0)
+    assert (actual.alpha.ravel()[hit] == 1).all() and 20 < int(hit.sum()) < len(hit)
     assert bool((front.alpha[hit] > 0.05).any())
 
 
@@ -273,7 +273,7 @@ def test_rays_that_have_ended_ask_for_nothing_behind(volumes):
 
 
 @pytest.mark.parametrize(
-    "make, told",
+    "make, message",
     [
         (lambda t: gv.render({}, view(), WARM), "there must be a tree"),
         (lambda t: gv.render({"ct": t}, view(), {"pt": WARM}), "shader of tree 'ct'"),
@@ -283,9 +283,9 @@ def test_rays_that_have_ended_ask_for_nothing_behind(volumes):
     ],
 )
 @pytest.mark.backend("cpp")
-def test_mistakes_are_told_in_a_line(volumes, make, told):
+def test_mistakes_are_told_in_a_line(volumes, make, message):
     tree = gv.N3Tree.from_volume(volumes["pet"], 8)
-    with pytest.raises(ValueError, match=told) as error:
+    with pytest.raises(ValueError, match=message) as error:
         make(tree)
     assert "\n" not in str(error.value)
 
@@ -296,28 +296,28 @@ def test_what_some_blocks_of_rays_lack_is_nothing(volumes, monkeypatch):
     monkeypatch.setattr(pixels, "_RAYS_PER_REPORT", 32)
     trees = {
         name: gv.N3Tree.from_volume(
-            {"value": one, "more": gv.Volume(one.data + 1, one.spacing, one.origin)}
+            {"value": v, "more": gv.Volume(v.data + 1, v.spacing, v.origin)}
         )
-        for name, one in volumes.items()
+        for name, v in volumes.items()
     }
     shader = gv.Features(WARM, "more")
-    shown = [view(16), gv.Camera.look_at((200, 0, 0), (300, 0, 0), (0, 0, 1), 38, 16, 16)]
+    cameras = [view(16), gv.Camera.look_at((200, 0, 0), (300, 0, 0), (0, 0, 1), 38, 16, 16)]
     both = gv.Camera(
-        torch.cat([one.viewmats for one in shown]), torch.cat([one.Ks for one in shown]), 16, 16
+        torch.cat([v.viewmats for v in cameras]), torch.cat([v.Ks for v in cameras]), 16, 16
     )
     picture = gv.render(trees, both, shader, progress=lambda *_: None)
     assert float(picture.features[0].max()) > 0 and not picture.features[1].any()
-    for at, camera in enumerate(shown):
+    for index, camera in enumerate(cameras):
         alone = gv.render(trees, camera, shader)
-        assert torch.equal(picture.features[at], alone.features)
+        assert torch.equal(picture.features[index], alone.features)
 
 
 def test_pre_integrated_media_overlap_as_others_do(volumes):
-    trees = {name: gv.N3Tree.from_volume(one) for name, one in volumes.items()}
+    trees = {name: gv.N3Tree.from_volume(volume) for name, volume in volumes.items()}
     fine = gv.render(trees, view(), {"ct": WARM, "pet": COLD}, step=0.1, lod="finest")
     shaders = {"ct": gv.PreIntegrated(WARM), "pet": gv.PreIntegrated(COLD)}
-    found = gv.render(trees, view(), shaders, step=0.5, lod="finest")
-    assert float((found.color - fine.color).abs().max()) < 0.01 < float(fine.color.max())
+    actual = gv.render(trees, view(), shaders, step=0.5, lod="finest")
+    assert float((actual.color - fine.color).abs().max()) < 0.01 < float(fine.color.max())
 
 
 def test_labels_are_told_among_media(volumes):
@@ -330,16 +330,16 @@ def test_labels_are_told_among_media(volumes):
         "pet": gv.N3Tree.from_volume(volumes["pet"], 8),
     }
     shaders = {"labels": gv.Labels(), "pet": COLD}
-    found = gv.render(trees, view(), shaders)
+    actual = gv.render(trees, view(), shaders)
     alone = gv.render(trees["labels"], view(), shaders["labels"])
     faint = gv.TransferFunction([(0, 1e-9)])
     through = gv.render(trees, view(), {**shaders, "pet": faint})
     assert sorted(set(alone.label.unique().tolist())) == [-1, 700_000_000_001]
     same = (through.label == alone.label).float().mean()
     assert same > 0.99, "but for pixels at the edge"
-    hidden = (found.label == -1) & (alone.label > 0)
-    assert ((found.label == alone.label) | hidden).float().mean() > 0.99
-    assert (found.label > 0).float().mean() > 0.05
+    hidden = (actual.label == -1) & (alone.label > 0)
+    assert ((actual.label == alone.label) | hidden).float().mean() > 0.99
+    assert (actual.label > 0).float().mean() > 0.05
 
 
 @pytest.mark.backend("cpp")
@@ -348,11 +348,11 @@ def test_of_surfaces_the_nearest_is_seen(volumes):
     trees = {name: gv.N3Tree.from_volume(volumes[name], 8) for name in volumes}
     hue = gv.TransferFunction([(0, 0)], [(0, 1, 0, 0), (1, 0, 0, 1)])
     shaders = {"ct": gv.Isosurface(0.5, hue, color_channel="value"), "pet": gv.Isosurface(0.4)}
-    found = gv.render(trees, view(), shaders)
+    actual = gv.render(trees, view(), shaders)
     ct, pet = (gv.render(trees[name], view(), shaders[name]) for name in trees)
     nearest = torch.where(ct.depth <= pet.depth, ct.color, pet.color)
-    assert torch.equal(found.color, nearest)
-    assert torch.equal(found.depth, torch.minimum(ct.depth, pet.depth))
-    hit = [one.depth < torch.inf for one in (ct, pet)]
+    assert torch.equal(actual.color, nearest)
+    assert torch.equal(actual.depth, torch.minimum(ct.depth, pet.depth))
+    hit = [picture.depth < torch.inf for picture in (ct, pet)]
     assert (hit[0] & hit[1]).any(), "they overlap in the picture"
     assert (hit[0] & (ct.depth < pet.depth)).any() and (hit[1] & (pet.depth < ct.depth)).any()

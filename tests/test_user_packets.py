@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import ROOT
-from helpers.compiled import ADD, HEADER, only_included, users_shader, write
-from helpers.packets import INSTRUCTIONS, LAMP, TRANSFER, cut, result, scene, shaded, start
+from helpers.compiled import ADD, HEADER, only_included, users_shader, write_header
+from helpers.packets import INSTRUCTIONS, LAMP, TRANSFER, cut_rays, result, scene, shaded, start
 from helpers.rays import camera_rays
-from helpers.traces import run
+from helpers.traces import trace
 from torch import Tensor
 
 import gvtorch as gv
@@ -52,15 +52,15 @@ def shader(name: str, folder: Path | None = None) -> gv.CompiledShader:
 
 def given(name: str, folder: Path | None = None) -> list[Tensor]:
     """Returns all that its traces write; N = 3 makes deep trees, and one brick no packets."""
-    own, found = shader(name, folder), []
+    user_shader, results = shader(name, folder), []
     for branching in (2, 4, 3):
-        found += shaded(own, "cpp", branching)
+        results += shaded(user_shader, "cpp", branching)
     values = torch.rand((6, 6, 6), generator=torch.Generator().manual_seed(1))
     channels = {"value": values, "rgba": values, "normal": values[..., None].expand(6, 6, 6, 3)}
     tree = gv.N3Tree.from_volume({key: gv.Volume(some) for key, some in channels.items()}, 8)
     assert tree.bricks.capacity == 1
-    hits, marks = run(tree, "cpp", camera_rays(tree, 9), own)
-    return [*found, *hits.values(), *marks.values()]
+    hits, marks = trace(tree, "cpp", camera_rays(tree, 9), user_shader)
+    return [*results, *hits.values(), *marks.values()]
 
 
 OPTIMISED = ["ink"]  # compiled as users have it: 11 s
@@ -68,29 +68,29 @@ OPTIMISED = ["ink"]  # compiled as users have it: 11 s
 
 def all_given() -> dict[str, list[Tensor]]:
     """Returns that of the shaders named in the environment; only some are compiled optimised."""
-    found = {}
+    results = {}
     for name in os.environ["SHADERS"].split(";"):
         with pytest.MonkeyPatch.context() as patch:
             if name not in os.environ["OPTIMISED"].split(";"):
                 patch.setenv("CXX", os.environ["QUICK"])
-            found[name] = given(name)
-    return found
+            results[name] = given(name)
+    return results
 
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("set_", INSTRUCTIONS)
 def test_every_bit_is_that_of_rays_one_by_one(tmp_path, monkeypatch, quick, set_):
-    own = set_ == instructions()
-    names, optimised = (list(SHADERS), OPTIMISED) if own else (OPTIMISED, [])
-    told = {"SHADERS": ";".join(names), "OPTIMISED": ";".join(optimised), "QUICK": quick}
-    run = start(all_given, tmp_path, set_, **told)
+    same_set = set_ == instructions()
+    names, optimised = (list(SHADERS), OPTIMISED) if same_set else (OPTIMISED, [])
+    environment = {"SHADERS": ";".join(names), "OPTIMISED": ";".join(optimised), "QUICK": quick}
+    run = start(all_given, tmp_path, set_, **environment)
     monkeypatch.setenv("CXX", quick)
     expected = {name: given(name, tmp_path) for name in names}
-    found = result(run)
+    actual = result(run)
     for name, tensors in expected.items():
-        for one, other in zip(found[name], tensors, strict=True):
-            assert torch.equal(one.nan_to_num(7), other.nan_to_num(7)), name
-        assert sum(len(one.unique()) for one in tensors) > 1000, "the test must see something"
+        for a, b in zip(actual[name], tensors, strict=True):
+            assert torch.equal(a.nan_to_num(7), b.nan_to_num(7)), name
+        assert sum(len(a.unique()) for a in tensors) > 1000, "the test must see something"
 
 
 @pytest.mark.backend("cpp")
@@ -98,16 +98,16 @@ def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch, quick)
     """The usual library contains the packet code, that of this file's ray-by-ray header does not;
     float64 is the same in both.
     """
-    own = shader("ink")
-    assert b"PacketWalk" in own.libraries[0].read_bytes()
+    user_shader = shader("ink")
+    assert b"PacketWalk" in user_shader.libraries[0].read_bytes()
     monkeypatch.setenv("CXX", quick)
     alone = shader("ink", tmp_path)
     assert b"PacketWalk" not in alone.libraries[0].read_bytes()
     tree = scene()
-    rays = cut(camera_rays(tree, 11, distance=1.5))
-    one, other = (run(tree, "cpp", rays, each, dtype=torch.float64)[0] for each in (own, alone))
-    assert all(torch.equal(one[key].nan_to_num(7), other[key].nan_to_num(7)) for key in other)
-    assert one["color"].unique().numel() > 20
+    rays = cut_rays(camera_rays(tree, 11, distance=1.5))
+    a, b = (trace(tree, "cpp", rays, each, dtype=torch.float64)[0] for each in (user_shader, alone))
+    assert all(torch.equal(a[key].nan_to_num(7), b[key].nan_to_num(7)) for key in b)
+    assert a["color"].unique().numel() > 20
 
 
 @pytest.mark.backend("cpp")
@@ -115,11 +115,11 @@ def test_a_folder_serves_several_instruction_sets(tmp_path, monkeypatch):
     """Each has its own library, of one op."""
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path))
     monkeypatch.setenv("CXX", only_included(tmp_path))
-    source = user.ShaderSource.read(write(tmp_path, ADD), "Own")
-    made = []
+    source = user.ShaderSource.read(write_header(tmp_path, ADD), "Own")
+    files = []
     for name in ("baseline", "avx512", "baseline"):
         monkeypatch.setattr(user, "instructions", lambda name=name: name)
-        made.append(user.compiled(source, ()))
-    assert made[0] == made[2] != made[1] and {*made} == {*(tmp_path / "shaders").iterdir()}
-    assert all(library.name.startswith(f"{source.op}_cpu_") for library in made)
-    assert made[0].read_bytes() != made[1].read_bytes()
+        files.append(user.compiled(source, ()))
+    assert files[0] == files[2] != files[1] and {*files} == {*(tmp_path / "shaders").iterdir()}
+    assert all(library.name.startswith(f"{source.op}_cpu_") for library in files)
+    assert files[0].read_bytes() != files[1].read_bytes()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.pictures import GRAY
-from helpers.viewer import FUNCTION, Page, bright_ball, pixels, turned
+from helpers.viewer import FUNCTION, Page, bright_ball, pixels, turned_camera
 
 import gvtorch as gv
 from gvtorch.io.surface import export_surface
@@ -32,10 +32,10 @@ def test_a_page_gets_the_picture_that_python_makes(session):
     assert head["samples"] == session.state.develop.samples == 16
     tree = gv.N3Tree.from_volume(bright_ball())
     camera = session.state.camera.camera(96, 64, tree.box)
-    made = gv.Progressive(lambda one: gv.render(tree, one, FUNCTION)).refine(camera, 16)
-    expected = made.to_srgb8().numpy()
+    drawn = gv.Progressive(lambda view: gv.render(tree, view, FUNCTION)).refine(camera, 16)
+    expected = drawn.to_srgb8().numpy()
     assert seen.shape == expected.shape == (64, 96, 3) and expected.std() > 10
-    assert np.array_equal(seen, pixels(image_file(made, "JPEG", quality=94, subsampling=0))), (
+    assert np.array_equal(seen, pixels(image_file(drawn, "JPEG", quality=94, subsampling=0))), (
         "to the last bit, before JPEG"
     )
     assert np.abs(seen.astype(int) - expected).mean() < 1
@@ -45,20 +45,22 @@ def test_pictures_stop_when_nothing_changes_and_go_on_when_something_does(sessio
     page = Page(session)
     page.final()
     count = len(page.pictures)
-    assert session.ask(lambda: [one.wants_picture() for one in session.clients.values()]) == [False]
+    assert session.ask(lambda: [c.wants_picture() for c in session.clients.values()]) == [False]
     _, before = page.final()
-    _, after = page.moved(turned(page.camera, 1.0))
+    _, after = page.moved(turned_camera(page.camera, 1.0))
     assert len(page.pictures) > count and np.abs(before.astype(int) - after).max() > 60
     page.send("change", state={"options": {"background": [0.0, 0.5, 0.0]}})
     page.until(
         lambda: page.pictures[-1][0]["final"] and pixels(page.pictures[-1][1])[0, 0, 1] > 150
     )
-    state = page.of("state")[-1]["state"]
+    state = page.of_type("state")[-1]["state"]
     assert state["options"]["background"] == [0.0, 0.5, 0.0] and state["options"]["step"] == 0.5
-    whole = {name: one for name, one in page.of("welcome")[0]["state"].items() if name != "camera"}
+    whole = {name: c for name, c in page.of_type("welcome")[0]["state"].items() if name != "camera"}
     page.send("change", state=whole)  # as undo does
-    page.until(lambda: page.of("state")[-1]["state"]["options"]["background"] == [0.0, 0.0, 0.0])
-    assert not page.of("refused")
+    page.until(
+        lambda: page.of_type("state")[-1]["state"]["options"]["background"] == [0.0, 0.0, 0.0]
+    )
+    assert not page.of_type("refused")
 
 
 def test_at_most_one_picture_is_on_its_way(session):
@@ -67,9 +69,9 @@ def test_at_most_one_picture_is_on_its_way(session):
     slow.until(lambda: slow.pictures)
     camera = page.camera
     for step in range(20):
-        camera = turned(camera, 0.2)
-        for one in (slow, page):
-            one.send("move", camera=camera, moving=step < 19)
+        camera = turned_camera(camera, 0.2)
+        for sender in (slow, page):
+            sender.send("move", camera=camera, moving=step < 19)
     page.until(lambda: page.pictures and page.pictures[-1][0]["camera"]["eye"] == camera["eye"])
     page.final()
     assert len(slow.pictures) == 1
@@ -80,45 +82,47 @@ def test_at_most_one_picture_is_on_its_way(session):
 
 
 def test_two_pages_have_cameras_of_their_own_and_may_follow(session):
-    one, other = Page(session), Page(session)
-    _, still = other.final()
-    there = turned(one.camera, 0.7)
-    _, moved = one.moved(there)
-    assert np.array_equal(other.final()[1], still) and not np.array_equal(moved, still)
-    other.send("follow", client=one.client.number)
-    other.until(lambda: other.of("camera"))
-    further = turned(there, 0.7)
-    _, seen = one.moved(further)
-    other.until(lambda: np.allclose(other.pictures[-1][0]["camera"]["eye"], further["eye"]))
-    assert np.array_equal(other.final()[1], seen)
-    assert other.of("clients")[-1]["clients"] == {"1": None, "2": 1}
-    session.leave(one.client)
-    other.until(lambda: other.of("clients")[-1]["clients"] == {"2": None})
-    other.moved(there)
-    other.send("follow", client=7)
-    assert "there is no client 7" in other.next("refused", 0)["text"]
+    first, second = Page(session), Page(session)
+    _, still = second.final()
+    there = turned_camera(first.camera, 0.7)
+    _, moved = first.moved(there)
+    assert np.array_equal(second.final()[1], still) and not np.array_equal(moved, still)
+    second.send("follow", client=first.client.number)
+    second.until(lambda: second.of_type("camera"))
+    further = turned_camera(there, 0.7)
+    _, seen = first.moved(further)
+    second.until(lambda: np.allclose(second.pictures[-1][0]["camera"]["eye"], further["eye"]))
+    assert np.array_equal(second.final()[1], seen)
+    assert second.of_type("clients")[-1]["clients"] == {"1": None, "2": 1}
+    session.leave(first.client)
+    second.until(lambda: second.of_type("clients")[-1]["clients"] == {"2": None})
+    second.moved(there)
+    second.send("follow", client=7)
+    assert "there is no client 7" in second.next("refused", 0)["text"]
 
 
 def test_a_change_is_seen_by_all_and_a_wrong_one_by_nobody(session):
-    one, other = Page(session), Page(session)
-    _, before = other.final()
+    first, second = Page(session), Page(session)
+    _, before = second.final()
     function = {"kind": "TransferFunction", "opacity": [[20, 0], [60, 1]], "color": [[0, 0, 1, 0]]}
-    one.send("change", state={"shader": function})
-    other.until(lambda: other.of("state"))
-    other.until(
-        lambda: other.pictures[-1][0]["final"] and pixels(other.pictures[-1][1])[..., 0].max() < 60
+    first.send("change", state={"shader": function})
+    second.until(lambda: second.of_type("state"))
+    second.until(
+        lambda: (
+            second.pictures[-1][0]["final"] and pixels(second.pictures[-1][1])[..., 0].max() < 60
+        )
     )
-    assert pixels(other.pictures[-1][1])[..., 1].max() > 200 > before[..., 1].min()
-    told = len(other.of("state"))
+    assert pixels(second.pictures[-1][1])[..., 1].max() > 200 > before[..., 1].min()
+    state_count = len(second.of_type("state"))
     for wrong in ({"shader": {"kind": "Lit"}}, {"options": {"step": -1}}, {"nothing": 1}):
-        count = len(one.of("refused"))
-        one.send("change", state=wrong)
-        text = one.next("refused", count)["text"]
+        count = len(first.of_type("refused"))
+        first.send("change", state=wrong)
+        text = first.next("refused", count)["text"]
         assert "\n" not in text and text
-    one.session.receive(one.client, b"\xff\xfe")
-    one.session.receive(one.client, "[1, 2]")
-    one.until(lambda: len(one.of("refused")) == 5)
-    assert len(other.of("state")) == told and not other.of("refused")
+    first.session.receive(first.client, b"\xff\xfe")
+    first.session.receive(first.client, "[1, 2]")
+    first.until(lambda: len(first.of_type("refused")) == 5)
+    assert len(second.of_type("state")) == state_count and not second.of_type("refused")
     assert session.state.shader.opacity.tolist() == [[20, 0], [60, 1]]
 
 
@@ -131,7 +135,7 @@ def test_a_state_that_can_not_be_drawn_gives_way_to_the_last_that_could(session)
         state={
             "shader": {
                 "kind": "Features",
-                "transfer": page.of("welcome")[0]["state"]["shader"],
+                "transfer": page.of_type("welcome")[0]["state"]["shader"],
                 "channel": "none",
             }
         },
@@ -139,11 +143,11 @@ def test_a_state_that_can_not_be_drawn_gives_way_to_the_last_that_could(session)
     assert "has no channel 'none'" in page.next("error", 0)["text"]
     page.until(
         lambda: (
-            page.of("state")
-            and page.of("state")[-1]["state"]["shader"]["kind"] == "TransferFunction"
+            page.of_type("state")
+            and page.of_type("state")[-1]["state"]["shader"]["kind"] == "TransferFunction"
         )
     )
-    page.moved(turned(page.camera, 0.1))
+    page.moved(turned_camera(page.camera, 0.1))
     _, after = page.moved(page.camera)
     assert np.abs(after.astype(int) - before).max() <= 2
 
@@ -154,8 +158,8 @@ def test_what_is_hit_histograms_presets_and_stills(session):
     page.send("pick", x=0.5, y=0.5, purpose="focus")
     corner = {"x": 0.0, "y": 0.0}
     page.send("pick", **corner)
-    page.until(lambda: len(page.of("picked")) == 2)
-    hit, missed = page.of("picked")
+    page.until(lambda: len(page.of_type("picked")) == 2)
+    hit, missed = page.of_type("picked")
     assert missed["place"] is None and hit["purpose"] == "focus"
     if hit["place"] is None:  # the ball is not in the middle
         rows, columns = np.nonzero(page.final()[1].max(-1) > 120)
@@ -165,16 +169,16 @@ def test_what_is_hit_histograms_presets_and_stills(session):
     away = np.linalg.norm(np.array(hit["place"]) - centre)
     assert 3 < away < 10, "on the ball's surface"
     page.send("histogram", in_view=False)
-    told = page.next("histogram", 0)
+    bars = page.next("histogram", 0)
     values = bright_ball().data.numpy()
-    assert sum(told["counts"]) == values.size and told["low"] <= 0 and told["high"] >= values.max()
-    assert told["counts"] == np.bincount(values.ravel()).tolist(), "a bar for each whole number"
+    assert sum(bars["counts"]) == values.size and bars["low"] <= 0 and bars["high"] >= values.max()
+    assert bars["counts"] == np.bincount(values.ravel()).tolist(), "a bar for each whole number"
     page.send("histogram", in_view=True)
-    told = page.next("histogram", 1)
-    assert 0 < sum(told["counts"]) < values.size * 2
+    bars = page.next("histogram", 1)
+    assert 0 < sum(bars["counts"]) < values.size * 2
     page.send("preset", name="hot", low=0.0, high=200.0)
-    found = page.next("preset", 0)["function"]
-    assert found["color"] == gv.TransferFunction.preset("hot", 0, 200).color.tolist()
+    function = page.next("preset", 0)["function"]
+    assert function["color"] == gv.TransferFunction.preset("hot", 0, 200).color.tolist()
     page.send("preset", name="no")
     assert "unknown preset 'no'" in page.next("refused", 0)["text"]
     page.send("still", width=80, height=40)
@@ -182,23 +186,23 @@ def test_what_is_hit_histograms_presets_and_stills(session):
     still = pixels(page.files["picture.png"])
     tree = gv.N3Tree.from_volume(bright_ball())
     camera = session.state.camera.camera(80, 40, tree.box)
-    made = gv.Progressive(lambda one: gv.render(tree, one, FUNCTION)).refine(camera, 16)
-    assert np.array_equal(still, made.to_srgb8().numpy())
+    progressive = gv.Progressive(lambda view: gv.render(tree, view, FUNCTION)).refine(camera, 16)
+    assert np.array_equal(still, progressive.to_srgb8().numpy())
 
 
 def test_figures_and_cost_pictures(session):
     page = Page(session)
     page.final()
     page.send("monitor", on=True)
-    told = page.next("figures", 0)
+    figures = page.next("figures", 0)
     assert (
-        told["samples"] > 0
-        and "trace" in told["stages"]
-        and told["report"]["occupancy"]["bricks"] > 0
+        figures["samples"] > 0
+        and "trace" in figures["stages"]
+        and figures["report"]["occupancy"]["bricks"] > 0
     )
-    assert told["rays"] == 64 * 48
+    assert figures["rays"] == 64 * 48
     page.send("change", state={"show": "samples"})
-    page.until(lambda: page.of("state"))
+    page.until(lambda: page.of_type("state"))
     page.until(lambda: pixels(page.pictures[-1][1]).shape == (24, 32, 3))
     page.send("do", what="fit")
     page.next("camera", 0)
@@ -227,13 +231,13 @@ def test_a_scene_that_dies_is_told_and_the_picture_goes_on():
         producer.alive = False
         near = {**page.camera, "target": [256.0, 256, 256], "eye": [300.0, 280, 520]}
         page.send("move", camera=near, moving=False)
-        told = page.next("failed", 0)
-        assert "the disk is gone" in told["text"] and told["count"] > 0
+        failure = page.next("failed", 0)
+        assert "the disk is gone" in failure["text"] and failure["count"] > 0
         _, seen = page.moved(near)
         assert seen.max() > 0
         producer.alive = True
         page.send("do", what="retry")
-        page.until(lambda: not page.of("busy") or page.of("busy")[-1]["misses"] == 0)
+        page.until(lambda: not page.of_type("busy") or page.of_type("busy")[-1]["misses"] == 0)
         page.final()
         assert session.ask(lambda: len(session.scene.engine.production.failures)) == 0
     finally:
@@ -267,9 +271,9 @@ def test_fields_of_a_dataclass_and_parameters_of_a_module_become_controls():
     try:
         page = Page(session)
         _, before = page.final()
-        told = page.of("welcome")[0]["parameters"]
-        assert told["radius"] == {"type": "number", "range": [1, 20], "value": 10.0}
-        assert told["hollow"] == {"type": "flag", "value": False}
+        parameters = page.of_type("welcome")[0]["parameters"]
+        assert parameters["radius"] == {"type": "number", "range": [1, 20], "value": 10.0}
+        assert parameters["hollow"] == {"type": "flag", "value": False}
         page.send("set", name="radius", value=4.0)
         assert page.next("parameters", 0)["parameters"]["radius"]["value"] == 4.0
         share = page.until(lambda: (page.final()[1] > 128).sum() / (before > 128).sum() % 1.0)
@@ -297,7 +301,7 @@ def test_fields_of_a_dataclass_and_parameters_of_a_module_become_controls():
     try:
         page = Page(session)
         _, before = page.final()
-        value = page.of("welcome")[0]["parameters"]["level"]
+        value = page.of_type("welcome")[0]["parameters"]["level"]
         assert value["type"] == "number" and abs(value["value"] - 0.1) < 1e-6
         page.send("set", name="level", value=0.9)
         page.until(lambda: page.final()[1].max() > before.max())
@@ -310,21 +314,21 @@ def test_memory_is_set_while_it_is_looked_at(session):
     _, before = page.final()
     page.send("resize", engine={"brick_pool": "2 MB"})
     page.until(lambda: session.ask(lambda: session.scene.engine.options.brick_pool) == "2 MB")
-    page.moved(turned(page.camera, 0.1))
+    page.moved(turned_camera(page.camera, 0.1))
     _, after = page.moved(page.camera)
     assert np.abs(after.astype(int) - before).max() <= 2
     page.send("resize", engine={"brick_pool": "2 B"})
     page.next("refused", 0)
     page.send("resize", engine={"device": "cuda"})
     assert "'device' can't be set" in page.next("refused", 1)["text"]
-    page.moved(turned(page.camera, 0.2))
+    page.moved(turned_camera(page.camera, 0.2))
 
 
 @pytest.mark.parametrize("kind", ["tree", "engine", "producer", "store", "array", "path", "labels"])
 def test_anything_can_be_looked_at(kind, scan_store, tmp_path):
     volume = bright_ball(16)
     np.save(tmp_path / "ball.npy", volume.data[..., 0].numpy())
-    what = {
+    subject = {
         "tree": lambda: gv.N3Tree.from_volume(volume),
         "engine": lambda: gv.Engine(gv.VolumeProducer(volume)),
         "producer": lambda: gv.VolumeProducer(volume),
@@ -333,7 +337,7 @@ def test_anything_can_be_looked_at(kind, scan_store, tmp_path):
         "path": lambda: str(tmp_path / "ball.npy"),
         "labels": lambda: gv.Volume((volume.data > 100).to(torch.uint8), labels=True),
     }[kind]()
-    session = new_session(what)
+    session = new_session(subject)
     try:
         page = Page(session)
         _, seen = page.final()
@@ -341,8 +345,8 @@ def test_anything_can_be_looked_at(kind, scan_store, tmp_path):
     finally:
         session.close()
     if kind == "engine":
-        what.frame(gv.Camera.orbit(width=8, height=8), FUNCTION)  # its owner may go on using it
-        what.close()
+        subject.frame(gv.Camera.orbit(width=8, height=8), FUNCTION)  # its owner may go on using it
+        subject.close()
     with pytest.raises(ValueError, match="view: takes an Engine"):
         new_session(object())
     with pytest.raises(FileNotFoundError):
@@ -357,7 +361,7 @@ def test_a_thousand_moves_leave_nothing_behind(session):
     def wander(times: int) -> None:
         nonlocal camera
         for _ in range(times):
-            camera = turned(camera, 0.05)
+            camera = turned_camera(camera, 0.05)
             page.send("move", camera=camera, moving=True)
             if len(page.pictures) > 20:
                 del page.pictures[:-5]
@@ -387,7 +391,7 @@ def test_a_surface_is_handed_over_as_a_file(session, monkeypatch, tmp_path):
     page.send("surface", value=100.0, format="ply")
     page.until(lambda: "surface.ply" in page.files)
     assert page.files["surface.ply"] == expected.read_bytes()
-    assert all(0 < one["done"] < one["total"] for one in page.of("exporting"))
+    assert all(0 < message["done"] < message["total"] for message in page.of_type("exporting"))
     page.until(lambda: session._export and not session._export.busy)
     page.send("surface", value=1e6)
     assert "1e+06" in page.next("refused", 0)["text"]
@@ -405,8 +409,8 @@ def test_who_follows_one_that_follows_moves_too(session):
     third.send("follow", client=second.client.number)
     first.send("follow", client=third.client.number)  # in a circle
     circle = {"1": 3, "2": 1, "3": 2}
-    third.until(lambda: [one["clients"] for one in third.of("clients")][-1:] == [circle])
-    there = turned(first.camera, 0.5)
+    third.until(lambda: [m["clients"] for m in third.of_type("clients")][-1:] == [circle])
+    there = turned_camera(first.camera, 0.5)
     first.moved(there)
 
     def seen(page: Page) -> bool:
@@ -418,19 +422,19 @@ def test_who_follows_one_that_follows_moves_too(session):
 
 
 def test_others_go_on_while_a_still_is_taken_and_it_ends_with_its_page(session):
-    one, other = Page(session), Page(session)
-    one.final()
-    other.final()
-    one.send("change", state={"develop": {"samples": 4096}}, rest=True)
-    one.send("still", width=200, height=200)
-    one.send("still", width=64, height=48)
-    assert "one is being made already" in one.next("refused", 0)["text"]
-    other.send("pick", x=0.5, y=0.5)
-    other.next("picked", 0)
-    assert not one.files and session.ask(lambda: len(session._stills)) == 1
-    session.leave(one.client)
-    other.until(lambda: not session._stills)
-    other.send("still", width=200, height=200)
+    first, second = Page(session), Page(session)
+    first.final()
+    second.final()
+    first.send("change", state={"develop": {"samples": 4096}}, rest=True)
+    first.send("still", width=200, height=200)
+    first.send("still", width=64, height=48)
+    assert "one is being made already" in first.next("refused", 0)["text"]
+    second.send("pick", x=0.5, y=0.5)
+    second.next("picked", 0)
+    assert not first.files and session.ask(lambda: len(session._stills)) == 1
+    session.leave(first.client)
+    second.until(lambda: not session._stills)
+    second.send("still", width=200, height=200)
     session.ask(lambda: None)
     begin = time.monotonic()
     session.close()
@@ -442,11 +446,11 @@ def test_whole_states_with_what_json_can_not_tell_are_taken():
     session = new_session(bright_ball(), module)
     try:
         page = Page(session)
-        page.until(lambda: page.of("welcome"))
-        state = page.of("welcome")[0]["state"]
+        page.until(lambda: page.of_type("welcome"))
+        state = page.of_type("welcome")[0]["state"]
         assert set(state["shader"]) == {"kept"}
         page.send("change", state={**state, "develop": {"exposure": 1.0}}, rest=True)
         page.until(lambda: session.state.develop.exposure == 1.0)
-        assert session.state.shader is module and not page.of("refused")
+        assert session.state.shader is module and not page.of_type("refused")
     finally:
         session.close()

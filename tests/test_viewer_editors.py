@@ -13,7 +13,7 @@ from helpers import ROOT, gvtorch
 from helpers.labels import cells
 from helpers.pictures import GRAY
 from helpers.stores import noise
-from helpers.viewer import FUNCTION, SOON, Grown, Page, bright_ball, pixels, turned
+from helpers.viewer import FUNCTION, TIMEOUT, Grown, Page, bright_ball, pixels, turned_camera
 
 import gvtorch as gv
 from gvtorch.io.stores.conversion import convert
@@ -32,15 +32,15 @@ def sliced(page: Page, **slices) -> tuple[dict, np.ndarray]:
 
     def come() -> bool:
         head = page.pictures[-1][0] if page.pictures else {}
-        layout, at = head.get("layout"), slices.get("at")
-        return bool(layout) and head["final"] and (at is None or layout["x"]["at"] == at)
+        layout, index = head.get("layout"), slices.get("at")
+        return bool(layout) and head["final"] and (index is None or layout["x"]["at"] == index)
 
     page.until(come)
     return page.final()
 
 
-def cut_out(image: np.ndarray, place: list[int]) -> np.ndarray:
-    left, top, width, height = place
+def cut_out(image: np.ndarray, rectangle: list[int]) -> np.ndarray:
+    left, top, width, height = rectangle
     return image[top : top + height, left : left + width]
 
 
@@ -62,14 +62,14 @@ def test_slices_are_those_of_slice_picture_beside_the_picture(session):
     sliced(page, at=[25.0, 19.0, 15.0], colors="shader")
     page.send("still", width=404, height=304)
     page.until(lambda: page.files)
-    found = cut_out(pixels(page.files["picture.png"]), layout["z"]["image"])
+    actual = cut_out(pixels(page.files["picture.png"]), layout["z"]["image"])
     scale = layout["z"]["image"][2] / 40
     expected = gv.slice_picture(volume, "z", 15, colors=FUNCTION, scale=scale).to_srgb8().numpy()
-    assert np.array_equal(found, expected)
+    assert np.array_equal(actual, expected)
     width, height = layout["view"][2:]
     tree = gv.N3Tree.from_volume(volume)
     camera = session.state.camera.camera(width, height, tree.box)
-    alone = gv.Progressive(lambda one: gv.render(tree, one, FUNCTION)).refine(camera, 16)
+    alone = gv.Progressive(lambda view: gv.render(tree, view, FUNCTION)).refine(camera, 16)
     assert np.array_equal(cut_out(still, layout["view"]), alone.to_srgb8().numpy())
     assert np.abs(seen.astype(int) - still).mean() < 2 and seen.shape == (304, 404, 3)
 
@@ -82,15 +82,15 @@ def test_edges_of_a_plane_are_where_the_page_is_told(session):
     layout = sliced(page, at=middle)[0]["layout"]
     seen = pixels(page.pictures[-1][1]).astype(int).sum(-1)
     for axis in "xyz":
-        told = layout[axis]
-        part = cut_out(seen, told["image"])
+        plane = layout[axis]
+        part = cut_out(seen, plane["image"])
         rows, columns = np.nonzero(part >= part.max() - 3)
-        for (name, first, last), at, count in (
-            (told["columns"], columns.mean(), part.shape[1]),
-            (told["rows"], rows.mean(), part.shape[0]),
+        for (name, first, last), pixel, count in (
+            (plane["columns"], columns.mean(), part.shape[1]),
+            (plane["rows"], rows.mean(), part.shape[0]),
         ):
-            place = first + (at + 0.5) / count * (last - first)
-            assert abs(place - middle["xyz".index(name)]) < 1, (axis, name)
+            position = first + (pixel + 0.5) / count * (last - first)
+            assert abs(position - middle["xyz".index(name)]) < 1, (axis, name)
 
 
 def test_a_plane_that_moves_leaves_the_picture_as_it_is(session, monkeypatch):
@@ -118,14 +118,14 @@ def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypat
     go, real = threading.Event(), Planes._render_plane
 
     def slow(self, axis, state, pixel):
-        assert go.wait(SOON)
+        assert go.wait(TIMEOUT)
         if state.slices.at[2] == 30:
             raise OSError("chunk 3\nis gone")
         return real(self, axis, state, pixel)
 
     monkeypatch.setattr(Planes, "_render_plane", slow)
     page.send("change", state={"slices": {"at": [10.0, 10.0, 20.0]}})
-    camera = turned(page.camera, 0.5)
+    camera = turned_camera(page.camera, 0.5)
     page.send("move", camera=camera, moving=False)
     page.until(lambda: page.pictures[-1][0]["camera"]["eye"] == camera["eye"])
     page.until(lambda: page.pictures[-1][0]["samples"] == 16)
@@ -133,21 +133,21 @@ def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypat
     go.set()
     page.final()
     page.send("change", state={"slices": {"at": [10.0, 10.0, 30.0]}})
-    told = page.next("error", 0)["text"]
-    assert told == "a slice can't be read: chunk 3 is gone"
+    text = page.next("error", 0)["text"]
+    assert text == "a slice can't be read: chunk 3 is gone"
     page.final()
     monkeypatch.setattr(Planes, "_render_plane", real)
     page.send("do", what="retry")
-    page.until(lambda: page.pictures[-1][0]["final"] and page.of("error")[-1]["text"] == told)
+    page.until(lambda: page.pictures[-1][0]["final"] and page.of_type("error")[-1]["text"] == text)
 
 
 def test_slices_of_a_store_read_no_finer_than_pixels(scan_store, monkeypatch):
     store = gv.Store.open(scan_store)
     state = gv.ViewState(shader=GRAY, slices=Slices())
-    asked, real = [], gv.Store.read_region
+    levels_read, real = [], gv.Store.read_region
 
     def read(self, level, low, high, **options):
-        asked.append(level)
+        levels_read.append(level)
         return real(self, level, low, high, **options)
 
     monkeypatch.setattr(gv.Store, "read_region", read)
@@ -157,12 +157,12 @@ def test_slices_of_a_store_read_no_finer_than_pixels(scan_store, monkeypatch):
     sizes = {}
     for size in (2000, 200, 60):
         parts = panes(size, size)
-        asked.clear()
-        made = planes.composed(picture, state, size, size, wait=True)
-        assert made.complete and made.picture.color.shape == (size, size, 3)
-        sizes[size] = set(asked)
+        levels_read.clear()
+        composed = planes.composed(picture, state, size, size, wait=True)
+        assert composed.complete and composed.picture.color.shape == (size, size, 3)
+        sizes[size] = set(levels_read)
         for axis in "xyz":
-            left, top, width, height = made.layout[axis]["image"]
+            left, top, width, height = composed.layout[axis]["image"]
             pane = parts[axis]
             assert pane.left <= left and left + width <= pane.left + pane.width
             assert pane.top <= top and top + height <= pane.top + pane.height
@@ -176,20 +176,20 @@ def test_slices_of_labels_have_their_colours():
     try:
         page = Page(session, 204, 154)
         page.final()
-        told = page.of("welcome")[0]["labels"]
-        assert told["names"] == sorted(set(data.ravel().tolist())) and told["count"] == 9
+        labels = page.of_type("welcome")[0]["labels"]
+        assert labels["names"] == sorted(set(data.ravel().tolist())) and labels["count"] == 9
         layout = sliced(page, at=[7.0, 6.0, 5.0])[0]["layout"]
         page.send("still", width=204, height=154)
         page.until(lambda: page.files)
-        found = cut_out(pixels(page.files["picture.png"]), layout["z"]["image"])
-        rows = ((np.arange(found.shape[0]) + 0.5) * 13 / found.shape[0]).astype(int)
-        columns = ((np.arange(found.shape[1]) + 0.5) * 14 / found.shape[1]).astype(int)
-        shown = data[5][np.ix_(rows, columns)]
-        own = {1000003: (1.0, 0.0, 0.0)}
-        colors = dict(zip(told["names"], told["colors"], strict=True)) | own
-        light = torch.tensor([colors[n] for n in shown.ravel().tolist()]).view(*shown.shape, 3)
+        actual = cut_out(pixels(page.files["picture.png"]), layout["z"]["image"])
+        rows = ((np.arange(actual.shape[0]) + 0.5) * 13 / actual.shape[0]).astype(int)
+        columns = ((np.arange(actual.shape[1]) + 0.5) * 14 / actual.shape[1]).astype(int)
+        names = data[5][np.ix_(rows, columns)]
+        changed_colors = {1000003: (1.0, 0.0, 0.0)}
+        colors = dict(zip(labels["names"], labels["colors"], strict=True)) | changed_colors
+        light = torch.tensor([colors[n] for n in names.ravel().tolist()]).view(*names.shape, 3)
         expected = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-        assert np.abs(found / 255 - expected).max() < 0.01
+        assert np.abs(actual / 255 - expected).max() < 0.01
     finally:
         session.close()
 
@@ -201,7 +201,7 @@ def test_what_has_no_voxels_has_no_slices(session):
         page.final()
         page.send("change", state={"slices": {}})
         assert "no voxels of its own" in page.next("refused", 0)["text"]
-        assert page.of("state")[-1]["state"]["slices"] is None
+        assert page.of_type("state")[-1]["state"]["slices"] is None
     finally:
         session_.close()
     page = Page(session)
@@ -210,7 +210,7 @@ def test_what_has_no_voxels_has_no_slices(session):
         ({"window": [3, 3]}, "a low and a high"),
         ({"colors": "red"}, "'gray' or 'shader'"),
     ):
-        count = len(page.of("refused"))
+        count = len(page.of_type("refused"))
         page.send("change", state={"slices": wrong})
         assert message in page.next("refused", count)["text"]
 
@@ -250,8 +250,8 @@ def test_render_makes_the_picture_of_a_state_with_slices_and_cost(tmp_path):
         if name == "blend":
             settings = {**state.settings(), "shader": FUNCTION}
             camera = state.camera.camera(120, 90, tree.box)
-            own = gv.Progressive(lambda one, s=settings, t=tree: gv.render(t, one, **s))
-            base = state.develop.develop(own.refine(camera, 2)).color
+            progressive = gv.Progressive(lambda view, s=settings, t=tree: gv.render(t, view, **s))
+            base = state.develop.develop(progressive.refine(camera, 2)).color
             cost = gv.cost(tree, camera, **settings).picture("samples")
             mixed = torch.lerp(base, cost.color, 0.4 * cost.alpha)
             assert (still.color - mixed).abs().max() < 1e-6
@@ -275,7 +275,7 @@ def test_time_points_of_a_store_are_gone_through(beat, tmp_path):
     try:
         page = Page(session, 96, 64)
         _, first = page.final()
-        assert page.of("welcome")[0]["time"]["times"] == TIMES
+        assert page.of_type("welcome")[0]["time"]["times"] == TIMES
         pictures = [first]
         for time in (1, 2):
             page.send("change", state={"time": time})
@@ -283,10 +283,10 @@ def test_time_points_of_a_store_are_gone_through(beat, tmp_path):
                 lambda t=time: page.pictures[-1][0]["time"] == t and page.pictures[-1][0]["final"]
             )
             pictures.append(page.final()[1])
-        one, other, last = (image.astype(int) for image in pictures)
-        assert np.abs(one - other).max() > 20 and np.abs(other - last).max() > 20
+        a, second, third = (image.astype(int) for image in pictures)
+        assert np.abs(a - second).max() > 20 and np.abs(second - third).max() > 20
         for wrong in (3, 0.5, -1):
-            count = len(page.of("refused"))
+            count = len(page.of_type("refused"))
             page.send("change", state={"time": wrong})
             assert "one of 3 time points, 0 to 2" in page.next("refused", count)["text"]
         assert session.state.time == 2
@@ -299,7 +299,7 @@ def test_time_points_of_a_store_are_gone_through(beat, tmp_path):
     )
     assert run.returncode == 0, run.stderr
     seen = pixels((tmp_path / "a.png").read_bytes()).astype(int)
-    assert np.abs(seen - last).mean() < 1 < np.abs(seen - other).mean()
+    assert np.abs(seen - third).mean() < 1 < np.abs(seen - second).mean()
     session = new_session(beat, state=tmp_path / "view.json")
     try:
         assert session.scene.time == 2 and session.scene.data.time == 2
@@ -315,7 +315,7 @@ def test_a_time_point_that_can_not_be_read_is_told_and_the_one_before_stays(beat
         real, go = session.scene.reopen, threading.Event()
 
         def reopen(time: int):
-            assert go.wait(SOON)
+            assert go.wait(TIMEOUT)
             if time == 1:
                 raise OSError("the disk\nis gone")
             return real(time)
@@ -326,7 +326,7 @@ def test_a_time_point_that_can_not_be_read_is_told_and_the_one_before_stays(beat
         assert np.array_equal(still, before)
         go.set()
         assert page.next("error", 0)["text"] == "time 1: the disk is gone"
-        page.until(lambda: page.of("state")[-1]["state"]["time"] == 0)
+        page.until(lambda: page.of_type("state")[-1]["state"]["time"] == 0)
         page.send("change", state={"time": 2})
         page.until(lambda: page.pictures[-1][0]["time"] == 2 and page.pictures[-1][0]["final"])
     finally:
@@ -339,8 +339,8 @@ def test_a_clock_of_a_producer_is_set():
     try:
         page = Page(session)
         _, before = page.final()
-        assert page.of("welcome")[0]["time"] == {"times": None}
-        assert page.of("welcome")[0]["state"]["time"] == 3.0
+        assert page.of_type("welcome")[0]["time"] == {"times": None}
+        assert page.of_type("welcome")[0]["state"]["time"] == 3.0
         page.send("change", state={"time": 8.0})
         page.until(lambda: page.pictures[-1][0]["time"] == 8 and page.pictures[-1][0]["final"])
         assert (page.final()[1] > 100).sum() > 3 * (before > 100).sum() > 0
@@ -349,7 +349,7 @@ def test_a_clock_of_a_producer_is_set():
     session = new_session(bright_ball(), FUNCTION)
     try:
         page = Page(session)
-        assert page.camera and page.of("welcome")[0]["time"] is None
+        assert page.camera and page.of_type("welcome")[0]["time"] is None
         page.send("change", state={"time": 1})
         assert "nothing changes with time" in page.next("refused", 0)["text"]
     finally:
@@ -365,25 +365,25 @@ def test_node_boxes_are_the_nodes_whose_bricks_were_read():
     gv.render(tree, camera, GRAY)
     eye = tuple((-camera.placed(tree.box).viewmats[0, :3, :3].mT
                  @ camera.placed(tree.box).viewmats[0, :3, 3]).tolist())  # fmt: skip
-    told = node_boxes(tree, eye)
+    answer = node_boxes(tree, eye)
     expected = set()
     for tile, child in itertools.product(*map(range, tree.nodes.brick_tn.shape)):
         brick = int(tree.nodes.brick_tn[tile, child])
         if brick >= 0 and int(tree.bricks.stamp_b[brick]) == tree.frame:
             node = torch.tensor([tile * tree.nodes.nodes_per_tile + child])
             expected.add(tuple(tree.loc(node)[0].tolist()))
-    assert set(map(tuple, told["boxes"])) == expected and told["count"] == len(expected) > 10
-    low, size = np.array(told["low"]), np.array(told["size"])
+    assert set(map(tuple, answer["boxes"])) == expected and answer["count"] == len(expected) > 10
+    low, size = np.array(answer["low"]), np.array(answer["size"])
     far = [
         np.linalg.norm(low + (np.array(loc[:3]) + 0.5) / 2 ** loc[3] * size - eye)
-        for loc in told["boxes"]
+        for loc in answer["boxes"]
     ]
     assert far == sorted(far)
     few = node_boxes(tree, eye, 5)
-    assert few["boxes"] == told["boxes"][:5] and few["count"] == told["count"]
-    x, y, z, depth = told["boxes"][0]
+    assert few["boxes"] == answer["boxes"][:5] and few["count"] == answer["count"]
+    x, y, z, depth = answer["boxes"][0]
     share = 2.0**-depth
-    low = np.add(told["low"], np.multiply((x, y, z), share) * told["size"])
+    low = np.add(answer["low"], np.multiply((x, y, z), share) * answer["size"])
     assert (low >= tree.box[0].numpy() - 1e-9).all() and (low < tree.box[1].numpy()).all()
 
 
@@ -391,16 +391,16 @@ def test_node_boxes_come_with_each_picture_as_long_as_they_are_wanted(session):
     page = Page(session)
     page.final()
     page.send("nodes", on=True)
-    told = page.next("nodes", 0)
-    assert 0 < len(told["boxes"]) <= told["count"]
-    count = len(page.of("nodes"))
-    page.moved(turned(page.camera, 1.0))
-    assert len(page.of("nodes")) > count
+    answer = page.next("nodes", 0)
+    assert 0 < len(answer["boxes"]) <= answer["count"]
+    count = len(page.of_type("nodes"))
+    page.moved(turned_camera(page.camera, 1.0))
+    assert len(page.of_type("nodes")) > count
     page.send("nodes", on=False)
     session.ask(lambda: None)
-    count = len(page.of("nodes"))
+    count = len(page.of_type("nodes"))
     page.moved(page.camera)
-    assert len(page.of("nodes")) == count
+    assert len(page.of_type("nodes")) == count
 
 
 # Labels, and files of presets.
@@ -412,19 +412,19 @@ def test_the_table_of_labels_changes_colours_and_what_is_shown():
     try:
         page = Page(session)
         page.final()
-        told = page.of("welcome")[0]["labels"]
-        assert told["names"] == [0, 1, 2, 3, 4, 5] and told["count"] == 6
-        assert np.allclose(told["colors"], gv.Labels()(np.arange(6))[:, :3], atol=1e-4)
-        shader = {**page.of("welcome")[0]["state"]["shader"], "lit": False}
+        labels = page.of_type("welcome")[0]["labels"]
+        assert labels["names"] == [0, 1, 2, 3, 4, 5] and labels["count"] == 6
+        assert np.allclose(labels["colors"], gv.Labels()(np.arange(6))[:, :3], atol=1e-4)
+        shader = {**page.of_type("welcome")[0]["state"]["shader"], "lit": False}
         shader |= {"visible": [2], "colors": {"2": [1.0, 0.0, 0.0]}}
         page.send("change", state={"shader": shader})
-        page.until(lambda: page.of("state"))
+        page.until(lambda: page.of_type("state"))
         page.until(lambda: page.pictures[-1][0]["final"])
-        _, seen = page.moved(turned(page.camera, 0.2))
+        _, seen = page.moved(turned_camera(page.camera, 0.2))
         assert seen[..., 0].max() > 200 and seen[..., 1:].max() < 60
         assert session.state.shader.visible == [2]
         for wrong in ({"visible": ["two"]}, {"colors": {"two": [1, 0, 0]}}, {"visible": [0.5]}):
-            count = len(page.of("refused"))
+            count = len(page.of_type("refused"))
             page.send("change", state={"shader": {**shader, **wrong}})
             assert "\n" not in page.next("refused", count)["text"]
     finally:
@@ -433,10 +433,10 @@ def test_the_table_of_labels_changes_colours_and_what_is_shown():
 
 def test_labels_called_with_numbers_give_the_colours_of_the_table():
     shader = gv.Labels({3: (1.0, 0.0, 0.0), 9: (0.25, 0.5, 1.0)}, opacity={9: 0.5}, visible=[3, 9])
-    found = shader(np.array([[3, 9], [4, 0]]))
-    assert found.shape == (2, 2, 4)
-    assert found[0].tolist() == [[1, 0, 0, 1], [0.25, 0.5, 1, 0.5]]
-    assert (found[1, :, 3] == 0).all() and (found[1, 0, :3] > 0).any()
+    colors = shader(np.array([[3, 9], [4, 0]]))
+    assert colors.shape == (2, 2, 4)
+    assert colors[0].tolist() == [[1, 0, 0, 1], [0.25, 0.5, 1, 0.5]]
+    assert (colors[1, :, 3] == 0).all() and (colors[1, 0, :3] > 0).any()
 
 
 def test_files_of_other_programs_are_read(session):
@@ -444,18 +444,18 @@ def test_files_of_other_programs_are_read(session):
     page.final()
     presets = json.loads((ROOT / "tests" / "paraview_presets.json").read_text())
     page.send("read", file="p.json", text=json.dumps(presets[:1]), low=10.0, high=90.0)
-    told = page.next("preset", 0)
-    opacity = np.array(told["function"]["opacity"])
-    assert (opacity[0, 0], opacity[-1, 0]) == (10, 90) and told["name"] == "p.json"
-    own = {"opacity": [[0, 0], [9, 1]], "color": [[0, 1, 0, 0]]}
-    page.send("read", file="mine.JSON", text=json.dumps(own), low=10.0, high=90.0)
-    assert page.next("preset", 1)["function"]["opacity"] == own["opacity"]
+    preset = page.next("preset", 0)
+    opacity = np.array(preset["function"]["opacity"])
+    assert (opacity[0, 0], opacity[-1, 0]) == (10, 90) and preset["name"] == "p.json"
+    own_function = {"opacity": [[0, 0], [9, 1]], "color": [[0, 1, 0, 0]]}
+    page.send("read", file="mine.JSON", text=json.dumps(own_function), low=10.0, high=90.0)
+    assert page.next("preset", 1)["function"]["opacity"] == own_function["opacity"]
     attributes = 'scalarOpacity="4 0 0 9 1" colorTransfer="8 0 1 0 0 9 0 0 1" shade="1"'
     both = "".join(f'<VolumeProperty name="{name}" {attributes}/>' for name in ("A", "B"))
     page.send("read", file="presets.xml", text=f"<MRML>{both}</MRML>", name="B")
-    told = page.next("preset", 2)
-    assert told["name"] == "B" and told["function"]["opacity"][-1] == [9, 1]
-    assert told["lost"] == ["presets.xml: not kept: shading, which --shader lit has (gv.Lit)"]
+    preset = page.next("preset", 2)
+    assert preset["name"] == "B" and preset["function"]["opacity"][-1] == [9, 1]
+    assert preset["lost"] == ["presets.xml: not kept: shading, which --shader lit has (gv.Lit)"]
 
 
 def test_colours_are_saved_for_paraview(session):
@@ -495,9 +495,9 @@ def test_what_is_no_preset_is_refused_in_a_line(session, file, text, message):
     page = Page(session)
     page.final()
     page.send("read", file=file, text=text)
-    told = page.next("refused", 0)["text"]
-    assert message in told and "\n" not in told and "/tmp" not in told and len(told) < 600
-    page.moved(turned(page.camera, 0.1))
+    line = page.next("refused", 0)["text"]
+    assert message in line and "\n" not in line and "/tmp" not in line and len(line) < 600
+    page.moved(turned_camera(page.camera, 0.1))
 
 
 @pytest.mark.parametrize("name", ["mr", "em", "cloud", "galaxy"])
@@ -518,13 +518,13 @@ def test_named_presets_show_what_they_are_for(name):
 def test_producers_that_hold_voxels_have_slices(kind, scan_store, tmp_path):
     """For a store, `gvtorch render --state` also equals the page's still."""
     volume = bright_ball()
-    what = {
+    subject = {
         "producer": lambda: gv.VolumeProducer(volume),
         "stored": lambda: gv.StoredProducer(scan_store),
         "store": lambda: str(scan_store),
     }[kind]()
     state = gv.ViewState(shader=GRAY, slices=Slices(), develop=Development(samples=1))
-    session = new_session(what, state=state)
+    session = new_session(subject, state=state)
     try:
         still = session.ask(lambda: session.still(session.state.camera, 160, 120), 120)
         parts = panes(160, 120)

@@ -21,7 +21,7 @@ import torch
 from helpers.pictures import GRAY
 from helpers.servers import WebServer
 from helpers.stores import Handler, noise
-from helpers.viewer import SOON, Page, turned
+from helpers.viewer import TIMEOUT, Page, turned_camera
 
 import gvtorch as gv
 from gvtorch.io.stores.conversion import convert
@@ -135,7 +135,7 @@ def test_there_is_a_right_one_of_each_message():
 def test_wrong_messages_are_each_refused_with_a_line_and_the_view_goes_on(session):
     page = Page(session)
     _, before = page.final()
-    whole = page.of("welcome")[0]["state"]
+    whole = page.of_type("welcome")[0]["state"]
     state = {"text": json.dumps({name: one for name, one in whole.items() if name != "camera"})}
     rng, told = np.random.default_rng(17), Counter[str]()
     kinds, lines = Counter[str](), list[str]()
@@ -159,9 +159,9 @@ def test_wrong_messages_are_each_refused_with_a_line_and_the_view_goes_on(sessio
     assert told["refused"] == COUNT == len(lines) and min(kinds.values()) > COUNT / 20
     assert all(line and "\n" not in line and len(line) < 4000 for line in lines)
     assert len({line[:40] for line in lines}) > 100, "of many kinds"
-    assert not told["error"] and not page.of("error") and not page.of("refused")
+    assert not told["error"] and not page.of_type("error") and not page.of_type("refused")
     assert session.state.to_json() == {**whole, "camera": session.state.to_json()["camera"]}
-    page.moved(turned(page.camera, 0.4))
+    page.moved(turned_camera(page.camera, 0.4))
     _, after = page.moved(page.camera)
     assert np.abs(after.astype(int) - before).max() <= 2
 
@@ -171,10 +171,10 @@ def test_wrong_messages_are_each_refused_with_a_line_and_the_view_goes_on(sessio
 
 def goes_on(page: Page, session: Session, angle: float = 0.3) -> None:
     """Asserts that pictures arrive, also of another camera, and that questions are answered."""
-    _, seen = page.moved(turned(page.camera, angle))
+    _, seen = page.moved(turned_camera(page.camera, angle))
     assert seen.max() > 0
     page.send("histogram", in_view=True)
-    page.until(lambda: page.of("histogram"))
+    page.until(lambda: page.of_type("histogram"))
     assert session._thread.is_alive()
 
 
@@ -206,7 +206,7 @@ def test_a_store_that_is_deleted_is_told_and_the_picture_goes_on(stored):
         page.final()
         goes_on(page, session)
         page.send("change", state={"slices": {}})  # planes can't be read either
-        page.until(lambda: any("a slice can't be read" in e["text"] for e in page.of("error")))
+        page.until(lambda: any("a slice can't be read" in e["text"] for e in page.of_type("error")))
         page.until(lambda: page.pictures[-1][0]["layout"] and page.pictures[-1][0]["final"])
     finally:
         session.close()
@@ -223,7 +223,7 @@ class Stalling(Handler):
         outputfile.write(content[: len(content) // 2] if self.stalled else content)
         if self.stalled:
             outputfile.flush()
-            Stalling.over.wait(SOON)
+            Stalling.over.wait(TIMEOUT)
 
     @property
     def stalled(self) -> bool:
@@ -238,7 +238,7 @@ class Stalling(Handler):
             self.end_headers()
             self.wfile.write(b"\0" * (count // 2))
             self.wfile.flush()
-            Stalling.over.wait(SOON)
+            Stalling.over.wait(TIMEOUT)
             return
         super().do_GET()
 
@@ -306,12 +306,12 @@ def test_code_that_raises_is_told_and_the_picture_goes_on():
         producer.wrong = True
         producer.changed()
         page.send("move", camera=near(page, session), moving=False)
-        page.until(lambda: page.of("failed") or page.of("error"))
-        told = (page.of("failed") or page.of("error"))[0]["text"]
+        page.until(lambda: page.of_type("failed") or page.of_type("error"))
+        told = (page.of_type("failed") or page.of_type("error"))[0]["text"]
         assert "division by zero" in told and "\n" not in told
         producer.wrong = False
         page.send("do", what="retry")
-        page.moved(turned(page.camera, 0.2))
+        page.moved(turned_camera(page.camera, 0.2))
         goes_on(page, session)
     finally:
         session.close()

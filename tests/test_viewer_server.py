@@ -16,7 +16,7 @@ import aiohttp
 import numpy as np
 import pytest
 from helpers import ROOT, gvtorch
-from helpers.viewer import FUNCTION, SOON, Page, bright_ball, pixels, split
+from helpers.viewer import FUNCTION, TIMEOUT, Page, bright_ball, pixels, split
 from yarl import URL
 
 import gvtorch as gv
@@ -42,7 +42,7 @@ def with_socket(server: Server, what, **options):
             path = f"http://127.0.0.1:{server.port}/ws"
             given = {"params": {"token": server.token}, **options}
             async with client.ws_connect(path, **given) as ws:
-                return await asyncio.wait_for(what(ws), SOON)
+                return await asyncio.wait_for(what(ws), TIMEOUT)
 
     return asyncio.run(run())
 

@@ -34,26 +34,26 @@ def cubes(side: int = 8, device="cpu", each: int = 40):
         torch.rand((len(sizes), 3), generator=generator).double() * 2 - 1,
         torch.tensor(sizes, dtype=torch.float64),
     )
-    return (*(one.to(device) for one in arguments), side, 1.25)
+    return (*(t.to(device) for t in arguments), side, 1.25)
 
 
-def known(
-    given, detail: float = 0.0, shares: bool = True, weights: bool = True, wide: bool = False
+def all_arguments(
+    args, detail: float = 0.0, shares: bool = True, weights: bool = True, wide: bool = False
 ):
     """Returns arguments of the bare op."""
-    return (*given, detail, shares, weights, wide)
+    return (*args, detail, shares, weights, wide)
 
 
 @pytest.mark.parametrize("side", [1, 3, 8, 10, 16, 20])
 @pytest.mark.parametrize("detail", [0.0, 0.9])
 def test_compiled_is_the_twin_in_every_bit(compiled, side, detail):
     """Also where voxels are searched one by one, as for small triangles."""
-    given = cubes(side, DEVICES[compiled])
-    expected = voxelize(*given, weights=True, backend="reference")
-    found = voxelize(*given, weights=True, detail=detail, backend=compiled)
-    for one, other in zip(found, expected, strict=True):
-        assert torch.equal(one, other)
-    distance, nearest, winding, coverage, weight = found
+    args = cubes(side, DEVICES[compiled])
+    expected = voxelize(*args, weights=True, backend="reference")
+    actual = voxelize(*args, weights=True, detail=detail, backend=compiled)
+    for a, b in zip(actual, expected, strict=True):
+        assert torch.equal(a, b)
+    distance, nearest, winding, coverage, weight = actual
     assert (nearest[3:5] == -1).all() and (distance[3:5] == torch.inf).all()
     assert (winding[4] == 0).all() and (coverage[4] == 0).all()
     assert len(winding.unique()) > 1 and 0 < coverage.mean() < 1
@@ -61,20 +61,20 @@ def test_compiled_is_the_twin_in_every_bit(compiled, side, detail):
 
 
 def test_float64_agrees_to_rounding(compiled):
-    given = cubes(device=DEVICES[compiled])
-    expected = voxelize(*given, weights=True, wide=True, backend="reference")
-    found = voxelize(*given, weights=True, wide=True, backend=compiled)
-    assert found[0].dtype == torch.float64
-    for one, other in zip(found, expected, strict=True):
-        assert torch.allclose(one.double(), other.double(), rtol=0, atol=1e-12)
+    args = cubes(device=DEVICES[compiled])
+    expected = voxelize(*args, weights=True, wide=True, backend="reference")
+    actual = voxelize(*args, weights=True, wide=True, backend=compiled)
+    assert actual[0].dtype == torch.float64
+    for a, b in zip(actual, expected, strict=True):
+        assert torch.allclose(a.double(), b.double(), rtol=0, atol=1e-12)
 
 
 def test_a_large_hierarchy_is_gone_through(compiled):
     """5,000 triangles in five levels of boxes, against brute force."""
-    given = cubes(6, DEVICES[compiled], each=5000)
-    expected = voxelize(*given, backend="reference")
-    for one, other in zip(voxelize(*given, backend=compiled), expected, strict=True):
-        assert torch.equal(one, other)
+    args = cubes(6, DEVICES[compiled], each=5000)
+    expected = voxelize(*args, backend="reference")
+    for a, b in zip(voxelize(*args, backend=compiled), expected, strict=True):
+        assert torch.equal(a, b)
 
 
 def test_share_of_a_box_below_a_plane_is_its_volume():
@@ -124,20 +124,20 @@ def test_a_plane_fills_its_exact_share(backend, solid):
     hierarchy = Hierarchy(faces)
     size = torch.tensor([[1.0, 1.0, torch.inf]], dtype=torch.float64)
     device = DEVICES[backend]
-    given = (faces[hierarchy.order].contiguous(), torch.full((len(faces),), solid), hierarchy.box)
-    given = (*given, torch.zeros(1, 3, dtype=torch.float64), size)
-    found = voxelize(*(one.to(device) for one in given), 8, 1.5, backend=backend)
-    at = (torch.arange(8 * 32) + 0.5) / 32
-    z, y, x = torch.meshgrid(at, at, at, indexing="ij")
+    args = (faces[hierarchy.order].contiguous(), torch.full((len(faces),), solid), hierarchy.box)
+    args = (*args, torch.zeros(1, 3, dtype=torch.float64), size)
+    outputs = voxelize(*(t.to(device) for t in args), 8, 1.5, backend=backend)
+    axis = (torch.arange(8 * 32) + 0.5) / 32
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     height = (torch.stack((x, y, z), -1) - middle) @ normal
     filled = height < 0 if solid else height.abs() < 0.75
     share = filled.float().view(8, 32, 8, 32, 8, 32).mean((1, 3, 5))
-    assert (found[3][0].cpu() - share).abs().max() < 1 / 64
+    assert (outputs[3][0].cpu() - share).abs().max() < 1 / 64
     assert ((share > 0) & (share < 1)).sum() > 50
     centres = height.view(8, 32, 8, 32, 8, 32)[:, 15:17, :, 15:17, :, 15:17].mean((1, 3, 5))
-    assert (found[0][0].cpu() - centres.abs()).abs().max() < 1e-4
+    assert (outputs[0][0].cpu() - centres.abs()).abs().max() < 1e-4
     if solid:
-        assert torch.equal(found[2][0].cpu() != 0, centres < 0)
+        assert torch.equal(outputs[2][0].cpu() != 0, centres < 0)
 
 
 def filled(mesh: gv.Mesh, backend, side: int = 8, solid: bool = True, wide: bool = False):
@@ -145,11 +145,11 @@ def filled(mesh: gv.Mesh, backend, side: int = 8, solid: bool = True, wide: bool
     faces = torch.from_numpy(mesh.corners)
     hierarchy = Hierarchy(faces)
     size = torch.tensor([[1.0, 1.0, 2.0]], dtype=torch.float64)
-    given = (faces[hierarchy.order].contiguous(), torch.full((len(faces),), solid), hierarchy.box)
-    given = (*given, torch.zeros(1, 3, dtype=torch.float64), size)
+    args = (faces[hierarchy.order].contiguous(), torch.full((len(faces),), solid), hierarchy.box)
+    args = (*args, torch.zeros(1, 3, dtype=torch.float64), size)
     device = DEVICES[backend]
-    found = voxelize(*(one.to(device) for one in given), side, 1.0, wide=wide, backend=backend)
-    return found[3][0].cpu().double()
+    outputs = voxelize(*(t.to(device) for t in args), side, 1.0, wide=wide, backend=backend)
+    return outputs[3][0].cpu().double()
 
 
 @pytest.mark.parametrize("wide", [False, True])
@@ -157,7 +157,7 @@ def test_a_box_along_the_axes_fills_the_product_of_its_sides(backend, wide):
     """Edges, corners and a box within a voxel; faces on those of voxels, where rounding must not
     matter.
     """
-    at = torch.arange(8, dtype=torch.float64)
+    axis = torch.arange(8, dtype=torch.float64)
     for low, high in (
         ((1.3, 2.6, 0.25), (6.1, 6.2, 7.9)),
         ((2, 2, 2), (5, 6, 4)),
@@ -166,12 +166,12 @@ def test_a_box_along_the_axes_fills_the_product_of_its_sides(backend, wide):
         ((-9, -9, -9), (4.5, 20, 20)),
     ):
         sides = [
-            ((at + 1).clamp(max=b) - at.clamp(min=a)).clamp(min=0)
+            ((axis + 1).clamp(max=b) - axis.clamp(min=a)).clamp(min=0)
             for a, b in zip(low, high, strict=True)
         ]
         exact = sides[2][:, None, None] * sides[1][:, None] * sides[0]
-        found = filled(meshes.box(low, high), backend, wide=wide)
-        assert (found - exact).abs().max() < 2e-6
+        actual = filled(meshes.box(low, high), backend, wide=wide)
+        assert (actual - exact).abs().max() < 2e-6
 
 
 def test_a_turned_box_fills_what_lies_in_its_six_planes(compiled):
@@ -181,14 +181,14 @@ def test_a_turned_box_fills_what_lies_in_its_six_planes(compiled):
     corners = torch.from_numpy(meshes.box(tuple(-half), tuple(half)).corners) @ turn + middle
     if torch.linalg.det(turn) < 0:
         corners = corners.flip(1)
-    at = (torch.arange(8 * 32).double() + 0.5) / 32
-    z, y, x = torch.meshgrid(at, at, at, indexing="ij")
+    axis = (torch.arange(8 * 32).double() + 0.5) / 32
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     local = (torch.stack((x, y, z), -1) - middle) @ turn.T
     share = (local.abs() < half).all(-1).double().view(8, 32, 8, 32, 8, 32).mean((1, 3, 5))
-    found = filled(meshes.of_corners(corners.numpy()), compiled)
-    assert (found - share).abs().max() < 1 / 128
+    actual = filled(meshes.of_corners(corners.numpy()), compiled)
+    assert (actual - share).abs().max() < 1 / 128
     assert ((share > 0.02) & (share < 0.98)).sum() > 50
-    assert found.sum() == pytest.approx(float(8 * half.prod()), rel=1e-6)
+    assert actual.sum() == pytest.approx(float(8 * half.prod()), rel=1e-6)
 
 
 def test_the_volume_of_a_solid_is_kept_in_voxels_of_any_size(compiled):
@@ -198,20 +198,20 @@ def test_the_volume_of_a_solid_is_kept_in_voxels_of_any_size(compiled):
     ball = meshes.of_corners(meshes.sphere(5).corners * 3.7 + 4.03)
     for scale in (1, 0.5, 0.125):
         small = meshes.of_corners(ball.corners * scale)
-        found = filled(small, compiled)
-        assert found.sum() == pytest.approx(meshes.volume(small), rel=1e-5)
+        coverage = filled(small, compiled)
+        assert coverage.sum() == pytest.approx(meshes.volume(small), rel=1e-5)
     across = meshes.of_corners(ball.corners + np.array((0.6, 0.3, 0.2)))
     both = filled(meshes.joined(ball, across), compiled)
-    one, other = filled(ball, compiled), filled(across, compiled)
-    assert both.max() == 1 and (both - (one + other).clamp(max=1)).abs().max() < 1e-5
+    a, b = filled(ball, compiled), filled(across, compiled)
+    assert both.max() == 1 and (both - (a + b).clamp(max=1)).abs().max() < 1e-5
     turned = meshes.of_corners(ball.corners[:, ::-1].copy())
-    assert (filled(turned, compiled) - one).abs().max() < 1e-5
+    assert (filled(turned, compiled) - a).abs().max() < 1e-5
 
 
 def test_opcheck(compiled):
-    given = cubes(4, DEVICES[compiled])
-    for told in ({}, {"shares": False}, {"weights": False}, {"wide": True}):
-        torch.library.opcheck(torch.ops.gvtorch.voxelize.default, known(given, **told))
+    args = cubes(4, DEVICES[compiled])
+    for options in ({}, {"shares": False}, {"weights": False}, {"wide": True}):
+        torch.library.opcheck(torch.ops.gvtorch.voxelize.default, all_arguments(args, **options))
 
 
 class _Module(torch.nn.Module):
@@ -223,10 +223,10 @@ class _Module(torch.nn.Module):
         low: torch.Tensor,
         size: torch.Tensor,
     ) -> torch.Tensor:
-        found = torch.ops.gvtorch.voxelize(
+        outputs = torch.ops.gvtorch.voxelize(
             corner, solid, box, low, size, 4, 1.0, 0.0, True, True, False
         )
-        return found[3]
+        return outputs[3]
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -244,7 +244,7 @@ def test_scripts_compiles_and_exports(compiled):
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "said"),
+    ("index", "value", "message"),
     [
         (0, torch.zeros(3, 3), "corner_f33 must be (f, 3, 3) float64"),
         (0, torch.zeros(0, 3, 3, dtype=torch.float64), "corner_f33 must hold at least one"),
@@ -256,18 +256,18 @@ def test_scripts_compiles_and_exports(compiled):
         (6, -1.0, "thickness must be"),
     ],
 )
-def test_bad_arguments_are_told_in_a_line(place, value, said):
-    given = [*cubes()]
-    given[place] = value
+def test_bad_arguments_are_told_in_a_line(index, value, message):
+    args = [*cubes()]
+    args[index] = value
     with pytest.raises(ValueError, match="voxelize: ") as error:
-        voxelize(*given)
+        voxelize(*args)
     assert "\n" not in str(error.value)
-    assert said in str(error.value)
+    assert message in str(error.value)
 
 
 def test_memory_stays_safe_without_the_python_checks(compiled):
     good = cubes(device=DEVICES[compiled])
-    for place, value in (
+    for index, value in (
         (0, good[0][:0].contiguous()),
         (1, good[1][:3]),
         (2, good[2][:40].contiguous()),
@@ -276,10 +276,10 @@ def test_memory_stays_safe_without_the_python_checks(compiled):
         (5, 33),
         (5, 0),
     ):
-        given = [*known(good)]
-        given[place] = value
+        args = [*all_arguments(good)]
+        args[index] = value
         with pytest.raises(RuntimeError, match="gvtorch"):
-            torch.ops.gvtorch.voxelize(*given)
-    nan = [*known(good)]
+            torch.ops.gvtorch.voxelize(*args)
+    nan = [*all_arguments(good)]
     nan[2], nan[4] = good[2] * torch.nan, good[4] * torch.nan
     torch.ops.gvtorch.voxelize(*nan)

@@ -12,8 +12,8 @@ import torch
 from helpers import DEVICES
 from helpers.rays import camera_rays, world_rays
 from helpers.shaders import SHADERS
-from helpers.traces import SHADER, arguments, assert_equal, run
-from helpers.trees import on
+from helpers.traces import SHADER, arguments, assert_equal, trace
+from helpers.trees import copy_to
 
 import gvtorch as gv
 from gvtorch.base.constants import ABSENT, TERMINAL
@@ -24,7 +24,7 @@ FAR = (2**31 - 1, 2**30, 10**6)
 
 def spoilt(tree: gv.N3Tree, seed: int, absent: bool = False) -> gv.N3Tree:
     """Returns a copy in which a third of the words lead out of the pools, or are absent."""
-    copy = on(tree, "cpu")
+    copy = copy_to(tree, "cpu")
     generator = torch.Generator().manual_seed(seed)
     for words, count in (
         (copy.nodes.child_tn, copy.nodes.capacity),
@@ -43,8 +43,8 @@ def spoilt(tree: gv.N3Tree, seed: int, absent: bool = False) -> gv.N3Tree:
 def test_words_that_lead_out_of_the_pools_count_as_absent(blobs, backend, dtype, branching):
     tree = gv.N3Tree.from_volume(blobs, 4, branching=branching)
     rays, seed = camera_rays(tree, 8), branching
-    actual = run(spoilt(tree, seed), backend, rays, dtype=dtype)
-    expected = run(spoilt(tree, seed, absent=True), backend, rays, dtype=dtype)
+    actual = trace(spoilt(tree, seed), backend, rays, dtype=dtype)
+    expected = trace(spoilt(tree, seed, absent=True), backend, rays, dtype=dtype)
     for mine, other in zip(actual, expected, strict=True):
         assert all(torch.equal(mine[name], other[name]) for name in other)
     assert actual[0]["missed"].any()
@@ -56,10 +56,10 @@ def test_words_below_all_that_are_known_end_a_tree_and_hide_nothing(blobs, backe
     tree = gv.N3Tree.from_volume(blobs, 4)
     rays, found = camera_rays(tree, 8), []
     for instead in (word, TERMINAL):
-        copy = on(tree, "cpu")
+        copy = copy_to(tree, "cpu")
         chosen = torch.rand(copy.nodes.child_tn.shape, generator=torch.Generator().manual_seed(5))
         copy.nodes.child_tn[chosen < 0.3] = instead
-        found.append(run(copy, backend, rays, dtype=dtype))
+        found.append(trace(copy, backend, rays, dtype=dtype))
     for mine, other in zip(*found, strict=True):
         assert all(torch.equal(mine[name], other[name]) for name in other)
     assert found[0][0]["alpha"].max() > 0.1, "the test must see something"

@@ -46,7 +46,7 @@ def options(kind: str, log: Path) -> dict[str, str]:
     }
 
 
-def found(name: str) -> str:
+def library_path(name: str) -> str:
     """Returns the path of a library that comes with the compiler."""
     call = ["g++", f"-print-file-name={name}"]
     return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
@@ -70,17 +70,17 @@ def main(kind: str, *tests: str) -> int:
         compilers.CXX_FLAGS = tuple(flag.replace("-O3", "-O1") for flag in compilers.CXX_FLAGS)
         build["compile_libraries"](Path("gvtorch/cpp_ext/lib"))
     log = folder / "told"
-    for old in folder.glob("told.*"):
-        old.unlink()
-    preload = " ".join(found(name) for name in LIBRARIES[kind])
-    own = {"LD_PRELOAD": preload, "PYTHONPATH": str(folder), **options(kind, log)}
+    for old_report in folder.glob("told.*"):
+        old_report.unlink()
+    preload = " ".join(library_path(name) for name in LIBRARIES[kind])
+    extra = {"LD_PRELOAD": preload, "PYTHONPATH": str(folder), **options(kind, log)}
     paths = [str(ROOT / test) if (ROOT / test).exists() else test for test in tests]
     call = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-c"]
     call += [str(ROOT / "pyproject.toml"), "--rootdir", str(ROOT), *paths]
-    status = subprocess.run(call, env=os.environ | own, cwd=folder, check=False).returncode
-    told = [file.read_text() for file in sorted(folder.glob("told.*"))]
-    print(*told, sep="\n", end="", file=sys.stderr)
-    return status or bool(told)
+    status = subprocess.run(call, env=os.environ | extra, cwd=folder, check=False).returncode
+    reports = [file.read_text() for file in sorted(folder.glob("told.*"))]
+    print(*reports, sep="\n", end="", file=sys.stderr)
+    return status or bool(reports)
 
 
 if __name__ == "__main__":

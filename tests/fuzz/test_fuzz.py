@@ -32,30 +32,30 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
 SECONDS = 60 * float(os.environ.get("GVTORCH_FUZZ", "0"))  # make fuzz
-FEW = 40  # inputs of each kind in a plain run
+PLAIN_INPUTS = 40  # inputs of each kind in a plain run
 FOUND = Path(__file__).parent / "found"
 SLOW = 10.0  # seconds of processor time that one input may take
 MEMORY = 2 * 10**9  # bytes that it may take
-TOLD = (ValueError, OSError)  # errors by which input is refused
+REFUSALS = (ValueError, OSError)  # errors by which input is refused
 
 
 def broken(content: bytes, pick: random.Random) -> bytes:
     """Cuts, changes and repeats bytes, and overwrites some with extreme numbers."""
-    made = bytearray(content)
+    damaged = bytearray(content)
     for _ in range(pick.choice((1, 2, 8))):
-        at = pick.randrange(len(made)) if made else 0
-        how = pick.randrange(5)
-        if how == 0:
-            del made[at:]
-        elif how == 1:
-            made[at : at + 1] = bytes([pick.randrange(256)])
-        elif how == 2:
-            made[at : at + 4] = pick.choice((b"\xff" * 4, bytes(4), b"\x7f\xff\xff\xff", b"-1"))
-        elif how == 3:
-            made[at:at] = made[at : at + pick.randrange(64)]
+        i = pick.randrange(len(damaged)) if damaged else 0
+        edit = pick.randrange(5)
+        if edit == 0:
+            del damaged[i:]
+        elif edit == 1:
+            damaged[i : i + 1] = bytes([pick.randrange(256)])
+        elif edit == 2:
+            damaged[i : i + 4] = pick.choice((b"\xff" * 4, bytes(4), b"\x7f\xff\xff\xff", b"-1"))
+        elif edit == 3:
+            damaged[i:i] = damaged[i : i + pick.randrange(64)]
         else:
-            made[at : at + 3] = pick.choice((b"999999999", b"-1", b"1e999", b"nan", b"[[[", b"\0"))
-    return bytes(made)
+            damaged[i : i + 3] = pick.choice((b"999999999", b"-1", b"1e999", b"nan", b"[[[", b"\0"))
+    return bytes(damaged)
 
 
 Attempt = Callable[[random.Random], tuple[str, Callable[[], bytes], str]]
@@ -66,22 +66,22 @@ def first_fault(kind: str, attempt: Attempt) -> str:
     input, and the input's name. Returns the first fault, also of time or memory, or "". A crash
     ends the tests.
     """
-    begun, seed = time.monotonic(), 0
-    begin = random.randrange(10**9) if SECONDS else 0
-    while seed < FEW or time.monotonic() < begun + SECONDS / 4:
-        start, before = time.process_time(), most_memory()
-        wrong, content, name = attempt(random.Random(f"{kind} {begin + seed}"))
-        spent, more = time.process_time() - start, most_memory() - before
-        if spent > SLOW:
-            wrong = wrong or f"{spent:.1f} s"
-        if more > MEMORY:
-            wrong = wrong or f"{more / 1e9:.1f} GB"
-        if wrong:
+    start_time, seed = time.monotonic(), 0
+    first_seed = random.randrange(10**9) if SECONDS else 0
+    while seed < PLAIN_INPUTS or time.monotonic() < start_time + SECONDS / 4:
+        cpu_start, memory_before = time.process_time(), most_memory()
+        fault, content, name = attempt(random.Random(f"{kind} {first_seed + seed}"))
+        seconds, memory = time.process_time() - cpu_start, most_memory() - memory_before
+        if seconds > SLOW:
+            fault = fault or f"{seconds:.1f} s"
+        if memory > MEMORY:
+            fault = fault or f"{memory / 1e9:.1f} GB"
+        if fault:
             if SECONDS:
-                (FOUND / f"{kind}-{begin + seed}-{name}").write_bytes(content())
-            return f"{kind} {begin + seed}: {wrong}"
+                (FOUND / f"{kind}-{first_seed + seed}-{name}").write_bytes(content())
+            return f"{kind} {first_seed + seed}: {fault}"
         seed += 1
-    rate = seed / (time.monotonic() - begun)
+    rate = seed / (time.monotonic() - start_time)
     print(f"{kind}: {seed} inputs, {rate:.0f}/s, without a fault")
     return ""
 
@@ -91,14 +91,14 @@ def most_memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def outcome(call: Callable[[], Any], *told: type[BaseException]) -> str:
+def outcome(call: Callable[[], Any], *expected_errors: type[BaseException]) -> str:
     """Returns which error a call raised wrongly, or ""."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             call()
-    except (*TOLD, *told) as error:
-        return "" if "\n" not in str(error) or told else f"several lines: {error}"
+    except (*REFUSALS, *expected_errors) as error:
+        return "" if "\n" not in str(error) or expected_errors else f"several lines: {error}"
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     return ""
@@ -172,23 +172,23 @@ def meshes(folder: Path) -> Whole:
 def images(folder: Path) -> Whole:
     """Writes a picture in every format that can be read back."""
     tree = gv.N3Tree.from_volume(gv.Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2)))
-    look = gv.TransferFunction.preset("hot", 0, 7)
-    made = gv.render(tree, gv.Camera.orbit(width=9, height=7), look)
+    transfer = gv.TransferFunction.preset("hot", 0, 7)
+    picture = gv.render(tree, gv.Camera.orbit(width=9, height=7), transfer)
     for ending in ("png", "exr", "tif", "npy"):
-        made.save(folder / f"image.{ending}")
+        picture.save(folder / f"image.{ending}")
     return read_by(folder, gv.read_image)
 
 
 def points(folder: Path) -> Whole:
-    place = np.random.default_rng(0).random((9, 3)).astype(np.float32)
-    np.savez_compressed(folder / "points.npz", position=place, mass=place[:, 0])
+    positions = np.random.default_rng(0).random((9, 3)).astype(np.float32)
+    np.savez_compressed(folder / "points.npz", position=positions, mass=positions[:, 0])
     head = "ply\nformat {} 1.0\nelement vertex 9\n" + "".join(
         f"property float {axis}\n" for axis in "xyz"
     )
-    text = head.format("ascii") + "end_header\n" + "\n".join("1 2 3" for _ in place)
+    text = head.format("ascii") + "end_header\n" + "\n".join("1 2 3" for _ in positions)
     (folder / "text.ply").write_text(text)
     binary = head.format("binary_little_endian") + "end_header\n"
-    (folder / "points.ply").write_bytes(binary.encode() + place.tobytes())
+    (folder / "points.ply").write_bytes(binary.encode() + positions.tobytes())
     return read_by(folder, gv.read_points)
 
 
@@ -197,15 +197,15 @@ def looks(folder: Path) -> Whole:
     camera = gv.Camera.look_at((1, 2, 3), (0, 0, 0), width=8, height=6)
     for name in ("cameras.json", "camera.pvcc"):
         gv.write_cameras(folder / name, camera)
-    made = read_by(folder, gv.read_cameras)
+    contents = read_by(folder, gv.read_cameras)
     keys = [{"eye": [n, 0, 5], "target": [0, 0, 0], "fov": 30} for n in range(3)]
-    made["path.json"] = (json.dumps(keys).encode(), gv.CameraPath.from_json)
-    look = gv.TransferFunction.preset("bone", 0, 1)
-    state = gv.ViewState(shader=gv.Lit(look), camera=Eye(eye=(0, 0, 5), target=(0, 0, 0)))
-    made["state.json"] = (json.dumps(state.to_json()).encode(), state.read)
+    contents["path.json"] = (json.dumps(keys).encode(), gv.CameraPath.from_json)
+    transfer = gv.TransferFunction.preset("bone", 0, 1)
+    state = gv.ViewState(shader=gv.Lit(transfer), camera=Eye(eye=(0, 0, 5), target=(0, 0, 0)))
+    contents["state.json"] = (json.dumps(state.to_json()).encode(), state.read)
     frames = [{"time": n, "state": state.to_json()} for n in range(2)]
-    made["keys.json"] = (json.dumps(frames).encode(), lambda file: gv.Flight.read(file, state))
-    return made
+    contents["keys.json"] = (json.dumps(frames).encode(), lambda file: gv.Flight.read(file, state))
+    return contents
 
 
 def test_readers(tmp_path_factory):
@@ -272,10 +272,10 @@ def changed(content: Any, pick: random.Random) -> Any:
     """Returns a JSON value with a random part replaced."""
     if isinstance(content, (dict, list)) and content and pick.random() < 0.8:
         keys = sorted(content) if isinstance(content, dict) else list(range(len(content)))
-        made: Any = dict(content) if isinstance(content, dict) else list(content)
+        result: Any = dict(content) if isinstance(content, dict) else list(content)
         key = pick.choice(keys)
-        made[key] = changed(made[key], pick)
-        return made
+        result[key] = changed(result[key], pick)
+        return result
     return value(pick)
 
 
@@ -305,18 +305,18 @@ def test_json_of_every_kind(tmp_path):
 
 
 def random_tensor(pick: random.Random) -> torch.Tensor:
-    whole = (torch.int16, torch.int32, torch.int64, torch.bool, torch.uint8)
-    kinds = (*whole, torch.float32, torch.float64)
+    integers = (torch.int16, torch.int32, torch.int64, torch.bool, torch.uint8)
+    dtypes = (*integers, torch.float32, torch.float64)
     shape = [pick.choice((0, 1, 2, 3, 4, 8)) for _ in range(pick.randrange(6))]
-    dtype, seed = pick.choice(kinds), pick.randrange(2**31)
+    dtype, seed = pick.choice(dtypes), pick.randrange(2**31)
     generator = torch.Generator().manual_seed(seed)
     if dtype.is_floating_point:
-        made = torch.rand(shape, generator=generator, dtype=dtype) * pick.choice((1, 1e30, -5))
-        if made.numel() and pick.random() < 0.3:
-            made.view(-1)[0] = pick.choice((torch.nan, torch.inf, -torch.inf))
-        return made
-    ends = {torch.bool: (0, 2), torch.uint8: (0, 256)}.get(dtype, (-4, pick.choice((9, 2**31 - 1))))
-    return torch.randint(*ends, shape, generator=generator).to(dtype)
+        values = torch.rand(shape, generator=generator, dtype=dtype) * pick.choice((1, 1e30, -5))
+        if values.numel() and pick.random() < 0.3:
+            values.view(-1)[0] = pick.choice((torch.nan, torch.inf, -torch.inf))
+        return values
+    span = {torch.bool: (0, 2), torch.uint8: (0, 256)}.get(dtype, (-4, pick.choice((9, 2**31 - 1))))
+    return torch.randint(*span, shape, generator=generator).to(dtype)
 
 
 def test_arguments_of_ops(blobs):
@@ -326,11 +326,11 @@ def test_arguments_of_ops(blobs):
     from helpers.traces import SHADER, arguments, packed
 
     tree = gv.N3Tree.from_volume(blobs, 4)
-    rays, given = arguments(tree, 4, SHADER)
+    rays, trace_arguments = arguments(tree, 4, SHADER)
     request, order = tree.nodes.request_tn, torch.arange(8, dtype=torch.int32)
-    known: dict[str, tuple[Any, ...]] = {
-        "trace_rays": (*rays, *given),
-        "count_segments": (*rays, *given, None, 0, False),
+    calls: dict[str, tuple[Any, ...]] = {
+        "trace_rays": (*rays, *trace_arguments),
+        "count_segments": (*rays, *trace_arguments, None, 0, False),
         "compact_requests": (request, 8),
         "choose_requests": (
             order.view(1, 2, 4) << 9,
@@ -343,31 +343,31 @@ def test_arguments_of_ops(blobs):
         "cut_bricks": (torch.rand(8, 8, 8, 1), torch.zeros((2, 3), dtype=torch.int64), 4, 1),
         "composite": (*packed(dtype=torch.float32), 0.01),
     }
-    assert set(known) <= set(FAKES)
+    assert set(calls) <= set(FAKES)
 
     def attempt(pick: random.Random) -> tuple[str, Callable[[], bytes], str]:
-        name = pick.choice(sorted(known))
-        values = [v.clone() if isinstance(v, torch.Tensor) else v for v in known[name]]
+        name = pick.choice(sorted(calls))
+        values = [v.clone() if isinstance(v, torch.Tensor) else v for v in calls[name]]
         for _ in range(pick.choice((1, 1, 2))):
-            at = pick.randrange(len(values))
-            if isinstance(values[at], torch.Tensor):
-                other = random_tensor(pick)
-                same = other.numel() and pick.random() < 0.6
-                if same:  # the right shape, with other content
-                    old = values[at]
-                    flat = other.flatten().repeat(-(-max(1, old.numel()) // other.numel()))
-                    other = flat[: old.numel()].view(old.shape).to(old.dtype)
-                values[at] = other
-            elif values[at] is not None:
+            i = pick.randrange(len(values))
+            if isinstance(values[i], torch.Tensor):
+                new = random_tensor(pick)
+                keeps_shape = new.numel() and pick.random() < 0.6
+                if keeps_shape:  # the right shape, with other content
+                    old = values[i]
+                    flat = new.flatten().repeat(-(-max(1, old.numel()) // new.numel()))
+                    new = flat[: old.numel()].view(old.shape).to(old.dtype)
+                values[i] = new
+            elif values[i] is not None:
                 small = (-1, 0, 1, 7, 0.0, float("nan"), 1e-4)  # 1e-9 would be a step of much work
-                values[at] = (
-                    type(values[at])(pick.choice(small))
-                    if isinstance(values[at], float)
+                values[i] = (
+                    type(values[i])(pick.choice(small))
+                    if isinstance(values[i], float)
                     else pick.choice((-1, 0, 1, 3, 2**62))
                 )
         op = getattr(torch.ops.gvtorch, name)
-        told = outcome(lambda: op(*values), RuntimeError, TypeError)
-        return told, lambda: repr(values).encode(), name
+        fault = outcome(lambda: op(*values), RuntimeError, TypeError)
+        return fault, lambda: repr(values).encode(), name
 
     assert not first_fault("op", attempt)
 

@@ -40,34 +40,34 @@ def gvtorch(*args: object, cwd: str | Path = ".") -> subprocess.CompletedProcess
     """Runs the command line within this process (another would import torch for each call), with
     the default warnings of a new process.
     """
-    out, error = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
     status = 0
     with (
         contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(error),
+        contextlib.redirect_stderr(err),
         contextlib.chdir(cwd),
         warnings.catch_warnings(),
     ):
         warnings.resetwarnings()
-        for unseen in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
-            warnings.simplefilter("ignore", unseen)
+        for category in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
+            warnings.simplefilter("ignore", category)
         try:
             main([str(arg) for arg in args])
-        except SystemExit as end:
-            status = int(end.code or 0)
-    for stream in (out, error):
+        except SystemExit as stop:
+            status = int(stop.code or 0)
+    for stream in (out, err):
         stream.seek(0)
-    return subprocess.CompletedProcess(args, status, out.read(), error.read())
+    return subprocess.CompletedProcess(args, status, out.read(), err.read())
 
 
-def run(capsys, *args: object) -> tuple[int, str, str]:
+def run_cli(capsys, *args: object) -> tuple[int, str, str]:
     """Runs the command line within this process, with the tests' warning filters, which raise
     errors; returns exit status, output and errors.
     """
     try:
         main([str(arg) for arg in args])
         code = 0
-    except SystemExit as end:
-        code = int(end.code or 0)
+    except SystemExit as stop:
+        code = int(stop.code or 0)
     out, err = capsys.readouterr()
     return code, out, err

@@ -11,7 +11,7 @@ import numpy as np
 
 from gvtorch.bench.browser import chromium_path, running_chromium, why_no_browser
 
-from .viewer import SOON
+from .viewer import TIMEOUT
 
 __all__ = ["Tab", "chromium_path", "running_chromium", "why_no_browser"]
 
@@ -32,8 +32,8 @@ class Tab:
         self.page.goto(url)
 
     def _said(self, message: Any) -> None:
-        own = "willReadFrequently" in message.text  # `pixels` does
-        if message.type in ("error", "warning") and not own:
+        from_pixels = "willReadFrequently" in message.text  # `pixels` does
+        if message.type in ("error", "warning") and not from_pixels:
             self.complaints.append(message.text)
 
     def app(self, script: str) -> Any:
@@ -42,14 +42,14 @@ class Tab:
             f"() => {{ const app = document.querySelector('.gv').app; return {script}; }}"
         )
 
-    def until(self, wanted: str | Callable[[], Any], soon: float = SOON) -> Any:
+    def until(self, condition: str | Callable[[], Any], timeout: float = TIMEOUT) -> Any:
         """Waits until an expression of `app`, or a function, is true."""
-        end = time.monotonic() + soon
+        end = time.monotonic() + timeout
         while True:
-            found = self.app(wanted) if isinstance(wanted, str) else wanted()
-            if found:
-                return found
-            assert time.monotonic() < end, f"it never came: {wanted}; {self.complaints}"
+            result = self.app(condition) if isinstance(condition, str) else condition()
+            if result:
+                return result
+            assert time.monotonic() < end, f"it never came: {condition}; {self.complaints}"
             self.page.wait_for_timeout(30)
 
     def final(self) -> np.ndarray:
@@ -82,9 +82,9 @@ class Tab:
 
     def open(self, section: str) -> None:
         """Opens a section of the panel."""
-        found = self.page.locator(f"details:has(> summary:text-is('{section}'))")
-        if found.get_attribute("open") is None:
-            found.locator("summary").first.click()
+        details = self.page.locator(f"details:has(> summary:text-is('{section}'))")
+        if details.get_attribute("open") is None:
+            details.locator("summary").first.click()
 
     def close(self) -> None:
         self.context.close()

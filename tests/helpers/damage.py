@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-WAYS = 50
+COPIES = 50
 _SECONDS = 240
 _MEMORY = 3 << 30  # bytes of address space beyond what the libraries use
 
@@ -40,14 +40,14 @@ for path in paths:
 
 def break_file(content: bytes, number: int) -> bytes:
     """Cuts a file (even numbers), or changes some of its bytes, mostly near its beginning."""
-    chance = random.Random(number)
+    rng = random.Random(number)
     if number % 2 == 0:
-        return content[: chance.randrange(len(content))]
-    broken = bytearray(content)
-    reach = len(content) if number % 4 == 1 else min(len(content), 600)
-    for _ in range(chance.choice((1, 4, 32))):
-        broken[chance.randrange(reach)] = chance.randrange(256)
-    return bytes(broken)
+        return content[: rng.randrange(len(content))]
+    damaged = bytearray(content)
+    end = len(content) if number % 4 == 1 else min(len(content), 600)
+    for _ in range(rng.choice((1, 4, 32))):
+        damaged[rng.randrange(end)] = rng.randrange(256)
+    return bytes(damaged)
 
 
 def outcomes(path: Path, folder: Path, **options: Any) -> list[tuple[str, str]]:
@@ -58,40 +58,40 @@ def outcomes(path: Path, folder: Path, **options: Any) -> list[tuple[str, str]]:
         AssertionError: The process crashed or did not end.
     """
     paths = [path]
-    for number in range(WAYS):
+    for number in range(COPIES):
         copy = folder / f"{number}" / path.name
         copy.parent.mkdir(parents=True)
         if path.is_dir():
             shutil.copytree(path, copy)
             files = sorted(file for file in copy.rglob("*") if file.is_file())
-            victim = files[number % len(files)]
-            victim.write_bytes(break_file(victim.read_bytes(), number))
+            damaged = files[number % len(files)]
+            damaged.write_bytes(break_file(damaged.read_bytes(), number))
         else:
             copy.write_bytes(break_file(path.read_bytes(), number))
         paths.append(copy)
-    told = json.dumps([[str(path) for path in paths], options, _MEMORY])
+    request = json.dumps([[str(path) for path in paths], options, _MEMORY])
     run = subprocess.run(
         [sys.executable, "-X", "faulthandler", "-c", _READER],
-        input=told,
+        input=request,
         capture_output=True,
         text=True,
         timeout=_SECONDS,
         check=False,
     )
     lines = [tuple(json.loads(line)) for line in run.stdout.splitlines() if line.startswith("[")]
-    at = paths[len(lines)] if len(lines) < len(paths) else "the end"
-    assert run.returncode == 0, f"crashed ({run.returncode}) at {at}: {run.stderr[-3000:]}"
+    failed_path = paths[len(lines)] if len(lines) < len(paths) else "the end"
+    assert run.returncode == 0, f"crashed ({run.returncode}) at {failed_path}: {run.stderr[-3000:]}"
     return lines
 
 
-def assert_told(path: Path, folder: Path, least: int = 15, **options: Any) -> None:
+def assert_robust(path: Path, folder: Path, min_refused: int = 15, **options: Any) -> None:
     """Asserts that the whole file is read, and that every damaged one is read or refused with a
-    one-line message that names it; at least `least` are refused.
+    one-line message that names it; at least `min_refused` are refused.
     """
     (first, message), *rest = outcomes(path, folder, **options)
     assert first == "read", message
-    assert len(rest) == WAYS
-    for kind, message in rest:
-        assert kind in ("read", "refused"), f"{kind}: {message}"
-        assert kind == "read" or ("\n" not in message and str(folder) in message), message
-    assert sum(kind == "refused" for kind, _ in rest) >= least, rest
+    assert len(rest) == COPIES
+    for outcome, message in rest:
+        assert outcome in ("read", "refused"), f"{outcome}: {message}"
+        assert outcome == "read" or ("\n" not in message and str(folder) in message), message
+    assert sum(outcome == "refused" for outcome, _ in rest) >= min_refused, rest

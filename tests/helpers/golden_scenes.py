@@ -25,13 +25,13 @@ LOOKS = (
     *("isosurface", "coloured isosurface", "distance field", "maximum", "minimum", "mean"),
     *("features", "module", "transfer module", "plain"),
 )
-FIRST, LATER = 200, ("channels",) * 10 + ("labels",) * 20  # scenes from number FIRST on
-SCENES = FIRST + len(LATER)
-WAYS = (
+FIRST_LATER, LATER = 200, ("channels",) * 10 + ("labels",) * 20  # scenes from number FIRST_LATER on
+SCENES = FIRST_LATER + len(LATER)
+METHODS = (
     *("render", "render", "render", "holes", "holes"),
     *("engine", "engine", "levels", "tracer", "cost"),
 )
-SPANS = {  # range of the values, by dtype
+VALUE_RANGES = {  # range of the values, by dtype
     "uint8": (0, 255),
     "int8": (-100, 100),
     "int16": (-1000, 3000),
@@ -67,8 +67,8 @@ class Dice:
     def whole(self, low: int, high: int) -> int:
         return low + int((high - low + 1) * self._random())
 
-    def pick(self, *what: Any) -> Any:
-        return what[int(len(what) * self._random())]
+    def pick(self, *choices: Any) -> Any:
+        return choices[int(len(choices) * self._random())]
 
     def chance(self, share: float) -> bool:
         return self._random() < share
@@ -81,31 +81,31 @@ class Dice:
 def settings(seed: int) -> Settings:
     """Returns everything that defines a scene, as plain values."""
     dice = Dice(seed)
-    look, way = LOOKS[seed % len(LOOKS)], WAYS[seed // len(LOOKS) % len(WAYS)]
-    if seed >= FIRST:
-        look = LATER[seed - FIRST]
-        way = WAYS[seed % (len(WAYS) - (look == "labels"))]  # `cost` does not support labels
-    if way == "cost" and look != "transfer":  # it supports only transfer functions
-        look, way = ("plain", way) if seed % 3 == 0 else (look, "render")
-    if way == "tracer" and look in MODULES:
-        way = "engine"
-    double = dice.chance(0.2) and way != "tracer"
-    if look == "transfer module" or way == "cost":
+    look, method = LOOKS[seed % len(LOOKS)], METHODS[seed // len(LOOKS) % len(METHODS)]
+    if seed >= FIRST_LATER:
+        look = LATER[seed - FIRST_LATER]
+        method = METHODS[seed % (len(METHODS) - (look == "labels"))]  # `cost` supports no labels
+    if method == "cost" and look != "transfer":  # it supports only transfer functions
+        look, method = ("plain", method) if seed % 3 == 0 else (look, "render")
+    if method == "tracer" and look in MODULES:
+        method = "engine"
+    double = dice.chance(0.2) and method != "tracer"
+    if look == "transfer module" or method == "cost":
         double = True
     raw = double and look in (*SURFACES, *PROJECTIONS)
-    s: Settings = {"seed": seed, "look": look, "way": way}
+    s: Settings = {"seed": seed, "look": look, "way": method}
     s["dtype"] = "float64" if double else "float32"
     s["hashed"] = "float32" if double and not raw else "raw"
-    s |= _volume(dice, look, way)
+    s |= _volume(dice, look, method)
     s |= _shader(dice, s, raw)
     s |= _view(dice, raw)
-    s |= _extras(dice, s) if not raw and way != "tracer" else {}
+    s |= _extras(dice, s) if not raw and method != "tracer" else {}
     s["lod"] = dice.pick("auto", "auto", "finest") if "lens" not in s else "auto"
     s["step"] = dice.pick(0.5, 0.5, 0.3, 1.0, 1.7, 3.0)
     s["stop_alpha"] = dice.pick(0.99, 0.99, 1.0, 0.6)
     s["depth_alpha"] = dice.pick(0.1, 0.1, 0.5, 0.02)
     s["cone_scale"] = dice.pick(4 / 3, 4 / 3, 1.0, 3.0)
-    if way in ("engine", "levels"):
+    if method in ("engine", "levels"):
         s["slots"] = dice.pick(*{4: (40, 64, 96), 8: (16, 24, 48), 16: (10, 16)}[s["brick"]])
         s["hold"] = dice.pick("voxels", "bricks")
         s["order"] = dice.pick("coarse", "fine")
@@ -114,21 +114,21 @@ def settings(seed: int) -> Settings:
     return s
 
 
-def _volume(dice: Dice, look: str, way: str) -> Settings:
+def _volume(dice: Dice, look: str, method: str) -> Settings:
     """Draws extent, position, bricks and channels."""
     brick = dice.pick(4, 4, 8, 8, 16)
-    most = {4: 30, 8: 44, 16: 60}[brick] if way in ("engine", "levels") else 44
-    dtype = dice.pick(*SPANS)
+    max_extent = {4: 30, 8: 44, 16: 60}[brick] if method in ("engine", "levels") else 44
+    dtype = dice.pick(*VALUE_RANGES)
     if look == "distance field":
         dtype = dice.pick("float16", "float32")
     if look == "labels":
         dtype = dice.pick("uint8", "int8", "int16", "uint16")
     spacing = dice.pick((1.0, 1.0, 1.0), (0.5, 0.5, 0.5), dice.triple(0.4, 2.0))
-    found: Settings = {
+    drawn: Settings = {
         "branching": dice.pick(2, 2, 3, 4),
         "brick": brick,
         "border": dice.pick(0, 1, 1, 1, 2),
-        "extent": tuple(dice.whole(8, most) for _ in range(3)),
+        "extent": tuple(dice.whole(8, max_extent) for _ in range(3)),
         "spacing": spacing,
         "origin": dice.pick((0.0, 0.0, 0.0), dice.triple(-20, 20)),
         "value": dtype,
@@ -139,27 +139,27 @@ def _volume(dice: Dice, look: str, way: str) -> Settings:
         "normal": dice.pick("uint8", "int8", "uint16", "int16", "float16", "float32"),
     }
     if look == "labels":
-        found |= {"threshold": None, "wide": dice.chance(0.5), "most": dice.pick(3, 9, 40)}
+        drawn |= {"threshold": None, "wide": dice.chance(0.5), "most": dice.pick(3, 9, 40)}
     if look == "six":
-        found["color"] = dice.pick("float16", "bfloat16", "float32")
+        drawn["color"] = dice.pick("float16", "bfloat16", "float32")
     if look == "channels":
-        found["width"] = dice.whole(2, 5)
-        spans = [(dice.number(0, 0.5), dice.number(0.1, 0.6)) for _ in range(found["width"])]
-        found["windows"] = [(low, low + length) for low, length in spans]
-        found["mode"] = dice.pick("additive", "opacity")
-    found["component"] = dice.whole(0, found["width"] - 1)
-    return found
+        drawn["width"] = dice.whole(2, 5)
+        spans = [(dice.number(0, 0.5), dice.number(0.1, 0.6)) for _ in range(drawn["width"])]
+        drawn["windows"] = [(low, low + length) for low, length in spans]
+        drawn["mode"] = dice.pick("additive", "opacity")
+    drawn["component"] = dice.whole(0, drawn["width"] - 1)
+    return drawn
 
 
 def _shader(dice: Dice, s: Settings, raw: bool) -> Settings:
     """Draws the transfer function (values as fractions of their range), light and material."""
     count, even = dice.whole(2, 5), dice.chance(0.7) or s["look"] == "pre-integrated"
     cells = 16 if even else 997
-    places = sorted({dice.whole(0, cells) for _ in range(count)} | {cells})
-    shown = [dice.number(0, 1) * dice.pick(0, 0.1, 0.5, 1) for _ in places]
-    found: Settings = {
-        "opacity": [(round(a / cells, 4), round(b, 4)) for a, b in zip(places, shown, strict=True)],
-        "colors": [(part, *dice.triple(0, 1)) for part in (0.0, 0.5, 1.0)[: dice.whole(1, 3)]],
+    points = sorted({dice.whole(0, cells) for _ in range(count)} | {cells})
+    alpha = [dice.number(0, 1) * dice.pick(0, 0.1, 0.5, 1) for _ in points]
+    drawn: Settings = {
+        "opacity": [(round(a / cells, 4), round(b, 4)) for a, b in zip(points, alpha, strict=True)],
+        "colors": [(x, *dice.triple(0, 1)) for x in (0.0, 0.5, 1.0)[: dice.whole(1, 3)]],
         "reference": dice.pick(None, None, dice.number(0.3, 3.0)),
         "level": dice.number(0.25, 0.75),
         "light": dice.pick(*LIGHTS),
@@ -168,15 +168,15 @@ def _shader(dice: Dice, s: Settings, raw: bool) -> Settings:
         "material": [dice.number(*ends) for ends in ((0, 0.5), (0.3, 1), (0, 0.6), (1, 60))],
     }
     if "shadows" in s["look"]:
-        found["light"] = dice.pick(*LIGHTS[2:])
+        drawn["light"] = dice.pick(*LIGHTS[2:])
     if raw:
-        found["material"][2] = 0.0
-    return found
+        drawn["material"][2] = 0.0
+    return drawn
 
 
 def _view(dice: Dice, raw: bool) -> Settings:
     """Draws the camera."""
-    found: Settings = {
+    drawn: Settings = {
         "camera": "rays" if raw else dice.pick(*CAMERAS),
         "size": (dice.whole(16, 28), dice.whole(12, 22)),
         "inside": dice.chance(0.15),
@@ -185,39 +185,39 @@ def _view(dice: Dice, raw: bool) -> Settings:
         "aim": dice.triple(-0.1, 0.1),
         "fov": dice.number(25, 50),
     }
-    found["inside"] |= found["camera"] == "panorama"
-    if found["camera"] == "rays":
-        found["rays"] = "float64" if raw else dice.pick("float32", "float64")
-        found["rows"] = dice.chance(0.5)
-    if found["camera"] in ("rays", "directions"):
-        found["cone"] = dice.pick("pixel", "wide", "finest")
-        found["ends"] = dice.chance(0.3)
-    return found
+    drawn["inside"] |= drawn["camera"] == "panorama"
+    if drawn["camera"] == "rays":
+        drawn["rays"] = "float64" if raw else dice.pick("float32", "float64")
+        drawn["rows"] = dice.chance(0.5)
+    if drawn["camera"] in ("rays", "directions"):
+        drawn["cone"] = dice.pick("pixel", "wide", "finest")
+        drawn["ends"] = dice.chance(0.3)
+    return drawn
 
 
 def _extras(dice: Dice, s: Settings) -> Settings:
     """Draws the options (clip, lens, lighting, layer, background) that the shader supports."""
-    look, found = s["look"], {}
+    look, drawn = s["look"], {}
     whole = look in PROJECTIONS
     if dice.chance(0.3):
-        found["clip"] = dice.pick("planes", "box", "boxes", "matrix", "without")
-        found["clip_in"] = dice.pick("box", "world")
-        found["caps"] = dice.chance(0.5) and not whole
-        found["cap"] = (dice.number(0.3, 1), dice.number(0, 1))
+        drawn["clip"] = dice.pick("planes", "box", "boxes", "matrix", "without")
+        drawn["clip_in"] = dice.pick("box", "world")
+        drawn["caps"] = dice.chance(0.5) and not whole
+        drawn["cap"] = (dice.number(0.3, 1), dice.number(0, 1))
     if dice.chance(0.2) and not whole:
-        found["lens"] = (dice.number(0.02, 0.3), dice.number(0.5, 2.0), dice.pick("box", "world"))
+        drawn["lens"] = (dice.number(0.02, 0.3), dice.number(0.5, 2.0), dice.pick("box", "world"))
     if dice.chance(0.4) and look in LIT and s["way"] != "cost":
-        found["lighting"] = dice.pick("shadows", "cones", "occlusion", "indirect", "everything")
-        if look == "coloured isosurface" and found["lighting"] in ("indirect", "everything"):
-            found["lighting"] = "occlusion"
-        found["lamps"] = dice.pick((), ("sun",), ("lamp", "head"), ("wide sun", "wide lamp"))
-        found["reach"] = dice.pick(None, dice.number(0.1, 0.5))
+        drawn["lighting"] = dice.pick("shadows", "cones", "occlusion", "indirect", "everything")
+        if look == "coloured isosurface" and drawn["lighting"] in ("indirect", "everything"):
+            drawn["lighting"] = "occlusion"
+        drawn["lamps"] = dice.pick((), ("sun",), ("lamp", "head"), ("wide sun", "wide lamp"))
+        drawn["reach"] = dice.pick(None, dice.number(0.1, 0.5))
     if dice.chance(0.25):
-        found["layer"] = dice.pick("opaque", "opaque" if whole else "translucent")
-    found["background"] = dice.pick("black", "color", "gradient", "image", "none")
-    if found["background"] == "gradient":  # CUDA's division by other heights is off by an ulp
-        found["size"] = (s["size"][0], 16)
-    return found
+        drawn["layer"] = dice.pick("opaque", "opaque" if whole else "translucent")
+    drawn["background"] = dice.pick("black", "color", "gradient", "image", "none")
+    if drawn["background"] == "gradient":  # CUDA's division by other heights is off by an ulp
+        drawn["size"] = (s["size"][0], 16)
+    return drawn
 
 
 def described(s: Settings) -> str:
@@ -238,11 +238,11 @@ def smooth(seed: int, extent: tuple[int, int, int], width: int) -> np.ndarray:
     """Interpolates (z, y, x, c) numbers in [0, 1] from a lattice of 5^3, using only + and *."""
     field = numbers(seed, 5, 5, 5, width)
     for axis, count in enumerate(reversed(extent)):
-        place = np.arange(count) * (4 / max(1, count - 1))
-        low = np.minimum(place.astype(np.int64), 3)
-        part = (place - low).reshape([-1 if i == axis else 1 for i in range(4)])
-        a, b = field.take(low, axis), field.take(low + 1, axis)
-        field = a + part * (b - a)
+        position = np.arange(count) * (4 / max(1, count - 1))
+        index = np.minimum(position.astype(np.int64), 3)
+        fraction = (position - index).reshape([-1 if i == axis else 1 for i in range(4)])
+        a, b = field.take(index, axis), field.take(index + 1, axis)
+        field = a + fraction * (b - a)
     return field
 
 
@@ -263,7 +263,7 @@ def volumes(s: Settings, shift: float = 0.0) -> dict[str, gv.Volume]:
     colors = smooth(10 * seed + 2, extent, 4)
     normal = 2 * smooth(10 * seed + 3, extent, 3) - 1
     nx, ny, nz = extent
-    low, high = SPANS[s["value"]]
+    low, high = VALUE_RANGES[s["value"]]
     if look == "distance field":
         z, y, x = np.mgrid[0:nz, 0:ny, 0:nx].astype(np.float64)
         (cx, cy, cz), (sx, sy, sz) = ((n - 1) / 2 for n in extent), s["spacing"]
@@ -272,37 +272,37 @@ def volumes(s: Settings, shift: float = 0.0) -> dict[str, gv.Volume]:
         value = (np.sqrt(x * x + y * y + z * z) - radius)[..., None] + 0.2 * value
     else:
         value = low + (high - low) * value.clip(0, 1)
-        for region, where, number in (
+        for region, part, fraction in (
             ("empty", np.s_[: max(1, nz // 3)], 0.0),
             ("constant", np.s_[:, ny // 2 :, : 2 * nx // 3], 0.6),
         ):
             if s["regions"] in (region, "both"):
-                value[where] = low + (high - low) * number
-                colors[where], normal[where] = (0.2, 0.9, 0.4, number / 2), (0.0, 0.6, 0.8)
+                value[part] = low + (high - low) * fraction
+                colors[part], normal[part] = (0.2, 0.9, 0.4, fraction / 2), (0.0, 0.6, 0.8)
     spacing, (x, *rest) = s["spacing"], s["origin"]
-    place = spacing, (x + shift, *rest)
+    placement = spacing, (x + shift, *rest)
     if look == "labels":
-        parts = (value - low) / (high - low)
-        label = np.floor(parts * s["most"]) - (low < 0)
+        fractions = (value - low) / (high - low)
+        label = np.floor(fractions * s["most"]) - (low < 0)
         label = label.astype(np.int64) * 2**33 if s["wide"] else label.astype(s["value"])
-        return {"value": gv.Volume(torch.from_numpy(label), *place, labels=True)}
+        return {"value": gv.Volume(torch.from_numpy(label), *placement, labels=True)}
 
     def whole(dtype: str) -> float:
         return 1.0 if "float" in dtype else float(np.iinfo(dtype).max)
 
-    found = {"value": gv.Volume(tensor(value, s["value"]), *place)}
+    channels = {"value": gv.Volume(tensor(value, s["value"]), *placement)}
     if look == "six":
-        rgba = gv.Volume(tensor(colors, "float32"), *place)
-        found["color"] = rgba.directional(dtype=getattr(torch, s["color"]))
+        rgba = gv.Volume(tensor(colors, "float32"), *placement)
+        channels["color"] = rgba.directional(dtype=getattr(torch, s["color"]))
     elif look in (*STORED, "features", "coloured isosurface", "module"):
         if look == "premultiplied":
             colors[..., :3] *= colors[..., 3:]
-        found["color"] = gv.Volume(tensor(colors * whole(s["color"]), s["color"]), *place)
+        channels["color"] = gv.Volume(tensor(colors * whole(s["color"]), s["color"]), *placement)
     if look in ("lit by normals", "stored by normals"):
         if s["normal"] in ("uint8", "uint16"):
             normal = 0.5 * normal + 0.5
-        found["normal"] = gv.Volume(tensor(normal * whole(s["normal"]), s["normal"]), *place)
-    return found
+        channels["normal"] = gv.Volume(tensor(normal * whole(s["normal"]), s["normal"]), *placement)
+    return channels
 
 
 class Ink(torch.nn.Module):
@@ -315,15 +315,15 @@ class Ink(torch.nn.Module):
     def forward(
         self, values: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor
     ) -> tuple[Tensor, Tensor]:
-        part = ((values[:, :1] - self.low) * self.scale).clamp(0, 1)
-        taken = 0.4 * part * lengths
+        fraction = ((values[:, :1] - self.low) * self.scale).clamp(0, 1)
+        taken = 0.4 * fraction * lengths
         side = directions[:, :1] * 0.5 + 0.5
         far = 1 / (1 + positions[:, 2:] * positions[:, 2:])
-        return torch.cat((part, side, far), 1), taken / (1 + taken)
+        return torch.cat((fraction, side, far), 1), taken / (1 + taken)
 
 
 def transfer_of(s: Settings) -> gv.TransferFunction:
-    low, high = SPANS[s["value"]]
+    low, high = VALUE_RANGES[s["value"]]
     opacity, color = (
         [(low + (high - low) * v, *rest) for v, *rest in s[n]] for n in ("opacity", "colors")
     )
@@ -347,18 +347,18 @@ def shader_of(s: Settings) -> Any:
     look, transfer = s["look"], transfer_of(s)
     names = ("ambient", "diffuse", "specular", "shininess")
     lit = {"light": light_of(s, s["light"]), **dict(zip(names, s["material"], strict=True))}
-    low, high = SPANS[s["value"]]
+    low, high = VALUE_RANGES[s["value"]]
     level = low + (high - low) * s["level"]
     if look in ("transfer", "plain"):
         return transfer
     if look in PROJECTIONS:
         return gv.Projection(look, transfer)
     if look == "labels":
-        unit_ = 2**33 if s["wide"] else 1
-        thin = {label * unit_: s["level"] ** label for label in range(0, s["most"], 2)}
+        factor = 2**33 if s["wide"] else 1
+        opacity = {label * factor: s["level"] ** label for label in range(0, s["most"], 2)}
         visible = None if s["level"] < 0.5 else "all"
         lit |= {"lit": s["seed"] % 4 > 0, "reference": s["reference"]}
-        return gv.Labels({unit_: s["glow"]}, thin, visible, **lit)
+        return gv.Labels({factor: s["glow"]}, opacity, visible, **lit)
     if look in STORED:
         lit |= {"lit": s["level"] > 0.5, "shadows": "shadows" in look}
         lit |= {"premultiplied": look == "premultiplied"}
@@ -366,10 +366,10 @@ def shader_of(s: Settings) -> Any:
         lit |= {} if look == "six" else {"reference": s["reference"]}
         return gv.StoredColor("color", **lit)
     if look == "channels":
-        windows = [tuple(low + (high - low) * end for end in one) for one in s["windows"]]
-        looks = [gv.ChannelLook(component=c, window=one) for c, one in enumerate(windows)]
-        more = gv.ChannelLook(component=0, transfer=transfer)
-        return gv.Channels([*looks[::-1], more], s["mode"])
+        windows = [tuple(low + (high - low) * end for end in window) for window in s["windows"]]
+        looks = [gv.ChannelLook(component=c, window=window) for c, window in enumerate(windows)]
+        extra = gv.ChannelLook(component=0, transfer=transfer)
+        return gv.Channels([*looks[::-1], extra], s["mode"])
     colored = gv.TransferFunction.from_points([(0, 1)], [(0, 0.2, 0.1, 0.9), (200, 1, 0.8, 0)])
     surface = lit | {"filled": s["seed"] % 2 == 0}
     return {
@@ -405,14 +405,14 @@ def unit(v: np.ndarray) -> np.ndarray:
 def camera_of(s: Settings) -> gv.Camera | gv.Rays:
     low, high = box_of(s)
     (width, height), kind, side = s["size"], s["camera"], float((high - low).max())
-    centre, away = (low + high) / 2, unit(np.array(s["from"]))
-    eye = centre + away * (0.1 if s["inside"] else 0.3 + s["away"]) * side
+    centre, direction = (low + high) / 2, unit(np.array(s["from"]))
+    eye = centre + direction * (0.1 if s["inside"] else 0.3 + s["away"]) * side
     target = centre + np.array(s["aim"]) * side
     if kind in ("orbit", "batch"):
-        far = 0.2 if s["inside"] else 0.3 + s["away"]
+        distance = 0.2 if s["inside"] else 0.3 + s["away"]
         turn = 40 * s["fov"]
         turns = torch.tensor([turn, turn + 70], dtype=torch.float64) if kind == "batch" else turn
-        return gv.Camera.orbit(turns, 100 * s["aim"][0], far, s["fov"], width, height)
+        return gv.Camera.orbit(turns, 100 * s["aim"][0], distance, s["fov"], width, height)
     if kind in ("directions", "rays"):
         return _own_rays(s, eye, target)
     model = kind.removeprefix("bent ")
@@ -441,14 +441,14 @@ def _own_rays(s: Settings, eye: np.ndarray, target: np.ndarray) -> gv.Camera | g
     cone = {"pixel": (0.0, pixel), "wide": (0.1, 4 * pixel), "finest": (0.0, 0.0)}[s["cone"]]
     low, high = box_of(s)
     side = float((high - low).max())
-    far = (0.3 + s["away"]) * side
-    span = (0.05 * side, 0.3 * side) if s["inside"] else (far - 0.3 * side, far + 0.1 * side)
+    depth = (0.3 + s["away"]) * side
+    span = (0.05 * side, 0.3 * side) if s["inside"] else (depth - 0.3 * side, depth + 0.1 * side)
     ends = span if s["ends"] else (0.0, math.inf)
     if s["camera"] == "directions":
-        given = [torch.from_numpy(part) for part in (origin, direction)]
-        own = None if s["cone"] == "pixel" else torch.tensor(cone)
+        vectors = [torch.from_numpy(part) for part in (origin, direction)]
+        cone_tensor = None if s["cone"] == "pixel" else torch.tensor(cone)
         limits = torch.tensor(ends, dtype=torch.float64)
-        return gv.CustomCamera.from_directions(*given, cone=own, range=limits)
+        return gv.CustomCamera.from_directions(*vectors, cone=cone_tensor, range=limits)
     count = width * height
     columns = {
         "origin": origin.reshape(-1, 3),
@@ -477,7 +477,7 @@ def clip_of(s: Settings) -> gv.Clip:
     )
     matrix[:3] *= scale
     matrix[:3, 3] += middle
-    what: dict[str, Any] = {
+    args: dict[str, Any] = {
         "planes": {"planes": [plane(0, 0, -1, 0.1), plane(1, 0.5, 0.2, 0.2)]},
         "box": {"boxes": [corners(-0.3, 0.25)]},
         "boxes": {"boxes": [corners(-0.4, -0.05), corners(0.05, 0.4), corners(-0.1, 0.1)]},
@@ -485,7 +485,7 @@ def clip_of(s: Settings) -> gv.Clip:
         "without": {"without": [corners(-0.2, 0.2), corners(0.1, 0.6)]},
     }[s["clip"]]
     opacity, light = s["cap"]
-    return gv.Clip(**what, frame=s["clip_in"], caps=s["caps"], cap_opacity=opacity, cap_light=light)
+    return gv.Clip(**args, frame=s["clip_in"], caps=s["caps"], cap_opacity=opacity, cap_light=light)
 
 
 def pixels_of(s: Settings) -> tuple[int, ...]:
@@ -499,13 +499,13 @@ def pixels_of(s: Settings) -> tuple[int, ...]:
 def layer_of(s: Settings) -> gv.Layer:
     low, high = box_of(s)
     shape, side = pixels_of(s), float((high - low).max())
-    found = numbers(10 * s["seed"] + 4, *shape, 5)
-    depth = (s["away"] * found[..., 3:4] + 0.2) * side
-    depth[found[..., 4:] > 0.7] = math.inf
+    draws = numbers(10 * s["seed"] + 4, *shape, 5)
+    depth = (s["away"] * draws[..., 3:4] + 0.2) * side
+    depth[draws[..., 4:] > 0.7] = math.inf
     alpha = None
     if s["layer"] == "translucent":
-        alpha = torch.from_numpy(found[..., 4:].astype(np.float32))
-    color = torch.from_numpy(found[..., :3].astype(np.float32))
+        alpha = torch.from_numpy(draws[..., 4:].astype(np.float32))
+    color = torch.from_numpy(draws[..., :3].astype(np.float32))
     return gv.Layer(color, torch.from_numpy(depth.astype(np.float32)), alpha)
 
 
@@ -513,37 +513,37 @@ def options_of(s: Settings) -> dict[str, Any]:
     """Returns fields of `gv.RenderOptions`."""
     low, high = box_of(s)
     side = float((high - low).max())
-    found: dict[str, Any] = {n: s[n] for n in ("lod", "step", "stop_alpha", "depth_alpha")}
-    found |= {"cone_scale": s["cone_scale"], "component": s["component"]}
-    found |= {"dtype": getattr(torch, s["dtype"]), "channel": "value"}
+    fields: dict[str, Any] = {n: s[n] for n in ("lod", "step", "stop_alpha", "depth_alpha")}
+    fields |= {"cone_scale": s["cone_scale"], "component": s["component"]}
+    fields |= {"dtype": getattr(torch, s["dtype"]), "channel": "value"}
     if "clip" in s:
-        found["clip"] = clip_of(s)
+        fields["clip"] = clip_of(s)
     if "lens" in s:
         aperture, focus, frame = s["lens"]
-        unit_ = 1.0 if frame == "box" else side
-        found["lens"] = gv.ThinLens(aperture=aperture * unit_, focus=focus * unit_, frame=frame)
+        scale = 1.0 if frame == "box" else side
+        fields["lens"] = gv.ThinLens(aperture=aperture * scale, focus=focus * scale, frame=frame)
     if "lighting" in s:
         cones = {"shadow_cones": 3, "shadows": 0.8}
-        few = {"cones": 2 + s["seed"] % 4}  # what the cones read must fit in small pools
-        light = few | {"occlusion": 0.8}
-        around = few | {"indirect": 0.7, "ambient": (0.5, 0.6, 0.7)}
-        what = {
+        cone_count = {"cones": 2 + s["seed"] % 4}  # what the cones read must fit in small pools
+        occlusion = cone_count | {"occlusion": 0.8}
+        bounce = cone_count | {"indirect": 0.7, "ambient": (0.5, 0.6, 0.7)}
+        arguments = {
             "shadows": {},
             "cones": cones,
-            "occlusion": light,
-            "indirect": around,
-            "everything": cones | light | around,
+            "occlusion": occlusion,
+            "indirect": bounce,
+            "everything": cones | occlusion | bounce,
         }[s["lighting"]]
         lights = [light_of(s, name) for name in s["lamps"]] or None
-        found["lighting"] = gv.Lighting(lights=lights, reach=s["reach"], frame="box", **what)
+        fields["lighting"] = gv.Lighting(lights=lights, reach=s["reach"], frame="box", **arguments)
     if "layer" in s:
-        found["layer"] = layer_of(s)
+        fields["layer"] = layer_of(s)
     image = numbers(10 * s["seed"] + 5, *pixels_of(s), 3).astype(np.float32)
-    found["background"] = {
+    fields["background"] = {
         "black": (0.0, 0.0, 0.0),
         "color": (0.1, 0.5, 0.9),
         "gradient": gv.Gradient((0.2, 0.4, 1.0), (1.0, 0.5, 0.0)),
         "image": torch.from_numpy(image),
         "none": None,
     }[s.get("background", "black")]
-    return found
+    return fields

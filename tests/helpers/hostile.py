@@ -20,30 +20,30 @@ def tiff(tags: Sequence[Tag] = (), *, following: int = 0, pixels: int = 64) -> b
     """Returns a TIFF of 8 x 8 bytes, with some of its tags replaced; `following` is the offset that
     it claims for its next page.
     """
-    known: dict[int, Tag] = {
+    merged: dict[int, Tag] = {
         number: (number, 3, 1, value)
         for number, value in ((256, 8), (257, 8), (258, 8), (259, 1), (262, 1), (277, 1), (278, 8))
     }
-    known[279] = (279, 4, 1, pixels)
-    known |= {tag[0]: tag for tag in tags}
-    known.setdefault(273, (273, 4, 1, 0))
-    begin = 8 + 2 + 12 * len(known) + 4
-    entries, after = b"", b""
-    for number, kind, count, value in sorted(known.values()):
+    merged[279] = (279, 4, 1, pixels)
+    merged |= {tag[0]: tag for tag in tags}
+    merged.setdefault(273, (273, 4, 1, 0))
+    data_begin = 8 + 2 + 12 * len(merged) + 4
+    entries, data = b"", b""
+    for number, code, count, value in sorted(merged.values()):
         if isinstance(value, bytes):
-            place = struct.pack("<I", begin + len(after))
-            after += value + bytes(len(value) % 2)
+            value_bytes = struct.pack("<I", data_begin + len(data))
+            data += value + bytes(len(value) % 2)
         else:
-            place = struct.pack("<I", value)
-        entries += struct.pack("<HHI", number, kind, count) + place
-    at = struct.pack("<HHII", 273, 4, 1, 0)
-    entries = entries.replace(at, struct.pack("<HHII", 273, 4, 1, begin + len(after)))
-    head = b"II*\0" + struct.pack("<IH", 8, len(known)) + entries + struct.pack("<I", following)
-    return head + after + bytes(range(pixels))
+            value_bytes = struct.pack("<I", value)
+        entries += struct.pack("<HHI", number, code, count) + value_bytes
+    entry = struct.pack("<HHII", 273, 4, 1, 0)
+    entries = entries.replace(entry, struct.pack("<HHII", 273, 4, 1, data_begin + len(data)))
+    head = b"II*\0" + struct.pack("<IH", 8, len(merged)) + entries + struct.pack("<I", following)
+    return head + data + bytes(range(pixels))
 
 
-def text(words: str) -> Tag:
-    content = words.encode() + b"\0"
+def text(description: str) -> Tag:
+    content = description.encode() + b"\0"
     return (270, 2, len(content), content)
 
 
@@ -91,16 +91,16 @@ def zeros(megabytes: int) -> bytes:
 
 def tiff_files() -> dict[str, bytes]:
     """Returns by name TIFFs whose tags, pages or descriptions claim too much data."""
-    told = "ImageJ=1.53k\nimages={0}\nslices={0}\nhyperstack=true\n"
+    description = "ImageJ=1.53k\nimages={0}\nslices={0}\nhyperstack=true\n"
     return {
         "cycle.tif": tiff(following=8),
         "ome_slices.tif": ome(10**9),
         "ome_times.tif": ome(10**6, 10**6),
         "ome_planes.tif": ome(4, 1, f'<TiffData IFD="0" PlaneCount="{10**9}"/>'),
         "ome_planes_2.tif": ome(10**7, 1, f'<TiffData IFD="0" PlaneCount="{10**7}"/>'),
-        "imagej.tif": tiff([text(told.format(10**9))]),
-        "imagej_packed.tif": tiff([text(told.format(10**8)), (259, 3, 1, 8)]),
-        "imagej_few.tif": tiff([text(told.format(10**7))]),
+        "imagej.tif": tiff([text(description.format(10**9))]),
+        "imagej_packed.tif": tiff([text(description.format(10**8)), (259, 3, 1, 8)]),
+        "imagej_few.tif": tiff([text(description.format(10**7))]),
         "shaped.tif": tiff([text('{"shape": [1000000000, 1000000, 8, 8]}')]),
         "shaped_few.tif": tiff([text('{"shape": [10000000, 8, 8]}')]),
         "text.tif": tiff([(270, 2, 2**32 - 1, 8)]),

@@ -11,15 +11,15 @@ WIDE = 2**24 + 1  # float32 rounds it to 2^24
 SPACING = (1.0, 0.8, 1.3)
 
 
-def numbers(*shape: int, most: int = 5, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, most, shape)
+def numbers(*shape: int, count: int = 5, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, count, shape)
 
 
 def cells(shape, count: int, seed: int = 0, dtype=np.int64) -> np.ndarray:
     """Returns for each voxel the index of the nearest of `count` points: connected labels."""
     grid = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
-    places = np.random.default_rng(seed).random((count, 3)) * shape
-    return ((grid[..., None, :] - places) ** 2).sum(-1).argmin(-1).astype(dtype)
+    positions = np.random.default_rng(seed).random((count, 3)) * shape
+    return ((grid[..., None, :] - positions) ** 2).sum(-1).argmin(-1).astype(dtype)
 
 
 def kept(volume: gv.Volume) -> np.ndarray:

@@ -11,13 +11,13 @@ import gvtorch as gv
 BLUE = (0.1, 0.2, 0.8)
 
 
-def screen(view: gv.Camera, place: torch.Tensor, normal: tuple[float, float, float]):
-    """Returns (h, w, 1) distances at which the rays of a camera meet the plane through `place`;
+def plane_distances(view: gv.Camera, point: torch.Tensor, normal: tuple[float, float, float]):
+    """Returns (h, w, 1) distances at which the rays of a camera meet the plane through `point`;
     +inf where they do not.
     """
     rays, normal = view.rays(), torch.tensor(normal, dtype=torch.float64)
-    along = ((place - rays.origin) @ normal) / (rays.direction @ normal)
-    return torch.where(along > 0, along, math.inf).reshape(view.height, view.width, 1)
+    distance = ((point - rays.origin) @ normal) / (rays.direction @ normal)
+    return torch.where(distance > 0, distance, math.inf).reshape(view.height, view.width, 1)
 
 
 def layer_of(depth: torch.Tensor, alpha: torch.Tensor | None = None, color=BLUE) -> gv.Layer:
@@ -28,8 +28,8 @@ def layer_of(depth: torch.Tensor, alpha: torch.Tensor | None = None, color=BLUE)
 
 def ball(radius: float, size: int) -> gv.Volume:
     """Returns the signed distance to a sphere at the origin, positive inside; voxels are 1 wide."""
-    place = torch.arange(size) - (size - 1) / 2
-    z, y, x = torch.meshgrid(place, place, place, indexing="ij")
+    axis = torch.arange(size) - (size - 1) / 2
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     origin = (-(size - 1) / 2,) * 3
     return gv.Volume(radius - (x * x + y * y + z * z).sqrt(), origin=origin)
 
@@ -43,21 +43,21 @@ def seam_error(picture: gv.Picture, view: gv.Camera, height: float, radius: floa
     where its ray meets the plane inside of it.
     """
     rays = view.rays()
-    along = (height - rays.origin[:, 2]) / rays.direction[:, 2]
-    place = rays.origin + along[:, None] * rays.direction
+    distance = (height - rays.origin[:, 2]) / rays.direction[:, 2]
+    hit = rays.origin + distance[:, None] * rays.direction
     ring = math.sqrt(radius**2 - height**2)
-    from_axis = place[:, :2].norm(dim=1)
+    from_axis = hit[:, :2].norm(dim=1)
     red, blue = picture.color.cpu().double().reshape(-1, 3)[:, (0, 2)].unbind(1)
     wrong = (red > blue) != (from_axis < ring)
     # The nearest point of the circle, in pixels.
-    edge = place.clone()
+    edge = hit.clone()
     edge[:, :2] *= (ring / from_axis)[:, None]
     matrix = view.Ks[0] @ view.viewmats[0, :3]
     pixels = []
-    for point in (place, edge):
-        flat = torch.cat((point, torch.ones_like(point[:, :1])), 1) @ matrix.T
-        pixels.append(flat[:, :2] / flat[:, 2:])
+    for point in (hit, edge):
+        homogeneous = torch.cat((point, torch.ones_like(point[:, :1])), 1) @ matrix.T
+        pixels.append(homogeneous[:, :2] / homogeneous[:, 2:])
     inside = int((from_axis < ring).sum())
-    assert inside > 500 and inside < 0.8 * len(place), "the test must see something"
-    off = (pixels[0] - pixels[1]).norm(dim=1)[wrong]
-    return float(off.max()) if len(off) else 0.0
+    assert inside > 500 and inside < 0.8 * len(hit), "the test must see something"
+    errors = (pixels[0] - pixels[1]).norm(dim=1)[wrong]
+    return float(errors.max()) if len(errors) else 0.0

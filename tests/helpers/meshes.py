@@ -31,13 +31,13 @@ def torus(ring: float = 1.0, tube: float = 0.4, counts: tuple[int, int] = (96, 4
     """Returns a torus around z; its vertices lie on the exact surface."""
     a, b = (np.arange(n) * 2 * math.pi / n for n in counts)
     a, b = np.meshgrid(a, b, indexing="ij")
-    wide = ring + tube * np.cos(b)
-    points = np.stack((wide * np.cos(a), wide * np.sin(a), tube * np.sin(b)), -1)
+    rho = ring + tube * np.cos(b)
+    points = np.stack((rho * np.cos(a), rho * np.sin(a), tube * np.sin(b)), -1)
     next_a, next_b = np.roll(points, -1, 0), np.roll(points, -1, 1)
-    both = np.roll(next_a, -1, 1)
-    first = np.stack((points, next_a, both), 2).reshape(-1, 3, 3)
+    next_both = np.roll(next_a, -1, 1)
+    first = np.stack((points, next_a, next_both), 2).reshape(-1, 3, 3)
     return of_corners(
-        np.concatenate((first, np.stack((points, both, next_b), 2).reshape(-1, 3, 3)))
+        np.concatenate((first, np.stack((points, next_both, next_b), 2).reshape(-1, 3, 3)))
     )
 
 
@@ -58,7 +58,7 @@ def sheet(count: int = 1, size: float = 1.0) -> gv.Mesh:
     points = grid[:, None, None] * u + grid[None, :, None] * v
     a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
     triangles = (np.stack((a, b, c), 2), np.stack((a, c, d), 2))
-    return of_corners(np.concatenate([one.reshape(-1, 3, 3) for one in triangles]))
+    return of_corners(np.concatenate([part.reshape(-1, 3, 3) for part in triangles]))
 
 
 def of_corners(corners: np.ndarray) -> gv.Mesh:
@@ -84,7 +84,7 @@ def area(mesh: gv.Mesh) -> float:
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
-def parts(mesh: gv.Mesh) -> list[gv.Mesh]:
+def components(mesh: gv.Mesh) -> list[gv.Mesh]:
     """Returns the components that are connected by corners at equal positions."""
     _, corner = np.unique(mesh.corners.reshape(-1, 3), axis=0, return_inverse=True)
     corner = corner.reshape(-1, 3)
@@ -92,5 +92,5 @@ def parts(mesh: gv.Mesh) -> list[gv.Mesh]:
     while not np.array_equal(label, before):
         before = label.copy()
         np.minimum.at(label, corner, label[corner].min(1, keepdims=True))
-    found = label[corner[:, 0]]
-    return [mesh.only(np.flatnonzero(found == one)) for one in np.unique(found)]
+    labels = label[corner[:, 0]]
+    return [mesh.only(np.flatnonzero(labels == component)) for component in np.unique(labels)]

@@ -17,8 +17,8 @@ from torch import Tensor
 import gvtorch as gv
 from helpers import TESTS
 from helpers.rays import camera_rays
-from helpers.traces import run
-from helpers.trees import forget
+from helpers.traces import trace
+from helpers.trees import with_holes
 
 INSTRUCTIONS = ["baseline", "avx2", "avx512"]
 
@@ -78,7 +78,7 @@ def scene(branching: int = 2) -> gv.N3Tree:
     )
 
 
-def cut(rays: gv.Rays) -> gv.Rays:
+def cut_rays(rays: gv.Rays) -> gv.Rays:
     """Returns rays that begin and end within the box, each elsewhere, with reduced light."""
     first = torch.linspace(30.0, 45.0, len(rays.origin), dtype=torch.float64)
     limits = torch.stack((first, first + 17.3), 1)
@@ -87,17 +87,17 @@ def cut(rays: gv.Rays) -> gv.Rays:
 
 def shaded(shader: gv.Shader, backend: str, branching: int = 2) -> list[Tensor]:
     """Returns everything that a shader's traces write."""
-    tree, found = scene(branching), []
-    holes = forget(tree, 0.3, 5)
-    for which, size, options in (
+    tree, results = scene(branching), []
+    holes = with_holes(tree, 0.3, 5)
+    for traced_tree, size, options in (
         (tree, 21, {}),
         (tree, 5, {}),  # cones as wide as several voxels: levels blend
         (tree, 11, {"lod": "finest", "step": 1.3}),
         (tree, 11, {"stop_alpha": 0.6, "depth_alpha": 0.5}),
         (holes, 14, {}),
     ):
-        rays = camera_rays(which, size, distance=1.5)
-        for some in (rays, cut(rays)):
-            hits, marks = run(which, backend, some, shader, **options)
-            found += [*hits.values(), *marks.values()]
-    return found
+        rays = camera_rays(traced_tree, size, distance=1.5)
+        for traced_rays in (rays, cut_rays(rays)):
+            hits, marks = trace(traced_tree, backend, traced_rays, shader, **options)
+            results += [*hits.values(), *marks.values()]
+    return results

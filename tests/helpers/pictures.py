@@ -9,15 +9,15 @@ import gvtorch as gv
 GRAY = gv.TransferFunction.preset("gray", 0, 1)
 
 
-PARTS = ("color", "alpha", "depth", "samples")
+FIELDS = ("color", "alpha", "depth", "samples")
 
 
-def camera(size=48, **place) -> gv.Camera:
-    return gv.Camera.orbit(**{"azimuth": 30, "elevation": 20, **place}, width=size, height=size)
+def camera(size=48, **options) -> gv.Camera:
+    return gv.Camera.orbit(**{"azimuth": 30, "elevation": 20, **options}, width=size, height=size)
 
 
 def assert_same_picture(actual: gv.Picture, expected: gv.Picture) -> None:
-    for name in PARTS:
+    for name in FIELDS:
         assert torch.equal(getattr(actual, name), getattr(expected, name)), name
     assert expected.alpha.max() > 0.3, "the test must see something"
 

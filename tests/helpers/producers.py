@@ -35,9 +35,9 @@ class Sponge(gv.Producer):
 
     def classify(self, nodes):
         self.classified += len(nodes)
-        middle = (nodes.loc[:, :3] % 3 == 1).sum(1)
+        middle_axes = (nodes.loc[:, :3] % 3 == 1).sum(1)
         whole = torch.where(nodes.depth == 0, gv.Region.DATA, gv.Region.ALIAS)
-        kind = torch.where((middle >= 2) & (nodes.depth > 0), gv.Region.EMPTY, whole)
+        kind = torch.where((middle_axes >= 2) & (nodes.depth > 0), gv.Region.EMPTY, whole)
         return gv.Regions(kind=kind, alias=torch.zeros_like(nodes.loc))
 
     def fill(self, nodes):
@@ -47,7 +47,7 @@ class Sponge(gv.Producer):
 
 
 class Held(gv.VolumeProducer):
-    """Holds its answers back until `go`, which gives them in random order."""
+    """Holds its answers back until `release`, which gives them in random order."""
 
     def __init__(self, volume, seed=0):
         super().__init__(volume)
@@ -59,7 +59,7 @@ class Held(gv.VolumeProducer):
         self.held.append((future := Future(), answer, nodes))
         return future
 
-    def go(self):
+    def release(self):
         self.random.shuffle(self.held)
         for future, answer, nodes in self.held:
             future.set_result(answer(nodes))
@@ -75,13 +75,13 @@ class Held(gv.VolumeProducer):
 class Late(gv.VolumeProducer):
     """Answers from threads, after random delays, so in any order."""
 
-    def __init__(self, volume: gv.Volume, seed: int = 0, most: float = 0.004) -> None:
+    def __init__(self, volume: gv.Volume, seed: int = 0, max_delay: float = 0.004) -> None:
         super().__init__(volume)
-        self.random, self.most = random.Random(seed), most
+        self.random, self.max_delay = random.Random(seed), max_delay
         self.threads = ThreadPoolExecutor(6)
 
     def later(self, answer, nodes: gv.Nodes) -> Future:
-        delay = self.random.uniform(0, self.most)
+        delay = self.random.uniform(0, self.max_delay)
 
         def work():
             time.sleep(delay)
@@ -108,13 +108,13 @@ class Checked(gv.Engine):
         nodes, bricks = self.cache.nodes, self.cache.bricks
         roots = len(self.trees)
         locked = nodes.brick_tn[:roots, 0].clone()
-        before = [bricks.owner_b.clone(), nodes.parent_t.clone()]
-        used_b = (bricks.stamp_b == self.frames) & (before[0] >= 0)
-        used_t = (nodes.stamp_t == self.frames) & (before[1] >= 0)
+        owners = [bricks.owner_b.clone(), nodes.parent_t.clone()]
+        used_b = (bricks.stamp_b == self.frames) & (owners[0] >= 0)
+        used_t = (nodes.stamp_t == self.frames) & (owners[1] >= 0)
         picture, stats = super().frame(*args, **options)
         self.validate()
-        assert torch.equal(bricks.owner_b[used_b], before[0][used_b]), "a brick in use was taken"
-        assert torch.equal(nodes.parent_t[used_t], before[1][used_t]), "a tile in use was taken"
+        assert torch.equal(bricks.owner_b[used_b], owners[0][used_b]), "a brick in use was taken"
+        assert torch.equal(nodes.parent_t[used_t], owners[1][used_t]), "a tile in use was taken"
         assert torch.equal(nodes.brick_tn[:roots, 0], locked), "a root was touched"
         assert stats.tiles_used == int((nodes.stamp_t == self.frames).sum())
         assert stats.bricks_used == int((bricks.stamp_b == self.frames).sum())

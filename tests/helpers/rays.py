@@ -14,19 +14,19 @@ def rays_along(
     origin: Tensor, direction: Tensor | Sequence[float], cone: float = 0.0, device: str = "cpu"
 ) -> gv.Rays:
     """Returns endless rays from `origin` (r, 3), along one direction or one each, of one width."""
-    flat = torch.zeros((len(origin), 2), dtype=torch.float64)
+    zeros = torch.zeros((len(origin), 2), dtype=torch.float64)
     unit = torch.nn.functional.normalize(torch.as_tensor(direction).double(), dim=-1)
     rays = gv.Rays(
         origin=origin,
         direction=unit.expand_as(origin).contiguous(),
-        cone=flat + torch.tensor([cone, 0.0]),
-        range=flat + torch.tensor([0.0, torch.inf]),
+        cone=zeros + torch.tensor([cone, 0.0]),
+        range=zeros + torch.tensor([0.0, torch.inf]),
     )
     return rays.to(device)
 
 
-def camera_rays(tree, size=24, **place):
-    return gv.Camera.orbit(width=size, height=size, **place).placed(tree.box).rays()
+def camera_rays(tree, size=24, **options):
+    return gv.Camera.orbit(width=size, height=size, **options).placed(tree.box).rays()
 
 
 def world_rays(tree_box, count: int, device) -> tuple[torch.Tensor, ...]:

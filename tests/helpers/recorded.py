@@ -17,25 +17,25 @@ from gvtorch.engine.host_frame import HostFrame
 from gvtorch.engine.setup import make_recorded_frame
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
-LOOK = gv.TransferFunction.from_points(
+TRANSFER = gv.TransferFunction.from_points(
     [(0, 0), (0.4, 0.9)], [(0.4, 0.1, 0.2, 0.7), (1, 1, 0.8, 0.4)], reference=0.1
 )
 
 
 class Ball(gv.Producer):
-    """A ball with bands; nodes outside are EMPTY: from `classify`, or with `kinds` from `fill`."""
+    """A ball with bands. `classify`, or with `fill_kinds` `fill`, makes nodes outside EMPTY."""
 
     on_device = True
 
-    def __init__(self, extent: int = 256, branching: int = 2, kinds: bool = False) -> None:
+    def __init__(self, extent: int = 256, branching: int = 2, fill_kinds: bool = False) -> None:
         super().__init__(extent, box=((-1, -1, -1), (1, 1, 1)), branching=branching)
-        self.kinds, self.asked = kinds, []
+        self.fill_kinds, self.batch_sizes = fill_kinds, []
         self.register_buffer("bands", torch.tensor([6.0, 28.0, 4.0]))
         self.register_buffer("spoiled", torch.zeros(()))  # above 0: bricks near here hold NaN
 
     def classify(self, nodes):
-        self.asked.append(len(nodes))
-        if self.kinds:
+        self.batch_sizes.append(len(nodes))
+        if self.fill_kinds:
             return torch.full_like(nodes.depth, gv.Region.DATA)
         outside = nodes.center.norm(dim=1) - nodes.radius > 0.9
         return torch.where(outside, gv.Region.EMPTY, gv.Region.DATA)
@@ -44,9 +44,9 @@ class Ball(gv.Producer):
         gap = 0.9 - nodes.positions.norm(dim=-1, keepdim=True)
         inside = (0.5 + gap / nodes.voxel_size.float()[:, None, None, None, :1]).clamp(0, 1)
         value = inside * (0.7 + 0.3 * (nodes.positions * self.bands).sum(-1, keepdim=True).sin())
-        near = (nodes.center[:, 0] > 0.3) & (nodes.depth > 2) & (self.spoiled > 0)
-        value = torch.where(near[:, None, None, None, None], torch.nan, value)
-        if not self.kinds:
+        spoiled_nodes = (nodes.center[:, 0] > 0.3) & (nodes.depth > 2) & (self.spoiled > 0)
+        value = torch.where(spoiled_nodes[:, None, None, None, None], torch.nan, value)
+        if not self.fill_kinds:
             return {"value": value}
         kind = torch.where((value == 0).flatten(1).all(1), gv.Region.EMPTY, gv.Region.DATA)
         return gv.Bricks(data={"value": value}, kind=kind)
@@ -63,32 +63,32 @@ class Frames:
         self,
         engine: gv.Engine,
         camera: gv.Camera,
-        look: gv.Shader,
+        shader: gv.Shader,
         batch: int,
         look_ahead: float = 0,
         fit: bool = False,
     ) -> None:
         self.engine, self.batch = engine, batch
-        self.view = engine.view("test", camera, look, {})
+        self.view = engine.view("test", camera, shader, {})
         self.ahead = LookAhead(self.view, look_ahead) if look_ahead else None
         self.look_from(camera)
-        made = make_recorded_frame(engine.production, batch, fit)
-        assert made is not None
-        self.served, self.number = made, -1
-        if isinstance(made, HostFrame):
-            engine.recorded.append(made)
+        frame = make_recorded_frame(engine.production, batch, fit)
+        assert frame is not None
+        self.served, self.number = frame, -1
+        if isinstance(frame, HostFrame):
+            engine.recorded.append(frame)
 
     def look_from(self, camera: gv.Camera) -> None:
         self.camera = camera.placed(self.view.box)
 
-    def whole(self, most: int = 200, pause: float = 0.0) -> tuple[gv.Hits, gv.FrameStats]:
+    def whole(self, max_frames: int = 200, pause: float = 0.0) -> tuple[gv.Hits, gv.FrameStats]:
         """Draws frames, with pauses in seconds, until one misses nothing; returns that one."""
-        for _ in range(most):
+        for _ in range(max_frames):
             hits, stats = self.frame()
             time.sleep(pause)
             if stats.converged:
                 return hits, stats
-        raise AssertionError(f"not whole within {most} frames: {stats.requests}")
+        raise AssertionError(f"not whole within {max_frames} frames: {stats.requests}")
 
     def frame(self) -> tuple[gv.Hits, gv.FrameStats]:
         with self.engine.new_frame(self.view.options) as stats:
@@ -120,9 +120,9 @@ class Frames:
 Replay = Callable[[gv.Camera], tuple[Tensor, gv.FrameStats]]
 
 
-def stepped(engine: gv.Engine, camera: gv.Camera, look: gv.Shader, **options: Any) -> Replay:
+def stepped(engine: gv.Engine, camera: gv.Camera, shader: gv.Shader, **options: Any) -> Replay:
     """Returns a function that draws a frame by `Frames`: colour (r, 3) and statistics."""
-    frames = Frames(engine, camera, look, **options)
+    frames = Frames(engine, camera, shader, **options)
 
     def step(camera: gv.Camera) -> tuple[Tensor, gv.FrameStats]:
         frames.look_from(camera)
@@ -132,11 +132,11 @@ def stepped(engine: gv.Engine, camera: gv.Camera, look: gv.Shader, **options: An
     return step
 
 
-def recorded(engine: gv.Engine, camera: gv.Camera, look: gv.Shader, **options: Any) -> Replay:
+def recorded(engine: gv.Engine, camera: gv.Camera, shader: gv.Shader, **options: Any) -> Replay:
     """As `stepped`, but on CUDA by a captured graph, whose replays overwrite the colour."""
     if engine.device.type != "cuda":
-        return stepped(engine, camera, look, **options)
-    graph = engine.capture(camera, look, **options)
+        return stepped(engine, camera, shader, **options)
+    graph = engine.capture(camera, shader, **options)
 
     def replay(camera: gv.Camera) -> tuple[Tensor, gv.FrameStats]:
         picture, stats = graph.replay(camera)

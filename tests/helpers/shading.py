@@ -22,37 +22,37 @@ def grid(extent, spacing=(1.0, 1.0, 1.0)) -> np.ndarray:
     return np.stack((x, y, z), -1) * np.array(spacing)
 
 
-def ball(backend: str, spacing=SPACING, brick_size: int = 4, **more: gv.Volume) -> gv.N3Tree:
+def ball(backend: str, spacing=SPACING, brick_size: int = 4, **extra: gv.Volume) -> gv.N3Tree:
     """Returns a tree of the signed distance to a sphere, float32, in many small bricks."""
-    place = grid((33, 39, 27), spacing)
-    distance = np.linalg.norm(place - CENTRE, axis=-1) - RADIUS
+    positions = grid((33, 39, 27), spacing)
+    distance = np.linalg.norm(positions - CENTRE, axis=-1) - RADIUS
     volume = gv.Volume(distance.astype(np.float32), spacing)
-    channels = {"value": volume, **more}
+    channels = {"value": volume, **extra}
     return gv.N3Tree.from_volume(channels, brick_size, device=DEVICES[backend])
 
 
 def parallel(count: int, reach: float, device: str, direction=(0.3, -0.2, 1.0)) -> gv.Rays:
     """Returns parallel rays through a disc around the sphere's centre."""
-    along = torch.tensor(direction, dtype=torch.float64)
-    along = along / along.norm()
-    right = torch.linalg.cross(along, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+    axis = torch.tensor(direction, dtype=torch.float64)
+    axis = axis / axis.norm()
+    right = torch.linalg.cross(axis, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
     right = right / right.norm()
-    up = torch.linalg.cross(right, along)
+    up = torch.linalg.cross(right, axis)
     a, b = torch.meshgrid(
         *(torch.linspace(-reach, reach, count).double() for _ in "ab"), indexing="ij"
     )
     keep = a**2 + b**2 < reach**2
-    places = torch.from_numpy(CENTRE) + a[keep][:, None] * right + b[keep][:, None] * up
-    return rays_along(places - 60 * along, along, device=device)
+    points = torch.from_numpy(CENTRE) + a[keep][:, None] * right + b[keep][:, None] * up
+    return rays_along(points - 60 * axis, axis, device=device)
 
 
 def sphere(rays: gv.Rays, radius: float = RADIUS) -> tuple[np.ndarray, np.ndarray]:
     """Returns the distance to the sphere's near side, and the outward normals there."""
-    origin, along = rays.origin.cpu().numpy(), rays.direction.cpu().numpy()
-    b = ((origin - CENTRE) * along).sum(1)
+    origin, direction = rays.origin.cpu().numpy(), rays.direction.cpu().numpy()
+    b = ((origin - CENTRE) * direction).sum(1)
     c = ((origin - CENTRE) ** 2).sum(1) - radius**2
     t = -b - np.sqrt(b**2 - c)
-    return t, (origin + t[:, None] * along - CENTRE) / radius
+    return t, (origin + t[:, None] * direction - CENTRE) / radius
 
 
 def phong(normal, to_light, eye, base, light, ambient, diffuse, specular, shininess):

@@ -18,10 +18,10 @@ def np_sphere(p, radius=0.7):
 
 def np_box(p, size=(1.0, 0.6, 0.8), round=0.1):
     """Inside, by the nearest face; outside, by the nearest point of the inner box."""
-    half = np.array(size) / 2 - round
-    nearest = np.clip(p, -half, half)
+    half_side = np.array(size) / 2 - round
+    nearest = np.clip(p, -half_side, half_side)
     outside = np.sqrt(((p - nearest) ** 2).sum(-1))
-    inside = (np.abs(p) - half).max(-1)
+    inside = (np.abs(p) - half_side).max(-1)
     return np.where(outside > 0, outside, inside) - round
 
 
@@ -71,11 +71,11 @@ def np_square_ring(p, radius=0.6):
 
 def np_repeated(p, counts=(4, 1, 0)):
     """By the nearest of all copies."""
-    found = np.full(len(p), np.inf)
+    distance = np.full(len(p), np.inf)
     for x in range(-counts[0], counts[0] + 1):
         for y in range(-counts[1], counts[1] + 1):
-            found = np.minimum(found, np_capsule(p - np.array((1.5 * x, 1.1 * y, 0))))
-    return found
+            distance = np.minimum(distance, np_capsule(p - np.array((1.5 * x, 1.1 * y, 0))))
+    return distance
 
 
 def np_twisted(p, rate=1.5):
@@ -87,12 +87,12 @@ def np_twisted(p, rate=1.5):
 
 def np_sponge(p, levels=3):
     """The maximum of a cube and of negated bars along all axes, of all sizes."""
-    found = np_box(p, (1, 1, 1), 0)
+    distance = np_box(p, (1, 1, 1), 0)
     for cell in 3.0 ** -np.arange(levels):
         x, y, z = np.abs((p + cell / 2) % cell - cell / 2).T
-        for one, other in ((x, y), (y, z), (z, x)):
-            found = np.maximum(found, cell / 6 - np.maximum(one, other))
-    return found
+        for a, b in ((x, y), (y, z), (z, x)):
+            distance = np.maximum(distance, cell / 6 - np.maximum(a, b))
+    return distance
 
 
 def np_turned(p, degrees=40):
@@ -169,39 +169,39 @@ SHAPES = {
 
 def np_escape(p, step, constant, iterations, bailout, estimate):
     """Iterates one point at a time; -1 where it does not escape."""
-    found = np.full(len(p), -1.0)
+    values = np.full(len(p), -1.0)
     for row, point in enumerate(p):
-        z, apart, c = point, 1.0, point if constant is None else np.array(constant)
-        for turn in range(iterations + 1):
+        z, slope, c = point, 1.0, point if constant is None else np.array(constant)
+        for iteration in range(iterations + 1):
             if np.linalg.norm(z) > bailout:
-                found[row] = estimate(np.linalg.norm(z), apart)
+                values[row] = estimate(np.linalg.norm(z), slope)
                 break
-            if turn < iterations:
-                z, grown = step(z)
-                z, apart = z + c, grown * apart + (constant is None)
-    return found
+            if iteration < iterations:
+                z, growth = step(z)
+                z, slope = z + c, growth * slope + (constant is None)
+    return values
 
 
 def np_power(z, n):
     """White and Nylander's formula, with the angle from the z axis."""
-    r, polar, around = (
+    r, polar, azimuth = (
         np.linalg.norm(z),
         np.arctan2(np.hypot(z[0], z[1]), z[2]),
         np.arctan2(z[1], z[0]),
     )
-    turned = np.sin(n * polar) * np.cos(n * around), np.sin(n * polar) * np.sin(n * around)
+    turned = np.sin(n * polar) * np.cos(n * azimuth), np.sin(n * polar) * np.sin(n * azimuth)
     return r**n * np.array((*turned, np.cos(n * polar))), n * r ** (n - 1)
 
 
 def np_fold(z, scale):
     z = np.array([2 - v if v > 1 else -2 - v if v < -1 else v for v in z])
     r = np.linalg.norm(z)
-    grown = 4.0 if r < 0.5 else 1 / r**2 if r < 1 else 1.0
-    return scale * grown * z, abs(scale) * grown
+    growth = 4.0 if r < 0.5 else 1 / r**2 if r < 1 else 1.0
+    return scale * growth * z, abs(scale) * growth
 
 
-def np_log(r, apart):
-    return r * np.log(r) / (2 * apart)
+def np_log(r, slope):
+    return r * np.log(r) / (2 * slope)
 
 
 #: Name: the fractal, and its value by NumPy.
@@ -243,13 +243,13 @@ def random_boxes(count, seed=1):
     return random_points(count, 3.0, seed + 1), half * shape
 
 
-def inside(center, half, count, seed=3):
+def points_inside(center, half, count, seed=3):
     """Returns (k, count, 3) points of boxes: their corners, and random ones."""
     corners = torch.cartesian_prod(*(torch.tensor([-1.0, 1.0], dtype=torch.float64),) * 3)
     generator = torch.Generator().manual_seed(seed)
     others = 2 * torch.rand(len(center), count - 8, 3, generator=generator).double() - 1
-    at = torch.cat((corners.expand(len(center), 8, 3), others), 1)
-    return center[:, None] + half[:, None] * at
+    offsets = torch.cat((corners.expand(len(center), 8, 3), others), 1)
+    return center[:, None] + half[:, None] * offsets
 
 
 def nodes_of(producer, depth, brick_size=4, border=1):

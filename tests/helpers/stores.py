@@ -23,25 +23,25 @@ from gvtorch.pool.pyramid import round_to, volume_levels
 from .servers import WebServer
 
 
-def read(path: Path, **options) -> tuple[gv.Volume, list[str]]:
+def read_with_warnings(path: Path, **options) -> tuple[gv.Volume, list[str]]:
     """Reads a volume; returns it, and the warnings of reading it."""
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         volume = gv.read_volume(path, **options)
-    return volume, [str(one.message) for one in told]
+    return volume, [str(warning.message) for warning in caught]
 
 
 @contextmanager
 def stopped_at(monkeypatch: pytest.MonkeyPatch, number: int) -> Iterator[None]:
     """Stops conversions on disk within the block at the number-th shard, as by Ctrl-C."""
-    original, places = shard.write_shard, []
+    original, positions = shard.write_shard, []
 
-    def stop(job, level, place):
+    def stop(job, level, position):
         if "memory" not in job.root["driver"]:
-            places.append(place)
-            if len(places) == number:
+            positions.append(position)
+            if len(positions) == number:
                 raise KeyboardInterrupt
-        return original(job, level, place)
+        return original(job, level, position)
 
     with monkeypatch.context() as patch:
         patch.setattr(shard, "write_shard", stop)
@@ -59,13 +59,13 @@ def noise(shape: tuple[int, ...], dtype: str = "uint8", seed: int = 0) -> np.nda
     return data
 
 
-def block_of(level: np.ndarray, at: np.ndarray, block: int) -> np.ndarray:
+def block_of(level: np.ndarray, position: np.ndarray, block: int) -> np.ndarray:
     """Returns a block with its border, cut out of a whole level."""
-    places = [
+    indices = [
         np.arange(n * block - 1, (n + 1) * block + 1).clip(0, size - 1)
-        for n, size in zip(at, level.shape[:3], strict=True)
+        for n, size in zip(position, level.shape[:3], strict=True)
     ]
-    return level[np.ix_(*places)]
+    return level[np.ix_(*indices)]
 
 
 def assert_holds(store: Store, data: np.ndarray) -> None:
@@ -76,11 +76,11 @@ def assert_holds(store: Store, data: np.ndarray) -> None:
         values = level.values.numpy()
         assert store.level_extent(number) == values.shape[2::-1]
         assert np.array_equal(store.read_region(number, (0, 0, 0), values.shape[:3]), values)
-        places = np.array(list(np.ndindex(*store.block_grid(number))))
-        blocks, errors = store.read_blocks(number, places)
+        positions = np.array(list(np.ndindex(*store.block_grid(number))))
+        blocks, errors = store.read_blocks(number, positions)
         assert not errors
-        for block, at in zip(blocks, places, strict=True):
-            assert np.array_equal(block, block_of(values, at, store.block))
+        for block, position in zip(blocks, positions, strict=True):
+            assert np.array_equal(block, block_of(values, position, store.block))
         if store.has_blocks:
             cells = store.read_cells(number, (0, 0, 0), store.cell_grid(number))
             for index, expected in enumerate((level.nodes.low, level.nodes.high, level.nodes.mean)):
@@ -107,10 +107,10 @@ def write_foreign(
     for number, (array, scale) in enumerate(zip(arrays, scales, strict=True)):
         chunk = tuple(min(16, n) for n in array.shape)
         options = {"shards": tuple(4 * n for n in chunk)} if sharded else {}
-        made = group.create_array(
+        dataset = group.create_array(
             f"s{number}", shape=array.shape, dtype=array.dtype, chunks=chunk, **options
         )
-        made[...] = array
+        dataset[...] = array
         transforms = [{"type": "scale", "scale": scale}]
         datasets.append({"path": f"s{number}", "coordinateTransformations": transforms})
     kinds = {"t": "time", "c": "channel"}
@@ -132,12 +132,12 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         if "/c/" in self.path:
             time.sleep(self.delay)
         file = Path(self.translate_path(self.path))
-        wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
-        if wanted is None or not file.is_file():
+        byte_range = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
+        if byte_range is None or not file.is_file():
             super().do_GET()
             return
         content = file.read_bytes()
-        first, last = wanted.groups()
+        first, last = byte_range.groups()
         start = int(first) if first else len(content) - int(last)
         stop = int(last) + 1 if first and last else len(content)
         self.send_response(206)

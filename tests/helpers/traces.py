@@ -9,7 +9,7 @@ from gvtorch.ops import RayArguments, TraceArguments
 from gvtorch.tracing.tracer import Tracer
 from helpers import DEVICES
 from helpers.rays import camera_rays
-from helpers.trees import on
+from helpers.trees import copy_to
 
 SHADER = gv.TransferFunction.from_points(
     opacity=[(0, 0), (0.2, 0), (0.6, 0.4), (1, 1)],
@@ -17,10 +17,10 @@ SHADER = gv.TransferFunction.from_points(
 )
 
 
-def run(tree, backend, rays, shader=SHADER, **options):
+def trace(tree, backend, rays, shader=SHADER, **options):
     """Traces rays; returns hits and marks (everything `trace_rays` writes), moved to the CPU."""
     device = DEVICES[backend]
-    copy = on(tree, device)
+    copy = copy_to(tree, device)
     moved = rays.to(device)
     hits = gv.trace(copy, moved, shader, backend=backend, **options)
     result = {n: t.cpu() for n, t in vars(hits).items() if t is not None}
@@ -36,8 +36,8 @@ def assert_equal(tree, backend, rays, shader=SHADER, **options):
     """Asserts that a backend's hits and marks equal the twin's: integers exactly, floats except for
     rounding. Returns the twin's hits and marks, and the backend's hits.
     """
-    expected, expected_marks = run(tree, "reference", rays, shader, **options)
-    actual, marks = run(tree, backend, rays, shader, **options)
+    expected, expected_marks = trace(tree, "reference", rays, shader, **options)
+    actual, marks = trace(tree, backend, rays, shader, **options)
     assert torch.equal(actual["samples"], expected["samples"])
     assert torch.equal(actual["missed"], expected["missed"])
     for name, mark in marks.items():
@@ -66,17 +66,17 @@ def arguments(
     device = tree.device
     real = {"dtype": torch.float64, "device": device}
     size = tree.box[1] - tree.box[0]
-    part = 0.25 + torch.linspace(0, 0.1, rays, dtype=torch.float64)[:, None]
+    fraction = 0.25 + torch.linspace(0, 0.1, rays, dtype=torch.float64)[:, None]
     direction = torch.tensor([0.3, 0.2, 1.0]) / torch.tensor([0.3, 0.2, 1.0]).norm()
-    given = RayArguments(
-        origin_r3=(tree.box[0] + part * size).to(device),
+    ray_arguments = RayArguments(
+        origin_r3=(tree.box[0] + fraction * size).to(device),
         direction_r3=direction.to(**real).repeat(rays, 1),
         cone_r2=torch.tensor([[0.5, 0.02]], **real).repeat(rays, 1),
         range_r2=torch.tensor([[0.0, 1e9]], **real).repeat(rays, 1),
     )
     frame_1 = torch.tensor([3], dtype=torch.int32, device=device)
     traced = Tracer(tree, shader, gv.RenderOptions(dtype=dtype, cone_scale=1.0), frame_1=frame_1)
-    return given, traced.arguments
+    return ray_arguments, traced.arguments
 
 
 def op_arguments(tree, shader, dtype) -> list:

@@ -8,7 +8,7 @@ import gvtorch as gv
 from gvtorch.base import constants as config
 
 
-def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
+def copy_to(tree: gv.N3Tree, device: str) -> gv.N3Tree:
     """Returns a copy of the tree on a device, with requests and usage stamps cleared."""
     nodes = gv.NodePool(
         tree.nodes.capacity, tree.bricks.channels, branching=tree.branching, device=device
@@ -37,14 +37,14 @@ def on(tree: gv.N3Tree, device: str) -> gv.N3Tree:
     return copy
 
 
-def forget(tree: gv.N3Tree, share: float, seed: int) -> gv.N3Tree:
+def with_holes(tree: gv.N3Tree, share: float, seed: int) -> gv.N3Tree:
     """Returns a copy in which a share of the bricks and of the tiles is absent."""
-    copy = on(tree, "cpu")
+    copy = copy_to(tree, "cpu")
     generator = torch.Generator().manual_seed(seed)
-    for words, absent in (
+    for pointers, absent in (
         (copy.nodes.brick_tn, config.ABSENT),
         (copy.nodes.child_tn, config.ABSENT),
     ):
-        gone = (torch.rand(words.shape, generator=generator) < share) & (words >= 0)
-        words[gone] = absent
+        removed = (torch.rand(pointers.shape, generator=generator) < share) & (pointers >= 0)
+        pointers[removed] = absent
     return copy

@@ -18,7 +18,7 @@ from gvtorch.io.reading import open_source
 SIDE = {0: 32, 1: 16}  # entries along a side of an upper and of a lower node
 REACH = (4096, 128, 8)  # voxels along a side of an entry of the root, an upper and a lower node
 ZIP, ACTIVE, BLOSC = 1, 2, 4
-Place = tuple[int, int, int]
+Position = tuple[int, int, int]
 
 
 @dataclass
@@ -29,10 +29,10 @@ class Grid:
 
     kind: str
     background: Any
-    leaves: dict[Place, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
-    tiles: tuple[dict[Place, Any], ...] = ({}, {}, {})
+    leaves: dict[Position, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    tiles: tuple[dict[Position, Any], ...] = ({}, {}, {})
     name: str = "density"
-    told: dict[str, tuple[str, bytes]] = field(default_factory=dict)
+    metadata: dict[str, tuple[str, bytes]] = field(default_factory=dict)
     map: tuple[str, bytes] = ("UniformScaleMap", struct.pack("<15d", *(0.5,) * 3, *(0,) * 12))
     half: bool = False
     parent: str = ""
@@ -49,19 +49,19 @@ class Grid:
         width = 3 if self.kind.startswith("vec3") else 1
         return np.broadcast_to(np.asarray(value, self.dtype), (width,))
 
-    def dense(self, low: Place, high: Place) -> np.ndarray:
+    def dense(self, low: Position, high: Position) -> np.ndarray:
         """Returns the voxels (i, j, k, c) of a box: tiles, overwritten by leaves."""
         out = np.empty((*np.subtract(high, low), len(self.value(0))), self.dtype)
         out[...] = self.value(self.background)
 
-        def paint(corner: Place, block: np.ndarray, half: bool) -> None:
+        def paint(corner: Position, block: np.ndarray, half: bool) -> None:
             side = len(block)
-            first = np.maximum(np.subtract(low, corner), 0)
+            begin = np.maximum(np.subtract(low, corner), 0)
             end = np.minimum(np.subtract(high, corner), side)
-            if (first < end).all():
-                part = block[tuple(map(slice, first, end))]
-                place = tuple(map(slice, first + corner - low, end + corner - low))
-                out[place] = part.astype("f2") if half else part
+            if (begin < end).all():
+                part = block[tuple(map(slice, begin, end))]
+                target = tuple(map(slice, begin + corner - low, end + corner - low))
+                out[target] = part.astype("f2") if half else part
 
         for reach, tiles in zip(REACH[::-1], self.tiles[::-1], strict=True):
             for corner, value in tiles.items():
@@ -77,7 +77,7 @@ def text(content: str) -> bytes:
     return struct.pack("<I", len(content)) + content.encode()
 
 
-def told(entries: dict[str, tuple[str, bytes]]) -> bytes:
+def metadata(entries: dict[str, tuple[str, bytes]]) -> bytes:
     """Returns metadata as OpenVDB writes it."""
     parts = [text(n) + text(k) + struct.pack("<I", len(v)) + v for n, (k, v) in entries.items()]
     return struct.pack("<I", len(parts)) + b"".join(parts)
@@ -95,34 +95,34 @@ class VdbWriter:
         self.version, self.packing = version, packing
         self.codes: set[int] = set()  # codes of inactive values that were used
 
-    def write(self, path: Path, *grids: Grid, places: bool = True) -> Path:
+    def write(self, path: Path, *grids: Grid, has_offsets: bool = True) -> Path:
         """Writes a file."""
-        out = struct.pack("<qIII?", 0x56444220, self.version, 10, 0, places)
+        out = struct.pack("<qIII?", 0x56444220, self.version, 10, 0, has_offsets)
         out += struct.pack("<?", bool(self.packing)) if self.version < 222 else b""
-        out += b"0" * 36 + told({"creator": ("string", b"tests"), "odd": ("matrix", b"1234")})
+        out += b"0" * 36 + metadata({"creator": ("string", b"tests"), "odd": ("matrix", b"1234")})
         out += struct.pack("<i", len(grids))
         for grid in grids:
             kind = f"Tree_{grid.kind}_5_4_3" + "_HalfFloat" * grid.half
             out += text(grid.name) + text(kind) + text(grid.parent)
             head = struct.pack("<I", self.packing) if self.version >= 222 else b""
-            head += told(grid.told) + text(grid.map[0]) + grid.map[1]
+            head += metadata(grid.metadata) + text(grid.map[0]) + grid.map[1]
             tree, leaves = (b"", b"") if grid.parent else self.tree(grid)
-            at = len(out) + 24
-            ends = at + len(head) + len(tree)
-            begin = 0 if grid.parent else ends  # of leaves; OpenVDB writes 0 where a tree is shared
-            out += struct.pack("<3q", at, begin, ends + len(leaves)) + head + tree + leaves
+            start = len(out) + 24
+            tree_end = start + len(head) + len(tree)
+            first = 0 if grid.parent else tree_end  # leaf; 0 where a tree is shared
+            out += struct.pack("<3q", start, first, tree_end + len(leaves)) + head + tree + leaves
         path.write_bytes(out)
         return path
 
     def tree(self, grid: Grid) -> tuple[bytes, bytes]:
         """Returns the topology, and the values of leaves."""
-        places = [set(grid.leaves) | set(grid.tiles[2]), set(grid.tiles[1])]
-        lowers = sorted({tuple(n // 128 * 128 for n in place) for place in places[0]})
-        uppers = sorted({tuple(n // 4096 * 4096 for n in place) for place in (*lowers, *places[1])})
+        origins = [set(grid.leaves) | set(grid.tiles[2]), set(grid.tiles[1])]
+        lowers = sorted({tuple(n // 128 * 128 for n in origin) for origin in origins[0]})
+        uppers = sorted({tuple(n // 4096 * 4096 for n in p) for p in (*lowers, *origins[1])})
         out = struct.pack("<I", 1) + grid.value(grid.background).tobytes()
         out += struct.pack("<2I", len(grid.tiles[0]), len(uppers))
-        for place, value in grid.tiles[0].items():
-            out += struct.pack("<3i", *place) + grid.value(value).tobytes() + b"\x01"
+        for origin, value in grid.tiles[0].items():
+            out += struct.pack("<3i", *origin) + grid.value(value).tobytes() + b"\x01"
         leaves = b""
         for upper in uppers:
             below = [p for p in lowers if tuple(n // 4096 * 4096 for n in p) == upper]
@@ -131,37 +131,37 @@ class VdbWriter:
                 inside = [p for p in grid.leaves if tuple(n // 128 * 128 for n in p) == lower]
                 inside.sort()
                 out += self.node(grid, 1, lower, inside)
-                out += b"".join(bits(grid.leaves[place][1]) for place in inside)
-                leaves += b"".join(self.leaf(grid, place) for place in inside)
+                out += b"".join(bits(grid.leaves[origin][1]) for origin in inside)
+                leaves += b"".join(self.leaf(grid, origin) for origin in inside)
         return out, leaves
 
-    def node(self, grid: Grid, level: int, origin: Place, children: list[Place]) -> bytes:
+    def node(self, grid: Grid, level: int, origin: Position, children: list[Position]) -> bytes:
         """Returns masks and tiles of an upper (0) or a lower (1) node."""
         n, side = SIDE[level], REACH[level + 1]
         active, values = np.zeros(n**3, bool), np.tile(grid.value(grid.background), (n**3, 1))
         is_child = active.copy()
 
-        def number(place: Place) -> int:
-            return int(np.ravel_multi_index(np.subtract(place, origin) // side, (n, n, n)))
+        def index(position: Position) -> int:
+            return int(np.ravel_multi_index(np.subtract(position, origin) // side, (n, n, n)))
 
-        is_child[[number(place) for place in children]] = True
-        for place, value in grid.tiles[level + 1].items():
-            if tuple(p // REACH[level] * REACH[level] for p in place) == origin:
-                active[number(place)] = sum(place) % 16 == 0  # some are
-                values[number(place)] = value
+        is_child[[index(position) for position in children]] = True
+        for position, value in grid.tiles[level + 1].items():
+            if tuple(p // REACH[level] * REACH[level] for p in position) == origin:
+                active[index(position)] = sum(position) % 16 == 0  # some are
+                values[index(position)] = value
         if self.version < 222:
             return bits(is_child) + bits(active) + self.numbers(grid, values[~is_child])
         return bits(is_child) + bits(active) + self.values(grid, values, active)
 
-    def leaf(self, grid: Grid, place: Place) -> bytes:
+    def leaf(self, grid: Grid, origin: Position) -> bytes:
         """Returns the values of a leaf."""
-        values, active = grid.leaves[place]
+        values, active = grid.leaves[origin]
         head = bits(active)
         if grid.kind in ("mask", "bool"):
-            head += struct.pack("<3i", *place)
+            head += struct.pack("<3i", *origin)
             return head + bits(values[:, 0]) * (grid.kind == "bool")
         if self.version < 222:
-            return head + struct.pack("<3ib", *place, 1) + self.numbers(grid, values)
+            return head + struct.pack("<3ib", *origin, 1) + self.numbers(grid, values)
         return head + self.values(grid, values, active)
 
     def values(self, grid: Grid, values: np.ndarray, active: np.ndarray) -> bytes:
@@ -170,22 +170,22 @@ class VdbWriter:
         minus = ~back if back.dtype.kind == "b" else -back
         code, extra = 6, b""
         if self.packing & ACTIVE:
-            seen = list(dict.fromkeys(map(tuple, values[~active].tolist())))
+            inactive = list(dict.fromkeys(map(tuple, values[~active].tolist())))
             b, m = tuple(back.tolist()), tuple(minus.tolist())
-            others = [np.array(value, grid.dtype).tobytes() for value in seen]
-            if set(seen) <= {b}:
+            others = [np.array(value, grid.dtype).tobytes() for value in inactive]
+            if set(inactive) <= {b}:
                 code = 0
-            elif seen == [m]:
+            elif inactive == [m]:
                 code = 1
-            elif len(seen) == 1:
+            elif len(inactive) == 1:
                 code, extra = 2, others[0]
-            elif set(seen) == {b, m}:
+            elif set(inactive) == {b, m}:
                 code, extra = 3, bits((values == back).all(1) & ~active)
-            elif len(seen) == 2 and b in seen:
-                rest = others[1 - seen.index(b)]
+            elif len(inactive) == 2 and b in inactive:
+                rest = others[1 - inactive.index(b)]
                 code, extra = 4, rest + bits((values == back).all(1) & ~active)
-            elif len(seen) == 2:
-                chosen = (values == seen[1]).all(1) & ~active
+            elif len(inactive) == 2:
+                chosen = (values == inactive[1]).all(1) & ~active
                 code, extra = 5, others[0] + others[1] + bits(chosen)
         self.codes.add(code)
         written = values[active] if code != 6 else values
@@ -246,14 +246,14 @@ def _nano_leaf(
     if steps:
         codes = rng.integers(0, 2**steps, 512)
         flags = codes[:, None] >> np.arange(steps) & 1
-        least, step = np.float32(0.25), np.float32(0.125)
-        head = struct.pack("<2f", least, step)
-        return bits(flags.reshape(-1)), codes.astype("f4") * step + least, head
+        minimum, step = np.float32(0.25), np.float32(0.125)
+        head = struct.pack("<2f", minimum, step)
+        return bits(flags.reshape(-1)), codes.astype("f4") * step + minimum, head
     if dtype.kind == "b":
-        found = rng.random(512) < 0.5
-        return bits(found), found, b""
-    found = rng.integers(0, 100, (512, width)).astype(dtype)
-    return found.tobytes(), found, b""
+        values = rng.random(512) < 0.5
+        return bits(values), values, b""
+    values = rng.integers(0, 100, (512, width)).astype(dtype)
+    return values.tobytes(), values, b""
 
 
 def _numbers(kind: str) -> tuple[np.dtype, int]:
@@ -283,25 +283,25 @@ def nano_grid(kind: str, rng: np.random.Generator, bits_of_leaf: int = 8) -> tup
     struct.pack_into("<4q", out, 672, at_leaf[0] - 672, at_lower[0] - 672, at_upper[0] - 672, 64)
     struct.pack_into("<6iI", out, at_root, -8, 0, 0, 7, 15, 23, 3)
     back, fill = (np.full(width, n).astype(dtype) for n in (1, 3))
-    at = at_root + (32 if dtype.itemsize == 8 else 28)
-    out[at : at + back.nbytes] = back.tobytes()
+    offset = at_root + (32 if dtype.itemsize == 8 else 28)
+    out[offset : offset + back.nbytes] = back.tobytes()
     box = np.tile(back, (16, 16, 24, 1))
     box[8:, :8, 16:] = fill
-    at = at_root + root + 2 * tile
-    struct.pack_into("<Qq", out, at, 2 << 42, 0)
-    out[at + tile_value : at + tile_value + fill.nbytes] = fill.tobytes()
-    for n, place in enumerate(((-8, 0, 0), (0, 8, 16))):
-        keys = [(p & 0xFFFFFFFF) >> 12 for p in place]
+    offset = at_root + root + 2 * tile
+    struct.pack_into("<Qq", out, offset, 2 << 42, 0)
+    out[offset + tile_value : offset + tile_value + fill.nbytes] = fill.tobytes()
+    for n, leaf_origin in enumerate(((-8, 0, 0), (0, 8, 16))):
+        keys = [(p & 0xFFFFFFFF) >> 12 for p in leaf_origin]
         key = keys[0] << 42 | keys[1] << 21 | keys[2]
         struct.pack_into("<Qq", out, at_root + root + n * tile, key, at_upper[n] - at_root)
-        cells = [p // 128 % 32 for p in place], [p // 8 % 16 for p in place]
+        cells = [p // 128 % 32 for p in leaf_origin], [p // 8 % 16 for p in leaf_origin]
         for base, count, cell, entries, child in (
             (at_upper[n], 32, cells[0], up, at_lower[n]),
             (at_lower[n], 16, cells[1], low, at_leaf[n]),
         ):
             index = int(np.ravel_multi_index(cell, (count,) * 3))
-            for one in range(count**3):
-                begin = base + entries + one * entry
+            for cell_index in range(count**3):
+                begin = base + entries + cell_index * entry
                 out[begin : begin + back.nbytes] = back.tobytes()
             out[base + 32 + count**3 // 8 + index // 8] |= 1 << index % 8
             struct.pack_into("<q", out, base + entries + index * entry, child - base)
@@ -315,7 +315,7 @@ def nano_grid(kind: str, rng: np.random.Generator, bits_of_leaf: int = 8) -> tup
         out[at_leaf[n] + 80 : at_leaf[n] + 80 + len(head)] = head
         begin = at_leaf[n] + values
         out[begin : begin + len(content)] = content
-        i, j, k = (p - o for p, o in zip(place, (-8, 0, 0), strict=True))
+        i, j, k = (p - o for p, o in zip(leaf_origin, (-8, 0, 0), strict=True))
         box[i : i + 8, j : j + 8, k : k + 8] = found.reshape(8, 8, 8, width)
     return bytes(out), (number, box)
 
@@ -374,26 +374,26 @@ def leaf_values(grid: Grid, rng: np.random.Generator) -> None:
         values = rng.integers(-50, 50, (512, width)).astype(grid.dtype)
         if grid.dtype.kind == "b":
             values = rng.random((512, 1)) < 0.5
-        which = np.arange(512) % len(kinds)
-        values[~active] = np.stack(kinds)[which[~active]]
+        kind_index = np.arange(512) % len(kinds)
+        values[~active] = np.stack(kinds)[kind_index[~active]]
         if grid.kind == "mask":
             values = active[:, None].copy()
-        place = ((number % 3 - 2) * 8, (number // 3 - 1) * 8, 8)
-        grid.leaves[place] = values, active
-    one = back.dtype.type(1) if grid.dtype.kind == "b" else (back * 5).astype(grid.dtype)
-    grid.tiles = ({}, {(128, 0, 0): one}, {(16, 8, 16): one, (16, 0, 16): one})
+        origin = ((number % 3 - 2) * 8, (number // 3 - 1) * 8, 8)
+        grid.leaves[origin] = values, active
+    tile_value = back.dtype.type(1) if grid.dtype.kind == "b" else (back * 5).astype(grid.dtype)
+    grid.tiles = ({}, {(128, 0, 0): tile_value}, {(16, 8, 16): tile_value, (16, 0, 16): tile_value})
 
 
-def check(path, expected, **options) -> None:
+def assert_reads(path, expected, **options) -> None:
     """Asserts that a grid is read as it was written, whole and in parts."""
     source = open_source(path, **options)
-    found = source.read_times(0, 1)[0]
-    wanted = expected.transpose(2, 1, 0, 3)
-    assert found.shape == wanted.shape
-    assert np.array_equal(found, wanted.astype(found.dtype))
+    actual = source.read_times(0, 1)[0]
+    expected_zyx = expected.transpose(2, 1, 0, 3)
+    assert actual.shape == expected_zyx.shape
+    assert np.array_equal(actual, expected_zyx.astype(actual.dtype))
     rng = np.random.default_rng(5)
     for _ in range(20):
-        low = [int(rng.integers(0, n)) for n in found.shape[:3]]
-        high = [int(rng.integers(a, n)) + 1 for a, n in zip(low, found.shape[:3], strict=True)]
+        low = [int(rng.integers(0, n)) for n in actual.shape[:3]]
+        high = [int(rng.integers(a, n)) + 1 for a, n in zip(low, actual.shape[:3], strict=True)]
         part = pickle.loads(pickle.dumps(source)).read_region(low, high)
-        assert np.array_equal(part, found[tuple(map(slice, low, high))])
+        assert np.array_equal(part, actual[tuple(map(slice, low, high))])

@@ -16,7 +16,7 @@ import torch
 import gvtorch as gv
 from gvtorch.viewer.session import Session
 
-SOON = 60.0  # time limit in seconds for an answer, on the slowest machine
+TIMEOUT = 60.0  # time limit in seconds for an answer, on the slowest machine
 
 
 class Page:
@@ -24,52 +24,52 @@ class Page:
 
     def __init__(self, session: Session, width: int = 64, height: int = 48, acks: bool = True):
         self.session, self.acks = session, acks
-        self.told: list[dict[str, Any]] = []
+        self.messages: list[dict[str, Any]] = []
         self.pictures: list[tuple[dict[str, Any], bytes]] = []
         self.files: dict[str, bytes] = {}
-        self._come = threading.Condition()
+        self._arrived = threading.Condition()
         self.client = session.join(self._take)
         self.send("hello", width=width, height=height)
 
     def _take(self, data: str | bytes) -> None:
-        with self._come:
+        with self._arrived:
             if isinstance(data, str):
-                self.told.append(json.loads(data))
+                self.messages.append(json.loads(data))
             else:
                 head, picture = split(data)
                 if "file" in head:
                     self.files[head["file"]] = picture
                 else:
                     self.pictures.append((head, picture))
-            self._come.notify_all()
+            self._arrived.notify_all()
         if isinstance(data, bytes) and self.acks and "number" in head:
             self.send("ack", number=head["number"])
 
     def send(self, kind: str, **content: Any) -> None:
         self.session.receive(self.client, json.dumps({"type": kind, **content}))
 
-    def until(self, wanted: Callable[[], Any], soon: float = SOON) -> Any:
+    def until(self, condition: Callable[[], Any], timeout: float = TIMEOUT) -> Any:
         """Waits until something is true, and returns it."""
-        end = time.monotonic() + soon
-        with self._come:
-            while not (found := wanted()):
+        end = time.monotonic() + timeout
+        with self._arrived:
+            while not (result := condition()):
                 left = end - time.monotonic()
-                assert left > 0, f"it never came; told {self.told[-3:]}"
-                self._come.wait(min(left, 0.2))
-        return found
+                assert left > 0, f"it never came; messages {self.messages[-3:]}"
+                self._arrived.wait(min(left, 0.2))
+        return result
 
-    def of(self, kind: str) -> list[dict[str, Any]]:
-        return [one for one in self.told if one["type"] == kind]
+    def of_type(self, kind: str) -> list[dict[str, Any]]:
+        return [message for message in self.messages if message["type"] == kind]
 
     def next(self, kind: str, after: int | None = None) -> dict[str, Any]:
         """Waits for the next message of a type after the first `after`; returns it."""
-        count = len(self.of(kind)) if after is None else after
-        self.until(lambda: len(self.of(kind)) > count)
-        return self.of(kind)[count]
+        count = len(self.of_type(kind)) if after is None else after
+        self.until(lambda: len(self.of_type(kind)) > count)
+        return self.of_type(kind)[count]
 
-    def final(self, soon: float = SOON) -> tuple[dict[str, Any], np.ndarray]:
+    def final(self, timeout: float = TIMEOUT) -> tuple[dict[str, Any], np.ndarray]:
         """Waits for the final picture; returns its head and (h, w, 3) uint8."""
-        self.until(lambda: self.pictures and self.pictures[-1][0]["final"], soon)
+        self.until(lambda: self.pictures and self.pictures[-1][0]["final"], timeout)
         head, data = self.pictures[-1]
         return head, pixels(data)
 
@@ -86,8 +86,10 @@ class Page:
 
     @property
     def camera(self) -> dict[str, Any]:
-        self.until(lambda: self.of("welcome"))
-        return {n: v for n, v in self.of("welcome")[0]["state"]["camera"].items() if n != "kind"}
+        self.until(lambda: self.of_type("welcome"))
+        return {
+            n: v for n, v in self.of_type("welcome")[0]["state"]["camera"].items() if n != "kind"
+        }
 
 
 def split(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -116,12 +118,12 @@ BANDS = gv.TransferFunction(
 )
 
 
-def turned(camera: dict, angle: float) -> dict:
+def turned_camera(camera: dict, angle: float) -> dict:
     """Returns the camera, turned around its target about +y."""
-    away = np.subtract(camera["eye"], camera["target"])
+    offset = np.subtract(camera["eye"], camera["target"])
     c, s = np.cos(angle), np.sin(angle)
-    away = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ away
-    return {**camera, "eye": (away + camera["target"]).tolist()}
+    offset = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ offset
+    return {**camera, "eye": (offset + camera["target"]).tolist()}
 
 
 class Grown(torch.nn.Module):

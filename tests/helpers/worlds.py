@@ -34,8 +34,8 @@ class Solid(gv.Producer):
 
     def fill(self, nodes):
         center = nodes.center[:, :, None, None, None]
-        places = (center[:, axis] + local for axis, local in enumerate(nodes.local_axes))
-        gap = self.gap(*places) / (8 * nodes.voxel_size[:, 0, None, None, None])
+        positions = (center[:, axis] + local for axis, local in enumerate(nodes.local_axes))
+        gap = self.gap(*positions) / (8 * nodes.voxel_size[:, 0, None, None, None])
         return {"value": (0.5 + gap).clamp(0, 1).float()}
 
 
@@ -55,13 +55,13 @@ def bulb(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     a, b, c, slope = x, y, z, torch.ones_like(x)
     r = (a * a + b * b + c * c).sqrt()
     for _ in range(60):
-        on = r < 4
+        inside = r < 4
         theta, phi = 8 * torch.acos((c / r).clamp(-1, 1)), 8 * torch.atan2(b, a)
-        slope = torch.where(on, 8 * r**7 * slope + 1, slope)
-        a = torch.where(on, r**8 * theta.sin() * phi.cos() + x, a)
-        b = torch.where(on, r**8 * theta.sin() * phi.sin() + y, b)
-        c = torch.where(on, r**8 * theta.cos() + z, c)
-        r = torch.where(on, (a * a + b * b + c * c).sqrt(), r)
+        slope = torch.where(inside, 8 * r**7 * slope + 1, slope)
+        a = torch.where(inside, r**8 * theta.sin() * phi.cos() + x, a)
+        b = torch.where(inside, r**8 * theta.sin() * phi.sin() + y, b)
+        c = torch.where(inside, r**8 * theta.cos() + z, c)
+        r = torch.where(inside, (a * a + b * b + c * c).sqrt(), r)
     return torch.where(r >= 4, -0.5 * r.log() * r / slope / 1.2, 0.0)
 
 
@@ -75,15 +75,15 @@ class Menger(gv.Producer):
         self.cells = cells
 
     def classify(self, nodes):
-        around = torch.cartesian_prod(*(torch.arange(-1, 2),) * 3)
-        near = nodes.loc[:, None, :3] + around
-        full = self.solid(*near.unbind(2), nodes.loc[:, 3, None]).any(1)
+        offsets = torch.cartesian_prod(*(torch.arange(-1, 2),) * 3)
+        neighbours = nodes.loc[:, None, :3] + offsets
+        full = self.solid(*neighbours.unbind(2), nodes.loc[:, 3, None]).any(1)
         return torch.where(full, gv.Region.DATA, gv.Region.EMPTY)
 
     def fill(self, nodes):
         x, y, z = (nodes.loc[:, axis, None] * 9 + nodes.layout.reach for axis in range(3))
-        places = x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
-        return {"value": self.solid(*places, nodes.loc[:, 3, None, None, None] + 2).float()}
+        cell_indices = x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
+        return {"value": self.solid(*cell_indices, nodes.loc[:, 3, None, None, None] + 2).float()}
 
     def solid(self, x: Tensor, y: Tensor, z: Tensor, digits: Tensor) -> Tensor:
         """Returns which cells of a grid of 3^digits a side are solid."""
@@ -105,8 +105,8 @@ def meets_menger(origin: Tensor, direction: Tensor, cells: int) -> float:
     side = 3**cells
     start = [Fraction(float(c)) * side for c in origin]
     whole = [math.floor(c) for c in start]
-    part = [float(c - w) for c, w in zip(start, whole, strict=True)]  # position in the eye's cell
-    way = [float(d) * side for d in direction]
+    fraction = [float(c - w) for c, w in zip(start, whole, strict=True)]  # within the cell
+    velocity = [float(d) * side for d in direction]
     cell, t = list(whole), 0.0
     while all(0 <= c < side for c in cell):
         size = side // 3
@@ -115,15 +115,15 @@ def meets_menger(origin: Tensor, direction: Tensor, cells: int) -> float:
         if not size:
             return t
         low = [c // size * size for c in cell]
-        faces = [a + size if d > 0 else a for a, d in zip(low, way, strict=True)]
+        faces = [a + size if d > 0 else a for a, d in zip(low, velocity, strict=True)]
         exits = [
             ((f - w) - p) / d if d else math.inf
-            for f, w, p, d in zip(faces, whole, part, way, strict=True)
+            for f, w, p, d in zip(faces, whole, fraction, velocity, strict=True)
         ]
         t = min(exits)
         for axis in range(3):
-            at = whole[axis] + math.floor(part[axis] + t * way[axis])
-            cell[axis] = min(max(at, low[axis]), low[axis] + size - 1)
+            position = whole[axis] + math.floor(fraction[axis] + t * velocity[axis])
+            cell[axis] = min(max(position, low[axis]), low[axis] + size - 1)
             if exits[axis] == t:
-                cell[axis] = faces[axis] if way[axis] > 0 else faces[axis] - 1
+                cell[axis] = faces[axis] if velocity[axis] > 0 else faces[axis] - 1
     return math.inf
