@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +13,9 @@ from helpers.rays import camera_rays
 from helpers.traces import assert_equal, trace
 
 import gvtorch as gv
+from gvtorch import cpp_ext
 from gvtorch.base.image_info import COLORS
-from gvtorch.shaders.channels import DEFAULT_COLORS, channel_color
+from gvtorch.shaders.channels import DEFAULT_COLORS, MAX_CHANNELS, channel_color
 
 SPACING, ORIGIN = (1.0, 0.8, 1.3), (3.0, -2.0, 5.0)
 MODES = ["additive", "opacity"]
@@ -473,3 +476,9 @@ def test_a_mistake_on_the_command_line_is_one_line(two_channels, tmp_path, flags
     done = gvtorch("render", two_channels / "v.npy", "-o", tmp_path / "out.png", *flags)
     assert done.returncode == 2 and message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_most_channels_are_as_many_as_the_kernels_read():
+    text = (cpp_ext.SOURCES / "shaders" / "probe.h").read_text()
+    assert re.findall(r"kMaxNumbers = (\d+);", text) == [str(MAX_CHANNELS)]
+    assert len(set(DEFAULT_COLORS)) == MAX_CHANNELS

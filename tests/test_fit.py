@@ -35,6 +35,25 @@ def test_views_that_the_pools_cannot_hold_are_drawn_at_levels_that_fit(backend):
 
 
 @pytest.mark.parametrize("backend", COMPILED)
+def test_rays_of_one_s_own_fit_as_their_camera_does(backend):
+    device, camera = DEVICES[backend], view(64, 0)
+    small = {"brick_pool": "0.6 MB", "node_pool": "2 MB", "device": device}
+    factors, pictures = [], []
+    for by_ray in (False, True):
+        with gv.Engine(Ball(1024), **small) as engine:
+            rays = camera.placed(engine.view("test", camera, TRANSFER, {}).box).rays()
+            seen = gv.CustomCamera(rays, 64, 64) if by_ray else camera
+            frames = Frames(engine, seen, gv.Isosurface(0.5), 512, 0, True)
+            for _ in range(25):
+                hits, stats = frames.frame()
+            assert stats.misses == 0 and stats.converged
+            factors.append(stats.coarser)
+            pictures.append(hits.color.cpu())
+    assert factors[0] == factors[1] > 1
+    assert torch.equal(*pictures)
+
+
+@pytest.mark.parametrize("backend", COMPILED)
 def test_views_that_fit_again_are_as_asked_for(backend):
     small = {"brick_pool": "1.2 MB", "node_pool": "2 MB", "device": DEVICES[backend]}
     with gv.Engine(Ball(1024), **small) as engine:
@@ -79,5 +98,8 @@ def test_a_graph_fits_as_well():
     class Unsaid(Ball):
         on_device = False
 
-    with gv.Engine(Unsaid(), device="cuda") as engine, pytest.raises(ValueError, match="fit needs"):
-        engine.capture(view(64, 0), TRANSFER, fit=True)
+    with gv.Engine(Unsaid(), device="cuda") as engine:
+        with pytest.raises(ValueError, match="fit needs replays that serve"):
+            engine.capture(view(64, 0), TRANSFER, fit=True)
+        with pytest.raises(ValueError, match="look_ahead needs replays that serve"):
+            engine.capture(view(64, 0), TRANSFER, look_ahead=4)

@@ -139,7 +139,7 @@ class RequestList:
 
 def requests_below(cache: Cache, subdivisions: Requests, branching: int) -> RequestsByKind:
     """Returns subdivisions of the nodes that `subdivisions` (k,) have just made, where rays will
-    want them; see `below`. There are no loads.
+    want them; see `nodes_to_subdivide`. There are no loads.
     """
     tile = cache.nodes.child_tn.view(-1)[subdivisions.node].to(torch.int64)
     priority = subdivisions.priority // branching

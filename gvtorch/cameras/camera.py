@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 Numbers = float | Sequence[float] | Tensor
 Up = str | Sequence[float] | Tensor  # a name of `DIRECTIONS` such as "+z", or (3,) world
-CONE = slice(16, 18)  # columns of `Camera.numbers`
 _MIN_FOV_DEGREES = 1e-12
 _FIT_FRACTION = 0.98  # share of half the picture's width or height that a fitted box takes
 _MAX_TURN_RADIANS = 0.1  # from frame to frame; a camera that turns by more has jumped
@@ -73,6 +72,7 @@ class Camera:
 
     sample = 0
     fitted: tuple[float, float] | None = None
+    cone_columns = slice(16, 18)  # of `numbers`
 
     def __init__(
         self,
@@ -409,7 +409,7 @@ class Camera:
         focal, centre = intrinsics[:, (0, 1), (0, 1)], intrinsics[:, :2, 2] - 0.5
         position = -_sum_of_three(rotation.swapaxes(0, 1), translation.T[..., None])  # -R^T t
         pixel, zero = 1 / focal.min(1, keepdims=True), np.zeros((len(self), 1))
-        cone = (pixel, zero) if MODELS[self.model].parallel else (zero, pixel)  # at CONE
+        cone = (pixel, zero) if MODELS[self.model].parallel else (zero, pixel)  # `cone_columns`
         range_ = (zero, zero + math.inf)
         lens = (self.radial_coeffs.numpy(), self.max_angle.numpy()[:, None])
         parts = (rotation.reshape(-1, 9), position, focal, centre, *cone, *range_, *lens)

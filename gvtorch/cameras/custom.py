@@ -19,6 +19,7 @@ class CustomCamera(Camera):
 
     model: Any = "custom"
     distorted = False
+    cone_columns = slice(6, 8)
 
     def __init__(self, rays: Rays, width: int | None = None, height: int | None = None) -> None:
         """Takes rays row by row, picture by picture.

@@ -47,7 +47,7 @@ class DeviceFrame(RecordedFrame):
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
         """Returns, before a frame, whether the listed requests are to be served. `stale`: another
         frame was rendered since this graph's last one; `steady`: the newest frame that was read
-        back missed nothing, and the last replay did not check_values ahead.
+        back missed nothing, and the last replay did not look ahead.
         """
         if stale:
             self._requests.zero_()  # the listed requests are out of date: the rays ask again

@@ -283,7 +283,7 @@ class Engine:
         self._missed = None
 
     def release(self, keep: HostFrame | None = None) -> None:
-        """Drops the answers that are on their way to captured frames, except those of `but`."""
+        """Drops the answers that are on their way to captured frames, except those of `keep`."""
         for host_frame in self.recorded:
             if host_frame is not keep:
                 host_frame.release()
@@ -483,7 +483,8 @@ class Engine:
 
         Raises:
             ValueError: The engine is not on CUDA, the layer is on another device, a shader is a
-                module, trees overlap, replays do not serve but should `fit`, or see `frame`.
+                module, trees overlap, replays do not serve but should `fit` or `look_ahead`, or see
+                `frame`.
             ProductionError: See `frame`.
         """
         shaders = shader.values() if isinstance(shader, Mapping) else (shader,)
@@ -508,10 +509,10 @@ class Engine:
         render_frame = partial(self.frame, shader=shader, **options)
         render_frame(camera)  # warm-up before recording
         recorded = make_recorded_frame(self.production, batch, fit)
-        if fit and recorded is None:
+        if recorded is None and (fit or look_ahead):
             raise ValueError(
-                "Engine.capture: fit needs replays that serve: all producers on_device, or all "
-                "on_host, without coarse channels"
+                f"Engine.capture: {'fit' if fit else 'look_ahead'} needs replays that serve: all "
+                "producers on_device, or all on_host, without coarse channels"
             )
         if isinstance(recorded, HostFrame):
             self.recorded.append(recorded)

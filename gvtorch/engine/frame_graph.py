@@ -78,7 +78,7 @@ class FrameGraph:
         self._engine, self._recorded, self._render_frame = engine, recorded, render_frame
         self._view = view = replace(view, numbers=view.numbers.clone())  # written by replays
         self._frame_number = -1  # of the last replay's picture
-        self._look_ahead = LookAhead(view, look_ahead) if recorded and look_ahead else None
+        self._look_ahead = LookAhead(view, look_ahead) if look_ahead else None
         graphs = [torch.cuda.CUDAGraph() for _ in range(5)]
         self._serve, self._deepen, self._draw, self._look, self._finish = graphs
         if recorded is not None:

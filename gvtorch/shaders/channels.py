@@ -28,7 +28,7 @@ DEFAULT_COLORS = (
     *("#8000ff", "#80ff00", "#ff0080", "#0080ff", "#00ff80", "#ff8080", "#80c0ff", "#ffd080"),
 )
 
-MAX_CHANNELS = len(DEFAULT_COLORS)  # channels in one picture
+MAX_CHANNELS = 16  # in one picture: `kMaxNumbers` in csrc/shaders/probe.h
 _RAMP_PIECES = 16  # linear pieces that approximate the quadratic rise of opacity
 _DEFAULT_OPACITY = 0.5
 _OPAQUE_HALVINGS = 1024.0  # halvings of light that represent an opacity of 1

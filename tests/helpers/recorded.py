@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -69,7 +70,8 @@ class Frames:
         fit: bool = False,
     ) -> None:
         self.engine, self.batch = engine, batch
-        self.view = engine.view("test", camera, shader, {})
+        first_view = engine.view("test", camera, shader, {})
+        self.view = replace(first_view, numbers=first_view.numbers.clone())
         self.ahead = LookAhead(self.view, look_ahead) if look_ahead else None
         self.look_from(camera)
         frame = make_recorded_frame(engine.production, batch, fit)
