@@ -62,6 +62,6 @@ def test_marks_are_all_that_is_written():
 
 @pytest.mark.parametrize("name", registry.FAKES)
 def test_a_fake_names_arguments_of_its_op(name):
-    known = {argument for argument, _ in schema(name)}
+    names = {argument for argument, _ in schema(name)}
     for parameter in inspect.signature(registry.FAKES[name]).parameters.values():
-        assert parameter.kind == parameter.VAR_KEYWORD or parameter.name in known
+        assert parameter.kind == parameter.VAR_KEYWORD or parameter.name in names

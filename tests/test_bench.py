@@ -77,16 +77,16 @@ def test_what_cant_run_here_is_left_out_of_all(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "moderngl", None)
     with pytest.raises(bench.Unavailable, match="opengl needs moderngl"):
         bench.run("opengl", CPU)
-    asked = []
+    names = []
 
     def run_workload(self, name):
-        asked.append(name)
+        names.append(name)
         if name == "opengl":
             raise bench.Unavailable("no OpenGL")
 
     monkeypatch.setattr(Bench, "_run_workload", run_workload)
     Bench(name="all").run()
-    assert asked == [*bench.WORKLOADS]
+    assert names == [*bench.WORKLOADS]
     assert capsys.readouterr().err == "opengl is left out: no OpenGL\n"
     with pytest.raises(bench.Unavailable):
         Bench(name="opengl").run()
@@ -100,8 +100,8 @@ def test_twins_and_streamed_shaders_draw_the_same(compiled):
     assert len(twins) == 4 and len(streamed) == len(VARIANTS) == len(rows) / 2
     assert max(row["max_difference"] for row in twins + streamed) <= 1e-4
     for row in rows:
-        (beside,) = (r for r in rows if (r["case"], r["who"]) == (row["case"], row["beside"]))
-        assert row["times"] == row["ms"] / beside["ms"]
+        (peer,) = (r for r in rows if (r["case"], r["who"]) == (row["case"], row["beside"]))
+        assert row["times"] == row["ms"] / peer["ms"]
 
 
 def test_a_shader_is_timed_with_what_it_stands_beside():
@@ -171,8 +171,8 @@ def test_scenes_are_what_their_names_say():
     )
     assert dense.bricks.capacity == 1 + 8 + 64 + 512 and sparse.bricks.capacity < 500
     clouds = scenes.clouds(64)
-    shown = clouds.shader(clouds.volume.data[..., 0].numpy())[..., 3] > 0
-    assert abs(1 - shown.mean() - 0.68) < 0.01
+    visible = clouds.shader(clouds.volume.data[..., 0].numpy())[..., 3] > 0
+    assert abs(1 - visible.mean() - 0.68) < 0.01
 
 
 def test_a_figure_that_takes_long_is_made_of_fewer_timings():
@@ -200,7 +200,7 @@ def test_the_command_lists_and_names_mistakes():
     )
     assert listed.returncode == 0
     assert [line.split()[0] for line in listed.stdout.splitlines()] == [*bench.WORKLOADS]
-    for args, words in (
+    for args, message in (
         (["nonsense"], "unknown workload 'nonsense'; known: march"),
         (["lru", "--peers", "nobody"], "unknown peer 'nobody'; known: grid_sample"),
         (["lru", "--device", "teapot"], "--device must be cpu, cuda or cuda:N"),
@@ -208,7 +208,7 @@ def test_the_command_lists_and_names_mistakes():
         (["lru", "--repeats", "0"], "repeats must be an int >= 1"),
     ):
         run = gvtorch("bench", *args)
-        assert run.returncode == 2 and words in run.stderr, run.stderr
+        assert run.returncode == 2 and message in run.stderr, run.stderr
         assert len(run.stderr.strip().splitlines()) == 1 and not run.stdout
 
 
@@ -241,9 +241,9 @@ def test_a_hand_in_a_browser_sees_its_jump(chromium, viewer):
     """Pictures arrive while the mouse drags, and one that shows the jump of the pointer."""
     page = browser.Page(chromium, viewer.url, pages.PAGES["gvtorch"][1], (320, 200))
     try:
-        shown = page.page.evaluate("() => document.querySelector('.gv-picture').clientWidth")
+        client_width = page.page.evaluate("() => document.querySelector('.gv-picture').clientWidth")
         result = page.drag(0.3, 1)
     finally:
         page.close()
-    assert shown == 320 and result.rate > 0
+    assert client_width == 320 and result.rate > 0
     assert len(result.delays) == 1 and 0 < result.delays[0] < 60e3

@@ -37,8 +37,8 @@ class Ball(gv.Producer):
         return {"value": waves(nodes.positions)}
 
 
-def field(branching, what=None):
-    return gv.FieldProducer(what or Waves(), EXTENT, box=BOX, samples=2, branching=branching)
+def field(branching, formula=None):
+    return gv.FieldProducer(formula or Waves(), EXTENT, box=BOX, samples=2, branching=branching)
 
 
 def scan():
@@ -49,9 +49,9 @@ def scan():
 
 def points(branching):
     random = torch.Generator().manual_seed(2)
-    place = 1.8 * torch.rand(100, 3, generator=random) - 0.9
+    positions = 1.8 * torch.rand(100, 3, generator=random) - 0.9
     options = {"radius": 0.1, "box": BOX, "branching": branching}
-    return gv.PointProducer(place, torch.full((100,), 20.0), EXTENT, **options)
+    return gv.PointProducer(positions, torch.full((100,), 20.0), EXTENT, **options)
 
 
 def octaves(branching):
@@ -60,8 +60,8 @@ def octaves(branching):
 
 
 def rough(branching):
-    look = {"thickness": 0.4, "amplitude": 0.5, "softness": 0.3, "dtype": torch.float32}
-    return gv.Hypertexture(gv.sdf.Sphere(0.6), EXTENT, box=BOX, **look, branching=branching)
+    options = {"thickness": 0.4, "amplitude": 0.5, "softness": 0.3, "dtype": torch.float32}
+    return gv.Hypertexture(gv.sdf.Sphere(0.6), EXTENT, box=BOX, **options, branching=branching)
 
 
 def solid(branching):
@@ -114,12 +114,12 @@ def level(producer: Producer, layout: Layout, depth: int) -> dict[str, torch.Ten
     z, y, x = (loc[:, :3].amax(0) + 1).flip(0).tolist()
     scale = layout.branching ** (layout.depth - depth)
     kept = [slice(0, -(-n // scale)) for n in layout.extent[::-1]]
-    found = {}
+    channels = {}
     for name, bricks in producer.bricks_at(loc, layout).items():
         inner = bricks[:, 1:-1, 1:-1, 1:-1].double()
         whole = inner.view(z, y, x, 4, 4, 4, -1).permute(0, 3, 1, 4, 2, 5, 6)
-        found[name] = whole.reshape(4 * z, 4 * y, 4 * x, -1)[kept[0], kept[1], kept[2]]
-    return found
+        channels[name] = whole.reshape(4 * z, 4 * y, 4 * x, -1)[kept[0], kept[1], kept[2]]
+    return channels
 
 
 def means(values: torch.Tensor, n: int) -> torch.Tensor:
@@ -139,7 +139,7 @@ def halved(kind: str) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("branching", [2, 3, 4])
 @pytest.mark.parametrize("kind", KINDS)
 def test_voxels_are_right_in_trees_of_any_n(kind, branching):
-    make, apart = KINDS[kind]
+    make, tolerance = KINDS[kind]
     producer = make(branching)
     layout = layout_of(producer)
     assert producer.branching == branching and layout.depth == (4 if branching == 2 else 2)
@@ -149,12 +149,12 @@ def test_voxels_are_right_in_trees_of_any_n(kind, branching):
         if name != "inherited":
             torch.testing.assert_close(values, halved(kind)[name], atol=1e-4, rtol=0)
             assert values.std() > 0.05 * scale.get(name, 1)
-    for up in range(1, layout.depth if apart else 0):
+    for up in range(1, layout.depth if tolerance else 0):
         for name, values in level(producer, layout, layout.depth - up).items():
             mean = means(fine[name], branching**up)
             z, y, x = (slice(0, size) for size in mean.shape[:3])
             error = (values[z, y, x] - mean).abs().max() / scale.get(name, 1)
-            assert error <= (apart if up == 1 or apart < 1e-3 else 0.2), (name, up)
+            assert error <= (tolerance if up == 1 or tolerance < 1e-3 else 0.2), (name, up)
 
 
 @pytest.mark.parametrize("branching", [2, 3, 4])
@@ -184,10 +184,10 @@ def test_regions_hold_in_trees_of_any_n(kind, branching):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("kind", ["volume", "mesh", "hypertexture", "octaves"])
 def test_the_picture_is_that_of_any_other_n(kind):
-    seen, look = [], gv.TransferFunction.preset("gray", 0, 255) if kind == "mesh" else GRAY
+    seen, transfer = [], gv.TransferFunction.preset("gray", 0, 255) if kind == "mesh" else GRAY
     for branching in (2, 3, 4):
         with gv.Engine(KINDS[kind][0](branching), brick_size=4) as engine:
-            picture = engine.render(camera(24), look, lod="finest")
+            picture = engine.render(camera(24), transfer, lod="finest")
             engine.validate()
         assert picture.stats.converged and picture.alpha.max() > 0.3
         seen.append(picture.color)

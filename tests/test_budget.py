@@ -33,10 +33,10 @@ def test_nothing_is_raised_behind_a_budget(tmp_path, monkeypatch):
     """Also if a second exception arrives while the first one propagates."""
     monkeypatch.setattr(budget, "SECONDS", 0.1)
     (tmp_path / "a.npy").write_bytes(b"")
-    made = budget._Watch.__init__
+    original = budget._Watch.__init__
 
     def slow(self, *args) -> None:
-        made(self, *args)
+        original(self, *args)
         self._lock = _Slow(self._lock)
 
     monkeypatch.setattr(budget._Watch, "__init__", slow)
@@ -47,7 +47,7 @@ def test_nothing_is_raised_behind_a_budget(tmp_path, monkeypatch):
     end = time.monotonic() + 1.0
     while time.monotonic() < end:
         pass
-    assert not [one for one in threading.enumerate() if one.name == "gvtorch-budget"]
+    assert not [thread for thread in threading.enumerate() if thread.name == "gvtorch-budget"]
 
 
 def test_a_budget_ends_the_work_of_its_thread_alone(tmp_path, monkeypatch):

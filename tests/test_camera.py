@@ -150,7 +150,7 @@ def test_up_plus_y_has_the_bits_it_had():
 
 def seen_corners(camera: gv.Camera, box: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns the corners of a box in the picture, -1 to 1 in x and y, and their depths."""
-    corners = torch.stack([box[at, (0, 1, 2)] for at in itertools.product((0, 1), repeat=3)])
+    corners = torch.stack([box[ends, (0, 1, 2)] for ends in itertools.product((0, 1), repeat=3)])
     view, K = camera.viewmats[0], camera.Ks[0]
     x, y, z = (corners @ view[:3, :3].T + view[:3, 3]).unbind(1)
     if camera.model == "pinhole":
@@ -181,10 +181,10 @@ def test_a_fitted_box_is_whole_and_fills_the_picture(data):
     box = torch.stack((low, low + sides))
     camera = gv.Camera.orbit(*angles, None, fov, *size, model, up=up, fit=True)
     placed = camera.placed(box)
-    at, depth = seen_corners(placed, box)
-    assert at.abs().max() < 0.985 and depth.min() > 0
+    corners, depth = seen_corners(placed, box)
+    assert corners.abs().max() < 0.985 and depth.min() > 0
     if model in ("pinhole", "ortho"):
-        assert at.abs().max() > 0.95
+        assert corners.abs().max() > 0.95
     else:  # not closer than where the box spans 90 degrees
         half = (fov or 180) / 2
         wide = half * size[0] / size[1] if model == "fisheye" else 2 * half
@@ -204,7 +204,7 @@ def test_a_fitted_box_is_whole_and_fills_the_picture(data):
 
 
 def _corners_along(camera: gv.Camera, box: torch.Tensor) -> list[torch.Tensor]:
-    corners = torch.stack([box[at, (0, 1, 2)] for at in itertools.product((0, 1), repeat=3)])
+    corners = torch.stack([box[ends, (0, 1, 2)] for ends in itertools.product((0, 1), repeat=3)])
     view = camera.viewmats[0]
     return list((corners @ view[:3, :3].T + view[:3, 3]).abs().unbind(1))
 
@@ -214,9 +214,9 @@ def _corners_along(camera: gv.Camera, box: torch.Tensor) -> list[torch.Tensor]:
 def test_a_path_around_a_box_keeps_it_whole_and_its_distance(model, up):
     size = (300, 200)
     path = gv.CameraPath.orbit(BOX, model, 25, elevation=35, up=up, fit=size)
-    cameras = [path.camera(place / 60, *size, model) for place in range(61)]
-    most = [float(seen_corners(camera, BOX)[0].abs().max()) for camera in cameras]
-    assert max(most) < 1 and max(most) > 0.95
+    cameras = [path.camera(index / 60, *size, model) for index in range(61)]
+    extents = [float(seen_corners(camera, BOX)[0].abs().max()) for camera in cameras]
+    assert max(extents) < 1 and max(extents) > 0.95
     eyes = torch.cat([centre_of(camera) for camera in cameras])
     far = (eyes - BOX.mean(0)).norm(dim=1)
     assert far.max() / far.min() < 1.002  # not exactly: the curve is open
@@ -276,8 +276,8 @@ def test_a_thinned_camera_looks_through_the_middle_of_its_pixels_ahead_of_the_mo
     whole, first = camera.rays(), slice(None, None, 3)
     for name in ("origin", "direction", "cone", "range"):
         every = getattr(whole, name).view(len(camera), 9, 15, -1)
-        which = first if model == "custom" else middle
-        part = every[:, which, which].reshape(-1, every.shape[-1])
+        offset = first if model == "custom" else middle
+        part = every[:, offset, offset].reshape(-1, every.shape[-1])
         torch.testing.assert_close(getattr(rays, name), part, rtol=1e-12, atol=1e-12)
     move = slice(0, 3) if model == "custom" else slice(9, 12)
     before = now.clone()
@@ -295,10 +295,10 @@ def test_pinhole_rays_are_the_twin_s(compiled, cameras):
     numbers = camera.numbers(DEVICES[compiled])
     for first, rows in ((0, 23 * cameras), (5, 23 * cameras - 7), (22, 1), (3, 0)):
         given_ = (first, rows, 41, 23)
-        made = ops.pinhole_rays(numbers, *given_, backend=compiled)
+        outputs = ops.pinhole_rays(numbers, *given_, backend=compiled)
         twins = ops.pinhole_rays(numbers.cpu(), *given_, backend="reference")
-        for one, twin in zip(made, twins, strict=True):
-            assert torch.equal(one.cpu(), twin) and len(twin) == rows * 41
+        for output, twin in zip(outputs, twins, strict=True):
+            assert torch.equal(output.cpu(), twin) and len(twin) == rows * 41
         assert torch.allclose(twins[1].norm(dim=1), torch.ones(1, dtype=torch.float64))
         assert not rows or torch.equal(twins[0][-1], numbers[(first + rows - 1) // 23, 9:12].cpu())
     torch.library.opcheck(torch.ops.gvtorch.pinhole_rays.default, (numbers, 5, 9, 41, 23))
@@ -342,18 +342,18 @@ def test_small_cameras_share_calls(monkeypatch):
     cameras = gv.Camera.orbit(torch.linspace(0, 300, 20), 20, 1.5, width=16, height=16)
     calls: list[int] = []
 
-    def told(what, done, total):
+    def report(stage, done, total):
         calls.append(done)
 
-    one_call = gv.render(tree, cameras, shader, progress=told)
+    one_call = gv.render(tree, cameras, shader, progress=report)
     assert calls == [320] and one_call.alpha.max() > 0.3
     calls.clear()
     monkeypatch.setattr(pixels, "_RAYS_PER_REPORT", 1000)  # 62 rows, in the middle of a camera
-    parts = gv.render(tree, cameras, shader, progress=told)
+    parts = gv.render(tree, cameras, shader, progress=report)
     assert calls == [62, 124, 186, 248, 310, 320]
     traced, march = [], Tracer.__call__
     monkeypatch.setattr(
-        Tracer, "__call__", lambda own, rays: traced.append(rays) or march(own, rays)
+        Tracer, "__call__", lambda tracer, rays: traced.append(rays) or march(tracer, rays)
     )
     gv.render(tree, cameras, shader)
     assert len(traced) == 1, "nobody watches: one trace"

@@ -42,10 +42,10 @@ def askew(model: str = "pinhole") -> gv.Camera:
     return gv.Camera(view, Ks, 64, 48, model=model, radial_coeffs=bends)
 
 
-def assert_same(found: gv.Camera, camera: gv.Camera) -> None:
-    assert (found.width, found.height, found.model) == (camera.width, camera.height, camera.model)
+def assert_same(read: gv.Camera, camera: gv.Camera) -> None:
+    assert (read.width, read.height, read.model) == (camera.width, camera.height, camera.model)
     for name in ("viewmats", "Ks", "radial_coeffs"):
-        assert torch.allclose(getattr(found, name), getattr(camera, name), atol=1e-12), name
+        assert torch.allclose(getattr(read, name), getattr(camera, name), atol=1e-12), name
 
 
 @settings(max_examples=100, deadline=None)
@@ -55,10 +55,10 @@ def assert_same(found: gv.Camera, camera: gv.Camera) -> None:
 def test_a_quaternion_comes_back_from_its_rotation(q):
     rotation = rotation_of(q)
     assert torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-12)
-    found = quaternion_of(rotation)
+    actual = quaternion_of(rotation)
     expected = np.array(q) / np.linalg.norm(q)
-    assert found[0] >= 0
-    same = np.abs(np.array(found) - expected).max(), np.abs(np.array(found) + expected).max()
+    assert actual[0] >= 0
+    same = np.abs(np.array(actual) - expected).max(), np.abs(np.array(actual) + expected).max()
     assert min(same) < 1e-12
 
 
@@ -67,10 +67,10 @@ def test_a_quaternion_comes_back_from_its_rotation(q):
 def test_cameras_come_back(tmp_path, model, name):
     cameras = {"a.png": askew(model), "b.png": gv.Camera.look_at((1, 2, 9), TARGET, width=20)}
     gv.write_cameras(tmp_path / name, cameras)
-    found = gv.read_cameras(tmp_path / name)
-    assert list(found) == ["a.png", "b.png"]
-    for one, camera in cameras.items():
-        assert_same(found[one], camera)
+    actual = gv.read_cameras(tmp_path / name)
+    assert list(actual) == ["a.png", "b.png"]
+    for key, camera in cameras.items():
+        assert_same(actual[key], camera)
     if name == "cameras":
         files = sorted(file.name for file in (tmp_path / name).iterdir())
         assert files == ["cameras.txt", "images.txt", "points3D.txt"]
@@ -91,30 +91,30 @@ def test_paraview_sees_what_we_see(tmp_path, model):
     with pytest.raises(ValueError, match="distance must be finite and > 0"):
         gv.write_cameras(file, camera, distance=0)
     gv.write_cameras(file, camera, distance=7.0)
-    found = gv.read_cameras(file, width=64, height=48)["camera"]
-    assert_same(found, camera)
+    actual = gv.read_cameras(file, width=64, height=48)["camera"]
+    assert_same(actual, camera)
     pytest.importorskip("vtkmodules")
     import xml.etree.ElementTree as xml
 
     from vtkmodules.vtkRenderingCore import vtkCamera
 
-    told = {
-        one.get("name"): [float(e.get("value")) for e in one]
-        for one in xml.parse(file).getroot().iter("Property")
+    proxy = {
+        element.get("name"): [float(e.get("value")) for e in element]
+        for element in xml.parse(file).getroot().iter("Property")
     }
     other = vtkCamera()
-    other.SetPosition(told["CameraPosition"])
-    other.SetFocalPoint(told["CameraFocalPoint"])
-    other.SetViewUp(told["CameraViewUp"])
-    other.SetViewAngle(told["CameraViewAngle"][0])
-    other.SetParallelScale(told["CameraParallelScale"][0])
-    other.SetParallelProjection(int(told["CameraParallelProjection"][0]))
+    other.SetPosition(proxy["CameraPosition"])
+    other.SetFocalPoint(proxy["CameraFocalPoint"])
+    other.SetViewUp(proxy["CameraViewUp"])
+    other.SetViewAngle(proxy["CameraViewAngle"][0])
+    other.SetParallelScale(proxy["CameraParallelScale"][0])
+    other.SetParallelProjection(int(proxy["CameraParallelProjection"][0]))
     matrix = other.GetCompositeProjectionTransformMatrix(64 / 48, -1, 1)
     rows = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
     clip = np.concatenate((POINTS.numpy(), np.ones((4, 1))), 1) @ rows.T
     pixel = (clip[:, :2] / clip[:, 3:] * (1, -1) + 1) / 2 * (64, 48)
     assert np.allclose(pixel, seen(camera), atol=1e-9)
-    assert math.isclose(math.dist(told["CameraPosition"], told["CameraFocalPoint"]), 7.0)
+    assert math.isclose(math.dist(proxy["CameraPosition"], proxy["CameraFocalPoint"]), 7.0)
 
 
 def test_a_camera_of_blender_looks_along_its_minus_z(tmp_path):
@@ -146,12 +146,12 @@ def test_a_text_model_of_colmap(tmp_path):
     )
     cameras = gv.read_cameras(tmp_path)
     assert list(cameras) == ["first picture.jpg", "second.jpg"]
-    at = seen(cameras["first picture.jpg"], torch.tensor([(2.0, 3, 0)], dtype=torch.float64))
+    pixel = seen(cameras["first picture.jpg"], torch.tensor([(2.0, 3, 0)], dtype=torch.float64))
     assert torch.allclose(
-        at, torch.tensor([(320 + 50 * (-3 + 0.5), 240 + 50 * (2 - 1.0))]).double()
+        pixel, torch.tensor([(320 + 50 * (-3 + 0.5), 240 + 50 * (2 - 1.0))]).double()
     )
-    at = seen(cameras["second.jpg"], torch.tensor([(1.0, 0, -1)], dtype=torch.float64))
-    assert torch.allclose(at, torch.tensor([(420.0, 240.0)]).double())
+    pixel = seen(cameras["second.jpg"], torch.tensor([(1.0, 0, -1)], dtype=torch.float64))
+    assert torch.allclose(pixel, torch.tensor([(420.0, 240.0)]).double())
 
 
 def test_damaged_and_unknown_files_are_one_line(tmp_path):
@@ -218,8 +218,8 @@ def test_flights_tell_their_cameras_and_render_takes_them(small, tmp_path):
         run = gvtorch("fly", small, "-o", tmp_path / "f", "--frames", "3", *flags,
                       "--poses", tmp_path / name)  # fmt: skip
         assert run.returncode == 0, run.stderr
-        place = f"file:{tmp_path / name},0001.png"
-        run = gvtorch("render", small, "-o", tmp_path / "a.png", *flags, "--camera", place)
+        camera_flag = f"file:{tmp_path / name},0001.png"
+        run = gvtorch("render", small, "-o", tmp_path / "a.png", *flags, "--camera", camera_flag)
         assert run.returncode == 0, run.stderr
         image, expected = (gv.read_image(tmp_path / file) for file in ("a.png", "f/0001.png"))
         assert (image - expected).abs().max() < 0.02 and image.max() > 0.3
@@ -247,8 +247,8 @@ def test_damaged_bytes_give_cameras_or_one_line(tmp_path, name):
     letters = np.frombuffer(b'0123456789-+.eE"{}[]<>/: ,\n\xff', np.uint8)
     for number in range(300):
         damaged = np.frombuffer(whole, np.uint8).copy()
-        at = rng.integers(0, len(damaged), 1 + number % 4)
-        damaged[at] = rng.choice(letters, len(at))
+        positions = rng.integers(0, len(damaged), 1 + number % 4)
+        damaged[positions] = rng.choice(letters, len(positions))
         cut = rng.integers(0, len(damaged)) if number % 3 == 0 else len(damaged)
         file.write_bytes(damaged[:cut].tobytes())
         path = tmp_path / "model" if name.startswith("model") else file

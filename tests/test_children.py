@@ -72,13 +72,13 @@ def test_coarse_levels_are_the_means_of_what_lies_below(shape, branching, dtypes
     whole = gv.VolumeProducer(volumes, threshold=threshold, branching=branching)
     producer = gv.FromChildren(fine)
     layout = Layout.of(producer, 4, 1, torch.device("cpu"))
-    for one in (producer, whole):
-        one.prepare(layout)
+    for p in (producer, whole):
+        p.prepare(layout)
     pairs = zip(every_brick(producer, layout), every_brick(whole, layout), strict=True)
-    for (depth, _, found), (_, _, expected) in pairs:
+    for (depth, _, actual), (_, _, expected) in pairs:
         for name, rows in expected.items():
-            assert found[name].dtype == rows.dtype
-            assert torch.equal(found[name].double(), rows.double()), depth
+            assert actual[name].dtype == rows.dtype
+            assert torch.equal(actual[name].double(), rows.double()), depth
 
 
 @pytest.mark.parametrize("backend", COMPILED)

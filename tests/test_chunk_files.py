@@ -41,8 +41,8 @@ def zarr3(chunk: list[int], *codecs: dict[str, Any], **more: Any) -> dict[str, A
 
 
 def sharded(chunk: list[int], inner: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
-    told = {"chunk_shape": chunk, "codecs": inner, "index_codecs": [LITTLE, CRC], **more}
-    return {"name": "sharding_indexed", "configuration": told}
+    configuration = {"chunk_shape": chunk, "codecs": inner, "index_codecs": [LITTLE, CRC], **more}
+    return {"name": "sharding_indexed", "configuration": configuration}
 
 
 def zarr2(**more: Any) -> dict[str, Any]:
@@ -83,45 +83,45 @@ def stored(request, tmp_path) -> Path:
     return tmp_path / "a"
 
 
-def opened(place: str | Path, folder: Path) -> Any:
+def opened(location: str | Path, folder: Path) -> Any:
     heads = {"zarr.json": "zarr3", ".zarray": "zarr", "attributes.json": "n5"}
     driver = next(driver for name, driver in heads.items() if (folder / name).exists())
-    return opened_at(kvstore(place), {"driver": driver}).result()
+    return opened_at(kvstore(location), {"driver": driver}).result()
 
 
 def read(view: Any) -> Any:
     return begin_read(view, ChunkFiles.of(view))
 
 
-def box(place: tuple[int, ...]) -> tuple[slice, ...]:
-    return tuple(slice(a * n, (a + 1) * n) for a, n in zip(place, CHUNK, strict=True))
+def box(index: tuple[int, ...]) -> tuple[slice, ...]:
+    return tuple(slice(a * n, (a + 1) * n) for a, n in zip(index, CHUNK, strict=True))
 
 
-def swell(folder: Path, at: int) -> Path:
+def swell(folder: Path, offset: int) -> Path:
     """Makes the header of the only chunk claim that it holds a gigabyte."""
     (file,) = (
         path for path in folder.rglob("*") if path.is_file() and path.name not in METADATA_FILES
     )
     content = bytearray(file.read_bytes())
-    assert 120 <= struct.unpack_from("<I", content, at + 4)[0] <= 124
-    struct.pack_into("<I", content, at + 4, 1 << 30)
+    assert 120 <= struct.unpack_from("<I", content, offset + 4)[0] <= 124
+    struct.pack_into("<I", content, offset + 4, 1 << 30)
     file.write_bytes(content)
     return file
 
 
 @pytest.mark.parametrize("remote", [False, True], ids=["disk", "http"])
-@pytest.mark.parametrize("place", [(0, 0, 0), (1, 2, 1), (2, 0, 1)])
-def test_a_chunk_that_swells_costs_itself(stored, request, place, remote, tmp_path):
+@pytest.mark.parametrize("index", [(0, 0, 0), (1, 2, 1), (2, 0, 1)])
+def test_a_chunk_that_swells_costs_itself(stored, request, index, remote, tmp_path):
     kind = request.node.callspec.params["stored"]
     array = opened(stored, stored)
-    array[box(place)].write(7).result()
+    array[box(index)].write(7).result()
     assert (read(array).result() == 7).sum() == 60
     file = swell(stored, KINDS[kind][1])
     with serving(tmp_path) if remote else nullcontext(tmp_path) as root:
         array = opened(f"{root}/a", stored)
-        lists = [range(cut.start, cut.stop) for cut in box(place)]
-        points = array.vindex[tuple([0, cut.start] for cut in box(place))]
-        for view in (array, array[box(place)], array.oindex[tuple(map(list, lists))], points):
+        lists = [range(cut.start, cut.stop) for cut in box(index)]
+        points = array.vindex[tuple([0, cut.start] for cut in box(index))]
+        for view in (array, array[box(index)], array.oindex[tuple(map(list, lists))], points):
             with pytest.raises(Exception, match=r"Blosc|40[03]"):
                 read(view).result(timeout=30)
         if remote:
@@ -131,7 +131,7 @@ def test_a_chunk_that_swells_costs_itself(stored, request, place, remote, tmp_pa
             )
         if kind == "shards, turned":  # all chunks of a file are checked
             return
-        others = [other for other in np.ndindex(3, 3, 2) if other != place]
+        others = [other for other in np.ndindex(3, 3, 2) if other != index]
         for other in others:
             assert not read(array[box(other)]).result(timeout=30).any()
         each = tuple((np.array(others) * CHUNK).T)
@@ -141,34 +141,34 @@ def test_a_chunk_that_swells_costs_itself(stored, request, place, remote, tmp_pa
         if files.folder:
             files.check(np.array(others))
             with pytest.raises(http.Endless, match="Blosc would make"):
-                files.check(np.array([*others, place]))
+                files.check(np.array([*others, index]))
 
 
-@pytest.mark.parametrize("what", ["pipe", "folder", "long", "device"])
-def test_what_is_no_file_of_a_chunk_is_told(stored, what):
+@pytest.mark.parametrize("kind", ["pipe", "folder", "long", "device"])
+def test_what_is_no_file_of_a_chunk_is_told(stored, kind):
     array = opened(stored, stored)
     array[box((0, 0, 0))].write(7).result()
     (file,) = (
         path for path in stored.rglob("*") if path.is_file() and path.name not in METADATA_FILES
     )
     file.unlink()
-    if what == "pipe":
+    if kind == "pipe":
         os.mkfifo(file)
-    elif what == "folder":
+    elif kind == "folder":
         file.mkdir()
-    elif what == "device":
+    elif kind == "device":
         file.symlink_to("/dev/zero")
     else:
         with file.open("wb") as out:
             out.truncate(1 << 33)
-    wanted = "takes 8589934592 bytes, more than the" if what == "long" else "is not a regular file"
-    with pytest.raises(http.Endless, match=f"{file.relative_to(stored)}: {wanted}"):
+    reason = "takes 8589934592 bytes, more than the" if kind == "long" else "is not a regular file"
+    with pytest.raises(http.Endless, match=f"{file.relative_to(stored)}: {reason}"):
         read(array).result(timeout=5)
     assert not read(array[box((2, 2, 1))]).result().any()
     head = next(stored / head for head in METADATA_FILES if (stored / head).exists())
     head.unlink()
     file.rename(head)
-    with pytest.raises(http.Endless, match=f"{head.name}: {wanted}"):
+    with pytest.raises(http.Endless, match=f"{head.name}: {reason}"):
         opened_at(kvstore(stored), {"driver": "n5"}).result(timeout=5)
 
 
@@ -177,8 +177,8 @@ def test_places_are_known_of_items_that_are_chunks_alone():
     plain = {"folder": "/", "separator": "/", "item_bytes": 1}
     for first, time in (((1, 1, 1), []), ((1, 1, 1, 1), [7])):
         files = ChunkFiles(**plain, file=(*first, *item), chunk=(*first, *item))
-        wanted = [[*time, *place, 0, 0, 0, 0] for place in zyx.tolist()]
-        assert files.chunk_indices(7, zyx, item).tolist() == wanted
+        expected = [[*time, *index, 0, 0, 0, 0] for index in zyx.tolist()]
+        assert files.chunk_indices(7, zyx, item).tolist() == expected
         assert replace(files, transposed=True).chunk_indices(7, zyx, item) is None
         assert replace(files, chunk=(2, *files.chunk[1:])).chunk_indices(7, zyx, item) is None
         assert replace(files, chunk=(*files.chunk[:-1], 2)).chunk_indices(7, zyx, item) is None
@@ -187,8 +187,8 @@ def test_places_are_known_of_items_that_are_chunks_alone():
 
 def test_blosc_inside_another_codec_is_refused(tmp_path):
     packed = {"name": "gzip", "configuration": {"level": 5}}
-    place = {"driver": "file", "path": f"{tmp_path}/a/"}
-    spec = {**zarr3(CHUNK, LITTLE, BLOSC, packed), "kvstore": place}
+    location = {"driver": "file", "path": f"{tmp_path}/a/"}
+    spec = {**zarr3(CHUNK, LITTLE, BLOSC, packed), "kvstore": location}
     ts.open(spec, create=True).result().write(1).result()
     with pytest.raises(ValueError, match="a: Blosc lies inside gzip, where its output can't"):
         gv.read_volume(tmp_path / "a", axes="zyx")
@@ -213,12 +213,12 @@ def test_blocks_of_a_store_that_swell_cost_themselves(tmp_path):
         struct.pack_into("<I", content, begin + 4, (1 << 31) - 1)
         file.write_bytes(content)
         if kind == "gvtorch/blocks/0":
-            found, errors = read()
+            actual, errors = read()
             assert len(errors) == 1 and "Blosc would make 2147483647 bytes" in next(
                 iter(errors.values())
             )
             rest = np.delete(np.arange(len(blocks)), list(errors))
-            assert np.array_equal(found[rest], good[rest]) and not found[list(errors)].any()
+            assert np.array_equal(actual[rest], good[rest]) and not actual[list(errors)].any()
         else:
             with pytest.raises(OSError, match="Blosc would make 2147483647 bytes of a chunk"):
                 read()

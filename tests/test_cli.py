@@ -27,10 +27,10 @@ def test_the_version_is_told():
 
 def test_a_process_of_its_own(small, tmp_path):
     """All other tests run commands within the test process."""
-    for path, status, said in ((small, 0, 0), (tmp_path / "none.nrrd", 2, 1)):
+    for path, status, lines in ((small, 0, 0), (tmp_path / "none.nrrd", 2, 1)):
         command = [sys.executable, "-m", "gvtorch", "info", str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == status and len(done.stderr.splitlines()) == said, done.stderr
+        assert done.returncode == status and len(done.stderr.splitlines()) == lines, done.stderr
 
 
 @pytest.mark.parametrize("stream", ["full", "out", "err"])
@@ -90,8 +90,8 @@ def test_render_takes_other_shaders(small, tmp_path, shader):
     for name in ("plain", shader):
         file, flags = tmp_path / f"{name}.npz", level if name == shader else ()
         colors = () if name == "isosurface" else ("--tf", "gray")
-        look = ("--size", "24x24", *colors, "--npz", file, "--shader", name, *flags)
-        run = gvtorch("render", small, "-o", tmp_path / "a.png", *look)
+        options = ("--size", "24x24", *colors, "--npz", file, "--shader", name, *flags)
+        run = gvtorch("render", small, "-o", tmp_path / "a.png", *options)
         assert run.returncode == 0, run.stderr
         arrays[name] = np.load(file)
     assert "normal" in arrays[shader] and "normal" not in arrays["plain"]
@@ -166,14 +166,14 @@ def test_raw_options(tmp_path):
 @pytest.mark.backend("cpp")
 def test_cost_pictures(small, tmp_path):
     """Each cost gives another picture; the NPZ and the statistics stay those of the picture."""
-    found = {}
+    pictures = {}
     for show in ("picture", "samples", "nodes", "lod", "age", "fill"):
         out, npz = tmp_path / f"{show}.png", tmp_path / f"{show}.npz"
         run = gvtorch("render", small, "-o", out, "--npz", npz, "--show", show, "--size", "16x16")
         assert run.returncode == 0, run.stderr
-        found[show] = out.read_bytes()
+        pictures[show] = out.read_bytes()
         assert npz.read_bytes() == (tmp_path / "picture.npz").read_bytes()
-    assert len(set(found.values())) >= 4, "age and lod of one level are flat"
+    assert len(set(pictures.values())) >= 4, "age and lod of one level are flat"
     wrong = gvtorch("render", small, "-o", tmp_path / "x.png", "--show", "heat")
     assert wrong.returncode == 2 and "heat" in wrong.stderr
 
@@ -327,7 +327,7 @@ def test_package_runs_as_a_module():
 def test_a_store_renders_as_its_volume_does(scan_store, tmp_path):
     """Through a pool of a few bricks, in every mode, with its cost."""
     arrays = {}
-    look = ("--size", "64x48", "--tf", "gray", "--camera", "orbit:30,20,1.5")
+    options = ("--size", "64x48", "--tf", "gray", "--camera", "orbit:30,20,1.5")
     small_pool = ("--brick-pool", "40 kB", "--node-pool", "20 kB", "--loading", "levels")
     for name, path, extra in (
         ("volume", scan_store.with_name("ball.npy"), ("--spacing", "1,1,2")),
@@ -337,7 +337,7 @@ def test_a_store_renders_as_its_volume_does(scan_store, tmp_path):
     ):
         out, npz, stats = (tmp_path / f"{name}.{end}" for end in ("png", "npz", "json"))
         run = gvtorch(
-            *("render", path, "-o", out, "--npz", npz, "--stats", stats, *look, *extra),
+            *("render", path, "-o", out, "--npz", npz, "--stats", stats, *options, *extra),
         )
         assert run.returncode == 0, run.stderr
         arrays[name] = np.load(npz)
@@ -504,8 +504,8 @@ def test_what_is_left_out_is_told(tmp_path):
     assert run.returncode == 0 and "nothing is seen: values range from" in run.stderr
     assert gvtorch("convert", tmp_path / "a.ome.tif", tmp_path / "a.zarr").returncode == 0
     run = gvtorch("render", tmp_path / "a.zarr", *flags, *surface, "--stats", tmp_path / "a.json")
-    told = f"values range from {data[:, 1].min()} to {data[:, 1].max()}"
-    assert run.returncode == 0 and told in run.stderr and (tmp_path / "a.json").exists()
+    message = f"values range from {data[:, 1].min()} to {data[:, 1].max()}"
+    assert run.returncode == 0 and message in run.stderr and (tmp_path / "a.json").exists()
 
 
 def test_info_counts_labels(tmp_path):

@@ -202,14 +202,14 @@ def test_flags_that_would_do_nothing_are_refused(small, scan_store, tmp_path, ma
 def test_a_component_that_is_not_there_names_what_is(small, scan_store, tmp_path):
     np.save(tmp_path / "two.npy", np.zeros((5, 6, 7, 2), np.uint8))
     for command in ("render", "slice"):
-        for path, told in (
+        for path, message in (
             (small, "one number: 0"),
             (scan_store, "one number: 0"),
             (tmp_path / "two.npy", "2 numbers: 0, 1"),
         ):
             run = gvtorch(command, path, "-o", tmp_path / "a.png", "--component", "2")
             assert run.returncode == 2 and len(run.stderr.splitlines()) == 1, run.stderr
-            assert f"--component 2: a voxel has {told}" in run.stderr, run.stderr
+            assert f"--component 2: a voxel has {message}" in run.stderr, run.stderr
 
 
 def test_help_offers_what_a_command_takes(scan_store, monkeypatch):
@@ -237,8 +237,8 @@ def test_commands_in_the_docs_are_commands():
     listed = re.compile(rf"^gvtorch (?:{'|'.join(cli._COMMANDS)}) .*", re.M)
     lines = [line for page in pages for line in listed.findall(page.read_text())]
     commands = [shlex.split(line, comments=True)[1:] for line in lines]
-    assert len(commands) > 30 and {words[0] for words in commands} == {*cli._COMMANDS}
-    for words in commands:
-        if "--help" not in words:
+    assert len(commands) > 30 and {command[0] for command in commands} == {*cli._COMMANDS}
+    for command in commands:
+        if "--help" not in command:
             config = (tyro.conf.CascadeSubcommandArgs,)
-            tyro.extras.subcommand_cli_from_dict(cli._COMMANDS, args=words, config=config)
+            tyro.extras.subcommand_cli_from_dict(cli._COMMANDS, args=command, config=config)

@@ -82,8 +82,8 @@ def test_backgrounds_tone_and_samples(small, tmp_path):
 def test_files_of_every_kind(small, tmp_path, name, bits):
     run(small, "-o", tmp_path / name, "--bits", bits, "--stats", tmp_path / "a.json")
     expected = picture(small, gv.Camera.orbit(20, 10, 0.8, None, 24, 16))
-    found = gv.read_image(tmp_path / name)[..., :3]
-    torch.testing.assert_close(found, expected.color, atol=0.01, rtol=0)
+    actual = gv.read_image(tmp_path / name)[..., :3]
+    torch.testing.assert_close(actual, expected.color, atol=0.01, rtol=0)
     assert '"rays": 384' in (tmp_path / "a.json").read_text()
 
 

@@ -121,8 +121,8 @@ def test_every_format_converts_to_what_read_volume_reads(tmp_path):
     files = source_files(tmp_path / "files")
     detached = files.pop("raw.raw", None)
     assert detached is not None and len(files) == 25
-    found = {find_format(str(file)).name for file in files.values()}
-    assert found == {f.name for f in FORMATS} - ELSEWHERE
+    formats = {find_format(str(file)).name for file in files.values()}
+    assert formats == {f.name for f in FORMATS} - ELSEWHERE
     for name, file in files.items():
         volume = gv.read_volume(file)
         source = open_source(file)
@@ -227,12 +227,12 @@ def crash_after(monkeypatch, count: int, error: Exception) -> list[tuple[int, ..
     ran: list[tuple[int, ...]] = []
     original = shard.write_shard
 
-    def write(job, level, place):
+    def write(job, level, position):
         if len(ran) == count:
             raise error
-        result = original(job, level, place)
+        result = original(job, level, position)
         if "memory" not in job.root["driver"]:
-            ran.append((level, *place))
+            ran.append((level, *position))
         return result
 
     monkeypatch.setattr(shard, "write_shard", write)
@@ -386,9 +386,9 @@ def test_command_converts_and_tells(tmp_path, raw, data, capsys):
     store = Store.open(target)
     assert (store.block, store.spacing, store.threshold) == (64, (1, 2, 3), 4)
     code, out, err = run_cli(capsys, "info", target, "--json")
-    told = json.loads(out)
-    assert told["extent"] == [300, 20, 9] and told["dtype"] == "uint8" and told["levels"] == 7
-    assert told["range"] == [[float(data.min()), float(data.max())]] and told["disk bytes"] > 0
+    facts = json.loads(out)
+    assert facts["extent"] == [300, 20, 9] and facts["dtype"] == "uint8" and facts["levels"] == 7
+    assert facts["range"] == [[float(data.min()), float(data.max())]] and facts["disk bytes"] > 0
     code, out, err = run_cli(capsys, "convert", raw, target)
     assert code == 2 and err.count("\n") == 1 and "there is a store already" in err
     code, out, err = run_cli(
@@ -399,9 +399,9 @@ def test_command_converts_and_tells(tmp_path, raw, data, capsys):
 
 def test_estimate_is_near_the_truth(tmp_path):
     data = noise((150, 150, 150, 1))
-    told = estimate(gv.Volume(data), tmp_path / "a.zarr")
+    estimated = estimate(gv.Volume(data), tmp_path / "a.zarr")
     store = convert(gv.Volume(data), tmp_path / "a.zarr")
     size = store.describe()["disk bytes"]
-    assert told.disk_bytes == pytest.approx(size, rel=0.35)
-    assert told.levels == store.levels and told.tasks == 6
-    assert told.source_bytes == data.nbytes and told.seconds > 0
+    assert estimated.disk_bytes == pytest.approx(size, rel=0.35)
+    assert estimated.levels == store.levels and estimated.tasks == 6
+    assert estimated.source_bytes == data.nbytes and estimated.seconds > 0

@@ -44,13 +44,13 @@ def test_a_converter_that_starts_at_the_same_time_leaves_a_finished_store_alone(
     target, other = tmp_path / "a.zarr", noise(SHAPE, seed=1)
     original, before = conversion.plan_of, {}
 
-    def plan(*given):
+    def plan(*args):
         """Lets the other converter start later and finish first."""
         if not before:
             before["running"] = b""
             convert(gv.Volume(other), target)
             before.update(listed(target))
-        return original(*given)
+        return original(*args)
 
     monkeypatch.setattr(conversion, "plan_of", plan)
     with pytest.raises(FileExistsError, match="there is a store already"):
@@ -63,7 +63,7 @@ def test_a_converter_that_starts_at_the_same_time_leaves_a_finished_store_alone(
 def test_a_converter_does_not_take_over_what_another_has_begun(tmp_path, raw, data, monkeypatch):
     target, original = tmp_path / "a.zarr", conversion.plan_of
 
-    def plan(*given):
+    def plan(*args):
         with monkeypatch.context() as patch:
             patch.setattr(conversion, "plan_of", original)
             patch.setattr(shard, "write_shard", lambda *_: 1 / 0)
@@ -71,7 +71,7 @@ def test_a_converter_does_not_take_over_what_another_has_begun(tmp_path, raw, da
             patch.setattr(conversion, "estimate_of", lambda *_: None)
             with pytest.raises(ZeroDivisionError):
                 convert(raw, target, workers=1)
-        return original(*given)
+        return original(*args)
 
     with monkeypatch.context() as patch:
         patch.setattr(conversion, "plan_of", plan)
@@ -85,11 +85,11 @@ def test_the_lock_of_a_target_that_went_away_is_taken_anew(tmp_path, monkeypatch
 
     target, original, turns = tmp_path / "a.zarr", fcntl.flock, []
 
-    def flock(*given):
+    def flock(*args):
         if not turns:
             shutil.rmtree(target)  # as another converter may, with the lock file that is open here
-        turns.append(given)
-        return original(*given)
+        turns.append(args)
+        return original(*args)
 
     monkeypatch.setattr(fcntl, "flock", flock)
     with unfinished.claimed(target, {}, resume=False):
@@ -128,12 +128,12 @@ def begun(tmp_path, raw, monkeypatch) -> Path:
     """A half-written store, of which three tasks are done."""
     original, ran = shard.write_shard, []
 
-    def write(task, level, place):
+    def write(task, level, position):
         if len(ran) == 3:
             raise ZeroDivisionError
-        result = original(task, level, place)
+        result = original(task, level, position)
         if task.root["driver"] == "file":
-            ran.append(place)
+            ran.append(position)
         return result
 
     with monkeypatch.context() as patch:
@@ -146,9 +146,9 @@ def begun(tmp_path, raw, monkeypatch) -> Path:
 def tasks_of_resuming(raw: Path, target: Path, monkeypatch) -> list[tuple[int, ...]]:
     original, ran = shard.write_shard, []
 
-    def write(task, level, place):
-        ran.append((level, *place))
-        return original(task, level, place)
+    def write(task, level, position):
+        ran.append((level, *position))
+        return original(task, level, position)
 
     with monkeypatch.context() as patch:
         patch.setattr(shard, "write_shard", write)
@@ -156,8 +156,8 @@ def tasks_of_resuming(raw: Path, target: Path, monkeypatch) -> list[tuple[int, .
     return ran
 
 
-@pytest.mark.parametrize("how", ["cut", "changed", "nonsense", "empty"])
-def test_a_damaged_line_of_the_journal_has_its_task_done_again(begun, raw, data, monkeypatch, how):
+@pytest.mark.parametrize("kind", ["cut", "changed", "nonsense", "empty"])
+def test_a_damaged_line_of_the_journal_has_its_task_done_again(begun, raw, data, monkeypatch, kind):
     journal = begun / WORK / "journal.jsonl"
     lines = journal.read_text().splitlines(keepends=True)
     assert len(lines) == 3
@@ -166,7 +166,7 @@ def test_a_damaged_line_of_the_journal_has_its_task_done_again(begun, raw, data,
         "changed": lines[1].replace('"voxels": ', '"voxels": 1'),
         "nonsense": "[" * 10**5 + "\n",
         "empty": "\n",
-    }[how]
+    }[kind]
     again = json.loads(journal.read_text().splitlines()[1])["task"]
     journal.write_text("".join(lines))
     ran = tasks_of_resuming(raw, begun, monkeypatch)
@@ -213,15 +213,15 @@ def refusals(target: Path) -> list[str]:
         store = Store.open(target)
     except (ValueError, OSError) as error:
         return [str(error)]
-    said = []
-    places = np.array(list(np.ndindex(*store.block_grid(0))))
-    said += sorted(set(store.read_blocks(0, places)[1].values()))
+    messages = []
+    positions = np.array(list(np.ndindex(*store.block_grid(0))))
+    messages += sorted(set(store.read_blocks(0, positions)[1].values()))
     for read, size in ((store.read_cells, store.cell_grid(0)), (store.read_region, None)):
         try:
             read(0, (0, 0, 0), size or store.level_extent(0)[::-1])
         except OSError as error:
-            said.append(str(error))
-    return said
+            messages.append(str(error))
+    return messages
 
 
 def test_whole_stores_are_read(whole, copied):
@@ -240,8 +240,8 @@ def test_whole_stores_are_read(whole, copied):
 def test_a_file_copied_over_another_is_an_error(copied, name, other):
     assert (copied / name).exists()
     shutil.copyfile(copied / other, copied / name)
-    said = refusals(copied)
-    assert said and all(name in one and "checksum" in one for one in said)
+    messages = refusals(copied)
+    assert messages and all(name in message and "checksum" in message for message in messages)
 
 
 def test_metadata_that_is_not_what_was_written_is_an_error(copied, whole):
@@ -258,8 +258,8 @@ def test_metadata_that_is_not_what_was_written_is_an_error(copied, whole):
     listed = sums.read_text()
     for text in ("{}", '{"files": {}}', "[" * 10**5, None):
         sums.unlink() if text is None else sums.write_text(text)
-        said = refusals(copied)
-        assert len(said) >= 3 and all("checksums.json" in one for one in said), said
+        messages = refusals(copied)
+        assert len(messages) >= 3 and all("checksums.json" in m for m in messages), messages
     sums.write_text(listed)
     assert refusals(copied) == []
 
@@ -267,8 +267,8 @@ def test_metadata_that_is_not_what_was_written_is_an_error(copied, whole):
 def test_a_store_without_checksums_is_read(copied):
     root = copied / "zarr.json"
     content = json.loads(root.read_text())
-    own = content["attributes"]["gvtorch"]
-    del own["checksum"], own["files_sum"]
+    attributes = content["attributes"]["gvtorch"]
+    del attributes["checksum"], attributes["files_sum"]
     root.write_text(json.dumps(content))
     (copied / "gvtorch/checksums.json").unlink()
     assert refusals(copied) == []
@@ -278,10 +278,10 @@ def test_a_streamed_node_of_a_wrong_file_fails_alone(copied):
     name = "gvtorch/blocks/0/c/0/0/0/1/0/0/0/0"
     shutil.copyfile(copied / name.replace("c/0", "c/1", 1), copied / name)
     with gv.Engine(gv.StoredProducer(str(copied))) as engine:
-        look = gv.TransferFunction.preset("gray", 0, 255)
+        transfer = gv.TransferFunction.preset("gray", 0, 255)
         for azimuth in (0, 90, 180, 270):
             view = gv.Camera.orbit(azimuth, width=24, height=16, distance=1)
-            picture = engine.render(view, look, lod="finest")
+            picture = engine.render(view, transfer, lod="finest")
             assert torch.isfinite(picture.color).all()
         assert {"checksum" in failure.message for failure in engine.failures} == {True}
         assert all(

@@ -47,12 +47,12 @@ def test_what_is_put_around_rays_is_counted(blobs, compiled, name):
     soft = gv.TransferFunction.from_points([(0, 0), (0.2, 0), (1, 0.6)])
     every = AROUND["lens"] | AROUND["clip"] | AROUND["layer"]
     options = AROUND.get(name, every)
-    beside = {} if name in AROUND else AROUND["lens"]
+    extra = {} if name in AROUND else AROUND["lens"]
     drawn, counted = (f(tree, CAMERA, soft, **options) for f in (gv.render, gv.cost))
-    whole = gv.cost(tree, CAMERA, soft, **beside)
+    whole = gv.cost(tree, CAMERA, soft, **extra)
     assert (drawn.samples != counted.samples).sum() <= 0.01 * 24 * 24, "rounding may move an end"
     assert torch.equal(counted.lod.isnan(), counted.lod.isnan() | (drawn.alpha == 0))
-    nodes, levels = ([f(one) for one in (counted, whole)] for f in (_nodes, _level))
+    nodes, levels = ([f(cost) for cost in (counted, whole)] for f in (_nodes, _level))
     if name == "translucent":
         torch.testing.assert_close(counted.lod, whole.lod, rtol=0, atol=0.02, equal_nan=True)
         assert nodes[0] >= nodes[1]
@@ -75,15 +75,15 @@ def test_nodes_are_counted_up_to_where_a_ray_ends(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     haze = gv.TransferFunction.from_points([(0, 0.001), (1, 0.002)])
     wall = gv.TransferFunction.from_points([(0, 1), (1, 1)])
-    found = gv.cost(tree, CAMERA, haze, lod="finest").nodes
+    nodes = gv.cost(tree, CAMERA, haze, lod="finest").nodes
     rays = CAMERA.placed(tree.box).rays().to(tree.device)
-    _, given = arguments(copy_to(tree, DEVICES[compiled]), 1, SHADER)
-    hides_none = torch.arange(1, len(given.opaque_m) + 1, dtype=torch.int32, device=tree.device)
-    given = given._replace(opaque_m=hides_none, table_lm4=given.table_lm4[:1], cone_scale=0.0)
-    segments = trace_segments(RayArguments.of(rays), given)
-    assert torch.equal(found.reshape(-1), segments.counts[:, 2]) and found.max() > 8
+    _, args = arguments(copy_to(tree, DEVICES[compiled]), 1, SHADER)
+    hides_none = torch.arange(1, len(args.opaque_m) + 1, dtype=torch.int32, device=tree.device)
+    args = args._replace(opaque_m=hides_none, table_lm4=args.table_lm4[:1], cone_scale=0.0)
+    segments = trace_segments(RayArguments.of(rays), args)
+    assert torch.equal(nodes.reshape(-1), segments.counts[:, 2]) and nodes.max() > 8
     first = gv.cost(tree, CAMERA, wall, lod="finest").nodes
-    assert (first <= found).all() and first.max() == 1
+    assert (first <= nodes).all() and first.max() == 1
 
 
 def test_nothing_is_marked(blobs, backend):
@@ -158,8 +158,8 @@ def test_pictures_in_false_colours(blobs, tmp_path):
     for name in ("samples", "nodes", "lod", "age", "fill"):
         picture = counted.picture(name)
         assert picture.color.shape == (24, 24, 3) and picture.to_srgb8().max() > 50
-        known = ~getattr(counted, name).float().isnan()
-        assert (picture.color[~known[..., 0]] == 0).all()
+        valid = ~getattr(counted, name).float().isnan()
+        assert (picture.color[~valid[..., 0]] == 0).all()
     picture.save(tmp_path / "cost.png")
     low, high = (counted.picture("samples", low=a, high=b) for a, b in ((0, 1e9), (-1e9, -1e8)))
     assert len(low.color.flatten(0, 1).unique(dim=0)) == 1

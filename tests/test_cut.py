@@ -22,12 +22,12 @@ def level(shape: tuple[int, ...], dtype: torch.dtype, seed: int = 0) -> torch.Te
     return torch.randint(0, 200, shape, generator=generator).to(dtype)
 
 
-def by_padding(values: torch.Tensor, place: torch.Tensor, size: int, border: int) -> np.ndarray:
+def by_padding(values: torch.Tensor, position: torch.Tensor, size: int, border: int) -> np.ndarray:
     """Cuts bricks from a level that is padded far enough on all sides."""
-    far = (int(place.abs().max()) + 2) * size + border if len(place) else 0
+    far = (int(position.abs().max()) + 2) * size + border if len(position) else 0
     padded = np.pad(values.double().numpy(), ((far, far),) * 3 + ((0, 0),), mode="edge")
     side = size + 2 * border
-    low = place.numpy() * size - border + far
+    low = position.numpy() * size - border + far
     cut = [padded[z : z + side, y : y + side, x : x + side] for z, y, x in low]
     return np.stack(cut) if cut else np.zeros((0, side, side, side, values.shape[3]))
 
@@ -40,25 +40,25 @@ def test_bricks_are_cut_with_borders_and_clamped_at_the_faces(backend, data, siz
     shape = [data.draw(st.integers(1, 12)) for _ in range(3)]
     values = level((*shape, data.draw(st.integers(1, 3))), data.draw(st.sampled_from(DTYPES)))
     rows = st.tuples(*[st.integers(-2, 13 // size + 1)] * 3)
-    place = torch.tensor(data.draw(st.lists(rows, max_size=9)), dtype=torch.int64).view(-1, 3)
+    position = torch.tensor(data.draw(st.lists(rows, max_size=9)), dtype=torch.int64).view(-1, 3)
     device = DEVICES[backend]
-    cut = ops.cut_bricks(values.to(device), place.to(device), size, border, backend=backend)
+    cut = ops.cut_bricks(values.to(device), position.to(device), size, border, backend=backend)
     assert cut.dtype == values.dtype
-    assert np.array_equal(cut.cpu().double().numpy(), by_padding(values, place, size, border))
+    assert np.array_equal(cut.cpu().double().numpy(), by_padding(values, position, size, border))
 
 
 def test_a_level_may_be_any_view(backend):
     values = level((9, 7, 11, 2), torch.float32).to(DEVICES[backend])
-    place = torch.tensor([[0, 1, 1], [1, 0, 2]], device=values.device)
+    position = torch.tensor([[0, 1, 1], [1, 0, 2]], device=values.device)
     turned = values.transpose(0, 2)
-    cut = ops.cut_bricks(turned, place, 4, 1, backend=backend)
-    assert torch.equal(cut, ops.cut_bricks(turned.contiguous(), place, 4, 1, backend=backend))
+    cut = ops.cut_bricks(turned, position, 4, 1, backend=backend)
+    assert torch.equal(cut, ops.cut_bricks(turned.contiguous(), position, 4, 1, backend=backend))
 
 
 def test_cut_bricks_passes_opcheck(compiled):
     values = level((5, 6, 7, 1), torch.uint8).to(DEVICES[compiled])
-    place = torch.tensor([[0, 0, 1]], device=values.device)
-    torch.library.opcheck(torch.ops.gvtorch.cut_bricks.default, (values, place, 4, 1))
+    position = torch.tensor([[0, 0, 1]], device=values.device)
+    torch.library.opcheck(torch.ops.gvtorch.cut_bricks.default, (values, position, 4, 1))
 
 
 @pytest.mark.parametrize(
@@ -81,5 +81,5 @@ def test_bricks_beyond_any_level_are_its_edge(backend):
     values = level((3, 4, 5, 2), torch.uint8).to(DEVICES[backend])
     far = torch.tensor([[2**63 - 1, 0, -(2**63)], [0, 2**62, 1]], device=values.device)
     near = far.clamp(-9, 9)
-    found = ops.cut_bricks(values, far, 2, 1, backend=backend)
-    assert torch.equal(found, ops.cut_bricks(values, near, 2, 1, backend=backend))
+    bricks = ops.cut_bricks(values, far, 2, 1, backend=backend)
+    assert torch.equal(bricks, ops.cut_bricks(values, near, 2, 1, backend=backend))

@@ -18,17 +18,17 @@ WAY = np.array([0.5, 0.32, 0.81])
 def gap(points: np.ndarray) -> np.ndarray:
     """Returns distance estimates (...,) of points (..., 3), 0 inside: z^8 + c by angles."""
     c = np.moveaxis(np.asarray(points, np.float64), -1, 0)
-    z, apart = c.copy(), np.ones(c.shape[1:])
+    z, slope = c.copy(), np.ones(c.shape[1:])
     radius = np.sqrt((z * z).sum(0))
     for _ in range(STEPS):
         on = radius <= 2
         theta = 8 * np.arctan2(np.hypot(z[0], z[1]), z[2])
         phi, power = 8 * np.arctan2(z[1], z[0]), radius**8
         turned = np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)))
-        apart = np.where(on, 8 * radius**7 * apart + 1, apart)
+        slope = np.where(on, 8 * radius**7 * slope + 1, slope)
         z = np.where(on, power * turned + c, z)
         radius = np.sqrt((z * z).sum(0))
-    outside = 0.5 * radius * np.log(np.maximum(radius, 1)) / apart
+    outside = 0.5 * radius * np.log(np.maximum(radius, 1)) / slope
     return np.where(radius <= 2, 0.0, outside)
 
 
@@ -42,12 +42,12 @@ def surface_place() -> np.ndarray:
     return outside * WAY / np.linalg.norm(WAY)
 
 
-def camera(place: np.ndarray, level: int, size: int) -> gv.Camera:
-    """Returns a camera 2^-level of the box away from `place`, where there is most room."""
-    ways = np.random.default_rng(0).normal(size=(500, 3))
-    eyes = place + BOX * 0.5**level * ways / np.linalg.norm(ways, axis=1, keepdims=True)
+def camera(point: np.ndarray, level: int, size: int) -> gv.Camera:
+    """Returns a camera 2^-level of the box away from `point`, where there is most room."""
+    directions = np.random.default_rng(0).normal(size=(500, 3))
+    eyes = point + BOX * 0.5**level * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     eye = eyes[gap(eyes).argmax()]
-    return gv.Camera.look_at(tuple(eye), tuple(place), (0, 0, 1), fov=50, width=size, height=size)
+    return gv.Camera.look_at(tuple(eye), tuple(point), (0, 0, 1), fov=50, width=size, height=size)
 
 
 def first_below(rays: gv.Rays, share: float, cone: np.ndarray, end: float) -> np.ndarray:
@@ -55,18 +55,18 @@ def first_below(rays: gv.Rays, share: float, cone: np.ndarray, end: float) -> np
     cones, which are `cone` wide per unit of distance; +inf: none before `end`.
     """
     origin, direction = rays.origin.double().numpy(), rays.direction.double().numpy()
-    t, found = np.full(len(origin), 1e-3 * end), np.full(len(origin), np.inf)
+    t, distance = np.full(len(origin), 1e-3 * end), np.full(len(origin), np.inf)
     for _ in range(3000):
-        open_ = np.isinf(found) & (t < end)
+        open_ = np.isinf(distance) & (t < end)
         if not open_.any():
             break
         near = gap(origin[open_] + t[open_, None] * direction[open_])
         wide = cone[open_] * t[open_]
         hit = near < share * wide
         row = open_.nonzero()[0]
-        found[row[hit]] = t[row[hit]]
+        distance[row[hit]] = t[row[hit]]
         t[row] += np.maximum(0.2 * near, 0.1 * wide)
-    return found
+    return distance
 
 
 @pytest.fixture(scope="module")
@@ -84,11 +84,11 @@ def opened(bricks: str) -> gv.Engine:
     return gv.Engine(producer, brick_pool=bricks, node_pool="8 MB")
 
 
-def seen_from_near(engine: gv.Engine, place: np.ndarray, level: int, size: int) -> gv.Picture:
+def seen_from_near(engine: gv.Engine, point: np.ndarray, level: int, size: int) -> gv.Picture:
     """Renders a picture, and asserts that the drawn surface lies where estimates fall from a cone's
     width to a fiftieth of it: nothing is in front of that, and no hole is behind.
     """
-    scale, view = 2.0, camera(place, level, size)
+    scale, view = 2.0, camera(point, level, size)
     picture = engine.render(view, gv.Isosurface(0.25), cone_scale=scale)
     engine.validate()
     assert picture.stats.converged and not picture.stats.failed
@@ -101,10 +101,10 @@ def seen_from_near(engine: gv.Engine, place: np.ndarray, level: int, size: int) 
     assert seen.mean() > 0.5 and np.isfinite(depth[seen]).all(), "no holes"
     wide = 2 * cone * np.where(np.isfinite(depth), depth, 0)
     assert (depth > early - wide)[np.isfinite(depth)].all(), "nothing stands in the way"
-    beside = (depth - late)[seen] / wide[seen]
-    assert np.quantile(beside, 0.97) < 1, beside.max()
+    error = (depth - late)[seen] / wide[seen]
+    assert np.quantile(error, 0.97) < 1, error.max()
     print(
-        f"2^-{level}: {seen.mean():.2f} seen, {np.quantile(beside, (0, 0.5, 0.97, 1))} cones beside"
+        f"2^-{level}: {seen.mean():.2f} seen, {np.quantile(error, (0, 0.5, 0.97, 1))} cones beside"
     )
     return picture
 
@@ -120,32 +120,32 @@ def test_a_flight_through_all_levels_is_that_of_the_formula():
     """From 2^-4 to 2^-30 of the box, with a pool that holds a part of what is seen on the way, and
     constant memory; back at the start, the picture has the same bits as before.
     """
-    place, made = surface_place(), 0
+    point, bricks_made = surface_place(), 0
     with opened("2 MB") as engine:
         for level in range(4, 31):
-            picture = seen_from_near(engine, place, level, 20)
-            made += picture.stats.produced["bricks"]
+            picture = seen_from_near(engine, point, level, 20)
+            bricks_made += picture.stats.produced["bricks"]
             if level == 4:
                 first, memory = picture, engine.memory()
             if level == 10:
                 resident = resident_bytes()
-        assert made > 2 * engine.cache.bricks.capacity, "the pool was filled anew"
+        assert bricks_made > 2 * engine.cache.bricks.capacity, "the pool was filled anew"
         assert engine.memory() == memory and resident_bytes() - resident < 20e6
-        back = seen_from_near(engine, place, 4, 20)
+        back = seen_from_near(engine, point, 4, 20)
         assert torch.equal(back.depth, first.depth) and torch.equal(back.color, first.color)
 
 
 @pytest.mark.backend("cpp")
 def test_single_and_double_see_the_same_from_near(bulb):
     """No jitter: float32 rays that begin 10^-8 of the box away meet what float64 rays do."""
-    engine, place = bulb
-    view = camera(place, 27, 16)
-    look = gv.Isosurface(0.25)
+    engine, point = bulb
+    view = camera(point, 27, 16)
+    shader = gv.Isosurface(0.25)
     single, double = (
-        engine.render(view, look, cone_scale=2.0, dtype=dtype)
+        engine.render(view, shader, cone_scale=2.0, dtype=dtype)
         for dtype in (torch.float32, torch.float64)
     )
     assert torch.equal(torch.isfinite(single.depth), torch.isfinite(double.depth))
     seen = torch.isfinite(double.depth)
-    beside = (single.depth - double.depth).abs()[seen] / double.depth[seen]
-    assert seen.float().mean() > 0.5 and beside.double().quantile(0.9) < 1e-4
+    error = (single.depth - double.depth).abs()[seen] / double.depth[seen]
+    assert seen.float().mean() > 0.5 and error.double().quantile(0.9) < 1e-4

@@ -17,24 +17,24 @@ def test_the_whole_range_of_a_dtype(dtype):
     data = torch.zeros(3, 4, 5, dtype=dtype)
     info = torch.finfo(dtype)
     data[0, 0, 0], data[1, 1, 1] = info.min, info.max
-    told = gv.Volume(data).describe(bins=7)
-    assert told["histogram"] == [1, 0, 0, 58, 0, 0, 1] and told["mean"] == 0
-    assert told["range"] == [info.min, info.max]
+    facts = gv.Volume(data).describe(bins=7)
+    assert facts["histogram"] == [1, 0, 0, 58, 0, 0, 1] and facts["mean"] == 0
+    assert facts["range"] == [info.min, info.max]
 
 
 @pytest.mark.parametrize("value", [0.0, 7.0, -3e30, 1e-30, 65504.0])
 def test_flat_data(value):
-    told = gv.Volume(np.full((3, 4, 5), value, np.float32)).describe()
-    assert sum(told["histogram"]) == told["histogram"][0] == 60
-    assert told["mean"] == pytest.approx(value)
+    facts = gv.Volume(np.full((3, 4, 5), value, np.float32)).describe()
+    assert sum(facts["histogram"]) == facts["histogram"][0] == 60
+    assert facts["mean"] == pytest.approx(value)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float16", "float32"])
 def test_one_label_and_neighbours(dtype):
     data = np.zeros((3, 4, 5), dtype)
     data[1, 2, 3] = 1
-    told = gv.Volume(data).describe()
-    assert told["histogram"][0] == 59 and told["histogram"][-1] == 1
+    facts = gv.Volume(data).describe()
+    assert facts["histogram"][0] == 59 and facts["histogram"][-1] == 1
 
 
 def test_the_command_tells_it(tmp_path):

@@ -39,16 +39,16 @@ def test_tensors_are_reduced_to_the_bits_of_arrays(dtype, factor, device):
     wider = {"uint16": np.int32}.get(dtype, array.dtype)
     tensor = torch.from_numpy(array.astype(wider)).to(device)
     for reduce in (pool_mean, pool_min, pool_max):
-        found = reduce(tensor, factor)
-        assert found.dtype == tensor.dtype
-        np.testing.assert_array_equal(found.cpu().numpy(), reduce(array, factor))
-    for how in ("min", "max", "mean"):
-        found = by_node(tensor, how, 4, 1)
-        assert found.dtype == torch.float32
-        np.testing.assert_array_equal(found.cpu().numpy(), by_node(array, how, 4, 1))
+        actual = reduce(tensor, factor)
+        assert actual.dtype == tensor.dtype
+        np.testing.assert_array_equal(actual.cpu().numpy(), reduce(array, factor))
+    for reduction in ("min", "max", "mean"):
+        actual = by_node(tensor, reduction, 4, 1)
+        assert actual.dtype == torch.float32
+        np.testing.assert_array_equal(actual.cpu().numpy(), by_node(array, reduction, 4, 1))
         np.testing.assert_array_equal(
-            reduce_windows(tensor, how, size=3, step=2).cpu().numpy(),
-            reduce_windows(array, how, size=3, step=2),
+            reduce_windows(tensor, reduction, size=3, step=2).cpu().numpy(),
+            reduce_windows(array, reduction, size=3, step=2),
         )
 
 
@@ -61,8 +61,8 @@ def test_a_device_that_is_not_there_is_told(device):
         "N3Tree.to": lambda: tree.to(device),
         "Volume.to": lambda: volume.to(device),
     }
-    for where, call in calls.items():
-        with pytest.raises(ValueError, match=f"^{where}: device "):
+    for context, call in calls.items():
+        with pytest.raises(ValueError, match=f"^{context}: device "):
             call()
 
 
@@ -76,12 +76,12 @@ def parts(tree: gv.N3Tree) -> dict[str, torch.Tensor]:
     """Returns all words and voxels of a tree, on the host."""
     pools = {f"nodes.{name}": value for name, value in vars(tree.nodes).items()}
     pools |= {f"bricks.{name}": value for name, value in vars(tree.bricks).items()}
-    found = {}
+    tensors = {}
     for name, value in pools.items():
-        for key, one in (value if isinstance(value, dict) else {"": value}).items():
-            if isinstance(one, torch.Tensor):
-                found[f"{name}.{key}"] = movable(one).cpu()
-    return found
+        for key, item in (value if isinstance(value, dict) else {"": value}).items():
+            if isinstance(item, torch.Tensor):
+                tensors[f"{name}.{key}"] = movable(item).cpu()
+    return tensors
 
 
 @pytest.mark.parametrize("branching", [2, 3])
@@ -90,18 +90,18 @@ def parts(tree: gv.N3Tree) -> dict[str, torch.Tensor]:
 def test_a_tree_made_on_a_device_is_the_one_made_on_the_host(dtype, branching):
     data = random_data(dtype, (50, 37, 61, 2))
     data[30:, :, 20:] = 3  # CONSTANT regions
-    given = {"branching": branching, "threshold": 3.0, "border": 1}
+    options = {"branching": branching, "threshold": 3.0, "border": 1}
     for there in (data, data.cuda()):
         volume = gv.Volume(there, spacing=(1, 2, 3))
         assert volume.data.device == there.device
-        made = gv.N3Tree.from_volume(volume, device="cuda", **given)
-        host = gv.N3Tree.from_volume(gv.Volume(data, spacing=(1, 2, 3)), **given)
-        assert made.bricks.bricks["value"].is_cuda
-        assert made.value_range == host.value_range
-        found, expected = parts(made), parts(host)
-        assert found.keys() == expected.keys() and len(found) > 8
-        for name, one in expected.items():
-            assert torch.equal(found[name], one), name
+        on_device = gv.N3Tree.from_volume(volume, device="cuda", **options)
+        host = gv.N3Tree.from_volume(gv.Volume(data, spacing=(1, 2, 3)), **options)
+        assert on_device.bricks.bricks["value"].is_cuda
+        assert on_device.value_range == host.value_range
+        actual, expected = parts(on_device), parts(host)
+        assert actual.keys() == expected.keys() and len(actual) > 8
+        for name, part in expected.items():
+            assert torch.equal(actual[name], part), name
 
 
 @pytest.mark.backend("cuda")
@@ -109,10 +109,10 @@ def test_labels_and_directional_volumes_of_a_device():
     values = torch.randint(0, 5, (20, 20, 20), generator=torch.Generator().manual_seed(1))
     colors = torch.rand(20, 20, 20, 4, generator=torch.Generator().manual_seed(1))
     for volume in (gv.Volume(values, labels=True), gv.Volume(colors).directional()):
-        made = gv.N3Tree.from_volume(volume, device="cuda")
+        on_device = gv.N3Tree.from_volume(volume, device="cuda")
         expected = parts(gv.N3Tree.from_volume(volume))
-        for name, one in parts(made).items():
-            assert torch.equal(one, expected[name]), name
+        for name, part in parts(on_device).items():
+            assert torch.equal(part, expected[name]), name
 
 
 @pytest.mark.backend("cuda")

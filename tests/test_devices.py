@@ -17,22 +17,22 @@ FIELDS = ("color", "alpha", "depth", "samples")
 def traced() -> list[torch.Tensor]:
     """Returns pictures of voxels of each size, with blended levels, on the CPU."""
     values = torch.rand(40, 40, 40, generator=torch.Generator().manual_seed(4))
-    found = []
+    results = []
     for dtype, factor in ((torch.uint8, 255), (torch.float16, 1), (torch.float32, 1)):
         tree = gv.N3Tree.from_volume(gv.Volume((values * factor).to(dtype)), 8)
         shader = gv.TransferFunction.from_points([(0.3 * factor, 0), (factor, 0.2)])
         for size in (33, 7):  # cones as wide as a voxel, and as several
             hits = gv.trace(tree, camera_rays(tree, size, distance=1.5), shader)
-            found += [getattr(hits, name) for name in FIELDS]
-    return found
+            results += [getattr(hits, name) for name in FIELDS]
+    return results
 
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("instructions", INSTRUCTIONS)
 def test_every_instruction_set_gives_the_same_bits(instructions, tmp_path):
-    found = result(start(traced, tmp_path, instructions))
-    for one, other in zip(found, traced(), strict=True):
-        assert torch.equal(one, other)
+    actual = result(start(traced, tmp_path, instructions))
+    for a, b in zip(actual, traced(), strict=True):
+        assert torch.equal(a, b)
 
 
 @pytest.mark.backend("cuda")

@@ -19,11 +19,11 @@ RED, GREEN = (1.0, 0.1, 0.0), (0.0, 0.9, 0.2)
 SIZES = {"brick_size": 4, "border": 1}
 
 
-def wall(side: int, at: int, spacing=(1.0, 1.0, 1.0)) -> gv.Volume:
-    """Returns an opaque wall of two voxels across x: red at `at`, green behind it."""
+def wall(side: int, column: int, spacing=(1.0, 1.0, 1.0)) -> gv.Volume:
+    """Returns an opaque wall of two voxels across x: red at `column`, green behind it."""
     rgba = torch.zeros((side, side, side, 4))
-    rgba[:, :, at] = torch.tensor((*RED, 1.0))
-    rgba[:, :, at + 1] = torch.tensor((*GREEN, 1.0))
+    rgba[:, :, column] = torch.tensor((*RED, 1.0))
+    rgba[:, :, column + 1] = torch.tensor((*GREEN, 1.0))
     return gv.Volume(rgba, spacing)
 
 
@@ -141,10 +141,10 @@ def test_no_light_leaks_through_a_wall_and_its_sides_do_not_mix(backend, branchi
             seen, alpha = shoot(six, backend, direction, cone, branching)
             assert alpha.min() > 0.99
             np.testing.assert_allclose(seen / alpha[:, None], [color] * len(seen), atol=1e-3)
-        for direction, own in (((1, 0.9, 0), 0), ((-1, 0.7, -0.5), 1)):
+        for direction, near in (((1, 0.9, 0), 0), ((-1, 0.7, -0.5), 1)):
             seen, alpha = shoot(six, backend, direction, cone, branching)
             assert alpha.min() > 0.85, "a sample takes what lies half a voxel beside the wall"
-            assert (seen[:, own] > 1.5 * seen[:, 1 - own]).all(), "its own side's colour prevails"
+            assert (seen[:, near] > 1.5 * seen[:, 1 - near]).all(), "its own side's colour prevails"
     seen, alpha = shoot(plain, backend, (1, 0, 0), cone, branching)
     assert alpha.max() < 0.97 and seen[:, 1].min() > 0.3, "means leak, and mix red with green"
 
@@ -156,11 +156,11 @@ def test_a_homogeneous_medium_is_that_of_one_direction(backend, branching):
     six = medium.directional(dtype=torch.float32)
     ramp = torch.linspace(0.2, 1.0, side)[:, None]  # along y: no node is CONSTANT
     medium.data, six.data = medium.data * ramp, six.data * ramp
-    one = gv.Volume(six.data[..., :4])
+    single = gv.Volume(six.data[..., :4])
     for cone in (0.0, 1.3):
         direction = (1.0, 0.0, 0.4)
         (color, alpha), (same_color, same_alpha) = (
-            shoot(volume, backend, direction, cone, branching) for volume in (one, six)
+            shoot(volume, backend, direction, cone, branching) for volume in (single, six)
         )
         assert 0.1 < alpha.min() and alpha.max() < 0.99
         tolerance = 0 if cone == 0 else 0.02
@@ -184,12 +184,12 @@ def test_a_ray_sees_the_three_directions_that_it_goes_along(backend, direction):
         color, clear = np.zeros(3), 1.0
         for k in range(int(np.ceil((far - near) / 0.7))):
             start, end = near + 0.7 * k, min(near + 0.7 * (k + 1), far)
-            place = (origin + (start + end) / 2 * d)[None]
+            position = (origin + (start + end) / 2 * d)[None]
             rgba = np.zeros(4)
             for axis in range(3):
                 number = 2 * axis + (d[axis] < 0)
                 rgba += d[axis] ** 2 * np.array(
-                    [float(trilinear(data[..., 4 * number + i], place)[0]) for i in range(4)]
+                    [float(trilinear(data[..., 4 * number + i], position)[0]) for i in range(4)]
                 )
             share = 1 - (1 - rgba[3]) ** (end - start)
             color += clear * share * rgba[:3] / rgba[3]

@@ -18,17 +18,17 @@ def anchors(text: str) -> set[str]:
 
 def broken(page: Path, text: str) -> list[str]:
     """Returns the links of a page that lead nowhere."""
-    found = []
+    links = []
     for link in re.findall(r"\]\(([^)\s]+)\)", text):
         path, _, anchor = link.partition("#")
         target = page.parent / path if path else page
         if re.match(r"\w+:", link):
             continue
         if not target.exists():
-            found.append(link)
+            links.append(link)
         elif anchor and anchor not in anchors(target.read_text(encoding="utf-8")):
-            found.append(link)
-    return found
+            links.append(link)
+    return links
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

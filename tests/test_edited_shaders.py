@@ -68,13 +68,13 @@ def test_an_edit_is_converted_as_by_the_constructor(blobs):
     shader = ramp()
     shader.opacity, shader.color = [(0, 0), (1, 0.9)], [(0, 1, 0, 0)]
     assert isinstance(shader.opacity, np.ndarray) and shader.opacity.dtype == np.float64
-    made = gv.TransferFunction([(0, 0), (1, 0.9)], [(0, 1, 0, 0)])
-    pictures = [gv.render(tree, camera(16), one).color for one in (shader, made)]
+    rebuilt = gv.TransferFunction([(0, 0), (1, 0.9)], [(0, 1, 0, 0)])
+    pictures = [gv.render(tree, camera(16), function).color for function in (shader, rebuilt)]
     assert torch.equal(*pictures)
     projection = gv.Projection("min", GRAY)
     assert projection.which == "minimum"
     projection.which = "max"
-    pictures = [gv.render(tree, camera(16), one).color for one in (
+    pictures = [gv.render(tree, camera(16), function).color for function in (
         projection, gv.Projection("maximum", GRAY))]  # fmt: skip
     assert torch.equal(*pictures) and projection.which == "maximum"
 

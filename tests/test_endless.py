@@ -66,10 +66,10 @@ class Handler(servers.BaseHTTPRequestHandler):
             self.close_connection = True
             return
         content = file.read_bytes()
-        wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
+        byte_range = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
         status = 200
-        if wanted is not None and server.parts:
-            first, last = wanted.groups()
+        if byte_range is not None and server.parts:
+            first, last = byte_range.groups()
             start = int(first) if first else max(0, len(content) - int(last))
             size = len(content)
             content = content[start : int(last) + 1 if first and last else None]
@@ -109,12 +109,12 @@ def server(tmp_path, monkeypatch) -> Iterator[Server]:
     monkeypatch.setattr(http, "STALL_SECONDS", 1.5)
     monkeypatch.setattr(http, "MIN_BYTES_PER_SECOND", 10**7)
     monkeypatch.setattr(http, "REFUSED_SECONDS", 60.0)
-    with Server(tmp_path) as found:
-        thread = threading.Thread(target=found.serve_forever)
+    with Server(tmp_path) as running:
+        thread = threading.Thread(target=running.serve_forever)
         thread.start()
-        yield found
-        found.over = True
-        found.shutdown()
+        yield running
+        running.over = True
+        running.shutdown()
         thread.join()
 
 
@@ -137,20 +137,20 @@ def resident() -> int:
 @contextlib.contextmanager
 def little_memory() -> Iterator[None]:
     """Asserts that the process stays small within the block."""
-    before, most, over = resident(), [0], threading.Event()
+    before, peak, over = resident(), [0], threading.Event()
 
-    def look() -> None:
+    def watch() -> None:
         while not over.wait(0.005):
-            most[0] = max(most[0], resident())
+            peak[0] = max(peak[0], resident())
 
-    thread = threading.Thread(target=look)
+    thread = threading.Thread(target=watch)
     thread.start()
     try:
         yield
     finally:
         over.set()
         thread.join()
-    assert most[0] - before < MEMORY
+    assert peak[0] - before < MEMORY
 
 
 @pytest.fixture(scope="module")
@@ -173,15 +173,15 @@ def test_a_chunk_without_an_end_costs_its_nodes(server, tmp_path, data, how):
     convert(gv.Volume(data), tmp_path / "a.zarr", workers=1)
     store = Store.open(f"{server.url}/a.zarr")
     server.bad, server.how = r"blocks/0/c/0/0/1/", how
-    places = np.array(list(np.ndindex(*store.block_grid(0))))
+    positions = np.array(list(np.ndindex(*store.block_grid(0))))
     with little_memory():
-        blocks, errors = store.read_blocks(0, places, timeout=60.0)
-    bad = np.flatnonzero(places[:, 2] * 32 >= 256).tolist()
+        blocks, errors = store.read_blocks(0, positions, timeout=60.0)
+    bad = np.flatnonzero(positions[:, 2] * 32 >= 256).tolist()
     assert sorted(errors) == bad
     for text in errors.values():
         assert re.search(REASONS[how], text) and "\n" not in text, text
         assert "a.zarr" in text and str(relay._server().server_port) not in text
-    assert not mended(server, lambda: store.read_blocks(0, places)[1])
+    assert not mended(server, lambda: store.read_blocks(0, positions)[1])
     assert np.array_equal(blocks[0, 1:33, 1:33, 1:33], data[:32, :32, :32])
 
 
@@ -190,16 +190,16 @@ def test_a_chunk_without_an_end_costs_its_nodes(server, tmp_path, data, how):
 def test_a_picture_of_such_a_store_is_made_of_the_rest(server, tmp_path, data, how):
     convert(gv.Volume(data), tmp_path / "a.zarr", workers=1)
     server.bad, server.how = r"blocks/[1-3]/c/", how
-    look = gv.TransferFunction.preset("gray", 0, 255)
+    transfer = gv.TransferFunction.preset("gray", 0, 255)
     with little_memory(), gv.Engine(gv.StoredProducer(f"{server.url}/a.zarr")) as engine:
-        picture = engine.render(VIEW, look)
+        picture = engine.render(VIEW, transfer)
         assert torch.isfinite(picture.color).all() and engine.failures
         assert all(re.search(REASONS[how], failure.message) for failure in engine.failures)
         mended(server, lambda: None)
         engine.forget_failures()
-        whole = engine.render(VIEW, look)
+        whole = engine.render(VIEW, transfer)
         assert whole.stats.converged and not engine.failures
-    resident = gv.render(gv.N3Tree.from_volume(gv.Volume(data)), VIEW, look)
+    resident = gv.render(gv.N3Tree.from_volume(gv.Volume(data)), VIEW, transfer)
     assert torch.equal(whole.color, resident.color) and whole.alpha.max() > 0
 
 
@@ -282,8 +282,8 @@ def test_buckets_are_read_within_bounds(tmp_path, data, how, monkeypatch):
     if how == "stall":
         _promise, future = ts.Promise.new()
         never = SimpleNamespace(read=lambda *_, **__: future)
-        for known in relay._server().folders:
-            stalls.setitem(vars(known), "_bucket", never)
+        for server_folder in relay._server().folders:
+            stalls.setitem(vars(server_folder), "_bucket", never)
         monkeypatch.setattr(relay, "STALL_SECONDS", 0.2)
         monkeypatch.setattr(relay, "MIN_BYTES_PER_SECOND", 10**9)
     elif how == "index":  # the first chunk is said to be huge
@@ -295,9 +295,9 @@ def test_buckets_are_read_within_bounds(tmp_path, data, how, monkeypatch):
     else:
         root[name] = bytes(100_000_000)
     reason = {"stall": "hardly anything", "index": "asked for"}.get(how, r"more than \d+ bytes")
-    with little_memory(), pytest.raises(OSError, match=reason) as told:
+    with little_memory(), pytest.raises(OSError, match=reason) as caught:
         Store.open(url) if how == "metadata" else read()
-    assert url in str(told.value) and "\n" not in str(told.value)
+    assert url in str(caught.value) and "\n" not in str(caught.value)
     root[name] = good
     stalls.undo()
     http._refused.clear()
@@ -310,8 +310,8 @@ def test_parts_of_files_that_never_end(server, tmp_path):
     url = f"{server.url}/a"
     for server.parts in (True, False):
         for part in (slice(0, 1), slice(5, 70_000), slice(200_000, 200_010), slice(-20, None)):
-            wanted = content[part]
-            assert read_http(url, len(wanted), part, max_file_bytes=len(content)) == wanted
+            expected = content[part]
+            assert read_http(url, len(expected), part, max_file_bytes=len(content)) == expected
     with pytest.raises(OSError, match="more than 255999 bytes"):
         read_http(url, 20, slice(-20, None), max_file_bytes=len(content) - 1)
     http._refused.clear()

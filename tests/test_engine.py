@@ -61,8 +61,8 @@ def test_many_views_from_one_small_pool(aneurism, lod):
     tree = gv.N3Tree.from_volume(aneurism)
     views = [camera(32, azimuth=a, distance=d) for a, d in ((0, 0.5), (80, 0.7), (200, 0.4))]
     whole = [gv.render(tree, view, VESSELS, lod=lod) for view in views]
-    most = max(working_set(picture) for picture in whole)
-    with gv.Engine(gv.VolumeProducer(aneurism), brick_pool=int(1.3 * most) * 1000) as engine:
+    largest = max(working_set(picture) for picture in whole)
+    with gv.Engine(gv.VolumeProducer(aneurism), brick_pool=int(1.3 * largest) * 1000) as engine:
         evicted = 0
         for view, expected in [*zip(views, whole, strict=True)] * 2:
             picture = engine.render(view, VESSELS, lod=lod)
@@ -70,7 +70,7 @@ def test_many_views_from_one_small_pool(aneurism, lod):
             assert picture.stats.converged
             assert_same_picture(picture, expected)
             evicted += picture.stats.evicted["bricks"]
-        assert evicted > most, "the views must not fit together"
+        assert evicted > largest, "the views must not fit together"
 
 
 @pytest.mark.parametrize("loading", ["straight", "levels"])
@@ -109,8 +109,8 @@ def test_a_frame_from_too_small_pools_is_complete_and_coarser(aneurism, compiled
             engine.validate()
             assert not any(stats.produced.values()), "it comes to rest"
             assert stats.capacity_exceeded == (share < 1) == (not stats.converged)
-            shown = (picture.alpha > 0).float().mean()
-            assert shown > 0.8 * (whole.alpha > 0).float().mean()
+            covered = (picture.alpha > 0).float().mean()
+            assert covered > 0.8 * (whole.alpha > 0).float().mean()
             errors.append(float((picture.color - whole.color).square().mean().sqrt()))
     assert errors == sorted(errors, reverse=True) and errors[-1] == 0 < errors[2] < errors[0]
 
@@ -239,18 +239,18 @@ def test_scouts_take_nothing_that_is_in_use(blobs, compiled, loading):
     rounds = evicted = 0
     for trial in range(8):
         slots, tiles_ = pick.choice([(pick.randint(8, 60), 200), (200, pick.randint(10, 60))])
-        most = pick.choice([3, 20, 1000])
+        limit = pick.choice([3, 20, 1000])
         options = {"brick_pool": slots * 6**3 * 4, "node_pool": tiles_ * 8 * 20, "brick_size": 4}
-        budgets = {"load_budget": most, "subdivide_budget": most, "scout_rounds": 1 + trial % 4}
-        where = {"device": DEVICES[compiled], "loading": loading}
-        with Watched(gv.VolumeProducer(blobs), **options, **budgets, **where) as engine:
+        budgets = {"load_budget": limit, "subdivide_budget": limit, "scout_rounds": 1 + trial % 4}
+        placement = {"device": DEVICES[compiled], "loading": loading}
+        with Watched(gv.VolumeProducer(blobs), **options, **budgets, **placement) as engine:
             azimuth, distance = 0.0, 1.0
             for _ in range(60):
                 azimuth += pick.gauss(0, 20)
                 distance = min(3.0, max(0.2, distance * np.exp(pick.gauss(0, 0.2))))
                 view = camera(12, azimuth=azimuth % 360 - 180, distance=distance)
                 _, stats = engine.frame(view, shader)
-                assert max(stats.produced["bricks"], stats.produced["tiles"]) <= most
+                assert max(stats.produced["bricks"], stats.produced["tiles"]) <= limit
             rounds, evicted = rounds + engine.rounds, evicted + engine.evicted
     assert rounds > 100 and evicted > 20
 
@@ -347,9 +347,9 @@ def test_pools_are_honoured_to_the_byte():
         assert 256e6 - 4000 < memory["brick_pool"] <= 256e6
         managed = memory["node_pool"] + memory["brick_pool"]
         assert memory["bookkeeping"] <= 0.031 * managed
-        lru = [one for group in engine.cache.lru.values() for one in group]
+        lru = [tensor for group in engine.cache.lru.values() for tensor in group]
         fields = [*engine.cache.nodes.fields.values(), *engine.cache.bricks.fields.values()]
-        total = sum(field.nbytes for field in fields) + sum(one.nbytes for one in lru)
+        total = sum(field.nbytes for field in fields) + sum(tensor.nbytes for tensor in lru)
         assert total == sum(memory.values())
 
 
@@ -370,7 +370,7 @@ def test_a_wandering_camera_leaves_memory_flat(blobs):
             if number % 500 == 499:
                 engine.validate()
                 gc.collect()
-                live.append(sum(isinstance(one, torch.Tensor) for one in gc.get_objects()))
+                live.append(sum(isinstance(item, torch.Tensor) for item in gc.get_objects()))
                 pages.append(int(Path("/proc/self/statm").read_text().split()[1]))
         engine.validate()
         assert len(live) == 4 and max(live) - live[0] <= 8, live  # others' garbage may be freed
@@ -477,14 +477,14 @@ def test_every_dtype_and_branching_streams_the_same_bits(dtype, branching):
     pair = torch.stack((torch.zeros_like(raw), raw), -1).view(kind)
     volumes = {"first": gv.Volume(ball), "second": gv.Volume(pair)}
     shader = gv.TransferFunction.preset("gray", 0, 100)
-    look = {"channel": "second", "component": 1}
+    channel = {"channel": "second", "component": 1}
     tree = gv.N3Tree.from_volume(volumes, 4, branching=branching)
-    whole = gv.render(tree, camera(distance=1.5), shader, **look)
+    whole = gv.render(tree, camera(distance=1.5), shader, **channel)
     producer = gv.VolumeProducer(volumes)
     producer.branching = branching
     pool = int(0.5 * working_set(whole)) * 6**3 * 3 * kind.itemsize
     with gv.Engine(producer, brick_size=4, brick_pool=pool) as engine:
-        picture = engine.render(camera(distance=1.5), shader, **look)
+        picture = engine.render(camera(distance=1.5), shader, **channel)
         engine.validate()
         assert picture.stats.converged and picture.stats.evicted["bricks"] > 0
         assert_same_picture(picture, whole)
@@ -531,7 +531,7 @@ def test_engine_objects_show_themselves_in_a_line(blobs):
         stats = engine.render(camera(), haze).stats
         assert "converged" in repr(stats)
         rays = camera().placed(engine.box).rays()
-        shown = [engine, engine.cache, *engine.cache.lru[REQUEST_LOAD], engine.scheduler, stats]
-        shown += [rays, engine.production, *engine.trees.values(), engine.report()]
-        for one in shown:
-            assert len(repr(one)) < 100 and "\n" not in repr(one) and " at 0x" not in repr(one)
+        objects = [engine, engine.cache, *engine.cache.lru[REQUEST_LOAD], engine.scheduler, stats]
+        objects += [rays, engine.production, *engine.trees.values(), engine.report()]
+        for item in objects:
+            assert len(repr(item)) < 100 and "\n" not in repr(item) and " at 0x" not in repr(item)

@@ -32,8 +32,8 @@ def test_example_writes_a_picture(example, tmp_path, monkeypatch, capsys):
     out = tmp_path / "picture.png"
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(example.parent))  # as when a script is run
-    given = ["--size", "48", "--output", str(out), *SHORT.get(example.stem, ())]
-    monkeypatch.setattr(sys, "argv", [str(example), *given])
+    arguments = ["--size", "48", "--output", str(out), *SHORT.get(example.stem, ())]
+    monkeypatch.setattr(sys, "argv", [str(example), *arguments])
     runpy.run_path(str(example), run_name="__main__")
     assert out.read_bytes().startswith(b"\x89PNG") and str(out) in capsys.readouterr().out
     assert 20 <= len(example.read_text().splitlines()) <= 80

@@ -89,9 +89,9 @@ WRITES: Calls = [
 
 @contextmanager
 def failing(
-    number: int, calls: Calls = WRITES, made: Callable[[], Exception] | None = None
+    number: int, calls: Calls = WRITES, make_error: Callable[[], Exception] | None = None
 ) -> Iterator[Faults]:
-    faults = Faults(number, made)
+    faults = Faults(number, make_error)
     with pytest.MonkeyPatch.context() as patch:
         for owner, name in calls:
             patch.setattr(owner, name, faults.wrapped(getattr(owner, name)))
@@ -101,7 +101,7 @@ def failing(
 @pytest.mark.parametrize("kind", ["write", "read", "memory"])
 def test_a_conversion_goes_on_after_a_fault_at_any_call(tmp_path, monkeypatch, kind):
     calls = {"write": WRITES, "read": READS, "memory": ALLOCATIONS}[kind]
-    made = no_memory if kind == "memory" else None
+    make_error = no_memory if kind == "memory" else None
     data = noise((12, 14, 150, 1))
     raw = tmp_path / "a_150x14x12_uint8.raw"
     raw.write_bytes(data.tobytes())
@@ -113,7 +113,7 @@ def test_a_conversion_goes_on_after_a_fault_at_any_call(tmp_path, monkeypatch, k
     for number in (*range(6), *range(6, whole.calls, max(1, whole.calls // 10))):
         target = tmp_path / f"{number}.zarr"
         try:
-            with failing(number, calls, made):
+            with failing(number, calls, make_error):
                 convert(raw, target, workers=1)
         except (OSError, ValueError, MemoryError) as error:
             assert str(error) and "\n" not in str(error)
@@ -140,8 +140,8 @@ def test_power_that_fails_before_any_file_is_on_disk(tmp_path):
     target = tmp_path / "a.zarr"
 
     def files() -> dict[str, bytes]:
-        found = (file for file in target.rglob("*") if file.is_file())
-        return {str(file.relative_to(target)): file.read_bytes() for file in found}
+        left = (file for file in target.rglob("*") if file.is_file())
+        return {str(file.relative_to(target)): file.read_bytes() for file in left}
 
     original = os.fsync
 
@@ -167,8 +167,8 @@ def test_power_that_fails_before_any_file_is_on_disk(tmp_path):
 @pytest.mark.parametrize("kind", ["read", "memory"])
 def test_reads_that_fail_cost_their_nodes_alone(tmp_path, kind):
     data = noise((40, 40, 40, 1))
-    look = gv.TransferFunction.preset("gray", 0, 255)
-    resident = gv.render(gv.N3Tree.from_volume(gv.Volume(data)), VIEW, look)
+    transfer = gv.TransferFunction.preset("gray", 0, 255)
+    resident = gv.render(gv.N3Tree.from_volume(gv.Volume(data)), VIEW, transfer)
     assert resident.alpha.max() > 0
     store = convert(gv.Volume(data), tmp_path / "a.zarr", workers=1)
     calls = {"read": [*READS, (Store, "_read_chunks"), (Store, "_read_cells")]}.get(kind)
@@ -176,10 +176,10 @@ def test_reads_that_fail_cost_their_nodes_alone(tmp_path, kind):
     for number in (*range(0, 14, 2), 20, 30):
         producer = gv.StoredProducer(Store.open(store.location), workers=1)
         with gv.Engine(producer, patience=20) as engine:
-            made = no_memory if kind == "memory" else None
-            with failing(number, calls or ALLOCATIONS, made) as faults:
+            make_error = no_memory if kind == "memory" else None
+            with failing(number, calls or ALLOCATIONS, make_error) as faults:
                 try:
-                    picture = engine.render(VIEW, look)
+                    picture = engine.render(VIEW, transfer)
                     assert torch.isfinite(picture.color).all()
                 except (MemoryError, RuntimeError) as error:
                     assert "\n" not in str(error)
@@ -188,7 +188,7 @@ def test_reads_that_fail_cost_their_nodes_alone(tmp_path, kind):
             assert faults.calls > 0
             engine.validate()
             engine.forget_failures()
-            again = engine.render(VIEW, look)
+            again = engine.render(VIEW, transfer)
             assert again.stats.converged and not engine.failures
             assert torch.equal(again.color, resident.color)
     assert failed > 2

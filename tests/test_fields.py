@@ -21,13 +21,13 @@ def test_a_solid_holds_the_share_of_each_voxel():
     producer = gv.FieldProducer(gv.Solid(ball(), colors=False), 32, box=((-1,) * 3, (1,) * 3))
     nodes = nodes_of(producer, 3)
     density = producer.fill(nodes).data["density"][..., 0]
-    places = (torch.arange(10) + 0.5) / 10 - 0.5
-    offsets = torch.cartesian_prod(places, places, places) * producer.spacing[0]
+    axis = (torch.arange(10) + 0.5) / 10 - 0.5
+    offsets = torch.cartesian_prod(axis, axis, axis) * producer.spacing[0]
     true = torch.stack(
-        [(ball()(nodes.positions + one) < 0).float() for one in offsets.split(1)]
+        [(ball()(nodes.positions + offset) < 0).float() for offset in offsets.split(1)]
     ).mean(0)
-    apart = (density - true).abs()
-    assert apart.max() < 0.1 and apart.mean() < 0.005
+    error = (density - true).abs()
+    assert error.max() < 0.1 and error.mean() < 0.005
     volume = density[:, 1:-1, 1:-1, 1:-1].sum() * producer.spacing[0] ** 3
     assert math.isclose(float(volume), 4 / 3 * math.pi * 0.7**3, rel_tol=5e-3)
 
@@ -53,9 +53,9 @@ def test_a_coarse_level_is_the_mean_of_what_lies_below(branching):
         axis = torch.arange(branching**depth)
         nodes = nodes_of(coarse, depth, border=0)
         for name in ("a", "b"):
-            made = coarse.fill(nodes).data[name] if depth < 3 else fine.fill(nodes).data[name]
+            bricks = coarse.fill(nodes).data[name] if depth < 3 else fine.fill(nodes).data[name]
             side = 4 * len(axis)
-            grid = made.view(*(len(axis),) * 3, 4, 4, 4, -1).permute(0, 3, 1, 4, 2, 5, 6)
+            grid = bricks.view(*(len(axis),) * 3, 4, 4, 4, -1).permute(0, 3, 1, 4, 2, 5, 6)
             grid = grid.reshape(side, side, side, -1)
             if name in below:
                 n = branching
@@ -71,10 +71,10 @@ def test_a_field_is_rendered_as_its_dense_volume():
     """The engine's bricks of the finest level, against a resident tree of the same values."""
     field, box = gv.sdf.Box((1.0, 0.8, 0.6), round=0.2), ((-0.8,) * 3, (0.8,) * 3)
     producer = gv.FieldProducer(gv.Solid(field, colors=False), 32, box=box)
-    places = (torch.arange(32) + 0.5) / 32 * 1.6 - 0.8
-    z, y, x = torch.meshgrid(places, places, places, indexing="ij")
+    axis = (torch.arange(32) + 0.5) / 32 * 1.6 - 0.8
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     values = (0.5 - field(torch.stack((x, y, z), -1)) / 0.05).clamp(0, 1)
-    volume = gv.Volume(values, (0.05,) * 3, (places[0].item(),) * 3)
+    volume = gv.Volume(values, (0.05,) * 3, (axis[0].item(),) * 3)
     tree = gv.N3Tree.from_volume({"density": volume}, 4)
     expected = gv.render(tree, camera(32), GRAY, lod="finest")
     with gv.Engine(producer, brick_size=4) as engine:
@@ -187,8 +187,8 @@ def test_what_a_shape_tells_wrongly_is_named(method, answer, message):
     rough = gv.Hypertexture(odd, 16, thickness=0.1, box=BOX)
     layout = Layout.of(rough, 8, 1, torch.device("cpu"))
     rough.prepare(layout)
-    place = torch.cartesian_prod(*(torch.arange(2),) * 3)
-    nodes = gv.Nodes(torch.cat((place, torch.ones_like(place[:, :1])), 1), layout)
+    positions = torch.cartesian_prod(*(torch.arange(2),) * 3)
+    nodes = gv.Nodes(torch.cat((positions, torch.ones_like(positions[:, :1])), 1), layout)
     with pytest.raises(ValueError) as caught:
         (rough.classify if method == "bounds" else rough.fill)(nodes)
     assert message in str(caught.value) and "\n" not in str(caught.value)
@@ -321,9 +321,9 @@ def test_producers_of_fields_compile_whole(colors):
     nodes = nodes_of(producer, 2)
 
     def ask(loc):
-        asked = gv.Nodes(loc, nodes.layout)
-        regions = producer.classify(asked)
-        return producer.fill(asked).data, regions.kind, regions.ranges
+        requested = gv.Nodes(loc, nodes.layout)
+        regions = producer.classify(requested)
+        return producer.fill(requested).data, regions.kind, regions.ranges
 
     expected = ask(nodes.loc)  # the layout caches what it makes
     compiled = torch.compile(ask, fullgraph=True, dynamic=False, backend="aot_eager")
@@ -335,8 +335,8 @@ def test_producers_of_fields_compile_whole(colors):
 
 def test_values_at_points_need_no_engine():
     producer, points = gv.FieldProducer(Waves(), box=BOX), random_points(10)
-    found = producer.at(points)
-    assert torch.equal(found["a"][:, 0], points.sum(-1).sin()) and found["b"].shape == (10, 2)
+    values = producer.at(points)
+    assert torch.equal(values["a"][:, 0], points.sum(-1).sin()) and values["b"].shape == (10, 2)
 
 
 def test_deep_voxels_are_told_apart():
@@ -346,22 +346,22 @@ def test_deep_voxels_are_told_apart():
     assert producer.dtype == torch.float64
     assert gv.FieldProducer(bulb, 2**16).dtype == torch.float32
     layout = Layout.of(producer, 8, 1, torch.device("cpu"))
-    ways = torch.nn.functional.normalize(random_points(400), dim=1)
+    directions = torch.nn.functional.normalize(random_points(400), dim=1)
     near, far = torch.zeros(400, 1).double(), torch.full((400, 1), 1.3).double()
     for _ in range(50):  # bisects to the surface: `middle` is inside, the end outside
         middle = (near + far) / 2
-        inside = bulb(ways * middle)[:, None] < 0
+        inside = bulb(directions * middle)[:, None] < 0
         near, far = torch.where(inside, middle, near), torch.where(inside, far, middle)
-    points = ways * near
+    points = directions * near
     voxel = ((points - layout.origin_3) / layout.spacing_3).floor().to(torch.int64)
     depth = torch.full_like(voxel[:, :1], layout.depth)
     nodes = gv.Nodes(torch.cat((voxel // 8, depth), 1), layout)
     rgba = producer.fill(nodes).data["rgba"]
     across = (rgba[:, :, :, 1:, 3] - rgba[:, :, :, :-1, 3]).abs().amax((1, 2, 3))
     assert (across > 0).double().mean() > 0.3, "bricks of 2e-9 of the box see the surface"
-    places = nodes.center[:, None, None, None] + nodes.local_positions
+    positions = nodes.center[:, None, None, None] + nodes.local_positions
     side = nodes.voxel_size[:, :1, None, None]
-    expected = (0.5 - bulb(places) / side).clamp(0, 1)
+    expected = (0.5 - bulb(positions) / side).clamp(0, 1)
     assert (rgba[..., 3] - expected).abs().max() < 1e-3
     empty = producer.classify(nodes).kind == gv.Region.EMPTY
     assert not rgba[empty].any()

@@ -43,15 +43,15 @@ def check_streamed(path, volume, shader, size=8, device="cpu", **pools) -> None:
     resident = gv.Filtered.of(
         *(tree, volume, shader.transfer), component=shader.component or 0, directions=None
     )
-    own, pools = gv.Filtered.stored(path), {"brick_size": size, "device": device, **pools}
-    with gv.Engine(gv.StoredProducer(path, filtered=own), **pools) as engine:
+    stored, pools = gv.Filtered.stored(path), {"brick_size": size, "device": device, **pools}
+    with gv.Engine(gv.StoredProducer(path, filtered=stored), **pools) as engine:
         for distance in (1.0, 4.0, 12.0):
             camera = gv.Camera.orbit(width=32, height=24, distance=distance)
-            found, expected = engine.render(camera, own), gv.render(tree, camera, resident)
-            assert found.stats.converged and not engine.failures
+            actual, expected = engine.render(camera, stored), gv.render(tree, camera, resident)
+            assert actual.stats.converged and not engine.failures
             for field in ("color", "alpha", "depth"):
-                assert torch.equal(getattr(found, field), getattr(expected, field)), field
-        assert found.alpha.max() > 0.05
+                assert torch.equal(getattr(actual, field), getattr(expected, field)), field
+        assert actual.alpha.max() > 0.05
         engine.validate()
 
 
@@ -107,9 +107,9 @@ def test_broken_off_work_leaves_the_store_as_it_was(store):
     gv.Filtered.add_to(store, MISTY)
     kept = gv.Filtered.stored(store).made_of
 
-    def stop(at: str):
-        def progress(what: str, done: int, total: int) -> None:
-            if what == at:
+    def stop(stage: str):
+        def progress(current: str, done: int, total: int) -> None:
+            if current == stage:
                 raise KeyboardInterrupt
 
         return progress
@@ -189,7 +189,7 @@ def test_what_is_missing_or_damaged_is_told(store):
 
 
 @pytest.mark.parametrize(
-    "told",
+    "attributes",
     [
         {"channels": 3},
         {"channels": {"filtered": {}}},
@@ -215,11 +215,11 @@ def test_what_is_missing_or_damaged_is_told(store):
         None,
     ],
 )
-def test_damaged_metadata_is_told(store, told):
+def test_damaged_metadata_is_told(store, attributes):
     gv.Filtered.add_to(store, MISTY)
     file = store / "gvtorch" / "coarse" / "zarr.json"
     content = json.loads(file.read_text())
-    content["attributes"] = told
+    content["attributes"] = attributes
     file.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"a\.zarr: damaged"):
         gv.Filtered.stored(store)
@@ -257,8 +257,8 @@ def test_the_command_line(store, tmp_path):
     assert done.returncode == 2 and "gvtorch filter" in done.stderr
     done = gvtorch("filter", store, "--tf", "hot", "--directions", "six")
     assert done.returncode == 0 and "of colours in" in done.stdout, done.stderr
-    for given in ((), ("--tf", "hot")):  # the function that the store records
-        done = gvtorch("render", store, "--shader", "filtered", *far, *given)
+    for options in ((), ("--tf", "hot")):  # the function that the store records
+        done = gvtorch("render", store, "--shader", "filtered", *far, *options)
         assert done.returncode == 0, done.stderr
         volume = matter()
         tree = gv.N3Tree.from_volume(volume)

@@ -15,23 +15,23 @@ from gvtorch.engine import host_frame
 
 @pytest.mark.parametrize("backend", COMPILED)
 def test_views_that_the_pools_cannot_hold_are_drawn_at_levels_that_fit(backend):
-    device, wide, look = DEVICES[backend], view(64, 0), gv.Isosurface(0.5)
+    device, wide, shader = DEVICES[backend], view(64, 0), gv.Isosurface(0.5)
     small = {"brick_pool": "0.6 MB", "node_pool": "2 MB", "device": device}
-    found = []
+    results = []
     for fit in (True, False):
         with gv.Engine(Ball(1024), **small) as engine:
-            frames = Frames(engine, wide, look, 512, 0, fit)
+            frames = Frames(engine, wide, shader, 512, 0, fit)
             for _ in range(25):
                 _, stats = frames.frame()
-            found.append(stats)
+            results.append(stats)
             engine.validate()
-    fitting, apart = found
-    assert apart.misses > 50 and apart.coarser == 1
+    fitting, unfitted = results
+    assert unfitted.misses > 50 and unfitted.coarser == 1
     assert fitting.misses == 0 and fitting.converged and 1 < fitting.coarser < 3
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=device) as engine:
-        whole, stats = Frames(engine, wide, look, 512, 0, True).whole()
+        whole, stats = Frames(engine, wide, shader, 512, 0, True).whole()
         assert stats.coarser == 1, "where all fits, nothing is coarser"
-        assert torch.equal(whole.color, Frames(engine, wide, look, 512).whole()[0].color)
+        assert torch.equal(whole.color, Frames(engine, wide, shader, 512).whole()[0].color)
 
 
 @pytest.mark.parametrize("backend", COMPILED)

@@ -70,8 +70,8 @@ def test_keys_are_exact_and_an_orbit_is_a_circle():
     for time, state in keys:
         assert flight.at(time) is state
     for time in np.linspace(0, 4, 23):
-        found = flight.at(time).camera
-        assert np.allclose(place(found), place(orbit(60 * time, 5.0, (3.0, 2.0, 1.0))), atol=1e-9)
+        actual = flight.at(time).camera
+        assert np.allclose(place(actual), place(orbit(60 * time, 5.0, (3.0, 2.0, 1.0))), atol=1e-9)
     assert flight.at(-1) is keys[0][1] and flight.at(9) is keys[-1][1]
 
 
@@ -181,8 +181,8 @@ def test_what_lies_between_states_is_a_state(seed):
         low, wide = number(), gap()
         values = np.cumsum([number(), gap(), gap()])
         opacity = [(v, rng.uniform()) for v in values]
-        look = gv.ChannelLook(window=(low, low + wide), color=(0, 1, 0))
-        channels = gv.Channels([look, gv.TransferFunction(opacity)])
+        channel = gv.ChannelLook(window=(low, low + wide), color=(0, 1, 0))
+        channels = gv.Channels([channel, gv.TransferFunction(opacity)])
         clip = gv.Clip(boxes=[((low, 0, 0), (low + wide, 1, 1))])
         keys.append((float(n), shown(orbit(number()), channels, clip=clip)))
     flight = gv.Flight(keys)
@@ -201,13 +201,13 @@ def test_what_has_no_between_switches_at_its_key():
     )
     flight = gv.Flight([(0, first), (1, second), (2, second)])
     for time, state in ((0.999, first), (1, second), (1.5, second)):
-        found = flight.at(time)
-        assert type(found.shader) is type(state.shader)
-        assert found.develop == state.develop and found.component == state.component
-        assert (found.options.lod, found.options.clip is None) == (
+        actual = flight.at(time)
+        assert type(actual.shader) is type(state.shader)
+        assert actual.develop == state.develop and actual.component == state.component
+        assert (actual.options.lod, actual.options.clip is None) == (
             *(state.options.lod, state.options.clip is None),
         )
-        assert found.camera.model == state.camera.model
+        assert actual.camera.model == state.camera.model
     module = gv.ModuleShader(gv.TransferModule(HOT, 1.0))
     kept = gv.Flight([(0, shown(shader=module)), (1, shown(orbit(30), shader=module))])
     assert kept.at(0.5).shader is module
@@ -266,7 +266,7 @@ def test_a_saved_view_is_turned(small, tmp_path):
     assert run.returncode == 0, run.stderr
     assert (film / "0000.png").read_bytes() == (tmp_path / "one.png").read_bytes()
     pictures = [pixels(file.read_bytes()) for file in sorted(film.iterdir())]
-    assert len({one.tobytes() for one in pictures}) == 4 and all(one.std() > 5 for one in pictures)
+    assert len({p.tobytes() for p in pictures}) == 4 and all(p.std() > 5 for p in pictures)
     for flags in (("--orbit", "1,2"), ("--fov", "20"), ("--step", "1"), ("--tf", "hot")):
         run = gvtorch("fly", small, "-o", tmp_path / "no", *saved, *flags)
         assert run.returncode == 2 and f"--state sets what {flags[0]} sets" in run.stderr

@@ -66,10 +66,10 @@ def labelled(grid) -> xarray.DataArray:
     ids=["array", "interface", "fortran", "torch", "dask", "zarr", "xarray", "swapped"],
 )
 def test_any_array_is_a_volume(tmp_path, grid, make):
-    given = make(grid)
-    for volume in (gv.as_volume(given), gv.read_volume(given)):
+    array = make(grid)
+    for volume in (gv.as_volume(array), gv.read_volume(array)):
         assert np.array_equal(volume.data[..., 0].numpy(), grid)
-    store = convert(given, tmp_path / "a.zarr", spacing=(1, 2, 3))
+    store = convert(array, tmp_path / "a.zarr", spacing=(1, 2, 3))
     assert store.spacing == (1, 2, 3)
     assert np.array_equal(store.read_region(0, (0, 0, 0), grid.shape)[..., 0], grid)
 
@@ -89,18 +89,18 @@ def test_names_places_and_units_of_xarray(grid):
 
 
 def test_dask_computes_what_is_asked_for(tmp_path):
-    asked: list[tuple[int, ...]] = []
+    requested: list[tuple[int, ...]] = []
 
     def block(block_info=None):
         low = [start for start, _ in block_info[None]["array-location"]]
-        asked.append(tuple(low))
+        requested.append(tuple(low))
         return np.full((16, 16, 16), sum(low), "int16")
 
     lazy = dask.map_blocks(block, chunks=((16,) * 4,) * 3, dtype="int16")
     source = open_source(lazy)
-    assert isinstance(source, ObjectSource) and not asked
+    assert isinstance(source, ObjectSource) and not requested
     part = source.read_region((0, 17, 33), (16, 20, 40))
-    assert asked == [(0, 16, 32)] and (part == 48).all()
+    assert requested == [(0, 16, 32)] and (part == 48).all()
     assert pickle.loads(pickle.dumps(open_source(zarr.zeros((3, 4, 5))))).extent == (5, 4, 3)
 
 
@@ -137,10 +137,10 @@ def test_times_and_axes_are_asked_about(grid):
     assert np.array_equal(gv.as_volume(named, time=2).data[..., 0].numpy(), grid)
 
 
-@pytest.mark.parametrize("given", [None, "words", [1, 2], object(), {"a": 1}])
-def test_what_is_no_array_is_named(given):
+@pytest.mark.parametrize("array", [None, "words", [1, 2], object(), {"a": 1}])
+def test_what_is_no_array_is_named(array):
     with pytest.raises(ValueError, match=r"as_volume \(\w+\): expected a volume"):
-        gv.as_volume(given)
+        gv.as_volume(array)
 
 
 def test_objects_and_words_are_refused():
@@ -154,8 +154,8 @@ def test_arrays_are_rendered(grid):
     shader = gv.TransferFunction.preset("gray", *map(float, (grid.min(), grid.max())))
     tree = gv.N3Tree.from_volume(gv.Volume(grid))
     expected = gv.render(tree, camera, shader)
-    for given in (grid, gv.Volume(grid), Own(grid), dask.from_array(grid)):
-        picture = gv.render(given, camera, shader)
+    for array in (grid, gv.Volume(grid), Own(grid), dask.from_array(grid)):
+        picture = gv.render(array, camera, shader)
         assert torch.equal(picture.color, expected.color) and picture.alpha.max() > 0
     assert gv.N3Tree.from_volume({"a": grid, "b": gv.Volume(grid)}).bricks.channels.keys() == {
         "a",

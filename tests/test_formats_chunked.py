@@ -28,14 +28,14 @@ def grid() -> np.ndarray:
 @pytest.mark.parametrize("version", [2, 3])
 def test_plain_zarr(tmp_path, grid, version):
     for name in ("a", "b.zarr"):
-        made = zarr.create_array(
+        array = zarr.create_array(
             str(tmp_path / name),
             shape=grid.shape,
             dtype="i2",
             chunks=(4, 4, 4),
             zarr_format=version,
         )
-        made[:] = grid
+        array[:] = grid
         source = open_source(tmp_path / name)
         assert not source.whole and source.extent == (12, 9, 7)
         assert np.array_equal(
@@ -48,12 +48,12 @@ def test_plain_zarr(tmp_path, grid, version):
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.filterwarnings("ignore:.*onsolidated")
 def test_zarr_of_xarray(tmp_path, grid, version):
-    places = {
+    coords = {
         "z": ("z", 5 + 2.0 * np.arange(7), {"units": "um"}),
         "y": ("y", -3.0 * np.arange(9), {"units": "um"}),
         "x": ("x", 0.5 * np.arange(12), {"units": "um"}),
     }
-    data = xarray.Dataset({"v": (("z", "y", "x"), grid), "w": (("z", "y", "x"), grid + 1)}, places)
+    data = xarray.Dataset({"v": (("z", "y", "x"), grid), "w": (("z", "y", "x"), grid + 1)}, coords)
     data.to_zarr(tmp_path / "a", zarr_format=version, consolidated=False)
     with pytest.raises(ValueError, match=r"holds 2 arrays, choose one with key .*: v, w"):
         gv.read_volume(tmp_path / "a")
@@ -120,14 +120,14 @@ def test_broken_arrays_give_one_line(tmp_path, grid, kind):
     if kind == "n5":
         assert_robust(n5(tmp_path / "a", grid[:4, :4, :8]), tmp_path / "broken")
         return
-    made = zarr.create_array(
+    array = zarr.create_array(
         str(tmp_path / "a"),
         shape=grid.shape,
         dtype="i2",
         chunks=(7, 9, 6),
         zarr_format=int(kind[1]),
     )
-    made[:] = grid
+    array[:] = grid
     assert_robust(tmp_path / "a", tmp_path / "broken", min_refused=8)
 
 
@@ -152,5 +152,5 @@ def test_raw_of_any_ending(tmp_path, grid, name):
 
 def test_the_command_reads_raw_of_any_ending(tmp_path, grid):
     (tmp_path / "a.bin").write_bytes(grid.tobytes())
-    told = run("info", tmp_path / "a.bin", "--shape", "12,9,7", "--dtype", "int16", "--json")
-    assert told.returncode == 0 and json.loads(told.stdout)["extent"] == [12, 9, 7], told.stderr
+    info = run("info", tmp_path / "a.bin", "--shape", "12,9,7", "--dtype", "int16", "--json")
+    assert info.returncode == 0 and json.loads(info.stdout)["extent"] == [12, 9, 7], info.stderr

@@ -25,13 +25,13 @@ def grid() -> np.ndarray:
 
 
 def netcdf(file: Path, grid: np.ndarray, **encoding: object) -> Path:
-    places = {
+    coordinates = {
         "depth": ("depth", 10.0 - 2.5 * np.arange(7), {"units": "mm"}),
         "y": ("y", 100 + 3.0 * np.arange(9), {"units": "mm"}),
         "x": ("x", 0.5 * np.arange(12), {"units": "cm"}),
     }
-    told = {"long_name": "temperature", "units": "K"}
-    data = xarray.Dataset({"T": (("depth", "y", "x"), grid, told)}, places)
+    attributes = {"long_name": "temperature", "units": "K"}
+    data = xarray.Dataset({"T": (("depth", "y", "x"), grid, attributes)}, coordinates)
     data.to_netcdf(file, engine="h5netcdf", encoding={"T": encoding})
     return file
 
@@ -138,11 +138,11 @@ def test_what_is_valid(tmp_path, attributes, gaps):
 def test_bytes_that_are_told_to_have_no_sign(tmp_path, grid, scaled):
     """As xarray reads them."""
     data = np.arange(-128, 128, dtype="i1").reshape(4, 8, 8)
-    told = {"scale_factor": 0.5, "_FillValue": np.int8(-1)} if scaled else {}
+    attributes = {"scale_factor": 0.5, "_FillValue": np.int8(-1)} if scaled else {}
     with h5py.File(tmp_path / "a.nc", "w") as file:
-        file.create_dataset("d", data=data).attrs.update({"_Unsigned": "true", **told})
+        file.create_dataset("d", data=data).attrs.update({"_Unsigned": "true", **attributes})
     volume = gv.read_volume(tmp_path / "a.nc", axes="zyx", nan=-9)
-    packed = xarray.Variable(tuple("zyx"), data, {"_Unsigned": "true", **told})
+    packed = xarray.Variable(tuple("zyx"), data, {"_Unsigned": "true", **attributes})
     peer = xarray.conventions.decode_cf_variable("d", packed)
     assert np.array_equal(volume.data[..., 0].numpy(), peer.fillna(-9).values)
     assert volume.data.max() == (127 if scaled else 255)
@@ -150,11 +150,11 @@ def test_bytes_that_are_told_to_have_no_sign(tmp_path, grid, scaled):
 
 def test_a_data_set_that_is_handed_over_tells_that_its_values_are_packed(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        made = file.create_dataset("d", data=np.zeros((4, 5, 6), "i2"))
-        made.attrs.update({"scale_factor": 2.0, "_FillValue": np.int16(0)})
-        told = r"not kept: scale_factor, _FillValue: values are taken as they are stored"
-        with pytest.warns(UserWarning, match=told):
-            gv.as_volume(made, axes="zyx")
+        dataset = file.create_dataset("d", data=np.zeros((4, 5, 6), "i2"))
+        dataset.attrs.update({"scale_factor": 2.0, "_FillValue": np.int16(0)})
+        message = r"not kept: scale_factor, _FillValue: values are taken as they are stored"
+        with pytest.warns(UserWarning, match=message):
+            gv.as_volume(dataset, axes="zyx")
 
 
 def test_wide_labels_with_a_value_for_none_stay_apart(tmp_path):

@@ -40,11 +40,11 @@ def assert_parts(path: str | Path, **options) -> gv.Volume:
 
 
 def image(grid: np.ndarray, direction=(1, 0, 0, 0, 1, 0, 0, 0, 1), vector=False):
-    found = itk.GetImageFromArray(grid, isVector=vector)
-    found.SetSpacing((0.5, 2.0, 3.0))
-    found.SetOrigin((10.0, -20.0, 30.0))
-    found.SetDirection(direction)
-    return found
+    itk_image = itk.GetImageFromArray(grid, isVector=vector)
+    itk_image.SetSpacing((0.5, 2.0, 3.0))
+    itk_image.SetOrigin((10.0, -20.0, 30.0))
+    itk_image.SetDirection(direction)
+    return itk_image
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -55,11 +55,11 @@ def image(grid: np.ndarray, direction=(1, 0, 0, 0, 1, 0, 0, 0, 1), vector=False)
 def test_metaimage_lies_where_nifti_does(tmp_path, grid, ending, packed, direction):
     for name in (f"a.{ending}", "a.nii"):
         itk.WriteImage(image(grid, direction), str(tmp_path / name), packed)
-    one, other = assert_parts(tmp_path / f"a.{ending}"), gv.read_volume(tmp_path / "a.nii")
-    assert one.spacing == pytest.approx(other.spacing) and one.extent == other.extent
-    assert one.origin == pytest.approx(other.origin)
-    assert np.array_equal(one.data.numpy(), other.data.numpy())
-    assert one.info.unit == "millimeter" and one.info.space == "right-anterior-superior"
+    metaimage, nifti = assert_parts(tmp_path / f"a.{ending}"), gv.read_volume(tmp_path / "a.nii")
+    assert metaimage.spacing == pytest.approx(nifti.spacing) and metaimage.extent == nifti.extent
+    assert metaimage.origin == pytest.approx(nifti.origin)
+    assert np.array_equal(metaimage.data.numpy(), nifti.data.numpy())
+    assert metaimage.info.unit == "millimeter" and metaimage.info.space == "right-anterior-superior"
     assert open_source(tmp_path / f"a.{ending}").whole == packed
 
 
@@ -72,8 +72,8 @@ def test_metaimage_with_colors_times_and_other_types(tmp_path, grid):
     itk.WriteImage(itk.GetImageFromArray(four, isVector=False), str(tmp_path / "t.mha"))
     source = open_source(tmp_path / "t.mha", time=2)
     assert source.times == 3
-    found = source.read_region((0, 0, 0), (7, 9, 12))[..., 0]
-    assert np.array_equal(found, four[2, :, ::-1, ::-1].astype("float32"))
+    actual = source.read_region((0, 0, 0), (7, 9, 12))[..., 0]
+    assert np.array_equal(actual, four[2, :, ::-1, ::-1].astype("float32"))
 
 
 def test_metaimage_without_its_numbers(tmp_path, grid):
@@ -131,18 +131,18 @@ def test_broken_maps_give_one_line(tmp_path, grid):
 
 def vtk_image(grid: np.ndarray, name: str = "density", cells: bool = False):
     """Returns a VTK image of (z, y, x) or (z, y, x, c) values, with a second array."""
-    found = vtk.vtkImageData()
+    result = vtk.vtkImageData()
     size = [n + cells for n in grid.shape[2::-1]]
-    found.SetExtent(2, size[0] + 1, 0, size[1] - 1, 0, size[2] - 1)
-    found.SetSpacing(0.5, 2, 3)
-    found.SetOrigin(10, 20, 30)
-    data = found.GetCellData() if cells else found.GetPointData()
+    result.SetExtent(2, size[0] + 1, 0, size[1] - 1, 0, size[2] - 1)
+    result.SetSpacing(0.5, 2, 3)
+    result.SetOrigin(10, 20, 30)
+    data = result.GetCellData() if cells else result.GetPointData()
     width = grid.shape[3] if grid.ndim == 4 else 1
     for add, called in ((0, name), (1, "other")):
         array = numpy_support.numpy_to_vtk((grid + add).reshape(-1, width), deep=True)
         array.SetName(called)
         (data.SetScalars if called == name else data.AddArray)(array)
-    return found
+    return result
 
 
 def write_vti(file: Path, data, mode: str = "Appended", packer: str = "ZLib") -> Path:
@@ -196,9 +196,9 @@ def test_vti_of_cells_vectors_and_turned_axes(tmp_path, grid):
     turned = vtk_image(grid)
     turned.SetDirectionMatrix(0, 1, 0, -1, 0, 0, 0, 0, 1)
     volume = gv.read_volume(write_vti(tmp_path / "t.vti", turned))
-    place = [0.0, 0.0, 0.0]
-    turned.TransformIndexToPhysicalPoint((2 + 11, 0, 0), place)  # the lowest world y, x
-    assert volume.origin == tuple(place) and volume.spacing == (2, 0.5, 3)
+    position = [0.0, 0.0, 0.0]
+    turned.TransformIndexToPhysicalPoint((2 + 11, 0, 0), position)  # the lowest world y, x
+    assert volume.origin == tuple(position) and volume.spacing == (2, 0.5, 3)
     assert np.array_equal(volume.data[..., 0].numpy(), grid[:, :, ::-1].transpose(0, 2, 1))
 
 
@@ -252,8 +252,8 @@ def test_kinds_of_numbers_of_legacy_vtk(tmp_path, kind, dtype):
     if dtype == "ids":
         ids = vtk.vtkIdTypeArray()
         ids.SetNumberOfTuples(grid.size)
-        for at, value in enumerate(grid.ravel().tolist()):
-            ids.SetValue(at, value)
+        for index, value in enumerate(grid.ravel().tolist()):
+            ids.SetValue(index, value)
         image.GetPointData().SetScalars(ids)
     image.GetPointData().GetScalars().SetName("a 100%")
     volume = gv.read_volume(write_legacy(tmp_path / "a.vtk", image, kind), key="a 100%")
@@ -297,17 +297,17 @@ def test_other_vtk_files_are_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("told", "instead", "message"),
+    ("original", "instead", "message"),
     [
         (b'offset="0"', b'offset="99999999999"', r"begins at \d+, the file has"),
         (b"LittleEndian", b"MiddleEndian", "MiddleEndian"),
     ],
 )
-def test_a_vti_that_tells_what_is_not_there(tmp_path, grid, told, instead, message):
+def test_a_vti_that_tells_what_is_not_there(tmp_path, grid, original, instead, message):
     file = write_vti(tmp_path / "a.vti", vtk_image(grid))
     content = file.read_bytes()
-    assert told in content
-    file.write_bytes(content.replace(told, instead))
+    assert original in content
+    file.write_bytes(content.replace(original, instead))
     with pytest.raises(ValueError, match=message):
         gv.read_volume(file)
 
@@ -357,7 +357,7 @@ def test_numbers_of_vtk_are_found_behind_others(tmp_path, before):
 
 
 @pytest.mark.parametrize(
-    ("numbers", "told"),
+    ("numbers", "message"),
     [
         (NUMBERS.replace("26", "300"), "numbers that uint8 does not"),
         (NUMBERS.replace("26", "-1"), "numbers that uint8 does not"),
@@ -366,15 +366,15 @@ def test_numbers_of_vtk_are_found_behind_others(tmp_path, before):
         ("1", "27 numbers expected, got 1 bytes"),
     ],
 )
-def test_words_of_vtk_that_are_other_numbers_are_refused(tmp_path, numbers, told):
+def test_words_of_vtk_that_are_other_numbers_are_refused(tmp_path, numbers, message):
     """300 was once read as 44."""
-    with pytest.raises(ValueError, match=rf"a\.vti: .*{told}"):
+    with pytest.raises(ValueError, match=rf"a\.vti: .*{message}"):
         gv.read_volume(vti_of_text(tmp_path / "a.vti", ARRAY.format("a", numbers)))
 
 
-def legacy_vtk(path, points: int, words: str, kind: str = "SCALARS a unsigned_char"):
+def legacy_vtk(path, points: int, numbers: str, kind: str = "SCALARS a unsigned_char"):
     head = "# vtk DataFile Version 3.0\na\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS 3 3 3\n"
-    path.write_text(f"{head}POINT_DATA {points}\n{kind} 1\n{words}\n")
+    path.write_text(f"{head}POINT_DATA {points}\n{kind} 1\n{numbers}\n")
     return path
 
 
@@ -387,9 +387,9 @@ def test_legacy_vtk_that_contradicts_itself_is_refused(tmp_path):
         gv.read_volume(legacy_vtk(path, 27, "nan " * 27, "COLOR_SCALARS a"))
 
 
-@pytest.mark.parametrize("words", [b"<AppendedData ", b"<VTKFile><!--" + b"<DataArray "])
-def test_tags_of_vtk_that_never_end_take_no_time(tmp_path, words):
-    (tmp_path / "a.vti").write_bytes(b'<VTKFile type="ImageData">' + words * 200_000)
+@pytest.mark.parametrize("repeated", [b"<AppendedData ", b"<VTKFile><!--" + b"<DataArray "])
+def test_tags_of_vtk_that_never_end_take_no_time(tmp_path, repeated):
+    (tmp_path / "a.vti").write_bytes(b'<VTKFile type="ImageData">' + repeated * 200_000)
     begin = time.process_time()
     with pytest.raises(ValueError, match=r"a\.vti: "):
         gv.read_volume(tmp_path / "a.vti")

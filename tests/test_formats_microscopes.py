@@ -32,18 +32,18 @@ def write_czi(file: Path, five: np.ndarray, scenes: int = 1, packed: str | None 
     with czi.create_czi(str(file), exist_ok=True, compression_options=packed) as out:
         for scene in range(scenes):
             for t, c, z in np.ndindex(five.shape[:3]):
-                place = {"T": t, "C": c, "Z": z}
+                plane = {"T": t, "C": c, "Z": z}
                 corner = (100 * scene + 7, 50 * scene)
-                out.write(five[t, c, z] + scene, location=corner, plane=place, scene=scene)
+                out.write(five[t, c, z] + scene, location=corner, plane=plane, scene=scene)
         color, mode = czi.Rgb8Color, czi.TintingMode.Color
-        shown = czi.ChannelDisplaySettingsDataClass
+        settings_class = czi.ChannelDisplaySettingsDataClass
         out.write_metadata(
             "scan",
             channel_names=dict(enumerate(["DAPI", "GFP", "Cy5"][: five.shape[1]])),
             scale_x=1e-7,
             scale_y=2e-7,
             scale_z=3e-6,
-            display_settings={0: shown(True, mode, color(255, 0, 51), 0.1, 0.9)},
+            display_settings={0: settings_class(True, mode, color(255, 0, 51), 0.1, 0.9)},
         )
     return file
 
@@ -191,8 +191,8 @@ class StandIn:
         return (0.1, 0.2, 3.0)
 
     def read_frame(self, number: int) -> np.ndarray:
-        at = self.loop_indices[number]
-        return self.data[at["T"], at["P"], at["Z"]].squeeze()
+        indices = self.loop_indices[number]
+        return self.data[indices["T"], indices["P"], indices["Z"]].squeeze()
 
 
 def test_nd2_through_a_stand_in(tmp_path, monkeypatch):

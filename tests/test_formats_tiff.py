@@ -22,7 +22,7 @@ Image = pytest.importorskip("PIL.Image")
 
 def ome(file: Path, data: np.ndarray, axes: str = "TCZYX", **options: object) -> Path:
     width = data.shape[axes.index("C")] if "C" in axes else 1
-    told = {
+    metadata = {
         "axes": axes,
         "PhysicalSizeX": 300.0,
         "PhysicalSizeXUnit": "nm",
@@ -37,7 +37,7 @@ def ome(file: Path, data: np.ndarray, axes: str = "TCZYX", **options: object) ->
             "Color": [65535, 0x00FF00FF, -16776961][:width],  # RGBA as a signed number
         },
     }
-    tifffile.imwrite(file, data, metadata=told, photometric="minisblack", ome=True, **options)
+    tifffile.imwrite(file, data, metadata=metadata, photometric="minisblack", ome=True, **options)
     return file
 
 
@@ -78,11 +78,11 @@ def test_several_series_and_pyramids(tmp_path):
     file = tmp_path / "a.ome.tif"
     fine, other = noise((3, 64, 64), "uint8"), noise((2, 5, 6), "uint8")
     with tifffile.TiffWriter(file) as out:
-        told = {"photometric": "minisblack", "tile": (16, 16)}
-        out.write(fine, subifds=1, metadata={"axes": "ZYX", "Name": "fine"}, **told)
-        out.write(fine[:, ::2, ::2], subfiletype=1, **told)
+        options = {"photometric": "minisblack", "tile": (16, 16)}
+        out.write(fine, subifds=1, metadata={"axes": "ZYX", "Name": "fine"}, **options)
+        out.write(fine[:, ::2, ::2], subfiletype=1, **options)
         sizes = {"PhysicalSizeX": 7.0, "PhysicalSizeY": 7.0, "PhysicalSizeZ": 7.0}
-        out.write(other, metadata={"axes": "ZYX", "Name": "other", **sizes}, **told)
+        out.write(other, metadata={"axes": "ZYX", "Name": "other", **sizes}, **options)
     with pytest.warns(UserWarning, match=r"1 other series; key .* among 0 'fine', 1 'other'"):
         volume = gv.read_volume(file)
     assert np.array_equal(volume.data[..., 0].numpy(), fine)
@@ -144,12 +144,12 @@ def test_colours_of_imagej(tmp_path):
     assert volume.info.channels[1].color == (0, 1, 0)
 
 
-@pytest.mark.parametrize(("kind", "told"), [("miniswhite", "MinIsWhite"), ("palette", "palette")])
-def test_values_that_are_shown_otherwise_are_told(tmp_path, kind, told):
+@pytest.mark.parametrize(("kind", "tag"), [("miniswhite", "MinIsWhite"), ("palette", "palette")])
+def test_values_that_are_shown_otherwise_are_told(tmp_path, kind, tag):
     data = noise((4, 9, 12), "uint8")
     options = {"colormap": np.zeros((3, 256), "uint16")} if kind == "palette" else {}
     tifffile.imwrite(tmp_path / "a.tif", data, photometric=kind, **options)
-    with pytest.warns(UserWarning, match=f"not kept: .*{told}"):
+    with pytest.warns(UserWarning, match=f"not kept: .*{tag}"):
         volume = gv.read_volume(tmp_path / "a.tif")
     assert np.array_equal(volume.data[..., 0].numpy(), data)
 
@@ -158,8 +158,8 @@ def test_turned_pages_and_centimeters_are_told(tmp_path):
     file = tmp_path / "a.tif"
     options = {"resolution": (2000, 2000), "resolutionunit": "CENTIMETER"}
     tifffile.imwrite(file, noise((3, 8, 9)), extratags=[(274, "H", 1, 6, False)], **options)
-    told = "size of a pixel in centimeters: .*; that its pages are to be shown turned"
-    with pytest.warns(UserWarning, match=told):
+    message = "size of a pixel in centimeters: .*; that its pages are to be shown turned"
+    with pytest.warns(UserWarning, match=message):
         gv.read_volume(file)
 
 
@@ -195,16 +195,16 @@ def test_folders_of_pillow(tmp_path, ending, shape):
     for number, image in enumerate(data):
         Image.fromarray(image).save(folder / f"s{number}.{ending}")  # s10 comes after s9
     source = open_source(folder)
-    found = source.read_times(0, 1)[0]
-    assert not source.whole and found.shape == (12, 40, 50, data[0, 0, 0].size)
-    wanted = data.reshape(found.shape).astype(int)
-    assert np.abs(found - wanted).max() <= (8 if ending == "jpg" else 0)
+    actual = source.read_times(0, 1)[0]
+    assert not source.whole and actual.shape == (12, 40, 50, data[0, 0, 0].size)
+    expected = data.reshape(actual.shape).astype(int)
+    assert np.abs(actual - expected).max() <= (8 if ending == "jpg" else 0)
     part = source.read_region((3, 4, 5), (11, 9, 30))
-    assert np.array_equal(part, found[3:11, 4:9, 5:30])
+    assert np.array_equal(part, actual[3:11, 4:9, 5:30])
     if len(shape) == 4:
         assert [c.name for c in source.info.channels] == ["red", "green", "blue"]
     store = convert(folder, tmp_path / "a.zarr")
-    assert np.array_equal(store.read_region(0, (0, 0, 0), (12, 40, 50)), found)
+    assert np.array_equal(store.read_region(0, (0, 0, 0), (12, 40, 50)), actual)
 
 
 def test_wide_png_of_simpleitk(tmp_path):

@@ -69,13 +69,13 @@ def test_torus_of_nanovdb_is_a_torus():
     volume = gv.read_volume(shared("vdb/torus.nvdb"))
     values = volume.data[..., 0].numpy()
     z, y, x = (np.arange(n) for n in values.shape)
-    places = np.stack(np.meshgrid(z, y, x, indexing="ij")[::-1], -1) * volume.spacing
-    places += np.array(volume.origin) - np.array((1.0, 2.0, 3.0))
+    positions = np.stack(np.meshgrid(z, y, x, indexing="ij")[::-1], -1) * volume.spacing
+    positions += np.array(volume.origin) - np.array((1.0, 2.0, 3.0))
     band = np.abs(values) < 0.25
-    axis = int(np.argmin([np.ptp(places[band][:, n]) for n in range(3)]))  # the torus's axis
-    flat = np.delete(places, axis, -1)
-    ring = (np.ptp(flat[values < 0], axis=0).mean() - np.ptp(places[values < 0][:, axis])) / 2
-    tube = np.hypot(np.linalg.norm(flat, axis=-1) - ring, places[..., axis])
+    axis = int(np.argmin([np.ptp(positions[band][:, n]) for n in range(3)]))  # the torus's axis
+    flat = np.delete(positions, axis, -1)
+    ring = (np.ptp(flat[values < 0], axis=0).mean() - np.ptp(positions[values < 0][:, axis])) / 2
+    tube = np.hypot(np.linalg.norm(flat, axis=-1) - ring, positions[..., axis])
     off = tube[band] - values[band]
     assert off.std() < 0.05 and ring > 0.5
 
@@ -111,9 +111,9 @@ np.save(target, out.numpy().reshape(size))
     for name in ("rocks", "torus"):
         source = open_source(shared(f"vdb/{name}.nvdb"))
         low, size = np.array(source.low) - 20, np.array(source.shape) + 40
-        told = [str(n) for n in (*low, *size)]
-        words = [sys.executable, tmp_path / "a.py", source.path, tmp_path / "a.npy", *told]
-        subprocess.run(words, check=True, capture_output=True)
+        box = [str(n) for n in (*low, *size)]
+        command = [sys.executable, tmp_path / "a.py", source.path, tmp_path / "a.npy", *box]
+        subprocess.run(command, check=True, capture_output=True)
         assert np.array_equal(
             source.grid().fill(low, low + size)[..., 0], np.load(tmp_path / "a.npy")
         )
@@ -155,10 +155,10 @@ def test_half_floats(tmp_path, kind):
     values = np.where(active[:, None], rng.random((512, len(grid.value(0)))), 0.1)
     grid.leaves[(0, 0, 0)] = values.astype(grid.dtype), active
     path = VdbWriter(packing=ZIP | ACTIVE).write(tmp_path / "a.vdb", grid)
-    found = open_source(path).grid().fill((0, 0, 0), (8, 8, 8)).reshape(512, -1)
+    actual = open_source(path).grid().fill((0, 0, 0), (8, 8, 8)).reshape(512, -1)
     halves = grid.leaves[(0, 0, 0)][0].astype(np.float16).astype(np.float32)
-    assert np.array_equal(found[active], halves[active])
-    assert np.array_equal(found[~active], np.full_like(found[~active], 0.1))  # written in full
+    assert np.array_equal(actual[active], halves[active])
+    assert np.array_equal(actual[~active], np.full_like(actual[~active], 0.1))  # written in full
 
 
 def test_tiles_and_far_away_boxes(tmp_path):
@@ -201,7 +201,7 @@ def test_several_grids_and_shared_trees(tmp_path):
         UserWarning, match=r"not kept: 2 other grids; key .* 0 'heat', 1 'density', 2"
     ):
         assert open_source(path).width == 3
-    names = [one.name for one in gv.read_volume(f"{path}:/density").info.channels]
+    names = [channel.name for channel in gv.read_volume(f"{path}:/density").info.channels]
     assert names == ["density.x", "density.y", "density.z"]
     with pytest.raises(
         ValueError, match=r"has no grid 'x'; it holds 0 'heat', .* 2 'density\[1\]'"
@@ -240,15 +240,15 @@ def test_every_kind_of_nanovdb(tmp_path, kind):
         assert_reads(path, box)
         source = open_source(path)
         assert source.spacing == (0.5, 0.25, 2.0) and source.origin == (6, 20, 30)
-        for low, wanted in ((127, (1, 3)), (255, (3, 1)), (8191, (1, 3)), (12287, (3, 1))):
+        for low, expected in ((127, (1, 3)), (255, (3, 1)), (8191, (1, 3)), (12287, (3, 1))):
             pair = source.grid().fill((low, 3, 3), (low + 2, 4, 4))[:, 0, 0, 0]
-            assert np.array_equal(pair, np.array(wanted).astype(pair.dtype))
+            assert np.array_equal(pair, np.array(expected).astype(pair.dtype))
 
 
 def test_several_grids_of_nanovdb(tmp_path):
     rng = np.random.default_rng(1)
-    made = {kind: nano_grid(kind, rng) for kind in ("float", "Vec3f")}
-    parts = [(kind, number, content) for kind, (content, (number, _)) in made.items()]
+    grids = {kind: nano_grid(kind, rng) for kind in ("float", "Vec3f")}
+    parts = [(kind, number, content) for kind, (content, (number, _)) in grids.items()]
     for codec, counted in ((0, True), (1, True), (1, False), (2, False)):
         path = nano_file(
             tmp_path / f"{codec}{counted}.nvdb", *parts, codec=codec, count_length=counted
@@ -256,7 +256,7 @@ def test_several_grids_of_nanovdb(tmp_path):
         both = path.read_bytes() * 2  # a second segment
         path.write_bytes(both)
         for key, kind in (("float", "float"), ("3", "Vec3f")):
-            assert_reads(path, made[kind][1][1], key=key)
+            assert_reads(path, grids[kind][1][1], key=key)
         with pytest.raises(ValueError, match="no grid 'x'; it holds 0 'float', 1 'Vec3f', 2 'flo"):
             open_source(path, key="x")
 
@@ -265,13 +265,13 @@ def test_the_command_line_and_stores(tmp_path, monkeypatch):
     grid = Grid("float", 0.0, metadata=BOX)
     leaf_values(grid, np.random.default_rng(3))
     path = VdbWriter(packing=BLOSC | ACTIVE).write(tmp_path / "a.vdb", grid)
-    told = gvtorch("info", path)
-    assert told.returncode == 0 and "50, 32, 44" in told.stdout, told
-    for words in (
+    info = gvtorch("info", path)
+    assert info.returncode == 0 and "50, 32, 44" in info.stdout, info
+    for command in (
         ("render", path, "-o", "a.png", "--size", "40x30"),
         ("slice", path, "-o", "b.png"),
     ):
-        done = gvtorch(*words, cwd=tmp_path)
+        done = gvtorch(*command, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
     monkeypatch.setattr(conversion_plan, "_FEW_TASKS", 1)  # in processes
     store = gv.convert(path, tmp_path / "a.zarr", workers=2)

@@ -22,16 +22,16 @@ def fur(shape=None, **options):
 def random_points(count):
     """Points near the unit sphere."""
     random = torch.Generator().manual_seed(0)
-    way = torch.randn((count, 3), generator=random, dtype=torch.float64)
+    direction = torch.randn((count, 3), generator=random, dtype=torch.float64)
     away = 0.8 + 0.5 * torch.rand((count, 1), generator=random, dtype=torch.float64)
-    return way / way.norm(dim=1, keepdim=True) * away
+    return direction / direction.norm(dim=1, keepdim=True) * away
 
 
 @pytest.mark.parametrize("size", [0.0, 0.05])
 def test_values_are_those_of_the_formula(size):
     points = random_points(200)
-    found = fur().filtered(points, torch.full_like(points, size))["value"]
-    for point, value in zip(points.numpy(), found.tolist(), strict=True):
+    values = fur().filtered(points, torch.full_like(points, size))["value"]
+    for point, value in zip(points.numpy(), values.tolist(), strict=True):
         away = np.linalg.norm(point) - 1
         height = away / 0.2
         root = point / np.linalg.norm(point) - np.array(FALL) * 0.2 * height**2
@@ -39,8 +39,8 @@ def test_values_are_those_of_the_formula(size):
         inside = np.clip((0.45 + 0.7 * hair - height) * 5, 0, 1)
         assert value == pytest.approx(inside * (0.1 + 0.9 * np.clip(height, 0, 1)), abs=1e-9)
     if not size:
-        torch.testing.assert_close(fur()(points)["value"], found)
-    assert 0.05 < (found == 0).double().mean() < 0.95 and found.max() > 0.5
+        torch.testing.assert_close(fur()(points)["value"], values)
+    assert 0.05 < (values == 0).double().mean() < 0.95 and values.max() > 0.5
 
 
 @pytest.mark.parametrize(
@@ -60,8 +60,8 @@ def test_bounds_hold_in_random_boxes(shape):
 
 def test_a_picture_of_fur_is_made_of_few_bricks():
     producer = gv.FieldProducer(fur(), 256)
-    look = gv.TransferFunction.from_points([(0.02, 0), (0.1, 0.5), (1, 0.6)])
-    picture = gv.Engine(producer).render(gv.Camera.orbit(width=48, height=48), look)
+    transfer = gv.TransferFunction.from_points([(0.02, 0), (0.1, 0.5), (1, 0.6)])
+    picture = gv.Engine(producer).render(gv.Camera.orbit(width=48, height=48), transfer)
     assert picture.stats.converged and picture.stats.bricks_used < 32**3 / 4
     assert picture.alpha.max() > 0.98 and picture.alpha.min() == 0
 

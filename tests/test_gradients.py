@@ -51,35 +51,35 @@ MODES = {"eager": lambda tracer: tracer, "script": scripted, "compile": compiled
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("name", SHADERS)
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("what", [*COLUMNS, "bricks_bzyxc", "table_lm4", "parameter_54"])
-def test_one_rule_in_every_mode(tree, name, mode, what):
+@pytest.mark.parametrize("leaf", [*COLUMNS, "bricks_bzyxc", "table_lm4", "parameter_54"])
+def test_one_rule_in_every_mode(tree, name, mode, leaf):
     """For rays, voxels, tables and the shader's numbers."""
-    if what == "parameter_54" and name == "plain":
+    if leaf == "parameter_54" and name == "plain":
         pytest.skip("the plain shader has no numbers")
-    tracer, given = gv.TreeTracer(tree, SHADERS[name]), columns(rays_of(tree))
-    if what in COLUMNS:
-        at = COLUMNS.index(what)
-        given[at] = given[at].clone().requires_grad_()
+    tracer, inputs = gv.TreeTracer(tree, SHADERS[name]), columns(rays_of(tree))
+    if leaf in COLUMNS:
+        index = COLUMNS.index(leaf)
+        inputs[index] = inputs[index].clone().requires_grad_()
     else:
-        setattr(tracer, what, getattr(tracer, what).clone().requires_grad_())
+        setattr(tracer, leaf, getattr(tracer, leaf).clone().requires_grad_())
     run = MODES[mode](tracer)
     with pytest.raises(RuntimeError) as caught:
-        run(*given)
-    assert lost(what) in str(caught.value)
+        run(*inputs)
+    assert lost(leaf) in str(caught.value)
     with torch.no_grad():
-        assert not run(*given)[0].requires_grad
+        assert not run(*inputs)[0].requires_grad
 
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("name", SHADERS)
 def test_an_exported_program_raises_when_it_runs_and_when_it_is_made(tree, name):
-    tracer, given = gv.TreeTracer(tree, SHADERS[name]), columns(rays_of(tree))
-    program = torch.export.export(tracer, tuple(given)).module()
-    program(*given)
-    given[0] = given[0].clone().requires_grad_()
+    tracer, inputs = gv.TreeTracer(tree, SHADERS[name]), columns(rays_of(tree))
+    program = torch.export.export(tracer, tuple(inputs)).module()
+    program(*inputs)
+    inputs[0] = inputs[0].clone().requires_grad_()
     for run in (program, lambda *rays: torch.export.export(tracer, rays)):
         with pytest.raises(RuntimeError) as caught:
-            run(*given)
+            run(*inputs)
         assert lost("origin_r3") in str(caught.value)
 
 
@@ -156,11 +156,11 @@ def test_ops_that_make_floats_refuse_what_they_would_lose(backend):
     with pytest.raises(RuntimeError, match="pinhole_rays: gradients by camera_nc would be lost"):
         gv.ops.pinhole_rays(camera_nc, 0, 2, 2, 2, backend=backend)
     values = torch.rand(4, 4, 4, 1, device=device, requires_grad=True)
-    place = torch.zeros(1, 3, dtype=torch.int64, device=device)
+    position = torch.zeros(1, 3, dtype=torch.int64, device=device)
     with pytest.raises(RuntimeError, match="cut_bricks: gradients by values_zyxc would be lost"):
-        gv.ops.cut_bricks(values, place, 2, 1, backend=backend)
+        gv.ops.cut_bricks(values, position, 2, 1, backend=backend)
     with torch.no_grad():
-        assert not gv.ops.cut_bricks(values, place, 2, 1, backend=backend).requires_grad
+        assert not gv.ops.cut_bricks(values, position, 2, 1, backend=backend).requires_grad
 
 
 def test_the_voxelizer_refuses_gradients_of_triangles():

@@ -34,7 +34,7 @@ RECORDS = [(gv.RenderOptions, RenderSettings), (gv.EngineOptions, EngineSettings
 def test_options_stand_once(record, typed):
     """Documentation and default are in the record; type checkers see the same names and types."""
     types_of = {field.name: field.type for field in dataclasses.fields(record)}
-    declared = {name: one.__forward_arg__ for name, one in typed.__annotations__.items()}
+    declared = {name: hint.__forward_arg__ for name, hint in typed.__annotations__.items()}
     assert declared == types_of and option_texts(record).keys() == types_of.keys()
 
 
@@ -44,12 +44,12 @@ def test_options_stand_once(record, typed):
 )
 def test_signature_and_help_show_every_option(function, record):
     parameters = inspect.signature(function).parameters
-    assert not any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+    assert not any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     text = inspect.getdoc(function)
     for field in dataclasses.fields(record):
-        shown = parameters[field.name]
-        assert shown.kind is shown.KEYWORD_ONLY
-        assert (shown.default, shown.annotation) == (field.default, field.type)
+        parameter = parameters[field.name]
+        assert parameter.kind is parameter.KEYWORD_ONLY
+        assert (parameter.default, parameter.annotation) == (field.default, field.type)
         begin = text.index(f"    {field.name}: ")
         assert repr(field.default) in " ".join(text[begin : begin + 300].split())
     assert "**options" not in text
@@ -101,8 +101,8 @@ def test_a_picture_is_shown_where_there_is_a_viewer(picture, monkeypatch):
     monkeypatch.setitem(sys.modules, "IPython", types.SimpleNamespace(get_ipython=lambda: None))
     monkeypatch.setattr(webbrowser, "open", lambda url: opened.append(url) or True)
     picture.show()
-    shown = gv.read_image(Path(opened[0].removeprefix("file://")))
-    assert shown.shape == (12, 12, 3)
+    image = gv.read_image(Path(opened[0].removeprefix("file://")))
+    assert image.shape == (12, 12, 3)
     monkeypatch.setattr(webbrowser, "open", lambda url: False)
     with pytest.raises(RuntimeError, match=r"no viewer can be opened here; the PNG is .*\.png"):
         picture.show()

@@ -124,15 +124,15 @@ def test_forged_pictures_are_refused_in_a_line(tmp_path):
         check=False,
     )
     lines = [json.loads(line) for line in run.stdout.splitlines() if line.startswith("[")]
-    at = paths[len(lines)].name if len(lines) < len(paths) else ""
-    assert run.returncode == 0, f"ended at {at}: {run.stderr[-2000:]}"
+    failed = paths[len(lines)].name if len(lines) < len(paths) else ""
+    assert run.returncode == 0, f"ended at {failed}: {run.stderr[-2000:]}"
     assert run.stderr == "" and len(run.stdout.splitlines()) == len(lines), run.stderr[:2000]
     for path, (kind, message) in zip(paths, lines, strict=True):
         broken = path.name.startswith("broken")
-        wanted = (
+        allowed = (
             ("read", "refused") if broken else ("read",) if path in whole.values() else ("refused",)
         )
-        assert kind in wanted, (path.name, kind, message)
+        assert kind in allowed, (path.name, kind, message)
         assert "\n" not in message and len(message) < 1700
         assert kind == "read" or str(path) in message, message
 
@@ -171,8 +171,8 @@ def test_only_the_end_of_its_own_scans_ends_a_jpeg():
     codecs = pytest.importorskip("imagecodecs")
     pixels = np.random.default_rng(1).integers(0, 256, (30, 40, 3), dtype=np.uint8)
     small, whole = codecs.jpeg8_encode(pixels[:8, :8].copy()), codecs.jpeg8_encode(pixels)
-    beside = b"\xff\xe1" + struct.pack(">H", len(small) + 2) + small  # thumbnail with an end marker
-    with_thumbnail = whole[:2] + beside + whole[2:]
+    inner = b"\xff\xe1" + struct.pack(">H", len(small) + 2) + small  # thumbnail with an end marker
+    with_thumbnail = whole[:2] + inner + whole[2:]
     assert has_jpeg_end(whole) and has_jpeg_end(with_thumbnail) and has_jpeg_end(whole + b"more")
     assert np.array_equal(codecs.jpeg8_decode(with_thumbnail), codecs.jpeg8_decode(whole))
     for cut in (1, 2, 50, len(whole) // 2, len(whole) - 3):

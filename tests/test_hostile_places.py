@@ -68,14 +68,14 @@ def vti(folder: Path, place: Place) -> Path:
 
 
 def zarr(folder: Path, place: Place) -> Path:
-    made = [
+    transforms = [
         {"type": kind, "scale" if kind == "scale" else kind: list(part)}
         for kind, part in zip(("scale", "translation"), place, strict=True)
     ]
     image = {
         "version": "0.4",
         "axes": [{"name": name, "type": "space"} for name in "zyx"],
-        "datasets": [{"path": "0", "coordinateTransformations": made}],
+        "datasets": [{"path": "0", "coordinateTransformations": transforms}],
     }
     array = {"zarr_format": 2, "shape": [4, 5, 6], "chunks": [4, 5, 6], "dtype": "<f4"}
     array |= {"compressor": None, "fill_value": 0, "order": "C", "filters": None}
@@ -105,19 +105,19 @@ def test_places_beyond_numbers_are_one_line(tmp_path, kind):
     spacing, origin = PLAIN
     assert open_source(write(tmp_path, PLAIN)).spacing == spacing
     for number in (1e308, 1e200, np.inf, -np.inf, np.nan, -1e308, 1e30, 5e-324, 0.0):
-        for place in (
+        for placement in (
             ((number, 1.0, 1.0), origin),
             ((number,) * 3, origin),
             (spacing, (number, 0.0, 0.0)),
         ):
             with np.errstate(over="ignore"):
-                told = float(np.float32(number)) if kind == "nii" else number
-            if (place[0] is spacing and abs(told) < 1e15) or (place[0] is not spacing and
-                                                             1e-60 <= told <= 1e60):  # fmt: skip
+                n = float(np.float32(number)) if kind == "nii" else number
+            if (placement[0] is spacing and abs(n) < 1e15) or (placement[0] is not spacing and
+                                                               1e-60 <= n <= 1e60):  # fmt: skip
                 continue  # valid
-            if kind == "nii" and place[0] is not spacing and told <= 0:
+            if kind == "nii" and placement[0] is not spacing and n <= 0:
                 continue  # nibabel repairs it, see below
-            path = write(tmp_path, place)
+            path = write(tmp_path, placement)
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
                 for read in (open_source, gv.read_volume, gv.Store.open):

@@ -41,16 +41,16 @@ def with_data(producer, depth, count):
 
 def by_formula(point, side, radius=1.0):
     """Returns the density of a voxel by plain numbers, see the class."""
-    own = {**ROUGH, **SIZES}
-    total = -(math.dist(point, (0, 0, 0)) - radius) / own["thickness"]
-    variance = own["softness"] ** 2 / 5 + (side / own["thickness"]) ** 2 / 12
-    for octave in range(own["octaves"]):
-        frequency = own["frequency"] * own["lacunarity"] ** octave
-        amplitude = own["amplitude"] * own["gain"] ** octave
+    options = {**ROUGH, **SIZES}
+    total = -(math.dist(point, (0, 0, 0)) - radius) / options["thickness"]
+    variance = options["softness"] ** 2 / 5 + (side / options["thickness"]) ** 2 / 12
+    for octave in range(options["octaves"]):
+        frequency = options["frequency"] * options["lacunarity"] ** octave
+        amplitude = options["amplitude"] * options["gain"] ** octave
         share = math.exp(-0.82 * (side * frequency) ** 2) if side * frequency <= 1.5 else 0.0
         variance += amplitude**2 * 0.0728 * (1 - share**2)
-        place = [one * frequency for one in point]
-        noise = numpy_noise.perlin(place, own["seed"] + octave * 0x10001) if share else 0.0
+        scaled = [c * frequency for c in point]
+        noise = numpy_noise.perlin(scaled, options["seed"] + octave * 0x10001) if share else 0.0
         total += amplitude * share * noise
     soft = math.sqrt(5 * variance)
     t = min(max((total - 0.5 + soft) / (2 * soft), 0.0), 1.0)
@@ -67,17 +67,17 @@ def test_voxels_are_those_of_the_formula(depth):
     assert len(partly) > 300
     for k, z, y, x, _ in random.permutation(partly)[:60]:
         side = float(nodes.voxel_size[k, 0])
-        at = nodes.center[k] + nodes.local_positions[k, z, y, x]
-        assert float(density[k, z, y, x]) == pytest.approx(by_formula(at.tolist(), side), abs=2e-4)
+        mid = nodes.center[k] + nodes.local_positions[k, z, y, x]
+        assert float(density[k, z, y, x]) == pytest.approx(by_formula(mid.tolist(), side), abs=2e-4)
 
 
 def test_values_at_points_are_those_of_the_formula():
     random = torch.Generator().manual_seed(2)
     points = (torch.rand((100, 3), generator=random, dtype=torch.float64) - 0.5) * 2.6
-    found = rough(**SIZES, distances=True).at(points)
+    values = rough(**SIZES, distances=True).at(points)
     expected = [by_formula(point, 0.0) for point in points.tolist()]
-    assert found["density"][:, 0].tolist() == pytest.approx(expected, abs=1e-9)
-    torch.testing.assert_close(found["distance"][:, 0], points.norm(dim=1) - 1)
+    assert values["density"][:, 0].tolist() == pytest.approx(expected, abs=1e-9)
+    torch.testing.assert_close(values["distance"][:, 0], points.norm(dim=1) - 1)
 
 
 @pytest.mark.parametrize("softness", [0.05, 0.3])
@@ -90,13 +90,13 @@ def test_voxels_are_means(softness):
         density = producer.fill(nodes)["density"]
         rows = ((density > 0.003) & (density < 0.997)).nonzero()
         rows = rows[torch.randperm(len(rows), generator=random)[:400]]
-        places = nodes.positions[tuple(rows[:, :4].T)].double()
+        positions = nodes.positions[tuple(rows[:, :4].T)].double()
         spread = torch.rand((len(rows), 512, 3), generator=random, dtype=torch.float64) - 0.5
         sides = nodes.voxel_size[rows[:, 0]][:, None]
-        mean = producer.at(places[:, None] + spread * sides)["density"].mean(1)[:, 0]
+        mean = producer.at(positions[:, None] + spread * sides)["density"].mean(1)[:, 0]
         error = density[tuple(rows.T)] - mean
         assert error.abs().mean() < 0.07 and abs(error.mean()) < 0.025
-        middle = producer.at(places)["density"][:, 0] - mean
+        middle = producer.at(positions)["density"][:, 0] - mean
         assert error.abs().mean() < 0.6 * middle.abs().mean()
 
 
@@ -105,26 +105,26 @@ def test_octaves_that_cannot_matter_change_no_bit(depth):
     producer = rough(shape=sdf.Sphere(0.8) - sdf.Box((0.5, 0.5, 3.0)))
     nodes = with_data(producer, depth, 300 if depth > 1 else 1)
     skipped = producer.fill(nodes)["density"]
-    made = producer.evaluations
+    evaluations = producer.evaluations
     assert (
-        made
+        evaluations
         <= producer.plain_evaluations
         == 1000 * len(nodes) * len(producer.level_of(depth).octaves)
     )
     producer.skip = False
     assert torch.equal(producer.fill(nodes)["density"], skipped)
-    assert producer.evaluations - made == producer.plain_evaluations / 2
+    assert producer.evaluations - evaluations == producer.plain_evaluations / 2
     if depth > 3:
-        assert made < 0.5 * producer.plain_evaluations / 2
+        assert evaluations < 0.5 * producer.plain_evaluations / 2
 
 
 def test_pictures_have_the_same_bits_with_and_without_them():
-    look = gv.Isosurface(0.5)
+    shader = gv.Isosurface(0.5)
     camera = gv.Camera.orbit(30, 20, 1.2, width=64, height=48)
     pictures, saved = [], []
     for skip in (True, False):
         producer = gv.Hypertexture(sdf.Sphere(1.0), 128, skip=skip, **ROUGH)
-        pictures.append(gv.Engine(producer).render(camera, look))
+        pictures.append(gv.Engine(producer).render(camera, shader))
         saved.append(producer.saved)
     assert torch.equal(pictures[0].color, pictures[1].color) and pictures[0].color.std() > 0.05
     assert saved[0] > 0.3 and saved[1] == 0
@@ -133,20 +133,20 @@ def test_pictures_have_the_same_bits_with_and_without_them():
 @pytest.mark.parametrize("softness", [0.05, 0.6])
 def test_what_is_called_empty_or_full_is_so_at_all_levels(softness):
     producer = rough(softness=softness, thickness=0.08)
-    random, found = torch.Generator().manual_seed(5), {0: 0, 1: 0}
+    random, counts = torch.Generator().manual_seed(5), {0: 0, 1: 0}
     for depth in range(1, 6):
         nodes = some_nodes(producer, depth, 3000)
         kind = producer.classify(nodes).kind
         for region, value in ((gv.Region.EMPTY, 0.0), (gv.Region.CONSTANT, 1.0)):
             proven = nodes[(kind == int(region)).nonzero()[:, 0]]
-            found[int(region)] += len(proven)
+            counts[int(region)] += len(proven)
             for below in range(depth, 6):  # itself and a random one below it at every level
                 down = 2 ** (below - depth)
                 inner = torch.randint(0, down, (len(proven), 3), generator=random)
                 loc = torch.cat((proven.loc[:, :3] * down + inner, 0 * inner[:, :1] + below), 1)
                 filled = producer.fill(gv.Nodes(loc[:200], proven.layout))["density"]
                 assert bool((filled == value).all())
-    assert min(found.values()) > 50
+    assert min(counts.values()) > 50
 
 
 def test_nothing_reaches_beyond_the_box():
@@ -161,9 +161,9 @@ def test_channels_and_places():
     producer = rough(distances=True, box=((-2, -2, -1), (2, 2, 1)), extent=64)
     assert producer.extent == (64, 64, 32) and list(producer.channels) == ["density", "distance"]
     nodes = with_data(producer, 2, 8)
-    found = producer.fill(nodes)
+    values = producer.fill(nodes)
     right = nodes.positions.norm(dim=-1, keepdim=True) - 1
-    torch.testing.assert_close(found["distance"], right)
+    torch.testing.assert_close(values["distance"], right)
 
 
 def test_a_volume_of_distances_stands_for_the_shape():
@@ -250,18 +250,18 @@ def test_places_are_exact_in_deep_trees():
     layout = Layout.of(producer, 8, 1, torch.device("cpu"))
     side = producer.spacing[0]
     for direction in ((1.0, 0.0, 0.0), (0.6, -0.48, 0.64)):
-        way = torch.tensor(direction, dtype=torch.float64)
+        unit = torch.tensor(direction, dtype=torch.float64)
         low, high = 0.5, 1.5  # where density passes 1/2 on this ray
         for _ in range(60):
             middle = (low + high) / 2
-            inside = producer.at(way * middle)["density"] > 0.5
+            inside = producer.at(unit * middle)["density"] > 0.5
             low, high = (middle, high) if inside else (low, middle)
-        voxel = ((way * low - torch.tensor(producer.origin).double()) / side).long()
+        voxel = ((unit * low - torch.tensor(producer.origin).double()) / side).long()
         loc = torch.cat((voxel // 8, torch.tensor([layout.depth])))[None]
         nodes = gv.Nodes(loc, layout)
         assert producer.classify(nodes).kind.item() == int(gv.Region.DATA)
-        found = producer.fill(nodes)
+        values = producer.fill(nodes)
         points = nodes.center[:, None, None, None] + nodes.local_positions
         right = producer.at(points)
-        torch.testing.assert_close(found["density"].double(), right["density"], atol=1e-6, rtol=0)
-        assert abs(float(found["density"].mean()) - 0.5) < 1e-4
+        torch.testing.assert_close(values["density"].double(), right["density"], atol=1e-6, rtol=0)
+        assert abs(float(values["density"].mean()) - 0.5) < 1e-4

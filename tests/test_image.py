@@ -33,13 +33,13 @@ def clear(tree):
 
 def made(color: torch.Tensor, alpha: torch.Tensor | None = None) -> gv.Picture:
     """Returns a picture of a given colour; transparent if alpha is given."""
-    one = torch.ones_like(color[..., :1])
+    ones = torch.ones_like(color[..., :1])
     return gv.Picture(
         color=color,
-        alpha=one if alpha is None else alpha,
-        depth=one * math.inf,
-        nearest=one * math.inf,
-        samples=one.int(),
+        alpha=ones if alpha is None else alpha,
+        depth=ones * math.inf,
+        nearest=ones * math.inf,
+        samples=ones.int(),
         transparent=alpha is not None,
         stats=RenderStats(),
     )
@@ -70,8 +70,8 @@ def test_a_gradient_is_even_in_linear_light(tree, backend):
         backend=backend,
         background=behind,
     )
-    place = (torch.arange(10) + 0.5)[:, None, None] / 10
-    expected = (top + (bottom - top) * place).expand(2, 10, 3, 3)
+    fraction = (torch.arange(10) + 0.5)[:, None, None] / 10
+    expected = (top + (bottom - top) * fraction).expand(2, 10, 3, 3)
     torch.testing.assert_close(picture.color.cpu(), expected)
 
 
@@ -109,8 +109,8 @@ def test_an_environment_blends_between_texels_and_around(backend):
     directions = torch.tensor(
         [[0, 0, 1.0], [1, 0, 1], [-1, 0, 1], [0, 1, 0], [0, 0, -1]], device=device
     ).double()
-    found = sky.look_up(directions / directions.norm(dim=1, keepdim=True))[:, 0].cpu()
-    assert found[[0, 1, 2, 4]].tolist() == pytest.approx([2, 3, 1, 0], abs=1e-5)
+    colors = sky.look_up(directions / directions.norm(dim=1, keepdim=True))[:, 0].cpu()
+    assert colors[[0, 1, 2, 4]].tolist() == pytest.approx([2, 3, 1, 0], abs=1e-5)
     up = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z is up in the world
     tall = gv.Environment(torch.linspace(1, 0, 64)[:, None, None].expand(64, 8, 3), rotation=up)
     seen = tall.look_up(torch.tensor([[0, 0, 1.0], [0, 0, -1]], device=device))[:, 0].cpu()
@@ -188,7 +188,7 @@ def test_integer_files_hold_srgb_and_straight_alpha(tmp_path, clear, ending, bit
     from tifffile import imread
 
     path = tmp_path / f"a{ending}"
-    most = 2**bits - 1
+    white = 2**bits - 1
     inside = (clear.alpha > 0)[..., 0].numpy()
     straight = np.divide(
         *(clear.color.double().numpy(), clear.alpha.double().numpy()),
@@ -198,17 +198,17 @@ def test_integer_files_hold_srgb_and_straight_alpha(tmp_path, clear, ending, bit
     clear.save(path, bits=bits)
     pixels = imread(path) if ending == ".tif" else png_decode(path.read_bytes())
     assert pixels.shape == (14, 20, 4) and pixels.dtype == f"uint{bits}"
-    assert np.abs(pixels[..., 3] - clear.alpha[..., 0].numpy() * most).max() <= 0.51
-    error = np.abs(pixels[..., :3] - srgb(straight.clip(0, 1)) * most)
+    assert np.abs(pixels[..., 3] - clear.alpha[..., 0].numpy() * white).max() <= 0.51
+    error = np.abs(pixels[..., :3] - srgb(straight.clip(0, 1)) * white)
     assert error.max() <= (0.51 if bits == 16 else 0.52)
     again = gv.read_image(path)
     torch.testing.assert_close(
-        again[..., :3], torch.from_numpy(straight).float().clamp(0, 1), atol=3 / most, rtol=0
+        again[..., :3], torch.from_numpy(straight).float().clamp(0, 1), atol=3 / white, rtol=0
     )
     opaque = made(torch.rand(6, 5, 3))
     opaque.save(path, bits=bits)
     assert gv.read_image(path).shape == (6, 5, 3)
-    torch.testing.assert_close(gv.read_image(path), opaque.color, atol=3 / most, rtol=0)
+    torch.testing.assert_close(gv.read_image(path), opaque.color, atol=3 / white, rtol=0)
 
 
 @pytest.mark.parametrize("bits", [16, 32])

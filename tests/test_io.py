@@ -118,11 +118,11 @@ def test_packed_files_take_memory_once(tmp_path, kind):
     tracemalloc.start()
     try:
         volume = gv.read_volume(file)
-        _, most = tracemalloc.get_traced_memory()
+        _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     assert np.array_equal(volume.data[..., 0].numpy(), data)
-    assert most < data.nbytes + 5_000_000
+    assert peak < data.nbytes + 5_000_000
 
 
 def test_real_nifti():

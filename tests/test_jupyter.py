@@ -29,8 +29,8 @@ view""",
 
 def notebook() -> str:
     """Returns the cells as a Jupyter notebook."""
-    told = {"metadata": {}, "outputs": [], "execution_count": None, "cell_type": "code"}
-    cells = [{"id": f"cell{n}", "source": text, **told} for n, text in enumerate(CELLS)]
+    cell_fields = {"metadata": {}, "outputs": [], "execution_count": None, "cell_type": "code"}
+    cells = [{"id": f"cell{n}", "source": text, **cell_fields} for n, text in enumerate(CELLS)]
     kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
     content = {"cells": cells, "metadata": {"kernelspec": kernel}}
     return json.dumps({**content, "nbformat": 4, "nbformat_minor": 5})
@@ -43,9 +43,9 @@ def lab(tmp_path: Path) -> Iterator[str]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    own = ("JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR")
-    own += ("JUPYTERLAB_SETTINGS_DIR", "JUPYTERLAB_WORKSPACES_DIR")
-    environment = {**os.environ, **{name: str(tmp_path / name) for name in own}}
+    variables = ("JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR")
+    variables += ("JUPYTERLAB_SETTINGS_DIR", "JUPYTERLAB_WORKSPACES_DIR")
+    environment = {**os.environ, **{name: str(tmp_path / name) for name in variables}}
     options = ("--no-browser", "--allow-root", "--ip=127.0.0.1", f"--port={port}")
     options += (
         "--IdentityProvider.token=",
@@ -73,7 +73,10 @@ def lab(tmp_path: Path) -> Iterator[str]:
 def test_a_cell_shows_the_live_page(chromium, lab):
     tab = Tab(chromium, lab, viewport={"width": 1200, "height": 900})
     try:
-        cells, asked = tab.page.locator(".jp-Notebook .jp-Cell"), tab.page.locator(".jp-mod-accept")
+        cells, accept = (
+            tab.page.locator(".jp-Notebook .jp-Cell"),
+            tab.page.locator(".jp-mod-accept"),
+        )
 
         def run(number: int) -> None:
             cells.nth(number).locator(".jp-InputArea-editor").click()
@@ -81,10 +84,10 @@ def test_a_cell_shows_the_live_page(chromium, lab):
 
         prompt, tried = cells.first.locator(".jp-InputPrompt"), [time.monotonic()]
 
-        def shown() -> int:
-            busy = asked.count()  # dialogs "which kernel?", as it had not started
+        def frame_count() -> int:
+            busy = accept.count()  # dialogs "which kernel?", as it had not started
             if busy:
-                asked.first.click()
+                accept.first.click()
             late = time.monotonic() > tried[0] + 5 and prompt.inner_text() == "[ ]:"
             if busy or late:  # the key was not handled
                 run(0)
@@ -92,7 +95,7 @@ def test_a_cell_shows_the_live_page(chromium, lab):
             return tab.page.locator(".gv-picture").count()
 
         run(0)
-        tab.until(shown)
+        tab.until(frame_count)
         before = tab.final()
         assert before.max() > 100
         box = tab.page.locator(".gv-picture").bounding_box()
@@ -102,6 +105,6 @@ def test_a_cell_shows_the_live_page(chromium, lab):
         run(1)
         tab.page.wait_for_selector(".gv-lost", timeout=1e3 * TIMEOUT)
         assert tab.page.locator(".gv-note").inner_text().startswith("The view was closed")
-        assert not [one for one in tab.complaints if "gv" in one]
+        assert not [complaint for complaint in tab.complaints if "gv" in complaint]
     finally:
         tab.close()

@@ -46,8 +46,8 @@ def test_a_store_of_times(unpacked):
 
 def test_a_store_of_labels(unpacked):
     store = Store.open(unpacked("labels.zarr"))
-    found = store.read_stored((0, 0, 0), SCAN.shape)[..., 0]
-    assert np.array_equal(found, SCAN.astype(np.int64) // 40 * 1000)
+    actual = store.read_stored((0, 0, 0), SCAN.shape)[..., 0]
+    assert np.array_equal(actual, SCAN.astype(np.int64) // 40 * 1000)
 
 
 @pytest.mark.filterwarnings("ignore")  # torch deprecates its own TorchScript
@@ -59,14 +59,14 @@ def test_tracers(kind, unpacked):
     if kind == "tracer_state.pt":
         tree = gv.N3Tree.from_volume(gv.Volume(SCAN[:6, :6, :6]), 4)
         state = torch.load(file, weights_only=True)
-        look = gv.TransferFunction.from_points([(0, 0), (100, 0.2), (250, 0.9)])
-        tracer = gv.TreeTracer(tree, look)
+        transfer = gv.TransferFunction.from_points([(0, 0), (100, 0.2), (250, 0.9)])
+        tracer = gv.TreeTracer(tree, transfer)
         tracer.load_state_dict(state)
-        found = tracer(*rays)
+        outputs = tracer(*rays)
     elif kind == "tracer.pt2":
-        found = torch.export.load(file).module()(*rays)
+        outputs = torch.export.load(file).module()(*rays)
     else:
-        found = torch.jit.load(file)(*rays)
-    for name, made in zip(("color", "alpha"), found, strict=False):
-        assert torch.equal(made, torch.from_numpy(expected[name])), name
-    assert np.array_equal(found[3].numpy(), expected["samples"]) and expected["alpha"].max() > 0.3
+        outputs = torch.jit.load(file)(*rays)
+    for name, output in zip(("color", "alpha"), outputs, strict=False):
+        assert torch.equal(output, torch.from_numpy(expected[name])), name
+    assert np.array_equal(outputs[3].numpy(), expected["samples"]) and expected["alpha"].max() > 0.3

@@ -37,8 +37,8 @@ def test_a_store_keeps_labels(tmp_path, kind):
     volume = gv.read_volume(file, labels=True, spacing=SPACING)
     assert np.array_equal(kept(volume), data)
     source = volume if kind == "volume" else file
-    place = {} if kind == "volume" else {"spacing": SPACING}
-    store = gv.convert(source, tmp_path / "labels.zarr", labels=True, **place)
+    placement = {} if kind == "volume" else {"spacing": SPACING}
+    store = gv.convert(source, tmp_path / "labels.zarr", labels=True, **placement)
     assert store.info.labels and (store.label_values is None) == ("uint16" in kind)
     again = gv.read_volume(tmp_path / "labels.zarr")
     assert again.info.labels and np.array_equal(kept(again), data)
@@ -62,20 +62,20 @@ def test_a_store_of_more_labels_than_16_bits_count_by_processes(tmp_path):
 def test_converting_labels_resumes_without_finding_them_again(tmp_path, monkeypatch):
     data = cells((300, 40, 30), 20) * 2**35
     np.save(tmp_path / "a.npy", data)
-    given = {"labels": True, "executor": ThreadPoolExecutor(1), "workers": 1}
+    options = {"labels": True, "executor": ThreadPoolExecutor(1), "workers": 1}
 
-    def stop(what: str, done: int, total: int) -> None:
-        if what == "converting" and done:
+    def stop(stage: str, done: int, total: int) -> None:
+        if stage == "converting" and done:
             raise RuntimeError("the power is gone")
 
     with pytest.raises(RuntimeError, match="the power is gone"):
-        gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", progress=stop, **given)
+        gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", progress=stop, **options)
     with pytest.raises(FileExistsError, match="half-written"):
-        gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", **given)
+        gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", **options)
     with pytest.raises(ValueError, match="was begun with"):
-        gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", resume=True, nan=0, **given)
+        gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", resume=True, nan=0, **options)
     monkeypatch.setattr(label_source, "distinct", None)  # calling it would fail
-    store = gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", resume=True, **given)
+    store = gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", resume=True, **options)
     assert np.array_equal(kept(gv.read_volume(tmp_path / "a.zarr")), data)
     assert store.label_values.tolist() == np.unique(data).tolist()
 
@@ -83,8 +83,8 @@ def test_converting_labels_resumes_without_finding_them_again(tmp_path, monkeypa
 def test_a_label_that_comes_while_it_is_read_is_an_error(tmp_path):
     np.save(tmp_path / "a.npy", cells((20, 20, 20), 5) * WIDE)
     source = open_source(tmp_path / "a.npy", labels=True)
-    for known in ([0, WIDE, 2 * WIDE, 3 * WIDE], [0, 5 * WIDE], [7]):
-        counted = label_source.IndexSource.of(source, np.array(known))
+    for labels in ([0, WIDE, 2 * WIDE, 3 * WIDE], [0, 5 * WIDE], [7]):
+        counted = label_source.IndexSource.of(source, np.array(labels))
         with pytest.raises(OSError, match="changed while it was read: a label is new"):
             counted.read_region((0, 0, 0), (20, 20, 20))
 
@@ -94,9 +94,9 @@ def test_damaged_label_tables_are_told(tmp_path):
     gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", labels=True)
     file = tmp_path / "a.zarr" / "zarr.json"
     text = file.read_text()
-    for count, said in ((0, "damaged"), (6, "damaged"), ('"x"', "damaged"), (2**25, "damaged")):
+    for count, message in ((0, "damaged"), (6, "damaged"), ('"x"', "damaged"), (2**25, "damaged")):
         file.write_text(text.replace('"label_count": 5', f'"label_count": {count}'))
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             gv.Store.open(tmp_path / "a.zarr")
     file.write_text(text)
     for part in (tmp_path / "a.zarr" / "gvtorch" / "labels").rglob("c/*"):
@@ -138,8 +138,8 @@ def test_the_command_line_shows_labels(tmp_path):
         *("render", "a.npy", "--labels", "-o", "a.png", "--npz", "a.npz", *size), cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
-    made = gvtorch("convert", "a.npy", "a.zarr", "--labels", cwd=tmp_path)
-    assert made.returncode == 0, made.stderr
+    run = gvtorch("convert", "a.npy", "a.zarr", "--labels", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
     for shader in ((), ("--shader", "labels")):
         done = gvtorch(
             *("render", "a.zarr", "-o", "b.png", "--npz", "b.npz", *size, *shader), cwd=tmp_path
@@ -152,8 +152,8 @@ def test_the_command_line_shows_labels(tmp_path):
         done = gvtorch("render", "a.npy", "--labels", "-o", "a.png", *flags, cwd=tmp_path)
         assert done.returncode == 2 and "labels" in done.stderr, flags
         assert len(done.stderr.splitlines()) == 1
-    told = gvtorch("info", "a.zarr", cwd=tmp_path).stdout
-    assert "labels" in told
+    info = gvtorch("info", "a.zarr", cwd=tmp_path).stdout
+    assert "labels" in info
 
 
 @pytest.mark.backend("cpp")
@@ -177,6 +177,6 @@ def test_label_images_that_another_library_wrote(tmp_path, dtype):
     else:
         with pytest.raises(ValueError, match=r"labels of <u4 must be indexed first: gvtorch"):
             gv.StoredProducer(store)
-    made = gv.convert(tmp_path / "cells.zarr", tmp_path / "own.zarr")
-    assert made.info.labels and made.spacing == SPACING
-    same_as_resident(made, volume)
+    converted = gv.convert(tmp_path / "cells.zarr", tmp_path / "own.zarr")
+    assert converted.info.labels and converted.spacing == SPACING
+    same_as_resident(converted, volume)

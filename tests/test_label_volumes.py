@@ -74,18 +74,18 @@ def test_what_does_not_fit_is_one_clear_error():
     with pytest.raises(ValueError, match="holds 16777217 labels or more, at most 16777216 fit"):
         base.check_count("Volume", 2**24 + 1)
     base.check_count("Volume", 2**24)
-    for what in (np.zeros((2, 2, 2), complex), np.zeros(3, int), "labels", np.zeros((0, 2, 2))):
+    for source in (np.zeros((2, 2, 2), complex), np.zeros(3, int), "labels", np.zeros((0, 2, 2))):
         with pytest.raises(ValueError, match="Volume: ") as caught:
-            gv.Volume(what, labels=True)
+            gv.Volume(source, labels=True)
         assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("dtype", ["int32", "uint32", "int64", "uint64"])
 def test_wide_integers_never_merge_in_silence(dtype):
     data = np.full((3, 3, 3), WIDE, dtype)
-    for given in (data, torch.from_numpy(data)):
+    for labels in (data, torch.from_numpy(data)):
         with pytest.raises(ValueError, match=r"16777217.*labels=True \(--labels\)") as caught:
-            gv.Volume(given)
+            gv.Volume(labels)
         assert "\n" not in str(caught.value)
     assert gv.Volume(data - 1).data.unique().tolist() == [2**24]
     if dtype.startswith("int"):
@@ -102,11 +102,11 @@ def brute_majority(values: np.ndarray, factor: int, background: float | None) ->
     out = np.empty((*shape, values.shape[3]), values.dtype)
     for z, y, x, c in np.ndindex(out.shape):
         index = [
-            np.minimum(np.arange(factor) + factor * at, n - 1)
-            for at, n in zip((z, y, x), values.shape, strict=False)
+            np.minimum(np.arange(factor) + factor * block, n - 1)
+            for block, n in zip((z, y, x), values.shape, strict=False)
         ]
-        found, counts = np.unique(values[..., c][np.ix_(*index)], return_counts=True)
-        order = sorted(zip(-counts, found == background, found, strict=True))
+        labels, counts = np.unique(values[..., c][np.ix_(*index)], return_counts=True)
+        order = sorted(zip(-counts, labels == background, labels, strict=True))
         out[z, y, x, c] = order[0][2]
     return out
 
@@ -115,13 +115,13 @@ def brute_majority(values: np.ndarray, factor: int, background: float | None) ->
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
 @pytest.mark.parametrize("factor", [2, 3])
 def test_majority_is_that_of_every_block(factor, dtype, background):
-    for most, seed in ((2, 0), (4, 1), (40, 2)):
-        values = numbers(9, 8, 11, 2, count=most, seed=seed).astype(dtype)
+    for count, seed in ((2, 0), (4, 1), (40, 2)):
+        values = numbers(9, 8, 11, 2, count=count, seed=seed).astype(dtype)
         values[:4] = values[0, 0, 0]  # blocks of one label
-        found = pool_majority(values, factor, background)
-        assert found.dtype == values.dtype
-        assert np.array_equal(found, brute_majority(values, factor, background))
-        assert np.array_equal(found[1:], pool_majority(values[factor:], factor, background))
+        actual = pool_majority(values, factor, background)
+        assert actual.dtype == values.dtype
+        assert np.array_equal(actual, brute_majority(values, factor, background))
+        assert np.array_equal(actual[1:], pool_majority(values[factor:], factor, background))
 
 
 def test_a_sheet_one_voxel_thick_stays():

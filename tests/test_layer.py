@@ -49,15 +49,15 @@ def test_a_homogeneous_medium_has_its_closed_form(backend, fog, alpha):
     a, b = (box[0] - rays.origin) / rays.direction, (box[1] - rays.origin) / rays.direction
     first, last = torch.fmin(a, b).amax(1), torch.fmax(a, b).amin(1)
     last = torch.maximum(first, last)
-    at = depth.reshape(-1).clamp(first, last)
-    clear_1, clear_2 = 0.97 ** (at - first), 0.97 ** (last - at)
-    shown = (depth.reshape(-1) < math.inf) * (1.0 if alpha is None else alpha)
+    cut = depth.reshape(-1).clamp(first, last)
+    clear_1, clear_2 = 0.97 ** (cut - first), 0.97 ** (last - cut)
+    coverage = (depth.reshape(-1) < math.inf) * (1.0 if alpha is None else alpha)
     body = torch.tensor([0.9, 0.5, 0.2], dtype=torch.float64)
     color = (1 - clear_1)[:, None] * body
-    color = color + (clear_1 * shown)[:, None] * torch.tensor(BLUE, dtype=torch.float64)
-    color = color + (clear_1 * (1 - shown) * (1 - clear_2))[:, None] * body
-    total = 1 - clear_1 * (1 - shown) * clear_2
-    total = torch.where((shown == 1), torch.ones_like(total), total)
+    color = color + (clear_1 * coverage)[:, None] * torch.tensor(BLUE, dtype=torch.float64)
+    color = color + (clear_1 * (1 - coverage) * (1 - clear_2))[:, None] * body
+    total = 1 - clear_1 * (1 - coverage) * clear_2
+    total = torch.where((coverage == 1), torch.ones_like(total), total)
     assert (picture.color.cpu().reshape(-1, 3) - color).abs().max() < 2e-6
     assert (picture.alpha.cpu().reshape(-1) - total).abs().max() < 2e-6
     assert 0.2 < float(clear_1.min()) < 0.8, "the test must see something"
@@ -74,18 +74,18 @@ def test_a_volume_is_cut_as_a_dense_marcher_cuts_it(backend, blobs, alpha):
     picture = gv.render(
         tree, view, GRAY, backend=backend, lod="finest", step=step, stop_alpha=1.0, layer=layer
     )
-    rays, at = view.rays(), depth.reshape(-1).numpy()
+    rays, cut = view.rays(), depth.reshape(-1).numpy()
     dense = (
         *(blobs.data[..., 0].double().numpy(), blobs.spacing, blobs.origin),
         *((rays.origin.numpy(), rays.direction.numpy()), GRAY, GRAY.reference or 0.8),
     )
-    front, front_alpha, _ = marcher.march(*dense, step=step * 0.8, last=at)
-    behind, behind_alpha, _ = marcher.march(*dense, step=step * 0.8, first=at)
-    solid = np.isfinite(at) * (1.0 if alpha is None else alpha)
+    front, front_alpha, _ = marcher.march(*dense, step=step * 0.8, last=cut)
+    behind, behind_alpha, _ = marcher.march(*dense, step=step * 0.8, first=cut)
+    solid = np.isfinite(cut) * (1.0 if alpha is None else alpha)
     clear = 1 - front_alpha
     color = front + (clear * solid)[:, None] * np.array(BLUE)
-    color += (clear * (1 - solid))[:, None] * np.where(np.isfinite(at)[:, None], behind, 0)
-    total = 1 - clear * (1 - solid) * np.where(np.isfinite(at), 1 - behind_alpha, 1)
+    color += (clear * (1 - solid))[:, None] * np.where(np.isfinite(cut)[:, None], behind, 0)
+    total = 1 - clear * (1 - solid) * np.where(np.isfinite(cut), 1 - behind_alpha, 1)
     errors = (
         np.abs(picture.color.cpu().reshape(-1, 3).numpy() - color).max(),
         np.abs(picture.alpha.cpu().reshape(-1).numpy() - total).max(),
@@ -136,18 +136,18 @@ def test_normals_count_by_what_each_part_takes_of_the_light(compiled, blobs):
     )
     share = (1 - front.alpha) * (1 - 0.4) * back.alpha
     both = front.normal * front.alpha + back.normal * share
-    wanted = torch.nn.functional.normalize(both, dim=1).view(20, 24, 3)
-    torch.testing.assert_close(mixed.normal, wanted, rtol=0, atol=1e-5)
+    expected = torch.nn.functional.normalize(both, dim=1).view(20, 24, 3)
+    torch.testing.assert_close(mixed.normal, expected, rtol=0, atol=1e-5)
     assert (mixed.normal - alone.normal).abs().max() > 0.01
 
 
-def behind_nodes(tree: gv.N3Tree, place: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
+def behind_nodes(tree: gv.N3Tree, point: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
     """Returns (t, n) bool: true for nodes that lie completely behind a plane."""
-    words = tree.nodes.child_tn
-    loc = tree.loc(torch.arange(words.numel()))
+    pointers = tree.nodes.child_tn
+    loc = tree.loc(torch.arange(pointers.numel()))
     size = tree.place[1] / float(tree.branching) ** loc[:, 3:].double()
     near = tree.place[0] + (loc[:, :3] + (normal < 0)) * size  # the corner nearest to the camera
-    return (((near - place) @ normal) > 0).view_as(words)
+    return (((near - point) @ normal) > 0).view_as(pointers)
 
 
 @pytest.mark.parametrize("backend_name", ["reference", "cpp"])
@@ -161,9 +161,9 @@ def test_nothing_behind_an_opaque_layer_is_used_or_asked_for(blobs, backend_name
     bare.nodes.brick_tn[(bare.nodes.brick_tn >= 0) & leaf] = config.ABSENT
     view = camera(32, distance=1.5).placed(whole.box)
     normal = -torch.tensor([0.469846, 0.342020, 0.813798], dtype=torch.float64)  # towards the box
-    place = middle(blobs)
-    depth = plane_distances(view, place, tuple(normal.tolist()))
-    behind = behind_nodes(whole, place, normal)
+    point = middle(blobs)
+    depth = plane_distances(view, point, tuple(normal.tolist()))
+    behind = behind_nodes(whole, point, normal)
     thin = torch.full_like(depth, 0.5)
     options = {"backend": backend_name, "lod": lod}
     seen = {}
@@ -178,12 +178,12 @@ def test_nothing_behind_an_opaque_layer_is_used_or_asked_for(blobs, backend_name
         gv.render(asked, view, GRAY, layer=layer, **options)
         brick = used.nodes.brick_tn
         stamped = (brick >= 0) & (used.bricks.stamp_b[brick.clamp(min=0).long()] == used.frame)
-        wanted = asked.nodes.request_tn != 0
+        marked = asked.nodes.request_tn != 0
         passed = (used.nodes.stamp_t == used.frame)[:, None] & (used.nodes.loc_t4[:, 3:] > 0)
         parents = behind.flatten()[used.nodes.parent_t.clamp(min=0).long()][:, None]
-        seen[name] = [int((marks & behind).sum()) for marks in (stamped, wanted)]
+        seen[name] = [int((marks & behind).sum()) for marks in (stamped, marked)]
         seen[name] += [int((passed & parents).sum())]
-        assert (stamped & ~behind).any() and (wanted & ~behind).any(), "the test must see something"
+        assert (stamped & ~behind).any() and (marked & ~behind).any(), "the test must see something"
     assert seen["opaque"] == seen["alpha 1"] == [0, 0, 0]
     assert min(seen["none"]) > 0
     for through, alone in zip(seen["translucent"], seen["none"], strict=True):
@@ -226,8 +226,8 @@ def test_batches_and_blocks_of_rays_change_nothing(monkeypatch, blobs):
         monkeypatch.setattr(pixels, "_RAYS_PER_BLOCK", 24 * 7)  # blocks that span cameras
         assert_same_picture(gv.render(tree, cameras, GRAY, layer=layer), whole)
         for i in range(3):
-            own = layer_of(depth[i], None if alpha is None else alpha[i])
-            alone = gv.render(tree, cameras[i], GRAY, layer=own)
+            single_layer = layer_of(depth[i], None if alpha is None else alpha[i])
+            alone = gv.render(tree, cameras[i], GRAY, layer=single_layer)
             for name in (*FIELDS, "nearest"):
                 assert torch.equal(getattr(alone, name), getattr(whole, name)[i]), name
 

@@ -66,10 +66,10 @@ def imported_files(path: Path) -> set[Path]:
     files = set()
     for name in imported(path):
         for parts in (name, name[:-1]):
-            place = PACKAGE.parent.joinpath(*parts)
-            found = [f for f in (place.with_suffix(".py"), place / "__init__.py") if f.is_file()]
-            if parts[:1] == ("gvtorch",) and found:
-                files.add(found[0])
+            stem = PACKAGE.parent.joinpath(*parts)
+            existing = [f for f in (stem.with_suffix(".py"), stem / "__init__.py") if f.is_file()]
+            if parts[:1] == ("gvtorch",) and existing:
+                files.add(existing[0])
                 break
     return files - {PACKAGE / "__init__.py"}
 
@@ -86,9 +86,9 @@ def test_there_are_no_loose_files():
 def test_imports_only_go_down():
     assert len(modules()) > 15
     for path in modules():
-        own = room(path)
-        for other in imported_rooms(path) - {own, "__version__"}:
-            assert floor(other) < floor(own), f"{path.relative_to(ROOT)} imports {other}"
+        importing = room(path)
+        for other in imported_rooms(path) - {importing, "__version__"}:
+            assert floor(other) < floor(importing), f"{path.relative_to(ROOT)} imports {other}"
 
 
 def test_no_import_circle():
@@ -135,9 +135,9 @@ def test_kernel_headers_include_only_downward():
     csrc = PACKAGE / "cpp_ext" / "csrc"
     number = {name: floor for floor, names in enumerate(floors) for name in names}
     for path in csrc.glob("*/*.h"):
-        own = path.parent.name
+        folder = path.parent.name
         for other in re.findall(r'#include "(\w+)/', path.read_text()):
-            below = number[other] < number[own] or other == own
+            below = number[other] < number[folder] or other == folder
             assert below, f"{path.relative_to(csrc)} includes {other}"
 
 
@@ -164,7 +164,7 @@ def test_no_two_things_share_a_name():
             shared = isinstance(node, ast.FunctionDef) and node.name[0] != "_"
             if (shared or isinstance(node, ast.ClassDef)) and not named_elsewhere(path, node.name):
                 homes.setdefault(node.name, []).append(str(path.relative_to(PACKAGE)))
-    assert not {name: found for name, found in homes.items() if len(found) > 1}
+    assert not {name: files for name, files in homes.items() if len(files) > 1}
     assert len(homes) > 900, "the test must see something"
 
 

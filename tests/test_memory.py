@@ -102,9 +102,9 @@ def test_pages_of_a_tiff_count(tmp_path):
 @pytest.mark.parametrize("given", [{}, {"GOMP_SPINCOUNT": "7"}, {"OMP_WAIT_POLICY": "active"}])
 def test_threads_of_openmp_sleep_soon_unless_the_user_tells_otherwise(given):
     code = "import gvtorch, os; print(os.environ.get('GOMP_SPINCOUNT'))"
-    own = {n: v for n, v in os.environ.items() if n not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
+    env = {n: v for n, v in os.environ.items() if n not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
     run = subprocess.run(
-        [sys.executable, "-c", code], env=own | given, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code], env=env | given, capture_output=True, text=True, check=True
     )
     assert run.stdout.strip() == given.get("GOMP_SPINCOUNT", "None" if given else "2000")
     assert torch.get_num_threads() >= 1

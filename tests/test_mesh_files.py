@@ -38,26 +38,26 @@ def test_every_format_comes_back(tmp_path, ending):
         file = tmp_path / "model.gltf"
     else:
         as_trimesh(expected).export(file)
-    found = gv.read_mesh(file)
-    assert found.name == str(file)
-    order = np.lexsort(found.corners.reshape(-1, 9).round(4).T)
+    actual = gv.read_mesh(file)
+    assert actual.name == str(file)
+    order = np.lexsort(actual.corners.reshape(-1, 9).round(4).T)
     other = np.lexsort(expected.corners.reshape(-1, 9).round(4).T)
-    assert np.abs(found.corners[order] - expected.corners[other]).max() < 1e-6
-    assert np.isclose(meshes.volume(found), meshes.volume(expected), rtol=1e-5)
+    assert np.abs(actual.corners[order] - expected.corners[other]).max() < 1e-6
+    assert np.isclose(meshes.volume(actual), meshes.volume(expected), rtol=1e-5)
 
 
 def test_parts_of_a_scene_stand_in_their_places(tmp_path):
     scene = trimesh.Scene()
     ball = as_trimesh(meshes.sphere(2))
     for number, shift in enumerate(((0, 0, 0), (3, 0, 0), (0, 5, 0))):
-        place = trimesh.transformations.translation_matrix(shift)
-        place[:3, :3] *= number + 1
-        scene.add_geometry(ball, node_name=f"n{number}", transform=place)
+        pose = trimesh.transformations.translation_matrix(shift)
+        pose[:3, :3] *= number + 1
+        scene.add_geometry(ball, node_name=f"n{number}", transform=pose)
     scene.export(tmp_path / "three.glb")
-    found = gv.read_mesh(tmp_path / "three.glb")
-    assert len(found.faces) == 3 * len(ball.faces)
-    assert np.allclose(found.bounds, [[-3, -2, -3], [5, 8, 3]], atol=0.1)
-    assert meshes.volume(found) == pytest.approx((1 + 8 + 27) * ball.volume, rel=1e-5)
+    joined = gv.read_mesh(tmp_path / "three.glb")
+    assert len(joined.faces) == 3 * len(ball.faces)
+    assert np.allclose(joined.bounds, [[-3, -2, -3], [5, 8, 3]], atol=0.1)
+    assert meshes.volume(joined) == pytest.approx((1 + 8 + 27) * ball.volume, rel=1e-5)
 
 
 def test_colours_of_vertices_and_triangles(tmp_path):
@@ -66,10 +66,10 @@ def test_colours_of_vertices_and_triangles(tmp_path):
     color[:, 3] = 255
     ball.visual.vertex_colors = color
     ball.export(tmp_path / "a.ply")
-    found = gv.read_mesh(tmp_path / "a.ply")
+    actual = gv.read_mesh(tmp_path / "a.ply")
     value = color[ball.faces][..., :3] / 255
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    assert found.color is not None and np.abs(found.color[..., :3] - linear).max() < 1e-6
+    assert actual.color is not None and np.abs(actual.color[..., :3] - linear).max() < 1e-6
     flat = trimesh.Trimesh(ball.vertices, ball.faces, process=False)
     flat.visual.face_colors = (
         color[: len(ball.faces)] if len(ball.faces) < len(color) else [255] * 4
@@ -98,9 +98,9 @@ def test_textures_and_materials_of_an_obj(tmp_path):
     assert mesh.uv is not None and np.array_equal(mesh.uv, mesh.corners[..., :2].astype(np.float32))
 
 
-@pytest.mark.parametrize(("told", "opacity"), [("d 0.25", 0.25), ("Tr 0.25", 0.75), ("d x", 1)])
-def test_an_obj_s_material_may_let_light_through(tmp_path, told, opacity):
-    (tmp_path / "a.mtl").write_text(f"newmtl glass\nKd 1 0 0\n{told}\n")
+@pytest.mark.parametrize(("line", "opacity"), [("d 0.25", 0.25), ("Tr 0.25", 0.75), ("d x", 1)])
+def test_an_obj_s_material_may_let_light_through(tmp_path, line, opacity):
+    (tmp_path / "a.mtl").write_text(f"newmtl glass\nKd 1 0 0\n{line}\n")
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + CUBE.replace("f ", "usemtl glass\nf ", 1))
     assert gv.read_mesh(tmp_path / "a.obj").materials[0].color == (1, 0, 0, opacity)
 
@@ -119,8 +119,8 @@ def test_polygons_that_are_not_convex_are_cut_within_themselves(tmp_path, count,
     flat = star(count, 3)[::-1] if clockwise else star(count, 3)
     tilt = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
     tilt *= np.sign(np.linalg.det(tilt))
-    places = np.concatenate((flat, np.zeros((count, 1))), 1) @ tilt.T
-    lines = [f"v {x:.17g} {y:.17g} {z:.17g}" for x, y, z in places.tolist()]
+    positions = np.concatenate((flat, np.zeros((count, 1))), 1) @ tilt.T
+    lines = [f"v {x:.17g} {y:.17g} {z:.17g}" for x, y, z in positions.tolist()]
     corners = [f"{n + 1 if n % 2 else n - count}//1" for n in range(count)]
     lines += ["vn 0 0 1", "f " + " ".join(corners), "f 1//1 2//1 3//1"]
     (tmp_path / "a.obj").write_text("\r\n".join(lines) + "\r\n")
@@ -137,8 +137,8 @@ def test_what_crosses_itself_is_a_fan_and_huge_polygons_are_refused(tmp_path):
     text = "v 0 0 0\nv 2 2 0\nv 2 0 0\nv 0 1 0\nf 1 2 3 4\n"
     (tmp_path / "a.obj").write_text(text)
     assert len(gv.read_mesh(tmp_path / "a.obj").faces) == 2
-    places = "".join(f"v {x} {y} 0\n" for x, y in star(1001, 0).tolist())
-    (tmp_path / "b.obj").write_text(places + "f " + " ".join(map(str, range(1, 1002))))
+    vertex_lines = "".join(f"v {x} {y} 0\n" for x, y in star(1001, 0).tolist())
+    (tmp_path / "b.obj").write_text(vertex_lines + "f " + " ".join(map(str, range(1, 1002))))
     with pytest.raises(ValueError, match="a polygon of 1001 corners is not convex, at most 1000"):
         gv.read_mesh(tmp_path / "b.obj")
 
@@ -178,7 +178,7 @@ def stl(claimed: int) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("a.obj", b"v 0 0 0\nv 1 0 0\n", "has no triangles"),
         ("a.obj", b"", "a.obj"),
@@ -200,11 +200,11 @@ def stl(claimed: int) -> bytes:
         ("a.pkl", b"x", "a mesh's name must end in"),
     ],
 )
-def test_bad_files_are_told_in_a_line(tmp_path, name, content, said):
+def test_bad_files_are_told_in_a_line(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     run = gvtorch("voxelize", tmp_path / name, "-o", tmp_path / "a.zarr")
     assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
-    assert said in run.stderr and run.stderr.startswith("gvtorch: error: ")
+    assert message in run.stderr and run.stderr.startswith("gvtorch: error: ")
     assert not (tmp_path / "a.zarr").exists()
 
 
@@ -246,7 +246,7 @@ def test_damaged_files_are_told(tmp_path):
     file = tmp_path / "a.glb"
     as_trimesh(meshes.torus(1.0, 0.4, (8, 6))).export(file)
     good = file.read_bytes()
-    random, told = np.random.default_rng(0), 0
+    random, refused = np.random.default_rng(0), 0
     for _ in range(60):
         bad = bytearray(good[: random.integers(20, len(good))] if random.random() < 0.5 else good)
         for _ in range(random.integers(1, 20)):
@@ -256,8 +256,8 @@ def test_damaged_files_are_told(tmp_path):
             gv.read_mesh(file)
         except (ValueError, MemoryError) as error:
             assert "\n" not in str(error) and "a.glb" in str(error)
-            told += 1
-    assert told > 20
+            refused += 1
+    assert refused > 20
 
 
 # --- Stores
@@ -300,14 +300,14 @@ def test_a_mesh_in_memory_goes_to_worker_processes(tmp_path):
 
 def test_a_broken_off_voxelization_goes_on(tmp_path, torus_file, monkeypatch):
     store = tmp_path / "a.zarr"
-    words = ("voxelize", torus_file, "-o", store, "--resolution", 300, "--workers", 1)
+    command = ("voxelize", torus_file, "-o", store, "--resolution", 300, "--workers", 1)
     with stopped_at(monkeypatch, 3):
-        run = gvtorch(*words)
+        run = gvtorch(*command)
     assert run.returncode == 130 and "2 of" in run.stderr
     assert f"gvtorch voxelize {torus_file} -o {store}" in run.stderr and "--resume" in run.stderr
-    changed = gvtorch(*words, "--band", 6, "--resume")
+    changed = gvtorch(*command, "--band", 6, "--resume")
     assert changed.returncode == 2 and "not the one that it was begun with" in changed.stderr
-    done = gvtorch(*words, "--resume")
+    done = gvtorch(*command, "--resume")
     assert done.returncode == 0, done.stderr
     assert gv.Store.open(store).extent == (300, 300, 89)
 
@@ -326,8 +326,8 @@ def test_a_dask_cluster_voxelizes(tmp_path, torus_file):
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
     ) as cluster:
         address = cluster.scheduler_address
-        words = ("--resolution", 40, "--scheduler", address)
-        run = gvtorch("voxelize", torus_file, "-o", tmp_path / "a.zarr", *words)
+        options = ("--resolution", 40, "--scheduler", address)
+        run = gvtorch("voxelize", torus_file, "-o", tmp_path / "a.zarr", *options)
     assert run.returncode == 0, run.stderr
 
 

@@ -27,8 +27,8 @@ def cut(mesh: gv.Mesh, height: float) -> gv.Mesh:
 
 
 def winding_number(mesh: gv.Mesh, points: Any) -> np.ndarray:
-    place = torch.from_numpy(np.asarray(points, np.float64))
-    return WindingNumber(torch.from_numpy(mesh.corners))(place).numpy()
+    positions = torch.from_numpy(np.asarray(points, np.float64))
+    return WindingNumber(torch.from_numpy(mesh.corners))(positions).numpy()
 
 
 def test_a_plane_hole_is_half_wound_around():
@@ -36,10 +36,10 @@ def test_a_plane_hole_is_half_wound_around():
     box = meshes.box((-1, -1, -1), (1, 1, 1))
     lid = np.flatnonzero((box.corners[:, :, 2] == 1).all(1))
     opened = without(box, *lid)
-    found = winding_number(opened, [[0, 0, 0], [0, 0, 1], [0.3, -0.2, 1], [0, 0, 5], [0, 0, -1.5]])
+    turns = winding_number(opened, [[0, 0, 0], [0, 0, 1], [0.3, -0.2, 1], [0, 0, 5], [0, 0, -1.5]])
     angle = 4 * np.arcsin(4 / (4 + 4 * 16)) / (4 * np.pi)  # of a 2 x 2 square, 4 away
-    assert np.abs(found[:4] - [5 / 6, 0.5, 0.5, angle]).max() < 1e-3
-    assert abs(found[4]) < 0.1
+    assert np.abs(turns[:4] - [5 / 6, 0.5, 0.5, angle]).max() < 1e-3
+    assert abs(turns[4]) < 0.1
 
 
 @pytest.mark.parametrize("name", ["open bunny", "castle", "ball"])
@@ -53,8 +53,8 @@ def test_winding_numbers_are_libigl_s(name):
         mesh = gv.read_mesh(shared("meshes/stanford_bunny.obj.gz"))
     low, high = mesh.bounds
     point = low - 0.1 + (high - low + 0.2) * np.random.default_rng(0).random((1000, 3))
-    apart = np.abs(winding_number(mesh, point) - igl.winding_number(*triangles(mesh), point))
-    assert apart.max() < 0.02 and apart.mean() < 2e-3
+    error = np.abs(winding_number(mesh, point) - igl.winding_number(*triangles(mesh), point))
+    assert error.max() < 0.02 and error.mean() < 2e-3
 
 
 def triangles(mesh: gv.Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -64,8 +64,8 @@ def triangles(mesh: gv.Mesh) -> tuple[np.ndarray, np.ndarray]:
 def test_rims_go_around_every_hole():
     ball = meshes.sphere(3)
     opened = without(ball, 0, 100, 101, 200)
-    found, _ = rims(opened)
-    assert sorted(len(one.face) for one in found) in ([3, 3, 4], [3, 3, 3, 3])
+    all_rims, _ = rims(opened)
+    assert sorted(len(rim.face) for rim in all_rims) in ([3, 3, 4], [3, 3, 3, 3])
     assert not rims(ball)[0]
 
 
@@ -82,9 +82,9 @@ def test_a_plane_hole_is_filled_by_its_plane():
     """Half a ball whose flat disc is missing; also inside out."""
     ball = meshes.sphere(4)
     half = cut(ball, 1e-9)
-    for one in (half, meshes.of_corners(half.corners[:, ::-1].copy())):
-        closed = filled(one)
-        new = closed.corners[len(one.faces) :]
+    for opened in (half, meshes.of_corners(half.corners[:, ::-1].copy())):
+        closed = filled(opened)
+        new = closed.corners[len(opened.faces) :]
         assert solids(closed)[1].all() and np.abs(new[..., 2]).max() < 2e-3
         assert abs(meshes.volume(closed)) == pytest.approx(meshes.volume(ball) / 2, rel=2e-3)
 
@@ -105,11 +105,11 @@ def test_a_strip_of_one_side_stays_as_it_is():
     turn = np.linspace(0, 2 * np.pi, 41)[:-1]
     side = np.array([-0.3, 0.3])[:, None]
     wide = 1 + side * np.cos(turn / 2)
-    place = np.stack((wide * np.cos(turn), wide * np.sin(turn), side * np.sin(turn / 2)), -1)
+    positions = np.stack((wide * np.cos(turn), wide * np.sin(turn), side * np.sin(turn / 2)), -1)
     low, high = np.arange(40), np.arange(40, 80)
     next_low, next_high = np.append(low[1:], 40), np.append(high[1:], 0)
     faces = np.stack((low, next_low, high, high, next_low, next_high), -1).reshape(-1, 3)
-    strip = gv.Mesh(vertices=place.reshape(-1, 3), faces=faces)
+    strip = gv.Mesh(vertices=positions.reshape(-1, 3), faces=faces)
     assert not len(facing_away(strip))
 
 
@@ -149,8 +149,8 @@ def test_the_bunny_s_inside_is_where_libigl_winds_around_it():
     low, high = opened.bounds
     point = low + (high - low) * np.random.default_rng(1).random((3000, 3))
     inside = np.abs(igl.winding_number(*triangles(opened), point)) > 0.5
-    found = grid.geometry.signed_distance(torch.from_numpy(point)).numpy() < 0
-    assert (found != inside).mean() < 1e-3 and 500 < inside.sum() < 2500
+    actual = grid.geometry.signed_distance(torch.from_numpy(point)).numpy() < 0
+    assert (actual != inside).mean() < 1e-3 and 500 < inside.sum() < 2500
     covered = grid.region((0, 0, 0), grid.extent[::-1])["coverage"].double().sum() / 255
     volume = abs(meshes.volume(grid.mesh))
     assert float(covered) * grid.spacing**3 == pytest.approx(volume, rel=2e-3)
@@ -186,14 +186,14 @@ def test_a_pole_that_is_computed_again_is_the_same_place():
     faces = np.stack(((a, a + 48, b), (b, a + 48, b + 48))).transpose(0, 2, 3, 1).reshape(-1, 3)
     ball = gv.Mesh(vertices=np.stack(part, -1).reshape(-1, 3), faces=faces)
     flat = gv.Mesh(vertices=ball.vertices.round(12), faces=faces)
-    ends = [gv.MeshProducer(one, resolution=32).voxelizer for one in (ball, flat)]
+    ends = [gv.MeshProducer(m, resolution=32).voxelizer for m in (ball, flat)]
     with pytest.raises(ValueError, match="faces must be whole numbers"):
         gv.Mesh(vertices=ball.vertices, faces=faces + 0.5)
     tensors = gv.Mesh(vertices=torch.from_numpy(ball.vertices), faces=torch.from_numpy(faces))
     assert np.array_equal(tensors.vertices, ball.vertices)
     assert np.array_equal(tensors.faces, faces)
-    made, expected = (one.region((0, 0, 0), one.extent)["coverage"].double().sum() for one in ends)
-    assert float(made) == pytest.approx(float(expected), rel=1e-6) and float(made) > 5000 * 255
+    actual, expected = (m.region((0, 0, 0), m.extent)["coverage"].double().sum() for m in ends)
+    assert float(actual) == pytest.approx(float(expected), rel=1e-6) and float(actual) > 5000 * 255
 
 
 def test_a_field_of_a_mesh_tells_of_its_holes():
@@ -209,11 +209,11 @@ def test_few_holes_are_told_in_a_line(tmp_path):
     ball = without(meshes.sphere(4), 7, 8)
     file = tmp_path / "ball.ply"
     trimesh.Trimesh(ball.vertices, ball.faces, process=False).export(file)
-    words = ("voxelize", file, "-o")
-    run = gvtorch(*words, tmp_path / "a.zarr", "--resolution", 32)
+    command = ("voxelize", file, "-o")
+    run = gvtorch(*command, tmp_path / "a.zarr", "--resolution", 32)
     assert run.returncode == 0 and run.stderr.count("\n") == 1, run.stderr
     assert "2 holes of 6 edges" in run.stderr and "--solid always" in run.stderr
-    run = gvtorch(*words, tmp_path / "b.zarr", "--resolution", 32, "--solid", "always")
+    run = gvtorch(*command, tmp_path / "b.zarr", "--resolution", 32, "--solid", "always")
     assert run.returncode == 0 and not run.stderr
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -18,13 +18,13 @@ def linear(value: float) -> float:
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
-def straight(mesh: gv.Mesh, place: tuple[float, float, float], resolution: int = 96) -> list[float]:
+def straight(mesh: gv.Mesh, point: tuple[float, float, float], resolution: int = 96) -> list[float]:
     """Returns the colour at a point of the surface, not premultiplied."""
     grid = Voxelizer(mesh, resolution=resolution, channels=("color",))
-    at = [round((p - o) / grid.spacing) for p, o in zip(place, grid.origin, strict=True)]
-    low = [n - 1 for n in at[::-1]]
-    found = grid.region(low, [n + 3 for n in low])["color"].float().view(-1, 4)
-    best = found[found[:, 3].argmax()]
+    index = [round((p - o) / grid.spacing) for p, o in zip(point, grid.origin, strict=True)]
+    low = [n - 1 for n in index[::-1]]
+    colors = grid.region(low, [n + 3 for n in low])["color"].float().view(-1, 4)
+    best = colors[colors[:, 3].argmax()]
     return (best[:3] / best[3]).tolist()
 
 
@@ -35,14 +35,14 @@ def test_parts_of_a_gltf_have_materials_of_their_own(tmp_path):
     wide[:, :256], wide[:, 256:] = (255, 0, 0), (0, 0, 255)
     tall = np.zeros((512, 2, 3), np.uint8)
     tall[:256], tall[256:] = (0, 255, 0), (255, 255, 0)
-    looks = (
+    material_fields = (
         {"baseColorTexture": Image.fromarray(wide)},
         {"baseColorTexture": Image.fromarray(tall), "baseColorFactor": [0.5, 0.5, 0.5, 1.0]},
         {"baseColorFactor": [0.25, 0.5, 0.75, 1.0]},
     )
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
-    for number, look in enumerate(looks):
-        material = trimesh.visual.material.PBRMaterial(name=f"m{number}", **look)
+    for number, fields in enumerate(material_fields):
+        material = trimesh.visual.material.PBRMaterial(name=f"m{number}", **fields)
         part = trimesh.Trimesh(
             square + np.array([1.5 * number, 0, 0]),
             [[0, 1, 2], [0, 2, 3]],
@@ -52,19 +52,19 @@ def test_parts_of_a_gltf_have_materials_of_their_own(tmp_path):
         scene.add_geometry(part)
     scene.export(tmp_path / "three.glb")
     mesh = gv.read_mesh(tmp_path / "three.glb")
-    assert sorted(one.name for one in mesh.materials) == ["m0", "m1", "m2"]
+    assert sorted(m.name for m in mesh.materials) == ["m0", "m1", "m2"]
     half = 128 / 255  # a factor is stored in 8 bits
-    for place, expected in (
+    for position, expected in (
         ((0.25, 0.5, 0), (1, 0, 0)),
         ((0.75, 0.5, 0), (0, 0, 1)),
         ((2.0, 0.8, 0), (0, half, 0)),
         ((2.0, 0.2, 0), (half, half, 0)),
         ((3.5, 0.5, 0), (0.25, 0.5, 0.75)),
     ):
-        assert straight(mesh, place, 200) == pytest.approx(expected, abs=0.01), place
+        assert straight(mesh, position, 200) == pytest.approx(expected, abs=0.01), position
     grid = Voxelizer(mesh, resolution=100, channels=("material",))
-    found = grid.region((0, 0, 0), grid.extent[::-1])["material"]
-    assert torch.unique(found).tolist() == [0, 1, 2, 3]
+    materials = grid.region((0, 0, 0), grid.extent[::-1])["material"]
+    assert torch.unique(materials).tolist() == [0, 1, 2, 3]
 
 
 def test_colours_of_an_obj_s_vertices_shade_into_each_other(tmp_path):

@@ -29,8 +29,8 @@ def test_units_of_nifti(tmp_path, units, expected):
     image.header.set_xyzt_units(*units)
     image.header["pixdim"][4] = 1.5
     nibabel.save(image, tmp_path / "a.nii")
-    volume, told = read_with_warnings(tmp_path / "a.nii", time=1)
-    assert (volume.info.unit, volume.info.time_unit) == expected and not told
+    volume, warned = read_with_warnings(tmp_path / "a.nii", time=1)
+    assert (volume.info.unit, volume.info.time_unit) == expected and not warned
     assert volume.info.time_step == 1.5 and volume.info.space == "right-anterior-superior"
     assert volume.describe().get("unit") == expected[0]
 
@@ -43,16 +43,16 @@ def test_simpleitk_writes_nifti_that_comes_back(tmp_path):
     image.SetOrigin((10, 20, 30))
     for ending in ("nii", "nii.gz", "nrrd"):
         sitk.WriteImage(image, str(tmp_path / f"a.{ending}"))
-        volume, told = read_with_warnings(tmp_path / f"a.{ending}")
-        assert not told and volume.spacing == (0.5, 1.5, 2.5)
-        found = volume.data[..., 0].numpy()
+        volume, warned = read_with_warnings(tmp_path / f"a.{ending}")
+        assert not warned and volume.spacing == (0.5, 1.5, 2.5)
+        actual = volume.data[..., 0].numpy()
         if ending == "nrrd":  # in the file's space
             assert volume.info.space == "left-posterior-superior"
-            assert volume.origin == (10, 20, 30) and np.array_equal(found, data)
+            assert volume.origin == (10, 20, 30) and np.array_equal(actual, data)
         else:  # x right, y anterior: both have the opposite sign
             assert volume.info.unit == "millimeter"
             assert volume.origin == (-10 - 6 * 0.5, -20 - 5 * 1.5, 30)
-            assert np.array_equal(found, data[:, ::-1, ::-1])
+            assert np.array_equal(actual, data[:, ::-1, ::-1])
     moving = sitk.JoinSeries([image, image + 7], 0.0, 4.0)
     sitk.WriteImage(moving, str(tmp_path / "t.nii"))
     volume, _ = read_with_warnings(tmp_path / "t.nii", time=1)
@@ -74,9 +74,9 @@ def test_what_a_nifti_header_tells_beside(tmp_path):
     image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", b"hello"))
     image.set_qform(np.diag([3, 3, 3, 1]), code=1)
     nibabel.save(image, tmp_path / "a.nii")
-    volume, told = read_with_warnings(tmp_path / "a.nii")
+    volume, warned = read_with_warnings(tmp_path / "a.nii")
     assert volume.info.channels == (ChannelInfo(window=(-100, 300)),)
-    assert told == [
+    assert warned == [
         f"{tmp_path}/a.nii: not kept: the qform, which differs from the sform; 1 header extensions"
     ]
     content = bytearray((tmp_path / "a.nii").read_bytes())
@@ -106,8 +106,8 @@ def test_colours_of_nifti(tmp_path):
 )
 def test_ends_of_axes_of_nrrd(tmp_path, centers, spacing, origin):
     """For cells these are the outer sides, for nodes the positions of the first and last one."""
-    told = f"axis mins: 1 2 3\naxis maxs: 3 8 15\ncenters: {centers} {centers} {centers}\n"
-    head = f"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 4 6 6\nencoding: raw\n{told}\n"
+    fields = f"axis mins: 1 2 3\naxis maxs: 3 8 15\ncenters: {centers} {centers} {centers}\n"
+    head = f"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 4 6 6\nencoding: raw\n{fields}\n"
     (tmp_path / "a.nrrd").write_bytes(head.encode() + bytes(144))
     volume, _ = read_with_warnings(tmp_path / "a.nrrd")
     assert volume.spacing == pytest.approx(spacing) and volume.origin == pytest.approx(origin)
@@ -126,19 +126,19 @@ def test_kinds_units_and_space_of_nrrd(tmp_path):
         "modality": "CT",
     }
     nrrd.write(str(tmp_path / "a.nrrd"), data, header)
-    volume, told = read_with_warnings(tmp_path / "a.nrrd")
+    volume, warned = read_with_warnings(tmp_path / "a.nrrd")
     assert np.array_equal(volume.data.numpy(), data.transpose(3, 2, 1, 0))
     assert volume.spacing == (2, 3, 4) and volume.info.quantity == "HU"
     assert (volume.info.unit, volume.info.space) == ("micrometer", "right-anterior-superior")
-    assert told == [f"{tmp_path}/a.nrrd: not kept: key/value pairs modality"]
+    assert warned == [f"{tmp_path}/a.nrrd: not kept: key/value pairs modality"]
     header = {
         "kinds": ["domain", "domain", "domain", "time"],
         "spacings": [0.5, 0.6, 0.7, 20],
         "units": ["mm", "mm", "mm", "ms"],
     }
     nrrd.write(str(tmp_path / "t.nrrd"), data, header)
-    volume, told = read_with_warnings(tmp_path / "t.nrrd", time=3)
-    assert np.array_equal(volume.data[..., 0].numpy(), data[..., 3].T) and not told
+    volume, warned = read_with_warnings(tmp_path / "t.nrrd", time=3)
+    assert np.array_equal(volume.data[..., 0].numpy(), data[..., 3].T) and not warned
     assert volume.spacing == (0.5, 0.6, 0.7) and volume.info.unit == "millimeter"
     assert (volume.info.time_step, volume.info.time_unit) == (20, "millisecond")
     nrrd.write(
@@ -194,9 +194,9 @@ def test_shapes_of_numpy_files(tmp_path, shape, axes, extent, width):
         volume, _ = read_with_warnings(tmp_path / name, axes=axes, time=0, **options)
         assert volume.extent == extent and volume.data.shape[3] == width
         letters = axes or "zyxc"[: len(shape)]
-        place = {"t": 0, "c": width - 1, "z": extent[2] - 1, "y": 3, "x": 2}
-        expected = data[tuple(place[letter] for letter in letters)]
-        assert volume.data[place["z"], 3, 2, width - 1] == expected
+        index = {"t": 0, "c": width - 1, "z": extent[2] - 1, "y": 3, "x": 2}
+        expected = data[tuple(index[letter] for letter in letters)]
+        assert volume.data[index["z"], 3, 2, width - 1] == expected
 
 
 @pytest.mark.parametrize(
@@ -249,14 +249,14 @@ def test_headers_broken_anywhere_are_one_line(tmp_path, ending):
         nrrd.write(str(whole), data, {**header, "encoding": "raw", "space units": ["mm"] * 3})
     content = whole.read_bytes()
     refused = 0
-    for place in range(len(content) - data.nbytes):
+    for offset in range(len(content) - data.nbytes):
         for bad in (0x00, 0xFF, 0x39):
-            broken.write_bytes(content[:place] + bytes([bad]) + content[place + 1 :])
+            broken.write_bytes(content[:offset] + bytes([bad]) + content[offset + 1 :])
             try:
                 gv.read_volume(broken, nan=0, time=0)
             except ValueError as error:
                 assert "\n" not in str(error) and str(broken) in str(error), str(error)
                 refused += 1
             except MemoryError:
-                pytest.fail(f"byte {place} as {bad} takes memory")
+                pytest.fail(f"byte {offset} as {bad} takes memory")
     assert refused > 50

@@ -63,14 +63,14 @@ def test_a_module_equals_the_fused_one_on_scans(aneurism, stent, compiled):
 def test_stored_colours_and_normals_as_module_equal_the_fused_ones(blobs, compiled, lod, lit):
     """The formulas of `StoredColor`, with Blinn-Phong light, in torch."""
     generator, device = torch.Generator().manual_seed(4), DEVICES[compiled]
-    place = blobs.spacing, blobs.origin
+    placement = blobs.spacing, blobs.origin
     shape = blobs.data.shape[:3]
     rgba = torch.cat((torch.rand(*shape, 3, generator=generator), 0.4 * blobs.data), -1)
     normal = torch.rand(*shape, 3, generator=generator) - 0.5
-    volumes = {"rgba": gv.Volume(rgba, *place), "normal": gv.Volume(normal, *place)}
+    volumes = {"rgba": gv.Volume(rgba, *placement), "normal": gv.Volume(normal, *placement)}
     tree = gv.N3Tree.from_volume(volumes, 4, device=device)
     to_sun = torch.nn.functional.normalize(torch.tensor([2.0, -1, 2]), dim=0).to(device)
-    look = {"ambient": 0.2, "diffuse": 0.6, "specular": 0.3, "shininess": 9.0}
+    phong = {"ambient": 0.2, "diffuse": 0.6, "specular": 0.3, "shininess": 9.0}
 
     def shade(values, positions, directions, lengths):
         color, opacity, n = values[:, :3], values[:, 3:4], values[:, 4:]
@@ -81,12 +81,14 @@ def test_stored_colours_and_normals_as_module_equal_the_fused_ones(blobs, compil
         n = unit(n, dim=1) * -(n * directions).sum(1, keepdim=True).sign()
         half = unit(sun - directions, dim=1)
         facing = (n * sun).sum(1, keepdim=True).clamp(min=0)
-        highlight = (n * half).sum(1, keepdim=True).clamp(min=0) ** look["shininess"]
+        highlight = (n * half).sum(1, keepdim=True).clamp(min=0) ** phong["shininess"]
         highlight = highlight * (facing > 0)
-        shaded = color * (look["ambient"] + look["diffuse"] * facing) + look["specular"] * highlight
+        shaded = (
+            color * (phong["ambient"] + phong["diffuse"] * facing) + phong["specular"] * highlight
+        )
         return shaded, alpha
 
-    light = {"normals": "normal", "light": gv.DirectionalLight((-2, 1, -2)), **look} if lit else {}
+    light = {"normals": "normal", "light": gv.DirectionalLight((-2, 1, -2)), **phong} if lit else {}
     camera = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
     fused = gv.render(tree, camera, gv.StoredColor("rgba", **light), lod=lod)
     module = gv.ModuleShader(shade, ["rgba", "normal"])
@@ -98,7 +100,7 @@ def test_stored_colours_and_normals_as_module_equal_the_fused_ones(blobs, compil
 def test_a_module_streams_what_the_fused_shader_streams(blobs, compiled):
     """The same bricks are requested, and the converged pictures are the same."""
     camera = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
-    found = {}
+    results = {}
     for name in ("fused", "module"):
         with gv.Engine(
             gv.VolumeProducer(blobs), brick_size=4, node_pool="1 MB", brick_pool="4 MB",
@@ -108,10 +110,10 @@ def test_a_module_streams_what_the_fused_shader_streams(blobs, compiled):
             shader = twin(SOFT, spacing, engine.device, hidden_by=SOFT)
             picture = engine.render(camera, SOFT if name == "fused" else shader)
             engine.validate()
-            found[name] = (picture, int((engine.cache.bricks.owner_b >= 0).sum()))
+            results[name] = (picture, int((engine.cache.bricks.owner_b >= 0).sum()))
             assert picture.stats.converged
-    assert_close_picture(found["module"][0], found["fused"][0])
-    assert found["fused"][1] <= found["module"][1] <= 1.2 * found["fused"][1], (
+    assert_close_picture(results["module"][0], results["fused"][0])
+    assert results["fused"][1] <= results["module"][1] <= 1.2 * results["fused"][1], (
         "a ray that ends inside a part has walked a little farther"
     )
 
@@ -157,19 +159,19 @@ def test_the_module_sees_places_directions_and_lengths(blobs, backend):
 def test_a_far_camera_costs_no_precision(blobs):
     """Positions are computed from where the ray enters the box: float32 is too coarse outside."""
     volume = gv.Volume(torch.ones(8, 8, 8))
-    tree, found = gv.N3Tree.from_volume(volume, 8), []
+    tree, calls = gv.N3Tree.from_volume(volume, 8), []
 
     def note(values, positions, directions, lengths):
-        found.append((positions[:, 2], lengths))
+        calls.append((positions[:, 2], lengths))
         return values.expand(-1, 3), torch.zeros_like(lengths)
 
     noise = gv.Volume(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(0)))
     tree = gv.N3Tree.from_volume(noise, 8)
     camera = gv.Camera.look_at((3.5, 3.5, 1e8), (3.5, 3.5, 3.5), (0, 1, 0), 1e-8, 1, 1)
     gv.render(tree, camera, gv.ModuleShader(note), lod="finest")
-    place, length = (torch.cat(column) for column in zip(*found, strict=True))
+    depth, length = (torch.cat(column) for column in zip(*calls, strict=True))
     expected = 7.5 - 0.5 * (torch.arange(16) + 0.5)
-    assert (place - expected).abs().max() < 1e-5 and (length - 0.5).abs().max() < 1e-5
+    assert (depth - expected).abs().max() < 1e-5 and (length - 0.5).abs().max() < 1e-5
 
 
 @torch.no_grad()
@@ -178,12 +180,12 @@ def test_several_channels_stand_side_by_side(blobs, compiled):
     tree = gv.N3Tree.from_volume({"a": blobs, "b": other}, 4, device=DEVICES[compiled])
     seen = []
 
-    def look(values, positions, directions, lengths):
+    def function(values, positions, directions, lengths):
         seen.append(values)
         return values, torch.full_like(lengths, 0.02)
 
     camera = gv.Camera.orbit(width=16, height=16, distance=1.5)
-    gv.render(tree, camera, gv.ModuleShader(look, ["a", "b"]))
+    gv.render(tree, camera, gv.ModuleShader(function, ["a", "b"]))
     values = torch.cat(seen)
     assert values.shape[1] == 3 and values[:, 0].max() > 0.5
     assert (values[:, 0] + values[:, 1] - 1).abs().max() < 1e-5
@@ -204,18 +206,18 @@ def test_gradients_reach_parameters_and_voxels(blobs, compiled):
     pool = tree.bricks.bricks["value"].requires_grad_()
     loss().backward()
     smooth = (module.rows[:, 3:] > 0.05) & (module.rows[:, 3:] < 0.9)  # away from the clamps
-    for leaf, where in ((module.rows, smooth.expand(-1, 4)), (pool, torch.ones_like(pool) > 0)):
+    for leaf, mask in ((module.rows, smooth.expand(-1, 4)), (pool, torch.ones_like(pool) > 0)):
         grad = leaf.grad
-        at = int((grad.abs() * where).argmax())
+        index = int((grad.abs() * mask).argmax())
         with torch.no_grad():
             flat, ends = leaf.view(-1), []
-            own = float(flat[at])
+            value = float(flat[index])
             for sign in (1, -1):
-                flat[at] = own + sign * 1e-3
+                flat[index] = value + sign * 1e-3
                 ends.append(float(loss()))
-            flat[at] = own
+            flat[index] = value
         slope = (ends[0] - ends[1]) / 2e-3
-        assert abs(slope) > 1e-2 and abs(float(grad.view(-1)[at]) - slope) < 0.02 * abs(slope)
+        assert abs(slope) > 1e-2 and abs(float(grad.view(-1)[index]) - slope) < 0.02 * abs(slope)
 
 
 @torch.no_grad()
@@ -248,7 +250,7 @@ def test_mistakes_have_one_clear_message(blobs):
     def wide(values, *_rest):
         return values.expand(-1, 4), values
 
-    def much(values, *_rest):
+    def too_opaque(values, *_rest):
         return values.expand(-1, 3), values + 5
 
     def nan(values, *_rest):
@@ -265,7 +267,7 @@ def test_mistakes_have_one_clear_message(blobs):
         (gv.ModuleShader(alone), "the module must give colour and alpha, got Tensor"),
         (gv.ModuleShader(lambda *four: four), "must give colour and alpha, got 4 parts"),
         (gv.ModuleShader(wide), "ModuleShader: the module's colour must be ("),
-        (gv.ModuleShader(much), "the module's alpha must lie in [0, 1]"),
+        (gv.ModuleShader(too_opaque), "the module's alpha must lie in [0, 1]"),
         (gv.ModuleShader(nan), "the module's alpha must lie in [0, 1]"),
         (gv.ModuleShader(wide, ["heat"]), "unknown channel 'heat'; the tree has value"),
         ("bright", "shader must be a TransferFunction"),

@@ -42,11 +42,11 @@ def bits(values: torch.Tensor) -> torch.Tensor:
 def test_compiled_is_the_twin_in_every_bit(compiled, kind, dtype, n, period):
     points = some_points(5003, n, dtype).to(DEVICES[compiled])
     for options in ({}, {"jitter": 0.3, "reach": 2}):
-        given = {"seed": -11, "period": period, **options}
-        expected = noise(points.cpu(), kind, **given, backend="reference")
-        found = noise(points, kind, **given, backend=compiled)
-        assert torch.equal(bits(found), bits(expected)) and expected.std() > 0.05
-        assert torch.equal(found, noise(points, kind, **given))
+        arguments = {"seed": -11, "period": period, **options}
+        expected = noise(points.cpu(), kind, **arguments, backend="reference")
+        actual = noise(points, kind, **arguments, backend=compiled)
+        assert torch.equal(bits(actual), bits(expected)) and expected.std() > 0.05
+        assert torch.equal(actual, noise(points, kind, **arguments))
         if not kind.startswith("F"):
             break
 
@@ -56,8 +56,8 @@ def test_what_is_no_number_stays_so(compiled, kind):
     points = torch.zeros(40, 3, device=DEVICES[compiled])
     points[torch.arange(0, 40, 2), torch.arange(0, 40, 2) % 3] = math.nan
     for backend in ("reference", compiled):
-        found = noise(points, kind, backend=backend).isnan().tolist()
-        assert found == [True, False] * 20, backend
+        is_nan = noise(points, kind, backend=backend).isnan().tolist()
+        assert is_nan == [True, False] * 20, backend
     assert noise(points[:0], kind).shape == (0,)
 
 
@@ -79,8 +79,8 @@ def test_all_instruction_sets_give_the_same_bits(instructions):
         env={**os.environ, "GVTORCH_CPU": instructions, "PYTHONPATH": str(ROOT)},
     )
     assert run.returncode == 0, run.stderr
-    words = eval(run.stdout)
-    assert words[:6] == words[6:] and len(set(words)) == 6
+    digests = eval(run.stdout)
+    assert digests[:6] == digests[6:] and len(set(digests)) == 6
 
 
 @dtypes
@@ -91,8 +91,8 @@ def test_coordinates_that_32_bits_cannot_count_are_0(backend, dtype):
     far[::2, 0] = torch.tensor([2.0**29, -(2.0**40), 1e30, torch.inf, -torch.inf]).repeat(50)
     for kind in twin.KINDS:
         expected = noise(torch.where(far.abs() >= 2**29, 0.0, far), kind, backend=backend)
-        found = noise(far, kind, backend=backend)
-        assert torch.equal(found, expected) and bool(found.isfinite().all())
+        actual = noise(far, kind, backend=backend)
+        assert torch.equal(actual, expected) and bool(actual.isfinite().all())
     whole = gv.noise.fbm(points, octaves=64)
     bounds = gv.noise.fbm_bounds(octaves=64)
     assert bounds.low <= float(whole.min()) and float(whole.max()) <= bounds.high
@@ -102,8 +102,8 @@ def test_coordinates_that_32_bits_cannot_count_are_0(backend, dtype):
 @dtypes
 def test_opcheck(compiled, dtype):
     points = some_points(50, 3, dtype).to(DEVICES[compiled])
-    given = (points, 0, 1, 2, 3, 0, 0, 5, 1.0, 1)
-    torch.library.opcheck(torch.ops.gvtorch.noise.default, given)
+    arguments = (points, 0, 1, 2, 3, 0, 0, 5, 1.0, 1)
+    torch.library.opcheck(torch.ops.gvtorch.noise.default, arguments)
 
 
 def test_memory_stays_safe_without_the_python_checks(compiled):
@@ -124,8 +124,8 @@ def test_memory_stays_safe_without_the_python_checks(compiled):
 def test_gradients_are_those_of_the_twin_and_none_is_lost(compiled):
     points = some_points(1000, 3).to(DEVICES[compiled]).requires_grad_()
     (expected,) = torch.autograd.grad(noise(points, "perlin", backend="reference").sum(), points)
-    (found,) = torch.autograd.grad(noise(points, "perlin").sum(), points)
-    assert torch.equal(found, expected) and expected.abs().max() > 1
+    (gradient,) = torch.autograd.grad(noise(points, "perlin").sum(), points)
+    assert torch.equal(gradient, expected) and expected.abs().max() > 1
     value, pull = torch.func.vjp(lambda p: noise(p, "perlin"), points.detach())
     assert torch.equal(pull(torch.ones_like(value))[0], expected)
     with pytest.raises(RuntimeError, match="noise: gradients by point_pn would be lost"):
@@ -144,5 +144,5 @@ def test_a_noisy_shape_has_normals():
     points = torch.nn.functional.normalize(some_points(500, 3, torch.float64), dim=1)
     steps = 1e-6 * torch.eye(3, dtype=torch.float64)
     shape = Bumpy()
-    by_steps = [(shape(points + one) - shape(points - one)) / 2e-6 for one in steps]
+    by_steps = [(shape(points + shift) - shape(points - shift)) / 2e-6 for shift in steps]
     assert (shape.gradient(points) - torch.stack(by_steps, -1)).abs().max() < 1e-6

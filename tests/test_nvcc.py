@@ -35,8 +35,8 @@ def test_what_only_cuda_includes_counts_and_no_name_comes_to_a_shell(tmp_path, c
     header = write_header(folder, ADD.replace("COLOR", "kColor"), "own $(touch here);'\".h")
     part = folder / "part.h"
     part.write_text("constexpr float kColor = 0.5f;\n")
-    ways = '#ifdef __CUDACC__\n#define PART "part.h"\n#include PART\n#else\n'
-    header.write_text(f"{ways}constexpr float kColor = 0.25f;\n#endif\n" + header.read_text())
+    branches = '#ifdef __CUDACC__\n#define PART "part.h"\n#include PART\n#else\n'
+    header.write_text(f"{branches}constexpr float kColor = 0.25f;\n#endif\n" + header.read_text())
     monkeypatch.chdir(tmp_path)
     before = user.ShaderSource.read(header, "Own")
     library = user.compiled(before, ARCHS)

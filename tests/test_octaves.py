@@ -23,8 +23,8 @@ def descent(total, levels, count=40, side=1 / 16, seed=0):
     parents = child = None
     for _ in range(levels):
         axes = axes_of(corner, side)
-        found, settled = total.bricks(axes, side, parents, child)
-        yield axes, side, found, settled
+        bricks, settled = total.bricks(axes, side, parents, child)
+        yield axes, side, bricks, settled
         child = torch.randint(0, 2, (count, 3), generator=random)
         corner, side, parents = corner + child * 4 * side, side / 2, settled
 
@@ -33,8 +33,8 @@ def direct(total, axes, side):
     x, y, z = axes
     points = x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
     parts = [
-        one.amplitude * noise.perlin([p * one.frequency for p in points], seed=one.seed)
-        for one in total.held(side)
+        octave.amplitude * noise.perlin([p * octave.frequency for p in points], seed=octave.seed)
+        for octave in total.held(side)
     ]
     return torch.stack(parts).sum(0)
 
@@ -50,24 +50,24 @@ def test_polynomials_are_inherited_exactly():
 
     parents = values(axes_of(corner, 0.1))
     children = values(axes_of(corner + child.double() * 0.8 / 3, 0.1 / 3))
-    found = noise.inherit(parents, child, branching=3)
-    torch.testing.assert_close(found, children, atol=1e-9, rtol=0)
+    actual = noise.inherit(parents, child, branching=3)
+    torch.testing.assert_close(actual, children, atol=1e-9, rtol=0)
     assert (noise.inherit(parents, child, branching=3, points=4) - children).abs().max() > 1e-4
 
 
-@pytest.mark.parametrize(("settled", "most"), [(4, 0.2), (8, 8e-3), (16, 9e-4), (32, 9e-5)])
-def test_levels_equal_the_direct_sum(settled, most):
+@pytest.mark.parametrize(("settled", "max_error"), [(4, 0.2), (8, 8e-3), (16, 9e-4), (32, 9e-5)])
+def test_levels_equal_the_direct_sum(settled, max_error):
     total = noise.OctaveSum(octaves=14, gain=0.6, settled=settled)
     worst = 0.0
-    for axes, side, found, _ in descent(total, 11):
-        worst = max(worst, float((found - direct(total, axes, side)).abs().max()))
-    assert len(total.held(side)) == 14 and 0.05 * most < worst < most
+    for axes, side, bricks, _ in descent(total, 11):
+        worst = max(worst, float((bricks - direct(total, axes, side)).abs().max()))
+    assert len(total.held(side)) == 14 and 0.05 * max_error < worst < max_error
 
 
 def test_what_is_never_settled_is_the_direct_sum():
     total = noise.OctaveSum(octaves=8, settled=float("inf"))
-    for axes, side, found, settled in descent(total, 5):
-        torch.testing.assert_close(found, direct(total, axes, side), atol=1e-12, rtol=0)
+    for axes, side, bricks, settled in descent(total, 5):
+        torch.testing.assert_close(bricks, direct(total, axes, side), atol=1e-12, rtol=0)
         assert not settled.any()
     assert total.evaluations == total.plain_evaluations
 
@@ -75,21 +75,21 @@ def test_what_is_never_settled_is_the_direct_sum():
 def test_a_level_evaluates_four_octaves_however_many_there_are():
     total = noise.OctaveSum(octaves=14, settled=16)
     before = 0
-    for depth, (_, side, found, _) in enumerate(descent(total, 11)):
-        made, before = total.evaluations - before, total.evaluations
+    for depth, (_, side, bricks, _) in enumerate(descent(total, 11)):
+        evaluated, before = total.evaluations - before, total.evaluations
         held = len(total.held(side))
         assert held == min(depth + 4, 14)
         # Octaves whose cells are 2, 4, 8 and, for the last time, 16 voxels wide.
-        assert made == min(4, 14 - depth) * found.numel()
+        assert evaluated == min(4, 14 - depth) * bricks.numel()
     assert total.evaluations < 0.45 * total.plain_evaluations
 
 
 def test_bricks_without_parents_are_whole():
     total = noise.OctaveSum(octaves=10)
-    for axes, side, found, settled in descent(total, 6):
+    for axes, side, bricks, settled in descent(total, 6):
         alone, calm = total.bricks(axes, side)
         assert (alone - direct(total, axes, side)).abs().max() < 1e-12
-        assert (alone - found).abs().max() < 1e-3 and (calm - settled).abs().max() < 1e-3
+        assert (alone - bricks).abs().max() < 1e-3 and (calm - settled).abs().max() < 1e-3
 
 
 @pytest.mark.parametrize(

@@ -42,17 +42,17 @@ def assert_same(actual, expected) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_opcheck(blobs, compiled, dtype):
     tree = copy_to(gv.N3Tree.from_volume(blobs, 4), DEVICES[compiled])
-    rays, given = arguments(tree, 5, dtype=dtype)
-    torch.library.opcheck(torch.ops.gvtorch.trace_rays.default, (*rays, *given))
+    rays, trace_args = arguments(tree, 5, dtype=dtype)
+    torch.library.opcheck(torch.ops.gvtorch.trace_rays.default, (*rays, *trace_args))
 
 
 def test_fake_gives_shapes_without_data(blobs, compiled):
     from torch._subclasses.fake_tensor import FakeTensorMode
 
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
-    rays, given = arguments(tree, 5)
+    rays, trace_args = arguments(tree, 5)
     with FakeTensorMode() as mode:
-        values = (*rays, *given)
+        values = (*rays, *trace_args)
         fake = [mode.from_tensor(v) if isinstance(v, torch.Tensor) else v for v in values]
         color, alpha, depth, samples, missed = torch.ops.gvtorch.trace_rays(*fake)
     assert color.shape == (5, 3) and alpha.shape == depth.shape == (5, 1)
@@ -89,11 +89,11 @@ def test_compiles_with_the_default_backend(blobs):
 
 def test_the_checked_function_compiles(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
-    rays, given = arguments(tree, 7)
+    rays, trace_args = arguments(tree, 7)
 
     def shoot(origin: torch.Tensor) -> torch.Tensor:
         moved = rays._replace(origin_r3=origin * 1.0)
-        color, alpha, *_ = trace_rays(moved, given, backend=compiled)
+        color, alpha, *_ = trace_rays(moved, trace_args, backend=compiled)
         return color + alpha
 
     fast = torch.compile(shoot, fullgraph=True, backend="aot_eager")
@@ -132,22 +132,22 @@ def test_module_traces_a_camera_s_rays_as_the_renderer_does(blobs, compiled, sca
     """At the level of detail that their cones require."""
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
     rays = camera_rays(tree, 16, distance=3.0).to(tree.device)
-    given = {} if scale is None else {"cone_scale": scale}
-    hits = gv.trace(tree, rays, SHADER, backend=compiled, **given)
+    options = {} if scale is None else {"cone_scale": scale}
+    hits = gv.trace(tree, rays, SHADER, backend=compiled, **options)
     columns = (rays.origin, rays.direction, rays.cone, rays.range)
-    fields = gv.TreeTracer(tree, SHADER, **given)(*columns)
+    fields = gv.TreeTracer(tree, SHADER, **options)(*columns)
     assert_same(fields, (hits.color, hits.alpha, hits.depth, hits.samples))
 
 
 def test_memory_stays_safe_without_the_python_checks(blobs, compiled):
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[compiled])
-    rays, given = arguments(tree, 5)
-    good = {**rays._asdict(), **given._asdict()}
+    rays, trace_args = arguments(tree, 5)
+    good = {**rays._asdict(), **trace_args._asdict()}
     for name, value in (
         ("direction_r3", rays.direction_r3[:3].contiguous()),
-        ("table_lm4", given.table_lm4[:, :1].contiguous()),
-        ("stamp_t", given.stamp_t[:1]),
-        ("constant_tnc", given.constant_tnc[:1]),
+        ("table_lm4", trace_args.table_lm4[:, :1].contiguous()),
+        ("stamp_t", trace_args.stamp_t[:1]),
+        ("constant_tnc", trace_args.constant_tnc[:1]),
         ("root", 10**6),
         ("component", 3),
         ("border", 9),

@@ -69,8 +69,8 @@ def test_near_and_far_planes_have_the_depths_of_the_book(clip_depth, reversed_z)
     camera = gv.Camera.look_at((0, 0, 5), (0, 0, 0), width=1, height=1)
     projection, _ = matrices(camera, 0.5, 20, clip_depth=clip_depth, reversed_z=reversed_z)
     near, far = (1.0, 0.0) if reversed_z else (0.0, 1.0)
-    places = {0.5: near, 20.0: far, 0.1: near, 50.0: far, math.inf: far, 0.0: near}
-    for distance, expected in places.items():
+    depths = {0.5: near, 20.0: far, 0.1: near, 50.0: far, math.inf: far, 0.0: near}
+    for distance, expected in depths.items():
         image = torch.full((1, 1, 1), distance, dtype=torch.float64)
         assert float(window_depth(image, projection, clip_depth=clip_depth)) == pytest.approx(
             expected, abs=1e-14
@@ -206,8 +206,8 @@ def test_vtk_draws_our_pixels_at_our_distances(vtk):
     normal = torch.linalg.cross(sides[0], sides[1])
     distance = plane_distances(camera, corners[0], tuple(normal.tolist()))
     rays = camera.rays()
-    place = rays.origin + distance.reshape(-1, 1) * rays.direction - corners[0]
-    share = torch.linalg.lstsq(sides.T, place.T).solution.T.reshape(150, 200, 2)  # 0 to 1 inside
+    offset = rays.origin + distance.reshape(-1, 1) * rays.direction - corners[0]
+    share = torch.linalg.lstsq(sides.T, offset.T).solution.T.reshape(150, 200, 2)  # 0 to 1 inside
     margin = torch.minimum(share, 1 - share).amin(-1)
     drawn = (layer.depth < math.inf)[..., 0]
     assert drawn.sum() > 3000

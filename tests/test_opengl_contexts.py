@@ -34,14 +34,14 @@ def _egl():
 def make_context(profile: int = CORE, share: ctypes.c_void_p | None = None) -> ctypes.c_void_p:
     egl, display = _egl()
     egl.eglBindAPI(0x30A2)
-    wanted = (ctypes.c_int * 5)(0x3040, 8, 0x3033, 1, 0x3038)  # OpenGL, pbuffers
+    attributes = (ctypes.c_int * 5)(0x3040, 8, 0x3033, 1, 0x3038)  # OpenGL, pbuffers
     config, count = ctypes.c_void_p(), ctypes.c_int()
-    egl.eglChooseConfig(display, wanted, ctypes.byref(config), 1, ctypes.byref(count))
-    wanted = (ctypes.c_int * 7)(0x3098, 3, 0x30FB, 3, 0x30FD, profile, 0x3038)
-    made = ctypes.c_void_p(egl.eglCreateContext(display, config, share, wanted))
-    if not made:
+    egl.eglChooseConfig(display, attributes, ctypes.byref(config), 1, ctypes.byref(count))
+    attributes = (ctypes.c_int * 7)(0x3098, 3, 0x30FB, 3, 0x30FD, profile, 0x3038)
+    context = ctypes.c_void_p(egl.eglCreateContext(display, config, share, attributes))
+    if not context:
         pytest.skip(f"EGL makes no context of profile {profile}")
-    return made
+    return context
 
 
 def use(context: ctypes.c_void_p | None) -> None:
@@ -66,12 +66,12 @@ def target(functions: gl.Functions) -> tuple[int, int, int]:
     frame = functions.make("Framebuffers")
     for binding in gl.FRAMEBUFFER_BINDINGS:
         functions.BindFramebuffer(binding, frame)
-    places = (gl.COLOR_ATTACHMENT0, gl.DEPTH_ATTACHMENT)
-    for name, (stored, layout), place in zip(names, layouts, places, strict=True):
+    attachments = (gl.COLOR_ATTACHMENT0, gl.DEPTH_ATTACHMENT)
+    for name, (stored, layout), attachment in zip(names, layouts, attachments, strict=True):
         functions.BindTexture(gl.TEXTURE_2D, name)
         size = (WIDTH, HEIGHT)
         functions.TexImage2D(gl.TEXTURE_2D, 0, stored, *size, 0, layout, gl.FLOAT, None)
-        functions.FramebufferTexture2D(gl.DRAW_FRAMEBUFFER, place, gl.TEXTURE_2D, name, 0)
+        functions.FramebufferTexture2D(gl.DRAW_FRAMEBUFFER, attachment, gl.TEXTURE_2D, name, 0)
     return frame, *names
 
 
@@ -130,8 +130,8 @@ def test_a_context_that_shares_objects_is_as_good(device):
     assert_passes(exchange)
     for frame, color, _ in frames:  # framebuffers are not shared
         functions.BindFramebuffer(gl.READ_FRAMEBUFFER, frame)
-        where = (gl.READ_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.ATTACHED_NAME)
-        assert functions.parameter("GetFramebufferAttachmentParameteriv", *where) == color
+        query = (gl.READ_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.ATTACHED_NAME)
+        assert functions.parameter("GetFramebufferAttachmentParameteriv", *query) == color
     exchange.close()
 
 
@@ -180,13 +180,13 @@ def test_old_state_of_a_compatibility_profile_changes_nothing_and_stays(device):
 
     def state() -> list[float]:
         value = ctypes.c_float()
-        found: list[float] = functions.integers(gl.POLYGON_MODE, 2)
-        found += [functions.IsEnabled(switch) for switch in gl._LEGACY_SWITCHES]
-        found += [functions.integer(gl.CLAMP_FRAGMENT_COLOR)]
+        gl_state: list[float] = functions.integers(gl.POLYGON_MODE, 2)
+        gl_state += [functions.IsEnabled(switch) for switch in gl._LEGACY_SWITCHES]
+        gl_state += [functions.integer(gl.CLAMP_FRAGMENT_COLOR)]
         for number in gl._PIXEL_TRANSFER:
             functions.GetFloatv(number, ctypes.byref(value))
-            found.append(value.value)
-        return found
+            gl_state.append(value.value)
+        return gl_state
 
     with gv.opengl.Exchange(WIDTH, HEIGHT, device) as exchange:
         set_odd(functions)

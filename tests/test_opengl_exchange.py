@@ -30,10 +30,10 @@ DEPTHS = {  # internal formats, with their attachments
 @pytest.fixture
 def context():
     """A current context, with no framebuffer bound and no capability enabled."""
-    made = opengl_context()
-    made.__enter__()
-    made.screen and made.screen.use()
-    return made
+    opened = opengl_context()
+    opened.__enter__()
+    opened.screen and opened.screen.use()
+    return opened
 
 
 HOST = pytest.param("cpu", False, id="cpu")
@@ -48,11 +48,11 @@ everywhere = pytest.mark.parametrize(("device", "shared"), [HOST, *CUDA])
 def exchange(context, device, shared):
     if device == "cuda" and (reason := unavailable()["cuda"]):
         pytest.skip(f"backend cuda: {reason}")
-    with gv.opengl.Exchange(WIDTH, HEIGHT, device, share=None if shared else False) as made:
-        if shared and not made.shared and "OpenGL draws on" in made.reason:
-            pytest.skip(made.reason)
-        assert made.shared == shared
-        yield made
+    with gv.opengl.Exchange(WIDTH, HEIGHT, device, share=None if shared else False) as opened:
+        if shared and not opened.shared and "OpenGL draws on" in opened.reason:
+            pytest.skip(opened.reason)
+        assert opened.shared == shared
+        yield opened
 
 
 def scene(context, kind="f1", depth=None):
@@ -163,8 +163,8 @@ def test_only_the_first_of_several_draw_buffers_changes(context, exchange):
     several.use()
     several.clear(0.2, 0.4, 0.6, 0.8)
     exchange.draw(torch.ones(HEIGHT, WIDTH, 4))
-    found = [list(texture.read()[-4:]) for texture in textures]
-    assert found == [[255] * 4, [51, 102, 153, 204], [51, 102, 153, 204]]
+    pixels = [list(texture.read()[-4:]) for texture in textures]
+    assert pixels == [[255] * 4, [51, 102, 153, 204], [51, 102, 153, 204]]
     assert bool((exchange.read_color() == 1).all())
 
 
@@ -172,8 +172,8 @@ def test_only_the_first_of_several_draw_buffers_changes(context, exchange):
 def test_depth_is_what_opengl_reads_itself(context, exchange):
     frame, _, _ = scene(context)
     raw = bytearray(frame.read(components=1, attachment=-1, dtype="f4"))
-    own = torch.frombuffer(raw, dtype=torch.float32).view(HEIGHT, WIDTH, 1).flip(0)
-    torch.testing.assert_close(exchange.read_depth().cpu(), own, rtol=0, atol=2**-24)
+    expected = torch.frombuffer(raw, dtype=torch.float32).view(HEIGHT, WIDTH, 1).flip(0)
+    torch.testing.assert_close(exchange.read_depth().cpu(), expected, rtol=0, atol=2**-24)
 
 
 @everywhere
@@ -238,19 +238,19 @@ def state(functions: gl.Functions) -> dict[int, list[int]]:
     ]
     queries += [gl.VERTEX_ARRAY, gl.DEPTH_MASK, gl.DEPTH_FUNC, gl.POLYGON_MODE, gl.ACTIVE_TEXTURE]
     queries += [gl.RENDERBUFFER_BINDING, gl.CLAMP_READ_COLOR]
-    found = {query: functions.integers(query, several.get(query, 1)) for query in queries}
+    saved = {query: functions.integers(query, several.get(query, 1)) for query in queries}
     for switch in (*gl._SWITCHES, gl.DEPTH_TEST):
-        found[switch] = [functions.IsEnabled(switch)]
+        saved[switch] = [functions.IsEnabled(switch)]
     for index in range(2):
         mask = (ctypes.c_ubyte * 4)()
         functions.GetBooleani_v(gl.COLOR_MASK, index, mask)
-        found[-1 - index] = [*mask, *(functions.IsEnabledi(s, index) for s in gl._INDEXED_SWITCHES)]
+        saved[-1 - index] = [*mask, *(functions.IsEnabledi(s, index) for s in gl._INDEXED_SWITCHES)]
     unit = functions.integer(gl.ACTIVE_TEXTURE)
     for each in (gl.TEXTURE0, gl.TEXTURE0 + 1):
         functions.ActiveTexture(each)
-        found[each] = [functions.integer(q) for q in (gl.TEXTURE_BINDING, gl.SAMPLER_BINDING)]
+        saved[each] = [functions.integer(q) for q in (gl.TEXTURE_BINDING, gl.SAMPLER_BINDING)]
     functions.ActiveTexture(unit)
-    return found
+    return saved
 
 
 def make_plain(functions: gl.Functions, odd, on) -> None:
@@ -336,8 +336,8 @@ def test_a_layer_drawn_by_opengl_is_the_layer_of_its_distances(context, exchange
     layer = gv.Layer(color[..., :3], depth)
     shader = gv.TransferFunction([(0, 0), (1, 0.9)], [(0, 1, 1, 1), (1, 1, 0, 0)])
     picture = gv.render(tree, placed, shader, layer=layer)
-    apart = gv.Layer(color[..., :3].cpu(), depth.cpu())
-    expected = gv.render(tree, placed, shader, layer=apart)
+    plain_layer = gv.Layer(color[..., :3].cpu(), depth.cpu())
+    expected = gv.render(tree, placed, shader, layer=plain_layer)
     assert torch.equal(picture.color, expected.color)
     exchange.draw(picture.color, gv.opengl.window_depth(picture.nearest, projection))
     assert (
@@ -396,11 +396,11 @@ def test_a_layer_is_read_if_it_has_the_size(context, exchange, kind):
     make = {"array": context.texture_array, "3D": context.texture3d}.get(kind)
     side = 32
     texture = make((side, side, 3), 4) if make else context.texture_cube((side, side), 4)
-    place = (gl.DRAW_FRAMEBUFFER, gl.COLOR_ATTACHMENT0)
+    attachment = (gl.DRAW_FRAMEBUFFER, gl.COLOR_ATTACHMENT0)
     if make:
-        functions.FramebufferTextureLayer(*place, texture.glo, 0, 1)
+        functions.FramebufferTextureLayer(*attachment, texture.glo, 0, 1)
     else:
-        functions.FramebufferTexture2D(*place, 0x8517, texture.glo, 0)
+        functions.FramebufferTexture2D(*attachment, 0x8517, texture.glo, 0)
     with pytest.raises(RuntimeError, match="has 32x32 pixels, the exchange 37x23"):
         exchange.read_color()
     color = torch.rand(side, side, 4, device=exchange.device).round()
@@ -474,17 +474,17 @@ def test_without_a_context_it_says_so(context):
         try:
             gv.opengl.Exchange(4, 4, "cpu")
         except RuntimeError as error:
-            said.append(str(error))
+            messages.append(str(error))
 
-    said: list[str] = []
+    messages: list[str] = []
     thread = threading.Thread(target=elsewhere)  # a context is current on one thread
     thread.start()
     thread.join()
-    assert len(said) == 1 and "no OpenGL context is current on this thread" in said[0]
+    assert len(messages) == 1 and "no OpenGL context is current on this thread" in messages[0]
 
 
 def test_ones_own_loader_is_asked(context):
-    asked: list[str] = []
+    names: list[str] = []
     with pytest.raises(RuntimeError, match="this OpenGL lacks glActiveTexture"):
-        gv.opengl.Exchange(4, 4, "cpu", load=asked.append)
-    assert asked == ["glActiveTexture"]
+        gv.opengl.Exchange(4, 4, "cpu", load=names.append)
+    assert names == ["glActiveTexture"]

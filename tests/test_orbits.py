@@ -66,11 +66,11 @@ def test_compiled_is_the_twin_in_every_bit(compiled, form, dtype):
     device = DEVICES[compiled]
     points = some_points(5003, dtype, wide(form))
     expected = orbits(points, given(form, dtype, "cpu"), backend="reference")
-    found = orbits(points.to(device), given(form, dtype, device), backend=compiled)
-    assert torch.equal(bits(found), bits(expected)) and torch.equal(
-        found.isnan().cpu(), expected.isnan()
+    actual = orbits(points.to(device), given(form, dtype, device), backend=compiled)
+    assert torch.equal(bits(actual), bits(expected)) and torch.equal(
+        actual.isnan().cpu(), expected.isnan()
     )
-    assert found.isnan().sum() == 9 and (expected[0] == -1).any() and (expected[0] > 0).any()
+    assert actual.isnan().sum() == 9 and (expected[0] == -1).any() and (expected[0] > 0).any()
     assert torch.equal(bits(orbits(points.to(device), given(form, dtype, device))), bits(expected))
 
 
@@ -84,13 +84,13 @@ def test_bounds_are_the_twin_s_and_hold_what_points_give(compiled, form, dtype):
     center, reach = center.to(dtype), reach.to(dtype)
     reach[:3] = torch.tensor((0.0, math.inf, math.nan))
     expected = orbit_bounds(center, reach, given(form, dtype, "cpu"), backend="reference")
-    own = given(form, dtype, device)
-    found = orbit_bounds(center.to(device), reach.to(device), own, backend=compiled)
-    assert torch.equal(bits(found), bits(expected))
+    parameters = given(form, dtype, device)
+    actual = orbit_bounds(center.to(device), reach.to(device), parameters, backend=compiled)
+    assert torch.equal(bits(actual), bits(expected))
     assert expected[:, 1:3].T.tolist() == [[-1, math.inf]] * 2, "nothing is proven"
-    way = torch.nn.functional.normalize(torch.randn((4001, 40, 3), generator=random), dim=-1)
+    directions = torch.nn.functional.normalize(torch.randn((4001, 40, 3), generator=random), dim=-1)
     far = reach[:, None, None] * torch.rand((4001, 40, 1), generator=random).to(dtype)
-    inside = (center[:, None] + way.to(dtype) * far)[3:]
+    inside = (center[:, None] + directions.to(dtype) * far)[3:]
     value = orbits(inside.flatten(0, 1), given(form, dtype, "cpu"))[0].view(-1, 40)
     low, high = expected[:, 3:, None] if dtype == torch.float64 else expected[:, 3:, None].double()
     slack = 1e-3 if dtype == torch.float32 else 1e-12
@@ -102,12 +102,12 @@ def test_bounds_are_the_twin_s_and_hold_what_points_give(compiled, form, dtype):
 def test_logarithm(dtype):
     value = torch.logspace(-30, 30, 100_001, dtype=torch.float64).to(dtype)
     exact = value.double().log()
-    apart = (log_exact(value).double() - exact).abs() / exact.abs().clamp(min=1)
-    assert apart.max() < (3e-7 if dtype == torch.float32 else 4e-16)
+    error = (log_exact(value).double() - exact).abs() / exact.abs().clamp(min=1)
+    assert error.max() < (3e-7 if dtype == torch.float32 else 4e-16)
     assert log_exact(torch.tensor([math.inf], dtype=dtype)).item() == math.inf
-    one = torch.tensor(3.0, dtype=dtype, requires_grad=True)
-    log_exact(one).backward()
-    assert one.grad.item() == pytest.approx(1 / 3)
+    three = torch.tensor(3.0, dtype=dtype, requires_grad=True)
+    log_exact(three).backward()
+    assert three.grad.item() == pytest.approx(1 / 3)
 
 
 @dtypes
@@ -117,7 +117,7 @@ def test_square_roots_are_rounded_once_whoever_follows(dtype):
     expected = torch.from_numpy(np.sqrt(value.numpy()))
     slope = 0.5 / expected
     leaf = value.clone().requires_grad_()
-    found = {
+    roots = {
         "plain": sqrt_exact(value),
         "of a leaf": sqrt_exact(leaf).detach(),
         "by rows": torch.vmap(sqrt_exact)(value),
@@ -125,8 +125,8 @@ def test_square_roots_are_rounded_once_whoever_follows(dtype):
         "of functions": make_fx(sqrt_exact)(value * 2)(value),
         "compiled": torch.compile(sqrt_exact, backend="eager", fullgraph=True)(value),
     }
-    for how, root in found.items():
-        assert torch.equal(root, expected), how
+    for operation, root in roots.items():
+        assert torch.equal(root, expected), operation
     assert torch.equal(sqrt_exact(value[0, 0]), expected[0, 0])
     sqrt_exact(leaf).sum().backward()
     torch.testing.assert_close(leaf.grad, slope)
@@ -139,15 +139,15 @@ def test_square_roots_are_rounded_once_whoever_follows(dtype):
 @forms
 def test_gradients_are_those_of_small_steps(form):
     points = some_points(3000, torch.float64, wide(form))[500:]
-    own = given(form, torch.float64, "cpu")
-    value = orbits(points, own)[0]
+    parameters = given(form, torch.float64, "cpu")
+    value = orbits(points, parameters)[0]
     points = points[(value > 0.01) & (value < 0.5)][:50].requires_grad_()
-    (slope,) = torch.autograd.grad(orbits(points, own)[0].sum(), points)
+    (slope,) = torch.autograd.grad(orbits(points, parameters)[0].sum(), points)
     for axis in range(3):
         step = torch.zeros(3, dtype=torch.float64)
         step[axis] = 1e-7
         with torch.no_grad():
-            ends = [orbits(points + sign * step, own)[0] for sign in (1, -1)]
+            ends = [orbits(points + sign * step, parameters)[0] for sign in (1, -1)]
         difference = (ends[0] - ends[1]) / 2e-7
         near = torch.isclose(slope[:, axis], difference, rtol=1e-3, atol=1e-4)
         assert near.float().mean() > 0.9, "but where an orbit takes one more step"

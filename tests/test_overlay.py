@@ -40,7 +40,7 @@ def test_png_rows_come_back(tmp_path, bits, count, rows):
     image = rng.integers(0, 2**bits, (50, 31, count)).astype(f"uint{bits}")
     image[20:40] = np.linspace(0, 2**bits - 1, 31)[:, None]
     image[40:] = 7
-    strips = (image[at : at + rows] for at in range(0, 50, rows))
+    strips = (image[first_row : first_row + rows] for first_row in range(0, 50, rows))
     write_png_rows(tmp_path / "a.png", image.shape, bits, strips)
     content = (tmp_path / "a.png").read_bytes()
     assert np.array_equal(png_decode(content), image)
@@ -64,15 +64,15 @@ def test_a_scale_bar_is_as_long_as_it_says():
         columns = np.flatnonzero(white[rows[0]])
         assert abs((columns[-1] - columns[0] + 1) * pixel - expected) < 2.5 * pixel
         assert columns[0] < 20 and rows[0] > 200, "at the lower left"
-    assert [unit_symbol(one) for one in ("micrometer", "mm", "ly", None)] == ["µm", "mm", "ly", ""]
+    assert [unit_symbol(u) for u in ("micrometer", "mm", "ly", None)] == ["µm", "mm", "ly", ""]
 
 
 def test_a_pixel_is_as_wide_as_the_rays_are_apart():
     for model in ("pinhole", "ortho"):
         camera = gv.Camera.look_at((0, 0, 9), (0, 0, 1), width=65, height=33, model=model)
         rays = camera.rays()
-        at = rays.origin + rays.direction * (8 / -rays.direction[:, 2:])
-        middle = at.view(33, 65, 3)[16]
+        hits = rays.origin + rays.direction * (8 / -rays.direction[:, 2:])
+        middle = hits.view(33, 65, 3)[16]
         wide = float(middle[40, 0] - middle[39, 0])
         assert abs(camera.pixel_width(8.0) - wide) < 1e-9
     for bad in (gv.Camera.orbit(), gv.Camera.look_at((0, 0, 9), (0, 0, 1), model="fisheye")):
@@ -83,10 +83,10 @@ def test_a_pixel_is_as_wide_as_the_rays_are_apart():
 def test_a_colour_bar_has_the_colours_of_the_function():
     bar = gv.ColorBar(colors=HOT, low=0, high=200, title="HU")
     drawn = gv.Overlay(400, 300, bar=bar).over(black(400, 300))
-    shown = drawn.to_srgb8().numpy().astype(int)
-    frame = (shown == 255).all(-1)
+    srgb = drawn.to_srgb8().numpy().astype(int)
+    frame = (srgb == 255).all(-1)
     right = 400 - 9 - 4  # within the bar, left of its margin
-    column = shown[:, right]
+    column = srgb[:, right]
     ends = np.flatnonzero(frame[:, right])
     top, bottom = ends[0], ends[-1]
     assert 0.4 * 300 < bottom - top < 0.55 * 300
@@ -96,7 +96,7 @@ def test_a_colour_bar_has_the_colours_of_the_function():
         **{**vars(black(1, len(rows))), "color": torch.from_numpy(HOT(values)[:, None, :3]).float()}
     ).to_srgb8()
     assert np.abs(column[rows] - expected.numpy()[:, 0]).max() < 8
-    assert (shown[:top, 300:] > 200).all(-1).any(), "the title"
+    assert (srgb[:top, 300:] > 200).all(-1).any(), "the title"
 
 
 @pytest.mark.parametrize(
@@ -104,11 +104,11 @@ def test_a_colour_bar_has_the_colours_of_the_function():
     [(0, 1, 6), (140, 1500, 3), (-3, 3, 4), (0, 255, 6), (1e-9, 7e-9, 4), (1000, 1001, 6)],
 )
 def test_ticks_are_few_and_round(low, high, expected):
-    found = _ticks(low, high)
-    assert 3 <= len(found) <= 6 and low - 1e-9 * high <= found[0] and found[-1] <= high * (1 + 1e-9)
-    steps = np.diff(found)
+    ticks = _ticks(low, high)
+    assert 3 <= len(ticks) <= 6 and low - 1e-9 * high <= ticks[0] and ticks[-1] <= high * (1 + 1e-9)
+    steps = np.diff(ticks)
     assert np.allclose(steps, steps[0]) and np.isclose(_round_below(steps[0]), steps[0])
-    assert len(found) >= expected - 1
+    assert len(ticks) >= expected - 1
 
 
 def test_overlays_blend_in_linear_light_and_are_opaque_where_nothing_was():
@@ -118,7 +118,7 @@ def test_overlays_blend_in_linear_light_and_are_opaque_where_nothing_was():
     assert same.float().mean() > 0.95 and torch.equal(same.all(-1, keepdim=True), drawn.alpha == 0)
     assert drawn.alpha.max() > 0.95
     two = gv.Overlay(320, 240, text="Mk\nMk").over(black(light=0.5))
-    lines = [int((one.color != 0.5).sum()) for one in (drawn, two)]
+    lines = [int((picture.color != 0.5).sum()) for picture in (drawn, two)]
     assert abs(lines[1] - 2 * lines[0]) < 0.02 * lines[0]
 
 
@@ -128,8 +128,8 @@ def test_strips_are_the_whole(tmp_path):
     whole = overlay.over(black(light=0.3)).color
     for rows in (1, 17, 100):
         strips = [
-            overlay.over(black(320, min(rows, 240 - at), 0.3), at).color
-            for at in range(0, 240, rows)
+            overlay.over(black(320, min(rows, 240 - row), 0.3), row).color
+            for row in range(0, 240, rows)
         ]
         assert torch.equal(torch.cat(strips), whole)
 

@@ -70,10 +70,10 @@ def of_instructions(tmp_path_factory) -> dict[str, dict[str, list[Tensor]]]:
 @pytest.mark.parametrize(("name", "branching"), CASES)
 @pytest.mark.parametrize("instructions", INSTRUCTIONS)
 def test_every_bit_is_the_reference_s(of_instructions, instructions, name, branching):
-    found = of_instructions[instructions][f"{name} {branching}"]
-    for one, other in zip(found, expected(name, branching), strict=True):
-        assert torch.equal(one.nan_to_num(7), other.nan_to_num(7))
-    assert sum(len(one.unique()) for one in found) > 1000, "the test must see something"
+    actual = of_instructions[instructions][f"{name} {branching}"]
+    for a, b in zip(actual, expected(name, branching), strict=True):
+        assert torch.equal(a.nan_to_num(7), b.nan_to_num(7))
+    assert sum(len(a.unique()) for a in actual) > 1000, "the test must see something"
 
 
 @pytest.mark.backend("cpp")

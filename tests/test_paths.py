@@ -106,18 +106,18 @@ def test_every_command_takes_any_path(tmp_path, data, name, monkeypatch, capsys)
     else:
         folder.mkdir()
     end = os.fsdecode(name.rpartition(b"/")[2])
-    place = folder / ".." / folder.name / end if b".." in name else folder / end
+    path = folder / ".." / folder.name / end if b".." in name else folder / end
 
     def file(ending: str) -> str:
-        return f"{place}{ending}"
+        return f"{path}{ending}"
 
     np.save(file(".npy"), data)
     np.savez(file(".npz"), position=np.random.default_rng(0).random((50, 3)))
     Path(file(".obj")).write_text(TETRAHEDRON)
     size, few = ["--size", "16x16"], ["--frames", "2"]
     looked: list[str] = []
-    monkeypatch.setattr("gvtorch.viewer.view", lambda what, *_, **__: looked.append(what.name))
-    made = [".zarr", "v.zarr", "p.zarr", ".png", "t.png", ".exr", ".tif", "fly", ".mp4", ".gif"]
+    monkeypatch.setattr("gvtorch.viewer.view", lambda volume, *_, **__: looked.append(volume.name))
+    written = [".zarr", "v.zarr", "p.zarr", ".png", "t.png", ".exr", ".tif", "fly", ".mp4", ".gif"]
     for command in (
         ["convert", file(".npy"), file(".zarr")],
         ["voxelize", file(".obj"), "-o", file("v.zarr"), "--resolution", "16"],
@@ -133,8 +133,8 @@ def test_every_command_takes_any_path(tmp_path, data, name, monkeypatch, capsys)
         main(command)
     assert looked == [end, f"{end}.npy"]
     assert_holds(Store.open(file(".zarr")), data)
-    given = [".npy", ".npz", ".obj"]
-    assert sorted(os.listdir(folder)) == sorted(f"{end}{ending}" for ending in (*given, *made))
+    inputs = [".npy", ".npz", ".obj"]
+    assert sorted(os.listdir(folder)) == sorted(f"{end}{ending}" for ending in (*inputs, *written))
     assert sorted(os.listdir(tmp_path)) == sorted(
         {folder.name} | ({"real"} & {*os.listdir(tmp_path)})
     )

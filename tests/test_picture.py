@@ -226,8 +226,8 @@ def test_depth_of_an_opaque_sphere(backend, step):
     depth = picture.depth.cpu()[..., 0].numpy()
     facing = length > 12  # on grazing rays, a fraction of a voxel across is many along
     assert np.abs(depth - near)[facing].max() < 0.5
-    beside = chord(camera, volume, radius + 1.5)[0] == 0
-    assert np.isinf(depth[beside]).all() and facing.sum() > 20 and beside.sum() > 20
+    outside = chord(camera, volume, radius + 1.5)[0] == 0
+    assert np.isinf(depth[outside]).all() and facing.sum() > 20 and outside.sum() > 20
 
 
 def test_auto_lod_is_close_to_the_finest_and_cheaper(aneurism, compiled):
@@ -290,9 +290,9 @@ def test_a_batch_of_cameras_equals_one_by_one(blobs, backend):
     pictures = gv.render(tree, batch, shader, backend=backend)
     assert pictures.color.shape == (3, 12, 20, 3) and pictures.depth.shape == (3, 12, 20, 1)
     for index in range(3):
-        one = gv.render(tree, batch[index], shader, backend=backend)
-        assert one.color.shape == (12, 20, 3)
-        assert torch.equal(one.color, pictures.color[index])
+        single = gv.render(tree, batch[index], shader, backend=backend)
+        assert single.color.shape == (12, 20, 3)
+        assert torch.equal(single.color, pictures.color[index])
 
 
 def test_stats_count_what_was_used(blobs, backend):
@@ -413,8 +413,8 @@ def test_a_picture_takes_few_operations_of_torch(blobs, compiled):
     rays = camera.placed(tree.box).rays(tree.device)
     shader = gv.TransferFunction.preset("gray", 0, 1)
     more = 0 if compiled == "cpp" else 10
-    for show, seen, most in ((gv.render, camera, 24), (gv.trace, rays, 3)):
+    for show, seen, max_calls in ((gv.render, camera, 24), (gv.trace, rays, 3)):
         show(tree, seen, shader)  # prepares the tables
         with Operations() as operations:
             show(tree, seen, shader)
-        assert 1 < operations.calls <= most + more
+        assert 1 < operations.calls <= max_calls + more

@@ -42,7 +42,7 @@ def write_ply(path, layout="binary_little_endian"):
     head += [f"element vertex {COUNT}", *(f"property {k} {n}" for n, k in names)]
     head += ["element face 1", "property list uchar int vertex_indices", "end_header"]
     if layout == "ascii":
-        body = "\n".join(" ".join(repr(one.item()) for one in row) for row in rows) + "\n3 0 1 2\n"
+        body = "\n".join(" ".join(repr(v.item()) for v in row) for row in rows) + "\n3 0 1 2\n"
         path.write_bytes("\n".join(head).encode() + b"\n" + body.encode())
     else:
         faces = b"\3" + np.arange(3, dtype=order + "i4").tobytes()
@@ -79,8 +79,8 @@ def test_a_file_is_read_whole_and_in_parts(tmp_path, name):
     assert np.array_equal(points.positions, PLACE)
     assert np.allclose(points.values[:, 0], MASS, rtol=1e-7)
     assert np.array_equal(points.radius, RADIUS)
-    shown = RGB / 255
-    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    srgb = RGB / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     assert np.allclose(points.colors, linear)
     parts = list(gv.PointFile(path).blocks(120))
     assert [len(part) for part in parts] == [120, 120, 120, 120, 20]
@@ -159,8 +159,8 @@ def test_a_strange_ply_is_named(tmp_path, head, message):
 
 
 def test_columns_of_another_length_are_told(tmp_path):
-    places = np.random.default_rng(0).random((9, 3))
-    np.savez(tmp_path / "a.npz", positions=places, values=np.ones(9), radius=np.ones(8))
+    positions = np.random.default_rng(0).random((9, 3))
+    np.savez(tmp_path / "a.npz", positions=positions, values=np.ones(9), radius=np.ones(8))
     with pytest.warns(UserWarning, match=r"not read, since others have 9 rows: radius \(8\)"):
         assert gv.read_points(tmp_path / "a.npz").radius is None
 
@@ -213,13 +213,13 @@ def test_light_has_colours_and_the_producer_s_voxels(tmp_path):
 
 def test_a_broken_off_splat_goes_on(tmp_path, monkeypatch):
     path, store = write_npz(tmp_path / "a.npz"), tmp_path / "a.zarr"
-    given = {"extent": 300, "workers": 1}
+    options = {"extent": 300, "workers": 1}
     with stopped_at(monkeypatch, 3), pytest.raises(KeyboardInterrupt, match="gvtorch splat"):
-        gv.splat(path, store, **given)
+        gv.splat(path, store, **options)
     assert (store / WORK / "points" / "points.json").exists()
     with pytest.raises(ValueError, match="begun with other points or settings"):
-        gv.splat(path, store, **given, radius=0.3, resume=True)
-    opened = gv.splat(path, store, **given, resume=True)
+        gv.splat(path, store, **options, radius=0.3, resume=True)
+    opened = gv.splat(path, store, **options, resume=True)
     total = opened.read_region(0, (0, 0, 0), opened.extent[::-1]).sum(dtype=np.float64)
     assert total == pytest.approx(MASS.sum(), rel=1e-5)
 
@@ -233,7 +233,7 @@ def test_points_in_memory_go_to_worker_processes(tmp_path):
 def test_mistakes_leave_nothing_behind(tmp_path):
     path = write_npz(tmp_path / "a.npz")
     store = tmp_path / "a.zarr"
-    for words, message in (
+    for options, message in (
         (("--box", "8,8,8,9,9,9"), "no point lies in the box"),
         (("--values", "mess"), "has no column 'mess'"),
         (("--box", "1,2"), "--box must be 6 numbers"),
@@ -242,6 +242,6 @@ def test_mistakes_leave_nothing_behind(tmp_path):
         (("--extent", str(2**30)), "more voxels than a 64-bit number tells apart"),
         (("--channels", "color", "--opacity", 2), "opacity must be"),
     ):
-        run = gvtorch("splat", path, "-o", store, *words)
+        run = gvtorch("splat", path, "-o", store, *options)
         assert run.returncode == 2 and message in run.stderr, run.stderr
         assert len(run.stderr.splitlines()) == 1 and not store.exists()

@@ -16,17 +16,17 @@ EXTENT = 64
 SIZE = 65
 
 
-def star(place, light=(1.0, 0.5, 0.25), **options) -> gv.PointProducer:
-    points = gv.Points([place], [(*light, 1e-6)])
+def star(position, light=(1.0, 0.5, 0.25), **options) -> gv.PointProducer:
+    points = gv.Points([position], [(*light, 1e-6)])
     return gv.PointProducer(points, extent=EXTENT, box=BOX, drawn=True, **options)
 
 
-def total_light(producer, engine, away, place) -> np.ndarray:
+def total_light(producer, engine, away, position) -> np.ndarray:
     """Returns (3,): the light of all pixels times the squared distance from a star, as the mean
     over eyes that look past it by fractions of a pixel."""
-    way, total = np.array([0.48, 0.6, 0.64]), np.zeros(3)
-    eye = tuple(np.array(place) + away * way)
-    straight = gv.Camera.look_at(eye, place, fov=40, width=SIZE, height=SIZE)
+    direction, total = np.array([0.48, 0.6, 0.64]), np.zeros(3)
+    eye = tuple(np.array(position) + away * direction)
+    straight = gv.Camera.look_at(eye, position, fov=40, width=SIZE, height=SIZE)
     for shift in itertools.product((0, 0.25, 0.5, 0.75), repeat=2):
         camera = straight.shifted(*shift)
         layer = gv.point_layer(producer, camera)
@@ -38,27 +38,27 @@ def total_light(producer, engine, away, place) -> np.ndarray:
 
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize(
-    "place", [(0.0156, 0.0156, 0.0156), (0.27, -0.11, 0.003), (0.5, 0.49, -0.3)]
+    "position", [(0.0156, 0.0156, 0.0156), (0.27, -0.11, 0.003), (0.5, 0.49, -0.3)]
 )
-def test_a_star_keeps_its_light_from_voxels_to_a_point(place):
-    producer = star(place)
+def test_a_star_keeps_its_light_from_voxels_to_a_point(position):
+    producer = star(position)
     focal = 0.5 * SIZE / np.tan(np.radians(20))
     switch = 2 / EXTENT * focal * 0.75  # a finest voxel is as wide as a pixel's cone
     expected = (2 / EXTENT) ** 2 * focal**2 * np.array([1.0, 0.5, 0.25])
     with gv.Engine(producer, brick_size=8, brick_pool="8 MB") as engine:
-        found = {
-            away: total_light(producer, engine, away * switch, place) / expected
+        ratios = {
+            away: total_light(producer, engine, away * switch, position) / expected
             for away in (0.05, 0.5, 0.9, 1.0, 1.15, 1.35, 1.5, 1.7, 1.85, 2.0, 2.2, 3.0)
         }
-    for away, light in found.items():
+    for away, light in ratios.items():
         # Beyond, only voxels are seen, and their middle is not the star's position.
         assert np.allclose(light, 1, atol=0.02 if away < 2 else 0.08), (away, light)
 
 
 @pytest.mark.backend("cpp")
 def test_without_the_layer_the_light_is_lost_near_and_kept_far():
-    place, camera = (0.0, 0.0, 0.0), gv.Camera.look_at((0, 0, 0.5), (0, 0, 0), width=33, height=33)
-    producer = star(place)
+    point, camera = (0.0, 0.0, 0.0), gv.Camera.look_at((0, 0, 0.5), (0, 0, 0), width=33, height=33)
+    producer = star(point)
     with gv.Engine(producer, brick_pool="8 MB") as engine:
         assert not engine.render(camera, LOOK).color.any()
         layer = gv.point_layer(producer, camera)
@@ -73,8 +73,8 @@ def test_dust_hides_a_point_behind_it_and_not_one_before():
     dust = gv.Points([(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 4000.0)], radius=0.3)
     behind, before = (0.0, 0.0, -0.7), (0.0, 0.0, 0.7)
     seen = []
-    for place in (behind, before):
-        star_ = gv.Points([place], [(1.0, 1.0, 1.0, 1e-6)], radius=0.0)
+    for position in (behind, before):
+        star_ = gv.Points([position], [(1.0, 1.0, 1.0, 1e-6)], radius=0.0)
         both = gv.Points(
             np.concatenate((dust.positions, star_.positions)),
             np.concatenate((dust.values, star_.values)),

@@ -45,16 +45,16 @@ def producers(store: Path) -> dict[str, gv.Producer]:
 @pytest.mark.parametrize("name", ["stored", "volume", "field", "points", "mesh"])
 def test_producers_are_pickled(store, name):
     producer = producers(store)[name]
-    look = gv.StoredColor("rgba") if "rgba" in producer.channels else None
-    look = look or gv.TransferFunction.preset("gray", 0, 1)
+    shader = gv.StoredColor("rgba") if "rgba" in producer.channels else None
+    shader = shader or gv.TransferFunction.preset("gray", 0, 1)
     other = pickle.loads(pickle.dumps(producer))
     with gv.Engine(producer) as engine:
-        expected = engine.render(VIEW, look)
+        expected = engine.render(VIEW, shader)
         assert expected.alpha.max() > 0
         again = copy.deepcopy(other)  # before an engine has prepared it
-    for one in (other, again):
-        with gv.Engine(one) as engine:
-            assert torch.equal(engine.render(VIEW, look).color, expected.color)
+    for copied in (other, again):
+        with gv.Engine(copied) as engine:
+            assert torch.equal(engine.render(VIEW, shader).color, expected.color)
 
 
 def test_a_store_is_pickled_with_what_it_was_asked_for(tmp_path):

@@ -56,10 +56,10 @@ def test_a_producer_is_asked_only_for_what_is_seen_and_once():
     with gv.Engine(ball, **SIZE) as engine:
         picture = engine.render(camera(24, distance=0.3), GRAY)
         assert picture.stats.converged and picture.alpha.max() > 0.5
-    asked = torch.cat(ball.filled)
-    assert len(asked.unique(dim=0)) == len(asked)
-    assert len(asked) < 0.1 * (256 // 4) ** 3
-    assert len(asked) == picture.stats.produced["bricks"] + 1, "and the root"
+    filled = torch.cat(ball.filled)
+    assert len(filled.unique(dim=0)) == len(filled)
+    assert len(filled) < 0.1 * (256 // 4) ** 3
+    assert len(filled) == picture.stats.produced["bricks"] + 1, "and the root"
 
 
 @pytest.mark.backend("cpp")
@@ -149,8 +149,8 @@ class Gray(Ball):
 def test_the_voxels_of_one_channel_need_no_name(blobs):
     view = camera(24)
     with gv.Engine(Ball(64), **SIZE) as engine, gv.Engine(Gray(64), **SIZE) as other:
-        expected, found = engine.render(view, GRAY), other.render(view, GRAY)
-    assert torch.equal(found.color, expected.color) and found.alpha.max() > 0.5
+        expected, actual = engine.render(view, GRAY), other.render(view, GRAY)
+    assert torch.equal(actual.color, expected.color) and actual.alpha.max() > 0.5
 
 
 def test_a_mask_is_no_kind_of_region():

@@ -161,8 +161,8 @@ def test_the_root_is_waited_for_as_long_as_the_producer_says(patience):
 
     class Late(Ball):
         def classify(self, nodes):
-            found = super().classify(nodes)
-            return pool.submit(lambda: (time.sleep(0.3), found)[1]) if len(nodes) == 1 else found
+            answer = super().classify(nodes)
+            return pool.submit(lambda: (time.sleep(0.3), answer)[1]) if len(nodes) == 1 else answer
 
     producer = Late()
     producer.patience = patience
@@ -195,20 +195,20 @@ def test_an_answer_for_a_node_that_is_gone_is_dropped():
 
 
 def test_pending_requests_are_not_listed_twice(backend):
-    asked = []
+    requested = []
 
     class Never(Ball):
         def fill(self, nodes):
             if (nodes.depth == 0).any():
                 return super().fill(nodes)
-            asked.append(nodes.loc)
+            requested.append(nodes.loc)
             return Future()
 
     device = "cuda" if backend == "cuda" else "cpu"
     with gv.Engine(Never(), device=device, **SIZE) as engine:
         for _ in range(6):
             _, stats = engine.frame(camera(8, distance=1.3), GRAY, backend=backend)
-        everything = torch.cat(asked)
+        everything = torch.cat(requested)
         assert len(everything.unique(dim=0)) == len(everything) == stats.pending
         assert stats.misses >= stats.pending > 0 and not stats.converged
         request = engine.cache.nodes.request_tn
@@ -364,8 +364,8 @@ def test_loaded_bricks_narrow_the_ranges_of_nodes_without_children(dtype):
         ranges = nodes.ranges["value"].to(torch.float64)
         assert leaf.sum() > 20
         assert torch.equal(ranges[leaf], torch.stack((voxels.amin(1), voxels.amax(1)), 1))
-        told = torch.tensor(gv.Channel(dtype).limits, dtype=torch.float64)[:, None]
-        assert (held & ~leaf).any() and (ranges[held & ~leaf] == told).all()
+        limits = torch.tensor(gv.Channel(dtype).limits, dtype=torch.float64)[:, None]
+        assert (held & ~leaf).any() and (ranges[held & ~leaf] == limits).all()
         assert torch.equal(engine.render(camera(64), shader).color, picture.color)
 
 

@@ -31,12 +31,12 @@ def supersampled(tree, size: int, across: int, backend: str) -> torch.Tensor:
 def test_jitter_fills_the_pixel_evenly():
     assert jitter(0) == (0.0, 0.0)
     for count in (16, 64, 256, 1024):
-        places = np.array([jitter(index) for index in range(count)])
-        assert np.abs(places).max() <= 0.5 and np.abs(places[: count - 1].mean(0)).max() < 1e-15
+        offsets = np.array([jitter(index) for index in range(count)])
+        assert np.abs(offsets).max() <= 0.5 and np.abs(offsets[: count - 1].mean(0)).max() < 1e-15
         # Star discrepancy over a grid of boxes: far below that of random points, 1 / sqrt(count).
         corners = np.linspace(-0.5, 0.5, 33)
-        inside = (places[:, None, None, 0] < corners[:, None]) & (
-            places[:, None, None, 1] < corners
+        inside = (offsets[:, None, None, 0] < corners[:, None]) & (
+            offsets[:, None, None, 1] < corners
         )
         area = (corners[:, None] + 0.5) * (corners + 0.5)
         assert np.abs(inside.mean(0) - area).max() < 3 / count**0.85
@@ -137,7 +137,7 @@ def test_frames_that_miss_something_do_not_stay_in_the_mean(blobs):
         for _ in range(20):
             picture = progressive.frame(camera)
         assert progressive.count == 24 and not picture.missed.any()
-    colors = torch.stack([one.color for one in whole]).double()
+    colors = torch.stack([drawn.color for drawn in whole]).double()
     expected = colors[-12:].mean(0)  # any run of complete frames is near it
     assert (picture.color - expected).abs().max() < 0.1 * (coarse.color - expected).abs().max()
 
@@ -171,15 +171,15 @@ def test_strips_make_the_whole_picture(blobs, tmp_path, model, background):
     tree = gv.N3Tree.from_volume(blobs)
     camera = gv.Camera.orbit(30, 20, 0.9, None, 40, 50, model)
     render = partial(gv.render, tree, shader=GRAY, background=behind)
-    whole, told = render(camera), []
+    whole, reports = render(camera), []
     limit = 40 * 400 * 9
     assert strip_rows(limit, 40, 50) == 8
     stats = gv.render_tiles(
         *(render, camera, tmp_path / "a.npy"),
         memory=limit,
-        progress=lambda what, done, total: told.append((what, done, total)),
+        progress=lambda stage, done, total: reports.append((stage, done, total)),
     )
-    assert told == [("rows", min(8 * n, 50), 50) for n in range(1, 8)]
+    assert reports == [("rows", min(8 * n, 50), 50) for n in range(1, 8)]
     assert stats.samples == whole.stats.samples and stats.rays == 2000
     array = np.load(tmp_path / "a.npy")
     for name, part in zip(PARTS, (slice(0, 3), slice(3, 4), slice(4, 5)), strict=True):

@@ -69,9 +69,9 @@ def test_rays_follow_the_formula_of_their_model(model):
             )
             origin, direction = local_ray(model, x, y)
             index = row * WIDTH + column
-            found = rays.origin[index].numpy(), rays.direction[index].numpy()
-            np.testing.assert_allclose(rotation @ found[0] + move, origin, atol=1e-12)
-            np.testing.assert_allclose(rotation @ found[1], direction, atol=1e-12)
+            actual = rays.origin[index].numpy(), rays.direction[index].numpy()
+            np.testing.assert_allclose(rotation @ actual[0] + move, origin, atol=1e-12)
+            np.testing.assert_allclose(rotation @ actual[1], direction, atol=1e-12)
     assert rays.width == WIDTH
 
 
@@ -111,10 +111,10 @@ def test_cones_are_as_wide_as_pixels_are_apart(model, bent):
             for dx, dy in ((h, 0), (0, h))
         ]
         widest = torch.linalg.svdvals(torch.stack(slopes, -1))[..., 0]
-        found = even.rays()
-        inside = found.range[:, 1] > 0
+        even_rays = even.rays()
+        inside = even_rays.range[:, 1] > 0
         assert inside.sum() > 100
-        torch.testing.assert_close(found.cone[inside, 1], widest[inside], atol=0, rtol=1e-3)
+        torch.testing.assert_close(even_rays.cone[inside, 1], widest[inside], atol=0, rtol=1e-3)
     assert bool((rays.cone[:, 0] == 0).all()) == (model != "ortho")
 
 
@@ -198,8 +198,8 @@ def test_a_batch_is_its_cameras_one_by_one(blobs, compiled, model):
     pictures = gv.render(tree, batch, GRAY, backend=compiled)
     assert pictures.alpha.max() > 0
     for index in range(3):
-        one = gv.render(tree, batch[index], GRAY, backend=compiled)
-        assert torch.equal(one.color, pictures.color[index])
+        single = gv.render(tree, batch[index], GRAY, backend=compiled)
+        assert torch.equal(single.color, pictures.color[index])
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -226,11 +226,11 @@ def test_an_orthographic_orbit_is_a_pinhole_from_afar():
     rays = near.rays()
     # Both cross the plane through the middle of the box at the same points.
     points = [
-        one.origin
-        + ((box.mean(0) - one.origin) * rays.direction).sum(1, keepdim=True)
-        / (one.direction * rays.direction).sum(1, keepdim=True)
-        * one.direction
-        for one in (rays, pinhole)
+        ortho.origin
+        + ((box.mean(0) - ortho.origin) * rays.direction).sum(1, keepdim=True)
+        / (ortho.direction * rays.direction).sum(1, keepdim=True)
+        * ortho.direction
+        for ortho in (rays, pinhole)
     ]
     torch.testing.assert_close(points[0], points[1], atol=1e-5, rtol=0)
     assert float(rays.cone[0, 0]) == pytest.approx(2 * 2.4 * 4 * math.tan(math.radians(15)) / 12)
@@ -282,9 +282,9 @@ def test_rays_make_the_picture_of_their_camera(blobs, backend, form):
     camera = gv.Camera.orbit(width=16, height=12)
     whole = gv.render(tree, camera, GRAY, backend=backend)
     rays = camera.placed(tree.box).rays(tree.device)
-    given = rays if form == "rays" else gv.CustomCamera(rays, 16, 12)
+    source = rays if form == "rays" else gv.CustomCamera(rays, 16, 12)
     for picture in (
-        gv.render(tree, given, GRAY, backend=backend),
+        gv.render(tree, source, GRAY, backend=backend),
         gv.render(tree, gv.CustomCamera(rays[:]), GRAY, backend=backend),
     ):
         assert torch.equal(picture.color.flatten(0, -2), whole.color.flatten(0, -2))
@@ -302,8 +302,8 @@ def test_an_engine_streams_what_any_rays_ask_for(blobs):
         assert len(custom) == 2 and custom.batched
         picture = engine.render(custom, GRAY)
         assert picture.stats.converged and torch.equal(picture.color, whole.color)
-        one, stats = engine.frame(custom[1].placed(engine.box), GRAY)
-        assert torch.equal(one.color, whole.color[1]) and stats.rays == 192
+        frame, stats = engine.frame(custom[1].placed(engine.box), GRAY)
+        assert torch.equal(frame.color, whole.color[1]) and stats.rays == 192
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -315,12 +315,12 @@ def test_cones_of_custom_rays_come_from_their_neighbours(model):
         rays.origin.reshape(shape), 3 * rays.direction.reshape(shape)
     )
     derived = custom.rays().cone.reshape(48, 64, 2)[20:28, 28:36]
-    given = rays.cone.reshape(48, 64, 2)[20:28, 28:36]
-    torch.testing.assert_close(derived, given, atol=1e-9, rtol=0.02)
-    told = gv.CustomCamera.from_directions(
+    exact = rays.cone.reshape(48, 64, 2)[20:28, 28:36]
+    torch.testing.assert_close(derived, exact, atol=1e-9, rtol=0.02)
+    with_cone = gv.CustomCamera.from_directions(
         rays.origin[0], rays.direction.reshape(shape), cone=torch.tensor([0.1, 0.2])
     )
-    assert bool((told.rays().cone == torch.tensor([0.1, 0.2]).double()).all())
+    assert bool((with_cone.rays().cone == torch.tensor([0.1, 0.2]).double()).all())
     moved, expected = custom.shifted(0.3, -0.4).rays(), camera.shifted(0.3, -0.4).rays()
     for name in ("origin", "direction"):
         error = getattr(moved, name) - getattr(expected, name)
@@ -370,8 +370,8 @@ def test_graphs_on_cuda_replay_every_model(blobs, model):
             for view in views:
                 engine.frame(view, GRAY, background=sky)
             seen = [graph.replay(view)[0].color.clone() for view in [*views, *views]]
-        for one, whole in zip(seen, [*expected, *expected], strict=True):
-            assert torch.equal(one, whole.color)
+        for replayed, whole in zip(seen, [*expected, *expected], strict=True):
+            assert torch.equal(replayed, whole.color)
 
 
 @pytest.mark.parametrize(

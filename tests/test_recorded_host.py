@@ -18,11 +18,11 @@ from gvtorch.engine import host_frame
 from gvtorch.io.stores.conversion import convert
 
 
-def on_the_host(blobs, tmp_path, which: str) -> gv.Producer:
+def on_the_host(blobs, tmp_path, kind: str) -> gv.Producer:
     """Returns a producer that answers from the host: at once, by rows of a table, or later."""
-    if which == "store":
+    if kind == "store":
         return gv.StoredProducer(convert(blobs, tmp_path))
-    return gv.VolumeProducer(blobs, hold=which)
+    return gv.VolumeProducer(blobs, hold=kind)
 
 
 class Later(gv.VolumeProducer):
@@ -40,26 +40,26 @@ class Later(gv.VolumeProducer):
 
 
 @pytest.mark.parametrize("backend", COMPILED)
-@pytest.mark.parametrize("which", ["voxels", "bricks", "store"])
+@pytest.mark.parametrize("kind", ["voxels", "bricks", "store"])
 @pytest.mark.parametrize("batch, pool", [(5, "4 MB"), (200, "4 MB"), (64, "150 kB")])
 def test_producers_on_the_host_answer_while_frames_go_on(
-    blobs, tmp_path, which, batch, pool, backend
+    blobs, tmp_path, kind, batch, pool, backend
 ):
     device = DEVICES[backend]
     camera = view(24 if pool == "4 MB" else 6)
     options = {"brick_size": 4, "brick_pool": pool, "device": device}
-    with gv.Engine(on_the_host(blobs, tmp_path / "one", which), **options) as engine:
+    with gv.Engine(on_the_host(blobs, tmp_path / "one", kind), **options) as engine:
         expected = engine.render(camera, TRANSFER)
         assert (expected.alpha > 0.5).any()
-    with gv.Engine(on_the_host(blobs, tmp_path / "two", which), **options) as engine:
-        frames, made = Frames(engine, camera, TRANSFER, batch), 0
+    with gv.Engine(on_the_host(blobs, tmp_path / "two", kind), **options) as engine:
+        frames, bricks_made = Frames(engine, camera, TRANSFER, batch), 0
         for _ in range(600):
             hits, stats = frames.frame()
-            made += stats.produced["bricks"]
-            time.sleep(0.002 * (which == "store"))
+            bricks_made += stats.produced["bricks"]
+            time.sleep(0.002 * (kind == "store"))
             if stats.converged:
                 break
-        assert stats.converged and made > 8
+        assert stats.converged and bricks_made > 8
         engine.validate()
         assert frames.served.pending == 0
         picture, _ = engine.frame(camera, TRANSFER)  # the host continues from there
@@ -205,7 +205,7 @@ def test_what_fails_on_the_host_is_named_and_not_asked_for_again(blobs, backend)
         frames = Frames(engine, view(24), TRANSFER, 64)
         hits, stats = frames.whole()
         assert stats.failed == len(engine.failures) > 4
-        assert all(one.message == "spoiled" and one.loc[3] == 3 for one in engine.failures)
+        assert all(f.message == "spoiled" and f.loc[3] == 3 for f in engine.failures)
         engine.validate()
     assert bool(torch.isfinite(hits.color).all())
 
@@ -225,10 +225,10 @@ def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, 
     with gv.Engine(Unruly(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         frames = Frames(engine, view(16), TRANSFER, 64)
         hits, _ = frames.whole(400, 0.002)
-        told = {one.message for one in engine.failures}
-        assert "OSError: no such column" in told
-        assert told <= {"OSError: no such column", "no answer within 0.2 s"}
-        raised = [one for one in engine.failures if one.message.startswith("OSError")]
-        assert all(one.loc[0] == 1 for one in raised)
+        messages = {failure.message for failure in engine.failures}
+        assert "OSError: no such column" in messages
+        assert messages <= {"OSError: no such column", "no answer within 0.2 s"}
+        raised = [failure for failure in engine.failures if failure.message.startswith("OSError")]
+        assert all(failure.loc[0] == 1 for failure in raised)
         engine.validate()
     assert bool(torch.isfinite(hits.color).all())

@@ -38,35 +38,35 @@ def equal(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 def nodes_of(tree: gv.N3Tree) -> dict[tuple[int, ...], int]:
     """Returns the index of each node that rays can reach, by its loc."""
-    found, front = {}, [((0, 0, 0, 0), tree.root)]
+    nodes, front = {}, [((0, 0, 0, 0), tree.root)]
     n, per_tile = tree.branching, tree.nodes.nodes_per_tile
     child = tree.nodes.child_tn.flatten().tolist()
     while front:
         (x, y, z, depth), node = front.pop()
         size = tree.bricks.brick_size * n ** (tree.depth - depth)
-        if any(at * size >= most for at, most in zip((x, y, z), tree.extent, strict=True)):
+        if any(c * size >= n_voxels for c, n_voxels in zip((x, y, z), tree.extent, strict=True)):
             continue
-        found[x, y, z, depth] = node
+        nodes[x, y, z, depth] = node
         if child[node] >= 0:
             for i in range(n**3):
-                place = (x * n + i % n, y * n + i // n % n, z * n + i // n**2, depth + 1)
-                front.append((place, child[node] * per_tile + i))
-    return found
+                loc = (x * n + i % n, y * n + i // n % n, z * n + i // n**2, depth + 1)
+                front.append((loc, child[node] * per_tile + i))
+    return nodes
 
 
 def assert_same_trees(actual: gv.N3Tree, expected: gv.N3Tree) -> None:
     """Asserts the same nodes with the same content; only slots may differ."""
     mine, theirs = nodes_of(actual), nodes_of(expected)
     assert mine.keys() == theirs.keys()
-    place = list(mine)
-    a, b = (torch.tensor([nodes[one] for one in place]) for nodes in (mine, theirs))
-    words = [t.nodes.brick_tn.flatten().cpu()[i] for t, i in ((actual, a), (expected, b))]
-    assert torch.equal(words[0].clamp(max=0), words[1].clamp(max=0))
-    has = words[0] >= 0
+    locs = list(mine)
+    a, b = (torch.tensor([nodes[loc] for loc in locs]) for nodes in (mine, theirs))
+    pointers = [t.nodes.brick_tn.flatten().cpu()[i] for t, i in ((actual, a), (expected, b))]
+    assert torch.equal(pointers[0].clamp(max=0), pointers[1].clamp(max=0))
+    has = pointers[0] >= 0
     for name in expected.bricks.channels:
         bricks = [
             movable(t.bricks[name].detach()).cpu()[word[has].long()]
-            for t, word in zip((actual, expected), words, strict=True)
+            for t, word in zip((actual, expected), pointers, strict=True)
         ]
         assert torch.equal(*bricks), f"bricks of {name}"
         for field in ("ranges", "constants"):
@@ -122,21 +122,21 @@ def test_a_refreshed_tree_is_one_built_anew(
     dense = torch.rand(*extent[::-1], 1, generator=generator) * 100 + 50  # bricks everywhere
     build = {"branching": branching, "threshold": threshold}
     tree = gv.N3Tree.from_volume(gv.Volume(dense.to(dtype), **PLACE), brick_size, border, **build)
-    wanted = dense.to(dtype, copy=True)
+    expected = dense.to(dtype, copy=True)
     for step in range(3):
         low = [int(torch.randint(0, n, (), generator=generator)) for n in extent]
         ends = zip(low, extent, strict=True)
         high = [int(torch.randint(a, n, (), generator=generator)) + 1 for a, n in ends]
         x, y, z = (slice(a, b) for a, b in zip(low, high, strict=True))
         new = patchy(extent, dtype, seed + step) if step < 2 else dense.to(dtype)
-        movable(wanted)[z, y, x] = movable(new)[z, y, x]
-        write_finest(tree, wanted, noise=whole)
+        movable(expected)[z, y, x] = movable(new)[z, y, x]
+        write_finest(tree, expected, noise=whole)
         box = tree.box[0] + (torch.tensor([low, high]) - torch.tensor([-0.2, 0.2])[:, None]) * (
             torch.tensor(tree.spacing, dtype=torch.float64)
         )
         tree.refresh(None if whole else box)
-        assert equal(tree.to_volume().data, wanted)
-        anew = gv.N3Tree.from_volume(gv.Volume(wanted, **PLACE), brick_size, border, **build)
+        assert equal(tree.to_volume().data, expected)
+        anew = gv.N3Tree.from_volume(gv.Volume(expected, **PLACE), brick_size, border, **build)
         assert_same_trees(tree, anew)
         tree.validate()
 
@@ -145,11 +145,11 @@ def write_finest(tree: gv.N3Tree, dense: torch.Tensor, noise: bool = True) -> No
     """Writes voxels (z, y, x, c) into the bricks of the finest level, and others into borders."""
     size, border = tree.bricks.brick_size, tree.bricks.border
     owner = tree.bricks.owner_b.long()
-    place = tree.loc(owner)
+    loc = tree.loc(owner)
     pool = movable(tree.bricks["value"].detach())
     values = movable(dense)
-    for slot in (place[:, 3] == tree.depth).nonzero()[:, 0].tolist():
-        x, y, z = (place[slot, :3] * size).tolist()
+    for slot in (loc[:, 3] == tree.depth).nonzero()[:, 0].tolist():
+        x, y, z = (loc[slot, :3] * size).tolist()
         part = values[z : z + size, y : y + size, x : x + size]
         inner = [slice(border, border + n) for n in part.shape[:3]]
         pool[slot] += noise  # borders, and what lies beyond the extent
@@ -209,7 +209,7 @@ def test_a_region_without_a_brick_stays_as_it_is():
 
 def test_bricks_that_are_learned_stay_bricks_and_stay_silent(blobs):
     tree = gv.N3Tree.from_volume(blobs, 4)
-    words = tree.nodes.brick_tn.clone()
+    pointers = tree.nodes.brick_tn.clone()
     tree.bricks["value"] = torch.nn.Parameter(tree.bricks["value"])
     optimizer = torch.optim.SGD([tree.bricks["value"]], lr=1.0)
     shader = gv.ModuleShader(lambda v, *_: (v.expand(-1, 3), v.clamp(0, 1)))
@@ -223,7 +223,7 @@ def test_bricks_that_are_learned_stay_bricks_and_stay_silent(blobs):
         tree.bricks["value"].fill_(0.25)
         tree.refresh()
         gv.render(tree, camera(8), SOFT)
-    assert torch.equal(tree.nodes.brick_tn, words) and tree.bricks["value"].requires_grad
+    assert torch.equal(tree.nodes.brick_tn, pointers) and tree.bricks["value"].requires_grad
     assert tree.value_range == {"value": (0.25, 0.25)} or (tree.to_volume().data != 0.25).any()
 
 

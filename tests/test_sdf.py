@@ -44,8 +44,8 @@ def shape(request):
 def test_fractals_are_those_of_numpy(name):
     make, by_numpy = FRACTALS[name]
     points = random_points(1500, 10.0 if name == "mandelbox" else 3.0)
-    expected, found = by_numpy(points.numpy()), make()(points).numpy()
-    same = np.isclose(found, expected, rtol=1e-6, atol=1e-12)
+    expected, actual = by_numpy(points.numpy()), make()(points).numpy()
+    same = np.isclose(actual, expected, rtol=1e-6, atol=1e-12)
     assert same.mean() > 0.999 and (expected < 0).any(), "rounding may tip who escapes"
 
 
@@ -101,13 +101,15 @@ def test_intervals_hold_in_random_boxes(shape):
     center, half = random_boxes(BOXES)
     low, high = shape.bounds(center, half)
     steep = shape.slope(center, half)
-    for at in torch.arange(len(center)).split(20_000):
-        points = points_inside(center[at], half[at], 27)
+    for rows in torch.arange(len(center)).split(20_000):
+        points = points_inside(center[rows], half[rows], 27)
         value = shape(points)
-        assert (value >= low[at, None] - 1e-12).all() and (value <= high[at, None] + 1e-12).all()
+        assert (value >= low[rows, None] - 1e-12).all() and (
+            value <= high[rows, None] + 1e-12
+        ).all()
         change = (value[:, :13] - value[:, 13:26]).abs()
-        way = (points[:, :13] - points[:, 13:26]).norm(dim=-1)
-        assert (change <= steep[at, None] * way * (1 + 1e-9) + 1e-12).all()
+        distance = (points[:, :13] - points[:, 13:26]).norm(dim=-1)
+        assert (change <= steep[rows, None] * distance * (1 + 1e-9) + 1e-12).all()
     if not isinstance(shape, gv.Mandelbox):  # all boxes lie within it
         assert ((low > 0) | (high < 0)).double().mean() > 0.15, "and they say something"
 
@@ -117,10 +119,10 @@ def test_gradients_are_those_of_differences(named):
     points, step = random_points(5000), 1e-6
     steps = step * torch.eye(3, dtype=torch.float64)
     by_steps = torch.stack(
-        [(shape(points + one) - shape(points - one)) / (2 * step) for one in steps], -1
+        [(shape(points + shift) - shape(points - shift)) / (2 * step) for shift in steps], -1
     )
-    apart = (shape.gradient(points) - by_steps).abs().amax(1)
-    assert apart.quantile(0.99) < 1e-6, "but where two surfaces meet"
+    error = (shape.gradient(points) - by_steps).abs().amax(1)
+    assert error.quantile(0.99) < 1e-6, "but where two surfaces meet"
 
 
 def test_the_distance_to_a_box_is_that_to_its_nearest_face_edge_or_corner():
@@ -139,8 +141,8 @@ def test_nothing_lies_beyond_a_box(shape):
     if box is not None:
         low, high = box.unbind(0)
         points = random_points(100_000, 14.0 if isinstance(shape, gv.Mandelbox) else 8.0)
-        found = shape(points) < 0
-        assert found.any() and ((points >= low) & (points <= high)).all(1)[found].all()
+        inside = shape(points) < 0
+        assert inside.any() and ((points >= low) & (points <= high)).all(1)[inside].all()
 
 
 def test_shapes_have_the_colour_of_what_is_nearer():
@@ -156,8 +158,8 @@ def test_shapes_have_the_colour_of_what_is_nearer():
     center, half = random_boxes(20_000)
     for shape in (union, ball() - block(), sdf.SmoothUnion(ball(), block(), 0.3)):
         low, high = shape.colors(center, half)
-        found = shape.surface(points_inside(center, half, 12))[1]
-        assert (found >= low[:, None] - 1e-6).all() and (found <= high[:, None] + 1e-6).all()
+        colors = shape.surface(points_inside(center, half, 12))[1]
+        assert (colors >= low[:, None] - 1e-6).all() and (colors <= high[:, None] + 1e-6).all()
         assert (low == high).all(1).double().mean() > 0.02, "of shapes that nearly touch"
 
 
@@ -174,8 +176,8 @@ def test_what_matters_near_a_box_has_the_same_bits(name):
             half = torch.full_like(center, 0.2 * wide * size)
             points = points_inside(center, half, 30).float()
             near = shape.near(center, half)
-            for one, other in zip(near.surface(points), shape.surface(points), strict=True):
-                assert torch.equal(one, other)
+            for a, b in zip(near.surface(points), shape.surface(points), strict=True):
+                assert torch.equal(a, b)
             assert torch.equal(near(points), shape(points))
 
 
@@ -216,8 +218,8 @@ def test_fractals_do_not_depend_on_which_points_come_together(shape, dtype):
     assert torch.equal(shape.surface(points[7:1000])[1], color[7:1000])
     assert shape(points[0]).shape == () and torch.equal(shape(points[0]), value[0])
     shape.iteration = Mine(shape.iteration)
-    for one, other in zip(shape.surface(points), (value, color), strict=True):
-        assert torch.equal(one, other), "a step of one's own is followed alike"
+    for a, b in zip(shape.surface(points), (value, color), strict=True):
+        assert torch.equal(a, b), "a step of one's own is followed alike"
 
 
 def test_a_repeated_shape_knows_its_box_on_the_device_that_it_is_on():
@@ -228,10 +230,10 @@ def test_a_repeated_shape_knows_its_box_on_the_device_that_it_is_on():
 
 def test_a_julia_set_takes_any_three_numbers():
     points = 3 * torch.rand(200, 3) - 1.5
-    found = [
+    values = [
         gv.Julia(c)(points)
         for c in ((0.1, 0.2, 0.3), torch.tensor((0.1, 0.2, 0.3), dtype=torch.float64))
     ]
-    assert torch.equal(*found) and found[0].unique().numel() > 10
+    assert torch.equal(*values) and values[0].unique().numel() > 10
     with pytest.raises(ValueError, match="constant must be three numbers"):
         gv.Julia(())

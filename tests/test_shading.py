@@ -76,8 +76,8 @@ def test_normals_show_no_seam_at_brick_faces(backend):
 @pytest.mark.parametrize("kind", ["head", "directional", "point"])
 @pytest.mark.parametrize("stored", [None, "int8", "uint8", "float32"])
 def test_phong_on_a_sphere(backend, kind, stored):
-    place = grid((33, 39, 27), SPACING) - CENTRE
-    outward = place / np.maximum(np.linalg.norm(place, axis=-1, keepdims=True), 1e-9)
+    offsets = grid((33, 39, 27), SPACING) - CENTRE
+    outward = offsets / np.maximum(np.linalg.norm(offsets, axis=-1, keepdims=True), 1e-9)
     if stored == "int8":
         outward = np.round(outward * 127).astype(np.int8)
     elif stored == "uint8":
@@ -90,21 +90,21 @@ def test_phong_on_a_sphere(backend, kind, stored):
     rays = parallel(21, 9.0, DEVICES[backend])
     t, normal = sphere(rays)
     eye = -rays.direction.cpu().numpy()
-    at = rays.origin.cpu().numpy() - t[:, None] * eye
+    hit = rays.origin.cpu().numpy() - t[:, None] * eye
     color = (1.0, 0.8, 0.5)
     lights = {
         "head": (gv.Headlight(color), eye),
         "directional": (gv.DirectionalLight((2, -1, 2), color), np.array([[-2, 1, -2]]) / 3),
-        "point": (gv.PointLight((0.0, 40.0, -20.0), color), np.array([[0.0, 40.0, -20.0]]) - at),
+        "point": (gv.PointLight((0.0, 40.0, -20.0), color), np.array([[0.0, 40.0, -20.0]]) - hit),
     }
     light, to_light = lights[kind]
     to_light = to_light / np.linalg.norm(to_light, axis=1, keepdims=True) + 0 * normal
-    look = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.4, "shininess": 12.0}
+    shading = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.4, "shininess": 12.0}
     normals = "n" if stored else None
-    shader = gv.DistanceField((0.9, 0.5, 0.3), normals=normals, light=light, **look)
+    shader = gv.DistanceField((0.9, 0.5, 0.3), normals=normals, light=light, **shading)
     hits = shoot(tree, rays, shader, backend)
     base = np.array([0.9, 0.5, 0.3])
-    expected = phong(normal, to_light, eye, base, np.array(color), **look)
+    expected = phong(normal, to_light, eye, base, np.array(color), **shading)
     assert expected.max() - expected.min() > 0.4
     assert np.abs(hits["color"] - expected).max() < 0.03
 
@@ -118,8 +118,8 @@ def test_without_light_or_gradient_the_plain_function_is_the_limit(backend, shad
     ramp = np.linspace(0, 1, 24, dtype=np.float32)[None, :, None] * np.ones((20, 1, 20), np.float32)
     tree = gv.N3Tree.from_volume(gv.Volume(ramp), 4, device=DEVICES[backend])
     rays = parallel(9, 7.0, DEVICES[backend], (0, 0.0, 1.0))
-    look = {"ambient": 1, "diffuse": 0, "specular": 0} if shader is gv.Lit else {}
-    hits = shoot(tree, rays, shader(transfer, **look), backend)
+    shading = {"ambient": 1, "diffuse": 0, "specular": 0} if shader is gv.Lit else {}
+    hits = shoot(tree, rays, shader(transfer, **shading), backend)
     plain = shoot(tree, rays, transfer, backend)
     assert plain["alpha"].max() > 0.8
     assert np.abs(hits["color"] - plain["color"]).max() < 3e-3
@@ -200,23 +200,23 @@ def test_pre_integration_on_a_step_function(backend):
         assert np.abs(hits["alpha"] - expected).max() < 5e-3, length
 
 
-@pytest.mark.parametrize("which", ["maximum", "minimum", "mean"])
-def test_projections_of_a_known_volume(backend, which):
+@pytest.mark.parametrize("kind", ["maximum", "minimum", "mean"])
+def test_projections_of_a_known_volume(backend, kind):
     """A trilinear ramp with one bright and one dark plane across the rays."""
     values = np.full((24, 20, 20), 0.5, np.float32)
     values[9:12], values[16:19] = 0.9, 0.1
     tree = gv.N3Tree.from_volume(gv.Volume(values), 4, device=DEVICES[backend])
     rays = parallel(7, 4.0, DEVICES[backend], (0, 0.0, 1.0))
     transfer = gv.TransferFunction.from_points([(0, 0)], [(0, 0, 0, 0), (1, 1, 0.5, 0.25)])
-    hits = shoot(tree, rays, gv.Projection(which, transfer), backend, step=0.25)
-    expected = {"maximum": 0.9, "minimum": 0.1, "mean": 0.5}[which]  # 3 planes up, 3 down
+    hits = shoot(tree, rays, gv.Projection(kind, transfer), backend, step=0.25)
+    expected = {"maximum": 0.9, "minimum": 0.1, "mean": 0.5}[kind]  # 3 planes up, 3 down
     assert np.abs(hits["features"] - expected).max() < 1e-5
     assert np.abs(hits["color"] - expected * np.array([1, 0.5, 0.25])).max() < 1e-4
     assert (hits["alpha"] == 1).all()
     near = float(CENTRE[2]) - 60
-    where = {"maximum": (9, 11), "minimum": (16, 18), "mean": (-0.5, -0.5)}[which]
+    z_range = {"maximum": (9, 11), "minimum": (16, 18), "mean": (-0.5, -0.5)}[kind]
     z = hits["depth"] + near
-    assert (z >= where[0] - 1e-3).all() and (z <= where[1] + 1e-3).all()
+    assert (z >= z_range[0] - 1e-3).all() and (z <= z_range[1] + 1e-3).all()
 
 
 def test_a_mean_counts_empty_regions(backend):
@@ -265,11 +265,11 @@ def test_features_are_composited_like_colours(backend, count):
 
 def test_parameters_read_back_as_they_were_packed():
     level = torch.tensor(0.25)
-    given = ShadeParameters(
+    parameters = ShadeParameters(
         (1.0, 2.0, 3.0), LightKind.POINT, (4.0, 5.0, 6.0), 7.0, 8.0, 9.0, 10.0, 11.0,
         own=IsosurfaceNumbers(level), normal_scale=2.0, normal_offset=-1.0,
     )  # fmt: skip
-    packed = given.pack(torch.float64, torch.device("cpu"))
+    packed = parameters.pack(torch.float64, torch.device("cpu"))
     assert packed.tolist() == [
         [1, 2, 3, LightKind.POINT], [4, 5, 6, 7], [8, 9, 10, 11], [0.25, 1, 0, 0], [2, -1, 0, 0],
     ]  # fmt: skip

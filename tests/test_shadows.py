@@ -28,11 +28,11 @@ def fog(seed: int, side: int = 16) -> np.ndarray:
 
 def tree_of(value: np.ndarray, backend: str, branching: int = 2) -> gv.N3Tree:
     """Returns density, colours of that opacity, and zero normals, which always face the light."""
-    place = SPACING, ORIGIN
+    placement = SPACING, ORIGIN
     zero = np.zeros((*value.shape, 3), np.float32)
     rgba = np.concatenate((zero + 1, value[..., None]), -1)
     channels = {"value": value, "none": zero, "rgba": rgba}
-    volumes = {name: gv.Volume(data, *place) for name, data in channels.items()}
+    volumes = {name: gv.Volume(data, *placement) for name, data in channels.items()}
     return gv.N3Tree.from_volume(volumes, 4, branching=branching, device=DEVICES[backend])
 
 
@@ -42,18 +42,18 @@ def rays_through(box: np.ndarray, device: str, count: int = 12) -> gv.Rays:
     target = box[0] + random.uniform(0.2, 0.8, (count, 3)) * (box[1] - box[0])
     along = random.normal(size=(count, 3))
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    places = torch.from_numpy(target - 60 * along)
-    return rays_along(places, torch.from_numpy(along), device=device)
+    origins = torch.from_numpy(target - 60 * along)
+    return rays_along(origins, torch.from_numpy(along), device=device)
 
 
-def to_light(light, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def to_light(light, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns directions (k, 3) and distances (k,) from points to a light."""
     if isinstance(light, gv.DirectionalLight):
-        way = -np.array(light.direction) + 0 * place
-        return way / np.linalg.norm(way, axis=1, keepdims=True), np.full(len(place), np.inf)
-    way = np.array(light.position) - place
-    distance = np.linalg.norm(way, axis=1)
-    return way / distance[:, None], distance
+        aim = -np.array(light.direction) + 0 * point
+        return aim / np.linalg.norm(aim, axis=1, keepdims=True), np.full(len(point), np.inf)
+    aim = np.array(light.position) - point
+    distance = np.linalg.norm(aim, axis=1)
+    return aim / distance[:, None], distance
 
 
 def seen(value, rays, light, transfer, step) -> np.ndarray:
@@ -65,12 +65,12 @@ def seen(value, rays, light, transfer, step) -> np.ndarray:
         near, far = np.minimum(low, high).max(), np.maximum(low, high).min()
         start = near + step * np.arange(int(np.ceil((far - near) / step)))
         end = np.minimum(start + step, far)
-        place = eye + ((start + end) / 2)[:, None] * d
-        alpha = transfer(trilinear(value, (place - origin) / spacing))[:, 3]
+        points = eye + ((start + end) / 2)[:, None] * d
+        alpha = transfer(trilinear(value, (points - origin) / spacing))[:, 3]
         alpha = 1 - (1 - alpha) ** (end - start)
-        way, distance = to_light(light, place)
+        direction, distance = to_light(light, points)
         _, taken, _ = march(
-            *(value, SPACING, ORIGIN, (place, way), transfer, 1.0, step),
+            *(value, SPACING, ORIGIN, (points, direction), transfer, 1.0, step),
             first=step,
             last=np.maximum(distance, step),
         )
@@ -95,10 +95,10 @@ def test_each_sample_stands_in_the_shadow_of_what_lies_before_its_light(backend,
     def opaque(v):
         return np.stack((*[np.ones_like(v)] * 3, v), -1)
 
-    look = {"normals": "none", "light": light, "shadows": True, **MATT}
+    shading = {"normals": "none", "light": light, "shadows": True, **MATT}
     for shader, function in (
-        (gv.Lit(linear, **look), transfer),
-        (gv.StoredColor("rgba", reference=1.0, **look), opaque),
+        (gv.Lit(linear, **shading), transfer),
+        (gv.StoredColor("rgba", reference=1.0, **shading), opaque),
     ):
         hits = gv.trace(tree, rays, shader, **options)
         expected = seen(value, rays, light, function, min(SPACING))
@@ -134,8 +134,8 @@ def test_light_decays_with_depth_in_a_homogeneous_medium(backend, dtype):
             backend=backend, dtype=dtype, lod="finest", step=step / min(SPACING), stop_alpha=1.0
         )
         hits = Tracer(tree, shader, options)(rays)
-        way = depth * np.sqrt(1 + (0.5 * slope) ** 2)
-        expected = torch.exp(-extinction * (way - step))  # its first interval is left out
+        distance = depth * np.sqrt(1 + (0.5 * slope) ** 2)
+        expected = torch.exp(-extinction * (distance - step))  # its first interval is left out
         actual = (hits.color / hits.alpha).cpu().double()
         torch.testing.assert_close(actual, expected[:, None].expand(4, 3), rtol=1e-4, atol=0)
 

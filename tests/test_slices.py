@@ -21,8 +21,8 @@ def volume() -> gv.Volume:
 def store(volume, tmp_path_factory):
     folder = tmp_path_factory.mktemp("slices")
     np.save(folder / "a.npy", volume.data[..., 0].numpy())
-    place = {"spacing": volume.spacing, "origin": volume.origin}
-    return gv.convert(folder / "a.npy", folder / "a.zarr", **place, workers=1)
+    placement = {"spacing": volume.spacing, "origin": volume.origin}
+    return gv.convert(folder / "a.npy", folder / "a.zarr", **placement, workers=1)
 
 
 def numbers(picture: gv.Picture) -> np.ndarray:
@@ -55,14 +55,14 @@ def test_three_planes_in_line(volume):
 
 
 @pytest.mark.parametrize(
-    ("at", "index"),
+    ("position", "index"),
     [
         *[(0.0, 0), (0.5, 7), (1.0, 13), (5, 5), ("50%", 7), ("13", 13), ("-4mm", 0)],
         *[("-3.1mm", 0), ("-2.9 mm", 1), ("0.2cm", 3), ("-2000um", 1)],
     ],
 )
-def test_places(volume, at, index):
-    picture = gv.slice_picture(volume, "z", at, span=(0, 255))
+def test_places(volume, position, index):
+    picture = gv.slice_picture(volume, "z", position, span=(0, 255))
     assert np.array_equal(numbers(picture), volume.data[index, ..., 0].numpy())
 
 
@@ -127,8 +127,8 @@ def test_the_command(volume, store, tmp_path):
         )
         assert run.returncode == 0, run.stderr
         assert "10x28" in run.stdout
-        found = gv.pictures.read_files._read_png(out)[..., 0]
-        assert np.array_equal(found, volume.data.numpy()[::-1, 3, :, 0].repeat(2, 0))
+        actual = gv.pictures.read_files._read_png(out)[..., 0]
+        assert np.array_equal(actual, volume.data.numpy()[::-1, 3, :, 0].repeat(2, 0))
         run = gvtorch("slice", path, *flags, "--axis", "all", "--at", "1,50%,2", "-o", out)
         assert run.returncode == 0, run.stderr
         viridis = gvtorch("slice", path, *flags, "--tf", "viridis", "-o", tmp_path / "v.png")
@@ -175,8 +175,8 @@ def test_patients_are_seen_as_radiologists_see_them():
         mid = {"x": 20, "y": 20, "z": 20} if space == RAS else {"x": 31, "y": 29, "z": 20}
         span = (0, float(values.max()))
         cut = {
-            n: gv.slice_picture(volume, n, at, span=span, radiological=True).color[..., 0].numpy()
-            for n, at in mid.items()
+            n: gv.slice_picture(volume, n, p, span=span, radiological=True).color[..., 0].numpy()
+            for n, p in mid.items()
         }
         grays = gv.slice_picture(patient(None), "z", 0, span=span)  # any: only the order counts
         assert grays.color.shape[:2] == (50, 52)

@@ -135,8 +135,8 @@ def resident(blobs: gv.Volume, store: Path, device: torch.device) -> Iterator[Re
     size: dict[str, Any] = {"device": device, "brick_size": 4}
     trees = {n: gv.N3Tree.from_volume(blobs, branching=n, **size) for n in (2, 3)}
     others = [Spotted(2), Spotted(3), gv.StoredProducer(store)]
-    kinds = [(type(one), one.branching) for one in others]
-    engines = [gv.Engine(one, brick_pool="16 MB", **size) for one in others]
+    kinds = [(type(volume), volume.branching) for volume in others]
+    engines = [gv.Engine(volume, brick_pool="16 MB", **size) for volume in others]
     roomy = dict(zip(kinds, engines, strict=True))
 
     def show(producer: gv.Producer, view: gv.Camera) -> gv.Picture:
@@ -148,8 +148,8 @@ def resident(blobs: gv.Volume, store: Path, device: torch.device) -> Iterator[Re
         return picture
 
     try:
-        for one in others:
-            show(one, gv.Camera.orbit(30, 20, 0.8, None, 12, 10))  # allocates all that it needs
+        for volume in others:
+            show(volume, gv.Camera.orbit(30, 20, 0.8, None, 12, 10))  # allocates all that it needs
         yield show
     finally:
         for engine in engines:

@@ -21,27 +21,27 @@ BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
 def cloud(count: int = 30_000, wide: bool = True) -> Points:
     random = np.random.default_rng(5)
-    place = np.clip(random.normal(0, 0.3, (count, 3)), -0.99, 0.99).astype(np.float32)
-    place[: count // 8] = 0.25  # thousands in one voxel
+    positions = np.clip(random.normal(0, 0.3, (count, 3)), -0.99, 0.99).astype(np.float32)
+    positions[: count // 8] = 0.25  # thousands in one voxel
     radius = random.choice([0, 0.01, 0.1], count).astype(np.float32) if wide else None
-    return Points(place, random.uniform(-0.2, 1, (count, 2)).astype(np.float32), radius=radius)
+    return Points(positions, random.uniform(-0.2, 1, (count, 2)).astype(np.float32), radius=radius)
 
 
 @pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.parametrize("branching", [2, 3])
 def test_points_on_disk_are_those_in_memory(tmp_path, wide, branching):
     points = cloud(wide=wide)
-    given = {"extent": 96, "box": BOX, "branching": branching}
-    memory = gv.sort_points(points, **given)
-    disk = gv.sort_points(points, **given, folder=tmp_path / "a.points", memory="2 MB")
+    options = {"extent": 96, "box": BOX, "branching": branching}
+    memory = gv.sort_points(points, **options)
+    disk = gv.sort_points(points, **options, folder=tmp_path / "a.points", memory="2 MB")
     assert len(disk) == len(memory) == 30_000
     random = np.random.default_rng(1)
     for level in range(memory.grid.levels):
         low = random.integers(-9, 96 // branching**level, (40, 3))
-        one, other = (values(made, Cubes(low, 10, level)) for made in (memory, disk))
-        assert np.allclose(one, other, rtol=1e-12, atol=1e-12)
+        first, second = (values(source, Cubes(low, 10, level)) for source in (memory, disk))
+        assert np.allclose(first, second, rtol=1e-12, atol=1e-12)
         for a, b in zip(
-            *(ranges(one, Cubes(low, 10, level)) for one in (memory, disk)), strict=True
+            *(ranges(first, Cubes(low, 10, level)) for first in (memory, disk)), strict=True
         ):
             assert np.allclose(a, b, rtol=1e-5)
     whole = region(disk, (3, 0, 5), (90, 96, 77))
@@ -59,31 +59,31 @@ def test_the_folder_is_there_when_all_is_done_and_not_before(tmp_path, monkeypat
         patch.setattr(sorting._Sorter, "add_up", interrupted)
         gv.sort_points(cloud(), folder=target)
     assert not list(tmp_path.iterdir()), "nothing is left"
-    made = gv.sort_points(cloud(), folder=target)
-    assert [one.name for one in tmp_path.iterdir()] == ["a.points"]
+    result = gv.sort_points(cloud(), folder=target)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.points"]
     with pytest.raises(FileExistsError, match="is there already"):
         gv.sort_points(cloud(), folder=target)
     again = gv.SortedPoints.open(target)
-    assert repr(again) == repr(made) and "30000" in repr(again)
+    assert repr(again) == repr(result) and "30000" in repr(again)
 
 
-@pytest.mark.parametrize("way", range(6))
-def test_a_damaged_folder_is_named(tmp_path, way):
+@pytest.mark.parametrize("damage", range(6))
+def test_a_damaged_folder_is_named(tmp_path, damage):
     target = tmp_path / "a.points"
     gv.sort_points(cloud(2000), folder=target)
     meta = target / "points.json"
-    if way == 0:
+    if damage == 0:
         (target / "points_0.value").write_bytes(b"1234")
-    elif way == 1:
+    elif damage == 1:
         (target / "points_0.code").unlink()
-    elif way == 2:
+    elif damage == 2:
         meta.write_text("{")
-    elif way == 3:
+    elif damage == 3:
         meta.write_text("[1]")
     else:
-        told = json.loads(meta.read_text())
-        told["grid"]["extent"], told["width"] = [[2**40] * 3, [0, 1, 1]][way - 4], "x"
-        meta.write_text(json.dumps(told))
+        metadata = json.loads(meta.read_text())
+        metadata["grid"]["extent"], metadata["width"] = [[2**40] * 3, [0, 1, 1]][damage - 4], "x"
+        meta.write_text(json.dumps(metadata))
     with pytest.raises(ValueError) as caught:
         gv.PointProducer(target)
     assert str(target) in str(caught.value) and "\n" not in str(caught.value)
@@ -115,10 +115,10 @@ def test_runs_are_merged_in_order():
     blocks = list(runs.sorted())
     assert np.array_equal(np.concatenate([block["code"] for block in blocks]), np.sort(code))
     total = list(grouped(iter(blocks), {"value": np.add.reduceat}, 3))
-    found = np.zeros(14)
+    sums = np.zeros(14)
     for rows in total:
-        found[rows["code"]] += rows["value"]
-    assert np.array_equal(found, np.bincount(code // 3, minlength=14))
+        sums[rows["code"]] += rows["value"]
+    assert np.array_equal(sums, np.bincount(code // 3, minlength=14))
     assert sum(len(rows["code"]) for rows in total) == len(np.unique(code // 3))
 
 

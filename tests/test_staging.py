@@ -139,11 +139,11 @@ def test_several_threads_may_send(device):
 @pytest.mark.parametrize("side", [2, 3, 5, 10])
 def test_rows_are_moved_in_the_widest_words_that_fit(dtype, side):
     pool, rows = voxels(7, dtype, side=side), voxels(9, dtype, side=side, seed=3)[2:6]
-    to, these = wide_rows(pool, rows)
-    to.index_copy_(0, torch.tensor([6, 0, 3, 2]), these)
+    to, words_rows = wide_rows(pool, rows)
+    to.index_copy_(0, torch.tensor([6, 0, 3, 2]), words_rows)
     assert torch.equal(
         pool[[6, 0, 3, 2]].float() if dtype != torch.uint16 else to[[6, 0, 3, 2]],
-        rows.float() if dtype != torch.uint16 else these,
+        rows.float() if dtype != torch.uint16 else words_rows,
     )
     assert to.itemsize == np.gcd(8, np.gcd(side**3 * dtype.itemsize, rows.data_ptr()))
 
@@ -242,16 +242,16 @@ def assert_slots_hold_what_the_producer_made(engine, nodes) -> None:
     assert bool((slot > 0).all()) and len(slot.unique()) == len(slot)
     assert torch.equal(cache.bricks.owner_b[slot].long(), nodes)
     for some in torch.arange(len(nodes)).split(5000):
-        made = source.producer.make(source.tree.loc(nodes[some.to(nodes.device)]))
-        at = slot[some.to(slot.device)]
+        answer = source.producer.make(source.tree.loc(nodes[some.to(nodes.device)]))
+        chosen_slots = slot[some.to(slot.device)]
         for name, pool in cache.bricks.bricks.items():
-            held = wide_rows(pool)[0][at]
+            held = wide_rows(pool)[0][chosen_slots]
             assert torch.equal(
                 held,
-                made[name]
+                answer[name]
                 .to(held.device)
-                .view_as(pool[: len(at)])
-                .view(len(at), -1)
+                .view_as(pool[: len(chosen_slots)])
+                .view(len(chosen_slots), -1)
                 .view(held.dtype),
             ), name
 
@@ -294,7 +294,7 @@ def test_the_host_waits_a_few_times_a_batch_whatever_its_size(device, where):
                 with nobody_waits("warn"):
                     stats = serve(engine, batch, config.REQUEST_LOAD)
             assert stats.produced["bricks"] == size
-            counts.append(sum("synchroniz" in str(one.message) for one in caught))
+            counts.append(sum("synchroniz" in str(warning.message) for warning in caught))
         assert max(counts) <= 6, counts
 
 

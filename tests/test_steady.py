@@ -97,7 +97,7 @@ def test_frames_go_on_where_counts_do_not_come(slow, blobs):
     something, it also waits for the newest list, and serves only that.
     """
     left, right = (camera(8, azimuth=azimuth, distance=0.6) for azimuth in (0, 180))
-    asked = []
+    requested = []
     for views in ((left, left, left, right), (right,) * 4, (left,) * 4):
         producer = Noted(blobs)
         with gv.Engine(producer, brick_size=4, monitor=False) as engine:
@@ -109,8 +109,8 @@ def test_frames_go_on_where_counts_do_not_come(slow, blobs):
             assert not slow and not producer.asked, "the host does not wait"
             engine.frame(right, GRAY)
             assert len(slow) == 4, "the fifth frame looks at the four before"
-            asked.append(set(producer.asked))
-    assert asked[0] == asked[1] != asked[2] and asked[2]
+            requested.append(set(producer.asked))
+    assert requested[0] == requested[1] != requested[2] and requested[2]
 
 
 @pytest.mark.backend("cpp")
@@ -209,16 +209,16 @@ def test_statistics_come_when_they_are_read(slow, blobs):
         assert stats.as_dict()["misses"] == stats.misses > 0
         assert stats.milliseconds >= sum(stats.stages.values()) > 0
         assert len(slow) == 1, "once is enough"
-        for again in (copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))):
+        for again in (copy.copy, copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))):
             _, stats = engine.frame(camera(), GRAY)
             assert again(stats) == stats and stats.tiles_used > 0
 
 
 def scenes(blobs) -> list:
-    beside = gv.Volume(blobs.data, blobs.spacing, (70.0, -3.0, 2.0))
+    neighbour = gv.Volume(blobs.data, blobs.spacing, (70.0, -3.0, 2.0))
     return [
         gv.VolumeProducer(blobs),
-        {"left": gv.VolumeProducer(blobs), "right": gv.VolumeProducer(beside)},
+        {"left": gv.VolumeProducer(blobs), "right": gv.VolumeProducer(neighbour)},
     ]
 
 
@@ -263,11 +263,11 @@ def test_a_replayed_graph_on_cuda_is_the_frame(cuda, blobs, trees):
             for view in views:
                 picture, stats = graph.replay(view)
                 replayed.append(({n: getattr(picture, n).clone() for n in FIELDS}, stats))
-        for (parts, stats), (whole, known) in zip(replayed, expected, strict=True):
+        for (parts, stats), (whole, expected_stats) in zip(replayed, expected, strict=True):
             assert all(torch.equal(parts[name], getattr(whole, name)) for name in FIELDS)
             assert stats.converged and stats.milliseconds > 0 and "replay" in stats.stages
             for name in ("samples", "tiles_used", "bricks_used", "rays", "misses", "bytes"):
-                assert getattr(stats, name) == getattr(known, name), name
+                assert getattr(stats, name) == getattr(expected_stats, name), name
         engine.validate()
         with pytest.raises(ValueError, match="camera must be 1 of 64x64 pixels as captured"):
             graph.replay(camera(32))

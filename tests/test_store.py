@@ -115,10 +115,10 @@ def test_empty_blocks_are_not_written_and_read_right(tmp_path):
 
 def test_regions_beyond_the_volume_repeat_its_faces(whole, data):
     store = Store.open(whole)
-    found = store.read_region(0, (-3, 40, 85), (2, 50, 99))
+    actual = store.read_region(0, (-3, 40, 85), (2, 50, 99))
     z, y, x = np.arange(-3, 2), np.arange(40, 50), np.arange(85, 99)
     expected = data[np.ix_(z.clip(0), y.clip(0, 44), x.clip(0, 89))]
-    assert np.array_equal(found, expected)
+    assert np.array_equal(actual, expected)
     assert (store.read_region(0, (-9, -9, -9), (-8, -8, -8)) == data[0, 0, 0]).all()
     with pytest.raises(ValueError, match="low < high"):
         store.read_region(0, (0, 0, 0), (0, 1, 1))
@@ -132,13 +132,13 @@ def test_regions_beyond_the_volume_repeat_its_faces(whole, data):
 
 def test_many_threads_read_the_same(whole, data):
     store = Store.open(whole)
-    places = np.array(list(np.ndindex(*store.block_grid(0))) * 4)
-    expected, _ = store.read_blocks(0, places)
+    positions = np.array(list(np.ndindex(*store.block_grid(0))) * 4)
+    expected, _ = store.read_blocks(0, positions)
     wrong = []
 
     def read() -> None:
         for _ in range(3):
-            if not np.array_equal(store.read_blocks(0, places)[0], expected):
+            if not np.array_equal(store.read_blocks(0, positions)[0], expected):
                 wrong.append(1)
 
     threads = [threading.Thread(target=read) for _ in range(4)]
@@ -159,14 +159,14 @@ def first_file(folder: Path) -> Path:
 def test_a_missing_chunk_is_an_error_of_its_block(damaged, data):
     first_file(damaged / "gvtorch/blocks/0").unlink()
     store = Store.open(damaged)
-    places = np.array(list(np.ndindex(*store.block_grid(0))))
-    errors = store.read_blocks(0, places)[1]
-    varied = [i for i, at in enumerate(places) if np.ptp(block_of(data, at, 32))]
+    positions = np.array(list(np.ndindex(*store.block_grid(0))))
+    errors = store.read_blocks(0, positions)[1]
+    varied = [i for i, position in enumerate(positions) if np.ptp(block_of(data, position, 32))]
     assert sorted(errors) == varied
-    z, y, x = places[varied[0]]
+    z, y, x = positions[varied[0]]
     name = f"{damaged}: block ({z}, {y}, {x}) z y x of level 0: missing chunk"
     assert errors[varied[0]] == name
-    assert not store.read_blocks(1, places[:1])[1], "other levels are whole"
+    assert not store.read_blocks(1, positions[:1])[1], "other levels are whole"
 
 
 def test_a_missing_shard_of_cells_is_an_error(damaged):
@@ -196,14 +196,14 @@ def test_a_corrupt_chunk_is_an_error_of_its_block_alone(damaged, data):
     content[100] ^= 0xFF
     file.write_bytes(content)
     store = Store.open(damaged)
-    places = np.array(list(np.ndindex(*store.block_grid(0))))
-    blocks, errors = store.read_blocks(0, places)
+    positions = np.array(list(np.ndindex(*store.block_grid(0))))
+    blocks, errors = store.read_blocks(0, positions)
     assert len(errors) == 1
     ((bad, text),) = errors.items()
     assert text.startswith(f"{damaged}: block") and "level 0" in text and "\n" not in text
     assert not blocks[bad].any()
-    for i in set(range(len(places))) - {bad}:
-        assert np.array_equal(blocks[i], block_of(data, places[i], 32))
+    for i in set(range(len(positions))) - {bad}:
+        assert np.array_equal(blocks[i], block_of(data, positions[i], 32))
     file = first_file(damaged / "0")
     file.write_bytes(file.read_bytes()[:-7])
     with pytest.raises(StoreError, match=r"damaged\.zarr/0"):
@@ -306,8 +306,8 @@ def test_foreign_images_hold_the_same(tmp_path, version, sharded, axes, dtype):
     with pytest.raises(ValueError, match="has no cells"):
         store.read_cells(0, (0, 0, 0), (1, 1, 1))
     if width == 2:
-        one = Store.open(tmp_path, time=1 if "t" in axes else 0, channels=[1])
-        assert_holds(one, np.ascontiguousarray(data[..., 1:]))
+        opened = Store.open(tmp_path, time=1 if "t" in axes else 0, channels=[1])
+        assert_holds(opened, np.ascontiguousarray(data[..., 1:]))
 
 
 def test_scales_that_leave_z_alone(tmp_path):
@@ -319,11 +319,11 @@ def test_scales_that_leave_z_alone(tmp_path):
     assert store.spacing == (1, 1, 4) and store.levels == 5
     for level, factor in ((1, (2, 1, 1)), (2, (4, 1, 1))):
         expected = pool_mean(levels[level], factor)
-        found = store.read_region(level, (0, 0, 0), expected.shape[:3])
-        assert np.array_equal(found, expected)
+        actual = store.read_region(level, (0, 0, 0), expected.shape[:3])
+        assert np.array_equal(actual, expected)
     third = pool_mean(pool_mean(levels[2], (4, 1, 1)), 2)
-    found = store.read_region(3, (0, 0, 0), third.shape[:3])
-    assert np.abs(found.astype(int) - third).max() <= 1, "rounded once or twice"
+    actual = store.read_region(3, (0, 0, 0), third.shape[:3])
+    assert np.abs(actual.astype(int) - third).max() <= 1, "rounded once or twice"
 
 
 def test_scales_that_dropped_a_last_voxel(tmp_path):
@@ -334,9 +334,9 @@ def test_scales_that_dropped_a_last_voxel(tmp_path):
         tmp_path, [data[..., 0], half[..., 0]], "zyx", [[1.0] * 3, [45 / 22] * 3], version=2
     )
     store = Store.open(tmp_path)
-    found = store.read_region(1, (0, 0, 0), (23, 23, 23))
-    assert np.array_equal(found[:22, :22, :22], half) and np.array_equal(
-        found[22, :22, :22], half[-1]
+    actual = store.read_region(1, (0, 0, 0), (23, 23, 23))
+    assert np.array_equal(actual[:22, :22, :22], half) and np.array_equal(
+        actual[22, :22, :22], half[-1]
     )
 
 
@@ -410,11 +410,11 @@ def served(whole):
 def test_a_store_behind_http(served, data):
     store = Store.open(f"{served}/whole.zarr")
     assert store.has_blocks
-    places = np.array(list(itertools.islice(np.ndindex(*store.block_grid(0)), 5)))
-    blocks, errors = store.read_blocks(0, places)
+    positions = np.array(list(itertools.islice(np.ndindex(*store.block_grid(0)), 5)))
+    blocks, errors = store.read_blocks(0, positions)
     assert not errors
-    for block, at in zip(blocks, places, strict=True):
-        assert np.array_equal(block, block_of(data, at, 32))
+    for block, position in zip(blocks, positions, strict=True):
+        assert np.array_equal(block, block_of(data, position, 32))
     with pytest.raises(ValueError, match="not a store"):
         Store.open(f"{served}/none.zarr")
 
@@ -422,9 +422,9 @@ def test_a_store_behind_http(served, data):
 def test_reads_end_in_time(served):
     store = Store.open(f"{served}/whole.zarr")
     Handler.delay = 1.5
-    places = np.array([[0, 0, 2]])
+    positions = np.array([[0, 0, 2]])
     for read in (
-        lambda: store.read_blocks(0, places, timeout=0.2),
+        lambda: store.read_blocks(0, positions, timeout=0.2),
         lambda: store.read_region(0, (0, 0, 0), (9, 9, 9), timeout=0.2),
         lambda: store.read_cells(0, (0, 0, 0), (1, 1, 1), timeout=0.2),
     ):

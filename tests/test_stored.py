@@ -171,7 +171,7 @@ def test_a_block_is_read_once_while_the_host_cache_holds_it(whole, monkeypatch):
     read, seen = Store.read_blocks, []
 
     def count(self, level, zyx, **options):
-        seen.extend((level, *place) for place in np.asarray(zyx).tolist())
+        seen.extend((level, *position) for position in np.asarray(zyx).tolist())
         return read(self, level, zyx, **options)
 
     monkeypatch.setattr(Store, "read_blocks", count)
@@ -241,8 +241,8 @@ def test_a_damaged_store_gives_a_complete_coarser_picture(store, cloud, fault, l
         assert stats.converged and stats.failed == len(engine.failures) > 0
         assert reason in engine.failures[0].message and str(store) in engine.failures[0].message
         assert "\n" not in str(engine.failures[0])
-        shown = (picture.alpha > 0.02).float().mean()
-        assert shown > 0.6 * (expected.alpha > 0.02).float().mean(), "complete, if coarse"
+        covered = (picture.alpha > 0.02).float().mean()
+        assert covered > 0.6 * (expected.alpha > 0.02).float().mean(), "complete, if coarse"
         if fault is not gone:
             assert (picture.color - expected.color).square().mean().sqrt() < 0.1
 
@@ -273,7 +273,7 @@ def test_a_store_that_errors_now_and_then_recovers(whole, monkeypatch):
     with gv.Engine(gv.StoredProducer(whole)) as engine:
         picture = engine.render(VIEW, GRAY)
         assert picture.stats.failed > 0
-        assert any("the network is down" in one.message for one in engine.failures)
+        assert any("the network is down" in failure.message for failure in engine.failures)
         for _ in range(50):
             if not engine.failures:
                 break
@@ -356,10 +356,10 @@ def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
     with gv.Engine(gv.StoredProducer(folder), brick_pool="900 MB", node_pool="40 MB") as engine:
         expected = [engine.render(view, GRAY) for view in views]
         assert not any(engine.render(view, GRAY).stats.evicted["bricks"] for view in views)
-    most = max(picture.stats.bricks_used for picture in expected)
-    assert most * 1000 < 64e6
+    largest = max(picture.stats.bricks_used for picture in expected)
+    assert largest * 1000 < 64e6
     for loading in ("straight", "levels"):
-        options = {"brick_pool": int(1.3 * most) * 1000, "node_pool": "4 MB", "loading": loading}
+        options = {"brick_pool": int(1.3 * largest) * 1000, "node_pool": "4 MB", "loading": loading}
         with gv.Engine(gv.StoredProducer(folder, host_cache="40 MB"), **options) as engine:
             for view, picture in zip(views, expected, strict=True):
                 assert_same_picture(engine.render(view, GRAY), picture)

@@ -39,8 +39,8 @@ def euler_number(mesh: gv.Mesh) -> int:
 
 def assert_closed(mesh: gv.Mesh) -> None:
     """Asserts that each edge occurs once in each direction: in two triangles of one orientation."""
-    ways = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    there, back = (np.sort(w[:, 0] * len(mesh.vertices) + w[:, 1]) for w in (ways, ways[:, ::-1]))
+    edges = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    there, back = (np.sort(w[:, 0] * len(mesh.vertices) + w[:, 1]) for w in (edges, edges[:, ::-1]))
     assert np.array_equal(there, back) and (np.diff(there) > 0).all()
     assert np.array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
 
@@ -100,14 +100,14 @@ def test_noise_is_wrapped_without_cracks(seed, side, block, whole):
 
 def test_every_kind_of_cell_occurs_and_is_cut_whole():
     """Loops of n corners make n - 2 triangles, and together they pass all crossed edges."""
-    found = cells._tables()
+    tables = cells._tables()
     for kind in range(256):
         loops = cells._loops(kind)
         crossed = {
             e for e, (a, n) in enumerate(cells._EDGES) if (kind >> n ^ kind >> (n | 1 << a)) & 1
         }
         assert sorted(edge for loop in loops for edge in loop) == sorted(crossed)
-        assert found.triangles[kind] == sum(len(loop) - 2 for loop in loops)
+        assert tables.triangles[kind] == sum(len(loop) - 2 for loop in loops)
 
 
 def test_vertices_are_those_of_another_marching_cubes():
@@ -136,8 +136,8 @@ def test_vertices_are_those_of_another_marching_cubes():
     assert abs(count - len(ours.faces)) <= 0.002 * count
     from scipy.spatial import cKDTree
 
-    away, which = cKDTree(ours.vertices).query(theirs)
-    assert away.max() < 1e-5 and len(np.unique(which)) == len(theirs)
+    away, nearest = cKDTree(ours.vertices).query(theirs)
+    assert away.max() < 1e-5 and len(np.unique(nearest)) == len(theirs)
 
 
 @pytest.mark.parametrize("caps", [True, False])
@@ -162,11 +162,11 @@ def test_streamed_is_resident_is_dense(tmp_path, monkeypatch):
     store = gv.convert(_saved(tmp_path, volume), tmp_path / "s.zarr", spacing=(1.0, 0.5, 2.0))
     tree = gv.N3Tree.from_volume(gv.Volume(volume.data, volume.spacing, store.origin))
     for level in range(4):
-        made = [gv.extract_surface(what, 0.0, level=level) for what in (tree, store)]
-        assert np.array_equal(triangles(made[0]), triangles(made[1])), level
-        assert_closed(made[0])
+        surfaces = [gv.extract_surface(source, 0.0, level=level) for source in (tree, store)]
+        assert np.array_equal(triangles(surfaces[0]), triangles(surfaces[1])), level
+        assert_closed(surfaces[0])
         full = 4 / 3 * math.pi * 30**3
-        assert math.isclose(area_and_volume(made[0])[1], full, rel_tol=0.02 * 4**level)
+        assert math.isclose(area_and_volume(surfaces[0])[1], full, rel_tol=0.02 * 4**level)
     finest = gv.Volume(volume.data, volume.spacing, store.origin)
     assert np.array_equal(triangles(gv.extract_surface(finest, 0.0)),
                           triangles(gv.extract_surface(store, 0.0)))  # fmt: skip
@@ -197,8 +197,8 @@ def test_a_label_is_wrapped(tmp_path, wide):
     volume = gv.Volume(data, labels=True)
     np.save(tmp_path / "l.npy", data)
     store = gv.convert(tmp_path / "l.npy", tmp_path / "l.zarr", labels=True)
-    for what in (volume, gv.N3Tree.from_volume(volume, border=2), store):
-        mesh = gv.extract_surface(what, float(data.max()))
+    for source in (volume, gv.N3Tree.from_volume(volume, border=2), store):
+        mesh = gv.extract_surface(source, float(data.max()))
         assert_closed(mesh)
         _, filled = area_and_volume(mesh)
         assert 0.9 * 5 * 7 * 14 < filled < 5 * 7 * 14, "faces half-way between centres, bevelled"
@@ -232,7 +232,7 @@ def test_ctrl_c_leaves_the_file_that_was_there(tmp_path):
     path = tmp_path / "s.ply"
     path.write_text("old")
 
-    def stop(what: str, done: int, total: int) -> None:
+    def stop(stage: str, done: int, total: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -40,12 +40,12 @@ def at_once(work: Callable[[int], object], count: int = 4) -> None:
     """Runs `work` of 0, 1, ... in threads that start together; raises what one of them raised."""
     begin = threading.Barrier(count)
 
-    def one(number: int) -> None:
+    def run_one(number: int) -> None:
         begin.wait()
         work(number)
 
     with ThreadPoolExecutor(count) as threads:
-        for future in [threads.submit(one, number) for number in range(count)]:
+        for future in [threads.submit(run_one, number) for number in range(count)]:
             future.result(timeout=120)
 
 
@@ -56,7 +56,7 @@ def test_threads_that_share_an_engine_render_what_each_asks_for(blobs, producer)
     whole = [gv.render(tree, view, GRAY) for view in VIEWS]
     with gv.Engine(producer(blobs), **POOLS) as engine:
 
-        def look(number: int) -> None:
+        def render_view(number: int) -> None:
             for turn in range(6):
                 if turn % 3 == 2:
                     engine.frame(VIEWS[number], GRAY)
@@ -65,7 +65,7 @@ def test_threads_that_share_an_engine_render_what_each_asks_for(blobs, producer)
                     assert_same_picture(engine.render(VIEWS[number], GRAY), whole[number])
                 engine.validate()
 
-        at_once(look)
+        at_once(render_view)
         engine.validate()
         assert engine.frames > 24
 
@@ -77,14 +77,14 @@ def test_captured_frames_answer_while_another_thread_renders(blobs):
         engine.trees["scene"].producer.on_host = True
         frames = Frames(engine, VIEWS[0], GRAY, 64)
 
-        def look(number: int) -> None:
+        def render_view(number: int) -> None:
             for _ in range(15):
                 if number:
                     engine.frame(VIEWS[number], GRAY)
                 else:
                     frames.frame()
 
-        at_once(look, 2)
+        at_once(render_view, 2)
         assert engine.frames >= 30
         engine.validate()
 
@@ -94,13 +94,13 @@ def test_an_engine_closed_by_another_thread_says_so(blobs):
     engine = gv.Engine(gv.VolumeProducer(blobs), **POOLS)
     begun = threading.Event()
 
-    def look() -> None:
+    def render_view() -> None:
         while True:
             engine.render(VIEWS[0], GRAY)
             begun.set()
 
     with ThreadPoolExecutor(1) as threads:
-        future = threads.submit(look)
+        future = threads.submit(render_view)
         assert begun.wait(60)
         engine.close()
         with pytest.raises(ValueError, match="Engine: it is closed"):
@@ -147,12 +147,12 @@ def test_threads_render_one_tree(blobs):
     tree = gv.N3Tree.from_volume(blobs, 4)
     whole = [gv.render(tree, view, GRAY) for view in VIEWS]
 
-    def look(number: int) -> None:
+    def render_view(number: int) -> None:
         for _ in range(10):
             assert_same_picture(gv.render(tree, VIEWS[number], GRAY), whole[number])
 
     before = tree.frame
-    at_once(look)
+    at_once(render_view)
     assert tree.frame == before + 40, "each picture has a number of its own"
     tree.validate()
 

@@ -155,12 +155,12 @@ def test_threads_give_the_same_bits(aneurism):
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        one = trace(tree, "cpp", rays, shader)
+        single = trace(tree, "cpp", rays, shader)
         torch.set_num_threads(2)
-        two = trace(tree, "cpp", rays, shader)
+        several = trace(tree, "cpp", rays, shader)
     finally:
         torch.set_num_threads(before)
-    for first, second in zip(one, two, strict=True):
+    for first, second in zip(single, several, strict=True):
         assert all(torch.equal(first[name], second[name]) for name in first)
 
 
@@ -333,15 +333,15 @@ def test_transparent_ranges_ask_for_nothing_and_change_no_bit(
     """Nodes whose range is transparent are not requested; a tree with unknown ranges gives the same
     picture in every bit, and requests more."""
     shader = gv.TransferFunction.from_points([(low, 0), (low + 0.1, 0.3)], [(0, 1, 0, 0)])
-    known = with_holes(gv.N3Tree.from_volume(blobs, 4), share, seed)
-    unknown = copy_to(known, "cpu")
+    ranged = with_holes(gv.N3Tree.from_volume(blobs, 4), share, seed)
+    unknown = copy_to(ranged, "cpu")
     limits = gv.Channel(torch.float32).limits
     unknown.nodes.ranges["value"][:, :, 0], unknown.nodes.ranges["value"][:, :, 1] = limits
-    rays = camera_rays(known, 16, distance=1.6)
-    a, a_marks = run_by_level(known, rays, shader, lod, by_level)
+    rays = camera_rays(ranged, 16, distance=1.6)
+    a, a_marks = run_by_level(ranged, rays, shader, lod, by_level)
     b, b_marks = run_by_level(unknown, rays, shader, lod, by_level)
-    asked, would_ask = a_marks != 0, b_marks != 0
-    assert not (asked & ~would_ask).any()
+    requested, would_ask = a_marks != 0, b_marks != 0
+    assert not (requested & ~would_ask).any()
     if share == 0:
         for name in ("color", "alpha", "depth"):
             assert torch.equal(a[name], b[name]), name
@@ -349,12 +349,12 @@ def test_transparent_ranges_ask_for_nothing_and_change_no_bit(
 
 def run_by_level(tree, rays, shader, lod, by_level):
     """Returns hits and request words; asserts that the twin's and the kernel's are equal."""
-    found = []
+    runs = []
     for backend in ("reference", "cpp"):
         copy = copy_to(tree, "cpu")
         options = gv.RenderOptions(backend=backend, lod=lod)
-        found.append((vars(Tracer(copy, shader, options, by_level=by_level)(rays)), copy))
-    (expected, twin), (actual, kernel) = found
+        runs.append((vars(Tracer(copy, shader, options, by_level=by_level)(rays)), copy))
+    (expected, twin), (actual, kernel) = runs
     for name in ("color", "alpha", "depth", "samples", "missed"):
         assert torch.equal(actual[name], expected[name]), name
     for name, field in twin.nodes.fields.items():
@@ -378,8 +378,8 @@ def test_level_by_level_asks_for_a_brick_before_its_children(blobs, backend):
     tree.nodes.request_tn.zero_()
     tree.nodes.brick_tn.view(-1)[tree.root] = 0
     Tracer(tree, SHADER, gv.RenderOptions(backend=backend), by_level=True)(rays)
-    asked = int(tree.nodes.request_tn.view(-1)[tree.root]) & config.REQUEST_KINDS
-    assert asked == config.REQUEST_SUBDIVIDE
+    requested = int(tree.nodes.request_tn.view(-1)[tree.root]) & config.REQUEST_KINDS
+    assert requested == config.REQUEST_SUBDIVIDE
 
 
 def test_trees_of_smaller_branching_share_wider_tiles(blobs, compiled):

@@ -36,23 +36,23 @@ def coarse_by_hand(data: np.ndarray, n: int) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("how", ["mean", "majority"])
-def test_each_level_is_made_once(how, monkeypatch):
+@pytest.mark.parametrize("reduction", ["mean", "majority"])
+def test_each_level_is_made_once(reduction, monkeypatch):
     """From the level below: values by the volume's filter, and the ends of ranges."""
-    made: dict[str, list[tuple[int, ...]]] = {}
+    shapes: dict[str, list[tuple[int, ...]]] = {}
     for name in ("coarser", "pool_min", "pool_max"):
         pool = getattr(pyramid, name)
 
-        def noted(values, *given, name=name, pool=pool, **named):
-            made.setdefault(name, []).append(values.shape)
-            return pool(values, *given, **named)
+        def noted(values, *args, name=name, pool=pool, **named):
+            shapes.setdefault(name, []).append(values.shape)
+            return pool(values, *args, **named)
 
         monkeypatch.setattr(pyramid, name, noted)
     volume = random_volume((40, 24, 30), torch.uint8)
-    volumes = {"a": gv.Volume(volume.data, labels=how == "majority"), "b": volume}
+    volumes = {"a": gv.Volume(volume.data, labels=reduction == "majority"), "b": volume}
     gv.N3Tree.from_volume(volumes, 4)
     levels = [(30, 24, 40, 1), (15, 12, 20, 1), (8, 6, 10, 1), (4, 3, 5, 1)]
-    assert made == dict.fromkeys(("coarser", "pool_min", "pool_max"), 2 * levels)
+    assert shapes == dict.fromkeys(("coarser", "pool_min", "pool_max"), 2 * levels)
 
 
 @pytest.mark.parametrize("branching", [2, 3])
@@ -101,7 +101,7 @@ def test_every_brick_holds_its_region_of_its_level(extent, branching, brick_size
     tree.validate()
     sizes = {"branching": branching, "brick_size": brick_size, "border": border}
     levels = [level.values for level in volume_levels(volume, tree.depth + 1, **sizes)][::-1]
-    found = 0
+    count = 0
     for depth, level in enumerate(levels):
         grid = [-(-size // brick_size) for size in level.shape[2::-1]]
         for xyz in np.ndindex(*grid):
@@ -109,7 +109,7 @@ def test_every_brick_holds_its_region_of_its_level(extent, branching, brick_size
             slot = config.EMPTY if node is None else int(tree.nodes.brick_tn.view(-1)[node])
             if slot < 0:
                 continue
-            found += 1
+            count += 1
             assert int(tree.bricks.owner_b[slot]) == node
             picks = [
                 np.clip(np.arange(i * brick_size - border, (i + 1) * brick_size + border), 0, s - 1)
@@ -117,7 +117,7 @@ def test_every_brick_holds_its_region_of_its_level(extent, branching, brick_size
             ]
             expected = level[np.ix_(*picks)]
             assert torch.equal(tree.bricks.bricks["value"][slot], expected)
-    assert found == tree.bricks.capacity
+    assert count == tree.bricks.capacity
 
 
 def test_tiles_know_their_place_and_parent():
@@ -137,8 +137,8 @@ def test_uniform_regions_take_no_brick():
     node = node_at(tree, tree.depth, (5, 5, 5))
     assert int(tree.nodes.brick_tn.view(-1)[node]) >= 0
     corner = node_at(tree, 1, (0, 0, 0))
-    words = tree.nodes.brick_tn.view(-1), tree.nodes.child_tn.view(-1)
-    assert [int(word[corner]) for word in words] == [config.CONSTANT, config.TERMINAL]
+    pointers = tree.nodes.brick_tn.view(-1), tree.nodes.child_tn.view(-1)
+    assert [int(pointer[corner]) for pointer in pointers] == [config.CONSTANT, config.TERMINAL]
     assert int(tree.nodes.constants["value"].view(-1)[corner]) == 5
 
 
@@ -203,8 +203,8 @@ def test_bad_arguments_are_named(call, message):
 def test_validate_finds_wrong_pointers(blobs):
     for change in ("far", "twice"):
         tree = gv.N3Tree.from_volume(blobs, 4)
-        words = tree.nodes.brick_tn.view(-1)
-        owned = (words >= 0).nonzero()[:, 0]
-        words[owned[0]] = tree.bricks.capacity if change == "far" else words[owned[1]]
+        pointers = tree.nodes.brick_tn.view(-1)
+        owned = (pointers >= 0).nonzero()[:, 0]
+        pointers[owned[0]] = tree.bricks.capacity if change == "far" else pointers[owned[1]]
         with pytest.raises(ValueError, match="brick"):
             tree.validate()

@@ -44,9 +44,9 @@ def test_links_from_other_programs_lead_somewhere():
     for link in re.findall(r"\]\(([^)#]+)", text):
         assert (ROOT / "docs" / link).exists(), link
     for name in set(re.findall(r"gv\.([A-Za-z_0-9]+(?:\.[A-Za-z_]+)*)", text)):
-        found: object = gv
+        target: object = gv
         for part in name.split("."):
-            found = getattr(found, part)
+            target = getattr(target, part)
 
 
 def test_the_gallery_has_every_example_and_its_picture():

@@ -20,13 +20,13 @@ def picture(number: int, height: int = HEIGHT) -> gv.Picture:
     y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, WIDTH), indexing="ij")
     color = torch.stack((x, y, 0.3 * torch.ones_like(x)), -1)
     color[4:12, 6 * number : 6 * number + 8] = 0.95
-    one = torch.ones_like(x)[..., None]
+    ones = torch.ones_like(x)[..., None]
     return gv.Picture(
         color=from_srgb(color),
-        alpha=one,
-        depth=one,
-        nearest=one,
-        samples=one.int(),
+        alpha=ones,
+        depth=ones,
+        nearest=ones,
+        samples=ones.int(),
         stats=RenderStats(),
     )
 
@@ -45,26 +45,26 @@ def written(path, fps: int, count: int = 6) -> list[np.ndarray]:
 def test_gif_and_webp_loop_at_their_speed(tmp_path, suffix, tolerance, fps):
     Image = pytest.importorskip("PIL.Image")
     expected = written(tmp_path / f"a{suffix}", fps)
-    shown = 0.0
+    duration = 0.0
     with Image.open(tmp_path / f"a{suffix}") as film:
         assert film.n_frames == 6 and film.info["loop"] == 0
         for number, frame in enumerate(expected):
             film.seek(number)
-            found = np.array(film.convert("RGB")).astype(int)
-            shown += film.info.get("duration") or 0
-            assert np.abs(found - frame).mean() < tolerance
+            decoded = np.array(film.convert("RGB")).astype(int)
+            duration += film.info.get("duration") or 0
+            assert np.abs(decoded - frame).mean() < tolerance
     if suffix == ".gif":
-        assert abs(shown - 6000 / fps) <= 5, "rounding to hundredths does not add up"
+        assert abs(duration - 6000 / fps) <= 5, "rounding to hundredths does not add up"
 
 
 def test_mp4(tmp_path):
     av = pytest.importorskip("av")
     expected = written(tmp_path / "a.mp4", 12)
     with av.open(str(tmp_path / "a.mp4")) as file:
-        found = [frame.to_ndarray(format="rgb24").astype(int) for frame in file.decode(video=0)]
+        decoded = [frame.to_ndarray(format="rgb24").astype(int) for frame in file.decode(video=0)]
         assert file.streams.video[0].average_rate == 12
-    assert len(found) == 6
-    for frame, other in zip(found, expected, strict=True):
+    assert len(decoded) == 6
+    for frame, other in zip(decoded, expected, strict=True):
         assert np.abs(frame - other).mean() < 12
 
 

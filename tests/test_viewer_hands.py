@@ -19,8 +19,8 @@ from gvtorch.viewer.state import Development
 pytestmark = pytest.mark.backend("browser")
 
 
-def differs(one: np.ndarray, other: np.ndarray) -> int:
-    return int(np.abs(one.astype(int) - other).max()) if one.shape == other.shape else 255
+def differs(first: np.ndarray, second: np.ndarray) -> int:
+    return int(np.abs(first.astype(int) - second).max()) if first.shape == second.shape else 255
 
 
 def middle(tab: Tab, axis: str, x: float = 0.5, y: float = 0.5) -> tuple[float, float]:
@@ -41,10 +41,10 @@ def test_slices_are_moved_by_click_drag_and_wheel(tab, viewer):
     alone = tab.final()
     before = with_slices(tab)
     assert differs(before, alone) > 60
-    place = viewer.session.ask(lambda: viewer.state.slices.at)
-    assert np.allclose(place, 19.5)
+    position = viewer.session.ask(lambda: viewer.state.slices.at)
+    assert np.allclose(position, 19.5)
     tab.page.mouse.click(*middle(tab, "z", 0.65, 0.25))  # x to the right, y down
-    tab.until(lambda: viewer.state.slices.at != place)
+    tab.until(lambda: viewer.state.slices.at != position)
     tab.final()
     x, y, z = viewer.session.ask(lambda: viewer.state.slices.at)
     assert abs(x - 25.5) < 0.5 and abs(y - 9.5) < 0.5 and z == 19.5
@@ -229,10 +229,10 @@ def test_node_boxes_are_drawn_over_the_picture(tab):
     tab.page.locator(".gv-tick:has-text('nodes') input").check()
     tab.until("app.nodes.message?.boxes.length > 0")
     assert strokes(tab) > before + 2000
-    told, box = tab.app("app.nodes.message"), np.array(tab.app("app.box"))
+    message, box = tab.app("app.nodes.message"), np.array(tab.app("app.box"))
     ends = np.array(tab.app("app.nodes.message.boxes.map((_, n) => app.nodes.box(n))"))
     assert (ends[:, 0] >= box[0] - 1e-6).all() and (ends[:, 1] <= box[1] + 1e-6).all()
-    assert (ends[:, 1] > ends[:, 0]).all() and told["count"] == len(ends)
+    assert (ends[:, 1] > ends[:, 0]).all() and message["count"] == len(ends)
     tab.drag((340, 210), (400, 230))
     tab.page.wait_for_timeout(300)
     tab.final()
@@ -274,10 +274,10 @@ def test_presets_of_files_and_of_ones_own(tab, viewer, tmp_path):
     select.select_option("HSV")
     tab.until(lambda: viewer.session.ask(viewer.state.shader.to_json) != before)
     expected = gv.TransferFunction.from_file(ROOT / "tests" / "paraview_presets.json", "HSV")
-    found = viewer.session.ask(viewer.state.shader.color.tolist)
-    assert expected.relative and len(found) == len(expected.color) > 1000
+    colors = viewer.session.ask(viewer.state.shader.color.tolist)
+    assert expected.relative and len(colors) == len(expected.color) > 1000
     ends = expected.stretched(0, 255)  # those of the function before
-    assert np.allclose(found, ends.color, atol=1e-9)
+    assert np.allclose(colors, ends.color, atol=1e-9)
     attributes = 'scalarOpacity="4 0 0 9 1" colorTransfer="8 0 1 0 0 9 0 0 1"'
     both = "".join(f'<VolumeProperty name="{name}" {attributes}/>' for name in ("CT-A", "MR-B"))
     (tmp_path / "presets.xml").write_text(f"<MRML>{both}</MRML>")
@@ -287,8 +287,8 @@ def test_presets_of_files_and_of_ones_own(tab, viewer, tmp_path):
     tab.until("app.transfer().opacity.at(-1)[0] === 9")
     name = tab.page.locator("input[placeholder='name']")
     target = tab.page.locator("select[title='Where these colours are saved']")
-    for where, file in (("save file", "few.json"), ("ParaView", "paraview.json")):
-        target.select_option(where)
+    for action, file in (("save file", "few.json"), ("ParaView", "paraview.json")):
+        target.select_option(action)
         name.fill("few")
         with tab.page.expect_download() as saved:
             tab.page.get_by_title("Save these colours").click()
@@ -403,10 +403,10 @@ def test_a_field_keeps_what_is_typed_while_the_view_changes(tab, viewer):
     tab.until("Object.keys(app.clients).length === 2")
 
     def change(size: float) -> None:
-        shown = step.input_value()
+        field_text = step.input_value()
         other.send("change", state={"options": {"step": size}})
         tab.until(f"app.state.options.step === {size}")
-        assert step.input_value() == shown
+        assert step.input_value() == field_text
 
     for typed, size in (("3.5", 0.6), ("4.5", 0.8)):
         seconds.select_text()
@@ -427,9 +427,9 @@ def test_every_shader_becomes_every_other(tab):
     names = row.locator("option").all_inner_texts()
     assert len(names) > 6 and tab.app("app.state.shader.kind") == "TransferFunction"
     knots = tab.app("app.state.shader.opacity")
-    for one in range(len(names)):
-        for other in range(one):
-            for chosen in (one, other):
+    for first in range(len(names)):
+        for second in range(first):
+            for chosen in (first, second):
                 row.select_option(label=names[chosen])
                 kind = "".join(word.capitalize() for word in names[chosen].split())
                 tab.until(f"app.state.shader.kind === '{kind}'")

@@ -65,25 +65,25 @@ NEVER: dict[Any, tuple[Any, ...]] = {
 def wrong_value(rng: np.random.Generator, hint: Any) -> Any:
     """Returns a value that the type hint of a message's field does not allow."""
     parts = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-    kinds = {get_origin(one) or one for one in parts}
+    kinds = {get_origin(v) or v for v in parts}
     if kinds & {Literal}:
         return [7, "nothing", None, [], {}][rng.integers(5)]
-    kind = next((one for one in (int, float, str, bool, dict) if one in kinds), dict)
-    known = [one for one in NEVER[kind] if not (one is None and type(None) in kinds)]
-    return known[rng.integers(len(known))]
+    kind = next((v for v in (int, float, str, bool, dict) if v in kinds), dict)
+    candidates = [v for v in NEVER[kind] if not (v is None and type(None) in kinds)]
+    return candidates[rng.integers(len(candidates))]
 
 
 def damaged_state(rng: np.random.Generator, state: dict[str, Any]) -> dict[str, Any]:
     """Returns a state with a wrong number, name or shape somewhere."""
     content = json.loads(state["text"])
-    place, way = content, []
-    while isinstance(place, dict) and place:
-        key = [*place][rng.integers(len(place))]
-        way.append((place, key))
-        place = place[key]
+    part, path = content, []
+    while isinstance(part, dict) and part:
+        key = [*part][rng.integers(len(part))]
+        path.append((part, key))
+        part = part[key]
         if rng.random() < 0.3:
             break
-    parent, key = way[-1]
+    parent, key = path[-1]
     choice = rng.integers(3)
     if choice == 0:
         parent[f"no {key}"] = parent.pop(key)
@@ -136,14 +136,14 @@ def test_wrong_messages_are_each_refused_with_a_line_and_the_view_goes_on(sessio
     page = Page(session)
     _, before = page.final()
     whole = page.of_type("welcome")[0]["state"]
-    state = {"text": json.dumps({name: one for name, one in whole.items() if name != "camera"})}
-    rng, told = np.random.default_rng(17), Counter[str]()
+    state = {"text": json.dumps({name: v for name, v in whole.items() if name != "camera"})}
+    rng, counts = np.random.default_rng(17), Counter[str]()
     kinds, lines = Counter[str](), list[str]()
 
     def take(data: str | bytes) -> None:
         if isinstance(data, str):
             content = json.loads(data)
-            told[content["type"]] += 1
+            counts[content["type"]] += 1
             if content["type"] == "refused":
                 lines.append(content["text"])
 
@@ -156,10 +156,10 @@ def test_wrong_messages_are_each_refused_with_a_line_and_the_view_goes_on(sessio
         if number % 2000 == 0:
             session.ask(lambda: None)  # so that not all are queued at once
     session.ask(lambda: None, 600)
-    assert told["refused"] == COUNT == len(lines) and min(kinds.values()) > COUNT / 20
+    assert counts["refused"] == COUNT == len(lines) and min(kinds.values()) > COUNT / 20
     assert all(line and "\n" not in line and len(line) < 4000 for line in lines)
     assert len({line[:40] for line in lines}) > 100, "of many kinds"
-    assert not told["error"] and not page.of_type("error") and not page.of_type("refused")
+    assert not counts["error"] and not page.of_type("error") and not page.of_type("refused")
     assert session.state.to_json() == {**whole, "camera": session.state.to_json()["camera"]}
     page.moved(turned_camera(page.camera, 0.4))
     _, after = page.moved(page.camera)
@@ -201,8 +201,8 @@ def test_a_store_that_is_deleted_is_told_and_the_picture_goes_on(stored):
         page.final()
         shutil.rmtree(stored)
         page.send("move", camera=near(page, session), moving=False)
-        told = page.next("failed", 0)
-        assert told["count"] > 0 and told["text"] and "\n" not in told["text"]
+        failure = page.next("failed", 0)
+        assert failure["count"] > 0 and failure["text"] and "\n" not in failure["text"]
         page.final()
         goes_on(page, session)
         page.send("change", state={"slices": {}})  # planes can't be read either
@@ -263,8 +263,8 @@ def test_a_server_that_stops_in_a_chunk_is_told_and_asked_again(stored, monkeypa
         there = near(page, session)
         page.send("move", camera=there, moving=False)
         page.until(lambda: np.allclose(page.pictures[-1][0]["camera"]["eye"], there["eye"]))
-        told = page.next("failed", 0)
-        assert told["count"] > 0 and "\n" not in told["text"]
+        failure = page.next("failed", 0)
+        assert failure["count"] > 0 and "\n" not in failure["text"]
         _, seen = page.final()
         assert seen.max() > 0
         goes_on(page, session)
@@ -307,8 +307,8 @@ def test_code_that_raises_is_told_and_the_picture_goes_on():
         producer.changed()
         page.send("move", camera=near(page, session), moving=False)
         page.until(lambda: page.of_type("failed") or page.of_type("error"))
-        told = (page.of_type("failed") or page.of_type("error"))[0]["text"]
-        assert "division by zero" in told and "\n" not in told
+        failure = (page.of_type("failed") or page.of_type("error"))[0]["text"]
+        assert "division by zero" in failure and "\n" not in failure
         producer.wrong = False
         page.send("do", what="retry")
         page.moved(turned_camera(page.camera, 0.2))

@@ -38,10 +38,10 @@ def test_the_page_asks_for_nothing_outside(tab, viewer):
     """Only its modules, its style and one websocket, all from its own server."""
     hosts = {urlsplit(url).netloc for url in tab.requests}
     assert hosts == {f"127.0.0.1:{viewer.server.port}"}
-    asked = {urlsplit(url).path.lstrip("/") for url in tab.requests}
+    paths = {urlsplit(url).path.lstrip("/") for url in tab.requests}
     assert {
         name for name in page_files() if name.endswith((".js", ".css"))
-    } <= asked and "ws" in asked
+    } <= paths and "ws" in paths
     for name, content in page_files().items():
         text = content.decode().replace("http://www.w3.org/2000/svg", "")
         for outside in (
@@ -86,8 +86,8 @@ def test_hands_turn_pan_zoom_and_fly(tab):
         tab.page.wait_for_timeout(250)
         return tab.final(), tab.app("app.camera")
 
-    def far(one: dict) -> float:
-        return float(np.linalg.norm(np.subtract(one["eye"], one["target"])))
+    def far(c: dict) -> float:
+        return float(np.linalg.norm(np.subtract(c["eye"], c["target"])))
 
     tab.drag(STAGE, (420, 230))
     turned, there = after()
@@ -137,19 +137,19 @@ def test_a_knot_is_dragged_added_removed_and_undone(tab, viewer):
     before = tab.final()
     box = tab.page.locator(".gv-tf").bounding_box()
 
-    def place(at: int) -> list[float]:
-        point = f"app.transfer().opacity[{at}]"
+    def knot_position(index: int) -> list[float]:
+        point = f"app.transfer().opacity[{index}]"
         return tab.app(f"[app.panel.editor.x({point}[0]), app.panel.editor.y({point}[1])]")
 
-    x, y = place(1)
+    x, y = knot_position(1)
     tab.drag((box["x"] + x, box["y"] + y), (box["x"] + x + 8, box["y"] + 15))
     tab.until(lambda: np.abs(tab.final().astype(int) - before).max() > 30)
-    own = viewer.session.ask(viewer.state.shader.opacity.tolist)
-    assert own[1][1] > 0.8 and own[0] == [20, 0] and own[1][0] > 120
-    assert own == tab.app("app.transfer().opacity")
+    opacity = viewer.session.ask(viewer.state.shader.opacity.tolist)
+    assert opacity[1][1] > 0.8 and opacity[0] == [20, 0] and opacity[1][0] > 120
+    assert opacity == tab.app("app.transfer().opacity")
     tab.page.mouse.click(box["x"] + x - 40, box["y"] + 100)
     tab.until("app.transfer().opacity.length === 4")
-    x, y = place(1)
+    x, y = knot_position(1)
     tab.page.mouse.click(box["x"] + x, box["y"] + y, button="right")
     tab.until("app.transfer().opacity.length === 3")
     for _ in range(3):
@@ -252,8 +252,8 @@ def test_fingers_turn_and_pinch(chromium, viewer):
         tab.final()
         touch = tab.context.new_cdp_session(tab.page)
 
-        def send(kind: str, *places: tuple[float, float]) -> None:
-            points = [{"x": x, "y": y, "id": n} for n, (x, y) in enumerate(places)]
+        def send(kind: str, *positions: tuple[float, float]) -> None:
+            points = [{"x": x, "y": y, "id": n} for n, (x, y) in enumerate(positions)]
             touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
         eye = tab.app("app.camera.eye")
@@ -282,8 +282,8 @@ def test_a_view_that_ends_is_told(chromium):
         tab.final()
         viewer.close()
         tab.until("app.root.classList.contains('gv-lost')")
-        told = tab.page.locator(".gv-note").inner_text()  # a busy machine may not report the end
-        assert told.startswith(("The view was closed", "The view is gone"))
+        note = tab.page.locator(".gv-note").inner_text()  # a busy machine may not report the end
+        assert note.startswith(("The view was closed", "The view is gone"))
     finally:
         tab.close()
         viewer.close()

@@ -28,21 +28,21 @@ pytestmark = pytest.mark.backend("cpp")
 
 @pytest.fixture
 def server(session):
-    made = Server(session)
-    yield made
-    made.close()
-    assert not made._thread.is_alive()
+    running = Server(session)
+    yield running
+    running.close()
+    assert not running._thread.is_alive()
 
 
-def with_socket(server: Server, what, **options):
+def with_socket(server: Server, talk, **options):
     """Runs a coroutine with a page's websocket."""
 
     async def run():
         async with aiohttp.ClientSession() as client:
             path = f"http://127.0.0.1:{server.port}/ws"
-            given = {"params": {"token": server.token}, **options}
-            async with client.ws_connect(path, **given) as ws:
-                return await asyncio.wait_for(what(ws), TIMEOUT)
+            arguments = {"params": {"token": server.token}, **options}
+            async with client.ws_connect(path, **arguments) as ws:
+                return await asyncio.wait_for(talk(ws), TIMEOUT)
 
     return asyncio.run(run())
 
@@ -88,9 +88,9 @@ def test_a_page_over_http_and_a_websocket(server):
 
 
 def test_what_is_no_http_is_answered_and_not_told(server, capfd, caplog):
-    with socket.create_connection(("127.0.0.1", server.port)) as one:
-        one.sendall(b"GET /ws?token=\xff HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        assert b" 400 " in one.recv(200).split(b"\r\n")[0]
+    with socket.create_connection(("127.0.0.1", server.port)) as connection:
+        connection.sendall(b"GET /ws?token=\xff HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert b" 400 " in connection.recv(200).split(b"\r\n")[0]
     assert not caplog.records and not any(capfd.readouterr())
 
 
@@ -125,9 +125,9 @@ def test_strangers_are_refused(server, params, headers):
     async def nothing(ws):
         return None
 
-    given = {"params": {"token": server.token} if params is None else params, "headers": headers}
+    request = {"params": {"token": server.token} if params is None else params, "headers": headers}
     with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-        with_socket(server, nothing, **given)
+        with_socket(server, nothing, **request)
     assert refused.value.status == 403
     if "Host" in headers:
         assert get(server, "/", Host=headers["Host"])[0] == 403
@@ -211,12 +211,12 @@ def test_the_command(tmp_path, small, scan_store, monkeypatch):
     """`gvtorch view` of a volume, a store and a script shows what `gvtorch render` does."""
     seen = []
 
-    def shown(viewer):
+    def wait(viewer):
         texts, *_ = with_socket(viewer.server, first_pictures)
         seen.append(texts[0])
         viewer.close()
 
-    monkeypatch.setattr(gv.Viewer, "wait", shown)
+    monkeypatch.setattr(gv.Viewer, "wait", wait)
     script = tmp_path / "scene.py"
     script.write_text(
         "import gvtorch as gv\nscene = gv.FieldProducer(gv.Solid(gv.sdf.Sphere(1.0)), 64)\n"
@@ -256,20 +256,20 @@ def test_the_widget_joins_leaves_and_has_a_png(session):
     pytest.importorskip("anywidget")
     from gvtorch.viewer.notebook import widget
 
-    made, sent = widget(session), []
-    made.send = lambda content, buffers=None: sent.append((content, buffers))
-    made._receive(made, {"joined": True}, [])
+    opened, sent = widget(session), []
+    opened.send = lambda content, buffers=None: sent.append((content, buffers))
+    opened._receive(opened, {"joined": True}, [])
     session.ask(lambda: None)
-    made._receive(made, {"text": '{"type": "hello", "width": 64, "height": 48}'}, [])
+    opened._receive(opened, {"text": '{"type": "hello", "width": 64, "height": 48}'}, [])
     for _ in range(100):
         session.ask(lambda: None)
         if any(buffers for _, buffers in sent):
             break
     assert json.loads(sent[0][0]["text"])["type"] == "welcome"
-    made._receive(made, {"joined": False}, [])
+    opened._receive(opened, {"joined": False}, [])
     assert session.ask(lambda: len(session.clients)) == 0
-    shown = made._repr_mimebundle_()
-    bundle = shown[0] if isinstance(shown, tuple) else shown
+    bundles = opened._repr_mimebundle_()
+    bundle = bundles[0] if isinstance(bundles, tuple) else bundles
     still = pixels(bundle["image/png"])
     assert still.shape == (540, 960, 3) and still.max() > 100
 

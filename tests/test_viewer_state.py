@@ -75,8 +75,8 @@ def test_what_json_leaves_out_or_can_not_tell_stays():
 
 def test_every_field_of_a_dataclass_is_in_the_state():
     """The state is derived from the dataclasses: a new option is in it without a list of names."""
-    told = gv.ViewState(shader=HOT, options=OPTIONS).to_json()["options"]
-    own = set(vars(gv.RenderOptions())) - {
+    saved = gv.ViewState(shader=HOT, options=OPTIONS).to_json()["options"]
+    field_names = set(vars(gv.RenderOptions())) - {
         "layer",
         "pose",
         "dtype",
@@ -84,9 +84,9 @@ def test_every_field_of_a_dataclass_is_in_the_state():
         "channel",
         "component",
     }
-    assert set(told) == own | {"kind"}
+    assert set(saved) == field_names | {"kind"}
     for kind in (gv.Clip, gv.Lighting, gv.ThinLens, gv.DirectionalLight, gv.ChannelLook):
-        fields = {one.name for one in dataclasses.fields(kind)}
+        fields = {f.name for f in dataclasses.fields(kind)}
         assert set(schema.describe_kind(kind)["fields"]) == fields
     for owner, name in schema.SLIDERS:
         kind = {"ViewState": gv.ViewState, "Eye": Eye, "Development": Development}.get(owner)
@@ -161,8 +161,8 @@ def test_render_takes_a_saved_state(tmp_path):
     assert run.returncode == 0, run.stderr
     tree = gv.N3Tree.from_volume(volume)
     camera = eye.camera(64, 48, tree.box)
-    made = gv.Progressive(lambda one: gv.render(tree, one, shader, **vars(options)))
-    expected = made.refine(camera, 3).tone_map("none", exposure=1.0).to_srgb8().numpy()
+    progressive = gv.Progressive(lambda view: gv.render(tree, view, shader, **vars(options)))
+    expected = progressive.refine(camera, 3).tone_map("none", exposure=1.0).to_srgb8().numpy()
     seen = pixels((tmp_path / "a.png").read_bytes())
     assert np.array_equal(seen, expected) and seen.std() > 5
     for flags, message in (
@@ -219,13 +219,11 @@ def test_a_state_with_one_wrong_place_is_refused_or_another_state(data):
     """One number, name or object of a valid state is replaced by anything."""
     shader = data.draw(st.sampled_from(SHADERS))
     content = gv.ViewState(shader=shader, options=OPTIONS, camera=EYE).to_json()
-    place, parent, key = content, None, None
-    while (
-        isinstance(place, (dict, list)) and place and (parent is None or data.draw(st.booleans()))
-    ):
-        keys = [*place] if isinstance(place, dict) else [*range(len(place))]
-        parent, key = place, data.draw(st.sampled_from(keys))
-        place = place[key]
+    part, parent, key = content, None, None
+    while isinstance(part, (dict, list)) and part and (parent is None or data.draw(st.booleans())):
+        keys = [*part] if isinstance(part, dict) else [*range(len(part))]
+        parent, key = part, data.draw(st.sampled_from(keys))
+        part = part[key]
     parent[key] = data.draw(JSON)
     try:
         state = gv.ViewState(shader=HOT).changed(content)
@@ -270,8 +268,8 @@ def test_damaged_messages_are_refused_or_messages():
     fine = 0
     for number in range(FUZZED):
         text = np.frombuffer(good[number % len(good)].encode(), np.uint8).copy()
-        for place in rng.integers(0, len(text), rng.integers(1, 4)):
-            text[place] = rng.choice(letters)
+        for index in rng.integers(0, len(text), rng.integers(1, 4)):
+            text[index] = rng.choice(letters)
         cut = rng.integers(0, len(text), 2)
         parts = (text, text[: cut[0]], np.concatenate((text[: cut[0]], text[cut[1] :])))
         damaged = parts[rng.choice(3, p=(0.8, 0.1, 0.1))].tobytes()

@@ -39,6 +39,6 @@ def test_machine_code_is_compressed_as_drivers_read_it(build, tmp_path, monkeypa
 
 
 def test_every_room_is_packed():
-    told = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    names = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
     rooms = {path.parent.relative_to(ROOT) for path in (ROOT / "gvtorch").rglob("__init__.py")}
-    assert sorted(told) == sorted(".".join(room.parts) for room in rooms)
+    assert sorted(names) == sorted(".".join(room.parts) for room in rooms)

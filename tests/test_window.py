@@ -81,8 +81,8 @@ def test_the_background_is_left_out(air, spread):
 def test_percentiles_are_those_of_numpy():
     data = noise()
     for percent in ((0, 100), (5, 80.5)):
-        found = gv.window(gv.Volume(data), percent)
-        assert found == pytest.approx(np.percentile(data, percent))
+        actual = gv.window(gv.Volume(data), percent)
+        assert actual == pytest.approx(np.percentile(data, percent))
 
 
 def test_flat_data_and_components():
@@ -153,22 +153,22 @@ def test_a_foreign_image_of_one_level_is_read_in_part(tmp_path, monkeypatch):
 def test_names_in_hounsfield_units_where_a_scan_has_them():
     data = 1000 * noise()
     scan = gv.Volume(data, info=gv.ImageInfo(quantity="HU"))
-    for name, own in (("bone", "ct-bone"), ("tissue", "ct-soft"), ("vessels", "ct-vessels")):
-        expected = gv.TransferFunction.preset(own)
+    for name, preset in (("bone", "ct-bone"), ("tissue", "ct-soft"), ("vessels", "ct-vessels")):
+        expected = gv.TransferFunction.preset(preset)
         for text in (None, "auto"):
             assert np.array_equal(parse_transfer(name, text, scan, 0).opacity, expected.opacity)
         spanned = parse_transfer(name, "-100,500", scan, 0).corners()[:2]
         assert spanned == (-100, 500)
         assert parse_transfer(name, None, gv.Volume(data), 0).corners()[0] != expected.corners()[0]
         assert np.array_equal(
-            parse_transfer(own, None, gv.Volume(data), 0).opacity, expected.opacity
+            parse_transfer(preset, None, gv.Volume(data), 0).opacity, expected.opacity
         )
     assert parse_transfer("ct-lung", "full", scan, 0).corners()[:2] == scan.value_range
 
 
 def test_files_keep_their_values_unless_a_window_is_given(tmp_path):
-    own = gv.TransferFunction([(5, 0), (7, 1)], [(5, 0, 0, 0), (7, 1, 0, 0)])
-    own.save(tmp_path / "own.json")
+    transfer = gv.TransferFunction([(5, 0), (7, 1)], [(5, 0, 0, 0), (7, 1, 0, 0)])
+    transfer.save(tmp_path / "own.json")
     (tmp_path / "pv.json").write_text('[{"Name": "a b", "RGBPoints": [0,0,0,0, 1,1,1,1]}]')
     volume = gv.Volume(noise())
     for name in (f"{tmp_path}/own.json",):

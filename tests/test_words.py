@@ -54,15 +54,15 @@ def test_words_that_lead_out_of_the_pools_count_as_absent(blobs, backend, dtype,
 @pytest.mark.parametrize("word", [-3, -(2**31)])
 def test_words_below_all_that_are_known_end_a_tree_and_hide_nothing(blobs, backend, dtype, word):
     tree = gv.N3Tree.from_volume(blobs, 4)
-    rays, found = camera_rays(tree, 8), []
+    rays, results = camera_rays(tree, 8), []
     for instead in (word, TERMINAL):
         copy = copy_to(tree, "cpu")
         chosen = torch.rand(copy.nodes.child_tn.shape, generator=torch.Generator().manual_seed(5))
         copy.nodes.child_tn[chosen < 0.3] = instead
-        found.append(trace(copy, backend, rays, dtype=dtype))
-    for mine, other in zip(*found, strict=True):
+        results.append(trace(copy, backend, rays, dtype=dtype))
+    for mine, other in zip(*results, strict=True):
         assert all(torch.equal(mine[name], other[name]) for name in other)
-    assert found[0][0]["alpha"].max() > 0.1, "the test must see something"
+    assert results[0][0]["alpha"].max() > 0.1, "the test must see something"
 
 
 @pytest.mark.parametrize("high", [1e6, -5.0, torch.nan])
@@ -70,22 +70,22 @@ def test_words_below_all_that_are_known_end_a_tree_and_hide_nothing(blobs, backe
 def test_a_scene_does_not_reach_out_of_its_root_cube(blobs, backend, branching, high):
     """Rays led there would request nodes of no tile, one interval at a time."""
     tree = gv.N3Tree.from_volume(blobs, 4, branching=branching, device=DEVICES[backend])
-    rays, given = arguments(tree, 4)
-    found = []
+    rays, trace_args = arguments(tree, 4)
+    results = []
     for corner in (high, 1.0 if high > 1 else 0.0):
-        place = given.place_33.clone()
-        place[2] = corner
-        hits = trace_rays(rays, given._replace(place_33=place), backend=backend)
-        found.append([*hits, tree.nodes.request_tn.clone()])
-    assert all(torch.equal(*each) for each in zip(*found, strict=True))
+        placement = trace_args.place_33.clone()
+        placement[2] = corner
+        hits = trace_rays(rays, trace_args._replace(place_33=placement), backend=backend)
+        results.append([*hits, tree.nodes.request_tn.clone()])
+    assert all(torch.equal(*each) for each in zip(*results, strict=True))
 
 
 def test_a_cone_that_is_no_number_ends_its_ray(blobs, backend):
     """Each node lookup would be valid for only one interval, of which there may be millions."""
     tree = gv.N3Tree.from_volume(blobs, 4, device=DEVICES[backend])
-    rays, given = arguments(tree, 4)
-    rays, given = rays._replace(cone_r2=rays.cone_r2 * torch.nan), given._replace(step=1e-4)
-    _, alpha, _, samples, missed = trace_rays(rays, given, backend=backend)
+    rays, args = arguments(tree, 4)
+    rays, args = rays._replace(cone_r2=rays.cone_r2 * torch.nan), args._replace(step=1e-4)
+    _, alpha, _, samples, missed = trace_rays(rays, args, backend=backend)
     assert not (alpha.any() or samples.any() or missed.any())
 
 
