@@ -82,7 +82,7 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
 
     with gv.Engine(Slow(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         Slow.gate.set()
-        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine.recorded[0]
+        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine.host_frames[0]
         while not frames.frame()[1].requests["load"]:
             asker._executor.submit(int).result()
         Slow.gate.clear()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from helpers import meshes
@@ -40,6 +41,8 @@ def test_objects_tell_of_themselves_in_one_line(tree):
         (gv.Environment(IMAGE), "Environment((6, 8, 3) float32 on cpu)"),
         (gv.Progressive(print), "Progressive(None, 0 frames)"),
         (gv.Video("a.gif", 8, 6), "Video('a.gif', 8x6)"),
+        (gv.Overlay(320, 240), "Overlay(320x240, 0 annotations)"),
+        (gv.Trace("a.json"), "Trace('a.json', 0 stages)"),
         (tree, "N3Tree(8x8x8"),
         (GRAY, "TransferFunction(3 opacities, 2 colours, from 0 to 1)"),
         (gv.Lit(GRAY, normals="n"), "Lit(normals='n', transfer=TransferFunction("),
@@ -104,3 +107,9 @@ def test_data_and_producers_tell_of_themselves_in_one_line(tmp_path):
         text = repr(thing)
         assert text.startswith(begin), text
         assert len(text) < 200 and "\n" not in text, text
+
+
+def test_a_file_of_points_tells_its_size_and_columns(tmp_path):
+    np.savez(tmp_path / "a.npz", positions=np.zeros((9, 3)), radius=np.ones(9))
+    text = repr(gv.PointFile(tmp_path / "a.npz"))
+    assert text.startswith("PointFile('") and text.endswith("a.npz': 9 points, positions, radius)")

@@ -167,6 +167,9 @@ class Trace:
         self._tracks: dict[int, tuple[int, str]] = {}  # number and name, by thread
         self._lock = threading.Lock()
 
+    def __repr__(self) -> str:
+        return f"Trace({str(self._path)!r}, {len(self._spans)} stages)"
+
     def __enter__(self) -> Trace:
         """Starts recording."""
         self._start_ns = time.perf_counter_ns()

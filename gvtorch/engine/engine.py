@@ -130,7 +130,7 @@ class Engine:
         self._missed: Tensor | None = None  # (r,) bool, which rays of the last picture missed
         self._recent_stats: deque[FrameStats] = deque(maxlen=_REPORTED_FRAMES)  # for the report
         self._versions: dict[str, int] = {}  # of the content that the trees hold
-        self.recorded: list[HostFrame] = []  # captured, with producers on the host
+        self.host_frames: list[HostFrame] = []  # captured, with producers on the host
         try:
             layouts: dict[str, Layout] = {}
             for name, producer in producers.items():
@@ -284,7 +284,7 @@ class Engine:
 
     def release(self, keep: HostFrame | None = None) -> None:
         """Drops the answers that are on their way to captured frames, except those of `keep`."""
-        for host_frame in self.recorded:
+        for host_frame in self.host_frames:
             if host_frame is not keep:
                 host_frame.release()
 
@@ -302,8 +302,8 @@ class Engine:
                 break  # nothing new to see, or no room for more
             produced_count = sum(stats.produced.values())
             if hits is None:
-                hits = empty_hits(self.device, view.options.dtype, view.rays)
-                if self._missed is not None and len(self._missed) == view.rays:
+                hits = empty_hits(self.device, view.options.dtype, view.ray_count)
+                if self._missed is not None and len(self._missed) == view.ray_count:
                     hits.missed.copy_(self._missed)
             view.hits(again=(hits, scouts(hits.missed, view.camera.width)))
             collected = self.collect_requests_and_use(hits.samples[:0])
@@ -415,13 +415,15 @@ class Engine:
     def _converge(self, view: View, max_frames: int, progress: Progress) -> tuple[Hits, FrameStats]:
         """Renders at most `max_frames` frames, each with rays that still miss something."""
         missed, scouts_first = self._missed, max_frames > 1
-        if missed is not None and len(missed) == view.rays:
+        if missed is not None and len(missed) == view.ray_count:
             # If no ray missed anything, this picture will hardly miss anything.
             scouts_first = scouts_first and bool(missed.any())
-        subsets = RaySubsets(view.rays, view.camera.width, self.device, scouts_first=scouts_first)
+        subsets = RaySubsets(
+            view.ray_count, view.camera.width, self.device, scouts_first=scouts_first
+        )
         total, again = FrameStats(), None
         if scouts_first:
-            again = empty_hits(self.device, view.options.dtype, view.rays), subsets.next
+            again = empty_hits(self.device, view.options.dtype, view.ray_count), subsets.next
         for frame_count in range(1, max_frames + 1):
             hits, stats = self._served_frame(view, again)
             subsets.update(hits.missed, stats, total.failed)
@@ -515,7 +517,7 @@ class Engine:
                 "producers on_device, or all on_host, without coarse channels"
             )
         if isinstance(recorded, HostFrame):
-            self.recorded.append(recorded)
+            self.host_frames.append(recorded)
         return FrameGraph(self, view, recorded, render_frame, look_ahead)
 
     @property
@@ -572,7 +574,7 @@ class Engine:
         """
         self._closed = True  # another thread's picture gets no further frame
         with self.lock:
-            for host_frame in self.recorded:
+            for host_frame in self.host_frames:
                 host_frame.close()
             self.production.close()
             for source in self.trees.values():

@@ -66,6 +66,9 @@ class PointFile:
     def __len__(self) -> int:
         return len(self.columns[self.used["positions"][0]])
 
+    def __repr__(self) -> str:
+        return f"PointFile({str(self.path)!r}: {len(self)} points, {', '.join(self.used)})"
+
     def blocks(self, count: int) -> Iterator[Points]:
         """Yields all points, `count` at a time; raises ValueError if a number is not finite."""
         for start in range(0, len(self), count):

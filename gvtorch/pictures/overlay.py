@@ -101,6 +101,9 @@ class Overlay:
             top = (height - image.shape[0]) // 2
             self._add_stamp(image, top=top, left=width - image.shape[1] - self._pen.size)
 
+    def __repr__(self) -> str:
+        return f"Overlay({self._size[0]}x{self._size[1]}, {len(self._stamps)} annotations)"
+
     def _add_stamp(self, image: np.ndarray, *, top: int, left: int) -> None:
         """Adds a stamp, sRGB with straight alpha, (h, w, 4) uint8."""
         height, width = image.shape[:2]

@@ -134,9 +134,7 @@ class Progressive:
             **self._centre_layers,
         )
 
-    def refine(
-        self, camera: Camera | Rays, samples: int, progress: Progress = no_progress
-    ) -> Picture:
+    def refine(self, camera: Camera | Rays, samples: int) -> Picture:
         """Renders frames, at least one, until there are `samples` of this camera, and returns their
         mean; earlier frames of the same camera count.
 
@@ -147,7 +145,6 @@ class Progressive:
         camera = as_camera("Progressive", camera)
         while True:
             picture = self.frame(camera)
-            progress("samples", self.count, target)
             if self.count >= target:
                 return picture
 

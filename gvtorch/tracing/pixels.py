@@ -214,7 +214,7 @@ class View:
     box: Tensor  # (2, 3) world corners of the scene
 
     @property
-    def rays(self) -> int:
+    def ray_count(self) -> int:
         """Number of rays."""
         return len(self.camera) * self.camera.height * self.camera.width
 
@@ -228,16 +228,16 @@ class View:
             len(self.camera) > 1 and progress is no_progress and isinstance(self.trace_rays, Tracer)
         )
         block = _RAYS_PER_BLOCK if at_once else _RAYS_PER_REPORT
-        size = self.rays * (8 * self.options.dtype.itemsize + 5)  # the colour twice
-        check.memory("render", f"a picture of {self.rays} pixels", size, device)
+        size = self.ray_count * (8 * self.options.dtype.itemsize + 5)  # the colour twice
+        check.memory("render", f"a picture of {self.ray_count} pixels", size, device)
         hits, mask = again or (None, None)
         if hits is None and len(list(self.camera.blocks(block))) > 1:  # allocates before any ray
-            hits = empty_hits(device, self.options.dtype, self.rays)
+            hits = empty_hits(device, self.options.dtype, self.ray_count)
         for pixels, block_hits in self.blocks(block, progress, mask):
             if hits is None:
                 hits = block_hits  # the only block
             else:
-                _write_hits(hits, pixels, block_hits, self.rays)
+                _write_hits(hits, pixels, block_hits, self.ray_count)
         assert hits is not None
         return hits
 

@@ -27,6 +27,8 @@ from .composite import tree_span
 from .options import RenderOptions
 from .pose import Pose
 
+#: What the ops give, in order; `trace_rays` the first five only.
+_RESULTS = ("color", "alpha", "depth", "samples", "missed", "normal", "features")
 _MAX_SAMPLES = {"cpu": 1 << 20, "cuda": 1 << 24}  # shaded at once
 
 
@@ -125,7 +127,7 @@ class Tracer:
             fields = ops.shade_rays(
                 ray_arguments, self.arguments, *shading, op=self.shader.op, backend=self.backend
             )
-        hits = Hits(**dict(zip(Hits.__annotations__, fields, strict=False)))
+        hits = Hits(**dict(zip(_RESULTS, fields, strict=False)))
         if self.label_names is None or hits.features is None:
             return hits
         label = self.label_names[hits.features.to(torch.int64)]

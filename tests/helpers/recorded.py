@@ -78,7 +78,7 @@ class Frames:
         assert frame is not None
         self.served, self.number = frame, -1
         if isinstance(frame, HostFrame):
-            engine.recorded.append(frame)
+            engine.host_frames.append(frame)
 
     def look_from(self, camera: gv.Camera) -> None:
         self.camera = camera.placed(self.view.box)
