@@ -39,7 +39,8 @@ def read(folder: Path) -> list[tuple[str, dict[str, Any]]]:
 
 def section(folder: str, name: str, record: dict[str, Any], drawn: bool) -> str:
     """Returns a record's part of the page."""
-    head = f"### {tables.title(record)}\n\n{WORKLOADS[record['workload']].capitalize()}.\n"
+    text = WORKLOADS[record["workload"]]
+    head = f"## {tables.title(record)}\n\n{text[0].upper()}{text[1:]}.\n"
     picture = f"\n![{record['workload']}]({folder}/{name}.png)\n" if drawn else ""
     return f"{head}{picture}\n{tables.markdown(record)}\n"
 
