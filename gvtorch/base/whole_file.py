@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def errors_name(path: Path, *drafts: str) -> Iterator[None]:
+def name_in_errors(path: Path, *drafts: str) -> Iterator[None]:
     """Makes an OSError of the block name `path`, if it names no file (a full disk) or one of the
     drafts of this file.
     """
@@ -46,7 +46,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise OSError(error.errno, error.strerror, str(path)) from None
     try:
         draft = os.path.join(text_path(os.path.abspath(path.parent)), os.path.basename(temp_path))
-        with errors_name(path, temp_path, draft):  # on an error, an existing file stays as it is
+        # On an error, an existing file stays as it is.
+        with name_in_errors(path, temp_path, draft):
             os.close(handle)
             yield Path(draft)
         mask = os.umask(0)
@@ -69,7 +70,7 @@ def durable_file(path: Path) -> Iterator[IO[bytes]]:
     leaves the whole file or none.
     """
     draft = path.with_name(f".{path.name}.draft")
-    with errors_name(path), draft.open("wb") as file:
+    with name_in_errors(path), draft.open("wb") as file:
         yield file
         file.flush()
         os.fsync(file.fileno())

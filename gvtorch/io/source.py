@@ -29,7 +29,7 @@ from ..base import boxes
 from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
-from ..base.whole_file import errors_name, save_npy
+from ..base.whole_file import name_in_errors, save_npy
 from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
@@ -246,7 +246,7 @@ class MemorySource(VolumeSource):
     def staged(self, folder: Path) -> VolumeSource:
         """Writes the values to a file in the folder."""
         file = folder / "source.npy"
-        with errors_name(file):
+        with name_in_errors(file):
             save_npy(file, self.data)
         return ArraySource(
             path=str(file),

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..base import check
 from ..base.stage import Progress, no_progress
-from ..base.whole_file import errors_name
+from ..base.whole_file import name_in_errors
 from .grid import Codes, PointGrid, peak, point_shares
 from .points import Points
 from .table import Fold, Rows, Runs, Table, grouped
@@ -132,7 +132,7 @@ class SortedPoints:
         grid = dataclasses.asdict(self.grid)
         meta = {"version": _VERSION, "width": self.width, "grid": grid, **tables_by_kind}
         path = self.folder / _META
-        with errors_name(path), path.open("w", encoding="utf-8") as file:
+        with name_in_errors(path), path.open("w", encoding="utf-8") as file:
             json.dump(meta, file)
             file.flush()
             os.fsync(file.fileno())

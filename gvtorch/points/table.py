@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.whole_file import errors_name
+from ..base.whole_file import name_in_errors
 
 Rows = dict[str, np.ndarray]  # columns of equal length; "code" is int64
 Fold = Callable[[np.ndarray, np.ndarray], np.ndarray]  # a reduction such as `np.add.reduceat`
@@ -58,7 +58,7 @@ class Table:
             return
         for column, values in rows.items():
             self.kinds[column] = (values.dtype.str, values.shape[1:])
-            with errors_name(self.file(column)), self.file(column).open("ab") as file:
+            with name_in_errors(self.file(column)), self.file(column).open("ab") as file:
                 file.write(np.ascontiguousarray(values).data)  # see `write_npy`
 
     @property

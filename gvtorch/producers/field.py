@@ -79,23 +79,19 @@ class FieldProducer(Producer):
         checked_field(context, "field", field)
         field = Solid(field) if isinstance(field, Distance) else field
         known_field = field if isinstance(field, Field) else None
-        if box is None:
-            extent, box = _grid_around(context, known_field, extent)
-        else:
-            extent = extent_in(context, extent, box)
-        field_widths = _channel_widths(context, field)
-        dtypes: Mapping[str, torch.dtype] = getattr(field, "dtypes", {})
-        default_channels = {
-            n: Channel(dtypes.get(n, torch.float32), width) for n, width in field_widths.items()
-        }
+        extent, box = _grid(context, known_field, extent, box)
+        field_channels = _field_channels(context, field)
         super().__init__(
             extent,
-            channels=default_channels if channels is None else channels,
+            channels=field_channels if channels is None else channels,
             box=box,
             branching=branching,
             value_range=value_range,
         )
-        widths = {name: channel.width for name, channel in self.channels.items()}
+        widths, field_widths = (
+            {name: channel.width for name, channel in part.items()}
+            for part in (self.channels, field_channels)
+        )
         if widths != field_widths:
             raise ValueError(
                 f"{context}: channels must be {field_widths} numbers wide, got {widths}"
@@ -379,8 +375,10 @@ def _by_channel(context: str, values: Any, points: Tensor) -> dict[str, Tensor]:
     return by_channel
 
 
-def _channel_widths(context: str, field: nn.Module) -> dict[str, int]:
-    """Returns the width of each channel of a field, found by evaluating it at 2 x 5 points."""
+def _field_channels(context: str, field: nn.Module) -> dict[str, Channel]:
+    """Returns the channels of a field: its dtypes, by default float32, and the widths of its values
+    at 2 x 5 points.
+    """
     tensors = [*field.parameters(), *field.buffers()]
     device = tensors[0].device if tensors else torch.device("cpu")
     points = torch.full((2, 5, 3), 0.25, device=device)
@@ -389,16 +387,29 @@ def _channel_widths(context: str, field: nn.Module) -> dict[str, int]:
             values = _call_field(context, field, field.filtered, points, points)
         else:
             values = _call_field(context, field, field, points)
-    return {n: value.shape[-1] for n, value in _by_channel(context, values, points).items()}
+    dtypes: Mapping[str, torch.dtype] = getattr(field, "dtypes", {})
+    return {
+        name: Channel(dtypes.get(name, torch.float32), value.shape[-1])
+        for name, value in _by_channel(context, values, points).items()
+    }
 
 
-def _grid_around(context: str, field: Field | None, extent: int | Sequence[int]) -> tuple[Any, Any]:
-    """Returns extent and box of a grid around a field's box, 2 voxels wider on each side."""
-    box = None if field is None else field.box()
-    if box is None or not bool(torch.isfinite(box).all()) or not bool((box[1] > box[0]).all()):
+def _grid(
+    context: str,
+    field: Field | None,
+    extent: int | Sequence[int],
+    box: Sequence[Sequence[float]] | None,
+) -> tuple[Any, Any]:
+    """Returns extent and box of the grid in `box`, or around a field's box, 2 voxels wider on each
+    side.
+    """
+    if box is not None:
+        return extent_in(context, extent, box), box
+    around = None if field is None else field.box()
+    if around is None or not bool(torch.isfinite(around).all() & (around[1] > around[0]).all()):
         raise ValueError(f"{context}: box must be given: the field does not say where it ends")
-    box = box.cpu()
-    sides, middle = box[1] - box[0], box.mean(0)
+    around = around.cpu()
+    sides, middle = around[1] - around[0], around.mean(0)
     if isinstance(extent, int):
         check.integer(context, "extent", extent, low=5, high=2**40)
         voxel = sides.max() / (extent - 4)

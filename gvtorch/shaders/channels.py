@@ -67,14 +67,14 @@ class ChannelLook:
 
     __repr__ = check.summary
 
-    def function(self, place: int, count: int) -> TransferFunction:
-        """Returns its transfer function, if it is the channel at index `place` of `count` channels.
+    def function(self, index: int, count: int) -> TransferFunction:
+        """Returns its transfer function, if it is the channel `index` of `count`, from 0.
 
         Raises:
             ValueError: A number is out of its range, the window is missing, or the look has a
                 transfer function and also a colour, window or opacity.
         """
-        context = f"Channels: channel {place}" + (f" ({self.name})" if self.name else "")
+        context = f"Channels: channel {index}" + (f" ({self.name})" if self.name else "")
         if self.transfer is not None:
             for name in ("color", "window", "opacity"):
                 if getattr(self, name) is not None:
@@ -86,7 +86,7 @@ class ChannelLook:
                 "Channels.of(volume) finds windows"
             )
         low, high = window_of(context, self.window)
-        default = DEFAULT_COLORS[place] if count > 1 else "white"
+        default = DEFAULT_COLORS[index] if count > 1 else "white"
         color = channel_color(context, default if self.color is None else self.color)
         opacity = _DEFAULT_OPACITY if self.opacity is None else self.opacity
         opacity = check.number(context, "opacity", opacity, low=0, high=1)

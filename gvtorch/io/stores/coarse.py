@@ -22,7 +22,7 @@ import numpy as np
 
 from ...base import boxes
 from ...base.stage import Progress, no_progress
-from ...base.whole_file import errors_name
+from ...base.whole_file import name_in_errors
 from ..resources import amount
 from .ngff import read_json_file
 from .shard import begin_write, bordered, create_array, finish_write
@@ -113,7 +113,7 @@ def _levels_in_files(store: Store, fill_width: int) -> Iterator[Sequence[np.ndar
 
 def _map_level_file(store: Store, folder: Path, level: int, fill_width: int) -> np.ndarray:
     shape, file = (*store.level_extent(level)[::-1], fill_width), folder / f"{level}.npy"
-    with errors_name(file):
+    with name_in_errors(file):
         mapped = np.lib.format.open_memmap(file, mode="w+", dtype=np.float16, shape=shape)
     with file.open("r+b") as handle:  # reserve the disk space: a full disk would kill the process
         try:

@@ -19,7 +19,7 @@ import numpy as np
 
 from ...base.image_info import ImageInfo
 from ...base.volume import Volume, movable
-from ...base.whole_file import durable_file, errors_name, rename
+from ...base.whole_file import durable_file, name_in_errors, rename
 from .checksums import CHECKSUMS_FILE, FileChecksums, json_checksum
 from .ngff import image_metadata, read_json_file
 from .store_layout import GROUPS, WORK, StoreLayout
@@ -48,7 +48,7 @@ class UnfinishedStore:
     def record(self, done: Mapping[Task, TaskResult]) -> None:
         """Adds finished tasks to the journal; they are on disk when this returns."""
         self.done |= done
-        with errors_name(self.target / WORK / _JOURNAL):
+        with name_in_errors(self.target / WORK / _JOURNAL):
             _write_journal_lines(self.journal, done)
 
     def finish(self, layout: StoreLayout, info: ImageInfo, settings: Mapping[str, Any]) -> None:
@@ -121,7 +121,7 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
             write_json(folder / _MANIFEST, settings)
         draft = folder / f".{_JOURNAL}.draft"
         with draft.open("w", encoding="utf-8") as journal:
-            with errors_name(draft):
+            with name_in_errors(draft):
                 _write_journal_lines(journal, done)
             rename(draft, folder / _JOURNAL)
             yield UnfinishedStore(target, journal, done)
