@@ -92,7 +92,8 @@ def test_what_cant_run_here_is_left_out_of_all(monkeypatch, capsys):
         Bench(name="opengl").run()
 
 
-def test_twins_and_streamed_shaders_draw_the_same(compiled):
+def test_twins_and_streamed_shaders_draw_the_same(compiled, monkeypatch, quick):
+    monkeypatch.setenv("CXX", quick)
     chosen = Settings(device=torch.device(DEVICES[compiled]), only="aneurism", **QUICK)
     rows = bench.run("shaders", chosen).rows
     twins = [row for row in rows if row["who"] in ("module", "user's header")]

@@ -176,12 +176,14 @@ def deep(request):
         yield tree, camera.rays()
 
 
-@pytest.mark.parametrize("name", LOOKS)
-def test_compiled_equals_reference(compiled, deep, name):
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [*((name, torch.float32) for name in LOOKS), *((n, torch.float64) for n in ("lit", "surface"))],
+)
+def test_compiled_equals_reference(compiled, deep, name, dtype):
     tree, rays = deep
-    for options in ({}, {"dtype": torch.float64}):
-        result, marks, _ = assert_equal(tree, compiled, rays, LOOKS[name], **options)
-        assert result["alpha"].max() > 0.9 and (marks["brick"] > 0).any()
+    result, marks, _ = assert_equal(tree, compiled, rays, LOOKS[name], dtype=dtype)
+    assert result["alpha"].max() > 0.9 and (marks["brick"] > 0).any()
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])

@@ -104,7 +104,7 @@ def test_a_tree_that_is_turned_is_seen_by_a_camera_that_is_turned(channels, name
     options = {"dtype": torch.float64, "backend": backend}
     expected = gv.trace(tree, rays.to(tree.device), shader, **options)
     assert (expected.alpha > 0.1).any()
-    for matrix in POSES.values():
+    for matrix in POSES.values() if backend != "reference" else [POSES["a mirror"]]:
         world = rays_in_the_world(matrix, rays).to(tree.device)
         lit = light_in_the_world(matrix, shader)
         actual = gv.trace(tree, world, lit, pose=matrix, **options)

@@ -16,6 +16,8 @@ import gvtorch as gv
 from gvtorch.producers import Layout
 
 sdf = gv.sdf
+#: Depth in bricks of 2^3 of the voxels that are all compared, 64^3 of them; 6 is the finest.
+WHOLE_DEPTH = 6 if os.environ.get("GVTORCH_SOAK") else 5
 BOX = ((-1.1,) * 3, (1.1,) * 3)
 ROUGH = {"thickness": 0.15, "frequency": 3.0, "octaves": 4, "softness": 0.1, "box": BOX}
 
@@ -165,14 +167,14 @@ def whole_level(producer, depth: int, brick_size: int) -> dict[str, torch.Tensor
 
 
 def test_no_voxel_is_dropped(name):
-    """Brute force: all nodes of all depths to 6, in bricks of 2^3, against all voxels of the finest
-    level in their reach. EMPTY and CONSTANT hold for every voxel, and every value is in its range.
+    """Brute force: all nodes of all depths to `WHOLE_DEPTH`, in bricks of 2^3, against all voxels of
+    that level in their reach. EMPTY and CONSTANT hold for every voxel, every value is in its range.
     """
     producer = PRODUCERS[name]()
-    levels, region_counts = whole_level(producer, 3, 16), dict.fromkeys(gv.Region, 0)
+    levels, region_counts = whole_level(producer, WHOLE_DEPTH - 3, 16), dict.fromkeys(gv.Region, 0)
     cells = {channel: (level, level) for channel, level in levels.items()}
     producer.prepare(Layout.of(producer, 2, 1, torch.device("cpu")))
-    for depth in range(6, -1, -1):
+    for depth in range(WHOLE_DEPTH, -1, -1):
         regions = producer.classify(nodes_of(producer, depth, brick_size=2))
         ends = {n: each(t, reach=True) for n, t in cells.items()}
         check_proofs(
@@ -181,7 +183,7 @@ def test_no_voxel_is_dropped(name):
         cells = {n: each(t, reach=False) for n, t in cells.items()}
         for region in gv.Region:
             region_counts[region] += int((regions.kind == region).sum())
-    least = 0.001 if name == "mandelbox" else 0.1
+    least = 0.0001 if name == "mandelbox" else 0.08
     proven = region_counts[gv.Region.CONSTANT if name == "distances to a mesh" else gv.Region.EMPTY]
     assert proven > least * sum(region_counts.values())
 
@@ -265,7 +267,7 @@ def test_a_level_is_the_mean_of_the_one_below(name):
     error = 0.3 if name == "mandelbox" else 0.03
     producer = PRODUCERS[name]()
     producer.prepare(Layout.of(producer, 8, 1, torch.device("cpu")))
-    for depth in (3, 2, 1, 0):
+    for depth in range(WHOLE_DEPTH - 3, -1, -1):
         nodes = nodes_of(producer, depth, brick_size=8, border=0)
         below = nodes_of(producer, depth + 1, brick_size=8, border=0)
         count = 2**depth
