@@ -167,8 +167,8 @@ def whole_level(producer, depth: int, brick_size: int) -> dict[str, torch.Tensor
 
 
 def test_no_voxel_is_dropped(name):
-    """Brute force: all nodes of all depths to `WHOLE_DEPTH`, in bricks of 2^3, against all voxels of
-    that level in their reach. EMPTY and CONSTANT hold for every voxel, every value is in its range.
+    """Brute force: all nodes of all depths to `WHOLE_DEPTH`, in bricks of 2^3, against all voxels
+    of that level in reach. EMPTY and CONSTANT hold for every voxel, every value is in its range.
     """
     producer = PRODUCERS[name]()
     levels, region_counts = whole_level(producer, WHOLE_DEPTH - 3, 16), dict.fromkeys(gv.Region, 0)
