@@ -25,11 +25,12 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
         for opengl in [path.stem in IN_OPENGL]
     ],
 )
-def test_example_writes_a_picture(example, tmp_path, monkeypatch, capsys):
+def test_example_writes_a_picture(example, tmp_path, monkeypatch, capsys, quick):
     """Runs within this process, because a new one would have to import torch."""
     if example.stem in IN_OPENGL and (reason := IN_OPENGL[example.stem]()):
         pytest.skip(reason)
     out = tmp_path / "picture.png"
+    monkeypatch.setenv("CXX", quick)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(example.parent))  # as when a script is run
     arguments = ["--size", "48", "--output", str(out), *SHORT.get(example.stem, ())]

@@ -63,7 +63,7 @@ def test_octaves_in_a_homogeneous_medium(backend, octaves, g, dtype):
     rays = rays_along(positions, (1.0, 0.0, 0.0), device=DEVICES[backend])
     sun = gv.DirectionalLight((0, -1, 0), color=(1.0, 2.0, 0.5))
     shader = gv.Lit(transfer(), light=sun, octaves=octaves, anisotropy=g, ambient=0.1, diffuse=0.7)
-    step = 0.25
+    step = 0.5 if backend == "reference" else 0.25
     options = gv.RenderOptions(
         backend=backend, dtype=dtype, lod="finest", step=step, stop_alpha=1.0
     )

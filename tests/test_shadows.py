@@ -79,8 +79,11 @@ def seen(value, rays, light, transfer, step) -> np.ndarray:
     return np.array(out)
 
 
-@pytest.mark.parametrize("branching", [2, 3])
-@pytest.mark.parametrize("light", [SUN, LAMP, INSIDE], ids=["sun", "lamp", "lamp inside"])
+@pytest.mark.parametrize(
+    ("light", "branching"),
+    [(SUN, 2), (LAMP, 3), (INSIDE, 2)],
+    ids=["sun, N = 2", "lamp, N = 3", "lamp inside, N = 2"],
+)
 def test_each_sample_stands_in_the_shadow_of_what_lies_before_its_light(backend, light, branching):
     value = fog(1)
     tree = tree_of(value, backend, branching)

@@ -27,8 +27,7 @@ def cloud(count: int = 30_000, wide: bool = True) -> Points:
     return Points(positions, random.uniform(-0.2, 1, (count, 2)).astype(np.float32), radius=radius)
 
 
-@pytest.mark.parametrize("wide", [False, True])
-@pytest.mark.parametrize("branching", [2, 3])
+@pytest.mark.parametrize(("branching", "wide"), [(2, False), (3, False), (3, True)])
 def test_points_on_disk_are_those_in_memory(tmp_path, wide, branching):
     points = cloud(wide=wide)
     options = {"extent": 96, "box": BOX, "branching": branching}

@@ -99,7 +99,7 @@ POSES = {
 )
 @pytest.mark.parametrize("pose", POSES)
 def test_trees_that_overlap_are_composited_by_sample_as_by_a_dense_marcher(volumes, pose, backend):
-    size, step = (10, 0.5) if backend == "reference" else (24, 0.05)
+    size, step = (10, 0.5) if backend == "reference" else (16, 0.05)
     trees = {
         name: gv.N3Tree.from_volume(volume, 8, device=DEVICES[backend])
         for name, volume in volumes.items()

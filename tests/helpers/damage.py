@@ -2,40 +2,47 @@
 
 from __future__ import annotations
 
+import faulthandler
 import json
+import multiprocessing
 import random
+import resource
 import shutil
-import subprocess
-import sys
+import warnings
 from pathlib import Path
 from typing import Any
+
+import gvtorch as gv
+from gvtorch.io.reading import open_source
 
 COPIES = 50
 _SECONDS = 240
 _MEMORY = 3 << 30  # bytes of address space beyond what the libraries use
+# Each call is a copy of a process that has imported these: it takes a twentieth of a start.
+_CONTEXT = multiprocessing.get_context("forkserver")
+_CONTEXT.set_forkserver_preload(["torch", "gvtorch.io.reading"])
 
-_READER = """
-import json, resource, sys, warnings
-import gvtorch as gv
-from gvtorch.io.reading import open_source
-warnings.simplefilter("ignore")
-paths, options, memory = json.loads(sys.stdin.read())
-gv.read_volume(paths[0], **options)  # the libraries are there from now on
-used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-resource.setrlimit(resource.RLIMIT_AS, (used + memory, -1))
-for path in paths:
-    try:
-        source = open_source(path, **options)
-        x, y, z = source.extent
-        source.read_region((0, 0, 0), (min(2, z), min(3, y), min(4, x)))
-        gv.read_volume(path, nan=0, **options)
-        told = ["read", ""]
-    except (ValueError, OSError) as error:
-        told = ["refused", str(error)]
-    except BaseException as error:
-        told = [type(error).__name__, str(error)]
-    print(json.dumps(told), flush=True)
-"""
+
+def _read(paths: list[Path], options: dict[str, Any], log: Path) -> None:
+    """Reads files; writes for each a line with its outcome, and last what a crash prints."""
+    warnings.simplefilter("ignore")
+    gv.read_volume(paths[0], **options)  # the libraries are there from now on
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + _MEMORY, -1))
+    with log.open("w") as file:
+        faulthandler.enable(file)
+        for path in paths:
+            try:
+                source = open_source(path, **options)
+                x, y, z = source.extent
+                source.read_region((0, 0, 0), (min(2, z), min(3, y), min(4, x)))
+                gv.read_volume(path, nan=0, **options)
+                outcome = ["read", ""]
+            except (ValueError, OSError) as error:
+                outcome = ["refused", str(error)]
+            except BaseException as error:
+                outcome = [type(error).__name__, str(error)]
+            print(json.dumps(outcome), file=file, flush=True)
 
 
 def break_file(content: bytes, number: int) -> bytes:
@@ -69,18 +76,16 @@ def outcomes(path: Path, folder: Path, **options: Any) -> list[tuple[str, str]]:
         else:
             copy.write_bytes(break_file(path.read_bytes(), number))
         paths.append(copy)
-    request = json.dumps([[str(path) for path in paths], options, _MEMORY])
-    run = subprocess.run(
-        [sys.executable, "-X", "faulthandler", "-c", _READER],
-        input=request,
-        capture_output=True,
-        text=True,
-        timeout=_SECONDS,
-        check=False,
-    )
-    lines = [tuple(json.loads(line)) for line in run.stdout.splitlines() if line.startswith("[")]
+    log = folder / "log"
+    process = _CONTEXT.Process(target=_read, args=(paths, options, log))
+    process.start()
+    process.join(_SECONDS)
+    process.kill()
+    process.join()
+    text = log.read_text() if log.exists() else ""
+    lines = [tuple(json.loads(line)) for line in text.splitlines() if line.startswith("[")]
     failed_path = paths[len(lines)] if len(lines) < len(paths) else "the end"
-    assert run.returncode == 0, f"crashed ({run.returncode}) at {failed_path}: {run.stderr[-3000:]}"
+    assert process.exitcode == 0, f"ended with {process.exitcode} at {failed_path}: {text[-3000:]}"
     return lines
 
 
