@@ -25,14 +25,7 @@ from ..shaders.shader import Shader
 from ..tracing import RenderOptions
 from ..tracing.options import RenderSettings, render_options
 from ..tracing.pixels import Again, View, empty_hits
-from ..tracing.trees import (
-    Shaders,
-    TreeTrace,
-    box_around,
-    overlaps,
-    trace_trees,
-    tree_traces,
-)
+from ..tracing.trees import Shaders, box_around, overlaps, tree_traces
 from .frame_graph import FrameGraph
 from .host_frame import HostFrame
 from .production import Failure
@@ -137,20 +130,12 @@ class Engine(FrameSteps):
         """Checks the arguments of `frame`, and returns its view. Errors begin with `context`."""
         camera = as_camera(context, camera)
         chosen = render_options(context, options, camera)
-        trees = {name: source.tree for name, source in self.trees.items()}
-        box = box_around(context, trees, chosen.pose)
-        placed, trace = camera.placed(box), partial(trace_trees, self._tracers(shader, chosen, box))
-        return View(placed, placed.numbers(self.device), trace, chosen, box)
-
-    def _tracers(self, shaders: Shaders, options: RenderOptions, box: Tensor) -> list[TreeTrace]:
-        """Returns a `TreeTrace` for each tree, given the (2, 3) box of the scene."""
         scene = {
             name: (source.tree, source.producer.channels) for name, source in self.trees.items()
         }
         by_level, frame_1 = self.production.by_level, self.cache.frame_1
-        return tree_traces(
-            "frame", scene, shaders, options, box, by_level=by_level, frame_1=frame_1
-        )
+        trees = tree_traces(context, scene, shader, chosen, by_level=by_level, frame_1=frame_1)
+        return View.of(camera, trees, chosen)
 
     @explicit(RenderOptions)
     @_locked
@@ -301,7 +286,7 @@ class Engine(FrameSteps):
         if self.device.type != "cuda":
             raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
         view = self.view("capture", camera, shader, options)
-        if overlaps(self._tracers(shader, view.options, view.box)):
+        if overlaps(view.trees):
             raise ValueError(
                 "Engine.capture: trees that overlap can't be recorded: the host waits for them"
             )
@@ -325,7 +310,7 @@ class Engine(FrameSteps):
     @cached_property
     def box(self) -> Tensor:
         """(2, 3) float64 world corners around all trees, without any pose."""
-        return box_around("Engine", {name: source.tree for name, source in self.trees.items()})
+        return box_around([source.tree.box for source in self.trees.values()])
 
     @property
     def failures(self) -> list[Failure]:

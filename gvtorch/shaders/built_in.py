@@ -90,6 +90,10 @@ class Lit(LitShader):
         super().__init__(**light)
         self.transfer, self.shadows, self.in_the_way = transfer, shadows, in_the_way
 
+    @property
+    def shows_nothing(self) -> bool:
+        return self.transfer.shows_nothing
+
     def blocker(self) -> Shader:
         return self.in_the_way or self.transfer
 

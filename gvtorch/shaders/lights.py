@@ -213,6 +213,9 @@ class LitShader(Shader):
             )
         return arguments._replace(shader=shader_number(self.shadowed_kind))
 
+    def own_light(self) -> Light:
+        return self.light
+
     def unlit(self) -> Self:
         unlit = copy(self)
         unlit.ambient, unlit.diffuse, unlit.specular = 1.0, 0.0, 0.0
