@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from math import inf
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypedDict
 
 import numpy as np
 import torch
@@ -141,6 +141,19 @@ Light = Headlight | DirectionalLight | PointLight
 _MATERIAL = ("ambient", "diffuse", "specular", "shininess", "octaves", "anisotropy")
 #: With more, the transmittances of thick clouds become 0 in float32 (see `Light.faintest`).
 MOST_OCTAVES = 5
+
+
+class LightSettings(TypedDict, total=False):
+    """The keyword arguments of `LitShader`, for constructors that pass them on."""
+
+    normals: str | None
+    light: Light | None
+    ambient: Number
+    diffuse: Number
+    specular: Number
+    shininess: Number
+    octaves: int
+    anisotropy: Number
 
 
 class LitShader(Shader):

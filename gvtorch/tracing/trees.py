@@ -33,7 +33,9 @@ def tree_traces(
     scene: Mapping[str, tuple[N3Tree, Collection[str]]],  # by name: the tree, and its channel names
     shaders: Shaders,
     options: RenderOptions,  # its channel is the first of each tree if left out
-    **settings: Any,  # of `Tracer`
+    *,
+    by_level: bool = False,
+    frame_1: Tensor | None = None,
 ) -> list[TreeTrace]:
     """Prepares the tracers of all trees for one frame. Raises ValueError if a shader is missing, or
     a tree has no such channel; see `Tracer` and `with_effects`.
@@ -51,7 +53,7 @@ def tree_traces(
                     f"{context}: tree {name!r} has no channel {needed!r}; it has {channel_list}"
                 )
         tree_options = replace(options, channel=channel, pose=poses[name])
-        tracer = Tracer(tree, shader, tree_options, **settings)
+        tracer = Tracer(tree, shader, tree_options, by_level=by_level, frame_1=frame_1)
         traces.append(TreeTrace.of(tracer, tree_options, box))
     return traces
 
