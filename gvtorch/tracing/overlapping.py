@@ -154,9 +154,7 @@ def _trace_mixed(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     depth, label = _locate_hits(trees, rays, pieces, hit, clear_before[hit], within)
     samples = torch.zeros(len(clear), dtype=torch.int32, device=clear.device)
     samples.index_add_(0, pieces.ray, torch.where(clear_before > 0, piece_sums.samples, 0))
-    return piece_sums.hits(
-        sums, clear_after, depth, samples=samples, missed=pieces.missed, label=label
-    )
+    return piece_sums.hits(sums, clear_after, depth, label, samples, pieces.missed)
 
 
 def _trace_pieces(trees: Sequence[TreeTrace], rays: Rays, pieces: _Pieces) -> _PieceSums:
@@ -248,10 +246,16 @@ class _PieceSums:
         columns = [*self.sums.values()] or [self.extinction[:, :0]]
         return torch.cat(columns, 1) / self.extinction.clamp(min=1e-300)
 
-    def hits(self, sums: Tensor, clear: Tensor, depth: Tensor, **counts: Any) -> Hits:
-        """Returns the hits of rays, given sums (r, c) of `features`, the transmittance left, the
-        depth (r,), and the fields of `Hits` that are no floats.
-        """
+    def hits(
+        self,
+        sums: Tensor,  # (r, c) of `features` along each ray
+        clear: Tensor,  # (r,) transmittance left
+        depth: Tensor,  # (r,)
+        label: Tensor | None,
+        samples: Tensor,
+        missed: Tensor,
+    ) -> Hits:
+        """Returns the hits of rays; label, samples and missed are fields of `Hits`."""
         widths = [columns.shape[1] for columns in self.sums.values()]
         fields = dict(zip(self.sums, sums.to(self.dtype).split(widths, 1), strict=True))
         color = fields.get("color", sums.new_zeros((len(sums), 3), dtype=self.dtype))
@@ -261,7 +265,9 @@ class _PieceSums:
             depth=depth[:, None].to(self.dtype),
             normal=_unit_vectors(fields["normal"]) if "normal" in fields else None,
             features=fields.get("features"),
-            **counts,
+            label=label,
+            samples=samples,
+            missed=missed,
         )
 
 
